@@ -1,0 +1,268 @@
+"""What is measured against what: the same episodes in the harness, one at a time, over TraCI, and in the twin.
+
+(a), (b) and (c) run the same `EpisodeLoop`: the same compiled policies, the same rule for ending an episode, the same
+rows and first nine control steps written to Parquet. They differ in the world alone, so their rows must be equal.
+"""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from benchmarks.one_at_a_time import OverTraci, in_libsumo, sumo_binary
+from harness.campaign.loading import load_campaign
+from harness.campaign.models import Campaign
+from harness.episode.loop import Shard
+from harness.records.folder import write_shard
+from harness.records.tables import shard_tables
+from harness.runner.prepare import Prepared, prepare
+from harness.runner.shards import ShardPool
+from harness.runner.worker import ShardSpec
+from harness.sumo.shim import shim_library
+from harness.sumo.world import SumoWorld
+from harness.twin import TwinWorld
+from harness.world import World
+
+SCENARIOS = Path(__file__).parents[1] / "scenarios"
+TWIN_CELLS = 1024
+FLOOR_STEPS = 200
+SHARD = 2_500
+
+
+class Work(NamedTuple):
+    """What one measurement did.
+
+    ``part_s`` is wall time by part where the contender knows it; ``timed_s`` are wall and CPU time of what counts,
+    where that is not everything.
+    """
+
+    episodes: int
+    cell_steps: int
+    bytes_written: int = 0
+    part_s: dict[str, float] | None = None
+    timed_s: tuple[float, float] | None = None
+
+
+class Contender(Protocol):
+    """Something that runs episodes."""
+
+    def run(self, first: int, n: int) -> Work:
+        """Run episodes ``first … first + n − 1``."""
+        ...
+
+    def rows(self, n: int) -> bytes | None:
+        """Outcome, steps, cut-in step and weight of the first n episodes, to compare; None if there are none."""
+        ...
+
+
+def campaign(name: str, **settings: object) -> Campaign:
+    """A shipped campaign; motion is not traced, so that only what estimates need is recorded."""
+    fixed = {"records.traces": "none", "records.trace_share": 0, **settings}
+    return load_campaign(SCENARIOS / f"overtaking_{name}.yaml", [f"{key}={value}" for key, value in fixed.items()])
+
+
+class Recorded:
+    """Episodes of a campaign in some world, written to disk as the runner writes them."""
+
+    def __init__(self, settings: Campaign, world: Callable[[Campaign], World]) -> None:
+        self.prepared: Prepared = prepare(settings)
+        self.world = world(settings)
+        self.loop = self.prepared.loop(self.world)
+        self.folder = Path(tempfile.mkdtemp(prefix="harness-benchmark-"))
+
+    def run(self, first: int, n: int) -> Work:
+        """Run and write a shard."""
+        shard = self.loop.run(first, self.prepared.states(first, n))
+        self.write(shard)
+        written = sum(path.stat().st_size for path in self.folder.rglob("*.parquet"))
+        return Work(n, int(shard.results.episode["n_steps"].sum()), written)
+
+    def write(self, shard: Shard) -> None:
+        """Write the shard's tables over those of the one before."""
+        write_shard(self.folder, 0, shard_tables(shard, self.prepared.campaign.seed, keep_traces=False))
+
+    def rows(self, n: int) -> bytes:
+        """Bits of the first n episodes."""
+        episode = self.loop.run(0, self.prepared.states(0, n)).results.episode
+        return b"".join(episode[name].tobytes() for name in ("outcome", "n_steps", "cut_in_step", "log_weight"))
+
+    def close(self) -> None:
+        """End the simulation and remove the records."""
+        self.world.close()
+        shutil.rmtree(self.folder)
+
+
+class WithParts(Recorded):
+    """The harness in SUMO with a stopwatch around each of its parts."""
+
+    def __init__(self, settings: Campaign, world: Callable[[Campaign], World]) -> None:
+        super().__init__(settings, world)
+        self._seconds: dict[str, float] = {}
+        self._time(self.loop, "_turn", "policy")
+        self._time(self.world, "place", "refill")
+        self._time(self.world, "_contacts", "collisions")
+        self._time(self, "write", "recording")
+        if self.world._shim is not None:
+            self._time(self.world._shim, "step", "SUMO: set, step, get in one call")
+        else:
+            self.world._api = _TimedStep(self.world._api, self._seconds)
+            self._time(self.world, "_tell", "set")
+            self._time(self.world, "_require_equal", "get and compare")
+
+    def _time(self, owner: object, method: str, part: str) -> None:
+        setattr(owner, method, _timed(getattr(owner, method), part, self._seconds))
+
+    def run(self, first: int, n: int) -> Work:
+        """Run and write a shard, with the seconds of every part."""
+        self._seconds.clear()
+        started = time.perf_counter()
+        work = super().run(first, n)
+        total = time.perf_counter() - started
+        rest = total - sum(self._seconds.values())
+        return work._replace(part_s={**self._seconds, "dynamics, loop": rest})
+
+
+def _timed(function: Callable[..., object], part: str, seconds: dict[str, float]) -> Callable[..., object]:
+    def call(*args: object, **kwargs: object) -> object:
+        nested = sum(seconds.values())
+        started = time.perf_counter()
+        result = function(*args, **kwargs)
+        inner = sum(seconds.values()) - nested
+        seconds[part] = seconds.get(part, 0.0) + time.perf_counter() - started - inner
+        return result
+
+    return call
+
+
+class _TimedStep:
+    """libsumo with its simulationStep timed."""
+
+    def __init__(self, api: object, seconds: dict[str, float]) -> None:
+        self._api = api
+        self.simulationStep = _timed(api.simulationStep, "SUMO step", seconds)
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self._api, name)
+
+
+class Floor:
+    """SUMO's simulationStep alone: K cells whose vehicles keep an equal speed, nothing told, nothing read."""
+
+    def __init__(self, settings: Campaign) -> None:
+        self._prepared = prepare(settings)
+        self._world = SumoWorld(settings.world.cells, shim=False)
+
+    def run(self, first: int, n: int) -> Work:
+        """As many full-length episodes as fit into whole rounds of K."""
+        world, cells = self._world, self._world.n_cells
+        rounds = max(1, n // cells)
+        wall_s = cpu_s = 0.0
+        for i in range(rounds):
+            world.x[:] = [250.0, 200.0, 100.0]
+            world.v[:] = self._prepared.states(first + i * cells, cells)[:, :1]
+            world.place(np.arange(cells), world.x, world.v)
+            wall, cpu = time.perf_counter(), time.process_time()
+            for _ in range(FLOOR_STEPS):
+                world._api.simulationStep()
+            wall_s += time.perf_counter() - wall
+            cpu_s += time.process_time() - cpu
+        return Work(rounds * cells, rounds * cells * FLOOR_STEPS, timed_s=(wall_s, cpu_s))
+
+    def rows(self, n: int) -> None:
+        """There are none."""
+
+    def close(self) -> None:
+        """End the simulation."""
+        self._world.close()
+
+
+class TwinAlone:
+    """The twin without records."""
+
+    def __init__(self, settings: Campaign) -> None:
+        self._prepared = prepare(settings)
+        self._loop = self._prepared.loop(TwinWorld(TWIN_CELLS))
+
+    def run(self, first: int, n: int) -> Work:
+        """Run episodes and forget them."""
+        shard = self._loop.run(first, self._prepared.states(first, n))
+        return Work(n, int(shard.results.episode["n_steps"].sum()))
+
+    def rows(self, n: int) -> None:
+        """Nothing is kept."""
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+
+class Workers:
+    """The runner's own worker processes, as `harness run` uses them."""
+
+    def __init__(self, settings: Campaign, workers: int) -> None:
+        self._folder = Path(tempfile.mkdtemp(prefix="harness-benchmark-"))
+        self._pool = ShardPool(settings, self._folder, workers)
+        self._workers = workers
+
+    def run(self, first: int, n: int) -> Work:
+        """Shards of 2,500 episodes, the same number for every worker."""
+        n_shards = max(2, n // SHARD)
+        specs = [ShardSpec(i, first + i * SHARD, SHARD) for i in range(n_shards)]
+        for _ in self._pool.run(iter(specs), lambda _: None):
+            pass
+        return Work(n_shards * SHARD, 0)
+
+    def rows(self, n: int) -> None:
+        """Start the workers; their rows are on disk."""
+        self.run(0, n)
+
+    def close(self) -> None:
+        """End the workers and remove their records."""
+        self._pool.close()
+        shutil.rmtree(self._folder)
+
+
+def in_sumo(*, shim: bool) -> Callable[[Campaign], World]:
+    """The harness's SUMO world with or without the compiled shim."""
+
+    def build(settings: Campaign) -> World:
+        return SumoWorld(settings.world.cells, shim=shim)
+
+    return build
+
+
+def missing(name: str) -> str | None:
+    """Why a contender cannot run here, in words; None if it can."""
+    if name == "traci" and sumo_binary() is None:
+        return "no sumo binary: pip install 'harness[sumo]'"
+    if "shim" in name and shim_library() is None:
+        return "no compiled shim: python setup.py build_ext --inplace"
+    return None
+
+
+CONTENDERS: dict[str, tuple[Callable[[], Contender], int]] = {
+    "harness": (lambda: Recorded(campaign("nade"), in_sumo(shim=False)), 5_000),
+    "harness+shim": (lambda: Recorded(campaign("nade"), in_sumo(shim=True)), 5_000),
+    "one-at-a-time": (lambda: Recorded(campaign("nade"), lambda _: in_libsumo()), 500),
+    "traci": (lambda: Recorded(campaign("nade"), lambda _: OverTraci(sumo_binary())), 50),
+    "floor": (lambda: Floor(campaign("nade")), 5_000),
+    "recursive": (lambda: Recorded(campaign("recursive"), in_sumo(shim=False)), 5_000),
+    "recursive+shim": (lambda: Recorded(campaign("recursive"), in_sumo(shim=True)), 5_000),
+    "twin nade": (lambda: TwinAlone(campaign("nade", **{"records.moments": "none"})), 50_000),
+    "twin nde": (lambda: TwinAlone(campaign("nde")), 100_000),
+    "twin recursive": (lambda: TwinAlone(campaign("recursive", **{"records.moments": "none"})), 40_000),
+    "twin recorded": (
+        lambda: Recorded(campaign("nade", **{"world.cells": TWIN_CELLS}), lambda c: TwinWorld(c.world.cells)),
+        40_000,
+    ),
+    "1 worker": (lambda: Workers(campaign("nade"), 1), 5_000),
+    "2 workers": (lambda: Workers(campaign("nade"), 2), 10_000),
+    "parts": (lambda: WithParts(campaign("nade"), in_sumo(shim=False)), 5_000),
+    "parts+shim": (lambda: WithParts(campaign("nade"), in_sumo(shim=True)), 5_000),
+}
+"""Name → how to build it, and episodes per measurement (about two seconds each)."""

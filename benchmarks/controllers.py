@@ -1,0 +1,72 @@
+"""What each form of controller costs per episode, as a ratio to the built-in IDM.
+
+    python -m benchmarks.controllers
+
+Every form drives the intelligent driver model through the same episodes in one process and one SUMO world, so that
+ratios of CPU time compare controllers and nothing else. Rounds are interleaved and the fastest counts.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import tempfile
+import time
+from pathlib import Path
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+from harness.campaign.loading import load_campaign
+from harness.runner.prepare import prepare
+from harness.sumo.world import SumoWorld
+
+ROOT = Path(__file__).parents[1]
+LISTENER = "{controller: 'harness.controllers.traci_style:StepListenerController', parameters: {listener: 'examples.idm_traci_style:Listener'}}"  # noqa: E501 - one campaign value
+FORMS = {
+    "built in": ("{model: idm}", 1.0),
+    "batch": ("{controller: 'examples.idm_batch:IDM'}", 1.2),
+    "per vehicle": ("{controller: 'examples.idm:IDM'}", 4.0),
+    "TraCI-style": ("{controller: 'examples.idm_traci_style:IDM'}", 6.0),
+    "step listener": (LISTENER, 6.0),
+}
+
+
+def fmu_form(folder: Path) -> tuple[str, float]:
+    """The FMU that the tests build, by pythonfmu."""
+    from pythonfmu.builder import FmuBuilder  # noqa: PLC0415 - of the test extra
+
+    file = FmuBuilder.build_FMU(ROOT / "examples/idm_fmu.py", dest=folder, project_files=[ROOT / "examples/idm.py"])
+    return f"{{fmu: {{file: '{file}', inputs: {{speed_mps: v, lead_speed_mps: v_lead, gap_m: gap}}, output: a}}}}", 6.0
+
+
+def main() -> None:
+    """Print a table."""
+    arguments = argparse.ArgumentParser(description=__doc__)
+    arguments.add_argument("--episodes", type=int, default=1000)
+    arguments.add_argument("--rounds", type=int, default=3)
+    given = arguments.parse_args()
+    os.chdir(ROOT)
+    with tempfile.TemporaryDirectory() as folder:
+        forms = FORMS | {"FMU (pythonfmu)": fmu_form(Path(folder))}
+        world = SumoWorld(96)
+        loops, best = {}, dict.fromkeys(forms, float("inf"))
+        for name, (av, _) in forms.items():
+            prepared = prepare(load_campaign(ROOT / "scenarios/smoke.yaml", [f"av={av}"]))
+            loops[name] = prepared.loop(world, traces="none", black_box=Path(folder) / "black-box")
+            loops[name].run(0, prepared.states(0, 96))
+        states = prepared.states(0, given.episodes)
+        for _ in range(given.rounds):
+            for name, loop in loops.items():
+                began = time.process_time()
+                shard = loop.run(0, states)
+                best[name] = min(best[name], time.process_time() - began)
+                assert not shard.failures
+        world.close()
+    print("| controller | CPU per episode, ms | ratio | at most |\n| --- | --- | --- | --- |")
+    for name, (_, most) in forms.items():
+        ratio = best[name] / best["built in"]
+        print(f"| {name} | {1e3 * best[name] / given.episodes:.2f} | {ratio:.2f} | {most:g} |")
+
+
+if __name__ == "__main__":
+    main()

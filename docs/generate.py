@@ -1,0 +1,250 @@
+"""Write the generated parts of the documentation: settings, columns, results of long runs.
+
+    python docs/generate.py            rewrites them in place
+    python docs/generate.py --check    says which pages are out of date (exit code 1)
+
+A generated part stands between ``<!-- generated: NAME -->`` and ``<!-- end -->``. Its source is the code (models of the
+campaign, Arrow schemas) or the committed results in ``docs/validation/``, so that it cannot drift from them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import re
+import types
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, Union, get_args, get_origin
+
+import pyarrow as pa
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+
+from harness.campaign.models import Campaign, Environment
+from harness.environment.loading import load_parameters
+from harness.records.schemas import episodes_schema, moments_schema, traces_schema
+
+FOLDER = Path(__file__).parent
+_PART = re.compile(r"(<!-- generated: (\S+) -->\n).*?(<!-- end -->)", re.DOTALL)
+
+SCHEMAS = {"episodes": episodes_schema(4, 3), "moments": moments_schema(3), "traces": traces_schema()}
+RESULTS = {
+    "level_1": ("nde_1", "forced_1", "step_recursive_1", "episode_recursive_1"),
+    "level_1e4": (
+        "nde_1e4",
+        "forced_1e4",
+        "step_recursive_1e4",
+        "episode_recursive_1e4",
+        "nade_1e4",
+        "nade_epsilon_0.9_1e4",
+    ),
+}
+"""Results by lane-change level; the forced one of level 1 is the tests' reference."""
+_ELSEWHERE = {"forced_1": FOLDER.parent / "tests" / "reference" / "default.json"}
+RELVAR_TO_TESTS = (1.6448536269514722 / 0.3) ** 2
+"""Tests for RHW 0.3 at 90 %, per unit of relvar."""
+
+
+def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
+    lines = ["| " + " | ".join(row) + " |" for row in (head, ("---",) * len(head), *rows)]
+    return "\n".join(lines) + "\n"
+
+
+def _kind(annotation: Any) -> str:
+    """Type of a setting in words."""
+    origin = get_origin(annotation)
+    if origin in (Union, types.UnionType):
+        inner = [option for option in get_args(annotation) if option is not type(None)]
+        return " or ".join(dict.fromkeys(_kind(option) for option in inner))
+    if origin is not None and hasattr(annotation, "__metadata__"):
+        return _kind(get_args(annotation)[0])
+    if origin is dict:
+        return "mapping"
+    if str(origin) == "typing.Literal":
+        return ", ".join(f"`{value}`" for value in get_args(annotation))
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return "section"
+    return {float: "number", int: "whole number", str: "text"}.get(annotation, str(annotation))
+
+
+def _limits(field: FieldInfo) -> str:
+    """Limits of a number, from its own constraints and those of its annotated type."""
+    signs = {"ge": "≥", "gt": ">", "le": "≤", "lt": "<"}
+    found = [
+        f"{sign} {getattr(rule, name):g}"
+        for name, sign in signs.items()
+        for rule in field.metadata
+        if getattr(rule, name, None) is not None
+    ]
+    return ", ".join(found)
+
+
+def _default(field: FieldInfo) -> str:
+    if field.is_required():
+        return "*required*"
+    value = field.get_default(call_default_factory=True, validated_data={})
+    if value is None:
+        return "none"
+    if value in ("", {}):
+        return "empty"
+    return "see below" if isinstance(value, BaseModel | dict) else f"`{value}`"
+
+
+def settings_table(section: type[BaseModel]) -> str:
+    """Table of a section's keys."""
+    rows = []
+    for name, field in section.model_fields.items():
+        kind = ", ".join(filter(None, [_kind(field.annotation), _limits(field)]))
+        text = field.description or _own_words(field.annotation)
+        rows.append((f"`{name}`", kind, _default(field), text.replace("|", "\\|")))
+    return _table(("key", "value", "default", "meaning"), rows)
+
+
+def sections(annotation: Any, path: str = "") -> Iterator[tuple[str, type[BaseModel]]]:
+    """Every section of a campaign with its dotted path, unions and mappings looked through."""
+    if not (isinstance(annotation, type) and issubclass(annotation, BaseModel)):
+        inner = [option for option in get_args(annotation) if not isinstance(option, str)]
+        models = [option for option in inner if isinstance(option, type) and issubclass(option, BaseModel)]
+        below = f"{path}.NAME" if get_origin(annotation) is dict else path
+        for option in inner:
+            yield from sections(option, below if len(models) < 2 else f"{path} ({option.__name__})")
+        return
+    yield path, annotation
+    for name, field in annotation.model_fields.items():
+        yield from sections(field.annotation, f"{path}.{name}".lstrip("."))
+
+
+def settings_reference() -> str:
+    """All sections, each with a heading and its table; one that was shown already is only named."""
+    shown: dict[type[BaseModel], str] = {}
+    text = []
+    for path, section in sections(Campaign):
+        text.append(f"### {f'`{path}`' if path else 'Top level'}\n\n")
+        if section in shown:
+            text.append(f"As `{shown[section]}`.\n\n")
+            continue
+        shown[section] = path
+        text.append(f"{_own_words(section)}\n\n{settings_table(section)}\n")
+    return "\n" + "".join(text)
+
+
+def _own_words(annotation: Any) -> str:
+    """First line of a section's docstring."""
+    is_section = isinstance(annotation, type) and issubclass(annotation, BaseModel)
+    return str(annotation.__doc__).strip().splitlines()[0] if is_section else ""
+
+
+def columns_table(schema: pa.Schema) -> str:
+    """Table of a schema's columns."""
+    rows = []
+    for field in schema:
+        words = {key.decode(): value.decode() for key, value in field.metadata.items()}
+        kind = re.sub(r"(?:fixed_size_)?list<\w+: (\w+).*", r"list of \1", str(field.type))
+        kind = re.sub(r"dictionary<values=(\w+),.*", r"\1 (dictionary)", kind)
+        optional = " or null" if field.nullable else ""
+        rows.append((f"`{field.name}`", kind + optional, words["unit"] or "–", words["doc"].replace("|", "\\|")))
+    return _table(("column", "type", "unit", "meaning"), rows)
+
+
+def environment_table() -> str:
+    """Numbers of the shipped environment, by section and source."""
+    parameters = load_parameters(Environment())
+    rows = []
+    for section, numbers in parameters:
+        if not isinstance(numbers, BaseModel):
+            continue
+        by_source: dict[str, list[str]] = {}
+        for name, number in numbers:
+            by_source.setdefault(number.source, []).append(f"`{name}` {number.value:g}")
+        rows += [(f"`{section}`", f"[{source}]", ", ".join(found)) for source, found in by_source.items()]
+    return _table(("section", "source", "numbers"), rows)
+
+
+def _result(name: str) -> dict[str, Any] | None:
+    path = _ELSEWHERE.get(name, FOLDER / "validation" / f"{name}.json")
+    return json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
+
+
+def results_table(names: tuple[str, ...]) -> str:
+    """Table of long runs, the commands below it; one that has not been made yet says so."""
+    head = ("run", "tests", "crashes", "crash rate", "std. error", "ratio", "relvar", "tests for RHW 0.3")
+    head = (*head, "P(cut-in)", "BV–LV")
+    yardstick = next((found for name in names if "episode" in name and (found := _result(name))), None)
+    rows, commands = [], []
+    for name in names:
+        found = _result(name)
+        if found is None:
+            rows.append((name, *("not yet run",) + ("",) * (len(head) - 2)))
+            continue
+        rows.append((name, *_result_cells(found, yardstick)))
+        commands.append(f"- {name}: `{found['command']}` ({found['seconds']:,.0f} s)")
+    return _table(head, rows) + "\n" + "\n".join(commands) + "\n"
+
+
+def _ratio(found: dict[str, Any], yardstick: dict[str, Any] | None) -> str:
+    """Rate over that of the yardstick, with its standard error."""
+    if yardstick is None or found == yardstick:
+        return "1" if yardstick else "–"
+    ratio = found["crash_rate"] / yardstick["crash_rate"]
+    return f"{ratio:.3f} ± {ratio * math.hypot(found['relative_error'], yardstick['relative_error']):.3f}"
+
+
+def _result_cells(found: dict[str, Any], yardstick: dict[str, Any] | None) -> Iterator[str]:
+    yield f"{found['n_episodes']:,}"
+    yield f"{found['n_crashes']:,}"
+    yield f"{found['crash_rate']:.4g}"
+    yield f"{found['relative_error']:.2%}"
+    yield _ratio(found, yardstick)
+    yield f"{found['relvar']:.3g}"
+    yield f"{_two_digits(found['relvar'] * RELVAR_TO_TESTS):,}"
+    yield f"{found['mean_weight_cut_in']:.3g}"
+    yield f"{found['mean_weight_contact']:.2g}"
+
+
+def _two_digits(value: float) -> int:
+    size = 10 ** max(math.floor(math.log10(value)) - 1, 0)
+    return round(value / size) * size
+
+
+def parts() -> dict[str, Callable[[], str]]:
+    """All generated parts by name."""
+    found: dict[str, Callable[[], str]] = {"settings": settings_reference, "environment": environment_table}
+    for name, schema in SCHEMAS.items():
+        found[f"columns-{name}"] = lambda schema=schema: columns_table(schema)
+    for name, results in RESULTS.items():
+        found[f"results-{name}"] = lambda results=results: results_table(results)
+    return found
+
+
+def regenerate(text: str) -> str:
+    """A page with its generated parts made anew."""
+    known = parts()
+    return _PART.sub(lambda match: match[1] + known[match[2]]() + match[3], text)
+
+
+def pages() -> Iterator[Path]:
+    """Pages that have generated parts."""
+    yield from (page for page in sorted(FOLDER.rglob("*.md")) if "<!-- generated:" in page.read_text(encoding="utf-8"))
+
+
+def main() -> int:
+    """Rewrite, or with ``--check`` only compare; returns the exit code."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--check", action="store_true")
+    check = parser.parse_args().check
+    stale = 0
+    for page in pages():
+        before = page.read_text(encoding="utf-8")
+        after = regenerate(before)
+        if after != before:
+            stale += 1
+            print(f"{page.relative_to(FOLDER.parent)}: {'out of date' if check else 'rewritten'}")  # noqa: T201
+            if not check:
+                page.write_text(after, encoding="utf-8")
+    return int(check and stale > 0)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,25 @@
+"""The intelligent driver model over arrays: `av: {controller: "examples.idm_batch:IDM"}`."""
+
+import math
+from typing import Any
+
+import numpy as np
+
+
+class IDM:
+    """All AVs of a worker at once."""
+
+    def start_batch(self, cells: Any, episodes: Any, random: Any) -> None:
+        """Nothing to forget."""
+
+    def step_batch(self, seen: Any) -> Any:
+        """Accelerations (m/s²)."""
+        gap, speed = np.maximum(seen.gap_m, 0.1), seen.speed_mps
+        closing = (speed * (speed - seen.lead_speed_mps)) / (2.0 * math.sqrt(2.0 * 3.0))
+        desired = 2.0 + np.maximum(0.0, speed * 1.0 + closing)
+        ratio = speed / 40.0
+        squared, close = ratio * ratio, desired / gap
+        return np.minimum(np.maximum(2.0 * (1.0 - squared * squared - close * close), -4.0), 2.0)
+
+    def close(self) -> None:
+        """Nothing to release."""

@@ -1,0 +1,149 @@
+"""Strict YAML 1.2: every value is what it looks like, and every value knows its line.
+
+``1e-5`` is a number, ``12:30`` and ``no`` are strings, a date stays text. A key written twice, a second document, an
+unknown tag, a syntax error or an empty file is a `CampaignError` that names file and line; nothing passes silently.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, NoReturn, TypeVar
+
+from pydantic import BaseModel, ValidationError
+from ruamel.yaml import YAML
+from ruamel.yaml.error import MarkedYAMLError, YAMLError
+from ruamel.yaml.nodes import Node
+from ruamel.yaml.reader import ReaderError
+
+from harness.campaign.problems import invalid_file
+from harness.campaign.yaml_lines import Lines
+from harness.campaign.yaml_nodes import PlainData
+from harness.errors import CampaignError
+
+Model = TypeVar("Model", bound=BaseModel)
+
+
+def read_yaml(path: str | Path) -> tuple[dict[str, Any], Lines]:
+    """Read a YAML file whose top level is a mapping.
+
+    Parameters
+    ----------
+    path : str or Path
+        UTF-8 text file with one YAML 1.2 document.
+
+    Returns
+    -------
+    data : dict
+        Plain ``dict``, ``list``, ``str``, ``int``, ``float``, ``bool`` and None.
+    lines : Lines
+        Line of every value.
+
+    Raises
+    ------
+    CampaignError
+        The file is missing, a folder, not UTF-8, empty, not a mapping, not YAML, or says a key twice.
+    """
+    name = str(path)
+    root = _compose(_read_text(Path(path)), name)
+    if root is None:
+        raise CampaignError(
+            name, found="an empty file", expected="YAML keys and values", mend="Is it the right file, fully written?"
+        )
+    data = PlainData(name).build(root)
+    if not isinstance(data, dict):
+        raise CampaignError(
+            f"{name}:{root.start_mark.line + 1}",
+            found=f"a {'list' if isinstance(data, list) else 'single value'} at the top level",
+            expected="keys and values",
+            mend="Write 'key: value' lines, without a dash before the first one.",
+        )
+    return data, Lines(name, root)
+
+
+def read_model(path: str | Path, model: type[Model]) -> Model:
+    """Read a YAML file into a pydantic model, such as an environment's parameters.
+
+    Raises
+    ------
+    CampaignError
+        As `read_yaml`; or the content does not fit ``model``, with every problem's path and line.
+    """
+    data, lines = read_yaml(path)
+    try:
+        return model.model_validate(data)
+    except ValidationError as error:
+        schema = model.model_json_schema()
+        raise invalid_file(error, path=str(path), data=data, schema=schema, place=lines.place) from None
+
+
+def parse_value(text: str, where: str) -> Any:
+    """Read one value by the rules of `read_yaml`, as after the ``=`` of ``--set a.b=value``.
+
+    Raises
+    ------
+    CampaignError
+        ``text`` is empty or not YAML; the error names ``where``.
+    """
+    try:
+        root = _compose(text, where)
+    except CampaignError as error:
+        raise CampaignError(where, found=error.found, expected=error.expected, mend=error.mend) from None
+    if root is None:
+        raise CampaignError(
+            where,
+            found="no value after '='",
+            expected="a value",
+            mend="Write null if you mean none, '\"\"' for no text.",
+        )
+    return PlainData(where).build(root)
+
+
+def _read_text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError:
+        found, mend = "no such file", "Check the spelling and the folder that you are in."
+    except IsADirectoryError:
+        found, mend = "a folder", "Name the file inside it."
+    except UnicodeDecodeError as error:
+        found, mend = f"bytes that are not UTF-8 (at byte {error.start})", "Save the file as UTF-8 text."
+    except (OSError, ValueError) as error:
+        found, mend = f"a file that cannot be read ({error})", "Check its name and permissions."
+    raise CampaignError(str(path), found=found, expected="a readable YAML file in UTF-8", mend=mend)
+
+
+def _compose(text: str, name: str) -> Node | None:
+    parser = YAML(typ="safe", pure=True)
+    try:
+        root: Node | None = parser.compose(text)
+    except MarkedYAMLError as error:
+        _fail_at_mark(error, name)
+    except ReaderError as error:
+        line = text.count("\n", 0, error.position) + 1
+        found = f"the character U+{ord(text[error.position]):04X}"
+        _fail(name, line, found, "printable text", "Delete it; it is often left by a word processor.")
+    except RecursionError:
+        _fail(name, 1, "values nested too deeply to read", "a few levels", "Close the brackets that were left open.")
+    except (YAMLError, ValueError) as error:
+        _fail(name, 1, str(error).splitlines()[0], "YAML 1.2", "Remove the directive or correct the syntax.")
+    if parser.resolver.processing_version != (1, 2):
+        _fail(name, 1, "a %YAML directive for another version", "YAML 1.2", "Delete the line that begins with %YAML.")
+    return root
+
+
+def _fail_at_mark(error: MarkedYAMLError, name: str) -> NoReturn:
+    mark = error.problem_mark or error.context_mark
+    # A mark prints itself over several lines; the first part of the first line is the problem proper.
+    problem = str(error.problem or error.context).splitlines()[0].split("   in ")[0].strip()
+    if "\\t" in problem:
+        _fail(name, mark.line + 1, "a tab", "spaces", "Indent with spaces only.")
+    if "another document" in problem:
+        _fail(name, mark.line + 1, "a second document (after ---)", "one document", "Keep one document per file.")
+    expected, _, found = problem.replace("but got ", "but found ").rpartition("but found ")
+    expected = expected.removeprefix("expected ").rstrip(" ,") or "valid YAML"
+    mend = "Check indentation, quotes and brackets near it."
+    _fail(name, mark.line + 1 if mark else 1, found.removeprefix("found "), expected, mend)
+
+
+def _fail(name: str, line: int, found: str, expected: str, mend: str) -> NoReturn:
+    raise CampaignError(f"{name}:{line}", found=found, expected=expected, mend=mend)

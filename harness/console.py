@@ -1,0 +1,170 @@
+"""How the command line shows results on stdout and complaints on stderr."""
+
+from __future__ import annotations
+
+import errno
+import json
+import math
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from harness.errors import HarnessError
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+    from harness.runner import AvCheck
+
+_WIDTH_OF_FILES = 140
+
+
+def show_error(error: HarnessError) -> None:
+    """Print an error on stderr: where it is, and what was found, expected and can be done, each on its line."""
+    parts = getattr(error, "problems", (error,))
+    if len(parts) > 1:
+        click.secho("error:", fg="red", bold=True, err=True, nl=False)
+        click.echo(f" {error.where}: {len(parts)} problems", err=True)
+    for part in parts:
+        click.secho("error:", fg="red", bold=True, err=True, nl=False)
+        click.echo(f" {part.where}", err=True)
+        for label in ("found", "expected", "mend"):
+            click.echo(f"  {label + ':':<9} {getattr(part, label)}", err=True)
+
+
+def show_interrupted(*, can_resume: bool) -> None:
+    """Say that Ctrl-C arrived, and that nothing finished is lost."""
+    advice = " Finished shards are kept: the same command with --resume goes on." if can_resume else ""
+    click.echo(f"Interrupted.{advice}", err=True)
+
+
+def system_error(error: OSError) -> HarnessError | None:
+    """Translate an error of the operating system that a user can mend; None for any other."""
+    where = str(error.filename or "disk")
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return HarnessError(
+            where,
+            found="no space left",
+            expected="room for the records",
+            mend="Nothing finished is lost: free some space, then run the same command with --resume.",
+        )
+    if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
+        return HarnessError(
+            where,
+            found=f"no permission ({error.strerror})",
+            expected="a place that may be read and written",
+            mend="Change its permissions, or choose another place.",
+        )
+    return None
+
+
+def print_json(content: Any) -> None:
+    """Print strict JSON (no NaN) on stdout."""
+    click.echo(json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False))
+
+
+def write_json(file: Path, content: Any) -> None:
+    """Replace ``file`` by strict JSON, at once or not at all."""
+    unfinished = file.with_name(f".{file.name}.unfinished")
+    unfinished.write_text(json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False) + "\n", encoding="utf-8")
+    os.replace(unfinished, file)  # noqa: PTH105 - os.replace says what it does on every system
+
+
+def print_plan(plan: dict[str, Any]) -> None:
+    """Print what a campaign will cost as YAML comments, so that the whole output stays a campaign file."""
+    click.echo("# What it will cost")
+    for key, value in plan.items():
+        shown = f"{value:,}" if isinstance(value, int) else f"{value:.4g}" if isinstance(value, float) else value
+        click.echo(f"#   {key.replace('_', ' ')}: {shown}")
+
+
+def print_av_check(found: AvCheck) -> None:
+    """Print what is known about an AV, line by line, with a verdict first."""
+    from rich.console import Console  # noqa: PLC0415 - keeps --help fast
+    from rich.table import Table  # noqa: PLC0415 - keeps --help fast
+
+    what, speed, (low, high) = found.behaviour, found.speed, found.limits_mps2
+    failed = sum(found.failures.values())
+    table = Table(title=f"AV from av.{found.source}: {found.n_episodes} episodes ({found.method}, {found.engine})")
+    table.add_column("question")
+    table.add_column("answer")
+    accelerations = (what.mean_acceleration_mps2, what.min_acceleration_mps2, what.max_acceleration_mps2)
+    different = f"NO: {len(found.differing)} episodes differ, first {found.differing[:1]}" if found.differing else "yes"
+    rows = {
+        "same bits in another order and in other cells": different,
+        "finite and within limits": f"NO: {failed} episodes failed" if failed else "yes",
+        "cut-ins, crashes among them": f"{what.n_cut_ins}, {what.n_crashes}",
+        "acceleration: mean, smallest, largest": ", ".join(f"{_defined(a)} m/s²" for a in accelerations),
+        f"steps at {low:g} and at {high:g} m/s²": ", ".join(
+            _defined(share, ".1%") for share in (what.share_at_min, what.share_at_max)
+        ),
+        "brakes after a cut-in": f"{_defined(what.braking_share, '.0%')}, median delay {_defined(what.reaction_s)} s",
+        "time per step": f"{speed.us_per_step:.3g} µs, {speed.ratio:.2f} × the built-in IDM's",
+        "episodes per second": f"{speed.episodes_per_s:,.0f} (built-in IDM {speed.idm_episodes_per_s:,.0f})",
+    }
+    for question, answer in rows.items():
+        table.add_row(question, answer)
+    console = Console()
+    if not console.is_terminal:
+        console.width = _WIDTH_OF_FILES
+    console.print(table)
+    for cause, count in found.failures.items():
+        click.echo(f"{count} × failed: {cause}")
+
+
+def _defined(value: float, style: str = ".2f") -> str:
+    return format(value, style) if math.isfinite(value) else "-"
+
+
+def print_estimates(content: dict[str, Any]) -> None:
+    """Print estimates as a table, with warnings and reasons below and the answer in a sentence last.
+
+    Parameters
+    ----------
+    content : dict
+        As in ``estimates.json``.
+    """
+    from rich.console import Console  # noqa: PLC0415 - keeps --help fast
+    from rich.table import Table  # noqa: PLC0415 - keeps --help fast
+
+    table = Table(title=f"{content['campaign']}: {content['n_crashes']:,} crashes in {content['n_episodes']:,} tests")
+    level = f"{content['confidence']:.0%} interval"
+    for heading in ("estimator", "crash rate per test", level, "RHW", "effective crashes", "largest weight share"):
+        table.add_column(heading, justify="left" if heading == "estimator" else "right")
+    for name, entry in content["estimates"].items():
+        table.add_row(name + (" *" if name == content["headline"] else ""), *_cells(entry))
+    console = Console()
+    if not console.is_terminal:
+        console.width = _WIDTH_OF_FILES
+    console.print(table)
+    for name, entry in content["estimates"].items():
+        for remark in [*entry.get("warnings", ()), *filter(None, [entry.get("reason")])]:
+            click.echo(f"{name}: {remark}")
+    click.echo(content["statement"])
+    click.echo(content["scope"])
+
+
+def _cells(entry: dict[str, Any]) -> list[str]:
+    if entry["crash_rate"] is None:
+        return ["-"] * 5
+    interval = f"{_number(entry['ci_low'], '.3e')} to {_number(entry['ci_high'], '.3e')}"
+    formats = {"rhw": ".3f", "n_effective": ",.1f", "largest_weight_share": ".2%"}
+    return [f"{entry['crash_rate']:.4e}", interval, *(_number(entry[key], style) for key, style in formats.items())]
+
+
+def _number(value: float | None, style: str) -> str:
+    return "-" if value is None else format(value, style)
+
+
+def write_trace(trace: pa.Table, file: Path) -> None:
+    """Write an episode's trace as Parquet or, when ``file`` ends in ``.csv``, as CSV."""
+    if file.suffix == ".csv":
+        from pyarrow import csv  # noqa: PLC0415 - keeps --help fast
+
+        csv.write_csv(trace, file)
+    else:
+        from pyarrow import parquet  # noqa: PLC0415 - keeps --help fast
+
+        parquet.write_table(trace, file, compression="zstd")

@@ -1,0 +1,239 @@
+"""FMI 2.0 co-simulation FMUs as controllers, by fmpy (extra ``harness[fmi]``).
+
+An FMU is unpacked once, into the cache, and instantiated once per cell. An episode begins with a reset, or with a new
+instance where the FMU refuses to be reset. Its clock is that of the episode: the experiment starts at the time of the
+controller's first step, and each step is ``doStep`` over 0.1 s between setting the inputs and reading the output.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+import zipfile
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import mkdtemp
+from typing import Any
+
+from harness.campaign.models import AutomatedVehicle, FmuController
+from harness.compiled import cache_root
+from harness.controllers.protocol import EpisodeStart, Observation, VehicleController
+from harness.errors import CampaignError
+from harness.vehicles.kinematics import STEP_S
+
+OBSERVATIONS: dict[str, Callable[[Observation], float]] = {
+    "time_s": lambda seen: seen.time_s,
+    "position_m": lambda seen: seen.position_m,
+    "speed_mps": lambda seen: seen.speed_mps,
+    "acceleration_mps2": lambda seen: seen.acceleration_mps2,
+    "gap_m": lambda seen: seen.gap_m,
+    "lead_speed_mps": lambda seen: seen.lead_speed_mps,
+    "bv_position_m": lambda seen: seen.bv.position_m,
+    "bv_speed_mps": lambda seen: seen.bv.speed_mps,
+    "bv_lane": lambda seen: float(seen.bv.lane),
+    "lv_position_m": lambda seen: seen.lv.position_m,
+    "lv_speed_mps": lambda seen: seen.lv.speed_mps,
+}
+"""What an FMU's inputs can be connected to."""
+
+
+@dataclass(frozen=True)
+class Wiring:
+    """A description checked against a campaign: value references (FMI 2.0 section 2.2.7) in a fixed order."""
+
+    guid: str
+    identifier: str
+    inputs: tuple[int, ...]
+    readings: tuple[Callable[[Observation], float], ...]
+    output: int
+    start_references: tuple[int, ...]
+    start_values: tuple[float, ...]
+    only_one_per_process: bool
+
+
+def fmu_maker(av: AutomatedVehicle) -> Callable[[], VehicleController]:
+    """What makes a controller for a cell.
+
+    Raises
+    ------
+    CampaignError
+        fmpy is not installed, the file is no FMI 2.0 co-simulation FMU, or ``av.fmu`` does not fit its variables.
+    """
+    if av.fmu is None:
+        raise ValueError("an AV without av.fmu")
+    fmpy = _fmpy()
+    try:
+        folder = _unpacked(Path(av.fmu.file))
+        description = fmpy.read_model_description(str(folder))
+    except Exception as error:
+        raise CampaignError(
+            "av.fmu.file",
+            found=f"{av.fmu.file}, which cannot be read ({' '.join(str(error).split())[:300]})",
+            expected="an FMI 2.0 co-simulation FMU",
+            mend="Export it again, and try 'fmpy validate' on it.",
+        ) from error
+    _require_co_simulation(av.fmu.file, description)
+    wiring = wire(av.fmu, description)
+    made: list[FmuVehicleController] = []
+
+    def make() -> VehicleController:
+        if wiring.only_one_per_process and made:
+            raise RuntimeError("the FMU can be instantiated only once per process: set world.cells to 1")
+        made[:] = [FmuVehicleController(wiring, folder)]
+        return made[0]
+
+    return make
+
+
+def _fmpy() -> Any:
+    try:
+        import fmpy  # noqa: PLC0415 - an extra
+        import fmpy.fmi2  # noqa: PLC0415 - an extra
+    except ImportError as error:
+        raise CampaignError(
+            "av.fmu",
+            found="no package fmpy",
+            expected="the extra for FMUs",
+            mend="Install it: pip install 'harness[fmi]'.",
+        ) from error
+    return fmpy
+
+
+def _unpacked(file: Path) -> Path:
+    """Folder with the FMU's content, in the cache, by its hash: workers share it."""
+    folder = cache_root() / "fmu" / hashlib.sha256(file.read_bytes()).hexdigest()[:16]
+    if not folder.exists():
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        fresh = Path(mkdtemp(prefix=f"{folder.name}-", dir=folder.parent))
+        try:
+            with zipfile.ZipFile(file) as archive:
+                archive.extractall(fresh)
+            with suppress(OSError):  # another worker was faster
+                fresh.rename(folder)
+        finally:
+            shutil.rmtree(fresh, ignore_errors=True)
+    return folder
+
+
+def _require_co_simulation(file: str, description: Any) -> None:
+    if not str(description.fmiVersion).startswith("2.") or description.coSimulation is None:
+        kind = "co-simulation" if description.coSimulation is not None else "model exchange"
+        raise CampaignError(
+            "av.fmu.file",
+            found=f"{file}, for FMI {description.fmiVersion} {kind}",
+            expected="FMI 2.0 co-simulation",
+            mend="Export the model as a co-simulation FMU of that version.",
+        )
+
+
+def wire(fmu: FmuController, description: Any) -> Wiring:
+    """Check ``av.fmu`` against the FMU's variables.
+
+    Raises
+    ------
+    CampaignError
+        Naming the key, with the FMU's variables.
+    """
+    for name in fmu.inputs:
+        if name not in OBSERVATIONS:
+            raise CampaignError(
+                f"av.fmu.inputs.{name}",
+                found="no such observation",
+                expected=f"one of {', '.join(OBSERVATIONS)}",
+                mend="The keys are observations, the values the FMU's input variables.",
+            )
+    inputs = [_reference(f"av.fmu.inputs.{key}", name, description, ("input",)) for key, name in fmu.inputs.items()]
+    starts = [_reference("av.fmu.start_values", name, description, ("parameter", "input", "local", "output"))
+              for name in fmu.start_values]  # fmt: skip
+    return Wiring(
+        description.guid,
+        description.coSimulation.modelIdentifier,
+        tuple(inputs),
+        tuple(OBSERVATIONS[key] for key in fmu.inputs),
+        _reference("av.fmu.output", fmu.output, description, ("output",)),
+        tuple(starts),
+        tuple(fmu.start_values.values()),
+        bool(description.coSimulation.canBeInstantiatedOnlyOncePerProcess),
+    )
+
+
+def _reference(where: str, name: str, description: Any, causalities: Sequence[str]) -> int:
+    variables = {variable.name: variable for variable in description.modelVariables}
+    found = variables.get(name)
+    if found is not None and found.type == "Real" and found.causality in causalities:
+        return int(found.valueReference)
+    listed = ", ".join(f"{each.name} ({each.type} {each.causality})" for each in variables.values())
+    raise CampaignError(
+        where,
+        found=f"{name}, " + ("no variable of the FMU" if found is None else f"a {found.type} {found.causality}"),
+        expected=f"a Real {' or '.join(causalities)}",
+        mend=f"The FMU has: {listed}.",
+    )
+
+
+class FmuVehicleController:
+    """One instance of an FMU.
+
+    Parameters
+    ----------
+    wiring : Wiring
+    folder : Path
+        Where the FMU is unpacked.
+    """
+
+    def __init__(self, wiring: Wiring, folder: Path) -> None:
+        self._wiring = wiring
+        self._folder = folder
+        self._fmu: Any = None
+        self._begun = False
+
+    def start(self, episode: EpisodeStart) -> None:  # noqa: ARG002 - FMI has no random stream to hand over
+        """Forget the last episode; the instance is set up with the first observation."""
+        if self._fmu is not None and self._begun:
+            self._forget()
+        self._begun = False
+
+    def _forget(self) -> None:
+        from fmpy.fmi1 import FMICallException  # noqa: PLC0415 - an extra
+
+        try:
+            self._fmu.terminate()
+            self._fmu.reset()
+        except FMICallException:
+            self.close()
+
+    def _begin(self, time_s: float) -> None:
+        if self._fmu is None:
+            self._fmu = self._instance()
+        self._fmu.setupExperiment(startTime=time_s)
+        if self._wiring.start_references:
+            self._fmu.setReal(self._wiring.start_references, self._wiring.start_values)
+        self._fmu.enterInitializationMode()
+        self._fmu.exitInitializationMode()
+        self._begun = True
+
+    def _instance(self) -> Any:
+        from fmpy.fmi2 import FMU2Slave  # noqa: PLC0415 - an extra
+
+        wiring = self._wiring
+        fmu = FMU2Slave(guid=wiring.guid, modelIdentifier=wiring.identifier, unzipDirectory=str(self._folder))
+        fmu.instantiate()
+        return fmu
+
+    def step(self, observation: Observation) -> float:
+        """Inputs, ``doStep`` over 0.1 s, output (m/s²)."""
+        values = [reading(observation) for reading in self._wiring.readings]
+        if not self._begun:
+            self._begin(observation.time_s)
+        fmu = self._fmu
+        fmu.setReal(self._wiring.inputs, values)
+        fmu.doStep(currentCommunicationPoint=observation.time_s, communicationStepSize=STEP_S)
+        return float(fmu.getReal((self._wiring.output,))[0])
+
+    def close(self) -> None:
+        """Free the instance; the shared library stays loaded for the other cells'."""
+        fmu, self._fmu, self._begun = self._fmu, None, False
+        if fmu is not None:
+            fmu.fmi2FreeInstance(fmu.component)

@@ -1,0 +1,142 @@
+"""Find the controller that a campaign names, and put the right host around it."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Callable, Mapping
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Any
+
+from harness.campaign.models import AutomatedVehicle
+from harness.controllers.black_box import Death
+from harness.controllers.hosts import BatchHost, ControllerHost, VehicleHost, cause_of
+from harness.errors import CampaignError
+
+GROUP = "harness.controllers"
+
+
+def controller_class(name: str) -> Callable[..., Any]:
+    """The class that ``package.module:Class``, or an entry point of group ``harness.controllers``, names.
+
+    The folder that the harness was started in is importable, as it is for a script.
+
+    Raises
+    ------
+    CampaignError
+        There is no such module, class or entry point.
+    """
+    if ":" not in name:
+        return _from_entry_point(name)
+    module_name, _, class_name = name.partition(":")
+    if (here := str(Path.cwd())) not in sys.path:
+        sys.path.insert(0, here)
+    try:
+        module = importlib.import_module(module_name)
+    except Exception as error:
+        raise CampaignError(
+            "av.controller",
+            found=f"{name}, whose module cannot be imported ({cause_of(error)})",
+            expected="a Python module that can be imported",
+            mend="Start the harness in the folder that holds it, or install it beside the harness.",
+        ) from error
+    found = getattr(module, class_name, None)
+    if not callable(found):
+        raise CampaignError(
+            "av.controller",
+            found=f"no class {class_name} in {module.__file__}",
+            expected="a controller class (see docs/controllers.md)",
+            mend=f"It has: {', '.join(name for name, value in vars(module).items() if isinstance(value, type))}.",
+        )
+    return found  # type: ignore[no-any-return]
+
+
+def _from_entry_point(name: str) -> Callable[..., Any]:
+    points = entry_points(group=GROUP)
+    if name not in points.names:
+        raise CampaignError(
+            "av.controller",
+            found=name,
+            expected=f"an entry point of group {GROUP}: {', '.join(sorted(points.names)) or 'none is installed'}",
+            mend="Install the package that brings it, or write 'package.module:Class'.",
+        )
+    found: Callable[..., Any] = points[name].load()
+    return found
+
+
+def build_host(
+    av: AutomatedVehicle,
+    *,
+    n_cells: int,
+    seed: int,
+    black_box: Path | None = None,
+    doomed: Mapping[int, Death] | None = None,
+) -> ControllerHost | None:
+    """Host of the AV's controller, or None for an AV that needs none (built in, or driven by SUMO).
+
+    Raises
+    ------
+    CampaignError
+        The controller cannot be found or made, or is of neither kind.
+    """
+    acts_early = av.before_cut_in == "controller"
+    if av.source == "controller":
+        make = _maker(av)
+        made = _make_first(make, str(av.controller))
+        if callable(getattr(made, "step_batch", None)) and callable(getattr(made, "start_batch", None)):
+            return BatchHost(made, seed, av.limits, acts_before_cut_in=acts_early)
+        _require_vehicle_controller(made, str(av.controller))
+    elif av.source == "fmu":
+        from harness.controllers.fmu import fmu_maker  # noqa: PLC0415 - an extra
+
+        make = fmu_maker(av)
+    else:
+        return None
+    return VehicleHost(
+        make, n_cells, seed, av.limits, black_box=black_box, doomed=doomed, acts_before_cut_in=acts_early
+    )
+
+
+def require_controller(av: AutomatedVehicle) -> None:
+    """Find and make the AV's controller once, before anything is written.
+
+    Raises
+    ------
+    CampaignError
+        The controller cannot be found or made, or is of neither kind.
+    """
+    if av.source in ("controller", "fmu"):
+        host = build_host(av, n_cells=1, seed=0)
+        if host is not None:
+            host.close()
+
+
+def _maker(av: AutomatedVehicle) -> Callable[[], Any]:
+    made_by = controller_class(str(av.controller))
+    parameters = av.parameters if isinstance(av.parameters, dict) else {}
+    return lambda: made_by(**parameters)
+
+
+def _make_first(make: Callable[[], Any], name: str) -> Any:
+    """Make one controller, so that wrong parameters are an error of the campaign and not of every episode."""
+    try:
+        return make()
+    except Exception as error:
+        raise CampaignError(
+            "av.parameters",
+            found=f"parameters that {name} refuses ({cause_of(error)})",
+            expected="keyword arguments of the controller's constructor",
+            mend="Correct av.parameters, or the constructor.",
+        ) from error
+
+
+def _require_vehicle_controller(made: Any, name: str) -> None:
+    missing = [method for method in ("start", "step", "close") if not callable(getattr(made, method, None))]
+    if missing:
+        raise CampaignError(
+            "av.controller",
+            found=f"{name} without {', '.join(missing)}",
+            expected="start, step and close (per vehicle), or start_batch, step_batch and close (arrays)",
+            mend="See docs/controllers.md for both, in ten lines each.",
+        )

@@ -1,0 +1,118 @@
+"""What an AV controller implements: per vehicle (easy) or over arrays (fast).
+
+A controller sees its own cell's vehicles and answers with an acceleration for the coming 0.1 s. It never commands
+anything but the AV: the motion of LV and BV is what the likelihood ratios are about.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol, runtime_checkable
+
+import numpy as np
+
+from harness.arrays import FloatArray, IntArray
+
+
+class Neighbour(NamedTuple):
+    """Another vehicle of the cell: front-bumper position (m), speed (m/s), lane (0 right, 1 left)."""
+
+    position_m: float
+    speed_mps: float
+    lane: int
+
+
+@dataclass(frozen=True, slots=True)
+class EpisodeStart:
+    """What a per-vehicle controller is told when an episode begins.
+
+    Attributes
+    ----------
+    episode : int
+        Index in the campaign.
+    step_s : float
+        Time between two calls of ``step`` (s).
+    random : numpy.random.Generator
+        The only randomness that a controller may use: seeded by campaign and episode, so that a replay sees the same.
+    """
+
+    episode: int
+    step_s: float
+    random: np.random.Generator
+
+
+@dataclass(frozen=True, slots=True)
+class Observation:
+    """What a per-vehicle controller sees before a step.
+
+    Attributes
+    ----------
+    time_s : float
+        Time since the episode began.
+    position_m, speed_mps, acceleration_mps2 : float
+        Front bumper, speed, and the acceleration of the last step.
+    gap_m, lead_speed_mps : float
+        Bumper-to-bumper gap to, and speed of, the vehicle ahead on the AV's lane; infinite and NaN without one.
+    bv, lv : Neighbour
+        Background and leading vehicle.
+    """
+
+    time_s: float
+    position_m: float
+    speed_mps: float
+    acceleration_mps2: float
+    gap_m: float
+    lead_speed_mps: float
+    bv: Neighbour
+    lv: Neighbour
+
+
+class BatchObservation(NamedTuple):
+    """What a batch controller sees before a step: one entry per AV that is to act, all arrays of shape (n,).
+
+    ``cell`` numbers the AV (0 … K − 1) and ``episode`` its episode; the other fields are those of `Observation`, with
+    positions and speeds of BV and LV.
+    """
+
+    cell: IntArray
+    episode: IntArray
+    time_s: FloatArray
+    position_m: FloatArray
+    speed_mps: FloatArray
+    acceleration_mps2: FloatArray
+    gap_m: FloatArray
+    lead_speed_mps: FloatArray
+    bv_position_m: FloatArray
+    bv_speed_mps: FloatArray
+    bv_lane: IntArray
+    lv_position_m: FloatArray
+    lv_speed_mps: FloatArray
+
+
+@runtime_checkable
+class VehicleController(Protocol):
+    """One AV. The class is called once per cell with the campaign's ``av.parameters`` as keyword arguments."""
+
+    def start(self, episode: EpisodeStart) -> None:
+        """Begin an episode: forget the last one."""
+
+    def step(self, observation: Observation) -> float:
+        """Acceleration (m/s²) for the coming step."""
+
+    def close(self) -> None:
+        """Release what the controller holds; called once, at the end."""
+
+
+@runtime_checkable
+class BatchController(Protocol):
+    """All AVs of a worker. The class is called once with the campaign's ``av.parameters`` as keyword arguments."""
+
+    def start_batch(self, cells: IntArray, episodes: IntArray, random: Sequence[np.random.Generator]) -> None:
+        """Begin episodes in the given cells, each with the only randomness that its controller may use."""
+
+    def step_batch(self, observation: BatchObservation) -> FloatArray:
+        """Accelerations (m/s²) for the coming step, shape (n,)."""
+
+    def close(self) -> None:
+        """Release what the controller holds; called once, at the end."""

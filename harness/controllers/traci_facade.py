@@ -1,0 +1,333 @@
+"""What a TraCI script sees of its cell: TraCI's own names over three vehicles, commands for the AV alone.
+
+Names, units and answers are those of the ``traci`` package 1.28; docs/controllers.md lists every difference.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NoReturn, Protocol
+
+from harness.controllers.protocol import Observation
+from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
+
+VEH_ID = "AV"
+ROAD = "cell0"
+LANE_CENTRES_M = (-1.6, 1.6)
+MAX_SPEED_MPS = 100.0
+HEADING_DEGREES = 90.0
+_ROUNDING = 1e-9
+
+_MOVES = "it would move vehicles past the harness and invalidate the likelihood ratios"
+_STEPS = "the harness itself starts, steps and ends the simulation"
+_EXACT = "it has no effect here: what the AV is told it does exactly, as under speed mode 32"
+_WHY = {
+    "setSpeedMode": _EXACT,
+    "setLaneChangeMode": "it has no effect here: the AV stays on its lane",
+    "addStepListener": "name the listener in the campaign: see StepListenerController",
+    "changeLane": "the AV stays on its lane; " + _MOVES,
+}
+_REFUSED_BEGINNINGS = ("set", "add", "remove", "move", "change", "reroute", "openGap", "replace", "insert", "resume")
+_REFUSED_OF_SIMULATION = (
+    *("start", "init", "connect", "switch", "setOrder", "close"),
+    *("load", "loadState", "saveState", "simulationStep", "step", "executeMove", "addStepListener"),
+)
+
+
+class TraCIException(Exception):  # noqa: N818 - TraCI's own name
+    """A command or question that TraCI, or the harness, does not answer."""
+
+
+class _Plan(Protocol):
+    """What a command asks of the coming steps."""
+
+    def next_acceleration(self, speed: float) -> float | None:
+        """Acceleration (m/s²) from the present speed (m/s), or None when the command is over."""
+
+
+class _Hold:
+    """``setSpeed``: this speed until further notice."""
+
+    def __init__(self, speed: float) -> None:
+        self._speed = speed
+
+    def next_acceleration(self, speed: float) -> float | None:
+        return (self._speed - speed) / STEP_S
+
+
+class _Accelerate:
+    """``setAcceleration``: for whole steps, and a share of a last one."""
+
+    def __init__(self, acceleration: float, duration: float) -> None:
+        self._acceleration = acceleration
+        self._steps_left = duration / STEP_S
+
+    def next_acceleration(self, speed: float) -> float | None:  # noqa: ARG002 - one protocol for all plans
+        left = self._steps_left
+        if left < _ROUNDING:
+            return None
+        self._steps_left = left - 1.0
+        return self._acceleration if left > 1.0 - _ROUNDING else self._acceleration * left
+
+
+class _Approach:
+    """``slowDown``: to a speed, linearly, in a time."""
+
+    def __init__(self, start: float, target: float, duration: float) -> None:
+        self._start, self._target = start, target
+        self._steps = max(duration / STEP_S, 1.0)
+        self._done = 0
+
+    def next_acceleration(self, speed: float) -> float | None:
+        if self._done > self._steps - _ROUNDING:
+            return None
+        self._done += 1
+        share = min(1.0, self._done / self._steps)
+        return (self._start + (self._target - self._start) * share - speed) / STEP_S
+
+
+class VehicleDomain:
+    """``traci.vehicle`` of one cell."""
+
+    def __init__(self) -> None:
+        self.legacy_leader = True
+        self._plan: _Plan | None = None
+        self._accel = self._decel = math.inf
+        self._speed: dict[str, float] = {}
+        self._position: dict[str, float] = {}
+        self._acceleration: dict[str, float] = {}
+        self._lane = {"LV": 1, "BV": 1, VEH_ID: 0}
+
+    def see(self, now: Observation) -> None:
+        """Take in what is there before a step."""
+        bv, lv = now.bv, now.lv
+        before = self._speed
+        self._speed = {"LV": lv.speed_mps, "BV": bv.speed_mps, VEH_ID: now.speed_mps}
+        self._position = {"LV": lv.position_m, "BV": bv.position_m, VEH_ID: now.position_m}
+        self._lane["BV"] = bv.lane
+        self._acceleration = {VEH_ID: now.acceleration_mps2, "LV": 0.0, "BV": 0.0}
+        if before:
+            self._acceleration["LV"] = (lv.speed_mps - before["LV"]) / STEP_S
+            self._acceleration["BV"] = (bv.speed_mps - before["BV"]) / STEP_S
+
+    def next_acceleration(self) -> float:
+        """What the AV is told for the coming step (m/s²); without a command it keeps its speed."""
+        if self._plan is None:
+            return 0.0
+        acceleration = self._plan.next_acceleration(self._speed[VEH_ID])
+        if acceleration is None:
+            self._plan = None
+            return 0.0
+        return min(max(acceleration, -self._decel), self._accel)
+
+    def _of(self, table: dict[str, Any], vehID: str) -> Any:
+        try:
+            return table[vehID]
+        except KeyError:
+            raise TraCIException(f"Vehicle '{vehID}' is not known: a cell has LV, BV and AV.") from None
+
+    def getIDList(self) -> tuple[str, ...]:
+        """The cell's vehicles."""
+        return tuple(self._speed)
+
+    def getIDCount(self) -> int:
+        """Their number."""
+        return len(self._speed)
+
+    def getSpeed(self, vehID: str) -> float:
+        """Speed (m/s)."""
+        return float(self._of(self._speed, vehID))
+
+    def getAcceleration(self, vehID: str) -> float:
+        """Acceleration of the last step (m/s²); of LV and BV 0 at the first call of an episode."""
+        return float(self._of(self._acceleration, vehID))
+
+    def getPosition(self, vehID: str) -> tuple[float, float]:
+        """Front bumper (m) along, and lane centre across, the cell's own road."""
+        return self._of(self._position, vehID), LANE_CENTRES_M[self._lane[vehID]]
+
+    def getLanePosition(self, vehID: str) -> float:
+        """Front bumper along the lane (m)."""
+        return float(self._of(self._position, vehID))
+
+    def getLaneIndex(self, vehID: str) -> int:
+        """0 right, 1 left."""
+        return int(self._of(self._lane, vehID))
+
+    def getLaneID(self, vehID: str) -> str:
+        """Road and lane index."""
+        return f"{ROAD}_{self.getLaneIndex(vehID)}"
+
+    def getRoadID(self, vehID: str) -> str:
+        """The cell's road."""
+        self.getLaneIndex(vehID)
+        return ROAD
+
+    def getAngle(self, vehID: str) -> float:
+        """Heading (degrees, 90 is along x)."""
+        self.getLaneIndex(vehID)
+        return HEADING_DEGREES
+
+    def getLength(self, vehID: str) -> float:
+        """Length (m)."""
+        self.getLaneIndex(vehID)
+        return VEHICLE_LENGTH_M
+
+    def getMinGap(self, vehID: str) -> float:
+        """MinGap (m): zero, so that gaps are bumper to bumper."""
+        self.getLaneIndex(vehID)
+        return 0.0
+
+    def getMaxSpeed(self, vehID: str) -> float:
+        """Speed (m/s) that the vehicle type allows."""
+        self.getLaneIndex(vehID)
+        return MAX_SPEED_MPS
+
+    def getTypeID(self, vehID: str) -> str:
+        """Vehicle type."""
+        self.getLaneIndex(vehID)
+        return "exact"
+
+    def getAccel(self, vehID: str) -> float:
+        """Bound that `setAccel` has put on commands (m/s²), infinite without."""
+        self._require_own(vehID, "getAccel", "is not known of traffic")
+        return self._accel
+
+    def getDecel(self, vehID: str) -> float:
+        """Bound that `setDecel` has put on commands (m/s², positive), infinite without."""
+        self._require_own(vehID, "getDecel", "is not known of traffic")
+        return self._decel
+
+    def getLeader(self, vehID: str, dist: float = 100.0) -> tuple[str, float] | None:  # noqa: ARG002 - TraCI's signature
+        """Vehicle ahead on the lane and the gap to it (m, less the minGap of zero), however far away.
+
+        Without one None, or ``("", -1.0)`` after ``traci.setLegacyGetLeader(False)``.
+        """
+        ahead = self._nearest(vehID, 1.0)
+        return ahead if ahead is not None or self.legacy_leader else ("", -1.0)
+
+    def getFollower(self, vehID: str, dist: float = 0.0) -> tuple[str, float]:  # noqa: ARG002 - TraCI's signature
+        """Vehicle behind on the lane and the gap from it (m); ``("", -1.0)`` without one."""
+        return self._nearest(vehID, -1.0) or ("", -1.0)
+
+    def _nearest(self, vehID: str, direction: float) -> tuple[str, float] | None:
+        here, lane = self._of(self._position, vehID), self._lane[vehID]
+        found: tuple[str, float] | None = None
+        for other, there in self._position.items():
+            distance = direction * (there - here)
+            if other == vehID or self._lane[other] != lane or distance < 0.0:
+                continue
+            # Operation by operation as the observed gap: bit-equal to what other controllers see.
+            gap = (there - VEHICLE_LENGTH_M - here) if direction > 0.0 else (here - VEHICLE_LENGTH_M - there)
+            if found is None or gap < found[1]:
+                found = other, gap
+        return found
+
+    def setSpeed(self, vehID: str, speed: float) -> None:
+        """Drive at this speed (m/s) from the next step on until told otherwise; -1 releases."""
+        self._require_own(vehID, "setSpeed")
+        self._plan = None if speed < 0.0 else _Hold(_finite(speed))
+
+    def setAcceleration(self, vehID: str, acceleration: float, duration: float) -> None:
+        """Accelerate (m/s²) for a duration (s)."""
+        self._require_own(vehID, "setAcceleration")
+        if duration < 0.0:
+            raise TraCIException("Duration must not be negative.")
+        self._plan = _Accelerate(_finite(acceleration), duration)
+
+    def slowDown(self, vehID: str, speed: float, duration: float) -> None:
+        """Change speed linearly to a value (m/s) in a duration (s)."""
+        self._require_own(vehID, "slowDown")
+        if not speed >= 0.0:
+            raise TraCIException("Speed must not be negative.")
+        if duration < 0.0:
+            raise TraCIException("Invalid time interval.")
+        self._plan = _Approach(self._speed[VEH_ID], _finite(speed), duration)
+
+    def setAccel(self, vehID: str, accel: float) -> None:
+        """Bound the acceleration (m/s²) that later commands lead to."""
+        self._require_own(vehID, "setAccel")
+        self._accel = accel
+
+    def setDecel(self, vehID: str, decel: float) -> None:
+        """Bound the braking (m/s², positive) that later commands lead to."""
+        self._require_own(vehID, "setDecel")
+        self._decel = decel
+
+    def _require_own(self, vehID: str, name: str, why: str = "") -> None:
+        if vehID != VEH_ID:
+            self._of(self._lane, vehID)
+            raise TraCIException(f"vehicle.{name}('{vehID}') is refused: {why or _MOVES}. Commands are for 'AV' only.")
+
+    def __getattr__(self, name: str) -> Any:
+        return _unknown(self, "traci.vehicle", name)
+
+
+class SimulationDomain:
+    """``traci.simulation`` of one cell."""
+
+    def __init__(self) -> None:
+        self.time_s = 0.0
+
+    def getTime(self) -> float:
+        """Time since the episode began (s)."""
+        return self.time_s
+
+    def getDeltaT(self) -> float:
+        """Step (s)."""
+        return STEP_S
+
+    def __getattr__(self, name: str) -> Any:
+        return _unknown(self, "traci.simulation", name)
+
+
+class Traci:
+    """What stands for the module ``traci``: one episode of one cell."""
+
+    TraCIException = TraCIException
+
+    def __init__(self) -> None:
+        self.vehicle = VehicleDomain()
+        self.simulation = SimulationDomain()
+
+    def see(self, now: Observation) -> None:
+        """Take in what is there before a step."""
+        self.simulation.time_s = now.time_s
+        self.vehicle.see(now)
+
+    @property
+    def exceptions(self) -> type[Traci]:
+        """So that ``traci.exceptions.TraCIException`` is found."""
+        return Traci
+
+    def setLegacyGetLeader(self, enabled: bool) -> None:
+        """Whether `getLeader` answers None (as 1.28 does by default) or ``("", -1.0)`` when nobody is ahead."""
+        self.vehicle.legacy_leader = enabled
+
+    def __getattr__(self, name: str) -> Any:
+        return _unknown(self, "traci", name)
+
+
+def _finite(value: float) -> float:
+    if not math.isfinite(value):
+        raise TraCIException(f"{value} is no command for a vehicle.")
+    return value
+
+
+def _unknown(domain: object, path: str, name: str) -> Any:
+    """A function that says why it is refused, for those that would do harm; an error that lists what there is."""
+    if name.startswith("_"):
+        raise AttributeError(name)
+    why = _WHY.get(name)
+    if why is None and name in _REFUSED_OF_SIMULATION:
+        why = _STEPS
+    if why is None and name.startswith(_REFUSED_BEGINNINGS):
+        why = _MOVES
+    if why is None:
+        there = ", ".join(entry for entry in dir(domain) if not entry.startswith("_") and entry != "see")
+        raise AttributeError(f"{path} has no {name} here; it has {there}")
+
+    def refused(*_arguments: Any, **_named: Any) -> NoReturn:
+        raise TraCIException(f"{path}.{name} is refused: {why}.")
+
+    return refused

@@ -1,0 +1,1 @@
+"""The naturalistic driving environment: initial states, accelerations, cut-ins."""

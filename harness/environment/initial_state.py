@@ -1,0 +1,98 @@
+"""Initial states of episodes: (v_BV, R1, R1dot, R2, R2dot) by inversion of five uniforms each."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import special, stats
+
+from harness.arrays import FloatArray, RecordArray
+from harness.random_stream import INITIAL, uniforms
+
+N_STATE = 5
+V_BV, R1, R1DOT, R2, R2DOT = range(N_STATE)
+_GRID = 8001
+
+
+class InitialStates:
+    """Sampler of initial states.
+
+    Parameters
+    ----------
+    numbers : structured ndarray, shape (1,)
+        Parameter record of the environment.
+    """
+
+    def __init__(self, numbers: RecordArray) -> None:
+        self._n = numbers[0]
+        n = self._n
+        self._v_grid = np.linspace(n["fit_range__v_min_mps"], n["fit_range__v_max_mps"], _GRID)
+        shape, location, scale = (float(n[f"initial_state__v_{k}"]) for k in ("shape", "location_mps", "scale_mps"))
+        cdf = stats.skewnorm.cdf(self._v_grid, shape, location, scale)
+        self._v_cdf = (cdf - cdf[0]) / (cdf[-1] - cdf[0])
+
+    def draw(self, seed: int, first_episode: int, n_episodes: int) -> FloatArray:
+        """States of consecutive episodes.
+
+        Returns
+        -------
+        ndarray of float64, shape (n_episodes, 5)
+            v_BV (m/s), R1 (m), R1dot (m/s), R2 (m), R2dot (m/s).
+        """
+        return self.from_uniforms(uniforms(seed, first_episode, n_episodes, INITIAL, N_STATE))
+
+    def from_uniforms(self, u: FloatArray) -> FloatArray:
+        """States from uniforms, shape (n, 5) → (n, 5)."""
+        n = self._n
+        v = np.interp(u[:, V_BV], self._v_cdf, self._v_grid)
+        r1 = self._gap(u[:, R1], v)
+        r1dot = self._rate(u[:, R1DOT], v, r1)
+        r2 = n["initial_state__r2_min_m"] + u[:, R2] * (n["initial_state__r2_max_m"] - n["initial_state__r2_min_m"])
+        span = n["initial_state__r2dot_max_mps"] - n["initial_state__r2dot_min_mps"]
+        r2dot = n["initial_state__r2dot_min_mps"] + u[:, R2DOT] * span
+        return np.column_stack([v, r1, r1dot, r2, r2dot])
+
+    def given_speed(self, speed: float, gap_u: FloatArray, rate_u: FloatArray) -> FloatArray:
+        """States at a fixed v_BV (m/s) from uniforms for R1 and R1dot, each (n,); columns v_BV, R1, R1dot: (n, 3)."""
+        v = np.full(gap_u.size, speed)
+        r1 = self._gap(gap_u, v)
+        return np.column_stack([v, r1, self._rate(rate_u, v, r1)])
+
+    def _u(self, v: FloatArray) -> FloatArray:
+        u: FloatArray = (v - self._n["fit_range__v_centre_mps"]) / self._n["fit_range__v_scale_mps"]
+        return u
+
+    def _gap(self, probability: FloatArray, v: FloatArray) -> FloatArray:
+        """R1 = shift + LogNormal, truncated to the fit range."""
+        n = self._n
+        u = self._u(v)
+        shift = n["initial_state__r1_shift_m"] + n["initial_state__r1_shift_u_m"] * u
+        mean = n["initial_state__r1_log_mean"] + n["initial_state__r1_log_mean_u"] * u
+        sd = np.exp(n["initial_state__r1_log_sd"] + n["initial_state__r1_log_sd_u"] * u)
+        with np.errstate(divide="ignore"):
+            below = special.ndtr((np.log(np.maximum(n["fit_range__r1_min_m"] - shift, 0.0)) - mean) / sd)
+            upto = special.ndtr((np.log(n["fit_range__r1_max_m"] - shift) - mean) / sd)
+        gap: FloatArray = shift + np.exp(mean + sd * special.ndtri(below + probability * (upto - below)))
+        return gap
+
+    def _rate(self, probability: FloatArray, v: FloatArray, r1: FloatArray) -> FloatArray:
+        """R1dot = location + scale t, given that R1 is not closed within the smallest time to collision."""
+        n = self._n
+        u = self._u(v)
+        w = (r1 - n["fit_range__r1_centre_m"]) / n["fit_range__r1_scale_m"]
+        location = (
+            n["initial_state__r1dot_location_mps"]
+            + n["initial_state__r1dot_location_u"] * u
+            + n["initial_state__r1dot_location_w"] * w
+            + n["initial_state__r1dot_location_uw"] * (u * w)
+            + n["initial_state__r1dot_location_uu"] * (u * u)
+        )
+        scale = np.exp(
+            n["initial_state__r1dot_log_scale"]
+            + n["initial_state__r1dot_log_scale_u"] * u
+            + n["initial_state__r1dot_log_scale_w"] * w
+            + n["initial_state__r1dot_log_scale_ww"] * (w * w)
+        )
+        df = float(n["initial_state__r1dot_df"])
+        slowest = special.stdtr(df, (-r1 / n["initial_state__r1dot_min_ttc_s"] - location) / scale)
+        rate: FloatArray = location + scale * special.stdtrit(df, slowest + probability * (1.0 - slowest))
+        return rate

@@ -1,0 +1,1 @@
+"""The episode loop: policy, world and controller, cell by cell and step by step."""

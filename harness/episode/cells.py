@@ -1,0 +1,255 @@
+"""State of the K episodes that run side by side, and the buffers that a shard's results are written to.
+
+Scalars of a cell are fields of one record, so that a kernel touches one cache line; what has a length is an array with
+the cell as first axis. Results are written to row ``episode − first`` of the shard: finishing order leaves no trace.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from harness.arrays import BoolArray, FloatArray, Int8Array, IntArray, RecordArray
+from harness.maneuvers import N_ACCELERATIONS
+
+_f8, _i8 = np.float64, np.int64
+
+CELL_DTYPE = np.dtype(
+    [
+        ("row", _i8),  # row of the shard, -1: idle
+        ("episode", _i8),  # index in the campaign
+        ("step", _i8),  # t, in steps
+        ("cut_step", _i8),  # -1 before the cut-in
+        ("component", _i8),  # importance function drawn for the episode, -1 without an episode mixture
+        ("lv_maneuver", _i8),
+        ("bv_maneuver", _i8),
+        ("n_lv", _i8),  # draws so far
+        ("n_bv", _i8),  # car-following draws so far
+        ("n_bv_free", _i8),  # free-driving draws so far
+        ("n_path", _i8),  # entries of BV's path, the cut-in included
+        ("n_control", _i8),
+        ("clock", _f8),  # hazard accumulated by the sampler
+        ("target", _f8),  # hazard at which BV cuts in
+        ("hazard", _f8),  # hazard accumulated under p
+        ("hazard_total", _f8),  # hazard of the whole path without cut-in (methods that draw the path ahead)
+        ("log_p_cut_in", _f8),
+        ("log_sampled", _f8),  # step mixture: sum of log q_alpha/p
+        ("min_ttc", _f8),
+        ("cut_r2", _f8),
+        ("cut_r2dot", _f8),
+        ("av_start", _f8),
+        ("buffer", _i8),  # which of the two trace buffers the running episode writes
+    ]
+)
+
+EPISODE_DTYPE = np.dtype(
+    [
+        ("outcome", np.int8),
+        ("n_steps", np.int16),
+        ("cut_in_step", np.int16),
+        ("cut_in_r2_m", _f8),
+        ("cut_in_r2dot_mps", _f8),
+        ("crash_time_s", _f8),
+        ("impact_speed_mps", _f8),
+        ("min_ttc_s", _f8),
+        ("av_distance_m", _f8),
+        ("n_control_steps", np.int16),
+        ("component", np.int8),
+        ("log_weight", _f8),
+        ("log_p_cut_in", _f8),
+        ("n_lv", np.int16),
+        ("n_bv", np.int16),
+    ]
+)
+
+MOMENT_DTYPE = np.dtype(
+    [
+        ("row", _i8),
+        ("step", np.int16),
+        ("maneuver", np.int8),
+        ("v_bv_mps", _f8),
+        ("r1_m", _f8),
+        ("r1dot_mps", _f8),
+        ("r2_m", _f8),
+        ("r2dot_mps", _f8),
+        ("p", _f8),
+        ("q_sampled", _f8),
+    ]
+)
+
+
+class Cells(NamedTuple):
+    """The K running episodes.
+
+    ``cell`` (K,) are `CELL_DTYPE` records. ``log_ratio`` (K, M) is L_j, ``martingale`` (K, J). ``cut_challenge`` and
+    ``stay_challenge`` (K, hold, J) look ahead to the end of the hold period. ``lv_path``, ``bv_path`` (K, draws) hold
+    maneuver indices. ``acceleration`` and ``speed`` (K, 3) are the commands for the coming step, ``cut_in`` (K,) says
+    whose BV changes lanes in it. ``trace`` (2 K, steps + 1, 3 vehicles, 3: x, v, a) is (2 K, 1, 3, 3) when not kept;
+    two per cell, so that an episode's motion can be fetched while the next one has begun.
+    """
+
+    cell: RecordArray
+    log_ratio: FloatArray
+    martingale: FloatArray
+    cut_challenge: FloatArray
+    stay_challenge: FloatArray
+    lv_path: Int8Array
+    bv_path: Int8Array
+    acceleration: FloatArray
+    speed: FloatArray
+    cut_in: Int8Array
+    trace: FloatArray
+
+
+class Results(NamedTuple):
+    """Rows of a shard: ``episode`` (n,) `EPISODE_DTYPE`, and what has a length beside it.
+
+    ``moment`` (capacity,) `MOMENT_DTYPE` with ``moment_q``, ``moment_v`` (capacity, J); ``moment_count`` (1,) says how
+    many are used and ``moment_limit`` how many are kept of each episode.
+    """
+
+    episode: RecordArray
+    log_q: FloatArray
+    martingale: FloatArray
+    lv_path: Int8Array
+    bv_path: Int8Array
+    moment: RecordArray
+    moment_q: FloatArray
+    moment_v: FloatArray
+    moment_count: IntArray
+    moment_limit: int
+
+
+GIVEN, PLACED, ENDED, DISAGREEING = range(4)
+"""Entries of `Exchange.counts`: rows given out so far; cells refilled and episodes ended in this turn; a cell in which
+the world's collision flag and the crash criterion differ, or -1."""
+
+
+class Exchange(NamedTuple):
+    """What kernels and the Python loop tell each other between two steps of the world.
+
+    ``counts`` (4,); ``contact`` (K,) bool: the world's collision flags; ``ended`` (K,) int8: outcomes, or `RUNNING`;
+    ``ended_row`` (K,): their rows; ``placed`` (K,): refilled cells; ``previous`` (K,): the
+    AVs' accelerations in the last step (m/s²).
+    """
+
+    counts: IntArray
+    contact: BoolArray
+    ended: Int8Array
+    ended_row: IntArray
+    placed: IntArray
+    previous: FloatArray
+
+
+def empty_exchange(n_cells: int) -> Exchange:
+    """Exchange of K cells."""
+    return Exchange(
+        counts=np.zeros(4, np.int64),
+        contact=np.zeros(n_cells, np.bool_),
+        ended=np.zeros(n_cells, np.int8),
+        ended_row=np.zeros(n_cells, np.int64),
+        placed=np.zeros(n_cells, np.int64),
+        previous=np.zeros(n_cells),
+    )
+
+
+class Scratch(NamedTuple):
+    """Room for what a kernel works out at one moment of one cell; kernels allocate nothing.
+
+    ``state`` (5,): v_BV, R1, R1dot, R2, R2dot. ``p`` (31,): exposure of the accelerations. ``q`` (J,) and
+    ``q_acceleration`` (J, 31): importance functions; ``challenge`` (J,): V_j. ``ratio`` (M,): q_j/p of the maneuver
+    taken; ``weight`` (M,): predictive weights of the importance functions.
+    """
+
+    state: FloatArray
+    p: FloatArray
+    q: FloatArray
+    q_acceleration: FloatArray
+    challenge: FloatArray
+    ratio: FloatArray
+    weight: FloatArray
+
+
+def empty_scratch(n_importance: int, n_surrogates: int) -> Scratch:
+    """Scratch for M importance functions and J surrogates."""
+    return Scratch(
+        state=np.zeros(5),
+        p=np.zeros(N_ACCELERATIONS),
+        q=np.zeros(n_surrogates),
+        q_acceleration=np.zeros((n_surrogates, N_ACCELERATIONS)),
+        challenge=np.zeros(n_surrogates),
+        ratio=np.zeros(n_importance),
+        weight=np.zeros(n_importance),
+    )
+
+
+def max_draws(max_steps: int, hold_steps: int) -> int:
+    """Most maneuvers that one vehicle draws in an episode; the cut-in restarts BV's clock and is itself an entry."""
+    return -(-max_steps // hold_steps) + 2
+
+
+def idle_cells(
+    n_cells: int, *, n_importance: int, n_surrogates: int, max_steps: int, hold_steps: int, keep_traces: bool
+) -> Cells:
+    """K cells without an episode."""
+    draws = max_draws(max_steps, hold_steps)
+    cell = np.zeros(n_cells, CELL_DTYPE)
+    cell["row"] = -1
+    trace_shape = (2 * n_cells, max_steps + 1 if keep_traces else 1, 3, 3)
+    return Cells(
+        cell=cell,
+        log_ratio=np.zeros((n_cells, n_importance)),
+        martingale=np.zeros((n_cells, n_surrogates)),
+        cut_challenge=np.zeros((n_cells, hold_steps, n_surrogates)),
+        stay_challenge=np.zeros((n_cells, hold_steps, n_surrogates)),
+        lv_path=np.zeros((n_cells, draws), np.int8),
+        bv_path=np.zeros((n_cells, draws), np.int8),
+        acceleration=np.zeros((n_cells, 3)),
+        speed=np.zeros((n_cells, 3)),
+        cut_in=np.zeros(n_cells, np.int8),
+        trace=np.full(trace_shape, np.nan),
+    )
+
+
+def empty_results(
+    n_episodes: int,
+    *,
+    n_importance: int,
+    n_surrogates: int,
+    draws: int,
+    moment_limit: int,
+    moment_capacity: int,
+) -> Results:
+    """Buffers for a shard of ``n_episodes``."""
+    capacity = moment_capacity if moment_limit else 0
+    return Results(
+        episode=np.zeros(n_episodes, EPISODE_DTYPE),
+        log_q=np.zeros((n_episodes, n_importance)),
+        martingale=np.zeros((n_episodes, n_surrogates)),
+        lv_path=np.zeros((n_episodes, draws), np.int8),
+        bv_path=np.zeros((n_episodes, draws), np.int8),
+        moment=np.zeros(capacity, MOMENT_DTYPE),
+        moment_q=np.zeros((capacity, n_surrogates)),
+        moment_v=np.zeros((capacity, n_surrogates)),
+        moment_count=np.zeros(1, np.int64),
+        moment_limit=moment_limit,
+    )
+
+
+def with_room_for_moments(results: Results, more: int) -> Results:
+    """The same results, their moment buffers doubled if fewer than ``more`` places are left."""
+    if not results.moment_limit or results.moment_count[0] + more <= results.moment.size:
+        return results
+    size = 2 * results.moment.size + more
+    return results._replace(
+        moment=_grown(results.moment, size),
+        moment_q=_grown(results.moment_q, size),
+        moment_v=_grown(results.moment_v, size),
+    )
+
+
+def _grown(old: RecordArray, size: int) -> RecordArray:
+    new = np.zeros((size, *old.shape[1:]), old.dtype)
+    new[: old.shape[0]] = old
+    return new

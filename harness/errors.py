@@ -1,0 +1,66 @@
+"""Errors that a user of the harness can cause, each with its exit code.
+
+Every message says four things: where (YAML path or file), what was found, what was expected, and how to mend it.
+Anything that is *not* a `HarnessError` is a defect of the harness itself and is shown with its traceback.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+EXIT_DONE = 0
+EXIT_BAD_INPUT = 2
+EXIT_TOO_MANY_FAILED = 3
+EXIT_BUDGET_SPENT = 4
+
+
+class HarnessError(Exception):
+    """Base of all errors that a user can cause and mend.
+
+    Parameters
+    ----------
+    where : str
+        YAML path (``testing.alpha``), file, or command-line option.
+    found, expected, mend : str
+        What was found, what was expected, and what to do about it.
+    """
+
+    exit_code = EXIT_BAD_INPUT
+
+    def __init__(self, where: str, *, found: str, expected: str, mend: str) -> None:
+        super().__init__(where, found, expected, mend)
+        self.where = where
+        self.found = found
+        self.expected = expected
+        self.mend = mend
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Errors travel from workers to the parent; pickle would call the class with positional arguments.
+        return _rebuild, (type(self), self.where, self.found, self.expected, self.mend)
+
+    def __str__(self) -> str:
+        return f"{self.where}: found {self.found}; expected {self.expected}. {self.mend}"
+
+
+def _rebuild(kind: type[HarnessError], where: str, found: str, expected: str, mend: str) -> HarnessError:
+    return kind(where, found=found, expected=expected, mend=mend)
+
+
+class CampaignError(HarnessError):
+    """The campaign file, or a file that it names, is wrong."""
+
+
+class RunFolderError(HarnessError):
+    """The output folder holds something else, or its records are damaged."""
+
+
+class WorldDisagreementError(HarnessError):
+    """SUMO did something else than it was told: the run cannot be trusted and stops."""
+
+    exit_code = EXIT_TOO_MANY_FAILED
+
+
+class TooManyFailedError(HarnessError):
+    """More episodes failed than the campaign allows."""
+
+    exit_code = EXIT_TOO_MANY_FAILED

@@ -1,0 +1,103 @@
+"""What the records say about the sampling itself: mean weight, mean ratios, failed tests, contacts of BV and LV.
+
+The mean of W = p/q_sampled over all episodes is 1 in expectation, and so is that of every q_j/q_sampled. They are
+**diagnostics, never tests**: for the step mixture the mean of W is carried by weights that hardly ever occur (the
+published NADE shows about 0.03 at 4e5 episodes, although it is unbiased), so a mean far from 1 does not say that
+something is wrong, but that the tests so far have not met the episodes that matter most.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from harness.campaign.models import Method
+from harness.estimators.block import Block
+from harness.estimators.exact_sum import MomentSums
+
+NOTE = (
+    "Diagnostics, never tests: each mean is 1 in expectation, except that of W·1{cut-in}, which is P(cut-in). Under "
+    "the step mixture the mean of W is carried by weights that hardly ever occur: published NADE shows about 0.03 at "
+    "4e5 episodes although it is unbiased. A mean far below 1 then means that the episodes that matter most have not "
+    "been met yet, not that a weight is wrong."
+)
+CARELESS_MEAN = 0.5
+
+
+class Diagnostics:
+    """Exact sums of weights and ratios; add blocks, merge, ask for the result."""
+
+    def __init__(self) -> None:
+        self.n = 0
+        self.n_failed = 0
+        self.n_cut_ins = 0
+        self.n_contacts = 0
+        self.method: Method | None = None
+        self._weight = MomentSums()
+        self._cut_in = MomentSums()
+        self._contact = MomentSums()
+        self._ratios: list[MomentSums] = []
+
+    def add(self, block: Block) -> None:
+        """Add one block."""
+        weights = block.weights()
+        self.method = block.method
+        self.n += len(block)
+        self.n_failed += int(np.count_nonzero(block.failed))
+        self.n_cut_ins += int(np.count_nonzero(block.cut_in))
+        self.n_contacts += int(np.count_nonzero(block.bv_lv_contact))
+        self._weight.add(weights)
+        self._cut_in.add(weights[block.cut_in])
+        self._contact.add(weights[block.bv_lv_contact])
+        if block.method in ("step_mixture", "episode_mixture"):
+            self._ratios = self._ratios or [MomentSums() for _ in block.alpha]
+            for sums, ratios in zip(self._ratios, block.mixture_ratios().T, strict=True):
+                sums.add(ratios)
+
+    def merge(self, other: Diagnostics) -> None:
+        """Add the sums over other episodes."""
+        self.method = other.method if self.method is None else self.method
+        self.n += other.n
+        self.n_failed += other.n_failed
+        self.n_cut_ins += other.n_cut_ins
+        self.n_contacts += other.n_contacts
+        self._weight.merge(other._weight)
+        self._cut_in.merge(other._cut_in)
+        self._contact.merge(other._contact)
+        self._ratios = self._ratios or [MomentSums() for _ in other._ratios]
+        for mine, theirs in zip(self._ratios, other._ratios, strict=False):
+            mine.merge(theirs)
+
+    def result(self, importance_names: tuple[str, ...] = ()) -> dict[str, Any]:
+        """Means with standard errors.
+
+        Parameters
+        ----------
+        importance_names : tuple of str
+            Names of the M importance functions, in order; numbered where left out.
+        """
+        names = importance_names or tuple(f"q_{j}" for j in range(len(self._ratios)))
+        result: dict[str, Any] = {
+            "mean_weight": self._mean(self._weight),
+            "mean_weight_cut_in": self._mean(self._cut_in),
+            "mean_ratio": {
+                name: self._mean(sums) for name, sums in zip(names, self._ratios, strict=False) if self._ratios
+            },
+            "bv_lv_contact_share": self._mean(self._contact),
+            "n_cut_ins": self.n_cut_ins,
+            "n_bv_lv_contacts": self.n_contacts,
+            "n_failed": self.n_failed,
+            "note": NOTE,
+        }
+        if self.n and self.method == "step_mixture" and self._weight.mean(self.n) < CARELESS_MEAN:
+            result["heavy_tail"] = (
+                f"the mean weight is {self._weight.mean(self.n):.3g} where 1 is expected: the episodes with large "
+                "weights are still missing"
+            )
+        return result
+
+    def _mean(self, sums: MomentSums) -> dict[str, float]:
+        if self.n == 0:
+            return {"mean": float("nan"), "std_error": float("inf")}
+        return {"mean": sums.mean(self.n), "std_error": sums.std_error(self.n)}

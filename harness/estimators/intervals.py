@@ -1,0 +1,88 @@
+"""Intervals and bounds for a crash rate: Clopper-Pearson, normal, and Hoeffding's bound for capped weights."""
+
+from __future__ import annotations
+
+import math
+
+from scipy.optimize import brentq
+from scipy.stats import beta, norm
+
+
+def clopper_pearson(n_crashes: int, n: int, confidence: float) -> tuple[float, float]:
+    """Exact two-sided interval for a binomial share.
+
+    Parameters
+    ----------
+    n_crashes, n : int
+        Crashes among n tests, n ≥ 1.
+    confidence : float
+        Level; each side keeps half of the rest.
+    """
+    tail = (1.0 - confidence) / 2.0
+    low = 0.0 if n_crashes == 0 else float(beta.ppf(tail, n_crashes, n - n_crashes + 1))
+    return low, clopper_pearson_upper(n_crashes, n, 1.0 - tail)
+
+
+def clopper_pearson_upper(n_crashes: int, n: int, confidence: float) -> float:
+    """Exact one-sided upper bound for a binomial share; without a crash 1 - (1 - confidence)^(1/n)."""
+    if n_crashes == n:
+        return 1.0
+    if n_crashes == 0:
+        return -math.expm1(math.log1p(-confidence) / n)
+    return float(beta.ppf(confidence, n_crashes + 1, n - n_crashes))
+
+
+def normal_half_width(std_error: float, confidence: float) -> float:
+    """Half-width of the two-sided normal interval."""
+    return float(norm.isf((1.0 - confidence) / 2.0)) * std_error
+
+
+def normal_upper_distance(std_error: float, confidence: float) -> float:
+    """Distance of the one-sided normal upper bound from the estimate."""
+    return float(norm.isf(1.0 - confidence)) * std_error
+
+
+def capped_mean_upper(mean: float, cap: float, n: int, confidence: float) -> float:
+    """One-sided upper bound for the mean of independent values in [0, cap], valid at every n.
+
+    It inverts Hoeffding's inequality in its relative-entropy form (W. Hoeffding, Probability inequalities for sums of
+    bounded random variables, JASA 58, 1963, Theorem 1): P(mean ≤ x) ≤ exp(-n·KL(x/cap, μ/cap)) for x ≤ μ. For a mean
+    of 0 it *is* the Clopper-Pearson bound times the cap; with crashes it uses their weights and not only their number.
+
+    Parameters
+    ----------
+    mean : float
+        Observed mean, in [0, cap].
+    cap : float
+        Largest possible value; infinite if unknown, and then only the trivial bound 1 is left.
+    n : int
+        Number of values.
+    confidence : float
+        Level of the bound.
+
+    Returns
+    -------
+    float
+        At most 1, since the mean is a probability.
+    """
+    if not math.isfinite(cap):
+        return 1.0
+    if mean <= 0.0:
+        return min(1.0, cap * clopper_pearson_upper(0, n, confidence))
+    share = mean / cap
+    if share >= 1.0:
+        return min(1.0, cap)
+    needed = -math.log1p(-confidence) / n
+    almost_one = math.log1p(-(2.0**-53))
+    if _relative_entropy(share, almost_one) <= needed:
+        return min(1.0, cap)
+    log_bound = brentq(
+        lambda log_p: _relative_entropy(share, log_p) - needed, math.log(share), almost_one, xtol=1e-14, rtol=1e-13
+    )
+    return min(1.0, cap * math.exp(float(log_bound)))
+
+
+def _relative_entropy(share: float, log_p: float) -> float:
+    """KL divergence of a coin with the given share from one with probability exp(log_p)."""
+    log_miss = math.log(-math.expm1(log_p)) if log_p < 0.0 else -math.inf
+    return share * (math.log(share) - log_p) + (1.0 - share) * (math.log1p(-share) - log_miss)

@@ -1,0 +1,129 @@
+"""`mixture_cv`: weighted crashes with the episode mixture's exactly known-mean control variates.
+
+Under q_alpha(x) = Σ_j alpha_j q_j(x) over whole episodes, h_j(x) = q_j(x)/q_alpha(x) - 1 has mean exactly 0, whatever
+the AV does. Regressing Y on [1, h_1 … h_M], with the columns *not* centred by their sample means, makes the intercept
+the estimate: it moves away from the plain mean by what the sample means of the h_j show to be luck. Its variance is at
+most min_j σ²_j/(n alpha_j) up to the estimation of β ([paper] Lemma 1, which is Theorem 2 of Owen and Zhou).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar, Self
+
+import numpy as np
+
+from harness.arrays import FloatArray
+from harness.campaign.models import EstimatorName
+from harness.estimators.accumulator import require_episodes
+from harness.estimators.block import Block
+from harness.estimators.estimate import Estimate
+from harness.estimators.triangular_factor import empty_factor, fold_rows
+from harness.estimators.weighted_sums import WeightedSums, weighted_estimate
+
+
+@dataclass(frozen=True)
+class Regression:
+    """Least squares of Y on [1, H], of the smallest norm where columns depend on each other.
+
+    Attributes
+    ----------
+    coefficients : (1 + M,) float64
+        Intercept, then β.
+    residual_squares : float
+        Residual sum of squares.
+    rank : int
+        Rank of [1, H].
+    intercept_leverage : float
+        Variance of the intercept per unit of residual variance, [(XᵀX)⁺]_00.
+    """
+
+    coefficients: FloatArray
+    residual_squares: float
+    rank: int
+    intercept_leverage: float
+
+
+class MixtureCv:
+    """Triangular factor of [1, H, Y], (M + 2)² numbers however many episodes."""
+
+    name: ClassVar[EstimatorName] = "mixture_cv"
+
+    def __init__(self) -> None:
+        self.sums = WeightedSums()
+        self._factor: FloatArray | None = None
+
+    @classmethod
+    def refusal(cls, block: Block) -> str | None:
+        """Only the episode mixture has few control variates whose means are known and whose values are bounded."""
+        if block.method == "step_mixture":
+            return (
+                "needs the episode mixture: under the step mixture the products of q_j/q_alpha have mean 1 too, "
+                "but tails too heavy for a regression"
+            )
+        if block.method != "episode_mixture":
+            return f"needs the episode mixture; {block.method} draws from a single distribution"
+        return None
+
+    def add(self, block: Block) -> None:
+        """Fold one block's rows into the factor, in index order."""
+        self.sums.add(block)
+        ones = np.ones((len(block), 1))
+        columns = [ones, block.mixture_ratios() - 1.0, block.weighted_crashes()[:, None]]
+        rows = np.asfortranarray(np.concatenate(columns, axis=1))
+        self._factor = empty_factor(rows.shape[1]) if self._factor is None else self._factor
+        fold_rows(self._factor, rows)
+
+    def merge(self, other: Self) -> None:
+        """Add the rows behind the other factor."""
+        self.sums.merge(other.sums)
+        if other._factor is not None:
+            self._factor = empty_factor(len(other._factor)) if self._factor is None else self._factor
+            fold_rows(self._factor, other._factor.copy(order="F"))
+
+    def result(self, confidence: float) -> Estimate:
+        """Intercept of the regression, with the residual variance on n - rank degrees of freedom."""
+        require_episodes(self.sums.n)
+        assert self._factor is not None
+        fit = regress(self._factor, self.sums.n)
+        freedom = self.sums.n - fit.rank
+        variance = fit.residual_squares / freedom * fit.intercept_leverage if freedom > 0 else math.inf
+        plain = self.sums.y.std_error(self.sums.n)
+        warnings = []
+        if fit.coefficients[0] < 0.0:
+            warnings.append("the regression's intercept is negative: too few crashes for control variates, use nade")
+        return weighted_estimate(
+            self.sums,
+            float(fit.coefficients[0]),
+            math.sqrt(variance),
+            confidence,
+            method="mean of weighted crashes with the episode mixture's known-mean control variates",
+            warnings=warnings,
+            details={
+                "beta": [float(value) for value in fit.coefficients[1:]],
+                "rank": fit.rank,
+                "plain_mean": self.sums.mean(),
+                "plain_std_error": plain,
+            },
+        )
+
+
+def regress(factor: FloatArray, n: int) -> Regression:
+    """Solve the least squares of Y on [1, H] from the triangular factor of [1, H, Y].
+
+    Parameters
+    ----------
+    factor : (k, k) float64
+        Upper triangular factor, the ones first and Y last.
+    n : int
+        Rows behind the factor; it scales the tolerance for the rank (Σ_j alpha_j h_j = 0 always costs one).
+    """
+    design, target = factor[:-1, :-1], factor[:-1, -1]
+    left, singular, right = np.linalg.svd(design)
+    kept = singular > max(n, len(design)) * np.finfo(np.float64).eps * singular[0]
+    projected = left.T @ target
+    coefficients = right[kept].T @ (projected[kept] / singular[kept])
+    residual_squares = float(factor[-1, -1] ** 2 + np.sum(projected[~kept] ** 2))
+    leverage = float(np.sum((right[kept, 0] / singular[kept]) ** 2))
+    return Regression(coefficients, residual_squares, int(np.count_nonzero(kept)), leverage)

@@ -1,0 +1,46 @@
+"""`nade`: the mean of weighted crashes, importance sampling as it stands ([paper] section II-B)."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Self
+
+from harness.campaign.models import EstimatorName
+from harness.estimators.accumulator import require_episodes
+from harness.estimators.block import Block
+from harness.estimators.estimate import Estimate
+from harness.estimators.weighted_sums import WeightedSums, weighted_estimate
+
+
+class Nade:
+    """Mean of Y = 1{crash}·weight. Unbiased for every method of drawing; without control it is the crash share."""
+
+    name: ClassVar[EstimatorName] = "nade"
+
+    def __init__(self) -> None:
+        self.sums = WeightedSums()
+
+    @classmethod
+    def refusal(cls, block: Block) -> str | None:  # noqa: ARG003 - part of the shape that all estimators share
+        """Never refuses: every record has an outcome and a weight."""
+        return None
+
+    def add(self, block: Block) -> None:
+        """Add one block's weighted crashes."""
+        self.sums.add(block)
+
+    def merge(self, other: Self) -> None:
+        """Add the sums over other episodes; exact, so any grouping gives the same bits."""
+        self.sums.merge(other.sums)
+
+    def result(self, confidence: float) -> Estimate:
+        """Mean of Y with its normal interval."""
+        require_episodes(self.sums.n)
+        return weighted_estimate(
+            self.sums,
+            self.sums.mean(),
+            self.sums.y.std_error(self.sums.n),
+            confidence,
+            method="mean of weighted crashes",
+            warnings=[],
+            details={},
+        )

@@ -1,0 +1,212 @@
+"""Sums over weighted crashes Y = 1{crash}·weight that every estimator of a weighted mean shares.
+
+They hold what decides whether a mean of Y can be trusted: how many crashes carry it, how unevenly, which cap their
+weights have by design, and what failed episodes would have done to it.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from harness.arrays import FloatArray
+from harness.campaign.models import Method
+from harness.estimators.block import Block
+from harness.estimators.estimate import Estimate
+from harness.estimators.exact_sum import MomentSums
+from harness.estimators.intervals import capped_mean_upper, normal_half_width, normal_upper_distance
+
+FEW_CRASHES = 50
+FEW_EFFECTIVE = 30.0
+LARGE_SHARE = 0.1
+
+
+class WeightedSums:
+    """Exact sums of Y, and the largest weights; one pass, any order.
+
+    Attributes
+    ----------
+    n, n_crashes, n_failed : int
+        Episodes, crashes and failed episodes so far.
+    y : MomentSums
+        ΣY and ΣY², a failed episode counting as no crash.
+    """
+
+    def __init__(self) -> None:
+        self.n = 0
+        self.n_crashes = 0
+        self.n_failed = 0
+        self.y = MomentSums()
+        self.method: Method | None = None
+        self._failed_weight = MomentSums()
+        self._largest_y = 0.0
+        self._largest_cut_in_log_weight = -math.inf
+        self._largest_log_weight = -math.inf
+        self._largest_log_path_cap = -math.inf
+        self._design_cap = -math.inf
+        self._has_path_caps = True
+
+    def add(self, block: Block) -> None:
+        """Add the episodes of one block."""
+        weights = np.exp(block.log_weight[block.crash])
+        self.method = block.method
+        self.n += len(block)
+        self.n_crashes += len(weights)
+        self.n_failed += int(np.count_nonzero(block.failed))
+        self.y.add(weights)
+        if block.failed.any():
+            self._failed_weight.add(block.weights()[block.failed])
+        self._largest_y = max(self._largest_y, _largest(weights))
+        self._add_caps(block)
+
+    def _add_caps(self, block: Block) -> None:
+        self._largest_log_weight = max(self._largest_log_weight, _largest(block.log_weight))
+        cut_in = block.log_weight[block.cut_in]
+        self._largest_cut_in_log_weight = max(self._largest_cut_in_log_weight, _largest(cut_in))
+        self._design_cap = max(self._design_cap, math.inf if block.weight_cap is None else block.weight_cap)
+        share = {"forced": 1.0, "episode_mixture": float(block.alpha[0]) if len(block.alpha) else 0.0}.get(block.method)
+        if block.log_p_cut_in is None or not share:
+            self._has_path_caps = False
+        else:
+            path_cap = _largest(block.log_p_cut_in) - math.log(share)
+            self._largest_log_path_cap = max(self._largest_log_path_cap, path_cap)
+
+    def merge(self, other: WeightedSums) -> None:
+        """Add the sums over other episodes."""
+        self.method = other.method if self.method is None else self.method
+        self.n += other.n
+        self.n_crashes += other.n_crashes
+        self.n_failed += other.n_failed
+        self.y.merge(other.y)
+        self._failed_weight.merge(other._failed_weight)
+        self._largest_y = max(self._largest_y, other._largest_y)
+        self._largest_cut_in_log_weight = max(self._largest_cut_in_log_weight, other._largest_cut_in_log_weight)
+        self._largest_log_weight = max(self._largest_log_weight, other._largest_log_weight)
+        self._largest_log_path_cap = max(self._largest_log_path_cap, other._largest_log_path_cap)
+        self._design_cap = max(self._design_cap, other._design_cap)
+        self._has_path_caps = self._has_path_caps and other._has_path_caps
+
+    def mean(self) -> float:
+        """ΣY/n."""
+        return self.y.mean(self.n)
+
+    def n_effective(self) -> float:
+        """(ΣY)²/ΣY², 0 without a crash."""
+        squares = self.y.squares.value()
+        return self.y.total.value() ** 2 / squares if squares > 0.0 else 0.0
+
+    def largest_share(self) -> float:
+        """Largest Y as a share of ΣY, 0 without a crash."""
+        total = self.y.total.value()
+        return self._largest_y / total if total > 0.0 else 0.0
+
+    def cap(self) -> tuple[float, str]:
+        """Cap on Y for the upper bound, and where it comes from, in words."""
+        if math.isfinite(self._design_cap):
+            return max(self._design_cap, self._largest_y), "the weight cap known by design"
+        if self._has_path_caps and math.isfinite(self._largest_log_path_cap):
+            largest = max(math.exp(self._largest_log_path_cap), self._largest_y)
+            return largest, "the largest P(cut-in | path)/share of forced cut-ins among the paths driven"
+        seen = self._largest_cut_in_log_weight
+        if math.isfinite(seen):
+            return _exp(seen), "the largest weight seen among episodes with a cut-in (no cap is known)"
+        return _exp(self._largest_log_weight), "the largest weight seen (no cap is known)"
+
+    def is_normal(self) -> bool:
+        """Whether there are enough crashes for a normal interval to mean what it says."""
+        return self.n_crashes >= FEW_CRASHES and self.n_effective() >= FEW_EFFECTIVE
+
+    def details(self) -> dict[str, float | int]:
+        """Failed episodes counted the other way: as crashes with the weight they had."""
+        total = self.y.total.fraction() + self._failed_weight.total.fraction()
+        squares = self.y.squares.fraction() + self._failed_weight.squares.fraction()
+        variance = max(0.0, float(squares - total * total / self.n)) / max(1, self.n - 1)
+        return {
+            "n_failed": self.n_failed,
+            "crash_rate_if_failed_had_crashed": float(total) / self.n,
+            "std_error_if_failed_had_crashed": math.sqrt(variance / self.n),
+        }
+
+    def warnings(self) -> list[str]:
+        """Why a mean of these Y may mislead."""
+        found = count_warnings(self.n_crashes, self.n_failed, self.n)
+        if 0.0 < self.n_effective() < FEW_EFFECTIVE:
+            found.append(f"effective sample size {self.n_effective():.3g} is below 30: few weights carry the estimate")
+        if self.largest_share() > LARGE_SHARE:
+            found.append(f"one crash carries {self.largest_share():.0%} of the estimate")
+        if math.isfinite(self._design_cap) and self._largest_y > self._design_cap * (1.0 + 1e-9):
+            found.append(
+                f"a crash weighs {self._largest_y:.6g}, more than the cap {self._design_cap:.6g} that the design "
+                "guarantees: the records contradict the campaign"
+            )
+        if not math.isfinite(self._design_cap) and not self.is_normal():
+            found.append(f"the upper bound rests on {self.cap()[1]}, not on a cap guaranteed by design")
+        if self.method == "step_mixture":
+            found.append(
+                "weights of the step mixture are not bounded: rare large weights may be missing, and neither the "
+                "sample variance nor the interval would show it"
+            )
+        return found
+
+
+def count_warnings(n_crashes: int, n_failed: int, n: int) -> list[str]:
+    """Warn of what matters to any estimator: too few crashes, failed episodes."""
+    found = []
+    if n_crashes < FEW_CRASHES:
+        found.append(f"only {n_crashes} crashes were sampled (below {FEW_CRASHES}): the interval is rough")
+    if n_failed:
+        found.append(f"{n_failed} of {n} episodes failed; the estimate counts them as no crash")
+    return found
+
+
+def weighted_estimate(
+    sums: WeightedSums,
+    rate: float,
+    std_error: float,
+    confidence: float,
+    *,
+    method: str,
+    warnings: list[str],
+    details: dict[str, object],
+) -> Estimate:
+    """Estimate with a normal interval around `rate`, and a one-sided upper bound.
+
+    The bound is the normal one where crashes are many enough for it, else Hoeffding's for the mean of capped Y, which
+    holds at every n and is in ``details`` in any case. Without a crash a normal interval says nothing; it is then
+    [0, two-sided Hoeffding bound].
+    """
+    cap, origin = sums.cap()
+    hoeffding = capped_mean_upper(sums.mean(), cap, sums.n, confidence)
+    upper = min(1.0, rate + normal_upper_distance(std_error, confidence)) if sums.is_normal() else hoeffding
+    half = normal_half_width(std_error, confidence)
+    low, high = max(0.0, rate - half), min(1.0, rate + half)
+    if sums.n_crashes == 0:
+        low, high = 0.0, capped_mean_upper(0.0, cap, sums.n, (1.0 + confidence) / 2.0)
+    bound = f"upper bound: Hoeffding's for the mean of Y, with {origin}; without a crash Clopper-Pearson times that cap"
+    if sums.is_normal():
+        bound = "upper bound: one-sided normal"
+    return Estimate(
+        crash_rate=rate,
+        std_error=std_error,
+        ci_low=low,
+        ci_high=high,
+        upper_bound=upper,
+        confidence=confidence,
+        rhw=half / rate if rate > 0.0 else math.inf,
+        n_episodes=sums.n,
+        n_crashes=sums.n_crashes,
+        n_effective=sums.n_effective(),
+        largest_weight_share=sums.largest_share(),
+        method=f"{method}; normal interval; {bound}",
+        warnings=tuple(sums.warnings() + warnings),
+        details={"upper_bound_hoeffding": hoeffding, **sums.details(), **details},
+    )
+
+
+def _largest(values: FloatArray) -> float:
+    return float(np.max(values, initial=-math.inf))
+
+
+def _exp(log_value: float) -> float:
+    return math.exp(log_value) if log_value < 700.0 else math.inf

@@ -1,0 +1,1 @@
+"""What maneuvers are drawn from at critical moments, and the likelihood ratios that this costs."""

@@ -1,0 +1,102 @@
+"""Assemble a campaign's importance functions from its settings and the challenge tables."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from harness.arrays import BoolArray, Float32Array
+from harness.campaign.models import Campaign
+from harness.criticality.after_cut_in import level_steps
+from harness.criticality.tables import Tables
+from harness.importance.functions import Importance
+from harness.outcomes import EPISODE_MIXTURE, FORCED, METHODS, STEP_MIXTURE
+from harness.vehicles.kinematics import CONTACT_M
+
+_SETTINGS = np.dtype(
+    [
+        ("method", np.int64),
+        ("recursive", np.int64),
+        ("n_surrogates", np.int64),
+        ("first", np.int64),
+        ("steps_per_level", np.int64),
+        ("epsilon", np.float64),
+        ("threshold", np.float64),
+    ]
+)
+
+_ROUNDING_M = 1e-9
+"""More than interpolation between gaps of up to a kilometre can lose."""
+
+
+def needs_tables(campaign: Campaign) -> bool:
+    """Whether the campaign's method looks at surrogates at all."""
+    return METHODS.index(campaign.testing.method) in (STEP_MIXTURE, EPISODE_MIXTURE)
+
+
+def importance_names(campaign: Campaign) -> tuple[str, ...]:
+    """Names of the importance functions, in the order of ``log_q``."""
+    method = METHODS.index(campaign.testing.method)
+    defensive = ("forced",) if method in (FORCED, EPISODE_MIXTURE) else ()
+    return defensive + (tuple(campaign.surrogates) if needs_tables(campaign) else ())
+
+
+def mixture_weights(campaign: Campaign) -> tuple[float, ...]:
+    """Weights α of the importance functions, in the order of `importance_names`."""
+    method = METHODS.index(campaign.testing.method)
+    if method == FORCED:
+        return (1.0,)
+    if method == STEP_MIXTURE:
+        return campaign.alpha()
+    if method == EPISODE_MIXTURE:
+        share = campaign.testing.defensive_share
+        return (share, *((1.0 - share) * weight for weight in campaign.alpha()))
+    return ()
+
+
+def build_importance(campaign: Campaign, tables: Tables | None) -> Importance:
+    """Importance functions of a campaign.
+
+    Parameters
+    ----------
+    campaign : Campaign
+    tables : Tables, optional
+        Challenge tables of its surrogates; not needed by ``nde`` and ``forced``.
+    """
+    method = METHODS.index(campaign.testing.method)
+    settings = np.zeros(1, _SETTINGS)
+    settings["method"] = method
+    settings["recursive"] = campaign.testing.challenge == "recursive"
+    settings["n_surrogates"] = len(campaign.surrogates) if needs_tables(campaign) else 0
+    settings["first"] = 1 if method in (FORCED, EPISODE_MIXTURE) else 0
+    settings["steps_per_level"] = level_steps(round(campaign.environment.acceleration_hold_s * 10))
+    settings["epsilon"] = campaign.testing.epsilon
+    settings["threshold"] = campaign.testing.criticality_threshold
+    alpha = np.array(mixture_weights(campaign), dtype=np.float64)
+    if tables is None:
+        return Importance(settings, alpha, _none(5), _none(5), _none(5), np.zeros((0, 1, 1, 1), np.bool_))
+    harmless = harmless_cells(tables.maneuvers, recursive=campaign.testing.challenge == "recursive")
+    return Importance(settings, alpha, tables.value, tables.maneuvers, tables.before, harmless)
+
+
+def harmless_cells(maneuvers: Float32Array, *, recursive: bool) -> BoolArray:
+    """Grid cells in which every acceleration has challenge 0, wherever in the cell it is interpolated.
+
+    Parameters
+    ----------
+    maneuvers : ndarray of float32, shape (J, v, R2, R2dot, 31)
+        Probabilities (recursive) or smallest gaps in metres (immediate).
+    recursive : bool
+
+    Returns
+    -------
+    ndarray of bool, shape (J, v - 1, R2 - 1, R2dot - 1)
+    """
+    cells: BoolArray = maneuvers.max(-1) == 0.0 if recursive else maneuvers.min(-1) > CONTACT_M + _ROUNDING_M
+    for axis in (1, 2, 3):
+        n = cells.shape[axis]
+        cells = cells.take(range(n - 1), axis) & cells.take(range(1, n), axis)
+    return cells
+
+
+def _none(dimensions: int) -> Float32Array:
+    return np.zeros((0,) + (1,) * (dimensions - 1), np.float32)

@@ -1,0 +1,192 @@
+"""Importance functions q_j at a critical moment, before and after the cut-in.
+
+    q_j(a|s) = ε p(a|s) + (1 − ε) p(a|s) C_j(s, a)/V_j(s),   V_j(s) = Σ_a p(a|s) C_j(s, a);   q_j = p where V_j = 0.
+
+A moment is critical if any V_j exceeds the threshold. Before the cut-in the maneuvers are {stay, cut_in}; after it, at
+redraw times, the 31 accelerations.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from harness.arrays import BoolArray, Float32Array, FloatArray, RecordArray
+from harness.compiled import compiled_inline
+from harness.criticality.before_cut_in import level_of
+from harness.criticality.grid import interpolate, interpolate_maneuvers, locate_after, locate_before
+from harness.environment.cut_in import acceptance
+from harness.environment.driving import Environment
+from harness.maneuvers import N_ACCELERATIONS
+from harness.vehicles.kinematics import CONTACT_M, STEP_S, next_speed
+
+
+class Importance(NamedTuple):
+    """All that kernels need to sample critical moments.
+
+    ``settings`` is a record (shape (1,)) with method, recursive, epsilon, threshold, steps_per_level, n_surrogates and
+    ``first`` (index of the first surrogate among the importance functions: 1 when the forced cut-in is component 0).
+    ``alpha`` (M,) are the mixture weights. ``value`` (J, levels + 1, v, R2, R2dot), ``maneuvers`` (J, v, R2, R2dot, 31)
+    and ``before`` (J, redraw times + 1, v, R2, R2dot) are the challenge tables (see `harness.criticality.tables`).
+    ``harmless`` (J, v - 1, R2 - 1, R2dot - 1) marks the grid cells after the cut-in in which no acceleration challenges
+    a surrogate: most of what is driven lies there, and nothing needs to be interpolated.
+    """
+
+    settings: RecordArray
+    alpha: FloatArray
+    value: Float32Array
+    maneuvers: Float32Array
+    before: Float32Array
+    harmless: BoolArray
+
+
+@compiled_inline
+def as_challenge(tabulated: float, recursive: int) -> float:
+    """Challenge from a table entry: a probability (recursive), or a smallest gap in metres (immediate)."""
+    if recursive:
+        return tabulated
+    return 1.0 if tabulated < CONTACT_M else 0.0
+
+
+@compiled_inline
+def look_ahead(
+    speed: float,
+    r2: float,
+    r2dot: float,
+    bv_acceleration: float,
+    step: int,
+    environment: Environment,
+    importance: Importance,
+    cut_challenge: FloatArray,
+    stay_challenge: FloatArray,
+) -> None:
+    """Challenges of cutting in and of staying, for every step of the hold period that begins now.
+
+    Until its next redraw BV's motion is known and the AV holds its speed, so one sweep serves the whole period.
+    ``cut_challenge`` (hold, J) receives C_j(s_i, cut_in); ``stay_challenge`` (hold, J) the challenge of staying per
+    unit of OL (zero for the immediate challenge).
+    """
+    n = environment.numbers[0]
+    s = importance.settings[0]
+    hold = n.hold_steps
+    follower = speed - r2dot
+    for i in range(hold):
+        accepted = acceptance(r2, speed - follower, environment)
+        passed = r2 <= 0.0
+        after = next_speed(speed, bv_acceleration)
+        r2 += (0.5 * (speed + after) - follower) * STEP_S
+        speed = after
+        where = locate_after(speed, r2, speed - follower)
+        level = level_of(step + i, n.max_steps, s.steps_per_level, importance.value.shape[1] - 1)
+        for j in range(s.n_surrogates):
+            challenge = 0.0
+            if not passed and level >= 0:
+                challenge = as_challenge(interpolate(importance.value[j, level], where), s.recursive)
+            cut_challenge[i, j] = challenge
+            stay_challenge[i, j] = STEP_S * accepted * challenge
+    if s.recursive == 0:
+        stay_challenge[:, :] = 0.0
+        return
+    period = (step + hold) // hold
+    where_end = locate_before(speed, r2, speed - follower)
+    for j in range(s.n_surrogates):
+        later = 0.0
+        if r2 > 0.0 and period < importance.before.shape[1]:
+            later = interpolate(importance.before[j, period], where_end)
+        for i in range(hold - 1, -1, -1):
+            here = stay_challenge[i, j]
+            stay_challenge[i, j] = later
+            later += here
+
+
+@compiled_inline
+def propose_cut_in(
+    p: float,
+    opportunity_1s: float,
+    cut_challenge: FloatArray,
+    stay_challenge: FloatArray,
+    importance: Importance,
+    q: FloatArray,
+    v: FloatArray,
+) -> bool:
+    """Probability of ``cut_in`` under every surrogate's importance function.
+
+    Parameters
+    ----------
+    p : float
+        Exposure of ``cut_in``.
+    opportunity_1s : float
+        OL of the state, which turns ``stay_challenge`` (J,) into a probability.
+    q, v : ndarray, shape (J,)
+        Receive q_j(cut_in | s) and V_j(s).
+
+    Returns
+    -------
+    bool
+        Whether the moment is critical.
+    """
+    s = importance.settings[0]
+    critical = False
+    for j in range(s.n_surrogates):
+        staying = -math.expm1(-opportunity_1s * stay_challenge[j]) if s.recursive else 0.0
+        cutting = p * cut_challenge[j]
+        total = cutting + (1.0 - p) * staying
+        v[j] = total
+        q[j] = p
+        if total > 0.0:
+            q[j] = s.epsilon * p + (1.0 - s.epsilon) * (cutting / total)
+        critical = critical or total > s.threshold
+    return critical
+
+
+@compiled_inline
+def is_harmless(j: int, where: tuple[int, float, int, float, int, float], importance: Importance) -> bool:
+    """Whether no acceleration challenges surrogate ``j`` in the grid cell of `locate_after`."""
+    return bool(importance.harmless[j, where[0], where[2], where[4]])
+
+
+@compiled_inline
+def challenges_nobody(speed: float, r2: float, r2dot: float, importance: Importance) -> bool:
+    """Whether a state after the cut-in is seen to be uncritical without a look at any acceleration."""
+    where = locate_after(speed, r2, r2dot)
+    harmless = True
+    for j in range(importance.settings[0].n_surrogates):
+        harmless = harmless and is_harmless(j, where, importance)
+    return harmless
+
+
+@compiled_inline
+def propose_acceleration(
+    speed: float,
+    r2: float,
+    r2dot: float,
+    p: FloatArray,
+    importance: Importance,
+    q: FloatArray,
+    v: FloatArray,
+) -> bool:
+    """Probabilities of the 31 accelerations under every surrogate's importance function.
+
+    ``p`` (31,) is the exposure; ``q`` (J, 31) and ``v`` (J,) receive the results. Returns whether the moment is
+    critical.
+    """
+    s = importance.settings[0]
+    where = locate_after(speed, r2, r2dot)
+    critical = False
+    for j in range(s.n_surrogates):
+        if is_harmless(j, where, importance):
+            v[j] = 0.0
+            for m in range(N_ACCELERATIONS):
+                q[j, m] = p[m]
+            continue
+        interpolate_maneuvers(importance.maneuvers[j], where, q[j])
+        for m in range(N_ACCELERATIONS):
+            q[j, m] = p[m] * as_challenge(q[j, m], s.recursive)
+        total = 0.0
+        for m in range(N_ACCELERATIONS):
+            total += q[j, m]
+        v[j] = total
+        critical = critical or total > s.threshold
+        for m in range(N_ACCELERATIONS):
+            q[j, m] = s.epsilon * p[m] + (1.0 - s.epsilon) * (q[j, m] / total) if total > 0.0 else p[m]
+    return critical

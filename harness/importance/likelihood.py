@@ -1,0 +1,101 @@
+"""Likelihood ratios of an episode, accumulated step by step.
+
+Per importance function j the logarithm L_j = Σ log(q_j/p) over the control steps so far is kept. The probability that a
+step was sampled with, *given the shared history*, is the mixture Σ_j w_j q_j with
+
+* step mixture: w_j = α_j in every step;
+* episode mixture: the posterior weights w_j ∝ α_j exp(L_j). The drawn component itself is not part of the history.
+
+Hence log q_sampled/p accumulates to Σ log Σ_j α_j q_j/p (step), or to log Σ_j α_j exp(L_j) (episode).
+"""
+
+from __future__ import annotations
+
+import math
+
+from harness.arrays import FloatArray
+from harness.compiled import compiled_inline
+from harness.outcomes import EPISODE_MIXTURE
+
+
+@compiled_inline
+def log_mixture(alpha: FloatArray, log_ratio: FloatArray) -> float:
+    """Log Σ_j α_j exp(L_j); ``alpha`` and ``log_ratio`` have shape (M,)."""
+    largest = -math.inf
+    for j in range(alpha.size):
+        largest = max(largest, log_ratio[j])
+    if largest == -math.inf:
+        return -math.inf
+    total = 0.0
+    for j in range(alpha.size):
+        total += alpha[j] * math.exp(log_ratio[j] - largest)
+    return largest + math.log(total)
+
+
+@compiled_inline
+def predictive_weights(method: int, alpha: FloatArray, log_ratio: FloatArray, out: FloatArray) -> None:
+    """Weights of the importance functions in the next step, given the shared history: ``out`` (M,), summing to 1."""
+    if method != EPISODE_MIXTURE:
+        for j in range(alpha.size):
+            out[j] = alpha[j]
+        return
+    total = log_mixture(alpha, log_ratio)
+    for j in range(alpha.size):
+        out[j] = alpha[j] * math.exp(log_ratio[j] - total)
+
+
+@compiled_inline
+def add_martingale(
+    weight_before: float, v: FloatArray, ratio: FloatArray, first: int, sampled: float, out: FloatArray
+) -> None:
+    """Add W_{t−1} V_j (q_{j,t}/q_{α,t} − 1) to ``out`` (J,).
+
+    ``ratio`` (M,) holds q_j/p of the maneuver taken, surrogates from index ``first`` on; ``sampled`` is q_α/p.
+    """
+    for j in range(v.size):
+        if v[j] > 0.0:
+            out[j] += weight_before * v[j] * (ratio[first + j] / sampled - 1.0)
+
+
+@compiled_inline
+def accumulate(
+    method: int,
+    first: int,
+    alpha: FloatArray,
+    ratio: FloatArray,
+    v: FloatArray,
+    log_sampled: float,
+    log_ratio: FloatArray,
+    martingale: FloatArray,
+    weight: FloatArray,
+) -> float:
+    """Take the maneuver of one step into an episode's likelihood ratios.
+
+    Parameters
+    ----------
+    method, first : int
+        Sampling method; index of the first surrogate among the importance functions.
+    alpha, ratio : ndarray, shape (M,)
+        Mixture weights, and q_j/p of the maneuver taken.
+    v : ndarray, shape (J,)
+        V_j(s); 0 where the moment is not critical.
+    log_sampled : float
+        Step mixture: Σ log q_α/p of the steps before.
+    log_ratio, martingale : ndarray, shapes (M,) and (J,)
+        Updated.
+    weight : ndarray, shape (M,)
+        Scratch.
+
+    Returns
+    -------
+    float
+        q_α/p of the step, given the shared history.
+    """
+    predictive_weights(method, alpha, log_ratio, weight)
+    before = log_mixture(alpha, log_ratio) if method == EPISODE_MIXTURE else log_sampled
+    sampled = 0.0
+    for j in range(ratio.size):
+        sampled += weight[j] * ratio[j]
+        log_ratio[j] += math.log(ratio[j])
+    add_martingale(math.exp(-before), v, ratio, first, sampled, martingale)
+    return sampled

@@ -1,0 +1,13 @@
+"""How an episode can end, which vehicles take part, and how critical moments can be sampled: names and codes."""
+
+from __future__ import annotations
+
+OUTCOMES = ("crash", "passed", "timeout", "bv_lv_contact", "failed")
+CRASH, PASSED, TIMEOUT, BV_LV_CONTACT, FAILED = range(len(OUTCOMES))
+RUNNING = -1
+
+VEHICLES = ("LV", "BV", "AV")
+LV, BV, AV = range(len(VEHICLES))
+
+METHODS = ("nde", "forced", "step_mixture", "episode_mixture")
+NDE, FORCED, STEP_MIXTURE, EPISODE_MIXTURE = range(len(METHODS))

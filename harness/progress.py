@@ -1,0 +1,168 @@
+"""Progress of a campaign: what the runner reports, and how a terminal shows it."""
+
+from __future__ import annotations
+
+import math
+import sys
+from types import TracebackType
+from typing import Protocol, Self, TextIO
+
+from rich.console import Console
+from rich.progress import BarColumn, TaskID, TaskProgressColumn, TextColumn
+from rich.progress import Progress as Bars
+
+Figure = float | int | str
+
+_BAR_WIDTH = 12  # leaves room for all figures on a terminal of 80 columns
+
+
+class Progress(Protocol):
+    """What the runner tells about its work. Nothing that is told here changes a result."""
+
+    def stage(self, name: str, total: int | None, *, done: int = 0) -> None:
+        """Begin a stage of ``total`` units (None: not known), ``done`` of which were finished by an earlier run."""
+
+    def advance(self, n: int) -> None:
+        """Report ``n`` more units as finished."""
+
+    def status(self, **figures: Figure) -> None:
+        """Show figures beside the bar; ``crashes`` and ``rhw`` also give the time left."""
+
+
+class SilentProgress:
+    """Shows nothing: for files, pipes, tests and the Python API."""
+
+    def stage(self, name: str, total: int | None, *, done: int = 0) -> None:
+        """Ignore it."""
+
+    def advance(self, n: int) -> None:
+        """Ignore it."""
+
+    def status(self, **figures: Figure) -> None:
+        """Ignore it."""
+
+
+def episodes_left(
+    done: int,
+    total: int,
+    *,
+    rhw: float | None = None,
+    target_rhw: float | None = None,
+    crashes: int | None = None,
+    min_crashes: int = 0,
+) -> int:
+    """Estimate how many more episodes a campaign needs until it stops.
+
+    The relative half-width falls as 1/√n and crashes come at a steady rate, so that a target needs about
+    n·(rhw/target)² episodes; the budget ``total`` ends the campaign in any case.
+    """
+    if not done or target_rhw is None or rhw is None or not crashes:
+        return max(total - done, 0)
+    # No ratio beyond the budget matters, and an infinite one could not be squared.
+    ratio = min(rhw / target_rhw, math.sqrt(total))
+    needed = done * max(ratio * ratio, min_crashes / crashes)
+    return max(math.ceil(min(needed, total)) - done, 0)
+
+
+class RichProgress:
+    """A bar on a terminal: share done, episodes per second, crashes so far, current RHW, time left.
+
+    Use as a context manager.
+
+    Parameters
+    ----------
+    target_rhw : float, optional
+        Relative half-width at which the campaign stops; without it the time left is that of the whole budget.
+    min_crashes : int
+        Crashes that it needs before it may stop.
+    stream : text stream
+        Where the bar is drawn; stderr, since stdout is for results.
+    """
+
+    def __init__(self, target_rhw: float | None = None, min_crashes: int = 0, stream: TextIO | None = None) -> None:
+        self._bars = Bars(
+            TextColumn("{task.description}"),
+            BarColumn(bar_width=_BAR_WIDTH),
+            TaskProgressColumn(),
+            TextColumn("{task.fields[figures]}"),
+            console=Console(file=stream or sys.stderr),
+        )
+        self._target_rhw = target_rhw
+        self._min_crashes = min_crashes
+        self._task: TaskID | None = None
+        self._figures: dict[str, Figure] = {}
+        self._done_before = 0
+
+    def __enter__(self) -> Self:
+        self._bars.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._bars.stop()
+
+    def stage(self, name: str, total: int | None, *, done: int = 0) -> None:
+        """Begin a bar; it takes the place of the last stage's, for there is one line on the terminal."""
+        if self._task is not None:
+            self._bars.update(self._task, visible=False)
+        self._figures, self._done_before = {}, done
+        self._task = self._bars.add_task(name, total=total, completed=done, figures="")
+
+    def advance(self, n: int) -> None:
+        """Move the bar on, and renew rate and time left."""
+        if self._task is not None:
+            self._bars.advance(self._task, n)
+            self._show()
+
+    def status(self, **figures: Figure) -> None:
+        """Show figures beside the bar, keeping those not named."""
+        self._figures |= figures
+        self._show()
+
+    def _show(self) -> None:
+        if self._task is not None:
+            worded = [_worded(name, figure) for name, figure in self._figures.items()]
+            rate, left = self._pace()
+            self._bars.update(self._task, figures=" · ".join([*rate, *worded, *left]))
+
+    def _pace(self) -> tuple[list[str], list[str]]:
+        """Rate, and time left, of what this run itself has done: an earlier run's share took no time now."""
+        task = self._bars.tasks[-1]
+        if not task.elapsed or task.completed <= self._done_before:
+            return [], []
+        rate_per_s = (task.completed - self._done_before) / task.elapsed
+        rate = [f"{rate_per_s:,.0f}/s" if rate_per_s >= 10 else f"{rate_per_s:.2g}/s"]
+        if task.total is None:
+            return rate, []
+        left_s = self._left(int(task.completed), int(task.total)) / rate_per_s
+        return rate, [f"{_clock(left_s)} left"]
+
+    def _left(self, done: int, total: int) -> int:
+        rhw, crashes = self._figures.get("rhw"), self._figures.get("crashes")
+        return episodes_left(
+            done,
+            total,
+            rhw=float(rhw) if isinstance(rhw, float | int) else None,
+            target_rhw=self._target_rhw,
+            crashes=crashes if isinstance(crashes, int) else None,
+            min_crashes=self._min_crashes,
+        )
+
+
+def terminal_progress(target_rhw: float | None = None, min_crashes: int = 0) -> RichProgress | None:
+    """Give a bar when stderr is a terminal, else None: a log file is no place for one."""
+    return RichProgress(target_rhw, min_crashes) if sys.stderr.isatty() else None
+
+
+def _worded(name: str, figure: Figure) -> str:
+    label = {"rhw": "RHW"}.get(name, name.replace("_", " "))
+    if isinstance(figure, int):
+        return f"{label} {figure:,}"
+    return f"{label} {figure:.2g}" if isinstance(figure, float) else f"{label} {figure}"
+
+
+def _clock(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"

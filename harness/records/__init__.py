@@ -1,0 +1,1 @@
+"""What a run leaves: Arrow schemas, atomic Parquet writing, reading in index order."""

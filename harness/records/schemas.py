@@ -1,0 +1,114 @@
+"""Arrow schemas of the three tables that a run leaves, with units in the field metadata.
+
+``episodes``: one row per episode, failed ones included. ``moments``: one row per control step. ``traces``: one row
+per step and vehicle. Importance functions are in the order of `importance_names`: for the episode mixture the
+defensive ``forced`` cut-in first, then the surrogates; for the others the surrogates alone.
+"""
+
+from __future__ import annotations
+
+import pyarrow as pa
+
+from harness.maneuvers import CUT_IN, STAY
+from harness.outcomes import BV_LV_CONTACT, CRASH, FAILED, OUTCOMES, PASSED, TIMEOUT, VEHICLES
+
+__all__ = [
+    "BV_LV_CONTACT",
+    "CRASH",
+    "CUT_IN",
+    "FAILED",
+    "OUTCOMES",
+    "PASSED",
+    "STAY",
+    "TIMEOUT",
+    "VEHICLES",
+    "episodes_schema",
+    "moments_schema",
+    "traces_schema",
+]
+
+
+def _field(name: str, kind: pa.DataType, unit: str, doc: str, *, nullable: bool = False) -> pa.Field:
+    return pa.field(name, kind, nullable=nullable, metadata={"unit": unit, "doc": doc})
+
+
+def _per(n: int) -> pa.DataType:
+    """List of one float64 per importance function or surrogate; Parquet has no fixed-size list of zero."""
+    return pa.list_(pa.float64(), n) if n else pa.list_(pa.float64())
+
+
+def _outcome_type() -> pa.DataType:
+    return pa.dictionary(pa.int8(), pa.string())
+
+
+def episodes_schema(n_importance: int, n_surrogates: int) -> pa.Schema:
+    """Schema of the ``episodes`` table for given numbers of importance functions and surrogates."""
+    f8 = pa.float64()
+    return pa.schema(
+        [
+            _field("episode", pa.int64(), "1", "index of the episode in the campaign"),
+            _field("seed", pa.int64(), "1", "campaign seed; with the index it determines every random number"),
+            _field("v_bv_mps", f8, "m/s", "initial speed of BV"),
+            _field("r1_m", f8, "m", "initial gap LV-BV, bumper to bumper"),
+            _field("r1dot_mps", f8, "m/s", "initial rate of R1: v_LV - v_BV"),
+            _field("r2_m", f8, "m", "initial gap BV-AV, bumper to bumper"),
+            _field("r2dot_mps", f8, "m/s", "initial rate of R2: v_BV - v_AV"),
+            _field("outcome", _outcome_type(), "", "crash, passed, timeout, bv_lv_contact or failed"),
+            _field("n_steps", pa.int16(), "0.1 s", "steps simulated until the episode ended"),
+            _field("cut_in_step", pa.int16(), "0.1 s", "step in which BV cut in, null without one", nullable=True),
+            _field("cut_in_r2_m", f8, "m", "R2 at the cut-in decision", nullable=True),
+            _field("cut_in_r2dot_mps", f8, "m/s", "R2dot at the cut-in decision", nullable=True),
+            _field("crash_time_s", f8, "s", "time of the crash", nullable=True),
+            _field("impact_speed_mps", f8, "m/s", "v_AV - v_BV at the crash", nullable=True),
+            _field("min_ttc_s", f8, "s", "smallest R2/-R2dot after the cut-in while closing", nullable=True),
+            _field("av_distance_m", f8, "m", "distance that the AV drove in the episode"),
+            _field("n_control_steps", pa.int16(), "1", "stratum l: steps drawn from an importance function"),
+            _field("component", pa.int8(), "1", "importance function drawn (episode mixture), else -1"),
+            _field("log_weight", f8, "1", "log p(x_c) - log q_sampled(x_c); exactly 0 without control"),
+            _field(
+                "log_p_cut_in", f8, "1", "log P(cut-in | path), where the method draws the path ahead", nullable=True
+            ),
+            _field("log_q", _per(n_importance), "1", "per importance function: sum of log(q_j/p)"),
+            _field("martingale", _per(n_surrogates), "1", "per surrogate: sum W_(t-1) V_j (q_j,t/q_alpha,t - 1)"),
+            _field("lv_maneuvers", pa.list_(pa.int8()), "1", "LV's draws, in order"),
+            _field("bv_maneuvers", pa.list_(pa.int8()), "1", "BV's draws, in order; 31 marks the cut-in"),
+            _field("failure", pa.string(), "", "cause, for failed episodes", nullable=True),
+        ]
+    )
+
+
+def moments_schema(n_surrogates: int) -> pa.Schema:
+    """Schema of the ``moments`` table: one row per control step."""
+    f8 = pa.float64()
+    return pa.schema(
+        [
+            _field("episode", pa.int64(), "1", "index of the episode"),
+            _field("step", pa.int16(), "0.1 s", "step of the control"),
+            _field("v_bv_mps", f8, "m/s", "speed of BV"),
+            _field("r1_m", f8, "m", "gap LV-BV"),
+            _field("r1dot_mps", f8, "m/s", "rate of R1"),
+            _field("r2_m", f8, "m", "gap BV-AV"),
+            _field("r2dot_mps", f8, "m/s", "rate of R2"),
+            _field("maneuver", pa.int8(), "1", "0..30 acceleration, 31 cut_in, 32 stay"),
+            _field("p", f8, "1", "exposure: probability under the NDE"),
+            _field("q_sampled", f8, "1", "probability it was drawn with, given the shared history"),
+            _field("q", _per(n_surrogates), "1", "probability under each surrogate's importance function"),
+            _field("v", _per(n_surrogates), "1", "criticality V_j of the state"),
+        ]
+    )
+
+
+def traces_schema() -> pa.Schema:
+    """Schema of the ``traces`` table: one row per step and vehicle."""
+    f8 = pa.float64()
+    return pa.schema(
+        [
+            _field("episode", pa.int64(), "1", "index of the episode"),
+            _field("step", pa.int16(), "0.1 s", "step, 0 is the initial state"),
+            _field("vehicle", pa.dictionary(pa.int8(), pa.string()), "", "LV, BV or AV"),
+            _field("lane", pa.int8(), "1", "0 right, 1 left"),
+            _field("x_m", f8, "m", "position of the front bumper along the road"),
+            _field("v_mps", f8, "m/s", "speed"),
+            _field("a_mps2", f8, "m/s2", "acceleration commanded for the next step", nullable=True),
+        ]
+    )

@@ -1,0 +1,127 @@
+"""From a shard's buffers to Arrow tables with the committed schemas."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import pyarrow as pa
+
+from harness.arrays import FloatArray, Int8Array
+from harness.episode.loop import Shard
+from harness.outcomes import OUTCOMES, VEHICLES
+from harness.records.schemas import episodes_schema, moments_schema, traces_schema
+
+
+class ShardTables(NamedTuple):
+    """The tables of a shard; ``moments`` and ``traces`` are None when the campaign keeps none."""
+
+    episodes: pa.Table
+    moments: pa.Table | None
+    traces: pa.Table | None
+
+
+def shard_tables(shard: Shard, seed: int, *, keep_traces: bool) -> ShardTables:
+    """Tables of a shard, sorted by episode, step and vehicle."""
+    return ShardTables(
+        episodes_table(shard, seed),
+        moments_table(shard) if shard.results.moment_limit else None,
+        traces_table(shard) if keep_traces else None,
+    )
+
+
+def _nullable(values: FloatArray) -> pa.Array:
+    """Float64 with null for NaN and infinity, which stand for «there is none»."""
+    return pa.array(values, mask=~np.isfinite(values))
+
+
+def _rows(values: FloatArray) -> pa.Array:
+    """List column of one float64 per importance function or surrogate."""
+    n, width = values.shape
+    flat = pa.array(np.ascontiguousarray(values).ravel())
+    if width:
+        return pa.FixedSizeListArray.from_arrays(flat, width)
+    return pa.ListArray.from_arrays(pa.array(np.zeros(n + 1, np.int32)), flat)
+
+
+def _prefixes(values: Int8Array, lengths: FloatArray) -> pa.Array:
+    """List column of the first ``lengths[i]`` entries of each row."""
+    used = np.arange(values.shape[1]) < lengths[:, None]
+    offsets = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32)
+    return pa.ListArray.from_arrays(pa.array(offsets), pa.array(values[used]))
+
+
+def _names(codes: Int8Array, names: tuple[str, ...]) -> pa.Array:
+    return pa.DictionaryArray.from_arrays(pa.array(codes.astype(np.int8)), pa.array(names))
+
+
+def episodes_table(shard: Shard, seed: int) -> pa.Table:
+    """One row per episode, in index order."""
+    e, n = shard.results.episode, shard.results.episode.size
+    schema = episodes_schema(shard.results.log_q.shape[1], shard.results.martingale.shape[1])
+    never = e["cut_in_step"] < 0
+    columns = {
+        "episode": pa.array(shard.first_episode + np.arange(n)),
+        "seed": pa.array(np.full(n, seed, np.int64)),
+        **{name: pa.array(shard.states[:, i]) for i, name in enumerate(schema.names[2:7])},
+        "outcome": _names(e["outcome"], OUTCOMES),
+        "cut_in_step": pa.array(e["cut_in_step"], mask=never),
+        "log_weight": pa.array(e["log_weight"]),
+        "av_distance_m": pa.array(e["av_distance_m"]),
+        "log_q": _rows(shard.results.log_q),
+        "martingale": _rows(shard.results.martingale),
+        "lv_maneuvers": _prefixes(shard.results.lv_path, e["n_lv"].astype(np.int64)),
+        "bv_maneuvers": _prefixes(shard.results.bv_path, e["n_bv"].astype(np.int64)),
+        "failure": pa.array([shard.failures.get(row) for row in range(n)], pa.string()),
+    }
+    for name in ("n_steps", "n_control_steps", "component"):
+        columns[name] = pa.array(e[name])
+    for name in ("cut_in_r2_m", "cut_in_r2dot_mps", "crash_time_s", "impact_speed_mps", "min_ttc_s", "log_p_cut_in"):
+        columns[name] = _nullable(e[name])
+    return pa.table([columns[name] for name in schema.names], schema=schema)
+
+
+def moments_table(shard: Shard) -> pa.Table:
+    """One row per control step, by episode and step."""
+    used = int(shard.results.moment_count[0])
+    m = shard.results.moment[:used]
+    order = np.lexsort((m["step"], m["row"]))
+    m, q, v = m[order], shard.results.moment_q[:used][order], shard.results.moment_v[:used][order]
+    schema = moments_schema(q.shape[1])
+    columns = {"episode": pa.array(shard.first_episode + m["row"]), "q": _rows(q), "v": _rows(v)}
+    for name in schema.names:
+        if name not in columns:
+            columns[name] = pa.array(np.ascontiguousarray(m[name]))
+    return pa.table([columns[name] for name in schema.names], schema=schema)
+
+
+def traces_table(shard: Shard) -> pa.Table:
+    """One row per step and vehicle of the traced episodes."""
+    schema = traces_schema()
+    if not shard.traces:
+        return schema.empty_table()
+    parts = [_trace_columns(shard, row) for row in sorted(shard.traces)]
+    joined = {name: np.concatenate([part[name] for part in parts]) for name in schema.names}
+    columns = {name: pa.array(values) for name, values in joined.items()}
+    columns["vehicle"] = _names(joined["vehicle"], VEHICLES)
+    columns["a_mps2"] = _nullable(joined["a_mps2"])
+    return pa.table([columns[name] for name in schema.names], schema=schema)
+
+
+def _trace_columns(shard: Shard, row: int) -> dict[str, np.ndarray]:
+    trace = shard.traces[row]
+    steps = trace.shape[0]
+    step = np.repeat(np.arange(steps, dtype=np.int16), len(VEHICLES))
+    vehicle = np.tile(np.arange(len(VEHICLES), dtype=np.int8), steps)
+    cut = int(shard.results.episode["cut_in_step"][row])
+    on_right = (vehicle == VEHICLES.index("AV")) | ((vehicle == VEHICLES.index("BV")) & (cut >= 0) & (step > cut))
+    flat = trace.reshape(-1, 3)
+    return {
+        "episode": np.full(step.size, shard.first_episode + row, np.int64),
+        "step": step,
+        "vehicle": vehicle,
+        "lane": np.where(on_right, 0, 1).astype(np.int8),
+        "x_m": flat[:, 0],
+        "v_mps": flat[:, 1],
+        "a_mps2": flat[:, 2],
+    }

@@ -1,0 +1,173 @@
+"""Put the report together: read once, draw, fill the template, write."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import matplotlib.style
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
+from harness.records.schemas import OUTCOMES
+from harness.report import number_format
+from harness.report.answer_plot import answer_plot
+from harness.report.atomic_files import write_atomically
+from harness.report.convergence_plot import convergence_plot
+from harness.report.crash_gallery import GalleryRow, crash_gallery
+from harness.report.crash_plot import crash_time_plot, impact_speed_plot
+from harness.report.cut_in_plot import cut_in_plot
+from harness.report.estimate_table import estimate_table, run_notes, target_rhw
+from harness.report.plot_style import RC, Plot, inline_svg, png, svg
+from harness.report.run_folder import RunFolder, read_run_folder
+from harness.report.settings_table import flat, setting_sections
+from harness.report.shard_tables import table_sizes
+from harness.report.strata_plot import strata_plot
+from harness.report.summary import RunSummary, summarise
+from harness.report.weight_plot import weight_plot
+
+PLOT_NAMES = re.compile(r"(answer|convergence|weights|strata|cut_ins|impact_speed|crash_time|crash-\d+)\.(png|svg)")
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A plot as the template needs it: markup that is ours, texts that are escaped."""
+
+    name: str
+    markup: Markup
+    alt: str
+    caption: str
+
+
+def write_report(folder: Path) -> Path:
+    """Write ``report.html`` and ``plots/`` (PNG and SVG) into a run folder.
+
+    The same folder gives the same bytes. Plots of an earlier report that this one does not have are removed.
+
+    Parameters
+    ----------
+    folder : Path
+        A finished run, as `harness run` leaves it.
+
+    Returns
+    -------
+    Path
+        The page, self-contained: it can be mailed, archived and opened offline.
+
+    Raises
+    ------
+    RunFolderError
+        If the folder misses a file, or a file is damaged or belongs to another run.
+    """
+    folder = Path(folder)
+    run = read_run_folder(folder)
+    sizes = table_sizes(run)
+    summary = summarise(run)
+    with matplotlib.style.context(["default", RC]):
+        gallery = crash_gallery(run, summary)
+        files, figures = _rendered(_plots(run, summary, gallery))
+    page = _page(run=run, summary=summary, sizes=sizes, gallery=gallery, figures=figures)
+    _write_plots(folder / "plots", files)
+    write_atomically(folder / "report.html", page.encode("utf-8"))
+    return folder / "report.html"
+
+
+def _plots(run: RunFolder, summary: RunSummary, gallery: list[GalleryRow]) -> list[Plot]:
+    plots = [
+        answer_plot(run.estimates),
+        convergence_plot(run.estimates, target_rhw(run)),
+        weight_plot(summary),
+        strata_plot(summary),
+        cut_in_plot(summary),
+        impact_speed_plot(summary),
+        crash_time_plot(summary),
+        *(row.plot for row in gallery),
+    ]
+    return [plot for plot in plots if plot is not None]
+
+
+def _rendered(plots: list[Plot]) -> tuple[dict[str, bytes], dict[str, Figure]]:
+    files: dict[str, bytes] = {}
+    figures: dict[str, Figure] = {}
+    for plot in plots:
+        drawing = svg(plot)
+        files[f"{plot.name}.svg"], files[f"{plot.name}.png"] = drawing, png(plot)
+        # The SVG is matplotlib's own output, in which every text is escaped: the one place that is not autoescaped.
+        figures[plot.name] = Figure(plot.name, Markup(inline_svg(drawing)), plot.alt, plot.caption)  # noqa: S704
+    return files, figures
+
+
+def _page(
+    *, run: RunFolder, summary: RunSummary, sizes: list[Any], gallery: list[GalleryRow], figures: dict[str, Figure]
+) -> str:
+    environment = Environment(
+        loader=PackageLoader("harness.report", "."),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters.update(_filters())
+    style = (Path(__file__).parent / "report.css").read_text(encoding="utf-8")
+    return environment.get_template("report.html.j2").render(
+        run=run,
+        summary=summary,
+        outcomes=_outcomes(summary),
+        sizes=sizes,
+        gallery=gallery,
+        figures=figures,
+        estimators=estimate_table(run.estimates),
+        notes=run_notes(run, summary),
+        target_rhw=target_rhw(run),
+        diagnostics=flat(run.estimates.get("diagnostics") or {}) if run.estimates.get("diagnostics") else [],
+        details=_details(run),
+        table_errors=run.manifest.get("table_errors") or [],
+        settings=setting_sections(run.campaign, reproducible=run.manifest.get("reproducible")),
+        folder_name=shlex.quote(run.path.resolve().name),
+        style=Markup(style),  # noqa: S704 - our own file
+    )
+
+
+def _filters() -> dict[str, Callable[..., str]]:
+    return {
+        "number": number_format.number,
+        "interval": number_format.interval,
+        "count": number_format.count,
+        "decimal": number_format.decimal,
+        "percent": number_format.percent,
+        "duration": number_format.duration,
+        "plain": number_format.plain,
+        "size": number_format.size,
+        "value": number_format.value,
+        "result": number_format.result,
+        "sentence": number_format.sentence,
+        "signed_percent": number_format.signed_percent,
+    }
+
+
+def _outcomes(summary: RunSummary) -> list[tuple[str, float, float, float]]:
+    """Per outcome: name, tests, share of the tests, sum of weights per test."""
+    n = max(summary.n_episodes, 1)
+    return [
+        (name, float(summary.count[k]), float(summary.count[k]) / n, float(summary.weight[k]) / n)
+        for k, name in enumerate(OUTCOMES)
+    ]
+
+
+def _details(run: RunFolder) -> list[tuple[str, Any]]:
+    """Return what single estimators report about themselves, as (estimator.key, value)."""
+    found = {name: e.get("details") for name, e in run.estimates["estimates"].items() if e.get("details")}
+    return flat(found) if found else []
+
+
+def _write_plots(folder: Path, files: dict[str, bytes]) -> None:
+    folder.mkdir(exist_ok=True)
+    for name, content in files.items():
+        write_atomically(folder / name, content)
+    for old in folder.iterdir():
+        if old.name not in files and PLOT_NAMES.fullmatch(old.name):
+            old.unlink()

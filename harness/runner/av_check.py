@@ -1,0 +1,241 @@
+"""Look at an AV before a campaign is spent on it: deterministic, finite, within limits, what it does, and how fast."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from harness.arrays import FloatArray
+from harness.campaign.models import AutomatedVehicle, Campaign
+from harness.episode.loop import EpisodeLoop, Shard
+from harness.errors import EXIT_DONE, EXIT_TOO_MANY_FAILED
+from harness.estimators.estimate import finite_json
+from harness.outcomes import AV, CRASH, FAILED
+from harness.runner.prepare import Prepared, build_world, prepare
+from harness.vehicles.kinematics import STEP_S
+
+EPISODES = 48
+CELLS, OTHER_CELLS = 16, 5
+"""Two layouts in which every episode has other neighbours, and mostly another cell."""
+WARM_UP_EPISODES = 2
+SHORTEST_TIMING_S = 0.3
+BRAKING_MPS2 = -0.1
+"""What counts as a reaction to the cut-in."""
+AT_LIMIT_MPS2 = 1e-9
+
+
+@dataclass(frozen=True)
+class Behaviour:
+    """What the AV did in all steps in which it acted, and after the cut-ins.
+
+    ``reaction_s`` is the median time from the cut-in to the first braking beyond 0.1 m/s², over the episodes that
+    braked at all; their share is ``braking_share``.
+    """
+
+    mean_acceleration_mps2: float
+    min_acceleration_mps2: float
+    max_acceleration_mps2: float
+    share_at_min: float
+    share_at_max: float
+    reaction_s: float
+    braking_share: float
+    n_cut_ins: int
+    n_crashes: int
+
+
+@dataclass(frozen=True)
+class Speed:
+    """Time per episode step, and episodes per second, beside the built-in IDM on the same episodes and cells."""
+
+    us_per_step: float
+    episodes_per_s: float
+    idm_us_per_step: float
+    idm_episodes_per_s: float
+
+    @property
+    def ratio(self) -> float:
+        """Time per step over the built-in IDM's."""
+        return self.us_per_step / self.idm_us_per_step
+
+
+@dataclass(frozen=True)
+class AvCheck:
+    """What a few dozen episodes say about an AV.
+
+    Attributes
+    ----------
+    source, engine, method : str
+        Which AV, where it ran, and how cut-ins were brought about.
+    n_episodes : int
+    failures : dict
+        Cause → number of episodes of the first run that failed with it.
+    differing : tuple of int
+        Episodes whose motion was not the same bits in the two layouts.
+    limits_mps2 : (float, float)
+        Accelerations that count as its limits.
+    behaviour : Behaviour
+    speed : Speed
+    """
+
+    source: str
+    engine: str
+    method: str
+    n_episodes: int
+    failures: dict[str, int]
+    differing: tuple[int, ...]
+    limits_mps2: tuple[float, float]
+    behaviour: Behaviour
+    speed: Speed
+
+    @property
+    def exit_code(self) -> int:
+        """0 when all is well, 3 when episodes failed or were not reproduced."""
+        return EXIT_TOO_MANY_FAILED if self.failures or self.differing else EXIT_DONE
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain JSON content; undefined numbers become null."""
+        content = {**asdict(self), "deterministic": not self.differing, "exit_code": self.exit_code}
+        content["speed"]["ratio"] = self.speed.ratio
+        cleaned: dict[str, Any] = finite_json(content)
+        return cleaned
+
+
+def check_av(campaign: Campaign, n_episodes: int = EPISODES) -> AvCheck:
+    """Run a few dozen episodes with a campaign's AV, twice, and say what is to be seen.
+
+    The second run has other cells, begins in the middle, and follows episodes of its own: a controller that remembers
+    an earlier episode, shares state between instances or draws from a global stream gives other bits there.
+
+    Parameters
+    ----------
+    campaign : Campaign
+        Its method, engine and records are replaced by what the check needs; its AV and seed are not.
+    n_episodes : int
+        At least 2.
+
+    Raises
+    ------
+    HarnessError
+        The campaign is wrong, or the AV cannot be found, made or started.
+    """
+    tested = _as_checked(campaign)
+    prepared = prepare(tested)
+    first, elapsed_s, steps = _timed_run(prepared, n_episodes)
+    again = _run_in_another_order(prepared, n_episodes)
+    idm = tested.model_copy(update={"av": AutomatedVehicle(before_cut_in=tested.av.before_cut_in)})
+    _, idm_s, idm_steps = _timed_run(prepare(idm), n_episodes)
+    limits = _limits(tested.av)
+    return AvCheck(
+        source=tested.av.source,
+        engine=tested.world.engine,
+        method=tested.testing.method,
+        n_episodes=n_episodes,
+        failures=dict(Counter(first.failures.values())),
+        differing=tuple(i for i in range(n_episodes) if _motion(first, i) != again[i]),
+        limits_mps2=limits,
+        behaviour=_behaviour(first, limits, early=tested.av.before_cut_in == "controller"),
+        speed=Speed(1e6 * elapsed_s / steps, n_episodes / elapsed_s, 1e6 * idm_s / idm_steps, n_episodes / idm_s),
+    )
+
+
+def _as_checked(campaign: Campaign) -> Campaign:
+    """The campaign with cut-ins in (nearly) every episode, all motion kept, and the twin where it can drive the AV."""
+    holds = campaign.av.before_cut_in == "hold_speed"
+    method = "forced" if holds else "step_mixture"
+    testing = campaign.testing.model_copy(update={"method": method})
+    engine = "sumo" if campaign.av.source in ("sumo", "traci") else "twin"
+    world = campaign.world.model_copy(update={"engine": engine, "cells": CELLS})
+    records = campaign.records.model_copy(update={"moments": "none", "traces": "all"})
+    surrogates = campaign.surrogates or Campaign(name="default").surrogates
+    alpha = {"surrogates": surrogates, "testing": testing, "world": world, "records": records}
+    return campaign.model_copy(update=alpha)
+
+
+def _timed_run(prepared: Prepared, n_episodes: int) -> tuple[Shard, float, int]:
+    """First run of the episodes; the time is the shortest of several, which other processes disturb least."""
+    world = build_world(prepared.campaign)
+    loop = prepared.loop(world)
+    try:
+        loop.run(0, prepared.states(0, min(WARM_UP_EPISODES, n_episodes)))  # compiles
+        states = prepared.states(0, n_episodes)
+        began = time.perf_counter()
+        shard, elapsed_s = loop.run(0, states), time.perf_counter() - began
+        until = began + SHORTEST_TIMING_S
+        while (again := time.perf_counter()) < until:
+            loop.run(0, states)
+            elapsed_s = min(elapsed_s, time.perf_counter() - again)
+    finally:
+        loop.close()
+        world.close()
+    return shard, elapsed_s, max(1, int(shard.results.episode["n_steps"].sum()))
+
+
+def _run_in_another_order(prepared: Prepared, n_episodes: int) -> dict[int, tuple[bytes, str | None]]:
+    """Motion of every episode, run in other cells, the second half first."""
+    world = build_world(prepared.campaign, OTHER_CELLS)
+    loop: EpisodeLoop = prepared.loop(world)
+    half = n_episodes // 2
+    found: dict[int, tuple[bytes, str | None]] = {}
+    try:
+        for begin, end in ((half, n_episodes), (0, half)):
+            shard = loop.run(begin, prepared.states(begin, end - begin))
+            found.update({begin + row: _motion(shard, row) for row in range(end - begin)})
+    finally:
+        loop.close()
+        world.close()
+    return found
+
+
+def _motion(shard: Shard, row: int) -> tuple[bytes, str | None]:
+    """Everything that moved in an episode, to the bit, and why it failed if it did."""
+    trace = shard.traces.get(row)
+    return b"" if trace is None else trace.tobytes(), shard.failures.get(row)
+
+
+def _limits(av: AutomatedVehicle) -> tuple[float, float]:
+    own = av.limits if isinstance(av.parameters, dict) else av.parameters
+    return own.min_acceleration_mps2, own.max_acceleration_mps2
+
+
+def _behaviour(shard: Shard, limits: tuple[float, float], *, early: bool) -> Behaviour:
+    episode = shard.results.episode
+    acted, reactions = [], []
+    for row, trace in sorted(shard.traces.items()):
+        cut = int(episode["cut_in_step"][row])
+        if episode["outcome"][row] == FAILED:
+            continue
+        if early or cut >= 0:
+            acted.append(_accelerations(trace, 0 if early else cut + 1))
+        if cut >= 0:
+            reactions.append(_reaction_s(_accelerations(trace, cut + 1)))
+    a = np.concatenate([*acted, np.empty(0)])
+    reaction = np.array(reactions)
+    braked = np.isfinite(reaction)
+    some = a if a.size else np.array([np.nan])
+    return Behaviour(
+        mean_acceleration_mps2=float(some.mean()),
+        min_acceleration_mps2=float(some.min()),
+        max_acceleration_mps2=float(some.max()),
+        share_at_min=float(np.mean(some <= limits[0] + AT_LIMIT_MPS2)),
+        share_at_max=float(np.mean(some >= limits[1] - AT_LIMIT_MPS2)),
+        reaction_s=float(np.median(reaction[braked])) if braked.any() else np.nan,
+        braking_share=float(braked.mean()) if reaction.size else np.nan,
+        n_cut_ins=len(reactions),
+        n_crashes=int(np.count_nonzero(episode["outcome"] == CRASH)),
+    )
+
+
+def _accelerations(trace: FloatArray, begin: int) -> FloatArray:
+    """Commanded accelerations (m/s²) of the AV from a step on; the last row of a trace commands nothing."""
+    a: FloatArray = trace[begin:-1, AV, 2]
+    return a
+
+
+def _reaction_s(a: FloatArray) -> float:
+    """Time (s) from the cut-in to the step that brakes; infinite if none does."""
+    braking = np.flatnonzero(a < BRAKING_MPS2)
+    return float(braking[0]) * STEP_S if braking.size else np.inf

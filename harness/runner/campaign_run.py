@@ -1,0 +1,192 @@
+"""Run a campaign: shards in order through the stop rule, then estimates and report."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from harness.campaign.models import Campaign
+from harness.controllers.loading import require_controller
+from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, TooManyFailedError
+from harness.estimators import StopRule, accumulator, estimate_run
+from harness.progress import Progress, SilentProgress
+from harness.records.folder import TABLES, shard_file, write_json
+from harness.runner.manifest import Manifest, require_own_folder
+from harness.runner.prepare import content_hash, distance_per_test_m, prepare
+from harness.runner.shards import SMALLEST_FAILED_SAMPLE, ShardPool, shard_specs, stored_shard
+from harness.runner.table_accuracy import table_errors
+from harness.runner.worker import ShardDone, ShardSpec
+
+MANIFEST_INTERVAL_S = 5.0
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """What a finished campaign left.
+
+    Attributes
+    ----------
+    folder : Path
+    report : Path
+        The page ``report.html``.
+    estimates : dict
+        Content of ``estimates.json``.
+    stopped_by : {"rhw", "episodes"}
+    exit_code : int
+        0, or 4 when the budget was spent before the asked precision.
+    """
+
+    folder: Path
+    report: Path
+    estimates: dict[str, Any]
+    stopped_by: Literal["rhw", "episodes"]
+    exit_code: int
+
+
+class _Prefix:
+    """The contiguous prefix of finished shards, and whether it is enough."""
+
+    def __init__(self, campaign: Campaign) -> None:
+        self._campaign = campaign
+        self._rule = StopRule(campaign.stop, campaign.testing.method, campaign.run.shard_size)
+        self._looks = iter(self._rule.looks)
+        self._next_look = next(self._looks)
+        self._sums = accumulator(self._rule.estimator)
+        self.specs: list[ShardSpec] = []
+        self.files: list[dict[str, str]] = []
+        self.n_episodes = self.n_crashes = self.n_failed = 0
+        self.rhw = float("inf")
+
+    @property
+    def reached(self) -> bool:
+        return self._rule.reached
+
+    def add(self, done: ShardDone) -> bool:
+        """Append a shard; True when the campaign is to stop."""
+        self.specs.append(done.spec)
+        self.files.append(done.files)
+        self._sums.add(done.block)
+        self.n_episodes += done.spec.n_episodes
+        self.n_crashes += int(done.block.crash.sum())
+        self.n_failed += int(done.block.failed.sum())
+        self._require_few_failed()
+        if self.n_episodes != self._next_look:
+            return False
+        estimate = self._sums.result(self._campaign.stop.confidence)
+        self.rhw = getattr(estimate, "rhw", float("inf"))
+        stop = self._rule.observe(self.n_episodes, estimate)
+        self._next_look = next(self._looks, -1)
+        return stop
+
+    def _require_few_failed(self) -> None:
+        most = self._campaign.run.max_failed_share
+        if self.n_episodes >= SMALLEST_FAILED_SAMPLE and self.n_failed > most * self.n_episodes:
+            raise TooManyFailedError(
+                "run.max_failed_share",
+                found=f"{self.n_failed} of {self.n_episodes} episodes failed",
+                expected=f"a share of at most {most:g}",
+                mend="Their causes are in the column 'failure' of the episodes table; raise the share to go on.",
+            )
+
+
+def run_campaign(
+    campaign: Campaign,
+    out: Path,
+    *,
+    workers: int | None = None,
+    resume: bool = False,
+    progress: Progress | None = None,
+) -> RunResult:
+    """Run a campaign into a folder.
+
+    Parameters
+    ----------
+    campaign : Campaign
+    out : Path
+        New, empty, or (with ``resume``) the folder of this campaign.
+    workers : int, optional
+        Worker processes; as many as there are cores by default. Never changes a result.
+    resume : bool
+        Continue a run that was interrupted, or to a smaller RHW.
+    progress : Progress, optional
+
+    Raises
+    ------
+    HarnessError
+        The campaign, the folder or the AV is at fault; nothing that was finished is lost.
+    """
+    started = time.monotonic()
+    progress = progress or SilentProgress()
+    require_controller(campaign.av)
+    earlier = require_own_folder(out, content_hash(campaign), resume=resume)
+    prepared = prepare(campaign, progress)
+    distance = distance_per_test_m(prepared.policy.environment)
+    n_workers = workers or os.cpu_count() or 1
+    manifest = Manifest(
+        out,
+        campaign,
+        prepared.content_hash,
+        earlier,
+        workers=n_workers,
+        distance_per_test_m=distance,
+        table_errors=table_errors(campaign, prepared.policy.environment, prepared.tables),
+    )
+    prefix = _run_shards(campaign, out, n_workers, progress, manifest, lambda: time.monotonic() - started)
+    _discard_beyond(out, len(prefix.specs))
+    elapsed = time.monotonic() - started
+    stopped_by: Literal["rhw", "episodes"] = "rhw" if prefix.reached else "episodes"
+    manifest.write(prefix.specs, prefix.files, status="done", elapsed_s=elapsed, stopped_by=stopped_by)
+    progress.stage("estimates and report", None)
+    estimates = estimate_run(out)
+    write_json(out / "estimates.json", estimates)
+    from harness.report import write_report  # noqa: PLC0415 - no episode waits for matplotlib, and no worker loads it
+
+    report = write_report(out)
+    missed = campaign.stop.rhw is not None and not prefix.reached
+    return RunResult(out, report, estimates, stopped_by, EXIT_BUDGET_SPENT if missed else EXIT_DONE)
+
+
+def _run_shards(
+    campaign: Campaign, out: Path, workers: int, progress: Progress, manifest: Manifest, elapsed: Callable[[], float]
+) -> _Prefix:
+    """Run shards until the stop rule is content; the manifest follows so that an interrupted run can be read."""
+    prefix = _Prefix(campaign)
+    pool = ShardPool(campaign, out, workers)
+    written = elapsed()
+    progress.stage("episodes", campaign.stop.episodes, done=_episodes_on_disk(campaign, out))
+    try:
+        for done in pool.run(shard_specs(campaign), lambda spec: stored_shard(out, campaign, spec)):
+            stop = prefix.add(done)
+            progress.advance(0 if done.stored else done.spec.n_episodes)
+            progress.status(crashes=prefix.n_crashes, rhw=prefix.rhw)
+            if elapsed() - written > MANIFEST_INTERVAL_S:
+                written = elapsed()
+                manifest.write(prefix.specs, prefix.files, status="running", elapsed_s=written)
+            if stop:
+                break
+    except BaseException:
+        manifest.write(prefix.specs, prefix.files, status="interrupted", elapsed_s=elapsed())
+        raise
+    finally:
+        pool.close()
+    return prefix
+
+
+def _episodes_on_disk(campaign: Campaign, folder: Path) -> int:
+    """Episodes that an earlier run has finished, for the progress bar."""
+    return sum(1 for _ in (folder / "episodes").glob("shard-*.parquet")) * campaign.run.shard_size
+
+
+def _discard_beyond(folder: Path, n_shards: int) -> None:
+    """Remove what was run beyond the stop: a result must not depend on how many workers were ahead."""
+    last = {table: Path(shard_file(table, n_shards - 1)).name for table in TABLES}
+    for table in TABLES:
+        for path in sorted((folder / table).glob("shard-*.parquet")):
+            if path.name > last[table]:
+                path.unlink()
+        for path in (folder / table).glob(".*.part"):
+            path.unlink()

@@ -1,0 +1,225 @@
+"""Compare two AVs on common random numbers: the same episodes with each, and the interval of the difference."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from harness.campaign.models import Campaign
+from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, CampaignError, RunFolderError
+from harness.estimators.block import Block
+from harness.estimators.difference import Difference, difference_statement, paired_difference
+from harness.estimators.from_records import EPISODE_COLUMNS, block_from_tables
+from harness.importance.build import mixture_weights
+from harness.progress import Progress
+from harness.records.folder import MANIFEST, read_json, read_manifest, write_json
+from harness.records.reader import read_shards
+from harness.runner.campaign_run import run_campaign
+from harness.runner.prepare import content_hash
+
+Side = Literal["a", "b"]
+SIDES: tuple[Side, Side] = ("a", "b")
+STOPS = "stops.json"
+MAY_DIFFER = frozenset({"av", "name", "description"})
+_STATE_COLUMNS = ("v_bv_mps", "r1_m", "r1dot_mps", "r2_m", "r2dot_mps")
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Two finished campaigns and what lies between them.
+
+    Attributes
+    ----------
+    folder : Path
+        Holds the run folders ``a`` and ``b``, and ``compare.json``.
+    difference : Difference
+    content : dict
+        Content of ``compare.json``.
+    exit_code : int
+        0, or 4 when either campaign spent its budget before the asked precision.
+    """
+
+    folder: Path
+    difference: Difference
+    content: dict[str, Any]
+    exit_code: int
+
+
+def compare_campaigns(
+    a: Campaign,
+    b: Campaign,
+    out: Path,
+    *,
+    workers: int | None = None,
+    progress: Progress | None = None,
+    labels: tuple[str, str] | None = None,
+) -> Comparison:
+    """Run two campaigns that differ in the AV over the same episodes, and estimate the difference.
+
+    Each runs to its own stop rule; then the shorter one is continued to the length of the longer. What an earlier call
+    has finished in ``out`` is used again.
+
+    Parameters
+    ----------
+    a, b : Campaign
+        Equal but for ``av``, ``name`` and ``description``.
+    out : Path
+        Folder; ``out/a`` and ``out/b`` become run folders.
+    workers, progress
+        See `harness.runner.run_campaign`.
+    labels : (str, str), optional
+        Names for the answer; the campaigns' own by default.
+
+    Raises
+    ------
+    CampaignError
+        The campaigns differ in something else.
+    RunFolderError
+        ``out`` holds other runs.
+    """
+    require_comparable(a, b)
+    campaigns: dict[Side, Campaign] = {"a": a, "b": b}
+    stops = _Stops(out, campaigns)
+    for side in SIDES:
+        if not stops.known(side):
+            result = run_campaign(campaigns[side], out / side, workers=workers, resume=True, progress=progress)
+            stops.note(side, int(result.estimates["n_episodes"]), result.stopped_by)
+    n = max(stops.n_episodes(side) for side in SIDES)
+    for side in SIDES:
+        if not _is_done(out / side, n):
+            longer = _exactly(campaigns[side], n)
+            run_campaign(longer, out / side, workers=workers, resume=True, progress=progress)
+    found = paired_difference(_pairs(campaigns, out), a.stop.confidence)
+    content = _content(campaigns, stops, found, labels or (a.name, b.name))
+    write_json(out / "compare.json", content)
+    missed = a.stop.rhw is not None and any(stops.stopped_by(side) != "rhw" for side in SIDES)
+    return Comparison(out, found, content, EXIT_BUDGET_SPENT if missed else EXIT_DONE)
+
+
+def require_comparable(a: Campaign, b: Campaign) -> None:
+    """Refuse campaigns that differ in more than the vehicle.
+
+    Raises
+    ------
+    CampaignError
+        Names every key that differs, with both values.
+    """
+    keys = MAY_DIFFER
+    apart = list(_differing("", a.model_dump(exclude=set(keys)), b.model_dump(exclude=set(keys))))
+    if not apart:
+        return
+    where, of_a, of_b = apart[0]
+    more = f"; also {', '.join(key for key, _, _ in apart[1:])}" if len(apart) > 1 else ""
+    raise CampaignError(
+        where,
+        found=f"{of_a} in A and {of_b} in B{more}",
+        expected=f"campaigns that differ in {', '.join(sorted(keys))} only: pairs of episodes need equal settings",
+        mend=f"Make them equal, e.g. with --set {where}=…, which holds for both.",
+    )
+
+
+def _differing(prefix: str, a: Any, b: Any) -> Iterator[tuple[str, Any, Any]]:
+    if isinstance(a, dict) and isinstance(b, dict):
+        for key in dict.fromkeys([*a, *b]):
+            yield from _differing(f"{prefix}.{key}" if prefix else str(key), a.get(key), b.get(key))
+        if a == b and list(a) != list(b):
+            yield prefix, f"the order {', '.join(a)}", f"{', '.join(b)}"
+    elif a != b:
+        yield prefix, a, b
+
+
+class _Stops:
+    """Where each campaign's own stop rule ended, kept in a file: a continued folder does not say it any more."""
+
+    def __init__(self, folder: Path, campaigns: dict[Side, Campaign]) -> None:
+        self._file = folder / STOPS
+        self._folder = folder
+        self._asked = {
+            side: {"campaign_hash": content_hash(campaign), "stop": campaign.stop.model_dump()}
+            for side, campaign in campaigns.items()
+        }
+        self._notes: dict[str, Any] = {}
+        if self._file.exists():
+            self._notes = read_json(self._file, mend="Delete it: the stop rules are then run through again.")
+
+    def known(self, side: Side) -> bool:
+        """Whether an earlier call took this campaign to its stop, and its run is still there."""
+        note = self._notes.get(side, {})
+        same = all(note.get(key) == value for key, value in self._asked[side].items())
+        manifest = self._folder / side / MANIFEST
+        return (
+            same and manifest.exists() and read_manifest(self._folder / side)["campaign_hash"] == note["campaign_hash"]
+        )
+
+    def note(self, side: Side, n_episodes: int, stopped_by: str) -> None:
+        self._notes[side] = {**self._asked[side], "n_episodes": n_episodes, "stopped_by": stopped_by}
+        write_json(self._file, self._notes)
+
+    def n_episodes(self, side: Side) -> int:
+        return int(self._notes[side]["n_episodes"])
+
+    def stopped_by(self, side: Side) -> str:
+        return str(self._notes[side]["stopped_by"])
+
+
+def _is_done(folder: Path, n_episodes: int) -> bool:
+    manifest = read_manifest(folder)
+    return manifest.get("status") == "done" and manifest["n_episodes"] == n_episodes
+
+
+def _exactly(campaign: Campaign, n_episodes: int) -> Campaign:
+    """The campaign with a fixed number of episodes instead of its stop rule; its episodes are the same."""
+    stop = campaign.stop.model_copy(update={"rhw": None, "episodes": n_episodes})
+    return campaign.model_copy(update={"stop": stop})
+
+
+def _pairs(campaigns: dict[Side, Campaign], out: Path) -> Iterator[tuple[Block, Block]]:
+    columns = [*EPISODE_COLUMNS, *_STATE_COLUMNS]
+    shards = (read_shards(out / side, episode_columns=columns, moment_columns=[]) for side in SIDES)
+    for (of_a, _), (of_b, _) in zip(*shards, strict=True):
+        if any(of_a[name] != of_b[name] for name in _STATE_COLUMNS):
+            raise RunFolderError(
+                str(out),
+                found="episodes of one index that begin differently in a and b",
+                expected="the same random numbers in both",
+                mend="The two were run with different versions; choose another folder with --out.",
+            )
+        a, b = (
+            block_from_tables(table, None, method=campaign.testing.method, alpha=mixture_weights(campaign))
+            for table, campaign in ((of_a, campaigns["a"]), (of_b, campaigns["b"]))
+        )
+        yield a, b
+
+
+def _content(
+    campaigns: dict[Side, Campaign], stops: _Stops, found: Difference, labels: tuple[str, str]
+) -> dict[str, Any]:
+    campaign = campaigns["a"]
+    sides = {
+        side: {
+            "label": label,
+            "campaign_hash": content_hash(campaigns[side]),
+            "own_stop": {"n_episodes": stops.n_episodes(side), "stopped_by": stops.stopped_by(side)},
+        }
+        for side, label in zip(SIDES, labels, strict=True)
+    }
+    return {
+        "format": 1,
+        "method": campaign.testing.method,
+        "seed": campaign.seed,
+        "pairing": _pairing(campaign),
+        "campaigns": sides,
+        **found.to_json(),
+        "statement": difference_statement(found, *labels),
+    }
+
+
+def _pairing(campaign: Campaign) -> str:
+    shared = "episode i of A is paired with episode i of B: same initial state and same random streams"
+    if campaign.testing.method == "forced":
+        return f"{shared}; under forced also the same paths, cut-ins and weights"
+    if campaign.testing.method == "nde":
+        return f"{shared}; all weights are 1"
+    return f"{shared}; after the vehicles' motions part, maneuvers and weights of a pair may differ"

@@ -1,0 +1,56 @@
+"""What a campaign will cost, before it is run."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+from harness.campaign.models import Campaign
+from harness.criticality.tables import tables_cached
+from harness.environment.loading import load_environment
+from harness.importance.build import needs_tables
+from harness.sumo.av_type import av_type
+from harness.vehicles.models import surrogate_records
+
+EPISODES_PER_SECOND_PER_CORE = {
+    ("sumo", "nde"): 2500, ("sumo", "forced"): 1200, ("sumo", "step_mixture"): 1300, ("sumo", "episode_mixture"): 1600,
+    ("twin", "nde"): 40000, ("twin", "forced"): 25000, ("twin", "step_mixture"): 15000,
+    ("twin", "episode_mixture"): 15000,
+}  # fmt: skip
+"""Orders of magnitude, measured on one core of a 2020s server; `benchmarks/` measures yours."""
+KB_PER_EPISODE = 0.4
+KB_PER_MOMENT = 0.1
+MOMENTS_PER_EPISODE = {"all": 70, "first_9": 9, "none": 0}
+
+
+def plan_campaign(campaign: Campaign) -> dict[str, Any]:
+    """Cost of a campaign that runs to its budget of episodes.
+
+    Returns
+    -------
+    dict
+        ``episodes``, ``episodes_per_second_estimate`` (all cores), ``seconds_estimate``, ``tables`` (in words) and
+        ``disk_mb``.
+    """
+    if campaign.av.sumo is not None:
+        av_type(campaign.av.sumo)
+    rate = EPISODES_PER_SECOND_PER_CORE[campaign.world.engine, campaign.testing.method] * (os.cpu_count() or 1)
+    moments = MOMENTS_PER_EPISODE[campaign.records.moments] if needs_tables(campaign) else 0
+    episodes = campaign.stop.episodes
+    return {
+        "episodes": episodes,
+        "episodes_per_second_estimate": rate,
+        "seconds_estimate": round(episodes / rate),
+        "tables": _tables(campaign),
+        "disk_mb": round(episodes * (KB_PER_EPISODE + KB_PER_MOMENT * moments) / 1000.0, 1),
+    }
+
+
+def _tables(campaign: Campaign) -> str:
+    if not needs_tables(campaign):
+        return "none needed"
+    environment = load_environment(campaign.environment)
+    if tables_cached(environment, surrogate_records(campaign.surrogates), campaign.testing.challenge):
+        return "cached"
+    seconds = 5 if campaign.environment.acceleration_hold_s >= 0.5 else 40
+    return f"to build (about {seconds * len(campaign.surrogates)} s of one core)"

@@ -1,0 +1,141 @@
+"""From a campaign to what its episodes need: environment, tables, importance functions, AV, world."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+from harness.arrays import FloatArray
+from harness.campaign.models import Campaign
+from harness.controllers.black_box import Death
+from harness.controllers.loading import build_host
+from harness.criticality.tables import Tables, build_tables, tables_cached
+from harness.environment.driving import Environment
+from harness.environment.initial_state import InitialStates
+from harness.environment.loading import load_environment, load_parameters
+from harness.episode.begin import mean_test_distance
+from harness.episode.loop import MOMENT_LIMITS, EpisodeLoop, Keep, Policy
+from harness.importance.build import build_importance, needs_tables
+from harness.progress import Progress, SilentProgress
+from harness.sumo.av_type import av_type
+from harness.vehicles.models import av_records, surrogate_records
+from harness.world import World
+
+DISTANCE_SEED = 20_000
+DISTANCE_PATHS = 20_000
+"""Paths over which the mean distance of a test is taken; its standard error is below 0.5 %."""
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A campaign ready to run."""
+
+    campaign: Campaign
+    content_hash: str
+    policy: Policy
+    initial_states: InitialStates
+    tables: Tables | None
+
+    def states(self, first_episode: int, n_episodes: int) -> FloatArray:
+        """Initial states of consecutive episodes, shape (n_episodes, 5)."""
+        return self.initial_states.draw(self.campaign.seed, first_episode, n_episodes)
+
+    def loop(
+        self,
+        world: World,
+        *,
+        traces: str | None = None,
+        black_box: Path | None = None,
+        doomed: Mapping[int, Death] | None = None,
+    ) -> EpisodeLoop:
+        """Episode loop in a world, recording what the campaign asks for.
+
+        Parameters
+        ----------
+        world : World
+        traces : str, optional
+            Instead of the campaign's ``records.traces``.
+        black_box : Path, optional
+            File that tells in which episode's controller a process died.
+        doomed : mapping, optional
+            Episodes known to kill the process; it may grow between two runs.
+        """
+        records = self.campaign.records
+        keep = Keep(MOMENT_LIMITS[records.moments], traces or records.traces, records.trace_share)
+        campaign = self.campaign
+        av = build_host(campaign.av, n_cells=world.n_cells, seed=campaign.seed, black_box=black_box, doomed=doomed)
+        return EpisodeLoop(world, self.policy, keep, av)
+
+
+def content_hash(campaign: Campaign) -> str:
+    """Hash of all that changes an episode's bits, the environment's numbers included."""
+    return campaign.content_hash(load_parameters(campaign.environment).content_hash())
+
+
+def prepare(campaign: Campaign, progress: Progress | None = None) -> Prepared:
+    """Load the environment and build (or read) the challenge tables.
+
+    Raises
+    ------
+    CampaignError
+        The environment's parameter file is wrong, or an attribute of an AV that SUMO drives.
+    """
+    progress = progress or SilentProgress()
+    if campaign.av.sumo is not None:
+        av_type(campaign.av.sumo)
+    parameters = load_parameters(campaign.environment)
+    environment = load_environment(campaign.environment, parameters)
+    tables = None
+    if needs_tables(campaign):
+        drivers = surrogate_records(campaign.surrogates)
+        challenge = campaign.testing.challenge
+        progress.stage("criticality tables", len(drivers))
+        with ThreadPoolExecutor(1) as thread:
+            building = thread.submit(build_tables, environment, drivers, challenge, progress.advance)
+            if not tables_cached(environment, drivers, challenge):
+                compile_kernels(campaign, environment)
+            tables = building.result()
+    policy = Policy(campaign.seed, environment, build_importance(campaign, tables), av_records(campaign.av))
+    return Prepared(
+        campaign,
+        campaign.content_hash(parameters.content_hash()),
+        policy,
+        InitialStates(environment.numbers),
+        tables,
+    )
+
+
+def compile_kernels(campaign: Campaign, environment: Environment) -> None:
+    """Compile what episodes will need, while threads build tables: neither waits for the other.
+
+    Kernels are the same for all methods and worlds, so one naturalistic episode in the twin compiles them into the
+    cache, where worker processes find them.
+    """
+    from harness.twin import TwinWorld  # noqa: PLC0415 - only a cold start needs it
+
+    naturalistic = campaign.model_copy(update={"testing": campaign.testing.model_copy(update={"method": "nde"})})
+    policy = Policy(campaign.seed, environment, build_importance(naturalistic, None), av_records(campaign.av))
+    EpisodeLoop(TwinWorld(1), policy, Keep(0, "none", 0.0)).run(0, InitialStates(environment.numbers).draw(0, 0, 1))
+    distance_per_test_m(environment)
+
+
+def build_world(campaign: Campaign, n_cells: int | None = None) -> World:
+    """The world that a campaign names, with its number of cells or another."""
+    if campaign.world.engine == "twin":
+        from harness.twin import TwinWorld  # noqa: PLC0415 - a run needs one of the two worlds
+
+        return TwinWorld(n_cells or campaign.world.cells)
+    from harness.sumo.build import build_sumo_world  # noqa: PLC0415 - libsumo takes half a second to import
+
+    return build_sumo_world(campaign, n_cells)
+
+
+def distance_per_test_m(environment: Environment) -> float:
+    """Mean distance (m) that the AV drives in a naturalistic test.
+
+    Overtakings without cut-in: the others are too few (some 3e-5 at level 1) to matter.
+    """
+    states = InitialStates(environment.numbers).draw(DISTANCE_SEED, 0, DISTANCE_PATHS)
+    return float(mean_test_distance(DISTANCE_SEED, states, environment))

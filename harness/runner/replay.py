@@ -1,0 +1,149 @@
+"""Run one episode of a stored run again, bit for bit, to look at it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from harness.campaign.loading import load_campaign
+from harness.campaign.models import Campaign
+from harness.errors import CampaignError, RunFolderError
+from harness.records.folder import read_manifest, read_table
+from harness.records.tables import shard_tables
+from harness.runner.prepare import Prepared, build_world, content_hash, prepare
+from harness.world import World
+
+_UNLIKE_BITS = ("episode", "seed", "failure")
+
+
+@dataclass(frozen=True)
+class ReplayResult:
+    """An episode run again.
+
+    Attributes
+    ----------
+    outcome : str
+    row : dict
+        Its row of the episodes table.
+    trace : pyarrow.Table
+        Its motion, with the schema of the traces table.
+    bit_equal : bool or None
+        Whether the stored row, and the stored trace where there is one, were reproduced in every bit.
+    compared : tuple of str
+        Which tables were compared.
+    """
+
+    outcome: str
+    row: dict[str, Any]
+    trace: pa.Table
+    bit_equal: bool | None
+    compared: tuple[str, ...]
+
+
+def replay_episode(folder: Path, episode: int, *, gui: bool = False, fcd: Path | None = None) -> ReplayResult:
+    """Replay an episode of a run.
+
+    Parameters
+    ----------
+    folder : Path
+        Run folder.
+    episode : int
+        Index in the campaign.
+    gui : bool
+        Show it in sumo-gui (extra ``harness[sumo]``).
+    fcd : Path, optional
+        Write SUMO's floating-car data to this file.
+
+    Raises
+    ------
+    RunFolderError
+        The folder is no run, or has no such episode.
+    CampaignError
+        The environment's parameter file has changed since, or the AV is not reproducible.
+    """
+    manifest = read_manifest(folder)
+    _require_reproducible(manifest)
+    stored = _stored(folder, manifest, episode)
+    campaign = load_campaign(folder / "campaign.yaml")
+    if content_hash(campaign) != manifest["campaign_hash"]:
+        raise CampaignError(
+            str(folder / "campaign.yaml"),
+            found=f"campaign {content_hash(campaign)}",
+            expected=f"campaign {manifest['campaign_hash']}, which made the records",
+            mend="Restore campaign.yaml and the environment parameter file that it names.",
+        )
+    prepared = prepare(campaign)
+    world = _world(campaign, gui=gui, fcd=fcd)
+    try:
+        row, trace = _run_again(prepared, world, episode)
+    finally:
+        world.close()
+    equal = {name: _equal(name, table, stored.get(name)) for name, table in (("episodes", row), ("traces", trace))}
+    compared = tuple(name for name, answer in equal.items() if answer is not None)
+    first: dict[str, Any] = row.to_pylist()[0]
+    bit_equal = all(equal[name] for name in compared) if compared else None
+    return ReplayResult(str(first["outcome"]), first, trace, bit_equal, compared)
+
+
+def _require_reproducible(manifest: dict[str, Any]) -> None:
+    if not manifest.get("reproducible", True):
+        raise CampaignError(
+            "av.traci",
+            found="a run that is not reproducible: a program outside of the harness drove the AV",
+            expected="an AV that does the same again: model, controller, sumo or fmu",
+            mend="Look at the traces that the run has kept (records.traces: crash), or let the program write a log.",
+        )
+
+
+def _run_again(prepared: Prepared, world: World, episode: int) -> tuple[pa.Table, pa.Table]:
+    shard = prepared.loop(world, traces="all").run(episode, prepared.states(episode, 1))
+    tables = shard_tables(shard, prepared.campaign.seed, keep_traces=True)
+    return tables.episodes, tables.traces
+
+
+def _world(campaign: Campaign, *, gui: bool, fcd: Path | None) -> World:
+    if not gui and fcd is None:
+        return build_world(campaign, n_cells=1)
+    from harness.sumo.build import build_sumo_world  # noqa: PLC0415 - libsumo takes half a second to import
+
+    options = () if fcd is None else ("--fcd-output", str(fcd), "--precision", "9")
+    return build_sumo_world(campaign, 1, gui=gui, options=options)
+
+
+def _stored(folder: Path, manifest: dict[str, Any], episode: int) -> dict[str, pa.Table]:
+    """Rows of the episode in the episodes and traces tables."""
+    for shard in manifest["shards"]:
+        if shard["first_episode"] <= episode < shard["first_episode"] + shard["n_episodes"]:
+            tables = {name: read_table(folder / path) for name, path in shard["files"].items() if name != "moments"}
+            return {name: table.filter(pc.equal(table["episode"], episode)) for name, table in tables.items()}
+    raise RunFolderError(
+        str(folder),
+        found=f"no episode {episode}",
+        expected=f"an index from 0 to {manifest['n_episodes'] - 1}",
+        mend="The report and the episodes table list the episodes of interest.",
+    )
+
+
+def _equal(name: str, again: pa.Table, stored: pa.Table | None) -> bool | None:
+    if stored is None or stored.num_rows == 0:
+        return None
+    columns = [column for column in again.column_names if name != "episodes" or column not in _UNLIKE_BITS]
+    return all(_plain(again[column]) == _plain(stored[column]) for column in columns)
+
+
+def _plain(column: pa.ChunkedArray) -> list[Any]:
+    values: list[Any] = (
+        column.cast(column.type.value_type).to_pylist() if pa.types.is_dictionary(column.type) else column.to_pylist()
+    )
+    return [_hex(value) for value in values]
+
+
+def _hex(value: Any) -> Any:
+    """Floats by their bits: 0.0 and -0.0 differ, NaN equals itself."""
+    if isinstance(value, float):
+        return value.hex()
+    return [_hex(item) for item in value] if isinstance(value, list) else value

@@ -1,0 +1,170 @@
+"""The shards of a campaign: fixed ranges of episodes, run by worker processes, handed back in order."""
+
+from __future__ import annotations
+
+import signal
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from itertools import islice
+from pathlib import Path
+
+from harness.campaign.models import Campaign
+from harness.controllers.black_box import Call, Death
+from harness.controllers.time_limit import death_cause
+from harness.errors import HarnessError, TooManyFailedError
+from harness.records.folder import TABLES, read_table, shard_file
+from harness.records.tables import ShardTables
+from harness.runner.processes import WorkerProcess, first_to_answer
+from harness.runner.worker import ShardDone, ShardSpec, shard_block
+
+ATTEMPTS = 3
+"""A shard whose worker dies is given to another one, this many times in all."""
+SMALLEST_FAILED_SAMPLE = 200
+"""Episodes before the share of failures can end a campaign."""
+SENT_FROM_OUTSIDE = (-signal.SIGKILL, -signal.SIGTERM)
+"""Ends that an operator or a shortage of memory brings: a controller is blamed only when its call is hit again."""
+
+
+class WorkerLostError(HarnessError):
+    """Workers die again and again on the same shard."""
+
+    exit_code = 3
+
+
+def shard_specs(campaign: Campaign) -> Iterator[ShardSpec]:
+    """All shards that the campaign may need, in order."""
+    size, total = campaign.run.shard_size, campaign.stop.episodes
+    for index, first in enumerate(range(0, total, size)):
+        yield ShardSpec(index, first, min(size, total - first))
+
+
+def stored_shard(folder: Path, campaign: Campaign, spec: ShardSpec) -> ShardDone | None:
+    """A shard that an earlier run has finished, or None.
+
+    Raises
+    ------
+    RunFolderError
+        One of its files is damaged.
+    """
+    files = {name: shard_file(name, spec.index) for name in TABLES if (folder / shard_file(name, spec.index)).exists()}
+    needed = {"episodes"} | ({"moments"} if campaign.records.moments != "none" else set())
+    if not needed <= set(files):
+        return None
+    tables = {name: read_table(folder / path) for name, path in files.items()}
+    if tables["episodes"].num_rows != spec.n_episodes:
+        return None  # the last shard of a smaller budget
+    kept = ShardTables(tables["episodes"], tables.get("moments"), tables.get("traces"))
+    return ShardDone(spec, files, shard_block(campaign, kept), stored=True)
+
+
+@dataclass
+class _Job:
+    """A shard that is wanted, with its result once there is one."""
+
+    spec: ShardSpec
+    done: ShardDone | None
+    deaths: int = 0
+    suspected: Call | None = None
+    doomed: dict[int, Death] = field(default_factory=dict)
+
+
+class ShardPool:
+    """Worker processes that run shards; one that dies takes nothing but its shard's unfinished work along.
+
+    Everything happens in the caller's thread and each worker has a pipe of its own. So there is no lock that a killed
+    process could keep, and no queue that Ctrl-C could leave half filled.
+    """
+
+    def __init__(self, campaign: Campaign, folder: Path, workers: int) -> None:
+        self._campaign, self._folder = campaign, folder
+        self._n_workers = workers
+        self._idle: list[WorkerProcess] = []
+        self._busy: dict[WorkerProcess, _Job] = {}
+
+    def close(self) -> None:
+        """Stop all workers, finished or not; those that are idle may release their controllers first."""
+        for worker in self._busy:
+            worker.kill()
+        for worker in self._idle:
+            worker.dismiss()
+        for worker in self._idle:
+            worker.wait()
+        self._idle, self._busy = [], {}
+        for left in self._folder.glob(".black-box-*"):  # of an earlier run that was killed
+            left.unlink()
+
+    def run(self, specs: Iterator[ShardSpec], stored: Callable[[ShardSpec], ShardDone | None]) -> Iterator[ShardDone]:
+        """Finished shards in index order; those that ``stored`` knows are not run again.
+
+        Two shards per worker are under way or wait for their turn to be handed back: little is lost at the stop.
+
+        Raises
+        ------
+        WorkerLostError
+            Workers died `ATTEMPTS` times on the same shard.
+        """
+        wanted: deque[_Job] = deque()
+        waiting: deque[_Job] = deque()
+        while True:
+            for spec in islice(specs, 2 * self._n_workers + 1 - len(wanted)):
+                wanted.append(_Job(spec, stored(spec)))
+                if wanted[-1].done is None:
+                    waiting.append(wanted[-1])
+            if not wanted:
+                return
+            self._hand_out(waiting)
+            while wanted[0].done is None:
+                self._collect(waiting)
+                self._hand_out(waiting)
+            yield wanted.popleft().done  # type: ignore[misc]
+
+    def _hand_out(self, waiting: deque[_Job]) -> None:
+        """Give waiting shards to idle workers, of which there may be up to as many as were asked for."""
+        while waiting and len(self._busy) < self._n_workers:
+            worker = self._idle.pop() if self._idle else WorkerProcess(self._campaign, self._folder)
+            if worker.give(waiting[0].spec, waiting[0].doomed):
+                self._busy[worker] = waiting.popleft()
+            else:
+                worker.kill()  # it died while it was idle
+
+    def _collect(self, waiting: deque[_Job]) -> None:
+        """Wait for one worker to finish its shard, or to die on it."""
+        worker = first_to_answer(list(self._busy))
+        job = self._busy[worker]
+        job.done = worker.answer()
+        del self._busy[worker]
+        if job.done is not None:
+            self._idle.append(worker)
+            return
+        call = worker.last_call()
+        exit_code = worker.kill()
+        waiting.appendleft(job)
+        first_time = call != job.suspected
+        job.suspected = call
+        if call is not None and not (exit_code in SENT_FROM_OUTSIDE and first_time):  # the controller's own doing
+            cause = death_cause(exit_code, self._campaign.av.limits.step_time_s)
+            job.doomed[call.episode] = Death(call.step, cause)
+            self._require_few_deaths(job)
+            return
+        job.deaths += 1
+        if job.deaths == ATTEMPTS:
+            raise WorkerLostError(
+                f"shard {job.spec.index} (from episode {job.spec.first_episode})",
+                found=f"{ATTEMPTS} worker processes that died, the last with exit code {exit_code}",
+                expected="a worker that finishes the shard",
+                mend="Look for a memory limit (fewer --workers), then continue with --resume.",
+            )
+
+    def _require_few_deaths(self, job: _Job) -> None:
+        """Each death costs a new process: a controller that dies too often is not run to the end of its shard."""
+        most = self._campaign.run.max_failed_share * max(job.spec.n_episodes, SMALLEST_FAILED_SAMPLE)
+        if len(job.doomed) > most:
+            episode, death = next(reversed(job.doomed.items()))
+            raise TooManyFailedError(
+                "run.max_failed_share",
+                found=f"{len(job.doomed)} episodes of shard {job.spec.index} that ended their worker process, "
+                f"the last of them episode {episode}: {death.cause}",
+                expected=f"a share of at most {self._campaign.run.max_failed_share:g}",
+                mend="Mend the controller, or raise the share to go on.",
+            )

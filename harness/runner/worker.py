@@ -1,0 +1,76 @@
+"""What a worker process does: prepare once, then run one shard after another."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from harness.campaign.models import Campaign
+from harness.controllers.black_box import Death
+from harness.episode.loop import EpisodeLoop
+from harness.estimators.block import Block
+from harness.estimators.from_records import block_from_tables
+from harness.importance.build import mixture_weights
+from harness.records.folder import write_shard
+from harness.records.tables import ShardTables, shard_tables
+from harness.runner.prepare import Prepared, build_world, prepare
+
+
+@dataclass(frozen=True)
+class ShardSpec:
+    """A fixed range of episodes."""
+
+    index: int
+    first_episode: int
+    n_episodes: int
+
+
+@dataclass(frozen=True)
+class ShardDone:
+    """A shard on disk, and what the stop rule needs of it."""
+
+    spec: ShardSpec
+    files: dict[str, str]
+    block: Block
+    stored: bool = False
+
+
+class ShardRunner:
+    """Runs shards of one campaign in one world, writing each to the run folder.
+
+    Parameters
+    ----------
+    campaign : Campaign
+    folder : Path
+        Run folder.
+    black_box : Path, optional
+        File that tells the parent in which call of a controller the process died.
+    """
+
+    def __init__(self, campaign: Campaign, folder: Path, black_box: Path | None = None) -> None:
+        self._folder = folder
+        self._doomed: dict[int, Death] = {}
+        self._prepared: Prepared = prepare(campaign)
+        self._loop: EpisodeLoop = self._prepared.loop(build_world(campaign), black_box=black_box, doomed=self._doomed)
+
+    def close(self) -> None:
+        """Release the AV's controllers."""
+        self._loop.close()
+
+    def run(self, spec: ShardSpec, doomed: Mapping[int, Death] | None = None) -> ShardDone:
+        """Run a shard and write its tables; episodes in ``doomed`` fail before the call that ended a process."""
+        self._doomed.update(doomed or {})
+        campaign = self._prepared.campaign
+        shard = self._loop.run(spec.first_episode, self._prepared.states(spec.first_episode, spec.n_episodes))
+        records = campaign.records
+        keep_traces = records.traces != "none" or records.trace_share > 0.0
+        tables = shard_tables(shard, campaign.seed, keep_traces=keep_traces)
+        files = write_shard(self._folder, spec.index, tables)
+        return ShardDone(spec, files, shard_block(campaign, tables))
+
+
+def shard_block(campaign: Campaign, tables: ShardTables) -> Block:
+    """What the stop rule's estimator sees of a shard."""
+    moments = tables.moments if campaign.stop.estimator == "scv" else None
+    return block_from_tables(tables.episodes, moments, method=campaign.testing.method, alpha=mixture_weights(campaign))

@@ -1,0 +1,1 @@
+"""SUMO: the only importer of libsumo and traci."""

@@ -1,0 +1,43 @@
+"""The SUMO world that a campaign's AV needs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from harness.campaign.models import Campaign
+from harness.sumo.av_type import recyclable
+from harness.sumo.driven_world import DrivenWorld, FreshWorld
+from harness.sumo.world import SumoWorld
+from harness.world import World
+
+
+def build_sumo_world(
+    campaign: Campaign, n_cells: int | None = None, *, gui: bool = False, options: Sequence[str] = ()
+) -> World:
+    """World for a campaign with engine ``sumo``.
+
+    Parameters
+    ----------
+    campaign : Campaign
+    n_cells : int, optional
+        Instead of ``world.cells``. An AV whose SUMO model keeps hidden state gets one cell in any case.
+    gui, options
+        See `SumoWorld`.
+
+    Raises
+    ------
+    CampaignError
+        SUMO refuses the AV's attributes, or more cells are asked for than there are roads.
+    """
+    cells = n_cells or campaign.world.cells
+    av = campaign.av
+    early = av.before_cut_in == "controller"
+    if av.traci is not None:
+        from harness.sumo.traci_world import TraciWorld  # noqa: PLC0415 - few campaigns need it
+
+        return TraciWorld(cells, av.traci, av.limits.step_time_s, acts_before_cut_in=early)
+    if av.sumo is None:
+        return SumoWorld(cells, gui=gui, options=options)
+    if recyclable(av.sumo):
+        return DrivenWorld(cells, av.sumo, acts_before_cut_in=early, gui=gui, options=options)
+    return FreshWorld(av.sumo, campaign.seed, acts_before_cut_in=early, gui=gui, options=options)

@@ -1,0 +1,54 @@
+"""The committed networks, and the settings under which SUMO does exactly what it is told."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from harness.errors import CampaignError
+
+MOST_CELLS = 256
+
+_CHECKOUT = Path(__file__).parents[2] / "sumo_networks"
+_INSTALLED = Path(__file__).parents[1] / "sumo_networks"
+
+EXACT_OPTIONS = (
+    "--step-length", "0.1",
+    "--step-method.ballistic", "true",
+    "--collision.action", "warn",
+    "--collision.mingap-factor", "0",
+    "--time-to-teleport", "-1",
+    "--default.speeddev", "0",
+    "--no-step-log", "true",
+    "--no-warnings", "true",
+    "--xml-validation", "never",
+    "--xml-validation.net", "never",
+)  # fmt: skip
+"""Ballistic update; collisions reported and otherwise ignored; no teleports; nothing random."""
+
+
+def network_file(n_cells: int) -> Path:
+    """Smallest committed network with at least ``n_cells`` roads.
+
+    Raises
+    ------
+    CampaignError
+        More cells are asked for than the largest network has.
+    """
+    if n_cells > MOST_CELLS:
+        raise CampaignError(
+            "world.cells",
+            found=str(n_cells),
+            expected=f"at most {MOST_CELLS} cells with engine sumo",
+            mend="32 to 128 cells are fastest; more make SUMO slower.",
+        )
+    return committed_file("highway-1.net.xml" if n_cells == 1 else f"highway-{MOST_CELLS}.net.xml")
+
+
+def committed_file(name: str) -> Path:
+    """A file of ``sumo_networks/``, from the installed package or from the checkout."""
+    path = (_INSTALLED if _INSTALLED.exists() else _CHECKOUT) / name
+    if not path.exists():
+        raise CampaignError(
+            str(path), found="no file", expected="the committed network", mend="Reinstall the harness from a checkout."
+        )
+    return path

@@ -1,0 +1,220 @@
+"""A real SUMO and the user's program, connected to it beside the harness: started, watched and ended together."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import TypeVar
+
+from traci.exceptions import FatalTraCIError
+
+from harness.campaign.models import TraciProcess
+from harness.errors import CampaignError
+from harness.sumo.traci_connection import BatchConnection
+from harness.world import AVLostError
+
+PROGRAM_ORDER, HARNESS_ORDER = 1, 2
+"""Order in which SUMO serves its clients within a step: the harness has the last word."""
+_POLL_S = 0.02
+_ESTABLISHED = "01"
+_TCP_TABLE = Path("/proc/net/tcp")
+
+_Answer = TypeVar("_Answer")
+
+
+class ConnectedProgram:
+    """SUMO as a server with two clients: the user's program and the harness.
+
+    Parameters
+    ----------
+    av : TraciProcess
+        ``av.traci``.
+    n_cells : int
+        Fills ``{cells}`` in the command.
+    sumo_arguments : sequence of str
+        SUMO's command line.
+    step_time_s : float
+        Time that a step may take (``av.limits.step_time_s``).
+
+    Raises
+    ------
+    AVLostError
+        The program ended, or did not connect in time.
+    CampaignError
+        SUMO or the program cannot be started at all.
+    """
+
+    def __init__(self, av: TraciProcess, n_cells: int, sumo_arguments: Sequence[str], step_time_s: float) -> None:
+        self._av = av
+        self._step_time_s = step_time_s
+        self._port = _free_port()
+        server = [_sumo_binary(), *sumo_arguments, "--remote-port", str(self._port), "--num-clients", "2"]
+        quiet = subprocess.DEVNULL
+        self._program: subprocess.Popen[bytes] | None = None
+        self._server = subprocess.Popen(server, stdout=quiet, stderr=quiet, start_new_session=True)  # noqa: S603
+        self._connection: BatchConnection | None = None
+        self._n_watched = 0
+        try:
+            self._connection = self._connect()
+            self._program = _start_program(av.command, self._port, n_cells)
+            self._await_program()
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def connection(self) -> BatchConnection:
+        """The harness's own connection.
+
+        Raises
+        ------
+        AVLostError
+            There is none yet.
+        """
+        if self._connection is None:
+            raise AVLostError("SUMO's TraCI server did not start")
+        return self._connection
+
+    def _connect(self) -> BatchConnection:
+        until = time.monotonic() + self._av.connect_time_s
+        while True:
+            try:
+                return BatchConnection(self._port)
+            except OSError as error:
+                if self._server.poll() is not None or time.monotonic() > until:
+                    raise AVLostError(f"SUMO's TraCI server did not start ({error})") from error
+            time.sleep(_POLL_S)
+
+    def _await_program(self) -> None:
+        """Wait until the program has connected, then agree on the order."""
+        until = time.monotonic() + self._av.connect_time_s
+        while self._n_connected() == 1:
+            self._require_running("before it connected")
+            if time.monotonic() > until:
+                raise AVLostError(f"the program did not connect within {self._av.connect_time_s:g} s")
+            time.sleep(_POLL_S)
+        self.answer(lambda: self.connection.setOrder(HARNESS_ORDER), self._av.connect_time_s)
+
+    def answer(self, ask: Callable[[], _Answer], seconds: float | None = None) -> _Answer:
+        """What SUMO answers to the harness, which may mean to wait for the program.
+
+        Raises
+        ------
+        AVLostError
+            No answer within ``seconds`` (default: the time of a step), the program has ended, or is not connected.
+        """
+        limit = seconds or self._step_time_s
+        began = time.monotonic()
+        try:
+            self.connection.limit(limit)
+            return ask()
+        except (FatalTraCIError, OSError) as error:
+            if time.monotonic() - began >= limit:
+                raise AVLostError(f"the program did not finish its step within {limit:g} s") from error
+            raise AVLostError(self._how_it_ended()) from error
+
+    def watch(self) -> None:
+        """From now on, with all files loaded, SUMO has one socket less when the program is gone."""
+        self._n_watched = self._n_sockets()
+
+    def require_connected(self) -> None:
+        """See to it, after a step, that the program was there to act in it.
+
+        Raises
+        ------
+        AVLostError
+            It was not.
+        """
+        if self._n_sockets() < self._n_watched:
+            raise AVLostError(self._how_it_ended())
+        self._require_running("in the middle of the run")
+
+    def _require_running(self, when: str) -> None:
+        if self._program is not None and (code := self._program.poll()) is not None:
+            raise AVLostError(f"the program ended {when}, {_exit_words(code)}")
+
+    def _how_it_ended(self) -> str:
+        with suppress(subprocess.TimeoutExpired, AttributeError):
+            return f"the program ended, {_exit_words(self._program.wait(1.0))}"  # type: ignore[union-attr]
+        return "the program closed its connection, but goes on running"
+
+    def _n_connected(self) -> int:
+        """Clients that SUMO has now; where the system has no table of connections, the program counts while it runs."""
+        if not _TCP_TABLE.exists():
+            return 2
+        here = f":{self._port:04X}"
+        rows = (line.split() for line in _TCP_TABLE.read_text(encoding="ascii").splitlines()[1:])
+        return sum(1 for row in rows if row[1].endswith(here) and row[3] == _ESTABLISHED)
+
+    def _n_sockets(self) -> int:
+        """Sockets that SUMO has open; 0 where the system does not say.
+
+        SUMO goes on without a word when a client takes its leave. The table of connections would say so too, but
+        reading it takes longer than a step.
+        """
+        try:
+            with os.scandir(f"/proc/{self._server.pid}/fd") as found:
+                return sum(os.readlink(file).startswith("socket:") for file in found)  # noqa: PTH115 - once per step
+        except OSError:
+            return 0
+
+    def close(self) -> None:
+        """End both processes."""
+        if self._connection is not None:
+            self._connection.drop()
+        for process in (self._program, self._server):
+            if process is not None:
+                _end(process)
+
+
+def _start_program(command: str, port: int, n_cells: int) -> subprocess.Popen[bytes]:
+    try:
+        words = shlex.split(command.format(port=port, cells=n_cells))
+        # What it prints belongs on the terminal, but stdout is for the harness's results.
+        return subprocess.Popen(words, stdout=sys.stderr.fileno(), start_new_session=True)  # noqa: S603 - the user's own
+    except (OSError, ValueError, KeyError, IndexError) as error:
+        raise CampaignError(
+            "av.traci.command",
+            found=f"{command} ({error})",
+            expected="a program that can be started, with {port} and {cells} the only things in braces",
+            mend="Try it in a shell, in the folder in which you start the harness.",
+        ) from error
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    """End a process and what it has started: all are in a session of their own."""
+    with suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+
+
+def _exit_words(code: int) -> str:
+    return f"killed by signal {-code}" if code < 0 else f"exit code {code}"
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def _sumo_binary() -> str:
+    try:
+        import sumo  # noqa: PLC0415 - an extra
+    except ImportError:
+        found = None
+    else:
+        found = Path(str(getattr(sumo, "SUMO_HOME", ""))) / "bin" / "sumo"
+    if found is None or not found.exists():
+        raise CampaignError(
+            "av.traci", found="no SUMO server", expected="the extra 'sumo'", mend="pip install 'harness[sumo]'."
+        )
+    return str(found)

@@ -1,0 +1,60 @@
+"""The same dynamics without SUMO: oracle of the differential tests, and engine where SUMO would be too slow."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from harness.arrays import BoolArray, FloatArray, Int8Array, IntArray
+from harness.compiled import compiled
+from harness.outcomes import AV, BV, LV
+from harness.vehicles.kinematics import CONTACT_M, gap, next_position
+
+
+@compiled
+def advance(x: FloatArray, v: FloatArray, speed: FloatArray) -> None:
+    """Move all vehicles (K, 3) to the commanded speeds, in SUMO's arithmetic."""
+    for k in range(x.shape[0]):
+        for vehicle in range(3):
+            x[k, vehicle] = next_position(x[k, vehicle], v[k, vehicle], speed[k, vehicle])
+            v[k, vehicle] = speed[k, vehicle]
+
+
+@compiled
+def contacts(x: FloatArray, on_right: Int8Array, out: BoolArray) -> None:
+    """Which cells (K,) have vehicles of one lane in contact; ``on_right`` says whose BV has cut in."""
+    for k in range(x.shape[0]):
+        if on_right[k]:
+            out[k] = gap(x[k, BV], x[k, AV]) < CONTACT_M
+        else:
+            out[k] = gap(x[k, LV], x[k, BV]) < CONTACT_M
+
+
+class TwinWorld:
+    """World without SUMO."""
+
+    def __init__(self, n_cells: int) -> None:
+        self.x: FloatArray = np.zeros((n_cells, 3))
+        self.v: FloatArray = np.zeros((n_cells, 3))
+        self._on_right: Int8Array = np.zeros(n_cells, np.int8)
+        self._contact: BoolArray = np.zeros(n_cells, np.bool_)
+
+    @property
+    def n_cells(self) -> int:
+        """K."""
+        return int(self.x.shape[0])
+
+    def place(self, cells: IntArray, x: FloatArray, v: FloatArray) -> None:
+        """See `harness.world.World`."""
+        self.x[cells] = x[cells]
+        self.v[cells] = v[cells]
+        self._on_right[cells] = 0
+
+    def step(self, speed: FloatArray, cut_in: Int8Array) -> BoolArray:
+        """See `harness.world.World`."""
+        self._on_right |= cut_in
+        advance(self.x, self.v, speed)
+        contacts(self.x, self._on_right, self._contact)
+        return self._contact
+
+    def close(self) -> None:
+        """Nothing to release."""

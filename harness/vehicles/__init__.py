@@ -1,0 +1,1 @@
+"""Longitudinal driver models and kinematics, shared by AVs, surrogates, SUMO world and twin."""

@@ -1,0 +1,86 @@
+"""Longitudinal driver models that AVs and surrogates share: IDM and FVDM.
+
+Only + − × ÷ √ and explicit products are used (and ``math.tanh``, inside compiled code alone), so that every caller gets
+the same bits.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from harness.arrays import Record, RecordArray
+from harness.campaign.models import FVDM, IDM, AutomatedVehicle, FVDMParameters, IDMParameters
+from harness.compiled import compiled_inline
+
+IDM_KIND, FVDM_KIND = 0, 1
+SMALLEST_GAP_M = 0.1
+"""Gap below which the models see this gap: they divide by it."""
+
+_COMMON = ("min_acceleration_mps2", "max_acceleration_mps2")
+_IDM = ("acceleration_mps2", "comfortable_deceleration_mps2", "time_headway_s", "minimum_gap_m", "desired_speed_mps")
+_FVDM = ("kappa_per_s", "lambda_per_s", "max_speed_mps", "v1", "v2", "c1_per_m", "c2")
+DRIVER_DTYPE = np.dtype([("kind", np.int64)] + [(name, np.float64) for name in (*_COMMON, *_IDM, *_FVDM)])
+
+
+def driver_records(drivers: list[IDMParameters | FVDMParameters]) -> RecordArray:
+    """Parameters of driver models as kernels read them, shape (number of drivers,)."""
+    records = np.zeros(len(drivers), dtype=DRIVER_DTYPE)
+    for record, driver in zip(records, drivers, strict=True):
+        record["kind"] = IDM_KIND if isinstance(driver, IDMParameters) else FVDM_KIND
+        for name, value in driver.model_dump().items():
+            record[name] = value
+    return records
+
+
+def av_records(av: AutomatedVehicle) -> RecordArray:
+    """Parameters of a built-in AV, shape (1,); of an AV that something else drives, shape (0,)."""
+    built_in = isinstance(av.parameters, IDMParameters | FVDMParameters)
+    return driver_records([av.parameters] if built_in else [])  # type: ignore[list-item]
+
+
+def surrogate_records(surrogates: dict[str, IDM | FVDM]) -> RecordArray:
+    """Parameters of the surrogates, in their order, shape (J,)."""
+    return driver_records([model.parameters for model in surrogates.values()])
+
+
+@compiled_inline
+def idm_acceleration(driver: Record, speed: float, lead_speed: float, gap: float) -> float:
+    """Intelligent driver model, before clipping (m/s²).
+
+    a = α [1 − (v/v0)⁴ − (s*/s)²], s* = s0 + max(0, v T + v (v − v_lead)/(2 √(α b))).
+    """
+    braking = 2.0 * math.sqrt(driver.acceleration_mps2 * driver.comfortable_deceleration_mps2)
+    desired = driver.minimum_gap_m + max(0.0, speed * driver.time_headway_s + (speed * (speed - lead_speed)) / braking)
+    ratio = speed / driver.desired_speed_mps
+    squared = ratio * ratio
+    close = desired / gap
+    return float(driver.acceleration_mps2 * (1.0 - squared * squared - close * close))
+
+
+@compiled_inline
+def fvdm_shape(driver: Record, gap: float) -> float:
+    """Tanh(C1 s − C2): the part of the optimal velocity that depends on the gap, increasing in it."""
+    return math.tanh(driver.c1_per_m * gap - driver.c2)
+
+
+@compiled_inline
+def fvdm_acceleration(driver: Record, speed: float, lead_speed: float, shape: float) -> float:
+    """Full velocity difference model, before clipping (m/s²), increasing in ``shape``.
+
+    a = κ (V(s) − v) + λ (v_lead − v), V(s) = v_max [V1 + V2 tanh(C1 s − C2)]/(V1 + V2).
+    """
+    optimal = (driver.max_speed_mps * (driver.v1 + driver.v2 * shape)) / (driver.v1 + driver.v2)
+    return float(driver.kappa_per_s * (optimal - speed) + driver.lambda_per_s * (lead_speed - speed))
+
+
+@compiled_inline
+def driver_acceleration(driver: Record, speed: float, lead_speed: float, gap: float) -> float:
+    """Acceleration (m/s²) of a driver behind a leader at a bumper-to-bumper gap (m), clipped to its limits."""
+    seen = max(gap, SMALLEST_GAP_M)
+    if driver.kind == IDM_KIND:
+        a = idm_acceleration(driver, speed, lead_speed, seen)
+    else:
+        a = fvdm_acceleration(driver, speed, lead_speed, fvdm_shape(driver, seen))
+    return float(min(max(a, driver.min_acceleration_mps2), driver.max_acceleration_mps2))

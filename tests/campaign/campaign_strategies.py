@@ -1,0 +1,103 @@
+"""Random campaigns that the JSON schema allows, for property tests."""
+
+from pathlib import Path
+from typing import Any
+
+from hypothesis import strategies as st
+
+from harness.campaign.models import AV_SOURCES
+from harness.campaign.schema import campaign_schema
+
+SCHEMA = campaign_schema()
+_NAMES = st.from_regex(r"[A-Za-z0-9][A-Za-z0-9_-]{0,11}", fullmatch=True)
+_PLAIN = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers(-(2**53), 2**53)
+    | st.floats(allow_nan=False, allow_infinity=False)
+    | st.text(max_size=9),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(_NAMES, inner, max_size=3),
+    max_leaves=4,
+)
+
+
+def values(node: dict[str, Any]) -> st.SearchStrategy[Any]:
+    """Values that one node of the schema allows; mappings leave out any part that has a default."""
+    if "$ref" in node:
+        return values(SCHEMA["$defs"][node["$ref"].rpartition("/")[2]])
+    if "if" in node:
+        return st.sampled_from([None, *AV_SOURCES]).flatmap(lambda source: _av(node, source))
+    for choice in ("anyOf", "oneOf"):
+        if choice in node:
+            return st.one_of([values(option) for option in node[choice]])
+    if "properties" in node:
+        required = {key: values(child) for key, child in node["properties"].items() if key in node.get("required", ())}
+        optional = {key: values(child) for key, child in node["properties"].items() if key not in required}
+        return st.fixed_dictionaries(required, optional=optional)
+    named = [*node.get("patternProperties", {}).values(), node.get("additionalProperties")]
+    if isinstance(named[0], dict):
+        return st.dictionaries(_NAMES, values(named[0]), min_size=1, max_size=3)
+    return _scalars(node)
+
+
+def _av(node: dict[str, Any], source: str | None) -> st.SearchStrategy[Any]:
+    """A vehicle driven by one source, or by none in particular, with the parameters that belong to it."""
+    if source == "model":
+        return st.sampled_from(["idm", "fvdm"]).flatmap(lambda model: _parts(node, {"model": st.just(model)}, model))
+    if source is None:
+        return _parts(node, {}, "idm")
+    return _parts(node, {source: values(node["properties"][source])}, source)
+
+
+def _parts(
+    node: dict[str, Any], required: dict[str, st.SearchStrategy[Any]], driver: str
+) -> st.SearchStrategy[dict[str, Any]]:
+    optional = {name: values(node["properties"][name]) for name in ("before_cut_in", "limits")}
+    if driver in ("idm", "fvdm"):
+        optional["parameters"] = values({"$ref": f"#/$defs/{driver.upper()}Parameters"})
+    if driver == "controller":
+        optional["parameters"] = st.dictionaries(_NAMES, _PLAIN, max_size=3) | values(
+            {"$ref": "#/$defs/IDMParameters"}  # names that a built-in model has, too
+        )
+    return st.fixed_dictionaries(required, optional=optional)
+
+
+def _scalars(node: dict[str, Any]) -> st.SearchStrategy[Any]:
+    low, high = node.get("minimum", node.get("exclusiveMinimum")), node.get("maximum", node.get("exclusiveMaximum"))
+    if "const" in node or "enum" in node:
+        return st.sampled_from(node.get("enum") or [node["const"]])
+    if node["type"] == "integer":
+        return st.integers(low, high - ("exclusiveMaximum" in node) if high is not None else None)
+    if node["type"] == "number":
+        bounds = {"exclude_min": "exclusiveMinimum" in node, "exclude_max": "exclusiveMaximum" in node}
+        return st.floats(low, high, allow_nan=False, allow_infinity=False, **bounds)
+    if node["type"] == "null":
+        return st.none()
+    if "pattern" in node:
+        return st.from_regex(node["pattern"], fullmatch=True)
+    return st.text(min_size=node.get("minLength", 0), max_size=40)
+
+
+def campaigns() -> st.SearchStrategy[dict[str, Any]]:
+    """Campaign data by which the rules between several values hold, too."""
+    return values(SCHEMA).map(_obey_rules)
+
+
+def _obey_rules(data: dict[str, Any]) -> dict[str, Any]:
+    environment, testing, stop = data.get("environment", {}), data.get("testing", {}), data.get("stop", {})
+    environment.pop("parameters", None)
+    fmu = (data.get("av") or {}).get("fmu")
+    if fmu:
+        fmu["file"] = str(Path(__file__).resolve())  # loading wants a file that exists, and makes its path absolute
+    if "acceleration_hold_s" in environment:
+        environment["acceleration_hold_s"] = round(environment["acceleration_hold_s"], 1)
+    if testing.get("alpha") is not None:
+        names = list(data.get("surrogates", ("SM-I", "SM-II", "SM-III")))
+        testing["alpha"] = dict.fromkeys(names[:-1], 0.25) | {names[-1]: 1 - 0.25 * (len(names) - 1)}
+    stop.pop("estimator", None)
+    av = data.get("av", {})
+    if testing.get("method", "episode_mixture") in ("forced", "episode_mixture"):
+        av.pop("before_cut_in", None)
+    if "sumo" in av or "traci" in av:
+        data.get("world", {}).pop("engine", None)
+    return data

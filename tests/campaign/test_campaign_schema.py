@@ -1,0 +1,85 @@
+"""The committed JSON schema is current, and says the same as the loader."""
+
+from pathlib import Path
+
+import jsonschema
+import pytest
+
+from harness.campaign.models import Campaign
+from harness.campaign.schema import SchemaView, campaign_schema, schema_text
+
+SCENARIOS = Path(__file__).parents[2] / "scenarios"
+
+
+def test_committed_schema_is_current():
+    committed = (SCENARIOS / "campaign.schema.json").read_text(encoding="utf-8")
+    assert committed == schema_text(), "write it anew: harness schema > scenarios/campaign.schema.json"
+
+
+def test_schema_is_a_schema():
+    jsonschema.Draft202012Validator.check_schema(campaign_schema())
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"testin": {}},
+        {"testing": {"epsilon": "0.1"}},
+        {"av": {"parameters": {"desired_speed_mps": 300}}},
+        {"av": {"model": "fvdm", "parameters": {"time_headway_s": 1}}},
+        {"av": {"parameters": {"kappa_per_s": 1}}},
+        {"av": {"model": "idm", "controller": "a:B"}},
+        {"av": {"sumo": {}, "traci": {"command": "x"}}},
+        {"av": {"controller": None}},
+        {"av": {"controller": "a b"}},
+        {"av": {"sumo": {"minGap": True}}},
+        {"av": {"sumo": {"tau": 1}, "parameters": {"tau": 1}}},
+        {"av": {"fmu": {"file": "a.fmu", "output": "a"}}},
+        {"surrogates": {"a.b": {"model": "idm"}}},
+        {"surrogates": {"A": {"model": "fvdm", "parameters": {"time_headway_s": 1}}}},
+        {"stop": {"episodes": 1.5}},
+        {"name": "a b"},
+    ],
+)
+def test_schema_refuses_what_the_loader_refuses(wrong):
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate({"name": "x", **wrong}, campaign_schema())
+
+
+@pytest.mark.parametrize(
+    "av",
+    [
+        {},
+        {"parameters": {"time_headway_s": 1}},
+        {"controller": "my_package.my_module:MyController", "parameters": {"anything": [1, {"deep": True}]}},
+        {"sumo": {"carFollowModel": "ACC", "minGap": 2}},
+        {"traci": {"command": "./my_av --port {port}"}},
+        {"fmu": {"file": "a.fmu", "output": "a", "inputs": {"speed_mps": "v"}}},
+    ],
+)
+def test_schema_allows_every_source(av):
+    jsonschema.validate({"name": "x", "av": av}, campaign_schema())
+    Campaign.model_validate({"name": "x", "av": av})
+
+
+def test_view_follows_models_and_tags():
+    view = SchemaView(campaign_schema())
+    data = {"av": {"model": "fvdm"}, "surrogates": {"A": {"model": "idm", "parameters": {"time_headway_s": 1}}}}
+    assert view.at(("av", "parameters", "max_speed_mps"), data)["maximum"] == 60.0
+    assert view.at(("av", "parameters", "time_headway_s"), data) == {}
+    assert view.at(("av", "parameters", "time_headway_s"), {})["maximum"] == 10.0
+    assert view.at(("stop", "rhw"), {})["nullable"]
+    assert view.at(("av", "parameters", "x"), {"av": {"controller": "a:B"}}) == {}
+    assert view.path_of(("av", "sumo", "minGap", "float"), {"av": {"sumo": {"minGap": True}}})[-1] == "minGap"
+    loc = ("surrogates", "A", "idm", "parameters", "time_headway_s")
+    assert view.path_of(loc, data) == ("surrogates", "A", "parameters", "time_headway_s")
+    assert view.path_of(("surrogates", "a.b", "[key]"), data) == ("surrogates", "a.b")
+
+
+def test_view_finds_keys_anywhere():
+    view = SchemaView(campaign_schema())
+    assert list(view.paths_of_key("epsilon")) == ["testing.epsilon"]
+    assert set(view.paths_of_key("kappa_per_s")) == {
+        "av.parameters.kappa_per_s",
+        "surrogates.NAME.parameters.kappa_per_s",
+    }

@@ -1,0 +1,140 @@
+"""The chain: tables, its crash probability by backward induction, and the importance functions of its surrogates."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+
+from harness.arrays import BoolArray, FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Chain:
+    """Finite chain over `horizon` steps: G states before the cut-in, D after it, then safe (index D) and crash (D + 1).
+
+    Attributes
+    ----------
+    start : (G,)
+        Distribution of the first state.
+    approach : (G, G)
+        Transition when staying.
+    hazard : (G,)
+        p(cut_in | state).
+    entry : (G, D + 2)
+        State after a cut-in.
+    exposure : (D, A)
+        p(a | state) after the cut-in.
+    response : (D, A, D + 2)
+        What the vehicle under test does.
+    surrogate_responses : (J, D, A, D + 2)
+        What its stand-ins do.
+    """
+
+    name: str
+    horizon: int
+    start: FloatArray
+    approach: FloatArray
+    hazard: FloatArray
+    entry: FloatArray
+    exposure: FloatArray
+    response: FloatArray
+    surrogate_responses: FloatArray
+    challenge: Literal["immediate", "recursive"] = "recursive"
+    epsilon: float = 0.1
+
+    @property
+    def n_surrogates(self) -> int:
+        return len(self.surrogate_responses)
+
+    @property
+    def crashed(self) -> int:
+        return self.entry.shape[1] - 1
+
+    @cached_property
+    def true_value(self) -> tuple[FloatArray, FloatArray]:
+        return self._values(self.response)
+
+    @cached_property
+    def crash_rate(self) -> float:
+        """μ, by backward induction."""
+        return float(self.start @ self.true_value[0][0])
+
+    @cached_property
+    def cut_in_rate(self) -> float:
+        """P(cut-in within the horizon)."""
+        none = np.ones(len(self.start))
+        for _ in range(self.horizon):
+            none = (1.0 - self.hazard) * (self.approach @ none)
+        return 1.0 - float(self.start @ none)
+
+    @cached_property
+    def cut_in_cap(self) -> float:
+        """Bound on P(cut-in | path) over all paths."""
+        return -float(np.expm1(self.horizon * np.log1p(-self.hazard.max())))
+
+    @cached_property
+    def step_mixture_variance(self) -> float:
+        """Var(Y) of one episode under the step mixture with equal weights, by backward induction of E[Y² | state]."""
+        proposals, before = self.proposals, np.zeros(len(self.start))
+        after = np.zeros(self.crashed + 1)
+        after[self.crashed] = 1.0
+        for t in range(self.horizon - 1, -1, -1):
+            cut = np.where(proposals.critical_before[t], proposals.cut[:, t].mean(axis=0), self.hazard)
+            staying = (1.0 - self.hazard) ** 2 / (1.0 - cut) * (self.approach @ before)
+            cutting = np.divide(self.hazard**2, cut, out=np.zeros_like(cut), where=cut > 0.0) * (self.entry @ after)
+            mixed = np.where(proposals.critical_after[t][:, None], proposals.maneuver[:, t].mean(axis=0), self.exposure)
+            after[:-2] = np.einsum("da,dae,e->d", self.exposure**2 / mixed, self.response, after)
+            before = staying + cutting
+        return float(self.start @ before) - self.crash_rate**2
+
+    def _values(self, response: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Crash probability by time and state: before (T + 1, G) and after the cut-in (T + 1, D + 2)."""
+        before = np.zeros((self.horizon + 1, len(self.start)))
+        after = np.zeros((self.horizon + 1, self.crashed + 1))
+        after[:, self.crashed] = 1.0
+        for t in range(self.horizon - 1, -1, -1):
+            after[t, :-2] = np.einsum("da,dae,e->d", self.exposure, response, after[t + 1])
+            cut, stay = self.entry @ after[t + 1], self.approach @ before[t + 1]
+            before[t] = self.hazard * cut + (1.0 - self.hazard) * stay
+        return before, after
+
+    @cached_property
+    def proposals(self) -> Proposals:
+        """q_j at every time and state."""
+        shape_before = (self.n_surrogates, self.horizon, len(self.start))
+        cut = np.empty(shape_before)
+        maneuver = np.empty((self.n_surrogates, self.horizon, *self.exposure.shape))
+        critical_before = np.zeros(shape_before[1:], dtype=bool)
+        critical_after = np.zeros((self.horizon, len(self.exposure)), dtype=bool)
+        for j, response in enumerate(self.surrogate_responses):
+            before, after = self._values(response)
+            for t in range(self.horizon):
+                stay = self.approach @ before[t + 1] * (self.challenge == "recursive")
+                challenge = np.stack([stay, self.entry @ after[t + 1]], axis=1)
+                p = np.stack([1.0 - self.hazard, self.hazard], axis=1)
+                q, v = importance_function(p, challenge, self.epsilon)
+                cut[j, t], critical_before[t] = q[:, 1], critical_before[t] | (v > 0.0)
+                maneuver[j, t], v = importance_function(self.exposure, response @ after[t + 1], self.epsilon)
+                critical_after[t] |= v > 0.0
+        return Proposals(cut, maneuver, critical_before, critical_after)
+
+
+@dataclass(frozen=True, eq=False)
+class Proposals:
+    """q_j(cut_in | t, state) of shape (J, T, G), q_j(a | t, state) of shape (J, T, D, A), and where they act."""
+
+    cut: FloatArray
+    maneuver: FloatArray
+    critical_before: BoolArray
+    critical_after: BoolArray
+
+
+def importance_function(p: FloatArray, challenge: FloatArray, epsilon: float) -> tuple[FloatArray, FloatArray]:
+    """q = ε p + (1 - ε) p C/V along the last axis, and V; q = p where V = 0 (statistics.md section 1)."""
+    value = (p * challenge).sum(axis=-1)
+    safe = np.where(value > 0.0, value, 1.0)[..., None]
+    q = epsilon * p + (1.0 - epsilon) * p * challenge / safe
+    return np.where(value[..., None] > 0.0, q, p), value

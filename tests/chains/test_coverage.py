@@ -1,0 +1,71 @@
+"""What the intervals are worth, by replication: nade's covers, the published scv's does not, mutants are caught.
+
+Seeds are fixed, so that the outcome is too. Each `binomtest` would reject a correct 90 % interval with probability
+1e-4; the defect must show at 1e-9.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.stats import binomtest
+
+from harness.estimators.block import Block
+from harness.estimators.mixture_cv import MixtureCv
+from harness.estimators.nade import Nade
+from harness.estimators.scv import Scv
+
+from .coverage import replicate
+from .library import frequent_decisive, rare_decisive
+from .sampler import draw
+from .single_choice import with_optimal_function
+
+REPLICATIONS = 400
+N = 2_000
+CONFIDENCE = 0.9
+FALSE_ALARM = 1e-4
+
+
+def covers(covered: int) -> bool:
+    return binomtest(covered, REPLICATIONS, CONFIDENCE).pvalue > FALSE_ALARM
+
+
+@pytest.mark.parametrize("chain", [frequent_decisive(), rare_decisive()], ids=lambda c: c.name)
+def test_nade_covers_and_the_published_scv_does_not(chain):
+    found = replicate(lambda rng: draw(chain, "step_mixture", N, rng), REPLICATIONS, 11, {"nade": Nade, "scv": Scv})
+    nade, scv, truth = found["nade"], found["scv"], chain.crash_rate
+    np.testing.assert_allclose(scv.rate, nade.rate, rtol=1e-12)
+    assert covers(nade.covered(truth))
+    assert binomtest(scv.covered(truth), REPLICATIONS, CONFIDENCE, alternative="less").pvalue < 1e-9
+    assert nade.claimed_relvar(truth, N) == pytest.approx(chain.step_mixture_variance / truth**2, rel=0.1)
+    assert scv.true_relvar(truth, N) > 1.5 * scv.claimed_relvar(truth, N)
+
+
+class SampleCentred(MixtureCv):
+    """Mutant: the columns centred by their sample means, as in Algorithm 1."""
+
+    def add(self, block: Block) -> None:
+        self.sums.add(block)
+        h = block.mixture_ratios()
+        rows = np.column_stack([np.ones(len(block)), h - h.mean(axis=0), block.weighted_crashes()])
+        self._factor = np.asfortranarray(np.linalg.qr(rows, mode="r"))
+
+
+@pytest.mark.parametrize("tilt", [0.3, 3.0])
+def test_known_means_cover_and_sample_means_do_not(tilt):
+    """A nearly optimal importance function among others: the gain is real only if the means are known."""
+    world = with_optimal_function(tilt)
+    found = replicate(
+        lambda rng: world.draw("episode_mixture", N, rng),
+        REPLICATIONS,
+        13,
+        {"right": MixtureCv, "wrong": SampleCentred},
+    )
+    assert covers(found["right"].covered(world.crash_rate))
+    assert not covers(found["wrong"].covered(world.crash_rate))
+
+
+def test_known_mean_control_variates_cover_on_a_chain():
+    chain = frequent_decisive()
+    found = replicate(lambda rng: draw(chain, "episode_mixture", N, rng), REPLICATIONS, 12, {"mixture_cv": MixtureCv})
+    assert covers(found["mixture_cv"].covered(chain.crash_rate))

@@ -1,0 +1,124 @@
+"""The difference of two vehicles from pairs: unbiased, covered as claimed, and worth the pairing.
+
+Two vehicles in a world of one maneuver: the same random numbers give the same maneuver, and B crashes in one of those
+in which A does. Both rates are known exactly.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import binomtest
+
+from harness.estimators.block import Block
+from harness.estimators.difference import Difference, PairedSums, difference_statement, paired_difference
+
+from .library import overtaking
+from .sampler import draw
+from .seed import SEED
+from .single_choice import with_optimal_function
+
+REPLICATIONS = 400
+N = 2_000
+CONFIDENCE = 0.9
+FALSE_ALARM = 1e-4
+
+A = with_optimal_function(0.5)
+B = replace(A, crash=np.array([False, False, False, False, True]))
+TRUTH = A.crash_rate - B.crash_rate
+
+
+def pair(k: int, *, shared: bool = True) -> tuple[Block, Block]:
+    seeds = [SEED, k], ([SEED, k] if shared else [SEED, k, 1])
+    return tuple(
+        world.draw("episode_mixture", N, np.random.default_rng(seed)) for world, seed in zip((A, B), seeds, strict=True)
+    )
+
+
+def replications(*, shared: bool = True) -> list[Difference]:
+    return [paired_difference([pair(k, shared=shared)], CONFIDENCE) for k in range(REPLICATIONS)]
+
+
+@pytest.fixture(scope="module")
+def paired():
+    return replications()
+
+
+def test_the_difference_is_unbiased(paired):
+    found = np.array([one.difference for one in paired])
+    assert abs(found.mean() - TRUTH) < 4.0 * found.std(ddof=1) / math.sqrt(REPLICATIONS)
+    claimed = math.sqrt(np.mean([one.std_error**2 for one in paired]))
+    assert claimed == pytest.approx(found.std(ddof=1), rel=0.15)
+
+
+def test_the_interval_of_the_difference_covers(paired):
+    covered = sum(one.ci_low <= TRUTH <= one.ci_high for one in paired)
+    assert binomtest(covered, REPLICATIONS, CONFIDENCE).pvalue > FALSE_ALARM
+
+
+def test_the_interval_of_the_ratio_covers(paired):
+    truth = A.crash_rate / B.crash_rate
+    covered = sum(one.ratio_low <= truth <= one.ratio_high for one in paired)
+    assert binomtest(covered, REPLICATIONS, CONFIDENCE).pvalue > FALSE_ALARM
+
+
+def test_the_variance_of_independent_runs_would_be_wrong_for_pairs(paired):
+    """Mutant: errors of A and B added in quadrature, as if the runs were independent."""
+    half = [1.6449 * math.hypot(one.a.std_error, one.b.std_error) for one in paired]
+    covered = sum(abs(one.difference - TRUTH) <= wide for one, wide in zip(paired, half, strict=True))
+    assert binomtest(covered, REPLICATIONS, CONFIDENCE).pvalue < FALSE_ALARM
+
+
+def test_what_pairing_saves_is_what_independent_runs_cost(paired):
+    independent = np.var([one.difference for one in replications(shared=False)], ddof=1)
+    saved = independent / np.var([one.difference for one in paired], ddof=1)
+    assert np.mean([one.variance_ratio for one in paired]) == pytest.approx(saved, rel=0.3)
+    assert saved > 1.5
+
+
+def test_vehicles_with_a_will_of_their_own_are_covered_too():
+    """Chains whose episodes share paths and weights, and part after the cut-in."""
+    a, b = (overtaking("x", skill=skill, surrogates=[0.5], level=0.02, horizon=8) for skill in (0.5, 0.6))
+    truth, covered = a.crash_rate - b.crash_rate, 0
+    for k in range(REPLICATIONS):
+        blocks = (draw(chain, "forced", N, np.random.default_rng([SEED, 7, k])) for chain in (a, b))
+        found = paired_difference([tuple(blocks)], CONFIDENCE)
+        covered += found.ci_low <= truth <= found.ci_high
+    assert binomtest(covered, REPLICATIONS, CONFIDENCE).pvalue > FALSE_ALARM
+
+
+def test_blocks_in_pieces_give_the_same_bits():
+    a, b = pair(0)
+    pieces = [slice(0, 700), slice(700, N)]
+    whole, parts = PairedSums(), PairedSums()
+    whole.add(a, b)
+    for rows in pieces:
+        parts.add(a.take(rows), b.take(rows))
+    assert whole.result(0.9) == parts.result(0.9)
+
+
+def test_other_episodes_are_no_pairs():
+    a, b = pair(0)
+    with pytest.raises(ValueError, match="no pairs"):
+        PairedSums().add(a, b.take(slice(1, N)))
+
+
+def test_equal_vehicles_have_a_bound_and_not_a_zero_width():
+    a, _ = pair(0)
+    found = paired_difference([(a, a)], CONFIDENCE)
+    assert found.difference == 0.0
+    assert found.ci_low < 0.0 < found.ci_high
+    assert math.isinf(found.variance_ratio)
+    assert found.to_json()["variance_ratio"] is None
+    assert "the vehicles may be equal" in " ".join(found.warnings)
+    assert "not distinguishable" in difference_statement(found, "a", "b")
+
+
+def test_the_statement_says_who_crashes_more(paired):
+    assert "A (one) crashes" in (text := difference_statement(paired[0], "one", "two"))
+    assert "A crashes more often" in text
+    a, b = pair(0)
+    assert "A crashes less often" in difference_statement(paired_difference([(b, a)], CONFIDENCE), "one", "two")

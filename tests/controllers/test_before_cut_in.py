@@ -1,0 +1,64 @@
+"""A controller that acts from the start meets the methods that do not need to know the AV's speed."""
+
+import numpy as np
+import pytest
+
+from harness.campaign.loading import load_campaign
+from harness.errors import CampaignError
+from harness.outcomes import PASSED
+from harness.runner.prepare import prepare
+from harness.twin import TwinWorld
+from tests.controllers.test_same_bits import ROOT
+
+EARLY = "{controller: 'tests.controllers.test_before_cut_in:Faster', before_cut_in: controller}"
+
+
+class Faster:
+    """Accelerates until someone is ahead, and remembers nothing but that."""
+
+    def start(self, episode):
+        self.steps = 0
+
+    def step(self, seen):
+        assert seen.time_s == pytest.approx(0.1 * self.steps)
+        self.steps += 1
+        ahead = np.isfinite(seen.gap_m)
+        assert ahead == (seen.bv.lane == 0)
+        assert ahead or np.isnan(seen.lead_speed_mps)
+        return -3.0 if ahead else 0.5
+
+    def close(self):
+        pass
+
+
+def load(method, *more):
+    changes = [f"av={EARLY}", f"testing={{method: {method}}}", "world.engine=twin", *more]
+    return load_campaign(ROOT / "scenarios/smoke.yaml", changes)
+
+
+@pytest.mark.parametrize("method", ["nde", "step_mixture"])
+def test_a_controller_acts_from_the_first_step(method, monkeypatch):
+    monkeypatch.chdir(ROOT)
+    prepared = prepare(load(method, "environment.lane_change_level=350"))
+    loop = prepared.loop(TwinWorld(32), traces="all")
+    shard = loop.run(0, prepared.states(0, 300))
+    loop.close()
+    assert shard.failures == {}
+    rows = shard.results.episode
+    cut = np.flatnonzero(rows["cut_in_step"] > 0)
+    assert cut.size > 0
+    for i in range(300):
+        av = shard.traces[i][:, 2]
+        last = rows["cut_in_step"][i] if rows["cut_in_step"][i] >= 0 else len(av) - 1
+        np.testing.assert_array_equal(av[:last, 2], 0.5)
+    passed = np.flatnonzero(rows["outcome"] == PASSED)
+    assert passed.size > 0
+    for i in passed:
+        r2 = shard.traces[i][:, 1, 0] - 5.0 - shard.traces[i][:, 2, 0]
+        assert r2[-1] < -10.0 <= r2[-2]
+
+
+@pytest.mark.parametrize("method", ["forced", "episode_mixture"])
+def test_methods_that_draw_the_path_ahead_refuse_it(method):
+    with pytest.raises(CampaignError, match=r"draws LV's and BV's path ahead"):
+        load(method)

@@ -1,0 +1,114 @@
+"""Every recipe of docs/controllers.md is run, as it stands on the page, by ``harness run``."""
+
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+
+ROOT = Path(__file__).parents[2]
+PAGE = (ROOT / "docs/controllers.md").read_text(encoding="utf-8")
+BLOCKS = re.findall(r"^```(\w+)\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
+CAMPAIGN = """\
+name: recipe
+testing: {method: forced}
+records: {moments: none}
+world: {cells: 8}
+stop: {episodes: 60}
+run: {shard_size: 60}
+"""
+RECIPES = [text for kind, text in BLOCKS if kind == "yaml"]
+BRAKES = [text for text in RECIPES if "Brakes" in text]
+
+
+def named(recipe):
+    return " ".join(recipe.split())[:50]
+
+
+def test_the_page_has_all_recipes():
+    assert len(RECIPES) == 7
+    assert len(BRAKES) == 5
+    assert sum(kind == "py" for kind, _ in BLOCKS) == 5
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A folder with the page's files, and what its shell lines make."""
+    folder = tmp_path_factory.mktemp("recipes")
+    shutil.copy(ROOT / "examples/traci_client/idm_client.py", folder)
+    for kind, text in BLOCKS:
+        if kind == "py":
+            (folder / re.match(r"# (\w+\.py)\n", text)[1]).write_text(text, encoding="utf-8")
+    return folder
+
+
+def run(folder, recipe):
+    number = RECIPES.index(recipe)
+    if "fmu:" in recipe:
+        pytest.importorskip("pythonfmu", reason="the extra test")
+        (line,) = (text for kind, text in BLOCKS if kind == "sh")
+        words = shlex.split(line)
+        subprocess.run([sys.executable, "-m", *words], cwd=folder, check=True, capture_output=True)
+    if "traci:" in recipe:
+        pytest.importorskip("sumo", reason="the extra sumo")
+    (folder / f"c{number}.yaml").write_text(CAMPAIGN + recipe, encoding="utf-8")
+    out = folder / f"run{number}"
+    command = [sys.executable, "-m", "harness", "run", f"c{number}.yaml", "--out", str(out), "--workers", "1"]
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    rows = pq.read_table(out / "episodes").to_pylist()
+    assert [row["failure"] for row in rows] == [None] * 60
+    return rows
+
+
+@pytest.fixture(scope="module")
+def per_vehicle(folder):
+    return run(folder, RECIPES[0])
+
+
+@pytest.mark.parametrize("recipe", [text for text in BRAKES[1:] if "fmu:" not in text], ids=named)
+def test_recipes_in_python_are_the_same_vehicle(recipe, folder, per_vehicle):
+    assert run(folder, recipe) == per_vehicle
+    assert {row["outcome"] for row in per_vehicle} >= {"crash", "timeout"}
+
+
+def test_the_fmu_is_that_vehicle_too(folder, per_vehicle):
+    (recipe,) = (text for text in BRAKES if "fmu:" in text)
+    for row, other in zip(run(folder, recipe), per_vehicle, strict=True):
+        assert row["outcome"] == other["outcome"]
+        assert row["av_distance_m"] == pytest.approx(other["av_distance_m"], abs=1e-9)
+
+
+@pytest.mark.parametrize("recipe", [text for text in RECIPES if text not in BRAKES], ids=named)
+def test_the_other_recipes_run(recipe, folder):
+    rows = run(folder, recipe)
+    assert len(rows) == 60
+
+
+def test_entry_points_are_found_by_name(folder, tmp_path, monkeypatch):
+    from harness.controllers.loading import controller_class
+
+    (toml,) = (text for kind, text in BLOCKS if kind == "toml")
+    name, target = re.search(r'^([\w-]+) = "(.*)"$', toml, re.MULTILINE).groups()
+    (group,) = re.findall(r'entry-points\."(.*)"', toml)
+    info = tmp_path / "mine-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: mine\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(f"[{group}]\n{name} = {target}\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.syspath_prepend(folder)
+    assert controller_class(name).__name__ == "Brakes"
+
+
+def test_the_costs_are_within_what_was_promised():
+    row = r"^\| ([\w -]+?)(?: \(\w+\))? \| [\d.]+ \| ([\d.]+) \|$"
+    ratios = {name: float(ratio) for name, ratio in re.findall(row, PAGE, re.MULTILINE)}
+    most = {"batch": 1.2, "per vehicle": 4.0, "TraCI-style": 6.0, "step listener": 6.0, "FMU": 6.0}
+    assert set(ratios) == {"built in", *most}
+    assert all(ratios[name] <= most[name] for name in most)

@@ -1,0 +1,144 @@
+"""``av.fmu`` is checked against the FMU before anything runs; an instance per cell, a reset per episode."""
+
+import builtins
+import re
+import zipfile
+
+import pytest
+
+from harness.campaign.loading import load_campaign
+from harness.controllers import EpisodeStart, Neighbour, Observation
+from harness.controllers.loading import require_controller
+from harness.errors import CampaignError
+from harness.runner.prepare import content_hash
+
+COUNTER = '''
+from pythonfmu import Fmi2Causality, Fmi2Slave, Real
+
+
+class Counter(Fmi2Slave):
+    """Output: the sum of its inputs so far, in hundredths."""
+
+    def __init__(self, **kwargs):
+        super().__init__(**kwargs)
+        self.total, self.x = 0.0, 0.0
+        self.register_variable(Real("x", causality=Fmi2Causality.input))
+        self.register_variable(Real("total", causality=Fmi2Causality.output))
+
+    def do_step(self, current_time, step_size):
+        self.total += self.x / 100.0
+        return True
+'''
+
+
+@pytest.fixture(scope="module")
+def fmu(tmp_path_factory):
+    builder = pytest.importorskip("pythonfmu.builder", reason="pythonfmu builds the FMU")
+    folder = tmp_path_factory.mktemp("fmu")
+    (folder / "counter.py").write_text(COUNTER)
+    return builder.FmuBuilder.build_FMU(folder / "counter.py", dest=folder)
+
+
+def load(folder, text):
+    (folder / "c.yaml").write_text(f"name: fmu\nav: {{fmu: {text}}}\n")
+    return load_campaign(folder / "c.yaml")
+
+
+def check(fmu, tmp_path, text):
+    require_controller(load(tmp_path, f"{{file: '{fmu}', {text}}}").av)
+
+
+@pytest.mark.parametrize(
+    ("text", "where", "found"),
+    [
+        ("inputs: {speed_mps: y}, output: total", "av.fmu.inputs.speed_mps", "y, no variable of the FMU"),
+        ("inputs: {speed_mps: total}, output: total", "av.fmu.inputs.speed_mps", "total, a Real output"),
+        ("inputs: {speed: x}, output: total", "av.fmu.inputs.speed", "no such observation"),
+        ("inputs: {speed_mps: x}, output: x", "av.fmu.output", "x, a Real input"),
+        ("inputs: {speed_mps: x}, output: total, start_values: {k: 1.0}", "av.fmu.start_values", "k, no variable"),
+    ],
+)
+def test_a_wrong_wiring_is_named_with_the_variables(fmu, tmp_path, text, where, found):
+    with pytest.raises(CampaignError) as error:
+        check(fmu, tmp_path, text)
+    assert error.value.where == where
+    assert found in error.value.found
+    if "observation" not in found:
+        assert "x (Real input), total (Real output)" in error.value.mend
+
+
+def test_a_file_that_is_missing_is_named_by_its_place(tmp_path):
+    with pytest.raises(CampaignError, match=r"av.fmu.file.*there is no file") as error:
+        load(tmp_path, "{file: none.fmu, inputs: {speed_mps: x}, output: y}")
+    assert str(tmp_path) in str(error.value)
+
+
+def test_a_file_that_is_no_fmu_is_refused(tmp_path):
+    pytest.importorskip("fmpy")
+    (tmp_path / "no.fmu").write_text("nothing")
+    with pytest.raises(CampaignError, match="cannot be read"):
+        check(tmp_path / "no.fmu", tmp_path, "inputs: {speed_mps: x}, output: total")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "found"),
+    [
+        (rb"<CoSimulation[^>]*>", b'<ModelExchange modelIdentifier="counter"/>', "for FMI 2.0 model exchange"),
+        (rb'fmiVersion="2.0"', b'fmiVersion="7.0"', "7.0"),
+    ],
+)
+def test_another_kind_or_version_is_refused(fmu, tmp_path, old, new, found):
+    with zipfile.ZipFile(fmu) as source, zipfile.ZipFile(tmp_path / "other.fmu", "w") as target:
+        for name in source.namelist():
+            content = source.read(name)
+            if name.endswith(".xml"):
+                content = re.sub(old, new, content)
+            target.writestr(name, content)
+    with pytest.raises(CampaignError) as error:
+        check(tmp_path / "other.fmu", tmp_path, "inputs: {speed_mps: x}, output: total")
+    assert error.value.where == "av.fmu.file"
+    assert found in error.value.found
+
+
+def test_without_the_extra_its_name_is_said(fmu, tmp_path, monkeypatch):
+    real = builtins.__import__
+
+    def missing(name, *more, **named):
+        if name.startswith("fmpy"):
+            raise ImportError(name)
+        return real(name, *more, **named)
+
+    monkeypatch.setattr(builtins, "__import__", missing)
+    with pytest.raises(CampaignError, match=r"pip install 'harness\[fmi\]'"):
+        check(fmu, tmp_path, "inputs: {speed_mps: x}, output: total")
+
+
+def test_the_path_is_relative_to_the_campaign_and_the_content_counts(fmu, tmp_path):
+    text = "{file: here.fmu, inputs: {speed_mps: x}, output: total}"
+    hashes = []
+    for name, more in (("a", b""), ("b", b""), ("c", b"more")):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "here.fmu").write_bytes(fmu.read_bytes() + more)
+        campaign = load(tmp_path / name, text)
+        assert campaign.av.fmu.file == str(tmp_path / name / "here.fmu")
+        hashes.append(content_hash(campaign))
+    assert hashes[0] == hashes[1] != hashes[2]
+
+
+def test_instances_are_apart_and_an_episode_forgets_the_last(fmu, tmp_path):
+    from harness.controllers.fmu import fmu_maker
+
+    make = fmu_maker(load(tmp_path, f"{{file: '{fmu}', inputs: {{speed_mps: x}}, output: total}}").av)
+    first, second = make(), make()
+
+    def step(controller, time_s):
+        seen = Observation(time_s, 0.0, 20.0, 0.0, 5.0, 20.0, Neighbour(10.0, 20.0, 0), Neighbour(90.0, 20.0, 1))
+        return controller.step(seen)
+
+    for controller in (first, second):
+        controller.start(EpisodeStart(0, 0.1, None))
+    assert [step(first, 0.0), step(first, 0.1), step(second, 3.0)] == pytest.approx([0.2, 0.4, 0.2])
+    first.start(EpisodeStart(1, 0.1, None))
+    assert [step(first, 5.0), step(second, 3.1)] == pytest.approx([0.2, 0.4])
+    first.close()
+    second.close()

@@ -1,0 +1,83 @@
+"""The intelligent driver model gives the same motion in whatever form it is plugged in."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from harness.campaign.loading import load_campaign
+from harness.runner.prepare import prepare
+from harness.twin import TwinWorld
+
+ROOT = Path(__file__).parents[2]
+EPISODES = 150
+FORMS = {
+    "per vehicle": "{controller: 'examples.idm:IDM'}",
+    "batch": "{controller: 'examples.idm_batch:IDM'}",
+    "TraCI-style": "{controller: 'examples.idm_traci_style:IDM'}",
+    "step listener": "{controller: 'harness.controllers.traci_style:StepListenerController', "
+    "parameters: {listener: 'examples.idm_traci_style:Listener'}}",
+}
+
+
+@pytest.fixture(autouse=True)
+def _in_the_checkout(monkeypatch):
+    monkeypatch.chdir(ROOT)
+
+
+@pytest.fixture(scope="module")
+def fmu(tmp_path_factory):
+    builder = pytest.importorskip("pythonfmu.builder", reason="pythonfmu builds the FMU")
+    folder = tmp_path_factory.mktemp("fmu")
+    return builder.FmuBuilder.build_FMU(
+        ROOT / "examples/idm_fmu.py", dest=folder, project_files=[ROOT / "examples/idm.py"]
+    )
+
+
+def fmu_av(file, more=""):
+    inputs = "{speed_mps: v, lead_speed_mps: v_lead, gap_m: gap}"
+    return f"{{fmu: {{file: '{file}', inputs: {inputs}, output: a}}{more}}}"
+
+
+def run(av, *more, cells=32, first=0, n=EPISODES):
+    overrides = [f"av={av}", "testing={method: forced}", "world.engine=twin", "stop.rhw=null", *more]
+    prepared = prepare(load_campaign(ROOT / "scenarios/smoke.yaml", overrides))
+    loop = prepared.loop(TwinWorld(cells), traces="all")
+    try:
+        return loop.run(first, prepared.states(first, n))
+    finally:
+        loop.close()
+
+
+@pytest.fixture(scope="module")
+def built_in():
+    return run("{model: idm}")
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_every_form_gives_the_bits_of_the_built_in_model(form, built_in):
+    other = run(FORMS[form])
+    assert other.failures == {}
+    assert other.results.episode.tobytes() == built_in.results.episode.tobytes()
+    assert all(other.traces[i].tobytes() == built_in.traces[i].tobytes() for i in range(EPISODES))
+
+
+def test_an_fmu_gives_the_same_motion(fmu, built_in):
+    other = run(fmu_av(fmu))
+    assert other.failures == {}
+    for i in range(EPISODES):
+        np.testing.assert_allclose(other.traces[i], built_in.traces[i], rtol=0, atol=1e-9)
+
+
+def test_start_values_reach_the_fmu_in_every_episode(fmu, built_in):
+    weaker = fmu_av(fmu).replace("output: a", "output: a, start_values: {a_min: -1.5}")
+    other = run(weaker)
+    braking = [other.traces[i][:-1, 2, 2].min() for i in range(EPISODES)]
+    assert min(braking) == -1.5
+    assert min(built_in.traces[i][:-1, 2, 2].min() for i in range(EPISODES)) < -1.5
+
+
+@pytest.mark.parametrize("form", ["per vehicle", "TraCI-style"])
+def test_cells_do_not_change_a_controllers_episodes(form, built_in):
+    other = run(FORMS[form], cells=7)
+    assert other.results.episode.tobytes() == built_in.results.episode.tobytes()

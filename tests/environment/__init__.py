@@ -1,0 +1,1 @@
+"""Tests of the naturalistic environment against scipy, numpy and the formulas written out again."""

@@ -1,0 +1,116 @@
+"""Accelerations of LV and BV: probabilities against the formulas, draws against the probabilities, the guard.
+
+Chi-square tests have fixed seeds and an error probability of 1e-4 each.
+"""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
+
+from harness.maneuvers import ACCELERATIONS_MPS2
+from tests.chains.seed import SEED
+from tests.environment import formulas
+from tests.environment.kernels import car_following, free_driving
+
+speeds = st.floats(0.0, 60.0)
+gaps = st.floats(-0.001, 200.0)
+rates = st.floats(-25.0, 25.0)
+STATES = [
+    (30.0, 35.0, 0.3),
+    (24.0, 12.0, -2.5),
+    (33.0, 4.0, -1.0),
+    (28.0, 60.0, -9.0),
+    (20.0, 110.0, 6.0),
+    (38.0, 8.0, 0.0),
+]
+N_DRAWS = 200_000
+
+
+def chi_square_p(drawn, pmf):
+    """p-value of draws against probabilities; bins with fewer than ten expected draws are pooled."""
+    counts = np.bincount(drawn, minlength=31)
+    expected = pmf * drawn.size
+    rare = expected < 10.0
+    observed = np.append(counts[~rare], counts[rare].sum())
+    wanted = np.append(expected[~rare], expected[rare].sum())
+    used = wanted > 0.0
+    assert observed[~used].sum() == 0
+    return stats.chisquare(observed[used], wanted[used]).pvalue if used.sum() > 1 else 1.0
+
+
+def uniforms_for_draws():
+    return np.random.default_rng(SEED).random(N_DRAWS)
+
+
+def test_the_grid():
+    np.testing.assert_allclose(ACCELERATIONS_MPS2, formulas.ACCELERATIONS, rtol=0, atol=1e-15)
+    assert ACCELERATIONS_MPS2[[0, 20, 30]].tolist() == [-4.0, 0.0, 2.0]
+
+
+def test_braking_shares_in_free_driving():
+    """Check values of the fit at 30 m/s: 5.1e-3 brake with 2 m/s² or more, 2.5e-3 with 3 or more."""
+    pmf = free_driving(30.0)[0][0]
+    assert pmf[ACCELERATIONS_MPS2 <= -2.0].sum() == pytest.approx(5.1e-3, abs=0.05e-3)
+    assert pmf[ACCELERATIONS_MPS2 <= -3.0].sum() == pytest.approx(2.5e-3, abs=0.05e-3)
+
+
+@given(speeds)
+def test_free_driving_probabilities(speed):
+    pmf = free_driving(speed)[0][0]
+    assert pmf.sum() == pytest.approx(1.0, abs=1e-12)
+    assert (pmf >= 0.0).all()
+    np.testing.assert_allclose(pmf, formulas.free_driving_pmf(speed), rtol=0, atol=2e-8)
+
+
+@given(speeds, gaps, rates)
+def test_car_following_probabilities(speed, r1, r1dot):
+    pmf, cap, _ = car_following((speed, r1, r1dot))
+    assert pmf[0].sum() == pytest.approx(1.0, abs=1e-12)
+    assert (pmf >= 0.0).all()
+    np.testing.assert_allclose(pmf[0], formulas.car_following_pmf(speed, r1, r1dot, cap[0]), rtol=0, atol=2e-8)
+    assert (pmf[0, cap[0] + 1 :] == 0.0).all()
+
+
+@given(gaps, rates)
+def test_the_guard_caps_at_the_largest_safe_acceleration(r1, r1dot):
+    assert car_following((30.0, r1, r1dot))[1][0] in formulas.guard_caps(r1, r1dot)
+
+
+def test_the_guard_binds_where_it_should():
+    close, far = (30.0, 3.0, -4.0), (30.0, 80.0, 0.0)
+    _, caps, drawn = car_following([close, far], uniforms_for_draws())
+    assert caps.tolist() == [0, 30]
+    assert (drawn[0] == 0).all()
+    assert np.unique(drawn[1]).size > 10
+
+
+@pytest.mark.parametrize("speed", [15.0, 22.0, 30.0, 38.0, 45.0])
+def test_free_driving_draws_follow_the_probabilities(speed):
+    pmf, drawn = free_driving(speed, uniforms_for_draws())
+    assert chi_square_p(drawn[0], pmf[0]) > 1e-4
+
+
+@pytest.mark.parametrize("state", STATES)
+def test_car_following_draws_follow_the_probabilities(state):
+    pmf, cap, drawn = car_following(state, uniforms_for_draws())
+    assert chi_square_p(drawn[0], pmf[0]) > 1e-4
+    assert drawn.max() <= cap[0]
+
+
+@pytest.mark.parametrize("state", STATES)
+def test_draws_invert_the_distribution(state):
+    """Equal steps of the uniform give every acceleration its probability to within one step."""
+    u = (np.arange(100_000) + 0.5) / 100_000
+    pmf, _, drawn = car_following(state, u)
+    free_pmf, free = free_driving(state[0], u)
+    for probabilities, indices in ((pmf[0], drawn[0]), (free_pmf[0], free[0])):
+        assert (np.diff(indices) >= 0).all()
+        np.testing.assert_allclose(np.bincount(indices, minlength=31) / u.size, probabilities, rtol=0, atol=1.001e-5)
+
+
+def test_the_chi_square_would_notice_another_speed():
+    """The check has teeth: draws at 30 m/s are not those of 31 m/s."""
+    drawn = free_driving(30.0, uniforms_for_draws())[1][0]
+    assert chi_square_p(drawn, free_driving(31.0)[0][0]) < 1e-8

@@ -1,0 +1,1 @@
+"""Tests of whole episodes in the twin: weights, paths, crash rates."""

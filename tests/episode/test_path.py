@@ -1,0 +1,123 @@
+"""The recorded path determines the episode: initial state and maneuvers, replayed in plain Python, give it again.
+
+Bit for bit in positions and speeds, with IDM, motion and clocks written out a second time.
+"""
+
+import math
+
+import numpy as np
+import pytest
+
+from harness.maneuvers import CUT_IN
+from harness.outcomes import BV_LV_CONTACT, CRASH, PASSED, TIMEOUT
+from tests.episode.twin_runs import run
+
+METHODS = {
+    "nde": {"level": 1e6},
+    "forced": {},
+    "step_mixture": {},
+    "episode_mixture": {},
+}
+N = 300
+
+
+def idm(v, v_lead, gap):
+    s = max(gap, 0.1)
+    s_star = 2.0 + max(0.0, v * 1.0 + (v * (v - v_lead)) / (2.0 * math.sqrt(2.0 * 3.0)))
+    r = (v / 40.0) * (v / 40.0)
+    return min(max(2.0 * (1.0 - r * r - (s_star / s) * (s_star / s)), -4.0), 2.0)
+
+
+def moved(x, v, a):
+    after = max(v + a * 0.1, 0.0)
+    change = (after - v) / 0.1 * 0.1
+    if v + change >= 0.0:
+        return x + (v + 0.5 * change) * 0.1, after
+    return x - 0.5 * v * v / change * 0.1, after
+
+
+def replayed(state, lv_path, bv_path, hold):
+    """Motion (steps + 1, 3, 2: x, v), outcome and cut-in step."""
+    v_bv, r1, r1dot, r2, r2dot = state
+    x = [100.0 + 5.0 + r2 + 5.0 + r1, 100.0 + 5.0 + r2, 100.0]
+    v = [max(v_bv + r1dot, 0.0), v_bv, v_bv - r2dot]
+    lv, bv = iter(lv_path), iter(bv_path)
+    upcoming = next(bv)
+    cut_step, motion = -1, [list(zip(x, v, strict=True))]
+    for step in range(200):
+        a_av = idm(v[2], v[1], x[1] - 5.0 - x[2]) if cut_step >= 0 else 0.0
+        if step % hold == 0:
+            a_lv = (next(lv) - 20) / 5.0
+        due = step % hold == 0 if cut_step < 0 else (step - cut_step - 1) % hold == 0
+        if due:
+            a_bv, upcoming = (upcoming - 20) / 5.0, next(bv, None)
+        # The path does not say in which step of a period the cut-in was: the caller hands it over.
+        if upcoming == CUT_IN and cut_step < 0 and (yield step):
+            cut_step, upcoming = step, next(bv, None)
+        moves = [moved(*one) for one in zip(x, v, (a_lv, a_bv, a_av), strict=True)]
+        x, v = [m[0] for m in moves], [m[1] for m in moves]
+        motion.append(list(zip(x, v, strict=True)))
+        outcome = ended(x, cut_step >= 0)
+        if outcome is not None:
+            break
+    else:
+        outcome = TIMEOUT
+    return np.array(motion), outcome, cut_step
+
+
+def ended(x, cut_in):
+    if cut_in:
+        return CRASH if x[1] - 5.0 - x[2] < -0.001 else None
+    if x[0] - 5.0 - x[1] < -0.001:
+        return BV_LV_CONTACT
+    return PASSED if x[1] - 5.0 - x[2] <= 0.0 else None
+
+
+def replay(done, row, hold):
+    """Drive `replayed`, answering its question in which step BV cuts in."""
+    episode = done.episode[row]
+    lv = done.shard.results.lv_path[row, : episode["n_lv"]].tolist()
+    bv = done.shard.results.bv_path[row, : episode["n_bv"]].tolist()
+    steps = replayed(done.shard.states[row].tolist(), lv, bv, hold)
+    answer = None
+    while True:
+        try:
+            answer = steps.send(answer) == episode["cut_in_step"]
+        except StopIteration as end:
+            return end.value
+
+
+@pytest.mark.parametrize("hold_s", [1.0, 0.1])
+@pytest.mark.parametrize("method", METHODS)
+def test_replay_in_plain_python(method, hold_s):
+    done = run(method, n=N, traces="all", hold_s=hold_s, **METHODS[method])
+    seen = set()
+    for row in range(N):
+        motion, outcome, cut_step = replay(done, row, round(hold_s * 10))
+        trace = done.shard.traces[row]
+        np.testing.assert_array_equal(trace[:, :, :2], motion)
+        assert outcome == done.episode["outcome"][row]
+        assert cut_step == done.episode["cut_in_step"][row]
+        assert len(motion) == done.episode["n_steps"][row] + 1
+        seen.add(outcome)
+    assert CRASH in seen
+    assert len(seen) > 1
+
+
+def test_a_path_with_one_other_maneuver_would_be_noticed():
+    done = run("forced", n=N, traces="all")
+    row = int(np.flatnonzero(done.episode["n_steps"] > 20)[0])
+    path = done.shard.results.lv_path[row]
+    path[0] += 1
+    try:
+        assert not np.array_equal(done.shard.traces[row][:, :, :2], replay(done, row, 10)[0])
+    finally:
+        path[0] -= 1
+
+
+def test_crash_time_and_impact_speed():
+    done = run("forced", n=N, traces="all")
+    for row in np.flatnonzero(done.crash):
+        last = done.shard.traces[row][-1]
+        assert done.episode["impact_speed_mps"][row] == last[2, 1] - last[1, 1]
+        assert done.episode["crash_time_s"][row] == pytest.approx(0.1 * done.episode["n_steps"][row])

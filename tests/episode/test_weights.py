@@ -1,0 +1,155 @@
+"""Weights of whole episodes: bounds, closed forms, means that are known; default level, IDM as the AV.
+
+Means are asked for within four standard errors, with bounded weights only (forced cut-in, defensive episode mixture).
+For the step mixture the mean weight is a diagnostic and never a test: it is 0.03 for published NADE at 4e5 episodes.
+"""
+
+import numpy as np
+import pytest
+from scipy.special import logsumexp
+
+from harness.maneuvers import CUT_IN
+from tests.episode.twin_runs import SEED, Mean, run
+
+N = 30_000
+ALL = {"n": 4_000, "moments": "all"}
+
+
+def mixture(**settings):
+    return run("episode_mixture", **{"n": N, **settings})
+
+
+def log(x):
+    with np.errstate(divide="ignore"):
+        return np.log(x)
+
+
+def test_no_weight_exceeds_the_known_bound():
+    """Y ≤ P(cut-in | path)/α_0, whatever the AV does."""
+    for av in ("idm", "never_brakes"):
+        done = mixture(av=av, n=10_000)
+        bound = np.exp(done.episode["log_p_cut_in"]) / done.alpha[0]
+        assert done.crash.sum() > 5_000
+        assert (done.y <= bound * (1.0 + 1e-12)).all()
+
+
+def test_the_forced_component_in_closed_form():
+    """Its ratio q/p is 1/P(cut-in | path) for paths with a cut-in and 0 for the others."""
+    done = mixture()
+    np.testing.assert_allclose(
+        done.log_q[done.cut_in, 0], -done.episode["log_p_cut_in"][done.cut_in], rtol=0, atol=1e-12
+    )
+    assert np.isneginf(done.log_q[~done.cut_in, 0]).all()
+    assert 100 < (~done.cut_in).sum() < done.cut_in.sum()
+    assert done.cut_in[done.episode["component"] == 0].all()
+
+
+def test_the_weight_is_that_of_the_mixture_over_whole_episodes():
+    done = mixture()
+    np.testing.assert_allclose(done.log_weight, -logsumexp(done.log_q, b=done.alpha, axis=1), rtol=0, atol=1e-12)
+
+
+def test_components_are_drawn_by_their_weights():
+    done = mixture()
+    counts = np.bincount(done.episode["component"], minlength=4)
+    assert (np.abs(counts - N * done.alpha) < 4.0 * np.sqrt(N * done.alpha)).all()
+
+
+@pytest.mark.parametrize("challenge", ["immediate", "recursive"])
+def test_moments_of_the_step_mixture_multiply_to_its_weights(challenge):
+    done = run("step_mixture", challenge, **ALL)
+    assert (np.bincount(done.moment["row"], minlength=4_000) == done.episode["n_control_steps"]).all()
+    sampled = done.summed(log(done.moment["q_sampled"]) - log(done.moment["p"]))
+    np.testing.assert_allclose(done.log_weight, -sampled, rtol=0, atol=1e-10)
+    each = done.summed(log(done.moment_q) - log(done.moment["p"])[:, None])
+    np.testing.assert_allclose(done.log_q, each, rtol=0, atol=1e-10)
+
+
+def fully_recorded(done):
+    """Episodes whose every step before the cut-in was critical.
+
+    In the others the forced cut-in, which acts in every step, changes the weight in steps that are no control steps.
+    """
+    before = done.moment["maneuver"] >= CUT_IN
+    steps = np.where(done.cut_in, done.episode["cut_in_step"] + 1, done.episode["n_steps"])
+    return np.bincount(done.moment["row"][before], minlength=len(steps)) == steps
+
+
+def test_moments_of_the_episode_mixture_multiply_to_its_weights():
+    done = run("episode_mixture", **ALL)
+    each = done.summed(log(done.moment_q) - log(done.moment["p"])[:, None])
+    np.testing.assert_allclose(done.log_q[:, 1:], each, rtol=0, atol=1e-10)
+    whole = fully_recorded(done)
+    assert whole.mean() > 0.95
+    sampled = done.summed(log(done.moment["q_sampled"]) - log(done.moment["p"]))
+    np.testing.assert_allclose(done.log_weight[whole], -sampled[whole], rtol=0, atol=1e-10)
+
+
+def test_mean_weight_of_cut_ins_is_their_probability():
+    """E_q[W 1{cut-in}] = P(cut-in), the latter from the paths of other episodes (their closed forms averaged)."""
+    done, other = mixture(), run("forced", n=100_000, seed=SEED + 1)
+    probability = Mean.of(np.exp(other.episode["log_p_cut_in"]))
+    assert Mean.of(done.weight * done.cut_in).errors_from(probability) < 4.0
+    assert 2.5e-5 < probability.value < 3.3e-5
+
+
+def test_mean_ratio_of_every_component_is_one():
+    done = mixture()
+    for j in range(done.alpha.size):
+        assert Mean.of(np.exp(done.log_q[:, j] + done.log_weight)).errors_from(1.0) < 4.0
+
+
+@pytest.mark.parametrize("method", ["step_mixture", "episode_mixture"])
+def test_martingale_sums_have_mean_zero(method):
+    martingale = run(method, n=N).shard.results.martingale
+    for j in range(3):
+        assert np.abs(martingale[:, j]).max() > 0.0
+        assert Mean.of(martingale[:, j]).errors_from(0.0) < 4.0
+
+
+def test_forced_episodes_weigh_what_their_path_says():
+    done = run("forced", n=100_000)
+    assert done.cut_in.all()
+    np.testing.assert_array_equal(done.log_weight, done.episode["log_p_cut_in"])
+    np.testing.assert_allclose(done.log_q[:, 0], -done.log_weight, rtol=0, atol=1e-12)
+
+
+def test_without_control_the_weight_is_exactly_one():
+    assert (run("nde", n=400_000).log_weight == 0.0).all()
+    published = run("step_mixture", "immediate", n=4_000, moments="all")
+    uncritical = published.episode["n_control_steps"] == 0
+    assert uncritical.sum() > 20
+    assert (published.log_weight[uncritical] == 0.0).all()
+    blind = run("step_mixture", n=4_000, threshold=0.999999)
+    uncritical = blind.episode["n_control_steps"] == 0
+    assert uncritical.mean() > 0.99
+    assert (blind.log_weight[uncritical] == 0.0).all()
+
+
+# The same checks, against what is deliberately wrong.
+
+
+def test_fixed_weights_instead_of_predictive_ones_would_be_noticed():
+    """Σ_t log Σ_j α_j r_j,t with α in every step, as for the step mixture, is not the weight of the episode mixture."""
+    done = run("episode_mixture", **ALL)
+    whole = fully_recorded(done) & ~done.cut_in
+    ratio = done.moment_q / done.moment["p"][:, None]
+    share = done.alpha[1:] / done.alpha[1:].sum()
+    wrong = -done.summed(np.log(ratio @ share))
+    right = -logsumexp(done.log_q[:, 1:], b=share, axis=1)
+    assert np.abs(wrong - right)[whole].max() > 0.5
+    for j, alpha in enumerate(share):
+        assert (done.log_q[:, 1 + j] + right <= -np.log(alpha) + 1e-12).all()
+        assert (done.log_q[:, 1 + j] + wrong).max() > -np.log(alpha) + 0.5
+
+
+def test_the_drawn_components_own_ratio_would_be_noticed():
+    """Weighing by p/q_drawn is also unbiased, but not bounded: Y exceeds P(cut-in | path)/α_0."""
+    done = mixture(n=10_000, av="never_brakes")
+    drawn = done.log_q[np.arange(len(done.episode)), done.episode["component"]]
+    y = np.where(done.crash, np.exp(-drawn), 0.0)
+    assert (y > np.exp(done.episode["log_p_cut_in"]) / done.alpha[0]).any()
+
+
+def test_dropped_ratios_would_be_noticed():
+    assert Mean.of(mixture().cut_in * 1.0).errors_from(2.9e-5) > 100.0

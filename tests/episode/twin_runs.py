@@ -1,0 +1,167 @@
+"""Campaigns run in the twin, shared by all tests of a session: whoever asks for the same run gets the same object."""
+
+from dataclasses import dataclass
+from functools import cache, cached_property
+
+import numpy as np
+
+from harness.campaign.models import (
+    FVDM,
+    IDM,
+    AutomatedVehicle,
+    Campaign,
+    Environment,
+    FVDMParameters,
+    IDMParameters,
+    Records,
+    Testing,
+)
+from harness.episode.loop import Shard
+from harness.outcomes import CRASH
+from harness.runner.prepare import Prepared, prepare
+from harness.twin import TwinWorld
+from tests.chains.seed import SEED
+
+CELLS = 512
+AVS = {
+    "idm": AutomatedVehicle(),
+    "never_brakes": AutomatedVehicle(parameters=IDMParameters(min_acceleration_mps2=-0.0)),
+    "SM-II": AutomatedVehicle(model="fvdm", parameters=FVDMParameters(min_acceleration_mps2=-1.0)),
+    "SM-III": AutomatedVehicle(model="fvdm", parameters=FVDMParameters(min_acceleration_mps2=-6.0)),
+}
+SURROGATES = {
+    "default": Campaign(name="default").surrogates,
+    "SM-I": {"SM-I": IDM(model="idm")},
+    "SM-III": {"SM-III": FVDM(model="fvdm", parameters=FVDMParameters(min_acceleration_mps2=-6.0))},
+}
+
+
+def campaign(
+    method: str,
+    challenge: str = "recursive",
+    *,
+    level: float = 1.0,
+    hold_s: float = 1.0,
+    av: str = "idm",
+    surrogates: str = "default",
+    epsilon: float = 0.1,
+    threshold: float = 0.0,
+    moments: str = "none",
+    seed: int = SEED,
+) -> Campaign:
+    return Campaign(
+        name="test",
+        seed=seed,
+        environment=Environment(lane_change_level=level, acceleration_hold_s=hold_s),
+        av=AVS[av],
+        surrogates=SURROGATES[surrogates],
+        testing=Testing(method=method, challenge=challenge, epsilon=epsilon, criticality_threshold=threshold),
+        records=Records(moments=moments),
+    )
+
+
+def prepared(method: str, challenge: str = "recursive", **settings) -> Prepared:
+    return _prepared(method, challenge, tuple(sorted(settings.items())))
+
+
+@cache
+def _prepared(method, challenge, settings) -> Prepared:
+    return prepare(campaign(method, challenge, **dict(settings)))
+
+
+@dataclass(frozen=True)
+class Mean:
+    """A sample mean and its standard error."""
+
+    value: float
+    std_error: float
+
+    @classmethod
+    def of(cls, sample) -> "Mean":
+        return cls(float(np.mean(sample)), float(np.std(sample, ddof=1) / np.sqrt(len(sample))))
+
+    def errors_from(self, other) -> float:
+        """Distance in standard errors, of the difference if the other is a sample mean too."""
+        if isinstance(other, Mean):
+            return abs(self.value - other.value) / float(np.hypot(self.std_error, other.std_error))
+        return abs(self.value - other) / self.std_error
+
+
+@dataclass(frozen=True)
+class Run:
+    """Episodes 0 … n − 1 of a campaign, and what tests ask of them."""
+
+    prepared: Prepared
+    shard: Shard
+
+    @cached_property
+    def episode(self):
+        return self.shard.results.episode
+
+    @property
+    def log_weight(self):
+        return self.episode["log_weight"]
+
+    @property
+    def log_q(self):
+        return self.shard.results.log_q
+
+    @cached_property
+    def weight(self):
+        return np.exp(self.log_weight)
+
+    @property
+    def crash(self):
+        return self.episode["outcome"] == CRASH
+
+    @property
+    def cut_in(self):
+        return self.episode["cut_in_step"] >= 0
+
+    @cached_property
+    def y(self):
+        return np.where(self.crash, self.weight, 0.0)
+
+    @property
+    def rate(self) -> Mean:
+        return Mean.of(self.y)
+
+    @property
+    def alpha(self):
+        return self.prepared.policy.importance.alpha
+
+    @cached_property
+    def moment_order(self):
+        moment = self.shard.results.moment[: self.shard.results.moment_count[0]]
+        return np.lexsort((moment["step"], moment["row"]))
+
+    @cached_property
+    def moment(self):
+        """Control steps (m,), by episode and step."""
+        return self.shard.results.moment[self.moment_order]
+
+    @cached_property
+    def moment_q(self):
+        return self.shard.results.moment_q[self.moment_order]
+
+    @cached_property
+    def moment_v(self):
+        return self.shard.results.moment_v[self.moment_order]
+
+    def summed(self, per_moment):
+        """Per episode the sum over its control steps (m,) or (m, J)."""
+        out = np.zeros((len(self.episode), *per_moment.shape[1:]))
+        np.add.at(out, self.moment["row"], per_moment)
+        return out
+
+
+def run(method: str, challenge: str = "recursive", *, n: int, traces: str = "none", **settings) -> Run:
+    """The first n episodes of a campaign; the keys of ``settings`` are those of `campaign`."""
+    return _run(method, challenge, n, traces, tuple(sorted(settings.items())))
+
+
+@cache
+def _run(method, challenge, n, traces, settings) -> Run:
+    ready = prepared(method, challenge, **dict(settings))
+    loop = ready.loop(TwinWorld(CELLS), traces=traces)
+    return Run(ready, loop.run(0, ready.states(0, n)))

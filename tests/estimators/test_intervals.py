@@ -1,0 +1,55 @@
+"""Intervals against scipy and by exact enumeration of their coverage."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.stats import binom, binomtest
+
+from harness.estimators.intervals import capped_mean_upper, clopper_pearson, clopper_pearson_upper
+
+levels = st.floats(0.5, 0.999)
+
+
+@given(st.integers(0, 60), st.integers(1, 60), levels)
+def test_clopper_pearson_is_scipys_exact_interval(n_crashes, n, confidence):
+    n = max(n, n_crashes)
+    low, high = clopper_pearson(n_crashes, n, confidence)
+    reference = binomtest(n_crashes, n).proportion_ci(confidence, method="exact")
+    assert low == pytest.approx(reference.low, rel=1e-9, abs=1e-12)
+    assert high == pytest.approx(reference.high, rel=1e-9)
+
+
+@given(st.integers(1, 10**9), levels, st.floats(1e-12, 1.0))
+def test_without_a_crash_the_capped_bound_is_clopper_pearson_times_the_cap(n, confidence, cap):
+    expected = cap * clopper_pearson_upper(0, n, confidence)
+    assert capped_mean_upper(0.0, cap, n, confidence) == pytest.approx(expected, rel=1e-12)
+    assert clopper_pearson_upper(0, n, confidence) == pytest.approx(1.0 - (1.0 - confidence) ** (1.0 / n), abs=1e-15)
+
+
+@given(st.floats(1e-12, 1.0), st.floats(0.0, 1.0), st.integers(1, 10**9), levels)
+def test_the_capped_bound_solves_hoeffdings_equation(cap, share, n, confidence):
+    upper = capped_mean_upper(share * cap, cap, n, confidence)
+    assert share * cap * (1.0 - 1e-12) <= upper <= cap * (1.0 + 1e-12)
+    p = upper / cap
+    if 1e-9 < share < 0.999 and p < 0.999 and share * n > 1e-3:
+        entropy = share * math.log(share / p) + (1 - share) * (math.log1p(-share) - math.log1p(-p))
+        assert n * entropy == pytest.approx(-math.log(1.0 - confidence), rel=1e-3)
+
+
+@pytest.mark.parametrize("p", [0.003, 0.05, 0.4])
+@pytest.mark.parametrize("n", [10, 200])
+def test_the_capped_bound_holds_at_its_level_for_the_hardest_case(p, n):
+    """Y is 0 or the cap: the exact probability that the bound fails, summed over all counts."""
+    cap, confidence = 3e-4, 0.9
+    counts = np.arange(n + 1)
+    bounds = np.array([capped_mean_upper(cap * c / n, cap, n, confidence) for c in counts])
+    assert binom.pmf(counts[bounds < cap * p], n, p).sum() <= 1.0 - confidence
+
+
+def test_an_unknown_cap_leaves_only_the_trivial_bound():
+    assert capped_mean_upper(1e-6, math.inf, 10**6, 0.9) == 1.0

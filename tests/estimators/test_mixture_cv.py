@@ -1,0 +1,82 @@
+"""Control variates against an ordinary least-squares solver with explicit columns."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from harness.estimators.mixture_cv import MixtureCv
+from tests.chains.library import panel
+from tests.chains.sampler import blocks, draw
+from tests.chains.seed import SEED
+
+from .small_blocks import block
+
+CHAIN = panel()[0]
+
+
+def feed(parts) -> MixtureCv:
+    state = MixtureCv()
+    for part in parts:
+        state.add(part)
+    return state
+
+
+def reference(parts) -> tuple[float, float]:
+    """Intercept and its standard error, with one column left out instead of an SVD."""
+    y = np.concatenate([part.weighted_crashes() for part in parts])
+    h = np.concatenate([part.mixture_ratios() for part in parts])[:, 1:] - 1.0
+    x = np.column_stack([np.ones(len(y)), h])
+    coefficients, residual, rank, _ = np.linalg.lstsq(x, y, rcond=None)
+    assert rank == x.shape[1]
+    variance = residual[0] / (len(y) - rank) * np.linalg.inv(x.T @ x)[0, 0]
+    return float(coefficients[0]), float(np.sqrt(variance))
+
+
+def test_is_the_intercept_of_least_squares():
+    parts = list(blocks(CHAIN, "episode_mixture", [4_000, 1_000, 3_000], SEED))
+    estimate = feed(parts).result(0.9)
+    rate, std_error = reference(parts)
+    assert estimate.crash_rate == pytest.approx(rate, rel=1e-11)
+    assert estimate.std_error == pytest.approx(std_error, rel=1e-9)
+    assert estimate.details["rank"] == len(parts[0].alpha)
+    assert estimate.crash_rate != estimate.details["plain_mean"]
+
+
+def test_merged_states_agree_with_one_pass():
+    parts = list(blocks(CHAIN, "episode_mixture", [3_000, 2_000, 1_000], SEED))
+    whole = feed(parts).result(0.9)
+    head, tail = feed(parts[:1]), feed(parts[1:2])
+    tail.merge(feed(parts[2:]))
+    head.merge(tail)
+    backwards = feed(parts[::-1]).result(0.9)
+    for other in (head.result(0.9), backwards):
+        assert other.crash_rate == pytest.approx(whole.crash_rate, rel=1e-10)
+        assert other.std_error == pytest.approx(whole.std_error, rel=1e-10)
+        assert other.n_effective == whole.n_effective
+
+
+def test_control_that_never_acted_leaves_the_plain_mean():
+    state = feed([block([True, False, False, True], method="episode_mixture", weight_cap=1.0)])
+    estimate = state.result(0.9)
+    assert estimate.crash_rate == pytest.approx(0.5, rel=1e-14)
+    assert estimate.details["rank"] == 1
+    assert estimate.std_error == pytest.approx(np.std([1, 0, 0, 1], ddof=1) / 2.0, rel=1e-12)
+
+
+def test_fewer_tests_than_columns_claim_no_precision():
+    one = draw(CHAIN, "episode_mixture", 1, np.random.default_rng(SEED))
+    assert feed([one]).result(0.9).std_error == np.inf
+
+
+def test_a_component_that_cannot_draw_an_episode_counts_minus_one():
+    part = draw(CHAIN, "episode_mixture", 500, np.random.default_rng(SEED))
+    assert np.all(part.mixture_ratios()[~part.cut_in, 0] == 0.0)
+    assert np.isfinite(feed([part]).result(0.9).crash_rate)
+
+
+@pytest.mark.parametrize("method", ["nde", "forced", "step_mixture"])
+def test_other_methods_are_refused_with_the_reason(method):
+    reason = MixtureCv.refusal(block([True], method=method))
+    assert reason is not None
+    assert "episode mixture" in reason

@@ -1,0 +1,125 @@
+"""Plain means: identities, failed episodes both ways, what is said when little is known."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from harness.estimators.nade import Nade
+from harness.estimators.nde import Nde
+
+from .small_blocks import block
+
+
+def nade(*blocks) -> Nade:
+    state = Nade()
+    for each in blocks:
+        state.add(each)
+    return state
+
+
+outcomes = st.lists(st.booleans(), min_size=1, max_size=50)
+weighted = st.lists(st.tuples(st.booleans(), st.floats(-40.0, 3.0)), min_size=1, max_size=40)
+
+
+def as_block(rows, **settings):
+    return block([c for c, _ in rows], [w for _, w in rows], **settings)
+
+
+@given(outcomes)
+def test_without_control_nade_is_the_share_of_crashes(crash):
+    plain = Nde()
+    plain.add(block(crash, method="nde", weight_cap=1.0))
+    weighted_mean = nade(block(crash, method="nde", weight_cap=1.0)).result(0.9)
+    assert weighted_mean.crash_rate == plain.result(0.9).crash_rate == np.mean(crash)
+
+
+@given(weighted, weighted, weighted)
+def test_merging_in_any_grouping_and_order_gives_the_same_bits(a, b, c):
+    one = nade(as_block(a), as_block(b), as_block(c)).result(0.9)
+    left, right = nade(as_block(a)), nade(as_block(b))
+    right.merge(nade(as_block(c)))
+    left.merge(right)
+    assert left.result(0.9) == one
+    assert nade(as_block(c), as_block(a), as_block(b)).result(0.9) == one
+    assert nade(as_block(a + b + c)).result(0.9) == one
+
+
+@given(weighted)
+def test_is_the_mean_with_its_standard_error(rows):
+    estimate = nade(as_block(rows)).result(0.9)
+    y = np.array([math.exp(w) if c else 0.0 for c, w in rows])
+    assert estimate.crash_rate == pytest.approx(y.mean(), rel=1e-12)
+    if len(y) > 1 and y.any():
+        assert estimate.std_error == pytest.approx(y.std(ddof=1) / math.sqrt(len(y)), rel=1e-6, abs=1e-9 * y.mean())
+        assert estimate.n_effective == pytest.approx(y.sum() ** 2 / (y**2).sum(), rel=1e-9)
+        assert estimate.largest_weight_share == pytest.approx(y.max() / y.sum(), rel=1e-12)
+
+
+def test_failed_episodes_count_both_ways():
+    some = block([True, False, False, False], [-2.0, 0.0, -1.0, 0.0], failed=[False, False, True, False])
+    estimate = nade(some).result(0.9)
+    assert estimate.crash_rate == pytest.approx(math.exp(-2.0) / 4)
+    assert estimate.details["crash_rate_if_failed_had_crashed"] == pytest.approx((math.exp(-2) + math.exp(-1)) / 4)
+    assert any("1 of 4 episodes failed" in warning for warning in estimate.warnings)
+
+
+def test_no_crash_still_gives_an_upper_bound_and_an_interval():
+    estimate = nade(block([False] * 100, method="forced", weight_cap=3e-4)).result(0.9)
+    assert (estimate.crash_rate, estimate.ci_low) == (0.0, 0.0)
+    assert estimate.upper_bound == pytest.approx(3e-4 * (1 - 0.1 ** (1 / 100)))
+    assert estimate.ci_high == pytest.approx(3e-4 * (1 - 0.05 ** (1 / 100)))
+    assert estimate.rhw == math.inf
+    assert estimate.to_json()["rhw"] is None
+
+
+def test_the_cap_comes_from_the_design_then_from_the_paths_then_from_weights():
+    paths = np.log([1e-3, 2e-3])
+    known = nade(block([True, False], [-7.0, 0.0], method="forced", weight_cap=5e-3, log_p_cut_in=paths))
+    driven = nade(block([True, False], [-7.0, 0.0], method="forced", log_p_cut_in=paths))
+    seen = nade(block([True, False], [-7.0, 0.0], method="step_mixture"))
+    assert known.sums.cap() == (5e-3, "the weight cap known by design")
+    assert driven.sums.cap()[0] == pytest.approx(2e-3)
+    assert seen.sums.cap()[0] == pytest.approx(math.exp(-7.0))
+    assert not any("upper bound rests" in w for w in known.result(0.9).warnings)
+    for unknown in (driven, seen):
+        assert any("upper bound rests" in w for w in unknown.result(0.9).warnings)
+        assert unknown.sums.cap()[1] in unknown.result(0.9).method
+
+
+def test_the_episode_mixture_divides_the_paths_cap_by_the_defensive_share():
+    state = nade(
+        block([True], [-7.0], method="episode_mixture", alpha=np.array([0.1, 0.9]), log_p_cut_in=np.log([1e-3]))
+    )
+    assert state.sums.cap()[0] == pytest.approx(1e-2)
+
+
+def test_a_weight_above_the_designs_cap_is_an_alarm():
+    estimate = nade(block([True] * 60, [0.0] * 60, method="forced", weight_cap=1e-3)).result(0.9)
+    assert any("contradict the campaign" in warning for warning in estimate.warnings)
+
+
+def test_what_a_user_must_be_told():
+    estimate = nade(block([True] * 60, [0.0] + [-9.0] * 59)).result(0.9)
+    text = " ".join(estimate.warnings)
+    assert "effective sample size" in text
+    assert "one crash carries" in text
+    assert "step mixture are not bounded" in text
+    assert "crashes were sampled" not in text
+    assert "only 3 crashes" in " ".join(nade(block([True] * 3)).result(0.9).warnings)
+    assert not nade(block([True] * 60, method="nde", weight_cap=1.0)).result(0.9).warnings
+
+
+def test_nde_is_for_naturalistic_tests_only():
+    assert Nde.refusal(block([True], method="nde")) is None
+    assert "step_mixture" in (Nde.refusal(block([True])) or "")
+
+
+def test_nothing_gives_no_estimate():
+    for state in (Nade(), Nde()):
+        with pytest.raises(ValueError, match="at least one episode"):
+            state.result(0.9)

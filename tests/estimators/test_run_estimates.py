@@ -1,0 +1,135 @@
+"""The whole way from a run folder to the content of ``estimates.json``."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from harness.errors import HarnessError, RunFolderError
+from harness.estimators import CampaignFacts, estimate_blocks, estimate_run
+from tests.chains.library import overtaking
+from tests.chains.sampler import blocks
+from tests.chains.seed import SEED
+
+from .run_folder import write_run
+from .small_blocks import block
+
+CHAIN = overtaking("two surrogates", skill=0.5, surrogates=[0.5, 0.2], level=0.02, horizon=6)
+SIZES = [600, 600, 300]
+KEYS = {
+    "campaign",
+    "campaign_hash",
+    "lane_change_level",
+    "confidence",
+    "n_episodes",
+    "n_crashes",
+    "headline",
+    "distance_per_test_km",
+    "crash_rate_per_1e6_km",
+    "estimates",
+    "diagnostics",
+    "convergence",
+    "statement",
+    "scope",
+}
+
+
+def drawn(method: str):
+    return list(blocks(CHAIN, method, SIZES, SEED))
+
+
+def facts(**settings) -> CampaignFacts:
+    return CampaignFacts("chain", "c0ffee", 3.0, **{"confidence": 0.8, **settings})
+
+
+@pytest.mark.parametrize(
+    ("method", "headline", "importance"),
+    [
+        ("nde", "nde", []),
+        ("forced", "nade", []),
+        ("step_mixture", "nade", ["one", "two"]),
+        ("episode_mixture", "mixture_cv", ["forced", "one", "two"]),
+    ],
+)
+def test_a_stored_run_gives_what_blocks_in_memory_give(tmp_path, method, headline, importance):
+    parts = drawn(method)
+    cap = None if method == "step_mixture" else parts[0].weight_cap
+    folder = write_run(tmp_path, parts, distance_per_test_m=400.0, weight_cap=cap)
+    content = estimate_run(folder)
+    assert set(content) == KEYS
+    assert content["headline"] == headline
+    assert content["n_episodes"] == sum(SIZES)
+    assert content["confidence"] == 0.8
+    assert content["lane_change_level"] == 3.0
+    assert list(content["diagnostics"]["mean_ratio"]) == importance
+    memory = estimate_blocks(parts, facts(distance_per_test_m=400.0, importance_names=tuple(importance)))
+    if method == "step_mixture":  # q was stored, q/q_sampled is divided again: one rounding in the regression
+        memory["estimates"].pop("scv")
+        content["estimates"].pop("scv")
+    assert json.loads(json.dumps(content, allow_nan=False)) == memory
+
+
+def test_rates_per_distance_scale_with_the_distance_of_a_test(tmp_path):
+    content = estimate_run(write_run(tmp_path, drawn("forced"), distance_per_test_m=400.0))
+    rate = content["estimates"]["nade"]["crash_rate"]
+    assert content["distance_per_test_km"] == 0.4
+    assert content["crash_rate_per_1e6_km"]["rate"] == pytest.approx(rate / 0.4 * 1e6)
+    assert "per 1e6 km" in content["statement"]
+    assert "lane-change level 3" in content["statement"]
+    assert "not about how well the environment matches the road" in content["scope"]
+
+
+def test_an_unknown_distance_says_nothing_per_kilometre(tmp_path):
+    content = estimate_run(write_run(tmp_path, drawn("forced")))
+    assert content["crash_rate_per_1e6_km"] is None
+    assert "km" not in content["statement"]
+
+
+def test_without_a_crash_the_statement_gives_the_upper_bound():
+    content = estimate_blocks(
+        [block([False] * 200, method="forced", weight_cap=1e-4)], facts(distance_per_test_m=400.0)
+    )
+    upper = content["estimates"]["nade"]["upper_bound"]
+    assert f"below {upper:.3g} per test" in content["statement"]
+    assert f"{upper / 0.4 * 1e6:.3g} per 1e6 km" in content["statement"]
+    assert content["convergence"][-1]["rhw"] is None
+
+
+def test_estimators_that_the_records_do_not_allow_are_there_with_the_reason(tmp_path):
+    content = estimate_run(write_run(tmp_path, drawn("step_mixture"), with_moments=False))
+    assert content["estimates"]["scv"]["crash_rate"] is None
+    assert "records.moments" in content["estimates"]["scv"]["reason"]
+    assert content["estimates"]["nde"]["crash_rate"] is None
+
+
+def test_only_asked_estimators_and_the_headline_are_reported(tmp_path):
+    folder = write_run(tmp_path, drawn("step_mixture"))
+    assert set(estimate_run(folder, estimators=["scv"])["estimates"]) == {"nade", "scv"}
+    wider = estimate_run(folder, confidence=0.99)["estimates"]["nade"]
+    narrow = estimate_run(folder)["estimates"]["nade"]
+    assert wider["confidence"] == 0.99
+    assert wider["ci_high"] > narrow["ci_high"]
+
+
+def test_only_the_prefix_that_counts_is_estimated(tmp_path):
+    content = estimate_run(write_run(tmp_path, drawn("forced"), n_episodes=700))
+    assert content["n_episodes"] == 700
+    assert content["convergence"][-1]["n"] == 700
+
+
+def test_missing_episodes_are_an_error(tmp_path):
+    folder = write_run(tmp_path, drawn("forced"), n_episodes=5_000)
+    with pytest.raises(RunFolderError, match="1500 episodes on record"):
+        estimate_run(folder)
+
+
+def test_a_shard_missing_in_between_is_an_error(tmp_path):
+    parts = drawn("forced")
+    with pytest.raises(RunFolderError, match="begins at episode 1200"):
+        estimate_run(write_run(tmp_path, [parts[0], parts[2]]))
+
+
+def test_a_folder_that_is_no_run_is_an_error(tmp_path):
+    with pytest.raises(HarnessError, match=r"manifest\.json"):
+        estimate_run(tmp_path)

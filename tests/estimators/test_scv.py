@@ -1,0 +1,154 @@
+"""The published estimator: equal to an independent solution, equal to nade, and warned of."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+
+from harness.estimators.nade import Nade
+from harness.estimators.scv import WARNING, Scv
+from harness.estimators.scv_columns import n_columns, product_columns, steps_used
+from harness.estimators.scv_stratum import CHUNK_ROWS, Stratum
+from tests.chains.library import frequent_decisive, overtaking, panel
+from tests.chains.sampler import blocks
+from tests.chains.seed import SEED
+
+from .scv_reference import algorithm_1
+from .small_blocks import block
+
+SMALL = overtaking("short", skill=0.5, surrogates=[0.5, 0.2, 0.8], level=0.02, horizon=5)
+
+
+def feed(parts, **settings) -> Scv:
+    state = Scv(**settings)
+    for part in parts:
+        state.add(part)
+    return state
+
+
+@pytest.mark.parametrize(
+    ("chain", "basis"),
+    [(SMALL, "reduced"), (SMALL, "full"), (frequent_decisive(), "reduced"), (panel()[1], "reduced")],
+    ids=["reduced", "full", "decisive", "two surrogates"],
+)
+def test_equals_an_independently_solved_regression_and_nade(chain, basis):
+    parts = list(blocks(chain, "step_mixture", [5_000, 2_000], SEED))
+    estimate = feed(parts, basis=basis).result(0.9)
+    rate, var_z, strata = algorithm_1(parts, chain.n_surrogates - (basis == "reduced"))
+    plain = Nade()
+    for part in parts:
+        plain.add(part)
+    nade = plain.result(0.9)
+    assert rate == pytest.approx(nade.crash_rate, rel=1e-12)
+    assert estimate.crash_rate == pytest.approx(nade.crash_rate, rel=1e-12)
+    assert estimate.details["var_z"] == pytest.approx(var_z, rel=1e-8)
+    assert estimate.details["nade_std_error"] == pytest.approx(nade.std_error, rel=1e-12)
+    found = {s["n_control_steps"]: (s["n"], s["columns"], s["rank"]) for s in estimate.details["strata"]}
+    assert {level: fit[:2] for level, fit in found.items()} == {level: fit[:2] for level, fit in strata.items()}
+    assert all(abs(found[level][2] - strata[level][2]) <= 1 for level in found)
+
+
+def test_the_claimed_variance_is_below_nades_by_the_fit_alone():
+    estimate = feed(blocks(SMALL, "step_mixture", [5_000], SEED)).result(0.9)
+    assert estimate.details["var_z"] < estimate.details["var_y"]
+    assert estimate.std_error < estimate.details["nade_std_error"]
+
+
+def test_always_carries_its_warning():
+    assert WARNING in feed(blocks(SMALL, "step_mixture", [100], SEED)).result(0.9).warnings
+
+
+def test_blocks_in_index_order_give_the_same_bits_however_they_are_cut():
+    (whole,) = blocks(SMALL, "step_mixture", [3 * CHUNK_ROWS], SEED)
+    cuts = [0, 7, 1_000, CHUNK_ROWS, CHUNK_ROWS + 1, 3 * CHUNK_ROWS]
+    parts = [whole.take(slice(a, b)) for a, b in itertools.pairwise(cuts)]
+    assert feed([whole]).result(0.9) == feed(parts).result(0.9)
+
+
+def test_merged_states_agree_with_one_pass():
+    parts = list(blocks(SMALL, "step_mixture", [9_000, 8_000, 1_000], SEED))
+    whole = feed(parts).result(0.9)
+    head, tail = feed(parts[:1]), feed(parts[1:2])
+    tail.merge(feed(parts[2:]))
+    head.merge(tail)
+    for other in (head.result(0.9), feed(parts[::-1]).result(0.9)):
+        assert other.crash_rate == pytest.approx(whole.crash_rate, rel=1e-12)
+        assert other.std_error == pytest.approx(whole.std_error, rel=1e-8)
+
+
+def test_asking_leaves_the_state_as_it_is():
+    parts = list(blocks(SMALL, "step_mixture", [3_000, 3_000], SEED))
+    asked = feed(parts[:1])
+    asked.result(0.9)
+    asked.add(parts[1])
+    assert asked.result(0.9) == feed(parts).result(0.9)
+
+
+def test_more_than_nine_control_steps_keep_their_stratum_and_use_nine():
+    parts = list(blocks(panel()[1], "step_mixture", [2_000], SEED))
+    strata = {s["n_control_steps"]: s for s in feed(parts, basis="full").result(0.9).details["strata"]}
+    assert max(strata) > 9
+    assert strata[max(strata)]["columns"] == 2**9
+
+
+def test_fewer_episodes_than_columns_leave_no_residual_but_the_same_estimate():
+    parts = list(blocks(panel()[3], "step_mixture", [200], SEED))
+    estimate = feed(parts, basis="full").result(0.9)
+    assert all(s["rank"] < max(1, s["n"]) for s in estimate.details["strata"])
+    assert estimate.crash_rate == pytest.approx(np.mean(parts[0].weighted_crashes()), rel=1e-12, abs=1e-300)
+
+
+def test_columns_that_never_vary_explain_nothing():
+    """What centring rounds away must not be fitted as if it were data."""
+    rng = np.random.default_rng(1)
+    stratum = Stratum(9, "reduced")
+    y = rng.exponential(size=20)
+    stratum.add(np.full((20, 9, 3), [1.0 / 0.7, 0.1 / 0.7, 1.0 / 0.7]), y)
+    fit = stratum.fit()
+    assert (fit.n_columns, fit.rank) == (512, 0)
+    assert fit.residual_squares == pytest.approx(np.sum((y - y.mean()) ** 2), rel=1e-12)
+
+
+def test_large_blocks_on_threads_give_the_bits_of_small_ones():
+    parts = list(blocks(panel()[1], "step_mixture", [9_000], SEED))
+    assert len(parts) == 1
+    pieces = [parts[0].take(slice(start, start + 500)) for start in range(0, 9_000, 500)]
+    assert feed(parts).result(0.9) == feed(pieces).result(0.9)
+
+
+def test_columns_are_products_in_the_order_of_vec():
+    ratios = np.arange(1.0, 2 * 9 * 3 + 1).reshape(2, 9, 3)
+    columns = product_columns(ratios, 2, "reduced")
+    expected = [[r[0, i] * r[1, j] for i in range(2) for j in range(2)] for r in ratios]
+    np.testing.assert_array_equal(columns, expected)
+    assert product_columns(ratios, 0, "full").shape == (2, 0)
+
+
+@pytest.mark.parametrize(
+    ("level", "surrogates", "basis", "steps", "columns"),
+    [
+        (0, 3, "full", 0, 0),
+        (6, 3, "full", 6, 729),
+        (9, 3, "full", 6, 729),
+        (30, 3, "reduced", 9, 512),
+        (9, 4, "reduced", 6, 729),
+        (9, 2, "reduced", 9, 1),
+        (9, 1, "reduced", 9, 0),
+        (3, 10, "reduced", 3, 729),
+        (3, 10, "full", 2, 100),
+    ],
+)
+def test_columns_stay_within_729(level, surrogates, basis, steps, columns):
+    assert steps_used(level, surrogates, basis) == steps
+    assert n_columns(level, surrogates, basis) == columns
+
+
+def test_is_refused_without_moments_or_for_other_methods():
+    assert "first_9" in (Scv.refusal(block([True])) or "")
+    assert "step mixture" in (Scv.refusal(block([True], method="forced")) or "")
+    with pytest.raises(ValueError, match="first_ratios"):
+        Scv().add(block([True]))
+    with pytest.raises(ValueError, match="cannot merge"):
+        Scv().merge(Scv(basis="full"))

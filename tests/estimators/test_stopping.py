@@ -1,0 +1,108 @@
+"""Stopping: looks are declared beforehand, two passes are needed, the same data stop at the same place."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from harness.campaign.models import Stop
+from harness.estimators import StopRule, accumulator
+from harness.estimators.stopping import LOOK_RATIO, look_grid
+from tests.chains.library import frequent_decisive
+from tests.chains.sampler import blocks
+from tests.chains.seed import SEED
+
+from .small_blocks import block
+
+SHARD = 200
+
+
+def passing(n: int, *, rhw: float = 0.01, n_crashes: int = 1_000):
+    state = accumulator("nade")
+    state.add(block([True] * 4))
+    return replace(state.result(0.9), n_episodes=n, rhw=rhw, n_crashes=n_crashes)
+
+
+@given(st.integers(1, 10**9), st.integers(1, 10**6))
+def test_looks_are_shard_boundaries_on_a_geometric_grid(n_episodes, shard_size):
+    looks = look_grid(n_episodes, shard_size)
+    assert looks[-1] == n_episodes
+    assert all(a < b for a, b in itertools.pairwise(looks))
+    assert all(look % shard_size == 0 for look in looks[:-1])
+    for a, b in itertools.pairwise(looks[:-1]):
+        assert b <= a * LOOK_RATIO + 2 * shard_size
+
+
+def test_looks_thin_out():
+    looks = look_grid(10_000_000, 5_000)
+    assert looks[:4] == (5_000, 10_000, 15_000, 20_000)
+    assert len(looks) < 70
+    assert looks[-2] / looks[-3] == pytest.approx(LOOK_RATIO, rel=0.01)
+
+
+def test_two_consecutive_passes_are_needed():
+    rule = StopRule(Stop(episodes=100_000, rhw=0.3, min_crashes=10), "forced", SHARD)
+    pattern = [True, False, True, True]
+    answers = [rule.observe(n, passing(n, rhw=0.2 if ok else 0.4)) for n, ok in zip(rule.looks, pattern, strict=False)]
+    assert answers == [False, False, False, True]
+    assert rule.reached
+    with pytest.raises(ValueError, match="already stopped"):
+        rule.observe(rule.looks[4], passing(rule.looks[4]))
+
+
+def test_too_few_crashes_never_stop():
+    rule = StopRule(Stop(episodes=2_000, rhw=0.3, min_crashes=50), "forced", SHARD)
+    answers = [rule.observe(n, passing(n, n_crashes=49)) for n in rule.looks]
+    assert answers == [False] * (len(rule.looks) - 1) + [True]
+    assert not rule.reached
+
+
+def test_without_a_precision_the_budget_decides():
+    rule = StopRule(Stop(episodes=1_050), "nde", SHARD)
+    answers = [rule.observe(n, passing(n)) for n in rule.looks]
+    assert answers == [False] * (len(rule.looks) - 1) + [True]
+    assert rule.looks[-1] == 1_050
+    assert not rule.reached
+
+
+def test_looking_elsewhere_is_refused():
+    rule = StopRule(Stop(episodes=10_000, rhw=0.3), "nde", SHARD)
+    with pytest.raises(ValueError, match="first 200 episodes"):
+        rule.observe(300, passing(300))
+    with pytest.raises(ValueError, match="first 200 episodes"):
+        rule.observe(200, passing(400))
+    rule.observe(200, passing(200))
+    with pytest.raises(ValueError, match="first 400 episodes"):
+        rule.observe(200, passing(200))
+
+
+def test_watches_the_methods_own_estimator_unless_told_otherwise():
+    assert StopRule(Stop(), "episode_mixture", SHARD).estimator == "mixture_cv"
+    assert StopRule(Stop(estimator="nade"), "episode_mixture", SHARD).estimator == "nade"
+
+
+@pytest.mark.parametrize("method", ["nde", "forced", "step_mixture", "episode_mixture"])
+def test_the_same_campaign_stops_at_the_same_test(method):
+    """However many tests are ready beyond the prefix, and however often it is run."""
+
+    def stopped_at(n_ready: int) -> tuple[int, float]:
+        rule = StopRule(Stop(episodes=40_000, rhw=0.2, min_crashes=30), method, SHARD)
+        state, n, look = accumulator(rule.estimator), 0, iter(rule.looks)
+        due = next(look)
+        for part in blocks(frequent_decisive(), method, [SHARD] * n_ready, SEED):
+            state.add(part)
+            n += len(part)
+            if n == due:
+                estimate = state.result(0.9)
+                if rule.observe(n, estimate):
+                    return n, estimate.crash_rate
+                due = next(look)
+        raise AssertionError("the prefix was too short")
+
+    first = stopped_at(200)
+    assert first == stopped_at(180 if first[0] <= 180 * SHARD else 200)
+    assert first[0] % SHARD == 0

@@ -1,0 +1,1 @@
+"""Tests of the importance functions: identities at recorded and at arbitrary states."""

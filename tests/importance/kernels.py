@@ -1,0 +1,109 @@
+"""Importance functions and likelihood ratios over arrays, so that tests can call the compiled functions in bulk.
+
+Import this module as ``tests.…`` everywhere: numba's cache remembers the name.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from harness.compiled import compiled_threads
+from harness.environment.cut_in import acceptance, cut_in_hazard, opportunity
+from harness.environment.driving import free_driving_pmf
+from harness.episode.after_cut_in import draw_from
+from harness.importance import functions, likelihood
+from harness.maneuvers import acceleration
+
+
+class Proposals(NamedTuple):
+    """p (n, A), q (n, J, A) and V (n, J) of states, and whether they are critical (n,).
+
+    A is 31 after the cut-in; before it 2: cut_in, stay.
+    """
+
+    p: np.ndarray
+    q: np.ndarray
+    v: np.ndarray
+    critical: np.ndarray
+
+
+@compiled_threads
+def _after(states, environment, importance, p, q, v, critical):
+    for i in range(states.shape[0]):
+        speed, r2, r2dot = states[i, 0], states[i, 3], states[i, 4]
+        free_driving_pmf(speed, environment, p[i])
+        critical[i] = functions.propose_acceleration(speed, r2, r2dot, p[i], importance, q[i], v[i])
+
+
+@compiled_threads
+def _before(states, maneuvers, steps, environment, importance, cut, stay, p, q, v, critical):
+    for i in range(states.shape[0]):
+        speed, r1, r1dot, r2, r2dot = states[i]
+        a = acceleration(maneuvers[i])
+        functions.look_ahead(speed, r2, r2dot, a, steps[i], environment, importance, cut[i], stay[i])
+        wish = opportunity(speed, r1, r1dot, environment)
+        hazard = cut_in_hazard(wish, acceptance(r2, r2dot, environment), environment)
+        p[i] = -np.expm1(-hazard)
+        critical[i] = functions.propose_cut_in(p[i], wish, cut[i, 0], stay[i, 0], importance, q[i], v[i])
+
+
+@compiled_threads
+def _draws(u, method, component, alpha, q, out):
+    for i in range(u.size):
+        out[i] = draw_from(u[i], method, component, alpha, q)
+
+
+@compiled_threads
+def _accumulate(method, first, alpha, ratios, v, log_ratio, martingale, sampled):
+    weight = np.empty(alpha.size)
+    log_sampled = 0.0
+    for t in range(ratios.shape[0]):
+        sampled[t] = likelihood.accumulate(
+            method, first, alpha, ratios[t], v[t], log_sampled, log_ratio, martingale, weight
+        )
+        log_sampled += np.log(sampled[t])
+
+
+@compiled_threads
+def _log_mixtures(alpha, log_ratio, out):
+    for i in range(log_ratio.shape[0]):
+        out[i] = likelihood.log_mixture(alpha, log_ratio[i])
+
+
+def after_cut_in(states, environment, importance) -> Proposals:
+    """Proposals at redraw times after the cut-in; states (n, 5)."""
+    n, j = len(states), importance.maneuvers.shape[0]
+    out = Proposals(np.empty((n, 31)), np.empty((n, j, 31)), np.empty((n, j)), np.empty(n, np.bool_))
+    _after(np.ascontiguousarray(states, float), environment, importance, *out)
+    return out
+
+
+def before_cut_in(states, maneuvers, steps, environment, importance) -> Proposals:
+    """Proposals at redraw times before the cut-in, BV having drawn ``maneuvers`` (n,) in ``steps`` (n,)."""
+    n, j, hold = len(states), importance.value.shape[0], int(environment.numbers["hold_steps"][0])
+    p, q, v, critical = np.empty(n), np.empty((n, j)), np.empty((n, j)), np.empty(n, np.bool_)
+    cut, stay = np.empty((n, hold, j)), np.empty((n, hold, j))
+    indices, times = np.asarray(maneuvers, np.int64), np.asarray(steps, np.int64)
+    _before(np.ascontiguousarray(states, float), indices, times, environment, importance, cut, stay, p, q, v, critical)
+    return Proposals(np.stack([p, 1.0 - p], axis=-1), np.stack([q, 1.0 - q], axis=-1), v, critical)
+
+
+def drawn(u, method, component, alpha, q):
+    """Indices (n,) that uniforms are turned into, under importance functions q (J, 31)."""
+    out = np.empty(u.size, np.int64)
+    _draws(u, method, component, alpha, np.ascontiguousarray(q), out)
+    return out
+
+
+def accumulated(method, first, alpha, ratios, v):
+    """Take in ratios q_j/p (steps, M) with V (steps, J): log ratios (M,), martingale sums (J,), q_α/p (steps,)."""
+    log_ratio, martingale, sampled = np.zeros(alpha.size), np.zeros(v.shape[1]), np.empty(len(ratios))
+    _accumulate(method, first, alpha, ratios, v, log_ratio, martingale, sampled)
+    return log_ratio, martingale, sampled
+
+
+def log_mixtures(alpha, log_ratio):
+    """Log Σ_j α_j exp(L_j) of rows (n, M)."""
+    out = np.empty(len(log_ratio))
+    _log_mixtures(np.asarray(alpha, float), np.ascontiguousarray(log_ratio, float), out)
+    return out

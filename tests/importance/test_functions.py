@@ -1,0 +1,174 @@
+"""Importance functions by exact summation, at states that campaigns recorded and at arbitrary ones.
+
+    Σ_a q_j = 1,   E_q[p/q | s] = Σ_{a: q_j > 0} p = 1,   E_q[C p/q | s] = V_j.
+
+With ε = 0 maneuvers that cannot lead to a crash are never drawn: the second sum is then the exposure of the others.
+"""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from harness.maneuvers import CUT_IN, STAY
+from harness.outcomes import EPISODE_MIXTURE, STEP_MIXTURE
+from tests.episode.twin_runs import prepared, run
+from tests.importance.kernels import after_cut_in, before_cut_in, drawn
+
+CHALLENGES = ("immediate", "recursive")
+EPSILONS = (0.0, 0.1, 1.0)
+settings = pytest.mark.parametrize(
+    ("challenge", "epsilon"), [(challenge, epsilon) for challenge in CHALLENGES for epsilon in EPSILONS]
+)
+
+speeds = st.floats(5.0, 45.0)
+r2dots = st.floats(-24.0, 6.0)
+states = st.tuples(speeds, st.floats(0.0, 200.0), st.floats(-10.0, 10.0), st.floats(1e-6, 110.0), r2dots)
+maneuvers = st.integers(0, 30)
+steps = st.integers(0, 19).map(lambda second: 10 * second)
+
+
+def policy_of(challenge, epsilon):
+    """Environment and importance functions, at a level where cutting in is not always negligible."""
+    policy = prepared("step_mixture", challenge, level=1e4).policy
+    importance_settings = policy.importance.settings.copy()
+    importance_settings["epsilon"] = epsilon
+    return policy.environment, policy.importance._replace(settings=importance_settings)
+
+
+def recorded(challenge):
+    """States, maneuvers and steps of BV's redraw times: before the cut-in, and after it."""
+    done = run("step_mixture", challenge, n=4_000, moments="all")
+    moment = done.moment
+    columns = ("v_bv_mps", "r1_m", "r1dot_mps", "r2_m", "r2dot_mps")
+    state = np.column_stack([moment[name] for name in columns])
+    before = np.isin(moment["maneuver"], (CUT_IN, STAY)) & (moment["step"] % 10 == 0)
+    return done, state, before, moment["maneuver"] < CUT_IN
+
+
+def held(done, moment):
+    """BV's maneuver at a redraw time before the cut-in."""
+    return done.shard.results.bv_path[moment["row"], moment["step"] // 10]
+
+
+def require_identities(proposals, epsilon):
+    p, q, v, critical = proposals
+    p = p[:, None, :]
+    np.testing.assert_allclose(q.sum(axis=-1), 1.0, rtol=0, atol=1e-12)
+    assert (q >= 0.0).all()
+    assert (q <= 1.0 + 1e-12).all()
+    mean_ratio = np.where(q > 0.0, p, 0.0).sum(axis=-1)
+    if epsilon > 0.0:
+        np.testing.assert_allclose(mean_ratio, 1.0, rtol=0, atol=1e-12)
+        assert (q >= epsilon * p * (1.0 - 1e-12)).all()
+    assert (mean_ratio <= 1.0 + 1e-12).all()
+    np.testing.assert_array_equal(np.where(v[..., None] == 0.0, q, 0.0), np.where(v[..., None] == 0.0, p, 0.0))
+    if epsilon == 1.0:
+        np.testing.assert_allclose(q, np.broadcast_to(p, q.shape), rtol=1e-12, atol=1e-300)
+    np.testing.assert_array_equal(critical, (v > 0.0).any(axis=1))
+    assert (v >= 0.0).all()
+    assert (v <= 1.0 + 1e-6).all()
+
+
+@settings
+def test_identities_at_recorded_states(challenge, epsilon):
+    done, state, before, after = recorded(challenge)
+    environment, importance = policy_of(challenge, epsilon)
+    assert before.sum() > 500
+    assert after.sum() > 50
+    moment = done.moment[before]
+    proposals = before_cut_in(state[before], held(done, moment), moment["step"], environment, importance)
+    require_identities(proposals, epsilon)
+    assert proposals.critical.mean() > 0.9
+    require_identities(after_cut_in(state[after], environment, importance), epsilon)
+
+
+@settings
+@given(st.lists(st.tuples(states, maneuvers, steps), min_size=1, max_size=20))
+def test_identities_anywhere(challenge, epsilon, situations):
+    environment, importance = policy_of(challenge, epsilon)
+    state, maneuver, step = (np.array(column) for column in zip(*situations, strict=True))
+    require_identities(before_cut_in(state, maneuver, step, environment, importance), epsilon)
+    require_identities(after_cut_in(state, environment, importance), epsilon)
+
+
+@pytest.mark.parametrize("challenge", CHALLENGES)
+def test_records_hold_what_was_drawn_from(challenge):
+    """p, V_j and q_j of the maneuver taken, recomputed from the recorded state alone: equal in every bit."""
+    done, state, before, after = recorded(challenge)
+    policy = done.prepared.policy
+    rows = done.moment[before]
+    found = before_cut_in(state[before], held(done, rows), rows["step"], policy.environment, policy.importance)
+    taken = (rows["maneuver"] == STAY).astype(int)
+    each = np.arange(len(rows))
+    np.testing.assert_array_equal(done.moment_v[before], found.v)
+    np.testing.assert_array_equal(done.moment_q[before], found.q[each, :, taken])
+    np.testing.assert_array_equal(rows["p"], found.p[each, taken])
+    found = after_cut_in(state[after], policy.environment, policy.importance)
+    rows, each = done.moment[after], np.arange(after.sum())
+    np.testing.assert_array_equal(done.moment_v[after], found.v)
+    np.testing.assert_array_equal(done.moment_q[after], found.q[each, :, rows["maneuver"]])
+    np.testing.assert_array_equal(rows["p"], found.p[each, rows["maneuver"]])
+
+
+@pytest.mark.parametrize("challenge", CHALLENGES)
+def test_the_step_mixture_is_what_was_sampled(challenge):
+    done = recorded(challenge)[0]
+    np.testing.assert_allclose(done.moment_q @ done.alpha, done.moment["q_sampled"], rtol=1e-12)
+
+
+@pytest.mark.parametrize("challenge", CHALLENGES)
+@given(states, maneuvers, steps)
+def test_nothing_is_steered_where_no_surrogate_can_crash(challenge, state, maneuver, step):
+    environment, importance = policy_of(challenge, 0.1)
+    harmless = 0.0 if challenge == "recursive" else 100.0  # a probability, or a smallest gap in metres
+    tables = {name: np.full_like(getattr(importance, name), harmless) for name in ("value", "maneuvers")}
+    importance = importance._replace(**tables, before=np.zeros_like(importance.before))
+    for found in (
+        before_cut_in([state], [maneuver], [step], environment, importance),
+        after_cut_in([state], environment, importance),
+    ):
+        assert not found.critical[0]
+        assert (found.v == 0.0).all()
+        np.testing.assert_array_equal(found.q[0], np.broadcast_to(found.p[0], found.q[0].shape))
+
+
+@given(st.tuples(speeds, st.just(30.0), st.just(0.0), st.floats(0.1, 80.0), r2dots))
+def test_accelerations_are_drawn_by_their_challenge(state):
+    """With ε = 0, E_q[C p/q | s] = V: q_j is p C_j/V_j, so harder braking is preferred where it crashes more."""
+    environment, importance = policy_of("recursive", 0.0)
+    found = after_cut_in([state], environment, importance)
+    sm_i, p, v = found.q[0, 0], found.p[0], found.v[0, 0]
+    challenge = np.where(p > 1e-12, sm_i * v / np.maximum(p, 1e-12), 0.0)
+    assert (challenge <= 1.0 + 1e-6).all()
+    if v > 1e-9:
+        usual = p > 1e-12
+        assert (np.diff(challenge[usual]) <= 1e-4).all()
+
+
+def test_a_higher_threshold_leaves_fewer_moments_critical():
+    environment, importance = policy_of("recursive", 0.1)
+    _, state, _, after = recorded("recursive")
+    counts = []
+    for threshold in (0.0, 1e-3, 0.5):
+        changed = importance.settings.copy()
+        changed["threshold"] = threshold
+        found = after_cut_in(state[after], environment, importance._replace(settings=changed))
+        np.testing.assert_array_equal(found.critical, (found.v > threshold).any(axis=1))
+        counts.append(int(found.critical.sum()))
+    assert counts[0] > counts[1] > counts[2] > 0
+
+
+@pytest.mark.parametrize("component", [1, 2, 3])
+def test_draws_follow_the_mixture_or_the_component(component):
+    """Equal steps of the uniform give every acceleration its probability to within one step."""
+    policy = prepared("step_mixture", "recursive").policy
+    found = after_cut_in([(30.0, 40.0, 0.0, 11.0, -8.0)], policy.environment, policy.importance)
+    q, alpha = found.q[0], np.array([0.5, 0.3, 0.2])
+    assert found.critical[0]
+    u = (np.arange(100_000) + 0.5) / 100_000
+    by_step = np.bincount(drawn(u, STEP_MIXTURE, -1, alpha, q), minlength=31) / u.size
+    np.testing.assert_allclose(by_step, alpha @ q, rtol=0, atol=1.001e-5)
+    by_component = np.bincount(drawn(u, EPISODE_MIXTURE, component, alpha, q), minlength=31) / u.size
+    np.testing.assert_allclose(by_component, q[component - 1], rtol=0, atol=1.001e-5)
+    assert np.abs(by_step - by_component).max() > 1e-3

@@ -1,0 +1,38 @@
+"""A few hundred episodes in the twin, as a shard and as tables; settings differ by test."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+from harness.campaign.loading import load_campaign
+from harness.campaign.models import Campaign
+from harness.episode.loop import Shard
+from harness.records.tables import ShardTables, shard_tables
+from harness.runner.prepare import prepare
+from harness.twin import TwinWorld
+
+SMOKE = Path(__file__).parents[2] / "scenarios" / "smoke.yaml"
+
+
+class Recorded(NamedTuple):
+    campaign: Campaign
+    shard: Shard
+    tables: ShardTables
+
+
+@pytest.fixture(scope="session")
+def record() -> Callable[..., Recorded]:
+    """Run episodes ``first`` … of the smoke campaign with overrides, in the twin."""
+
+    def recorded(*overrides: str, first: int = 0, n: int = 300, n_cells: int = 32) -> Recorded:
+        campaign = load_campaign(SMOKE, overrides)
+        prepared = prepare(campaign)
+        shard = prepared.loop(TwinWorld(n_cells)).run(first, prepared.states(first, n))
+        keep = campaign.records.traces != "none" or campaign.records.trace_share > 0.0
+        return Recorded(campaign, shard, shard_tables(shard, campaign.seed, keep_traces=keep))
+
+    return recorded

@@ -1,0 +1,174 @@
+"""Files are there completely or not at all, and what cannot be read is named."""
+
+from __future__ import annotations
+
+import errno
+import os
+import resource
+import signal
+import stat
+import subprocess
+import sys
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from harness.errors import RunFolderError
+from harness.records import folder as records_folder
+from harness.records.folder import (
+    read_json,
+    read_manifest,
+    read_table,
+    shard_file,
+    write_atomically,
+    write_json,
+    write_shard,
+)
+from harness.records.reader import read_shards
+
+
+def files_below(path: Path) -> set[str]:
+    return {str(file.relative_to(path)) for file in path.rglob("*") if file.is_file()}
+
+
+def half_then_fail(path: Path) -> None:
+    path.write_text("half of it")
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+
+
+def test_a_write_that_fails_leaves_nothing(tmp_path):
+    with pytest.raises(OSError, match="No space left"):
+        write_atomically(tmp_path / "new" / "file", half_then_fail)
+    assert files_below(tmp_path) == set()
+
+
+def test_a_write_that_fails_leaves_the_old_file(tmp_path):
+    path = tmp_path / "file"
+    write_atomically(path, lambda temporary: temporary.write_text("old") and None)
+    with pytest.raises(OSError, match="No space left"):
+        write_atomically(path, half_then_fail)
+    assert path.read_text() == "old"
+    assert files_below(tmp_path) == {"file"}
+
+
+def test_a_file_that_is_written_is_never_seen_in_part(tmp_path):
+    path = tmp_path / "file"
+
+    def write(temporary: Path) -> None:
+        assert temporary.parent == path.parent, "or putting it in place would not be atomic"
+        temporary.write_text("half")
+        assert not path.exists()
+        temporary.write_text("whole")
+
+    write_atomically(path, write)
+    assert path.read_text() == "whole"
+    assert stat.S_IMODE(path.stat().st_mode) == 0o644
+
+
+def test_a_process_killed_in_the_middle_leaves_no_file_of_that_name(tmp_path):
+    code = """
+import os, signal, sys
+from pathlib import Path
+from harness.records.folder import write_atomically
+
+def write(path):
+    path.write_text("half")
+    os.kill(os.getpid(), signal.SIGKILL)
+
+write_atomically(Path(sys.argv[1]), write)
+"""
+    root = Path(__file__).parents[2]
+    done = subprocess.run([sys.executable, "-c", code, str(tmp_path / "file")], cwd=root, check=False)
+    assert done.returncode == -signal.SIGKILL
+    assert not (tmp_path / "file").exists()
+
+
+def test_a_real_limit_on_file_size_leaves_nothing(tmp_path, record):
+    """The kernel itself refuses to write more than a kilobyte, as a full disk would."""
+    tables = record("records.traces=all", n=20).tables
+    before, handler = resource.getrlimit(resource.RLIMIT_FSIZE), signal.getsignal(signal.SIGXFSZ)
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1024, before[1]))
+    try:
+        with pytest.raises(OSError, match=r"[Ff]ile too large"):
+            write_shard(tmp_path, 0, tables)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        signal.signal(signal.SIGXFSZ, handler)
+    assert files_below(tmp_path) == set()
+    assert set(write_shard(tmp_path, 0, tables)) == {"episodes", "moments", "traces"}
+
+
+def test_episodes_come_last_so_that_they_say_that_a_shard_is_complete(tmp_path, record, monkeypatch):
+    written = []
+    write = pq.write_table
+
+    def fail_at_third(table: pa.Table, path: Path, **options: object) -> None:
+        written.append(Path(path).parent.name)
+        if len(written) == 3:
+            half_then_fail(Path(path))
+        write(table, path, **options)
+
+    monkeypatch.setattr(records_folder.pq, "write_table", fail_at_third)
+    with pytest.raises(OSError, match="No space left"):
+        write_shard(tmp_path, 4, record("records.traces=all", n=20).tables)
+    assert written == ["traces", "moments", "episodes"]
+    assert files_below(tmp_path) == {shard_file("traces", 4), shard_file("moments", 4)}
+
+
+def test_json_is_strict(tmp_path):
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        write_json(tmp_path / "file.json", {"rhw": float("inf")})
+    assert files_below(tmp_path) == set()
+    write_json(tmp_path / "file.json", {"rate": 0.1, "σ": [1, None]})
+    assert read_json(tmp_path / "file.json", mend="") == {"rate": 0.1, "σ": [1, None]}
+
+
+@pytest.mark.parametrize("damage", [lambda content: content[:-30], lambda content: b"", lambda content: content[::-1]])
+def test_a_damaged_table_is_named(damage, tmp_path, record):
+    path = tmp_path / write_shard(tmp_path, 0, record("records.traces=none", n=20).tables)["episodes"]
+    path.write_bytes(damage(path.read_bytes()))
+    with pytest.raises(RunFolderError, match="a file that cannot be read") as raised:
+        read_table(path)
+    assert raised.value.where == str(path)
+    assert "--resume" in raised.value.mend
+
+
+def test_a_table_without_a_column_that_is_needed_is_named(tmp_path):
+    path = tmp_path / "shard-000000.parquet"
+    pq.write_table(pa.table({"episode": [1]}), path)
+    with pytest.raises(RunFolderError) as raised:
+        read_table(path, ["episode", "log_weight"])
+    assert raised.value.where == str(path)
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(RunFolderError, match="shard-000007"):
+        read_table(tmp_path / "shard-000007.parquet")
+    with pytest.raises(RunFolderError, match=r"manifest\.json"):
+        read_manifest(tmp_path)
+
+
+@pytest.mark.parametrize("content", ['{"n_episodes": 3}', "[1, 2]", "{", ""])
+def test_something_else_than_a_manifest_is_named(content, tmp_path):
+    (tmp_path / "manifest.json").write_text(content)
+    with pytest.raises(RunFolderError) as raised:
+        read_manifest(tmp_path)
+    assert raised.value.where == str(tmp_path / "manifest.json")
+
+
+def test_shards_are_read_in_the_manifests_order_and_no_others(tmp_path, record):
+    shards = []
+    for index, first in enumerate((0, 30, 60)):
+        files = write_shard(tmp_path, index, record("records.traces=none", first=first, n=30).tables)
+        shards.append({"index": index, "first_episode": first, "n_episodes": 30, "files": files})
+    write_json(tmp_path / "manifest.json", {"campaign_hash": "", "n_episodes": 60, "shards": shards[:2]})
+    read = list(read_shards(tmp_path))
+    assert [episodes["episode"].to_pylist()[0] for episodes, _ in read] == [0, 30]
+    assert all(moments is not None for _, moments in read)
+    assert all(moments is None for _, moments in read_shards(tmp_path, moment_columns=[]))
+    for episodes, moments in read_shards(tmp_path, episode_columns=["outcome"], moment_columns=["q"]):
+        assert episodes.column_names == ["outcome"]
+        assert moments.column_names == ["q"]

@@ -1,0 +1,118 @@
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from harness.errors import RunFolderError
+from harness.report import write_report
+
+
+def edit(path: Path, **changes) -> None:
+    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+
+
+def truncate(path: Path) -> None:
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) // 2])
+
+
+def corrupt_middle(path: Path) -> None:
+    content = bytearray(path.read_bytes())
+    middle = slice(len(content) // 4, len(content) // 2)
+    content[middle] = bytes(b ^ 0xFF for b in content[middle])
+    path.write_bytes(bytes(content))
+
+
+@pytest.mark.parametrize("table", ["episodes", "moments", "traces"])
+@pytest.mark.parametrize("damage", [truncate, Path.unlink])
+def test_a_damaged_or_missing_shard_is_named(run_folder, table, damage):
+    shard = run_folder / table / "shard-000001.parquet"
+    damage(shard)
+    page = (run_folder / "report.html").read_bytes()
+    with pytest.raises(RunFolderError, match=re.escape(str(shard))) as caught:
+        write_report(run_folder)
+    assert caught.value.exit_code == 2
+    assert (run_folder / "report.html").read_bytes() == page
+
+
+@pytest.mark.parametrize("table", ["episodes", "traces"])
+def test_a_shard_with_a_good_footer_and_broken_pages_is_named(run_folder, table):
+    shard = run_folder / table / "shard-000001.parquet"
+    corrupt_middle(shard)
+    with pytest.raises(RunFolderError, match=re.escape(str(shard))):
+        write_report(run_folder)
+
+
+def test_a_shard_that_lost_rows_is_named(run_folder):
+    shard = run_folder / "episodes" / "shard-000002.parquet"
+    pq.write_table(pq.read_table(shard).slice(0, 990), shard)
+    with pytest.raises(RunFolderError, match=r"shard-000002.*found 990 rows; expected 1000 rows"):
+        write_report(run_folder)
+
+
+def test_a_missing_column_is_named(run_folder):
+    shard = run_folder / "episodes" / "shard-000000.parquet"
+    pq.write_table(pq.read_table(shard).drop_columns(["log_weight"]), shard)
+    with pytest.raises(RunFolderError, match=r"shard-000000.*no column 'log_weight'"):
+        write_report(run_folder)
+
+
+def test_an_unknown_outcome_is_named(run_folder):
+    shard = run_folder / "episodes" / "shard-000000.parquet"
+    table = pq.read_table(shard)
+    place = table.schema.get_field_index("outcome")
+    pq.write_table(table.set_column(place, "outcome", pa.array(["flew away"] * table.num_rows)), shard)
+    with pytest.raises(RunFolderError, match="flew away"):
+        write_report(run_folder)
+
+
+@pytest.mark.parametrize("name", ["manifest.json", "estimates.json", "campaign.yaml"])
+def test_a_missing_file_is_named_with_what_to_do(run_folder, name):
+    (run_folder / name).unlink()
+    with pytest.raises(RunFolderError, match=rf"{name}: found no such file") as caught:
+        write_report(run_folder)
+    assert caught.value.mend
+
+
+@pytest.mark.parametrize("name", ["manifest.json", "estimates.json", "campaign.yaml"])
+@pytest.mark.parametrize("content", ["{broken", "[]", "\x00"])
+def test_a_broken_file_is_named(run_folder, name, content):
+    (run_folder / name).write_text(content)
+    with pytest.raises(RunFolderError, match=name):
+        write_report(run_folder)
+
+
+def test_estimates_of_another_campaign_are_refused(run_folder):
+    edit(run_folder / "estimates.json", campaign_hash="feedfeedfeedfeed")
+    with pytest.raises(RunFolderError, match="feedfeedfeedfeed"):
+        write_report(run_folder)
+
+
+def test_an_unknown_headline_is_refused(run_folder):
+    edit(run_folder / "estimates.json", headline="oracle")
+    with pytest.raises(RunFolderError, match="oracle"):
+        write_report(run_folder)
+
+
+def test_a_convergence_point_without_rate_is_refused_not_drawn_as_zero(run_folder):
+    points = json.loads((run_folder / "estimates.json").read_text())["convergence"]
+    edit(run_folder / "estimates.json", convergence=[{k: v for k, v in p.items() if k != "crash_rate"} for p in points])
+    with pytest.raises(RunFolderError, match=r"without 'crash_rate'"):
+        write_report(run_folder)
+
+
+def test_a_shard_entry_without_files_is_refused(run_folder):
+    edit(run_folder / "manifest.json", shards=[{"index": 0, "first_episode": 0, "n_episodes": 1}])
+    with pytest.raises(RunFolderError, match=r"manifest\.json"):
+        write_report(run_folder)
+
+
+def test_a_folder_that_is_no_run_is_refused_and_stays_empty(tmp_path):
+    with pytest.raises(RunFolderError, match=r"manifest\.json"):
+        write_report(tmp_path)
+    assert list(tmp_path.iterdir()) == []

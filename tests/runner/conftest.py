@@ -1,0 +1,88 @@
+"""Small campaigns with the real policies, run once and looked at by many tests."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import pytest
+
+from harness.campaign.loading import load_campaign
+from harness.campaign.models import Campaign
+from harness.controllers.black_box import Death
+from harness.runner import RunResult, campaign_run, run_campaign, shards
+from harness.runner.worker import ShardDone, ShardRunner, ShardSpec
+
+SMOKE = Path(__file__).parents[2] / "scenarios" / "smoke.yaml"
+SMALL = ("stop.episodes=1600", "stop.rhw=null", "run.shard_size=80", "records.trace_share=0.05")
+TWIN = ("world.engine=twin", "stop.episodes=400")
+
+
+@pytest.fixture(scope="session")
+def campaign() -> Callable[..., Campaign]:
+    """The smoke campaign in small, with overrides."""
+    return lambda *overrides: load_campaign(SMOKE, [*SMALL, *overrides])
+
+
+@pytest.fixture(scope="session")
+def run() -> Callable[..., RunResult]:
+    """`run_campaign` without the page, which takes longer than these campaigns; test_api.py looks at the page."""
+
+    def run_without_page(*arguments, **options) -> RunResult:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(campaign_run, "write_report", lambda folder: folder / "report.html")
+            return run_campaign(*arguments, **options)
+
+    return run_without_page
+
+
+class WorkerInThisProcess:
+    """Stands in for `WorkerProcess` where the tests are not about processes: spares starting one."""
+
+    def __init__(self, campaign: Campaign, folder: Path) -> None:
+        self._runner = ShardRunner(campaign, folder)
+
+    def give(self, spec: ShardSpec, doomed: Mapping[int, Death]) -> bool:
+        self._done = self._runner.run(spec, doomed)
+        return True
+
+    def answer(self) -> ShardDone:
+        return self._done
+
+    def kill(self) -> None:
+        self.dismiss()
+
+    def dismiss(self) -> None:
+        self._runner.close()
+        self._runner._loop._world.close()
+
+    def wait(self) -> None: ...
+
+
+@pytest.fixture(scope="session")
+def run_here(run) -> Callable[..., RunResult]:
+    """`run` with one worker that is this process."""
+
+    def run_in_this_process(campaign: Campaign, out: Path, **options) -> RunResult:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(shards, "WorkerProcess", WorkerInThisProcess)
+            patch.setattr(shards, "first_to_answer", lambda workers: workers[0])
+            return run(campaign, out, workers=1, **options)
+
+    return run_in_this_process
+
+
+@pytest.fixture(scope="session")
+def sumo_run(campaign, run, tmp_path_factory) -> Path:
+    """One worker, eight cells. Never written to: damage a copy."""
+    out = tmp_path_factory.mktemp("sumo") / "run"
+    run(campaign("world.cells=8"), out, workers=1)
+    return out
+
+
+@pytest.fixture(scope="session")
+def twin_run(campaign, run_here, tmp_path_factory) -> Path:
+    """Its first 400 episodes in the twin. Never written to: damage a copy."""
+    out = tmp_path_factory.mktemp("twin") / "run"
+    run_here(campaign(*TWIN), out)
+    return out

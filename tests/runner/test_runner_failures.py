@@ -1,0 +1,168 @@
+"""What happens when workers fail: the error names the place, what was finished stays, and a resumed run is complete."""
+
+from __future__ import annotations
+
+import errno
+import multiprocessing
+import os
+import pickle
+import signal
+
+import pytest
+
+from harness.cli import main
+from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, WorldDisagreementError
+from harness.runner import campaign_run, processes, shards
+from harness.runner.shards import WorkerLostError
+from harness.runner.worker import ShardSpec
+from tests.runner import bad_workers
+from tests.runner.conftest import SMALL, SMOKE, TWIN
+from tests.runner.stored_runs import copy_of, manifest, shard_files, unlike_columns
+
+
+def test_a_shard_that_kills_every_worker_ends_the_run_and_is_named(run, campaign, tmp_path, monkeypatch):
+    monkeypatch.setattr(processes, "serve", bad_workers.dying)
+    monkeypatch.setattr(shards, "ATTEMPTS", 2)
+    with pytest.raises(
+        WorkerLostError, match=r"shard 0 \(from episode 0\): found 2 worker processes that died"
+    ) as lost:
+        run(campaign(*TWIN), tmp_path, workers=1)
+    assert lost.value.exit_code == EXIT_TOO_MANY_FAILED
+    assert "exit code -9" in lost.value.found
+    assert manifest(tmp_path)["status"] == "interrupted"
+    assert multiprocessing.active_children() == []
+
+
+def test_a_disagreement_in_a_worker_ends_the_run_and_all_workers(run, campaign, tmp_path, monkeypatch):
+    monkeypatch.setattr(processes, "serve", bad_workers.disobedient)
+    with pytest.raises(WorldDisagreementError, match="SUMO, BV3, m"):
+        run(campaign(*TWIN), tmp_path, workers=2)
+    assert manifest(tmp_path)["status"] == "interrupted"
+    assert multiprocessing.active_children() == []
+
+
+def test_a_full_disk_is_said_in_words_and_the_run_can_be_resumed(
+    run_here, campaign, twin_run, tmp_path, monkeypatch, capsys
+):
+    out = tmp_path / "run"
+    options = [word for override in (*SMALL, *TWIN) for word in ("--set", override)]
+    with monkeypatch.context() as patch:
+        patch.setattr(processes, "serve", bad_workers.without_room)
+        assert main(["run", str(SMOKE), "--out", str(out), "--workers", "1", *options]) == 2
+    complaint = capsys.readouterr().err
+    assert "no space left" in complaint
+    assert "--resume" in complaint
+    assert len(shard_files(out)) == bad_workers.SHARDS_BEFORE_FAILURE
+    assert manifest(out)["n_episodes"] == 80 * bad_workers.SHARDS_BEFORE_FAILURE
+    assert manifest(out)["status"] == "interrupted"
+    assert not list(out.rglob("*.part"))
+    run_here(campaign(*TWIN), out, resume=True)
+    assert unlike_columns(twin_run, out) == []
+
+
+def test_a_disk_that_is_full_at_the_very_end(run_here, campaign, twin_run, tmp_path, monkeypatch):
+    out = copy_of(twin_run, tmp_path / "run")
+    (out / "estimates.json").unlink()
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "estimates.json")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(campaign_run, "write_json", full)
+        with pytest.raises(OSError, match="No space left"):
+            run_here(campaign(*TWIN), out, resume=True)
+    assert not (out / "estimates.json").exists()
+    run_here(campaign(*TWIN), out, resume=True)
+    assert unlike_columns(twin_run, out) == []
+
+
+# -- the worker's side of the pipe --
+
+
+class Pipe:
+    """A connection whose other end sends shards and then is closed."""
+
+    def __init__(self, n_shards: int) -> None:
+        self._specs = [ShardSpec(i, 10 * i, 10) for i in range(n_shards)]
+        self.sent: list[object] = []
+
+    def recv(self) -> tuple[ShardSpec, dict]:
+        if not self._specs:
+            raise EOFError
+        return self._specs.pop(0), {}
+
+    def send(self, answer: object) -> None:
+        pickle.dumps(answer)
+        self.sent.append(answer)
+
+
+@pytest.fixture
+def serve(campaign, tmp_path, monkeypatch):
+    """Serve some shards with a runner of one's own; returns what was sent back."""
+    before = signal.getsignal(signal.SIGINT)
+
+    def served(runner: type, n_shards: int) -> list:
+        monkeypatch.setattr(processes, "ShardRunner", runner)
+        pipe = Pipe(n_shards)
+        processes.serve(pipe, campaign(), tmp_path, tmp_path / "black-box")
+        return pipe.sent
+
+    yield served
+    signal.signal(signal.SIGINT, before)
+
+
+def test_a_worker_prepares_once_and_ends_with_its_parent(serve):
+    events = []
+
+    class Runner:
+        def __init__(self, *_: object) -> None:
+            events.append("prepared")
+
+        def run(self, spec: ShardSpec, doomed: dict) -> int:
+            return spec.index
+
+        def close(self) -> None:
+            events.append("closed")
+
+    assert serve(Runner, 3) == [0, 1, 2]
+    assert events == ["prepared", "closed"]
+
+
+def test_an_error_of_preparation_reaches_the_parent(serve):
+    class Runner:
+        def __init__(self, *_: object) -> None:
+            raise CampaignError("world.cells", found="300", expected="at most 256", mend="Use fewer.")
+
+    (error,) = serve(Runner, 1)
+    assert isinstance(error, CampaignError)
+    assert str(error) == "world.cells: found 300; expected at most 256. Use fewer."
+
+
+def test_a_defect_reaches_the_parent_with_the_workers_traceback(serve):
+    class Runner:
+        def __init__(self, *_: object) -> None: ...
+
+        def close(self) -> None: ...
+
+        def run(self, spec: ShardSpec, doomed: dict) -> float:
+            return 1 / 0
+
+    (error,) = serve(Runner, 1)
+    assert isinstance(error, ZeroDivisionError)
+    assert "return 1 / 0" in pickle.loads(pickle.dumps(error)).__notes__[0]
+
+
+def test_an_error_that_cannot_be_pickled_reaches_the_parent_in_words(serve):
+    class Runner:
+        def __init__(self, *_: object) -> None: ...
+
+        def close(self) -> None: ...
+
+        def run(self, spec: ShardSpec, doomed: dict) -> None:
+            error = ValueError("of a strange kind")
+            error.handle = lambda: None
+            raise error
+
+    (error,) = serve(Runner, 1)
+    assert isinstance(error, RuntimeError)
+    assert "ValueError: of a strange kind" in str(error)

@@ -1,0 +1,72 @@
+"""Where a campaign stops, what it says then, and going on to another precision with the same records."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE
+from tests.runner.stored_runs import copy_of, manifest, shard_files, stored_table, unlike_columns
+
+LOOSE, TIGHT = "stop.rhw=0.3", "stop.rhw=0.08"
+COMMON = ("world.engine=twin", "stop.episodes=4000", "stop.min_crashes=20", "run.shard_size=50")
+
+
+@pytest.fixture(scope="module")
+def runs(run_here, campaign, tmp_path_factory):
+    """The same campaign, run afresh to either precision."""
+    folder, results = tmp_path_factory.mktemp("stop"), {}
+    for name, rhw in (("loose", LOOSE), ("tight", TIGHT)):
+        results[name] = run_here(campaign(*COMMON, rhw), folder / name)
+        assert results[name].stopped_by == "rhw"
+        assert results[name].exit_code == EXIT_DONE
+    return results
+
+
+def test_the_asked_precision_is_reached_and_nothing_beyond_it_is_kept(runs):
+    loose, tight = runs["loose"].folder, runs["tight"].folder
+    for folder, rhw in ((loose, 0.3), (tight, 0.08)):
+        content = manifest(folder)
+        assert len(shard_files(folder)) == len(content["shards"]) == content["n_episodes"] // 50
+        assert stored_table(folder, "episodes").num_rows == content["n_episodes"]
+        estimates = json.loads((folder / "estimates.json").read_text())
+        assert estimates["estimates"][estimates["headline"]]["rhw"] <= rhw
+    assert manifest(loose)["n_episodes"] < manifest(tight)["n_episodes"] < 4000
+
+
+def test_a_run_resumed_to_a_smaller_rhw_extends_the_same_records(runs, run_here, campaign, tmp_path):
+    out = copy_of(runs["loose"].folder, tmp_path / "run")
+    before = {path.name: path.stat().st_mtime_ns for path in shard_files(out)}
+    result = run_here(campaign(*COMMON, TIGHT), out, resume=True)
+    assert result.exit_code == EXIT_DONE
+    after = {path.name: path.stat().st_mtime_ns for path in shard_files(out)}
+    assert {name: after[name] for name in before} == before, "finished shards are not written again"
+    assert len(after) > len(before)
+    assert unlike_columns(runs["tight"].folder, out) == []
+
+
+def test_a_run_resumed_to_a_larger_rhw_is_the_same_as_a_fresh_one(runs, run_here, campaign, tmp_path):
+    out = copy_of(runs["tight"].folder, tmp_path / "run")
+    run_here(campaign(*COMMON, LOOSE), out, resume=True)
+    assert unlike_columns(runs["loose"].folder, out) == []
+    assert len(shard_files(out)) == len(shard_files(runs["loose"].folder))
+
+
+def test_a_finished_run_resumed_as_it_is_does_nothing(runs, run_here, campaign, tmp_path):
+    out = copy_of(runs["loose"].folder, tmp_path / "run")
+    run_here(campaign(*COMMON, LOOSE), out, resume=True)
+    assert unlike_columns(runs["loose"].folder, out) == []
+
+
+def test_a_spent_budget_is_exit_code_4_and_can_be_enlarged(runs, run_here, campaign, tmp_path):
+    out = tmp_path / "run"
+    small = [*COMMON[:1], "stop.episodes=130", *COMMON[2:], LOOSE]
+    result = run_here(campaign(*small, "stop.rhw=0.01"), out)
+    assert (result.exit_code, result.stopped_by) == (EXIT_BUDGET_SPENT, "episodes")
+    assert stored_table(out, "episodes").num_rows == 130
+    assert (out / "estimates.json").exists()
+
+    result = run_here(campaign(*COMMON, LOOSE), out, resume=True)
+    assert (result.exit_code, result.stopped_by) == (EXIT_DONE, "rhw")
+    assert unlike_columns(runs["loose"].folder, out) == []

@@ -1,0 +1,135 @@
+"""Folders that are not what a command needs: exit code 2, the place named, nothing harmed."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from harness.cli import main
+from tests.runner.conftest import SMALL, SMOKE, TWIN
+from tests.runner.stored_runs import copy_of, shard_files, truncate, unlike_columns
+
+SAME = [word for override in (*SMALL, *TWIN) for word in ("--set", override)]
+
+
+def complaint_of(capsys, *arguments: object) -> str:
+    """What a call that must end with exit code 2 says."""
+    assert main([str(argument) for argument in arguments]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert "Traceback" not in err
+    return " ".join(err.split())
+
+
+@pytest.fixture
+def stored(twin_run, tmp_path):
+    """A finished run of the campaign that `SAME` describes, to be damaged."""
+    return copy_of(twin_run, tmp_path / "run")
+
+
+# -- where a run may write --
+
+
+def test_a_folder_of_another_campaign(stored, capsys, twin_run):
+    text = complaint_of(capsys, "run", SMOKE, "--out", stored, *SAME, "--set", "seed=2")
+    assert str(stored) in text
+    assert "another campaign (smoke," in text
+    text = complaint_of(capsys, "run", SMOKE, "--out", stored, *SAME, "--set", "testing.epsilon=0.2", "--resume")
+    assert "another campaign" in text
+    assert unlike_columns(twin_run, stored) == []
+
+
+def test_a_run_begun_already_needs_resume(stored, capsys, twin_run):
+    text = complaint_of(capsys, "run", SMOKE, "--out", stored, *SAME)
+    assert str(stored) in text
+    assert "--resume" in text
+    assert unlike_columns(twin_run, stored) == []
+
+
+@pytest.mark.parametrize("resume", [[], ["--resume"]])
+def test_a_folder_with_foreign_files(resume, tmp_path, capsys):
+    (tmp_path / "thesis.tex").write_text("three years of work")
+    text = complaint_of(capsys, "run", SMOKE, "--out", tmp_path, *SAME, *resume)
+    assert str(tmp_path) in text
+    assert "other files" in text
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+def test_a_folder_with_somebody_elses_manifest(tmp_path, capsys):
+    (tmp_path / "manifest.json").write_text('{"short_name": "a web page"}')
+    assert "another campaign" in complaint_of(capsys, "run", SMOKE, "--out", tmp_path, *SAME, "--resume")
+    for command in (("estimate", tmp_path), ("report", tmp_path), ("replay", tmp_path, 0)):
+        assert str(tmp_path) in complaint_of(capsys, *command)
+
+
+# -- damaged records --
+
+
+@pytest.mark.parametrize("command", ["estimate", "report"])
+def test_a_truncated_shard(command, stored, capsys):
+    broken = shard_files(stored)[2]
+    truncate(broken)
+    assert str(broken) in complaint_of(capsys, command, stored)
+
+
+def test_a_missing_shard(stored, capsys):
+    broken = shard_files(stored)[1]
+    broken.unlink()
+    assert str(broken) in complaint_of(capsys, "estimate", stored)
+    assert str(broken) in complaint_of(capsys, "replay", stored, 150)
+
+
+@pytest.mark.parametrize("table", ["episodes", "moments", "traces"])
+def test_resuming_with_a_truncated_shard_names_it_and_its_mend_works(
+    table, stored, capsys, run_here, campaign, twin_run
+):
+    broken = shard_files(stored, table)[1]
+    truncate(broken)
+    text = complaint_of(capsys, "run", SMOKE, "--out", stored, *SAME, "--resume")
+    assert str(broken) in text
+    assert "Delete it and its episodes file" in text
+    for path in {broken, shard_files(stored)[1]}:
+        path.unlink()
+    run_here(campaign(*TWIN), stored, resume=True)
+    assert unlike_columns(twin_run, stored) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        *(("manifest.json", content) for content in (None, "{", "{}", "[]")),
+        *(("campaign.yaml", content) for content in (None, "{")),
+    ],
+)
+def test_a_missing_or_damaged_manifest_or_campaign(name, content, stored, capsys):
+    path = stored / name
+    path.unlink()
+    if content is not None:
+        path.write_text(content)
+    for command in (("estimate", stored), ("report", stored), ("replay", stored, 0)):
+        assert str(path) in complaint_of(capsys, *command)
+
+
+def test_a_folder_that_is_not_there(tmp_path, capsys):
+    for command in (("estimate", tmp_path / "no"), ("report", tmp_path / "no"), ("replay", tmp_path / "no", 0)):
+        assert str(tmp_path / "no") in complaint_of(capsys, *command)
+
+
+def test_an_episode_that_was_not_run(twin_run, capsys):
+    text = complaint_of(capsys, "replay", twin_run, 400)
+    assert "no episode 400" in text
+    assert "from 0 to 399" in text
+
+
+def test_a_campaign_that_was_changed_after_the_run(stored, capsys):
+    path = stored / "campaign.yaml"
+    path.write_text(path.read_text().replace("seed: 1", "seed: 2"))
+    assert str(path) in complaint_of(capsys, "replay", stored, 3)
+
+
+def test_a_manifest_that_counts_more_than_there_is(stored, capsys):
+    path = stored / "manifest.json"
+    content = json.loads(path.read_text())
+    path.write_text(json.dumps({**content, "n_episodes": 500}))
+    assert "400 episodes on record" in complaint_of(capsys, "estimate", stored)

@@ -1,0 +1,102 @@
+"""One step of SUMO, for any two speeds, is `next_position` to the last bit: standstill included."""
+
+from __future__ import annotations
+
+import libsumo
+import numpy as np
+import pytest
+
+from harness.outcomes import AV, BV, LV, VEHICLES
+from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M, gap, next_position, next_speed
+
+CELLS, ROUNDS, SEED = 64, 40, 20_261_121
+
+
+def random_positions(random: np.random.Generator) -> np.ndarray:
+    """Positions (CELLS, 3) at which nobody touches anybody; near the road's start floats are fine enough to differ."""
+    x = np.empty((CELLS, 3))
+    x[:, AV] = np.exp(random.uniform(np.log(0.1), np.log(3000.0), CELLS))
+    x[:, BV] = np.exp(random.uniform(np.log(0.1), np.log(2000.0), CELLS))
+    x[:, LV] = x[:, BV] + random.uniform(100.0, 1500.0, CELLS)
+    return x
+
+
+def any_change(random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    return random.uniform(0.0, 45.0, (CELLS, 3)), random.uniform(0.0, 45.0, (CELLS, 3))
+
+
+def driving(random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    speed = random.uniform(0.0, 45.0, (CELLS, 3))
+    acceleration = random.integers(-100, 51, (CELLS, 3)) / 5.0
+    return speed, np.maximum(speed + acceleration * STEP_S, 0.0)
+
+
+def braking_to_a_stop(random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    return random.uniform(0.0, 2.0, (CELLS, 3)), np.zeros((CELLS, 3))
+
+
+def stopping_from_any_speed(random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    return np.exp(random.uniform(np.log(1e-12), np.log(45.0), (CELLS, 3))), np.zeros((CELLS, 3))
+
+
+def driving_off(random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    return np.zeros((CELLS, 3)), random.uniform(0.0, 2.0, (CELLS, 3))
+
+
+@pytest.mark.parametrize("vanilla", [False, True])
+@pytest.mark.parametrize("speeds", [any_change, driving, braking_to_a_stop, stopping_from_any_speed, driving_off])
+def test_a_step_of_sumo_is_the_formula_in_every_bit(speeds, vanilla, open_world):
+    random = np.random.default_rng(SEED)
+    world = open_world(CELLS, vanilla=vanilla)
+    everywhere, nobody = np.arange(CELLS), np.zeros(CELLS, np.int8)
+    for _ in range(ROUNDS):
+        x, (before, after) = random_positions(random), speeds(random)
+        world.place(everywhere, x, before)
+        world.step(after, nobody)
+        for k in range(CELLS):
+            for vehicle, name in enumerate(VEHICLES):
+                expected = next_position(x[k, vehicle], before[k, vehicle], after[k, vehicle])
+                assert libsumo.vehicle.getLanePosition(f"{name}{k}").hex() == expected.hex()
+                assert libsumo.vehicle.getSpeed(f"{name}{k}").hex() == float(after[k, vehicle]).hex()
+
+
+def test_these_samples_tell_sumos_formula_from_the_textbooks():
+    random = np.random.default_rng(SEED)
+    x = np.concatenate([random_positions(random)[:, BV] for _ in range(ROUNDS)])
+    speed = random.uniform(0.0, 2.0, x.size)
+    textbook = x + 0.5 * (speed + 0.0) * STEP_S
+    exact = np.array([next_position(*pair, 0.0) for pair in zip(x, speed, strict=True)])
+    assert (textbook != exact).sum() >= 5
+    np.testing.assert_allclose(textbook, exact, rtol=1e-14)
+
+
+def test_many_steps_in_a_row_keep_every_bit(open_world):
+    """Errors of one step would add up: 150 steps of hard braking and driving off again."""
+    random = np.random.default_rng(2)
+    world = open_world(8)
+    x = random_positions(random)[:8]
+    x[:, LV] += 500.0
+    v = random.uniform(5.0, 15.0, (8, 3))
+    world.place(np.arange(8), x, v)
+    for _ in range(150):
+        v_after = np.array([[next_speed(v[k, i], random.integers(-40, 41) / 5.0) for i in range(3)] for k in range(8)])
+        x = np.array([[next_position(x[k, i], v[k, i], v_after[k, i]) for i in range(3)] for k in range(8)])
+        v = v_after
+        world.step(v, np.zeros(8, np.int8))
+    for k in range(8):
+        for i, name in enumerate(VEHICLES):
+            assert libsumo.vehicle.getLanePosition(f"{name}{k}").hex() == float(x[k, i]).hex()
+    assert (world.v == v).all()
+
+
+@pytest.mark.parametrize("overlap_m", [0.0, 0.0005, 0.00099, 0.00101, 0.01, 3.0])
+def test_sumo_flags_a_collision_exactly_beyond_a_millimetre(overlap_m, open_world):
+    world = open_world(1)
+    speed = np.full((1, 3), 20.0)
+    x = np.array([[1000.0, 500.0, 500.0 - VEHICLE_LENGTH_M + overlap_m]])
+    nobody, bv = np.zeros(1, np.int8), np.ones(1, np.int8)
+    world.place(np.arange(1), x, speed)
+    assert not world.step(speed, nobody)[0], "side by side, on two lanes"
+    contact = world.step(speed, bv)[0]
+    assert contact == (gap(world.x[0, BV], world.x[0, AV]) < -0.001)
+    assert contact == (overlap_m > 0.001)

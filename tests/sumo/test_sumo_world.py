@@ -1,0 +1,226 @@
+"""What the SUMO world refuses, what it notices, and that it is used again without memory of what was."""
+
+from __future__ import annotations
+
+import pickle
+import sys
+from types import SimpleNamespace
+
+import libsumo
+import numpy as np
+import pytest
+
+from harness.episode.loop import EpisodeLoop, Keep, Shard
+from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, WorldDisagreementError
+from harness.outcomes import AV, BV, CRASH, LV
+from harness.runner.prepare import prepare
+from harness.sumo.network import MOST_CELLS, network_file
+from harness.twin import TwinWorld
+
+
+def apart(n_cells: int) -> tuple[np.ndarray, np.ndarray]:
+    """Positions and speeds (n_cells, 3) of vehicles that do not meet."""
+    return np.tile([300.0, 200.0, 100.0], (n_cells, 1)), np.tile([30.0, 28.0, 35.0], (n_cells, 1))
+
+
+def drive(world, v: np.ndarray, *, steps: int) -> None:
+    for _ in range(steps):
+        world.step(v, np.zeros(len(v), np.int8))
+
+
+# -- one simulation per process --
+
+
+def test_a_second_simulation_is_refused_and_the_first_goes_on(open_world):
+    world = open_world(2)
+    with pytest.raises(CampaignError, match="already runs in this process"):
+        open_world(2)
+    x, v = apart(2)
+    world.place(np.arange(2), x, v)
+    world.step(v, np.zeros(2, np.int8))
+    assert world.x[1, LV] == pytest.approx(303.0)
+
+
+def test_after_closing_another_world_may_be_opened(open_world):
+    open_world(2).close()
+    world = open_world(3)
+    assert world.n_cells == 3
+    assert len(libsumo.vehicle.getIDList()) == 9
+
+
+def test_closing_a_world_twice_leaves_the_next_one_alone(open_world):
+    first = open_world(2)
+    first.close()
+    second = open_world(2)
+    first.close()
+    x, v = apart(2)
+    second.place(np.arange(2), x, v)
+    second.step(v, np.zeros(2, np.int8))
+    with pytest.raises(CampaignError, match="already runs"):
+        open_world(2)
+
+
+def test_more_cells_than_the_largest_network_has_are_refused():
+    with pytest.raises(CampaignError, match=r"world\.cells: found 257; expected at most 256"):
+        network_file(MOST_CELLS + 1)
+
+
+def test_without_its_extra_the_gui_is_refused_in_words(open_world, monkeypatch):
+    monkeypatch.setitem(sys.modules, "sumo", None)
+    api = SimpleNamespace(vehicle=libsumo.vehicle)
+    monkeypatch.setitem(sys.modules, "traci", api)
+    with pytest.raises(CampaignError, match=r"--gui: found no sumo-gui; expected the extra 'sumo'"):
+        open_world(1, gui=True)
+    assert open_world(1).n_cells == 1
+
+
+# -- a world that disobeys --
+
+
+@pytest.mark.parametrize("shim", [True, False])
+@pytest.mark.parametrize("victim", ["LV0", "BV3", "AV7"])
+def test_a_vehicle_one_unit_in_the_last_place_off_is_noticed_at_once(victim, shim, open_world):
+    world = open_world(8, shim=shim)
+    x, v = apart(8)
+    world.place(np.arange(8), x, v)
+    world.step(v, np.zeros(8, np.int8))
+    lane = libsumo.vehicle.getLaneID(victim)
+    libsumo.vehicle.moveTo(victim, lane, np.nextafter(libsumo.vehicle.getLanePosition(victim), 1e9))
+    with pytest.raises(WorldDisagreementError, match=f"{victim}, m: found ") as raised:
+        world.step(v, np.zeros(8, np.int8))
+    assert raised.value.exit_code == EXIT_TOO_MANY_FAILED
+    found, expected = raised.value.found, raised.value.expected.split(",")[0]
+    assert float.fromhex(found) == np.nextafter(float.fromhex(expected), np.inf)
+
+
+@pytest.mark.parametrize("shim", [True, False])
+@pytest.mark.parametrize("victim", ["LV1", "BV0", "AV2"])
+def test_a_speed_one_unit_in_the_last_place_off_is_noticed_within_ten_steps(victim, shim, open_world):
+    """So small a difference does not show in a position of some 100 m; the speed itself is asked for now and then."""
+    world = open_world(3, shim=shim)
+    x, v = apart(3)
+    world.place(np.arange(3), x, v)
+    libsumo.vehicle.setSpeed(victim, np.nextafter(libsumo.vehicle.getSpeed(victim), 0.0))
+    with pytest.raises(WorldDisagreementError, match=f"{victim}, m"):
+        drive(world, v, steps=10)
+
+
+def test_a_speed_that_was_not_set_at_placement_is_noticed(open_world, monkeypatch):
+    world = open_world(3)
+    x, v = apart(3)
+    set_previous = libsumo.vehicle.setPreviousSpeed
+    monkeypatch.setattr(
+        libsumo.vehicle,
+        "setPreviousSpeed",
+        lambda name, speed: set_previous(name, np.nextafter(speed, 0.0) if name == "AV1" else speed),
+    )
+    with pytest.raises(WorldDisagreementError, match="AV1, m/s"):
+        world.place(np.arange(3), x, v)
+
+
+def test_a_vehicle_that_was_not_put_where_it_belongs_is_noticed(open_world, monkeypatch):
+    world = open_world(4)
+    x, v = apart(4)
+    move_to = libsumo.vehicle.moveTo
+    monkeypatch.setattr(libsumo.vehicle, "moveTo", lambda name, *at: None if name == "BV2" else move_to(name, *at))
+    x[:, BV] = 222.0
+    with pytest.raises(WorldDisagreementError, match="BV2, m"):
+        world.place(np.arange(4), x, v)
+
+
+def test_a_lane_change_that_does_not_happen_is_noticed(open_world, monkeypatch):
+    world = open_world(4)
+    x, v = apart(4)
+    world.place(np.arange(4), x, v)
+    monkeypatch.setattr(libsumo.vehicle, "changeLane", lambda *arguments: None)
+    with pytest.raises(WorldDisagreementError, match="BV2, lane"):
+        world.step(v, np.array([0, 0, 1, 0], np.int8))
+
+
+def test_a_disagreement_survives_the_way_from_a_worker_to_its_parent():
+    error = WorldDisagreementError("SUMO, BV3, m", found="0x1p0", expected="0x1p1", mend="Report it.")
+    again = pickle.loads(pickle.dumps(error))
+    assert type(again) is WorldDisagreementError
+    assert str(again) == str(error)
+
+
+# -- the collision flag and the formula --
+
+
+class BlindTwin(TwinWorld):
+    """Never flags a collision."""
+
+    def step(self, speed, cut_in):
+        return super().step(speed, cut_in) & False
+
+
+class NervousTwin(TwinWorld):
+    """Flags a collision in cell 3 at its 20th step, when nobody touches anybody."""
+
+    steps = 0
+
+    def step(self, speed, cut_in):
+        self.steps += 1
+        return super().step(speed, cut_in) | ((self.steps == 20) & (np.arange(self.n_cells) == 3))
+
+
+def run_in(world, campaign) -> Shard:
+    prepared = prepare(campaign)
+    return EpisodeLoop(world, prepared.policy, Keep(0, "none", 0.0)).run(500, prepared.states(500, 60))
+
+
+def test_a_crash_that_the_world_does_not_flag_stops_the_run_and_names_the_episode(smoke):
+    run = run_in(TwinWorld(16), smoke()).results.episode
+    crashes = {f"episode {500 + row}, step {run['n_steps'][row]}" for row in np.flatnonzero(run["outcome"] == CRASH)}
+    with pytest.raises(WorldDisagreementError, match="found no collision where the positions show one") as raised:
+        run_in(BlindTwin(16), smoke())
+    assert raised.value.where in crashes
+
+
+def test_a_flag_without_a_crash_stops_the_run_and_names_the_episode(smoke):
+    with pytest.raises(
+        WorldDisagreementError, match="episode 503, step 20: found a collision that the positions do not show"
+    ):
+        run_in(NervousTwin(16), smoke())
+
+
+# -- cells are used again --
+
+
+def test_a_collision_in_the_first_step_of_a_refilled_cell_is_flagged(open_world):
+    world = open_world(2)
+    speed = np.tile([0.0, 30.0, 20.0], (2, 1))
+    nobody = np.zeros(2, np.int8)
+    for _ in range(3):
+        world.place(np.arange(2), np.tile([172.3, 166.0, 100.0], (2, 1)), speed)
+        assert world.step(speed, nobody).tolist() == [True, True]
+    world.place(np.array([0]), np.tile([300.0, 200.0, 100.0], (2, 1)), speed)
+    assert world.step(speed, nobody).tolist() == [False, True]
+
+
+def test_an_episode_after_many_others_is_the_same_as_in_a_fresh_simulation(smoke, open_world):
+    prepared = prepare(smoke())
+    used = open_world(4)
+    loop = prepared.loop(used, traces="all")
+    loop.run(0, prepared.states(0, 100))
+    after_others = loop.run(100, prepared.states(100, 12))
+    used.close()
+    fresh = prepared.loop(open_world(4), traces="all").run(100, prepared.states(100, 12))
+    assert (fresh.results.episode["outcome"] == CRASH).any()
+    assert after_others.results.episode.tobytes() == fresh.results.episode.tobytes()
+    for row in range(12):
+        assert after_others.traces[row].tobytes() == fresh.traces[row].tobytes()
+
+
+def test_a_cut_in_changes_only_its_own_cell(open_world):
+    world = open_world(4)
+    x, v = apart(4)
+    world.place(np.arange(4), x, v)
+    world.step(v, np.array([0, 1, 0, 0], np.int8))
+    lanes = {name: libsumo.vehicle.getLaneIndex(name) for name in libsumo.vehicle.getIDList()}
+    assert lanes == {
+        f"{name}{k}": int(name != "AV" and (name, k) != ("BV", 1)) for name in ("LV", "BV", "AV") for k in range(4)
+    }
+    world.place(np.array([1]), x, v)
+    assert libsumo.vehicle.getLaneIndex("BV1") == 1
+    assert world.x[1, AV] == x[1, AV]

@@ -1,0 +1,1 @@
+"""AVs that SUMO moves: its own models, and programs connected to it."""

@@ -1,0 +1,80 @@
+"""Clients that misbehave, each in one way: `misbehaving_client.py FAULT --port P --cells K`."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import time
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "examples" / "traci_client"))
+
+import idm_client
+
+FAULT_STEP = 60
+
+
+class Faulty:
+    """A connection that does something wrong at step `FAULT_STEP`."""
+
+    def __init__(self, connection, fault):
+        self._connection, self._fault, self._step = connection, fault, 0
+
+    def __getattr__(self, name):
+        return getattr(self._connection, name)
+
+    def simulationStep(self):  # noqa: N802 - TraCI's name
+        self._step += 1
+        if self._step == FAULT_STEP:
+            getattr(self, self._fault)()
+        if self._fault == "pushes_held_avs" and self._step > 1:
+            self._connection.vehicle.setSpeed("AV0", 3.0)
+        return self._connection.simulationStep()
+
+    def exits(self):
+        sys.exit(7)
+
+    def is_killed(self):
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    def hangs(self):
+        time.sleep(600)
+
+    def closes(self):
+        self._connection.close()
+        time.sleep(600)
+
+    def drops(self):
+        self._connection._socket.close()
+        time.sleep(600)
+
+    def moves_bv(self):
+        self._connection.vehicle.moveTo("BV1", "cell1_1", 500.0)
+
+    def slows_lv(self):
+        self._connection.vehicle.setSpeedMode("LV1", 0)
+        self._connection.vehicle.slowDown("LV1", 0.0, 2.0)
+        self._connection.vehicle.setPreviousSpeed("LV1", 1.0)
+
+    def changes_lane(self):
+        for k in range(4):
+            self._connection.vehicle.setActionStepLength(f"AV{k}", 0.1, True)
+            self._connection.vehicle.changeLane(f"AV{k}", 1, 0.0)
+
+    def pushes_held_avs(self):
+        pass
+
+
+def main():
+    fault, port, cells = sys.argv[1], int(sys.argv[3]), int(sys.argv[5])
+    if fault == "never_connects":
+        time.sleep(600)
+    if fault == "connects_late":
+        time.sleep(1.5)
+        fault = "pushes_held_avs"
+    idm_client.drive(Faulty(idm_client.connect(port), fault), cells)
+
+
+if __name__ == "__main__":
+    main()

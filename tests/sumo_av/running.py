@@ -1,0 +1,62 @@
+"""Episodes with an AV that SUMO moves, and the same episodes with the built-in IDM in the twin."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from harness.campaign.models import AutomatedVehicle, Campaign, Limits, Records, Run, Stop, Testing, TraciProcess, World
+from harness.episode.loop import Shard
+from harness.runner.prepare import build_world, prepare
+from harness.twin import TwinWorld
+
+ROOT = Path(__file__).parents[2]
+EXAMPLE = ROOT / "examples" / "traci_client" / "idm_client.py"
+MISBEHAVING = Path(__file__).parent / "misbehaving_client.py"
+
+
+def campaign(av: AutomatedVehicle, *, cells: int = 4, episodes: int = 100) -> Campaign:
+    return Campaign(
+        name="test",
+        av=av,
+        testing=Testing(method="forced"),
+        records=Records(moments="none", traces="all"),
+        world=World(cells=cells),
+        stop=Stop(episodes=episodes),
+        run=Run(shard_size=episodes),
+    )
+
+
+def sumo_av(**attributes) -> AutomatedVehicle:
+    return AutomatedVehicle(sumo=attributes)
+
+
+def program(*words: str | Path, connect_time_s: float = 60.0, restarts: int = 3, step_time_s: float = 60.0):
+    command = " ".join([sys.executable, *map(str, words), "--port {port} --cells {cells}"])
+    traci = TraciProcess(command=command, connect_time_s=connect_time_s, restarts=restarts)
+    return AutomatedVehicle(traci=traci, limits=Limits(step_time_s=step_time_s))
+
+
+def run_in(world, av: AutomatedVehicle, ranges: Sequence[tuple[int, int]]) -> list[Shard]:
+    """Run ranges (first episode, number) one after another in a world."""
+    prepared = prepare(campaign(av))
+    loop = prepared.loop(world, traces="all")
+    return [loop.run(first, prepared.states(first, n)) for first, n in ranges]
+
+
+def run(av: AutomatedVehicle, first: int, n: int, *, cells: int = 4) -> Shard:
+    """Episodes in a world of their own, as a campaign would have it."""
+    world = build_world(campaign(av, cells=cells))
+    try:
+        return run_in(world, av, [(first, n)])[0]
+    finally:
+        world.close()
+
+
+def run_idm(first: int, n: int) -> Shard:
+    return run_in(TwinWorld(8), AutomatedVehicle(), [(first, n)])[0]
+
+
+def bits(shard: Shard, row: int) -> bytes:
+    return shard.results.episode[row].tobytes() + shard.traces[row].tobytes()

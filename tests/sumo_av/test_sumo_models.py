@@ -1,0 +1,168 @@
+import numpy as np
+import pytest
+
+from harness.errors import CampaignError
+from harness.outcomes import AV, BV, CRASH, LV
+from harness.sumo import driven_world
+from harness.sumo.av_type import DEFAULTS, recyclable
+from harness.sumo.driven_world import DrivenWorld, FreshWorld
+from tests.sumo_av.running import ROOT, bits, run, run_idm, run_in, sumo_av
+
+
+def driven(av, ranges, *, cells=4):
+    world = DrivenWorld(cells, av.sumo)
+    try:
+        return run_in(world, av, ranges)
+    finally:
+        world.close()
+
+
+def fresh_bits(av, first, n):
+    """Every episode in a new simulation."""
+    return [bits(driven(av, [(first + i, 1)], cells=1)[0], 0) for i in range(n)]
+
+
+@pytest.mark.parametrize("model", ["Krauss", "IDM", "ACC", "CACC"])
+def test_recyclable_models_move_after_many_episodes_as_in_a_fresh_simulation(model):
+    av = sumo_av(carFollowModel=model)
+    assert recyclable(av.sumo)
+    _, shard = driven(av, [(0, 40), (40, 12)])
+    assert [bits(shard, row) for row in range(12)] == fresh_bits(av, 40, 12)
+
+
+@pytest.mark.parametrize(
+    "attributes",
+    [
+        {"carFollowModel": "Krauss", "sigma": 0.5},
+        {"carFollowModel": "EIDM"},
+        {"carFollowModel": "Wiedemann"},
+    ],
+    ids=lambda attributes: "-".join(map(str, attributes.values())),
+)
+def test_other_models_do_not_and_get_a_seeded_simulation_per_episode(attributes):
+    av = sumo_av(**attributes)
+    assert not recyclable(av.sumo)
+    _, recycled = driven(av, [(0, 40), (40, 8)])
+    assert [bits(recycled, row) for row in range(8)] != fresh_bits(av, 40, 8)
+    in_order, alone = run(av, 40, 8), run(av, 45, 2, cells=16)
+    assert [bits(in_order, row) for row in (5, 6)] == [bits(alone, row) for row in (0, 1)]
+
+
+def test_random_numbers_differ_between_episodes_and_campaigns():
+    seeds = {driven_world.sumo_seed(seed, episode) for seed in (1, 2) for episode in range(50)}
+    assert len(seeds) == 100
+
+
+@pytest.mark.parametrize(
+    "attributes", [{"sigma": 0.1}, {"speedDev": 0.1}, {"actionStepLength": 0.5}, {"startupDelay": 1}]
+)
+def test_attributes_that_nobody_has_measured_are_not_recycled(attributes):
+    assert not recyclable(attributes)
+
+
+def test_lv_and_bv_move_as_with_any_other_av_and_the_av_holds_its_speed_until_the_step_after_the_cut_in():
+    av = sumo_av(carFollowModel="ACC")
+    shard, idm = run(av, 0, 24), run_idm(0, 24)
+    responded = 0
+    for row in range(24):
+        mine, theirs = shard.traces[row], idm.traces[row]
+        n = min(len(mine), len(theirs))
+        assert np.array_equal(mine[:n, [LV, BV], :2], theirs[:n, [LV, BV], :2])
+        cut = shard.results.episode["cut_in_step"][row]
+        assert np.array_equal(mine[: cut + 2, AV, :2], theirs[: cut + 2, AV, :2])
+        assert (mine[: cut + 2, AV, 1] == mine[0, AV, 1]).all()
+        responded += mine[min(cut + 3, len(mine) - 1), AV, 1] != mine[0, AV, 1]
+    assert responded > 12
+
+
+def test_speeds_of_the_av_explain_its_positions_and_recorded_accelerations():
+    shard = run(sumo_av(carFollowModel="IDM"), 0, 8)
+    for trace in shard.traces.values():
+        x, v, a = trace[:, AV].T
+        assert np.allclose(np.diff(x), 0.05 * (v[1:] + v[:-1]), atol=1e-9)
+        assert np.allclose(np.diff(v), 0.1 * a[:-1], atol=1e-12)
+        assert np.abs(a[:-1]).max() > 0.5
+
+
+def test_collision_flag_and_formula_agree_for_an_av_that_keeps_a_gap_but_hardly_brakes():
+    # A difference between SUMO's flag and the bumper formula would raise WorldDisagreementError.
+    shard = run(sumo_av(carFollowModel="Krauss", minGap=5.0, decel=0.4, emergencyDecel=0.5), 0, 60)
+    assert (shard.results.episode["outcome"] == CRASH).sum() >= 5
+
+
+def test_the_speed_mode_of_a_released_av_does_not_matter_as_nothing_is_commanded(monkeypatch):
+    av = sumo_av(carFollowModel="Krauss")
+    (default,) = driven(av, [(0, 16)])
+    monkeypatch.setattr(driven_world, "SUMO_DECIDES", driven_world.OBEY)
+    (obeying,) = driven(av, [(0, 16)])
+    assert [bits(default, row) for row in range(16)] == [bits(obeying, row) for row in range(16)]
+
+
+def test_python_and_shim_move_alike():
+    av = sumo_av(carFollowModel="CACC")
+    world = DrivenWorld(4, av.sumo, shim=False)
+    try:
+        (without,) = run_in(world, av, [(0, 12)])
+    finally:
+        world.close()
+    (with_shim,) = driven(av, [(0, 12)])
+    assert [bits(without, row) for row in range(12)] == [bits(with_shim, row) for row in range(12)]
+
+
+def test_an_av_that_acts_from_the_start_changes_its_speed_before_the_cut_in():
+    av = sumo_av(carFollowModel="IDM")
+    world = DrivenWorld(4, av.sumo, acts_before_cut_in=True)
+    try:
+        (shard,) = run_in(world, av, [(0, 12)])
+    finally:
+        world.close()
+    assert all(trace[1, AV, 1] != trace[0, AV, 1] for trace in shard.traces.values())
+
+
+@pytest.mark.parametrize(
+    ("attributes", "where", "words"),
+    [
+        ({"tao": 1.0}, "av.sumo.tao", "Did you mean 'tau'"),
+        ({"carFollowModel": "Kraus"}, "av.sumo.carFollowModel", "Did you mean 'Krauss'"),
+        ({"accel": -1.0}, "av.sumo.accel", "Must be greater than 0"),
+        ({"tau": "short"}, "av.sumo.tau", "Cannot be parsed"),
+        ({"sigma": 2.0, "carFollowModel": "Krauss"}, "av.sumo.sigma", "Only values between"),
+        ({"length": 4.0}, "av.sumo.length", "Delete"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_wrong_attributes_are_named_with_what_sumo_says(attributes, where, words, capfd):
+    with pytest.raises(CampaignError) as caught:
+        run(sumo_av(**attributes), 0, 1)
+    assert caught.value.where == where
+    assert caught.value.exit_code == 2
+    assert words in str(caught.value)
+    assert "Error" not in capfd.readouterr().err
+
+
+def test_a_world_can_be_opened_after_sumo_has_refused_a_type():
+    with pytest.raises(CampaignError):
+        DrivenWorld(1, {"accel": -1.0})
+    DrivenWorld(1, {}).close()
+    FreshWorld({"carFollowModel": "EIDM"}, 1).close()
+
+
+def test_documented_defaults_are_the_real_ones():
+    text = (ROOT / "docs" / "sumo-av.md").read_text(encoding="utf-8")
+    for name, value in DEFAULTS.items():
+        shown = value if isinstance(value, str) else f"{value:g}"
+        assert f"| `{name}` | {shown} |" in text
+
+
+@pytest.mark.parametrize(("overtakes", "speed_mps"), [(1.0, 40.0), (0.0, 26.0)])
+def test_by_default_the_av_looks_at_its_own_lane_alone(overtakes, speed_mps):
+    world = DrivenWorld(1, {"lcOvertakeRight": overtakes})
+    try:
+        speeds = np.array([[20.0, 30.0, 30.0]])
+        world.place(np.array([0]), np.array([[700.0, 640.0, 100.0]]), speeds)
+        world.step(speeds, np.ones(1, np.int8))
+        for _ in range(300):
+            world.step(speeds, np.zeros(1, np.int8))
+        assert world.v[0, AV] == pytest.approx(speed_mps, abs=1.0)  # LV, at 20 m/s, is 24 m or 106 m ahead on the left
+    finally:
+        world.close()

@@ -1,0 +1,98 @@
+import json
+
+import numpy as np
+import pytest
+
+from harness.errors import CampaignError, TooManyFailedError, WorldDisagreementError
+from harness.outcomes import FAILED
+from harness.runner.campaign_run import run_campaign
+from harness.runner.replay import replay_episode
+from tests.sumo_av.misbehaving_client import FAULT_STEP
+from tests.sumo_av.running import EXAMPLE, MISBEHAVING, bits, campaign, program, run, run_idm
+
+
+def assert_same_motion(shard, expected, rows):
+    for row in rows:
+        assert shard.results.episode[row].tobytes() == expected.results.episode[row].tobytes()
+        assert shard.traces[row][:, :, :2].tobytes() == expected.traces[row][:, :, :2].tobytes()
+
+
+def test_the_example_client_drives_like_the_built_in_idm_in_every_bit():
+    shard, expected = run(program(EXAMPLE), 0, 24, cells=8), run_idm(0, 24)
+    assert not shard.failures
+    assert_same_motion(shard, expected, range(24))
+
+
+def test_commands_to_an_av_that_must_hold_its_speed_are_overruled():
+    shard, expected = run(program(MISBEHAVING, "pushes_held_avs"), 0, 6, cells=2), run_idm(0, 6)
+    for row in range(6):
+        cut = expected.results.episode["cut_in_step"][row]
+        assert shard.traces[row][: cut + 2, :, :2].tobytes() == expected.traces[row][: cut + 2, :, :2].tobytes()
+    assert any(bits(shard, row) != bits(expected, row) for row in range(6)), "it never drove"
+
+
+def test_connecting_late_is_no_fault():
+    assert not run(program(MISBEHAVING, "connects_late"), 0, 2, cells=2).failures
+
+
+@pytest.mark.parametrize(
+    ("fault", "cause"),
+    [
+        ("exits", "exit code 7"),
+        ("is_killed", "killed by signal 9"),
+        ("hangs", "did not finish its step within 3 s"),
+        ("closes", "closed its connection, but goes on running"),
+        ("drops", "closed its connection, but goes on running"),
+    ],
+)
+def test_a_program_lost_in_mid_run_fails_what_ran_and_is_started_again(fault, cause):
+    # Each start lives for 60 steps, some less than an episode: one restart, then the rest is given up.
+    av = program(MISBEHAVING, fault, restarts=1, step_time_s=3.0)
+    shard, expected = run(av, 0, 12, cells=4), run_idm(0, 12)
+    outcome = shard.results.episode["outcome"]
+    assert set(np.flatnonzero(outcome == FAILED)) == set(shard.failures)
+    lost = [row for row, said in shard.failures.items() if cause in said]
+    given_up = [row for row, said in shard.failures.items() if "is not started again" in said]
+    assert len(lost) >= 8
+    assert sorted(lost + given_up) == sorted(shard.failures)
+    for row in lost:
+        n = shard.results.episode["n_steps"][row]
+        assert n <= FAULT_STEP
+        assert np.isfinite(shard.results.episode["log_weight"][row])
+        assert shard.traces[row][:, :, :2].tobytes() == expected.traces[row][: n + 1, :, :2].tobytes()
+    assert_same_motion(shard, expected, np.flatnonzero(outcome != FAILED))
+
+
+def test_a_program_that_never_connects_fails_its_episodes():
+    shard = run(program(MISBEHAVING, "never_connects", connect_time_s=1.0, restarts=0), 0, 6, cells=2)
+    assert len(shard.failures) == 6
+    assert "did not connect within 1 s" in shard.failures[0]
+    assert "is not started again" in shard.failures[5]
+
+
+@pytest.mark.parametrize(("fault", "vehicle"), [("moves_bv", "BV1"), ("slows_lv", "LV1"), ("changes_lane", "AV")])
+def test_moving_what_is_not_the_clients_stops_the_run(fault, vehicle):
+    with pytest.raises(WorldDisagreementError, match=f"SUMO, {vehicle}") as caught:
+        run(program(MISBEHAVING, fault), 0, 8, cells=4)
+    assert "may only command AVs" in str(caught.value)
+
+
+def test_a_command_that_cannot_be_started_is_an_error_of_the_campaign():
+    av = program(EXAMPLE)
+    av = av.model_copy(update={"traci": av.traci.model_copy(update={"command": "./no_such_program {port}"})})
+    with pytest.raises(CampaignError, match=r"av\.traci\.command.*no_such_program"):
+        run(av, 0, 1)
+
+
+def test_a_campaign_whose_program_ends_at_once_ends_with_exit_code_3(tmp_path):
+    with pytest.raises(TooManyFailedError) as caught:
+        run_campaign(campaign(program("-c", "exit(5)", restarts=0), episodes=200), tmp_path / "run", workers=1)
+    assert caught.value.exit_code == 3
+
+
+def test_a_run_says_that_it_is_not_reproducible_and_is_not_replayed(tmp_path):
+    folder = tmp_path / "run"
+    run_campaign(campaign(program(EXAMPLE), episodes=4), folder, workers=1)
+    assert json.loads((folder / "manifest.json").read_text())["reproducible"] is False
+    with pytest.raises(CampaignError, match="not reproducible"):
+        replay_episode(folder, 0)

@@ -1,0 +1,338 @@
+"""The command line: what goes where, which exit code, and errors in plain words."""
+
+import errno
+import json
+import os
+import subprocess
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import get_args
+
+import pyarrow as pa
+import pytest
+from click.testing import CliRunner
+from pyarrow import csv, parquet
+
+from harness.campaign.loading import load_campaign
+from harness.campaign.models import EstimatorName
+from harness.cli import cli, main
+from harness.errors import RunFolderError, TooManyFailedError
+
+SCENARIOS = Path(__file__).parents[1] / "scenarios"
+SMOKE = str(SCENARIOS / "smoke.yaml")
+
+NADE = {
+    "crash_rate": 1.2e-7,
+    "std_error": 4e-9,
+    "ci_low": 1.14e-7,
+    "ci_high": 1.26e-7,
+    "upper_bound": 1.25e-7,
+    "confidence": 0.9,
+    "rhw": 0.05,
+    "n_episodes": 40_000,
+    "n_crashes": 3_210,
+    "n_effective": 1_234.5,
+    "largest_weight_share": 0.012,
+    "method": "mean of weights",
+    "warnings": ["a remark on the weights"],
+}
+ESTIMATES = {
+    "campaign": "smoke",
+    "campaign_hash": "0123",
+    "lane_change_level": 1.0,
+    "confidence": 0.9,
+    "n_episodes": 40_000,
+    "n_crashes": 3_210,
+    "headline": "nade",
+    "distance_per_test_km": 0.6,
+    "crash_rate_per_1e6_km": 0.2,
+    "estimates": {"nade": NADE, "nde": {"crash_rate": None, "reason": "weights are not 1"}},
+    "statement": "The vehicle crashes once in 8.3 million tests.",
+    "scope": "Sampling error only.",
+}
+
+
+@dataclass
+class Result:
+    folder: Path
+    report: Path
+    estimates: dict = field(default_factory=lambda: ESTIMATES)
+    stopped_by: str = "rhw"
+    exit_code: int = 0
+
+
+@dataclass
+class Replay:
+    bit_equal: bool | None
+    outcome: str = "crash"
+    trace: pa.Table = field(
+        default_factory=lambda: pa.table(
+            {"step": pa.array([0, 1], pa.int16()), "vehicle": pa.array(["LV", "BV"]).dictionary_encode()}
+        )
+    )
+
+
+@pytest.fixture
+def calls(monkeypatch, tmp_path):
+    """Stands in for what the commands call, and notes how they were called."""
+    seen = {}
+
+    def stand_in(target, answer):
+        def called(*arguments, **options):
+            seen[target] = (arguments, options)
+            result = answer(*arguments) if callable(answer) else answer
+            if isinstance(result, BaseException):
+                raise result
+            return result
+
+        monkeypatch.setattr(target, called, raising=False)
+
+    stand_in("harness.runner.plan_campaign", {"episodes": 400_000, "tables": "to build (about 20 s)", "disk_mb": 12.5})
+    stand_in("harness.runner.run_campaign", lambda _, folder: Result(folder, folder / "report.html"))
+    stand_in("harness.report.write_report", lambda folder: folder / "report.html")
+    stand_in("harness.estimators.estimate_run", ESTIMATES)
+    stand_in("harness.runner.replay_episode", Replay(bit_equal=True))
+    seen["stand_in"] = stand_in
+    return seen
+
+
+def test_help_teaches_and_needs_nothing_heavy():
+    for command in (
+        [],
+        ["check"],
+        ["av-check"],
+        ["run"],
+        ["compare"],
+        ["estimate"],
+        ["report"],
+        ["replay"],
+        ["schema"],
+    ):
+        result = CliRunner().invoke(cli, [*command, "--help"])
+        assert result.exit_code == 0
+        assert "Examples:\n    harness " in result.output
+    heavy = "{'numba', 'scipy', 'pyarrow', 'pydantic', 'rich'}"
+    loaded = f"import sys, harness.cli; print(sorted({heavy} & set(sys.modules)))"
+    assert subprocess.run([sys.executable, "-c", loaded], capture_output=True, check=True).stdout == b"[]\n"
+
+
+def test_check_prints_a_campaign_file(calls, capsys, tmp_path):
+    assert main(["check", SMOKE, "--set", "stop.rhw=0.2"]) == 0
+    output = capsys.readouterr().out
+    (tmp_path / "resolved.yaml").write_text(output)
+    assert load_campaign(tmp_path / "resolved.yaml") == load_campaign(SMOKE, ["stop.rhw=0.2"])
+    assert "#   episodes: 400,000" in output
+    assert "#   tables: to build (about 20 s)" in output
+    assert "#   disk mb: 12.5" in output
+
+
+def test_check_as_json(calls, capsys):
+    assert main(["check", SMOKE, "--json"]) == 0
+    output = json.loads(capsys.readouterr().out)
+    assert output["campaign"]["stop"]["rhw"] == 0.05
+    assert output["plan"]["disk_mb"] == 12.5
+
+
+def test_run_prints_the_answer_and_where_more_is(calls, capsys, tmp_path):
+    folder = tmp_path / "out"
+    assert main(["run", SMOKE, "--out", str(folder), "--workers", "2", "--resume", "--set", "seed=7"]) == 0
+    out, err = capsys.readouterr()
+    assert out.splitlines() == [
+        ESTIMATES["statement"],
+        ESTIMATES["scope"],
+        str(folder / "report.html"),
+        str(folder / "estimates.json"),
+    ]
+    assert err == ""
+    (campaign, to), options = calls["harness.runner.run_campaign"]
+    assert (campaign.seed, to) == (7, folder)
+    assert options == {"workers": 2, "resume": True, "progress": None}
+
+
+def test_run_as_json_and_with_the_budget_spent(calls, capsys, tmp_path):
+    calls["stand_in"](
+        "harness.runner.run_campaign", lambda _, folder: Result(folder, folder / "report.html", exit_code=4)
+    )
+    assert main(["run", SMOKE, "--out", str(tmp_path / "out"), "--json"]) == 4
+    assert json.loads(capsys.readouterr().out) == ESTIMATES
+
+
+def test_wrong_campaign_leaves_nothing_behind(calls, capsys, tmp_path):
+    assert main(["run", SMOKE, "--out", str(tmp_path / "out"), "--set", "testing.epsilom=1"]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.splitlines()[0] == "error: --set testing.epsilom=1"
+    assert [line.split()[0] for line in err.splitlines()[1:]] == ["found:", "expected:", "mend:"]
+    assert "Did you mean 'epsilon'?" in err
+    assert "harness.runner.run_campaign" not in calls
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "path", "line"),
+    [
+        ("testin: {}", "testin", 2),
+        ("testing:\n  epsilon: x", "testing.epsilon", 3),
+        ("stop:\n  rhw: 0.1\n  rhw: 0.2", "stop.rhw", 4),
+        ("av:\n  parameters:\n    desired_speed_mps: 300", "av.parameters.desired_speed_mps", 4),
+        ("environment:\n  parameters: ./gone.yaml", "environment.parameters", 3),
+        ("testing:\n  alpha: {SM-I: 0.5, SM-II: 0.2, SM-III: 0.2}", "testing.alpha", 3),
+    ],
+)
+@pytest.mark.parametrize("command", ["check", "run"])
+def test_bad_campaigns_end_with_2_and_the_place(calls, capsys, tmp_path, text, path, line, command):
+    (tmp_path / "bad.yaml").write_text(f"name: bad\n{text}\n")
+    out = ["--out", str(tmp_path / "out")] if command == "run" else []
+    assert main([command, str(tmp_path / "bad.yaml"), *out]) == 2
+    assert capsys.readouterr().err.startswith(f"error: {path} ({tmp_path / 'bad.yaml'}:{line})\n")
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["bad.yaml"]
+
+
+def test_numbers_without_dot_run(calls, tmp_path):
+    (tmp_path / "good.yaml").write_text("name: good\ntesting: {epsilon: 1e-5}\n")
+    assert main(["run", str(tmp_path / "good.yaml"), "--out", str(tmp_path / "out")]) == 0
+    assert calls["harness.runner.run_campaign"][0][0].testing.epsilon == 1e-5
+
+
+def test_several_problems_are_listed(calls, capsys, tmp_path):
+    (tmp_path / "bad.yaml").write_text("name: bad\nseed: x\nwordl: {}\n")
+    assert main(["check", str(tmp_path / "bad.yaml")]) == 2
+    err = capsys.readouterr().err
+    assert err.startswith(f"error: {tmp_path / 'bad.yaml'}: 2 problems\nerror: seed (")
+    assert "\nerror: wordl (" in err
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["run", SMOKE],
+        ["run", SMOKE, "--out", "x", "--workers", "0"],
+        ["nothing"],
+        ["check", SMOKE, "--nothing"],
+        ["estimate", "no-such-folder"],
+        ["estimate", ".", "--confidence", "1"],
+        ["replay", ".", "-1"],
+        ["replay", ".", "1", "--out", "trace.txt"],
+        [],
+    ],
+)
+def test_wrong_calls_end_with_2(calls, capsys, arguments):
+    assert main(arguments) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert "Usage: harness" in err
+
+
+@pytest.mark.parametrize("kind", [RunFolderError, TooManyFailedError])
+def test_errors_of_the_work_keep_their_exit_code(calls, capsys, tmp_path, kind):
+    error = kind("episodes/0.parquet", found="half a file", expected="a whole one", mend="Delete it.")
+    calls["stand_in"]("harness.runner.run_campaign", error)
+    assert main(["run", SMOKE, "--out", str(tmp_path)]) == kind.exit_code
+    expected = "error: episodes/0.parquet\n  found:    half a file\n  expected: a whole one\n  mend:     Delete it.\n"
+    assert capsys.readouterr().err == expected
+
+
+def test_interrupt_says_how_to_go_on(calls, capsys, tmp_path):
+    calls["stand_in"]("harness.runner.run_campaign", KeyboardInterrupt())
+    assert main(["run", SMOKE, "--out", str(tmp_path)]) == 130
+    assert "--resume" in capsys.readouterr().err
+    calls["stand_in"]("harness.estimators.estimate_run", KeyboardInterrupt())
+    assert main(["estimate", str(tmp_path)]) == 130
+    assert "--resume" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("number", "words"),
+    [(errno.ENOSPC, "free some space"), (errno.EDQUOT, "--resume"), (errno.EACCES, "permissions")],
+)
+def test_errors_of_the_system_that_can_be_mended(calls, capsys, tmp_path, number, words):
+    calls["stand_in"]("harness.runner.run_campaign", OSError(number, os.strerror(number), "episodes/0.parquet"))
+    assert main(["run", SMOKE, "--out", str(tmp_path)]) == 2
+    err = capsys.readouterr().err
+    assert "error: episodes/0.parquet" in err
+    assert words in err
+
+
+def test_defects_are_not_hidden(calls, tmp_path):
+    calls["stand_in"]("harness.runner.run_campaign", OSError(errno.EIO, "broken disk"))
+    with pytest.raises(OSError, match="broken disk"):
+        main(["run", SMOKE, "--out", str(tmp_path)])
+    calls["stand_in"]("harness.runner.run_campaign", ZeroDivisionError())
+    with pytest.raises(ZeroDivisionError):
+        main(["run", SMOKE, "--out", str(tmp_path)])
+
+
+def test_estimate_prints_a_table(calls, capsys, tmp_path):
+    assert main(["estimate", str(tmp_path), "-e", "nade", "-e", "nde", "--confidence", "0.95"]) == 0
+    out = capsys.readouterr().out
+    assert calls["harness.estimators.estimate_run"] == (
+        (tmp_path,),
+        {"estimators": ("nade", "nde"), "confidence": 0.95},
+    )
+    row = next(line for line in out.splitlines() if "nade *" in line)
+    assert all(text in row for text in ("1.2000e-07", "1.140e-07 to 1.260e-07", "0.050", "1,234.5", "1.20%"))
+    assert "nade: a remark on the weights" in out
+    assert "nde: weights are not 1" in out
+    assert out.splitlines()[-2:] == [ESTIMATES["statement"], ESTIMATES["scope"]]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_estimate_without_a_crash_has_gaps(calls, capsys, tmp_path):
+    entry = {**NADE, "crash_rate": 0.0, "rhw": None, "n_effective": None, "largest_weight_share": None}
+    calls["stand_in"]("harness.estimators.estimate_run", {**ESTIMATES, "estimates": {"nade": entry}})
+    assert main(["estimate", str(tmp_path)]) == 0
+    assert "0.0000e+00" in capsys.readouterr().out
+
+
+def test_estimate_knows_every_estimator():
+    option = next(option for option in cli.commands["estimate"].params if option.name == "estimators")
+    assert option.type.choices == get_args(EstimatorName)
+
+
+def test_estimate_writes_only_when_asked(calls, capsys, tmp_path):
+    assert main(["estimate", str(tmp_path), "--write", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == ESTIMATES
+    assert json.loads((tmp_path / "estimates.json").read_text()) == ESTIMATES
+    assert [file.name for file in tmp_path.iterdir()] == ["estimates.json"]
+
+
+def test_report_prints_the_page(calls, capsys, tmp_path):
+    assert main(["report", str(tmp_path)]) == 0
+    assert capsys.readouterr().out == f"{tmp_path / 'report.html'}\n"
+
+
+def test_replay_writes_the_trace(calls, capsys, tmp_path):
+    as_csv, as_parquet = tmp_path / "trace.csv", tmp_path / "trace.parquet"
+    assert main(["replay", str(tmp_path), "17", "--out", str(as_csv), "--fcd", "fcd.xml"]) == 0
+    out = capsys.readouterr().out
+    assert out.splitlines() == ["episode 17: crash; bit for bit as stored", str(as_csv), "fcd.xml"]
+    assert calls["harness.runner.replay_episode"] == ((tmp_path, 17), {"gui": False, "fcd": Path("fcd.xml")})
+    assert csv.read_csv(as_csv)["vehicle"].to_pylist() == ["LV", "BV"]
+    assert main(["replay", str(tmp_path), "17", "--out", str(as_parquet), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["bit_equal"] is True
+    assert parquet.read_table(as_parquet)["step"].to_pylist() == [0, 1]
+
+
+def test_replay_that_differs_is_an_error(calls, capsys, tmp_path):
+    calls["stand_in"]("harness.runner.replay_episode", Replay(bit_equal=False))
+    assert main(["replay", str(tmp_path), "17"]) == 3
+    out, err = capsys.readouterr()
+    assert out == "episode 17: crash; NOT as stored\n"
+    assert "manifest.json" in err
+    calls["stand_in"]("harness.runner.replay_episode", Replay(bit_equal=None))
+    assert main(["replay", str(tmp_path), "17"]) == 0
+    assert "no stored trace" in capsys.readouterr().out
+
+
+def test_schema_prints_what_is_committed():
+    result = subprocess.run([sys.executable, "-m", "harness", "schema"], capture_output=True, check=True)
+    assert result.stdout.decode() == (SCENARIOS / "campaign.schema.json").read_text(encoding="utf-8")
+
+
+def test_a_reader_that_leaves_is_no_error():
+    command = f"{sys.executable} -m harness schema | head -c 1; exit ${{PIPESTATUS[0]}}"
+    result = subprocess.run(["bash", "-c", command], capture_output=True, check=False)
+    assert result.stdout == b"{"
+    assert result.stderr == b""
+    assert result.returncode in (0, 1)

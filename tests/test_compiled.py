@@ -1,0 +1,100 @@
+"""The hash that names the kernel cache covers every file that machine code can come from."""
+
+import ast
+import os
+from pathlib import Path
+
+import pytest
+
+import harness
+from harness.compiled import KERNEL_SOURCES, source_hash
+
+ROOT = Path(harness.__file__).parent
+DECORATORS = {"compiled", "compiled_inline", "compiled_threads"}
+
+
+def module_path(name: str) -> str | None:
+    """File of a module of the harness, relative to the package."""
+    parts = name.split(".")[1:]
+    for path in (Path(*parts).with_suffix(".py") if parts else Path("__init__.py"), Path(*parts, "__init__.py")):
+        if (ROOT / path).is_file():
+            return path.as_posix()
+    return None
+
+
+def imported_from(tree: ast.Module) -> dict[str, str]:
+    """Name in the module → file of the harness that it comes from."""
+    origin = {}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("harness"):
+            for alias in node.names:
+                path = module_path(f"{node.module}.{alias.name}") or module_path(node.module)
+                origin[alias.asname or alias.name] = path
+    return origin
+
+
+def names_in(nodes) -> set[str]:
+    return {name.id for node in nodes for name in ast.walk(node) if isinstance(name, ast.Name)}
+
+
+def compiled_functions(tree: ast.Module) -> list[ast.FunctionDef]:
+    functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
+    return [f for f in functions if names_in(f.decorator_list) & DECORATORS]
+
+
+def constants(tree: ast.Module) -> list[ast.expr]:
+    """What the module's own names are made from."""
+    return [node.value for node in tree.body if isinstance(node, ast.Assign | ast.AnnAssign) and node.value]
+
+
+def files_read(tree: ast.Module, nodes) -> set[str]:
+    origin = imported_from(tree)
+    return {origin[name] for name in names_in(nodes) if origin.get(name)}
+
+
+def needed_by(name: str) -> set[str]:
+    """Files whose content ends in the machine code of this one: its own, and those of the names its kernels read."""
+    tree = ast.parse((ROOT / name).read_text(encoding="utf-8"))
+    functions = compiled_functions(tree)
+    if not functions:
+        return set()
+    bodies = [node for function in functions for node in (*function.body, *function.decorator_list)]
+    return {name} | files_read(tree, bodies) | files_read(tree, constants(tree))
+
+
+def constants_of(name: str) -> set[str]:
+    """Files that the constants of a file are made from, whether or not it holds kernels."""
+    tree = ast.parse((ROOT / name).read_text(encoding="utf-8"))
+    return files_read(tree, constants(tree))
+
+
+def covered(patterns) -> set[str]:
+    return {path.relative_to(ROOT).as_posix() for pattern in patterns for path in ROOT.glob(pattern)}
+
+
+@pytest.fixture(scope="module")
+def needed() -> set[str]:
+    modules = [path.relative_to(ROOT).as_posix() for path in ROOT.rglob("*.py")]
+    found = set().union(*map(needed_by, modules))
+    while more := set().union(*map(constants_of, found)) - found:
+        found |= more
+    return found
+
+
+def test_every_file_that_kernels_come_from_is_hashed(needed):
+    assert len(needed) >= 18  # the search itself must not silently find nothing
+    assert needed <= covered(KERNEL_SOURCES)
+
+
+@pytest.mark.parametrize("left_out", ["compiled.py", "outcomes.py", "environment/*.py", "episode/*.py", "twin.py"])
+def test_leaving_out_a_pattern_is_noticed(needed, left_out):
+    assert left_out in KERNEL_SOURCES
+    assert not needed <= covered([pattern for pattern in KERNEL_SOURCES if pattern != left_out])
+
+
+def test_every_pattern_names_a_file():
+    assert all(covered([pattern]) for pattern in KERNEL_SOURCES)
+
+
+def test_the_cache_is_named_after_the_hash():
+    assert os.environ["NUMBA_CACHE_DIR"].endswith(f"kernels-{source_hash()}")

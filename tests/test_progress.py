@@ -1,0 +1,86 @@
+"""Progress: what a terminal shows, and how the time left is reckoned."""
+
+import io
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from harness.progress import RichProgress, SilentProgress, episodes_left, terminal_progress
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+@pytest.mark.parametrize(
+    ("figures", "left"),
+    [
+        ({}, 9_000),
+        ({"rhw": 0.2, "target_rhw": 0.1, "crashes": 50}, 3_000),
+        ({"rhw": 0.2, "target_rhw": 0.1, "crashes": 50, "min_crashes": 300}, 5_000),
+        ({"rhw": 0.2, "target_rhw": 0.01, "crashes": 50}, 9_000),
+        ({"rhw": 0.1, "target_rhw": 0.2, "crashes": 50}, 0),
+        ({"rhw": 0.2, "target_rhw": 0.1, "crashes": 0}, 9_000),
+        ({"rhw": float("inf"), "target_rhw": 0.1, "crashes": 1}, 9_000),
+    ],
+)
+def test_episodes_left(figures, left):
+    assert episodes_left(1_000, 10_000, **figures) == left
+
+
+@given(
+    done=st.integers(0, 10**10),
+    total=st.integers(1, 10**10),
+    rhw=st.none() | st.floats(0, allow_nan=False),
+    crashes=st.none() | st.integers(0, 10**9),
+)
+def test_episodes_left_stays_within_the_budget(done, total, rhw, crashes):
+    left = episodes_left(done, total, rhw=rhw, target_rhw=0.05, crashes=crashes, min_crashes=3_000)
+    assert 0 <= left <= max(total - done, 0)
+
+
+def test_bar_shows_rate_figures_and_time_left_on_a_narrow_terminal(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    stream = Terminal()
+    with RichProgress(0.05, 3_000, stream) as bar:
+        bar.stage("criticality tables", total=3)
+        bar.advance(3)
+        bar.stage("episodes", total=400_000)
+        bar.advance(5_000)
+        bar.status(crashes=1_234, rhw=0.0812)
+    last_line = stream.getvalue().splitlines()[-2]
+    for text in ("episodes", " 1%", "/s · crashes 1,234 · RHW 0.081 · 0:0", " left"):
+        assert text in last_line
+    assert "criticality" not in last_line
+
+
+def test_work_of_an_earlier_run_does_not_count_as_speed():
+    stream = Terminal()
+    with RichProgress(stream=stream) as bar:
+        bar.stage("episodes", total=10_000, done=5_000)
+        bar.status(crashes=3)
+    assert "50%" in stream.getvalue()
+    assert "/s" not in stream.getvalue()
+
+
+def test_figures_before_any_stage_are_no_error():
+    with RichProgress(stream=Terminal()) as bar:
+        bar.advance(1)
+        bar.status(crashes=1)
+
+
+def test_a_bar_only_on_a_terminal(monkeypatch):
+    monkeypatch.setattr("sys.stderr", io.StringIO())
+    assert terminal_progress() is None
+    monkeypatch.setattr("sys.stderr", Terminal())
+    assert isinstance(terminal_progress(), RichProgress)
+
+
+def test_silence(capsys):
+    silent = SilentProgress()
+    silent.stage("episodes", total=3)
+    silent.advance(1)
+    silent.status(crashes=1)
+    assert capsys.readouterr() == ("", "")

@@ -1,0 +1,1 @@
+"""Tests of the driver models and of motion within a step."""

@@ -1,0 +1,60 @@
+"""Motion within a step: constant acceleration, no reversing, standstill."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.vehicles.kernels import motions
+
+positions = st.floats(0.0, 2_000.0)
+speeds = st.floats(0.0, 60.0)
+braking = st.floats(-20.0, 20.0)
+
+
+@given(positions, speeds, braking)
+def test_never_backwards(x, v, a):
+    after, speed = motions((x, v, a))[0]
+    assert speed >= 0.0
+    assert after >= x
+    assert speed == max(v + a * 0.1, 0.0)
+
+
+@given(positions, speeds, braking)
+def test_distance_is_mean_speed_times_the_step(x, v, a):
+    """0.5 (v + v_after) dt, within the rounding of x; at a standstill SUMO's own form differs by less than that."""
+    after, speed = motions((x, v, a))[0]
+    assert after - x == pytest.approx(0.5 * (v + speed) * 0.1, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("v", "a", "speed", "distance"),
+    [
+        (30.0, -4.0, 29.6, 2.98),
+        (30.0, 0.0, 30.0, 3.0),
+        (0.4, -4.0, 0.0, 0.02),  # stops exactly at the end of the step
+        (0.2, -4.0, 0.0, 0.01),  # would stop within it: braking is only as hard as the step allows
+        (0.0, -4.0, 0.0, 0.0),
+        (0.0, 2.0, 0.2, 0.01),
+    ],
+)
+def test_worked_by_hand(v, a, speed, distance):
+    after, found = motions((100.0, v, a))[0]
+    assert found == pytest.approx(speed, abs=1e-15)
+    assert after - 100.0 == pytest.approx(distance, abs=1e-12)
+
+
+@given(positions, st.floats(0.0, 2.0))
+def test_braking_to_a_standstill_and_staying_there(x, v):
+    state = (x, v)
+    for _ in range(10):
+        state = motions((*state, -4.0))[0].tolist()
+    assert state[1] == 0.0
+    again = motions((*state, -4.0))[0].tolist()
+    assert again == state
+
+
+@given(positions, st.floats(1.0, 60.0))
+def test_a_first_order_step_would_be_noticed(x, v):
+    """The check has teeth: with v_after dt, as in SUMO's default integration, the distance is another."""
+    after, speed = motions((x, v, -4.0))[0]
+    assert abs(after - x - speed * 0.1) > 1e-3

@@ -1,0 +1,129 @@
+"""IDM and FVDM against the formulas in plain Python: the IDM in every bit, FVDM (with its tanh) to 1e-12."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from harness.campaign.models import FVDMParameters, IDMParameters
+from tests.vehicles.kernels import accelerations
+
+speeds = st.floats(0.0, 60.0)
+gaps = st.floats(-5.0, 200.0)
+situations = st.tuples(speeds, speeds, gaps)
+braking = st.sampled_from([0.0, -1.0, -3.0, -4.0, -6.0, -8.0, -20.0])
+idm_parameters = st.builds(
+    IDMParameters,
+    acceleration_mps2=st.sampled_from([0.5 * i for i in range(1, 13)]),
+    comfortable_deceleration_mps2=st.floats(0.5, 8.0),
+    time_headway_s=st.floats(0.0, 3.0),
+    minimum_gap_m=st.floats(0.0, 5.0),
+    desired_speed_mps=st.floats(15.0, 60.0),
+    min_acceleration_mps2=braking,
+)
+fvdm_parameters = st.builds(
+    FVDMParameters,
+    kappa_per_s=st.floats(0.01, 2.0),
+    lambda_per_s=st.floats(0.0, 2.0),
+    max_speed_mps=st.floats(15.0, 60.0),
+    min_acceleration_mps2=braking,
+)
+
+
+def clipped(a, p):
+    return min(max(a, p.min_acceleration_mps2), p.max_acceleration_mps2)
+
+
+def idm(p, v, v_lead, gap):
+    """Every operation in the order of the kernels: with doubles, that is part of the formula."""
+    s = max(gap, 0.1)
+    wanted = v * p.time_headway_s + (v * (v - v_lead)) / (
+        2.0 * math.sqrt(p.acceleration_mps2 * p.comfortable_deceleration_mps2)
+    )
+    s_star = p.minimum_gap_m + max(0.0, wanted)
+    r = (v / p.desired_speed_mps) * (v / p.desired_speed_mps)
+    return clipped(p.acceleration_mps2 * (1.0 - r * r - (s_star / s) * (s_star / s)), p)
+
+
+def fvdm(p, v, v_lead, gap):
+    s = max(gap, 0.1)
+    optimal = p.max_speed_mps * (p.v1 + p.v2 * math.tanh(p.c1_per_m * s - p.c2)) / (p.v1 + p.v2)
+    return clipped(p.kappa_per_s * (optimal - v) + p.lambda_per_s * (v_lead - v), p)
+
+
+@given(idm_parameters, situations)
+def test_idm_in_every_bit(parameters, situation):
+    assert accelerations(parameters, situation)[0] == idm(parameters, *situation)
+
+
+@given(fvdm_parameters, situations)
+def test_fvdm(parameters, situation):
+    assert accelerations(parameters, situation)[0] == pytest.approx(fvdm(parameters, *situation), rel=1e-12, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "situation", "expected"),
+    [
+        # v = v_lead = 20, v0 = 40: 2 [1 - 1/16 - (22/44)^2] = 1.375
+        (IDMParameters(), (20.0, 20.0, 44.0), 1.375),
+        # closing with 10 m/s: s* = 2 + 30 + 300/(2 sqrt 6) = 93.237, far beyond 40 m: clipped
+        (IDMParameters(), (30.0, 20.0, 40.0), -4.0),
+        # the leader gets away: s* = s0 = 2, so 2 [1 - (20/40)^4 - (2/20)^2] = 1.855
+        (IDMParameters(), (20.0, 60.0, 20.0), 1.855),
+        # V(s) = 40 [6.75 + 7.91 tanh 0]/14.66 at s = 1.57/0.13, v = 18, v_lead = 17
+        (FVDMParameters(), (18.0, 17.0, 1.57 / 0.13), 0.85 * (40.0 * 6.75 / 14.66 - 18.0) - 0.5),
+        (FVDMParameters(), (40.0, 20.0, 10.0), -1.0),
+        (FVDMParameters(), (0.0, 10.0, 100.0), 2.0),
+    ],
+)
+def test_worked_by_hand(parameters, situation, expected):
+    assert accelerations(parameters, situation)[0] == pytest.approx(expected, rel=1e-12)
+
+
+@given(st.one_of(idm_parameters, fvdm_parameters), situations)
+def test_within_the_limits(parameters, situation):
+    found = accelerations(parameters, situation)[0]
+    assert parameters.min_acceleration_mps2 <= found <= parameters.max_acceleration_mps2
+
+
+@given(st.one_of(idm_parameters, fvdm_parameters), speeds, speeds, st.floats(-5.0, 0.1))
+def test_gaps_below_the_floor_are_the_floor(parameters, v, v_lead, gap):
+    found = accelerations(parameters, [(v, v_lead, gap), (v, v_lead, 0.1)])
+    assert found[0] == found[1]
+
+
+@given(st.one_of(idm_parameters, fvdm_parameters), speeds, st.tuples(speeds, speeds), st.tuples(gaps, gaps))
+def test_more_room_or_a_faster_leader_never_means_harder_braking(parameters, v, leads, pair):
+    near, far = sorted(pair)
+    slow, fast = sorted(leads)
+    careful, by_gap, by_lead = accelerations(parameters, [(v, slow, near), (v, slow, far), (v, fast, near)])
+    assert by_gap >= careful - 1e-9 * max(1.0, abs(careful))
+    assert by_lead >= careful - 1e-9 * max(1.0, abs(careful))
+
+
+def test_a_vehicle_that_may_not_brake_does_not():
+    for zero in (0.0, -0.0):
+        found = accelerations(
+            IDMParameters(min_acceleration_mps2=zero), [(30.0, 10.0, g) for g in np.arange(-1.0, 9.0)]
+        )
+        assert (found == 0.0).all()
+
+
+def test_the_bit_for_bit_check_would_notice_a_power():
+    """The check has teeth: v**4 written as such differs in the last place somewhere."""
+
+    def with_power(p, v, v_lead, gap):
+        s_star = p.minimum_gap_m + max(
+            0.0,
+            v * p.time_headway_s
+            + (v * (v - v_lead)) / (2.0 * math.sqrt(p.acceleration_mps2 * p.comfortable_deceleration_mps2)),
+        )
+        return clipped(p.acceleration_mps2 * (1.0 - (v / p.desired_speed_mps) ** 4 - (s_star / gap) ** 2), p)
+
+    p = IDMParameters()
+    points = np.random.default_rng(0).uniform([10.0, 10.0, 60.0], [35.0, 35.0, 200.0], (2_000, 3))
+    exact = [idm(p, *point) for point in points.tolist()]
+    np.testing.assert_array_equal(accelerations(p, points), exact)
+    assert [with_power(p, *point) for point in points.tolist()] != exact
