@@ -10,7 +10,7 @@ import pytest
 from harness.campaign.loading import load_campaign
 from harness.campaign.models import Campaign
 from harness.controllers.black_box import Death
-from harness.runner import RunResult, campaign_run, run_campaign, shards
+from harness.runner import RunResult, run_campaign, shards
 from harness.runner.worker import ShardDone, ShardRunner, ShardSpec
 
 SMOKE = Path(__file__).parents[2] / "scenarios" / "smoke.yaml"
@@ -30,7 +30,7 @@ def run() -> Callable[..., RunResult]:
 
     def run_without_page(*arguments, **options) -> RunResult:
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(campaign_run, "write_report", lambda folder: folder / "report.html")
+            patch.setattr("harness.report.write_report", lambda folder: folder / "report.html")
             return run_campaign(*arguments, **options)
 
     return run_without_page
