@@ -31,6 +31,7 @@ KERNEL_SOURCES = (
     "criticality/*.py",
     "importance/*.py",
     "episode/*.py",
+    "pool/enumeration.py",
     "twin.py",
 )
 """All files that compiled code may come from, or take constants from (a test holds this against the imports)."""

@@ -14,7 +14,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationInfo, field_validator, model_validator
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationInfo, field_validator, model_validator
 from pydantic_core import PydanticCustomError, PydanticKnownError
 
 NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_.-]*$"
@@ -87,6 +87,12 @@ class FVDMParameters(Section):
     max_acceleration_mps2: Positive = Field(2.0, le=20.0, description="upper clip [paper]")
 
 
+class ConstantParameters(Section):
+    """A vehicle that accelerates in the same way whatever happens before it: 0 never brakes."""
+
+    acceleration_mps2: float = Field(0.0, ge=-20.0, le=20.0, description="its acceleration [assumed]")
+
+
 class IDM(Section):
     """A vehicle that follows the intelligent driver model."""
 
@@ -101,7 +107,58 @@ class FVDM(Section):
     parameters: FVDMParameters = FVDMParameters()
 
 
+class Constant(Section):
+    """A vehicle that does not look ahead."""
+
+    model: Literal["constant"]
+    parameters: ConstantParameters = ConstantParameters()
+
+
 DriverModel = Annotated[IDM | FVDM, Field(discriminator="model")]
+BuiltInParameters = IDMParameters | FVDMParameters | ConstantParameters
+_PARAMETERS: dict[str, type[BuiltInParameters]] = {
+    "idm": IDMParameters,
+    "fvdm": FVDMParameters,
+    "constant": ConstantParameters,
+}
+
+
+def _whole_steps(seconds: float) -> float:
+    """Refuse a time that is not a multiple of the 0.1 s step."""
+    steps = seconds * 10.0
+    if abs(steps - round(steps)) >= 1e-9:
+        raise broken_rule(
+            "",
+            found=f"{seconds:g} s",
+            expected="a multiple of the 0.1 s step",
+            mend=f"The nearest one is {round(steps) / 10.0:g}.",
+        )
+    return seconds
+
+
+StepTime = Annotated[float, AfterValidator(_whole_steps)]
+
+
+class Reflexes(Section):
+    """How a driver lags behind its model: surrogates may be late and smooth, but not random."""
+
+    delay_s: StepTime = Field(
+        0.0, ge=0.0, le=10.0, description="time after the cut-in during which it keeps its speed [assumed]"
+    )
+    max_jerk_mps3: Positive | None = Field(
+        None, ge=0.1, le=1000.0, description="fastest change of its acceleration; unlimited when left out [assumed]"
+    )
+
+
+class Reaction(Reflexes):
+    """How a built-in AV lags behind its model, now and then by inattention."""
+
+    inattention_probability: Probability = Field(
+        0.0, description="share of episodes in which it reacts later still [assumed]"
+    )
+    inattention_delay_s: StepTime = Field(
+        0.0, ge=0.0, le=10.0, description="how much later it then reacts to the cut-in [assumed]"
+    )
 
 
 class Environment(Section):
@@ -113,22 +170,9 @@ class Environment(Section):
         le=1e8,
         description="multiplies the cut-in hazard: 1 = dense-learning tables, 100 = a later table, about 350 = highD",
     )
-    acceleration_hold_s: float = Field(
+    acceleration_hold_s: StepTime = Field(
         1.0, ge=0.1, le=2.0, description="how long a drawn acceleration is held, in whole 0.1 s steps; 1.0 or 0.1"
     )
-
-    @field_validator("acceleration_hold_s")
-    @classmethod
-    def _hold_is_whole_steps(cls, hold_s: float) -> float:
-        steps = hold_s * 10.0
-        if abs(steps - round(steps)) >= 1e-9:
-            raise broken_rule(
-                "",
-                found=f"{hold_s:g} s",
-                expected="a multiple of the 0.1 s step",
-                mend=f"The nearest one is {round(steps) / 10.0:g}.",
-            )
-        return hold_s
 
 
 class Limits(Section):
@@ -168,7 +212,9 @@ AV_SOURCES = ("model", "controller", "sumo", "traci", "fmu")
 class AutomatedVehicle(Section):
     """The automated vehicle under test: one of model, controller, sumo, traci and fmu."""
 
-    model: Literal["idm", "fvdm"] | None = Field(None, description="built-in driver model; idm when nothing is named")
+    model: Literal["idm", "fvdm", "constant"] | None = Field(
+        None, description="built-in driver model; idm when nothing is named"
+    )
     controller: str | None = Field(
         None,
         pattern=CONTROLLER_PATTERN,
@@ -180,11 +226,12 @@ class AutomatedVehicle(Section):
     )
     traci: TraciProcess | None = Field(None, description="your program, in any language, as a TraCI client")
     fmu: FmuController | None = Field(None, description="an FMI 2.0 co-simulation FMU")
-    parameters: IDMParameters | FVDMParameters | dict[str, Any] = Field(
+    parameters: BuiltInParameters | dict[str, Any] = Field(
         default_factory=dict,
         validate_default=True,
         description="parameters of the built-in model (defaults where left out) or of the controller",
     )
+    reaction: Reaction = Reaction()
     before_cut_in: Literal["hold_speed", "controller"] = Field(
         "hold_speed",
         description="until the cut-in the AV keeps its speed [itsc], or its controller acts from the start",
@@ -230,7 +277,7 @@ class AutomatedVehicle(Section):
             # A wrong model is an error of its own; complaints about parameters of a guessed model would only confuse.
             return IDMParameters()
         if (model := info.data["model"]) is not None:
-            return (FVDMParameters if model == "fvdm" else IDMParameters).model_validate(value)
+            return _PARAMETERS[model].model_validate(value)
         if not isinstance(value, dict):
             raise PydanticKnownError("dict_type")
         return value
@@ -260,6 +307,17 @@ class AutomatedVehicle(Section):
                 found=f"{_listed(dict(self.parameters))}, which nothing reads",
                 expected=f"no parameters beside av.{self.source}",
                 mend=elsewhere[self.source],
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _only_a_built_in_model_is_slowed_down(self) -> Self:
+        if self.model is None and self.reaction != Reaction():
+            raise broken_rule(
+                "reaction",
+                found=f"a reaction beside av.{self.source}",
+                expected="a reaction only of a built-in model",
+                mend="Your own driver has its own delays: leave av.reaction out.",
             )
         return self
 

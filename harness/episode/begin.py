@@ -99,6 +99,7 @@ def begin_cell(
     cell.min_ttc = math.inf
     cell.cut_r2 = cell.cut_r2dot = math.nan
     cell.av_start = x[k, AV]
+    cells.acceleration[k, AV] = 0.0
     cells.log_ratio[k, :] = 0.0
     cells.martingale[k, :] = 0.0
     forced = method == FORCED

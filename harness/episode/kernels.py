@@ -22,7 +22,7 @@ from harness.maneuvers import acceleration
 from harness.outcomes import AV, BV, BV_LV_CONTACT, CRASH, LV, PASSED, RUNNING, TIMEOUT
 from harness.random_stream import LV_DRAWS, uniform
 from harness.vehicles.kinematics import CONTACT_M, gap, next_speed
-from harness.vehicles.models import driver_acceleration
+from harness.vehicles.reaction import reacting_acceleration, reaction_steps
 
 PASSED_M, PASSED_UNDER_CONTROL_M = 0.0, -10.0
 """R2 at which the AV has passed BV: at once if it holds its speed, with a margin if its controller acts."""
@@ -77,16 +77,19 @@ def decide(
             redraw_free(k, seed, cells, results, scratch, environment, importance)
         cells.acceleration[k, LV] = acceleration(cell.lv_maneuver)
         cells.acceleration[k, BV] = acceleration(cell.bv_maneuver)
-        cells.acceleration[k, AV] = 0.0
 
 
 @compiled
-def respond(x: FloatArray, v: FloatArray, cells: Cells, driver: RecordArray) -> None:
-    """Acceleration of a built-in AV wherever it has been cut in on; it acts from the step after the cut-in."""
+def respond(seed: int, x: FloatArray, v: FloatArray, cells: Cells, driver: RecordArray) -> None:
+    """Acceleration of a built-in AV wherever it has been cut in on; it acts from the step after the cut-in at most."""
     for k in range(cells.cell.size):
         cell = cells.cell[k]
-        if cell.row >= 0 and 0 <= cell.cut_step < cell.step:
-            cells.acceleration[k, AV] = driver_acceleration(driver[0], v[k, AV], v[k, BV], gap(x[k, BV], x[k, AV]))
+        if cell.row < 0 or cell.cut_step < 0:
+            continue
+        if cell.step - cell.cut_step > reaction_steps(driver[0], seed, cell.episode):
+            cells.acceleration[k, AV] = reacting_acceleration(
+                driver[0], cells.acceleration[k, AV], v[k, AV], v[k, BV], gap(x[k, BV], x[k, AV])
+            )
 
 
 @compiled
@@ -200,7 +203,7 @@ def turn(
     refill(seed, first_episode, states, x, v, cells, exchange, environment, importance)
     decide(seed, x, v, cells, results, scratch, environment, importance)
     if driver.size > 0:
-        respond(x, v, cells, driver)
+        respond(seed, x, v, cells, driver)
     command(x, v, cells, keep_traces)
 
 

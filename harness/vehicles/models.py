@@ -1,4 +1,4 @@
-"""Longitudinal driver models that AVs and surrogates share: IDM and FVDM.
+"""Longitudinal driver models that AVs and surrogates share: IDM, FVDM, and one that does not look ahead.
 
 Only + − × ÷ √ and explicit products are used (and ``math.tanh``, inside compiled code alone), so that every caller gets
 the same bits.
@@ -7,37 +7,69 @@ the same bits.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
 from harness.arrays import Record, RecordArray
-from harness.campaign.models import FVDM, IDM, AutomatedVehicle, FVDMParameters, IDMParameters
+from harness.campaign.models import (
+    FVDM,
+    IDM,
+    AutomatedVehicle,
+    BuiltInParameters,
+    ConstantParameters,
+    FVDMParameters,
+    IDMParameters,
+    Reaction,
+    Reflexes,
+)
 from harness.compiled import compiled_inline
 
-IDM_KIND, FVDM_KIND = 0, 1
+IDM_KIND, FVDM_KIND, CONSTANT_KIND = 0, 1, 2
+_KINDS = {IDMParameters: IDM_KIND, FVDMParameters: FVDM_KIND, ConstantParameters: CONSTANT_KIND}
 SMALLEST_GAP_M = 0.1
 """Gap below which the models see this gap: they divide by it."""
 
 _COMMON = ("min_acceleration_mps2", "max_acceleration_mps2")
 _IDM = ("acceleration_mps2", "comfortable_deceleration_mps2", "time_headway_s", "minimum_gap_m", "desired_speed_mps")
 _FVDM = ("kappa_per_s", "lambda_per_s", "max_speed_mps", "v1", "v2", "c1_per_m", "c2")
-DRIVER_DTYPE = np.dtype([("kind", np.int64)] + [(name, np.float64) for name in (*_COMMON, *_IDM, *_FVDM)])
+_REACTION = ("max_jerk_mps3", "inattention_probability")
+_STEPS = ("delay_steps", "inattention_steps")
+DRIVER_DTYPE = np.dtype(
+    [(name, np.int64) for name in ("kind", *_STEPS)]
+    + [(name, np.float64) for name in (*_COMMON, *_IDM, *_FVDM, *_REACTION)]
+)
 
 
-def driver_records(drivers: list[IDMParameters | FVDMParameters]) -> RecordArray:
-    """Parameters of driver models as kernels read them, shape (number of drivers,)."""
+def driver_records(
+    drivers: Sequence[BuiltInParameters], reactions: Sequence[Reflexes] | None = None
+) -> RecordArray:
+    """Parameters of driver models as kernels read them, shape (number of drivers,).
+
+    Parameters
+    ----------
+    drivers : sequence of parameters
+    reactions : sequence of Reflexes, optional
+        One for each driver; all react at once by default.
+    """
     records = np.zeros(len(drivers), dtype=DRIVER_DTYPE)
-    for record, driver in zip(records, drivers, strict=True):
-        record["kind"] = IDM_KIND if isinstance(driver, IDMParameters) else FVDM_KIND
+    for record, driver, reaction in zip(records, drivers, reactions or [Reflexes()] * len(drivers), strict=True):
+        record["kind"] = _KINDS[type(driver)]
         for name, value in driver.model_dump().items():
             record[name] = value
+        record["max_jerk_mps3"] = math.inf if reaction.max_jerk_mps3 is None else reaction.max_jerk_mps3
+        record["delay_steps"] = round(reaction.delay_s * 10.0)
+        if isinstance(reaction, Reaction):
+            record["inattention_probability"] = reaction.inattention_probability
+            record["inattention_steps"] = round(reaction.inattention_delay_s * 10.0)
     return records
 
 
 def av_records(av: AutomatedVehicle) -> RecordArray:
     """Parameters of a built-in AV, shape (1,); of an AV that something else drives, shape (0,)."""
-    built_in = isinstance(av.parameters, IDMParameters | FVDMParameters)
-    return driver_records([av.parameters] if built_in else [])  # type: ignore[list-item]
+    if isinstance(av.parameters, BuiltInParameters):
+        return driver_records([av.parameters], [av.reaction])
+    return driver_records([])
 
 
 def surrogate_records(surrogates: dict[str, IDM | FVDM]) -> RecordArray:
@@ -78,6 +110,8 @@ def fvdm_acceleration(driver: Record, speed: float, lead_speed: float, shape: fl
 @compiled_inline
 def driver_acceleration(driver: Record, speed: float, lead_speed: float, gap: float) -> float:
     """Acceleration (m/s²) of a driver behind a leader at a bumper-to-bumper gap (m), clipped to its limits."""
+    if driver.kind == CONSTANT_KIND:
+        return float(driver.acceleration_mps2)
     seen = max(gap, SMALLEST_GAP_M)
     if driver.kind == IDM_KIND:
         a = idm_acceleration(driver, speed, lead_speed, seen)
