@@ -137,7 +137,7 @@ def run(
     from harness.progress import terminal_progress  # noqa: PLC0415 - keeps --help fast
     from harness.runner import run_campaign  # noqa: PLC0415 - slow to import: only once the campaign is right
 
-    bar = None if quiet else terminal_progress(campaign.stop.rhw, campaign.stop.min_crashes)
+    bar = None if quiet else terminal_progress(campaign.stop.rhw, campaign.min_crashes)
     with bar or nullcontext():
         result = run_campaign(campaign, folder, workers=workers, resume=resume, progress=bar)
         if bar is not None:
@@ -235,7 +235,7 @@ def compare(
     from harness.runner import compare_campaigns  # noqa: PLC0415 - slow to import: only once the campaigns are right
 
     label_b = ", ".join([b.name, *against]) if file_b is None else b.name
-    bar = None if quiet else terminal_progress(a.stop.rhw, a.stop.min_crashes)
+    bar = None if quiet else terminal_progress(a.stop.rhw, a.min_crashes)
     with bar or nullcontext():
         found = compare_campaigns(a, b, folder, workers=workers, progress=bar, labels=(a.name, label_b))
     if as_json:

@@ -9,5 +9,5 @@ RUNNING = -1
 VEHICLES = ("LV", "BV", "AV")
 LV, BV, AV = range(len(VEHICLES))
 
-METHODS = ("nde", "forced", "step_mixture", "episode_mixture")
-NDE, FORCED, STEP_MIXTURE, EPISODE_MIXTURE = range(len(METHODS))
+METHODS = ("nde", "forced", "step_mixture", "episode_mixture", "shells")
+NDE, FORCED, STEP_MIXTURE, EPISODE_MIXTURE, SHELLS = range(len(METHODS))

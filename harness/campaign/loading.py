@@ -53,6 +53,7 @@ def load_campaign(path: str | Path, overrides: Sequence[str] = (), *, check_file
     except ValidationError as error:
         raise invalid_file(error, path=str(path), data=data, schema=campaign_schema(), place=place) from None
     campaign = _with_absolute_fmu(campaign, Path(path).parent, place, check_files=check_files)
+    campaign = _with_absolute_library(campaign, Path(path).parent, place, check_files=check_files)
     return _with_absolute_paths(campaign, Path(path).parent, place, check_files=check_files)
 
 
@@ -99,6 +100,20 @@ def _with_absolute_fmu(campaign: Campaign, folder: Path, place: Place, *, check_
         )
     av = campaign.av.model_copy(update={"fmu": fmu.model_copy(update={"file": str(file)})})
     return campaign.model_copy(update={"av": av})
+
+
+def _with_absolute_library(campaign: Campaign, folder: Path, place: Place, *, check_files: bool) -> Campaign:
+    if not names_a_file(campaign.pool.library):
+        return campaign
+    file = (folder / Path(campaign.pool.library).expanduser()).resolve()
+    if check_files and not file.is_file():
+        raise CampaignError(
+            place(("pool", "library")),
+            found=f"{campaign.pool.library}, but there is no file {file}",
+            expected="a surrogate library, or the name of a shipped one",
+            mend="Correct the path; it is relative to the folder of the campaign file.",
+        )
+    return campaign.model_copy(update={"pool": campaign.pool.model_copy(update={"library": str(file)})})
 
 
 def _unknown_parameters(parameters: str, where: str) -> CampaignError:

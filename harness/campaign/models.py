@@ -34,8 +34,8 @@ Probability = Annotated[float, Field(ge=0.0, le=1.0)]
 Positive = Annotated[float, Field(gt=0.0)]
 Whole = Annotated[int, BeforeValidator(_whole)]
 SurrogateName = Annotated[str, Field(pattern=SURROGATE_PATTERN)]
-Method = Literal["nde", "forced", "step_mixture", "episode_mixture"]
-EstimatorName = Literal["nde", "nade", "mixture_cv", "scv"]
+Method = Literal["nde", "forced", "step_mixture", "episode_mixture", "shells"]
+EstimatorName = Literal["nde", "nade", "mixture_cv", "scv", "shells", "martingale", "replay"]
 
 MAX_CONFIGURED_SPEED_MPS = 60.0
 
@@ -334,13 +334,26 @@ def _default_surrogates() -> dict[str, DriverModel]:
     }
 
 
+class Shells(Section):
+    """How tests are spread over the shells of the pool."""
+
+    boundary: SurrogateName | None = Field(
+        None, description="surrogate within which the conditional statement assumes all crashes; the library's own"
+    )
+    statement: Literal["assumption_free", "conditional"] = Field(
+        "assumption_free", description="what has to reach stop.rhw; conditional tests only within the boundary"
+    )
+    first_tests: Whole = Field(12, ge=1, le=10_000, description="tests of each shell before any is preferred")
+
+
 class Testing(Section):
     """How maneuvers are drawn at critical moments."""
 
     method: Method = Field(
         "episode_mixture",
         description="nde: no control; forced: cut-in time drawn given that one happens; step_mixture: published NADE; "
-        "episode_mixture: one importance function per episode, forced cut-in as defence",
+        "episode_mixture: one importance function per episode, forced cut-in as defence; shells: cut-ins of a pool, "
+        "counted within shells of known probability",
     )
     challenge: Literal["immediate", "recursive"] = Field(
         "recursive", description="immediate: crash if BV cuts in now (published); recursive: backward induction"
@@ -353,6 +366,7 @@ class Testing(Section):
         0.1, gt=0.0, lt=1.0, description="alpha_0, share of forced cut-ins in the episode mixture"
     )
     criticality_threshold: float = Field(0.0, ge=0.0, lt=1.0, description="a moment is critical above it")
+    shells: Shells = Shells()
 
     @field_validator("alpha")
     @classmethod
@@ -366,6 +380,19 @@ class Testing(Section):
                 mend="Change them, or leave alpha out for equal weights.",
             )
         return alpha
+
+
+class PoolSettings(Section):
+    """The pool of cut-ins that shells, surrogate replay and the alarm on SUMO use; built once, in the twin."""
+
+    library: str = Field("ladder-1", description="name of a shipped surrogate library, or a path to your own")
+    relative_error: float = Field(
+        0.005, gt=0.0, le=0.2, description="standard error of the surrogates' crash rates to reach, relative"
+    )
+    cut_ins_per_shell: Whole = Field(
+        10_000, ge=100, le=1_000_000, description="cut-ins kept of each shell: the most tests that it can give"
+    )
+    seed: Whole = Field(1, ge=0, lt=2**63, description="every random number of the pool follows from it")
 
 
 class World(Section):
@@ -392,7 +419,9 @@ class Stop(Section):
     rhw: float | None = Field(None, gt=0.0, lt=10.0, description="stop at this relative half-width of the interval")
     confidence: float = Field(0.9, gt=0.0, lt=1.0, description="level of every interval")
     estimator: EstimatorName | None = Field(None, description="whose RHW is watched; default: the method's own")
-    min_crashes: Whole = Field(100, ge=1, description="sampled crashes needed before RHW may stop the campaign")
+    min_crashes: Whole | None = Field(
+        None, ge=1, description="sampled crashes needed before RHW may stop the campaign; 100, with shells 1"
+    )
 
 
 class Run(Section):
@@ -414,6 +443,7 @@ class Campaign(Section):
         default_factory=_default_surrogates, description="stand-ins for the unknown AV, by name"
     )
     testing: Testing = Testing()
+    pool: PoolSettings = PoolSettings()
     world: World = World()
     records: Records = Records()
     stop: Stop = Stop()
@@ -434,7 +464,7 @@ class Campaign(Section):
     @model_validator(mode="after")
     def _paths_need_an_av_that_holds_its_speed(self) -> Self:
         method = self.testing.method
-        if self.av.before_cut_in == "controller" and method in ("forced", "episode_mixture"):
+        if self.av.before_cut_in == "controller" and method in ("forced", "episode_mixture", "shells"):
             raise broken_rule(
                 "av.before_cut_in",
                 found=f"controller, with testing.method {method}",
@@ -472,6 +502,10 @@ class Campaign(Section):
             "nde": (method == "nde", "testing.method nde"),
             "mixture_cv": (method == "episode_mixture", "testing.method episode_mixture"),
             "scv": (self.records.moments != "none", "records.moments first_9 or all"),
+            "shells": (method == "shells", "testing.method shells"),
+            "nade": (method != "shells", "another testing.method than shells"),
+            "martingale": (method in ("step_mixture", "episode_mixture"), "testing.method step_mixture"),
+            "replay": (False, "a stored run: give it to `harness estimate`"),
         }
         available, need = needs.get(watched or "", (True, ""))
         if not available:
@@ -482,6 +516,13 @@ class Campaign(Section):
                 mend="Change one of the two, or leave stop.estimator out for the method's own.",
             )
         return self
+
+    @property
+    def min_crashes(self) -> int:
+        """Sampled crashes needed before RHW may stop the campaign; limits within shells are exact, without a floor."""
+        if self.stop.min_crashes is not None:
+            return self.stop.min_crashes
+        return 1 if self.testing.method == "shells" else 100
 
     def alpha(self) -> tuple[float, ...]:
         """Mixture weights of the surrogates, in their order, summing to 1."""
@@ -509,6 +550,7 @@ class Campaign(Section):
             "av": self.av.identity(),
             "surrogates": [(name, model.model_dump()) for name, model in self.surrogates.items()],
             "testing": self.testing.model_dump(),
+            "pool": self.pool.model_dump() if self.testing.method == "shells" else None,
             "engine": self.world.engine,
             "moments": self.records.moments,
             "shard_size": self.run.shard_size,

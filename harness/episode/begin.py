@@ -8,10 +8,10 @@ from harness.arrays import FloatArray
 from harness.compiled import compiled, compiled_inline, compiled_threads
 from harness.environment.cut_in import acceptance, cut_in_hazard, opportunity
 from harness.environment.driving import Environment, draw_car_following, draw_free_driving
-from harness.episode.cells import GIVEN, PLACED, Cells, Exchange
+from harness.episode.cells import GIVEN, PLACED, Cells, Exchange, Script
 from harness.importance.functions import Importance
 from harness.maneuvers import acceleration
-from harness.outcomes import AV, BV, EPISODE_MIXTURE, FORCED, LV
+from harness.outcomes import AV, BV, EPISODE_MIXTURE, FORCED, LV, SHELLS
 from harness.random_stream import BV_DRAWS, CUT_IN, LV_DRAWS, uniform
 from harness.vehicles.kinematics import CONTACT_M, VEHICLE_LENGTH_M, gap, next_position, next_speed
 
@@ -88,6 +88,7 @@ def begin_cell(
     cells: Cells,
     environment: Environment,
     importance: Importance,
+    script: Script,
 ) -> None:
     """Reset cell ``k`` for an episode whose vehicles stand at ``x[k]``, ``v[k]``."""
     method = importance.settings[0].method
@@ -102,6 +103,9 @@ def begin_cell(
     cells.acceleration[k, AV] = 0.0
     cells.log_ratio[k, :] = 0.0
     cells.martingale[k, :] = 0.0
+    if method == SHELLS:
+        cell.component, cell.log_sampled = script.component[row], -script.log_weight[row]
+        return
     forced = method == FORCED
     if method == EPISODE_MIXTURE:
         cell.component = draw_component(uniform(seed, episode, CUT_IN, COMPONENT_DRAW), importance.alpha)
@@ -129,6 +133,7 @@ def refill(
     exchange: Exchange,
     environment: Environment,
     importance: Importance,
+    script: Script,
 ) -> None:
     """Give every idle cell the next episode of the shard.
 
@@ -142,6 +147,8 @@ def refill(
         Receive the placement of refilled cells.
     exchange : Exchange
         Counts the rows given out; receives the refilled cells.
+    script : Script
+        Traffic of the shard's rows, where it is prescribed.
     """
     exchange.counts[PLACED] = 0
     for k in range(cells.cell.size):
@@ -150,7 +157,7 @@ def refill(
             return
         if cells.cell[k].row < 0:
             place(states[row], x[k], v[k])
-            begin_cell(k, row, first_episode + row, seed, x, v, cells, environment, importance)
+            begin_cell(k, row, first_episode + row, seed, x, v, cells, environment, importance, script)
             exchange.placed[exchange.counts[PLACED]] = k
             exchange.counts[PLACED] += 1
             exchange.counts[GIVEN] += 1

@@ -126,6 +126,26 @@ GIVEN, PLACED, ENDED, DISAGREEING = range(4)
 the world's collision flag and the crash criterion differ, or -1."""
 
 
+class Script(NamedTuple):
+    """Episodes whose traffic is prescribed: what LV and BV do in each row of a shard; no rows if it is drawn.
+
+    ``lv``, ``bv`` (rows, draws) int8 are maneuver indices as an episode records them, 31 in ``bv`` being the cut-in in
+    step ``cut_step`` (rows,). ``component`` (rows,) is the shell and ``log_weight`` (rows,) its log probability.
+    """
+
+    lv: Int8Array
+    bv: Int8Array
+    cut_step: IntArray
+    component: IntArray
+    log_weight: FloatArray
+
+
+def no_script() -> Script:
+    """For episodes that draw their own traffic."""
+    none = np.zeros((0, 1), np.int8)
+    return Script(none, none, np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0))
+
+
 class Exchange(NamedTuple):
     """What kernels and the Python loop tell each other between two steps of the world.
 

@@ -14,11 +14,11 @@ from harness.environment.driving import Environment, draw_free_driving
 from harness.episode.after_cut_in import redraw_free
 from harness.episode.before_cut_in import choose_lane, redraw_following
 from harness.episode.begin import refill
-from harness.episode.cells import DISAGREEING, ENDED, Cells, Exchange, Results, Scratch
+from harness.episode.cells import DISAGREEING, ENDED, Cells, Exchange, Results, Scratch, Script
 from harness.episode.observe import observe
 from harness.episode.record import record_episode
+from harness.episode.scripted import follow_script, hold
 from harness.importance.functions import Importance
-from harness.maneuvers import acceleration
 from harness.outcomes import AV, BV, BV_LV_CONTACT, CRASH, LV, PASSED, RUNNING, TIMEOUT
 from harness.random_stream import LV_DRAWS, uniform
 from harness.vehicles.kinematics import CONTACT_M, gap, next_speed
@@ -46,6 +46,7 @@ def decide(
     scratch: Scratch,
     environment: Environment,
     importance: Importance,
+    script: Script,
 ) -> None:
     """LV's and BV's maneuvers for the coming step, in every running cell.
 
@@ -63,6 +64,9 @@ def decide(
         if cell.row < 0:
             continue
         read_state(k, x, v, scratch.state)
+        if script.cut_step.size > 0:
+            follow_script(k, hold_steps, cells, scratch, script)
+            continue
         redraw = cell.step % hold_steps == 0
         if redraw:
             u = uniform(seed, cell.episode, LV_DRAWS, cell.n_lv)
@@ -75,8 +79,7 @@ def decide(
             choose_lane(k, cells, results, scratch, environment, importance)
         elif (cell.step - cell.cut_step - 1) % hold_steps == 0:
             redraw_free(k, seed, cells, results, scratch, environment, importance)
-        cells.acceleration[k, LV] = acceleration(cell.lv_maneuver)
-        cells.acceleration[k, BV] = acceleration(cell.bv_maneuver)
+        hold(k, cells)
 
 
 @compiled
@@ -181,6 +184,7 @@ def turn(
     exchange: Exchange,
     environment: Environment,
     importance: Importance,
+    script: Script,
     driver: RecordArray,
     passed_m: float,
     keep_traces: bool,
@@ -200,8 +204,8 @@ def turn(
     """
     max_steps = environment.numbers[0].max_steps
     judge(x, v, cells, results, scratch, exchange, importance, max_steps, passed_m, keep_traces)
-    refill(seed, first_episode, states, x, v, cells, exchange, environment, importance)
-    decide(seed, x, v, cells, results, scratch, environment, importance)
+    refill(seed, first_episode, states, x, v, cells, exchange, environment, importance, script)
+    decide(seed, x, v, cells, results, scratch, environment, importance, script)
     if driver.size > 0:
         respond(seed, x, v, cells, driver)
     command(x, v, cells, keep_traces)
@@ -220,6 +224,7 @@ def turn_to_controller(
     exchange: Exchange,
     environment: Environment,
     importance: Importance,
+    script: Script,
     passed_m: float,
     keep_traces: bool,
     acts_before_cut_in: bool,
@@ -235,6 +240,6 @@ def turn_to_controller(
     for k in range(cells.cell.size):
         exchange.previous[k] = cells.acceleration[k, AV]
     judge(x, v, cells, results, scratch, exchange, importance, environment.numbers[0].max_steps, passed_m, keep_traces)
-    refill(seed, first_episode, states, x, v, cells, exchange, environment, importance)
-    decide(seed, x, v, cells, results, scratch, environment, importance)
+    refill(seed, first_episode, states, x, v, cells, exchange, environment, importance, script)
+    decide(seed, x, v, cells, results, scratch, environment, importance, script)
     return observe(x, v, cells, acts_before_cut_in, exchange.previous, observation)

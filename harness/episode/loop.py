@@ -20,11 +20,13 @@ from harness.episode.cells import (
     Exchange,
     Results,
     Scratch,
+    Script,
     empty_exchange,
     empty_results,
     empty_scratch,
     idle_cells,
     max_draws,
+    no_script,
     with_room_for_moments,
 )
 from harness.episode.kernels import PASSED_M, PASSED_UNDER_CONTROL_M, command, turn, turn_to_controller
@@ -64,6 +66,7 @@ class Keep(NamedTuple):
 class Shard:
     """Everything that a range of episodes left behind.
 
+    ``cut_ins`` (n,) are the rows of the pool that were prescribed, if any were.
     ``traces`` maps an episode's row to its (steps + 1, 3 vehicles, 3: x, v, a) motion, ``failures`` to the cause.
     """
 
@@ -72,6 +75,8 @@ class Shard:
     results: Results
     traces: dict[int, FloatArray] = field(default_factory=dict)
     failures: dict[int, str] = field(default_factory=dict)
+    script: Script = field(default_factory=no_script)
+    cut_ins: IntArray | None = None
 
 
 def traced_by_index(seed: int, episodes: IntArray, share: float) -> BoolArray:
@@ -138,7 +143,7 @@ class EpisodeLoop:
             keep_traces=keep.any_trace,
         )
 
-    def run(self, first_episode: int, states: FloatArray) -> Shard:
+    def run(self, first_episode: int, states: FloatArray, script: Script | None = None) -> Shard:
         """Run episodes ``first_episode … first_episode + n − 1``.
 
         Parameters
@@ -147,6 +152,8 @@ class EpisodeLoop:
             Campaign index of the first episode.
         states : ndarray, shape (n, 5)
             Initial states.
+        script : Script, optional
+            What LV and BV do, where it is not drawn.
 
         Raises
         ------
@@ -154,7 +161,7 @@ class EpisodeLoop:
             The world did something else than it was told.
         """
         n_episodes = states.shape[0]
-        shard = Shard(first_episode, states, self._empty_results(n_episodes))
+        shard = Shard(first_episode, states, self._empty_results(n_episodes), script=script or no_script())
         always = traced_by_index(self._policy.seed, first_episode + np.arange(n_episodes), self._keep.trace_share)
         exchange, world, cells = self._exchange, self._world, self._cells
         cells.cell["row"] = -1
@@ -224,6 +231,7 @@ class EpisodeLoop:
             exchange,
             policy.environment,
             policy.importance,
+            shard.script,
             policy.driver,
             PASSED_UNDER_CONTROL_M if self._driving is not None and self._driving.acts_before_cut_in else PASSED_M,
             self._keep.any_trace,
@@ -245,6 +253,7 @@ class EpisodeLoop:
             exchange,
             policy.environment,
             policy.importance,
+            shard.script,
             PASSED_UNDER_CONTROL_M if av.acts_before_cut_in else PASSED_M,
             self._keep.any_trace,
             av.acts_before_cut_in,

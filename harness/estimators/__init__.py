@@ -9,6 +9,7 @@ from harness.estimators.estimate import Estimate, Unavailable
 from harness.estimators.headline import headline
 from harness.estimators.one_pass import ESTIMATORS, accumulator, one_pass
 from harness.estimators.run_estimates import CampaignFacts, estimate_blocks, estimate_run
+from harness.estimators.shells import Shells
 from harness.estimators.stopping import StopRule
 
 __all__ = [
@@ -16,6 +17,7 @@ __all__ = [
     "Block",
     "CampaignFacts",
     "Estimate",
+    "Shells",
     "StopRule",
     "Unavailable",
     "accumulator",

@@ -12,6 +12,7 @@ import numpy as np
 
 from harness.arrays import BoolArray, FloatArray, IntArray
 from harness.campaign.models import Method
+from harness.pool.shells import ShellDesign
 
 MAX_CONTROL_STEPS = 9
 """Control steps that sparse control variates are built from, at most ([paper] section VI-E)."""
@@ -44,6 +45,10 @@ class Block:
         Bound on Y = 1{crash}·weight that the design guarantees for every episode, seen or not; None if there is none.
     log_p_cut_in : (n,) float64 or None
         log P(cut-in | path), where the method draws the path ahead. Bounds Y of that episode alone.
+    component : (n,) int or None
+        Stratum of each test, where they are drawn from shells.
+    shells : ShellDesign or None
+        Those strata and their probabilities.
     """
 
     first_episode: int
@@ -59,6 +64,8 @@ class Block:
     first_ratios: FloatArray | None = None
     weight_cap: float | None = None
     log_p_cut_in: FloatArray | None = None
+    component: IntArray | None = None
+    shells: ShellDesign | None = None
 
     def __post_init__(self) -> None:
         n = len(self.crash)
@@ -70,6 +77,7 @@ class Block:
             "log_q": (n, len(self.alpha)),
             "n_control_steps": (n,),
             "log_p_cut_in": (n,),
+            "component": (n,),
         }
         for name, shape in expected.items():
             array = getattr(self, name)

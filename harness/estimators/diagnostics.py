@@ -22,6 +22,7 @@ NOTE = (
     "4e5 episodes although it is unbiased. A mean far below 1 then means that the episodes that matter most have not "
     "been met yet, not that a weight is wrong."
 )
+NOTE_SHELLS = "Every test within a shell stands for the same probability: there are no weights to be diagnosed."
 CARELESS_MEAN = 0.5
 
 
@@ -88,7 +89,7 @@ class Diagnostics:
             "n_cut_ins": self.n_cut_ins,
             "n_bv_lv_contacts": self.n_contacts,
             "n_failed": self.n_failed,
-            "note": NOTE,
+            "note": NOTE_SHELLS if self.method == "shells" else NOTE,
         }
         if self.n and self.method == "step_mixture" and self._weight.mean(self.n) < CARELESS_MEAN:
             result["heavy_tail"] = (
@@ -98,6 +99,6 @@ class Diagnostics:
         return result
 
     def _mean(self, sums: MomentSums) -> dict[str, float]:
-        if self.n == 0:
+        if self.n == 0 or self.method == "shells":
             return {"mean": float("nan"), "std_error": float("inf")}
         return {"mean": sums.mean(self.n), "std_error": sums.std_error(self.n)}

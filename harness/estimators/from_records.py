@@ -12,6 +12,7 @@ from harness.arrays import BoolArray, FloatArray, IntArray
 from harness.campaign.models import Method
 from harness.errors import RunFolderError
 from harness.estimators.block import MAX_CONTROL_STEPS, Block
+from harness.pool.shells import ShellDesign
 
 _AGAIN = "Remove the shard and run `harness run` with --resume, which makes it again."
 EPISODE_COLUMNS = (
@@ -22,6 +23,7 @@ EPISODE_COLUMNS = (
     "log_weight",
     "log_p_cut_in",
     "log_q",
+    "component",
 )
 MOMENT_COLUMNS = ("episode", "q_sampled", "q")
 
@@ -33,6 +35,7 @@ def block_from_tables(
     method: Method,
     alpha: Sequence[float],
     weight_cap: float | None = None,
+    shells: ShellDesign | None = None,
 ) -> Block:
     """Block of one shard.
 
@@ -49,6 +52,8 @@ def block_from_tables(
         Mixture weights in the order of ``log_q``, M of them.
     weight_cap : float, optional
         Bound on Y that the design guarantees; 1 for ``nde`` and never above 1 for ``forced`` whatever is given.
+    shells : ShellDesign, optional
+        Strata of the campaign, if it draws from shells.
 
     Raises
     ------
@@ -77,6 +82,8 @@ def block_from_tables(
         first_ratios=ratios,
         weight_cap=_design_cap(method, weight_cap),
         log_p_cut_in=_log_p_cut_in(episodes, failed),
+        component=None if shells is None else _column(episodes, "component").astype(np.int64),
+        shells=shells,
     )
 
 

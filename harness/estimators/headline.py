@@ -9,6 +9,7 @@ _OWN: dict[Method, EstimatorName] = {
     "forced": "nade",
     "step_mixture": "nade",
     "episode_mixture": "mixture_cv",
+    "shells": "shells",
 }
 
 

@@ -20,8 +20,10 @@ class Nade:
         self.sums = WeightedSums()
 
     @classmethod
-    def refusal(cls, block: Block) -> str | None:  # noqa: ARG003 - part of the shape that all estimators share
-        """Never refuses: every record has an outcome and a weight."""
+    def refusal(cls, block: Block) -> str | None:
+        """Refuses shells: how many tests each gets depends on results, so that no plain mean is meant."""
+        if block.method == "shells":
+            return "tests were drawn within shells, whose shares must be added by their probabilities (estimator shells)"
         return None
 
     def add(self, block: Block) -> None:

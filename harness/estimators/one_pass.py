@@ -17,9 +17,10 @@ from harness.estimators.mixture_cv import MixtureCv
 from harness.estimators.nade import Nade
 from harness.estimators.nde import Nde
 from harness.estimators.scv import Scv
+from harness.estimators.shells import Shells
 
-ESTIMATORS: tuple[EstimatorName, ...] = ("nde", "nade", "mixture_cv", "scv")
-_CLASSES: dict[EstimatorName, type[Accumulator]] = {"nde": Nde, "nade": Nade, "mixture_cv": MixtureCv, "scv": Scv}
+ESTIMATORS: tuple[EstimatorName, ...] = ("nde", "nade", "mixture_cv", "scv", "shells")
+_CLASSES: dict[EstimatorName, type[Accumulator]] = {"nde": Nde, "nade": Nade, "mixture_cv": MixtureCv, "scv": Scv, "shells": Shells}
 
 
 @dataclass(frozen=True)

@@ -14,10 +14,11 @@ from harness.estimators.block import Block
 from harness.estimators.estimate import finite_json
 from harness.estimators.from_records import EPISODE_COLUMNS, MOMENT_COLUMNS, block_from_tables
 from harness.estimators.one_pass import ESTIMATORS, one_pass
-from harness.estimators.statement import SCOPE, per_distance, statement
+from harness.estimators.statement import SCOPE, conditional_statement, per_distance, statement
 from harness.estimators.threads import read_ahead
 from harness.importance.build import importance_names, mixture_weights
-from harness.records.folder import read_manifest
+from harness.pool.shells import ShellDesign
+from harness.records.folder import SHELLS, read_json, read_manifest
 from harness.records.reader import read_shards
 
 _FINISH = "Run `harness run` with --resume, which makes missing shards."
@@ -74,6 +75,7 @@ def estimate_blocks(
         "diagnostics": done.diagnostics.result(facts.importance_names),
         "convergence": done.convergence,
         "statement": statement(best, facts.lane_change_level, distance_km),
+        "conditional_statement": conditional_statement(best),
         "scope": SCOPE,
     }
     cleaned: dict[str, Any] = finite_json(content)
@@ -127,9 +129,15 @@ def _stored_blocks(
     """Blocks of the episodes that count, in index order; a gap or too few of them is an error."""
     n, n_counted, cap = 0, int(manifest["n_episodes"]), manifest.get("weight_cap")
     columns = list(MOMENT_COLUMNS) if wants_moments else []
+    shells = read_shells(folder) if campaign.testing.method == "shells" else None
     for episodes, moments in read_shards(folder, episode_columns=list(EPISODE_COLUMNS), moment_columns=columns):
         block = block_from_tables(
-            episodes, moments, method=campaign.testing.method, alpha=mixture_weights(campaign), weight_cap=cap
+            episodes,
+            moments,
+            method=campaign.testing.method,
+            alpha=mixture_weights(campaign),
+            weight_cap=cap,
+            shells=shells,
         )
         if block.first_episode != n:
             raise _incomplete(folder, f"a shard that begins at episode {block.first_episode}", f"episode {n}")
@@ -139,6 +147,22 @@ def _stored_blocks(
         if n == n_counted:
             return
     raise _incomplete(folder, f"{n} episodes on record", f"{n_counted} (manifest.json)")
+
+
+def read_shells(folder: Path) -> ShellDesign:
+    """Strata of a shells campaign.
+
+    Raises
+    ------
+    RunFolderError
+        The file is missing or damaged.
+    """
+    path = folder / SHELLS
+    try:
+        return ShellDesign.from_json(read_json(path, mend=_FINISH))
+    except (KeyError, TypeError, ValueError) as error:
+        found = f"no complete description of shells ({error})"
+        raise RunFolderError(str(path), found=found, expected="what the run has written", mend=_FINISH) from error
 
 
 def _incomplete(folder: Path, found: str, expected: str) -> RunFolderError:

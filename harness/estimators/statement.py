@@ -18,6 +18,30 @@ def per_distance(estimate: Estimate, distance_per_test_km: float) -> dict[str, f
     }
 
 
+def conditional_statement(estimate: Estimate) -> str | None:
+    """What holds if the vehicle crashes only where the boundary surrogate does; None unless drawn from shells."""
+    found = estimate.details.get("conditional")
+    if found is None:
+        return None
+    boundary, level = estimate.details["boundary"], f"{estimate.confidence:.0%}"
+    if found["refuted"]:
+        return (
+            f"This vehicle crashed {found['n_crashes_outside']:,} times where the surrogate {boundary} does not crash: "
+            f"nothing can be said under the assumption that it crashes only where {boundary} does."
+        )
+    text = (
+        f"If this vehicle crashes only where the surrogate {boundary} or a more careful one crashes, its crash rate is "
+        f"{found['crash_rate']:.3g} per test ({level} interval {found['ci_low']:.3g} to {found['ci_high']:.3g}), "
+        f"estimated from {found['n_episodes']:,} tests ({found['n_crashes']:,} sampled crashes)."
+    )
+    if not found["n_episodes_outside"]:
+        return f"{text} Nothing was tested outside: whether the assumption holds is not known."
+    return (
+        f"{text} No crash was found in {found['n_episodes_outside']:,} tests outside: with {level} confidence fewer than "
+        f"{found['upper_bound_outside']:.3g} crashes per test lie there."
+    )
+
+
 def statement(estimate: Estimate, lane_change_level: float, distance_per_test_km: float | None) -> str:
     """Rate, interval, number of tests and level, in words."""
     tests = (

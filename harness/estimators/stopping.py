@@ -20,6 +20,7 @@ from harness.estimators.headline import headline
 
 LOOK_RATIO = 1.1
 PASSES_NEEDED = 2
+DEFAULT_MIN_CRASHES = 100
 
 
 def look_grid(n_episodes: int, shard_size: int, ratio: float = LOOK_RATIO) -> tuple[int, ...]:
@@ -57,6 +58,8 @@ class StopRule:
         ``run.shard_size``.
     ratio : float
         Of the geometric grid of looks.
+    min_crashes : int
+        Floor on sampled crashes where ``stop.min_crashes`` says nothing.
 
     Attributes
     ----------
@@ -66,15 +69,31 @@ class StopRule:
         Numbers of episodes at which it wants it.
     reached : bool
         Whether the asked precision was reached; always False when none was asked.
+    rhw : float
+        Relative half-width at the last look.
     """
 
-    def __init__(self, campaign_stop: Stop, method: Method, shard_size: int, ratio: float = LOOK_RATIO) -> None:
+    def __init__(
+        self,
+        campaign_stop: Stop,
+        method: Method,
+        shard_size: int,
+        ratio: float = LOOK_RATIO,
+        *,
+        min_crashes: int = DEFAULT_MIN_CRASHES,
+    ) -> None:
         self.estimator: EstimatorName = campaign_stop.estimator or headline(method)
         self.looks = look_grid(campaign_stop.episodes, shard_size, ratio)
         self.reached = False
+        self.rhw = math.inf
         self._stop = campaign_stop
+        self._min_crashes = campaign_stop.min_crashes or min_crashes
         self._n_seen = 0
         self._n_passes = 0
+
+    def due(self, n: int) -> bool:
+        """Whether `observe` wants the estimate of the first ``n`` episodes."""
+        return self._n_seen < len(self.looks) and n == self.looks[self._n_seen]
 
     def observe(self, n: int, estimate: Estimate) -> bool:
         """Whether to stop after the look at `n` episodes.
@@ -99,10 +118,11 @@ class StopRule:
                 f"got n = {n} with an estimate of {estimate.n_episodes}"
             )
         self._n_seen += 1
+        self.rhw = estimate.rhw
         self._n_passes = self._n_passes + 1 if self._passes(estimate) else 0
         self.reached = self._n_passes >= PASSES_NEEDED
         return self.reached or self._n_seen == len(self.looks)
 
     def _passes(self, estimate: Estimate) -> bool:
         precise = self._stop.rhw is not None and estimate.rhw <= self._stop.rhw
-        return precise and estimate.n_crashes >= self._stop.min_crashes
+        return precise and estimate.n_crashes >= self._min_crashes

@@ -16,6 +16,8 @@ from harness.errors import RunFolderError
 from harness.records.tables import ShardTables
 
 MANIFEST = "manifest.json"
+SHELLS = "shells.json"
+"""Strata of a shells campaign, as its estimates need them."""
 TABLES = ("episodes", "moments", "traces")
 COMPRESSION = "zstd"
 

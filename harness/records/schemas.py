@@ -63,7 +63,7 @@ def episodes_schema(n_importance: int, n_surrogates: int) -> pa.Schema:
             _field("min_ttc_s", f8, "s", "smallest R2/-R2dot after the cut-in while closing", nullable=True),
             _field("av_distance_m", f8, "m", "distance that the AV drove in the episode"),
             _field("n_control_steps", pa.int16(), "1", "stratum l: steps drawn from an importance function"),
-            _field("component", pa.int8(), "1", "importance function drawn (episode mixture), else -1"),
+            _field("component", pa.int8(), "1", "importance function drawn (episode mixture), or shell, else -1"),
             _field("log_weight", f8, "1", "log p(x_c) - log q_sampled(x_c); exactly 0 without control"),
             _field(
                 "log_p_cut_in", f8, "1", "log P(cut-in | path), where the method draws the path ahead", nullable=True
@@ -72,6 +72,7 @@ def episodes_schema(n_importance: int, n_surrogates: int) -> pa.Schema:
             _field("martingale", _per(n_surrogates), "1", "per surrogate: sum W_(t-1) V_j (q_j,t/q_alpha,t - 1)"),
             _field("lv_maneuvers", pa.list_(pa.int8()), "1", "LV's draws, in order"),
             _field("bv_maneuvers", pa.list_(pa.int8()), "1", "BV's draws, in order; 31 marks the cut-in"),
+            _field("pool_cut_in", pa.int64(), "1", "row of the pool's cut-in (method shells), else null", nullable=True),
             _field("failure", pa.string(), "", "cause, for failed episodes", nullable=True),
         ]
     )

@@ -74,6 +74,7 @@ def episodes_table(shard: Shard, seed: int) -> pa.Table:
         "bv_maneuvers": _prefixes(shard.results.bv_path, e["n_bv"].astype(np.int64)),
         "failure": pa.array([shard.failures.get(row) for row in range(n)], pa.string()),
     }
+    columns["pool_cut_in"] = pa.nulls(n, pa.int64()) if shard.cut_ins is None else pa.array(shard.cut_ins)
     for name in ("n_steps", "n_control_steps", "component"):
         columns[name] = pa.array(e[name])
     for name in ("cut_in_r2_m", "cut_in_r2dot_mps", "crash_time_s", "impact_speed_mps", "min_ttc_s", "log_p_cut_in"):

@@ -4,22 +4,24 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 from harness.campaign.models import Campaign
 from harness.controllers.loading import require_controller
-from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, TooManyFailedError
-from harness.estimators import StopRule, accumulator, estimate_run
+from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE
+from harness.estimators import estimate_run
 from harness.progress import Progress, SilentProgress
-from harness.records.folder import TABLES, shard_file, write_json
+from harness.records.folder import SHELLS, TABLES, shard_file, write_json
 from harness.runner.manifest import Manifest, require_own_folder
-from harness.runner.prepare import content_hash, distance_per_test_m, prepare
-from harness.runner.shards import SMALLEST_FAILED_SAMPLE, ShardPool, shard_specs, stored_shard
+from harness.runner.prefix import Prefix
+from harness.runner.prepare import Prepared, content_hash, distance_per_test_m, prepare
+from harness.runner.rounds import rounds, stop_rule
+from harness.runner.shards import ShardPool, stored_shard
 from harness.runner.table_accuracy import table_errors
-from harness.runner.worker import ShardDone, ShardSpec
+from harness.runner.worker import ShardSpec
 
 MANIFEST_INTERVAL_S = 5.0
 
@@ -45,52 +47,6 @@ class RunResult:
     estimates: dict[str, Any]
     stopped_by: Literal["rhw", "episodes"]
     exit_code: int
-
-
-class _Prefix:
-    """The contiguous prefix of finished shards, and whether it is enough."""
-
-    def __init__(self, campaign: Campaign) -> None:
-        self._campaign = campaign
-        self._rule = StopRule(campaign.stop, campaign.testing.method, campaign.run.shard_size)
-        self._looks = iter(self._rule.looks)
-        self._next_look = next(self._looks)
-        self._sums = accumulator(self._rule.estimator)
-        self.specs: list[ShardSpec] = []
-        self.files: list[dict[str, str]] = []
-        self.n_episodes = self.n_crashes = self.n_failed = 0
-        self.rhw = float("inf")
-
-    @property
-    def reached(self) -> bool:
-        return self._rule.reached
-
-    def add(self, done: ShardDone) -> bool:
-        """Append a shard; True when the campaign is to stop."""
-        self.specs.append(done.spec)
-        self.files.append(done.files)
-        self._sums.add(done.block)
-        self.n_episodes += done.spec.n_episodes
-        self.n_crashes += int(done.block.crash.sum())
-        self.n_failed += int(done.block.failed.sum())
-        self._require_few_failed()
-        if self.n_episodes != self._next_look:
-            return False
-        estimate = self._sums.result(self._campaign.stop.confidence)
-        self.rhw = getattr(estimate, "rhw", float("inf"))
-        stop = self._rule.observe(self.n_episodes, estimate)
-        self._next_look = next(self._looks, -1)
-        return stop
-
-    def _require_few_failed(self) -> None:
-        most = self._campaign.run.max_failed_share
-        if self.n_episodes >= SMALLEST_FAILED_SAMPLE and self.n_failed > most * self.n_episodes:
-            raise TooManyFailedError(
-                "run.max_failed_share",
-                found=f"{self.n_failed} of {self.n_episodes} episodes failed",
-                expected=f"a share of at most {most:g}",
-                mend="Their causes are in the column 'failure' of the episodes table; raise the share to go on.",
-            )
 
 
 def run_campaign(
@@ -135,7 +91,12 @@ def run_campaign(
         distance_per_test_m=distance,
         table_errors=table_errors(campaign, prepared.policy.environment, prepared.tables),
     )
-    prefix = _run_shards(campaign, out, n_workers, progress, manifest, lambda: time.monotonic() - started)
+    if prepared.prescribed is not None:
+        write_json(out / SHELLS, prepared.prescribed.design.to_json())
+    rule = stop_rule(campaign)
+    prefix = Prefix(campaign, rule)
+    batches = rounds(campaign, prepared.prescribed, prefix, rule)
+    _run_shards(prepared, out, n_workers, progress, manifest, lambda: time.monotonic() - started, prefix, batches)
     _discard_beyond(out, len(prefix.specs))
     elapsed = time.monotonic() - started
     stopped_by: Literal["rhw", "episodes"] = "rhw" if prefix.reached else "episodes"
@@ -151,29 +112,36 @@ def run_campaign(
 
 
 def _run_shards(
-    campaign: Campaign, out: Path, workers: int, progress: Progress, manifest: Manifest, elapsed: Callable[[], float]
-) -> _Prefix:
+    prepared: Prepared,
+    out: Path,
+    workers: int,
+    progress: Progress,
+    manifest: Manifest,
+    elapsed: Callable[[], float],
+    prefix: Prefix,
+    batches: Iterator[Iterator[ShardSpec]],
+) -> None:
     """Run shards until the stop rule is content; the manifest follows so that an interrupted run can be read."""
-    prefix = _Prefix(campaign)
+    campaign = prepared.campaign
     pool = ShardPool(campaign, out, workers)
     written = elapsed()
     progress.stage("episodes", campaign.stop.episodes, done=_episodes_on_disk(campaign, out))
     try:
-        for done in pool.run(shard_specs(campaign), lambda spec: stored_shard(out, campaign, spec)):
-            stop = prefix.add(done)
-            progress.advance(0 if done.stored else done.spec.n_episodes)
-            progress.status(crashes=prefix.n_crashes, rhw=prefix.rhw)
-            if elapsed() - written > MANIFEST_INTERVAL_S:
-                written = elapsed()
-                manifest.write(prefix.specs, prefix.files, status="running", elapsed_s=written)
-            if stop:
-                break
+        for specs in batches:
+            for done in pool.run(specs, lambda spec: stored_shard(out, campaign, spec, prepared.prescribed)):
+                stop = prefix.add(done)
+                progress.advance(0 if done.stored else done.spec.n_episodes)
+                progress.status(crashes=prefix.n_crashes, rhw=prefix.rhw)
+                if elapsed() - written > MANIFEST_INTERVAL_S:
+                    written = elapsed()
+                    manifest.write(prefix.specs, prefix.files, status="running", elapsed_s=written)
+                if stop:
+                    return
     except BaseException:
         manifest.write(prefix.specs, prefix.files, status="interrupted", elapsed_s=elapsed())
         raise
     finally:
         pool.close()
-    return prefix
 
 
 def _episodes_on_disk(campaign: Campaign, folder: Path) -> int:

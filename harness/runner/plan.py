@@ -13,7 +13,8 @@ from harness.sumo.av_type import av_type
 from harness.vehicles.models import surrogate_records
 
 EPISODES_PER_SECOND_PER_CORE = {
-    ("sumo", "nde"): 2500, ("sumo", "forced"): 1200, ("sumo", "step_mixture"): 1300, ("sumo", "episode_mixture"): 1600,
+    ("sumo", "nde"): 2500, ("sumo", "shells"): 1500, ("twin", "shells"): 20000,
+    ("sumo", "forced"): 1200, ("sumo", "step_mixture"): 1300, ("sumo", "episode_mixture"): 1600,
     ("twin", "nde"): 40000, ("twin", "forced"): 25000, ("twin", "step_mixture"): 15000,
     ("twin", "episode_mixture"): 15000,
 }  # fmt: skip

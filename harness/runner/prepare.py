@@ -18,6 +18,8 @@ from harness.environment.loading import load_environment, load_parameters
 from harness.episode.begin import mean_test_distance
 from harness.episode.loop import MOMENT_LIMITS, EpisodeLoop, Keep, Policy
 from harness.importance.build import build_importance, needs_tables
+from harness.pool.prescribed import PrescribedEpisodes
+from harness.pool.storage import campaign_pool, campaign_pool_key, pool_path
 from harness.progress import Progress, SilentProgress
 from harness.sumo.av_type import av_type
 from harness.vehicles.models import av_records, surrogate_records
@@ -37,6 +39,7 @@ class Prepared:
     policy: Policy
     initial_states: InitialStates
     tables: Tables | None
+    prescribed: PrescribedEpisodes | None = None
 
     def states(self, first_episode: int, n_episodes: int) -> FloatArray:
         """Initial states of consecutive episodes, shape (n_episodes, 5)."""
@@ -75,7 +78,7 @@ def content_hash(campaign: Campaign) -> str:
 
 
 def prepare(campaign: Campaign, progress: Progress | None = None) -> Prepared:
-    """Load the environment and build (or read) the challenge tables.
+    """Load the environment and build (or read) the challenge tables or the pool of cut-ins.
 
     Raises
     ------
@@ -83,6 +86,7 @@ def prepare(campaign: Campaign, progress: Progress | None = None) -> Prepared:
         The environment's parameter file is wrong, or an attribute of an AV that SUMO drives.
     """
     progress = progress or SilentProgress()
+    prescribed: PrescribedEpisodes | None = None
     if campaign.av.sumo is not None:
         av_type(campaign.av.sumo)
     parameters = load_parameters(campaign.environment)
@@ -97,6 +101,12 @@ def prepare(campaign: Campaign, progress: Progress | None = None) -> Prepared:
             if not tables_cached(environment, drivers, challenge):
                 compile_kernels(campaign, environment)
             tables = building.result()
+    if campaign.testing.method == "shells":
+        with ThreadPoolExecutor(1) as thread:
+            pooling = thread.submit(campaign_pool, campaign, progress)
+            if not pool_path(campaign_pool_key(campaign)).is_file():
+                compile_kernels(campaign, environment)
+            prescribed = PrescribedEpisodes(campaign, pooling.result())
     policy = Policy(campaign.seed, environment, build_importance(campaign, tables), av_records(campaign.av))
     return Prepared(
         campaign,
@@ -104,6 +114,7 @@ def prepare(campaign: Campaign, progress: Progress | None = None) -> Prepared:
         policy,
         InitialStates(environment.numbers),
         tables,
+        prescribed,
     )
 
 

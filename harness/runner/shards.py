@@ -9,10 +9,14 @@ from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
 
+import numpy as np
+import pyarrow as pa
+
 from harness.campaign.models import Campaign
 from harness.controllers.black_box import Call, Death
 from harness.controllers.time_limit import death_cause
 from harness.errors import HarnessError, TooManyFailedError
+from harness.pool.prescribed import PrescribedEpisodes
 from harness.records.folder import TABLES, read_table, shard_file
 from harness.records.tables import ShardTables
 from harness.runner.processes import WorkerProcess, first_to_answer
@@ -39,7 +43,9 @@ def shard_specs(campaign: Campaign) -> Iterator[ShardSpec]:
         yield ShardSpec(index, first, min(size, total - first))
 
 
-def stored_shard(folder: Path, campaign: Campaign, spec: ShardSpec) -> ShardDone | None:
+def stored_shard(
+    folder: Path, campaign: Campaign, spec: ShardSpec, prescribed: PrescribedEpisodes | None = None
+) -> ShardDone | None:
     """A shard that an earlier run has finished, or None.
 
     Raises
@@ -54,8 +60,16 @@ def stored_shard(folder: Path, campaign: Campaign, spec: ShardSpec) -> ShardDone
     tables = {name: read_table(folder / path) for name, path in files.items()}
     if tables["episodes"].num_rows != spec.n_episodes:
         return None  # the last shard of a smaller budget
+    if prescribed is not None and not _same_cut_ins(tables["episodes"], prescribed, spec):
+        return None  # the last round of a smaller budget
     kept = ShardTables(tables["episodes"], tables.get("moments"), tables.get("traces"))
-    return ShardDone(spec, files, shard_block(campaign, kept), stored=True)
+    return ShardDone(spec, files, shard_block(campaign, kept, prescribed), stored=True)
+
+
+def _same_cut_ins(episodes: pa.Table, prescribed: PrescribedEpisodes, spec: ShardSpec) -> bool:
+    rows, _ = prescribed.rows(spec.draws)
+    stored = episodes.column("pool_cut_in")
+    return stored.null_count == 0 and np.array_equal(stored.to_numpy(), rows)
 
 
 @dataclass

@@ -8,10 +8,11 @@ from pathlib import Path
 
 from harness.campaign.models import Campaign
 from harness.controllers.black_box import Death
-from harness.episode.loop import EpisodeLoop
+from harness.episode.loop import EpisodeLoop, Shard
 from harness.estimators.block import Block
 from harness.estimators.from_records import block_from_tables
 from harness.importance.build import mixture_weights
+from harness.pool.prescribed import Draw, PrescribedEpisodes
 from harness.records.folder import write_shard
 from harness.records.tables import ShardTables, shard_tables
 from harness.runner.prepare import Prepared, build_world, prepare
@@ -19,11 +20,12 @@ from harness.runner.prepare import Prepared, build_world, prepare
 
 @dataclass(frozen=True)
 class ShardSpec:
-    """A fixed range of episodes."""
+    """A fixed range of episodes; ``draws`` says which cut-ins they are, where they are prescribed."""
 
     index: int
     first_episode: int
     n_episodes: int
+    draws: tuple[Draw, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -62,15 +64,30 @@ class ShardRunner:
         """Run a shard and write its tables; episodes in ``doomed`` fail before the call that ended a process."""
         self._doomed.update(doomed or {})
         campaign = self._prepared.campaign
-        shard = self._loop.run(spec.first_episode, self._prepared.states(spec.first_episode, spec.n_episodes))
+        shard = self._shard(spec)
         records = campaign.records
         keep_traces = records.traces != "none" or records.trace_share > 0.0
         tables = shard_tables(shard, campaign.seed, keep_traces=keep_traces)
         files = write_shard(self._folder, spec.index, tables)
-        return ShardDone(spec, files, shard_block(campaign, tables))
+        return ShardDone(spec, files, shard_block(campaign, tables, self._prepared.prescribed))
+
+    def _shard(self, spec: ShardSpec) -> Shard:
+        prescribed = self._prepared.prescribed
+        if prescribed is None:
+            return self._loop.run(spec.first_episode, self._prepared.states(spec.first_episode, spec.n_episodes))
+        states, script, rows = prescribed.episodes(spec.draws)
+        shard = self._loop.run(spec.first_episode, states, script)
+        shard.cut_ins = rows
+        return shard
 
 
-def shard_block(campaign: Campaign, tables: ShardTables) -> Block:
+def shard_block(campaign: Campaign, tables: ShardTables, prescribed: PrescribedEpisodes | None = None) -> Block:
     """What the stop rule's estimator sees of a shard."""
     moments = tables.moments if campaign.stop.estimator == "scv" else None
-    return block_from_tables(tables.episodes, moments, method=campaign.testing.method, alpha=mixture_weights(campaign))
+    return block_from_tables(
+        tables.episodes,
+        moments,
+        method=campaign.testing.method,
+        alpha=mixture_weights(campaign),
+        shells=None if prescribed is None else prescribed.design,
+    )

@@ -1,0 +1,81 @@
+"""Crash rate as Σ p_s c_s with known p_s: intervals of the shares c_s combined, and the error of the p_s added.
+
+Each share has its own exact (Clopper-Pearson) limits; they are combined by the method of variance estimates recovery
+(G. Y. Zou and A. Donner, Statistics in Medicine 27, 2008, 1693): the distance of each limit of the sum is the root of
+the summed squares of the terms' distances. A stratum without a crash widens the upper limit only.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.stats import beta, norm
+
+from harness.arrays import FloatArray, IntArray
+
+
+class Limits(NamedTuple):
+    """A rate with a lower and an upper limit."""
+
+    rate: float
+    low: float
+    high: float
+
+    @property
+    def rhw(self) -> float:
+        """Half of the interval's length over the rate; infinite at rate 0."""
+        return (self.high - self.low) / 2.0 / self.rate if self.rate > 0.0 else float("inf")
+
+
+def share_limits(crashes: IntArray, tests: IntArray, tail: float) -> tuple[FloatArray, FloatArray]:
+    """Clopper-Pearson limits of shares, each with the given tail probability; [0, 1] without a test.
+
+    Parameters
+    ----------
+    crashes, tests : ndarray of int64, shape (S,)
+    tail : float
+        Probability left out at each end.
+
+    Returns
+    -------
+    low, high : ndarray, shape (S,)
+    """
+    k, n = crashes.astype(np.float64), tests.astype(np.float64)
+    low = np.where(k > 0, beta.ppf(tail, np.maximum(k, 0.5), n - k + 1.0), 0.0)
+    high = np.where(k < n, beta.ppf(1.0 - tail, k + 1.0, np.maximum(n - k, 0.5)), 1.0)
+    return low, high
+
+
+def pool_variance(share: FloatArray, moments: FloatArray, rate: float, n_paths: int) -> float:
+    """Variance of Σ p_s c_s that comes from the pool's finite number of paths, an upper bound of it.
+
+    A path contributes at most its whole probability in the part of the strata in which the vehicle crashes. If its
+    crashes were spread over paths, the mean square would be Σ c_s c_t m_st; if they were the same paths in all strata,
+    Σ min(c_s, c_t) m_st. The latter is taken.
+    """
+    worst = float((np.minimum(share[:, None], share[None, :]) * moments).sum())
+    return max(worst - rate * rate, 0.0) / n_paths
+
+
+def combined(
+    p: FloatArray, crashes: IntArray, tests: IntArray, moments: FloatArray, n_paths: int, tail: float
+) -> Limits:
+    """Rate Σ p_s c_s with limits that leave out ``tail`` at each end.
+
+    Parameters
+    ----------
+    p : ndarray, shape (S,)
+        Probabilities of the strata.
+    crashes, tests : ndarray of int64, shape (S,)
+    moments, n_paths
+        Of the pool, see `pool_variance`.
+    """
+    share = crashes / np.maximum(tests, 1)
+    low, high = share_limits(crashes, tests, tail)
+    rate = float(p @ share)
+    z = float(norm.isf(tail))
+    pool = z * z * pool_variance(share, moments, rate, n_paths)
+    down = np.sqrt(((p * (share - low)) ** 2).sum() + pool)
+    up = np.sqrt(((p * (high - share)) ** 2).sum() + pool)
+    return Limits(rate, max(rate - float(down), 0.0), min(rate + float(up), 1.0))

@@ -1,0 +1,244 @@
+"""Build a pool: pilot run, aimed paths until crash rates are known well enough, shells, and cut-ins to keep."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+
+from harness.arrays import FloatArray, IntArray, RecordArray
+from harness.campaign.models import PoolSettings
+from harness.environment.driving import Environment
+from harness.environment.initial_state import N_STATE, InitialStates
+from harness.episode.cells import max_draws
+from harness.pool.cut_ins import CutIns, Pool, shells_of
+from harness.pool.enumeration import empty_path, enumerate_cut_ins, write_pairs
+from harness.pool.library import Library
+from harness.pool.proposal import Proposal, fit_proposal
+from harness.progress import Progress, SilentProgress
+from harness.random_stream import DIAGNOSTIC, INITIAL, uniforms
+
+PILOT_PATHS = 2048
+ROUND_PATHS = 4096
+BLOCK_PATHS = 256
+MOST_PATHS = 1 << 20
+CARELESS_SHARE = 0.2
+"""How much the surrogates beyond the boundary count in aiming: only a bound is wanted there."""
+CARELESS_ERROR = 4.0
+"""Their relative error may be this many times the target."""
+AIMED_DRAW, KEEP_DRAW = 0, 1
+"""Indices within the diagnostic stream."""
+
+
+@dataclass(frozen=True)
+class Enumerated:
+    """All cut-ins of some paths.
+
+    ``weight`` (n,) is naturalistic over proposal density; ``state`` (n, 5); ``probability`` (n, steps) of a cut-in in
+    each step; ``crashes`` (n, steps) one bit per surrogate, in the order of the library.
+    """
+
+    first: int
+    weight: FloatArray
+    state: FloatArray
+    probability: FloatArray
+    crashes: IntArray
+
+    def rates(self, n_surrogates: int) -> FloatArray:
+        """Per path: its weighted probability that each surrogate crashes, and of a cut-in; shape (n, D + 1)."""
+        mass = self.probability * self.weight[:, None]
+        columns = [(mass * ((self.crashes >> d) & 1)).sum(1) for d in range(n_surrogates)]
+        return np.column_stack([*columns, mass.sum(1)])
+
+
+class Enumerator:
+    """Enumerates consecutive paths of one environment, on all cores; the number of cores changes no bit."""
+
+    def __init__(
+        self, environment: Environment, drivers: RecordArray, envelope: int, seed: int, proposal: Proposal | None = None
+    ) -> None:
+        n = environment.numbers[0]
+        self._environment, self._drivers, self._envelope = environment, drivers, envelope
+        self._seed, self._proposal = seed, proposal
+        self._states = InitialStates(environment.numbers)
+        self._max_steps = int(n["max_steps"])
+        self._draws = max_draws(self._max_steps, int(n["hold_steps"]))
+
+    def aimed(self, proposal: Proposal) -> Enumerator:
+        """The same, with initial states drawn from a proposal."""
+        return Enumerator(self._environment, self._drivers, self._envelope, self._seed, proposal)
+
+    def uniforms(self, first: int, n: int) -> FloatArray:
+        """Uniforms of the initial states of consecutive paths, shape (n, 5)."""
+        return uniforms(self._seed, first, n, INITIAL, N_STATE)
+
+    def run(self, first: int, n: int, progress: Progress) -> list[Enumerated]:
+        """Paths ``first … first + n - 1``, in blocks."""
+        with ThreadPoolExecutor(os.cpu_count()) as threads:
+            blocks = []
+            for block in threads.map(self._block, range(first, first + n, BLOCK_PATHS)):
+                blocks.append(block)
+                progress.advance(BLOCK_PATHS)
+        return blocks
+
+    def _block(self, first: int) -> Enumerated:
+        u = self.uniforms(first, BLOCK_PATHS)
+        weight = np.ones(BLOCK_PATHS)
+        if self._proposal is not None:
+            u, weight = self._proposal.map(u, uniforms(self._seed, first, BLOCK_PATHS, DIAGNOSTIC, 1)[:, AIMED_DRAW])
+        state = self._states.from_uniforms(u)
+        probability = np.zeros((BLOCK_PATHS, self._max_steps))
+        crashes = np.zeros((BLOCK_PATHS, self._max_steps), np.int64)
+        path = empty_path(self._max_steps, self._draws)
+        enumerate_cut_ins(
+            self._seed, first, state, self._environment, self._drivers, self._envelope, path, probability, crashes
+        )
+        return Enumerated(first, weight, state, probability, crashes)
+
+    def pairs(self, path: IntArray, step: IntArray, state: FloatArray) -> tuple[IntArray, ...]:
+        """Maneuvers of chosen (path, cut-in step) pairs: LV's and BV's (n, draws), and how many of each (n,)."""
+        n, draws = len(path), self._draws
+        lv, bv = np.zeros((n, draws), np.int8), np.zeros((n, draws), np.int8)
+        n_lv, n_bv = np.zeros(n, np.int64), np.zeros(n, np.int64)
+        room = empty_path(self._max_steps, draws)
+        write_pairs(self._seed, path, step, state, self._environment, room, lv, bv, n_lv, n_bv)
+        return lv, bv, n_lv, n_bv
+
+
+def build_pool(
+    environment: Environment, library: Library, settings: PoolSettings, key: str, progress: Progress | None = None
+) -> Pool:
+    """Build a pool in the twin.
+
+    Parameters
+    ----------
+    environment : Environment
+    library : Library
+    settings : PoolSettings
+        Seed, relative error to reach, and how many cut-ins to keep of each shell.
+    key : str
+        Content hash that the pool will carry.
+    """
+    progress = progress or SilentProgress()
+    names = list(library.surrogates)
+    pilot = Enumerator(environment, library.drivers, names.index(library.envelope), settings.seed)
+    progress.stage("pool: pilot", PILOT_PATHS)
+    rates = _joined(pilot.run(0, PILOT_PATHS, progress), len(names))
+    careful = _up_to_boundary(rates, names.index(library.boundary))
+    aimed = pilot.aimed(fit_proposal(pilot.uniforms(0, PILOT_PATHS), _importance(rates, careful)))
+    blocks: list[Enumerated] = []
+    for blocks in _rounds(aimed, rates, careful, settings, progress):  # noqa: B007 - the last list is the result
+        pass
+    return _pool(blocks, aimed, library, settings, key)
+
+
+def _joined(blocks: list[Enumerated], n_surrogates: int) -> FloatArray:
+    return np.concatenate([block.rates(n_surrogates) for block in blocks])
+
+
+def _up_to_boundary(rates: FloatArray, boundary: int) -> FloatArray:
+    """Which columns (surrogates, and the cut-in) are no more careless than the boundary, shape (D + 1,) bool."""
+    mean = rates.mean(0)
+    inside: FloatArray = mean <= mean[boundary]
+    return inside
+
+
+def _importance(rates: FloatArray, careful: FloatArray) -> FloatArray:
+    """What a path contributes to all crash rates together, each relative to its mean, shape (n,)."""
+    mean = rates.mean(0)
+    relative = rates / np.where(mean > 0.0, mean, 1.0)
+    share = np.where(careful, 1.0, CARELESS_SHARE)
+    return np.sqrt((relative * relative * share).sum(1))
+
+
+def _rounds(
+    aimed: Enumerator, pilot: FloatArray, careful: FloatArray, settings: PoolSettings, progress: Progress
+) -> Iterator[list[Enumerated]]:
+    """All blocks so far, until the relative errors are small enough."""
+    wanted = settings.relative_error * np.where(careful, 1.0, CARELESS_ERROR)
+    progress.stage("pool of cut-ins", _paths_needed(pilot, wanted))
+    blocks: list[Enumerated] = []
+    rates = np.zeros((0, pilot.shape[1]))
+    while len(rates) < MOST_PATHS:
+        done = aimed.run(PILOT_PATHS + len(rates), ROUND_PATHS, progress)
+        blocks.extend(done)
+        rates = np.concatenate([rates, _joined(done, pilot.shape[1] - 1)])
+        mean = rates.mean(0)
+        known = mean > 0.0
+        error = rates.std(0)[known] / np.sqrt(len(rates)) / mean[known]
+        progress.status(error=f"{error[careful[known]].max(initial=0.0):.2%}")
+        yield blocks
+        if np.all(error <= wanted[known]):
+            return
+
+
+def _paths_needed(pilot: FloatArray, wanted: FloatArray) -> int:
+    """Rough number of paths, for the progress bar: aiming about halves the squared error of the pilot's."""
+    mean = pilot.mean(0)
+    known = mean > 0.0
+    relvar = pilot.var(0)[known] / mean[known] ** 2
+    needed = 0.5 * float((relvar / wanted[known] ** 2).max(initial=1.0))
+    return min(MOST_PATHS, -(-int(needed) // ROUND_PATHS) * ROUND_PATHS)
+
+
+def _pool(
+    blocks: list[Enumerated], enumerator: Enumerator, library: Library, settings: PoolSettings, key: str
+) -> Pool:
+    """Order the surrogates, sort all cut-ins into shells, and keep a sample of each."""
+    n_surrogates = len(library.surrogates)
+    rates = _joined(blocks, n_surrogates)
+    n = len(rates)
+    order = np.argsort(rates[:, :n_surrogates].mean(0), kind="stable")
+    mass = np.concatenate([block.probability * block.weight[:, None] for block in blocks])
+    crashes = np.concatenate([block.crashes for block in blocks])
+    shell = shells_of(crashes, order)
+    by_path = np.column_stack([np.where(shell == s, mass, 0.0).sum(1) for s in range(n_surrogates + 1)])
+    ordered = rates[:, order]
+    path, step, kept_shell = _keep(mass, shell, n_surrogates + 1, settings)
+    state = np.concatenate([block.state for block in blocks])[path]
+    index = blocks[0].first + path
+    lv, bv, n_lv, n_bv = enumerator.pairs(index, step, state)
+    bits = crashes[path, step]
+    return Pool(
+        key=key,
+        library=library,
+        names=tuple(np.array(list(library.surrogates))[order].tolist()),
+        n_paths=n,
+        p_cut_in=float(rates[:, -1].mean()),
+        p_cut_in_se=float(rates[:, -1].std() / np.sqrt(n)),
+        mu=ordered.mean(0),
+        mu_covariance=np.atleast_2d(np.cov(ordered.T, bias=True)) / n,
+        shell_p=by_path.mean(0),
+        shell_moments=by_path.T @ by_path / n,
+        cut_ins=CutIns(
+            index, step, kept_shell, state, lv, bv, n_lv, n_bv, ((bits[:, None] >> order[None, :]) & 1).astype(np.bool_)
+        ),
+    )
+
+
+def _keep(
+    mass: FloatArray, shell: IntArray, n_shells: int, settings: PoolSettings
+) -> tuple[IntArray, IntArray, IntArray]:
+    """Systematic sample of cut-ins of every shell, with probability proportional to mass.
+
+    Returns
+    -------
+    path, step, shell : ndarray, shape (n,)
+        Row and column in ``mass``, and the shell, sorted by shell and path.
+    """
+    paths, steps, shells = [], [], []
+    for s in range(n_shells):
+        places = np.flatnonzero((shell == s) & (mass > 0.0))
+        if places.size == 0:
+            continue
+        cumulative = np.cumsum(mass.ravel()[places])
+        offset = uniforms(settings.seed, s, 1, DIAGNOSTIC, KEEP_DRAW + 1)[0, KEEP_DRAW]
+        wanted = (offset + np.arange(settings.cut_ins_per_shell)) * (cumulative[-1] / settings.cut_ins_per_shell)
+        chosen = places[np.minimum(np.searchsorted(cumulative, wanted, side="right"), places.size - 1)]
+        paths.append(chosen // mass.shape[1])
+        steps.append(chosen % mass.shape[1])
+        shells.append(np.full(chosen.size, s, np.int64))
+    return np.concatenate(paths), np.concatenate(steps), np.concatenate(shells)

@@ -1,0 +1,106 @@
+"""What a pool is: shells with their probabilities, surrogates with their crash rates, and cut-ins to test with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from harness.arrays import BoolArray, FloatArray, Int8Array, IntArray
+from harness.pool.library import Library
+
+
+@dataclass(frozen=True, eq=False)
+class CutIns:
+    """A weighted sample of cut-ins, each with the paths of LV and BV before and after it.
+
+    Within a shell all have the same probability.
+
+    Attributes
+    ----------
+    path, step, shell : ndarray of int64, shape (n,)
+        Which path of the pool, cut-in step, and shell.
+    state : ndarray, shape (n, 5)
+        Initial states.
+    lv, bv : ndarray of int8, shape (n, draws)
+        Maneuver indices as an episode records them; 31 marks the cut-in.
+    n_lv, n_bv : ndarray of int64, shape (n,)
+        How many of them are used.
+    crashes : ndarray of bool, shape (n, D)
+        Which surrogates crash, in the pool's order.
+    """
+
+    path: IntArray
+    step: IntArray
+    shell: IntArray
+    state: FloatArray
+    lv: Int8Array
+    bv: Int8Array
+    n_lv: IntArray
+    n_bv: IntArray
+    crashes: BoolArray
+
+
+@dataclass(frozen=True, eq=False)
+class Pool:
+    """Pool of one environment and one library.
+
+    Attributes
+    ----------
+    key : str
+        Content hash of all that it was made from.
+    library : Library
+    names : tuple of str, length D
+        Surrogates from careful to careless, by crash rate.
+    n_paths : int
+        Paths that the probabilities come from.
+    p_cut_in, p_cut_in_se : float
+        Probability that BV cuts in in a test, and its standard error.
+    mu : ndarray, shape (D,)
+        Crash rates of the surrogates, per test.
+    mu_covariance : ndarray, shape (D, D)
+        Of their errors.
+    shell_p : ndarray, shape (D + 1,)
+        Probability of each shell; the last is a cut-in on which no surrogate crashes.
+    shell_moments : ndarray, shape (D + 1, D + 1)
+        Mean product of a path's probabilities in two shells.
+    cut_ins : CutIns
+    """
+
+    key: str
+    library: Library
+    names: tuple[str, ...]
+    n_paths: int
+    p_cut_in: float
+    p_cut_in_se: float
+    mu: FloatArray
+    mu_covariance: FloatArray
+    shell_p: FloatArray
+    shell_moments: FloatArray
+    cut_ins: CutIns
+
+    @property
+    def mu_se(self) -> FloatArray:
+        """Standard errors of the surrogates' crash rates, shape (D,)."""
+        return np.sqrt(np.diag(self.mu_covariance))
+
+    @property
+    def boundary(self) -> int:
+        """Index of the outermost shell that the conditional statement keeps."""
+        return self.names.index(self.library.boundary)
+
+
+def shells_of(crashes: IntArray, order: IntArray) -> Int8Array:
+    """Shell of cut-ins: the place in the order of the first surrogate that crashes, D if none does.
+
+    Parameters
+    ----------
+    crashes : ndarray of int64, any shape
+        One bit per surrogate.
+    order : ndarray, shape (D,)
+        Bits from the most careful surrogate to the most careless.
+    """
+    shell = np.full(crashes.shape, len(order), np.int8)
+    for place in reversed(range(len(order))):
+        shell[(crashes >> order[place]) & 1 == 1] = place
+    return shell

@@ -1,0 +1,163 @@
+"""The surrogate library: drivers from careful to careless, in one YAML file."""
+
+from __future__ import annotations
+
+import difflib
+from pathlib import Path
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from harness.arrays import RecordArray
+from harness.campaign.models import FVDM, IDM, Constant, Reflexes, Section, SurrogateName, broken_rule
+from harness.campaign.yaml_text import read_model
+from harness.errors import CampaignError
+from harness.vehicles.models import driver_records
+
+MOST_SURROGATES = 60
+"""Outcomes of a cut-in are bits of one integer."""
+
+
+class LibraryIDM(IDM):
+    """An IDM driver with its reflexes."""
+
+    reaction: Reflexes = Reflexes()
+
+
+class LibraryFVDM(FVDM):
+    """An FVDM driver with its reflexes."""
+
+    reaction: Reflexes = Reflexes()
+
+
+class LibraryConstant(Constant):
+    """A driver that does not react."""
+
+    reaction: Reflexes = Reflexes()
+
+
+LibraryDriver = Annotated[LibraryIDM | LibraryFVDM | LibraryConstant, Field(discriminator="model")]
+
+
+class Library(Section):
+    """Surrogates that shells are made of.
+
+    The order in the file does not matter: they are put in the order of their crash rates when the pool is built.
+    """
+
+    format: Literal["surrogate-library"]
+    version: Literal[1]
+    description: str = ""
+    boundary: SurrogateName = Field(
+        description="the most careless driver that the vehicle under test is assumed to be more careful than, "
+        "in the conditional statement"
+    )
+    envelope: SurrogateName = Field(
+        description="a driver at constant full throttle: it crashes wherever any vehicle within its acceleration does"
+    )
+    surrogates: dict[SurrogateName, LibraryDriver] = Field(description="drivers by name")
+
+    @property
+    def drivers(self) -> RecordArray:
+        """The surrogates as kernels read them, in the order of the file, shape (D,)."""
+        models = self.surrogates.values()
+        return driver_records([model.parameters for model in models], [model.reaction for model in models])
+
+    @property
+    def envelope_mps2(self) -> float:
+        """Acceleration of the envelope (m/s²)."""
+        envelope = self.surrogates[self.envelope]
+        if not isinstance(envelope, LibraryConstant):  # the validator has seen to it
+            raise TypeError(type(envelope).__name__)
+        return envelope.parameters.acceleration_mps2
+
+    def without(self, names: set[str]) -> Library:
+        """The library with some surrogates left out, never its boundary or envelope."""
+        kept = {name: model for name, model in self.surrogates.items() if name not in names}
+        return Library.model_validate({**dict(self), "surrogates": kept})
+
+    @model_validator(mode="after")
+    def _names_are_known(self) -> Self:
+        for key in ("boundary", "envelope"):
+            name = getattr(self, key)
+            if name not in self.surrogates:
+                close = difflib.get_close_matches(name, self.surrogates, n=1)
+                raise broken_rule(
+                    key,
+                    found=f"'{name}'",
+                    expected=f"one of the surrogates: {', '.join(self.surrogates)}",
+                    mend=f"Did you mean '{close[0]}'?" if close else "Add it to surrogates, or name another.",
+                )
+        if self.boundary == self.envelope:
+            raise broken_rule(
+                "boundary",
+                found=f"'{self.boundary}', which is the envelope",
+                expected="a driver that reacts: the envelope crashes nearly always, and assuming less than it says "
+                "nothing",
+                mend="Name the most careless driver that the vehicle can be expected to outdo.",
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _few_enough(self) -> Self:
+        if len(self.surrogates) > MOST_SURROGATES:
+            raise broken_rule(
+                "surrogates",
+                found=f"{len(self.surrogates)} of them",
+                expected=f"at most {MOST_SURROGATES}",
+                mend="Every shell costs tests: keep those that differ in crash rate by a quarter or more.",
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _envelope_encloses(self) -> Self:
+        envelope = self.surrogates[self.envelope]
+        if not isinstance(envelope, LibraryConstant):
+            raise broken_rule(
+                f"surrogates.{self.envelope}.model",
+                found=envelope.model,
+                expected="constant: the envelope is a vehicle at full throttle",
+                mend="Write {model: constant, parameters: {acceleration_mps2: 2.0}}.",
+            )
+        most = envelope.parameters.acceleration_mps2
+        for name, model in self.surrogates.items():
+            parameters = model.parameters
+            own = getattr(parameters, "max_acceleration_mps2", None)
+            fastest = own if own is not None else getattr(parameters, "acceleration_mps2", 0.0)
+            if fastest > most:
+                raise broken_rule(
+                    f"surrogates.{self.envelope}.parameters.acceleration_mps2",
+                    found=f"{most:g} m/s², less than {name}'s {fastest:g}",
+                    expected="an envelope that accelerates at least as hard as every surrogate",
+                    mend=f"Raise it to {fastest:g}, or limit {name}.",
+                )
+        return self
+
+
+SHIPPED_FOLDER = Path(__file__).parent
+
+
+def shipped_libraries() -> list[str]:
+    """Names of the libraries that come with the harness."""
+    return sorted(file.stem for file in SHIPPED_FOLDER.glob("*.yaml"))
+
+
+def load_library(name: str) -> Library:
+    """Read a shipped library by name, or a file by its path.
+
+    Raises
+    ------
+    CampaignError
+        There is none of that name, or the file is wrong; every place is named.
+    """
+    if name.endswith((".yaml", ".yml")) or "/" in name:
+        return read_model(Path(name), Library)
+    if name not in shipped_libraries():
+        close = difflib.get_close_matches(name, shipped_libraries(), n=1)
+        raise CampaignError(
+            "pool.library",
+            found=f"'{name}', which is not shipped",
+            expected=f"the name of a shipped library: {', '.join(shipped_libraries())}; or a path that ends in .yaml",
+            mend=f"Did you mean '{close[0]}'?" if close else "For a file of your own write its path: ./mine.yaml.",
+        )
+    return read_model(SHIPPED_FOLDER / f"{name}.yaml", Library)

@@ -1,0 +1,62 @@
+"""From draws of a campaign to the episodes that the world runs: initial states, and what LV and BV do."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from harness.arrays import FloatArray, IntArray
+from harness.campaign.models import Campaign
+from harness.episode.cells import Script
+from harness.pool.cut_ins import Pool
+from harness.pool.shells import Draws, ShellDesign, acceleration_limit, design_shells, shells_in_strata
+
+
+@dataclass(frozen=True)
+class Draw:
+    """Consecutive draws from one stratum."""
+
+    stratum: int
+    first: int
+    n: int
+
+
+class PrescribedEpisodes:
+    """The tests of a shells campaign.
+
+    Parameters
+    ----------
+    campaign : Campaign
+    pool : Pool
+
+    Attributes
+    ----------
+    design : ShellDesign
+    draws : Draws
+    """
+
+    def __init__(self, campaign: Campaign, pool: Pool) -> None:
+        limit = acceleration_limit(campaign.av)
+        self._pool = pool
+        self.design: ShellDesign = design_shells(pool, boundary=campaign.testing.shells.boundary, limit_mps2=limit)
+        boundary = pool.names.index(self.design.boundary)
+        self.draws = Draws(pool, shells_in_strata(pool, boundary, limit), campaign.seed)
+
+    def rows(self, draws: tuple[Draw, ...]) -> tuple[IntArray, IntArray]:
+        """Rows of the pool's cut-ins, and their strata, shape (n,) each."""
+        rows = [self.draws.take(draw.stratum, draw.first, draw.n) for draw in draws]
+        return np.concatenate(rows), np.repeat([draw.stratum for draw in draws], [draw.n for draw in draws])
+
+    def episodes(self, draws: tuple[Draw, ...]) -> tuple[FloatArray, Script, IntArray]:
+        """Initial states (n, 5), script, and rows of the pool's cut-ins (n,)."""
+        rows, stratum = self.rows(draws)
+        c = self._pool.cut_ins
+        script = Script(
+            lv=np.ascontiguousarray(c.lv[rows]),
+            bv=np.ascontiguousarray(c.bv[rows]),
+            cut_step=c.step[rows],
+            component=stratum.astype(np.int64),
+            log_weight=np.log(self.design.p[stratum]),
+        )
+        return c.state[rows], script, rows

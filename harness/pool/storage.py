@@ -1,0 +1,183 @@
+"""Pools on disk: one Parquet file of cut-ins, with all that is known of shells and surrogates in its metadata."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from harness.arrays import IntArray
+from harness.campaign.models import Campaign, PoolSettings
+from harness.compiled import cache_root
+from harness.environment.driving import Environment
+from harness.environment.loading import load_environment
+from harness.errors import RunFolderError
+from harness.pool.build import build_pool
+from harness.pool.cut_ins import CutIns, Pool
+from harness.pool.library import Library, load_library
+from harness.progress import Progress
+from harness.records.folder import write_atomically
+
+_FORMAT = 1
+"""Raise it when the meaning of a pool changes."""
+_METADATA = b"harness_pool"
+_STATE = ("v_bv_mps", "r1_m", "r1dot_mps", "r2_m", "r2dot_mps")
+
+
+def pool_key(environment: Environment, library: Library, settings: PoolSettings) -> str:
+    """Hash of all that a pool depends on: environment, level of lane changing, library and settings."""
+    numbers = {name: environment.numbers[name][0].item() for name in environment.numbers.dtype.names or ()}
+    drivers = {name: model.model_dump() for name, model in library.surrogates.items()}
+    roles = [library.boundary, library.envelope]
+    content = [_FORMAT, numbers, drivers, roles, settings.model_dump(exclude={"library"})]
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:24]
+
+
+def pool_path(key: str) -> Path:
+    """Where a pool is cached."""
+    return cache_root() / "pools" / f"{key}.parquet"
+
+
+def campaign_pool_key(campaign: Campaign) -> str:
+    """Key of the pool that belongs to a campaign's environment and library."""
+    return pool_key(load_environment(campaign.environment), load_library(campaign.pool.library), campaign.pool)
+
+
+def campaign_pool(campaign: Campaign, progress: Progress | None = None) -> Pool:
+    """The pool of a campaign's environment and library, from the cache or built and cached.
+
+    Raises
+    ------
+    CampaignError
+        The library's file is missing or wrong.
+    """
+    environment, library = load_environment(campaign.environment), load_library(campaign.pool.library)
+    key = pool_key(environment, library, campaign.pool)
+    path = pool_path(key)
+    if path.is_file():
+        try:
+            return read_pool(path)
+        except RunFolderError:
+            pass  # damaged: it is built again
+    pool = build_pool(environment, library, campaign.pool, key, progress)
+    write_pool(path, pool)
+    return pool
+
+
+def cached_pool(campaign: Campaign) -> Pool | None:
+    """The pool of a campaign if it has been built on this machine, else None."""
+    path = pool_path(campaign_pool_key(campaign))
+    return read_pool(path) if path.is_file() else None
+
+
+def write_pool(path: Path, pool: Pool) -> None:
+    """Write a pool atomically."""
+    table = _table(pool)
+    write_atomically(path, lambda temporary: pq.write_table(table, temporary, compression="zstd"))
+
+
+def read_pool(path: Path) -> Pool:
+    """Read a pool.
+
+    Raises
+    ------
+    RunFolderError
+        The file is missing, damaged, or not a pool.
+    """
+    try:
+        table = pq.read_table(path, partitioning=None)
+        facts = json.loads((table.schema.metadata or {})[_METADATA])
+        return _pool(table, facts)
+    except (OSError, pa.ArrowException, KeyError, ValueError) as error:
+        raise RunFolderError(
+            str(path),
+            found=f"a file that is not a whole pool ({str(error).splitlines()[0] if str(error) else error!r})",
+            expected="a pool that `harness pool` has written",
+            mend="Delete it: it is built again when it is needed.",
+        ) from error
+
+
+def _facts(pool: Pool) -> dict[str, Any]:
+    facts: dict[str, Any] = {"format": _FORMAT, "library": pool.library.model_dump()}
+    for field in fields(pool):
+        if field.name not in ("library", "cut_ins"):
+            value = getattr(pool, field.name)
+            facts[field.name] = value.tolist() if isinstance(value, np.ndarray) else value
+    return facts
+
+
+def _table(pool: Pool) -> pa.Table:
+    c = pool.cut_ins
+    kept = np.bincount(c.shell, minlength=pool.shell_p.size)
+    columns: dict[str, tuple[pa.Array, str]] = {
+        "path": (pa.array(c.path), "index of the path in the pool"),
+        **{name: (pa.array(c.state[:, i]), "initial state") for i, name in enumerate(_STATE)},
+        "cut_in_step": (pa.array(c.step.astype(np.int16)), "step (0.1 s) in which BV cuts in"),
+        "probability": (pa.array((pool.shell_p / np.maximum(kept, 1))[c.shell]), "P under the NDE that it stands for"),
+        "shell": (pa.array(c.shell.astype(np.int8)), "first surrogate that crashes; the last shell: none does"),
+        "crashes": (_rows(c.crashes), "which surrogates crash, in the order of the metadata's names"),
+        "lv_maneuvers": (_prefixes(c.lv, c.n_lv), "LV's draws, one per hold period"),
+        "bv_maneuvers": (_prefixes(c.bv, c.n_bv), "BV's draws; 31 marks the cut-in"),
+    }
+    schema = pa.schema(
+        [pa.field(name, array.type, nullable=False, metadata={"doc": doc}) for name, (array, doc) in columns.items()],
+        metadata={_METADATA: json.dumps(_facts(pool))},
+    )
+    return pa.table([array for array, _ in columns.values()], schema=schema)
+
+
+def _rows(values: np.ndarray) -> pa.Array:
+    return pa.FixedSizeListArray.from_arrays(pa.array(values.ravel()), values.shape[1])
+
+
+def _prefixes(values: np.ndarray, lengths: IntArray) -> pa.Array:
+    used = np.arange(values.shape[1]) < lengths[:, None]
+    offsets = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32)
+    return pa.ListArray.from_arrays(pa.array(offsets), pa.array(values[used]))
+
+
+def _padded(column: pa.ChunkedArray, width: int) -> tuple[np.ndarray, IntArray]:
+    lists = column.combine_chunks()
+    lengths = np.asarray(lists.value_lengths()).astype(np.int64)
+    values = np.zeros((len(lists), width), np.int8)
+    values[np.arange(width) < lengths[:, None]] = np.asarray(lists.flatten())
+    return values, lengths
+
+
+def _pool(table: pa.Table, facts: dict[str, Any]) -> Pool:
+    if facts["format"] != _FORMAT:
+        raise ValueError(f"format {facts['format']}")
+    n_surrogates = len(facts["names"])
+    bv_column = table.column("bv_maneuvers")
+    width = int(np.asarray(bv_column.combine_chunks().value_lengths()).max(initial=0))
+    lv, n_lv = _padded(table.column("lv_maneuvers"), width)
+    bv, n_bv = _padded(bv_column, width)
+    flat = table.column("crashes").combine_chunks().flatten()
+    cut_ins = CutIns(
+        path=np.asarray(table.column("path")),
+        step=np.asarray(table.column("cut_in_step")).astype(np.int64),
+        shell=np.asarray(table.column("shell")).astype(np.int64),
+        state=np.column_stack([np.asarray(table.column(name)) for name in _STATE]),
+        lv=lv,
+        bv=bv,
+        n_lv=n_lv,
+        n_bv=n_bv,
+        crashes=np.asarray(flat.to_numpy(zero_copy_only=False)).reshape(-1, n_surrogates),
+    )
+    arrays = {name: np.array(facts[name]) for name in ("mu", "mu_covariance", "shell_p", "shell_moments")}
+    return Pool(
+        key=str(facts["key"]),
+        library=Library.model_validate(facts["library"]),
+        names=tuple(facts["names"]),
+        n_paths=int(facts["n_paths"]),
+        p_cut_in=float(facts["p_cut_in"]),
+        p_cut_in_se=float(facts["p_cut_in_se"]),
+        cut_ins=cut_ins,
+        **arrays,
+    )

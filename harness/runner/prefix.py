@@ -1,0 +1,62 @@
+"""The contiguous prefix of finished shards: what it adds up to, and whether it is enough."""
+
+from __future__ import annotations
+
+from harness.campaign.models import Campaign
+from harness.errors import TooManyFailedError
+from harness.estimators import accumulator
+from harness.estimators.accumulator import Accumulator
+from harness.runner.rounds import Rule
+from harness.runner.shards import SMALLEST_FAILED_SAMPLE
+from harness.runner.worker import ShardDone, ShardSpec
+
+
+class Prefix:
+    """Finished shards in order, from the first on.
+
+    Attributes
+    ----------
+    sums : Accumulator
+        Of the estimator whose precision is watched.
+    rhw : float
+        At the last look.
+    """
+
+    def __init__(self, campaign: Campaign, rule: Rule) -> None:
+        self._campaign, self._rule = campaign, rule
+        self.sums: Accumulator = accumulator(rule.estimator)
+        self.specs: list[ShardSpec] = []
+        self.files: list[dict[str, str]] = []
+        self.n_episodes = self.n_crashes = self.n_failed = 0
+        self.rhw = float("inf")
+
+    @property
+    def reached(self) -> bool:
+        """Whether the asked precision was reached."""
+        return self._rule.reached
+
+    def add(self, done: ShardDone) -> bool:
+        """Append a shard; True when the campaign is to stop."""
+        self.specs.append(done.spec)
+        self.files.append(done.files)
+        self.sums.add(done.block)
+        self.n_episodes += done.spec.n_episodes
+        self.n_crashes += int(done.block.crash.sum())
+        self.n_failed += int(done.block.failed.sum())
+        self._require_few_failed()
+        if not self._rule.due(self.n_episodes):
+            return False
+        estimate = self.sums.result(self._campaign.stop.confidence)
+        stop = self._rule.observe(self.n_episodes, estimate)
+        self.rhw = self._rule.rhw
+        return stop
+
+    def _require_few_failed(self) -> None:
+        most = self._campaign.run.max_failed_share
+        if self.n_episodes >= SMALLEST_FAILED_SAMPLE and self.n_failed > most * self.n_episodes:
+            raise TooManyFailedError(
+                "run.max_failed_share",
+                found=f"{self.n_failed} of {self.n_episodes} episodes failed",
+                expected=f"a share of at most {most:g}",
+                mend="Their causes are in the column 'failure' of the episodes table; raise the share to go on.",
+            )

@@ -1,0 +1,132 @@
+"""In which rounds a campaign's shards are run, and when its stop rule looks.
+
+Most methods know all their episodes beforehand: one round. Shells decide from each round what the next one tests, so
+that a round is run to its end before the next begins, whatever the number of workers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Protocol
+
+import numpy as np
+
+from harness.arrays import IntArray
+from harness.campaign.models import Campaign, EstimatorName
+from harness.estimators import Shells, StopRule
+from harness.estimators.accumulator import Accumulator
+from harness.estimators.estimate import Estimate
+from harness.pool.prescribed import Draw, PrescribedEpisodes
+from harness.runner.allocation import Allocation
+from harness.runner.shards import shard_specs
+from harness.runner.worker import ShardSpec
+
+MOST_SHARDS_PER_ROUND = 16
+SMALLEST_SHARD = 64
+
+
+class Rule(Protocol):
+    """When to look, and when to stop."""
+
+    estimator: EstimatorName
+    reached: bool
+    rhw: float
+
+    def due(self, n: int) -> bool:
+        """Whether to look after ``n`` episodes."""
+        ...
+
+    def observe(self, n: int, estimate: Estimate) -> bool:
+        """Whether to stop after this look."""
+        ...
+
+
+class Counts(Protocol):
+    """What rounds need of the finished prefix."""
+
+    sums: Accumulator
+    n_episodes: int
+
+
+class RoundRule:
+    """Looks after each round; one pass suffices, because limits within shells are exact at every number of tests."""
+
+    estimator: EstimatorName = "shells"
+
+    def __init__(self, campaign: Campaign) -> None:
+        self._target = campaign.stop.rhw
+        self._min_crashes = campaign.min_crashes
+        self._conditional = campaign.testing.shells.statement == "conditional"
+        self.reached = False
+        self.rhw = float("inf")
+        self.look = 0
+
+    def due(self, n: int) -> bool:
+        """See `Rule`."""
+        return n == self.look
+
+    def observe(self, n: int, estimate: Estimate) -> bool:  # noqa: ARG002 - part of the shape of a rule
+        """See `Rule`."""
+        self.rhw = estimate.details["conditional"]["rhw"] if self._conditional else estimate.rhw
+        precise = self._target is not None and self.rhw <= self._target
+        self.reached = precise and estimate.n_crashes >= self._min_crashes
+        return self.reached
+
+
+def stop_rule(campaign: Campaign) -> StopRule | RoundRule:
+    """The rule that watches a campaign."""
+    if campaign.testing.method == "shells":
+        return RoundRule(campaign)
+    return StopRule(campaign.stop, campaign.testing.method, campaign.run.shard_size, min_crashes=campaign.min_crashes)
+
+
+def rounds(
+    campaign: Campaign, prescribed: PrescribedEpisodes | None, prefix: Counts, rule: StopRule | RoundRule
+) -> Iterator[Iterator[ShardSpec]]:
+    """Shards of each round; the next round is asked for when ``prefix`` holds the last one."""
+    if prescribed is None or not isinstance(rule, RoundRule):
+        yield shard_specs(campaign)
+        return
+    shells = campaign.testing.shells
+    allocation = Allocation(
+        prescribed.design, shells.first_tests, prescribed.draws.available, shells.statement == "conditional"
+    )
+    tests = crashes = np.zeros(prescribed.design.p.size, np.int64)
+    n_shards = 0
+    while True:
+        if isinstance(prefix.sums, Shells) and prefix.n_episodes:
+            tests, crashes = prefix.sums.tests, prefix.sums.crashes
+        added = allocation.next_round(tests, crashes, campaign.stop.episodes - prefix.n_episodes)
+        if not added.any():
+            return
+        rule.look = prefix.n_episodes + int(added.sum())
+        specs = round_specs(tests, added, n_shards, prefix.n_episodes, campaign.run.shard_size)
+        n_shards += len(specs)
+        yield iter(specs)
+
+
+def round_specs(tests: IntArray, added: IntArray, index: int, first_episode: int, shard_size: int) -> list[ShardSpec]:
+    """Divide a round into shards, each a range of the round's tests in the order of strata.
+
+    Parameters
+    ----------
+    tests, added : ndarray, shape (S,)
+        Draws taken so far, and those of the round.
+    index, first_episode : int
+        Of the first shard.
+    shard_size : int
+        Most episodes of a shard.
+    """
+    total = int(added.sum())
+    n_shards = max(-(-total // shard_size), min(MOST_SHARDS_PER_ROUND, total // SMALLEST_SHARD), 1)
+    edges = np.linspace(0, total, n_shards + 1).round().astype(np.int64)
+    begins = np.concatenate([[0], np.cumsum(added)])
+    specs = []
+    for k, (low, high) in enumerate(zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True)):
+        draws = []
+        for s in range(added.size):
+            begin, end = max(low, int(begins[s])), min(high, int(begins[s + 1]))
+            if begin < end:
+                draws.append(Draw(s, int(tests[s]) + begin - int(begins[s]), end - begin))
+        specs.append(ShardSpec(index + k, first_episode + low, high - low, tuple(draws)))
+    return specs
