@@ -111,7 +111,7 @@ class WithParts(Recorded):
         if self.world._shim is not None:
             self._time(self.world._shim, "step", "SUMO: set, step, get in one call")
         else:
-            self.world._api = _TimedStep(self.world._api, self._seconds)
+            self._time(self.world, "_simulation_step", "SUMO step")
             self._time(self.world, "_tell", "set")
             self._time(self.world, "_require_equal", "get and compare")
 
@@ -138,17 +138,6 @@ def _timed(function: Callable[..., object], part: str, seconds: dict[str, float]
         return result
 
     return call
-
-
-class _TimedStep:
-    """libsumo with its simulationStep timed."""
-
-    def __init__(self, api: object, seconds: dict[str, float]) -> None:
-        self._api = api
-        self.simulationStep = _timed(api.simulationStep, "SUMO step", seconds)
-
-    def __getattr__(self, name: str) -> object:
-        return getattr(self._api, name)
 
 
 class Floor:
@@ -241,7 +230,7 @@ def missing(name: str) -> str | None:
     if name == "traci" and sumo_binary() is None:
         return "no sumo binary: pip install 'harness[sumo]'"
     if "shim" in name and shim_library() is None:
-        return "no compiled shim: python setup.py build_ext --inplace"
+        return "no compiled shim: it is built at installation where there is a C++ compiler (pip install -e .)"
     return None
 
 

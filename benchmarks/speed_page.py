@@ -14,9 +14,9 @@ Campaign: scenarios/overtaking_nade.yaml (published NADE), {campaign("nade").wor
 {TWIN_CELLS} in the twin.
 What ends an episode, everywhere: a crash; BV and LV in contact; AV past BV without a cut-in; 20 s (about 99 of 100).
 Recorded: one row per episode and the first nine control steps, written to Parquet; "twin" alone keeps nothing.
-Read back: by harness every position after every step and every speed after every tenth, compared with what was
-commanded, bit for bit; by one-at-a-time (getters) and traci (subscriptions) every position and speed after every step;
-by floor nothing. Harness, one-at-a-time and traci have given equal rows for the first episodes."""
+Read back: by harness every position after every step, and every speed after every tenth step, with the shim after
+every step; all are compared with what was commanded, bit for bit. By one-at-a-time (getters) and traci (subscriptions)
+every position and speed after every step; by floor nothing. Harness, one-at-a-time and traci have given equal rows for the first episodes."""
 
 
 class Ratio(NamedTuple):

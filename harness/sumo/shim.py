@@ -16,6 +16,7 @@ import numpy as np
 from harness.arrays import FloatArray
 
 _POINTER = ctypes.c_void_p
+_OBEYED, _FAILED = 0, 1
 
 
 def shim_library() -> Path | None:
@@ -33,24 +34,29 @@ def open_shim(names: Sequence[str]) -> Shim | None:
         return None
     try:
         library = ctypes.CDLL(str(path))
-    except OSError:
-        return None  # built for another machine
-    library.shim_open.restype = _POINTER
-    library.shim_step.argtypes = [_POINTER, _POINTER, _POINTER, _POINTER]
-    library.shim_error.restype = ctypes.c_char_p
-    library.shim_error.argtypes = library.shim_close.argtypes = [_POINTER]
+        library.shim_open.restype = _POINTER
+        library.shim_find_vehicles.argtypes = [_POINTER]
+        library.shim_step.argtypes = [_POINTER] * 7
+        library.shim_error.restype = ctypes.c_char_p
+        library.shim_error.argtypes = library.shim_close.argtypes = [_POINTER]
+    except (OSError, AttributeError):
+        return None  # built for another machine, or by an earlier version
     encoded = (ctypes.c_char_p * len(names))(*(name.encode() for name in names))
     handle = library.shim_open(inner.__file__.encode(), encoded, ctypes.c_long(len(names)))
-    return Shim(library, handle, len(names)) if handle else None
+    if not handle:
+        return None
+    shim = Shim(library, handle, len(names))
+    shim.find_vehicles()
+    return shim
 
 
 class Shim:
-    """Vehicles of one simulation, told and read in one call.
+    """Vehicles of one simulation, told, read and compared in one call.
 
     Attributes
     ----------
-    position : ndarray, shape (n,)
-        Positions (m) that SUMO reported after the last step.
+    position, speed : ndarray, shape (n,)
+        Positions (m) and speeds (m/s) that SUMO reported after the last step.
     """
 
     def __init__(self, library: ctypes.CDLL, handle: int, n: int) -> None:
@@ -58,18 +64,42 @@ class Shim:
         self._handle: int | None = handle
         self._step = library.shim_step
         self.position: FloatArray = np.zeros(n)
-        self._position = self.position.ctypes.data
+        self.speed: FloatArray = np.zeros(n)
+        self._given: tuple[FloatArray, ...] = ()
+        self._addresses: tuple[int, ...] = ()
 
-    def step(self, speed: FloatArray, told: FloatArray) -> None:
-        """Tell changed speeds (noting them in ``told``), simulate one step, read all positions.
+    def find_vehicles(self) -> None:
+        """Look the vehicles up again: those of an earlier simulation in this process are gone.
 
         Raises
         ------
         RuntimeError
-            SUMO raised an error.
+            There is no such vehicle.
         """
-        if self._step(self._handle, speed.ctypes.data, told.ctypes.data, self._position):
+        if self._library.shim_find_vehicles(self._handle):
             raise RuntimeError(self._library.shim_error(self._handle).decode())
+
+    def step(self, speed: FloatArray, told: FloatArray, x: FloatArray, v: FloatArray) -> bool:
+        """Tell changed speeds (noting them in ``told``), simulate one step, read all positions and speeds.
+
+        Returns
+        -------
+        bool
+            Whether every position and speed is the wanted one, ``x`` and ``v``, in every bit.
+
+        Raises
+        ------
+        RuntimeError
+            SUMO raised an error, or a vehicle has left the road.
+        """
+        given = (speed, told, x, v)
+        if [*map(id, given)] != [*map(id, self._given)]:  # to ask for six addresses takes longer than the call
+            self._given = given
+            self._addresses = tuple(array.ctypes.data for array in (*given, self.position, self.speed))
+        answer: int = self._step(self._handle, *self._addresses)
+        if answer == _FAILED:
+            raise RuntimeError(self._library.shim_error(self._handle).decode())
+        return answer == _OBEYED
 
     def close(self) -> None:
         """Forget the vehicles."""
