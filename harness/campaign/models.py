@@ -14,7 +14,16 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationInfo, field_validator, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
 from pydantic_core import PydanticCustomError, PydanticKnownError
 
 NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_.-]*$"
@@ -92,6 +101,16 @@ class ConstantParameters(Section):
 
     acceleration_mps2: float = Field(0.0, ge=-20.0, le=20.0, description="its acceleration [assumed]")
 
+    @property
+    def min_acceleration_mps2(self) -> float:
+        """Its only acceleration (m/s²)."""
+        return self.acceleration_mps2
+
+    @property
+    def max_acceleration_mps2(self) -> float:
+        """Its only acceleration (m/s²)."""
+        return self.acceleration_mps2
+
 
 class IDM(Section):
     """A vehicle that follows the intelligent driver model."""
@@ -145,8 +164,8 @@ class Reflexes(Section):
     delay_s: StepTime = Field(
         0.0, ge=0.0, le=10.0, description="time after the cut-in during which it keeps its speed [assumed]"
     )
-    max_jerk_mps3: Positive | None = Field(
-        None, ge=0.1, le=1000.0, description="fastest change of its acceleration; unlimited when left out [assumed]"
+    max_jerk_mps3: Annotated[float, Field(ge=0.1, le=1000.0)] | None = Field(
+        None, description="fastest change of its acceleration; unlimited when left out [assumed]"
     )
 
 
@@ -419,8 +438,8 @@ class Stop(Section):
     rhw: float | None = Field(None, gt=0.0, lt=10.0, description="stop at this relative half-width of the interval")
     confidence: float = Field(0.9, gt=0.0, lt=1.0, description="level of every interval")
     estimator: EstimatorName | None = Field(None, description="whose RHW is watched; default: the method's own")
-    min_crashes: Whole | None = Field(
-        None, ge=1, description="sampled crashes needed before RHW may stop the campaign; 100, with shells 1"
+    min_crashes: Annotated[Whole, Field(ge=1)] | None = Field(
+        None, description="sampled crashes needed before RHW may stop the campaign; 100, with shells 1"
     )
 
 

@@ -23,7 +23,9 @@ class Nade:
     def refusal(cls, block: Block) -> str | None:
         """Refuses shells: how many tests each gets depends on results, so that no plain mean is meant."""
         if block.method == "shells":
-            return "tests were drawn within shells, whose shares must be added by their probabilities (estimator shells)"
+            return (
+                "tests were drawn within shells, whose shares must be added by their probabilities (estimator shells)"
+            )
         return None
 
     def add(self, block: Block) -> None:

@@ -20,7 +20,13 @@ from harness.estimators.scv import Scv
 from harness.estimators.shells import Shells
 
 ESTIMATORS: tuple[EstimatorName, ...] = ("nde", "nade", "mixture_cv", "scv", "shells")
-_CLASSES: dict[EstimatorName, type[Accumulator]] = {"nde": Nde, "nade": Nade, "mixture_cv": MixtureCv, "scv": Scv, "shells": Shells}
+_CLASSES: dict[EstimatorName, type[Accumulator]] = {
+    "nde": Nde,
+    "nade": Nade,
+    "mixture_cv": MixtureCv,
+    "scv": Scv,
+    "shells": Shells,
+}
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """`shells`: crashes counted within shells of known probability, and the two statements that they allow.
 
-The assumption-free statement counts every shell, tested or empty. The conditional one holds for vehicles that crash only
-where the boundary surrogate, or a more careful one, crashes too: it needs far fewer tests, and one crash outside
+The assumption-free statement counts every shell, tested or empty. The conditional one holds for vehicles that crash
+only where the boundary surrogate, or a more careful one, crashes too: it needs far fewer tests, and one crash outside
 refutes it.
 """
 
@@ -46,8 +46,10 @@ class Shells:
             raise ValueError("the block has no shells")
         if self.design is None:
             self._begin(block.shells)
-        for counts, rows in ((self.tests, slice(None)), (self.crashes, block.crash), (self.failed, block.failed)):
-            counts += np.bincount(block.component[rows], minlength=counts.size)
+        n_strata = self.tests.size
+        self.tests += np.bincount(block.component, minlength=n_strata)
+        self.crashes += np.bincount(block.component[block.crash], minlength=n_strata)
+        self.failed += np.bincount(block.component[block.failed], minlength=n_strata)
 
     def _begin(self, design: ShellDesign) -> None:
         self.design = design

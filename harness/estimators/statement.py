@@ -37,8 +37,8 @@ def conditional_statement(estimate: Estimate) -> str | None:
     if not found["n_episodes_outside"]:
         return f"{text} Nothing was tested outside: whether the assumption holds is not known."
     return (
-        f"{text} No crash was found in {found['n_episodes_outside']:,} tests outside: with {level} confidence fewer than "
-        f"{found['upper_bound_outside']:.3g} crashes per test lie there."
+        f"{text} There was no crash in {found['n_episodes_outside']:,} tests outside: with {level} confidence fewer "
+        f"than {found['upper_bound_outside']:.3g} crashes per test lie there."
     )
 
 

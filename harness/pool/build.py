@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from harness.arrays import FloatArray, IntArray, RecordArray
+from harness.arrays import FloatArray, Int8Array, IntArray, RecordArray
 from harness.campaign.models import PoolSettings
 from harness.environment.driving import Environment
 from harness.environment.initial_state import N_STATE, InitialStates
@@ -98,7 +98,9 @@ class Enumerator:
         )
         return Enumerated(first, weight, state, probability, crashes)
 
-    def pairs(self, path: IntArray, step: IntArray, state: FloatArray) -> tuple[IntArray, ...]:
+    def pairs(
+        self, path: IntArray, step: IntArray, state: FloatArray
+    ) -> tuple[Int8Array, Int8Array, IntArray, IntArray]:
         """Maneuvers of chosen (path, cut-in step) pairs: LV's and BV's (n, draws), and how many of each (n,)."""
         n, draws = len(path), self._draws
         lv, bv = np.zeros((n, draws), np.int8), np.zeros((n, draws), np.int8)
@@ -151,7 +153,8 @@ def _importance(rates: FloatArray, careful: FloatArray) -> FloatArray:
     mean = rates.mean(0)
     relative = rates / np.where(mean > 0.0, mean, 1.0)
     share = np.where(careful, 1.0, CARELESS_SHARE)
-    return np.sqrt((relative * relative * share).sum(1))
+    importance: FloatArray = np.sqrt((relative * relative * share).sum(1))
+    return importance
 
 
 def _rounds(
@@ -184,9 +187,7 @@ def _paths_needed(pilot: FloatArray, wanted: FloatArray) -> int:
     return min(MOST_PATHS, -(-int(needed) // ROUND_PATHS) * ROUND_PATHS)
 
 
-def _pool(
-    blocks: list[Enumerated], enumerator: Enumerator, library: Library, settings: PoolSettings, key: str
-) -> Pool:
+def _pool(blocks: list[Enumerated], enumerator: Enumerator, library: Library, settings: PoolSettings, key: str) -> Pool:
     """Order the surrogates, sort all cut-ins into shells, and keep a sample of each."""
     n_surrogates = len(library.surrogates)
     rates = _joined(blocks, n_surrogates)
@@ -220,7 +221,7 @@ def _pool(
 
 
 def _keep(
-    mass: FloatArray, shell: IntArray, n_shells: int, settings: PoolSettings
+    mass: FloatArray, shell: Int8Array, n_shells: int, settings: PoolSettings
 ) -> tuple[IntArray, IntArray, IntArray]:
     """Systematic sample of cut-ins of every shell, with probability proportional to mass.
 

@@ -82,9 +82,7 @@ def walk(seed: int, index: int, state: FloatArray, environment: Environment, pat
             return step
         if step % n.hold_steps == 0:
             path.lv[draws] = draw_free_driving(uniform(seed, index, LV_DRAWS, draws), v_lv, environment)
-            path.bv[draws] = draw_car_following(
-                uniform(seed, index, BV_DRAWS, draws), v_bv, r1, r1dot, environment
-            )
+            path.bv[draws] = draw_car_following(uniform(seed, index, BV_DRAWS, draws), v_bv, r1, r1dot, environment)
             a_lv, a_bv = acceleration(path.lv[draws]), acceleration(path.bv[draws])
             draws += 1
         path.hazard[step] = cut_in_hazard(

@@ -121,9 +121,7 @@ class Library(Section):
             )
         most = envelope.parameters.acceleration_mps2
         for name, model in self.surrogates.items():
-            parameters = model.parameters
-            own = getattr(parameters, "max_acceleration_mps2", None)
-            fastest = own if own is not None else getattr(parameters, "acceleration_mps2", 0.0)
+            fastest = model.parameters.max_acceleration_mps2
             if fastest > most:
                 raise broken_rule(
                     f"surrogates.{self.envelope}.parameters.acceleration_mps2",

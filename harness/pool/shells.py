@@ -1,4 +1,4 @@
-"""Shells as strata of a test campaign: which cut-ins belong together, how probable they are, and in which order to draw.
+"""Shells as strata of a test campaign: which cut-ins belong together, their probability, the order of draws.
 
 Shells up to the boundary are strata of their own. All beyond it is one stratum, *outside*: what a careful vehicle is
 tested for there is that nothing happens, and dividing a stratum without crashes only costs tests. A shell on which not
@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from harness.arrays import FloatArray, IntArray
-from harness.campaign.models import AutomatedVehicle, ConstantParameters, FVDMParameters, IDMParameters
+from harness.campaign.models import AutomatedVehicle, BuiltInParameters
 from harness.errors import CampaignError
 from harness.pool.cut_ins import Pool
 
@@ -70,10 +70,8 @@ class ShellDesign:
 
 def acceleration_limit(av: AutomatedVehicle) -> float:
     """Hardest acceleration (m/s²) that an AV can reach; infinite if nothing in the harness limits it."""
-    if isinstance(av.parameters, IDMParameters | FVDMParameters):
+    if isinstance(av.parameters, BuiltInParameters):
         return av.parameters.max_acceleration_mps2
-    if isinstance(av.parameters, ConstantParameters):
-        return av.parameters.acceleration_mps2
     if av.controller is not None or av.fmu is not None:
         return av.limits.max_acceleration_mps2
     return float("inf")

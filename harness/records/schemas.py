@@ -72,7 +72,9 @@ def episodes_schema(n_importance: int, n_surrogates: int) -> pa.Schema:
             _field("martingale", _per(n_surrogates), "1", "per surrogate: sum W_(t-1) V_j (q_j,t/q_alpha,t - 1)"),
             _field("lv_maneuvers", pa.list_(pa.int8()), "1", "LV's draws, in order"),
             _field("bv_maneuvers", pa.list_(pa.int8()), "1", "BV's draws, in order; 31 marks the cut-in"),
-            _field("pool_cut_in", pa.int64(), "1", "row of the pool's cut-in (method shells), else null", nullable=True),
+            _field(
+                "pool_cut_in", pa.int64(), "1", "row of the pool's cut-in (method shells), else null", nullable=True
+            ),
             _field("failure", pa.string(), "", "cause, for failed episodes", nullable=True),
         ]
     )

@@ -1,7 +1,7 @@
 """How many tests each shell gets next: rounds that grow geometrically, to where they narrow the interval most.
 
-Depends on counts alone, not on the stop rule or on time: a run can be continued to a smaller RHW. First the strata inside
-the boundary are tested until the conditional statement is roughly known, which takes a hundred tests; then all.
+Depends on counts alone, not on the stop rule or on time: a run can be continued to a smaller RHW. First the strata
+inside the boundary are tested until the conditional statement is roughly known, some hundred tests; then all are.
 """
 
 from __future__ import annotations

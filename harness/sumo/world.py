@@ -70,7 +70,7 @@ class SumoWorld:
                 expected="one at a time",
                 mend="Close the other world first, or use another process.",
             )
-        self.x: FloatArray = np.zeros((n_cells, 3))
+        self.x: FloatArray = np.tile([_PARKED_M[vehicle] for vehicle in (LV, BV, AV)], (n_cells, 1))
         self.v: FloatArray = np.zeros((n_cells, 3))
         self._api: Any = _gui_api() if gui else libsumo
         self._vanilla = vanilla

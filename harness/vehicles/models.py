@@ -41,9 +41,7 @@ DRIVER_DTYPE = np.dtype(
 )
 
 
-def driver_records(
-    drivers: Sequence[BuiltInParameters], reactions: Sequence[Reflexes] | None = None
-) -> RecordArray:
+def driver_records(drivers: Sequence[BuiltInParameters], reactions: Sequence[Reflexes] | None = None) -> RecordArray:
     """Parameters of driver models as kernels read them, shape (number of drivers,).
 
     Parameters

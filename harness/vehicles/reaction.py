@@ -1,6 +1,6 @@
 """How a driver lags behind its model: it reacts late, changes its acceleration slowly, or does not look.
 
-A driver keeps its speed until it reacts to the cut-in; from then on its model decides, as fast as its jerk limit allows.
+A driver keeps its speed until it reacts to the cut-in; then its model decides, as fast as its jerk limit allows.
 """
 
 from __future__ import annotations
