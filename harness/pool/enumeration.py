@@ -31,8 +31,8 @@ NO_CRASH = -1
 class Path(NamedTuple):
     """LV's and BV's motion without a cut-in, and the AV at constant speed.
 
-    ``lv``, ``bv`` (draws,) are maneuver indices. ``x_lv``, ``x_bv``, ``v_bv``, ``x_av`` (steps + 1,) are positions (m) and
-    speeds (m/s); ``hazard`` (steps,) the cut-in hazard of each step. ``x``, ``v`` (3,) are the initial placement.
+    ``lv``, ``bv`` (draws,) are maneuver indices. ``x_lv``, ``x_bv``, ``x_av``, ``v_bv`` (steps + 1,) are positions (m)
+    and speeds (m/s); ``hazard`` (steps,) the cut-in hazard of each step. ``x``, ``v`` (3,) are the initial placement.
     ``x_after``, ``v_after`` (steps + 1,) receive BV's motion after a cut-in.
     """
 
