@@ -113,7 +113,8 @@ class SumoWorld:
         return "vanilla" if self._vanilla else "exact"
 
     def _populate(self) -> None:
-        """Put the vehicles of all cells on the road, parked."""
+        """Put the vehicles of all cells on the road, parked: there a cell that gets no episode stays."""
+        self.x[:], self.v[:] = [_PARKED_M[LV], _PARKED_M[BV], _PARKED_M[AV]], 0.0
         for k, names in enumerate(self._names):
             self._api.route.add(f"cell{k}", [f"cell{k}"])
             for vehicle, name in enumerate(names):
