@@ -43,6 +43,11 @@ def test_with_before_cut_in_controller_the_program_drives_from_the_start():
     assert shard.traces[0][3, AV, 1] < shard.traces[0][0, AV, 1] - 1.0
 
 
+def test_cells_that_never_get_an_episode_stay_parked():
+    shard, expected = run(program(EXAMPLE), 0, 3, cells=8), run_idm(0, 3)
+    assert_same_motion(shard, expected, range(3))
+
+
 def test_connecting_late_is_no_fault():
     assert not run(program(MISBEHAVING, "connects_late"), 0, 2, cells=2).failures
 
