@@ -13,7 +13,7 @@ COMPONENT = "component"
 
 
 def log_scales(run: RunFolder) -> Floats:
-    """Logarithm of 1/n_s per shell, shape (S,), which turns recorded weights p_s into ones that add up to probabilities.
+    """Logarithm of 1/n_s per shell, shape (S,): it turns recorded weights p_s into ones that add up to probabilities.
 
     A record carries log p_s, because it is written before anybody knows how many tests its shell will get. Weights
     p_s/n_s add up to Σ p_s c_s; weights p_s would count a shell as often as it was tested. A shell without tests has

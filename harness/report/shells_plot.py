@@ -20,7 +20,7 @@ def shells_plot(found: ShellsResult) -> Plot:
     rates, widths = figure.subplots(1, 2, sharey=True, width_ratios=(3, 2))
     # An untested shell may hold anything up to its probability: it would flatten all others, and runs out instead.
     tested = [shell for shell in found.shells if shell.n_tests] or list(found.shells)
-    limit = 1.12 * max(*(shell.high for shell in tested), found.rate)
+    limit = 1.12 * max(shell.high for shell in tested)
     for row, shell in enumerate(found.shells):
         _draw_rate(rates, row, shell, limit)
     half_widths = [*(shell.half_width for shell in found.shells), found.pool_half_width]

@@ -11,7 +11,7 @@ from harness.errors import RunFolderError
 SHOWN_IN_SECTION = frozenset({"shells", "conditional", "boundary", "pool", "p_cut_in", "p_impossible"})
 """Details of the estimate that have a place of their own on the page."""
 NEGLIGIBLE = 1e-9
-"""Parts of P(cut-in) smaller than this come from rounding."""
+"""Differences of this share, of P(cut-in) or of a squared width, come from rounding."""
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,8 @@ class ShellsResult:
     def pool_half_width(self) -> float:
         """What the pool's own error leaves open: the part of the upper limit that no shell accounts for."""
         up = self.high - self.rate
-        return math.sqrt(max(up * up - math.fsum((s.high - s.contribution) ** 2 for s in self.shells), 0.0))
+        square = up * up - math.fsum((s.high - s.contribution) ** 2 for s in self.shells)
+        return math.sqrt(square) if square > NEGLIGIBLE * up * up else 0.0
 
     def share_of_uncertainty(self, half_width: float) -> float:
         """Share in the sum of squared half-widths, which is what makes the interval of the rate."""
