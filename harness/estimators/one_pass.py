@@ -6,8 +6,6 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from threadpoolctl import threadpool_limits
-
 from harness.campaign.models import EstimatorName
 from harness.estimators.accumulator import Accumulator
 from harness.estimators.block import Block
@@ -86,17 +84,6 @@ def one_pass(
     ValueError
         If there is no episode, or a block does not follow the one before.
     """
-    # Strata are fitted side by side; BLAS's own threads would wait for each other in busy loops.
-    with threadpool_limits(1, "blas"):
-        return _one_pass(blocks, names, confidence, make)
-
-
-def _one_pass(
-    blocks: Iterable[Block],
-    names: Sequence[EstimatorName],
-    confidence: float,
-    make: Callable[[EstimatorName], Accumulator],
-) -> PassResult:
     states: dict[EstimatorName, Accumulator] = {}
     refusals: dict[EstimatorName, str] = {}
     diagnostics, convergence, own = Diagnostics(), Convergence(), None
