@@ -19,12 +19,12 @@ from harness.environment.driving import Environment
 from harness.environment.loading import load_environment
 from harness.errors import RunFolderError
 from harness.pool.build import build_pool
-from harness.pool.cut_ins import CutIns, Pool
+from harness.pool.cut_ins import CutIns, Pool, environment_hash
 from harness.pool.library import Library, load_library
 from harness.progress import Progress
 from harness.records.folder import write_atomically
 
-_FORMAT = 1
+_FORMAT = 2
 """Raise it when the meaning of a pool changes."""
 _METADATA = b"harness_pool"
 _STATE = ("v_bv_mps", "r1_m", "r1dot_mps", "r2_m", "r2dot_mps")
@@ -32,10 +32,9 @@ _STATE = ("v_bv_mps", "r1_m", "r1dot_mps", "r2_m", "r2dot_mps")
 
 def pool_key(environment: Environment, library: Library, settings: PoolSettings) -> str:
     """Hash of all that a pool depends on: environment, level of lane changing, library and settings."""
-    numbers = {name: environment.numbers[name][0].item() for name in environment.numbers.dtype.names or ()}
     drivers = {name: model.model_dump() for name, model in library.surrogates.items()}
     roles = [library.boundary, library.envelope]
-    content = [_FORMAT, numbers, drivers, roles, settings.model_dump(exclude={"library"})]
+    content = [_FORMAT, environment_hash(environment), drivers, roles, settings.model_dump(exclude={"library"})]
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:24]
 
 
@@ -173,6 +172,7 @@ def _pool(table: pa.Table, facts: dict[str, Any]) -> Pool:
     arrays = {name: np.array(facts[name]) for name in ("mu", "mu_covariance", "shell_p", "shell_moments")}
     return Pool(
         key=str(facts["key"]),
+        environment=str(facts["environment"]),
         library=Library.model_validate(facts["library"]),
         names=tuple(facts["names"]),
         n_paths=int(facts["n_paths"]),
