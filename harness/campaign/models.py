@@ -406,7 +406,7 @@ class PoolSettings(Section):
 
     library: str = Field("ladder-1", description="name of a shipped surrogate library, or a path to your own")
     relative_error: float = Field(
-        0.005, gt=0.0, le=0.2, description="standard error of the surrogates' crash rates to reach, relative"
+        0.005, ge=0.001, le=0.2, description="standard error of the surrogates' crash rates to reach, relative"
     )
     cut_ins_per_shell: Whole = Field(
         10_000, ge=100, le=1_000_000, description="cut-ins kept of each shell: the most tests that it can give"
@@ -438,7 +438,7 @@ class Stop(Section):
     rhw: float | None = Field(None, gt=0.0, lt=10.0, description="stop at this relative half-width of the interval")
     confidence: float = Field(0.9, gt=0.0, lt=1.0, description="level of every interval")
     estimator: EstimatorName | None = Field(None, description="whose RHW is watched; default: the method's own")
-    min_crashes: Annotated[Whole, Field(ge=1)] | None = Field(
+    min_crashes: Annotated[int, Field(ge=1), BeforeValidator(_whole)] | None = Field(
         None, description="sampled crashes needed before RHW may stop the campaign; 100, with shells 1"
     )
 

@@ -6,7 +6,7 @@ import json
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from harness.campaign.models import AV_SOURCES, Campaign
+from harness.campaign.models import AV_SOURCES, Campaign, ConstantParameters
 
 Schema = dict[str, Any]
 
@@ -14,6 +14,7 @@ Schema = dict[str, Any]
 def campaign_schema() -> Schema:
     """JSON schema (draft 2020-12) of a campaign file, generated from the models."""
     schema = Campaign.model_json_schema()
+    schema["$defs"]["ConstantParameters"] = ConstantParameters.model_json_schema()  # no surrogate has them
     _tidy(schema)
     _tell_sources_apart(schema["$defs"]["AutomatedVehicle"])
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "harness campaign", **schema}
@@ -35,12 +36,16 @@ def _tell_sources_apart(av: Schema) -> None:
         "if": {"required": ["model"], "properties": {"model": {"const": "fvdm"}}},
         "then": {"properties": {"parameters": {"$ref": "#/$defs/FVDMParameters", **about}}},
         "else": {
-            "if": {"required": ["controller"]},
-            "then": {"properties": {"parameters": {"type": "object", **about}}},
+            "if": {"required": ["model"], "properties": {"model": {"const": "constant"}}},
+            "then": {"properties": {"parameters": {"$ref": "#/$defs/ConstantParameters", **about}}},
             "else": {
-                "if": {"anyOf": [{"required": [name]} for name in ("sumo", "traci", "fmu")]},
-                "then": {"properties": {"parameters": {"type": "object", "maxProperties": 0, **about}}},
-                "else": {"properties": {"parameters": {"$ref": "#/$defs/IDMParameters", **about}}},
+                "if": {"required": ["controller"]},
+                "then": {"properties": {"parameters": {"type": "object", **about}}},
+                "else": {
+                    "if": {"anyOf": [{"required": [name]} for name in ("sumo", "traci", "fmu")]},
+                    "then": {"properties": {"parameters": {"type": "object", "maxProperties": 0, **about}}},
+                    "else": {"properties": {"parameters": {"$ref": "#/$defs/IDMParameters", **about}}},
+                },
             },
         },
     }

@@ -24,8 +24,8 @@ EPISODE_COLUMNS = (
     "log_weight",
     "log_p_cut_in",
     "log_q",
-    "component",
 )
+SHELL_COLUMNS = ("component",)
 MARTINGALE_COLUMN = "martingale"
 MOMENT_COLUMNS = ("episode", "q_sampled", "q")
 

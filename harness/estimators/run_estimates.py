@@ -12,7 +12,13 @@ from harness.campaign.models import Campaign, EstimatorName
 from harness.errors import RunFolderError
 from harness.estimators.block import Block
 from harness.estimators.estimate import Unavailable, finite_json
-from harness.estimators.from_records import EPISODE_COLUMNS, MARTINGALE_COLUMN, MOMENT_COLUMNS, block_from_tables
+from harness.estimators.from_records import (
+    EPISODE_COLUMNS,
+    MARTINGALE_COLUMN,
+    MOMENT_COLUMNS,
+    SHELL_COLUMNS,
+    block_from_tables,
+)
 from harness.estimators.one_pass import ESTIMATORS, PassResult, one_pass
 from harness.estimators.statement import SCOPE, conditional_statement, per_distance, statement
 from harness.estimators.surrogates import MOST_UNASKED, PoolRequest, surrogates_of
@@ -205,7 +211,8 @@ def _stored_blocks(folder: Path, campaign: Campaign, manifest: dict[str, Any], w
     n, n_counted, cap = 0, int(manifest["n_episodes"]), manifest.get("weight_cap")
     columns = list(MOMENT_COLUMNS) if wanted.moments else []
     shells = read_shells(folder) if campaign.testing.method == "shells" else None
-    for episodes, moments in read_shards(folder, episode_columns=wanted.columns, moment_columns=columns):
+    wanted_columns = [*wanted.columns, *(SHELL_COLUMNS if shells else ())]
+    for episodes, moments in read_shards(folder, episode_columns=wanted_columns, moment_columns=columns):
         block = block_from_tables(
             episodes,
             moments,
