@@ -106,11 +106,11 @@ def test_the_step_mixture_is_shown_and_not_judged():
 
 
 @pytest.mark.parametrize("factor", [0.7, 1.4])
-@pytest.mark.parametrize("k", [0, 4, 6])
+@pytest.mark.parametrize("k", [4, 5, 6])
 def test_one_corrupted_rate_raises_the_alarm(forced, k, factor):
     one, table, pool = forced
     mu = pool.mu.copy()
-    mu[k] *= factor if k > 0 else factor**3  # the most careful one crashes rarely
+    mu[k] *= factor
     for rates, raised in ((pool.mu, False), (mu, True)):
         alarm = Alarm()
         alarm.add(replayed(one, table, replace(pool, mu=rates)))

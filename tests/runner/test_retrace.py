@@ -6,6 +6,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from stored_runs import copy_of, manifest, shard_files, stored_table
 
 from harness.campaign.models import AutomatedVehicle, Campaign, IDMParameters, Reaction
 from harness.environment.loading import load_environment
@@ -15,8 +16,6 @@ from harness.runner.prepare import prepare
 from harness.runner.retrace import Retracing
 from harness.twin import TwinWorld
 from tests.chains.seed import SEED
-
-from stored_runs import copy_of, manifest, shard_files, stored_table
 
 N = 600
 AVS = {
@@ -83,7 +82,7 @@ def one_bit(value: float) -> float:
         ("cut_in_r2dot_mps", one_bit, "cut_in_r2dot_mps"),
         ("impact_speed_mps", one_bit, "impact_speed_mps"),
         ("crash_time_s", one_bit, "crash_time_s"),
-        ("r2_m", one_bit, "cut_in_r2_m"),
+        ("r2_m", lambda r2: r2 + 1e-9, "cut_in_r2_m"),
         ("outcome", lambda _: "timeout", "outcome"),
         ("n_steps", lambda n: n - 1, "outcome"),
         ("bv_maneuvers", lambda path: [30 - path[0], *path[1:]], "cut_in_r2_m"),
