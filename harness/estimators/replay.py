@@ -21,6 +21,11 @@ from harness.estimators.martingale import PLAIN, RESIDUALS
 from harness.estimators.weighted_sums import FEW_EFFECTIVE, WeightedSums, weighted_estimate
 from harness.pool.surrogate_replay import KnownRates
 
+UNBOUNDED = (
+    "under the step mixture the surrogates' weighted crashes are not bounded either: with few tests their rare large "
+    "values can make this worse than the plain mean"
+)
+
 
 class Replay:
     """Cross-fitted regression of Y on the surrogates' weighted crashes.
@@ -80,6 +85,8 @@ class Replay:
         disagreements = self._residuals.n_effective(found.beta)
         trusted = self.sums.is_normal() and disagreements >= FEW_EFFECTIVE
         warnings = [RESIDUALS if trusted else PLAIN.format(what="crashes, or disagreements with the surrogates,")]
+        if self.sums.method == "step_mixture":
+            warnings.append(UNBOUNDED)
         if self.n_lost:
             warnings.append(f"{self.n_lost} failed tests have no cut-in; surrogates count as not crashing in them")
         details: dict[str, Any] = {
