@@ -523,7 +523,7 @@ class Campaign(Section):
             "scv": (self.records.moments != "none", "records.moments first_9 or all"),
             "shells": (method == "shells", "testing.method shells"),
             "nade": (method != "shells", "another testing.method than shells"),
-            "martingale": (method in ("step_mixture", "episode_mixture"), "testing.method step_mixture"),
+            "martingale": (False, "a stored run: never stop on regression residuals alone"),
             "replay": (False, "a stored run: give it to `harness estimate`"),
         }
         available, need = needs.get(watched or "", (True, ""))
