@@ -83,6 +83,16 @@ def approach(i: int, end: int, hold_steps: int, stored: StoredPaths, path: Path)
 
 
 @compiled_inline
+def approach_cut_in(i: int, hold_steps: int, stored: StoredPaths, path: Path) -> tuple[int, int]:
+    """`approach` through the step of the stored cut-in: BV may touch LV before it has left the lane."""
+    cut = stored.cut_step[i]
+    decided, step = approach(i, cut + 1, hold_steps, stored, path)
+    if decided == PASSED and step == cut + 1:  # beside the AV on its own lane: that is for the AV to answer
+        return RUNNING, step
+    return decided, step
+
+
+@compiled_inline
 def leave_stored(i: int, end: int, hold_steps: int, stored: StoredPaths, environment: Environment, path: Path) -> bool:
     """BV's motion from its cut-in to step ``end``: as stored, then under p; False if no cut-in is stored where it was.
 
@@ -119,7 +129,12 @@ def retrace_episode(
     n = environment.numbers[0]
     cut, end = stored.cut_step[i], min(stored.n_steps[i], n.max_steps)
     twin.cut_r2[i] = twin.cut_r2dot[i] = twin.impact[i] = float("nan")
-    twin.outcome[i], twin.n_steps[i] = approach(i, end if cut < 0 else min(cut, end), n.hold_steps, stored, path)
+    if cut < 0 or cut >= end:
+        twin.outcome[i], twin.n_steps[i] = approach(i, end, n.hold_steps, stored, path)
+    else:
+        twin.outcome[i], twin.n_steps[i] = approach_cut_in(i, n.hold_steps, stored, path)
+    if 0 <= cut <= twin.n_steps[i]:
+        twin.cut_r2[i], twin.cut_r2dot[i] = gap(path.x_bv[cut], path.x_av[cut]), path.v_bv[cut] - path.v[AV]
     if twin.outcome[i] != RUNNING:
         return
     if cut < 0:
@@ -128,7 +143,6 @@ def retrace_episode(
         return
     twin.n_steps[i] = end
     x, v = path.x_av[cut], path.v[AV]
-    twin.cut_r2[i], twin.cut_r2dot[i] = gap(path.x_bv[cut], x), path.v_bv[cut] - v
     if not leave_stored(i, end, n.hold_steps, stored, environment, path):
         twin.outcome[i] = FAILED
         return
@@ -209,7 +223,9 @@ def replay_surrogates(
         cut = stored.cut_step[i]
         if cut < 0:
             continue
-        decided, _ = approach(i, cut, n.hold_steps, stored, path)
+        decided, step = approach_cut_in(i, n.hold_steps, stored, path)
+        if decided == BV_LV_CONTACT and step == cut + 1:
+            continue
         if decided != RUNNING or not leave_stored(i, n.max_steps, n.hold_steps, stored, environment, path):
             return i
         crashes[i] = who_crashes(path.x_av[cut], path.v[AV], cut, n.max_steps, drivers, envelope, path)

@@ -11,6 +11,11 @@ from harness.episode.loop import EpisodeLoop, Keep, Policy, Shard
 from harness.importance.build import build_importance
 from harness.maneuvers import CUT_IN
 from harness.outcomes import BV_LV_CONTACT, CRASH, TIMEOUT
+from harness.pool.library import load_library
+from harness.pool.replay import replay_surrogates
+from harness.pool.surrogate_replay import room_for, stored_paths
+from harness.records.tables import episodes_table
+from harness.runner.retrace import Retracing
 from harness.twin import TwinWorld
 from harness.vehicles.models import av_records
 
@@ -46,6 +51,19 @@ def test_the_twin_judges_cut_ins_beside_lv(smoke):
     episode = run(TwinWorld(4), smoke).results.episode
     assert episode["outcome"].tolist() == OUTCOMES
     assert episode["n_steps"].tolist() == [1, 200, 1, 1]
+
+
+def test_contact_in_the_step_of_the_cut_in_is_retraced_and_no_surrogate_crashes(smoke):
+    campaign = smoke("testing.method=shells")
+    environment, library = load_environment(campaign.environment), load_library("ladder-1")
+    episodes = episodes_table(run(TwinWorld(4), smoke), campaign.seed)
+    assert Retracing(campaign, environment).check(episodes) == len(STATES)
+    crashes = np.full(len(STATES), -1, np.int64)
+    stored, room = stored_paths(episodes, campaign.seed), room_for(environment)
+    assert replay_surrogates(stored, environment, library.drivers, -1, room, crashes) == -1
+    everybody = 2 ** len(library.surrogates) - 1
+    assert crashes.tolist()[::2] == [0, everybody]
+    assert crashes[3] == 0
 
 
 @pytest.mark.parametrize("shim", [True, False])
