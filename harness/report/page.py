@@ -138,6 +138,8 @@ def _page(
         target_rhw=target_rhw(run),
         asked_of_conditional=asked_of_conditional(run),
         diagnostics=_diagnostics(run, shells),
+        retraced=run.manifest.get("retraced"),
+        alarm=(run.estimates.get("diagnostics") or {}).get("alarm"),
         details=_details(run),
         table_errors=run.manifest.get("table_errors") or [],
         settings=setting_sections(run.campaign, reproducible=run.manifest.get("reproducible")),
