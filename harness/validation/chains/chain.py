@@ -31,6 +31,8 @@ class Chain:
         What the vehicle under test does.
     surrogate_responses : (J, D, A, D + 2)
         What its stand-ins do.
+    noise : {"own", "shared", "opposite"}
+        How the noise of a surrogate that is replayed goes with that of the vehicle, see `outcomes`.
     """
 
     name: str
@@ -44,6 +46,7 @@ class Chain:
     surrogate_responses: FloatArray
     challenge: Literal["immediate", "recursive"] = "recursive"
     epsilon: float = 0.1
+    noise: Literal["own", "shared", "opposite"] = "own"
 
     @property
     def n_surrogates(self) -> int:
@@ -61,6 +64,10 @@ class Chain:
     def crash_rate(self) -> float:
         """μ, by backward induction."""
         return float(self.start @ self.true_value[0][0])
+
+    def surrogate_rate(self, j: int) -> float:
+        """Crash rate that surrogate j would have as the vehicle under test."""
+        return float(self.start @ self._values(self.surrogate_responses[j])[0][0])
 
     @cached_property
     def cut_in_rate(self) -> float:

@@ -11,7 +11,7 @@ from harness.arrays import FloatArray, IntArray
 from harness.campaign.models import Method
 from harness.estimators.block import MAX_CONTROL_STEPS, Block
 
-from .overtaking_chain import Chain
+from harness.validation.chains.chain import Chain
 
 DEFENSIVE_SHARE = 0.1
 
@@ -48,12 +48,28 @@ def draw(
     return _Sampler(chain, method, n, rng, forget_cut_in).run(first_episode)
 
 
+def approach_paths(chain: Chain, n: int, rng: np.random.Generator) -> IntArray:
+    """States that staying would pass through, shape (n, T); no vehicle under test is involved."""
+    path = np.empty((n, chain.horizon), dtype=np.int64)
+    path[:, 0] = _choose(np.broadcast_to(chain.start, (n, len(chain.start))), rng)
+    for t in range(1, chain.horizon):
+        path[:, t] = _choose(chain.approach[path[:, t - 1]], rng)
+    return path
+
+
+def _choose(p: FloatArray, rng: np.random.Generator) -> IntArray:
+    """Index drawn from each row of probabilities (m, A), shape (m,)."""
+    u = rng.random(len(p))
+    chosen: IntArray = np.minimum((np.cumsum(p, axis=1) <= u[:, None]).sum(axis=1), p.shape[1] - 1)
+    return chosen
+
+
 class _Sampler:
     def __init__(self, chain: Chain, method: Method, n: int, rng: np.random.Generator, forget_cut_in: bool) -> None:
         self.chain, self.method, self.n, self.rng = chain, method, n, rng
         self.forget_cut_in = forget_cut_in
         self.alpha = mixture_weights(chain, method)
-        self.path = self._approach_paths()
+        self.path = approach_paths(chain, n, rng)
         survival = np.log1p(-chain.hazard[self.path])
         log_none = np.cumsum(survival[:, ::-1], axis=1)[:, ::-1]
         self.p_cut_later = -np.expm1(log_none)
@@ -66,17 +82,8 @@ class _Sampler:
         self.after = np.full(n, -1)
         self.cut_in = np.zeros(n, dtype=bool)
 
-    def _approach_paths(self) -> IntArray:
-        """States that staying would pass through, shape (n, T); no vehicle under test is involved."""
-        chain, path = self.chain, np.empty((self.n, self.chain.horizon), dtype=np.int64)
-        path[:, 0] = self._choose(np.broadcast_to(chain.start, (self.n, len(chain.start))))
-        for t in range(1, chain.horizon):
-            path[:, t] = self._choose(chain.approach[path[:, t - 1]])
-        return path
-
     def _choose(self, p: FloatArray) -> IntArray:
-        u = self.rng.random(len(p))
-        return np.minimum((np.cumsum(p, axis=1) <= u[:, None]).sum(axis=1), p.shape[1] - 1)
+        return _choose(p, self.rng)
 
     def run(self, first_episode: int) -> Block:
         for t in range(self.chain.horizon):
