@@ -20,6 +20,8 @@ CONDITIONAL_RHW = 0.3
 """Relative half-width of the conditional statement at which testing turns to what lies outside."""
 CONFIDENCE = 0.9
 """Level at which widths are compared, whatever the campaign reports."""
+MOST_FIRST_TESTS = 4
+"""Testing turns to what lies outside after this many times the first tests, known or not."""
 SMALLEST_ROUND = 8
 SHARES_PER_ROUND = 32
 
@@ -70,8 +72,9 @@ class Allocation:
         known = combined(d.p[s], crashes[s], tests[s], d.moments[s, s], d.n_paths, tail).rhw <= CONDITIONAL_RHW
         exhausted = bool(np.all(tests[s] >= self.available[s]))
         started = bool(np.any(tests[self.design.n_inside :] > 0))
-        hopeless = crashes[s].sum() == 0 and bool(np.all(tests[s] >= 4 * self.first_tests))
-        return np.ones_like(inside) if known or exhausted or started or hopeless else inside
+        # Without this end a vehicle that crashes rarely inside, and often outside, would not be tested outside at all.
+        spent = bool(tests[s].sum() >= MOST_FIRST_TESTS * self.first_tests * self.design.n_inside)
+        return np.ones_like(inside) if known or exhausted or started or spent else inside
 
     def _spread(self, size: int, tests: IntArray, crashes: IntArray, active: BoolArray) -> IntArray:
         """Give portions, one after the other, to where each narrows the sum of squared half-widths most."""
