@@ -7,8 +7,8 @@ import pytest
 from scipy.stats import binomtest
 
 from .enumeration import enumerate_episodes
-from .library import frequent_decisive, overtaking, panel, rare_decisive
-from .sampler import draw
+from harness.validation.chains.named import frequent_decisive, overtaking, panel, rare_decisive
+from harness.validation.chains.sampler import draw
 from .seed import SEED
 
 

@@ -16,8 +16,8 @@ from harness.estimators.nade import Nade
 from harness.estimators.scv import Scv
 
 from .coverage import replicate
-from .library import frequent_decisive, rare_decisive
-from .sampler import draw
+from harness.validation.chains.named import frequent_decisive, rare_decisive
+from harness.validation.chains.sampler import draw
 from .single_choice import with_optimal_function
 
 REPLICATIONS = 400

@@ -36,7 +36,7 @@ class ChainShells:
         by_shell = np.stack([joint[:, :, shell == s].sum(axis=2) for s in range(n_shells)], axis=2)
         self._shell = by_shell.sum(axis=3)  # (horizon, G, S)
         self._crash = by_shell[..., 1]
-        self.crashes_outside = self._exact(self._crash)[-1] / chain.crash_rate
+        self.crashes_outside = float(self._exact(self._crash)[-1]) / chain.crash_rate
 
     def _exact(self, table: FloatArray) -> FloatArray:
         """Probability per test of what a table (horizon, G, S) says given a cut-in, shape (S,)."""
