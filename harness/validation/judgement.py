@@ -1,7 +1,7 @@
 """What replications say about a method: bias, true and claimed variance, coverage, tests needed.
 
 A coverage is judged by the binomial test against its nominal value, one-sided, with Holm's correction (S. Holm, A
-simple sequentially rejective multiple test procedure, Scand. J. Statist. 6, 1979, 65) over all that are judged together.
+simple sequentially rejective multiple test procedure, Scand. J. Statist. 6, 1979, 65) over all vehicles or chains.
 """
 
 from __future__ import annotations
@@ -180,9 +180,7 @@ def corrected(judgements: Sequence[Judgement]) -> list[Judgement]:
         family = [one for one in judgements if one.result == result and one.p_value is not None]
         for one, p in zip(family, holm([one.p_value or 0.0 for one in family]), strict=True):
             found[one.subject, result] = p
-    return [
-        Judgement(**{**asdict(one), "p_value_holm": found.get((one.subject, one.result))}) for one in judgements
-    ]
+    return [Judgement(**{**asdict(one), "p_value_holm": found.get((one.subject, one.result))}) for one in judgements]
 
 
 def holm(p_values: Sequence[float]) -> list[float]:

@@ -63,9 +63,7 @@ class Drivers:
             late = _reactions(av)
             parameters += [_built_in(av)] * len(late)
             reactions += [reflexes for reflexes, _ in late]
-            self.vehicles[name] = Mixed(
-                tuple(range(first, len(parameters))), tuple(share for _, share in late)
-            )
+            self.vehicles[name] = Mixed(tuple(range(first, len(parameters))), tuple(share for _, share in late))
         if len(parameters) > MOST_DRIVERS:
             raise CampaignError(
                 "avs",

@@ -22,8 +22,10 @@ EQUAL_RATE = 0.02
 class ShellSource(Protocol):
     """Where the pools of replications come from."""
 
-    crashes_outside: float
-    """Share of the vehicle's crash rate that lies beyond the boundary."""
+    @property
+    def crashes_outside(self) -> float:
+        """Share of the vehicle's crash rate that lies beyond the boundary."""
+        ...
 
     def draw(self, rng: np.random.Generator) -> tuple[ShellDesign, FloatArray]:
         """A new pool: its strata, and the vehicle's share of crashes (S,) in each."""

@@ -65,7 +65,7 @@ class RepeatedWeighted:
 
 
 @cache
-def _episodes(name: str, campaign_json: str, seed: int, is_chain: bool, moments: bool) -> EpisodeSource:  # noqa: FBT001
+def _episodes(name: str, campaign_json: str, seed: int, is_chain: bool, moments: bool) -> EpisodeSource:
     campaign = Campaign.model_validate_json(campaign_json)
     if is_chain:
         return ChainEpisodes(CHAINS[name], campaign, seed)

@@ -61,7 +61,7 @@ class SuperPopulation:
 
     def by_path(self, mass: FloatArray) -> FloatArray:
         """Sum of a mass of cut-ins (m,) over each path, shape (n,)."""
-        return np.bincount(self.path, mass, minlength=self.n_paths)
+        return np.asarray(np.bincount(self.path, mass, minlength=self.n_paths), np.float64)
 
 
 def enumerate_paths(

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from harness.arrays import BoolArray, FloatArray
-
 from harness.validation.chains.chain import Chain
 from harness.validation.chains.sampler import mixture_weights
 

@@ -50,14 +50,17 @@ class Chain:
 
     @property
     def n_surrogates(self) -> int:
+        """J."""
         return len(self.surrogate_responses)
 
     @property
     def crashed(self) -> int:
-        return self.entry.shape[1] - 1
+        """Number of the state that is a crash."""
+        return int(self.entry.shape[1]) - 1
 
     @cached_property
     def true_value(self) -> tuple[FloatArray, FloatArray]:
+        """Crash probability by time and state, before and after the cut-in."""
         return self._values(self.response)
 
     @cached_property
@@ -140,7 +143,7 @@ class Proposals:
 
 
 def importance_function(p: FloatArray, challenge: FloatArray, epsilon: float) -> tuple[FloatArray, FloatArray]:
-    """q = ε p + (1 - ε) p C/V along the last axis, and V; q = p where V = 0 (statistics.md section 1)."""
+    """Q = ε p + (1 - ε) p C/V along the last axis, and V; q = p where V = 0 (statistics.md section 1)."""
     value = (p * challenge).sum(axis=-1)
     safe = np.where(value > 0.0, value, 1.0)[..., None]
     q = epsilon * p + (1.0 - epsilon) * p * challenge / safe

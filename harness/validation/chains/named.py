@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from harness.arrays import FloatArray
-
 from harness.validation.chains.chain import Chain
 
 N_APPROACH = 6
@@ -13,7 +14,9 @@ N_DANGER = 4
 P_BRAKE = 0.05
 
 
-def overtaking(name: str, *, skill: float, surrogates: list[float], level: float, horizon: int, **settings) -> Chain:
+def overtaking(
+    name: str, *, skill: float, surrogates: list[float], level: float, horizon: int, **settings: Any
+) -> Chain:
     """Chain of a vehicle with a skill in (0, 1), tested with surrogates of other skills.
 
     A skilled vehicle leaves danger fast. `level` is the probability of a cut-in per step at the closest approach.
@@ -116,6 +119,7 @@ def frequent_decisive() -> Chain:
 def rare_decisive() -> Chain:
     """Crash probability 6e-6, otherwise alike."""
     return decisive("rare decisive", skill=1.0, surrogates=[0.9, 0.6, 0.3], level=1e-3, horizon=5, brake=0.01)
+
 
 def replayed() -> list[Chain]:
     """Chains whose surrogates can be replayed on the vehicle's paths: good, partly and wholly wrong, strong noise."""

@@ -53,7 +53,8 @@ def _step_back(chain: Chain, value: FloatArray) -> FloatArray:
     move = _own_noise if chain.noise == "own" else _common_noise
     opposite = chain.noise == "opposite"
     parts = [p * move(of_a, value, opposite) for p, of_a in zip(chain.exposure[0], tables, strict=True)]
-    return np.sum(parts, axis=0)
+    total: FloatArray = np.sum(parts, axis=0)
+    return total
 
 
 def _with_absorbing(table: FloatArray) -> FloatArray:

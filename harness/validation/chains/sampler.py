@@ -7,10 +7,9 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.special import logsumexp
 
-from harness.arrays import FloatArray, IntArray
+from harness.arrays import BoolArray, FloatArray, IntArray
 from harness.campaign.models import Method
 from harness.estimators.block import MAX_CONTROL_STEPS, Block
-
 from harness.validation.chains.chain import Chain
 
 DEFENSIVE_SHARE = 0.1
@@ -25,6 +24,7 @@ def blocks(chain: Chain, method: Method, sizes: list[int], seed: int, **settings
 
 
 def mixture_weights(chain: Chain, method: Method) -> FloatArray:
+    """Weights of the importance functions, with the forced cut-in as component 0 of the episode mixture, shape (M,)."""
     equal = np.full(chain.n_surrogates, 1.0 / chain.n_surrogates)
     if method == "episode_mixture":
         return np.concatenate([[DEFENSIVE_SHARE], (1.0 - DEFENSIVE_SHARE) * equal])
@@ -126,7 +126,9 @@ class _Sampler:
         maneuver = self._maneuver(rows, p, q, p, chain.proposals.critical_after[t, state])
         self.after[rows] = self._choose(chain.response[state, maneuver])
 
-    def _maneuver(self, rows: IntArray, p: FloatArray, q: FloatArray, forced: FloatArray, critical) -> IntArray:
+    def _maneuver(
+        self, rows: IntArray, p: FloatArray, q: FloatArray, forced: FloatArray, critical: BoolArray
+    ) -> IntArray:
         """Draw from what the method says and keep the likelihood ratios; p (m, A), q (m, J, A)."""
         chosen = self._choose(self._sampled(rows, p, q, forced, critical))
         self.cut_in[rows] |= (self.after[rows] < 0) & (chosen == 1)
@@ -146,7 +148,9 @@ class _Sampler:
         self.n_control[episode] += 1
         return chosen
 
-    def _sampled(self, rows: IntArray, p: FloatArray, q: FloatArray, forced: FloatArray, critical) -> FloatArray:
+    def _sampled(
+        self, rows: IntArray, p: FloatArray, q: FloatArray, forced: FloatArray, critical: BoolArray
+    ) -> FloatArray:
         if self.method == "nde":
             return p
         if self.method == "forced":
@@ -154,6 +158,8 @@ class _Sampler:
         if self.method == "step_mixture":
             return np.where(critical[:, None], np.einsum("mja,j->ma", q, self.alpha), p)
         candidates = np.concatenate([forced[:, None, :], q], axis=1)
+        if self.component is None:
+            raise ValueError(f"{self.method} draws no component")
         return candidates[np.arange(len(rows)), self.component[rows]]
 
     def _log_q(self) -> FloatArray:

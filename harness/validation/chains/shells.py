@@ -36,7 +36,6 @@ class ChainShells:
         by_shell = np.stack([joint[:, :, shell == s].sum(axis=2) for s in range(n_shells)], axis=2)
         self._shell = by_shell.sum(axis=3)  # (horizon, G, S)
         self._crash = by_shell[..., 1]
-        self.crashes_outside = float(self._exact(self._crash)[-1]) / chain.crash_rate
 
     def _exact(self, table: FloatArray) -> FloatArray:
         """Probability per test of what a table (horizon, G, S) says given a cut-in, shape (S,)."""
@@ -46,6 +45,11 @@ class ChainShells:
             total += (state * chain.hazard) @ table[t]
             state = (state * (1.0 - chain.hazard)) @ chain.approach
         return total
+
+    @property
+    def crashes_outside(self) -> float:
+        """See `harness.validation.shell_source.ShellSource`."""
+        return float(self.crash_p[-1]) / self._chain.crash_rate
 
     @property
     def shell_p(self) -> FloatArray:
