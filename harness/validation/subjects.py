@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Protocol
 
-import numpy as np
-
 from harness.campaign.models import Campaign, EstimatorName
 from harness.environment.loading import load_environment
 from harness.pool.library import load_library
@@ -22,6 +20,7 @@ from harness.validation.rows import Row
 from harness.validation.shell_campaign import ShellCampaign
 from harness.validation.shell_source import OvertakingShells, overtaking_shells
 from harness.validation.super_population import SuperPopulation, enumerate_paths
+from harness.validation.truth import truths
 from harness.validation.weighted_campaign import ChainEpisodes, EpisodeSource, TwinEpisodes, WeightedCampaign
 
 
@@ -103,20 +102,18 @@ def _vehicles(experiment: Experiment, progress: Progress) -> Iterator[tuple[Subj
     environment, library = load_environment(campaign.environment), load_library(campaign.pool.library)
     drivers = Drivers(library, experiment.avs)
     shells = campaign.testing.method == "shells"
-
-    def population(seed: int, paths: int) -> SuperPopulation:
-        return enumerate_paths(environment, drivers.records, drivers.envelope, seed, paths, progress)
-
-    pools = population(experiment.seed, size.paths) if shells else None
-    reference = population(experiment.seed + 1, size.reference_paths)
+    pools: SuperPopulation | None = None
+    if shells:
+        pools = enumerate_paths(environment, drivers.records, drivers.envelope, experiment.seed, size.paths, progress)
+    known = truths(environment, drivers, experiment.seed + 1, size.reference_paths, progress)
     for place, (name, av) in enumerate(experiment.avs.items()):
-        vehicle, seed = drivers.vehicles[name], _seed(experiment, place)
-        by_path = reference.by_path(vehicle.crash_mass(reference))
-        truth, error = float(by_path.mean()), float(by_path.std() / np.sqrt(by_path.size))
+        vehicle, seed, truth = drivers.vehicles[name], _seed(experiment, place), known[name]
         if pools is None:
             repeated = RepeatedWeighted(name, experiment.subject(name), seed, experiment.results, is_chain=False)
-            yield Subject(name, truth, error), repeated
+            yield Subject(name, truth.crash_rate, truth.std_error), repeated
             continue
         source: OvertakingShells = overtaking_shells(library, pools, av, vehicle, size.pool_paths)
-        subject = Subject(name, truth, error, source.crashes_outside, source.left_out, source.boundary)
+        subject = Subject(
+            name, truth.crash_rate, truth.std_error, source.crashes_outside, source.left_out, source.boundary
+        )
         yield subject, RepeatedShells(ShellCampaign(experiment.subject(name), source, seed, experiment.fault))

@@ -20,10 +20,10 @@ WANTED = 0.3
 
 
 class RegressionStopping:
-    """A campaign to repeat; `stop_on_residuals` False stops on the plain variance of Y instead."""
+    """A campaign to repeat."""
 
-    def __init__(self, chain: Chain, seed: int, *, stop_on_residuals: bool = True) -> None:
-        self._chain, self._seed, self._residuals = chain, seed, stop_on_residuals
+    def __init__(self, chain: Chain, seed: int) -> None:
+        self._chain, self._seed = chain, seed
         joint = joint_outcomes(chain)
         self._cumulative = np.cumsum(joint.reshape(chain.horizon, len(chain.start), -1), axis=2)
         self._mu = np.array([chain.surrogate_rate(j) for j in range(chain.n_surrogates)])
@@ -49,7 +49,7 @@ class RegressionStopping:
         rng = np.random.default_rng([self._seed, replication])
         y, h = self.draw(FIRST_LOOK, rng)
         while True:
-            x = np.column_stack([np.ones(len(y)), h]) if self._residuals else np.ones((len(y), 1))
+            x = np.column_stack([np.ones(len(y)), h])
             beta, *_ = np.linalg.lstsq(x, y, rcond=None)
             rate, residual = float(beta[0]), y - x @ beta
             error = float(residual.std(ddof=x.shape[1])) / np.sqrt(len(y))

@@ -26,7 +26,7 @@ from .regression_stopping import RegressionStopping
 ROOT = Path(__file__).parents[2]
 CONFIDENCE = 0.9
 LARGEST_BIAS = 0.01
-FEW = 120
+FEW, MANY = 100, 300
 
 
 def campaign(method: str, episodes: int) -> Campaign:
@@ -85,7 +85,7 @@ def test_the_published_variance_is_caught(chain):
 
 def test_stopping_on_regression_residuals_is_caught():
     chain = CHAINS["good surrogates"]
-    (wrong,) = judged({chain.name: RegressionStopping(chain, 3).run(range(FEW))}, "regression")
+    (wrong,) = judged({chain.name: RegressionStopping(chain, 3).run(range(MANY))}, "regression")
     assert wrong.too_low
     assert wrong.p_value_holm < 1e-6
 
