@@ -208,6 +208,76 @@ def _two_digits(value: float) -> int:
     return round(value / size) * size
 
 
+VALIDATED = ("shells_panel", "chains_shells", "chains_forced")
+"""Replication experiments that are shown line by line."""
+METHODS = {
+    "twin_nde": "no control, level 10,000",
+    "twin_nade": "step mixture, immediate challenge (published NADE)",
+    "twin_step_recursive": "step mixture, recursive challenge",
+    "twin_episode": "episode mixture, recursive challenge",
+    "twin_forced": "forced cut-ins",
+    "twin_replay": "surrogate replay",
+    "shells_panel": "pool and shells, online rule",
+}
+"""Experiments from which one vehicle (idm) is compared over methods."""
+
+
+def _command(name: str) -> str:
+    return f"`harness validate scenarios/validate/{name}.yaml --out DIR`"
+
+
+def validated_table(name: str) -> str:
+    """Table of a replication experiment, with its command."""
+    found = _result(name)
+    if found is None:
+        return f"Not yet run: {_command(name)}\n"
+    head = ("vehicle or chain", "statement", "true rate", "bias", "coverage", "p (Holm)", "tests", "5–95 %", "alarm")
+    return _table(head, [_validated_cells(one) for one in found["judgements"]]) + f"\n{_command(name)}\n"
+
+
+def _validated_cells(one: dict[str, Any]) -> tuple[str, ...]:
+    p = one["p_value_holm"]
+    return (
+        one["subject"],
+        one["result"],
+        f"{one['truth']:.3g}",
+        f"{one['bias']:+.1%} ± {one['bias_std_error']:.1%}",
+        f"{one['coverage']:.3f}",
+        "not judged" if p is None else f"{p:.2g}",
+        f"{one['tests_median']:,.0f}",
+        f"{one['tests_5']:,.0f}–{one['tests_95']:,.0f}",
+        f"{one['alarm']:.1%}",
+    )
+
+
+def methods_table() -> str:
+    """Table of methods on the default vehicle, all by replication."""
+    head = ("method", "estimator", "replications × tests", "bias", "true relvar", "claimed relvar", "coverage")
+    rows, commands = [], []
+    for name, words in METHODS.items():
+        found = _result(name)
+        if found is None:
+            rows.append((words, "not yet run", *("",) * len(head)))
+            continue
+        rows += [(words, *_method_cells(one)) for one in found["judgements"] if one["subject"] == "idm"]
+        commands.append(f"- {words}: {_command(name)}")
+    return _table((*head, "tests for RHW 0.3", "as claimed"), rows) + "\n" + "\n".join(commands) + "\n"
+
+
+def _method_cells(one: dict[str, Any]) -> Iterator[str]:
+    tests = one["tests_median"]
+    needed = one["tests_for_wanted_rhw"]
+    yield f"`{one['result']}`"
+    yield f"{one['replications']:,} × {tests:,.0f}"
+    yield f"{one['bias']:+.1%} ± {one['bias_std_error']:.1%}"
+    yield f"{one['true_relvar'] * tests:.3g}"
+    yield f"{one['claimed_relvar'] * tests:.3g}"
+    yield f"{one['coverage']:.3f}"
+    yield f"{tests:,.0f} (median)" if needed is None else f"{_two_digits(needed):,}"
+    claimed = one["claimed_relvar"] * tests * RELVAR_TO_TESTS
+    yield "–" if needed is None or claimed <= 0.0 else f"{_two_digits(claimed):,}"
+
+
 def parts() -> dict[str, Callable[[], str]]:
     """All generated parts by name."""
     found: dict[str, Callable[[], str]] = {"settings": settings_reference, "environment": environment_table}
@@ -215,6 +285,9 @@ def parts() -> dict[str, Callable[[], str]]:
         found[f"columns-{name}"] = lambda schema=schema: columns_table(schema)
     for name, results in RESULTS.items():
         found[f"results-{name}"] = lambda results=results: results_table(results)
+    for name in VALIDATED:
+        found[f"validated-{name}"] = lambda name=name: validated_table(name)
+    found["validated-methods"] = methods_table
     return found
 
 

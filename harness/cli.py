@@ -1,4 +1,4 @@
-"""The command ``harness``: check, av-check, run, compare, estimate, report, replay, schema.
+"""The command ``harness``: check, av-check, run, compare, estimate, report, replay, validate, schema.
 
 Results go to stdout or to files, progress and complaints to stderr. Exit codes: 0 done; 2 the campaign or the call is
 wrong; 3 too many episodes failed or the world disagreed; 4 budget spent before the asked precision; 130 interrupted.
@@ -385,6 +385,44 @@ def replay(folder: Path, episode: int, *, out: Path | None, fcd: Path | None, gu
             expected="the same bits",
             mend="Compare versions and CPU in manifest.json with this machine's; bits are promised for equal ones.",
         )
+
+
+@cli.command(
+    short_help="Repeat a campaign thousands of times: what are its intervals worth?",
+    epilog=_examples("harness validate scenarios/validate/shells_panel.yaml --out runs/shells_panel"),
+)
+@click.argument("experiment_file", metavar="EXPERIMENT", type=_CAMPAIGN)
+@click.option("--out", "folder", type=_FOLDER, required=True, help="Folder of the results; made if it is not there.")
+@click.option("--replications", type=click.IntRange(min=2), help="Instead of the experiment's own number.")
+@click.option("--workers", type=click.IntRange(min=1), help="Processes. Default: one per core.")
+@click.option("--quiet", is_flag=True, help="No progress bar. There is none either when stderr is not a terminal.")
+@_json_option
+def validate(
+    experiment_file: Path, folder: Path, *, replications: int | None, workers: int | None, quiet: bool, as_json: bool
+) -> None:
+    """Repeat the campaign of EXPERIMENT for each of its vehicles or chains, and judge its intervals by that.
+
+    Printed are bias, true and claimed variance, coverage with its binomial interval and Holm-corrected p-value, and
+    the tests needed. The folder receives results.json, replications.parquet (one row each) and coverage.png.
+    """
+    from harness.validation.experiment import load_experiment  # noqa: PLC0415 - keeps --help fast
+
+    experiment = load_experiment(experiment_file)
+    if replications is not None:
+        experiment = experiment.model_copy(update={"replications": replications})
+    from harness.progress import terminal_progress  # noqa: PLC0415 - keeps --help fast
+    from harness.validation import validate as repeat  # noqa: PLC0415 - slow to import: only once the file is right
+    from harness.validation.results import RESULTS, table_lines  # noqa: PLC0415
+
+    bar = None if quiet else terminal_progress(None, 0)
+    with bar or nullcontext():
+        done = repeat(experiment, folder, workers=workers, progress=bar)
+    if as_json:
+        print_json([one.to_json() for one in done.judgements])
+        return
+    for line in table_lines(done.judgements):
+        click.echo(line)
+    click.echo(str(folder / RESULTS))
 
 
 @cli.command(

@@ -10,7 +10,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import beta, norm
+from scipy.special import betaincinv, ndtri
 
 from harness.arrays import FloatArray, IntArray
 
@@ -42,8 +42,8 @@ def share_limits(crashes: IntArray, tests: IntArray, tail: float) -> tuple[Float
     low, high : ndarray, shape (S,)
     """
     k, n = crashes.astype(np.float64), tests.astype(np.float64)
-    low = np.where(k > 0, beta.ppf(tail, np.maximum(k, 0.5), n - k + 1.0), 0.0)
-    high = np.where(k < n, beta.ppf(1.0 - tail, k + 1.0, np.maximum(n - k, 0.5)), 1.0)
+    low = np.where(k > 0, betaincinv(np.maximum(k, 0.5), n - k + 1.0, tail), 0.0)
+    high = np.where(k < n, betaincinv(k + 1.0, np.maximum(n - k, 0.5), 1.0 - tail), 1.0)
     return low, high
 
 
@@ -74,7 +74,7 @@ def combined(
     share = crashes / np.maximum(tests, 1)
     low, high = share_limits(crashes, tests, tail)
     rate = float(p @ share)
-    z = float(norm.isf(tail))
+    z = -float(ndtri(tail))
     pool = z * z * pool_variance(share, moments, rate, n_paths)
     down = np.sqrt(((p * (share - low)) ** 2).sum() + pool)
     up = np.sqrt(((p * (high - share)) ** 2).sum() + pool)

@@ -20,6 +20,8 @@ CONDITIONAL_RHW = 0.3
 """Relative half-width of the conditional statement at which testing turns to what lies outside."""
 CONFIDENCE = 0.9
 """Level at which widths are compared, whatever the campaign reports."""
+MOST_FIRST_TESTS = 4
+"""Testing turns to what lies outside after this many times the first tests, known or not."""
 SMALLEST_ROUND = 8
 SHARES_PER_ROUND = 32
 
@@ -70,32 +72,42 @@ class Allocation:
         known = combined(d.p[s], crashes[s], tests[s], d.moments[s, s], d.n_paths, tail).rhw <= CONDITIONAL_RHW
         exhausted = bool(np.all(tests[s] >= self.available[s]))
         started = bool(np.any(tests[self.design.n_inside :] > 0))
-        hopeless = crashes[s].sum() == 0 and bool(np.all(tests[s] >= 4 * self.first_tests))
-        return np.ones_like(inside) if known or exhausted or started or hopeless else inside
+        # Without this end a vehicle that crashes rarely inside, and often outside, would not be tested outside at all.
+        spent = bool(tests[s].sum() >= MOST_FIRST_TESTS * self.first_tests * self.design.n_inside)
+        return np.ones_like(inside) if known or exhausted or started or spent else inside
 
     def _spread(self, size: int, tests: IntArray, crashes: IntArray, active: BoolArray) -> IntArray:
         """Give portions, one after the other, to where each narrows the sum of squared half-widths most."""
         low, high = share_limits(crashes, tests, (1.0 - CONFIDENCE) / 2.0)
         half_width = self.design.p * (high - low) / 2.0
-        one_sided = (crashes == 0) | (crashes == tests)
-        planned = tests.astype(np.float64)
+        gain = _Gain(half_width, (crashes == 0) | (crashes == tests), tests)
+        room = np.where(active, self.available - tests, 0).tolist()
+        given = [0] * tests.size
         portion = max(1, size // SHARES_PER_ROUND)
         left = size
-        while left > 0 and np.any(open_ := active & (planned < self.available)):
-            gain = np.where(open_, _gain(half_width, one_sided, tests, planned), -1.0)
-            best = int(np.argmax(gain))
-            given = min(portion, left, int(self.available[best] - planned[best]))
-            planned[best] += given
-            left -= given
-        return planned.astype(np.int64) - tests
+        value = [gain.at(s, 0) if room[s] > 0 else -1.0 for s in range(tests.size)]
+        while left > 0 and max(value) >= 0.0:
+            best = value.index(max(value))
+            more = min(portion, left, room[best] - given[best])
+            given[best] += more
+            left -= more
+            value[best] = gain.at(best, given[best]) if given[best] < room[best] else -1.0
+        return np.array(given, np.int64)
 
 
-def _gain(half_width: FloatArray, one_sided: BoolArray, tests: IntArray, planned: FloatArray) -> FloatArray:
+class _Gain:
     """Fall of the squared half-width per further test: it shrinks as 1/n, or as 1/n² where shares are all 0 or 1."""
-    power = np.where(one_sided, 2.0, 1.0)
-    n = np.maximum(planned, 1.0)
-    gain: FloatArray = half_width**2 * (np.maximum(tests, 1) / n) ** power * power / n
-    return gain
+
+    def __init__(self, half_width: FloatArray, one_sided: BoolArray, tests: IntArray) -> None:
+        self._tests = tests.tolist()
+        self._power = np.where(one_sided, 2, 1).tolist()
+        self._scale = (half_width**2).tolist()
+
+    def at(self, stratum: int, given: int) -> float:
+        """Gain of one more test after ``given`` further ones."""
+        power, tests = self._power[stratum], max(self._tests[stratum], 1)
+        n = max(self._tests[stratum] + given, 1)
+        return float(self._scale[stratum] * (tests / n) ** power * power / n)
 
 
 def _within(wanted: IntArray, budget: int) -> IntArray:

@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from harness.arrays import BoolArray, FloatArray
-
-from .overtaking_chain import Chain
-from .sampler import mixture_weights
+from harness.validation.chains.chain import Chain
+from harness.validation.chains.sampler import mixture_weights
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from scipy.stats import binomtest
 
+from harness.validation.chains.named import frequent_decisive, overtaking, panel, rare_decisive
+from harness.validation.chains.sampler import draw
+
 from .enumeration import enumerate_episodes
-from .library import frequent_decisive, overtaking, panel, rare_decisive
-from .sampler import draw
 from .seed import SEED
 
 

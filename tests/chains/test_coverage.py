@@ -14,10 +14,10 @@ from harness.estimators.block import Block
 from harness.estimators.mixture_cv import MixtureCv
 from harness.estimators.nade import Nade
 from harness.estimators.scv import Scv
+from harness.validation.chains.named import frequent_decisive, rare_decisive
+from harness.validation.chains.sampler import draw
 
 from .coverage import replicate
-from .library import frequent_decisive, rare_decisive
-from .sampler import draw
 from .single_choice import with_optimal_function
 
 REPLICATIONS = 400

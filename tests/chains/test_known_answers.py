@@ -12,9 +12,9 @@ from scipy.stats import binomtest
 
 from harness.estimators import Estimate, one_pass
 from harness.estimators.nade import Nade
+from harness.validation.chains.named import frequent_decisive, panel, rare_decisive
+from harness.validation.chains.sampler import blocks
 
-from .library import frequent_decisive, panel, rare_decisive
-from .sampler import blocks
 from .seed import SEED
 
 SIZES = [5_000] * 12

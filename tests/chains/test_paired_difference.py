@@ -15,9 +15,9 @@ from scipy.stats import binomtest
 
 from harness.estimators.block import Block
 from harness.estimators.difference import Difference, PairedSums, difference_statement, paired_difference
+from harness.validation.chains.named import overtaking
+from harness.validation.chains.sampler import draw
 
-from .library import overtaking
-from .sampler import draw
 from .seed import SEED
 from .single_choice import with_optimal_function
 

@@ -7,9 +7,9 @@ import pytest
 
 from harness.estimators.mixture_cv import MixtureCv
 from harness.estimators.scv import Scv
+from harness.validation.chains.named import overtaking, rare_decisive
 
 from .enumeration import enumerate_episodes
-from .library import overtaking, rare_decisive
 from .seed import SEED
 from .single_choice import with_optimal_function
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from harness.estimators.mixture_cv import MixtureCv
-from tests.chains.library import panel
-from tests.chains.sampler import blocks, draw
+from harness.validation.chains.named import panel
+from harness.validation.chains.sampler import blocks, draw
 from tests.chains.seed import SEED
 
 from .small_blocks import block

@@ -8,8 +8,8 @@ import pytest
 
 from harness.errors import HarnessError, RunFolderError
 from harness.estimators import CampaignFacts, estimate_blocks, estimate_run
-from tests.chains.library import overtaking
-from tests.chains.sampler import blocks
+from harness.validation.chains.named import overtaking
+from harness.validation.chains.sampler import blocks
 from tests.chains.seed import SEED
 
 from .run_folder import write_run

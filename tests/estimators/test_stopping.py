@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from harness.campaign.models import Stop
 from harness.estimators import StopRule, accumulator
 from harness.estimators.stopping import LOOK_RATIO, look_grid
-from tests.chains.library import frequent_decisive
-from tests.chains.sampler import blocks
+from harness.validation.chains.named import frequent_decisive
+from harness.validation.chains.sampler import blocks
 from tests.chains.seed import SEED
 
 from .small_blocks import block

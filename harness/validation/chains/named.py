@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from harness.arrays import FloatArray
-
-from .overtaking_chain import Chain
+from harness.validation.chains.chain import Chain
 
 N_APPROACH = 6
 N_DANGER = 4
 P_BRAKE = 0.05
 
 
-def overtaking(name: str, *, skill: float, surrogates: list[float], level: float, horizon: int, **settings) -> Chain:
+def overtaking(
+    name: str, *, skill: float, surrogates: list[float], level: float, horizon: int, **settings: Any
+) -> Chain:
     """Chain of a vehicle with a skill in (0, 1), tested with surrogates of other skills.
 
     A skilled vehicle leaves danger fast. `level` is the probability of a cut-in per step at the closest approach.
@@ -116,3 +119,19 @@ def frequent_decisive() -> Chain:
 def rare_decisive() -> Chain:
     """Crash probability 6e-6, otherwise alike."""
     return decisive("rare decisive", skill=1.0, surrogates=[0.9, 0.6, 0.3], level=1e-3, horizon=5, brake=0.01)
+
+
+def replayed() -> list[Chain]:
+    """Chains whose surrogates can be replayed on the vehicle's paths: good, partly and wholly wrong, strong noise."""
+    return [
+        overtaking("good surrogates", skill=0.7, surrogates=[0.8, 0.65, 0.5], level=0.02, horizon=8, noise="shared"),
+        overtaking("partly wrong", skill=0.55, surrogates=[0.9, 0.75], level=0.02, horizon=8, noise="shared"),
+        overtaking("wholly wrong", skill=0.6, surrogates=[0.8, 0.6], level=0.02, horizon=8, noise="opposite"),
+        overtaking("strong noise", skill=0.6, surrogates=[0.75, 0.6, 0.45], level=0.02, horizon=8, noise="own"),
+    ]
+
+
+CHAINS: dict[str, Chain] = {
+    chain.name: chain for chain in [*panel(), *replayed(), frequent_decisive(), rare_decisive()]
+}
+"""Chains that an experiment can name."""

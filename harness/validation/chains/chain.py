@@ -31,6 +31,8 @@ class Chain:
         What the vehicle under test does.
     surrogate_responses : (J, D, A, D + 2)
         What its stand-ins do.
+    noise : {"own", "shared", "opposite"}
+        How the noise of a surrogate that is replayed goes with that of the vehicle, see `outcomes`.
     """
 
     name: str
@@ -44,23 +46,31 @@ class Chain:
     surrogate_responses: FloatArray
     challenge: Literal["immediate", "recursive"] = "recursive"
     epsilon: float = 0.1
+    noise: Literal["own", "shared", "opposite"] = "own"
 
     @property
     def n_surrogates(self) -> int:
+        """J."""
         return len(self.surrogate_responses)
 
     @property
     def crashed(self) -> int:
-        return self.entry.shape[1] - 1
+        """Number of the state that is a crash."""
+        return int(self.entry.shape[1]) - 1
 
     @cached_property
     def true_value(self) -> tuple[FloatArray, FloatArray]:
+        """Crash probability by time and state, before and after the cut-in."""
         return self._values(self.response)
 
     @cached_property
     def crash_rate(self) -> float:
         """μ, by backward induction."""
         return float(self.start @ self.true_value[0][0])
+
+    def surrogate_rate(self, j: int) -> float:
+        """Crash rate that surrogate j would have as the vehicle under test."""
+        return float(self.start @ self._values(self.surrogate_responses[j])[0][0])
 
     @cached_property
     def cut_in_rate(self) -> float:
@@ -137,7 +147,7 @@ class Proposals:
 
 
 def importance_function(p: FloatArray, challenge: FloatArray, epsilon: float) -> tuple[FloatArray, FloatArray]:
-    """q = ε p + (1 - ε) p C/V along the last axis, and V; q = p where V = 0 (statistics.md section 1)."""
+    """Q = ε p + (1 - ε) p C/V along the last axis, and V; q = p where V = 0 (statistics.md section 1)."""
     value = (p * challenge).sum(axis=-1)
     safe = np.where(value > 0.0, value, 1.0)[..., None]
     q = epsilon * p + (1.0 - epsilon) * p * challenge / safe

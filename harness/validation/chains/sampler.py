@@ -7,11 +7,10 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.special import logsumexp
 
-from harness.arrays import FloatArray, IntArray
+from harness.arrays import BoolArray, FloatArray, IntArray
 from harness.campaign.models import Method
 from harness.estimators.block import MAX_CONTROL_STEPS, Block
-
-from .overtaking_chain import Chain
+from harness.validation.chains.chain import Chain
 
 DEFENSIVE_SHARE = 0.1
 
@@ -25,6 +24,7 @@ def blocks(chain: Chain, method: Method, sizes: list[int], seed: int, **settings
 
 
 def mixture_weights(chain: Chain, method: Method) -> FloatArray:
+    """Weights of the importance functions, with the forced cut-in as component 0 of the episode mixture, shape (M,)."""
     equal = np.full(chain.n_surrogates, 1.0 / chain.n_surrogates)
     if method == "episode_mixture":
         return np.concatenate([[DEFENSIVE_SHARE], (1.0 - DEFENSIVE_SHARE) * equal])
@@ -52,12 +52,28 @@ def draw(
     return sampler.run(first_episode)
 
 
+def approach_paths(chain: Chain, n: int, rng: np.random.Generator) -> IntArray:
+    """States that staying would pass through, shape (n, T); no vehicle under test is involved."""
+    path = np.empty((n, chain.horizon), dtype=np.int64)
+    path[:, 0] = _choose(np.broadcast_to(chain.start, (n, len(chain.start))), rng)
+    for t in range(1, chain.horizon):
+        path[:, t] = _choose(chain.approach[path[:, t - 1]], rng)
+    return path
+
+
+def _choose(p: FloatArray, rng: np.random.Generator) -> IntArray:
+    """Index drawn from each row of probabilities (m, A), shape (m,)."""
+    u = rng.random(len(p))
+    chosen: IntArray = np.minimum((np.cumsum(p, axis=1) <= u[:, None]).sum(axis=1), p.shape[1] - 1)
+    return chosen
+
+
 class _Sampler:
     def __init__(self, chain: Chain, method: Method, n: int, rng: np.random.Generator, forget_cut_in: bool) -> None:
         self.chain, self.method, self.n, self.rng = chain, method, n, rng
         self.forget_cut_in = forget_cut_in
         self.alpha = mixture_weights(chain, method)
-        self.path = self._approach_paths()
+        self.path = approach_paths(chain, n, rng)
         survival = np.log1p(-chain.hazard[self.path])
         log_none = np.cumsum(survival[:, ::-1], axis=1)[:, ::-1]
         self.p_cut_later = -np.expm1(log_none)
@@ -73,17 +89,8 @@ class _Sampler:
         self.after = np.full(n, -1)
         self.cut_in = np.zeros(n, dtype=bool)
 
-    def _approach_paths(self) -> IntArray:
-        """States that staying would pass through, shape (n, T); no vehicle under test is involved."""
-        chain, path = self.chain, np.empty((self.n, self.chain.horizon), dtype=np.int64)
-        path[:, 0] = self._choose(np.broadcast_to(chain.start, (self.n, len(chain.start))))
-        for t in range(1, chain.horizon):
-            path[:, t] = self._choose(chain.approach[path[:, t - 1]])
-        return path
-
     def _choose(self, p: FloatArray) -> IntArray:
-        u = self.rng.random(len(p))
-        return np.minimum((np.cumsum(p, axis=1) <= u[:, None]).sum(axis=1), p.shape[1] - 1)
+        return _choose(p, self.rng)
 
     def run(self, first_episode: int) -> Block:
         for t in range(self.chain.horizon):
@@ -129,7 +136,9 @@ class _Sampler:
         maneuver = self._maneuver(rows, p, q, p, critical, v)
         self.after[rows] = self._choose(chain.response[state, maneuver])
 
-    def _maneuver(self, rows: IntArray, p: FloatArray, q: FloatArray, forced: FloatArray, critical, v) -> IntArray:
+    def _maneuver(
+        self, rows: IntArray, p: FloatArray, q: FloatArray, forced: FloatArray, critical: BoolArray, v: FloatArray
+    ) -> IntArray:
         """Draw from what the method says and keep the likelihood ratios; p (m, A), q (m, J, A)."""
         chosen = self._choose(self._sampled(rows, p, q, forced, critical))
         self.cut_in[rows] |= (self.after[rows] < 0) & (chosen == 1)
@@ -150,7 +159,16 @@ class _Sampler:
         self.n_control[episode] += 1
         return chosen
 
-    def _add_martingale(self, rows, p, q, forced, critical, v, chosen) -> None:
+    def _add_martingale(
+        self,
+        rows: IntArray,
+        p: FloatArray,
+        q: FloatArray,
+        forced: FloatArray,
+        critical: BoolArray,
+        v: FloatArray,
+        chosen: IntArray,
+    ) -> None:
         """W_{t-1} V_j (q_j,t/q_alpha,t - 1) at critical steps; v (m, J)."""
         each = np.arange(len(rows))
         with np.errstate(divide="ignore"):
@@ -170,7 +188,9 @@ class _Sampler:
         self.martingale[rows] += np.where(critical[:, None], term, 0.0)
         self.log_forced[rows] += log_forced
 
-    def _sampled(self, rows: IntArray, p: FloatArray, q: FloatArray, forced: FloatArray, critical) -> FloatArray:
+    def _sampled(
+        self, rows: IntArray, p: FloatArray, q: FloatArray, forced: FloatArray, critical: BoolArray
+    ) -> FloatArray:
         if self.method == "nde":
             return p
         if self.method == "forced":
@@ -178,6 +198,8 @@ class _Sampler:
         if self.method == "step_mixture":
             return np.where(critical[:, None], np.einsum("mja,j->ma", q, self.alpha), p)
         candidates = np.concatenate([forced[:, None, :], q], axis=1)
+        if self.component is None:
+            raise ValueError(f"{self.method} draws no component")
         return candidates[np.arange(len(rows)), self.component[rows]]
 
     def _log_q(self) -> FloatArray:
