@@ -17,10 +17,10 @@ from harness.estimators.martingale import PLAIN, RESIDUALS, Martingale
 from harness.estimators.nade import Nade
 from harness.estimators.replay import Replay
 from harness.pool.surrogate_replay import KnownRates
+from harness.validation.chains.named import frequent_decisive, panel
+from harness.validation.chains.sampler import draw
 
 from .coverage import replicate
-from .library import frequent_decisive, panel
-from .sampler import draw
 from .seed import SEED
 from .single_choice import SingleChoice
 
