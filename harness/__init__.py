@@ -29,11 +29,11 @@ __all__ = ["HarnessError", "av_check", "compare", "estimate", "load_campaign", "
 # What does the work is imported inside each function, so that `import harness` and `harness --help` answer at once.
 
 
-def load_campaign(path: str | Path, overrides: Sequence[str] = ()) -> Campaign:
+def load_campaign(path: str | Path, overrides: Sequence[str] = (), *, av: str | None = None) -> Campaign:
     """Read and validate a campaign; ``overrides`` are ``section.key=value`` each (see `harness.campaign.loading`)."""
     from harness.campaign.loading import load_campaign as load  # noqa: PLC0415
 
-    return load(path, overrides)
+    return load(path, overrides, av=av)
 
 
 def run(

@@ -438,7 +438,7 @@ class Stop(Section):
     rhw: float | None = Field(None, gt=0.0, lt=10.0, description="stop at this relative half-width of the interval")
     confidence: float = Field(0.9, gt=0.0, lt=1.0, description="level of every interval")
     estimator: EstimatorName | None = Field(None, description="whose RHW is watched; default: the method's own")
-    min_crashes: Annotated[Whole, Field(ge=1)] | None = Field(
+    min_crashes: Annotated[int, Field(ge=1), BeforeValidator(_whole)] | None = Field(
         None, description="sampled crashes needed before RHW may stop the campaign; 100, with shells 1"
     )
 

@@ -6,17 +6,28 @@ import json
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from harness.campaign.models import AV_SOURCES, Campaign
+from pydantic import BaseModel
+
+from harness.campaign.models import AV_SOURCES, Campaign, ConstantParameters, FVDMParameters, IDMParameters
 
 Schema = dict[str, Any]
 
 
 def campaign_schema() -> Schema:
     """JSON schema (draft 2020-12) of a campaign file, generated from the models."""
-    schema = Campaign.model_json_schema()
+    about = {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "harness campaign"}
+    return {**about, **schema_of(Campaign)}
+
+
+def schema_of(model: type[BaseModel]) -> Schema:
+    """JSON schema of a file that holds vehicles: a campaign, or a panel."""
+    schema = model.model_json_schema()
+    for parameters in (IDMParameters, FVDMParameters, ConstantParameters):
+        schema["$defs"].setdefault(parameters.__name__, parameters.model_json_schema())
+    schema["$defs"] = dict(sorted(schema["$defs"].items()))
     _tidy(schema)
     _tell_sources_apart(schema["$defs"]["AutomatedVehicle"])
-    return {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "harness campaign", **schema}
+    return schema
 
 
 def _tell_sources_apart(av: Schema) -> None:
@@ -35,12 +46,16 @@ def _tell_sources_apart(av: Schema) -> None:
         "if": {"required": ["model"], "properties": {"model": {"const": "fvdm"}}},
         "then": {"properties": {"parameters": {"$ref": "#/$defs/FVDMParameters", **about}}},
         "else": {
-            "if": {"required": ["controller"]},
-            "then": {"properties": {"parameters": {"type": "object", **about}}},
+            "if": {"required": ["model"], "properties": {"model": {"const": "constant"}}},
+            "then": {"properties": {"parameters": {"$ref": "#/$defs/ConstantParameters", **about}}},
             "else": {
-                "if": {"anyOf": [{"required": [name]} for name in ("sumo", "traci", "fmu")]},
-                "then": {"properties": {"parameters": {"type": "object", "maxProperties": 0, **about}}},
-                "else": {"properties": {"parameters": {"$ref": "#/$defs/IDMParameters", **about}}},
+                "if": {"required": ["controller"]},
+                "then": {"properties": {"parameters": {"type": "object", **about}}},
+                "else": {
+                    "if": {"anyOf": [{"required": [name]} for name in ("sumo", "traci", "fmu")]},
+                    "then": {"properties": {"parameters": {"type": "object", "maxProperties": 0, **about}}},
+                    "else": {"properties": {"parameters": {"$ref": "#/$defs/IDMParameters", **about}}},
+                },
             },
         },
     }

@@ -9,6 +9,7 @@ from harness.campaign.models import AV_SOURCES
 from harness.campaign.schema import campaign_schema
 
 SCHEMA = campaign_schema()
+MODELS = {"idm": "IDMParameters", "fvdm": "FVDMParameters", "constant": "ConstantParameters"}
 _NAMES = st.from_regex(r"[A-Za-z0-9][A-Za-z0-9_-]{0,11}", fullmatch=True)
 _PLAIN = st.recursive(
     st.none()
@@ -43,7 +44,7 @@ def values(node: dict[str, Any]) -> st.SearchStrategy[Any]:
 def _av(node: dict[str, Any], source: str | None) -> st.SearchStrategy[Any]:
     """A vehicle driven by one source, or by none in particular, with the parameters that belong to it."""
     if source == "model":
-        return st.sampled_from(["idm", "fvdm"]).flatmap(lambda model: _parts(node, {"model": st.just(model)}, model))
+        return st.sampled_from(list(MODELS)).flatmap(lambda model: _parts(node, {"model": st.just(model)}, model))
     if source is None:
         return _parts(node, {}, "idm")
     return _parts(node, {source: values(node["properties"][source])}, source)
@@ -53,8 +54,8 @@ def _parts(
     node: dict[str, Any], required: dict[str, st.SearchStrategy[Any]], driver: str
 ) -> st.SearchStrategy[dict[str, Any]]:
     optional = {name: values(node["properties"][name]) for name in ("before_cut_in", "limits")}
-    if driver in ("idm", "fvdm"):
-        optional["parameters"] = values({"$ref": f"#/$defs/{driver.upper()}Parameters"})
+    if driver in MODELS:
+        optional["parameters"] = values({"$ref": f"#/$defs/{MODELS[driver]}"})
     if driver == "controller":
         optional["parameters"] = st.dictionaries(_NAMES, _PLAIN, max_size=3) | values(
             {"$ref": "#/$defs/IDMParameters"}  # names that a built-in model has, too
@@ -95,8 +96,9 @@ def _obey_rules(data: dict[str, Any]) -> dict[str, Any]:
         names = list(data.get("surrogates", ("SM-I", "SM-II", "SM-III")))
         testing["alpha"] = dict.fromkeys(names[:-1], 0.25) | {names[-1]: 1 - 0.25 * (len(names) - 1)}
     stop.pop("estimator", None)
+    data.get("pool", {}).pop("library", None)  # a name of a library, or of a file
     av = data.get("av", {})
-    if testing.get("method", "episode_mixture") in ("forced", "episode_mixture"):
+    if testing.get("method", "episode_mixture") in ("forced", "episode_mixture", "shells"):
         av.pop("before_cut_in", None)
     if "sumo" in av or "traci" in av:
         data.get("world", {}).pop("engine", None)

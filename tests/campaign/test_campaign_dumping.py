@@ -52,7 +52,7 @@ def test_every_value_is_written_out(file):
 def test_sources_that_do_not_drive_are_not_written(file):
     file.write_text(dump_campaign(Campaign(name="x", av={"sumo": {"carFollowModel": "ACC", "minGap": 2.5}})))
     av = read_yaml(file)[0]["av"]
-    assert av.keys() == {"sumo", "parameters", "before_cut_in", "limits"}
+    assert av.keys() == {"sumo", "parameters", "reaction", "before_cut_in", "limits"}
     assert av["sumo"] == {"carFollowModel": "ACC", "minGap": 2.5}
 
 
