@@ -156,8 +156,7 @@ def run(
     if as_json:
         print_json(result.estimates)
     else:
-        click.echo(result.estimates["statement"])
-        click.echo(result.estimates["scope"])
+        print_statements(result.estimates)
         click.echo(str(report_file))
         click.echo(str(result.folder / "estimates.json"))
     ctx.exit(result.exit_code)

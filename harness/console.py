@@ -142,8 +142,29 @@ def print_estimates(content: dict[str, Any]) -> None:
     for name, entry in content["estimates"].items():
         for remark in [*entry.get("warnings", ()), *filter(None, [entry.get("reason")])]:
             click.echo(f"{name}: {remark}")
-    click.echo(content["statement"])
-    click.echo(content["scope"])
+    if shells := content["estimates"].get("shells", {}).get("details", {}).get("shells"):
+        console.print(_shells_table(shells))
+    print_statements(content)
+
+
+def print_statements(content: dict[str, Any]) -> None:
+    """Print the answer in a sentence, what holds under the conditional assumption, and what all this is about."""
+    for sentence in (content["statement"], content.get("conditional_statement"), content["scope"]):
+        if sentence:
+            click.echo(sentence)
+
+
+def _shells_table(shells: list[dict[str, Any]]) -> Any:
+    from rich.table import Table  # noqa: PLC0415 - keeps --help fast
+
+    table = Table(title="Shells, from careful to careless")
+    for heading in ("first to crash", "probability", "tests", "crashes", "contribution to the crash rate"):
+        table.add_column(heading, justify="left" if heading == "first to crash" else "right")
+    for shell in shells:
+        name = shell["shell"] + ("" if shell["inside"] else " (beyond the boundary)")
+        row = (f"{shell['p']:.3e}", f"{shell['n_episodes']:,}", f"{shell['n_crashes']:,}", f"{shell['contribution']:.3e}")
+        table.add_row(name, *row)
+    return table
 
 
 def _cells(entry: dict[str, Any]) -> list[str]:

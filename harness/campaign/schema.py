@@ -24,7 +24,6 @@ def schema_of(model: type[BaseModel]) -> Schema:
     schema = model.model_json_schema()
     for parameters in (IDMParameters, FVDMParameters, ConstantParameters):
         schema["$defs"].setdefault(parameters.__name__, parameters.model_json_schema())
-    schema["$defs"] = dict(sorted(schema["$defs"].items()))
     _tidy(schema)
     _tell_sources_apart(schema["$defs"]["AutomatedVehicle"])
     return schema

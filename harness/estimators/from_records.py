@@ -23,8 +23,8 @@ EPISODE_COLUMNS = (
     "log_weight",
     "log_p_cut_in",
     "log_q",
-    "component",
 )
+SHELL_COLUMNS = ("component",)
 MOMENT_COLUMNS = ("episode", "q_sampled", "q")
 
 

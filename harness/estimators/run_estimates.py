@@ -12,7 +12,7 @@ from harness.campaign.models import Campaign, EstimatorName
 from harness.errors import RunFolderError
 from harness.estimators.block import Block
 from harness.estimators.estimate import finite_json
-from harness.estimators.from_records import EPISODE_COLUMNS, MOMENT_COLUMNS, block_from_tables
+from harness.estimators.from_records import EPISODE_COLUMNS, MOMENT_COLUMNS, SHELL_COLUMNS, block_from_tables
 from harness.estimators.one_pass import ESTIMATORS, one_pass
 from harness.estimators.statement import SCOPE, conditional_statement, per_distance, statement
 from harness.estimators.threads import read_ahead
@@ -130,7 +130,8 @@ def _stored_blocks(
     n, n_counted, cap = 0, int(manifest["n_episodes"]), manifest.get("weight_cap")
     columns = list(MOMENT_COLUMNS) if wants_moments else []
     shells = read_shells(folder) if campaign.testing.method == "shells" else None
-    for episodes, moments in read_shards(folder, episode_columns=list(EPISODE_COLUMNS), moment_columns=columns):
+    wanted = [*EPISODE_COLUMNS, *(SHELL_COLUMNS if shells else ())]
+    for episodes, moments in read_shards(folder, episode_columns=wanted, moment_columns=columns):
         block = block_from_tables(
             episodes,
             moments,

@@ -22,7 +22,7 @@ from harness.progress import Progress, SilentProgress
 from harness.random_stream import DIAGNOSTIC, INITIAL, uniforms
 
 PILOT_PATHS = 2048
-ROUND_PATHS = 4096
+ROUND_PATHS = 1024
 BLOCK_PATHS = 256
 MOST_PATHS = 1 << 20
 CARELESS_SHARE = 0.2

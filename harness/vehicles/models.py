@@ -26,7 +26,6 @@ from harness.campaign.models import (
 from harness.compiled import compiled_inline
 
 IDM_KIND, FVDM_KIND, CONSTANT_KIND = 0, 1, 2
-_KINDS = {IDMParameters: IDM_KIND, FVDMParameters: FVDM_KIND, ConstantParameters: CONSTANT_KIND}
 SMALLEST_GAP_M = 0.1
 """Gap below which the models see this gap: they divide by it."""
 
@@ -50,9 +49,10 @@ def driver_records(drivers: Sequence[BuiltInParameters], reactions: Sequence[Ref
     reactions : sequence of Reflexes, optional
         One for each driver; all react at once by default.
     """
+    kinds = {IDMParameters: IDM_KIND, FVDMParameters: FVDM_KIND, ConstantParameters: CONSTANT_KIND}
     records = np.zeros(len(drivers), dtype=DRIVER_DTYPE)
     for record, driver, reaction in zip(records, drivers, reactions or [Reflexes()] * len(drivers), strict=True):
-        record["kind"] = _KINDS[type(driver)]
+        record["kind"] = kinds[type(driver)]
         for name, value in driver.model_dump().items():
             record[name] = value
         record["max_jerk_mps3"] = math.inf if reaction.max_jerk_mps3 is None else reaction.max_jerk_mps3

@@ -9,7 +9,7 @@ from harness.campaign.models import AV_SOURCES
 from harness.campaign.schema import campaign_schema
 
 SCHEMA = campaign_schema()
-MODELS = {"idm": "IDMParameters", "fvdm": "FVDMParameters", "constant": "ConstantParameters"}
+BUILT_IN = {"idm": "IDM", "fvdm": "FVDM", "constant": "Constant"}
 _NAMES = st.from_regex(r"[A-Za-z0-9][A-Za-z0-9_-]{0,11}", fullmatch=True)
 _PLAIN = st.recursive(
     st.none()
@@ -44,18 +44,23 @@ def values(node: dict[str, Any]) -> st.SearchStrategy[Any]:
 def _av(node: dict[str, Any], source: str | None) -> st.SearchStrategy[Any]:
     """A vehicle driven by one source, or by none in particular, with the parameters that belong to it."""
     if source == "model":
-        return st.sampled_from(list(MODELS)).flatmap(lambda model: _parts(node, {"model": st.just(model)}, model))
+        return st.sampled_from(sorted(BUILT_IN)).flatmap(lambda model: _parts(node, {"model": st.just(model)}, model))
     if source is None:
         return _parts(node, {}, "idm")
     return _parts(node, {source: values(node["properties"][source])}, source)
+
+
+def _in_steps(reaction: dict[str, Any]) -> dict[str, Any]:
+    return {key: round(value, 1) if key.endswith("delay_s") else value for key, value in reaction.items()}
 
 
 def _parts(
     node: dict[str, Any], required: dict[str, st.SearchStrategy[Any]], driver: str
 ) -> st.SearchStrategy[dict[str, Any]]:
     optional = {name: values(node["properties"][name]) for name in ("before_cut_in", "limits")}
-    if driver in MODELS:
-        optional["parameters"] = values({"$ref": f"#/$defs/{MODELS[driver]}"})
+    if driver in BUILT_IN:
+        optional["parameters"] = values({"$ref": f"#/$defs/{BUILT_IN[driver]}Parameters"})
+        optional["reaction"] = values({"$ref": "#/$defs/Reaction"}).map(_in_steps)
     if driver == "controller":
         optional["parameters"] = st.dictionaries(_NAMES, _PLAIN, max_size=3) | values(
             {"$ref": "#/$defs/IDMParameters"}  # names that a built-in model has, too
@@ -87,6 +92,7 @@ def campaigns() -> st.SearchStrategy[dict[str, Any]]:
 def _obey_rules(data: dict[str, Any]) -> dict[str, Any]:
     environment, testing, stop = data.get("environment", {}), data.get("testing", {}), data.get("stop", {})
     environment.pop("parameters", None)
+    data.get("pool", {}).pop("library", None)
     fmu = (data.get("av") or {}).get("fmu")
     if fmu:
         fmu["file"] = str(Path(__file__).resolve())  # loading wants a file that exists, and makes its path absolute
@@ -96,7 +102,6 @@ def _obey_rules(data: dict[str, Any]) -> dict[str, Any]:
         names = list(data.get("surrogates", ("SM-I", "SM-II", "SM-III")))
         testing["alpha"] = dict.fromkeys(names[:-1], 0.25) | {names[-1]: 1 - 0.25 * (len(names) - 1)}
     stop.pop("estimator", None)
-    data.get("pool", {}).pop("library", None)  # a name of a library, or of a file
     av = data.get("av", {})
     if testing.get("method", "episode_mixture") in ("forced", "episode_mixture", "shells"):
         av.pop("before_cut_in", None)

@@ -31,6 +31,7 @@ KEYS = {
     "diagnostics",
     "convergence",
     "statement",
+    "conditional_statement",
     "scope",
 }
 

@@ -1,0 +1,190 @@
+"""Shells: exact limits per stratum, combined; counts that merge; statements that say what they rest on."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.stats import binom
+
+from harness.estimators import Estimate, Shells, one_pass
+from harness.estimators.block import Block
+from harness.estimators.estimate import finite_json
+from harness.estimators.intervals import clopper_pearson
+from harness.estimators.statement import conditional_statement
+from harness.estimators.stratified import combined, pool_variance, share_limits
+from harness.pool.shells import ShellDesign
+
+P = np.array([1e-4, 3e-4, 2e-2])
+EXACT = np.zeros((3, 3))
+"""Second moments of a pool that is known exactly."""
+
+
+def design(moments: np.ndarray = EXACT, n_paths: int = 10**9) -> ShellDesign:
+    return ShellDesign(
+        pool="0" * 24, strata=("careful", "careless", "outside"), p=P, moments=moments, n_paths=n_paths,
+        n_inside=2, boundary="careless", p_cut_in=0.03, p_impossible=0.0096,
+    )  # fmt: skip
+
+
+def block(strata: list[int], crash: list[bool], failed: list[bool] | None = None, first: int = 0) -> Block:
+    n = len(strata)
+    no = np.zeros(n, np.bool_)
+    return Block(
+        first_episode=first,
+        method="shells",
+        crash=np.array(crash, np.bool_),
+        failed=no if failed is None else np.array(failed, np.bool_),
+        cut_in=~no,
+        bv_lv_contact=no,
+        log_weight=np.log(P)[strata],
+        log_q=np.zeros((n, 0)),
+        alpha=np.zeros(0),
+        n_control_steps=np.ones(n, np.int64),
+        component=np.array(strata, np.int64),
+        shells=design(),
+    )
+
+
+counts = st.lists(st.tuples(st.integers(0, 2), st.booleans(), st.booleans()), min_size=1, max_size=30)
+
+
+def from_rows(rows, first: int = 0) -> Block:
+    strata, crash, failed = zip(*rows, strict=True)
+    return block(list(strata), [c and not f for c, f in zip(crash, failed, strict=True)], list(failed), first)
+
+
+@given(rows=counts, cut=st.integers(0, 30))
+def test_merging_and_order_do_not_matter(rows, cut):
+    whole, left, right, backwards = Shells(), Shells(), Shells(), Shells()
+    whole.add(from_rows(rows))
+    for part, state in ((rows[:cut], left), (rows[cut:], right)):
+        if part:
+            state.add(from_rows(part))
+    left.merge(right)
+    backwards.add(from_rows(rows[::-1]))
+    assert whole.result(0.9) == left.result(0.9) == backwards.result(0.9)
+
+
+def test_one_stratum_has_the_clopper_pearson_interval():
+    one = np.array([0.25])
+    for crashes in (0, 1, 7, 20):
+        limits = combined(one, np.array([crashes]), np.array([20]), np.zeros((1, 1)), 1, 0.05)
+        low, high = clopper_pearson(crashes, 20, 0.9)
+        assert (limits.low, limits.high) == pytest.approx((0.25 * low, 0.25 * high), rel=1e-12, abs=1e-15)
+
+
+def test_limits_combine_as_written_down_by_hand():
+    crashes, tests = np.array([5, 0, 0]), np.array([10, 10, 100])
+    low, high = share_limits(crashes, tests, 0.05)
+    limits = combined(P, crashes, tests, EXACT, 10**9, 0.05)
+    assert limits.rate == pytest.approx(5e-5)
+    assert limits.low == pytest.approx(5e-5 - 1e-4 * (0.5 - low[0]))
+    up = np.sqrt((1e-4 * (high[0] - 0.5)) ** 2 + (3e-4 * high[1]) ** 2 + (2e-2 * high[2]) ** 2)
+    assert limits.high == pytest.approx(5e-5 + up)
+
+
+def test_an_untested_stratum_may_hold_anything():
+    limits = combined(P, np.array([5, 5, 0]), np.array([10, 10, 0]), EXACT, 10**9, 0.05)
+    assert limits.high >= P[2]
+
+
+def test_the_error_of_the_pool_widens_the_interval():
+    crashes, tests = np.array([5, 5, 5]), np.array([10, 10, 10])
+    moments = np.diag(P * P) * 50.0
+    exact = combined(P, crashes, tests, EXACT, 10**9, 0.05)
+    rough = combined(P, crashes, tests, moments, 100, 0.05)
+    assert rough.rate == exact.rate
+    assert rough.high - rough.rate > 1.5 * (exact.high - exact.rate)
+
+
+def test_the_variance_of_the_pool_bounds_that_of_any_vehicle():
+    """Paths of a made-up pool; vehicles that crash on whole paths, on parts of them, or here and there."""
+    rng = np.random.default_rng(3)
+    n = 200_000
+    mass = rng.exponential(size=(n, 3)) * P * (rng.random((n, 1)) < 0.2) * 5.0
+    moments = mass.T @ mass / n
+    for share in (np.array([1.0, 0.5, 0.0]), np.array([0.9, 0.3, 0.01]), np.array([1.0, 1.0, 1.0])):
+        on_paths = np.where(rng.random((n, 1)) < share, mass, 0.0).sum(1)
+        thinned = (mass * share).sum(1)
+        nested = np.where(rng.random((n, 1)) < share[None, :], mass, 0.0).sum(1)
+        rate = float(P @ share)
+        bound = pool_variance(share, moments, rate, n)
+        for crash_mass in (on_paths, thinned, nested):
+            assert crash_mass.var() / n <= bound * 1.03  # the bound is itself estimated from the paths
+
+
+def test_two_statements():
+    rows = [(0, True)] * 8 + [(0, False)] * 2 + [(1, True)] * 3 + [(1, False)] * 17 + [(2, False)] * 400
+    found = one_pass([block([s for s, _ in rows], [c for _, c in rows])], ("shells", "nade", "nde")).estimates
+    estimate = found["shells"]
+    assert isinstance(estimate, Estimate)
+    assert estimate.crash_rate == pytest.approx(0.8e-4 + 0.15 * 3e-4)
+    conditional = estimate.details["conditional"]
+    assert conditional["crash_rate"] == pytest.approx(estimate.crash_rate)
+    assert conditional["ci_high"] < estimate.ci_high
+    assert conditional["n_episodes"] == 30
+    assert conditional["upper_bound_outside"] == pytest.approx(2e-2 * -np.expm1(np.log(0.1) / 400))
+    assert "No" not in str(conditional["refuted"])
+    text = conditional_statement(estimate)
+    assert text is not None
+    assert "careless" in text
+    assert "There was no crash in 400 tests outside" in text
+    assert sum(shell["contribution"] for shell in estimate.details["shells"]) == pytest.approx(estimate.crash_rate)
+    json.dumps(finite_json(estimate.to_json()), allow_nan=False)
+    assert "within shells" in found["nade"].reason
+    assert "nde" in found["nde"].reason
+
+
+def test_a_crash_outside_refutes_the_assumption():
+    estimate = one_pass([block([0, 1, 2, 2], [True, False, True, False])]).estimates["shells"]
+    assert estimate.details["conditional"]["refuted"]
+    assert "crashed 1 times where the surrogate careless does not crash" in conditional_statement(estimate)
+    assert any("does not hold" in warning for warning in estimate.warnings)
+
+
+def test_failed_episodes_are_counted_both_ways():
+    estimate = one_pass([block([0, 0, 1, 2], [True, False, False, False], [False, True, False, False])]).estimates
+    shells = estimate["shells"]
+    assert shells.crash_rate == pytest.approx(0.5e-4)
+    assert shells.details["crash_rate_if_failed_had_crashed"] == pytest.approx(1e-4)
+    assert any("failed" in warning for warning in shells.warnings)
+
+
+def test_others_are_refused():
+    other = block([0], [True])
+    other = Block(**{**{f: getattr(other, f) for f in other.__dataclass_fields__}, "method": "nde", "shells": None})
+    assert "testing.method shells" in one_pass([other], ("shells",)).estimates["shells"].reason
+
+
+def coverage(tests: np.ndarray, share: np.ndarray, p: np.ndarray = P, tail: float = 0.05) -> float:
+    """Exact probability that the interval covers, by summing over all outcomes of three strata."""
+    truth, covered = float(p @ share), 0.0
+    for a in range(tests[0] + 1):
+        for b in range(tests[1] + 1):
+            for c in range(tests[2] + 1):
+                chance = np.prod(binom.pmf([a, b, c], tests, share))
+                if chance > 1e-9:
+                    limits = combined(p, np.array([a, b, c]), tests, EXACT, 10**9, tail)
+                    covered += chance * (limits.low <= truth * (1 + 1e-12) and truth <= limits.high * (1 + 1e-12))
+    return float(covered)
+
+
+@pytest.mark.parametrize("share", [(1.0, 0.3, 0.0), (0.6, 0.1, 0.002), (0.9, 0.5, 0.1)])
+def test_the_interval_covers_exactly_enough(share):
+    """Known answers: coverage summed over all outcomes, nominal 0.90."""
+    assert coverage(np.array([12, 12, 30]), np.array(share)) >= 0.90
+
+
+def test_without_the_empty_stratum_it_does_not():
+    """The sibling that must fail: a stratum that was tested without a crash is left out of the limits."""
+    tests, share = np.array([12, 12, 30]), np.array([1.0, 0.3, 0.02])
+    without = P * [1.0, 1.0, 0.0]
+    truth, covered = float(P @ share), 0.0
+    for b in range(13):
+        limits = combined(without, np.array([12, b, 0]), tests, EXACT, 10**9, 0.05)
+        covered += binom.pmf(b, 12, 0.3) * (limits.low <= truth <= limits.high)
+    assert covered < 0.5

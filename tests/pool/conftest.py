@@ -1,0 +1,32 @@
+"""A small pool of the default environment, built once (about five seconds) and looked at by many tests."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from harness.campaign.loading import load_campaign
+from harness.campaign.models import Campaign
+from harness.environment.driving import Environment
+from harness.environment.loading import load_environment
+from harness.pool.cut_ins import Pool
+from harness.pool.storage import campaign_pool
+
+SMOKE = Path(__file__).parents[2] / "scenarios" / "smoke.yaml"
+SMALL_POOL = ("pool.relative_error=0.03", "pool.cut_ins_per_shell=600")
+
+
+@pytest.fixture(scope="session")
+def campaign() -> Campaign:
+    return load_campaign(SMOKE, ["testing.method=shells", *SMALL_POOL])
+
+
+@pytest.fixture(scope="session")
+def environment(campaign) -> Environment:
+    return load_environment(campaign.environment)
+
+
+@pytest.fixture(scope="session")
+def pool(campaign) -> Pool:
+    return campaign_pool(campaign)

@@ -1,0 +1,133 @@
+"""A pool's probabilities are right, its shells divide all cut-ins, and it survives the disk."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from harness.campaign.models import Campaign
+from harness.errors import RunFolderError
+from harness.pool.proposal import NATURALISTIC_SHARE, fit_proposal
+from harness.pool.shells import Draws, design_shells, shells_in_strata
+from harness.pool.storage import campaign_pool, campaign_pool_key, pool_key, pool_path, read_pool, write_pool
+from tests.chains.seed import SEED
+
+FORCED_RATE = 1.352e-7
+"""Crash rate of the default vehicle, a_min -4 m/s², from tests/reference (relative error 0.42 %)."""
+
+
+def test_surrogates_are_ordered_from_careful_to_careless(pool):
+    assert pool.names == (
+        "brakes-8", "brakes-5", "brakes-3", "brakes-3-late-700ms", "brakes-2-late-1s", "never-brakes", "full-throttle-2",
+    )  # fmt: skip
+    assert np.all(np.diff(pool.mu) > 0.0)
+    inside = pool.mu[: pool.boundary + 1]
+    assert np.all(inside[1:] < 2.0 * inside[:-1])
+
+
+def test_shells_divide_all_cut_ins(pool):
+    assert pool.shell_p.sum() == pytest.approx(pool.p_cut_in, rel=1e-12)
+    assert pool.shell_p[0] == pytest.approx(pool.mu[0], rel=1e-12)
+    assert np.all(np.cumsum(pool.shell_p[:-1]) >= pool.mu * (1.0 - 1e-12))  # crashes of one may lie in another's shell
+
+
+def test_kept_cut_ins_stand_for_their_shell(pool):
+    """Crash shares among the kept reproduce the crash rates: 600 of each shell, four standard errors."""
+    c = pool.cut_ins
+    for s in range(pool.shell_p.size - 1):
+        assert c.crashes[c.shell == s, s].all()
+        assert not c.crashes[c.shell == s, :s].any()
+    assert not c.crashes[c.shell == len(pool.names)].any()
+    kept = np.bincount(c.shell)
+    for k in range(len(pool.names)):
+        share = np.array([c.crashes[c.shell == s, k].mean() for s in range(kept.size)])
+        error = np.sqrt((pool.shell_p**2 * share * (1.0 - share) / kept).sum())
+        assert abs(pool.shell_p @ share - pool.mu[k]) <= 4.0 * error + 1e-12 * pool.mu[k]
+
+
+def test_crash_rates_lie_around_the_reference(pool):
+    """A vehicle between brakes-5 and brakes-3 was measured by another method, with other code and seeds."""
+    low, high = pool.mu[pool.names.index("brakes-5")], pool.mu[pool.names.index("brakes-3")]
+    assert low < FORCED_RATE < high
+
+
+def test_the_same_settings_give_the_same_bits(campaign, pool, tmp_path, monkeypatch):
+    monkeypatch.setenv("HARNESS_CACHE_DIR", str(tmp_path))
+    again = campaign_pool(campaign)
+    for field in dataclasses.fields(pool.cut_ins):
+        assert np.array_equal(getattr(pool.cut_ins, field.name), getattr(again.cut_ins, field.name))
+    for name in ("mu", "mu_covariance", "shell_p", "shell_moments"):
+        assert np.array_equal(getattr(pool, name), getattr(again, name))
+
+
+def test_what_changes_a_pool_changes_its_key(campaign):
+    from harness.environment.loading import load_environment  # noqa: PLC0415
+    from harness.pool.library import load_library  # noqa: PLC0415
+
+    library = load_library("ladder-1")
+    other_level = campaign.environment.model_copy(update={"lane_change_level": 2.0})
+    keys = {
+        campaign_pool_key(campaign),
+        pool_key(load_environment(other_level), library, campaign.pool),
+        pool_key(load_environment(campaign.environment), library.without({"brakes-5"}), campaign.pool),
+        pool_key(load_environment(campaign.environment), library, campaign.pool.model_copy(update={"seed": 2})),
+    }
+    assert len(keys) == 4
+
+
+def test_a_pool_is_read_as_it_was_written(pool, tmp_path):
+    write_pool(tmp_path / "pool.parquet", pool)
+    again = read_pool(tmp_path / "pool.parquet")
+    assert (again.key, again.names, again.library) == (pool.key, pool.names, pool.library)
+    assert np.array_equal(again.cut_ins.bv, pool.cut_ins.bv)
+    assert np.array_equal(again.mu_covariance, pool.mu_covariance)
+
+
+def test_a_damaged_pool_is_named_and_built_again(campaign, pool, tmp_path, monkeypatch):
+    monkeypatch.setenv("HARNESS_CACHE_DIR", str(tmp_path))
+    path = pool_path(campaign_pool_key(campaign))
+    write_pool(path, pool)
+    path.write_bytes(path.read_bytes()[:1000])
+    with pytest.raises(RunFolderError, match="not a whole pool"):
+        read_pool(path)
+    monkeypatch.setattr("harness.pool.storage.build_pool", lambda *_: pool)
+    assert campaign_pool(campaign) is pool
+    assert read_pool(path).key == pool.key
+
+
+def test_draws_are_a_permutation_within_a_shell_and_follow_probabilities_outside(pool):
+    design = design_shells(pool, limit_mps2=2.0)
+    groups = shells_in_strata(pool, pool.boundary, 2.0)
+    draws = Draws(pool, groups, SEED)
+    assert draws.available[0] == (pool.cut_ins.shell == 0).sum()
+    first = draws.take(0, 0, int(draws.available[0]))
+    assert sorted(first) == np.flatnonzero(pool.cut_ins.shell == 0).tolist()
+    outside = draws.take(design.n_inside, 0, 500)
+    assert len(set(outside.tolist())) == 500
+    share = (pool.cut_ins.shell[outside] == groups[-1][0]).mean()
+    p = pool.shell_p[groups[-1][0]] / pool.shell_p[groups[-1]].sum()
+    assert abs(share - p) < 4.0 * np.sqrt(p * (1.0 - p) / 500)  # misses with probability 6e-5
+    with pytest.raises(IndexError):
+        draws.take(0, int(draws.available[0]), 1)
+
+
+def test_weights_of_a_proposal_make_up_for_its_aim():
+    rng = np.random.default_rng(SEED)
+    u = rng.random((4000, 3))
+    proposal = fit_proposal(u, np.exp(-8.0 * u[:, 0]))
+    points, weights = proposal.map(rng.random((20_000, 3)), rng.random(20_000))
+    assert weights.max() <= 1.0 / NATURALISTIC_SHARE
+    for f, mean in ((np.ones(20_000), 1.0), (points[:, 0], 0.5), (np.exp(-8.0 * points[:, 0]), -np.expm1(-8.0) / 8.0)):
+        assert abs((weights * f).mean() - mean) < 4.0 * (weights * f).std() / np.sqrt(20_000)
+    unweighted = np.exp(-8.0 * points[:, 0])
+    assert unweighted.mean() > 1.5 * -np.expm1(-8.0) / 8.0  # it does aim
+
+
+def test_an_unknown_library_is_refused():
+    from harness.errors import CampaignError  # noqa: PLC0415
+
+    campaign = Campaign(name="x", pool={"library": "ladder1"})
+    with pytest.raises(CampaignError, match="Did you mean 'ladder-1'"):
+        campaign_pool(campaign)

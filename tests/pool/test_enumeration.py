@@ -1,0 +1,97 @@
+"""Enumerated cut-ins are what episodes would be: same motion, same crashes, probabilities that add up."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from harness.arrays import RecordArray
+from harness.campaign.models import PoolSettings
+from harness.environment.initial_state import InitialStates
+from harness.episode.cells import max_draws
+from harness.episode.loop import EpisodeLoop, Keep, Policy
+from harness.importance.build import build_importance
+from harness.outcomes import CRASH
+from harness.pool.build import Enumerator
+from harness.pool.enumeration import empty_path, enumerate_cut_ins
+from harness.pool.library import load_library
+from harness.pool.prescribed import Draw, PrescribedEpisodes
+from harness.pool.shells import design_shells
+from harness.progress import SilentProgress
+from harness.twin import TwinWorld
+from tests.chains.seed import SEED
+
+LIBRARY = load_library("ladder-1")
+NAMES = list(LIBRARY.surrogates)
+
+
+def enumerated(environment, n: int, envelope: int, drivers: RecordArray = LIBRARY.drivers):
+    numbers = environment.numbers[0]
+    steps = int(numbers["max_steps"])
+    states = InitialStates(environment.numbers).draw(SEED, 0, n)
+    probability, crashes = np.zeros((n, steps)), np.zeros((n, steps), np.int64)
+    path = empty_path(steps, max_draws(steps, int(numbers["hold_steps"])))
+    enumerate_cut_ins(SEED, 0, states, environment, drivers, envelope, path, probability, crashes)
+    return probability, crashes
+
+
+def test_full_throttle_crashes_wherever_anyone_does(environment):
+    probability, crashes = enumerated(environment, 150, -1)
+    envelope = NAMES.index(LIBRARY.envelope)
+    someone = crashes != 0
+    assert someone.sum() > 5_000
+    assert np.all((crashes[someone] >> envelope) & 1 == 1)
+    assert np.any((crashes == 0) & (probability > 0.0))  # there are cut-ins that nobody can make a crash of
+    with_shortcut = enumerated(environment, 150, envelope)
+    assert np.array_equal(with_shortcut[0], probability)
+    assert np.array_equal(with_shortcut[1], crashes)
+
+
+def test_a_slower_vehicle_is_no_envelope(environment):
+    """The sibling that must fail: with a vehicle at constant speed as envelope, crashes would be missed."""
+    _, crashes = enumerated(environment, 150, -1)
+    constant = NAMES.index("never-brakes")
+    assert np.any(((crashes >> constant) & 1 == 0) & (crashes != 0))
+
+
+@pytest.mark.parametrize("surrogate", NAMES)
+def test_a_prescribed_episode_ends_as_the_pool_says(campaign, pool, environment, surrogate):
+    """LV's and BV's paths, the cut-in and the surrogate's answer, driven by the episode loop instead of the pool."""
+    prescribed = PrescribedEpisodes(campaign, pool)
+    shells = [Draw(s, 0, 60) for s in range(prescribed.design.p.size)]
+    states, script, rows = prescribed.episodes(tuple(shells))
+    driver = LIBRARY.drivers[NAMES.index(surrogate)][None]
+    policy = Policy(1, environment, build_importance(campaign, None), driver)
+    shard = EpisodeLoop(TwinWorld(16), policy, Keep(0, "none", 0.0)).run(0, states, script)
+    episode = shard.results.episode
+    crashed = episode["outcome"] == CRASH
+    assert np.array_equal(crashed, pool.cut_ins.crashes[rows, pool.names.index(surrogate)])
+    assert np.array_equal(episode["cut_in_step"], pool.cut_ins.step[rows])
+    assert np.allclose(episode["log_weight"], np.log(prescribed.design.p[script.component]), rtol=1e-15)
+
+
+def test_the_probabilities_of_a_path_add_up_to_that_of_a_cut_in(environment):
+    """Against an independent walk of the same path: 1 - exp(-hazard)."""
+    from tests.pool.walked import p_cut_in_of_paths  # noqa: PLC0415 - compiles a kernel of its own
+
+    probability, _ = enumerated(environment, 40, NAMES.index(LIBRARY.envelope))
+    expected = p_cut_in_of_paths(SEED, InitialStates(environment.numbers).draw(SEED, 0, 40), environment)
+    assert np.allclose(probability.sum(1), expected, rtol=1e-12, atol=0.0)
+
+
+def test_the_number_of_cores_changes_no_bit(environment, monkeypatch):
+    enumerator = Enumerator(environment, LIBRARY.drivers, NAMES.index(LIBRARY.envelope), PoolSettings().seed)
+    many = enumerator.run(0, 512, SilentProgress())
+    monkeypatch.setattr("os.cpu_count", lambda: 1)
+    one = enumerator.run(0, 512, SilentProgress())
+    for a, b in zip(many, one, strict=True):
+        assert np.array_equal(a.probability, b.probability)
+        assert np.array_equal(a.crashes, b.crashes)
+
+
+def test_strata_of_a_vehicle_that_may_accelerate_harder_include_what_the_envelope_survives(pool):
+    within = design_shells(pool, limit_mps2=2.0)
+    beyond = design_shells(pool, limit_mps2=2.5)
+    assert within.p_impossible == pytest.approx(pool.shell_p[-1])
+    assert beyond.p_impossible == pytest.approx(0.0, abs=1e-20)
+    assert beyond.p[-1] == pytest.approx(within.p[-1] + pool.shell_p[-1])

@@ -1,0 +1,162 @@
+"""A shells campaign gives the same bits however it was run, follows its counts, and stops where it says."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from harness.errors import CampaignError, RunFolderError
+from harness.pool.shells import ShellDesign
+from harness.runner.allocation import GROWTH, Allocation
+from harness.runner.rounds import round_specs
+from tests.pool.conftest import SMALL_POOL
+from tests.runner.stored_runs import manifest, shard_files, stored_table, unlike_columns
+
+SHELLS = ("testing.method=shells", "stop.rhw=0.5", "stop.episodes=3000", "stop.min_crashes=null", *SMALL_POOL)
+
+
+@pytest.fixture(scope="session")
+def shells_run(campaign, run, tmp_path_factory):
+    """One worker, eight cells, in SUMO. Never written to."""
+    out = tmp_path_factory.mktemp("shells") / "run"
+    return run(campaign(*SHELLS, "world.cells=8"), out, workers=1)
+
+
+def test_it_reaches_the_precision_and_says_both_things(shells_run):
+    assert (shells_run.exit_code, shells_run.stopped_by) == (0, "rhw")
+    content = shells_run.estimates
+    assert content["headline"] == "shells"
+    estimate = content["estimates"]["shells"]
+    assert estimate["rhw"] <= 0.5
+    assert 1.352e-7 == pytest.approx(estimate["crash_rate"], rel=0.5)
+    assert estimate["ci_low"] < 1.352e-7 < estimate["ci_high"]
+    assert "If this vehicle crashes only where" in content["conditional_statement"]
+    assert not estimate["details"]["conditional"]["refuted"]
+
+
+def test_the_twin_gives_the_same_bits(shells_run, campaign, run_here, tmp_path):
+    twin = run_here(campaign(*SHELLS, "world.engine=twin"), tmp_path / "run")
+    assert [name for name in unlike_columns(shells_run.folder, twin.folder) if name != "estimates.json"] == []
+
+
+def test_two_workers_and_other_cells(shells_run, campaign, run, tmp_path):
+    other = run(campaign(*SHELLS, "world.cells=64"), tmp_path / "run", workers=2)
+    assert unlike_columns(shells_run.folder, other.folder) == []
+
+
+def test_continued_to_a_narrower_interval(shells_run, campaign, run_here, tmp_path):
+    """Twin: a rougher run, continued; shards are taken over, and the end is that of a run in one go."""
+    twin = "world.engine=twin"
+    out = tmp_path / "run"
+    run_here(campaign(*SHELLS, twin, "stop.rhw=1.5"), out)
+    begun = {file.name: file.read_bytes() for file in shard_files(out)}
+    run_here(campaign(*SHELLS, twin), out, resume=True)
+    assert len(begun) < len(shard_files(out))
+    assert all((out / "episodes" / name).read_bytes() == content for name, content in begun.items())
+    assert [name for name in unlike_columns(shells_run.folder, out) if name != "estimates.json"] == []
+
+
+def test_a_budget_that_is_spent_is_exit_code_4(campaign, run_here, tmp_path):
+    result = run_here(campaign(*SHELLS, "world.engine=twin", "stop.rhw=0.01", "stop.episodes=150"), tmp_path / "run")
+    assert result.exit_code == 4
+    assert manifest(result.folder)["n_episodes"] == 150
+
+
+def test_a_pool_that_is_used_up_ends_the_run(campaign, run_here, tmp_path):
+    small = ("stop.rhw=0.001", "stop.episodes=100000", "pool.cut_ins_per_shell=100")
+    result = run_here(campaign(*SHELLS, *small, "world.engine=twin"), tmp_path / "run")
+    assert result.exit_code == 4
+    tests = [shell["n_episodes"] for shell in result.estimates["estimates"]["shells"]["details"]["shells"]]
+    assert tests[:-1] == [100] * (len(tests) - 1)
+
+
+def test_the_conditional_statement_alone_stays_inside(campaign, run_here, tmp_path):
+    conditional = ("testing.shells.statement=conditional", "stop.rhw=0.3", "world.engine=twin")
+    result = run_here(campaign(*SHELLS, *conditional), tmp_path / "run")
+    details = result.estimates["estimates"]["shells"]["details"]
+    assert result.exit_code == 0
+    assert details["conditional"]["rhw"] <= 0.3
+    assert details["conditional"]["n_episodes_outside"] == 0
+    assert "Nothing was tested outside" in result.estimates["conditional_statement"]
+    assert any("no test in outside" in warning for warning in result.estimates["estimates"]["shells"]["warnings"])
+
+
+def test_a_careless_vehicle_is_found_out(campaign, run_here, tmp_path):
+    careless = ("world.engine=twin", "av.model=constant", "av.parameters={acceleration_mps2: 0.0}")
+    result = run_here(campaign(*SHELLS, *careless), tmp_path / "run")
+    assert "crashed" in result.estimates["conditional_statement"]
+    assert result.estimates["estimates"]["shells"]["crash_rate"] == pytest.approx(2.4e-5, rel=0.5)
+
+
+def test_rows_say_which_cut_in_they_were(shells_run):
+    episodes = stored_table(shells_run.folder, "episodes")
+    assert episodes.column("pool_cut_in").null_count == 0
+    assert set(episodes.column("component").to_pylist()) == set(range(6))
+    weights = np.unique(np.round(episodes.column("log_weight").to_numpy(), 12))
+    assert weights.size == 6
+
+
+def test_a_vehicle_that_acts_before_the_cut_in_is_refused(campaign):
+    with pytest.raises(CampaignError, match="hold_speed"):
+        campaign(*SHELLS, "av.before_cut_in=controller")
+
+
+def test_an_unknown_boundary_is_refused(campaign, run_here, tmp_path):
+    with pytest.raises(CampaignError, match="a surrogate of the library"):
+        run_here(campaign(*SHELLS, "testing.shells.boundary=brakes-4"), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_run_without_its_shells_is_named(shells_run, tmp_path):
+    from harness import estimate  # noqa: PLC0415
+    from tests.runner.stored_runs import copy_of  # noqa: PLC0415
+
+    folder = copy_of(shells_run.folder, tmp_path / "run")
+    (folder / "shells.json").write_text(json.dumps({"strata": ["a"]}))
+    with pytest.raises(RunFolderError, match="shells"):
+        estimate(folder)
+
+
+DESIGN = ShellDesign(
+    pool="0" * 24, strata=("a", "b", "outside"), p=np.array([1e-7, 2e-7, 3e-5]), moments=np.zeros((3, 3)),
+    n_paths=10**9, n_inside=2, boundary="b", p_cut_in=4e-5, p_impossible=0.0,
+)  # fmt: skip
+MANY = np.full(3, 10_000)
+
+
+def test_what_lies_inside_is_tested_first():
+    rule = Allocation(DESIGN, 12, MANY, conditional_only=False)
+    assert rule.next_round(np.zeros(3, int), np.zeros(3, int), 10**6).tolist() == [12, 12, 0]
+    assert rule.next_round(np.array([12, 12, 0]), np.array([6, 0, 0]), 10**6)[2] == 0
+    assert rule.next_round(np.array([400, 400, 0]), np.array([200, 0, 0]), 10**6).tolist() == [0, 0, 12]
+    hopeless = rule.next_round(np.array([48, 48, 0]), np.zeros(3, int), 10**6)
+    assert hopeless.tolist() == [0, 0, 12]
+
+
+def test_rounds_grow_to_where_the_interval_is_widest():
+    rule = Allocation(DESIGN, 12, MANY, conditional_only=False)
+    tests = np.array([400, 400, 800])
+    added = rule.next_round(tests, np.array([200, 10, 0]), 10**6)
+    assert added.sum() == np.ceil((GROWTH - 1.0) * tests.sum())
+    assert added[2] > 0.9 * added.sum()
+    assert rule.next_round(tests, np.array([200, 10, 0]), 7).sum() == 7
+    assert rule.next_round(tests, np.array([200, 10, 0]), 0).sum() == 0
+    full = Allocation(DESIGN, 12, tests, conditional_only=False)
+    assert full.next_round(tests, np.array([200, 10, 0]), 100).sum() == 0
+
+
+def test_a_round_is_divided_into_shards_without_gap():
+    specs = round_specs(np.array([12, 12, 100]), np.array([70, 0, 300]), 5, 124, 100)
+    assert [spec.index for spec in specs] == list(range(5, 5 + len(specs)))
+    assert specs[0].first_episode == 124
+    assert sum(spec.n_episodes for spec in specs) == 370
+    assert max(spec.n_episodes for spec in specs) <= 100
+    for spec in specs:
+        assert sum(draw.n for draw in spec.draws) == spec.n_episodes
+    taken = {0: [], 2: []}
+    for spec in specs:
+        for draw in spec.draws:
+            taken[draw.stratum] += range(draw.first, draw.first + draw.n)
+    assert taken == {0: list(range(12, 82)), 2: list(range(100, 400))}
