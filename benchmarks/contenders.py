@@ -171,6 +171,31 @@ class Floor:
         self._world.close()
 
 
+class BareOneAtATime:
+    """The usual way with no policy, no checks and no records: speeds told and values read, as fast as it can be."""
+
+    def __init__(self, settings: Campaign) -> None:
+        self._prepared = prepare(settings)
+        self._world = in_libsumo()
+
+    def run(self, first: int, n: int) -> Work:
+        """Full-length episodes at constant speed."""
+        cell, nobody = np.zeros(1, np.int64), np.zeros(1, np.int8)
+        for state in self._prepared.states(first, n):
+            x, v = np.array([[250.0, 200.0, 100.0]]), np.full((1, 3), state[0])
+            self._world.place(cell, x, v)
+            for _ in range(FLOOR_STEPS):
+                self._world.step(v, nobody)
+        return Work(n, n * FLOOR_STEPS)
+
+    def rows(self, n: int) -> None:
+        """There are none."""
+
+    def close(self) -> None:
+        """End the simulation."""
+        self._world.close()
+
+
 class TwinAlone:
     """The twin without records."""
 
@@ -238,6 +263,7 @@ CONTENDERS: dict[str, tuple[Callable[[], Contender], int]] = {
     "harness": (lambda: Recorded(campaign("nade"), in_sumo(shim=False)), 5_000),
     "harness+shim": (lambda: Recorded(campaign("nade"), in_sumo(shim=True)), 5_000),
     "one-at-a-time": (lambda: Recorded(campaign("nade"), lambda _: in_libsumo()), 500),
+    "bare one-at-a-time": (lambda: BareOneAtATime(campaign("nade")), 1_000),
     "traci": (lambda: Recorded(campaign("nade"), lambda _: OverTraci(sumo_binary())), 50),
     "floor": (lambda: Floor(campaign("nade")), 5_000),
     "recursive": (lambda: Recorded(campaign("recursive"), in_sumo(shim=False)), 5_000),

@@ -51,7 +51,7 @@ def main() -> None:
         world = SumoWorld(96)
         loops, best = {}, dict.fromkeys(forms, float("inf"))
         for name, (av, _) in forms.items():
-            prepared = prepare(load_campaign(ROOT / "scenarios/smoke.yaml", [f"av={av}"]))
+            prepared = prepare(load_campaign(ROOT / "scenarios/overtaking_mixture.yaml", [f"av={av}"]))
             loops[name] = prepared.loop(world, traces="none", black_box=Path(folder) / "black-box")
             loops[name].run(0, prepared.states(0, 96))
         states = prepared.states(0, given.episodes)

@@ -16,7 +16,9 @@ What ends an episode, everywhere: a crash; BV and LV in contact; AV past BV with
 Recorded: one row per episode and the first nine control steps, written to Parquet; "twin" alone keeps nothing.
 Read back: by harness every position after every step, and every speed after every tenth step, with the shim after
 every step; all are compared with what was commanded, bit for bit. By one-at-a-time (getters) and traci (subscriptions)
-every position and speed after every step; by floor nothing. Harness, one-at-a-time and traci have given equal rows for the first episodes."""
+every position and speed after every step; by floor nothing. Harness, one-at-a-time and traci have given equal rows for
+the first episodes. "bare one-at-a-time" tells and reads the same with no policy, no records and nothing compared: what
+SUMO costs that way, whoever decides."""
 
 
 class Ratio(NamedTuple):
@@ -32,6 +34,8 @@ class Ratio(NamedTuple):
 RATIOS = (
     Ratio("harness", "one-at-a-time", "episodes_per_cpu_s", least=1.8),
     Ratio("harness+shim", "one-at-a-time", "episodes_per_cpu_s", least=3.0),
+    Ratio("harness", "bare one-at-a-time", "episodes_per_cpu_s"),
+    Ratio("harness+shim", "bare one-at-a-time", "episodes_per_cpu_s"),
     Ratio("harness", "traci", "episodes_per_cpu_s", least=35.0),
     Ratio("harness+shim", "traci", "episodes_per_cpu_s", least=55.0),
     Ratio("harness", "floor", "cpu_ns_per_cell_step", most=3.5),
@@ -69,7 +73,7 @@ def _verdict(value: float, least: float | None, most: float | None) -> str:
 def show(found: dict[str, list[Measurement]], starts: dict[str, tuple[Start, list[Start]]]) -> None:
     """Print everything that was measured."""
     head = ("", "episodes/s/core", "(range)", "wall eps/s", "ns/cell-step", "kB/episode")
-    print(f"\n{HOW}\n\n{head[0]:<16}{head[1]:>16}{head[2]:>18}{head[3]:>12}{head[4]:>14}{head[5]:>12}")
+    print(f"\n{HOW}\n\n{head[0]:<20}{head[1]:>16}{head[2]:>18}{head[3]:>12}{head[4]:>14}{head[5]:>12}")
     for name, rounds in found.items():
         rates = [one.episodes_per_cpu_s for one in rounds]
         step = median(one.cpu_ns_per_cell_step for one in rounds)
@@ -78,7 +82,7 @@ def show(found: dict[str, list[Measurement]], starts: dict[str, tuple[Start, lis
         wall = median(one.episodes_per_s for one in rounds)
         verdict = _verdict(median(rates), RATES.get(name), None)
         print(
-            f"{name:<16}{median(rates):>16,.0f}{span:>18}{wall:>12,.0f}{step:>14,.1f}"
+            f"{name:<20}{median(rates):>16,.0f}{span:>18}{wall:>12,.0f}{step:>14,.1f}"
             f"{f'{size:.2f}' if size else '-':>12}  {verdict}".rstrip()
         )
     print("\nRatios (median over rounds)")

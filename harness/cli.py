@@ -20,6 +20,8 @@ from harness.console import (
     print_estimates,
     print_json,
     print_plan,
+    print_pool,
+    print_statements,
     show_error,
     show_interrupted,
     system_error,
@@ -269,6 +271,35 @@ def compare(
             click.echo(f"note: {remark}")
         click.echo(str(folder / "compare.json"))
     ctx.exit(found.exit_code)
+
+
+@cli.command(
+    short_help="Build the pool of cut-ins, and show its shells.",
+    epilog=_examples("harness pool scenarios/smoke.yaml", "harness pool scenarios/smoke.yaml --out pool.parquet"),
+)
+@click.argument("campaign_file", metavar="CAMPAIGN", type=_CAMPAIGN)
+@click.option("--out", type=_FILE, help="Write the pool there, too: FILE.parquet, one row per cut-in.")
+@_set_option
+@_json_option
+def pool(campaign_file: Path, *, out: Path | None, overrides: Sequence[str], as_json: bool) -> None:
+    """Build the pool that belongs to CAMPAIGN's environment and surrogate library, and show what is in it.
+
+    Shown are the surrogates from careful to careless with their crash rates, and how probable it is that a cut-in is
+    the first in this order that a surrogate crashes on. A pool is built once and kept; `harness run` builds it, too.
+    """
+    campaign = _load(campaign_file, overrides)
+    from harness.pool.storage import campaign_pool, write_pool  # noqa: PLC0415 - slow to import
+    from harness.progress import terminal_progress  # noqa: PLC0415 - keeps --help fast
+
+    bar = terminal_progress()
+    with bar or nullcontext():
+        found = campaign_pool(campaign, bar)
+    if out is not None:
+        write_pool(out, found)
+    if as_json:
+        print_json(found.to_json())
+    else:
+        print_pool(found.to_json())
 
 
 @cli.command(

@@ -147,6 +147,28 @@ def print_estimates(content: dict[str, Any]) -> None:
     print_statements(content)
 
 
+def print_pool(content: dict[str, Any]) -> None:
+    """Print a pool: its surrogates from careful to careless, and the shells between them."""
+    from rich.console import Console  # noqa: PLC0415 - keeps --help fast
+    from rich.table import Table  # noqa: PLC0415 - keeps --help fast
+
+    table = Table(title=f"Pool {content['pool']}: {content['n_paths']:,} paths, all their cut-ins")
+    for heading in ("surrogate", "crash rate per test", "std. error", "probability of its shell"):
+        table.add_column(heading, justify="left" if heading == "surrogate" else "right")
+    for entry in content["surrogates"]:
+        marks = {content["boundary"]: " (boundary)", content["envelope"]: " (envelope)"}
+        error = entry["std_error"] / entry["crash_rate"] if entry["crash_rate"] else math.nan
+        rate, p = f"{entry['crash_rate']:.3e}", f"{entry['shell_probability']:.3e}"
+        table.add_row(entry["name"] + marks.get(entry["name"], ""), rate, _defined(error, ".2%"), p)
+    table.add_row("nobody crashes", "", "", f"{content['no_surrogate_crashes']:.3e}")
+    console = Console()
+    if not console.is_terminal:
+        console.width = _WIDTH_OF_FILES
+    console.print(table)
+    error = content["p_cut_in_std_error"] / content["p_cut_in"]
+    click.echo(f"BV cuts in in {content['p_cut_in']:.3e} of all tests (standard error {error:.2%}).")
+
+
 def print_statements(content: dict[str, Any]) -> None:
     """Print the answer in a sentence, what holds under the conditional assumption, and what all this is about."""
     for sentence in (content["statement"], content.get("conditional_statement"), content["scope"]):
@@ -162,7 +184,12 @@ def _shells_table(shells: list[dict[str, Any]]) -> Any:
         table.add_column(heading, justify="left" if heading == "first to crash" else "right")
     for shell in shells:
         name = shell["shell"] + ("" if shell["inside"] else " (beyond the boundary)")
-        row = (f"{shell['p']:.3e}", f"{shell['n_episodes']:,}", f"{shell['n_crashes']:,}", f"{shell['contribution']:.3e}")
+        row = (
+            f"{shell['p']:.3e}",
+            f"{shell['n_episodes']:,}",
+            f"{shell['n_crashes']:,}",
+            f"{shell['contribution']:.3e}",
+        )
         table.add_row(name, *row)
     return table
 

@@ -20,13 +20,18 @@ def advance(x: FloatArray, v: FloatArray, speed: FloatArray) -> None:
 
 
 @compiled
-def contacts(x: FloatArray, on_right: Int8Array, out: BoolArray) -> None:
-    """Which cells (K,) have vehicles of one lane in contact; ``on_right`` says whose BV has cut in."""
+def contacts(x: FloatArray, on_right: Int8Array, cut_in: Int8Array, out: BoolArray) -> None:
+    """Which cells (K,) have vehicles of one lane in contact.
+
+    ``on_right`` (K,) says whose BV has cut in, ``cut_in`` (K,) whose did in this step: it has moved on the left lane
+    before it changes to the right one, and may touch vehicles on both.
+    """
     for k in range(x.shape[0]):
+        out[k] = False
         if on_right[k]:
             out[k] = gap(x[k, BV], x[k, AV]) < CONTACT_M
-        else:
-            out[k] = gap(x[k, LV], x[k, BV]) < CONTACT_M
+        if cut_in[k] or not on_right[k]:
+            out[k] = out[k] or gap(x[k, LV], x[k, BV]) < CONTACT_M
 
 
 class TwinWorld:
@@ -53,7 +58,7 @@ class TwinWorld:
         """See `harness.world.World`."""
         self._on_right |= cut_in
         advance(self.x, self.v, speed)
-        contacts(self.x, self._on_right, self._contact)
+        contacts(self.x, self._on_right, cut_in, self._contact)
         return self._contact
 
     def close(self) -> None:

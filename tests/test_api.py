@@ -13,13 +13,13 @@ import pytest
 import harness
 from harness.errors import CampaignError, RunFolderError
 
-SMOKE = Path(__file__).parents[1] / "scenarios" / "smoke.yaml"
+MIXTURE_FILE = Path(__file__).parents[1] / "scenarios" / "overtaking_mixture.yaml"
 SMALL = ["world.engine=twin", "stop.episodes=300", "stop.rhw=0.5", "stop.min_crashes=20", "run.shard_size=60"]
 
 
 @pytest.fixture(scope="module")
 def result(tmp_path_factory):
-    campaign = harness.load_campaign(SMOKE, SMALL)
+    campaign = harness.load_campaign(MIXTURE_FILE, SMALL)
     return harness.run(campaign, str(tmp_path_factory.mktemp("api") / "run"), workers=1)
 
 
@@ -32,17 +32,17 @@ def test_all_that_is_promised_is_there():
 
 def test_importing_it_loads_nothing_slow():
     code = "import harness, sys; print(sorted({'numba', 'libsumo', 'pyarrow', 'matplotlib'} & set(sys.modules)))"
-    root = SMOKE.parents[1]
+    root = MIXTURE_FILE.parents[1]
     done = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
 
 
 def test_a_campaign_is_loaded_with_overrides():
-    campaign = harness.load_campaign(str(SMOKE), ["stop.rhw=0.1", "seed=7"])
+    campaign = harness.load_campaign(str(MIXTURE_FILE), ["stop.rhw=0.1", "seed=7"])
     assert campaign.stop.rhw == 0.1
     assert campaign.seed == 7
     with pytest.raises(CampaignError, match=r"stop\.rwh"):
-        harness.load_campaign(SMOKE, ["stop.rwh=0.1"])
+        harness.load_campaign(MIXTURE_FILE, ["stop.rwh=0.1"])
 
 
 def test_a_run_returns_what_the_folder_holds(result):
@@ -64,7 +64,7 @@ def test_a_run_returns_what_the_folder_holds(result):
 
 
 def test_the_resolved_campaign_of_a_run_is_the_campaign(result):
-    assert harness.load_campaign(result.folder / "campaign.yaml") == harness.load_campaign(SMOKE, SMALL)
+    assert harness.load_campaign(result.folder / "campaign.yaml") == harness.load_campaign(MIXTURE_FILE, SMALL)
 
 
 def test_estimating_and_reporting_again(result):
@@ -89,6 +89,6 @@ def test_replaying(result, tmp_path):
 
 
 def test_a_run_is_not_written_over(result):
-    campaign = harness.load_campaign(SMOKE, SMALL)
+    campaign = harness.load_campaign(MIXTURE_FILE, SMALL)
     with pytest.raises(harness.HarnessError, match="--resume"):
         harness.run(campaign, result.folder)

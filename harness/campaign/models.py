@@ -406,7 +406,7 @@ class PoolSettings(Section):
 
     library: str = Field("ladder-1", description="name of a shipped surrogate library, or a path to your own")
     relative_error: float = Field(
-        0.005, gt=0.0, le=0.2, description="standard error of the surrogates' crash rates to reach, relative"
+        0.005, ge=0.001, le=0.2, description="standard error of the surrogates' crash rates to reach, relative"
     )
     cut_ins_per_shell: Whole = Field(
         10_000, ge=100, le=1_000_000, description="cut-ins kept of each shell: the most tests that it can give"

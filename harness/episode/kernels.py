@@ -113,6 +113,8 @@ def outcome_of(k: int, state: FloatArray, cells: Cells, max_steps: int, passed_m
     """How the episode ends in its present state, or `RUNNING`."""
     cell = cells.cell[k]
     if cell.cut_step >= 0:
+        if cell.step == cell.cut_step + 1 and state[1] < CONTACT_M:
+            return BV_LV_CONTACT  # it touched LV before it had left the lane
         if state[3] < CONTACT_M:
             return CRASH
     elif state[1] < CONTACT_M:

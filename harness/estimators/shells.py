@@ -16,7 +16,7 @@ from harness.campaign.models import EstimatorName
 from harness.estimators.accumulator import require_episodes
 from harness.estimators.block import Block
 from harness.estimators.estimate import Estimate
-from harness.estimators.stratified import Limits, combined, share_limits
+from harness.estimators.stratified import Limits, combined, pool_variance, share_limits
 from harness.pool.shells import ShellDesign
 
 _METHOD = "crashes within shells of known probability; Clopper-Pearson limits per shell, combined (MOVER)"
@@ -94,6 +94,7 @@ class Shells:
         y = design.p / np.maximum(self.tests, 1)  # contribution of one crash, up to the factor n
         squares = float((self.crashes * y * y).sum())
         variance = float((design.p**2 * share * (1.0 - share) / np.maximum(self.tests, 1)).sum())
+        variance += pool_variance(share, design.moments, free.rate, design.n_paths)
         return Estimate(
             crash_rate=free.rate,
             std_error=float(np.sqrt(variance)),

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 
-from harness.arrays import FloatArray, Int8Array, IntArray, RecordArray
+from harness.arrays import BoolArray, FloatArray, Int8Array, IntArray, RecordArray
 from harness.campaign.models import PoolSettings
 from harness.environment.driving import Environment
 from harness.environment.initial_state import N_STATE, InitialStates
@@ -131,9 +130,7 @@ def build_pool(
     rates = _joined(pilot.run(0, PILOT_PATHS, progress), len(names))
     careful = _up_to_boundary(rates, names.index(library.boundary))
     aimed = pilot.aimed(fit_proposal(pilot.uniforms(0, PILOT_PATHS), _importance(rates, careful)))
-    blocks: list[Enumerated] = []
-    for blocks in _rounds(aimed, rates, careful, settings, progress):  # noqa: B007 - the last list is the result
-        pass
+    blocks = _until_known(aimed, rates, careful, settings, progress)
     return _pool(blocks, aimed, library, settings, key)
 
 
@@ -141,14 +138,14 @@ def _joined(blocks: list[Enumerated], n_surrogates: int) -> FloatArray:
     return np.concatenate([block.rates(n_surrogates) for block in blocks])
 
 
-def _up_to_boundary(rates: FloatArray, boundary: int) -> FloatArray:
+def _up_to_boundary(rates: FloatArray, boundary: int) -> BoolArray:
     """Which columns (surrogates, and the cut-in) are no more careless than the boundary, shape (D + 1,) bool."""
     mean = rates.mean(0)
-    inside: FloatArray = mean <= mean[boundary]
+    inside: BoolArray = mean <= mean[boundary]
     return inside
 
 
-def _importance(rates: FloatArray, careful: FloatArray) -> FloatArray:
+def _importance(rates: FloatArray, careful: BoolArray) -> FloatArray:
     """What a path contributes to all crash rates together, each relative to its mean, shape (n,)."""
     mean = rates.mean(0)
     relative = rates / np.where(mean > 0.0, mean, 1.0)
@@ -157,10 +154,10 @@ def _importance(rates: FloatArray, careful: FloatArray) -> FloatArray:
     return importance
 
 
-def _rounds(
-    aimed: Enumerator, pilot: FloatArray, careful: FloatArray, settings: PoolSettings, progress: Progress
-) -> Iterator[list[Enumerated]]:
-    """All blocks so far, until the relative errors are small enough."""
+def _until_known(
+    aimed: Enumerator, pilot: FloatArray, careful: BoolArray, settings: PoolSettings, progress: Progress
+) -> list[Enumerated]:
+    """Enumerate paths until the relative errors are small enough; what is left of them is part of every interval."""
     wanted = settings.relative_error * np.where(careful, 1.0, CARELESS_ERROR)
     progress.stage("pool of cut-ins", _paths_needed(pilot, wanted))
     blocks: list[Enumerated] = []
@@ -173,9 +170,9 @@ def _rounds(
         known = mean > 0.0
         error = rates.std(0)[known] / np.sqrt(len(rates)) / mean[known]
         progress.status(error=f"{error[careful[known]].max(initial=0.0):.2%}")
-        yield blocks
         if np.all(error <= wanted[known]):
-            return
+            break
+    return blocks
 
 
 def _paths_needed(pilot: FloatArray, wanted: FloatArray) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -83,6 +84,23 @@ class Pool:
     def mu_se(self) -> FloatArray:
         """Standard errors of the surrogates' crash rates, shape (D,)."""
         return np.sqrt(np.diag(self.mu_covariance))
+
+    def to_json(self) -> dict[str, Any]:
+        """What is known of surrogates and shells, as plain content."""
+        mu, se, p = self.mu.tolist(), self.mu_se.tolist(), self.shell_p.tolist()
+        return {
+            "pool": self.key,
+            "n_paths": self.n_paths,
+            "p_cut_in": self.p_cut_in,
+            "p_cut_in_std_error": self.p_cut_in_se,
+            "boundary": self.library.boundary,
+            "envelope": self.library.envelope,
+            "surrogates": [
+                {"name": name, "crash_rate": mu[k], "std_error": se[k], "shell_probability": p[k]}
+                for k, name in enumerate(self.names)
+            ],
+            "no_surrogate_crashes": p[-1],
+        }
 
     @property
     def boundary(self) -> int:

@@ -31,13 +31,14 @@ NO_CRASH = -1
 class Path(NamedTuple):
     """LV's and BV's motion without a cut-in, and the AV at constant speed.
 
-    ``lv``, ``bv`` (draws,) are maneuver indices. ``x_bv``, ``v_bv``, ``x_av`` (steps + 1,) are positions (m) and
-    speeds (m/s); ``hazard`` (steps,) the cut-in hazard of each step. ``x``, ``v`` (3,) are the initial placement.
+    ``lv``, ``bv`` (draws,) are maneuver indices. ``x_lv``, ``x_bv``, ``x_av``, ``v_bv`` (steps + 1,) are positions (m)
+    and speeds (m/s); ``hazard`` (steps,) the cut-in hazard of each step. ``x``, ``v`` (3,) are the initial placement.
     ``x_after``, ``v_after`` (steps + 1,) receive BV's motion after a cut-in.
     """
 
     lv: Int8Array
     bv: Int8Array
+    x_lv: FloatArray
     x_bv: FloatArray
     v_bv: FloatArray
     x_av: FloatArray
@@ -54,6 +55,7 @@ def empty_path(max_steps: int, draws: int) -> Path:
     return Path(
         lv=np.zeros(draws, np.int8),
         bv=np.zeros(draws, np.int8),
+        x_lv=np.zeros(n),
         x_bv=np.zeros(n),
         v_bv=np.zeros(n),
         x_av=np.zeros(n),
@@ -77,7 +79,7 @@ def walk(seed: int, index: int, state: FloatArray, environment: Environment, pat
     for step in range(n.max_steps):
         r1, r1dot = gap(x_lv, x_bv), v_lv - v_bv
         r2, r2dot = gap(x_bv, x_av), v_bv - v_av
-        path.x_bv[step], path.v_bv[step], path.x_av[step] = x_bv, v_bv, x_av
+        path.x_lv[step], path.x_bv[step], path.v_bv[step], path.x_av[step] = x_lv, x_bv, v_bv, x_av
         if step > 0 and (r1 < CONTACT_M or r2 <= 0.0):
             return step
         if step % n.hold_steps == 0:
@@ -93,7 +95,8 @@ def walk(seed: int, index: int, state: FloatArray, environment: Environment, pat
         x_bv = next_position(x_bv, v_bv, after_bv)
         x_av = next_position(x_av, v_av, v_av)
         v_lv, v_bv = after_lv, after_bv
-    path.x_bv[n.max_steps], path.v_bv[n.max_steps], path.x_av[n.max_steps] = x_bv, v_bv, x_av
+    last = n.max_steps
+    path.x_lv[last], path.x_bv[last], path.v_bv[last], path.x_av[last] = x_lv, x_bv, v_bv, x_av
     return int(n.max_steps)
 
 
@@ -181,6 +184,8 @@ def enumerate_cut_ins(
             if probability[i, cut] == 0.0:
                 continue
             leave(seed, first + i, cut, environment, path, free)
+            if gap(path.x_lv[cut + 1], path.x_after[cut + 1]) < CONTACT_M:
+                continue  # BV touches LV before it has left the lane: the episode ends as bv_lv_contact
             x, v = path.x_av[cut], path.v[AV]
             if envelope >= 0 and crash_step(drivers[envelope], 0, x, v, cut, path, max_steps) == NO_CRASH:
                 continue

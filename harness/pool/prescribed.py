@@ -51,6 +51,10 @@ class PrescribedEpisodes:
     def episodes(self, draws: tuple[Draw, ...]) -> tuple[FloatArray, Script, IntArray]:
         """Initial states (n, 5), script, and rows of the pool's cut-ins (n,)."""
         rows, stratum = self.rows(draws)
+        return (*self.of_rows(rows, stratum), rows)
+
+    def of_rows(self, rows: IntArray, stratum: IntArray) -> tuple[FloatArray, Script]:
+        """Initial states (n, 5) and script of given cut-ins of the pool (n,), tested for given strata (n,)."""
         c = self._pool.cut_ins
         script = Script(
             lv=np.ascontiguousarray(c.lv[rows]),
@@ -59,4 +63,4 @@ class PrescribedEpisodes:
             component=stratum.astype(np.int64),
             log_weight=np.log(self.design.p[stratum]),
         )
-        return c.state[rows], script, rows
+        return c.state[rows], script

@@ -14,11 +14,11 @@ import pyarrow.parquet as pq
 
 from harness.arrays import IntArray
 from harness.campaign.models import Campaign, PoolSettings
-from harness.compiled import cache_root
+from harness.compiled import cache_root, source_hash
 from harness.environment.driving import Environment
 from harness.environment.loading import load_environment
 from harness.errors import RunFolderError
-from harness.pool.build import build_pool
+from harness.pool.build import PILOT_PATHS, ROUND_PATHS, build_pool
 from harness.pool.cut_ins import CutIns, Pool
 from harness.pool.library import Library, load_library
 from harness.progress import Progress
@@ -31,11 +31,20 @@ _STATE = ("v_bv_mps", "r1_m", "r1dot_mps", "r2_m", "r2dot_mps")
 
 
 def pool_key(environment: Environment, library: Library, settings: PoolSettings) -> str:
-    """Hash of all that a pool depends on: environment, level of lane changing, library and settings."""
+    """Hash of all that a pool depends on: environment, level of lane changing, library, settings, and the kernels."""
     numbers = {name: environment.numbers[name][0].item() for name in environment.numbers.dtype.names or ()}
     drivers = {name: model.model_dump() for name, model in library.surrogates.items()}
     roles = [library.boundary, library.envelope]
-    content = [_FORMAT, numbers, drivers, roles, settings.model_dump(exclude={"library"})]
+    content = [
+        _FORMAT,
+        source_hash(),
+        PILOT_PATHS,
+        ROUND_PATHS,
+        numbers,
+        drivers,
+        roles,
+        settings.model_dump(exclude={"library"}),
+    ]
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:24]
 
 

@@ -17,7 +17,7 @@ from harness.progress import Progress, SilentProgress
 from harness.records.folder import SHELLS, TABLES, shard_file, write_json
 from harness.runner.manifest import Manifest, require_own_folder
 from harness.runner.prefix import Prefix
-from harness.runner.prepare import Prepared, content_hash, distance_per_test_m, prepare
+from harness.runner.prepare import Prepared, content_hash, distance_per_test_m, prepare, require_same_pool
 from harness.runner.rounds import rounds, stop_rule
 from harness.runner.shards import ShardPool, stored_shard
 from harness.runner.table_accuracy import table_errors
@@ -92,6 +92,7 @@ def run_campaign(
         table_errors=table_errors(campaign, prepared.policy.environment, prepared.tables),
     )
     if prepared.prescribed is not None:
+        require_same_pool(out, prepared)
         write_json(out / SHELLS, prepared.prescribed.design.to_json())
     rule = stop_rule(campaign)
     prefix = Prefix(campaign, rule)

@@ -106,6 +106,13 @@ def require_comparable(a: Campaign, b: Campaign) -> None:
     CampaignError
         Names every key that differs, with both values.
     """
+    if a.testing.method == "shells":
+        raise CampaignError(
+            "testing.method",
+            found="shells, which test each AV where its own crashes are",
+            expected="a method under which both AVs meet the same cut-ins",
+            mend="Write --set testing.method=forced: the same cut-ins for both, and no assumption about either.",
+        )
     keys = MAY_DIFFER
     apart = list(_differing("", a.model_dump(exclude=set(keys)), b.model_dump(exclude=set(keys))))
     if not apart:

@@ -9,6 +9,7 @@ from harness.campaign.models import Campaign
 from harness.criticality.tables import tables_cached
 from harness.environment.loading import load_environment
 from harness.importance.build import needs_tables
+from harness.pool.storage import campaign_pool_key, pool_path
 from harness.sumo.av_type import av_type
 from harness.vehicles.models import surrogate_records
 
@@ -19,6 +20,7 @@ EPISODES_PER_SECOND_PER_CORE = {
     ("twin", "episode_mixture"): 15000,
 }  # fmt: skip
 """Orders of magnitude, measured on one core of a 2020s server; `benchmarks/` measures yours."""
+POOL_S = "about half a minute"
 KB_PER_EPISODE = 0.4
 KB_PER_MOMENT = 0.1
 MOMENTS_PER_EPISODE = {"all": 70, "first_9": 9, "none": 0}
@@ -48,6 +50,9 @@ def plan_campaign(campaign: Campaign) -> dict[str, Any]:
 
 
 def _tables(campaign: Campaign) -> str:
+    if campaign.testing.method == "shells":
+        cached = pool_path(campaign_pool_key(campaign)).is_file()
+        return "pool of cut-ins: " + ("cached" if cached else f"to build ({POOL_S} on two cores)")
     if not needs_tables(campaign):
         return "none needed"
     environment = load_environment(campaign.environment)

@@ -17,10 +17,12 @@ from harness.environment.initial_state import InitialStates
 from harness.environment.loading import load_environment, load_parameters
 from harness.episode.begin import mean_test_distance
 from harness.episode.loop import MOMENT_LIMITS, EpisodeLoop, Keep, Policy
+from harness.errors import RunFolderError
 from harness.importance.build import build_importance, needs_tables
 from harness.pool.prescribed import PrescribedEpisodes
 from harness.pool.storage import campaign_pool, campaign_pool_key, pool_path
 from harness.progress import Progress, SilentProgress
+from harness.records.folder import SHELLS, read_json
 from harness.sumo.av_type import av_type
 from harness.vehicles.models import av_records, surrogate_records
 from harness.world import World
@@ -116,6 +118,27 @@ def prepare(campaign: Campaign, progress: Progress | None = None) -> Prepared:
         tables,
         prescribed,
     )
+
+
+def require_same_pool(folder: Path, prepared: Prepared) -> None:
+    """Refuse to go on with a run whose cut-ins came from another pool.
+
+    Raises
+    ------
+    RunFolderError
+        The pool has changed since: its library, or the harness itself.
+    """
+    path = folder / SHELLS
+    if prepared.prescribed is None or not path.exists():
+        return
+    found = read_json(path, mend="Run the campaign into a new folder.").get("pool")
+    if found != prepared.prescribed.design.pool:
+        raise RunFolderError(
+            str(path),
+            found=f"cut-ins of pool {found}",
+            expected=f"those of pool {prepared.prescribed.design.pool}, which this campaign now has",
+            mend="Restore the surrogate library, or the version of the harness (manifest.json), or use a new folder.",
+        )
 
 
 def compile_kernels(campaign: Campaign, environment: Environment) -> None:

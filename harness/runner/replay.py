@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
@@ -14,7 +15,7 @@ from harness.campaign.models import Campaign
 from harness.errors import CampaignError, RunFolderError
 from harness.records.folder import read_manifest, read_table
 from harness.records.tables import shard_tables
-from harness.runner.prepare import Prepared, build_world, content_hash, prepare
+from harness.runner.prepare import Prepared, build_world, content_hash, prepare, require_same_pool
 from harness.world import World
 
 _UNLIKE_BITS = ("episode", "seed", "failure")
@@ -77,9 +78,10 @@ def replay_episode(folder: Path, episode: int, *, gui: bool = False, fcd: Path |
             mend="Restore campaign.yaml and the environment parameter file that it names.",
         )
     prepared = prepare(campaign)
+    require_same_pool(folder, prepared)
     world = _world(campaign, gui=gui, fcd=fcd)
     try:
-        row, trace = _run_again(prepared, world, episode)
+        row, trace = _run_again(prepared, world, episode, stored["episodes"])
     finally:
         world.close()
     equal = {name: _equal(name, table, stored.get(name)) for name, table in (("episodes", row), ("traces", trace))}
@@ -99,8 +101,14 @@ def _require_reproducible(manifest: dict[str, Any]) -> None:
         )
 
 
-def _run_again(prepared: Prepared, world: World, episode: int) -> tuple[pa.Table, pa.Table]:
-    shard = prepared.loop(world, traces="all").run(episode, prepared.states(episode, 1))
+def _run_again(prepared: Prepared, world: World, episode: int, stored: pa.Table) -> tuple[pa.Table, pa.Table]:
+    loop = prepared.loop(world, traces="all")
+    if prepared.prescribed is None:
+        shard = loop.run(episode, prepared.states(episode, 1))
+    else:
+        row, stratum = (np.asarray(stored[name]).astype(np.int64) for name in ("pool_cut_in", "component"))
+        shard = loop.run(episode, *prepared.prescribed.of_rows(row, stratum))
+        shard.cut_ins = row
     tables = shard_tables(shard, prepared.campaign.seed, keep_traces=True)
     return tables.episodes, tables.traces
 

@@ -74,7 +74,7 @@ def _complaint(load, data):
 
 
 def test_the_promised_scenarios_are_there():
-    kinds = ("forced", "nade", "nde", "recursive")
+    kinds = ("forced", "mixture", "nade", "nde", "recursive")
     assert {file.name for file in SCENARIOS} >= {"smoke.yaml", *(f"overtaking_{kind}.yaml" for kind in kinds)}
 
 
@@ -88,9 +88,9 @@ def test_scenario_is_valid(file):
 
 def test_smoke_asks_for_what_the_readme_promises():
     smoke = load_campaign(FOLDER / "smoke.yaml")
-    assert (smoke.testing.method, smoke.testing.challenge) == ("episode_mixture", "recursive")
+    assert (smoke.testing.method, smoke.testing.shells.statement) == ("shells", "assumption_free")
     assert (smoke.stop.rhw, smoke.stop.min_crashes, smoke.stop.episodes) == (0.05, 3000, 400_000)
-    assert (smoke.world.engine, smoke.records.moments, smoke.records.traces) == ("sumo", "first_9", "crash")
+    assert (smoke.world.engine, smoke.records.moments, smoke.records.traces) == ("sumo", "none", "crash")
 
 
 def test_nade_has_the_published_settings():

@@ -33,7 +33,7 @@ class Faster:
 
 def load(method, *more):
     changes = [f"av={EARLY}", f"testing={{method: {method}}}", "world.engine=twin", *more]
-    return load_campaign(ROOT / "scenarios/smoke.yaml", changes)
+    return load_campaign(ROOT / "scenarios/overtaking_mixture.yaml", changes)
 
 
 @pytest.mark.parametrize("method", ["nde", "step_mixture"])

@@ -41,7 +41,7 @@ def fmu_av(file, more=""):
 
 def run(av, *more, cells=32, first=0, n=EPISODES):
     overrides = [f"av={av}", "testing={method: forced}", "world.engine=twin", "stop.rhw=null", *more]
-    prepared = prepare(load_campaign(ROOT / "scenarios/smoke.yaml", overrides))
+    prepared = prepare(load_campaign(ROOT / "scenarios/overtaking_mixture.yaml", overrides))
     loop = prepared.loop(TwinWorld(cells), traces="all")
     try:
         return loop.run(first, prepared.states(first, n))

@@ -13,13 +13,13 @@ from harness.environment.loading import load_environment
 from harness.pool.cut_ins import Pool
 from harness.pool.storage import campaign_pool
 
-SMOKE = Path(__file__).parents[2] / "scenarios" / "smoke.yaml"
+MIXTURE_FILE = Path(__file__).parents[2] / "scenarios" / "overtaking_mixture.yaml"
 SMALL_POOL = ("pool.relative_error=0.03", "pool.cut_ins_per_shell=600")
 
 
 @pytest.fixture(scope="session")
 def campaign() -> Campaign:
-    return load_campaign(SMOKE, ["testing.method=shells", *SMALL_POOL])
+    return load_campaign(MIXTURE_FILE, ["testing.method=shells", *SMALL_POOL])
 
 
 @pytest.fixture(scope="session")

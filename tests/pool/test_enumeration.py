@@ -72,7 +72,7 @@ def test_a_prescribed_episode_ends_as_the_pool_says(campaign, pool, environment,
 
 def test_the_probabilities_of_a_path_add_up_to_that_of_a_cut_in(environment):
     """Against an independent walk of the same path: 1 - exp(-hazard)."""
-    from tests.pool.walked import p_cut_in_of_paths  # noqa: PLC0415 - compiles a kernel of its own
+    from tests.pool.walked import p_cut_in_of_paths
 
     probability, _ = enumerated(environment, 40, NAMES.index(LIBRARY.envelope))
     expected = p_cut_in_of_paths(SEED, InitialStates(environment.numbers).draw(SEED, 0, 40), environment)

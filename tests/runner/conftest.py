@@ -13,7 +13,7 @@ from harness.controllers.black_box import Death
 from harness.runner import RunResult, run_campaign, shards
 from harness.runner.worker import ShardDone, ShardRunner, ShardSpec
 
-SMOKE = Path(__file__).parents[2] / "scenarios" / "smoke.yaml"
+MIXTURE_FILE = Path(__file__).parents[2] / "scenarios" / "overtaking_mixture.yaml"
 SMALL = ("stop.episodes=1600", "stop.rhw=null", "run.shard_size=80", "records.trace_share=0.05")
 TWIN = ("world.engine=twin", "stop.episodes=400")
 
@@ -21,7 +21,7 @@ TWIN = ("world.engine=twin", "stop.episodes=400")
 @pytest.fixture(scope="session")
 def campaign() -> Callable[..., Campaign]:
     """The smoke campaign in small, with overrides."""
-    return lambda *overrides: load_campaign(SMOKE, [*SMALL, *overrides])
+    return lambda *overrides: load_campaign(MIXTURE_FILE, [*SMALL, *overrides])
 
 
 @pytest.fixture(scope="session")

@@ -9,7 +9,7 @@ from harness.campaign.loading import load_campaign
 from harness.cli import main
 from harness.runner.av_check import check_av
 
-SMOKE = str(Path(__file__).parents[2] / "scenarios/smoke.yaml")
+MIXTURE_FILE = str(Path(__file__).parents[2] / "scenarios/overtaking_mixture.yaml")
 CONTROLLERS = '''
 import random
 
@@ -68,7 +68,7 @@ def check(tmp_path, monkeypatch):
 
     def check_one(name, *overrides):
         source = ["av={}", f"av.controller=checked_controllers:{name}"] if name else []
-        return check_av(load_campaign(SMOKE, [*source, *overrides]), 24)
+        return check_av(load_campaign(MIXTURE_FILE, [*source, *overrides]), 24)
 
     return check_one
 
@@ -119,11 +119,11 @@ def test_a_controller_that_acts_early_is_checked_without_forcing(check):
 
 
 def test_the_command_line(check, capsys):
-    assert main(["av-check", SMOKE, "--episodes", "6"]) == 0
+    assert main(["av-check", MIXTURE_FILE, "--episodes", "6"]) == 0
     out = capsys.readouterr().out
     assert "same bits in another order and in other cells" in out
     assert "built-in IDM" in out
-    assert main(["av-check", SMOKE, "--episodes", "6", "--json"]) == 0
+    assert main(["av-check", MIXTURE_FILE, "--episodes", "6", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["deterministic"] is True
-    assert main(["av-check", SMOKE, "--set", "av={}", "--set", "av.controller=not_there:X"]) == 2
+    assert main(["av-check", MIXTURE_FILE, "--set", "av={}", "--set", "av.controller=not_there:X"]) == 2
     assert "cannot be imported" in capsys.readouterr().err

@@ -16,7 +16,7 @@ from harness.runner import campaign_run, processes, shards
 from harness.runner.shards import WorkerLostError
 from harness.runner.worker import ShardSpec
 from tests.runner import bad_workers
-from tests.runner.conftest import SMALL, SMOKE, TWIN
+from tests.runner.conftest import MIXTURE_FILE, SMALL, TWIN
 from tests.runner.stored_runs import copy_of, manifest, shard_files, unlike_columns
 
 
@@ -48,7 +48,7 @@ def test_a_full_disk_is_said_in_words_and_the_run_can_be_resumed(
     options = [word for override in (*SMALL, *TWIN) for word in ("--set", override)]
     with monkeypatch.context() as patch:
         patch.setattr(processes, "serve", bad_workers.without_room)
-        assert main(["run", str(SMOKE), "--out", str(out), "--workers", "1", *options]) == 2
+        assert main(["run", str(MIXTURE_FILE), "--out", str(out), "--workers", "1", *options]) == 2
     complaint = capsys.readouterr().err
     assert "no space left" in complaint
     assert "--resume" in complaint

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from harness.campaign.loading import load_campaign
-from tests.runner.conftest import SMOKE
+from tests.runner.conftest import MIXTURE_FILE
 
 SHARD, WARM_UP, EPISODES = 1_000, 10_000, 200_000
 
@@ -23,7 +23,7 @@ def run_shards(connection, folder: Path) -> None:
     """Work like a worker process, and say after every shard how much memory that takes."""
     from harness.runner.worker import ShardRunner, ShardSpec
 
-    runner = ShardRunner(load_campaign(SMOKE), folder)
+    runner = ShardRunner(load_campaign(MIXTURE_FILE), folder)
     for index in range(EPISODES // SHARD):
         runner.run(ShardSpec(index, index * SHARD, SHARD))
         for path in folder.rglob("*.parquet"):

@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from harness.progress import SilentProgress
-from tests.runner.conftest import SMALL, SMOKE
+from tests.runner.conftest import MIXTURE_FILE, SMALL
 from tests.runner.stored_runs import copy_of, manifest, shard_files, stored_table, unlike_columns
 
 PATIENCE_S = 120.0
@@ -72,13 +72,28 @@ def begin() -> Iterator[Callable[..., subprocess.Popen]]:
     begun: list[subprocess.Popen] = []
 
     def start(out: Path, complaints: Path, *options: str) -> subprocess.Popen:
-        command = [sys.executable, "-m", "harness", "run", str(SMOKE), "--out", str(out), "--workers", "1", *options]
+        command = [
+            sys.executable,
+            "-m",
+            "harness",
+            "run",
+            str(MIXTURE_FILE),
+            "--out",
+            str(out),
+            "--workers",
+            "1",
+            *options,
+        ]
         for override in (*SMALL, "world.cells=16"):
             command += ["--set", override]
         with complaints.open("w") as stderr:
             begun.append(
                 subprocess.Popen(
-                    command, cwd=SMOKE.parents[1], start_new_session=True, stdout=subprocess.DEVNULL, stderr=stderr
+                    command,
+                    cwd=MIXTURE_FILE.parents[1],
+                    start_new_session=True,
+                    stdout=subprocess.DEVNULL,
+                    stderr=stderr,
                 )
             )
         return begun[-1]

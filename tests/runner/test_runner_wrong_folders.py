@@ -7,7 +7,7 @@ import json
 import pytest
 
 from harness.cli import main
-from tests.runner.conftest import SMALL, SMOKE, TWIN
+from tests.runner.conftest import MIXTURE_FILE, SMALL, TWIN
 from tests.runner.stored_runs import copy_of, shard_files, truncate, unlike_columns
 
 SAME = [word for override in (*SMALL, *TWIN) for word in ("--set", override)]
@@ -32,16 +32,16 @@ def stored(twin_run, tmp_path):
 
 
 def test_a_folder_of_another_campaign(stored, capsys, twin_run):
-    text = complaint_of(capsys, "run", SMOKE, "--out", stored, *SAME, "--set", "seed=2")
+    text = complaint_of(capsys, "run", MIXTURE_FILE, "--out", stored, *SAME, "--set", "seed=2")
     assert str(stored) in text
     assert "another campaign (smoke," in text
-    text = complaint_of(capsys, "run", SMOKE, "--out", stored, *SAME, "--set", "testing.epsilon=0.2", "--resume")
+    text = complaint_of(capsys, "run", MIXTURE_FILE, "--out", stored, *SAME, "--set", "testing.epsilon=0.2", "--resume")
     assert "another campaign" in text
     assert unlike_columns(twin_run, stored) == []
 
 
 def test_a_run_begun_already_needs_resume(stored, capsys, twin_run):
-    text = complaint_of(capsys, "run", SMOKE, "--out", stored, *SAME)
+    text = complaint_of(capsys, "run", MIXTURE_FILE, "--out", stored, *SAME)
     assert str(stored) in text
     assert "--resume" in text
     assert unlike_columns(twin_run, stored) == []
@@ -50,7 +50,7 @@ def test_a_run_begun_already_needs_resume(stored, capsys, twin_run):
 @pytest.mark.parametrize("resume", [[], ["--resume"]])
 def test_a_folder_with_foreign_files(resume, tmp_path, capsys):
     (tmp_path / "thesis.tex").write_text("three years of work")
-    text = complaint_of(capsys, "run", SMOKE, "--out", tmp_path, *SAME, *resume)
+    text = complaint_of(capsys, "run", MIXTURE_FILE, "--out", tmp_path, *SAME, *resume)
     assert str(tmp_path) in text
     assert "other files" in text
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
@@ -58,7 +58,7 @@ def test_a_folder_with_foreign_files(resume, tmp_path, capsys):
 
 def test_a_folder_with_somebody_elses_manifest(tmp_path, capsys):
     (tmp_path / "manifest.json").write_text('{"short_name": "a web page"}')
-    assert "another campaign" in complaint_of(capsys, "run", SMOKE, "--out", tmp_path, *SAME, "--resume")
+    assert "another campaign" in complaint_of(capsys, "run", MIXTURE_FILE, "--out", tmp_path, *SAME, "--resume")
     for command in (("estimate", tmp_path), ("report", tmp_path), ("replay", tmp_path, 0)):
         assert str(tmp_path) in complaint_of(capsys, *command)
 
@@ -86,7 +86,7 @@ def test_resuming_with_a_truncated_shard_names_it_and_its_mend_works(
 ):
     broken = shard_files(stored, table)[1]
     truncate(broken)
-    text = complaint_of(capsys, "run", SMOKE, "--out", stored, *SAME, "--resume")
+    text = complaint_of(capsys, "run", MIXTURE_FILE, "--out", stored, *SAME, "--resume")
     assert str(broken) in text
     assert "Delete it and its episodes file" in text
     for path in {broken, shard_files(stored)[1]}:

@@ -7,12 +7,14 @@ import json
 import numpy as np
 import pytest
 
+from harness import estimate, replay
 from harness.errors import CampaignError, RunFolderError
 from harness.pool.shells import ShellDesign
+from harness.runner import compare_campaigns
 from harness.runner.allocation import GROWTH, Allocation
 from harness.runner.rounds import round_specs
 from tests.pool.conftest import SMALL_POOL
-from tests.runner.stored_runs import manifest, shard_files, stored_table, unlike_columns
+from tests.runner.stored_runs import copy_of, manifest, shard_files, stored_table, unlike_columns
 
 SHELLS = ("testing.method=shells", "stop.rhw=0.5", "stop.episodes=3000", "stop.min_crashes=null", *SMALL_POOL)
 
@@ -30,7 +32,7 @@ def test_it_reaches_the_precision_and_says_both_things(shells_run):
     assert content["headline"] == "shells"
     estimate = content["estimates"]["shells"]
     assert estimate["rhw"] <= 0.5
-    assert 1.352e-7 == pytest.approx(estimate["crash_rate"], rel=0.5)
+    assert pytest.approx(estimate["crash_rate"], rel=0.5) == 1.352e-7
     assert estimate["ci_low"] < 1.352e-7 < estimate["ci_high"]
     assert "If this vehicle crashes only where" in content["conditional_statement"]
     assert not estimate["details"]["conditional"]["refuted"]
@@ -110,13 +112,31 @@ def test_an_unknown_boundary_is_refused(campaign, run_here, tmp_path):
 
 
 def test_a_run_without_its_shells_is_named(shells_run, tmp_path):
-    from harness import estimate  # noqa: PLC0415
-    from tests.runner.stored_runs import copy_of  # noqa: PLC0415
-
     folder = copy_of(shells_run.folder, tmp_path / "run")
     (folder / "shells.json").write_text(json.dumps({"strata": ["a"]}))
     with pytest.raises(RunFolderError, match="shells"):
         estimate(folder)
+
+
+def test_an_episode_is_replayed_bit_for_bit(shells_run):
+    again = replay(shells_run.folder, 3)
+    assert again.bit_equal
+    assert again.row["pool_cut_in"] is not None
+
+
+def test_another_pool_is_refused(shells_run, campaign, run_here, tmp_path):
+    folder = copy_of(shells_run.folder, tmp_path / "run")
+    content = json.loads((folder / "shells.json").read_text())
+    (folder / "shells.json").write_text(json.dumps({**content, "pool": "f" * 24}))
+    with pytest.raises(RunFolderError, match="cut-ins of pool ffff"):
+        replay(folder, 3)
+    with pytest.raises(RunFolderError, match="cut-ins of pool ffff"):
+        run_here(campaign(*SHELLS, "world.cells=8"), folder, resume=True)
+
+
+def test_comparing_is_refused(campaign, tmp_path):
+    with pytest.raises(CampaignError, match=r"testing\.method=forced"):
+        compare_campaigns(campaign(*SHELLS), campaign(*SHELLS), tmp_path / "out")
 
 
 DESIGN = ShellDesign(

@@ -10,7 +10,7 @@ import pytest
 from harness.campaign.loading import load_campaign
 from harness.campaign.models import Campaign
 
-SMOKE = Path(__file__).parents[2] / "scenarios" / "smoke.yaml"
+MIXTURE_FILE = Path(__file__).parents[2] / "scenarios" / "overtaking_mixture.yaml"
 
 
 @pytest.fixture
@@ -32,4 +32,4 @@ def open_world() -> Iterator[Callable]:
 @pytest.fixture(scope="session")
 def smoke() -> Callable[..., Campaign]:
     """The smoke campaign, with overrides."""
-    return lambda *overrides: load_campaign(SMOKE, overrides)
+    return lambda *overrides: load_campaign(MIXTURE_FILE, overrides)

@@ -1,0 +1,57 @@
+"""Prescribed traffic in both worlds: cut-ins close to LV and to the AV, and fewer episodes than cells."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from harness.environment.loading import load_environment
+from harness.episode.cells import Script
+from harness.episode.loop import EpisodeLoop, Keep, Policy, Shard
+from harness.importance.build import build_importance
+from harness.maneuvers import CUT_IN
+from harness.outcomes import BV_LV_CONTACT, CRASH, TIMEOUT
+from harness.twin import TwinWorld
+from harness.vehicles.models import av_records
+
+KEEP_SPEED, BRAKE = 20, 0
+STATES = np.array(
+    [
+        (21.0, 0.3, -4.0, 30.0, -8.0),  # BV is over LV's rear when it has left the lane
+        (21.0, 3.0, -4.0, 30.0, -8.0),  # in good time
+        (21.0, 30.0, 0.0, 0.5, -8.0),  # in front of the AV's bumper
+        (21.0, 0.3, -4.0, 0.5, -8.0),  # both at once
+    ]
+)
+OUTCOMES = [BV_LV_CONTACT, TIMEOUT, CRASH, BV_LV_CONTACT]
+
+
+def cut_in_at_once() -> Script:
+    """In every row BV cuts in in the first step; after it nobody changes speed."""
+    n = len(STATES)
+    lv, bv = np.full((n, 22), KEEP_SPEED, np.int8), np.full((n, 22), KEEP_SPEED, np.int8)
+    bv[:, 1] = CUT_IN
+    return Script(lv, bv, np.zeros(n, np.int64), np.zeros(n, np.int64), np.zeros(n))
+
+
+def run(world, smoke) -> Shard:
+    campaign = smoke("testing.method=shells")
+    policy = Policy(
+        1, load_environment(campaign.environment), build_importance(campaign, None), av_records(campaign.av)
+    )
+    return EpisodeLoop(world, policy, Keep(0, "all", 0.0)).run(0, STATES, cut_in_at_once())
+
+
+def test_the_twin_judges_cut_ins_beside_lv(smoke):
+    episode = run(TwinWorld(4), smoke).results.episode
+    assert episode["outcome"].tolist() == OUTCOMES
+    assert episode["n_steps"].tolist() == [1, 200, 1, 1]
+
+
+@pytest.mark.parametrize("shim", [True, False])
+@pytest.mark.parametrize("n_cells", [1, 4, 64])
+def test_sumo_agrees_also_with_cells_that_stay_empty(smoke, open_world, n_cells, shim):
+    twin, sumo = run(TwinWorld(4), smoke), run(open_world(n_cells, shim=shim), smoke)
+    assert twin.results.episode.tobytes() == sumo.results.episode.tobytes()
+    for row, trace in twin.traces.items():
+        assert np.array_equal(trace, sumo.traces[row], equal_nan=True)
