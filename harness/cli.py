@@ -1,4 +1,4 @@
-"""The command ``harness``: check, av-check, run, compare, estimate, report, replay, schema.
+"""The command ``harness``: check, av-check, run, compare, estimate, report, replay, ladder, schema.
 
 Results go to stdout or to files, progress and complaints to stderr. Exit codes: 0 done; 2 the campaign or the call is
 wrong; 3 too many episodes failed or the world disagreed; 4 budget spent before the asked precision; 130 interrupted.
@@ -392,6 +392,35 @@ def replay(folder: Path, episode: int, *, out: Path | None, fcd: Path | None, gu
             expected="the same bits",
             mend="Compare versions and CPU in manifest.json with this machine's; bits are promised for equal ones.",
         )
+
+
+@cli.command(
+    short_help="Fit a surrogate to the AV of a run.",
+    epilog=_examples(
+        "harness run my.yaml --out runs/rough --set records.trace_share=0.2",
+        "harness ladder runs/rough --out my-ladder.yaml",
+        "harness run my.yaml --out runs/fine --set testing.method=shells --set pool.library=./my-ladder.yaml",
+    ),
+)
+@click.argument("folder", metavar="DIR", type=_RUN_FOLDER)
+@click.option("--out", type=_FILE, required=True, help="Library to write, a new .yaml file.")
+@_json_option
+def ladder(folder: Path, out: Path, *, as_json: bool) -> None:
+    """Fit a driver to the AV of the run in DIR, and write the run's surrogate library with it.
+
+    The driver is an IDM with a reaction delay and limits to braking and jerk. It is fitted to accelerations in episodes
+    that were traced whatever came of them (records.trace_share, or records.traces all); how well it predicts the AV's
+    crashes is told by the tests that it was not fitted to. A more careless neighbour is added beside it.
+    """
+    from harness.pool.refined_ladder import refine_ladder  # noqa: PLC0415 - keeps --help fast
+
+    refined = refine_ladder(folder, out)
+    if as_json:
+        print_json({**refined.to_json(), "file": str(out)})
+        return
+    for sentence in refined.statements:
+        click.echo(sentence)
+    click.echo(str(out))
 
 
 @cli.command(
