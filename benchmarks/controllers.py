@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import sys
 import tempfile
 import time
 from pathlib import Path
@@ -17,10 +18,12 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from harness.campaign.loading import load_campaign
-from harness.runner.prepare import prepare
+from harness.runner.prepare import build_world, prepare
 from harness.sumo.world import SumoWorld
 
 ROOT = Path(__file__).parents[1]
+CELLS = 64
+FULL_LENGTH_STEPS = 200
 LISTENER = "{controller: 'harness.controllers.traci_style:StepListenerController', parameters: {listener: 'examples.idm_traci_style:Listener'}}"  # noqa: E501 - one campaign value
 FORMS = {
     "built in": ("{model: idm}", 1.0),
@@ -37,6 +40,24 @@ def fmu_form(folder: Path) -> tuple[str, float]:
 
     file = FmuBuilder.build_FMU(ROOT / "examples/idm_fmu.py", dest=folder, project_files=[ROOT / "examples/idm.py"])
     return f"{{fmu: {{file: '{file}', inputs: {{speed_mps: v, lead_speed_mps: v_lead, gap_m: gap}}, output: a}}}}", 6.0
+
+
+def external_process(n_episodes: int) -> float:
+    """Full-length (20 s) episodes per second of the example client, which shares one SUMO server with the harness."""
+    client = f"{sys.executable} {ROOT}/examples/traci_client/idm_client.py --port {{port}} --cells {{cells}}"
+    changes = [f"av={{traci: {{command: '{client}'}}}}", f"world.cells={CELLS}"]
+    campaign = load_campaign(ROOT / "scenarios/overtaking_forced.yaml", changes)
+    prepared, world = prepare(campaign), build_world(campaign)
+    loop = prepared.loop(world, traces="none")
+    try:
+        loop.run(0, prepared.states(0, CELLS))
+        began = time.perf_counter()
+        shard = loop.run(0, prepared.states(0, n_episodes))
+        elapsed_s = time.perf_counter() - began
+    finally:
+        loop.close()
+        world.close()
+    return float(shard.results.episode["n_steps"].sum()) / FULL_LENGTH_STEPS / elapsed_s
 
 
 def main() -> None:
@@ -62,6 +83,7 @@ def main() -> None:
                 best[name] = min(best[name], time.process_time() - began)
                 assert not shard.failures
         world.close()
+    print(f"\nExternal TraCI process, {CELLS} cells: {external_process(given.episodes):.0f} full-length episodes/s\n")
     print("| controller | CPU per episode, ms | ratio | at most |\n| --- | --- | --- | --- |")
     for name, (_, most) in forms.items():
         ratio = best[name] / best["built in"]

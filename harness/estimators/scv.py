@@ -21,7 +21,7 @@ from harness.campaign.models import EstimatorName
 from harness.estimators.accumulator import require_episodes
 from harness.estimators.block import Block
 from harness.estimators.estimate import Estimate
-from harness.estimators.scv_columns import Basis
+from harness.estimators.scv_columns import Basis, n_columns
 from harness.estimators.scv_stratum import CHUNK_ROWS, Stratum
 from harness.estimators.threads import side_by_side
 from harness.estimators.weighted_sums import WeightedSums, weighted_estimate
@@ -68,6 +68,9 @@ class Scv:
         strata, starts = np.unique(block.n_control_steps[order], return_index=True)
         first_ratios = block.first_ratios
         parts = list(zip(map(self._stratum, strata.tolist()), np.split(order, starts[1:]), strict=True))
+        n_surrogates = first_ratios.shape[2]
+        # The dearest first: else one thread would be left with it when the others have finished.
+        parts.sort(key=lambda part: -len(part[1]) * n_columns(part[0].level, n_surrogates, self.basis) ** 2)
 
         def add(part: tuple[Stratum, IntArray]) -> None:
             stratum, rows = part

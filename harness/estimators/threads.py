@@ -11,6 +11,8 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from typing import TypeVar
 
+from threadpoolctl import ThreadpoolController
+
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 
@@ -18,6 +20,11 @@ _Result = TypeVar("_Result")
 @cache
 def _threads() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="estimators")
+
+
+@cache
+def _libraries() -> ThreadpoolController:
+    return ThreadpoolController()
 
 
 def side_by_side(
@@ -32,7 +39,8 @@ def side_by_side(
     worthwhile : bool
         False does it without threads: handing over a trifle costs more than doing it.
     """
-    return list(_threads().map(function, items)) if worthwhile else [function(item) for item in items]
+    with _libraries().limit(limits=1, user_api="blas"):  # BLAS's own threads would wait for each other in busy loops
+        return list(_threads().map(function, items)) if worthwhile else [function(item) for item in items]
 
 
 def read_ahead(items: Iterator[_Item]) -> Iterator[_Item]:

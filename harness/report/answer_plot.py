@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 from harness.report.number_format import exponent_of, interval, number, plain, with_interval
 from harness.report.plot_style import BLUE, FULL_WIDTH_IN, GREY, INK, MUTED, Plot, new_figure
 from harness.report.rate_axis import decades, scaled
+from harness.report.shells_result import shells_result
 
 LOG_AXIS_RATIO = 30.0
 
@@ -57,7 +58,16 @@ def _intervals(estimates: dict[str, Any]) -> list[Interval]:
             isinstance(e.get(key), int | float) and math.isfinite(e[key]) for key in ("crash_rate", "ci_low", "ci_high")
         )
     ]
-    return sorted(rows, key=lambda row: not row.is_headline)
+    return [*sorted(rows, key=lambda row: not row.is_headline), *_conditional(estimates)]
+
+
+def _conditional(estimates: dict[str, Any]) -> list[Interval]:
+    """Return the interval of the conditional statement of a shells run, unless its tests have refuted it."""
+    found = shells_result(estimates)
+    if found is None or found.conditional.refuted:
+        return []
+    inside = found.conditional
+    return [Interval("if none outside", inside.rate, inside.low, inside.high, is_headline=False)]
 
 
 def _set_scale(axes: Axes, shown: list[Interval]) -> bool:
@@ -138,6 +148,9 @@ def _caption(estimates: dict[str, Any], shown: list[Interval], on_log: bool) -> 
         text += " The axis is logarithmic because they differ by orders of magnitude."
     if shown[0].rate == 0.0:
         text += " No crash was sampled: the interval reaches from zero to the upper bound."
+    elif shells_result(estimates) is not None:
+        if len(shown) > 1:
+            text += " The other one holds if there are no crashes outside the boundary."
     elif len(shown) > 1:
         text += (
             " Estimators that use the same tests are not independent: agreement among them is expected, not evidence."

@@ -13,9 +13,29 @@ from harness.report.number_format import count, number, percent, plain
 from harness.report.plot_style import BLUE, FULL_WIDTH_IN, GREY, INK, MUTED, VERMILLION, Plot, new_figure
 from harness.report.rate_axis import decades, scaled
 
+_WEIGHTED = (
+    "Left, the band should narrow around a level line: a rate that still climbs, or drops between jumps, has not "
+    "settled. Right, RHW should fall along the dotted line; each jump upwards is a crash with a large weight, and "
+    "many late jumps mean that the interval cannot be trusted yet."
+)
+_SHELLS = (
+    "Tests come in rounds, first inside the boundary. A shell without tests counts as free of crashes in the estimate "
+    "(line) and as anything in the interval (band), which is why the band begins wide and one-sided, and why the line "
+    "may jump when a shell is first tested. Right, RHW falls faster than the dotted line while what remains is to see "
+    "no crash outside, and along it where crashes must be counted."
+)
 
-def convergence_plot(estimates: dict[str, Any], target_rhw: float | None) -> Plot | None:
-    """Rate with its band, and RHW with its target, against tests; None without convergence records."""
+
+def convergence_plot(
+    estimates: dict[str, Any], target_rhw: float | None, *, of_conditional: bool = False
+) -> Plot | None:
+    """Rate with its band, and RHW with its target, against tests; None without convergence records.
+
+    Parameters
+    ----------
+    of_conditional : bool
+        Whether the target is one for the conditional statement of a shells run, which convergence does not record.
+    """
     curve = _curve(estimates.get("convergence") or [])
     if curve["n"].size < 2:
         return None
@@ -27,18 +47,18 @@ def convergence_plot(estimates: dict[str, Any], target_rhw: float | None) -> Plo
     for axes in (rate_axes, rhw_axes):
         _label_tests(axes, curve)
     _draw_rate(rate_axes, curve, confidence, level)
-    _draw_rhw(rhw_axes, curve, target_rhw)
+    _draw_rhw(rhw_axes, curve, None if of_conditional else target_rhw)
     alt = (
         f"Left: crash rate against number of tests with its {confidence} band, ending at "
         f"{number(curve['crash_rate'][-1])} after {count(curve['n'][-1])} tests. Right: relative half-width against "
         f"tests, ending at {number(curve['rhw'][-1])}."
     )
-    caption = (
-        "Left, the band should narrow around a level line: a rate that still climbs, or drops between jumps, has not "
-        "settled. Right, RHW should fall along the dotted line; each jump upwards is a crash with a large weight, and "
-        "many late jumps mean that the interval cannot be trusted yet."
-    )
-    return Plot("convergence", figure, alt, caption + (" No RHW was asked for." if target_rhw is None else ""))
+    caption = _WEIGHTED if estimates["headline"] != "shells" else _SHELLS
+    if target_rhw is None:
+        caption += " No RHW was asked for."
+    elif of_conditional:
+        caption += " The RHW that was asked for is that of the conditional statement; drawn is the assumption-free one."
+    return Plot("convergence", figure, alt, caption)
 
 
 def _plot_without_crash(curve: dict[str, Floats], confidence: str, level: str) -> Plot:

@@ -5,9 +5,13 @@ from __future__ import annotations
 import shlex
 from dataclasses import dataclass
 
+import pyarrow as pa
+
+from harness.report.number_format import number
 from harness.report.plot_style import Plot
 from harness.report.run_folder import RunFolder
 from harness.report.shard_tables import trace_rows
+from harness.report.shells_result import shells_result
 from harness.report.summary import RunSummary
 from harness.report.time_space_plot import TRACE_COLUMNS, time_space_plot, tracks_of
 from harness.report.worst_crashes import Crash
@@ -28,7 +32,7 @@ class GalleryRow:
 
 
 def crash_gallery(run: RunFolder, summary: RunSummary) -> list[GalleryRow]:
-    """Hardest impacts first, then the largest weights that are not among them.
+    """Hardest impacts first, then the largest weights (of shells: the outermost) that are not among them.
 
     Traced crashes go first where some of the worst have no trace: a diagram is worth more than a rank.
 
@@ -38,7 +42,9 @@ def crash_gallery(run: RunFolder, summary: RunSummary) -> list[GalleryRow]:
         If a traces shard is damaged.
     """
     rankings = [(summary.hardest.crashes, "impact")]
-    if not summary.all_weights_one:
+    if summary.from_shells:
+        rankings.append((summary.outermost.crashes, "outermost"))
+    elif not summary.all_weights_one:
         rankings.append((summary.heaviest.crashes, "weight"))
     traces = trace_rows(run, {crash.episode for ranked, _ in rankings for crash in ranked}, TRACE_COLUMNS)
     traced = set() if traces is None else set(traces.column("episode").unique().to_pylist())
@@ -54,10 +60,17 @@ def crash_gallery(run: RunFolder, summary: RunSummary) -> list[GalleryRow]:
             share_of_estimate=_share(crash, summary),
             component=component_name(run, crash.component),
             command=replay_command(run, crash.episode),
-            plot=time_space_plot(crash, tracks_of(traces, crash.episode)) if crash.episode in traced else None,
+            plot=_diagram(run, summary, crash, traces) if crash.episode in traced else None,
         )
         for crash, why in reasons.items()
     ]
+
+
+def _diagram(run: RunFolder, summary: RunSummary, crash: Crash, traces: pa.Table) -> Plot:
+    worth = f"weight {number(crash.weight)}"
+    if summary.from_shells:
+        worth = f"in the shell {component_name(run, crash.component)}, adding {number(crash.weight)} to the rate"
+    return time_space_plot(crash, tracks_of(traces, crash.episode), worth=worth)
 
 
 def replay_command(run: RunFolder, episode: int) -> str:
@@ -66,11 +79,13 @@ def replay_command(run: RunFolder, episode: int) -> str:
 
 
 def component_name(run: RunFolder, component: int) -> str:
-    """Name the importance function that an episode of the episode mixture followed; the forced cut-in is the first."""
+    """Name the shell of an episode, or the importance function it followed, of which the forced cut-in is the first."""
     if component < 0:
         return "–"
-    surrogates = run.campaign.get("surrogates")
+    surrogates, shells = run.campaign.get("surrogates"), shells_result(run.estimates)
     names = ["forced", *(surrogates if isinstance(surrogates, dict) else ())]
+    if shells is not None:
+        names = [shell.name for shell in shells.shells]
     return str(names[component]) if component < len(names) else str(component)
 
 

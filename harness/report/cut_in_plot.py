@@ -134,10 +134,15 @@ def _add_key(figure: Figure, ramps: list[tuple[str, ...]]) -> None:
 
 
 def _caption(summary: RunSummary) -> str:
-    per_test = number(float(summary.cut_in.weight.sum()) / max(summary.n_episodes, 1))
+    per_test = number(summary.per_test(float(summary.cut_in.weight.sum())))
     text = "Gap R2 and its rate R2dot (BV minus AV) when BV decides to cut in. "
     if summary.all_weights_one:
         text += f"Tests are naturalistic driving itself; there are {per_test} cut-ins per test."
+    elif summary.from_shells:
+        text += (
+            "Left, where the tests went; right, the same cut-ins with each shell counted by its probability, as they "
+            f"occur in naturalistic driving ({per_test} per test)."
+        )
     else:
         text += (
             "Left, where the tests went; right, the same cut-ins weighted by their likelihood ratio, as they occur in "

@@ -3,11 +3,21 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 from harness.report.answer_plot import rate_exponent
-from harness.report.number_format import MISSING, count, exponent_of, fixed, number, percent, power_of_ten
+from harness.report.number_format import (
+    MISSING,
+    count,
+    exponent_of,
+    fixed,
+    number,
+    percent,
+    power_of_ten,
+    significant,
+)
 from harness.report.run_folder import RunFolder
 from harness.report.summary import RunSummary
 
@@ -71,6 +81,8 @@ def _coverage_notes(run: RunFolder, summary: RunSummary) -> list[str]:
             "harness estimate again."
         )
     target, rhw = target_rhw(run), run.headline.get("rhw")
+    if asked_of_conditional(run):
+        rhw = run.headline["details"]["conditional"]["rhw"]
     if target is not None and (rhw is None or not rhw <= target):
         reached = "it is not defined without a crash" if rhw is None else f"it is {number(rhw)}"
         notes.append(f"The asked relative half-width of {target:g} was not reached: {reached}.")
@@ -82,6 +94,20 @@ def target_rhw(run: RunFolder) -> float | None:
     stop = run.campaign.get("stop")
     target = stop.get("rhw") if isinstance(stop, dict) else None
     return float(target) if isinstance(target, int | float) else None
+
+
+def asked_of_conditional(run: RunFolder) -> bool:
+    """Whether it is the conditional statement of a shells run that should reach the relative half-width."""
+    if run.method != "shells":
+        return False
+    settings = run.campaign["testing"].get("shells")
+    return isinstance(settings, dict) and settings.get("statement") == "conditional"
+
+
+def in_unit(estimates: dict[str, Any]) -> Callable[[float, int], str]:
+    """Return what writes a rate in the table's power of ten with a given number of significant digits."""
+    factor = 10.0 ** rate_exponent(estimates)
+    return lambda rate, digits: significant(rate / factor, digits)
 
 
 def _row(name: str, estimates: dict[str, Any], exponent: int) -> EstimateRow:

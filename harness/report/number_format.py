@@ -98,6 +98,11 @@ def percent(value: float | None) -> str:
     return f"{significant(shown, 2)} %" if shown >= 0.01 else f"{number(shown, 2)} %"
 
 
+def coarse_percent(value: float) -> str:
+    """Write a share of something that only matters where it is large: ``90 %``, ``1.2 %``, ``< 0.1 %``."""
+    return "< 0.1 %" if 0.0 < value < 1e-3 else percent(value)
+
+
 def duration(seconds: float | None) -> str:
     """Wall-clock time as ``1 h 02 min``, ``3 min 20 s`` or ``12.3 s``."""
     if seconds is None:

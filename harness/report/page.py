@@ -21,16 +21,20 @@ from harness.report.convergence_plot import convergence_plot
 from harness.report.crash_gallery import GalleryRow, crash_gallery
 from harness.report.crash_plot import crash_time_plot, impact_speed_plot
 from harness.report.cut_in_plot import cut_in_plot
-from harness.report.estimate_table import estimate_table, run_notes, target_rhw
+from harness.report.estimate_table import asked_of_conditional, estimate_table, in_unit, run_notes, target_rhw
 from harness.report.plot_style import RC, Plot, inline_svg, png, svg
 from harness.report.run_folder import RunFolder, read_run_folder
 from harness.report.settings_table import flat, setting_sections
 from harness.report.shard_tables import table_sizes
+from harness.report.shells_plot import shells_plot
+from harness.report.shells_result import SHOWN_IN_SECTION, ShellsResult, shells_result
 from harness.report.strata_plot import strata_plot
 from harness.report.summary import RunSummary, summarise
 from harness.report.weight_plot import weight_plot
 
-PLOT_NAMES = re.compile(r"(answer|convergence|weights|strata|cut_ins|impact_speed|crash_time|crash-\d+)\.(png|svg)")
+PLOT_NAMES = re.compile(
+    r"(answer|shells|convergence|weights|strata|cut_ins|impact_speed|crash_time|crash-\d+)\.(png|svg)"
+)
 
 
 @dataclass(frozen=True)
@@ -66,22 +70,23 @@ def write_report(folder: Path) -> Path:
     folder = Path(folder)
     run = read_run_folder(folder)
     sizes = table_sizes(run)
-    summary = summarise(run)
+    summary, shells = summarise(run), shells_result(run.estimates)
     with matplotlib.style.context(["default", RC]):
         gallery = crash_gallery(run, summary)
-        files, figures = _rendered(_plots(run, summary, gallery))
-    page = _page(run=run, summary=summary, sizes=sizes, gallery=gallery, figures=figures)
+        files, figures = _rendered(_plots(run, summary, shells, gallery))
+    page = _page(run=run, summary=summary, shells=shells, sizes=sizes, gallery=gallery, figures=figures)
     _write_plots(folder / "plots", files)
     write_atomically(folder / "report.html", page.encode("utf-8"))
     return folder / "report.html"
 
 
-def _plots(run: RunFolder, summary: RunSummary, gallery: list[GalleryRow]) -> list[Plot]:
+def _plots(run: RunFolder, summary: RunSummary, shells: ShellsResult | None, gallery: list[GalleryRow]) -> list[Plot]:
+    # Within a shell all tests weigh the same and there is one control step, the cut-in: nothing to draw of either.
+    drawn_by = [weight_plot(summary), strata_plot(summary)] if shells is None else [shells_plot(shells)]
     plots = [
         answer_plot(run.estimates),
-        convergence_plot(run.estimates, target_rhw(run)),
-        weight_plot(summary),
-        strata_plot(summary),
+        convergence_plot(run.estimates, target_rhw(run), of_conditional=asked_of_conditional(run)),
+        *drawn_by,
         cut_in_plot(summary),
         impact_speed_plot(summary),
         crash_time_plot(summary),
@@ -102,7 +107,13 @@ def _rendered(plots: list[Plot]) -> tuple[dict[str, bytes], dict[str, Figure]]:
 
 
 def _page(
-    *, run: RunFolder, summary: RunSummary, sizes: list[Any], gallery: list[GalleryRow], figures: dict[str, Figure]
+    *,
+    run: RunFolder,
+    summary: RunSummary,
+    shells: ShellsResult | None,
+    sizes: list[Any],
+    gallery: list[GalleryRow],
+    figures: dict[str, Figure],
 ) -> str:
     environment = Environment(
         loader=PackageLoader("harness.report", "."),
@@ -116,14 +127,17 @@ def _page(
     return environment.get_template("report.html.j2").render(
         run=run,
         summary=summary,
+        shells=shells,
         outcomes=_outcomes(summary),
         sizes=sizes,
         gallery=gallery,
         figures=figures,
         estimators=estimate_table(run.estimates),
+        in_unit=in_unit(run.estimates),
         notes=run_notes(run, summary),
         target_rhw=target_rhw(run),
-        diagnostics=flat(run.estimates.get("diagnostics") or {}) if run.estimates.get("diagnostics") else [],
+        asked_of_conditional=asked_of_conditional(run),
+        diagnostics=_diagnostics(run, shells),
         details=_details(run),
         table_errors=run.manifest.get("table_errors") or [],
         settings=setting_sections(run.campaign, reproducible=run.manifest.get("reproducible")),
@@ -139,6 +153,7 @@ def _filters() -> dict[str, Callable[..., str]]:
         "count": number_format.count,
         "decimal": number_format.decimal,
         "percent": number_format.percent,
+        "coarse_percent": number_format.coarse_percent,
         "duration": number_format.duration,
         "plain": number_format.plain,
         "size": number_format.size,
@@ -150,17 +165,28 @@ def _filters() -> dict[str, Callable[..., str]]:
 
 
 def _outcomes(summary: RunSummary) -> list[tuple[str, float, float, float]]:
-    """Per outcome: name, tests, share of the tests, sum of weights per test."""
+    """Per outcome: name, tests, share of the tests, how often it happens per naturalistic test."""
     n = max(summary.n_episodes, 1)
     return [
-        (name, float(summary.count[k]), float(summary.count[k]) / n, float(summary.weight[k]) / n)
+        (name, float(summary.count[k]), float(summary.count[k]) / n, summary.per_test(float(summary.weight[k])))
         for k, name in enumerate(OUTCOMES)
     ]
 
 
+def _diagnostics(run: RunFolder, shells: ShellsResult | None) -> list[tuple[str, Any]]:
+    """Return sums of the run as (key, value); of shells without those about weights, which have none to say."""
+    content = run.estimates.get("diagnostics")
+    leaves = flat(content) if content else []
+    return leaves if shells is None else [(path, leaf) for path, leaf in leaves if leaf not in (None, {})]
+
+
 def _details(run: RunFolder) -> list[tuple[str, Any]]:
-    """Return what single estimators report about themselves, as (estimator.key, value)."""
-    found = {name: e.get("details") for name, e in run.estimates["estimates"].items() if e.get("details")}
+    """Return what single estimators report about themselves and no other section shows, as (estimator.key, value)."""
+    found = {
+        name: {key: value for key, value in e["details"].items() if name != "shells" or key not in SHOWN_IN_SECTION}
+        for name, e in run.estimates["estimates"].items()
+        if e.get("details")
+    }
     return flat(found) if found else []
 
 

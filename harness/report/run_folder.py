@@ -42,6 +42,12 @@ class RunFolder:
         return int(self.manifest["n_episodes"])
 
     @property
+    def method(self) -> str:
+        """How tests were drawn (``testing.method``); empty where the campaign does not say."""
+        testing = self.campaign.get("testing")
+        return str(testing.get("method", "")) if isinstance(testing, dict) else ""
+
+    @property
     def headline(self) -> dict[str, Any]:
         """The estimate that answers the campaign's question."""
         chosen: dict[str, Any] = self.estimates["estimates"][self.estimates["headline"]]

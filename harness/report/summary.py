@@ -16,6 +16,7 @@ from harness.report.cut_in_grid import CutInGrid
 from harness.report.fine_histogram import FineHistogram, Floats
 from harness.report.run_folder import RunFolder
 from harness.report.shard_tables import episode_batches
+from harness.report.shell_weights import log_scales
 from harness.report.worst_crashes import WorstCrashes
 from harness.vehicles.kinematics import STEP_S
 
@@ -52,10 +53,13 @@ class RunSummary:
     """Counts, weight sums and histograms of a run.
 
     Weighted sums use the likelihood ratio of each episode: divided by the number of tests they say how often something
-    happens in naturalistic driving. Failed episodes are counted but have no weight.
+    happens in naturalistic driving. Tests from shells weigh p_s/n_s instead, and their sums need no division:
+    `per_test` knows. Failed episodes are counted but have no weight.
 
     Attributes
     ----------
+    log_scales : ndarray, shape (S,), optional
+        For tests that were drawn from shells: added to the recorded log-weight of each, see `shell_weights`.
     count, weight : ndarray, shape (5,)
         Episodes and sum of weights per outcome, in the order of ``OUTCOMES``.
     causes : Counter of str
@@ -66,8 +70,11 @@ class RunSummary:
         Of crashes: number of control steps, impact speed, time of the crash, time from cut-in to crash.
     cut_in, cut_in_crash : CutInGrid
         All cut-ins, and those that ended in a crash.
+    hardest, heaviest, outermost : WorstCrashes
+        By impact speed, by weight, and (of tests from shells) from the most careless shell inwards.
     """
 
+    log_scales: Floats | None = None
     count: Floats = field(default_factory=lambda: np.zeros(len(OUTCOMES)))
     weight: Floats = field(default_factory=lambda: np.zeros(len(OUTCOMES)))
     causes: Counter[str] = field(default_factory=Counter)
@@ -82,6 +89,7 @@ class RunSummary:
     cut_in_crash: CutInGrid = field(default_factory=CutInGrid)
     hardest: WorstCrashes = field(default_factory=lambda: WorstCrashes("impact_speed_mps"))
     heaviest: WorstCrashes = field(default_factory=lambda: WorstCrashes("log_weight"))
+    outermost: WorstCrashes = field(default_factory=lambda: WorstCrashes("component"))
 
     @property
     def n_episodes(self) -> int:
@@ -98,9 +106,20 @@ class RunSummary:
         """Whether no maneuver was drawn from an importance function: plain naturalistic driving."""
         return self.weights_seen == (0.0, 0.0)
 
+    @property
+    def from_shells(self) -> bool:
+        """Whether tests were drawn from shells."""
+        return self.log_scales is not None
+
+    def per_test(self, weight: float) -> float:
+        """How often per naturalistic test something happens whose weights add up to ``weight``."""
+        return weight if self.from_shells else weight / max(self.n_episodes, 1)
+
     def add(self, batch: pa.RecordBatch, outcome: npt.NDArray[np.int64]) -> None:
         """Add a batch whose outcomes are given as indices into ``OUTCOMES``."""
         columns = {name: _floats(batch.column(name)) for name in NUMBERS}
+        if self.log_scales is not None:
+            columns["log_weight"] = columns["log_weight"] + self.log_scales[columns["component"].astype(np.int64)]
         valid, crash = outcome != FAILED, outcome == CRASH
         log_weight = columns["log_weight"]
         weight = np.where(valid, np.exp(log_weight), 0.0)
@@ -148,6 +167,8 @@ class RunSummary:
             histogram.add(values[crash], weight[crash])
         self.hardest.add(columns, crash)
         self.heaviest.add(columns, crash)
+        if self.from_shells:
+            self.outermost.add(columns, crash)
 
 
 def summarise(run: RunFolder) -> RunSummary:
@@ -158,7 +179,7 @@ def summarise(run: RunFolder) -> RunSummary:
     RunFolderError
         If a shard is damaged or holds an unknown outcome.
     """
-    summary = RunSummary()
+    summary = RunSummary(log_scales(run) if run.method == "shells" else None)
     for batch in episode_batches(run, COLUMNS):
         summary.add(batch, _outcome_index(batch.column("outcome"), run))
     return summary

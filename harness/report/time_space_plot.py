@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 
 from harness.records.schemas import VEHICLES
 from harness.report.fine_histogram import Floats
-from harness.report.number_format import decimal, number
+from harness.report.number_format import decimal
 from harness.report.plot_style import HALF_WIDTH_IN, INK, VEHICLE_COLOURS, Plot, new_figure
 from harness.report.worst_crashes import Crash
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
@@ -44,8 +44,11 @@ def tracks_of(traces: pa.Table, episode: int) -> dict[str, Track]:
     return tracks
 
 
-def time_space_plot(crash: Crash, tracks: dict[str, Track]) -> Plot:
-    """Positions in a frame that moves with BV's initial speed, and speeds, with cut-in and crash marked."""
+def time_space_plot(crash: Crash, tracks: dict[str, Track], *, worth: str) -> Plot:
+    """Positions in a frame that moves with BV's initial speed, and speeds, with cut-in and crash marked.
+
+    ``worth`` ends the caption: what the crash means for the estimate.
+    """
     figure = new_figure(HALF_WIDTH_IN, 4.7)
     position, speed = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
     frame_mps = float(tracks["BV"].v_mps[0]) if "BV" in tracks else crash.v_bv_mps
@@ -63,7 +66,7 @@ def time_space_plot(crash: Crash, tracks: dict[str, Track]) -> Plot:
     )
     caption = (
         f"R2 = {decimal(crash.cut_in_r2_m)} m and R2dot = {decimal(crash.cut_in_r2dot_mps)} m/s at the cut-in, crash "
-        f"{decimal(crash.crash_time_s - crash.cut_in_time_s)} s later; weight {number(crash.weight)}."
+        f"{decimal(crash.crash_time_s - crash.cut_in_time_s)} s later; {worth}."
     )
     return Plot(f"crash-{crash.episode:09d}", figure, alt, caption)
 

@@ -32,7 +32,7 @@ class Crash:
 
     @property
     def weight(self) -> float:
-        """Likelihood ratio: what this one crash adds to the sum that is the estimate."""
+        """What this one crash adds to the sum that is the estimate: likelihood ratio, or p_s/n_s in a shell."""
         return math.exp(self.log_weight)
 
     @property

@@ -11,17 +11,17 @@ from harness.environment.loading import load_environment
 from harness.importance.build import needs_tables
 from harness.pool.storage import campaign_pool_key, pool_path
 from harness.sumo.av_type import av_type
+from harness.sumo.shim import shim_library
 from harness.vehicles.models import surrogate_records
 
 EPISODES_PER_SECOND_PER_CORE = {
-    ("sumo", "nde"): 2500, ("sumo", "shells"): 1500, ("twin", "shells"): 20000,
-    ("sumo", "forced"): 1200, ("sumo", "step_mixture"): 1300, ("sumo", "episode_mixture"): 1600,
-    ("twin", "nde"): 40000, ("twin", "forced"): 25000, ("twin", "step_mixture"): 15000,
-    ("twin", "episode_mixture"): 15000,
-}  # fmt: skip
-"""Orders of magnitude, measured on one core of a 2020s server; `benchmarks/` measures yours."""
+    "sumo": {"nde": 3500, "forced": 1500, "step_mixture": 1600, "episode_mixture": 2000, "shells": 1700},
+    "sumo with shim": {"nde": 6000, "forced": 2500, "step_mixture": 2700, "episode_mixture": 3000, "shells": 2700},
+    "twin": {"nde": 70000, "forced": 32000, "step_mixture": 25000, "episode_mixture": 18000, "shells": 30000},
+}
+"""Orders of magnitude, recording included, measured on one core of a 2020s server; `benchmarks/` measures yours."""
 POOL_S = "about half a minute"
-KB_PER_EPISODE = 0.4
+KB_PER_EPISODE = 0.2
 KB_PER_MOMENT = 0.1
 MOMENTS_PER_EPISODE = {"all": 70, "first_9": 9, "none": 0}
 
@@ -37,7 +37,8 @@ def plan_campaign(campaign: Campaign) -> dict[str, Any]:
     """
     if campaign.av.sumo is not None:
         av_type(campaign.av.sumo)
-    rate = EPISODES_PER_SECOND_PER_CORE[campaign.world.engine, campaign.testing.method] * (os.cpu_count() or 1)
+    engine = "sumo with shim" if campaign.world.engine == "sumo" and shim_library() else campaign.world.engine
+    rate = EPISODES_PER_SECOND_PER_CORE[engine][campaign.testing.method] * (os.cpu_count() or 1)
     moments = MOMENTS_PER_EPISODE[campaign.records.moments] if needs_tables(campaign) else 0
     episodes = campaign.stop.episodes
     return {

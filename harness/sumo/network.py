@@ -4,7 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+
+from harness.arrays import FloatArray
 from harness.errors import CampaignError
+from harness.outcomes import AV, BV, LV
 
 MOST_CELLS = 256
 
@@ -24,6 +28,15 @@ EXACT_OPTIONS = (
     "--xml-validation.net", "never",
 )  # fmt: skip
 """Ballistic update; collisions reported and otherwise ignored; no teleports; nothing random."""
+
+
+PARKED_M = {LV: 300.0, BV: 200.0, AV: 100.0}
+"""Where the vehicles of a cell stand that has not been given an episode."""
+
+
+def parked(n_cells: int) -> FloatArray:
+    """Positions (m) of parked vehicles, shape (n_cells, 3)."""
+    return np.tile([PARKED_M[LV], PARKED_M[BV], PARKED_M[AV]], (n_cells, 1))
 
 
 def network_file(n_cells: int) -> Path:

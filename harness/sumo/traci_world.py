@@ -18,14 +18,13 @@ from harness.arrays import BoolArray, FloatArray, Int8Array, IntArray
 from harness.campaign.models import TraciProcess
 from harness.errors import WorldDisagreementError
 from harness.outcomes import AV, BV, LV, VEHICLES
-from harness.sumo.network import EXACT_OPTIONS, committed_file, network_file
+from harness.sumo.network import EXACT_OPTIONS, PARKED_M, committed_file, network_file, parked
 from harness.sumo.program import ConnectedProgram
 from harness.twin import advance
 from harness.world import AVLostError
 
 LEFT, RIGHT = 1, 0
 NEVER_PLAN_S, PLAN_NOW_S = 1000.0, 0.1
-PARKED_M = {LV: 300.0, BV: 200.0, AV: 100.0}
 _SUBSCRIBED = (tc.VAR_LANEPOSITION, tc.VAR_SPEED, tc.VAR_LANE_INDEX)
 
 
@@ -44,7 +43,7 @@ class TraciWorld:
 
     def __init__(self, n_cells: int, av: TraciProcess, step_time_s: float, *, acts_before_cut_in: bool = False) -> None:
         self.acts_before_cut_in = acts_before_cut_in
-        self.x: FloatArray = np.zeros((n_cells, 3))
+        self.x: FloatArray = parked(n_cells)
         self.v: FloatArray = np.zeros((n_cells, 3))
         self._av = av
         self._step_time_s = step_time_s
@@ -78,6 +77,8 @@ class TraciWorld:
             self._program = ConnectedProgram(self._av, self.n_cells, [*files, *EXACT_OPTIONS], self._step_time_s)
             self._program.answer(self._populate, self._av.connect_time_s)
             self._program.watch()
+            idle = np.setdiff1d(np.arange(self.n_cells), cells)  # a program begun again knows nothing of the last one
+            self.x[idle], self.v[idle] = parked(idle.size), 0.0
 
     def _populate(self) -> None:
         """Park the vehicles of all cells, step once so that they exist, and subscribe to them."""

@@ -22,7 +22,7 @@ import numpy as np
 from harness.arrays import BoolArray, FloatArray, Int8Array, IntArray
 from harness.errors import CampaignError, WorldDisagreementError
 from harness.outcomes import AV, BV, LV, VEHICLES
-from harness.sumo.network import EXACT_OPTIONS, committed_file, network_file
+from harness.sumo.network import EXACT_OPTIONS, PARKED_M, committed_file, network_file, parked
 from harness.sumo.shim import Shim, open_shim
 from harness.twin import advance
 
@@ -32,7 +32,6 @@ if TYPE_CHECKING:
 LEFT, RIGHT = 1, 0
 NEVER_PLAN_S, PLAN_NOW_S = 1000.0, 0.1
 SPEED_CHECK_STEPS = 10
-_PARKED_M = {LV: 300.0, BV: 200.0, AV: 100.0}
 
 
 class SumoWorld:
@@ -70,7 +69,7 @@ class SumoWorld:
                 expected="one at a time",
                 mend="Close the other world first, or use another process.",
             )
-        self.x: FloatArray = np.tile([_PARKED_M[vehicle] for vehicle in (LV, BV, AV)], (n_cells, 1))
+        self.x: FloatArray = parked(n_cells)
         self.v: FloatArray = np.zeros((n_cells, 3))
         self._api: Any = _gui_api() if gui else libsumo
         self._vanilla = vanilla
@@ -117,13 +116,13 @@ class SumoWorld:
         for k, names in enumerate(self._names):
             self._api.route.add(f"cell{k}", [f"cell{k}"])
             for vehicle, name in enumerate(names):
-                lane, position = str(RIGHT if vehicle == AV else LEFT), str(_PARKED_M[vehicle])
+                lane, position = str(RIGHT if vehicle == AV else LEFT), str(PARKED_M[vehicle])
                 self._api.vehicle.add(
                     name, f"cell{k}", typeID=self._type_of(vehicle), departLane=lane, departPos=position
                 )
                 self._api.vehicle.setSpeedMode(name, 0)
                 self._api.vehicle.setLaneChangeMode(name, 0)
-                self._move(k, vehicle, _PARKED_M[vehicle], 0.0)
+                self._move(k, vehicle, PARKED_M[vehicle], 0.0)
         # A vehicle that is still pending after the first step ignores moveTo: all stand on the road before it.
         self._api.simulationStep()
         if self._shim is not None:

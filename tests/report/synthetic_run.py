@@ -12,8 +12,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from scipy import stats
 from synthetic_overtaking import N_SURROGATES, STEP_S, Episodes, simulate
+from synthetic_shells import put_into_shells, shells_estimates
 
 from harness.campaign.models import Campaign
+from harness.estimators.run_estimates import CampaignFacts
 from harness.records.schemas import CUT_IN, STAY, VEHICLES, episodes_schema, moments_schema, traces_schema
 
 HASH = "0123456789abcdef"
@@ -34,6 +36,13 @@ class RunRecipe:
     seed: int = 7
     name: str = "synthetic"
     target_rhw: float | None = 0.1
+    outside: str = "safe"
+    statement: str = "assumption_free"
+
+    @property
+    def controlled(self) -> bool:
+        """Whether maneuvers were drawn from importance functions."""
+        return self.method not in {"nde", "shells"}
 
 
 RECIPES = {
@@ -44,16 +53,24 @@ RECIPES = {
     "nde": RunRecipe(method="nde", level=2e6, n_episodes=3_000, target_rhw=None),
     "nde_no_crashes": RunRecipe(method="nde", n_episodes=1_500, traces="none"),
     "failed": RunRecipe(n_failed=25, n_episodes=1_500, traces="none"),
+    "shells": RunRecipe(method="shells", moments=False, n_episodes=1_500, n_failed=5),
+    "shells_refuted": RunRecipe(method="shells", moments=False, n_episodes=1_500, outside="crashes"),
+    "shells_no_crashes": RunRecipe(method="shells", moments=False, n_episodes=1_500, crashes=False, traces="none"),
+    "shells_inside_only": RunRecipe(
+        method="shells", moments=False, n_episodes=1_500, traces="none", outside="untested", statement="conditional"
+    ),
 }
 
 
 def write_run(folder: Path, recipe: RunRecipe) -> Path:
     """Write the folder and return it."""
-    controlled = recipe.method != "nde"
-    episodes = simulate(recipe.n_episodes, seed=recipe.seed, level=recipe.level, controlled=controlled)
+    drawn = recipe.method != "nde"
+    episodes = simulate(recipe.n_episodes, seed=recipe.seed, level=recipe.level, controlled=drawn)
     if not recipe.crashes:
         _let_every_crash_time_out(episodes)
     _let_some_fail(episodes, recipe.n_failed)
+    if recipe.method == "shells":
+        put_into_shells(episodes, outside=recipe.outside, seed=recipe.seed)
     for table in ("episodes", "moments", "traces"):
         (folder / table).mkdir(parents=True)
     shards = [_write_shard(folder, episodes, recipe, first) for first in range(0, recipe.n_episodes, recipe.shard_size)]
@@ -94,13 +111,13 @@ def _write_shard(folder: Path, episodes: Episodes, recipe: RunRecipe, first: int
 
 
 def _episodes_table(episodes: Episodes, rows: np.ndarray, recipe: RunRecipe) -> pa.Table:
-    controlled = recipe.method != "nde"
-    n_importance, n_surrogates = (N_SURROGATES + 1, N_SURROGATES) if controlled else (0, 0)
+    n_importance, n_surrogates = (N_SURROGATES + 1, N_SURROGATES) if recipe.controlled else (0, 0)
     schema = episodes_schema(n_importance, n_surrogates)
     columns: dict[str, Any] = {name: values[rows] for name, values in episodes.columns.items()}
     columns |= {
         "episode": rows,
         "seed": np.full(len(rows), recipe.seed),
+        "pool_cut_in": [int(r) if recipe.method == "shells" else None for r in rows],
         "log_p_cut_in": np.full(len(rows), np.nan),
         "log_q": [list(map(float, episodes.log_q[r][:n_importance])) for r in rows],
         "martingale": [[0.0] * n_surrogates for _ in rows],
@@ -180,7 +197,8 @@ def _campaign(recipe: RunRecipe) -> dict[str, Any]:
             "description": "Synthetic overtaking tests that exercise the report.",
             "seed": recipe.seed,
             "environment": {"lane_change_level": recipe.level},
-            "testing": {"method": recipe.method},
+            "testing": {"method": recipe.method}
+            | ({"shells": {"statement": recipe.statement}} if recipe.method == "shells" else {}),
             "records": {"traces": recipe.traces, "moments": "first_9" if recipe.moments else "none"},
             "stop": {"episodes": recipe.n_episodes, "rhw": recipe.target_rhw},
         }
@@ -206,7 +224,7 @@ def _manifest(recipe: RunRecipe, shards: list[dict[str, Any]], episodes: Episode
              "monte_carlo": 3.18e-5, "std_error": 2.1e-7},
             {"surrogate": "SM-II", "table": "before the cut-in", "quantity": "crash probability",
              "table_value": 8.05e-6, "monte_carlo": 7.96e-6, "std_error": 6.0e-8},
-        ] if recipe.method != "nde" else [],
+        ] if recipe.controlled else [],
     }  # fmt: skip
 
 
@@ -237,6 +255,9 @@ def _clopper_pearson(crash: np.ndarray) -> dict[str, Any]:
 
 def _estimates(recipe: RunRecipe, episodes: Episodes) -> dict[str, Any]:
     c = episodes.columns
+    if recipe.method == "shells":
+        facts = CampaignFacts(recipe.name, HASH, recipe.level, 0.9, float(c["av_distance_m"].mean()))
+        return shells_estimates(episodes, facts)
     valid, crash = c["outcome"] != "failed", c["outcome"] == "crash"
     y = np.where(crash, np.exp(c["log_weight"]), 0.0)[valid]
     nade = _normal(y)

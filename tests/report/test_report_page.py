@@ -29,6 +29,10 @@ EXPECTED = {
     "nde": ALWAYS | OF_CRASHES,
     "nde_no_crashes": ALWAYS,
     "failed": ALWAYS | OF_WEIGHTS | OF_CRASHES | {"strata"},
+    "shells": ALWAYS | OF_CRASHES | {"shells"},
+    "shells_refuted": ALWAYS | OF_CRASHES | {"shells"},
+    "shells_no_crashes": ALWAYS | {"cut_ins", "shells"},
+    "shells_inside_only": ALWAYS | OF_CRASHES | {"shells"},
 }
 
 

@@ -212,6 +212,16 @@ def test_an_episode_after_many_others_is_the_same_as_in_a_fresh_simulation(smoke
         assert after_others.traces[row].tobytes() == fresh.traces[row].tobytes()
 
 
+@pytest.mark.parametrize("shim", [True, False])
+def test_fewer_episodes_than_cells_are_run(shim, smoke, open_world):
+    prepared = prepare(smoke())
+    few = prepared.loop(open_world(8, shim=shim)).run(0, prepared.states(0, 3))
+    assert (
+        few.results.episode.tobytes()
+        == prepared.loop(TwinWorld(2)).run(0, prepared.states(0, 3)).results.episode.tobytes()
+    )
+
+
 def test_a_cut_in_changes_only_its_own_cell(open_world):
     world = open_world(4)
     x, v = apart(4)

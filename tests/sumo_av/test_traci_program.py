@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 
 from harness.errors import CampaignError, TooManyFailedError, WorldDisagreementError
-from harness.outcomes import FAILED
+from harness.outcomes import AV, FAILED
 from harness.runner.campaign_run import run_campaign
 from harness.runner.replay import replay_episode
+from harness.sumo.traci_world import TraciWorld
 from tests.sumo_av.misbehaving_client import FAULT_STEP
-from tests.sumo_av.running import EXAMPLE, MISBEHAVING, bits, campaign, program, run, run_idm
+from tests.sumo_av.running import EXAMPLE, MISBEHAVING, bits, campaign, program, run, run_idm, run_in
 
 
 def assert_same_motion(shard, expected, rows):
@@ -29,6 +30,22 @@ def test_commands_to_an_av_that_must_hold_its_speed_are_overruled():
         cut = expected.results.episode["cut_in_step"][row]
         assert shard.traces[row][: cut + 2, :, :2].tobytes() == expected.traces[row][: cut + 2, :, :2].tobytes()
     assert any(bits(shard, row) != bits(expected, row) for row in range(6)), "it never drove"
+
+
+def test_with_before_cut_in_controller_the_program_drives_from_the_start():
+    av = program(MISBEHAVING, "pushes_held_avs")
+    world = TraciWorld(2, av.traci, 60.0, acts_before_cut_in=True)
+    try:
+        (shard,) = run_in(world, av, [(0, 2)])
+    finally:
+        world.close()
+    assert not shard.failures
+    assert shard.traces[0][3, AV, 1] < shard.traces[0][0, AV, 1] - 1.0
+
+
+def test_cells_that_never_get_an_episode_stay_parked():
+    shard, expected = run(program(EXAMPLE), 0, 3, cells=8), run_idm(0, 3)
+    assert_same_motion(shard, expected, range(3))
 
 
 def test_connecting_late_is_no_fault():
