@@ -313,23 +313,40 @@ def pool(campaign_file: Path, *, out: Path | None, overrides: Sequence[str], as_
     "--estimator",
     "-e",
     "estimators",
-    type=click.Choice(["nde", "nade", "mixture_cv", "scv"]),
+    type=click.Choice(["nde", "nade", "mixture_cv", "scv", "shells", "martingale", "replay"]),
     multiple=True,
     help="Only this one; may be given several times.",
 )
 @click.option("--confidence", type=click.FloatRange(0, 1, min_open=True, max_open=True), help="Level of intervals.")
+@click.option(
+    "--pool", "pool_file", type=_FILE, help="Pool of cut-ins to replay surrogates of. Default: the run's own."
+)
 @click.option("--write", is_flag=True, help="Replace DIR/estimates.json by the result.")
 @_json_option
 def estimate(
-    folder: Path, *, estimators: Sequence[EstimatorName], confidence: float | None, write: bool, as_json: bool
+    folder: Path,
+    *,
+    estimators: Sequence[EstimatorName],
+    confidence: float | None,
+    pool_file: Path | None,
+    write: bool,
+    as_json: bool,
 ) -> None:
     """Estimate the crash rate again from the records in DIR, with any estimator.
 
-    Nothing is simulated. An estimator that the records do not allow is shown with the reason.
+    Nothing is simulated in SUMO. An estimator that the records do not allow is shown with the reason.
+
+    'replay' puts surrogates in the AV's place, in the twin. It needs a pool of cut-ins, which is built (about half a
+    minute) when 'replay' is asked for by name and it is not there yet.
     """
     from harness.estimators import estimate_run  # noqa: PLC0415 - keeps --help fast
+    from harness.progress import terminal_progress  # noqa: PLC0415 - keeps --help fast
 
-    content = estimate_run(folder, estimators=estimators or None, confidence=confidence)
+    bar = terminal_progress() if "replay" in estimators else None
+    with bar or nullcontext():
+        content = estimate_run(
+            folder, estimators=estimators or None, confidence=confidence, pool=pool_file, progress=bar
+        )
     if write:
         write_json(folder / "estimates.json", content)
     if as_json:

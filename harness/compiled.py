@@ -32,6 +32,7 @@ KERNEL_SOURCES = (
     "importance/*.py",
     "episode/*.py",
     "pool/enumeration.py",
+    "pool/replay.py",
     "twin.py",
 )
 """All files that compiled code may come from, or take constants from (a test holds this against the imports)."""

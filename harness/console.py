@@ -142,6 +142,14 @@ def print_estimates(content: dict[str, Any]) -> None:
     for name, entry in content["estimates"].items():
         for remark in [*entry.get("warnings", ()), *filter(None, [entry.get("reason")])]:
             click.echo(f"{name}: {remark}")
+    if (alarm := content.get("diagnostics", {}).get("alarm", {})).get("raised"):
+        rates = alarm["surrogate_crash_rates"]
+        click.secho(
+            "ALARM: replayed surrogates do not crash as often as the pool says (p-value "
+            f"{min(rates['p_value_holm'], rates['p_value_jointly']):.1e}): weights, maneuvers, twin or pool are wrong. "
+            "See diagnostics.alarm.",
+            fg="red",
+        )
     if shells := content["estimates"].get("shells", {}).get("details", {}).get("shells"):
         console.print(_shells_table(shells))
     print_statements(content)

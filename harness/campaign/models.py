@@ -409,7 +409,7 @@ class PoolSettings(Section):
         0.005, ge=0.001, le=0.2, description="standard error of the surrogates' crash rates to reach, relative"
     )
     cut_ins_per_shell: Whole = Field(
-        10_000, ge=100, le=1_000_000, description="cut-ins kept of each shell: the most tests that it can give"
+        25_000, ge=100, le=1_000_000, description="cut-ins kept of each shell: the most tests that it can give"
     )
     seed: Whole = Field(1, ge=0, lt=2**63, description="every random number of the pool follows from it")
 
@@ -523,7 +523,7 @@ class Campaign(Section):
             "scv": (self.records.moments != "none", "records.moments first_9 or all"),
             "shells": (method == "shells", "testing.method shells"),
             "nade": (method != "shells", "another testing.method than shells"),
-            "martingale": (method in ("step_mixture", "episode_mixture"), "testing.method step_mixture"),
+            "martingale": (False, "a stored run: never stop on regression residuals alone"),
             "replay": (False, "a stored run: give it to `harness estimate`"),
         }
         available, need = needs.get(watched or "", (True, ""))

@@ -21,6 +21,7 @@ from harness.criticality.after_cut_in import LEVELS, build_after_cut_in, level_s
 from harness.criticality.before_cut_in import build_before_cut_in, naturalistic_pmf
 from harness.criticality.immediate import build_immediate
 from harness.environment.driving import Environment
+from harness.vehicles.models import MODEL_FIELDS
 
 _FORMAT = 2
 """Raise it when the meaning of a table changes."""
@@ -45,7 +46,7 @@ def tables_hash(environment: Environment, driver: RecordArray, challenge: str) -
         name: environment.numbers[name][0].item() for name in environment.numbers.dtype.fields or () if name != "level"
     }
     axes = {name: list(value) for name, value in vars(grid).items() if isinstance(value, grid.Axis)}
-    surrogate = {name: driver[name][0].item() for name in driver.dtype.fields or ()}
+    surrogate = {name: driver[name][0].item() for name in MODEL_FIELDS}
     content = json.dumps([_FORMAT, challenge, numbers, axes, surrogate, LEVELS], sort_keys=True)
     return hashlib.sha256(content.encode()).hexdigest()[:24]
 

@@ -13,6 +13,7 @@ import numpy as np
 from harness.arrays import BoolArray, FloatArray, IntArray
 from harness.campaign.models import Method
 from harness.pool.shells import ShellDesign
+from harness.pool.surrogate_replay import KnownRates
 
 MAX_CONTROL_STEPS = 9
 """Control steps that sparse control variates are built from, at most ([paper] section VI-E)."""
@@ -49,6 +50,12 @@ class Block:
         Stratum of each test, where they are drawn from shells.
     shells : ShellDesign or None
         Those strata and their probabilities.
+    martingale : (n, J) float64 or None
+        Per surrogate the sum of martingale terms, of mean exactly 0; only where it was asked for.
+    surrogates_crash : (n, D) bool or None
+        Which surrogates of a pool would have crashed on the same traffic; only where it was asked for.
+    known_rates : KnownRates or None
+        Their crash rates.
     """
 
     first_episode: int
@@ -66,6 +73,9 @@ class Block:
     log_p_cut_in: FloatArray | None = None
     component: IntArray | None = None
     shells: ShellDesign | None = None
+    martingale: FloatArray | None = None
+    surrogates_crash: BoolArray | None = None
+    known_rates: KnownRates | None = None
 
     def __post_init__(self) -> None:
         n = len(self.crash)
@@ -85,6 +95,10 @@ class Block:
                 raise ValueError(f"Block.{name} has shape {array.shape}, expected {shape}")
         if self.first_ratios is not None and self.first_ratios.shape[:2] != (n, MAX_CONTROL_STEPS):
             raise ValueError(f"Block.first_ratios has shape {self.first_ratios.shape}, expected ({n}, 9, J)")
+        for name in ("martingale", "surrogates_crash"):
+            array = getattr(self, name)
+            if array is not None and array.shape[:1] != (n,):
+                raise ValueError(f"Block.{name} has shape {array.shape}, expected ({n}, …)")
         if np.any(self.crash & self.failed):
             raise ValueError("Block: an episode is both crashed and failed")
         if np.isnan(self.log_weight).any():

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from harness.campaign.models import Method
+from harness.estimators.alarm import Alarm
 from harness.estimators.block import Block
 from harness.estimators.exact_sum import MomentSums
 
@@ -39,11 +40,13 @@ class Diagnostics:
         self._cut_in = MomentSums()
         self._contact = MomentSums()
         self._ratios: list[MomentSums] = []
+        self.alarm = Alarm()
 
     def add(self, block: Block) -> None:
         """Add one block."""
         weights = block.weights()
         self.method = block.method
+        self.alarm.add(block)
         self.n += len(block)
         self.n_failed += int(np.count_nonzero(block.failed))
         self.n_cut_ins += int(np.count_nonzero(block.cut_in))
@@ -59,6 +62,7 @@ class Diagnostics:
     def merge(self, other: Diagnostics) -> None:
         """Add the sums over other episodes."""
         self.method = other.method if self.method is None else self.method
+        self.alarm.merge(other.alarm)
         self.n += other.n
         self.n_failed += other.n_failed
         self.n_cut_ins += other.n_cut_ins

@@ -11,15 +11,24 @@ from harness.campaign.loading import load_campaign
 from harness.campaign.models import Campaign, EstimatorName
 from harness.errors import RunFolderError
 from harness.estimators.block import Block
-from harness.estimators.estimate import finite_json
-from harness.estimators.from_records import EPISODE_COLUMNS, MOMENT_COLUMNS, SHELL_COLUMNS, block_from_tables
-from harness.estimators.one_pass import ESTIMATORS, one_pass
+from harness.estimators.estimate import Unavailable, finite_json
+from harness.estimators.from_records import (
+    EPISODE_COLUMNS,
+    MARTINGALE_COLUMN,
+    MOMENT_COLUMNS,
+    SHELL_COLUMNS,
+    block_from_tables,
+)
+from harness.estimators.one_pass import ESTIMATORS, PassResult, one_pass
 from harness.estimators.statement import SCOPE, conditional_statement, per_distance, statement
+from harness.estimators.surrogates import MOST_UNASKED, PoolRequest, surrogates_of
 from harness.estimators.threads import read_ahead
-from harness.importance.build import importance_names, mixture_weights
+from harness.importance.build import importance_names, mixture_weights, needs_tables
 from harness.pool.shells import ShellDesign
+from harness.pool.surrogate_replay import PATH_COLUMNS, SurrogateReplay
+from harness.progress import Progress
 from harness.records.folder import SHELLS, read_json, read_manifest
-from harness.records.reader import read_shards
+from harness.records.reader import read_shards, stored_columns
 
 _FINISH = "Run `harness run` with --resume, which makes missing shards."
 
@@ -34,6 +43,12 @@ class CampaignFacts:
         Mean distance that the AV drives in a naturalistic test; None if unknown, and then nothing is said per km.
     importance_names : tuple of str
         Names of the importance functions, in order.
+    retraced : dict
+        What the run says about the twin retracing its episodes.
+    no_surrogates : str
+        Why surrogates were not asked about the tests, where they were not.
+    no_replay : str or None
+        Why there is no estimate from replayed surrogates; None where there may be one.
     """
 
     name: str
@@ -42,6 +57,9 @@ class CampaignFacts:
     confidence: float = 0.9
     distance_per_test_m: float | None = None
     importance_names: tuple[str, ...] = ()
+    retraced: dict[str, Any] | None = None
+    no_surrogates: str = "the blocks do not say what surrogates would have done"
+    no_replay: str | None = None
 
 
 def estimate_blocks(
@@ -57,9 +75,13 @@ def estimate_blocks(
     estimators : sequence of str, optional
         Which to report beside the method's own; all by default.
     """
-    done = one_pass(blocks, estimators or ESTIMATORS, confidence=facts.confidence)
+    asked = estimators or ESTIMATORS
+    refused: dict[EstimatorName, Unavailable] = {}
+    if "replay" in asked and facts.no_replay is not None:
+        refused["replay"] = Unavailable(facts.no_replay)
+    done = one_pass(blocks, [name for name in asked if name not in refused], confidence=facts.confidence)
     best = done.headline_estimate
-    estimates = {done.headline: best, **done.estimates}
+    estimates = {done.headline: best, **done.estimates, **refused}
     distance_km = None if facts.distance_per_test_m is None else facts.distance_per_test_m / 1000.0
     content: dict[str, Any] = {
         "campaign": facts.name,
@@ -72,7 +94,7 @@ def estimate_blocks(
         "distance_per_test_km": distance_km,
         "crash_rate_per_1e6_km": None if distance_km is None else per_distance(best, distance_km),
         "estimates": {name: estimate.to_json() for name, estimate in estimates.items()},
-        "diagnostics": done.diagnostics.result(facts.importance_names),
+        "diagnostics": {**done.diagnostics.result(facts.importance_names), "alarm": _alarm(done, facts)},
         "convergence": done.convergence,
         "statement": statement(best, facts.lane_change_level, distance_km),
         "conditional_statement": conditional_statement(best),
@@ -82,8 +104,21 @@ def estimate_blocks(
     return cleaned
 
 
+def _alarm(done: PassResult, facts: CampaignFacts) -> dict[str, Any]:
+    """Whether traffic, twin and pool belong together: what the run has retraced, and the surrogates' crash rates."""
+    alarm = done.diagnostics.alarm
+    rates = alarm.result() if alarm.asked else {"reason": facts.no_surrogates}
+    retraced = facts.retraced or {"reason": "the run did not retrace its episodes"}
+    return {"raised": bool(rates.get("raised")), "retraced": retraced, "surrogate_crash_rates": rates}
+
+
 def estimate_run(
-    folder: Path, *, estimators: Sequence[EstimatorName] | None = None, confidence: float | None = None
+    folder: Path,
+    *,
+    estimators: Sequence[EstimatorName] | None = None,
+    confidence: float | None = None,
+    pool: Path | None = None,
+    progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Estimate a stored run from its records.
 
@@ -95,6 +130,11 @@ def estimate_run(
         Which to report beside the method's own; all by default.
     confidence : float, optional
         Level of the intervals; the campaign's by default.
+    pool : Path, optional
+        File of a pool to replay surrogates of, instead of the campaign's own. That one is built if ``replay`` is asked
+        for by name, and used without being asked for if it is there.
+    progress : Progress, optional
+        Follows the building of a pool.
 
     Returns
     -------
@@ -104,12 +144,16 @@ def estimate_run(
     Raises
     ------
     HarnessError
-        If the folder is not a run, or its records are damaged or incomplete.
+        If the folder is not a run, its records are damaged or incomplete, or the pool is of another environment.
     """
     folder = Path(folder)
     manifest = read_manifest(folder)
     campaign = load_campaign(folder / "campaign.yaml", check_files=False)
     distance = manifest.get("distance_per_test_m")
+    columns = stored_columns(folder)
+    request = PoolRequest(pool, "replay" in (estimators or ()), progress)
+    surrogates = surrogates_of(campaign, columns, request)
+    n_replayed = int(manifest["n_episodes"]) if request.explicit else MOST_UNASKED
     facts = CampaignFacts(
         name=campaign.name,
         content_hash=str(manifest["campaign_hash"]),
@@ -117,21 +161,58 @@ def estimate_run(
         confidence=campaign.stop.confidence if confidence is None else confidence,
         distance_per_test_m=None if distance is None else float(distance),
         importance_names=importance_names(campaign),
+        retraced=manifest.get("retraced"),
+        no_surrogates=surrogates if isinstance(surrogates, str) else "",
+        no_replay=_no_replay(surrogates, int(manifest["n_episodes"]), n_replayed),
     )
-    wants_moments = campaign.testing.method == "step_mixture" and "scv" in (estimators or ESTIMATORS)
-    blocks = _stored_blocks(folder, campaign, manifest, wants_moments=wants_moments)
+    wanted = _Wanted(
+        moments=campaign.testing.method == "step_mixture" and "scv" in (estimators or ESTIMATORS),
+        n_martingale=_n_martingale(campaign, columns) if "martingale" in (estimators or ESTIMATORS) else 0,
+        surrogates=None if isinstance(surrogates, str) else surrogates,
+        n_replayed=n_replayed,
+    )
+    blocks = _stored_blocks(folder, campaign, manifest, wanted)
     return estimate_blocks(read_ahead(blocks), facts, estimators=estimators)
 
 
-def _stored_blocks(
-    folder: Path, campaign: Campaign, manifest: dict[str, Any], *, wants_moments: bool
-) -> Iterator[Block]:
+def _no_replay(surrogates: SurrogateReplay | str, n_episodes: int, n_replayed: int) -> str | None:
+    if isinstance(surrogates, str):
+        return surrogates
+    if n_replayed < n_episodes:
+        return (
+            f"only the first {n_replayed:,} tests are replayed unasked; ask by name: `harness estimate DIR -e replay`"
+        )
+    return None
+
+
+def _n_martingale(campaign: Campaign, columns: set[str]) -> int:
+    """Surrogates with martingale sums on record."""
+    return len(campaign.surrogates) if needs_tables(campaign) and MARTINGALE_COLUMN in columns else 0
+
+
+@dataclass(frozen=True)
+class _Wanted:
+    """What is to be read beside what all estimates need; surrogates are asked about ``n_replayed`` tests."""
+
+    moments: bool
+    n_martingale: int
+    surrogates: SurrogateReplay | None
+    n_replayed: int
+
+    @property
+    def columns(self) -> list[str]:
+        """Of the episodes table, without repetition."""
+        martingale = [MARTINGALE_COLUMN] if self.n_martingale else []
+        return list(dict.fromkeys([*EPISODE_COLUMNS, *martingale, *(PATH_COLUMNS if self.surrogates else ())]))
+
+
+def _stored_blocks(folder: Path, campaign: Campaign, manifest: dict[str, Any], wanted: _Wanted) -> Iterator[Block]:
     """Blocks of the episodes that count, in index order; a gap or too few of them is an error."""
     n, n_counted, cap = 0, int(manifest["n_episodes"]), manifest.get("weight_cap")
-    columns = list(MOMENT_COLUMNS) if wants_moments else []
+    columns = list(MOMENT_COLUMNS) if wanted.moments else []
     shells = read_shells(folder) if campaign.testing.method == "shells" else None
-    wanted = [*EPISODE_COLUMNS, *(SHELL_COLUMNS if shells else ())]
-    for episodes, moments in read_shards(folder, episode_columns=wanted, moment_columns=columns):
+    wanted_columns = [*wanted.columns, *(SHELL_COLUMNS if shells else ())]
+    for episodes, moments in read_shards(folder, episode_columns=wanted_columns, moment_columns=columns):
         block = block_from_tables(
             episodes,
             moments,
@@ -139,6 +220,8 @@ def _stored_blocks(
             alpha=mixture_weights(campaign),
             weight_cap=cap,
             shells=shells,
+            n_martingale=wanted.n_martingale,
+            surrogates=wanted.surrogates if n < wanted.n_replayed else None,
         )
         if block.first_episode != n:
             raise _incomplete(folder, f"a shard that begins at episode {block.first_episode}", f"episode {n}")

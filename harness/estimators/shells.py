@@ -170,6 +170,16 @@ class Shells:
         found = []
         if empty := [name for name, tests in zip(design.strata, self.tests, strict=True) if tests == 0]:
             found.append(f"no test in {', '.join(empty)}: the interval allows for any share of crashes there")
+        used_up = [
+            name
+            for name, tests, kept in zip(design.strata, self.tests, design.available, strict=False)
+            if tests >= kept
+        ]
+        if used_up:
+            found.append(
+                f"all cut-ins that the pool has kept of {', '.join(used_up)} were tested: for more precision raise "
+                "pool.cut_ins_per_shell, and run into a new folder"
+            )
         if crashes := int(self.crashes[design.n_inside :].sum()):
             found.append(
                 f"{crashes} crashes where {design.boundary} does not crash: the conditional statement does not hold "

@@ -13,7 +13,7 @@ from harness.campaign.models import PoolSettings
 from harness.environment.driving import Environment
 from harness.environment.initial_state import N_STATE, InitialStates
 from harness.episode.cells import max_draws
-from harness.pool.cut_ins import CutIns, Pool, shells_of
+from harness.pool.cut_ins import CutIns, Pool, environment_hash, shells_of
 from harness.pool.enumeration import empty_path, enumerate_cut_ins, write_pairs
 from harness.pool.library import Library
 from harness.pool.proposal import Proposal, fit_proposal
@@ -131,7 +131,7 @@ def build_pool(
     careful = _up_to_boundary(rates, names.index(library.boundary))
     aimed = pilot.aimed(fit_proposal(pilot.uniforms(0, PILOT_PATHS), _importance(rates, careful)))
     blocks = _until_known(aimed, rates, careful, settings, progress)
-    return _pool(blocks, aimed, library, settings, key)
+    return _pool(blocks, aimed, library, settings, (key, environment_hash(environment)))
 
 
 def _joined(blocks: list[Enumerated], n_surrogates: int) -> FloatArray:
@@ -184,7 +184,9 @@ def _paths_needed(pilot: FloatArray, wanted: FloatArray) -> int:
     return min(MOST_PATHS, -(-int(needed) // ROUND_PATHS) * ROUND_PATHS)
 
 
-def _pool(blocks: list[Enumerated], enumerator: Enumerator, library: Library, settings: PoolSettings, key: str) -> Pool:
+def _pool(
+    blocks: list[Enumerated], enumerator: Enumerator, library: Library, settings: PoolSettings, hashes: tuple[str, str]
+) -> Pool:
     """Order the surrogates, sort all cut-ins into shells, and keep a sample of each."""
     n_surrogates = len(library.surrogates)
     rates = _joined(blocks, n_surrogates)
@@ -201,7 +203,8 @@ def _pool(blocks: list[Enumerated], enumerator: Enumerator, library: Library, se
     lv, bv, n_lv, n_bv = enumerator.pairs(index, step, state)
     bits = crashes[path, step]
     return Pool(
-        key=key,
+        key=hashes[0],
+        environment=hashes[1],
         library=library,
         names=tuple(np.array(list(library.surrogates))[order].tolist()),
         n_paths=n,

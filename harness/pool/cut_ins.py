@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from harness.arrays import BoolArray, FloatArray, Int8Array, IntArray
+from harness.environment.driving import Environment
 from harness.pool.library import Library
 
 
@@ -50,6 +53,8 @@ class Pool:
     ----------
     key : str
         Content hash of all that it was made from.
+    environment : str
+        Content hash of its environment, see `environment_hash`.
     library : Library
     names : tuple of str, length D
         Surrogates from careful to careless, by crash rate.
@@ -69,6 +74,7 @@ class Pool:
     """
 
     key: str
+    environment: str
     library: Library
     names: tuple[str, ...]
     n_paths: int
@@ -106,6 +112,12 @@ class Pool:
     def boundary(self) -> int:
         """Index of the outermost shell that the conditional statement keeps."""
         return self.names.index(self.library.boundary)
+
+
+def environment_hash(environment: Environment) -> str:
+    """Hash of all numbers of an environment, level of lane changing and hold time included."""
+    numbers = {name: environment.numbers[name][0].item() for name in environment.numbers.dtype.names or ()}
+    return hashlib.sha256(json.dumps(numbers, sort_keys=True).encode()).hexdigest()[:24]
 
 
 def shells_of(crashes: IntArray, order: IntArray) -> Int8Array:

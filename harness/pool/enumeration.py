@@ -121,8 +121,8 @@ def leave(seed: int, index: int, cut: int, environment: Environment, path: Path,
 
 
 @compiled_inline
-def crash_step(driver: Record, late: int, x: float, v: float, cut: int, path: Path, max_steps: int) -> int:
-    """Step after which a driver has run into BV, or `NO_CRASH`.
+def follow(driver: Record, late: int, x: float, v: float, cut: int, path: Path, max_steps: int) -> tuple[int, float]:
+    """Step after which a driver has run into BV, or `NO_CRASH`, and its speed (m/s) at the end.
 
     ``x`` (m) and ``v`` (m/s) are the AV's at the cut-in; it reacts ``late`` steps after its first chance.
     """
@@ -134,8 +134,14 @@ def crash_step(driver: Record, late: int, x: float, v: float, cut: int, path: Pa
         x = next_position(x, v, v_after)
         v = v_after
         if gap(path.x_after[step + 1], x) < CONTACT_M:
-            return step + 1
-    return NO_CRASH
+            return step + 1, v
+    return NO_CRASH, v
+
+
+@compiled_inline
+def crash_step(driver: Record, late: int, x: float, v: float, cut: int, path: Path, max_steps: int) -> int:
+    """Step after which a driver has run into BV, or `NO_CRASH`; see `follow`."""
+    return follow(driver, late, x, v, cut, path, max_steps)[0]
 
 
 @compiled_threads

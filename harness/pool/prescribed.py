@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -39,9 +39,9 @@ class PrescribedEpisodes:
     def __init__(self, campaign: Campaign, pool: Pool) -> None:
         limit = acceleration_limit(campaign.av)
         self._pool = pool
-        self.design: ShellDesign = design_shells(pool, boundary=campaign.testing.shells.boundary, limit_mps2=limit)
-        boundary = pool.names.index(self.design.boundary)
-        self.draws = Draws(pool, shells_in_strata(pool, boundary, limit), campaign.seed)
+        design = design_shells(pool, boundary=campaign.testing.shells.boundary, limit_mps2=limit)
+        self.draws = Draws(pool, shells_in_strata(pool, pool.names.index(design.boundary), limit), campaign.seed)
+        self.design: ShellDesign = replace(design, available=tuple(self.draws.available.tolist()))
 
     def rows(self, draws: tuple[Draw, ...]) -> tuple[IntArray, IntArray]:
         """Rows of the pool's cut-ins, and their strata, shape (n,) each."""

@@ -44,6 +44,8 @@ class ShellDesign:
         Probability of a cut-in.
     p_impossible : float
         Part of it on which no vehicle within the envelope's acceleration can crash, and which is not tested.
+    available : tuple of int, length S
+        Cut-ins that the pool has kept of each; empty if that is no limit.
     """
 
     pool: str
@@ -55,17 +57,26 @@ class ShellDesign:
     boundary: str
     p_cut_in: float
     p_impossible: float
+    available: tuple[int, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
         """Plain content for a file."""
         content = asdict(self)
-        return {**content, "strata": list(self.strata), "p": self.p.tolist(), "moments": self.moments.tolist()}
+        return {
+            **content,
+            "strata": list(self.strata),
+            "p": self.p.tolist(),
+            "moments": self.moments.tolist(),
+            "available": list(self.available),
+        }
 
     @classmethod
     def from_json(cls, content: dict[str, Any]) -> ShellDesign:
         """Back from `to_json`."""
         arrays = {name: np.array(content[name], dtype=np.float64) for name in ("p", "moments")}
-        return cls(**{**content, **arrays, "strata": tuple(content["strata"])})
+        return cls(
+            **{**content, **arrays, "strata": tuple(content["strata"]), "available": tuple(content["available"])}
+        )
 
 
 def acceleration_limit(av: AutomatedVehicle) -> float:

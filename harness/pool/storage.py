@@ -19,12 +19,12 @@ from harness.environment.driving import Environment
 from harness.environment.loading import load_environment
 from harness.errors import RunFolderError
 from harness.pool.build import PILOT_PATHS, ROUND_PATHS, build_pool
-from harness.pool.cut_ins import CutIns, Pool
+from harness.pool.cut_ins import CutIns, Pool, environment_hash
 from harness.pool.library import Library, load_library
 from harness.progress import Progress
 from harness.records.folder import write_atomically
 
-_FORMAT = 1
+_FORMAT = 2
 """Raise it when the meaning of a pool changes."""
 _METADATA = b"harness_pool"
 _STATE = ("v_bv_mps", "r1_m", "r1dot_mps", "r2_m", "r2dot_mps")
@@ -32,7 +32,6 @@ _STATE = ("v_bv_mps", "r1_m", "r1dot_mps", "r2_m", "r2dot_mps")
 
 def pool_key(environment: Environment, library: Library, settings: PoolSettings) -> str:
     """Hash of all that a pool depends on: environment, level of lane changing, library, settings, and the kernels."""
-    numbers = {name: environment.numbers[name][0].item() for name in environment.numbers.dtype.names or ()}
     drivers = {name: model.model_dump() for name, model in library.surrogates.items()}
     roles = [library.boundary, library.envelope]
     content = [
@@ -40,7 +39,7 @@ def pool_key(environment: Environment, library: Library, settings: PoolSettings)
         source_hash(),
         PILOT_PATHS,
         ROUND_PATHS,
-        numbers,
+        environment_hash(environment),
         drivers,
         roles,
         settings.model_dump(exclude={"library"}),
@@ -182,6 +181,7 @@ def _pool(table: pa.Table, facts: dict[str, Any]) -> Pool:
     arrays = {name: np.array(facts[name]) for name in ("mu", "mu_covariance", "shell_p", "shell_moments")}
     return Pool(
         key=str(facts["key"]),
+        environment=str(facts["environment"]),
         library=Library.model_validate(facts["library"]),
         names=tuple(facts["names"]),
         n_paths=int(facts["n_paths"]),

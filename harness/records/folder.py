@@ -90,12 +90,17 @@ def read_table(path: Path, columns: list[str] | None = None) -> pa.Table:
     try:
         return pq.read_table(path, columns=columns, memory_map=False, partitioning=None)
     except (OSError, pa.ArrowException, KeyError) as error:
-        raise RunFolderError(
-            str(path),
-            found=f"a file that cannot be read ({str(error).splitlines()[0]})",
-            expected="a complete Parquet file of this run",
-            mend="Delete it and its episodes file and run again with --resume: the same episodes are made anew.",
-        ) from error
+        raise damaged(path, error) from error
+
+
+def damaged(path: Path, error: Exception) -> RunFolderError:
+    """What to say of a Parquet file of a run that cannot be read."""
+    return RunFolderError(
+        str(path),
+        found=f"a file that cannot be read ({str(error).splitlines()[0]})",
+        expected="a complete Parquet file of this run",
+        mend="Delete it and its episodes file and run again with --resume: the same episodes are made anew.",
+    )
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:

@@ -6,8 +6,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pyarrow as pa
+import pyarrow.parquet as pq
 
-from harness.records.folder import read_manifest, read_table
+from harness.records.folder import damaged, read_manifest, read_table
 
 
 def read_shards(
@@ -39,3 +40,21 @@ def read_shards(
         if "moments" in files and moment_columns != []:
             moments = read_table(folder / files["moments"], moment_columns)
         yield episodes, moments
+
+
+def stored_columns(folder: Path) -> set[str]:
+    """Columns of the episodes table of a run; none if it has no shard.
+
+    Raises
+    ------
+    RunFolderError
+        The first shard is missing or damaged.
+    """
+    shards = read_manifest(folder)["shards"]
+    if not shards:
+        return set()
+    path = folder / shards[0]["files"]["episodes"]
+    try:
+        return set(pq.read_schema(path).names)
+    except (OSError, pa.ArrowException) as error:
+        raise damaged(path, error) from error

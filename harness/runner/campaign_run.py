@@ -18,10 +18,11 @@ from harness.records.folder import SHELLS, TABLES, shard_file, write_json
 from harness.runner.manifest import Manifest, require_own_folder
 from harness.runner.prefix import Prefix
 from harness.runner.prepare import Prepared, content_hash, distance_per_test_m, prepare, require_same_pool
+from harness.runner.retrace import Retracing
 from harness.runner.rounds import rounds, stop_rule
 from harness.runner.shards import ShardPool, stored_shard
 from harness.runner.table_accuracy import table_errors
-from harness.runner.worker import ShardSpec
+from harness.runner.worker import ShardDone, ShardSpec
 
 MANIFEST_INTERVAL_S = 5.0
 
@@ -94,14 +95,20 @@ def run_campaign(
     if prepared.prescribed is not None:
         require_same_pool(out, prepared)
         write_json(out / SHELLS, prepared.prescribed.design.to_json())
+    retracing = Retracing(campaign, prepared.policy.environment)
     rule = stop_rule(campaign)
     prefix = Prefix(campaign, rule)
     batches = rounds(campaign, prepared.prescribed, prefix, rule)
-    _run_shards(prepared, out, n_workers, progress, manifest, lambda: time.monotonic() - started, prefix, batches)
+    _run_shards(
+        prepared, out, n_workers, progress, manifest, lambda: time.monotonic() - started, prefix, batches, retracing
+    )
     _discard_beyond(out, len(prefix.specs))
     elapsed = time.monotonic() - started
     stopped_by: Literal["rhw", "episodes"] = "rhw" if prefix.reached else "episodes"
-    manifest.write(prefix.specs, prefix.files, status="done", elapsed_s=elapsed, stopped_by=stopped_by)
+    retraced = retracing.summary(prefix.n_retraced)
+    manifest.write(
+        prefix.specs, prefix.files, status="done", elapsed_s=elapsed, stopped_by=stopped_by, retraced=retraced
+    )
     progress.stage("estimates and report", None)
     estimates = estimate_run(out)
     write_json(out / "estimates.json", estimates)
@@ -121,15 +128,20 @@ def _run_shards(
     elapsed: Callable[[], float],
     prefix: Prefix,
     batches: Iterator[Iterator[ShardSpec]],
+    retracing: Retracing,
 ) -> None:
     """Run shards until the stop rule is content; the manifest follows so that an interrupted run can be read."""
     campaign = prepared.campaign
     pool = ShardPool(campaign, out, workers)
     written = elapsed()
+
+    def stored(spec: ShardSpec) -> ShardDone | None:
+        return stored_shard(out, campaign, spec, prepared.prescribed, retracing)
+
     progress.stage("episodes", campaign.stop.episodes, done=_episodes_on_disk(campaign, out))
     try:
         for specs in batches:
-            for done in pool.run(specs, lambda spec: stored_shard(out, campaign, spec, prepared.prescribed)):
+            for done in pool.run(specs, stored):
                 stop = prefix.add(done)
                 progress.advance(0 if done.stored else done.spec.n_episodes)
                 progress.status(crashes=prefix.n_crashes, rhw=prefix.rhw)

@@ -105,6 +105,7 @@ class Manifest:
         status: str,
         elapsed_s: float = 0.0,
         stopped_by: str | None = None,
+        retraced: dict[str, Any] | None = None,
     ) -> None:
         """Record the contiguous prefix of finished shards."""
         shards = [
@@ -117,6 +118,7 @@ class Manifest:
                 **self._content,
                 "status": status,
                 "stopped_by": stopped_by,
+                "retraced": retraced,
                 "wall_time_s": round(self._wall_time_s + elapsed_s, 3),
                 "n_episodes": sum(spec.n_episodes for spec in specs),
                 "shards": shards,

@@ -27,7 +27,7 @@ class Prefix:
         self.sums: Accumulator = accumulator(rule.estimator)
         self.specs: list[ShardSpec] = []
         self.files: list[dict[str, str]] = []
-        self.n_episodes = self.n_crashes = self.n_failed = 0
+        self.n_episodes = self.n_crashes = self.n_failed = self.n_retraced = 0
         self.rhw = float("inf")
 
     @property
@@ -41,6 +41,7 @@ class Prefix:
         self.files.append(done.files)
         self.sums.add(done.block)
         self.n_episodes += done.spec.n_episodes
+        self.n_retraced += done.n_retraced
         self.n_crashes += int(done.block.crash.sum())
         self.n_failed += int(done.block.failed.sum())
         self._require_few_failed()

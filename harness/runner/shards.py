@@ -20,6 +20,7 @@ from harness.pool.prescribed import PrescribedEpisodes
 from harness.records.folder import TABLES, read_table, shard_file
 from harness.records.tables import ShardTables
 from harness.runner.processes import WorkerProcess, first_to_answer
+from harness.runner.retrace import Retracing
 from harness.runner.worker import ShardDone, ShardSpec, shard_block
 
 ATTEMPTS = 3
@@ -44,14 +45,20 @@ def shard_specs(campaign: Campaign) -> Iterator[ShardSpec]:
 
 
 def stored_shard(
-    folder: Path, campaign: Campaign, spec: ShardSpec, prescribed: PrescribedEpisodes | None = None
+    folder: Path,
+    campaign: Campaign,
+    spec: ShardSpec,
+    prescribed: PrescribedEpisodes | None = None,
+    retracing: Retracing | None = None,
 ) -> ShardDone | None:
-    """A shard that an earlier run has finished, or None.
+    """A shard that an earlier run has finished, or None; retraced again.
 
     Raises
     ------
     RunFolderError
         One of its files is damaged.
+    WorldDisagreementError
+        The twin retraces an episode differently.
     """
     files = {name: shard_file(name, spec.index) for name in TABLES if (folder / shard_file(name, spec.index)).exists()}
     needed = {"episodes"} | ({"moments"} if campaign.records.moments != "none" else set())
@@ -63,7 +70,8 @@ def stored_shard(
     if prescribed is not None and not _same_cut_ins(tables["episodes"], prescribed, spec):
         return None  # the last round of a smaller budget
     kept = ShardTables(tables["episodes"], tables.get("moments"), tables.get("traces"))
-    return ShardDone(spec, files, shard_block(campaign, kept, prescribed), stored=True)
+    n_retraced = 0 if retracing is None else retracing.check(tables["episodes"])
+    return ShardDone(spec, files, shard_block(campaign, kept, prescribed), stored=True, n_retraced=n_retraced)
 
 
 def _same_cut_ins(episodes: pa.Table, prescribed: PrescribedEpisodes, spec: ShardSpec) -> bool:

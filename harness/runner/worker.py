@@ -16,6 +16,7 @@ from harness.pool.prescribed import Draw, PrescribedEpisodes
 from harness.records.folder import write_shard
 from harness.records.tables import ShardTables, shard_tables
 from harness.runner.prepare import Prepared, build_world, prepare
+from harness.runner.retrace import Retracing
 
 
 @dataclass(frozen=True)
@@ -30,12 +31,13 @@ class ShardSpec:
 
 @dataclass(frozen=True)
 class ShardDone:
-    """A shard on disk, and what the stop rule needs of it."""
+    """A shard on disk, what the stop rule needs of it, and how many of its episodes the twin has retraced."""
 
     spec: ShardSpec
     files: dict[str, str]
     block: Block
     stored: bool = False
+    n_retraced: int = 0
 
 
 class ShardRunner:
@@ -54,6 +56,7 @@ class ShardRunner:
         self._folder = folder
         self._doomed: dict[int, Death] = {}
         self._prepared: Prepared = prepare(campaign)
+        self._retracing = Retracing(campaign, self._prepared.policy.environment)
         self._loop: EpisodeLoop = self._prepared.loop(build_world(campaign), black_box=black_box, doomed=self._doomed)
 
     def close(self) -> None:
@@ -61,15 +64,23 @@ class ShardRunner:
         self._loop.close()
 
     def run(self, spec: ShardSpec, doomed: Mapping[int, Death] | None = None) -> ShardDone:
-        """Run a shard and write its tables; episodes in ``doomed`` fail before the call that ended a process."""
+        """Run a shard and write its tables; episodes in ``doomed`` fail before the call that ended a process.
+
+        Raises
+        ------
+        WorldDisagreementError
+            The twin retraces an episode differently; nothing is written then.
+        """
         self._doomed.update(doomed or {})
         campaign = self._prepared.campaign
         shard = self._shard(spec)
         records = campaign.records
         keep_traces = records.traces != "none" or records.trace_share > 0.0
         tables = shard_tables(shard, campaign.seed, keep_traces=keep_traces)
+        n_retraced = self._retracing.check(tables.episodes)
         files = write_shard(self._folder, spec.index, tables)
-        return ShardDone(spec, files, shard_block(campaign, tables, self._prepared.prescribed))
+        block = shard_block(campaign, tables, self._prepared.prescribed)
+        return ShardDone(spec, files, block, n_retraced=n_retraced)
 
     def _shard(self, spec: ShardSpec) -> Shard:
         prescribed = self._prepared.prescribed

@@ -34,6 +34,8 @@ _IDM = ("acceleration_mps2", "comfortable_deceleration_mps2", "time_headway_s", 
 _FVDM = ("kappa_per_s", "lambda_per_s", "max_speed_mps", "v1", "v2", "c1_per_m", "c2")
 _REACTION = ("max_jerk_mps3", "inattention_probability")
 _STEPS = ("delay_steps", "inattention_steps")
+MODEL_FIELDS = ("kind", *_COMMON, *_IDM, *_FVDM)
+"""What decides a driver's acceleration once it has reacted; the other fields say how it lags behind."""
 DRIVER_DTYPE = np.dtype(
     [(name, np.int64) for name in ("kind", *_STEPS)]
     + [(name, np.float64) for name in (*_COMMON, *_IDM, *_FVDM, *_REACTION)]

@@ -107,6 +107,7 @@ class Chain:
         shape_before = (self.n_surrogates, self.horizon, len(self.start))
         cut = np.empty(shape_before)
         maneuver = np.empty((self.n_surrogates, self.horizon, *self.exposure.shape))
+        value_before, value_after = np.zeros(shape_before), np.zeros((*shape_before[:2], len(self.exposure)))
         critical_before = np.zeros(shape_before[1:], dtype=bool)
         critical_after = np.zeros((self.horizon, len(self.exposure)), dtype=bool)
         for j, response in enumerate(self.surrogate_responses):
@@ -116,20 +117,23 @@ class Chain:
                 challenge = np.stack([stay, self.entry @ after[t + 1]], axis=1)
                 p = np.stack([1.0 - self.hazard, self.hazard], axis=1)
                 q, v = importance_function(p, challenge, self.epsilon)
-                cut[j, t], critical_before[t] = q[:, 1], critical_before[t] | (v > 0.0)
+                cut[j, t], critical_before[t], value_before[j, t] = q[:, 1], critical_before[t] | (v > 0.0), v
                 maneuver[j, t], v = importance_function(self.exposure, response @ after[t + 1], self.epsilon)
                 critical_after[t] |= v > 0.0
-        return Proposals(cut, maneuver, critical_before, critical_after)
+                value_after[j, t] = v
+        return Proposals(cut, maneuver, critical_before, critical_after, value_before, value_after)
 
 
 @dataclass(frozen=True, eq=False)
 class Proposals:
-    """q_j(cut_in | t, state) of shape (J, T, G), q_j(a | t, state) of shape (J, T, D, A), and where they act."""
+    """q_j(cut_in | t, state) of shape (J, T, G), q_j(a | t, state) of shape (J, T, D, A), where they act, and V_j."""
 
     cut: FloatArray
     maneuver: FloatArray
     critical_before: BoolArray
     critical_after: BoolArray
+    value_before: FloatArray
+    value_after: FloatArray
 
 
 def importance_function(p: FloatArray, challenge: FloatArray, epsilon: float) -> tuple[FloatArray, FloatArray]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from harness.arrays import BoolArray, FloatArray
+from harness.arrays import BoolArray, FloatArray, IntArray
 from harness.campaign.models import Method
 from harness.estimators.block import Block
 
@@ -26,7 +26,15 @@ class SingleChoice:
 
     def draw(self, method: Method, n: int, rng: np.random.Generator) -> Block:
         """Episodes of exactly one control step each."""
-        maneuver = rng.choice(len(self.p), size=n, p=self.alpha @ self.q)
+        return self.block(method, self.maneuvers(n, rng))
+
+    def maneuvers(self, n: int, rng: np.random.Generator) -> IntArray:
+        """Drawn from the mixture."""
+        return rng.choice(len(self.p), size=n, p=self.alpha @ self.q)
+
+    def block(self, method: Method, maneuver: IntArray) -> Block:
+        """Episodes with given maneuvers."""
+        n = len(maneuver)
         with np.errstate(divide="ignore"):
             log_q = np.log(self.q[:, maneuver] / self.p[maneuver]).T
         log_weight = np.log(self.p / (self.alpha @ self.q))[maneuver]

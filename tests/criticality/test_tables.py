@@ -6,7 +6,7 @@ import pytest
 from harness.campaign.models import IDMParameters
 from harness.criticality import tables as cache
 from harness.criticality.tables import Tables, build_tables, table_path, tables_cached, tables_hash
-from harness.vehicles.models import driver_records
+from harness.vehicles.models import MODEL_FIELDS, driver_records
 from tests.environment.kernels import environment
 
 DRIVER = driver_records([IDMParameters()])
@@ -26,7 +26,7 @@ def built(monkeypatch):
 
     def build_one(environment, driver, challenge):
         arguments.append((driver, challenge))
-        numbers = np.array([driver[name][0] for name in driver.dtype.names], np.float32)
+        numbers = np.array([driver[name][0] for name in MODEL_FIELDS], np.float32)
         return Tables(np.full((13, 9, 150, 12), numbers.sum(), np.float32), np.outer(numbers, numbers), numbers)
 
     monkeypatch.setattr(cache, "_build_one", build_one)
@@ -84,7 +84,7 @@ def test_what_the_hash_depends_on():
     assert tables_hash(environment(level=350.0), DRIVER, "recursive") == reference
     assert tables_hash(environment(hold_s=0.1), DRIVER, "recursive") != reference
     assert tables_hash(environment(), DRIVER, "immediate") != reference
-    for name in DRIVER.dtype.names:
+    for name in MODEL_FIELDS:
         changed = DRIVER.copy()
         changed[name] += 1
         assert tables_hash(environment(), changed, "recursive") != reference

@@ -34,7 +34,7 @@ def stored(twin_run, tmp_path):
 def test_a_folder_of_another_campaign(stored, capsys, twin_run):
     text = complaint_of(capsys, "run", MIXTURE_FILE, "--out", stored, *SAME, "--set", "seed=2")
     assert str(stored) in text
-    assert "another campaign (smoke," in text
+    assert "another campaign (overtaking-mixture," in text
     text = complaint_of(capsys, "run", MIXTURE_FILE, "--out", stored, *SAME, "--set", "testing.epsilon=0.2", "--resume")
     assert "another campaign" in text
     assert unlike_columns(twin_run, stored) == []

@@ -72,6 +72,7 @@ def test_a_pool_that_is_used_up_ends_the_run(campaign, run_here, tmp_path):
     assert result.exit_code == 4
     tests = [shell["n_episodes"] for shell in result.estimates["estimates"]["shells"]["details"]["shells"]]
     assert tests[:-1] == [100] * (len(tests) - 1)
+    assert any("raise pool.cut_ins_per_shell" in said for said in result.estimates["estimates"]["shells"]["warnings"])
 
 
 def test_the_conditional_statement_alone_stays_inside(campaign, run_here, tmp_path):

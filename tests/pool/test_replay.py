@@ -1,0 +1,144 @@
+"""Surrogates in the place of the AV: the same crashes where they are the AV, and the pool's rates where they are not.
+
+Four standard errors miss with a probability of 6e-5 per surrogate and method.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from harness.campaign.models import AutomatedVehicle, Campaign, IDMParameters, PoolSettings, Reaction
+from harness.episode.loop import Shard
+from harness.errors import CampaignError, RunFolderError
+from harness.estimators.alarm import MANY_HITS, Alarm
+from harness.estimators.block import Block
+from harness.estimators.from_records import block_from_tables
+from harness.importance.build import mixture_weights
+from harness.outcomes import CRASH
+from harness.pool.cut_ins import Pool
+from harness.pool.storage import campaign_pool
+from harness.pool.surrogate_replay import SurrogateReplay
+from harness.records.tables import episodes_table
+from harness.runner.prepare import prepare
+from harness.twin import TwinWorld
+from tests.chains.seed import SEED
+
+SMALL = PoolSettings(relative_error=0.03, cut_ins_per_shell=600)
+N = 10_000
+LATE = AutomatedVehicle(parameters=IDMParameters(min_acceleration_mps2=-3.0), reaction=Reaction(delay_s=0.7))
+
+
+def campaign(method: str, **settings) -> Campaign:
+    plain = Campaign(name="replayed", seed=SEED, pool=SMALL, av=settings.pop("av", AutomatedVehicle()))
+    environment = plain.environment.model_copy(update=settings)
+    testing = plain.testing.model_copy(update={"method": method})
+    return plain.model_copy(update={"environment": environment, "testing": testing})
+
+
+def drive(campaign: Campaign, n: int = N) -> tuple[Shard, pa.Table]:
+    ready = prepare(campaign)
+    shard = ready.loop(TwinWorld(256)).run(0, ready.states(0, n))
+    return shard, episodes_table(shard, campaign.seed)
+
+
+def replayed(campaign: Campaign, table: pa.Table, pool: Pool) -> Block:
+    surrogates = SurrogateReplay(campaign, pool)
+    method = campaign.testing.method
+    return block_from_tables(table, None, method=method, alpha=mixture_weights(campaign), surrogates=surrogates)
+
+
+@pytest.fixture(scope="module")
+def forced() -> tuple[Campaign, pa.Table, Pool]:
+    one = campaign("forced", av=LATE)
+    return one, drive(one)[1], campaign_pool(one)
+
+
+def test_a_surrogate_that_is_the_av_crashes_where_the_av_did(forced):
+    one, table, pool = forced
+    block = replayed(one, table, pool)
+    own = block.surrogates_crash[:, pool.names.index("brakes-3-late-700ms")]
+    assert block.crash.sum() > 30
+    np.testing.assert_array_equal(own, block.crash)
+    assert not np.array_equal(block.surrogates_crash[:, pool.names.index("brakes-3")], block.crash)
+
+
+@pytest.mark.parametrize("hold_s", [1.0, 0.1])
+def test_other_draws_after_the_end_do_not_change_what_was_driven(hold_s):
+    """The AV never brakes: its crashes cut the paths short, and careful surrogates need what comes after."""
+    never = AutomatedVehicle(model="constant")
+    one = campaign("forced", av=never, acceleration_hold_s=hold_s)
+    shard, table = drive(one, 400)
+    other = campaign("forced", av=AutomatedVehicle(), acceleration_hold_s=hold_s)
+    _, longer = drive(other, 400)
+    pool = campaign_pool(one)
+    short, long = (replayed(c, t, pool).surrogates_crash for c, t in ((one, table), (other, longer)))
+    assert np.count_nonzero(shard.results.episode["outcome"] == CRASH) > 100
+    np.testing.assert_array_equal(short, long)
+
+
+@pytest.mark.parametrize(
+    ("method", "settings", "n"),
+    [("nde", {"lane_change_level": 1e5}, 4 * N), ("forced", {}, 2 * N), ("episode_mixture", {}, 2 * N)],
+)
+def test_weighted_crashes_of_surrogates_have_the_rates_of_the_pool(method, settings, n):
+    one = campaign(method, **settings)
+    alarm = Alarm()
+    alarm.add(replayed(one, drive(one, n)[1], campaign_pool(one)))
+    found = alarm.result()
+    tested = [entry["z"] for entry in found["surrogates"] if entry["n_effective"] >= MANY_HITS]
+    assert len(tested) >= 5
+    assert np.max(np.abs(tested)) < 4.0
+    assert not found["raised"]
+
+
+def test_the_step_mixture_is_shown_and_not_judged():
+    one = campaign("step_mixture")
+    alarm = Alarm()
+    alarm.add(replayed(one, drive(one)[1], campaign_pool(one)))
+    found = alarm.result()
+    assert "not bounded" in found["no_verdict"]
+    for entry in found["surrogates"]:  # of the right size, although no interval can be given
+        assert 0.5 < entry["mean"] / entry["mu"] < 2.0
+
+
+@pytest.mark.parametrize("factor", [0.7, 1.4])
+@pytest.mark.parametrize("k", [4, 5, 6])
+def test_one_corrupted_rate_raises_the_alarm(forced, k, factor):
+    one, table, pool = forced
+    mu = pool.mu.copy()
+    mu[k] *= factor
+    for rates, raised in ((pool.mu, False), (mu, True)):
+        alarm = Alarm()
+        alarm.add(replayed(one, table, replace(pool, mu=rates)))
+        assert alarm.result()["raised"] == raised
+
+
+def test_too_few_crashes_are_judged_by_an_inequality(forced):
+    """A hundred times the rate cannot be missed in a few hundred tests, normal or not."""
+    one, table, pool = forced
+    for factor, raised in ((1.0, False), (1_000.0, True)):
+        alarm = Alarm()
+        alarm.add(replayed(one, table.slice(0, 300), replace(pool, mu=pool.mu * [factor, 1, 1, 1, 1, 1, 1])))
+        found = alarm.result()
+        assert found["surrogates"][0]["z"] is None
+        assert found["raised"] == raised
+
+
+def test_a_pool_of_another_environment_is_refused(forced):
+    _, _, pool = forced
+    with pytest.raises(CampaignError, match="a pool of another environment"):
+        SurrogateReplay(campaign("forced", lane_change_level=2.0), pool)
+
+
+def test_maneuvers_that_do_not_fit_are_refused(forced):
+    one, table, pool = forced
+    paths = table.column("bv_maneuvers").to_pylist()
+    paths[7] = [m for m in paths[7] if m != 31]
+    at = table.column_names.index("bv_maneuvers")
+    damaged = table.set_column(at, table.schema.field(at), pa.array(paths, pa.list_(pa.int8())))
+    with pytest.raises(RunFolderError, match="episode 7"):
+        SurrogateReplay(one, pool).crashes(damaged)
