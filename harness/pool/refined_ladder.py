@@ -82,8 +82,13 @@ class RefinedLadder:
             false = "" if p.false_alarms is None else f", with {100.0 * p.false_alarms:.1f} % false alarms"
             said.append(f"By weight it predicts {100.0 * p.caught:.1f} % of the AV's crash rate{false}.")
         if not self.predicted:
-            said.append("NOT PREDICTED: this driver does not describe the AV. Using it costs tests, not correctness.")
+            said.append(f"NOT PREDICTED: {self._what_is_not()}. Using this driver costs tests, not correctness.")
         return said
+
+    def _what_is_not(self) -> str:
+        if self.explained >= ENOUGH:
+            return "the driver does not crash where the AV does"
+        return "the driver does not describe how the AV accelerates, so that crashes in common say little beyond these"
 
     def to_json(self) -> dict[str, Any]:
         """Plain content for a file."""
