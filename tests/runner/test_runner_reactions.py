@@ -8,7 +8,7 @@ from harness.campaign.loading import load_campaign
 from harness.errors import RunFolderError
 from harness.runner.prepare import prepare
 from harness.twin import TwinWorld
-from tests.runner.conftest import SMOKE, TWIN
+from tests.runner.conftest import MIXTURE_FILE, TWIN
 from tests.runner.stored_runs import stored_table, unlike_columns
 
 REACTION = "{delay_s: 0.4, max_jerk_mps3: 8, inattention_probability: 0.4, inattention_delay_s: 1.1}"
@@ -51,7 +51,7 @@ def test_a_built_in_driver_keeps_its_speed_until_the_cut_in_whatever_before_cut_
     shards = []
     for start in ("hold_speed", "controller"):
         settings = ("world.engine=twin", f"testing.method={method}", "environment.lane_change_level=3000", AV)
-        prepared = prepare(load_campaign(SMOKE, [*settings, f"av.before_cut_in={start}"]))
+        prepared = prepare(load_campaign(MIXTURE_FILE, [*settings, f"av.before_cut_in={start}"]))
         shards.append(prepared.loop(TwinWorld(16), traces="all").run(0, prepared.states(0, 200)))
     hold, early = shards
     rows = hold.results.episode
