@@ -15,6 +15,7 @@ def expected() -> set[str]:
         for path in Path(folder).rglob("*"):
             if path.suffix in DATA and path not in NOT_SHIPPED:
                 found.add(f"{inside}/{path.relative_to(folder).as_posix()}")
+    found.add("harness/scenarios/av_panel.yaml")
     return found
 
 

@@ -21,19 +21,30 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from harness.campaign.models import Campaign, EstimatorName
+    from harness.pool.refined_ladder import RefinedLadder
     from harness.progress import Progress
     from harness.runner import AvCheck, Comparison, ReplayResult, RunResult
 
-__all__ = ["HarnessError", "av_check", "compare", "estimate", "load_campaign", "replay", "run", "write_report"]
+__all__ = [
+    "HarnessError",
+    "av_check",
+    "compare",
+    "estimate",
+    "ladder",
+    "load_campaign",
+    "replay",
+    "run",
+    "write_report",
+]
 
 # What does the work is imported inside each function, so that `import harness` and `harness --help` answer at once.
 
 
-def load_campaign(path: str | Path, overrides: Sequence[str] = ()) -> Campaign:
+def load_campaign(path: str | Path, overrides: Sequence[str] = (), *, av: str | None = None) -> Campaign:
     """Read and validate a campaign; ``overrides`` are ``section.key=value`` each (see `harness.campaign.loading`)."""
     from harness.campaign.loading import load_campaign as load  # noqa: PLC0415
 
-    return load(path, overrides)
+    return load(path, overrides, av=av)
 
 
 def run(
@@ -81,6 +92,13 @@ def write_report(folder: str | Path) -> Path:
     from harness.report import write_report as write  # noqa: PLC0415
 
     return write(Path(folder))
+
+
+def ladder(folder: str | Path, out: str | Path) -> RefinedLadder:
+    """Fit a driver to the AV of a stored run and write a library with it (see `harness.pool.refined_ladder`)."""
+    from harness.pool.refined_ladder import refine_ladder  # noqa: PLC0415
+
+    return refine_ladder(Path(folder), Path(out))
 
 
 def replay(folder: str | Path, episode: int, *, gui: bool = False, fcd: str | Path | None = None) -> ReplayResult:

@@ -1,4 +1,4 @@
-"""The command ``harness``: check, av-check, run, compare, estimate, report, replay, validate, schema.
+"""The command ``harness``: check, av-check, run, compare, pool, ladder, estimate, report, replay, validate, schema.
 
 Results go to stdout or to files, progress and complaints to stderr. Exit codes: 0 done; 2 the campaign or the call is
 wrong; 3 too many episodes failed or the world disagreed; 4 budget spent before the asked precision; 130 interrupted.
@@ -47,6 +47,12 @@ _set_option = click.option(
     metavar="A.B=C",
     help="Replace a value of the campaign, e.g. --set stop.rhw=0.3. May be given several times.",
 )
+_av_option = click.option(
+    "--av",
+    "av",
+    metavar="[PANEL.yaml:]NAME",
+    help="Test this vehicle of a panel instead of the campaign's; a bare NAME is one of the shipped panel.",
+)
 _json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON on stdout instead of text.")
 
 
@@ -81,14 +87,15 @@ def cli() -> None:
     ),
 )
 @click.argument("campaign_file", metavar="CAMPAIGN", type=_CAMPAIGN)
+@_av_option
 @_set_option
 @_json_option
-def check(campaign_file: Path, overrides: Sequence[str], *, as_json: bool) -> None:
+def check(campaign_file: Path, overrides: Sequence[str], av: str | None, *, as_json: bool) -> None:
     """Validate CAMPAIGN; print it with every default filled in, and what it will cost.
 
     Nothing is simulated and nothing is written. The output is itself a campaign file; its cost stands in comments.
     """
-    campaign = _load(campaign_file, overrides)
+    campaign = _load(campaign_file, overrides, av)
     from harness.campaign.dumping import dump_campaign  # noqa: PLC0415 - keeps --help fast
     from harness.runner import plan_campaign  # noqa: PLC0415 - slow to import: only once the campaign is right
 
@@ -106,6 +113,7 @@ def check(campaign_file: Path, overrides: Sequence[str], *, as_json: bool) -> No
         "harness run scenarios/smoke.yaml --out runs/smoke",
         "harness run scenarios/smoke.yaml --out runs/smoke --resume --set stop.rhw=0.03",
         "harness run scenarios/smoke.yaml --out runs/hard --set av.parameters.min_acceleration_mps2=-8",
+        "harness run scenarios/smoke.yaml --out runs/late --av late-600ms",
     ),
 )
 @click.argument("campaign_file", metavar="CAMPAIGN", type=_CAMPAIGN)
@@ -113,6 +121,7 @@ def check(campaign_file: Path, overrides: Sequence[str], *, as_json: bool) -> No
 @click.option("--workers", type=click.IntRange(min=1), help="Processes that simulate. Default: one per core.")
 @click.option("--resume", is_flag=True, help="Go on with what the run folder already holds.")
 @click.option("--quiet", is_flag=True, help="No progress bar. There is none either when stderr is not a terminal.")
+@_av_option
 @_set_option
 @_json_option
 @click.pass_context
@@ -124,6 +133,7 @@ def run(
     workers: int | None,
     resume: bool,
     quiet: bool,
+    av: str | None,
     overrides: Sequence[str],
     as_json: bool,
 ) -> None:
@@ -135,7 +145,7 @@ def run(
 
     Exit code 4 says that stop.episodes was spent before stop.rhw was reached; the results are there all the same.
     """
-    campaign = _load(campaign_file, overrides)
+    campaign = _load(campaign_file, overrides, av)
     from harness.progress import terminal_progress  # noqa: PLC0415 - keeps --help fast
     from harness.runner import run_campaign  # noqa: PLC0415 - slow to import: only once the campaign is right
 
@@ -164,11 +174,18 @@ def run(
 )
 @click.argument("campaign_file", metavar="CAMPAIGN", type=_CAMPAIGN)
 @click.option("--episodes", type=click.IntRange(min=2), default=48, show_default=True, help="Episodes to run.")
+@_av_option
 @_set_option
 @_json_option
 @click.pass_context
 def av_check(
-    ctx: click.Context, campaign_file: Path, *, episodes: int, overrides: Sequence[str], as_json: bool
+    ctx: click.Context,
+    campaign_file: Path,
+    *,
+    episodes: int,
+    av: str | None,
+    overrides: Sequence[str],
+    as_json: bool,
 ) -> None:
     """Run a few dozen cut-ins with the AV of CAMPAIGN, twice, and say what it is like.
 
@@ -177,7 +194,7 @@ def av_check(
 
     Exit code 3 says that episodes failed or were not reproduced; 2 that the campaign or the controller is wrong.
     """
-    campaign = _load(campaign_file, overrides)
+    campaign = _load(campaign_file, overrides, av)
     from harness.console import print_av_check  # noqa: PLC0415 - keeps --help fast
     from harness.runner import check_av  # noqa: PLC0415 - slow to import: only once the campaign is right
 
@@ -194,6 +211,7 @@ def av_check(
     epilog=_examples(
         "harness compare A.yaml B.yaml --out runs/a_b",
         "harness compare scenarios/overtaking_forced.yaml --against av.model=fvdm --out runs/idm_fvdm",
+        "harness compare scenarios/overtaking_forced.yaml --av idm --against-av late-600ms --out runs/late",
     ),
 )
 @click.argument("file_a", metavar="A", type=_CAMPAIGN)
@@ -205,8 +223,12 @@ def av_check(
     metavar="A.B=C",
     help="Value that B has instead; with it B may be left out. May be given several times.",
 )
+@click.option(
+    "--against-av", metavar="[PANEL.yaml:]NAME", help="Vehicle that B has instead; with it B may be left out."
+)
 @click.option("--workers", type=click.IntRange(min=1), help="Processes that simulate. Default: one per core.")
 @click.option("--quiet", is_flag=True, help="No progress bar. There is none either when stderr is not a terminal.")
+@_av_option
 @_set_option
 @_json_option
 @click.pass_context
@@ -217,8 +239,10 @@ def compare(
     folder: Path,
     *,
     against: Sequence[str],
+    against_av: str | None,
     workers: int | None,
     quiet: bool,
+    av: str | None,
     overrides: Sequence[str],
     as_json: bool,
 ) -> None:
@@ -229,13 +253,13 @@ def compare(
 
     testing.method forced is the one to choose: there both AVs meet the very same cut-ins.
     """
-    if file_b is None and not against:
-        raise click.UsageError("Name a second campaign, or say with --against what is different in B.")
-    a, b = _load(file_a, overrides), _load(file_b or file_a, [*overrides, *against])
+    if file_b is None and not against and against_av is None:
+        raise click.UsageError("Name a second campaign, or say with --against or --against-av what is different in B.")
+    a, b = _load(file_a, overrides, av), _load(file_b or file_a, [*overrides, *against], against_av or av)
     from harness.progress import terminal_progress  # noqa: PLC0415 - keeps --help fast
     from harness.runner import compare_campaigns  # noqa: PLC0415 - slow to import: only once the campaigns are right
 
-    label_b = ", ".join([b.name, *against]) if file_b is None else b.name
+    label_b = ", ".join([b.name, *filter(None, [against_av]), *against]) if file_b is None else b.name
     bar = None if quiet else terminal_progress(a.stop.rhw, a.min_crashes)
     with bar or nullcontext():
         found = compare_campaigns(a, b, folder, workers=workers, progress=bar, labels=(a.name, label_b))
@@ -426,6 +450,35 @@ def validate(
 
 
 @cli.command(
+    short_help="Fit a surrogate to the AV of a run.",
+    epilog=_examples(
+        "harness run my.yaml --out runs/rough --set records.trace_share=0.2",
+        "harness ladder runs/rough --out my-ladder.yaml",
+        "harness run my.yaml --out runs/fine --set testing.method=shells --set pool.library=./my-ladder.yaml",
+    ),
+)
+@click.argument("folder", metavar="DIR", type=_RUN_FOLDER)
+@click.option("--out", type=_FILE, required=True, help="Library to write, a new .yaml file.")
+@_json_option
+def ladder(folder: Path, out: Path, *, as_json: bool) -> None:
+    """Fit a driver to the AV of the run in DIR, and write the run's surrogate library with it.
+
+    The driver is an IDM with a reaction delay and limits to braking and jerk. It is fitted to accelerations in episodes
+    that were traced whatever came of them (records.trace_share, or records.traces all); how well it predicts the AV's
+    crashes is told by the tests that it was not fitted to. A more careless neighbour is added beside it.
+    """
+    from harness.pool.refined_ladder import refine_ladder  # noqa: PLC0415 - keeps --help fast
+
+    refined = refine_ladder(folder, out)
+    if as_json:
+        print_json({**refined.to_json(), "file": str(out)})
+        return
+    for sentence in refined.statements:
+        click.echo(sentence)
+    click.echo(str(out))
+
+
+@cli.command(
     short_help="Print the JSON schema of a campaign.", epilog=_examples("harness schema > campaign.schema.json")
 )
 def schema() -> None:
@@ -466,10 +519,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return code if isinstance(code, int) else EXIT_DONE
 
 
-def _load(campaign_file: Path, overrides: Sequence[str]) -> Campaign:
+def _load(campaign_file: Path, overrides: Sequence[str], av: str | None = None) -> Campaign:
     from harness.campaign.loading import load_campaign  # noqa: PLC0415 - keeps --help fast
 
-    return load_campaign(campaign_file, overrides)
+    return load_campaign(campaign_file, overrides, av=av)
 
 
 def _is_run(arguments: Sequence[str] | None) -> bool:

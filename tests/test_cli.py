@@ -107,6 +107,7 @@ def test_help_teaches_and_needs_nothing_heavy():
         ["estimate"],
         ["report"],
         ["replay"],
+        ["ladder"],
         ["schema"],
     ):
         result = CliRunner().invoke(cli, [*command, "--help"])

@@ -10,6 +10,7 @@ from pydantic import ValidationError
 
 from harness.campaign.models import Campaign
 from harness.campaign.overrides import Places, apply_overrides, parse_override
+from harness.campaign.panel import av_override
 from harness.campaign.problems import Place, invalid_file
 from harness.campaign.schema import campaign_schema
 from harness.campaign.yaml_text import read_yaml
@@ -18,7 +19,9 @@ from harness.errors import CampaignError
 SHIPPED_PARAMETERS = Path(__file__).parent.parent / "environment"
 
 
-def load_campaign(path: str | Path, overrides: Sequence[str] = (), *, check_files: bool = True) -> Campaign:
+def load_campaign(
+    path: str | Path, overrides: Sequence[str] = (), *, av: str | None = None, check_files: bool = True
+) -> Campaign:
     """Read, override and validate a campaign.
 
     Parameters
@@ -27,6 +30,9 @@ def load_campaign(path: str | Path, overrides: Sequence[str] = (), *, check_file
         Campaign file.
     overrides : sequence of str
         ``section.key=value`` each, as after ``--set``.
+    av : str, optional
+        Vehicle that replaces the campaign's, as after ``--av``: ``PANEL.yaml:NAME``, or ``NAME`` in the shipped panel.
+        Overrides are laid over it.
     check_files : bool
         Whether files that the campaign names must exist; False to look at a run whose environment file is gone.
 
@@ -45,7 +51,7 @@ def load_campaign(path: str | Path, overrides: Sequence[str] = (), *, check_file
     >>> load_campaign("scenarios/smoke.yaml", ["stop.rhw=0.3", "av.parameters.min_acceleration_mps2=-6"])
     """
     data, lines = read_yaml(path)
-    changes = [parse_override(text) for text in overrides]
+    changes = [*([] if av is None else [av_override(av)]), *map(parse_override, overrides)]
     data = apply_overrides(data, changes)
     place = Places(lines, changes)
     try:

@@ -15,16 +15,17 @@ from harness.errors import CampaignError
 
 @dataclass(frozen=True)
 class Override:
-    """One ``--set``: where, and the value that replaces what is there."""
+    """One ``--set`` (or ``--av``): where, and the value that replaces what is there."""
 
     path: tuple[str, ...]
     value: Any
     text: str
+    flag: str = "--set"
 
     @property
     def option(self) -> str:
         """The option as it was typed."""
-        return f"--set {self.text}"
+        return f"{self.flag} {self.text}"
 
 
 def parse_override(text: str) -> Override:

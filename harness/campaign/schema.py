@@ -6,18 +6,27 @@ import json
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from harness.campaign.models import AV_SOURCES, Campaign, ConstantParameters
+from pydantic import BaseModel
+
+from harness.campaign.models import AV_SOURCES, Campaign, ConstantParameters, FVDMParameters, IDMParameters
 
 Schema = dict[str, Any]
 
 
 def campaign_schema() -> Schema:
     """JSON schema (draft 2020-12) of a campaign file, generated from the models."""
-    schema = Campaign.model_json_schema()
-    schema["$defs"]["ConstantParameters"] = ConstantParameters.model_json_schema()  # no surrogate has them
+    about = {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "harness campaign"}
+    return {**about, **schema_of(Campaign)}
+
+
+def schema_of(model: type[BaseModel]) -> Schema:
+    """JSON schema of a file that holds vehicles: a campaign, or a panel."""
+    schema = model.model_json_schema()
+    for parameters in (IDMParameters, FVDMParameters, ConstantParameters):
+        schema["$defs"].setdefault(parameters.__name__, parameters.model_json_schema())
     _tidy(schema)
     _tell_sources_apart(schema["$defs"]["AutomatedVehicle"])
-    return {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "harness campaign", **schema}
+    return schema
 
 
 def _tell_sources_apart(av: Schema) -> None:

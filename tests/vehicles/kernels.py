@@ -4,8 +4,9 @@ Import this module as ``tests.…`` everywhere: numba's cache remembers the name
 
 import numpy as np
 
+from harness.campaign.models import IDMParameters
 from harness.compiled import compiled_threads
-from harness.vehicles import kinematics, models
+from harness.vehicles import kinematics, models, reaction
 
 
 @compiled_threads
@@ -22,6 +23,22 @@ def _motions(situations, out):
         out[i, 0] = kinematics.next_position(x, v, out[i, 1])
 
 
+@compiled_threads
+def _follow(driver, seed, episode, situations, out):
+    late = reaction.reaction_steps(driver[0], seed, episode)
+    a = 0.0
+    for i in range(situations.shape[0]):
+        if i > late:
+            a = reaction.reacting_acceleration(driver[0], a, situations[i, 0], situations[i, 1], situations[i, 2])
+        out[i] = a
+
+
+@compiled_threads
+def _late(driver, seed, first, out):
+    for i in range(out.size):
+        out[i] = reaction.reaction_steps(driver[0], seed, first + i)
+
+
 def accelerations(parameters, situations):
     """Accelerations (n,) at speed, leader's speed and gap: (n, 3)."""
     situations = np.atleast_2d(np.asarray(situations, float))
@@ -35,4 +52,19 @@ def motions(situations):
     situations = np.atleast_2d(np.asarray(situations, float))
     out = np.empty((len(situations), 2))
     _motions(situations, out)
+    return out
+
+
+def follow(parameters, reflexes, situations, *, seed=0, episode=0):
+    """Accelerations (n,) from the cut-in on, at speed, leader's speed and gap in each step: (n, 3)."""
+    situations = np.asarray(situations, float)
+    out = np.empty(len(situations))
+    _follow(models.driver_records([parameters], [reflexes]), seed, episode, situations, out)
+    return out
+
+
+def steps_late(reflexes, n, *, seed=0, first=0):
+    """Steps between cut-in and reaction in consecutive episodes (n,)."""
+    out = np.empty(n, np.int64)
+    _late(models.driver_records([IDMParameters()], [reflexes]), seed, first, out)
     return out

@@ -1,0 +1,151 @@
+"""How well a driver predicts an AV's crashes: the same stored tests, once with the AV, once with the driver."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from harness.arrays import BoolArray, FloatArray, IntArray, RecordArray
+from harness.campaign.models import Campaign
+from harness.environment.driving import Environment
+from harness.environment.loading import load_environment
+from harness.errors import RunFolderError
+from harness.pool.library import LibraryDriver
+from harness.pool.replay import StoredPaths, replay_surrogates
+from harness.pool.surrogate_replay import PATH_COLUMNS, room_for, stored_paths
+from harness.records.folder import read_manifest, read_table
+from harness.vehicles.models import driver_records
+
+_COLUMNS = [*PATH_COLUMNS, "outcome", "component", "log_weight"]
+
+
+@dataclass(frozen=True, eq=False)
+class Replayed:
+    """Stored tests, failed ones left out, and who crashes in them.
+
+    Attributes
+    ----------
+    episode : ndarray of int64, shape (n,)
+        Index in the campaign.
+    probability : ndarray, shape (n,)
+        Likelihood ratio of the test; with shells the probability of its stratum.
+    stratum : ndarray of int64, shape (n,)
+        With shells, else 0.
+    av : ndarray of bool, shape (n,)
+        The AV crashed.
+    drivers : ndarray of bool, shape (n, D)
+        Each driver would have.
+    """
+
+    episode: IntArray
+    probability: FloatArray
+    stratum: IntArray
+    av: BoolArray
+    drivers: BoolArray
+
+    def apart_from(self, episodes: IntArray) -> Replayed:
+        """All tests but some."""
+        kept = ~np.isin(self.episode, episodes)
+        return Replayed(
+            self.episode[kept], self.probability[kept], self.stratum[kept], self.av[kept], self.drivers[kept]
+        )
+
+    @property
+    def weight(self) -> FloatArray:
+        """What a crash in each test contributes to the crash rate, shape (n,)."""
+        weight: FloatArray = self.probability / np.bincount(self.stratum)[self.stratum]
+        return weight
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Crashes of the AV against those of a driver, by number and by weight.
+
+    Attributes
+    ----------
+    both, only_av, only_driver, neither : int
+        Tests.
+    crash_rate, crash_rate_driver : float
+        Weighted, per test.
+    caught : float or None
+        Share of the AV's crash rate in tests in which the driver crashes too; None without a crash of the AV.
+    false_alarms : float or None
+        Share of the driver's crash rate in tests in which the AV does not crash; None without a crash of the driver.
+    """
+
+    both: int
+    only_av: int
+    only_driver: int
+    neither: int
+    crash_rate: float
+    crash_rate_driver: float
+    caught: float | None
+    false_alarms: float | None
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain content for a file."""
+        return dict(vars(self))
+
+
+def predict(replayed: Replayed, driver: int) -> Prediction:
+    """How well one of the drivers predicts the AV's crashes in these tests."""
+    av, other, weight = replayed.av, replayed.drivers[:, driver], replayed.weight
+    rate, rate_driver, rate_both = (float(weight[who].sum()) for who in (av, other, av & other))
+    return Prediction(
+        both=int((av & other).sum()),
+        only_av=int((av & ~other).sum()),
+        only_driver=int((~av & other).sum()),
+        neither=int((~av & ~other).sum()),
+        crash_rate=rate,
+        crash_rate_driver=rate_driver,
+        caught=rate_both / rate if rate > 0.0 else None,
+        false_alarms=1.0 - rate_both / rate_driver if rate_driver > 0.0 else None,
+    )
+
+
+def replay_drivers(folder: Path, campaign: Campaign, drivers: Sequence[LibraryDriver]) -> Replayed:
+    """Put drivers in the place of the AV in all tests of a run.
+
+    Raises
+    ------
+    RunFolderError
+        Records are missing or damaged.
+    """
+    environment = load_environment(campaign.environment)
+    records = driver_records([model.parameters for model in drivers], [model.reaction for model in drivers])
+    in_shells = campaign.testing.method == "shells"
+    parts = []
+    for shard in read_manifest(folder)["shards"]:
+        table = read_table(folder / shard["files"]["episodes"], _COLUMNS)
+        crashes = _who_crashes(stored_paths(table, campaign.seed), environment, records)
+        outcome = np.array(table.column("outcome").cast(pa.string()).to_pylist())
+        component = np.asarray(table.column("component")).astype(np.int64)
+        columns = (
+            np.asarray(table.column("episode")),
+            np.exp(np.asarray(table.column("log_weight"))),
+            component if in_shells else np.zeros_like(component),
+            outcome == "crash",
+            crashes,
+        )
+        parts.append([values[outcome != "failed"] for values in columns])
+    return Replayed(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def _who_crashes(stored: StoredPaths, environment: Environment, records: RecordArray) -> BoolArray:
+    """Which drivers crash in stored tests, shape (n, D)."""
+    bits = np.zeros(stored.cut_step.size, np.int64)
+    wrong = replay_surrogates(stored, environment, records, -1, room_for(environment), bits)
+    if wrong >= 0:
+        raise RunFolderError(
+            f"episodes, episode {stored.first + wrong}",
+            found="maneuvers that do not fit its steps",
+            expected="the maneuvers that were driven: they determine the episode",
+            mend="Remove the shard and run `harness run` with --resume, which makes it again.",
+        )
+    found: BoolArray = ((bits[:, None] >> np.arange(records.size)) & 1).astype(np.bool_)
+    return found

@@ -1,0 +1,252 @@
+"""The adaptive ladder: a library with a driver fitted to the AV that a run has tested, and one a little more careless.
+
+The nearer the surrogates of a library are to the AV, the fewer tests it needs; a wrong one costs tests and never
+correctness. So a first, rough run pays for a second, precise one. How far the fitted driver may be believed is told by
+the tests that it was not fitted to.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from ruamel.yaml import YAML
+
+from harness.campaign.loading import load_campaign
+from harness.campaign.models import Campaign, Reflexes
+from harness.errors import CampaignError, RunFolderError
+from harness.pool.fit_driver import MOST_DELAY_STEPS, FittedDriver, agreement, fit_driver
+from harness.pool.library import Library, LibraryDriver, LibraryIDM, load_library
+from harness.pool.observed import Observed, read_observed
+from harness.pool.predicted import Prediction, predict, replay_drivers
+from harness.records.folder import read_manifest, write_text
+
+MOST_FITTED = 200
+"""Cut-ins that a driver is fitted to; more change nothing but the time."""
+CARELESS_BRAKING, CARELESS_DELAY_STEPS = 0.9, 2
+"""The neighbour brakes at most this share as hard, and so much later."""
+ENOUGH = 0.5
+"""Share of variance, and of the crash rate, from which on a driver is called a prediction."""
+
+
+@dataclass(frozen=True)
+class RefinedLadder:
+    """What came of it.
+
+    Attributes
+    ----------
+    library : Library
+        With the drivers added.
+    name, careless : str
+        The fitted driver, and its more careless neighbour.
+    fitted : FittedDriver
+        With its agreement in the cut-ins that it was fitted to.
+    rms_mps2, explained : float
+        Agreement of accelerations in ``n_checked`` other cut-ins.
+    n_checked : int
+    prediction : Prediction
+        Of crashes in all tests that it was not fitted to.
+    """
+
+    library: Library
+    name: str
+    careless: str
+    fitted: FittedDriver
+    rms_mps2: float
+    explained: float
+    n_checked: int
+    prediction: Prediction
+
+    @property
+    def predicted(self) -> bool:
+        """Whether the driver describes the AV: most of the variance of its accelerations, and most of its crashes."""
+        p = self.prediction
+        crashes = (p.caught is None or p.caught >= ENOUGH) and (p.false_alarms is None or p.false_alarms <= ENOUGH)
+        return self.explained >= ENOUGH and crashes
+
+    @property
+    def statements(self) -> list[str]:
+        """What a person wants to read, a sentence each."""
+        p = self.prediction
+        said = [
+            f"{self.name}: {describe(self.fitted.driver)}.",
+            f"Fitted to {self.fitted.n_cut_ins} cut-ins; in {self.n_checked} others it explains "
+            f"{100.0 * self.explained:.1f} % of the variance of the accelerations (RMS {self.rms_mps2:.2f} m/s²).",
+            f"In the {p.both + p.only_av + p.only_driver + p.neither:,} tests that it was not fitted to, both crash "
+            f"{p.both:,} times, the AV alone {p.only_av:,}, the driver alone {p.only_driver:,}.",
+        ]
+        if p.caught is not None:
+            false = "" if p.false_alarms is None else f", with {100.0 * p.false_alarms:.1f} % false alarms"
+            said.append(f"By weight it predicts {100.0 * p.caught:.1f} % of the AV's crash rate{false}.")
+        if not self.predicted:
+            said.append(f"NOT PREDICTED: {self._what_is_not()}. Using this driver costs tests, not correctness.")
+        return said
+
+    def _what_is_not(self) -> str:
+        if self.explained >= ENOUGH:
+            return "the driver does not crash where the AV does"
+        return "the driver does not describe how the AV accelerates, so that crashes in common say little beyond these"
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain content for a file."""
+        return {
+            "name": self.name,
+            "careless": self.careless,
+            "driver": self.fitted.driver.model_dump(),
+            "n_cut_ins_fitted": self.fitted.n_cut_ins,
+            "n_cut_ins_checked": self.n_checked,
+            "rms_mps2": self.rms_mps2,
+            "explained": self.explained,
+            "prediction": self.prediction.to_json(),
+            "predicted": self.predicted,
+            "boundary": self.library.boundary,
+        }
+
+
+def refine_ladder(folder: Path, out: Path) -> RefinedLadder:
+    """Fit a driver to the AV of a run, write the run's library with it, and see how well it predicts.
+
+    Parameters
+    ----------
+    folder : Path
+        Run folder.
+    out : Path
+        Library to write; must not be there yet.
+
+    Raises
+    ------
+    CampaignError
+        The AV acts before the cut-in, or the library's file is gone.
+    RunFolderError
+        The run's traces depend on the outcome or hold too few cut-ins, or ``out`` is there already.
+    """
+    _require_new(out)
+    campaign = load_campaign(folder / "campaign.yaml")
+    if campaign.av.before_cut_in == "controller":
+        raise CampaignError(
+            "av.before_cut_in",
+            found="controller",
+            expected="hold_speed: a fitted driver keeps its speed until the cut-in, as all surrogates do",
+            mend="Run the campaign with --set av.before_cut_in=hold_speed.",
+        )
+    library = load_library(campaign.pool.library)
+    observed = read_observed(folder, campaign)
+    cut_ins = np.arange(observed.episode.size)
+    to_fit, to_check = observed.part(cut_ins[::2][:MOST_FITTED]), observed.part(cut_ins[1::2])
+    fitted = fit_driver(to_fit, library.envelope_mps2)
+    refined = _refined(folder, campaign, library, fitted, to_fit, to_check)
+    write_text(out, _text(refined, folder))
+    return refined
+
+
+def _refined(
+    folder: Path, campaign: Campaign, library: Library, fitted: FittedDriver, to_fit: Observed, to_check: Observed
+) -> RefinedLadder:
+    careless = more_careless(fitted.driver)
+    name, careless_name = _free_names(library)
+    drivers: list[LibraryDriver] = [fitted.driver, careless, library.surrogates[library.boundary]]
+    replayed = replay_drivers(folder, campaign, drivers).apart_from(to_fit.episode)
+    # The conditional statement is about vehicles inside the boundary: it must not lie within the AV's own neighbour.
+    beyond = predict(replayed, 1).crash_rate_driver > predict(replayed, 2).crash_rate_driver
+    added = {**library.surrogates, name: fitted.driver, careless_name: careless}
+    content = {**dict(library), "surrogates": added, "boundary": careless_name if beyond else library.boundary}
+    return RefinedLadder(
+        Library.model_validate(content),
+        name,
+        careless_name,
+        fitted,
+        *agreement(fitted.driver, to_check),
+        to_check.episode.size,
+        predict(replayed, 0),
+    )
+
+
+def more_careless(driver: LibraryIDM) -> LibraryIDM:
+    """A neighbour that brakes a little less and a little later."""
+    braking = float(f"{CARELESS_BRAKING * driver.parameters.min_acceleration_mps2:.4g}")
+    late = min(round(driver.reaction.delay_s * 10.0) + CARELESS_DELAY_STEPS, MOST_DELAY_STEPS + CARELESS_DELAY_STEPS)
+    return LibraryIDM(
+        model="idm",
+        parameters=driver.parameters.model_copy(update={"min_acceleration_mps2": braking}),
+        reaction=Reflexes(delay_s=late / 10.0, max_jerk_mps3=driver.reaction.max_jerk_mps3),
+    )
+
+
+def describe(driver: LibraryIDM) -> str:
+    """A driver in words."""
+    p, r = driver.parameters, driver.reaction
+    jerk = "" if r.max_jerk_mps3 is None else f", changing its acceleration by at most {r.max_jerk_mps3:.3g} m/s³"
+    return (
+        f"an IDM that reacts after {r.delay_s:.1f} s and brakes with at most {-p.min_acceleration_mps2:.3g} m/s²{jerk}"
+        f" (alpha {p.acceleration_mps2:.3g}, b {p.comfortable_deceleration_mps2:.3g}, T {p.time_headway_s:.3g}, "
+        f"s0 {p.minimum_gap_m:.3g}, v0 {p.desired_speed_mps:.3g})"
+    )
+
+
+def _free_names(library: Library) -> tuple[str, str]:
+    """Names for the two drivers that the library does not have yet."""
+    ending = ""
+    k = 1
+    while {f"fitted{ending}", f"fitted{ending}-careless"} & set(library.surrogates):
+        k += 1
+        ending = f"-{k}"
+    return f"fitted{ending}", f"fitted{ending}-careless"
+
+
+def _require_new(out: Path) -> None:
+    if out.suffix not in (".yaml", ".yml"):
+        raise CampaignError(
+            "--out", found=str(out), expected="a name that ends in .yaml", mend=f"Write --out {out.name}.yaml."
+        )
+    if out.exists():
+        raise RunFolderError(
+            str(out),
+            found="a file that is there already",
+            expected="a new one: a library that runs have used must not change",
+            mend="Choose another name, or delete it.",
+        )
+
+
+def _text(refined: RefinedLadder, folder: Path) -> str:
+    """The library as a file: what the new drivers were fitted to, then every driver on a line."""
+    manifest = read_manifest(folder)
+    library = refined.library
+    p = refined.prediction
+    comment = [
+        f"Surrogate library with a driver fitted to the vehicle of campaign {manifest.get('name')}",
+        f"({manifest['campaign_hash']}, {manifest['n_episodes']:,} tests), by `harness ladder`.",
+        "",
+        *refined.statements,
+        "",
+        f"Weighted crash rates in those tests: vehicle {p.crash_rate:.3g}, {refined.name} {p.crash_rate_driver:.3g}.",
+        f"{refined.careless} brakes {100.0 * (1.0 - CARELESS_BRAKING):.0f} % less and "
+        f"{CARELESS_DELAY_STEPS / 10.0:g} s later.",
+    ]
+    drivers = [f"  {name}: {_flow(model.model_dump(exclude_unset=True))}" for name, model in library.surrogates.items()]
+    return "\n".join(
+        [
+            *(f"# {line}".rstrip() for line in comment),
+            "",
+            f"format: {library.format}",
+            f"version: {library.version}",
+            f"description: {_flow(library.description)}",
+            f"boundary: {library.boundary}",
+            f"envelope: {library.envelope}",
+            "surrogates:",
+            *drivers,
+            "",
+        ]
+    )
+
+
+def _flow(value: Any) -> str:
+    """A value on one line of YAML."""
+    writer = YAML(typ="safe", pure=True)
+    writer.default_flow_style = True
+    writer.width = 1_000_000
+    stream = StringIO()
+    writer.dump(value, stream)
+    return stream.getvalue().removesuffix("...\n").strip()
