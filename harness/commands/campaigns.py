@@ -1,0 +1,125 @@
+"""A campaign: check it, run it, and what it may say."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from harness.commands.options import (
+    CAMPAIGN,
+    FOLDER,
+    av_option,
+    examples,
+    json_option,
+    loaded,
+    set_option,
+)
+from harness.console import (
+    print_json,
+    print_plan,
+    print_statements,
+)
+
+if TYPE_CHECKING:
+    pass
+
+
+@click.command(
+    short_help="Validate a campaign, print it resolved, and its cost.",
+    epilog=examples(
+        "harness check scenarios/smoke.yaml", "harness check scenarios/smoke.yaml --set av.model=fvdm > resolved.yaml"
+    ),
+)
+@click.argument("campaign_file", metavar="CAMPAIGN", type=CAMPAIGN)
+@av_option
+@set_option
+@json_option
+def check(campaign_file: Path, overrides: Sequence[str], av: str | None, *, as_json: bool) -> None:
+    """Validate CAMPAIGN; print it with every default filled in, and what it will cost.
+
+    Nothing is simulated and nothing is written. The output is itself a campaign file; its cost stands in comments.
+    """
+    campaign = loaded(campaign_file, overrides, av)
+    from harness.campaign.dumping import dump_campaign  # noqa: PLC0415 - keeps --help fast
+    from harness.runner import plan_campaign  # noqa: PLC0415 - slow to import: only once the campaign is right
+
+    plan = plan_campaign(campaign)
+    if as_json:
+        print_json({"campaign": campaign.model_dump(mode="json"), "plan": plan})
+        return
+    click.echo(dump_campaign(campaign))
+    print_plan(plan)
+
+
+@click.command(
+    short_help="Run a campaign until it is precise enough.",
+    epilog=examples(
+        "harness run scenarios/smoke.yaml --out runs/smoke",
+        "harness run scenarios/smoke.yaml --out runs/smoke --resume --set stop.rhw=0.03",
+        "harness run scenarios/smoke.yaml --out runs/hard --set av.parameters.min_acceleration_mps2=-8",
+        "harness run scenarios/smoke.yaml --out runs/late --av late-600ms",
+    ),
+)
+@click.argument("campaign_file", metavar="CAMPAIGN", type=CAMPAIGN)
+@click.option("--out", "folder", type=FOLDER, required=True, help="Run folder; made if it is not there.")
+@click.option("--workers", type=click.IntRange(min=1), help="Processes that simulate. Default: one per core.")
+@click.option("--resume", is_flag=True, help="Go on with what the run folder already holds.")
+@click.option("--quiet", is_flag=True, help="No progress bar. There is none either when stderr is not a terminal.")
+@av_option
+@set_option
+@json_option
+@click.pass_context
+def run(
+    ctx: click.Context,
+    campaign_file: Path,
+    folder: Path,
+    *,
+    workers: int | None,
+    resume: bool,
+    quiet: bool,
+    av: str | None,
+    overrides: Sequence[str],
+    as_json: bool,
+) -> None:
+    """Run CAMPAIGN until it is precise enough, and print the crash rate.
+
+    The same campaign gives the same records, bit for bit, whatever the number of workers, and also when it was
+    interrupted and resumed. The run folder holds the resolved campaign, all records (Parquet), estimates.json and
+    report.html.
+
+    Exit code 4 says that stop.episodes was spent before stop.rhw was reached; the results are there all the same.
+    """
+    campaign = loaded(campaign_file, overrides, av)
+    from harness.progress import terminal_progress  # noqa: PLC0415 - keeps --help fast
+    from harness.runner import run_campaign  # noqa: PLC0415 - slow to import: only once the campaign is right
+
+    bar = None if quiet else terminal_progress(campaign.stop.rhw, campaign.min_crashes)
+    with bar or nullcontext():
+        result = run_campaign(campaign, folder, workers=workers, resume=resume, progress=bar)
+        if bar is not None:
+            bar.stage("report", total=None)
+        report_file = result.report
+    if as_json:
+        print_json(result.estimates)
+    else:
+        print_statements(result.estimates)
+        click.echo(str(report_file))
+        click.echo(str(result.folder / "estimates.json"))
+    ctx.exit(result.exit_code)
+
+
+@click.command(
+    short_help="Print the JSON schema of a campaign.", epilog=examples("harness schema > campaign.schema.json")
+)
+def schema() -> None:
+    """Print the JSON schema of a campaign, by which an editor completes and checks campaign files.
+
+    Let the first line of a campaign name the file: '# yaml-language-server: $schema=campaign.schema.json'.
+    """
+    from harness.campaign.schema import schema_text  # noqa: PLC0415 - keeps --help fast
+
+    click.echo(schema_text(), nl=False)

@@ -1,0 +1,94 @@
+"""What lies behind results: the pool of cut-ins, and what intervals are worth."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from harness.commands.options import (
+    CAMPAIGN,
+    FILE,
+    FOLDER,
+    examples,
+    json_option,
+    loaded,
+    set_option,
+)
+from harness.console import (
+    print_json,
+    print_pool,
+)
+
+if TYPE_CHECKING:
+    pass
+
+
+@click.command(
+    short_help="Build the pool of cut-ins, and show its shells.",
+    epilog=examples("harness pool scenarios/smoke.yaml", "harness pool scenarios/smoke.yaml --out pool.parquet"),
+)
+@click.argument("campaign_file", metavar="CAMPAIGN", type=CAMPAIGN)
+@click.option("--out", type=FILE, help="Write the pool there, too: FILE.parquet, one row per cut-in.")
+@set_option
+@json_option
+def pool(campaign_file: Path, *, out: Path | None, overrides: Sequence[str], as_json: bool) -> None:
+    """Build the pool that belongs to CAMPAIGN's environment and surrogate library, and show what is in it.
+
+    Shown are the surrogates from careful to careless with their crash rates, and how probable it is that a cut-in is
+    the first in this order that a surrogate crashes on. A pool is built once and kept; `harness run` builds it, too.
+    """
+    campaign = loaded(campaign_file, overrides)
+    from harness.pool.storage import campaign_pool, write_pool  # noqa: PLC0415 - slow to import
+    from harness.progress import terminal_progress  # noqa: PLC0415 - keeps --help fast
+
+    bar = terminal_progress()
+    with bar or nullcontext():
+        found = campaign_pool(campaign, bar)
+    if out is not None:
+        write_pool(out, found)
+    if as_json:
+        print_json(found.to_json())
+    else:
+        print_pool(found.to_json())
+
+
+@click.command(
+    short_help="Repeat a campaign thousands of times: what are its intervals worth?",
+    epilog=examples("harness validate scenarios/validate/shells_panel.yaml --out runs/shells_panel"),
+)
+@click.argument("experiment_file", metavar="EXPERIMENT", type=CAMPAIGN)
+@click.option("--out", "folder", type=FOLDER, required=True, help="Folder of the results; made if it is not there.")
+@click.option("--replications", type=click.IntRange(min=2), help="Instead of the experiment's own number.")
+@click.option("--workers", type=click.IntRange(min=1), help="Processes. Default: one per core.")
+@click.option("--quiet", is_flag=True, help="No progress bar. There is none either when stderr is not a terminal.")
+@json_option
+def validate(
+    experiment_file: Path, folder: Path, *, replications: int | None, workers: int | None, quiet: bool, as_json: bool
+) -> None:
+    """Repeat the campaign of EXPERIMENT for each of its vehicles or chains, and judge its intervals by that.
+
+    Printed are bias, true and claimed variance, coverage with its binomial interval and Holm-corrected p-value, and
+    the tests needed. The folder receives results.json, replications.parquet (one row each) and coverage.png.
+    """
+    from harness.validation.experiment import load_experiment  # noqa: PLC0415 - keeps --help fast
+
+    experiment = load_experiment(experiment_file)
+    if replications is not None:
+        experiment = experiment.model_copy(update={"replications": replications})
+    from harness.progress import terminal_progress  # noqa: PLC0415 - keeps --help fast
+    from harness.validation import validate as repeat  # noqa: PLC0415 - slow to import: only once the file is right
+    from harness.validation.results import RESULTS, table_lines  # noqa: PLC0415
+
+    bar = None if quiet else terminal_progress(None, 0)
+    with bar or nullcontext():
+        done = repeat(experiment, folder, workers=workers, progress=bar)
+    if as_json:
+        print_json([one.to_json() for one in done.judgements])
+        return
+    for line in table_lines(done.judgements):
+        click.echo(line)
+    click.echo(str(folder / RESULTS))

@@ -1,0 +1,166 @@
+"""Vehicles: look at one, compare two, fit a surrogate to one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from harness.commands.options import (
+    CAMPAIGN,
+    FILE,
+    FOLDER,
+    RUN_FOLDER,
+    av_option,
+    examples,
+    json_option,
+    loaded,
+    set_option,
+)
+from harness.console import (
+    print_av_check,
+    print_json,
+)
+
+if TYPE_CHECKING:
+    pass
+
+
+@click.command(
+    name="av-check",
+    short_help="Look at the AV before a campaign is spent on it.",
+    epilog=examples(
+        "harness av-check scenarios/smoke.yaml",
+        "harness av-check scenarios/smoke.yaml --set av.model=null --set av.controller=my_pkg.my_module:MyController",
+    ),
+)
+@click.argument("campaign_file", metavar="CAMPAIGN", type=CAMPAIGN)
+@click.option("--episodes", type=click.IntRange(min=2), default=48, show_default=True, help="Episodes to run.")
+@av_option
+@set_option
+@json_option
+@click.pass_context
+def av_check(
+    ctx: click.Context,
+    campaign_file: Path,
+    *,
+    episodes: int,
+    av: str | None,
+    overrides: Sequence[str],
+    as_json: bool,
+) -> None:
+    """Run a few dozen cut-ins with the AV of CAMPAIGN, twice, and say what it is like.
+
+    Shown are whether it gives the same bits in another order and in other cells, whether it stays finite and within
+    limits, how it reacts to cut-ins, and its time per step beside the built-in IDM. Nothing is written.
+
+    Exit code 3 says that episodes failed or were not reproduced; 2 that the campaign or the controller is wrong.
+    """
+    campaign = loaded(campaign_file, overrides, av)
+    from harness.runner import check_av  # noqa: PLC0415 - slow to import: only once the campaign is right
+
+    found = check_av(campaign, episodes)
+    if as_json:
+        print_json(found.to_json())
+    else:
+        print_av_check(found)
+    ctx.exit(found.exit_code)
+
+
+@click.command(
+    short_help="Two AVs on common random numbers: the interval of the difference.",
+    epilog=examples(
+        "harness compare A.yaml B.yaml --out runs/a_b",
+        "harness compare scenarios/overtaking_forced.yaml --against av.model=fvdm --out runs/idm_fvdm",
+        "harness compare scenarios/overtaking_forced.yaml --av idm --against-av late-600ms --out runs/late",
+    ),
+)
+@click.argument("file_a", metavar="A", type=CAMPAIGN)
+@click.argument("file_b", metavar="[B]", type=CAMPAIGN, required=False)
+@click.option("--out", "folder", type=FOLDER, required=True, help="Folder; run folders a and b are made in it.")
+@click.option(
+    "--against",
+    multiple=True,
+    metavar="A.B=C",
+    help="Value that B has instead; with it B may be left out. May be given several times.",
+)
+@click.option(
+    "--against-av", metavar="[PANEL.yaml:]NAME", help="Vehicle that B has instead; with it B may be left out."
+)
+@click.option("--workers", type=click.IntRange(min=1), help="Processes that simulate. Default: one per core.")
+@click.option("--quiet", is_flag=True, help="No progress bar. There is none either when stderr is not a terminal.")
+@av_option
+@set_option
+@json_option
+@click.pass_context
+def compare(
+    ctx: click.Context,
+    file_a: Path,
+    file_b: Path | None,
+    folder: Path,
+    *,
+    against: Sequence[str],
+    against_av: str | None,
+    workers: int | None,
+    quiet: bool,
+    av: str | None,
+    overrides: Sequence[str],
+    as_json: bool,
+) -> None:
+    """Run campaigns A and B, which differ in their AV only, on the same random numbers, and print the difference.
+
+    Both run to their own stop rule, then the shorter one as far as the longer. Finished parts of an earlier call with
+    the same folder are used again. The folder receives the run folders a and b, and compare.json.
+
+    testing.method forced is the one to choose: there both AVs meet the very same cut-ins.
+    """
+    if file_b is None and not against and against_av is None:
+        raise click.UsageError("Name a second campaign, or say with --against or --against-av what is different in B.")
+    a, b = loaded(file_a, overrides, av), loaded(file_b or file_a, [*overrides, *against], against_av or av)
+    from harness.progress import terminal_progress  # noqa: PLC0415 - keeps --help fast
+    from harness.runner import compare_campaigns  # noqa: PLC0415 - slow to import: only once the campaigns are right
+
+    label_b = ", ".join([b.name, *filter(None, [against_av]), *against]) if file_b is None else b.name
+    bar = None if quiet else terminal_progress(a.stop.rhw, a.min_crashes)
+    with bar or nullcontext():
+        found = compare_campaigns(a, b, folder, workers=workers, progress=bar, labels=(a.name, label_b))
+    if as_json:
+        print_json(found.content)
+    else:
+        click.echo(found.content["statement"])
+        for remark in found.difference.warnings:
+            click.echo(f"note: {remark}")
+        click.echo(str(folder / "compare.json"))
+    ctx.exit(found.exit_code)
+
+
+@click.command(
+    short_help="Fit a surrogate to the AV of a run.",
+    epilog=examples(
+        "harness run my.yaml --out runs/rough --set records.trace_share=0.2",
+        "harness ladder runs/rough --out my-ladder.yaml",
+        "harness run my.yaml --out runs/fine --set testing.method=shells --set pool.library=./my-ladder.yaml",
+    ),
+)
+@click.argument("folder", metavar="DIR", type=RUN_FOLDER)
+@click.option("--out", type=FILE, required=True, help="Library to write, a new .yaml file.")
+@json_option
+def ladder(folder: Path, out: Path, *, as_json: bool) -> None:
+    """Fit a driver to the AV of the run in DIR, and write the run's surrogate library with it.
+
+    The driver is an IDM with a reaction delay and limits to braking and jerk. It is fitted to accelerations in episodes
+    that were traced whatever came of them (records.trace_share, or records.traces all); how well it predicts the AV's
+    crashes is told by the tests that it was not fitted to. A more careless neighbour is added beside it.
+    """
+    from harness.pool.refined_ladder import refine_ladder  # noqa: PLC0415 - keeps --help fast
+
+    refined = refine_ladder(folder, out)
+    if as_json:
+        print_json({**refined.to_json(), "file": str(out)})
+        return
+    for sentence in refined.statements:
+        click.echo(sentence)
+    click.echo(str(out))
