@@ -493,6 +493,17 @@ class Campaign(Section):
         return self
 
     @model_validator(mode="after")
+    def _built_in_models_wait_for_the_cut_in(self) -> Self:
+        if self.av.before_cut_in == "controller" and self.av.model is not None:
+            raise broken_rule(
+                "av.before_cut_in",
+                found=f"controller, with the built-in model {self.av.model}",
+                expected="hold_speed: a built-in model has nothing to follow before the cut-in",
+                mend="Delete the key, or bring a controller of your own.",
+            )
+        return self
+
+    @model_validator(mode="after")
     def _engine_can_drive_the_av(self) -> Self:
         if self.world.engine == "twin" and self.av.source in ("sumo", "traci"):
             raise broken_rule(

@@ -28,6 +28,8 @@ CARELESS_SHARE = 0.2
 """How much the surrogates beyond the boundary count in aiming: only a bound is wanted there."""
 CARELESS_ERROR = 4.0
 """Their relative error may be this many times the target."""
+_APART = 0x706F6F6C
+"""Keeps a pool's random numbers apart from those of a campaign with the same seed."""
 AIMED_DRAW, KEEP_DRAW = 0, 1
 """Indices within the diagnostic stream."""
 
@@ -125,7 +127,7 @@ def build_pool(
     """
     progress = progress or SilentProgress()
     names = list(library.surrogates)
-    pilot = Enumerator(environment, library.drivers, names.index(library.envelope), settings.seed)
+    pilot = Enumerator(environment, library.drivers, names.index(library.envelope), settings.seed ^ _APART)
     progress.stage("pool: pilot", PILOT_PATHS)
     rates = _joined(pilot.run(0, PILOT_PATHS, progress), len(names))
     careful = _up_to_boundary(rates, names.index(library.boundary))

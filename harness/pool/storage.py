@@ -18,7 +18,7 @@ from harness.compiled import cache_root, source_hash
 from harness.environment.driving import Environment
 from harness.environment.loading import load_environment
 from harness.errors import RunFolderError
-from harness.pool.build import PILOT_PATHS, ROUND_PATHS, build_pool
+from harness.pool.build import build_pool
 from harness.pool.cut_ins import CutIns, Pool, environment_hash
 from harness.pool.library import Library, load_library
 from harness.progress import Progress
@@ -26,19 +26,20 @@ from harness.records.folder import write_atomically
 
 _FORMAT = 2
 """Raise it when the meaning of a pool changes."""
+_MADE_BY = ("build.py", "cut_ins.py", "proposal.py")
+"""Code that decides what is in a pool, beside the kernels."""
 _METADATA = b"harness_pool"
 _STATE = ("v_bv_mps", "r1_m", "r1dot_mps", "r2_m", "r2dot_mps")
 
 
 def pool_key(environment: Environment, library: Library, settings: PoolSettings) -> str:
-    """Hash of all that a pool depends on: environment, level of lane changing, library, settings, and the kernels."""
+    """Hash of all that a pool depends on: environment, level of lane changing, library, settings, and code."""
     drivers = {name: model.model_dump() for name, model in library.surrogates.items()}
     roles = [library.boundary, library.envelope]
     content = [
         _FORMAT,
         source_hash(),
-        PILOT_PATHS,
-        ROUND_PATHS,
+        *(hashlib.sha256((Path(__file__).parent / name).read_bytes()).hexdigest() for name in _MADE_BY),
         environment_hash(environment),
         drivers,
         roles,

@@ -24,6 +24,8 @@ MOST_FIRST_TESTS = 4
 """Testing turns to what lies outside after this many times the first tests, known or not."""
 SMALLEST_ROUND = 8
 SHARES_PER_ROUND = 32
+USED_UP_SHARE = 0.95
+"""Share of the squared widths that must lie in exhausted strata for the allocation to end."""
 
 
 @dataclass(frozen=True)
@@ -56,12 +58,21 @@ class Allocation:
         budget : int
             Most tests to add.
         """
+        if self._used_up(tests, crashes):
+            return np.zeros_like(tests)
         active = self._active(tests, crashes) & (tests < self.available)
         wanted = np.where(active, np.maximum(self.first_tests - tests, 0), 0)
         if not wanted.any() and active.any():
             size = max(SMALLEST_ROUND, int(np.ceil(tests[self._active(tests, crashes)].sum() * (GROWTH - 1.0))))
             wanted = self._spread(min(size, budget), tests, crashes, active)
         return _within(np.minimum(wanted, self.available - tests), budget)
+
+    def _used_up(self, tests: IntArray, crashes: IntArray) -> bool:
+        """Whether nearly all that is left to know lies in strata without further cut-ins."""
+        low, high = share_limits(crashes, tests, (1.0 - CONFIDENCE) / 2.0)
+        relevant = np.arange(tests.size) < (self.design.n_inside if self.conditional_only else tests.size)
+        squares = np.where(relevant, (self.design.p * (high - low)) ** 2, 0.0)
+        return bool(squares[tests >= self.available].sum() >= USED_UP_SHARE * squares.sum())
 
     def _active(self, tests: IntArray, crashes: IntArray) -> BoolArray:
         inside = np.arange(tests.size) < self.design.n_inside

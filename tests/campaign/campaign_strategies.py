@@ -105,6 +105,8 @@ def _obey_rules(data: dict[str, Any]) -> dict[str, Any]:
     av = data.get("av", {})
     if testing.get("method", "episode_mixture") in ("forced", "episode_mixture", "shells"):
         av.pop("before_cut_in", None)
+    if not any(av.get(source) for source in ("controller", "sumo", "traci", "fmu")):
+        av.pop("before_cut_in", None)
     if "sumo" in av or "traci" in av:
         data.get("world", {}).pop("engine", None)
     return data

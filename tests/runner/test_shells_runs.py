@@ -71,7 +71,8 @@ def test_a_pool_that_is_used_up_ends_the_run(campaign, run_here, tmp_path):
     result = run_here(campaign(*SHELLS, *small, "world.engine=twin"), tmp_path / "run")
     assert result.exit_code == 4
     tests = [shell["n_episodes"] for shell in result.estimates["estimates"]["shells"]["details"]["shells"]]
-    assert tests[:-1] == [100] * (len(tests) - 1)
+    assert tests[-1] >= 100
+    assert result.estimates["n_episodes"] < 1000
     assert any("raise pool.cut_ins_per_shell" in said for said in result.estimates["estimates"]["shells"]["warnings"])
 
 

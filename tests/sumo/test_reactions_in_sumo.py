@@ -41,12 +41,8 @@ def jobs(smoke) -> dict[str, Job]:
         "five_in_64_cells": job(smoke, "{model: idm}", n=5, cells=64),
         "five_in_64_cells_without_shim": job(smoke, "{model: idm}", n=5, cells=64, shim=False),
     }
-    early = {
-        "early": Job(
-            smoke("testing.method=step_mixture", f"av={AVS['late'][:-1]}, before_cut_in: controller}}"), 60, 16
-        )
-    }
-    return {**every_av, **first_shard, **early}
+    mixed = {"step_mixture": Job(smoke("testing.method=step_mixture", f"av={AVS['late']}"), 60, 16)}
+    return {**every_av, **first_shard, **mixed}
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +56,7 @@ def twins(jobs) -> dict[str, Shard]:
     return {name: run_episodes(job, TwinWorld(48)) for name, job in jobs.items()}
 
 
-@pytest.mark.parametrize("name", [*AVS, "early", "five_in_64_cells", "five_in_64_cells_without_shim"])
+@pytest.mark.parametrize("name", [*AVS, "step_mixture", "five_in_64_cells", "five_in_64_cells_without_shim"])
 def test_sumo_and_twin_agree_in_every_bit(name, recordings, twins):
     assert differences(motions_seen(recordings[name]), motions_computed(twins[name])) == {}
     assert np.array_equal(recordings[name]["outcome"], twins[name].results.episode["outcome"])
