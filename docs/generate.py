@@ -216,7 +216,6 @@ METHODS = {
     "twin_step_recursive": "step mixture, recursive challenge",
     "twin_episode": "episode mixture, recursive challenge",
     "twin_forced": "forced cut-ins",
-    "twin_replay": "surrogate replay",
     "shells_panel": "pool and shells, online rule",
 }
 """Experiments from which one vehicle (idm) is compared over methods."""
