@@ -14,7 +14,7 @@ from harness.pool.cut_ins import Pool
 from harness.pool.storage import campaign_pool
 
 MIXTURE_FILE = Path(__file__).parents[2] / "scenarios" / "overtaking_mixture.yaml"
-SMALL_POOL = ("pool.relative_error=0.03", "pool.cut_ins_per_shell=600")
+SMALL_POOL = ("pool.relative_error=0.03", "pool.cut_ins_per_shell=1500")
 
 
 @pytest.fixture(scope="session")

@@ -33,7 +33,7 @@ def test_shells_divide_all_cut_ins(pool):
 
 
 def test_kept_cut_ins_stand_for_their_shell(pool):
-    """Crash shares among the kept reproduce the crash rates: 600 of each shell, four standard errors."""
+    """Crash shares among the kept reproduce the crash rates: 1,500 of each shell, four standard errors."""
     c = pool.cut_ins
     for s in range(pool.shell_p.size - 1):
         assert c.crashes[c.shell == s, s].all()
