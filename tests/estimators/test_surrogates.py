@@ -31,7 +31,11 @@ def no_pool(monkeypatch, tmp_path):
 @pytest.mark.parametrize(
     ("settings", "columns", "reason"),
     [
-        ({"av": AutomatedVehicle(controller="a:B", before_cut_in="controller")}, COLUMNS, "keeps its speed until the cut-in"),
+        (
+            {"av": AutomatedVehicle(controller="a:B", before_cut_in="controller")},
+            COLUMNS,
+            "keeps its speed until the cut-in",
+        ),
         ({"testing": models.Testing(method="shells")}, COLUMNS, "drawn from shells"),
         ({}, COLUMNS - {"bv_maneuvers", "r2_m"}, "columns r2_m, bv_maneuvers of the episodes table"),
         ({}, COLUMNS, "harness estimate DIR -e replay"),
