@@ -50,17 +50,19 @@ def episodes_left(
     target_rhw: float | None = None,
     crashes: int | None = None,
     min_crashes: int = 0,
+    heaviest: float = 0.0,
 ) -> int:
     """Estimate how many more episodes a campaign needs until it stops.
 
     The relative half-width falls as 1/√n and crashes come at a steady rate, so that a target needs about
-    n·(rhw/target)² episodes; the budget ``total`` ends the campaign in any case.
+    n·(rhw/target)² episodes. One crash of the largest weight moves the estimate in proportion to 1/n, and may do so by
+    no more than the target (`harness.estimators.stopping`). The budget ``total`` ends the campaign in any case.
     """
     if not done or target_rhw is None or rhw is None or not crashes:
         return max(total - done, 0)
     # No ratio beyond the budget matters, and an infinite one could not be squared.
     ratio = min(rhw / target_rhw, math.sqrt(total))
-    needed = done * max(ratio * ratio, min_crashes / crashes)
+    needed = done * max(ratio * ratio, min_crashes / crashes, min(heaviest / target_rhw, total))
     return max(math.ceil(min(needed, total)) - done, 0)
 
 
@@ -140,6 +142,7 @@ class RichProgress:
 
     def _left(self, done: int, total: int) -> int:
         rhw, crashes = self._figures.get("rhw"), self._figures.get("crashes")
+        heaviest = self._figures.get("heaviest")
         return episodes_left(
             done,
             total,
@@ -147,6 +150,7 @@ class RichProgress:
             target_rhw=self._target_rhw,
             crashes=crashes if isinstance(crashes, int) else None,
             min_crashes=self._min_crashes,
+            heaviest=float(heaviest) if isinstance(heaviest, float | int) else 0.0,
         )
 
 

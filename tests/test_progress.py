@@ -20,6 +20,8 @@ class Terminal(io.StringIO):
         ({}, 9_000),
         ({"rhw": 0.2, "target_rhw": 0.1, "crashes": 50}, 3_000),
         ({"rhw": 0.2, "target_rhw": 0.1, "crashes": 50, "min_crashes": 300}, 5_000),
+        ({"rhw": 0.2, "target_rhw": 0.1, "crashes": 50, "heaviest": 0.5}, 4_000),
+        ({"rhw": 0.2, "target_rhw": 0.1, "crashes": 50, "heaviest": float("inf")}, 9_000),
         ({"rhw": 0.2, "target_rhw": 0.01, "crashes": 50}, 9_000),
         ({"rhw": 0.1, "target_rhw": 0.2, "crashes": 50}, 0),
         ({"rhw": 0.2, "target_rhw": 0.1, "crashes": 0}, 9_000),

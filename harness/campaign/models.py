@@ -526,6 +526,19 @@ class Campaign(Section):
         return self
 
     @model_validator(mode="after")
+    def _precision_can_be_promised(self) -> Self:
+        if self.stop.rhw is not None and self.testing.method == "step_mixture":
+            raise broken_rule(
+                "stop.rhw",
+                found=f"{self.stop.rhw:g}, with testing.method step_mixture",
+                expected="no precision to stop at: nothing bounds the weights of the step mixture, and while the large "
+                "ones are missing its interval looks narrow",
+                mend="Leave it out for a fixed number of tests (stop.episodes), or choose shells, forced or "
+                "episode_mixture.",
+            )
+        return self
+
+    @model_validator(mode="after")
     def _watched_estimator_is_available(self) -> Self:
         watched, method = self.stop.estimator, self.testing.method
         needs = {

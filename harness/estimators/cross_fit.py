@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from harness.arrays import FloatArray
+from harness.estimators.third_moments import ThirdMoments
 from harness.estimators.triangular_factor import empty_factor, fold_rows
 
 FOLDS = 10
@@ -26,6 +27,8 @@ class CrossFitted:
     Attributes
     ----------
     rate, std_error : float
+    third_moment : float
+        Third central moment of the sampling error of the rate.
     beta : (k,) float64
         Mean coefficients.
     known_share : float
@@ -34,12 +37,13 @@ class CrossFitted:
 
     rate: float
     std_error: float
+    third_moment: float
     beta: FloatArray
     known_share: float
 
 
 class CrossFit:
-    """Triangular factors of [1, H, Y], one for each fold: (k + 2)² numbers times ten, however many tests.
+    """Triangular factors and third moments of [1, H, Y] for each fold: (k + 2)³ numbers times ten, however many tests.
 
     Parameters
     ----------
@@ -51,6 +55,7 @@ class CrossFit:
         self.n_columns = n_columns
         self.n = np.zeros(FOLDS, np.int64)
         self._factors = [empty_factor(n_columns + 2) for _ in range(FOLDS)]
+        self._cubes = [ThirdMoments(n_columns + 2) for _ in range(FOLDS)]
 
     def add(self, first: int, h: FloatArray, y: FloatArray) -> None:
         """Add tests ``first … first + n - 1``.
@@ -66,13 +71,17 @@ class CrossFit:
         for fold in range(FOLDS):
             rows = slice((fold - first) % FOLDS, None, FOLDS)
             self.n[fold] += len(y[rows])
-            fold_rows(self._factors[fold], _design(h[rows], y[rows]))
+            design = _design(h[rows], y[rows])
+            self._cubes[fold].add(_unjoined(design))
+            fold_rows(self._factors[fold], design)
 
     def merge(self, other: CrossFit) -> None:
         """Add the tests behind other factors."""
         self.n += other.n
         for mine, theirs in zip(self._factors, other._factors, strict=True):
             fold_rows(mine, theirs.copy(order="F"))
+        for mine_cubes, their_cubes in zip(self._cubes, other._cubes, strict=True):
+            mine_cubes.merge(their_cubes)
 
     def result(self, mean: FloatArray, covariance: FloatArray) -> CrossFitted:
         """Cross-fitted mean of Y.
@@ -87,10 +96,12 @@ class CrossFit:
         n = int(self.n.sum())
         root = _root(covariance)
         total, squares, beta = 0.0, 0.0, np.zeros(len(mean))
+        combinations = []
         for fold in range(FOLDS):
             fitted = self._fit(fold, n, root)
             factor = self._factors[fold]
-            rows = factor @ np.concatenate([[fitted @ mean], -fitted, [1.0]])
+            combinations.append(np.concatenate([[fitted @ mean], -fitted, [1.0]]))
+            rows = factor @ combinations[-1]
             total += float(factor[0, 0] * rows[0])
             squares += float(rows @ rows)
             beta += fitted * (self.n[fold] / n)
@@ -98,7 +109,11 @@ class CrossFit:
         sampling = max(squares - n * rate * rate, 0.0) / (n - 1) / n if n > 1 else math.inf
         known = float(beta @ covariance @ beta)
         share = known / (sampling + known) if known > 0.0 else 0.0
-        return CrossFitted(rate, math.sqrt(sampling + known), beta, share)
+        cubes = 0.0
+        for moments, combination in zip(self._cubes, combinations, strict=True):
+            combination[0] -= rate
+            cubes += moments.of(combination)
+        return CrossFitted(rate, math.sqrt(sampling + known), cubes / n**3, beta, share)
 
     def _fit(self, fold: int, n: int, root: FloatArray) -> FloatArray:
         """Coefficients β (k,) from all folds but one."""
@@ -126,6 +141,13 @@ def _design(h: FloatArray, y: FloatArray) -> FloatArray:
     rows = np.zeros((n_used + 1, h.shape[1] + 2), order="F")
     rows[:n_used, 0], rows[:n_used, 1:-1], rows[:n_used, -1] = 1.0, h[used], y[used]
     rows[n_used, 0] = math.sqrt(len(y) - n_used)
+    return rows
+
+
+def _unjoined(design: FloatArray) -> FloatArray:
+    """Rows whose third moments are those of the tests: c equal rows [1, 0] have the cube c, not c^(3/2)."""
+    rows = design.copy()
+    rows[-1, 0] = np.cbrt(design[-1, 0] ** 2)
     return rows
 
 

@@ -18,8 +18,8 @@ import numpy as np
 from harness.estimators.accumulator import require_episodes
 from harness.estimators.block import Block
 from harness.estimators.estimate import Estimate, finite_json
-from harness.estimators.exact_sum import MomentSums
-from harness.estimators.intervals import capped_mean_upper, normal_half_width
+from harness.estimators.exact_sum import MomentSums, SkewedSums
+from harness.estimators.intervals import capped_mean_upper, normal_half_width, skewed_distances
 from harness.estimators.nade import Nade
 
 FEW_PAIRS = 50
@@ -81,7 +81,7 @@ class PairedSums:
         self.n = 0
         self.n_differing = 0
         self._each = (Nade(), Nade())
-        self._difference = MomentSums()
+        self._difference = SkewedSums()
         self._distance = MomentSums()
 
     def add(self, a: Block, b: Block) -> None:
@@ -117,9 +117,10 @@ class PairedSums:
         covariance = (variance_a + variance_b - variance) / 2.0
         difference = self._difference.mean(self.n)
         std_error = self._difference.std_error(self.n)
-        half = (
-            normal_half_width(std_error, confidence) if self.n_differing else self._half_without_difference(confidence)
-        )
+        below = above = self._half_without_difference(confidence)
+        if self.n_differing:
+            third_moment = self._difference.third_moment(self.n)
+            below, above = skewed_distances(std_error, third_moment, (1.0 - confidence) / 2.0)
         relative = _relative_error(a.crash_rate, b.crash_rate, variance_a, variance_b, covariance, self.n)
         ratio = a.crash_rate / b.crash_rate if a.crash_rate > 0.0 and b.crash_rate > 0.0 else math.nan
         factor = math.exp(normal_half_width(relative, confidence))
@@ -129,8 +130,8 @@ class PairedSums:
             b=b,
             difference=difference,
             std_error=std_error,
-            ci_low=difference - half,
-            ci_high=difference + half,
+            ci_low=difference - below,
+            ci_high=difference + above,
             ratio=ratio,
             ratio_low=ratio / factor,
             ratio_high=ratio * factor,

@@ -27,6 +27,8 @@ class Estimate:
         (ΣY)²/ΣY².
     largest_weight_share : float
         Largest single Y as a share of ΣY.
+    weight_cap : float
+        Largest weight that a crash can have by design; infinite where nothing is known to bound it.
     method : str
         How rate, interval and upper bound were made, in words.
     warnings : tuple of str
@@ -47,6 +49,7 @@ class Estimate:
     n_effective: float
     largest_weight_share: float
     method: str
+    weight_cap: float = math.inf
     warnings: tuple[str, ...] = ()
     details: dict[str, Any] = field(default_factory=dict)
 

@@ -110,6 +110,41 @@ class MomentSums:
         return float(np.sqrt(self.variance(n) / n))
 
 
+class SkewedSums(MomentSums):
+    """Exact sums of x and x², and of rounded x³: enough for the skewness of a mean too.
+
+    Attributes
+    ----------
+    cubes : ExactSum
+        Σx³, each cube rounded once; skewness needs no more.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.cubes = ExactSum()
+
+    def add(self, values: FloatArray) -> None:
+        """Add all entries of a one-dimensional array."""
+        super().add(values)
+        with np.errstate(over="ignore", under="ignore"):
+            self.cubes.add(values * values * values)
+
+    def merge(self, other: MomentSums) -> None:
+        """Add the sums over other numbers."""
+        super().merge(other)
+        assert isinstance(other, SkewedSums)
+        self.cubes.merge(other.cubes)
+
+    def third_moment(self, n: int) -> float:
+        """Third central moment of the mean, Σ(x - x̄)³/n³; 0 where a sum is not finite."""
+        sums = (self.total.value(), self.squares.value(), self.cubes.value())
+        if n < 1 or not np.isfinite(sums).all():
+            return 0.0
+        mean = self.total.fraction() / n
+        central = self.cubes.fraction() - 3 * mean * self.squares.fraction() + 2 * n * mean**3
+        return float(central / n**3)
+
+
 def _exact_squares(values: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Rounded squares and what rounding took from them (Dekker's product), each of the shape of `values`.
 

@@ -70,12 +70,14 @@ class Martingale:
         zeros = np.zeros(self._fit.n_columns)
         found = self._fit.result(zeros, np.diag(zeros))
         plain = self.sums.y.std_error(self.sums.n)
-        trusted = self.sums.is_normal()
+        trusted = self.sums.is_settled()
+        own = trusted or found.std_error >= plain
         return weighted_estimate(
             self.sums,
             found.rate,
-            found.std_error if trusted else max(found.std_error, plain),
+            found.std_error if own else plain,
             confidence,
+            third_moment=found.third_moment if own else self.sums.y.third_moment(self.sums.n),
             method="mean of weighted crashes with martingale terms of mean 0, cross-fitted in ten folds",
             warnings=[RESIDUALS if trusted else PLAIN.format(what="crashes")],
             details={

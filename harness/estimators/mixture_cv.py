@@ -19,6 +19,7 @@ from harness.campaign.models import EstimatorName
 from harness.estimators.accumulator import require_episodes
 from harness.estimators.block import Block
 from harness.estimators.estimate import Estimate
+from harness.estimators.third_moments import ThirdMoments
 from harness.estimators.triangular_factor import empty_factor, fold_rows
 from harness.estimators.weighted_sums import WeightedSums, weighted_estimate
 
@@ -46,13 +47,14 @@ class Regression:
 
 
 class MixtureCv:
-    """Triangular factor of [1, H, Y], (M + 2)² numbers however many episodes."""
+    """Triangular factor and third moments of [1, H, Y], at most (M + 2)³ numbers however many episodes."""
 
     name: ClassVar[EstimatorName] = "mixture_cv"
 
     def __init__(self) -> None:
         self.sums = WeightedSums()
         self._factor: FloatArray | None = None
+        self._cubes: ThirdMoments | None = None
 
     @classmethod
     def refusal(cls, block: Block) -> str | None:
@@ -73,6 +75,8 @@ class MixtureCv:
         columns = [ones, block.mixture_ratios() - 1.0, block.weighted_crashes()[:, None]]
         rows = np.asfortranarray(np.concatenate(columns, axis=1))
         self._factor = empty_factor(rows.shape[1]) if self._factor is None else self._factor
+        self._cubes = self._cubes or ThirdMoments(rows.shape[1])
+        self._cubes.add(rows)
         fold_rows(self._factor, rows)
 
     def merge(self, other: Self) -> None:
@@ -81,11 +85,15 @@ class MixtureCv:
         if other._factor is not None:
             self._factor = empty_factor(len(other._factor)) if self._factor is None else self._factor
             fold_rows(self._factor, other._factor.copy(order="F"))
+        if other._cubes is not None and self._factor is not None:
+            self._cubes = self._cubes or ThirdMoments(len(self._factor))
+            self._cubes.merge(other._cubes)
 
     def result(self, confidence: float) -> Estimate:
         """Intercept of the regression, with the residual variance on n - rank degrees of freedom."""
         require_episodes(self.sums.n)
         assert self._factor is not None
+        assert self._cubes is not None
         fit = regress(self._factor, self.sums.n)
         freedom = self.sums.n - fit.rank
         variance = fit.residual_squares / freedom * fit.intercept_leverage if freedom > 0 else math.inf
@@ -98,6 +106,7 @@ class MixtureCv:
             float(fit.coefficients[0]),
             math.sqrt(variance),
             confidence,
+            third_moment=self._cubes.of(np.array([*-fit.coefficients, 1.0])) / self.sums.n**3,
             method="mean of weighted crashes with the episode mixture's known-mean control variates",
             warnings=warnings,
             details={

@@ -37,13 +37,14 @@ class Nade:
         self.sums.merge(other.sums)
 
     def result(self, confidence: float) -> Estimate:
-        """Mean of Y with its normal interval."""
+        """Mean of Y with its interval."""
         require_episodes(self.sums.n)
         return weighted_estimate(
             self.sums,
             self.sums.mean(),
             self.sums.y.std_error(self.sums.n),
             confidence,
+            third_moment=self.sums.y.third_moment(self.sums.n),
             method="mean of weighted crashes",
             warnings=[],
             details={},

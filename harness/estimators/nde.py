@@ -62,6 +62,7 @@ class Nde:
             n_effective=float(self.n_crashes),
             largest_weight_share=1.0 / self.n_crashes if self.n_crashes else 0.0,
             method="share of crashes; Clopper-Pearson interval and upper bound",
+            weight_cap=1.0,
             warnings=tuple(count_warnings(self.n_crashes, self.n_failed, self.n)),
             details={
                 "n_failed": self.n_failed,

@@ -83,7 +83,8 @@ class Replay:
         found = self._fit.result(self._known.mu, self._known.covariance)
         plain = self.sums.y.std_error(self.sums.n)
         disagreements = self._residuals.n_effective(found.beta)
-        trusted = self.sums.is_normal() and disagreements >= FEW_EFFECTIVE
+        trusted = self.sums.is_settled() and disagreements >= FEW_EFFECTIVE
+        own = trusted or found.std_error >= plain
         warnings = [RESIDUALS if trusted else PLAIN.format(what="crashes, or disagreements with the surrogates,")]
         if self.sums.method == "step_mixture":
             warnings.append(UNBOUNDED)
@@ -101,8 +102,9 @@ class Replay:
         return weighted_estimate(
             self.sums,
             found.rate,
-            found.std_error if trusted else max(found.std_error, plain),
+            found.std_error if own else plain,
             confidence,
+            third_moment=found.third_moment if own else self.sums.y.third_moment(self.sums.n),
             method="mean of weighted crashes with replayed surrogates of known crash rate, cross-fitted in ten folds",
             warnings=warnings,
             details=details,

@@ -116,6 +116,7 @@ class Scv:
             rate,
             math.sqrt(var_z / n),
             confidence,
+            third_moment=None,
             method="sparse control variates as published (Algorithm 1)",
             warnings=[WARNING],
             details=details,

@@ -4,6 +4,11 @@ Looking after every test and stopping at the first narrow interval favours runs 
 looks only at shard boundaries nearest to a geometric grid, only at the contiguous prefix of finished episodes, needs a
 floor of crashes and two consecutive passes. Looks depend on the campaign alone, never on workers or time.
 
+With weights that is not enough. While the rare crashes of large weight have not occurred, mean, standard error and
+largest weight seen are all too small, and the rule would stop just then. So it trusts an interval only when one more
+crash of the largest weight that the design allows would move the estimate by no more than the half-width asked for:
+cap/(n·rate) ≤ RHW. Where no cap is known (step mixture) no precision can be promised, and none may be asked for.
+
 Ratio 1.1: since the half-width shrinks with 1/√n, neighbouring looks differ by 5 % in precision, which is the noise of
 the half-width itself at the default floor of 100 crashes (half of 1/√100); a finer grid mostly repeats the same look.
 With two passes a campaign uses about 20 % more tests than a fixed size would need, where a ratio of 1.25 costs nearly
@@ -71,6 +76,8 @@ class StopRule:
         Whether the asked precision was reached; always False when none was asked.
     rhw : float
         Relative half-width at the last look.
+    heaviest : float
+        By how much of itself one more crash of the largest weight would have moved the last look's estimate.
     """
 
     def __init__(
@@ -85,7 +92,7 @@ class StopRule:
         self.estimator: EstimatorName = campaign_stop.estimator or headline(method)
         self.looks = look_grid(campaign_stop.episodes, shard_size, ratio)
         self.reached = False
-        self.rhw = math.inf
+        self.rhw = self.heaviest = math.inf
         self._stop = campaign_stop
         self._min_crashes = campaign_stop.min_crashes or min_crashes
         self._n_seen = 0
@@ -119,10 +126,12 @@ class StopRule:
             )
         self._n_seen += 1
         self.rhw = estimate.rhw
+        total = n * estimate.crash_rate
+        self.heaviest = estimate.weight_cap / total if total > 0.0 else math.inf
         self._n_passes = self._n_passes + 1 if self._passes(estimate) else 0
         self.reached = self._n_passes >= PASSES_NEEDED
         return self.reached or self._n_seen == len(self.looks)
 
     def _passes(self, estimate: Estimate) -> bool:
-        precise = self._stop.rhw is not None and estimate.rhw <= self._stop.rhw
+        precise = self._stop.rhw is not None and max(self.rhw, self.heaviest) <= self._stop.rhw
         return precise and estimate.n_crashes >= self._min_crashes

@@ -14,8 +14,8 @@ from harness.arrays import FloatArray
 from harness.campaign.models import Method
 from harness.estimators.block import Block
 from harness.estimators.estimate import Estimate
-from harness.estimators.exact_sum import MomentSums
-from harness.estimators.intervals import capped_mean_upper, normal_half_width, normal_upper_distance
+from harness.estimators.exact_sum import MomentSums, SkewedSums
+from harness.estimators.intervals import capped_mean_upper, skewed_distances
 
 FEW_CRASHES = 50
 FEW_EFFECTIVE = 30.0
@@ -29,15 +29,15 @@ class WeightedSums:
     ----------
     n, n_crashes, n_failed : int
         Episodes, crashes and failed episodes so far.
-    y : MomentSums
-        ΣY and ΣY², a failed episode counting as no crash.
+    y : SkewedSums
+        ΣY, ΣY² and ΣY³, a failed episode counting as no crash.
     """
 
     def __init__(self) -> None:
         self.n = 0
         self.n_crashes = 0
         self.n_failed = 0
-        self.y = MomentSums()
+        self.y = SkewedSums()
         self.method: Method | None = None
         self._failed_weight = MomentSums()
         self._largest_y = 0.0
@@ -101,20 +101,32 @@ class WeightedSums:
         total = self.y.total.value()
         return self._largest_y / total if total > 0.0 else 0.0
 
+    def known_cap(self) -> float:
+        """Largest Y that the tests could have had, whatever the AV does; infinite where nothing bounds it.
+
+        Under forced cut-ins a crash weighs P(cut-in | path), which is known before the AV drives; the largest is taken
+        over all paths driven, the few that ended in a crash and the many that did not.
+        """
+        if math.isfinite(self._design_cap):
+            return max(self._design_cap, self._largest_y)
+        if self._has_path_caps and math.isfinite(self._largest_log_path_cap):
+            return max(math.exp(self._largest_log_path_cap), self._largest_y)
+        return math.inf
+
     def cap(self) -> tuple[float, str]:
         """Cap on Y for the upper bound, and where it comes from, in words."""
+        known = self.known_cap()
         if math.isfinite(self._design_cap):
-            return max(self._design_cap, self._largest_y), "the weight cap known by design"
-        if self._has_path_caps and math.isfinite(self._largest_log_path_cap):
-            largest = max(math.exp(self._largest_log_path_cap), self._largest_y)
-            return largest, "the largest P(cut-in | path)/share of forced cut-ins among the paths driven"
+            return known, "the weight cap known by design"
+        if math.isfinite(known):
+            return known, "the largest P(cut-in | path)/share of forced cut-ins among the paths driven"
         seen = self._largest_cut_in_log_weight
         if math.isfinite(seen):
             return _exp(seen), "the largest weight seen among episodes with a cut-in (no cap is known)"
         return _exp(self._largest_log_weight), "the largest weight seen (no cap is known)"
 
-    def is_normal(self) -> bool:
-        """Whether there are enough crashes for a normal interval to mean what it says."""
+    def is_settled(self) -> bool:
+        """Whether there are enough crashes for limits from moments to mean what they say."""
         return self.n_crashes >= FEW_CRASHES and self.n_effective() >= FEW_EFFECTIVE
 
     def details(self) -> dict[str, float | int]:
@@ -140,7 +152,7 @@ class WeightedSums:
                 f"a crash weighs {self._largest_y:.6g}, more than the cap {self._design_cap:.6g} that the design "
                 "guarantees: the records contradict the campaign"
             )
-        if not math.isfinite(self._design_cap) and not self.is_normal():
+        if not math.isfinite(self._design_cap) and not self.is_settled():
             found.append(f"the upper bound rests on {self.cap()[1]}, not on a cap guaranteed by design")
         if self.method == "step_mixture":
             found.append(
@@ -166,26 +178,40 @@ def weighted_estimate(
     std_error: float,
     confidence: float,
     *,
+    third_moment: float | None,
     method: str,
     warnings: list[str],
     details: dict[str, object],
 ) -> Estimate:
-    """Estimate with a normal interval around `rate`, and a one-sided upper bound.
+    """Estimate with an interval around `rate` that is as skewed as its error, and a one-sided upper bound.
 
-    The bound is the normal one where crashes are many enough for it, else Hoeffding's for the mean of capped Y, which
-    holds at every n and is in ``details`` in any case. Without a crash a normal interval says nothing; it is then
-    [0, two-sided Hoeffding bound].
+    The bound is the interval's own, one-sided, where crashes are many enough for it, else Hoeffding's for the mean of
+    capped Y, which holds at every n and is in ``details`` in any case. Without a crash moments say nothing; the
+    interval is then [0, two-sided Hoeffding bound].
+
+    Parameters
+    ----------
+    sums : WeightedSums
+    rate, std_error, confidence : float
+    third_moment : float or None
+        Third central moment of the error of ``rate``; None for a plain normal interval.
+    method : str
+    warnings : list of str
+    details : dict
     """
     cap, origin = sums.cap()
     hoeffding = capped_mean_upper(sums.mean(), cap, sums.n, confidence)
-    upper = min(1.0, rate + normal_upper_distance(std_error, confidence)) if sums.is_normal() else hoeffding
-    half = normal_half_width(std_error, confidence)
-    low, high = max(0.0, rate - half), min(1.0, rate + half)
+    below, above = skewed_distances(std_error, third_moment or 0.0, (1.0 - confidence) / 2.0)
+    low, high = max(0.0, rate - below), min(1.0, rate + above)
     if sums.n_crashes == 0:
         low, high = 0.0, capped_mean_upper(0.0, cap, sums.n, (1.0 + confidence) / 2.0)
+    upper = hoeffding
     bound = f"upper bound: Hoeffding's for the mean of Y, with {origin}; without a crash Clopper-Pearson times that cap"
-    if sums.is_normal():
-        bound = "upper bound: one-sided normal"
+    if sums.is_settled():
+        upper = min(1.0, rate + skewed_distances(std_error, third_moment or 0.0, 1.0 - confidence)[1])
+        bound = "upper bound: the same, one-sided"
+    interval = "normal interval" if third_moment is None else "normal interval, widened for skewness (Hall)"
+    half = (below + above) / 2.0
     return Estimate(
         crash_rate=rate,
         std_error=std_error,
@@ -198,10 +224,22 @@ def weighted_estimate(
         n_crashes=sums.n_crashes,
         n_effective=sums.n_effective(),
         largest_weight_share=sums.largest_share(),
-        method=f"{method}; normal interval; {bound}",
-        warnings=tuple(sums.warnings() + warnings),
+        method=f"{method}; {interval}; {bound}",
+        weight_cap=sums.known_cap(),
+        warnings=(*sums.warnings(), *_cap_warning(sums, half), *warnings),
         details={"upper_bound_hoeffding": hoeffding, **sums.details(), **details},
     )
+
+
+def _cap_warning(sums: WeightedSums, half_width: float) -> list[str]:
+    """Warn where one unseen crash could overturn the interval."""
+    move = sums.known_cap() / sums.n
+    if not 0.0 < half_width < move < math.inf:
+        return []
+    return [
+        f"one more crash of the largest weight that the design allows ({sums.known_cap():.3g}) would move the estimate "
+        f"by {move:.3g}, farther than the interval reaches: only more tests can rule that out"
+    ]
 
 
 def _largest(values: FloatArray) -> float:

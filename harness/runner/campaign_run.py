@@ -144,7 +144,7 @@ def _run_shards(
             for done in pool.run(specs, stored):
                 stop = prefix.add(done)
                 progress.advance(0 if done.stored else done.spec.n_episodes)
-                progress.status(crashes=prefix.n_crashes, rhw=prefix.rhw)
+                progress.status(**prefix.figures)
                 if elapsed() - written > MANIFEST_INTERVAL_S:
                     written = elapsed()
                     manifest.write(prefix.specs, prefix.files, status="running", elapsed_s=written)

@@ -18,8 +18,6 @@ class Prefix:
     ----------
     sums : Accumulator
         Of the estimator whose precision is watched.
-    rhw : float
-        At the last look.
     """
 
     def __init__(self, campaign: Campaign, rule: Rule) -> None:
@@ -28,7 +26,13 @@ class Prefix:
         self.specs: list[ShardSpec] = []
         self.files: list[dict[str, str]] = []
         self.n_episodes = self.n_crashes = self.n_failed = self.n_retraced = 0
-        self.rhw = float("inf")
+
+    @property
+    def figures(self) -> dict[str, int | float]:
+        """What a progress bar shows: crashes, and what the stop rule saw at its last look."""
+        figures: dict[str, int | float] = {"crashes": self.n_crashes, "rhw": self._rule.rhw}
+        weighted = self._campaign.testing.method in ("forced", "episode_mixture")
+        return figures | ({"heaviest": self._rule.heaviest} if weighted else {})
 
     @property
     def reached(self) -> bool:
@@ -48,9 +52,7 @@ class Prefix:
         if not self._rule.due(self.n_episodes):
             return False
         estimate = self.sums.result(self._campaign.stop.confidence)
-        stop = self._rule.observe(self.n_episodes, estimate)
-        self.rhw = self._rule.rhw
-        return stop
+        return self._rule.observe(self.n_episodes, estimate)
 
     def _require_few_failed(self) -> None:
         most = self._campaign.run.max_failed_share

@@ -31,6 +31,7 @@ class Rule(Protocol):
     estimator: EstimatorName
     reached: bool
     rhw: float
+    heaviest: float
 
     def due(self, n: int) -> bool:
         """Whether to look after ``n`` episodes."""
@@ -59,6 +60,7 @@ class RoundRule:
         self._conditional = campaign.testing.shells.statement == "conditional"
         self.reached = False
         self.rhw = float("inf")
+        self.heaviest = 0.0  # limits within shells allow for every crash that has not been seen
         self.look = 0
 
     def due(self, n: int) -> bool:

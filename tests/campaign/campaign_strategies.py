@@ -102,6 +102,8 @@ def _obey_rules(data: dict[str, Any]) -> dict[str, Any]:
         names = list(data.get("surrogates", ("SM-I", "SM-II", "SM-III")))
         testing["alpha"] = dict.fromkeys(names[:-1], 0.25) | {names[-1]: 1 - 0.25 * (len(names) - 1)}
     stop.pop("estimator", None)
+    if testing.get("method") == "step_mixture":
+        stop.pop("rhw", None)
     av = data.get("av", {})
     if testing.get("method", "episode_mixture") in ("forced", "episode_mixture", "shells"):
         av.pop("before_cut_in", None)

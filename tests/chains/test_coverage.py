@@ -14,6 +14,7 @@ from harness.estimators.block import Block
 from harness.estimators.mixture_cv import MixtureCv
 from harness.estimators.nade import Nade
 from harness.estimators.scv import Scv
+from harness.estimators.third_moments import ThirdMoments
 from harness.validation.chains.named import frequent_decisive, rare_decisive
 from harness.validation.chains.sampler import draw
 
@@ -48,6 +49,8 @@ class SampleCentred(MixtureCv):
         self.sums.add(block)
         h = block.mixture_ratios()
         rows = np.column_stack([np.ones(len(block)), h - h.mean(axis=0), block.weighted_crashes()])
+        self._cubes = ThirdMoments(rows.shape[1])
+        self._cubes.add(rows)
         self._factor = np.asfortranarray(np.linalg.qr(rows, mode="r"))
 
 

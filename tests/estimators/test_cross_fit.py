@@ -41,7 +41,8 @@ def reference(h, y, mean, covariance):
         fitted = np.linalg.solve(others[:-1, :-1] / n + covariance, others[:-1, -1] / n)
         z[inside] = y[inside] - (h[inside] - mean) @ fitted
         beta += fitted * inside.mean()
-    return z.mean(), np.sqrt(z.var(ddof=1) / n + beta @ covariance @ beta), beta
+    third_moment = np.sum((z - z.mean()) ** 3) / n**3
+    return z.mean(), np.sqrt(z.var(ddof=1) / n + beta @ covariance @ beta), third_moment, beta
 
 
 @pytest.mark.parametrize("error", [0.0, 0.02, 10.0])
@@ -49,9 +50,10 @@ def test_is_the_regression_on_the_other_folds(error):
     h, y = rows()
     mean, covariance = MEAN * SCALE, np.diag((error * SCALE) ** 2)
     found = feed(h, y, [N]).result(mean, covariance)
-    rate, std_error, beta = reference(h, y, mean, covariance)
+    rate, std_error, third_moment, beta = reference(h, y, mean, covariance)
     assert found.rate == pytest.approx(rate, rel=1e-10)
     assert found.std_error == pytest.approx(std_error, rel=1e-9)
+    assert found.third_moment == pytest.approx(third_moment, rel=1e-6)
     np.testing.assert_allclose(found.beta, beta, rtol=1e-8)
     assert (found.known_share > 0.0) == (error > 0.0)
 

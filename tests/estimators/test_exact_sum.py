@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from harness.estimators.exact_sum import ExactSum, MomentSums
+from harness.estimators.exact_sum import ExactSum, MomentSums, SkewedSums
 
 finite = st.floats(allow_nan=False, allow_infinity=False, min_value=-1e300, max_value=1e300)
 lists = st.lists(finite, max_size=30)
@@ -80,3 +80,23 @@ def test_equal_numbers_have_no_variance(value, n):
     sums = MomentSums()
     sums.add(np.full(n, value))
     assert sums.variance(n) == 0.0
+
+
+@given(st.lists(st.floats(-1e3, 1e3), min_size=1, max_size=40), st.integers(0, 40))
+def test_third_moments_are_those_of_numpy_however_they_are_merged(values, cut):
+    array = np.array(values)
+    sums, rest = SkewedSums(), SkewedSums()
+    sums.add(array[cut:])
+    rest.add(array[:cut])
+    sums.merge(rest)
+    expected = np.sum((array - array.mean()) ** 3) / len(values) ** 3
+    assert sums.third_moment(len(values)) == pytest.approx(expected, rel=1e-9, abs=1e-6)
+    whole = SkewedSums()
+    whole.add(array)
+    assert whole.third_moment(len(values)) == sums.third_moment(len(values))
+
+
+def test_third_moments_of_what_is_not_finite_say_nothing():
+    sums = SkewedSums()
+    sums.add(np.array([1.0, math.inf]))
+    assert sums.third_moment(2) == 0.0

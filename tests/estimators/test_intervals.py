@@ -10,7 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import binom, binomtest
 
-from harness.estimators.intervals import capped_mean_upper, clopper_pearson, clopper_pearson_upper
+from harness.estimators.intervals import (
+    _hall,
+    capped_mean_upper,
+    clopper_pearson,
+    clopper_pearson_upper,
+    normal_half_width,
+    skewed_distances,
+)
 
 levels = st.floats(0.5, 0.999)
 
@@ -53,3 +60,29 @@ def test_the_capped_bound_holds_at_its_level_for_the_hardest_case(p, n):
 
 def test_an_unknown_cap_leaves_only_the_trivial_bound():
     assert capped_mean_upper(1e-6, math.inf, 10**6, 0.9) == 1.0
+
+
+@given(st.floats(-2.0, 2.0).filter(lambda k: k == 0.0 or abs(k) > 1e-9), st.floats(-3.0, 3.0))
+def test_halls_transformation_is_inverted(skewness, z):
+    t = _hall(z, skewness) if skewness else z
+    assert t + skewness * t * t / 3.0 + skewness**2 * t**3 / 27.0 + skewness / 6.0 == pytest.approx(z, abs=1e-6)
+
+
+@given(st.floats(1e-9, 1.0), st.floats(-1.0, 1.0), levels)
+def test_limits_reach_as_far_as_the_normal_ones_and_lean_to_the_side_of_the_skew(std_error, skewness, confidence):
+    below, above = skewed_distances(std_error, skewness * std_error**3, (1.0 - confidence) / 2.0)
+    mirrored = skewed_distances(std_error, -skewness * std_error**3, (1.0 - confidence) / 2.0)
+    assert (below, above) == pytest.approx(mirrored[::-1])
+    assert min(below, above) >= normal_half_width(std_error, confidence) * (1.0 - 1e-12)
+    if skewness > 1e-3 and confidence > 0.8:
+        assert above > below
+
+
+def test_equal_weights_give_nearly_the_limits_of_counts():
+    """Fifty crashes of equal weight: Clopper-Pearson's limits are 38.96 and 63.29 at 90 %."""
+    n, count = 1_000_000, 50
+    std_error, third_moment = math.sqrt(count) / n, count / n**3
+    below, above = skewed_distances(std_error, third_moment, 0.05)
+    low, high = clopper_pearson(count, n, 0.9)
+    assert count / n + above == pytest.approx(high, rel=0.01)
+    assert count / n - below < low

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from harness.estimators.intervals import normal_half_width, skewed_distances
 from harness.estimators.mixture_cv import MixtureCv
 from harness.validation.chains.named import panel
 from harness.validation.chains.sampler import blocks, draw
@@ -43,6 +44,18 @@ def test_is_the_intercept_of_least_squares():
     assert estimate.crash_rate != estimate.details["plain_mean"]
 
 
+def test_the_interval_is_as_skewed_as_the_residuals():
+    parts = list(blocks(CHAIN, "episode_mixture", [400, 100], SEED))
+    estimate = feed(parts).result(0.9)
+    y = np.concatenate([part.weighted_crashes() for part in parts])
+    h = np.concatenate([part.mixture_ratios() for part in parts]) - 1.0
+    residuals = y - estimate.crash_rate - h @ estimate.details["beta"]
+    below, above = skewed_distances(estimate.std_error, np.sum(residuals**3) / len(y) ** 3, 0.05)
+    assert estimate.ci_high - estimate.crash_rate == pytest.approx(above, rel=1e-9)
+    assert estimate.crash_rate - estimate.ci_low == pytest.approx(min(below, estimate.crash_rate), rel=1e-9)
+    assert above > 1.01 * normal_half_width(estimate.std_error, 0.9)
+
+
 def test_merged_states_agree_with_one_pass():
     parts = list(blocks(CHAIN, "episode_mixture", [3_000, 2_000, 1_000], SEED))
     whole = feed(parts).result(0.9)
@@ -53,6 +66,7 @@ def test_merged_states_agree_with_one_pass():
     for other in (head.result(0.9), backwards):
         assert other.crash_rate == pytest.approx(whole.crash_rate, rel=1e-10)
         assert other.std_error == pytest.approx(whole.std_error, rel=1e-10)
+        assert other.ci_high == pytest.approx(whole.ci_high, rel=1e-10)
         assert other.n_effective == whole.n_effective
 
 

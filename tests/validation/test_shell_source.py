@@ -73,7 +73,7 @@ def test_the_envelope_stays_and_another_surrogate_becomes_the_boundary(library):
     reduced = leave_out(library, {"brakes-2-late-1s", "full-throttle-2"}, careful_first)
     assert reduced.boundary == "brakes-3-late-700ms"
     assert reduced.envelope == "full-throttle-2"
-    alone = leave_out(library, set(careful_first[:5]), careful_first)
+    alone = leave_out(library, set(careful_first[:6]), careful_first)
     assert alone.boundary == "never-brakes"
 
 
