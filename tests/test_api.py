@@ -14,7 +14,15 @@ import harness
 from harness.errors import CampaignError, RunFolderError
 
 MIXTURE_FILE = Path(__file__).parents[1] / "scenarios" / "overtaking_mixture.yaml"
-SMALL = ["world.engine=twin", "stop.episodes=300", "stop.rhw=0.5", "stop.min_crashes=20", "run.shard_size=60"]
+SMALL = [
+    "world.engine=twin",
+    "testing.method=forced",
+    "av={model: fvdm}",
+    "stop.episodes=3000",
+    "stop.rhw=0.5",
+    "stop.min_crashes=20",
+    "run.shard_size=60",
+]
 
 
 @pytest.fixture(scope="module")

@@ -15,8 +15,8 @@ from harness.runner.compare import compare_campaigns, require_comparable
 FORCED = str(Path(__file__).parents[2] / "scenarios/overtaking_forced.yaml")
 SMALL = [
     "world.engine=twin",
-    "run.shard_size=250",
-    "stop.episodes=2500",
+    "run.shard_size=2500",
+    "stop.episodes=40000",
     "stop.rhw=0.9",
     "stop.min_crashes=20",
     "records.traces=none",

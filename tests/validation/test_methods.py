@@ -104,8 +104,7 @@ def test_committed_experiments_say_so_at_full_length(name):
     for one in judgements:
         assert one["replications"] >= 5000
         assert abs(one["bias"]) <= LARGEST_BIAS
-        # The normal interval of weighted crashes is known to be a little short (docs/shells-validation.md says so).
-        assert one["coverage"] > 0.88 if one["result"] == "nade" else not one["coverage_too_low"]
+        assert not one["coverage_too_low"]
 
 
 @pytest.mark.slow
