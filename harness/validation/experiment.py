@@ -126,9 +126,11 @@ class Experiment(Section):
             "shells": {"shells"},
             "nde": {"nde", "nade"},
             "forced": {"nade"},
-            "step_mixture": {"nade", "scv"},
-            "episode_mixture": {"nade", "mixture_cv"},
+            "step_mixture": {"nade", "scv", "martingale"},
+            "episode_mixture": {"nade", "mixture_cv", "martingale"},
         }
+        if self.avs and method != "shells":  # the chains' own records hold no replay
+            allowed[method].add("replay")
         if wrong := set(self.results) - allowed[method]:
             raise broken_rule(
                 "estimators",

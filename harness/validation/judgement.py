@@ -138,7 +138,7 @@ def judge(subject: Subject, result: str, rows: Rows, confidence: float, *, condi
     met = subject.meets_assumption or not conditional
     tests_5, median, tests_95 = (float(q) for q in np.quantile(rows.n_tests, [0.05, 0.5, 0.95]))
     relvar = float(np.mean((rows.crash_rate / truth - 1.0) ** 2))
-    fixed = bool(np.all(rows.n_tests == rows.n_tests[0]))
+    fixed = not rows.reached.any() and bool(np.all(rows.n_tests == rows.n_tests[0]))
     return Judgement(
         subject=subject.name,
         result=result,

@@ -55,20 +55,18 @@ class RepeatedWeighted:
 
     def run(self, replications: range) -> list[Row]:
         """See `Repeated`."""
-        source = _episodes(self.name, self.campaign.model_dump_json(), self.seed, self.is_chain, self._moments)
+        source = _episodes(self.name, self.campaign.model_dump_json(), self.seed, self.is_chain, self.estimators)
         return WeightedCampaign(self.campaign, source, self.estimators).run(replications)
-
-    @property
-    def _moments(self) -> bool:
-        return "scv" in self.estimators
 
 
 @cache
-def _episodes(name: str, campaign_json: str, seed: int, is_chain: bool, moments: bool) -> EpisodeSource:
+def _episodes(
+    name: str, campaign_json: str, seed: int, is_chain: bool, estimators: tuple[EstimatorName, ...]
+) -> EpisodeSource:
     campaign = Campaign.model_validate_json(campaign_json)
     if is_chain:
         return ChainEpisodes(CHAINS[name], campaign, seed)
-    return TwinEpisodes(campaign, seed, moments=moments)
+    return TwinEpisodes(campaign, seed, estimators)
 
 
 def subjects(experiment: Experiment, progress: Progress) -> Iterator[tuple[Subject, Repeated]]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
@@ -13,6 +14,8 @@ from harness.estimators import StopRule, accumulator
 from harness.estimators.block import Block
 from harness.estimators.from_records import block_from_tables
 from harness.importance.build import mixture_weights
+from harness.pool.storage import campaign_pool
+from harness.pool.surrogate_replay import SurrogateReplay
 from harness.records.tables import shard_tables
 from harness.runner.prepare import prepare
 from harness.twin import TwinWorld
@@ -21,6 +24,8 @@ from harness.validation.chains.sampler import draw
 from harness.validation.rows import Row, estimate_row
 
 CELLS = 1024
+REDRAWN = 5
+"""Seed of the pools' errors, apart from those of tests."""
 CHUNK = 20_000
 """Episodes of several small replications that the twin runs at a time."""
 
@@ -45,15 +50,27 @@ class ChainEpisodes:
 
 
 class TwinEpisodes:
-    """Episodes of a campaign in the twin, without files."""
+    """Episodes of a campaign in the twin, without files.
 
-    def __init__(self, campaign: Campaign, seed: int, *, moments: bool) -> None:
+    Parameters
+    ----------
+    campaign : Campaign
+    seed : int
+    estimators : sequence of str
+        What they need is kept. For ``replay`` surrogates come from the campaign's pool.
+    """
+
+    def __init__(self, campaign: Campaign, seed: int, estimators: Sequence[EstimatorName]) -> None:
+        moments = "scv" in estimators
         kept = "first_9" if moments else "none"
         records = campaign.records.model_copy(update={"moments": kept, "traces": "none", "trace_share": 0.0})
         self._campaign = campaign.model_copy(update={"seed": seed, "records": records})
         self._prepared = prepare(self._campaign)
         self._loop: EpisodeLoop = self._prepared.loop(TwinWorld(CELLS))
         self._moments = moments
+        self._surrogates = (
+            SurrogateReplay(self._campaign, campaign_pool(self._campaign)) if "replay" in estimators else None
+        )
 
     def block(self, first: int, n: int) -> Block:
         """See `EpisodeSource`."""
@@ -64,6 +81,7 @@ class TwinEpisodes:
             tables.moments if self._moments else None,
             method=self._campaign.testing.method,
             alpha=mixture_weights(self._campaign),
+            surrogates=self._surrogates,
         )
 
 
@@ -100,9 +118,10 @@ class WeightedCampaign:
 
     def _results(self, replication: int, blocks: Sequence[Block], *, reached: bool = False) -> list[Row]:
         rows = []
+        redrawn = [_with_redrawn_rates(block, replication) for block in blocks]
         for name in self._estimators:
             state = accumulator(name)
-            for block in blocks:
+            for block in redrawn:
                 state.add(block)
             result = state.result(self._campaign.stop.confidence)
             rows.append(estimate_row(name, replication, result, reached=reached))
@@ -123,4 +142,13 @@ class WeightedCampaign:
         return self._results(replication, blocks, reached=rule.reached)
 
 
-Runner = Callable[[range], list[Row]]
+def _with_redrawn_rates(block: Block, replication: int) -> Block:
+    """The block with surrogates' crash rates as another pool of the same size would know them.
+
+    A pool's rates are means over thousands of paths, so that their errors are normal, with the covariance it states.
+    """
+    known = block.known_rates
+    if known is None:
+        return block
+    mu = np.random.default_rng([REDRAWN, replication]).multivariate_normal(known.mu, known.covariance, method="eigh")
+    return replace(block, known_rates=replace(known, mu=mu))

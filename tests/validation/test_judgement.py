@@ -11,7 +11,7 @@ from harness.validation.rows import Row, Rows
 
 def rows(rates, half: float, tests: int = 100, outside: int = 0) -> Rows:
     return Rows.of(
-        [Row("x", k, tests, 5, r, half / 1.6449, r - half, r + half, True, outside) for k, r in enumerate(rates)]
+        [Row("x", k, tests, 5, r, half / 1.6449, r - half, r + half, False, outside) for k, r in enumerate(rates)]
     )
 
 

@@ -14,11 +14,11 @@ import pytest
 from harness.campaign.models import Campaign
 from harness.validation.chains.named import CHAINS, frequent_decisive, rare_decisive, replayed
 from harness.validation.chains.shells import ChainShells
-from harness.validation.experiment import Fault, load_experiment
+from harness.validation.experiment import Experiment, Fault, load_experiment
 from harness.validation.judgement import Judgement, Subject, corrected, judge
 from harness.validation.rows import Row, Rows
 from harness.validation.run import validate
-from harness.validation.shell_campaign import FREE, ShellCampaign
+from harness.validation.shell_campaign import CONDITIONAL, FREE, ShellCampaign
 from harness.validation.weighted_campaign import ChainEpisodes, WeightedCampaign
 
 from .regression_stopping import RegressionStopping
@@ -96,15 +96,29 @@ COMMITTED = ["chains_shells", "chains_forced"]
 @pytest.mark.parametrize("name", COMMITTED)
 def test_committed_experiments_say_so_at_full_length(name):
     content = json.loads((ROOT / "docs" / "validation" / f"{name}.json").read_text())
-    assert content["experiment"] == load_experiment(ROOT / "scenarios" / "validate" / f"{name}.yaml").model_dump(
-        mode="json"
-    )
-    judgements = [one for one in content["judgements"] if one["result"] != "shells, conditional"]
+    shipped = load_experiment(ROOT / "scenarios" / "validate" / f"{name}.yaml")
+    assert Experiment.model_validate(content["experiment"]) == shipped
+    judgements = [one for one in content["judgements"] if one["result"] != CONDITIONAL]
     assert len(judgements) >= 4
     for one in judgements:
         assert one["replications"] >= 5000
         assert abs(one["bias"]) <= LARGEST_BIAS
         assert not one["coverage_too_low"]
+
+
+def test_the_committed_panel_meets_what_shells_promise():
+    content = json.loads((ROOT / "docs" / "validation" / "shells_panel.json").read_text())
+    shipped = load_experiment(ROOT / "scenarios" / "validate" / "shells_panel.yaml")
+    assert Experiment.model_validate(content["experiment"]) == shipped
+    assert content["largest_relative_error_of_truth"] <= 0.005
+    found = {(one["subject"], one["result"]): one for one in content["judgements"]}
+    assert set(found) == {(name, result) for name in shipped.avs for result in (FREE, CONDITIONAL)}
+    for (_, result), one in found.items():
+        assert one["replications"] >= 2000
+        assert not one["coverage_too_low"]
+        assert one["tests_median"] <= (5000 if result == FREE else 200)
+    assert not found["SM-II", CONDITIONAL]["assumption_met"]
+    assert found["SM-II", FREE]["alarm"] == found["never-brakes", FREE]["alarm"] == 1.0
 
 
 @pytest.mark.slow

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from harness.campaign.models import AutomatedVehicle, Environment
+from harness.campaign.models import AutomatedVehicle, Environment, PoolSettings
 from harness.environment.loading import load_environment
+from harness.pool.build import build_pool
 from harness.pool.library import Library, load_library
 from harness.progress import SilentProgress
 from harness.validation.panel import NO_ENVELOPE, Drivers
@@ -91,3 +92,21 @@ def test_drawn_pools_scatter_around_the_population(library, population, drivers,
 def test_a_vehicle_that_accelerates_harder_has_no_envelope(library):
     wild = AutomatedVehicle.model_validate({"model": "constant", "parameters": {"acceleration_mps2": 3.0}})
     assert Drivers(library, {"wild": wild}).envelope == NO_ENVELOPE
+
+
+@pytest.mark.slow
+def test_real_pools_have_the_shells_of_drawn_ones(library, avs, drivers):
+    """A pool as a campaign builds it, from other paths: shell probabilities and their errors agree."""
+    environment = load_environment(Environment())
+    paths = 16_384
+    population = enumerate_paths(environment, drivers.records, drivers.envelope, 3, paths, SilentProgress())
+    source = overtaking_shells(library, population, avs["own"], drivers.vehicles["own"], paths)
+    real = build_pool(environment, library, PoolSettings(relative_error=0.01, seed=7), "real")
+    assert real.names == source.template.names
+    errors = [
+        np.sqrt(np.maximum(np.diag(pool.shell_moments) - pool.shell_p**2, 0.0) / n)
+        for pool, n in ((source.template, paths), (real, real.n_paths))
+    ]
+    assert np.all(np.abs(real.shell_p - source.template.shell_p) < 4.5 * np.hypot(*errors))
+    ratio = errors[1] * np.sqrt(real.n_paths) / (errors[0] * np.sqrt(paths))
+    assert np.all((ratio[:5] > 0.6) & (ratio[:5] < 1.6))  # inside; outside the aims differ
