@@ -37,14 +37,11 @@ def normal_half_width(std_error: float, confidence: float) -> float:
     return float(norm.isf((1.0 - confidence) / 2.0)) * std_error
 
 
-def skewed_distances(std_error: float, third_moment: float, tail: float) -> tuple[float, float]:
-    """Distances of the lower and the upper limit from an estimate whose error is skewed.
+def hall_distances(std_error: float, third_moment: float, tail: float) -> tuple[float, float]:
+    """Distances of Hall's lower and upper limit from an estimate whose error is skewed.
 
-    A mean of rare large values is skewed: samples without the largest have both a mean and a standard error that are
-    too small, so that normal limits miss the truth above. Hall's transformation (P. Hall, On the removal of skewness by
-    transformation, JRSS B 54, 1992) makes the studentised mean T nearly normal by g(T) = T + κT²/3 + κ²T³/27 + κ/6,
-    which moves both limits towards the skew. Where the skewness itself is only estimated the limit that it draws nearer
-    then misses too often; so each side keeps the farther one of Hall's limit and the normal one.
+    His transformation (P. Hall, On the removal of skewness by transformation, JRSS B 54, 1992) makes the studentised
+    mean T nearly normal by g(T) = T + κT²/3 + κ²T³/27 + κ/6, which moves both limits towards the skew.
 
     Parameters
     ----------
@@ -54,19 +51,35 @@ def skewed_distances(std_error: float, third_moment: float, tail: float) -> tupl
         Third central moment of the estimate's error; over std_error³ it is the skewness κ.
     tail : float
         Probability to be left out on each side, below 1/2.
+    """
+    z = float(norm.isf(tail))
+    if third_moment == 0.0 or not 0.0 < std_error < math.inf:
+        return z * std_error, z * std_error
+    skewness = third_moment / std_error**3
+    return _hall(z, skewness) * std_error, -_hall(-z, skewness) * std_error
+
+
+def skewed_distances(std_error: float, third_moment: float, tail: float) -> tuple[float, float]:
+    """Distances of the lower and the upper limit that are reported for an estimate whose error is skewed.
+
+    A mean of rare large values is skewed: samples without the largest have both a mean and a standard error that are
+    too small, so that normal limits miss the truth above. Hall's limits mend that. But their lower limit is nearer than
+    the normal one on the word of a skewness that is itself estimated, and misses too often. So each side keeps the
+    farther one of the two (measured in docs/estimators.md).
+
+    Parameters
+    ----------
+    std_error, third_moment, tail : float
+        See `hall_distances`.
 
     Returns
     -------
     (float, float)
-        Both at least 0.
+        Both at least the normal distance.
     """
-    z = float(norm.isf(tail))
-    below, above = z, z
-    if third_moment != 0.0 and 0.0 < std_error < math.inf:
-        skewness = third_moment / std_error**3
-        below = max(z, _hall(z, skewness))
-        above = max(z, -_hall(-z, skewness))
-    return below * std_error, above * std_error
+    normal = float(norm.isf(tail)) * std_error
+    below, above = hall_distances(std_error, third_moment, tail)
+    return max(normal, below), max(normal, above)
 
 
 def _hall(z: float, skewness: float) -> float:

@@ -110,8 +110,8 @@ class MixtureCv:
         if self.sums.n_crashes and self.sums.n_effective() < FEW_FOR_RESIDUALS and std_error < plain:
             std_error, third_moment = plain, self.sums.y.third_moment(self.sums.n)
             warnings.append(
-                f"fewer than {FEW_FOR_RESIDUALS:.0f} effective crashes: the interval is as wide as that of the plain mean "
-                "of weighted crashes"
+                f"fewer than {FEW_FOR_RESIDUALS:.0f} effective crashes: the interval is as wide as that of the plain "
+                "mean of weighted crashes"
             )
         if fit.coefficients[0] < 0.0:
             warnings.append("the regression's intercept is negative: too few crashes for control variates, use nade")
