@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from scipy.optimize import brentq
-from scipy.stats import beta, norm
+from scipy.special import betaincinv, ndtri
 
 
 def clopper_pearson(n_crashes: int, n: int, confidence: float) -> tuple[float, float]:
@@ -19,7 +19,7 @@ def clopper_pearson(n_crashes: int, n: int, confidence: float) -> tuple[float, f
         Level; each side keeps half of the rest.
     """
     tail = (1.0 - confidence) / 2.0
-    low = 0.0 if n_crashes == 0 else float(beta.ppf(tail, n_crashes, n - n_crashes + 1))
+    low = 0.0 if n_crashes == 0 else float(betaincinv(n_crashes, n - n_crashes + 1, tail))
     return low, clopper_pearson_upper(n_crashes, n, 1.0 - tail)
 
 
@@ -29,12 +29,12 @@ def clopper_pearson_upper(n_crashes: int, n: int, confidence: float) -> float:
         return 1.0
     if n_crashes == 0:
         return -math.expm1(math.log1p(-confidence) / n)
-    return float(beta.ppf(confidence, n_crashes + 1, n - n_crashes))
+    return float(betaincinv(n_crashes + 1, n - n_crashes, confidence))
 
 
 def normal_half_width(std_error: float, confidence: float) -> float:
     """Half-width of the two-sided normal interval."""
-    return float(norm.isf((1.0 - confidence) / 2.0)) * std_error
+    return -float(ndtri((1.0 - confidence) / 2.0)) * std_error
 
 
 def hall_distances(std_error: float, third_moment: float, tail: float) -> tuple[float, float]:
@@ -52,7 +52,7 @@ def hall_distances(std_error: float, third_moment: float, tail: float) -> tuple[
     tail : float
         Probability to be left out on each side, below 1/2.
     """
-    z = float(norm.isf(tail))
+    z = -float(ndtri(tail))
     if third_moment == 0.0 or not 0.0 < std_error < math.inf:
         return z * std_error, z * std_error
     skewness = third_moment / std_error**3
@@ -77,7 +77,7 @@ def skewed_distances(std_error: float, third_moment: float, tail: float) -> tupl
     (float, float)
         Both at least the normal distance.
     """
-    normal = float(norm.isf(tail)) * std_error
+    normal = -float(ndtri(tail)) * std_error
     below, above = hall_distances(std_error, third_moment, tail)
     return max(normal, below), max(normal, above)
 

@@ -25,7 +25,10 @@ ROUND_PATHS = 1024
 BLOCK_PATHS = 256
 MOST_PATHS = 1 << 20
 CARELESS_SHARE = 0.2
-"""How much the surrogates beyond the boundary count in aiming: only a bound is wanted there."""
+"""How much the surrogates beyond the boundary count in aiming, and those far off: less has to be known there."""
+FAR_OFF = 10.0
+"""A surrogate whose rate varies this much more from path to path than the boundary's (relvar) crashes in traffic of its
+own, which few paths meet: paths aimed there would be lost for all others."""
 CARELESS_ERROR = 4.0
 """Their relative error may be this many times the target."""
 _APART = 0x706F6F6C
@@ -130,7 +133,7 @@ def build_pool(
     pilot = Enumerator(environment, library.drivers, names.index(library.envelope), settings.seed ^ _APART)
     progress.stage("pool: pilot", PILOT_PATHS)
     rates = _joined(pilot.run(0, PILOT_PATHS, progress), len(names))
-    careful = _up_to_boundary(rates, names.index(library.boundary))
+    careful = _careful(rates, names.index(library.boundary))
     aimed = pilot.aimed(fit_proposal(pilot.uniforms(0, PILOT_PATHS), _importance(rates, careful)))
     blocks = _until_known(aimed, rates, careful, settings, progress)
     return _pool(blocks, aimed, library, settings, (key, environment_hash(environment)))
@@ -140,11 +143,15 @@ def _joined(blocks: list[Enumerated], n_surrogates: int) -> FloatArray:
     return np.concatenate([block.rates(n_surrogates) for block in blocks])
 
 
-def _up_to_boundary(rates: FloatArray, boundary: int) -> BoolArray:
-    """Which columns (surrogates, and the cut-in) are no more careless than the boundary, shape (D + 1,) bool."""
+def _careful(rates: FloatArray, boundary: int) -> BoolArray:
+    """Which columns (surrogates, and the cut-in) are to be known well, shape (D + 1,) bool.
+
+    Those that are no more careless than the boundary, and crash in the traffic that it crashes in.
+    """
     mean = rates.mean(0)
-    inside: BoolArray = mean <= mean[boundary]
-    return inside
+    relvar = rates.var(0) / np.maximum(mean, np.finfo(np.float64).tiny) ** 2
+    careful: BoolArray = (mean <= mean[boundary]) & (relvar <= FAR_OFF * relvar[boundary])
+    return careful
 
 
 def _importance(rates: FloatArray, careful: BoolArray) -> FloatArray:

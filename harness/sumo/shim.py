@@ -10,7 +10,6 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
-import libsumo
 import numpy as np
 
 from harness.arrays import FloatArray
@@ -29,8 +28,12 @@ def shim_library() -> Path | None:
 def open_shim(names: Sequence[str]) -> Shim | None:
     """Shim for the given vehicles, or None: not built, switched off, or another libsumo than it knows."""
     path = shim_library()
+    if path is None:
+        return None
+    import libsumo  # noqa: PLC0415 - takes 0.2 s, and only worlds need it
+
     inner = getattr(libsumo, "_libsumo", None)
-    if path is None or inner is None:
+    if inner is None:
         return None
     try:
         library = ctypes.CDLL(str(path))
