@@ -406,7 +406,11 @@ class PoolSettings(Section):
 
     library: str = Field("ladder-1", description="name of a shipped surrogate library, or a path to your own")
     relative_error: float = Field(
-        0.005, ge=0.001, le=0.2, description="standard error of the surrogates' crash rates to reach, relative"
+        0.005,
+        ge=0.001,
+        le=0.2,
+        description="standard error of the surrogates' crash rates to reach, relative; four times as much for those "
+        "beyond the boundary, or that crash in rare traffic of their own",
     )
     cut_ins_per_shell: Whole = Field(
         25_000, ge=100, le=1_000_000, description="cut-ins kept of each shell: the most tests that it can give"
@@ -435,7 +439,9 @@ class Stop(Section):
     """When the campaign is long enough."""
 
     episodes: Whole = Field(100_000, ge=1, le=10**10, description="most episodes to run")
-    rhw: float | None = Field(None, gt=0.0, lt=10.0, description="stop at this relative half-width of the interval")
+    rhw: float | None = Field(
+        None, gt=0.0, lt=10.0, description="stop at this relative half-width of the interval; not for step_mixture"
+    )
     confidence: float = Field(0.9, gt=0.0, lt=1.0, description="level of every interval")
     estimator: EstimatorName | None = Field(None, description="whose RHW is watched; default: the method's own")
     min_crashes: Annotated[int, Field(ge=1), BeforeValidator(_whole)] | None = Field(

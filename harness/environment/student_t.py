@@ -26,8 +26,9 @@ def t_table(df: float) -> FloatArray:
         Values, and derivatives times the grid step.
     """
     z = np.arange(-_LIMIT * _PER_UNIT, _LIMIT * _PER_UNIT + 1) / _PER_UNIT
-    log_density = np.log(special.poch(0.5 * df, 0.5)) - 0.5 * np.log(df * np.pi) - (df + 1.0) / 2.0 * np.log1p(z**2 / df)
-    return np.column_stack([special.stdtr(df, z), np.exp(log_density) / _PER_UNIT])
+    peak = special.poch(0.5 * df, 0.5) / np.sqrt(df * np.pi)
+    density = peak * np.exp(-0.5 * (df + 1.0) * np.log1p(z * z / df))
+    return np.column_stack([special.stdtr(df, z), density / _PER_UNIT])
 
 
 @compiled_inline
