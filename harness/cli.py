@@ -15,7 +15,7 @@ import click
 
 from harness.commands.campaigns import check, run, schema
 from harness.commands.options import examples
-from harness.commands.stored import estimate, replay, report
+from harness.commands.stored import estimate, replay, report, rnot
 from harness.commands.studies import pool, validate
 from harness.commands.vehicles import av_check, compare, ladder
 from harness.console import show_error, show_interrupted, system_error
@@ -43,7 +43,7 @@ def cli() -> None:
     """
 
 
-for command in (check, av_check, run, compare, pool, ladder, estimate, report, replay, validate, schema):
+for command in (check, av_check, run, compare, pool, ladder, estimate, rnot, report, replay, validate, schema):
     cli.add_command(command)
 
 

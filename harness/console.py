@@ -155,6 +155,40 @@ def print_estimates(content: dict[str, Any]) -> None:
     print_statements(content)
 
 
+def print_required_tests(content: dict[str, Any]) -> None:
+    """Print required numbers of tests as a table, with what limits each of them below."""
+    from rich.console import Console  # noqa: PLC0415 - keeps --help fast
+    from rich.table import Table  # noqa: PLC0415 - keeps --help fast
+
+    level, n_shuffles = f"{content['confidence']:.0%}", f"{content['n_shuffles']:,}"
+    table = Table(title=f"Tests until RHW stays at most {content['rhw']:g} ({level} normal interval)")
+    for heading in ("run", "estimator", "tests on record", "grid", "shuffles", "mean RNoT", "5-95 %", "never", "AAR"):
+        table.add_column(
+            heading, justify="left" if heading in ("run", "estimator", "grid") else "right", overflow="fold"
+        )
+    for row in content["rows"]:
+        cells = ["-"] * 6
+        if row["mean"] is not None:
+            limit = "≥ " if row["mean_is_lower_limit"] else ""
+            aar = {"equal": "", "at least": "≥ ", "at most": "≤ "}.get(row["aar_is"])
+            cells = [
+                row["grid"],
+                n_shuffles,
+                f"{limit}{row['mean']:,.0f}",
+                f"{row['low_5']:,} to {row['high_95']:,}",
+                f"{row['never_reached']:,}",
+                "-" if aar is None else f"{aar}{row['aar']:.3g}",
+            ]
+        table.add_row(row["run"], row["estimator"], f"{row['n_episodes']:,}", *cells)
+    console = Console()
+    if not console.is_terminal:
+        console.width = _WIDTH_OF_FILES
+    console.print(table)
+    for row in content["rows"]:
+        for remark in [*row.get("remarks", ()), *filter(None, [row.get("reason")])]:
+            click.echo(f"{row['run']} {row['estimator']}: {remark}")
+
+
 def print_pool(content: dict[str, Any]) -> None:
     """Print a pool: its surrogates from careful to careless, and the shells between them."""
     from rich.console import Console  # noqa: PLC0415 - keeps --help fast

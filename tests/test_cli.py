@@ -105,6 +105,7 @@ def test_help_teaches_and_needs_nothing_heavy():
         ["run"],
         ["compare"],
         ["estimate"],
+        ["rnot"],
         ["report"],
         ["replay"],
         ["ladder"],

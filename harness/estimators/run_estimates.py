@@ -206,6 +206,27 @@ class _Wanted:
         return list(dict.fromkeys([*EPISODE_COLUMNS, *martingale, *(PATH_COLUMNS if self.surrogates else ())]))
 
 
+def stored_blocks(folder: Path, *, moments: bool) -> Iterator[Block]:
+    """Tests of a run as the plain estimators and, with the ratios of its control steps, `scv` read them.
+
+    Parameters
+    ----------
+    folder : Path
+        Run folder with ``manifest.json``, ``campaign.yaml`` and shards.
+    moments : bool
+        Whether to read the control steps, where there are any on record.
+
+    Raises
+    ------
+    HarnessError
+        As `estimate_run`.
+    """
+    campaign = load_campaign(folder / "campaign.yaml", check_files=False)
+    ratios = moments and campaign.testing.method == "step_mixture"
+    wanted = _Wanted(moments=ratios, n_martingale=0, surrogates=None, n_replayed=0)
+    yield from _stored_blocks(folder, campaign, read_manifest(folder), wanted)
+
+
 def _stored_blocks(folder: Path, campaign: Campaign, manifest: dict[str, Any], wanted: _Wanted) -> Iterator[Block]:
     """Blocks of the episodes that count, in index order; a gap or too few of them is an error."""
     n, n_counted, cap = 0, int(manifest["n_episodes"]), manifest.get("weight_cap")

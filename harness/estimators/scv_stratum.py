@@ -13,7 +13,7 @@ import numpy as np
 
 from harness.arrays import FloatArray
 from harness.estimators.scv_columns import Basis, fill_product_columns, n_columns
-from harness.estimators.triangular_factor import empty_factor, fold_rows
+from harness.estimators.triangular_factor import empty_factor, fold_rows, short_factor
 
 CHUNK_ROWS = 2_048
 
@@ -85,21 +85,30 @@ class Stratum:
 
     def _folded(self, factor: FloatArray | None) -> FloatArray:
         """Fold the waiting rows into `factor`, which is changed, or into a new one."""
+        rows = self._waiting_rows()
+        factor = empty_factor(rows.shape[1]) if factor is None else factor
+        fold_rows(factor, rows)
+        return factor
+
+    def _waiting_rows(self) -> FloatArray:
+        """Rows [1, H, Y] that wait, shape (m, d + 2), in Fortran order."""
         first_ratios = np.concatenate(self._ratios)
         width = n_columns(self.level, first_ratios.shape[2], self.basis) + 2
         rows = np.empty((self._n_waiting, width), order="F")
         rows[:, 0], rows[:, -1] = 1.0, np.concatenate(self._y)
         fill_product_columns(first_ratios, self.level, self.basis, rows[:, 1:-1])
-        factor = empty_factor(width) if factor is None else factor
-        fold_rows(factor, rows)
-        return factor
+        return rows
 
     def _with_waiting_rows(self) -> FloatArray:
-        """Triangular factor of all rows so far; the state stays as it is."""
-        if self._ratios:
-            return self._folded(None if self._factor is None else self._factor.copy(order="F"))
-        assert self._factor is not None
-        return self._factor
+        """Triangular factor of all rows so far; the state stays as it is.
+
+        Fewer rows than columns have a factor of as many rows; the square one would be filled up with zeros, and its
+        decomposition would take hundreds of times as long.
+        """
+        if self._factor is not None:
+            return self._folded(self._factor.copy(order="F")) if self._ratios else self._factor
+        rows = self._waiting_rows()
+        return short_factor(rows) if rows.shape[0] < rows.shape[1] else self._folded(None)
 
     def fit(self) -> StratumFit:
         """Solve the regression by SVD of the centred columns' triangular factor.
@@ -110,13 +119,14 @@ class Stratum:
         """
         factor = self._with_waiting_rows()
         intercept = float(factor[0, -1] / factor[0, 0])
-        centred, target = factor[1:-1, 1:-1], factor[1:-1, -1]
-        residual_squares = float(factor[-1, -1] ** 2)
+        last = factor.shape[1] - 1
+        centred, target = factor[1:last, 1:last], factor[1:last, last]
+        residual_squares = float(factor[last, last] ** 2) if len(factor) > last else 0.0
         rank = 0
-        if len(centred):
-            left, singular, _ = np.linalg.svd(centred)
+        if centred.size:
+            left, singular, _ = np.linalg.svd(centred, full_matrices=False)
             largest = max(singular[0], np.linalg.norm(factor[0, :-1]))
-            kept = singular > max(self.n, len(centred)) * np.finfo(np.float64).eps * largest
+            kept = singular > max(self.n, last - 1) * np.finfo(np.float64).eps * largest
             rank = int(np.count_nonzero(kept))
             residual_squares += float(np.sum((left[:, ~kept].T @ target) ** 2))
-        return StratumFit(self.n, len(centred), rank, intercept, residual_squares)
+        return StratumFit(self.n, last - 1, rank, intercept, residual_squares)

@@ -28,6 +28,11 @@ def empty_factor(n_columns: int) -> FloatArray:
     return np.zeros((n_columns, n_columns), order="F")
 
 
+def short_factor(rows: FloatArray) -> FloatArray:
+    """Factor of fewer rows than columns, shape (m, k) like ``rows``: the further rows of a square one would be 0."""
+    return np.asarray(np.linalg.qr(rows, mode="r"))
+
+
 def fold_rows(factor: FloatArray, rows: FloatArray) -> None:
     """Make `factor` that of the matrix behind it with more rows below.
 

@@ -111,6 +111,28 @@ def test_columns_that_never_vary_explain_nothing():
     assert fit.residual_squares == pytest.approx(np.sum((y - y.mean()) ** 2), rel=1e-12)
 
 
+@pytest.mark.parametrize("n", [2, 31, 33, 34, 35, 100])
+def test_a_factor_of_few_rows_fits_as_the_square_one_does(n):
+    rng = np.random.default_rng(n)
+    ratios, y = rng.uniform(0.5, 1.5, size=(n, 9, 3)), rng.exponential(size=n)
+    stratum = Stratum(5, "reduced")
+    stratum.add(ratios, y)
+    fit = stratum.fit()
+    whole = block([True] * n, list(np.log(y)), first_ratios=ratios, n_control_steps=np.full(n, 5))
+    _, var_z, strata = algorithm_1([whole], 2)
+    assert (fit.n, fit.n_columns, fit.rank) == strata[5]
+    assert fit.intercept == pytest.approx(np.mean(y), rel=1e-12)
+    assert fit.residual_squares == pytest.approx(var_z * (n - 1), rel=1e-8, abs=1e-15)
+
+
+def test_one_episode_is_its_own_mean_with_nothing_left():
+    stratum = Stratum(5, "reduced")
+    stratum.add(np.full((1, 9, 3), 1.2), np.array([0.25]))
+    fit = stratum.fit()
+    assert (fit.n, fit.n_columns, fit.rank, fit.residual_squares) == (1, 32, 0, 0.0)
+    assert fit.intercept == pytest.approx(0.25, rel=1e-12)
+
+
 def test_large_blocks_on_threads_give_the_bits_of_small_ones():
     parts = list(blocks(panel()[1], "step_mixture", [9_000], SEED))
     assert len(parts) == 1
