@@ -117,8 +117,9 @@ def svg(plot: Plot) -> bytes:
     """Return the plot as an SVG file that stands alone."""
     with mpl.rc_context({"svg.hashsalt": plot.name}):
         drawing = _saved(plot, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
-    # Laying out takes as long as drawing, and both forms should look alike anyway.
-    plot.figure.set_layout_engine("none")
+    # Laying out takes as long as drawing, and both forms should look alike anyway. None, since "none" leaves a
+    # placeholder, for which everything is drawn twice.
+    plot.figure.set_layout_engine(None)
     return drawing
 
 

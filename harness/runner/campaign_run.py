@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
+import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal
 
@@ -112,7 +114,8 @@ def run_campaign(
     progress.stage("estimates and report", None)
     estimates = estimate_run(out)
     write_json(out / "estimates.json", estimates)
-    from harness.report import write_report  # noqa: PLC0415 - no episode waits for matplotlib, and no worker loads it
+    # No worker loads matplotlib, and it has been loaded here while workers were busy.
+    from harness.report import write_report  # noqa: PLC0415
 
     report = write_report(out)
     missed = campaign.stop.rhw is not None and not prefix.reached
@@ -139,6 +142,7 @@ def _run_shards(
         return stored_shard(out, campaign, spec, prepared.prescribed, retracing)
 
     progress.stage("episodes", campaign.stop.episodes, done=_episodes_on_disk(campaign, out))
+    threading.Thread(target=import_module, args=("harness.report",), daemon=True).start()
     try:
         for specs in batches:
             for done in pool.run(specs, stored):
