@@ -208,7 +208,7 @@ def _two_digits(value: float) -> int:
     return round(value / size) * size
 
 
-VALIDATED = ("shells_panel", "chains_shells", "chains_forced")
+VALIDATED = ("shells_panel", "chains_shells", "chains_forced", "twin_forced_online")
 """Replication experiments that are shown line by line."""
 METHODS = {
     "twin_nde": "no control, level 10,000",
@@ -216,6 +216,8 @@ METHODS = {
     "twin_step_recursive": "step mixture, recursive challenge",
     "twin_episode": "episode mixture, recursive challenge",
     "twin_forced": "forced cut-ins",
+    "twin_forced_online": "forced cut-ins, online rule",
+    "twin_replay": "forced cut-ins, surrogates replayed",
     "shells_panel": "pool and shells, online rule",
 }
 """Experiments from which one vehicle (idm) is compared over methods."""

@@ -28,7 +28,7 @@ UNBOUNDED = (
 
 
 class Replay:
-    """Cross-fitted regression of Y on the surrogates' weighted crashes.
+    """Cross-fitted regression of Y on the weighted crashes of surrogates that crash in ordinary traffic.
 
     Attributes
     ----------
@@ -61,8 +61,9 @@ class Replay:
         self.sums.add(block)
         self.n_lost += int(np.count_nonzero(block.failed & ~block.cut_in))
         self._known = block.known_rates
-        self._fit = self._fit or CrossFit(len(block.known_rates.mu))
-        self._fit.add(block.first_episode, weighted_surrogates(block), block.weighted_crashes())
+        used = block.known_rates.ordinary
+        self._fit = self._fit or CrossFit(int(np.count_nonzero(used)))
+        self._fit.add(block.first_episode, weighted_surrogates(block)[:, used], block.weighted_crashes())
         self._residuals.add(block)
 
     def merge(self, other: Self) -> None:
@@ -80,9 +81,12 @@ class Replay:
         require_episodes(self.sums.n)
         assert self._fit is not None
         assert self._known is not None
-        found = self._fit.result(self._known.mu, self._known.covariance)
+        used = self._known.ordinary
+        found = self._fit.result(self._known.mu[used], self._known.covariance[np.ix_(used, used)])
+        beta = np.zeros(len(used))
+        beta[used] = found.beta
         plain = self.sums.y.std_error(self.sums.n)
-        disagreements = self._residuals.n_effective(found.beta)
+        disagreements = self._residuals.n_effective(beta)
         trusted = self.sums.is_settled() and disagreements >= FEW_EFFECTIVE
         own = trusted or found.std_error >= plain
         warnings = [RESIDUALS if trusted else PLAIN.format(what="crashes, or disagreements with the surrogates,")]
@@ -92,7 +96,7 @@ class Replay:
             warnings.append(f"{self.n_lost} failed tests have no cut-in; surrogates count as not crashing in them")
         details: dict[str, Any] = {
             "pool": self._known.pool,
-            "beta": dict(zip(self._known.names, found.beta.tolist(), strict=True)),
+            "beta": dict(zip(self._known.names, beta.tolist(), strict=True)),
             "residual_std_error": found.std_error,
             "n_effective_residuals": disagreements,
             "share_of_variance_from_pool": found.known_share,

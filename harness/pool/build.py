@@ -13,7 +13,7 @@ from harness.campaign.models import PoolSettings
 from harness.environment.driving import Environment
 from harness.environment.initial_state import N_STATE, InitialStates
 from harness.episode.cells import max_draws
-from harness.pool.cut_ins import CutIns, Pool, environment_hash, shells_of
+from harness.pool.cut_ins import FAR_OFF, CutIns, Pool, environment_hash, shells_of
 from harness.pool.enumeration import empty_path, enumerate_cut_ins, write_pairs
 from harness.pool.library import Library
 from harness.pool.proposal import Proposal, fit_proposal
@@ -26,9 +26,6 @@ BLOCK_PATHS = 256
 MOST_PATHS = 1 << 20
 CARELESS_SHARE = 0.2
 """How much the surrogates beyond the boundary count in aiming, and those far off: less has to be known there."""
-FAR_OFF = 10.0
-"""A surrogate whose rate varies this much more from path to path than the boundary's (relvar) crashes in traffic of its
-own, which few paths meet: paths aimed there would be lost for all others."""
 CARELESS_ERROR = 4.0
 """Their relative error may be this many times the target."""
 _APART = 0x706F6F6C

@@ -13,6 +13,10 @@ from harness.arrays import BoolArray, FloatArray, Int8Array, IntArray
 from harness.environment.driving import Environment
 from harness.pool.library import Library
 
+FAR_OFF = 10.0
+"""A surrogate whose rate varies this much more from path to path than the boundary's (relvar) crashes in traffic of its
+own, which few paths meet: paths aimed there would be lost for all others."""
+
 
 @dataclass(frozen=True, eq=False)
 class CutIns:
@@ -107,6 +111,13 @@ class Pool:
             ],
             "no_surrogate_crashes": p[-1],
         }
+
+    @property
+    def ordinary(self) -> BoolArray:
+        """Which surrogates crash in the traffic that the boundary crashes in, and not in rare traffic of their own."""
+        relvar = np.diag(self.mu_covariance) * self.n_paths / self.mu**2
+        ordinary: BoolArray = relvar <= FAR_OFF * relvar[self.boundary]
+        return ordinary
 
     @property
     def boundary(self) -> int:

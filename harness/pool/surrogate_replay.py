@@ -40,12 +40,15 @@ class KnownRates:
         Crash rates per test.
     covariance : ndarray, shape (D, D)
         Of their errors.
+    ordinary : ndarray of bool, shape (D,)
+        Those that crash in the traffic that the boundary crashes in. The weighted crashes of others are few and heavy.
     """
 
     pool: str
     names: tuple[str, ...]
     mu: FloatArray
     covariance: FloatArray
+    ordinary: BoolArray
 
 
 class SurrogateReplay:
@@ -69,7 +72,7 @@ class SurrogateReplay:
     def __init__(self, campaign: Campaign, pool: Pool) -> None:
         self._environment: Environment = load_environment(campaign.environment)
         require_same_environment(self._environment, pool)
-        self.known = KnownRates(pool.key, pool.names, pool.mu, pool.mu_covariance)
+        self.known = KnownRates(pool.key, pool.names, pool.mu, pool.mu_covariance, pool.ordinary)
         self._seed = campaign.seed
         names = list(pool.library.surrogates)
         self._drivers = pool.library.drivers

@@ -57,7 +57,9 @@ def replayed(
     maneuver = WORLD.maneuvers(n, rng)
     truth = SURROGATES @ WORLD.p
     pool = truth * (1.0 + error * rng.normal(size=3)) * [corrupt, 1.0, 1.0]
-    known = KnownRates("pool", ("careful", "careless", "other"), pool, np.diag((claimed * truth) ** 2))
+    known = KnownRates(
+        "pool", ("careful", "careless", "other"), pool, np.diag((claimed * truth) ** 2), np.ones(3, np.bool_)
+    )
     block = WORLD.block("episode_mixture", maneuver)
     return replace(block, surrogates_crash=SURROGATES[:, maneuver].T, known_rates=known)
 
@@ -77,6 +79,21 @@ def test_a_corrupted_rate_does_not_cover_and_raises_the_alarm():
         alarm = Alarm()
         alarm.add(replayed(np.random.default_rng(SEED), corrupt=corrupt, n=20_000))
         assert alarm.result()["raised"] == raised
+
+
+def test_surrogates_of_rare_traffic_are_left_out():
+    block = replayed(np.random.default_rng(SEED))
+    assert block.known_rates is not None
+    assert block.surrogates_crash is not None
+    kept = np.array([True, True, False])
+    known = block.known_rates
+    fewer = KnownRates("pool", known.names[:2], known.mu[:2], known.covariance[:2, :2], np.ones(2, np.bool_))
+    left_out, absent = Replay(), Replay()
+    left_out.add(replace(block, known_rates=replace(known, ordinary=kept)))
+    absent.add(replace(block, surrogates_crash=block.surrogates_crash[:, :2], known_rates=fewer))
+    one, other = left_out.result(CONFIDENCE), absent.result(CONFIDENCE)
+    assert (one.crash_rate, one.ci_low, one.ci_high) == (other.crash_rate, other.ci_low, other.ci_high)
+    assert one.details["beta"] == {**other.details["beta"], "other": 0.0}
 
 
 def test_a_pool_said_to_be_exact_covers_too_little():

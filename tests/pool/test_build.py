@@ -19,7 +19,7 @@ FORCED_RATE = 1.352e-7
 
 
 def test_surrogates_are_ordered_from_careful_to_careless(pool):
-    ladder = ("brakes-8", "brakes-5", "brakes-3", "brakes-3-late-700ms", "brakes-2-late-1s")
+    ladder = ("brakes-8", "brakes-5", "brakes-3", "brakes-3-late-700ms", "fvdm-brakes-4", "brakes-2-late-1s")
     assert pool.names == (*ladder, "never-brakes", "full-throttle-2")
     assert np.all(np.diff(pool.mu) > 0.0)
     inside = pool.mu[: pool.boundary + 1]
@@ -50,6 +50,12 @@ def test_crash_rates_lie_around_the_reference(pool):
     """A vehicle between brakes-5 and brakes-3 was measured by another method, with other code and seeds."""
     low, high = pool.mu[pool.names.index("brakes-5")], pool.mu[pool.names.index("brakes-3")]
     assert low < FORCED_RATE < high
+
+
+def test_one_surrogate_crashes_in_rare_traffic_of_its_own(pool):
+    apart = [name for name, ordinary in zip(pool.names, pool.ordinary, strict=True) if not ordinary]
+    assert apart == ["fvdm-brakes-4"]
+    assert pool.n_paths < 20_000  # paths are not aimed at it
 
 
 def test_the_same_settings_give_the_same_bits(campaign, pool, tmp_path, monkeypatch):
