@@ -47,6 +47,8 @@ Method = Literal["nde", "forced", "step_mixture", "episode_mixture", "shells"]
 EstimatorName = Literal["nde", "nade", "mixture_cv", "scv", "shells", "martingale", "replay"]
 
 MAX_CONFIGURED_SPEED_MPS = 60.0
+MOST_SUMO_CELLS = 256
+"""Roads of the largest committed network."""
 
 
 def broken_rule(key: str, *, found: str, expected: str, mend: str) -> PydanticCustomError:
@@ -517,6 +519,17 @@ class Campaign(Section):
                 found=f"twin, with an AV that SUMO moves (av.{self.av.source})",
                 expected="sumo",
                 mend="Write engine: sumo.",
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _network_has_the_cells(self) -> Self:
+        if self.world.engine == "sumo" and self.world.cells > MOST_SUMO_CELLS:
+            raise broken_rule(
+                "world.cells",
+                found=f"{self.world.cells}, with engine sumo",
+                expected=f"at most {MOST_SUMO_CELLS}: so many roads has the largest network",
+                mend="Lower it; about 64 is fastest. It never changes a result.",
             )
         return self
 

@@ -13,10 +13,10 @@ import matplotlib.style
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
+from harness.records.folder import write_bytes
 from harness.records.schemas import OUTCOMES
 from harness.report import number_format
 from harness.report.answer_plot import answer_plot
-from harness.report.atomic_files import write_atomically
 from harness.report.convergence_plot import convergence_plot
 from harness.report.crash_gallery import GalleryRow, crash_gallery
 from harness.report.crash_plot import crash_time_plot, impact_speed_plot
@@ -76,7 +76,7 @@ def write_report(folder: Path) -> Path:
         files, figures = _rendered(_plots(run, summary, shells, gallery))
     page = _page(run=run, summary=summary, shells=shells, sizes=sizes, gallery=gallery, figures=figures)
     _write_plots(folder / "plots", files)
-    write_atomically(folder / "report.html", page.encode("utf-8"))
+    write_bytes(folder / "report.html", page.encode("utf-8"))
     return folder / "report.html"
 
 
@@ -195,7 +195,7 @@ def _details(run: RunFolder) -> list[tuple[str, Any]]:
 def _write_plots(folder: Path, files: dict[str, bytes]) -> None:
     folder.mkdir(exist_ok=True)
     for name, content in files.items():
-        write_atomically(folder / name, content)
+        write_bytes(folder / name, content)
     for old in folder.iterdir():
         if old.name not in files and PLOT_NAMES.fullmatch(old.name):
             old.unlink()

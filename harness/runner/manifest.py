@@ -94,8 +94,8 @@ class Manifest:
             **facts,
         }
         folder.mkdir(parents=True, exist_ok=True)
+        self.write([], [], status="running")  # first: --resume knows a folder by its manifest
         write_text(folder / "campaign.yaml", dump_campaign(campaign))
-        self.write([], [], status="running")
 
     def write(
         self,

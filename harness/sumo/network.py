@@ -7,10 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from harness.arrays import FloatArray
+from harness.campaign.models import MOST_SUMO_CELLS
 from harness.errors import CampaignError
 from harness.outcomes import AV, BV, LV
-
-MOST_CELLS = 256
 
 _CHECKOUT = Path(__file__).parents[2] / "sumo_networks"
 _INSTALLED = Path(__file__).parents[1] / "sumo_networks"
@@ -47,14 +46,14 @@ def network_file(n_cells: int) -> Path:
     CampaignError
         More cells are asked for than the largest network has.
     """
-    if n_cells > MOST_CELLS:
+    if n_cells > MOST_SUMO_CELLS:
         raise CampaignError(
             "world.cells",
             found=str(n_cells),
-            expected=f"at most {MOST_CELLS} cells with engine sumo",
+            expected=f"at most {MOST_SUMO_CELLS} cells with engine sumo",
             mend="32 to 128 cells are fastest; more make SUMO slower.",
         )
-    return committed_file("highway-1.net.xml" if n_cells == 1 else f"highway-{MOST_CELLS}.net.xml")
+    return committed_file("highway-1.net.xml" if n_cells == 1 else f"highway-{MOST_SUMO_CELLS}.net.xml")
 
 
 def committed_file(name: str) -> Path:

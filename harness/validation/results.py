@@ -9,7 +9,7 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from harness.records.folder import write_atomically, write_json
+from harness.records.folder import write_atomically, write_bytes, write_json
 from harness.report.plot_style import png
 from harness.validation.coverage_plot import coverage_plot
 from harness.validation.experiment import Experiment
@@ -43,7 +43,7 @@ def write_results(
     table = _table(rows)
     write_atomically(folder / REPLICATIONS, lambda file: pq.write_table(table, file, compression="zstd"))
     picture = png(coverage_plot(judgements, experiment.campaign.stop.confidence))
-    write_atomically(folder / PLOT, lambda file: _write_bytes(file, picture))
+    write_bytes(folder / PLOT, picture)
     write_json(
         folder / RESULTS,
         {
@@ -55,10 +55,6 @@ def write_results(
             "judgements": [one.to_json() for one in judgements],
         },
     )
-
-
-def _write_bytes(file: Path, content: bytes) -> None:
-    file.write_bytes(content)
 
 
 def _table(rows: Mapping[str, Sequence[Row]]) -> pa.Table:

@@ -5,7 +5,7 @@ from typing import Any
 
 from hypothesis import strategies as st
 
-from harness.campaign.models import AV_SOURCES
+from harness.campaign.models import AV_SOURCES, MOST_SUMO_CELLS
 from harness.campaign.schema import campaign_schema
 
 SCHEMA = campaign_schema()
@@ -109,6 +109,9 @@ def _obey_rules(data: dict[str, Any]) -> dict[str, Any]:
         av.pop("before_cut_in", None)
     if not any(av.get(source) for source in ("controller", "sumo", "traci", "fmu")):
         av.pop("before_cut_in", None)
+    world = data.get("world", {})
+    if "cells" in world:
+        world["cells"] = min(world["cells"], MOST_SUMO_CELLS)
     if "sumo" in av or "traci" in av:
         data.get("world", {}).pop("engine", None)
     return data

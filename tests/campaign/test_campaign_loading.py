@@ -80,6 +80,7 @@ def load(tmp_path):
         ("av:\n  limits: {step_time_s: 0}", "av.limits.step_time_s", 3, "above 0"),
         ("av:\n  before_cut_in: controller", "av.before_cut_in", 3, "step_mixture or nde"),
         ("stop:\n  rhw: 1\n  rhw: 2", "stop.rhw", 4, "first written on line 3"),
+        ("world: {cells: 257}", "world.cells", 2, "at most 256"),
         ("testing: {method: step_mixture}\nstop:\n  rhw: 0.3", "stop.rhw", 4, "a fixed number of tests"),
     ],
 )

@@ -10,11 +10,12 @@ import libsumo
 import numpy as np
 import pytest
 
+from harness.campaign.models import MOST_SUMO_CELLS
 from harness.episode.loop import EpisodeLoop, Keep, Shard
 from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, WorldDisagreementError
 from harness.outcomes import AV, BV, CRASH, LV
 from harness.runner.prepare import prepare
-from harness.sumo.network import MOST_CELLS, network_file
+from harness.sumo.network import network_file
 from harness.twin import TwinWorld
 
 
@@ -62,7 +63,7 @@ def test_closing_a_world_twice_leaves_the_next_one_alone(open_world):
 
 def test_more_cells_than_the_largest_network_has_are_refused():
     with pytest.raises(CampaignError, match=r"world\.cells: found 257; expected at most 256"):
-        network_file(MOST_CELLS + 1)
+        network_file(MOST_SUMO_CELLS + 1)
 
 
 def test_without_its_extra_the_gui_is_refused_in_words(open_world, monkeypatch):
