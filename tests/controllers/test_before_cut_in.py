@@ -32,7 +32,7 @@ class Faster:
 
 
 def load(method, *more):
-    changes = [f"av={EARLY}", f"testing={{method: {method}}}", "world.engine=twin", *more]
+    changes = [f"av={EARLY}", f"testing={{method: {method}}}", "world.engine=twin", "stop.rhw=null", *more]
     return load_campaign(ROOT / "scenarios/overtaking_mixture.yaml", changes)
 
 

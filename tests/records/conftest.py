@@ -29,7 +29,7 @@ def record() -> Callable[..., Recorded]:
     """Run episodes ``first`` … of the smoke campaign with overrides, in the twin."""
 
     def recorded(*overrides: str, first: int = 0, n: int = 300, n_cells: int = 32) -> Recorded:
-        campaign = load_campaign(MIXTURE_FILE, overrides)
+        campaign = load_campaign(MIXTURE_FILE, ["stop.rhw=null", *overrides])
         prepared = prepare(campaign)
         shard = prepared.loop(TwinWorld(n_cells)).run(first, prepared.states(first, n))
         keep = campaign.records.traces != "none" or campaign.records.trace_share > 0.0

@@ -32,4 +32,4 @@ def open_world() -> Iterator[Callable]:
 @pytest.fixture(scope="session")
 def smoke() -> Callable[..., Campaign]:
     """The smoke campaign, with overrides."""
-    return lambda *overrides: load_campaign(MIXTURE_FILE, overrides)
+    return lambda *overrides: load_campaign(MIXTURE_FILE, ["stop.rhw=null", *overrides])
