@@ -99,8 +99,9 @@ def _read_campaign(path: Path) -> dict[str, Any]:
         content = YAML(typ="safe", pure=True).load(_read_text(path, mend))
     except YAMLError as error:
         raise RunFolderError(str(path), found=f"broken YAML ({error})", expected="a campaign", mend=mend) from error
-    if not isinstance(content, dict):
-        raise RunFolderError(str(path), found=type(content).__name__, expected="a campaign (a mapping)", mend=mend)
+    if not isinstance(content, dict) or not isinstance(content.get("testing"), dict):
+        found = "no section 'testing'" if isinstance(content, dict) else type(content).__name__
+        raise RunFolderError(str(path), found=found, expected="a campaign with all its sections", mend=mend)
     return content
 
 

@@ -71,6 +71,13 @@ def test_an_unknown_outcome_is_named(run_folder):
         write_report(run_folder)
 
 
+@pytest.mark.parametrize("text", ["{}", "testing: 5", "[]"])
+def test_a_campaign_without_its_sections_is_named(run_folder, text):
+    (run_folder / "campaign.yaml").write_text(text, encoding="utf-8")
+    with pytest.raises(RunFolderError, match=r"campaign.yaml: found .*; expected a campaign"):
+        write_report(run_folder)
+
+
 @pytest.mark.parametrize("name", ["manifest.json", "estimates.json", "campaign.yaml"])
 def test_a_missing_file_is_named_with_what_to_do(run_folder, name):
     (run_folder / name).unlink()
