@@ -97,9 +97,10 @@ def test_a_careless_vehicle_is_found_out(campaign, run_here, tmp_path):
 def test_rows_say_which_cut_in_they_were(shells_run):
     episodes = stored_table(shells_run.folder, "episodes")
     assert episodes.column("pool_cut_in").null_count == 0
-    assert set(episodes.column("component").to_pylist()) == set(range(6))
+    strata = len(json.loads((shells_run.folder / "shells.json").read_text())["strata"])
+    assert set(episodes.column("component").to_pylist()) == set(range(strata))
     weights = np.unique(np.round(episodes.column("log_weight").to_numpy(), 12))
-    assert weights.size == 6
+    assert weights.size == strata
 
 
 def test_a_vehicle_that_acts_before_the_cut_in_is_refused(campaign):
