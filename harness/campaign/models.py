@@ -552,7 +552,7 @@ class Campaign(Section):
                 found=f"{self.stop.rhw:g}, with testing.method step_mixture",
                 expected="no precision to stop at: nothing bounds the weights of the step mixture, and while the large "
                 "ones are missing its interval looks narrow",
-                mend="Leave it out for a fixed number of tests (stop.episodes), or choose shells, forced or "
+                mend="Set it to null for a fixed number of tests (stop.episodes), or choose shells, forced or "
                 "episode_mixture.",
             )
         return self
