@@ -66,9 +66,7 @@ def surrogates_of(campaign: Campaign, columns: set[str], request: PoolRequest) -
         if request.explicit:
             raise
         return f"the pool of cut-ins cannot be used: {error}"
-    return (
-        "the pool of cut-ins has not been built here; `harness estimate DIR -e replay` builds it (about half a minute)"
-    )
+    return "the pool of cut-ins has not been built here; `harness estimate DIR -e replay` builds it (about 15 s)"
 
 
 def refusal(campaign: Campaign, columns: set[str]) -> str | None:

@@ -14,7 +14,7 @@ from harness.environment.driving import Environment
 from harness.environment.initial_state import N_STATE, InitialStates
 from harness.episode.cells import max_draws
 from harness.pool.cut_ins import FAR_OFF, CutIns, Pool, environment_hash, shells_of
-from harness.pool.enumeration import empty_path, enumerate_cut_ins, write_pairs
+from harness.pool.enumeration import STRIDE, empty_path, enumerate_cut_ins, write_pairs
 from harness.pool.library import Library
 from harness.pool.proposal import Proposal, fit_proposal
 from harness.progress import Progress, SilentProgress
@@ -30,16 +30,18 @@ CARELESS_ERROR = 4.0
 """Their relative error may be this many times the target."""
 _APART = 0x706F6F6C
 """Keeps a pool's random numbers apart from those of a campaign with the same seed."""
-AIMED_DRAW, KEEP_DRAW = 0, 1
-"""Indices within the diagnostic stream."""
+AIMED_DRAW, OFFSET_DRAW = 0, 1
+"""Draws of a path within the diagnostic stream."""
+KEEP_DRAW = 1
+"""The same, of a shell."""
 
 
 @dataclass(frozen=True)
 class Enumerated:
-    """All cut-ins of some paths.
+    """Cut-ins of some paths.
 
-    ``weight`` (n,) is naturalistic over proposal density; ``state`` (n, 5); ``probability`` (n, steps) of a cut-in in
-    each step; ``crashes`` (n, steps) one bit per surrogate, in the order of the library.
+    ``weight`` (n,) is naturalistic over proposal density; ``state`` (n, 5); ``probability`` (n, steps) is that of the
+    cut-ins that one in this step stands for; ``crashes`` (n, steps) one bit per surrogate, as the library orders them.
     """
 
     first: int
@@ -59,18 +61,24 @@ class Enumerator:
     """Enumerates consecutive paths of one environment, on all cores; the number of cores changes no bit."""
 
     def __init__(
-        self, environment: Environment, drivers: RecordArray, envelope: int, seed: int, proposal: Proposal | None = None
+        self,
+        environment: Environment,
+        drivers: RecordArray,
+        envelope: int,
+        seed: int,
+        proposal: Proposal | None = None,
+        stride: int = STRIDE,
     ) -> None:
         n = environment.numbers[0]
         self._environment, self._drivers, self._envelope = environment, drivers, envelope
-        self._seed, self._proposal = seed, proposal
+        self._seed, self._proposal, self._stride = seed, proposal, stride
         self._states = InitialStates(environment.numbers)
         self._max_steps = int(n["max_steps"])
         self._draws = max_draws(self._max_steps, int(n["hold_steps"]))
 
     def aimed(self, proposal: Proposal) -> Enumerator:
         """The same, with initial states drawn from a proposal."""
-        return Enumerator(self._environment, self._drivers, self._envelope, self._seed, proposal)
+        return Enumerator(self._environment, self._drivers, self._envelope, self._seed, proposal, self._stride)
 
     def uniforms(self, first: int, n: int) -> FloatArray:
         """Uniforms of the initial states of consecutive paths, shape (n, 5)."""
@@ -88,15 +96,16 @@ class Enumerator:
     def _block(self, first: int) -> Enumerated:
         u = self.uniforms(first, BLOCK_PATHS)
         weight = np.ones(BLOCK_PATHS)
+        drawn = uniforms(self._seed, first, BLOCK_PATHS, DIAGNOSTIC, 2)
+        offset = (drawn[:, OFFSET_DRAW] * self._stride).astype(np.int64)
         if self._proposal is not None:
-            u, weight = self._proposal.map(u, uniforms(self._seed, first, BLOCK_PATHS, DIAGNOSTIC, 1)[:, AIMED_DRAW])
+            u, weight = self._proposal.map(u, drawn[:, AIMED_DRAW])
         state = self._states.from_uniforms(u)
         probability = np.zeros((BLOCK_PATHS, self._max_steps))
         crashes = np.zeros((BLOCK_PATHS, self._max_steps), np.int64)
         path = empty_path(self._max_steps, self._draws)
-        enumerate_cut_ins(
-            self._seed, first, state, self._environment, self._drivers, self._envelope, path, probability, crashes
-        )
+        where = self._environment, self._drivers, self._envelope
+        enumerate_cut_ins(self._seed, first, state, *where, self._stride, offset, path, probability, crashes)
         return Enumerated(first, weight, state, probability, crashes)
 
     def pairs(
@@ -193,7 +202,7 @@ def _paths_needed(pilot: FloatArray, wanted: FloatArray) -> int:
 def _pool(
     blocks: list[Enumerated], enumerator: Enumerator, library: Library, settings: PoolSettings, hashes: tuple[str, str]
 ) -> Pool:
-    """Order the surrogates, sort all cut-ins into shells, and keep a sample of each."""
+    """Order the surrogates, sort the cut-ins into shells, and keep a sample of each."""
     n_surrogates = len(library.surrogates)
     rates = _joined(blocks, n_surrogates)
     n = len(rates)

@@ -128,7 +128,7 @@ def require_same_environment(environment: Environment, pool: Pool) -> None:
             found=f"a pool of another environment ({pool.environment})",
             expected=f"one of the campaign's ({own}): crash rates of surrogates depend on traffic, level of lane "
             "changing and hold time",
-            mend="Leave the pool out: the right one is built, which takes about half a minute.",
+            mend="Leave the pool out: the right one is built, which takes about 15 s.",
         )
 
 

@@ -20,7 +20,7 @@ EPISODES_PER_SECOND_PER_CORE = {
     "twin": {"nde": 70000, "forced": 32000, "step_mixture": 25000, "episode_mixture": 18000, "shells": 30000},
 }
 """Orders of magnitude, recording included, measured on one core of a 2020s server; `benchmarks/` measures yours."""
-POOL_S = "about half a minute"
+POOL_S = "about 15 s"
 KB_PER_EPISODE = 0.2
 KB_PER_MOMENT = 0.1
 MOMENTS_PER_EPISODE = {"all": 70, "first_9": 9, "none": 0}

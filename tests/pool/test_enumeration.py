@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.stats import chisquare
 
 from harness.arrays import RecordArray
 from harness.campaign.models import PoolSettings
@@ -13,7 +14,7 @@ from harness.episode.loop import EpisodeLoop, Keep, Policy
 from harness.importance.build import build_importance
 from harness.outcomes import CRASH
 from harness.pool.build import Enumerator
-from harness.pool.enumeration import empty_path, enumerate_cut_ins
+from harness.pool.enumeration import STRIDE, empty_path, enumerate_cut_ins
 from harness.pool.library import load_library
 from harness.pool.prescribed import Draw, PrescribedEpisodes
 from harness.pool.shells import design_shells
@@ -25,13 +26,16 @@ LIBRARY = load_library("ladder-1")
 NAMES = list(LIBRARY.surrogates)
 
 
-def enumerated(environment, n: int, envelope: int, drivers: RecordArray = LIBRARY.drivers):
+def enumerated(
+    environment, n: int, envelope: int, drivers: RecordArray = LIBRARY.drivers, stride: int = 1, offset: int = 0
+):
     numbers = environment.numbers[0]
     steps = int(numbers["max_steps"])
     states = InitialStates(environment.numbers).draw(SEED, 0, n)
     probability, crashes = np.zeros((n, steps)), np.zeros((n, steps), np.int64)
     path = empty_path(steps, max_draws(steps, int(numbers["hold_steps"])))
-    enumerate_cut_ins(SEED, 0, states, environment, drivers, envelope, path, probability, crashes)
+    offsets = np.full(n, offset)
+    enumerate_cut_ins(SEED, 0, states, environment, drivers, envelope, stride, offsets, path, probability, crashes)
     return probability, crashes
 
 
@@ -77,6 +81,25 @@ def test_the_probabilities_of_a_path_add_up_to_that_of_a_cut_in(environment):
     probability, _ = enumerated(environment, 40, NAMES.index(LIBRARY.envelope))
     expected = p_cut_in_of_paths(SEED, InitialStates(environment.numbers).draw(SEED, 0, 40), environment)
     assert np.allclose(probability.sum(1), expected, rtol=1e-12, atol=0.0)
+
+
+def test_a_stride_asks_the_same_cut_ins_and_each_stands_for_as_many(environment):
+    """Over all offsets every cut-in is asked once, with the same answer, so that any sum has the same mean."""
+    envelope = NAMES.index(LIBRARY.envelope)
+    probability, crashes = enumerated(environment, 40, envelope)
+    strided = [enumerated(environment, 40, envelope, stride=STRIDE, offset=offset) for offset in range(STRIDE)]
+    assert np.array_equal(np.sum([p for p, _ in strided], axis=0), STRIDE * probability)
+    assert np.array_equal(np.sum([c for _, c in strided], axis=0), crashes)
+    assert np.max([p > 0.0 for p, _ in strided], axis=0).sum() > 1000
+
+
+def test_blocks_use_every_offset_about_equally(environment):
+    blocks = Enumerator(environment, LIBRARY.drivers, NAMES.index(LIBRARY.envelope), 5).run(0, 2048, SilentProgress())
+    asked = np.concatenate([block.probability for block in blocks]) > 0.0
+    offsets = [np.flatnonzero(row) % STRIDE for row in asked if row.any()]
+    assert all(np.unique(found).size == 1 for found in offsets)
+    counts = np.bincount([found[0] for found in offsets], minlength=STRIDE)
+    assert chisquare(counts).pvalue > 1e-3  # seed fixed; another one would fail it once in a thousand
 
 
 def test_the_number_of_cores_changes_no_bit(environment, monkeypatch):

@@ -1,0 +1,57 @@
+"""How many cut-ins of a path a pool should ask: variance and time per path, by stride.
+
+    python -m benchmarks.pool_stride
+
+One line per stride: n·Var/μ² of each surrogate's crash rate over aimed paths, the CPU time of a path, and the largest
+product of both (of the surrogates up to the boundary that ordinary traffic brings to a crash) against stride 1: what a
+pool of the asked precision costs.
+"""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+
+from harness import load_campaign
+from harness.environment.loading import load_environment
+from harness.pool.build import PILOT_PATHS, Enumerator
+from harness.pool.library import load_library
+from harness.pool.proposal import fit_proposal
+from harness.progress import SilentProgress
+
+PATHS = 8192
+STRIDES = (1, 2, 3, 4, 6, 8)
+SEED = 77
+
+
+def main() -> None:
+    """Print the rows."""
+    campaign = load_campaign("scenarios/smoke.yaml")
+    environment, library = load_environment(campaign.environment), load_library(campaign.pool.library)
+    names = list(library.surrogates)
+    before = names[: names.index(library.boundary) + 1]
+    asked, envelope = (environment, library.drivers), names.index(library.envelope)
+    pilot = Enumerator(*asked, envelope, SEED)
+    rates = np.concatenate([block.rates(len(names)) for block in pilot.run(0, PILOT_PATHS, SilentProgress())])
+    relative = rates[:, : len(before)] / rates[:, : len(before)].mean(0)
+    proposal = fit_proposal(pilot.uniforms(0, PILOT_PATHS), np.sqrt((relative**2).sum(1)))
+    print("stride  ms/path  cost  " + "  ".join(before))
+    first = 0.0
+    for stride in STRIDES:
+        enumerator = Enumerator(*asked, envelope, SEED, proposal, stride)
+        begin = time.process_time()
+        blocks = enumerator.run(PILOT_PATHS, PATHS, SilentProgress())
+        milliseconds = (time.process_time() - begin) / PATHS * 1e3
+        rates = np.concatenate([block.rates(len(names)) for block in blocks])[:, : len(before)]
+        relvar = rates.var(0) / rates.mean(0) ** 2
+        cost = milliseconds * relvar.max()
+        first = first or cost
+        print(
+            f"{stride:6}  {milliseconds:7.2f}  {cost / first:4.2f}  " + "  ".join(f"{v:.2f}" for v in relvar),
+            flush=True,
+        )
+
+
+if __name__ == "__main__":
+    main()
