@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
@@ -23,9 +22,6 @@ from harness.console import (
     print_plan,
     print_statements,
 )
-
-if TYPE_CHECKING:
-    pass
 
 
 @click.command(

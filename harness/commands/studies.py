@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
@@ -22,9 +21,6 @@ from harness.console import (
     print_json,
     print_pool,
 )
-
-if TYPE_CHECKING:
-    pass
 
 
 @click.command(

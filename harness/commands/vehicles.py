@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
@@ -24,9 +23,6 @@ from harness.console import (
     print_av_check,
     print_json,
 )
-
-if TYPE_CHECKING:
-    pass
 
 
 @click.command(
