@@ -75,6 +75,9 @@ class Enumerator:
         self._states = InitialStates(environment.numbers)
         self._max_steps = int(n["max_steps"])
         self._draws = max_draws(self._max_steps, int(n["hold_steps"]))
+        # Compiled here, by one thread: of two that want a new kernel at once, the second would wait behind whatever else
+        # is compiled meanwhile.
+        self._block(0, 0)
 
     def aimed(self, proposal: Proposal) -> Enumerator:
         """The same, with initial states drawn from a proposal."""
@@ -93,16 +96,16 @@ class Enumerator:
                 progress.advance(BLOCK_PATHS)
         return blocks
 
-    def _block(self, first: int) -> Enumerated:
-        u = self.uniforms(first, BLOCK_PATHS)
-        weight = np.ones(BLOCK_PATHS)
-        drawn = uniforms(self._seed, first, BLOCK_PATHS, DIAGNOSTIC, 2)
+    def _block(self, first: int, n: int = BLOCK_PATHS) -> Enumerated:
+        u = self.uniforms(first, n)
+        weight = np.ones(n)
+        drawn = uniforms(self._seed, first, n, DIAGNOSTIC, 2)
         offset = (drawn[:, OFFSET_DRAW] * self._stride).astype(np.int64)
         if self._proposal is not None:
             u, weight = self._proposal.map(u, drawn[:, AIMED_DRAW])
         state = self._states.from_uniforms(u)
-        probability = np.zeros((BLOCK_PATHS, self._max_steps))
-        crashes = np.zeros((BLOCK_PATHS, self._max_steps), np.int64)
+        probability = np.zeros((n, self._max_steps))
+        crashes = np.zeros((n, self._max_steps), np.int64)
         path = empty_path(self._max_steps, self._draws)
         where = self._environment, self._drivers, self._envelope
         enumerate_cut_ins(self._seed, first, state, *where, self._stride, offset, path, probability, crashes)
