@@ -160,6 +160,14 @@ def test_run_as_json_and_with_the_budget_spent(calls, capsys, tmp_path):
     assert json.loads(capsys.readouterr().out) == ESTIMATES
 
 
+@pytest.mark.parametrize(("spent", "mend"), [("episodes", "stop.episodes"), ("pool", "pool.cut_ins_per_shell")])
+def test_a_run_that_ends_too_early_says_why(spent, mend, calls, capsys, tmp_path):
+    result = Result(tmp_path, tmp_path / "report.html", stopped_by=spent, exit_code=4)
+    calls["stand_in"]("harness.runner.run_campaign", lambda _, folder: result)
+    assert main(["run", SMOKE, "--out", str(tmp_path / "out")]) == 4
+    assert mend in capsys.readouterr().out
+
+
 def test_wrong_campaign_leaves_nothing_behind(calls, capsys, tmp_path):
     assert main(["run", SMOKE, "--out", str(tmp_path / "out"), "--set", "testing.epsilom=1"]) == 2
     out, err = capsys.readouterr()

@@ -22,6 +22,13 @@ from harness.console import (
     print_plan,
     print_statements,
 )
+from harness.errors import EXIT_BUDGET_SPENT
+
+SPENT = {
+    "episodes": "stop.episodes was spent; raise it and go on with --resume",
+    "pool": "all cut-ins that the pool keeps of a shell were tested; raise pool.cut_ins_per_shell and use a new folder",
+}
+"""Why a campaign ended before its precision, and the mend."""
 
 
 @click.command(
@@ -103,6 +110,8 @@ def run(
         print_json(result.estimates)
     else:
         print_statements(result.estimates)
+        if result.exit_code == EXIT_BUDGET_SPENT:
+            click.echo(f"Less precise than was asked for: {SPENT[result.stopped_by]}.")
         click.echo(str(report_file))
         click.echo(str(result.folder / "estimates.json"))
     ctx.exit(result.exit_code)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib
 import sys
 from collections.abc import Callable, Mapping
@@ -110,6 +111,15 @@ def require_controller(av: AutomatedVehicle) -> None:
         host = build_host(av, n_cells=1, seed=0)
         if host is not None:
             host.close()
+
+
+def controller_hash(av: AutomatedVehicle) -> str | None:
+    """SHA-256 of the source file of the AV's controller class; None for an AV without one, or without a source."""
+    if av.source != "controller":
+        return None
+    module = sys.modules.get(getattr(controller_class(str(av.controller)), "__module__", ""))
+    file = Path(getattr(module, "__file__", None) or "")
+    return hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else None
 
 
 def _maker(av: AutomatedVehicle) -> Callable[[], Any]:

@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import Any, Literal
 
 from harness.campaign.models import Campaign
-from harness.controllers.loading import require_controller
+from harness.controllers.loading import controller_hash, require_controller
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE
 from harness.estimators import estimate_run
 from harness.progress import Progress, SilentProgress
 from harness.records.folder import SHELLS, TABLES, shard_file, write_json
-from harness.runner.manifest import Manifest, require_own_folder
+from harness.runner.manifest import Manifest, require_no_fewer, require_own_folder
 from harness.runner.prefix import Prefix
 from harness.runner.prepare import Prepared, content_hash, distance_per_test_m, prepare, require_same_pool
 from harness.runner.retrace import Retracing
@@ -27,6 +27,7 @@ from harness.runner.table_accuracy import table_errors
 from harness.runner.worker import ShardDone, ShardSpec
 
 MANIFEST_INTERVAL_S = 5.0
+StoppedBy = Literal["rhw", "episodes", "pool"]
 
 
 @dataclass(frozen=True)
@@ -40,15 +41,16 @@ class RunResult:
         The page ``report.html``.
     estimates : dict
         Content of ``estimates.json``.
-    stopped_by : {"rhw", "episodes"}
+    stopped_by : {"rhw", "episodes", "pool"}
+        The asked precision, the budget, or the last cut-in that the pool holds of a shell that needs more.
     exit_code : int
-        0, or 4 when the budget was spent before the asked precision.
+        0, or 4 when the budget or the pool was spent before the asked precision.
     """
 
     folder: Path
     report: Path
     estimates: dict[str, Any]
-    stopped_by: Literal["rhw", "episodes"]
+    stopped_by: StoppedBy
     exit_code: int
 
 
@@ -58,6 +60,7 @@ def run_campaign(
     *,
     workers: int | None = None,
     resume: bool = False,
+    shorten: bool = False,
     progress: Progress | None = None,
 ) -> RunResult:
     """Run a campaign into a folder.
@@ -71,6 +74,8 @@ def run_campaign(
         Worker processes; as many as there are cores by default. Never changes a result.
     resume : bool
         Continue a run that was interrupted, or to a smaller RHW.
+    shorten : bool
+        Whether it may end with fewer tests than the folder holds; the others stay on disk, uncounted.
     progress : Progress, optional
 
     Raises
@@ -81,7 +86,10 @@ def run_campaign(
     started = time.monotonic()
     progress = progress or SilentProgress()
     require_controller(campaign.av)
-    earlier = require_own_folder(out, content_hash(campaign), resume=resume)
+    controller = controller_hash(campaign.av)
+    earlier = require_own_folder(out, content_hash(campaign), controller, resume=resume)
+    if not shorten:
+        require_no_fewer(out, earlier, campaign.stop.episodes)
     prepared = prepare(campaign, progress)
     distance = distance_per_test_m(prepared.policy.environment)
     n_workers = workers or os.cpu_count() or 1
@@ -90,6 +98,7 @@ def run_campaign(
         campaign,
         prepared.content_hash,
         earlier,
+        controller_sha256=controller,
         workers=n_workers,
         distance_per_test_m=distance,
         table_errors=table_errors(campaign, prepared.policy.environment, prepared.tables),
@@ -104,9 +113,12 @@ def run_campaign(
     _run_shards(
         prepared, out, n_workers, progress, manifest, lambda: time.monotonic() - started, prefix, batches, retracing
     )
-    _discard_beyond(out, len(prefix.specs))
+    if not shorten:
+        require_no_fewer(out, earlier, prefix.n_episodes)
+        _discard_beyond(out, len(prefix.specs))
     elapsed = time.monotonic() - started
-    stopped_by: Literal["rhw", "episodes"] = "rhw" if prefix.reached else "episodes"
+    spent: StoppedBy = "episodes" if prefix.n_episodes >= campaign.stop.episodes else "pool"
+    stopped_by: StoppedBy = "rhw" if prefix.reached else spent
     retraced = retracing.summary(prefix.n_retraced)
     manifest.write(
         prefix.specs, prefix.files, status="done", elapsed_s=elapsed, stopped_by=stopped_by, retraced=retraced

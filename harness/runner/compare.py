@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from harness.campaign.models import Campaign
+from harness.controllers.loading import controller_hash
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, CampaignError, RunFolderError
 from harness.estimators.block import Block
 from harness.estimators.difference import Difference, difference_statement, paired_difference
@@ -17,6 +18,7 @@ from harness.progress import Progress
 from harness.records.folder import MANIFEST, read_json, read_manifest, write_json
 from harness.records.reader import read_shards
 from harness.runner.campaign_run import run_campaign
+from harness.runner.manifest import require_own_folder
 from harness.runner.prepare import content_hash
 
 Side = Literal["a", "b"]
@@ -81,10 +83,15 @@ def compare_campaigns(
     """
     require_comparable(a, b)
     campaigns: dict[Side, Campaign] = {"a": a, "b": b}
+    for side in SIDES:  # both, before either is touched
+        campaign = campaigns[side]
+        require_own_folder(out / side, content_hash(campaign), controller_hash(campaign.av), resume=True)
     stops = _Stops(out, campaigns)
     for side in SIDES:
         if not stops.known(side):
-            result = run_campaign(campaigns[side], out / side, workers=workers, resume=True, progress=progress)
+            result = run_campaign(
+                campaigns[side], out / side, workers=workers, resume=True, shorten=True, progress=progress
+            )
             stops.note(side, int(result.estimates["n_episodes"]), result.stopped_by)
     n = max(stops.n_episodes(side) for side in SIDES)
     for side in SIDES:

@@ -38,13 +38,26 @@ def cpu_name() -> str:
     return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.machine())
 
 
-def require_own_folder(folder: Path, content_hash: str, *, resume: bool) -> dict[str, Any] | None:
+def require_own_folder(
+    folder: Path, content_hash: str, controller: str | None, *, resume: bool
+) -> dict[str, Any] | None:
     """Refuse a folder that holds something else; return the manifest of a run to be continued.
+
+    Parameters
+    ----------
+    folder : Path
+    content_hash : str
+        Of the campaign.
+    controller : str, optional
+        Hash of the AV's own code: one file may not mix two versions of it.
+    resume : bool
+        Whether to continue what the folder holds.
 
     Raises
     ------
     RunFolderError
-        The folder holds another campaign, this one without ``--resume``, or files that are no run.
+        The folder holds another campaign, this one without ``--resume`` or with another controller, or files that are
+        no run.
     """
     if not folder.exists() or not any(folder.iterdir()):
         return None
@@ -70,7 +83,32 @@ def require_own_folder(folder: Path, content_hash: str, *, resume: bool) -> dict
             expected="a new or empty folder",
             mend="Continue it with --resume, or choose another folder with --out.",
         )
+    if manifest.get("controller_sha256") != controller:
+        raise RunFolderError(
+            str(folder),
+            found="tests of this campaign whose controller's source file has been changed since",
+            expected="the same controller for all tests of a run",
+            mend="Restore the file, or test the new controller in another folder with --out.",
+        )
     return manifest
+
+
+def require_no_fewer(folder: Path, earlier: dict[str, Any] | None, n_episodes: int) -> None:
+    """Refuse to throw away tests that an earlier run has finished.
+
+    Raises
+    ------
+    RunFolderError
+        The folder holds more tests than the stop rule that is asked for now would keep.
+    """
+    held = 0 if earlier is None else int(earlier["n_episodes"])
+    if n_episodes < held:
+        raise RunFolderError(
+            str(folder),
+            found=f"{held:,} finished tests, of which the campaign as it is asked for now would keep {n_episodes:,}",
+            expected="a stop rule (stop.rhw, stop.episodes) that needs at least the tests that are there",
+            mend="Repeat the --set options of the earlier run or ask for more; `harness estimate` reads what is there.",
+        )
 
 
 class Manifest:
@@ -80,6 +118,8 @@ class Manifest:
         self, folder: Path, campaign: Campaign, content_hash: str, earlier: dict[str, Any] | None, **facts: Any
     ) -> None:
         self._folder = folder
+        self._campaign = dump_campaign(campaign)
+        self._n_kept = int((earlier or {}).get("n_episodes", 0))
         self._wall_time_s = float((earlier or {}).get("wall_time_s", 0.0))
         self._content: dict[str, Any] = {
             "format": 1,
@@ -95,7 +135,6 @@ class Manifest:
         }
         folder.mkdir(parents=True, exist_ok=True)
         self.write([], [], status="running")  # first: --resume knows a folder by its manifest
-        write_text(folder / "campaign.yaml", dump_campaign(campaign))
 
     def write(
         self,
@@ -107,7 +146,13 @@ class Manifest:
         stopped_by: str | None = None,
         retraced: dict[str, Any] | None = None,
     ) -> None:
-        """Record the contiguous prefix of finished shards."""
+        """Record the contiguous prefix of finished shards.
+
+        While a run goes on and has not come as far as an earlier one, what that one has left stays true.
+        """
+        n_episodes = sum(spec.n_episodes for spec in specs)
+        if status != "done" and n_episodes < self._n_kept:
+            return
         shards = [
             {"index": spec.index, "first_episode": spec.first_episode, "n_episodes": spec.n_episodes, "files": file}
             for spec, file in zip(specs, files, strict=True)
@@ -120,7 +165,8 @@ class Manifest:
                 "stopped_by": stopped_by,
                 "retraced": retraced,
                 "wall_time_s": round(self._wall_time_s + elapsed_s, 3),
-                "n_episodes": sum(spec.n_episodes for spec in specs),
+                "n_episodes": n_episodes,
                 "shards": shards,
             },
         )
+        write_text(self._folder / "campaign.yaml", self._campaign)

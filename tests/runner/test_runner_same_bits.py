@@ -138,7 +138,7 @@ def test_interrupted_then_killed_then_resumed(begin, sumo_run, campaign, run_her
     wait_for_shards(second, out, n_stored + 3)
     kill_group(second)
     assert second.returncode == -signal.SIGKILL
-    assert manifest(out)["status"] == "running"
+    assert manifest(out)["status"] != "done"
     assert n_stored + 3 <= len(shard_files(out)) < N_SHARDS
     assert not (out / "estimates.json").exists()
 

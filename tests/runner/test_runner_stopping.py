@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE
+from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, RunFolderError
 from tests.runner.stored_runs import copy_of, manifest, shard_files, stored_table, unlike_columns
 
 LOOSE, TIGHT = "stop.rhw=0.3", "stop.rhw=0.15"
@@ -53,11 +53,13 @@ def test_a_run_resumed_to_a_smaller_rhw_extends_the_same_records(runs, run_here,
     assert unlike_columns(runs["tight"].folder, out) == []
 
 
-def test_a_run_resumed_to_a_larger_rhw_is_the_same_as_a_fresh_one(runs, run_here, campaign, tmp_path):
+def test_a_larger_rhw_than_was_reached_is_refused_and_costs_nothing(runs, run_here, campaign, tmp_path):
     out = copy_of(runs["tight"].folder, tmp_path / "run")
-    run_here(campaign(*COMMON, LOOSE), out, resume=True)
-    assert unlike_columns(runs["loose"].folder, out) == []
-    assert len(shard_files(out)) == len(shard_files(runs["loose"].folder))
+    with pytest.raises(RunFolderError, match="finished tests, of which the campaign as it is asked for now would keep"):
+        run_here(campaign(*COMMON, LOOSE), out, resume=True)
+    assert unlike_columns(runs["tight"].folder, out) == []
+    assert manifest(out) == manifest(runs["tight"].folder)
+    assert (out / "campaign.yaml").read_bytes() == (runs["tight"].folder / "campaign.yaml").read_bytes()
 
 
 def test_a_finished_run_resumed_as_it_is_does_nothing(runs, run_here, campaign, tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 
 import pytest
 
@@ -61,6 +62,50 @@ def test_a_folder_with_somebody_elses_manifest(tmp_path, capsys):
     assert "another campaign" in complaint_of(capsys, "run", MIXTURE_FILE, "--out", tmp_path, *SAME, "--resume")
     for command in (("estimate", tmp_path), ("report", tmp_path), ("replay", tmp_path, 0)):
         assert str(tmp_path) in complaint_of(capsys, *command)
+
+
+def test_fewer_tests_than_are_there_are_refused(stored, capsys, twin_run):
+    """A forgotten --set must not cost finished tests."""
+    before = (stored / "manifest.json").read_bytes()
+    text = complaint_of(capsys, "run", MIXTURE_FILE, "--out", stored, *SAME, "--set", "stop.episodes=150", "--resume")
+    assert "400 finished tests" in text
+    assert "150" in text
+    assert (stored / "manifest.json").read_bytes() == before
+    assert unlike_columns(twin_run, stored) == []
+
+
+def test_a_refused_resumption_leaves_the_manifest(stored, capsys):
+    """What was finished is still listed, so that an estimate cannot pass over a shard that was deleted meanwhile."""
+    broken = shard_files(stored)[1]
+    truncate(broken)
+    complaint_of(capsys, "run", MIXTURE_FILE, "--out", stored, *SAME, "--resume")
+    broken.unlink()
+    assert str(broken) in complaint_of(capsys, "estimate", stored)
+
+
+CONTROLLER = """
+class Careful:
+    def start(self, episode, cut_in): pass
+    def step(self, observation): return {acceleration}
+    def close(self): pass
+"""
+
+
+def test_another_version_of_the_controller_is_refused(tmp_path, capsys, monkeypatch):
+    file = tmp_path / "versioned_controller.py"
+    file.write_text(CONTROLLER.format(acceleration=-2.0))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.path", [str(tmp_path), *sys.path])
+    source = ["--set", "av={}", "--set", "av.controller=versioned_controller:Careful"]
+    settings = [*SAME, *source, "--set", "world.engine=sumo", "--set", "stop.episodes=20", "--workers", "1", "--quiet"]
+    out = tmp_path / "run"
+    assert main(["run", str(MIXTURE_FILE), "--out", str(out), *settings]) == 0
+    capsys.readouterr()
+    file.write_text(CONTROLLER.format(acceleration=-3.0))
+    more = [*settings, "--set", "stop.episodes=40", "--resume"]
+    assert "source file has been changed" in complaint_of(capsys, "run", MIXTURE_FILE, "--out", out, *more)
+    file.write_text(CONTROLLER.format(acceleration=-2.0))
+    assert main(["run", str(MIXTURE_FILE), "--out", str(out), *more]) == 0
 
 
 # -- damaged records --

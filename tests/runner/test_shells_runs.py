@@ -69,7 +69,7 @@ def test_a_budget_that_is_spent_is_exit_code_4(campaign, run_here, tmp_path):
 def test_a_pool_that_is_used_up_ends_the_run(campaign, run_here, tmp_path):
     small = ("stop.rhw=0.001", "stop.episodes=100000", "pool.cut_ins_per_shell=100")
     result = run_here(campaign(*SHELLS, *small, "world.engine=twin"), tmp_path / "run")
-    assert result.exit_code == 4
+    assert (result.exit_code, result.stopped_by) == (4, "pool")
     tests = [shell["n_episodes"] for shell in result.estimates["estimates"]["shells"]["details"]["shells"]]
     assert tests[-1] >= 100
     assert result.estimates["n_episodes"] < 1000
