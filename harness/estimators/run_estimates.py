@@ -20,7 +20,7 @@ from harness.estimators.from_records import (
     block_from_tables,
 )
 from harness.estimators.one_pass import ESTIMATORS, PassResult, one_pass
-from harness.estimators.statement import SCOPE, conditional_statement, per_distance, statement
+from harness.estimators.statement import SCOPE, conditional_statement, failed_statement, per_distance, statement
 from harness.estimators.surrogates import MOST_UNASKED, PoolRequest, surrogates_of
 from harness.estimators.threads import read_ahead
 from harness.importance.build import importance_names, mixture_weights, needs_tables
@@ -96,7 +96,7 @@ def estimate_blocks(
         "estimates": {name: estimate.to_json() for name, estimate in estimates.items()},
         "diagnostics": {**done.diagnostics.result(facts.importance_names), "alarm": _alarm(done, facts)},
         "convergence": done.convergence,
-        "statement": statement(best, facts.lane_change_level, distance_km),
+        "statement": statement(best, facts.lane_change_level, distance_km) + failed_statement(best),
         "conditional_statement": conditional_statement(best),
         "scope": SCOPE,
     }

@@ -42,6 +42,17 @@ def conditional_statement(estimate: Estimate) -> str | None:
     )
 
 
+def failed_statement(estimate: Estimate) -> str:
+    """What failed tests would change, as a sentence to follow the answer; empty without any."""
+    n_failed = estimate.details["n_failed"]
+    if not n_failed:
+        return ""
+    return (
+        f" Of these tests {n_failed:,} FAILED and count as no crash: had they crashed, the rate would be "
+        f"{estimate.details['crash_rate_if_failed_had_crashed']:.3g}."
+    )
+
+
 def statement(estimate: Estimate, lane_change_level: float, distance_per_test_km: float | None) -> str:
     """Rate, interval, number of tests and level, in words."""
     tests = (

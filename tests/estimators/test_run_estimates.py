@@ -100,6 +100,17 @@ def test_without_a_crash_the_statement_gives_the_upper_bound():
     assert content["convergence"][-1]["rhw"] is None
 
 
+@pytest.mark.parametrize("method", ["nde", "forced", "episode_mixture"])
+def test_failed_tests_are_named_in_the_answer_itself(method):
+    """Failures look like a safe vehicle otherwise."""
+    crashes = [True] * 4 + [False] * 196
+    some = block(crashes, failed=[False] * 150 + [True] * 50, method=method, weight_cap=1.0)
+    content = estimate_blocks([some], facts())
+    assert "50 FAILED and count as no crash: had they crashed, the rate would be 0.27" in content["statement"]
+    none = estimate_blocks([block(crashes, method=method, weight_cap=1.0)], facts())
+    assert "FAILED" not in none["statement"]
+
+
 def test_estimators_that_the_records_do_not_allow_are_there_with_the_reason(tmp_path):
     content = estimate_run(write_run(tmp_path, drawn("step_mixture"), with_moments=False))
     assert content["estimates"]["scv"]["crash_rate"] is None
