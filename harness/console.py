@@ -6,6 +6,7 @@ import errno
 import json
 import math
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -118,29 +119,34 @@ def _defined(value: float, style: str = ".2f") -> str:
     return format(value, style) if math.isfinite(value) else "-"
 
 
-def print_estimates(content: dict[str, Any]) -> None:
+def print_estimates(content: dict[str, Any], asked: Sequence[str] = ()) -> None:
     """Print estimates as a table, with warnings and reasons below and the answer in a sentence last.
 
     Parameters
     ----------
     content : dict
         As in ``estimates.json``.
+    asked : sequence of str
+        Estimators to show; all by default. What is said in the end is about them.
     """
     from rich.console import Console  # noqa: PLC0415 - keeps --help fast
     from rich.table import Table  # noqa: PLC0415 - keeps --help fast
 
+    shown = {name: entry for name, entry in content["estimates"].items() if not asked or name in asked}
     table = Table(title=f"{content['campaign']}: {content['n_crashes']:,} crashes in {content['n_episodes']:,} tests")
     level = f"{content['confidence']:.0%} interval"
     for heading in ("estimator", "crash rate per test", level, "RHW", "effective crashes", "largest weight share"):
         table.add_column(heading, justify="left" if heading == "estimator" else "right")
-    for name, entry in content["estimates"].items():
+    for name, entry in shown.items():
         table.add_row(name + (" *" if name == content["headline"] else ""), *_cells(entry))
     console = Console()
     if not console.is_terminal:
         console.width = _WIDTH_OF_FILES
     console.print(table)
-    for name, entry in content["estimates"].items():
-        for remark in [*entry.get("warnings", ()), *filter(None, [entry.get("reason")])]:
+    answered = content["headline"] in shown
+    for name, entry in shown.items():
+        # Without the campaign's own estimator the reason is the answer, and comes last.
+        for remark in [*entry.get("warnings", ()), *filter(None, [entry.get("reason") if answered else None])]:
             click.echo(f"{name}: {remark}")
     if (alarm := content.get("diagnostics", {}).get("alarm", {})).get("raised"):
         rates = alarm["surrogate_crash_rates"]
@@ -150,9 +156,15 @@ def print_estimates(content: dict[str, Any]) -> None:
             "See diagnostics.alarm.",
             fg="red",
         )
-    if shells := content["estimates"].get("shells", {}).get("details", {}).get("shells"):
+    if shells := shown.get("shells", {}).get("details", {}).get("shells"):
         console.print(_shells_table(shells))
-    print_statements(content)
+    if answered:
+        print_statements(content)
+        return
+    for name in shown:
+        click.echo(f"{name}: {content['statements'][name]}")
+    if any(entry["crash_rate"] is not None for entry in shown.values()):
+        click.echo(content["scope"])
 
 
 def print_required_tests(content: dict[str, Any]) -> None:
@@ -240,8 +252,15 @@ def _cells(entry: dict[str, Any]) -> list[str]:
     if entry["crash_rate"] is None:
         return ["-"] * 5
     interval = f"{_number(entry['ci_low'], '.3e')} to {_number(entry['ci_high'], '.3e')}"
-    formats = {"rhw": ".3f", "n_effective": ",.1f", "largest_weight_share": ".2%"}
-    return [f"{entry['crash_rate']:.4e}", interval, *(_number(entry[key], style) for key, style in formats.items())]
+    formats = {"n_effective": ",.1f", "largest_weight_share": ".2%"}
+    others = [_number(entry[key], style) for key, style in formats.items()]
+    return [f"{entry['crash_rate']:.4e}", interval, _half_width(entry["rhw"]), *others]
+
+
+def _half_width(rhw: float | None) -> str:
+    from harness.estimators.estimate import WIDEST_RHW  # noqa: PLC0415 - keeps --help fast
+
+    return f"> {WIDEST_RHW:g}" if rhw is not None and rhw > WIDEST_RHW else _number(rhw, ".3f")
 
 
 def _number(value: float | None, style: str) -> str:

@@ -69,7 +69,8 @@ def episodes_left(
 class RichProgress:
     """A bar on a terminal: share done, episodes per second, crashes so far, current RHW, time left.
 
-    Use as a context manager.
+    The share is that of the work which is thought necessary: a campaign that stops on precision ends at 100 %, however
+    little of its budget it took. Use as a context manager.
 
     Parameters
     ----------
@@ -94,6 +95,7 @@ class RichProgress:
         self._task: TaskID | None = None
         self._figures: dict[str, Figure] = {}
         self._done_before = 0
+        self._budget: int | None = None
 
     def __enter__(self) -> Self:
         self._bars.start()
@@ -108,7 +110,7 @@ class RichProgress:
         """Begin a bar; it takes the place of the last stage's, for there is one line on the terminal."""
         if self._task is not None:
             self._bars.update(self._task, visible=False)
-        self._figures, self._done_before = {}, done
+        self._figures, self._done_before, self._budget = {}, done, total
         self._task = self._bars.add_task(name, total=total, completed=done, figures="")
 
     def advance(self, n: int) -> None:
@@ -125,20 +127,20 @@ class RichProgress:
     def _show(self) -> None:
         if self._task is not None:
             worded = [_worded(name, figure) for name, figure in self._figures.items()]
-            rate, left = self._pace()
-            self._bars.update(self._task, figures=" · ".join([*rate, *worded, *left]))
+            done = int(self._bars.tasks[-1].completed)
+            n_left = None if self._budget is None else self._left(done, self._budget)
+            rate, left = self._pace(n_left)
+            total = None if n_left is None else done + n_left
+            self._bars.update(self._task, total=total, figures=" · ".join([*rate, *worded, *left]))
 
-    def _pace(self) -> tuple[list[str], list[str]]:
+    def _pace(self, n_left: int | None) -> tuple[list[str], list[str]]:
         """Rate, and time left, of what this run itself has done: an earlier run's share took no time now."""
         task = self._bars.tasks[-1]
         if not task.elapsed or task.completed <= self._done_before:
             return [], []
         rate_per_s = (task.completed - self._done_before) / task.elapsed
         rate = [f"{rate_per_s:,.0f}/s" if rate_per_s >= 10 else f"{rate_per_s:.2g}/s"]
-        if task.total is None:
-            return rate, []
-        left_s = self._left(int(task.completed), int(task.total)) / rate_per_s
-        return rate, [f"{_clock(left_s)} left"]
+        return rate, [] if n_left is None else [f"{_clock(n_left / rate_per_s)} left"]
 
     def _left(self, done: int, total: int) -> int:
         rhw, crashes = self._figures.get("rhw"), self._figures.get("crashes")

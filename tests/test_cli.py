@@ -49,6 +49,10 @@ ESTIMATES = {
     "crash_rate_per_1e6_km": 0.2,
     "estimates": {"nade": NADE, "nde": {"crash_rate": None, "reason": "weights are not 1"}},
     "statement": "The vehicle crashes once in 8.3 million tests.",
+    "statements": {
+        "nade": "The vehicle crashes once in 8.3 million tests.",
+        "nde": "No crash rate from these records: weights are not 1.",
+    },
     "scope": "Sampling error only.",
 }
 
@@ -286,6 +290,15 @@ def test_estimate_prints_a_table(calls, capsys, tmp_path):
     assert "nde: weights are not 1" in out
     assert out.splitlines()[-2:] == [ESTIMATES["statement"], ESTIMATES["scope"]]
     assert list(tmp_path.iterdir()) == []
+
+
+def test_estimate_closes_with_what_was_asked(calls, capsys, tmp_path):
+    assert main(["estimate", str(tmp_path), "-e", "nde"]) == 0
+    out = capsys.readouterr().out
+    assert out.splitlines()[-1] == f"nde: {ESTIMATES['statements']['nde']}"
+    assert ESTIMATES["statement"] not in out
+    assert "nade" not in out
+    assert out.count("weights are not 1") == 1
 
 
 def test_estimate_without_a_crash_has_gaps(calls, capsys, tmp_path):

@@ -1,6 +1,7 @@
 """Progress: what a terminal shows, and how the time left is reckoned."""
 
 import io
+import re
 
 import pytest
 from hypothesis import given
@@ -53,9 +54,33 @@ def test_bar_shows_rate_figures_and_time_left_on_a_narrow_terminal(monkeypatch):
         bar.advance(5_000)
         bar.status(crashes=1_234, rhw=0.0812)
     last_line = stream.getvalue().splitlines()[-2]
-    for text in ("episodes", " 1%", "/s · crashes 1,234 · RHW 0.081 · 0:0", " left"):
+    for text in ("episodes", " 38%", "/s · crashes 1,234 · RHW 0.081 · 0:0", " left"):
         assert text in last_line
     assert "criticality" not in last_line
+
+
+def last_share(stream):
+    return re.findall(r"(\d+)%", stream.getvalue())[-1]
+
+
+def test_a_campaign_that_stops_on_precision_ends_at_all_of_its_work():
+    stream = Terminal()
+    with RichProgress(0.05, 3_000, stream) as bar:
+        bar.stage("episodes", total=400_000)
+        bar.advance(5_000)
+        bar.status(crashes=1_500, rhw=0.2)
+        bar.advance(5_000)
+        bar.status(crashes=3_280, rhw=0.036)
+    assert last_share(stream) == "100"
+
+
+def test_without_an_rhw_that_is_asked_for_the_share_is_that_of_the_budget():
+    stream = Terminal()
+    with RichProgress(0.05, 3_000, stream) as bar:
+        bar.stage("episodes", total=20_000)
+        bar.advance(5_000)
+        bar.status(crashes=3_280, half_width=0.036)
+    assert last_share(stream) == "25"
 
 
 def test_work_of_an_earlier_run_does_not_count_as_speed():

@@ -77,7 +77,7 @@ def estimate(
     if as_json:
         print_json(content)
     else:
-        print_estimates(content)
+        print_estimates(content, estimators)
 
 
 @click.command(

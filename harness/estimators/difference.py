@@ -37,7 +37,8 @@ class Difference:
     difference, std_error, ci_low, ci_high : float
         A - B in crashes per test; the error is that of the paired differences.
     ratio, ratio_low, ratio_high : float
-        A/B with its interval (normal on the logarithm, delta method); NaN where either rate is 0.
+        A/B with its interval (normal on the logarithm, delta method); NaN where either rate is 0. The ends are NaN also
+        where no pair differs: a sample variance of 0 says nothing.
     correlation : float
         Of the two outcomes of a pair; NaN where one of them never varies.
     variance_ratio : float
@@ -121,7 +122,9 @@ class PairedSums:
         if self.n_differing:
             third_moment = self._difference.third_moment(self.n)
             below, above = skewed_distances(std_error, third_moment, (1.0 - confidence) / 2.0)
-        relative = _relative_error(a.crash_rate, b.crash_rate, variance_a, variance_b, covariance, self.n)
+        relative = math.nan
+        if self.n_differing:
+            relative = _relative_error(a.crash_rate, b.crash_rate, variance_a, variance_b, covariance, self.n)
         ratio = a.crash_rate / b.crash_rate if a.crash_rate > 0.0 and b.crash_rate > 0.0 else math.nan
         factor = math.exp(normal_half_width(relative, confidence))
         spread = math.sqrt(variance_a * variance_b)
@@ -201,13 +204,22 @@ def difference_statement(found: Difference, name_a: str, name_b: str) -> str:
         verdict = "A crashes more often"
     elif found.n_differing and found.ci_high < 0.0:
         verdict = "A crashes less often"
-    ratio = ""
-    if math.isfinite(found.ratio):
-        ratio = f", A/B = {found.ratio:.3g} ({found.ratio_low:.3g} to {found.ratio_high:.3g})"
-    saved = "."
-    if math.isfinite(found.variance_ratio):
-        saved = f"; independent runs would need {found.variance_ratio:.3g} times as many."
     return (
         f"{rates}: {verdict}, A - B = {found.difference:.3g} ({level} {found.ci_low:.3g} to {found.ci_high:.3g})"
-        f"{ratio}, from {found.n_pairs:,} pairs of tests{saved}"
+        f"{_ratio(found)}, from {found.n_pairs:,} pairs of tests{_saved(found)}."
     )
+
+
+def _ratio(found: Difference) -> str:
+    if not math.isfinite(found.ratio):
+        return ""
+    if not found.n_differing:
+        return f", A/B = {found.ratio:.3g} (its interval is not known: no pair differs)"
+    return f", A/B = {found.ratio:.3g} ({found.ratio_low:.3g} to {found.ratio_high:.3g})"
+
+
+def _saved(found: Difference) -> str:
+    if not math.isfinite(found.variance_ratio):
+        return ""
+    times = f"{found.variance_ratio:.3g}"
+    return f"; independent runs would need {'as many' if times == '1' else f'{times} times as many'}"

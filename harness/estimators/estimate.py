@@ -6,6 +6,9 @@ import math
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
+WIDEST_RHW = 10.0
+"""Relative half-widths above are not given as a number: next to nothing is known, and the digits would mean nothing."""
+
 
 @dataclass(frozen=True)
 class Estimate:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ from harness.campaign.loading import load_campaign
 from harness.campaign.models import Campaign, EstimatorName
 from harness.errors import RunFolderError
 from harness.estimators.block import Block
-from harness.estimators.estimate import Unavailable, finite_json
+from harness.estimators.estimate import Estimate, Unavailable, finite_json
 from harness.estimators.from_records import (
     EPISODE_COLUMNS,
     MARTINGALE_COLUMN,
@@ -97,11 +97,24 @@ def estimate_blocks(
         "diagnostics": {**done.diagnostics.result(facts.importance_names), "alarm": _alarm(done, facts)},
         "convergence": done.convergence,
         "statement": statement(best, facts.lane_change_level, distance_km) + failed_statement(best),
+        "statements": _statements(estimates, facts, distance_km),
         "conditional_statement": conditional_statement(best),
         "scope": SCOPE,
     }
     cleaned: dict[str, Any] = finite_json(content)
     return cleaned
+
+
+def _statements(
+    estimates: Mapping[EstimatorName, Estimate | Unavailable], facts: CampaignFacts, distance_km: float | None
+) -> dict[str, str]:
+    """What each estimator says, in a sentence; of one without a value, why."""
+    return {
+        name: statement(found, facts.lane_change_level, distance_km)
+        if isinstance(found, Estimate)
+        else f"No crash rate from these records: {found.reason.rstrip('.')}."
+        for name, found in estimates.items()
+    }
 
 
 def _alarm(done: PassResult, facts: CampaignFacts) -> dict[str, Any]:

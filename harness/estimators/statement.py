@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from harness.estimators.estimate import Estimate
+from harness.estimators.estimate import WIDEST_RHW, Estimate
 
 _PER_KM = 1e6
 SCOPE = "The interval is about sampling error in this environment, not about how well the environment matches the road."
@@ -68,7 +68,7 @@ def statement(estimate: Estimate, lane_change_level: float, distance_per_test_km
         return f"{bound}."
     text = (
         f"The crash rate is {estimate.crash_rate:.3g} per test ({level} interval {estimate.ci_low:.3g} to "
-        f"{estimate.ci_high:.3g}, relative half-width {estimate.rhw:.1%}), estimated from {tests}"
+        f"{estimate.ci_high:.3g}, {_width(estimate.rhw)}), estimated from {tests}"
     )
     if distance_per_test_km:
         scaled = per_distance(estimate, distance_per_test_km)
@@ -77,3 +77,9 @@ def statement(estimate: Estimate, lane_change_level: float, distance_per_test_km
             f"({scaled['ci_low']:.3g} to {scaled['ci_high']:.3g})"
         )
     return f"{text}."
+
+
+def _width(rhw: float) -> str:
+    if rhw > WIDEST_RHW:
+        return "still open upwards: far wider than the rate"
+    return f"relative half-width {rhw:.1%}"

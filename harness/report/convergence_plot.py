@@ -24,6 +24,7 @@ _SHELLS = (
     "may jump when a shell is first tested. Right, RHW falls faster than the dotted line while what remains is to see "
     "no crash outside, and along it where crashes must be counted."
 )
+_RHW = "Relative half-width (RHW)"
 
 
 def convergence_plot(
@@ -121,8 +122,17 @@ def _draw_rate(axes: Axes, curve: dict[str, Floats], confidence: str, level: str
     axes.set_ylim(0.0, top)
     unit = scaled(axes.yaxis, top)
     axes.set_ylabel(f"crash rate per test{unit} (level {level})")
-    axes.set_title("Crash rate")
-    axes.legend(loc="lower right", fontsize=8, labelcolor=MUTED)
+    _head(axes, "Crash rate")
+
+
+def _head(axes: Axes, title: str) -> None:
+    """Title, and below it the legend in one line: within the panel there is no place where no curve can be."""
+    axes.set_title(title, pad=24.0)
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(
+            loc="lower left", bbox_to_anchor=(0.0, 1.0), borderaxespad=0.2, borderpad=0.3, ncols=3, fontsize=8,
+            labelcolor=MUTED, columnspacing=1.3, handlelength=1.8,
+        )  # fmt: skip
 
 
 def _rate_limit(curve: dict[str, Floats]) -> float:
@@ -135,10 +145,10 @@ def _rate_limit(curve: dict[str, Floats]) -> float:
 
 
 def _draw_rhw(axes: Axes, curve: dict[str, Floats], target_rhw: float | None) -> None:
-    axes.set_title("Relative half-width (RHW)")
     axes.set_ylabel("RHW")
     known = np.isfinite(curve["rhw"]) & (curve["rhw"] > 0.0)
     if not known.any():
+        _head(axes, _RHW)
         axes.text(0.5, 0.5, "not recorded", transform=axes.transAxes, ha="center", color=MUTED)
         return
     n, rhw = curve["n"][known], curve["rhw"][known]
@@ -149,9 +159,10 @@ def _draw_rhw(axes: Axes, curve: dict[str, Floats], target_rhw: float | None) ->
     if target_rhw is not None:
         axes.axhline(target_rhw, color=VERMILLION, linewidth=1.1, linestyle=(0, (5, 2)), label=f"target {target_rhw:g}")
         low, high = min(low, target_rhw), max(high, target_rhw)
-    axes.set_ylim(low / 1.5, high * 1.6)
+    # The last value is written below its point, which must not be on the edge however many decades are shown.
+    axes.set_ylim(low / max(1.5, (high / low) ** 0.15), high * 1.6)
     decades(axes.yaxis, *axes.get_ylim())
-    axes.legend(loc="upper right", fontsize=8, labelcolor=MUTED)
+    _head(axes, _RHW)
     axes.plot(n[-1:], rhw[-1:], "o", color=BLUE, markersize=5, clip_on=False)
     axes.annotate(
         f"{rhw[-1]:.3g}", (n[-1], rhw[-1]), xytext=(-7, -11), textcoords="offset points", ha="right", color=INK

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import shlex
 from dataclasses import dataclass
 
 import pyarrow as pa
 
 from harness.report.number_format import number
 from harness.report.plot_style import Plot
-from harness.report.run_folder import RunFolder
+from harness.report.run_folder import RunFolder, typed_folder
 from harness.report.shard_tables import trace_rows
 from harness.report.shells_result import shells_result
 from harness.report.summary import RunSummary
@@ -75,7 +74,7 @@ def _diagram(run: RunFolder, summary: RunSummary, crash: Crash, traces: pa.Table
 
 def replay_command(run: RunFolder, episode: int) -> str:
     """Return the shell command that runs an episode again, bit for bit."""
-    return f"harness replay {shlex.quote(run.path.resolve().name)} {episode}"
+    return f"harness replay {typed_folder(run.path)} {episode}"
 
 
 def component_name(run: RunFolder, component: int) -> str:

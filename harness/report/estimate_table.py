@@ -13,6 +13,7 @@ from harness.report.number_format import (
     count,
     exponent_of,
     fixed,
+    half_width,
     number,
     percent,
     power_of_ten,
@@ -84,7 +85,7 @@ def _coverage_notes(run: RunFolder, summary: RunSummary) -> list[str]:
     if asked_of_conditional(run):
         rhw = run.headline["details"]["conditional"]["rhw"]
     if target is not None and (rhw is None or not rhw <= target):
-        reached = "it is not defined without a crash" if rhw is None else f"it is {number(rhw)}"
+        reached = "it is not defined without a crash" if rhw is None else f"it is {half_width(rhw)}"
         notes.append(f"The asked relative half-width of {target:g} was not reached: {reached}.")
     return notes
 
@@ -120,7 +121,7 @@ def _row(name: str, estimates: dict[str, Any], exponent: int) -> EstimateRow:
         rate=_rate(rate, exponent),
         ends=_ends(e.get("ci_low"), e.get("ci_high"), exponent),
         upper_bound=_rate(e.get("upper_bound"), exponent),
-        rhw=number(e.get("rhw")),
+        rhw=half_width(e.get("rhw")),
         per_1e6_km=_per_1e6_km(rate, estimates.get("distance_per_test_km")),
         n_episodes=count(e.get("n_episodes")),
         n_crashes=count(e.get("n_crashes")),

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from harness.estimators.estimate import WIDEST_RHW
+
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 MISSING = "–"
 MINUS = "−"
@@ -96,6 +98,11 @@ def percent(value: float | None) -> str:
     if shown == 0.0 or shown >= 99.95:
         return f"{shown:.0f} %"
     return f"{significant(shown, 2)} %" if shown >= 0.01 else f"{number(shown, 2)} %"
+
+
+def half_width(rhw: float | None) -> str:
+    """Write a relative half-width, without digits where it only says that next to nothing is known."""
+    return f"> {WIDEST_RHW:g}" if rhw is not None and rhw > WIDEST_RHW else number(rhw)
 
 
 def coarse_percent(value: float) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import shlex
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,7 +22,7 @@ from harness.report.crash_plot import crash_time_plot, impact_speed_plot
 from harness.report.cut_in_plot import cut_in_plot
 from harness.report.estimate_table import asked_of_conditional, estimate_table, in_unit, run_notes, target_rhw
 from harness.report.plot_style import RC, Plot, inline_svg, png, svg
-from harness.report.run_folder import RunFolder, read_run_folder
+from harness.report.run_folder import RunFolder, read_run_folder, typed_folder
 from harness.report.settings_table import flat, setting_sections
 from harness.report.shard_tables import table_sizes
 from harness.report.shells_plot import shells_plot
@@ -50,7 +49,9 @@ class Figure:
 def write_report(folder: Path) -> Path:
     """Write ``report.html`` and ``plots/`` (PNG and SVG) into a run folder.
 
-    The same folder gives the same bytes. Plots of an earlier report that this one does not have are removed.
+    The same folder gives the same bytes if it is reached from the working directory by the same relative path, by which
+    the commands on the page name it; outside the working directory they use its name alone. Plots of an earlier report
+    that this one does not have are removed.
 
     Parameters
     ----------
@@ -143,7 +144,7 @@ def _page(
         details=_details(run),
         table_errors=run.manifest.get("table_errors") or [],
         settings=setting_sections(run.campaign, reproducible=run.manifest.get("reproducible")),
-        folder_name=shlex.quote(run.path.resolve().name),
+        folder=typed_folder(run.path),
         style=Markup(style),  # noqa: S704 - our own file
     )
 
@@ -154,6 +155,7 @@ def _filters() -> dict[str, Callable[..., str]]:
         "interval": number_format.interval,
         "count": number_format.count,
         "decimal": number_format.decimal,
+        "half_width": number_format.half_width,
         "percent": number_format.percent,
         "coarse_percent": number_format.coarse_percent,
         "duration": number_format.duration,

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -56,6 +58,20 @@ class RunFolder:
     def files(self, table: str) -> list[tuple[Shard, Path]]:
         """Shards that have a file of this table (``episodes``, ``moments``, ``traces``)."""
         return [(shard, shard.files[table]) for shard in self.shards if table in shard.files]
+
+
+def typed_folder(folder: Path) -> str:
+    """Return the folder as it is typed in a shell: relative to the working directory, or its bare name.
+
+    The bare name stands for a folder that is not below the working directory. An absolute path would say where somebody
+    keeps their files to everybody whom the page is mailed to.
+    """
+    here = Path.cwd()
+    unlinked = Path(os.path.abspath(folder))  # noqa: PTH100 - resolve() would leave by a link what was typed below `here`
+    for path in (unlinked, folder.resolve()):
+        if path.is_relative_to(here):
+            return shlex.quote(path.relative_to(here).as_posix())
+    return shlex.quote(folder.resolve().name)
 
 
 def read_run_folder(path: Path) -> RunFolder:

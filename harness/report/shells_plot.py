@@ -11,6 +11,8 @@ from harness.report.shells_result import Shell, ShellsResult
 
 POOL = "pool’s own error"
 BAR = 0.62
+VISIBLE = 0.005
+"""Smallest share of an axis that a bar must have to show a colour."""
 
 
 def shells_plot(found: ShellsResult) -> Plot:
@@ -39,8 +41,8 @@ def shells_plot(found: ShellsResult) -> Plot:
         f"limits, and half-width. {source} {open_question}"
     )
     caption = (
-        "From careful (top) to careless. Left: what each shell adds to the crash rate, with its limits; blue inside "
-        f"the boundary, orange outside. {source} Right: probability × half-width of the crash share, with its share "
+        "From careful (top) to careless. Left: what each shell adds to the crash rate, with its "
+        f"limits{_colours(found, limit)}. {source} Right: probability × half-width of the crash share, with its share "
         f"of the sum of squares, which is what makes the interval. {open_question}"
     )
     return Plot("shells", figure, alt, caption)
@@ -107,6 +109,16 @@ def _label(axes: Axes, limit: float, title: str, label: str) -> None:
     axes.set_xlabel(f"{label}, per test{scaled(axes.xaxis, limit)}")
     axes.grid(visible=False, axis="y")
     axes.tick_params(axis="y", length=0, pad=8, labelcolor=INK)
+
+
+def _colours(found: ShellsResult, limit: float) -> str:
+    """Name the colours that can be seen, none where all bars have one because there is no outside."""
+    seen = {shell.inside for shell in found.shells if shell.contribution > VISIBLE * limit}
+    if not found.has_outside or not seen:
+        return ""
+    if seen == {True, False}:
+        return "; blue inside the boundary, orange outside"
+    return "; all that can be seen (blue) lies inside the boundary" if True in seen else "; all lies outside (orange)"
 
 
 def _source(found: ShellsResult) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +19,8 @@ from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
 
 TRACE_COLUMNS = ("episode", "step", "vehicle", "lane", "x_m", "v_mps")
 SECONDS_BEFORE_CUT_IN = 2.0
+NAME_HEIGHT = 0.11
+"""Least distance of two names beside the speed panel, as a share of its height."""
 
 
 @dataclass(frozen=True)
@@ -118,6 +121,7 @@ def _label(position: Axes, speed: Axes, crash: Crash, tracks: dict[str, Track], 
     _name_vehicles(position, tracks, frame_mps, start)
     position.set_title(f"Episode {crash.episode:,}: impact at {decimal(crash.impact_speed_mps)} m/s")
     position.set_ylabel(f"position in a frame\nmoving at {frame_mps:.1f} m/s, m")
+    _name_speeds(speed, tracks, crash.crash_time_s)
     speed.set_ylabel("speed, m/s")
     speed.set_xlabel("time, s")
     for axis in (speed.xaxis, speed.yaxis, position.yaxis):
@@ -138,6 +142,26 @@ def _name_vehicles(axes: Axes, tracks: dict[str, Track], frame_mps: float, start
             va="top" if outside else "bottom",
             color=VEHICLE_COLOURS[vehicle],
             fontweight="bold",
+        )
+
+
+def _name_speeds(axes: Axes, tracks: dict[str, Track], end: float) -> None:
+    """Name each line right of the panel, at its height at the crash; names of nearly equal speeds move apart."""
+    low, high = axes.get_ylim()
+    heights = {vehicle: float(np.interp(end, track.time_s, track.v_mps)) for vehicle, track in tracks.items()}
+    lowest = -math.inf
+    for vehicle in sorted(heights, key=lambda name: heights[name]):
+        lowest = max((heights[vehicle] - low) / (high - low), lowest + NAME_HEIGHT)
+        axes.annotate(
+            vehicle,
+            (1.0, lowest),
+            xycoords="axes fraction",
+            xytext=(4, 0),
+            textcoords="offset points",
+            va="center",
+            color=VEHICLE_COLOURS[vehicle],
+            fontweight="bold",
+            annotation_clip=False,
         )
 
 

@@ -29,8 +29,12 @@ class Prefix:
 
     @property
     def figures(self) -> dict[str, int | float]:
-        """What a progress bar shows: crashes, and what the stop rule saw at its last look."""
-        figures: dict[str, int | float] = {"crashes": self.n_crashes, "rhw": self._rule.rhw}
+        """What a progress bar shows: crashes, and what the stop rule saw at its last look.
+
+        Only what a rule asks for is called ``rhw``: a bar reckons from it when the campaign will stop.
+        """
+        watched = "half_width" if self._campaign.stop.rhw is None else "rhw"
+        figures: dict[str, int | float] = {"crashes": self.n_crashes, watched: self._rule.rhw}
         weighted = self._campaign.testing.method in ("forced", "episode_mixture")
         return figures | ({"heaviest": self._rule.heaviest} if weighted else {})
 

@@ -114,7 +114,18 @@ def test_equal_vehicles_have_a_bound_and_not_a_zero_width():
     assert math.isinf(found.variance_ratio)
     assert found.to_json()["variance_ratio"] is None
     assert "the vehicles may be equal" in " ".join(found.warnings)
-    assert "not distinguishable" in difference_statement(found, "a", "b")
+    text = difference_statement(found, "a", "b")
+    assert "not distinguishable" in text
+    assert "A/B = 1 (its interval is not known: no pair differs)" in text
+    assert "times as many" not in text
+    assert found.to_json()["ratio"] == 1.0
+    assert found.to_json()["ratio_low"] is found.to_json()["ratio_high"] is None
+
+
+def test_pairing_that_saves_nothing_is_said_in_words(paired):
+    text = difference_statement(replace(paired[0], variance_ratio=1.0004), "a", "b")
+    assert text.endswith("; independent runs would need as many.")
+    assert "would need 2.5 times as many." in difference_statement(replace(paired[0], variance_ratio=2.5), "a", "b")
 
 
 def test_the_statement_says_who_crashes_more(paired):

@@ -31,6 +31,7 @@ KEYS = {
     "diagnostics",
     "convergence",
     "statement",
+    "statements",
     "conditional_statement",
     "scope",
 }
@@ -70,6 +71,7 @@ def test_a_stored_run_gives_what_blocks_in_memory_give(tmp_path, method, headlin
         content["estimates"].pop("scv")
     for found in (content, memory):  # what surrogates would have done is on record in neither, for other reasons
         assert found["estimates"].pop("replay")["crash_rate"] is None
+        found["statements"].pop("replay")
         assert not found["diagnostics"].pop("alarm")["raised"]
     assert json.loads(json.dumps(content, allow_nan=False)) == memory
 
@@ -82,6 +84,14 @@ def test_rates_per_distance_scale_with_the_distance_of_a_test(tmp_path):
     assert "per 1e6 km" in content["statement"]
     assert "lane-change level 3" in content["statement"]
     assert "not about how well the environment matches the road" in content["scope"]
+
+
+def test_each_estimator_has_its_sentence(tmp_path):
+    content = estimate_run(write_run(tmp_path, drawn("forced")))
+    assert set(content["statements"]) == set(content["estimates"])
+    assert content["statements"]["nade"] == content["statement"]
+    assert content["statements"]["nde"].startswith("No crash rate from these records: ")
+    assert content["estimates"]["nde"]["reason"].rstrip(".") in content["statements"]["nde"]
 
 
 def test_an_unknown_distance_says_nothing_per_kilometre(tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from harness.estimators import Estimate, Shells, one_pass
 from harness.estimators.block import Block
 from harness.estimators.estimate import finite_json
 from harness.estimators.intervals import clopper_pearson
-from harness.estimators.statement import conditional_statement
+from harness.estimators.statement import conditional_statement, statement
 from harness.estimators.stratified import combined, pool_variance, share_limits
 from harness.pool.shells import ShellDesign
 
@@ -137,6 +138,16 @@ def test_two_statements():
     json.dumps(finite_json(estimate.to_json()), allow_nan=False)
     assert "within shells" in found["nade"].reason
     assert "nde" in found["nde"].reason
+
+
+def test_a_half_width_far_wider_than_the_rate_is_no_number():
+    """Nothing was tested outside: all of its probability may be crashes."""
+    estimate = one_pass([block([0] * 10 + [1] * 20, [True] * 10 + [False] * 20)]).estimates["shells"]
+    assert estimate.rhw > 10.0
+    text = statement(estimate, 1.0, None)
+    assert f"to {estimate.ci_high:.3g}, still open upwards: far wider than the rate)" in text
+    assert "half-width" not in text
+    assert "relative half-width 50.0%)" in statement(replace(estimate, rhw=0.5), 1.0, None)
 
 
 def test_a_crash_outside_refutes_the_assumption():

@@ -27,6 +27,13 @@ def test_number(value, text):
     assert f.number(value) == text
 
 
+@pytest.mark.parametrize(
+    ("rhw", "text"), [(0.05, "0.0500"), (9.99, "9.99"), (842.79, "> 10"), (math.inf, "> 10"), (None, "–")]
+)
+def test_a_half_width_that_says_nothing_has_no_digits(rhw, text):
+    assert f.half_width(rhw) == text
+
+
 def test_interval_shares_power_and_decimals():
     assert f.interval(9.67e-8, 1.11e-7) == "(0.97 to 1.11) × 10⁻⁷"
     assert f.with_interval(1.04e-7, 9.67e-8, 1.11e-7) == "1.04 (0.97 to 1.11) × 10⁻⁷"

@@ -163,6 +163,30 @@ def test_the_plot_shows_contributions_and_half_widths(reports):
     ]  # fmt: skip
 
 
+@pytest.mark.parametrize(
+    ("name", "blue", "orange"),
+    [("shells", True, False), ("shells_refuted", None, True), ("shells_no_crashes", False, False)],
+)
+def test_the_caption_names_the_colours_that_are_there(reports, name, blue, orange):
+    found = result_of(reports[name])
+    plot = shells_plot(found)
+    axes = plot.figure.axes[0]
+    seen = {
+        shell.inside
+        for bar, shell in zip(axes.patches, found.shells, strict=True)
+        if bar.get_width() > 0.005 * axes.get_xlim()[1]
+    }
+    assert ("blue" in plot.caption) == (True in seen)
+    assert ("orange" in plot.caption) == (False in seen) == orange
+    assert blue is None or blue == (True in seen)
+
+
+def test_a_half_width_that_says_nothing_is_not_written_out(reports):
+    text = words(page_of(reports["shells_inside_only"]))
+    assert "Relative half-width> 10" in text
+    assert "still open upwards" in text
+
+
 def test_estimates_without_part_of_the_shells_are_named(reports):
     content = estimates_of(reports["shells"])
     del content["estimates"]["shells"]["details"]["shells"][0]["p"]
