@@ -83,6 +83,7 @@ def estimate_blocks(
     best = done.headline_estimate
     estimates = {done.headline: best, **done.estimates, **refused}
     distance_km = None if facts.distance_per_test_m is None else facts.distance_per_test_m / 1000.0
+    statements = _statements(estimates, facts, distance_km)
     content: dict[str, Any] = {
         "campaign": facts.name,
         "campaign_hash": facts.content_hash,
@@ -96,8 +97,8 @@ def estimate_blocks(
         "estimates": {name: estimate.to_json() for name, estimate in estimates.items()},
         "diagnostics": {**done.diagnostics.result(facts.importance_names), "alarm": _alarm(done, facts)},
         "convergence": done.convergence,
-        "statement": statement(best, facts.lane_change_level, distance_km) + failed_statement(best),
-        "statements": _statements(estimates, facts, distance_km),
+        "statement": statements[done.headline],
+        "statements": statements,
         "conditional_statement": conditional_statement(best),
         "scope": SCOPE,
     }
@@ -110,7 +111,7 @@ def _statements(
 ) -> dict[str, str]:
     """What each estimator says, in a sentence; of one without a value, why."""
     return {
-        name: statement(found, facts.lane_change_level, distance_km)
+        name: statement(found, facts.lane_change_level, distance_km) + failed_statement(found)
         if isinstance(found, Estimate)
         else f"No crash rate from these records: {found.reason.rstrip('.')}."
         for name, found in estimates.items()
