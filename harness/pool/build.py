@@ -75,8 +75,8 @@ class Enumerator:
         self._states = InitialStates(environment.numbers)
         self._max_steps = int(n["max_steps"])
         self._draws = max_draws(self._max_steps, int(n["hold_steps"]))
-        # Compiled here, by one thread: of two that want a new kernel at once, the second would wait behind whatever else
-        # is compiled meanwhile.
+        # Compiled here, by one thread: of two that want a new kernel at once, the second would wait behind whatever
+        # else is compiled meanwhile.
         self._block(0, 0)
 
     def aimed(self, proposal: Proposal) -> Enumerator:
