@@ -61,6 +61,17 @@ def system_error(error: OSError) -> HarnessError | None:
     return None
 
 
+def usage_error(error: click.UsageError, context: click.Context) -> HarnessError:
+    """Put what click says of a wrong call into the words of all errors."""
+    usage = " ".join(context.get_usage().removeprefix("Usage: ").split())
+    return HarnessError(
+        context.command_path,
+        found=error.format_message().rstrip("."),
+        expected=f"a call of the form: {usage}",
+        mend=f"See `{context.command_path} --help`.",
+    )
+
+
 def print_json(content: Any) -> None:
     """Print strict JSON (no NaN) on stdout."""
     click.echo(json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False))
@@ -269,11 +280,11 @@ def _number(value: float | None, style: str) -> str:
 
 def write_trace(trace: pa.Table, file: Path) -> None:
     """Write an episode's trace as Parquet or, when ``file`` ends in ``.csv``, as CSV."""
+    from pyarrow import csv, parquet  # noqa: PLC0415 - keeps --help fast
+
+    from harness.records.folder import write_atomically  # noqa: PLC0415 - keeps --help fast
+
     if file.suffix == ".csv":
-        from pyarrow import csv  # noqa: PLC0415 - keeps --help fast
-
-        csv.write_csv(trace, file)
+        write_atomically(file, lambda unfinished: csv.write_csv(trace, unfinished))
     else:
-        from pyarrow import parquet  # noqa: PLC0415 - keeps --help fast
-
-        parquet.write_table(trace, file, compression="zstd")
+        write_atomically(file, lambda unfinished: parquet.write_table(trace, unfinished, compression="zstd"))

@@ -235,7 +235,11 @@ def test_wrong_calls_end_with_2(calls, capsys, arguments):
     assert main(arguments) == 2
     out, err = capsys.readouterr()
     assert out == ""
-    assert "Usage: harness" in err
+    if arguments and arguments != ["nothing"]:
+        assert err.startswith("error: ")
+        assert [line.split()[0] for line in err.splitlines()[1:]] == ["found:", "expected:", "mend:"]
+    else:
+        assert "Usage: harness" in err
 
 
 @pytest.mark.parametrize("kind", [RunFolderError, TooManyFailedError])
@@ -335,6 +339,58 @@ def test_replay_writes_the_trace(calls, capsys, tmp_path):
     assert main(["replay", str(tmp_path), "17", "--out", str(as_parquet), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["bit_equal"] is True
     assert parquet.read_table(as_parquet)["step"].to_pylist() == [0, 1]
+
+
+def test_a_file_to_write_may_need_its_folder(calls, capsys, tmp_path):
+    file = tmp_path / "new" / "deeper" / "trace.csv"
+    assert main(["replay", str(tmp_path), "17", "--out", str(file)]) == 0
+    assert capsys.readouterr().out.endswith(f"\n{file}\n")
+    assert [path.name for path in file.parent.iterdir()] == ["trace.csv"]
+
+
+@pytest.mark.parametrize("option", ["--out", "--fcd"])
+def test_a_file_that_cannot_be_written_is_refused_first(calls, capsys, tmp_path, option):
+    (tmp_path / "file").write_text("not a folder")
+    assert main(["replay", str(tmp_path), "17", option, str(tmp_path / "file" / "x.csv")]) == 2
+    assert "nothing can be written" in capsys.readouterr().err
+    assert "harness.runner.replay_episode" not in calls
+
+
+@dataclass
+class SmallPool:
+    """What `harness pool` looks at."""
+
+    def to_json(self) -> dict:
+        one = {"name": "a", "crash_rate": 1e-6, "std_error": 1e-8, "shell_probability": 1e-6}
+        return {
+            "pool": "abc",
+            "n_paths": 10,
+            "surrogates": [one],
+            "boundary": "a",
+            "envelope": "b",
+            "no_surrogate_crashes": 1e-5,
+            "p_cut_in": 1e-5,
+            "p_cut_in_std_error": 1e-8,
+        }
+
+
+def test_pool_prints_what_it_wrote(calls, capsys, tmp_path):
+    calls["stand_in"]("harness.pool.storage.campaign_pool", SmallPool())
+    calls["stand_in"]("harness.pool.storage.write_pool", None)
+    file = tmp_path / "pool.parquet"
+    assert main(["pool", SMOKE, "--out", str(file)]) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == str(file)
+    assert calls["harness.pool.storage.write_pool"][0][0] == file
+    assert main(["pool", SMOKE, "--out", str(file), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["file"] == str(file)
+
+
+def test_pool_refuses_another_kind_of_file(calls, capsys, tmp_path):
+    assert main(["pool", SMOKE, "--out", str(tmp_path / "new" / "pool.txt")]) == 2
+    err = capsys.readouterr().err
+    assert "'.txt'" in err
+    assert f"Write --out {tmp_path}/new/pool.parquet." in err
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_replay_that_differs_is_an_error(calls, capsys, tmp_path):

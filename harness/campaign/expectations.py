@@ -4,8 +4,14 @@ from __future__ import annotations
 
 from typing import Any
 
+from harness.campaign.models import NAME_PATTERN, SURROGATE_PATTERN
+
 _UNITS = {"_mps2": "m/s²", "_mps": "m/s", "_per_s": "1/s", "_per_m": "1/m", "_s": "s", "_m": "m"}
 _LONGEST = 60
+_PATTERNS = {
+    NAME_PATTERN: "a name of letters, digits, _ . and -, without spaces, that begins with a letter or digit",
+    SURROGATE_PATTERN: "a name of letters, digits, _ and -, without spaces, that begins with a letter or digit",
+}
 
 
 def describe_found(value: Any) -> str:
@@ -54,7 +60,7 @@ def _describe_words(schema: dict[str, Any]) -> str:
 def _describe_text(schema: dict[str, Any]) -> str:
     if "examples" in schema:
         return "text such as " + " or ".join(map(str, schema["examples"]))
-    return f"text of the form {schema['pattern']}" if "pattern" in schema else "text"
+    return _PATTERNS.get(schema.get("pattern", ""), "text")
 
 
 def _describe_number(schema: dict[str, Any], key: str, noun: str) -> str:

@@ -22,6 +22,52 @@ from harness.errors import CampaignError
 
 Model = TypeVar("Model", bound=BaseModel)
 
+_OPEN = "Look above for a [, { or quote that is not closed, and close it."
+_SYNTAX = {
+    "mapping values are not allowed": (
+        "a second 'key:' where a value should end",
+        "one 'key: value' per line",
+        "Indent the key like its neighbours; put a text with ': ' in it in quotes.",
+    ),
+    "could not find expected ':'": (
+        "a line without a colon just before here",
+        "'key: value', with a space after the colon",
+        "Add the colon, or indent the line if it belongs to the text above.",
+    ),
+    "found '<block mapping start>'": (
+        "a key whose indentation fits no line above",
+        "the same indentation for all keys of a section",
+        "Put the key exactly below its neighbours.",
+    ),
+    "found '?'": ("a key after a list", "another '- item', or the end of the list", "Add a dash, or indent the key."),
+    "found '-'": (
+        "a list item among keys",
+        "another 'key: value'",
+        "Indent the list below the key that it belongs to.",
+    ),
+    "sequence entries are not allowed": (
+        "a list item on the line of its key",
+        "the first '- item' on a line of its own",
+        "Begin a new line before the dash, or write [a, b].",
+    ),
+    "found '<scalar>'": (
+        "text after a closing quote",
+        "the end of the line",
+        "Put all of the value in the same quotes.",
+    ),
+    "found '<stream end>'": ("the end of the file", "a closing bracket", _OPEN),
+    "unexpected end of stream": ("the end of the file", "a closing quote", _OPEN),
+    "expected ',' or": ("something else inside brackets", "a comma or the closing bracket", _OPEN),
+    "found ']'": ("a ] that closes nothing", "a value", "Delete it, or write the [ that it belongs to."),
+    "found '}'": ("a } that closes nothing", "a value", "Delete it, or write the { that it belongs to."),
+    "cannot start any token": (
+        "a character that a value may not begin with",
+        "a value, or text in quotes",
+        "Put the text in quotes.",
+    ),
+}
+"""By a part of the parser's message: what was found and expected, and how to mend it."""
+
 
 def read_yaml(path: str | Path) -> tuple[dict[str, Any], Lines]:
     """Read a YAML file whose top level is a mapping.
@@ -139,10 +185,16 @@ def _fail_at_mark(error: MarkedYAMLError, name: str) -> NoReturn:
         _fail(name, mark.line + 1, "a tab", "spaces", "Indent with spaces only.")
     if "another document" in problem:
         _fail(name, mark.line + 1, "a second document (after ---)", "one document", "Keep one document per file.")
-    expected, _, found = problem.replace("but got ", "but found ").rpartition("but found ")
-    expected = expected.removeprefix("expected ").rstrip(" ,") or "valid YAML"
-    mend = "Check indentation, quotes and brackets near it."
-    _fail(name, mark.line + 1 if mark else 1, found.removeprefix("found "), expected, mend)
+    line, column = mark.line + 1, mark.column + 1
+    for part, (found, expected, mend) in _SYNTAX.items():
+        if part in problem:
+            raise CampaignError(f"{name}:{line}:{column}", found=found, expected=expected, mend=mend)
+    raise CampaignError(
+        f"{name}:{line}:{column}",
+        found=problem.removeprefix("found "),
+        expected="valid YAML",
+        mend="Check indentation, quotes and brackets near it.",
+    )
 
 
 def _fail(name: str, line: int, found: str, expected: str, mend: str) -> NoReturn:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
+
+from harness.errors import HarnessError
 
 if TYPE_CHECKING:
     from harness.campaign.models import Campaign
@@ -16,12 +18,35 @@ RUN_FOLDER = click.Path(path_type=Path, file_okay=False, exists=True)
 FILE = click.Path(path_type=Path, dir_okay=False)
 CAMPAIGN = click.Path(path_type=Path)
 
+
+def written_file(*suffixes: str) -> Callable[[click.Context, click.Parameter, Path | None], Path | None]:
+    """Callback of an option that names a file to write: its suffix says what is written, its folder may be made."""
+
+    def checked(_ctx: click.Context, parameter: click.Parameter, value: Path | None) -> Path | None:
+        if value is None:
+            return None
+        if suffixes and value.suffix not in suffixes:
+            raise HarnessError(
+                f"{parameter.opts[0]} {value}",
+                found=f"a name that ends in '{value.suffix}'" if value.suffix else "a name without a suffix",
+                expected=f"a name that ends in {' or '.join(suffixes)}",
+                mend=f"Write {parameter.opts[0]} {value.with_suffix(suffixes[0])}.",
+            )
+        from harness.records.folder import require_place  # noqa: PLC0415 - keeps --help fast
+
+        require_place(value.parent)
+        return value
+
+    return checked
+
+
 set_option = click.option(
     "--set",
     "overrides",
     multiple=True,
     metavar="A.B=C",
-    help="Replace a value of the campaign, e.g. --set stop.rhw=0.3. May be given several times.",
+    help="Replace a value of the campaign, e.g. --set stop.rhw=0.3. May be given several times. A path is relative "
+    "to the campaign's file, as in the file itself.",
 )
 av_option = click.option(
     "--av",
@@ -32,9 +57,14 @@ av_option = click.option(
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON on stdout instead of text.")
 
 
-def examples(*lines: str) -> str:
+def as_written(heading: str, *lines: str) -> str:
     """Lay out lines below a help text, kept as they are (the backspace is click's mark for that)."""
-    return "\b\nExamples:\n" + "\n".join(f"  {line}" for line in lines)
+    return f"\b\n{heading}\n" + "\n".join(f"  {line}" for line in lines)
+
+
+def examples(*lines: str) -> str:
+    """Lay out examples below a help text."""
+    return as_written("Examples:", *lines)
 
 
 def loaded(campaign_file: Path, overrides: Sequence[str], av: str | None = None) -> Campaign:

@@ -14,6 +14,7 @@ from harness.commands.options import (
     RUN_FOLDER,
     examples,
     json_option,
+    written_file,
 )
 from harness.console import (
     print_estimates,
@@ -171,12 +172,6 @@ def report(folder: Path) -> None:
     click.echo(str(write_report(folder)))
 
 
-def _trace_file(_ctx: click.Context, _parameter: click.Parameter, value: Path | None) -> Path | None:
-    if value is not None and value.suffix not in (".parquet", ".csv"):
-        raise click.BadParameter("the name must end in .parquet or .csv")
-    return value
-
-
 @click.command(
     short_help="Simulate one episode of a run again, bit for bit.",
     epilog=examples(
@@ -187,8 +182,10 @@ def _trace_file(_ctx: click.Context, _parameter: click.Parameter, value: Path | 
 )
 @click.argument("folder", metavar="DIR", type=RUN_FOLDER)
 @click.argument("episode", type=click.IntRange(min=0))
-@click.option("--out", type=FILE, callback=_trace_file, help="Write the trace: FILE.parquet or FILE.csv.")
-@click.option("--fcd", type=FILE, help="Write SUMO's floating car data (XML) of the episode.")
+@click.option(
+    "--out", type=FILE, callback=written_file(".csv", ".parquet"), help="Write the trace: FILE.parquet or FILE.csv."
+)
+@click.option("--fcd", type=FILE, callback=written_file(), help="Write SUMO's floating car data (XML) of the episode.")
 @click.option("--gui", is_flag=True, help="Show the episode in sumo-gui (extra 'sumo').")
 @json_option
 def replay(folder: Path, episode: int, *, out: Path | None, fcd: Path | None, gui: bool, as_json: bool) -> None:

@@ -12,10 +12,12 @@ from harness.commands.options import (
     CAMPAIGN,
     FILE,
     FOLDER,
+    as_written,
     examples,
     json_option,
     loaded,
     set_option,
+    written_file,
 )
 from harness.console import (
     print_json,
@@ -28,7 +30,12 @@ from harness.console import (
     epilog=examples("harness pool scenarios/smoke.yaml", "harness pool scenarios/smoke.yaml --out pool.parquet"),
 )
 @click.argument("campaign_file", metavar="CAMPAIGN", type=CAMPAIGN)
-@click.option("--out", type=FILE, help="Write the pool there, too: FILE.parquet, one row per cut-in.")
+@click.option(
+    "--out",
+    type=FILE,
+    callback=written_file(".parquet"),
+    help="Write the pool there, too: FILE.parquet, one row per cut-in.",
+)
 @set_option
 @json_option
 def pool(campaign_file: Path, *, out: Path | None, overrides: Sequence[str], as_json: bool) -> None:
@@ -47,14 +54,28 @@ def pool(campaign_file: Path, *, out: Path | None, overrides: Sequence[str], as_
     if out is not None:
         write_pool(out, found)
     if as_json:
-        print_json(found.to_json())
-    else:
-        print_pool(found.to_json())
+        print_json(found.to_json() | ({} if out is None else {"file": str(out)}))
+        return
+    print_pool(found.to_json())
+    if out is not None:
+        click.echo(str(out))
 
 
 @click.command(
     short_help="Repeat a campaign thousands of times: what are its intervals worth?",
-    epilog=examples("harness validate scenarios/validate/shells_panel.yaml --out runs/shells_panel"),
+    epilog=as_written(
+        "Columns:",
+        "truth        the crash rate that all replications should find",
+        "bias         mean of the estimates relative to the truth, ± its standard error",
+        "relvar true  mean squared error of the estimates, over the square of the truth",
+        "claimed      the same, as the campaigns themselves estimate it",
+        "coverage     share of the intervals that hold the truth, with its 95 % interval",
+        "p (Holm)     of so low a coverage if the intervals were right, for as many lines",
+        "tests        that a campaign needed: median, 5 % and 95 % quantile",
+        "alarm        share of replications with a crash outside the library's boundary",
+    )
+    + "\n\n"
+    + examples("harness validate scenarios/validate/shells_panel.yaml --out runs/shells_panel"),
 )
 @click.argument("experiment_file", metavar="EXPERIMENT", type=CAMPAIGN)
 @click.option("--out", "folder", type=FOLDER, required=True, help="Folder of the results; made if it is not there.")
@@ -67,8 +88,8 @@ def validate(
 ) -> None:
     """Repeat the campaign of EXPERIMENT for each of its vehicles or chains, and judge its intervals by that.
 
-    Printed are bias, true and claimed variance, coverage with its binomial interval and Holm-corrected p-value, and
-    the tests needed. The folder receives results.json, replications.parquet (one row each) and coverage.png.
+    Printed is a line per vehicle and result, with the columns below. The folder receives results.json,
+    replications.parquet (one row each) and coverage.png.
     """
     from harness.validation.experiment import load_experiment  # noqa: PLC0415 - keeps --help fast
 

@@ -18,6 +18,7 @@ from harness.commands.options import (
     json_option,
     loaded,
     set_option,
+    written_file,
 )
 from harness.console import (
     print_av_check,
@@ -53,12 +54,13 @@ def av_check(
     Shown are whether it gives the same bits in another order and in other cells, whether it stays finite and within
     limits, how it reacts to cut-ins, and its time per step beside the built-in IDM. Nothing is written.
 
-    Exit code 3 says that episodes failed or were not reproduced; 2 that the campaign or the controller is wrong.
+    Exit code 3 says that episodes failed, were not reproduced, or ended the process; 2 that the campaign or the
+    controller is wrong.
     """
     campaign = loaded(campaign_file, overrides, av)
-    from harness.runner import check_av  # noqa: PLC0415 - slow to import: only once the campaign is right
+    from harness.runner.av_check import check_av_apart  # noqa: PLC0415 - slow to import: only once the campaign is right
 
-    found = check_av(campaign, episodes)
+    found = check_av_apart(campaign, episodes)
     if as_json:
         print_json(found.to_json())
     else:
@@ -142,7 +144,7 @@ def compare(
     ),
 )
 @click.argument("folder", metavar="DIR", type=RUN_FOLDER)
-@click.option("--out", type=FILE, required=True, help="Library to write, a new .yaml file.")
+@click.option("--out", type=FILE, callback=written_file(), required=True, help="Library to write, a new .yaml file.")
 @json_option
 def ladder(folder: Path, out: Path, *, as_json: bool) -> None:
     """Fit a driver to the AV of the run in DIR, and write the run's surrogate library with it.

@@ -6,7 +6,9 @@ import hashlib
 import importlib
 import sys
 from collections.abc import Callable, Mapping
+from functools import partial
 from importlib.metadata import entry_points
+from inspect import signature
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +37,7 @@ def controller_class(name: str) -> Callable[..., Any]:
         sys.path.insert(0, here)
     try:
         module = importlib.import_module(module_name)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise CampaignError(
             "av.controller",
             found=f"{name}, whose module cannot be imported ({cause_of(error)})",
@@ -82,9 +84,10 @@ def build_host(
         The controller cannot be found or made, or is of neither kind.
     """
     acts_early = av.before_cut_in == "controller"
+    make: Callable[[], Any]
     if av.source == "controller":
-        make = _maker(av)
-        made = _make_first(make, str(av.controller))
+        make = constructor = _maker(av)
+        made = _make_first(constructor, av)
         if callable(getattr(made, "step_batch", None)) and callable(getattr(made, "start_batch", None)):
             return BatchHost(made, seed, av.limits, acts_before_cut_in=acts_early)
         _require_vehicle_controller(made, str(av.controller))
@@ -122,23 +125,41 @@ def controller_hash(av: AutomatedVehicle) -> str | None:
     return hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else None
 
 
-def _maker(av: AutomatedVehicle) -> Callable[[], Any]:
-    made_by = controller_class(str(av.controller))
+def _maker(av: AutomatedVehicle) -> partial[Any]:
     parameters = av.parameters if isinstance(av.parameters, dict) else {}
-    return lambda: made_by(**parameters)
+    return partial(controller_class(str(av.controller)), **parameters)
 
 
-def _make_first(make: Callable[[], Any], name: str) -> Any:
-    """Make one controller, so that wrong parameters are an error of the campaign and not of every episode."""
+def _make_first(make: partial[Any], av: AutomatedVehicle) -> Any:
+    """Make one controller, so that what its constructor refuses is an error of the campaign, not of every episode."""
     try:
         return make()
-    except Exception as error:
+    except (Exception, SystemExit) as error:
+        if not _takes(make):
+            raise CampaignError(
+                "av.parameters",
+                found=f"parameters that {av.controller} does not take ({cause_of(error)})",
+                expected="keyword arguments of the controller's constructor",
+                mend="Correct av.parameters, or the constructor.",
+            ) from error
+        given = ", ".join(make.keywords) or "none"
         raise CampaignError(
-            "av.parameters",
-            found=f"parameters that {name} refuses ({cause_of(error)})",
-            expected="keyword arguments of the controller's constructor",
-            mend="Correct av.parameters, or the constructor.",
+            "av.controller",
+            found=f"{av.controller}, whose constructor raised {cause_of(error)}",
+            expected="a controller that can be made",
+            mend=f"Mend its constructor, or what it needs; av.parameters given to it: {given}.",
         ) from error
+
+
+def _takes(make: partial[Any]) -> bool:
+    """Whether the names of the parameters suit the constructor."""
+    try:
+        signature(make.func).bind(**make.keywords)
+    except TypeError:
+        return False
+    except ValueError:  # a class in C may have no signature
+        return True
+    return True
 
 
 def _require_vehicle_controller(made: Any, name: str) -> None:

@@ -14,8 +14,8 @@ from harness.errors import RunFolderError
 from harness.estimators.block import MAX_CONTROL_STEPS, Block
 from harness.pool.shells import ShellDesign
 from harness.pool.surrogate_replay import SurrogateReplay
+from harness.records.folder import MEND_SHARD
 
-_AGAIN = "Remove the shard and run `harness run` with --resume, which makes it again."
 EPISODE_COLUMNS = (
     "episode",
     "outcome",
@@ -130,14 +130,14 @@ def _nested(table: pa.Table, name: str, width: int) -> FloatArray:
             f"column {name}",
             found=f"{len(values)} numbers in {table.num_rows} rows",
             expected=f"{width} in each row, one per importance function of the campaign",
-            mend="The records belong to another campaign or are damaged. " + _AGAIN,
+            mend="The records belong to another campaign or are damaged. " + MEND_SHARD,
         )
     return values.reshape(table.num_rows, width)
 
 
 def _require_consecutive(index: IntArray) -> int:
     if len(index) == 0:
-        raise RunFolderError("episodes", found="no rows", expected="at least one episode per shard", mend=_AGAIN)
+        raise RunFolderError("episodes", found="no rows", expected="at least one episode per shard", mend=MEND_SHARD)
     steps = np.diff(index)
     if np.any(steps != 1):
         at = int(np.argmax(steps != 1))
@@ -145,7 +145,7 @@ def _require_consecutive(index: IntArray) -> int:
             f"episodes, row {at + 1}",
             found=f"episode {index[at + 1]} after episode {index[at]}",
             expected="every episode once, in index order; a failed one is a row too",
-            mend=_AGAIN,
+            mend=MEND_SHARD,
         )
     return int(index[0])
 
@@ -162,7 +162,7 @@ def _log_weights(episodes: pa.Table, failed: BoolArray, first: int) -> FloatArra
             f"episodes, episode {first + at}",
             found=f"log_weight {log_weight[at]}",
             expected="a number: every weight decides the crash rate",
-            mend=_AGAIN,
+            mend=MEND_SHARD,
         )
     return log_weight
 
@@ -184,7 +184,7 @@ def _first_ratios(moments: pa.Table, index: IntArray, n_control_steps: IntArray)
             "moments",
             found=f"rows of episodes {row.min() + index[0]} to {row.max() + index[0]}, or out of order",
             expected=f"episodes {index[0]} to {index[-1]}, in order",
-            mend=_AGAIN,
+            mend=MEND_SHARD,
         )
     counts = np.bincount(row, minlength=len(index))
     _require_moments(counts, n_control_steps, int(index[0]))
@@ -206,5 +206,5 @@ def _require_moments(counts: IntArray, n_control_steps: IntArray, first: int) ->
             f"moments, episode {first + at}",
             found=f"{counts[at]} control steps",
             expected=f"{min(int(n_control_steps[at]), MAX_CONTROL_STEPS)} as the episodes table says",
-            mend=_AGAIN,
+            mend=MEND_SHARD,
         )

@@ -27,7 +27,7 @@ from harness.importance.build import importance_names, mixture_weights, needs_ta
 from harness.pool.shells import ShellDesign
 from harness.pool.surrogate_replay import PATH_COLUMNS, SurrogateReplay
 from harness.progress import Progress
-from harness.records.folder import SHELLS, read_json, read_manifest
+from harness.records.folder import SHELLS, no_episodes, read_json, read_manifest
 from harness.records.reader import read_shards, stored_columns
 
 _FINISH = "Run `harness run` with --resume, which makes missing shards."
@@ -244,6 +244,8 @@ def stored_blocks(folder: Path, *, moments: bool) -> Iterator[Block]:
 def _stored_blocks(folder: Path, campaign: Campaign, manifest: dict[str, Any], wanted: _Wanted) -> Iterator[Block]:
     """Blocks of the episodes that count, in index order; a gap or too few of them is an error."""
     n, n_counted, cap = 0, int(manifest["n_episodes"]), manifest.get("weight_cap")
+    if n_counted == 0:
+        raise no_episodes(folder)
     columns = list(MOMENT_COLUMNS) if wanted.moments else []
     shells = read_shells(folder) if campaign.testing.method == "shells" else None
     wanted_columns = [*wanted.columns, *(SHELL_COLUMNS if shells else ())]

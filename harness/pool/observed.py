@@ -13,7 +13,7 @@ from harness.campaign.models import Campaign
 from harness.episode.loop import traced_by_index
 from harness.errors import RunFolderError
 from harness.outcomes import AV, BV, VEHICLES
-from harness.records.folder import read_manifest, read_table
+from harness.records.folder import MEND_SHARD, read_manifest, read_table
 from harness.vehicles.kinematics import VEHICLE_LENGTH_M
 
 WINDOW_STEPS = 60
@@ -117,7 +117,7 @@ def _require_three_vehicles(traces: pa.Table) -> None:
             "traces",
             found="rows in another order",
             expected=f"{', '.join(VEHICLES)} of each step",
-            mend="Remove the shard and run `harness run` with --resume, which makes it again.",
+            mend=MEND_SHARD,
         )
 
 

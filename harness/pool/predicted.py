@@ -18,7 +18,7 @@ from harness.errors import RunFolderError
 from harness.pool.library import LibraryDriver
 from harness.pool.replay import StoredPaths, replay_surrogates
 from harness.pool.surrogate_replay import PATH_COLUMNS, room_for, stored_paths
-from harness.records.folder import read_manifest, read_table
+from harness.records.folder import MEND_SHARD, read_manifest, read_table
 from harness.vehicles.models import driver_records
 
 _COLUMNS = [*PATH_COLUMNS, "outcome", "component", "log_weight"]
@@ -145,7 +145,7 @@ def _who_crashes(stored: StoredPaths, environment: Environment, records: RecordA
             f"episodes, episode {stored.first + wrong}",
             found="maneuvers that do not fit its steps",
             expected="the maneuvers that were driven: they determine the episode",
-            mend="Remove the shard and run `harness run` with --resume, which makes it again.",
+            mend=MEND_SHARD,
         )
     found: BoolArray = ((bits[:, None] >> np.arange(records.size)) & 1).astype(np.bool_)
     return found

@@ -106,6 +106,23 @@ def shells_in_strata(pool: Pool, boundary: int, limit_mps2: float) -> list[list[
     return [*inside, outside] if outside else inside
 
 
+def require_boundary(name: str, surrogates: tuple[str, ...]) -> None:
+    """Refuse a boundary that is none of the surrogates.
+
+    Raises
+    ------
+    CampaignError
+        There is no such surrogate.
+    """
+    if name not in surrogates:
+        raise CampaignError(
+            "testing.shells.boundary",
+            found=f"'{name}'",
+            expected=f"a surrogate of the library: {', '.join(surrogates)}",
+            mend="Name one of them, or leave boundary out for the library's own.",
+        )
+
+
 def design_shells(pool: Pool, *, boundary: str | None = None, limit_mps2: float) -> ShellDesign:
     """Strata of a campaign.
 
@@ -123,13 +140,7 @@ def design_shells(pool: Pool, *, boundary: str | None = None, limit_mps2: float)
         The pool knows no such surrogate.
     """
     name = boundary or pool.library.boundary
-    if name not in pool.names:
-        raise CampaignError(
-            "testing.shells.boundary",
-            found=f"'{name}'",
-            expected=f"a surrogate of the library: {', '.join(pool.names)}",
-            mend="Name one of them, or leave boundary out for the library's own.",
-        )
+    require_boundary(name, pool.names)
     groups = shells_in_strata(pool, pool.names.index(name), limit_mps2)
     joined = np.zeros((len(groups), pool.shell_p.size))
     for row, group in enumerate(groups):

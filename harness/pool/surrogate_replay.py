@@ -18,6 +18,7 @@ from harness.errors import CampaignError, RunFolderError
 from harness.pool.cut_ins import Pool, environment_hash
 from harness.pool.enumeration import Path, empty_path
 from harness.pool.replay import StoredPaths, replay_surrogates
+from harness.records.folder import MEND_SHARD
 
 STATE_COLUMNS = ("v_bv_mps", "r1_m", "r1dot_mps", "r2_m", "r2dot_mps")
 PATH_COLUMNS = ("episode", *STATE_COLUMNS, "n_steps", "cut_in_step", "lv_maneuvers", "bv_maneuvers")
@@ -108,7 +109,7 @@ class SurrogateReplay:
                 f"episodes, episode {stored.first + wrong}",
                 found=f"maneuvers that do not lead to a cut-in in step {stored.cut_step[wrong]}",
                 expected="the maneuvers that were driven: they determine the episode",
-                mend="Remove the shard and run `harness run` with --resume, which makes it again.",
+                mend=MEND_SHARD,
             )
         return bits
 

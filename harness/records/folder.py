@@ -6,6 +6,7 @@ import json
 import os
 import tempfile
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,12 @@ SHELLS = "shells.json"
 """Strata of a shells campaign, as its estimates need them."""
 TABLES = ("episodes", "moments", "traces")
 COMPRESSION = "zstd"
+MEND_SHARD = (
+    "Delete all files of this shard (in episodes/, moments/ and traces/) and run again with --resume: "
+    "the same episodes are made anew."
+)
+"""A shard counts as finished by its episodes file: one of the others alone is not made again."""
+NO_RUN = "Give a folder that `harness run` has written."
 
 
 def shard_file(table: str, index: int) -> str:
@@ -42,6 +49,32 @@ def write_atomically(path: Path, write: Callable[[Path], None]) -> None:
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def require_place(folder: Path) -> None:
+    """Refuse a folder in which nothing can be written, before work is spent on it; leaves it as it was.
+
+    Raises
+    ------
+    RunFolderError
+        It cannot be made, or nothing can be made in it.
+    """
+    missing: list[Path] = []
+    try:
+        missing = [path for path in (folder, *folder.parents) if not path.exists()]
+        folder.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        raise RunFolderError(
+            str(folder),
+            found=f"a place where nothing can be written ({error.strerror})",
+            expected="a folder, or a place where one can be made",
+            mend="Choose another place, or change its permissions.",
+        ) from error
+    finally:
+        with suppress(OSError):
+            for path in missing:
+                path.rmdir()
 
 
 def write_bytes(path: Path, content: bytes) -> None:
@@ -100,11 +133,22 @@ def read_table(path: Path, columns: list[str] | None = None) -> pa.Table:
 
 def damaged(path: Path, error: Exception) -> RunFolderError:
     """What to say of a Parquet file of a run that cannot be read."""
+    missing = isinstance(error, FileNotFoundError)
     return RunFolderError(
         str(path),
-        found=f"a file that cannot be read ({str(error).splitlines()[0]})",
+        found="no such file" if missing else f"a file that cannot be read ({str(error).splitlines()[0]})",
         expected="a complete Parquet file of this run",
-        mend="Delete it and its episodes file and run again with --resume: the same episodes are made anew.",
+        mend=MEND_SHARD,
+    )
+
+
+def no_episodes(folder: Path) -> RunFolderError:
+    """What to say of a run that was ended before its first shard was finished."""
+    return RunFolderError(
+        str(folder),
+        found="a run that has not finished an episode yet",
+        expected="episodes on record",
+        mend="Let `harness run` go on with --resume.",
     )
 
 
@@ -116,7 +160,10 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     RunFolderError
         There is none, or it is not one that a run has written.
     """
-    path, mend = folder / MANIFEST, "Give a folder that `harness run` has written."
+    path, mend = folder / MANIFEST, NO_RUN
+    if not path.exists():
+        expected = "a run folder, which holds a manifest.json"
+        raise RunFolderError(str(path), found="no such file: this is no run folder", expected=expected, mend=mend)
     content = read_json(path, mend=mend)
     missing = [key for key in ("campaign_hash", "n_episodes", "shards") if key not in content]
     if missing:
@@ -135,6 +182,8 @@ def read_json(path: Path, *, mend: str) -> dict[str, Any]:
     """
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise RunFolderError(str(path), found="no such file", expected="a JSON file of a run", mend=mend) from None
     except (OSError, ValueError) as error:
         raise RunFolderError(str(path), found=str(error), expected="a JSON file of a run", mend=mend) from error
     if not isinstance(content, dict):

@@ -108,7 +108,7 @@ def _number(point: dict[str, Any], name: str) -> float:
             "estimates.json",
             found=f"a convergence point without {name!r}",
             expected="n, crash_rate, ci_low, ci_high and rhw in each",
-            mend="Make it again with `harness estimate`.",
+            mend="Make it again with `harness estimate DIR --write`.",
         )
     return np.nan if point[key] is None else float(point[key])
 

@@ -79,7 +79,7 @@ def _coverage_notes(run: RunFolder, summary: RunSummary) -> list[str]:
     if n_estimated is not None and n_estimated not in (summary.n_episodes, summary.n_episodes - n_failed):
         notes.append(
             f"The estimates cover {count(n_estimated)} tests but the records hold {count(summary.n_episodes)}: run "
-            "harness estimate again."
+            "harness estimate DIR --write."
         )
     target, rhw = target_rhw(run), run.headline.get("rhw")
     if asked_of_conditional(run):

@@ -13,6 +13,7 @@ from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
 from harness.errors import RunFolderError
+from harness.records.folder import NO_RUN
 
 MANIFEST_KEYS = ("campaign_hash", "created", "versions", "seed", "shards", "n_episodes")
 ESTIMATES_KEYS = ("campaign", "campaign_hash", "lane_change_level", "confidence", "headline", "estimates", "statement")
@@ -82,8 +83,10 @@ def read_run_folder(path: Path) -> RunFolder:
     RunFolderError
         If a file is missing, is not what its name says, or belongs to another campaign.
     """
-    manifest = _read_json(path / "manifest.json", MANIFEST_KEYS, mend="Run `harness run` with --resume to finish it.")
-    estimates = _read_json(path / "estimates.json", ESTIMATES_KEYS, mend=f"Make it with `harness estimate {path}`.")
+    manifest = _read_json(path / "manifest.json", MANIFEST_KEYS, mend=NO_RUN)
+    estimates = _read_json(
+        path / "estimates.json", ESTIMATES_KEYS, mend=f"Make it with `harness estimate {path} --write`."
+    )
     _check_belong_together(path, manifest, estimates)
     return RunFolder(path, _read_campaign(path / "campaign.yaml"), manifest, estimates, _shards(path, manifest))
 
@@ -122,7 +125,7 @@ def _read_campaign(path: Path) -> dict[str, Any]:
 
 
 def _check_belong_together(path: Path, manifest: dict[str, Any], estimates: dict[str, Any]) -> None:
-    where, again = str(path / "estimates.json"), f"Make it again with `harness estimate {path}`."
+    where, again = str(path / "estimates.json"), f"Make it again with `harness estimate {path} --write`."
     if estimates["campaign_hash"] != manifest["campaign_hash"]:
         raise RunFolderError(
             where,

@@ -15,11 +15,11 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from harness.errors import RunFolderError
+from harness.records.folder import MEND_SHARD
 from harness.report.run_folder import RunFolder
 
 TABLES = ("episodes", "moments", "traces")
 BATCH_ROWS = 65_536
-MEND_SHARD = "Remove the file and run `harness run` with --resume, which makes the shard again."
 
 
 @dataclass(frozen=True)

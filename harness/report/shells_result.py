@@ -134,7 +134,7 @@ def shells_result(estimates: dict[str, Any]) -> ShellsResult | None:
             "estimates.json",
             found=f"no complete description of shells ({error!r})",
             expected="what `harness estimate` writes for a run with testing.method shells",
-            mend="Make it again with `harness estimate`.",
+            mend="Make it again with `harness estimate DIR --write`.",
         ) from error
 
 

@@ -2,20 +2,29 @@
 
 from __future__ import annotations
 
+import signal
 import time
 from collections import Counter
+from contextlib import suppress
 from dataclasses import asdict, dataclass
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 
 from harness.arrays import FloatArray
 from harness.campaign.models import AutomatedVehicle, Campaign
+from harness.controllers.black_box import START, Call, last_call
+from harness.controllers.time_limit import death_cause
 from harness.episode.loop import EpisodeLoop, Shard
-from harness.errors import EXIT_DONE, EXIT_TOO_MANY_FAILED
+from harness.errors import EXIT_DONE, EXIT_TOO_MANY_FAILED, HarnessError
 from harness.estimators.estimate import finite_json
 from harness.outcomes import AV, CRASH, FAILED
 from harness.runner.prepare import Prepared, build_world, prepare
+from harness.runner.processes import fit_to_travel
 from harness.vehicles.kinematics import STEP_S
 
 EPISODES = 48
@@ -26,6 +35,12 @@ SHORTEST_TIMING_S = 0.3
 BRAKING_MPS2 = -0.1
 """What counts as a reaction to the cut-in."""
 AT_LIMIT_MPS2 = 1e-9
+
+
+class AvEndedProcessError(HarnessError):
+    """The AV's controller ended the process that looked at it."""
+
+    exit_code = EXIT_TOO_MANY_FAILED
 
 
 @dataclass(frozen=True)
@@ -104,7 +119,7 @@ class AvCheck:
         return cleaned
 
 
-def check_av(campaign: Campaign, n_episodes: int = EPISODES) -> AvCheck:
+def check_av(campaign: Campaign, n_episodes: int = EPISODES, *, black_box: Path | None = None) -> AvCheck:
     """Run a few dozen episodes with a campaign's AV, twice, and say what is to be seen.
 
     The second run has other cells, begins in the middle, and follows episodes of its own: a controller that remembers
@@ -116,6 +131,8 @@ def check_av(campaign: Campaign, n_episodes: int = EPISODES) -> AvCheck:
         Its method, engine and records are replaced by what the check needs; its AV and seed are not.
     n_episodes : int
         At least 2.
+    black_box : Path, optional
+        File that tells in which call of the controller the process died.
 
     Raises
     ------
@@ -124,8 +141,8 @@ def check_av(campaign: Campaign, n_episodes: int = EPISODES) -> AvCheck:
     """
     tested = _as_checked(campaign)
     prepared = prepare(tested)
-    first, elapsed_s, steps = _timed_run(prepared, n_episodes)
-    again = _run_in_another_order(prepared, n_episodes)
+    first, elapsed_s, steps = _timed_run(prepared, n_episodes, black_box)
+    again = _run_in_another_order(prepared, n_episodes, black_box)
     idm = tested.model_copy(update={"av": AutomatedVehicle(before_cut_in=tested.av.before_cut_in)})
     _, idm_s, idm_steps = _timed_run(prepare(idm), n_episodes)
     limits = _limits(tested.av)
@@ -142,6 +159,64 @@ def check_av(campaign: Campaign, n_episodes: int = EPISODES) -> AvCheck:
     )
 
 
+def check_av_apart(campaign: Campaign, n_episodes: int = EPISODES) -> AvCheck:
+    """`check_av` in a process of its own where the AV is a user's code, so that code which ends its process is told.
+
+    Raises
+    ------
+    HarnessError
+        As `check_av`.
+    AvEndedProcessError
+        The controller ended the process; its last call is named.
+    """
+    if campaign.av.source not in ("controller", "fmu"):
+        return check_av(campaign, n_episodes)
+    context = get_context("spawn")
+    ours, theirs = context.Pipe()
+    with TemporaryDirectory(prefix="harness-av-check-") as folder:
+        black_box = Path(folder) / "black-box"
+        child = context.Process(target=_check_and_tell, args=(theirs, campaign, n_episodes, black_box), daemon=True)
+        child.start()
+        theirs.close()  # or the child's death would not end the pipe
+        try:
+            answer: AvCheck | Exception = ours.recv()
+        except EOFError:
+            child.join()
+            raise _ended(campaign, child.exitcode, last_call(black_box)) from None
+        finally:
+            child.kill()
+            child.join()
+            ours.close()
+    if isinstance(answer, Exception):
+        raise answer
+    return answer
+
+
+def _check_and_tell(connection: Connection, campaign: Campaign, n_episodes: int, black_box: Path) -> None:
+    """What the child does; its parent alone answers to Ctrl-C."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        answer: AvCheck | Exception = check_av(campaign, n_episodes, black_box=black_box)
+    except Exception as error:  # noqa: BLE001 - whatever goes wrong here is the parent's to judge
+        answer = fit_to_travel(error)
+    with suppress(OSError):  # the parent was killed: nobody is left to tell
+        connection.send(answer)
+
+
+def _ended(campaign: Campaign, exit_code: int | None, call: Call | None) -> AvEndedProcessError:
+    where = "while it was found or made, or in an array call"
+    if call is not None:
+        where = f"in episode {call.episode}, " + (
+            "in start" if call.step == START else f"in the call of step {call.step}"
+        )
+    return AvEndedProcessError(
+        f"av.{campaign.av.source}",
+        found=f"{death_cause(exit_code, campaign.av.limits.step_time_s)}, {where}",
+        expected="a controller that returns or raises",
+        mend="Look for os._exit, a crash of compiled code, or a shortage of memory; then check again.",
+    )
+
+
 def _as_checked(campaign: Campaign) -> Campaign:
     """The campaign with cut-ins in (nearly) every episode, all motion kept, and the twin where it can drive the AV."""
     holds = campaign.av.before_cut_in == "hold_speed"
@@ -155,10 +230,10 @@ def _as_checked(campaign: Campaign) -> Campaign:
     return campaign.model_copy(update=alpha)
 
 
-def _timed_run(prepared: Prepared, n_episodes: int) -> tuple[Shard, float, int]:
+def _timed_run(prepared: Prepared, n_episodes: int, black_box: Path | None = None) -> tuple[Shard, float, int]:
     """First run of the episodes; the time is the shortest of several, which other processes disturb least."""
     world = build_world(prepared.campaign)
-    loop = prepared.loop(world)
+    loop = prepared.loop(world, black_box=black_box)
     try:
         loop.run(0, prepared.states(0, min(WARM_UP_EPISODES, n_episodes)))  # compiles
         states = prepared.states(0, n_episodes)
@@ -174,10 +249,12 @@ def _timed_run(prepared: Prepared, n_episodes: int) -> tuple[Shard, float, int]:
     return shard, elapsed_s, max(1, int(shard.results.episode["n_steps"].sum()))
 
 
-def _run_in_another_order(prepared: Prepared, n_episodes: int) -> dict[int, tuple[bytes, str | None]]:
+def _run_in_another_order(
+    prepared: Prepared, n_episodes: int, black_box: Path | None
+) -> dict[int, tuple[bytes, str | None]]:
     """Motion of every episode, run in other cells, the second half first."""
     world = build_world(prepared.campaign, OTHER_CELLS)
-    loop: EpisodeLoop = prepared.loop(world)
+    loop: EpisodeLoop = prepared.loop(world, black_box=black_box)
     half = n_episodes // 2
     found: dict[int, tuple[bytes, str | None]] = {}
     try:

@@ -12,14 +12,21 @@ from pathlib import Path
 from typing import Any, Literal
 
 from harness.campaign.models import Campaign
-from harness.controllers.loading import controller_hash, require_controller
+from harness.controllers.loading import controller_hash
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE
 from harness.estimators import estimate_run
 from harness.progress import Progress, SilentProgress
 from harness.records.folder import SHELLS, TABLES, shard_file, write_json
 from harness.runner.manifest import Manifest, require_no_fewer, require_own_folder
 from harness.runner.prefix import Prefix
-from harness.runner.prepare import Prepared, content_hash, distance_per_test_m, prepare, require_same_pool
+from harness.runner.prepare import (
+    Prepared,
+    content_hash,
+    distance_per_test_m,
+    prepare,
+    require_ready,
+    require_same_pool,
+)
 from harness.runner.retrace import Retracing
 from harness.runner.rounds import rounds, stop_rule
 from harness.runner.shards import ShardPool, stored_shard
@@ -85,7 +92,7 @@ def run_campaign(
     """
     started = time.monotonic()
     progress = progress or SilentProgress()
-    require_controller(campaign.av)
+    require_ready(campaign)
     controller = controller_hash(campaign.av)
     earlier = require_own_folder(out, content_hash(campaign), controller, resume=resume)
     if not shorten:

@@ -12,7 +12,7 @@ from typing import Any
 from harness.campaign.dumping import dump_campaign
 from harness.campaign.models import Campaign
 from harness.errors import RunFolderError
-from harness.records.folder import MANIFEST, read_json, write_json, write_text
+from harness.records.folder import MANIFEST, read_json, require_place, write_json, write_text
 from harness.runner.worker import ShardSpec
 
 _PACKAGES = ("harness", "libsumo", "numba", "llvmlite", "numpy", "scipy", "pyarrow")
@@ -56,9 +56,10 @@ def require_own_folder(
     Raises
     ------
     RunFolderError
-        The folder holds another campaign, this one without ``--resume`` or with another controller, or files that are
-        no run.
+        The folder cannot be written to, holds another campaign, this one without ``--resume`` or with another
+        controller, or files that are no run.
     """
+    require_place(folder)
     if not folder.exists() or not any(folder.iterdir()):
         return None
     if not (folder / MANIFEST).exists():

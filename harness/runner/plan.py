@@ -10,7 +10,7 @@ from harness.criticality.tables import tables_cached
 from harness.environment.loading import load_environment
 from harness.importance.build import needs_tables
 from harness.pool.storage import campaign_pool_key, pool_path
-from harness.sumo.av_type import av_type
+from harness.runner.prepare import require_ready
 from harness.sumo.shim import shim_library
 from harness.vehicles.models import surrogate_records
 
@@ -34,9 +34,13 @@ def plan_campaign(campaign: Campaign) -> dict[str, Any]:
     dict
         ``episodes``, ``episodes_per_second_estimate`` (all cores), ``seconds_estimate``, ``tables`` (in words) and
         ``disk_mb``.
+
+    Raises
+    ------
+    CampaignError
+        A run would refuse the campaign before it starts.
     """
-    if campaign.av.sumo is not None:
-        av_type(campaign.av.sumo)
+    require_ready(campaign)
     engine = "sumo with shim" if campaign.world.engine == "sumo" and shim_library() else campaign.world.engine
     rate = EPISODES_PER_SECOND_PER_CORE[engine][campaign.testing.method] * (os.cpu_count() or 1)
     moments = MOMENTS_PER_EPISODE[campaign.records.moments] if needs_tables(campaign) else 0

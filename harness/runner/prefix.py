@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import Counter
+
 from harness.campaign.models import Campaign
 from harness.errors import TooManyFailedError
 from harness.estimators import accumulator
@@ -26,6 +28,7 @@ class Prefix:
         self.specs: list[ShardSpec] = []
         self.files: list[dict[str, str]] = []
         self.n_episodes = self.n_crashes = self.n_failed = self.n_retraced = 0
+        self._causes: Counter[str] = Counter()
 
     @property
     def figures(self) -> dict[str, int | float]:
@@ -52,6 +55,7 @@ class Prefix:
         self.n_retraced += done.n_retraced
         self.n_crashes += int(done.block.crash.sum())
         self.n_failed += int(done.block.failed.sum())
+        self._causes += done.failures
         self._require_few_failed()
         if not self._rule.due(self.n_episodes):
             return False
@@ -61,9 +65,11 @@ class Prefix:
     def _require_few_failed(self) -> None:
         most = self._campaign.run.max_failed_share
         if self.n_episodes >= SMALLEST_FAILED_SAMPLE and self.n_failed > most * self.n_episodes:
+            cause = "".join(f", {n} of them with: {why}" for why, n in self._causes.most_common(1))
             raise TooManyFailedError(
                 "run.max_failed_share",
-                found=f"{self.n_failed} of {self.n_episodes} episodes failed",
+                found=f"{self.n_failed} of {self.n_episodes} episodes failed{cause}",
                 expected=f"a share of at most {most:g}",
-                mend="Their causes are in the column 'failure' of the episodes table; raise the share to go on.",
+                mend="Mend the AV (`harness av-check` looks at it in seconds), or raise the share to go on. All causes "
+                "are in the column 'failure' of the episodes table.",
             )

@@ -10,7 +10,7 @@ from pathlib import Path
 from harness.arrays import FloatArray
 from harness.campaign.models import Campaign
 from harness.controllers.black_box import Death
-from harness.controllers.loading import build_host
+from harness.controllers.loading import build_host, require_controller
 from harness.criticality.tables import Tables, build_tables, tables_cached
 from harness.environment.driving import Environment
 from harness.environment.initial_state import InitialStates
@@ -19,7 +19,9 @@ from harness.episode.begin import mean_test_distance
 from harness.episode.loop import MOMENT_LIMITS, EpisodeLoop, Keep, Policy
 from harness.errors import RunFolderError
 from harness.importance.build import build_importance, needs_tables
+from harness.pool.library import load_library
 from harness.pool.prescribed import PrescribedEpisodes
+from harness.pool.shells import require_boundary
 from harness.pool.storage import campaign_pool, campaign_pool_key, pool_path
 from harness.progress import Progress, SilentProgress
 from harness.records.folder import SHELLS, read_json
@@ -74,6 +76,24 @@ class Prepared:
         return EpisodeLoop(world, self.policy, keep, av)
 
 
+def require_ready(campaign: Campaign) -> None:
+    """Refuse what can be known to be wrong before anything is simulated or written.
+
+    Raises
+    ------
+    CampaignError
+        The AV's controller cannot be found or made, SUMO knows no such attribute of it, the environment's parameters
+        are wrong, or the surrogate library is wrong or lacks the boundary.
+    """
+    require_controller(campaign.av)
+    if campaign.av.sumo is not None:
+        av_type(campaign.av.sumo)
+    load_parameters(campaign.environment)
+    if campaign.testing.method == "shells":
+        library = load_library(campaign.pool.library)
+        require_boundary(campaign.testing.shells.boundary or library.boundary, tuple(library.surrogates))
+
+
 def content_hash(campaign: Campaign) -> str:
     """Hash of all that changes an episode's bits, the environment's numbers included."""
     return campaign.content_hash(load_parameters(campaign.environment).content_hash())
@@ -89,8 +109,6 @@ def prepare(campaign: Campaign, progress: Progress | None = None) -> Prepared:
     """
     progress = progress or SilentProgress()
     prescribed: PrescribedEpisodes | None = None
-    if campaign.av.sumo is not None:
-        av_type(campaign.av.sumo)
     parameters = load_parameters(campaign.environment)
     environment = load_environment(campaign.environment, parameters)
     tables = None

@@ -102,19 +102,22 @@ def serve(connection: Connection, campaign: Campaign, folder: Path, black_box: P
     while True:
         try:
             spec, doomed = connection.recv()
-        except EOFError:
+        except (EOFError, OSError):
             break
         try:
             runner = runner or ShardRunner(campaign, folder, black_box)
             answer: ShardDone | Exception = runner.run(spec, doomed)
         except Exception as error:  # noqa: BLE001 - whatever goes wrong here is the parent's to judge
-            answer = _fit_to_travel(error)
-        connection.send(answer)
+            answer = fit_to_travel(error)
+        try:
+            connection.send(answer)
+        except OSError:  # the parent was killed: nobody is left to tell
+            break
     if runner is not None:
         runner.close()
 
 
-def _fit_to_travel(error: Exception) -> Exception:
+def fit_to_travel(error: Exception) -> Exception:
     """The error with its traceback as a note; in words where it cannot be pickled."""
     text = "".join(traceback.format_exception(error))
     error.add_note(f"In a worker process:\n{text}")

@@ -13,7 +13,7 @@ import pyarrow.compute as pc
 from harness.campaign.loading import load_campaign
 from harness.campaign.models import Campaign
 from harness.errors import CampaignError, RunFolderError
-from harness.records.folder import read_manifest, read_table
+from harness.records.folder import no_episodes, read_manifest, read_table
 from harness.records.tables import shard_tables
 from harness.runner.prepare import Prepared, build_world, content_hash, prepare, require_same_pool
 from harness.world import World
@@ -128,6 +128,8 @@ def _stored(folder: Path, manifest: dict[str, Any], episode: int) -> dict[str, p
         if shard["first_episode"] <= episode < shard["first_episode"] + shard["n_episodes"]:
             tables = {name: read_table(folder / path) for name, path in shard["files"].items() if name != "moments"}
             return {name: table.filter(pc.equal(table["episode"], episode)) for name, table in tables.items()}
+    if not manifest["n_episodes"]:
+        raise no_episodes(folder)
     raise RunFolderError(
         str(folder),
         found=f"no episode {episode}",

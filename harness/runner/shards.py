@@ -21,7 +21,7 @@ from harness.records.folder import TABLES, read_table, shard_file
 from harness.records.tables import ShardTables
 from harness.runner.processes import WorkerProcess, first_to_answer
 from harness.runner.retrace import Retracing
-from harness.runner.worker import ShardDone, ShardSpec, shard_block
+from harness.runner.worker import ShardDone, ShardSpec, failure_causes, shard_block
 
 ATTEMPTS = 3
 """A shard whose worker dies is given to another one, this many times in all."""
@@ -71,7 +71,8 @@ def stored_shard(
         return None  # the last round of a smaller budget
     kept = ShardTables(tables["episodes"], tables.get("moments"), tables.get("traces"))
     n_retraced = 0 if retracing is None else retracing.check(tables["episodes"])
-    return ShardDone(spec, files, shard_block(campaign, kept, prescribed), stored=True, n_retraced=n_retraced)
+    block, causes = shard_block(campaign, kept, prescribed), failure_causes(kept.episodes)
+    return ShardDone(spec, files, block, stored=True, n_retraced=n_retraced, failures=causes)
 
 
 def _same_cut_ins(episodes: pa.Table, prescribed: PrescribedEpisodes, spec: ShardSpec) -> bool:

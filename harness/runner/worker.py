@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+
+import pyarrow as pa
 
 from harness.campaign.models import Campaign
 from harness.controllers.black_box import Death
@@ -31,13 +34,14 @@ class ShardSpec:
 
 @dataclass(frozen=True)
 class ShardDone:
-    """A shard on disk, what the stop rule needs of it, and how many of its episodes the twin has retraced."""
+    """A shard on disk: what the stop rule needs of it, how many episodes the twin has retraced, causes of failures."""
 
     spec: ShardSpec
     files: dict[str, str]
     block: Block
     stored: bool = False
     n_retraced: int = 0
+    failures: Counter[str] = field(default_factory=Counter)
 
 
 class ShardRunner:
@@ -80,7 +84,7 @@ class ShardRunner:
         n_retraced = self._retracing.check(tables.episodes)
         files = write_shard(self._folder, spec.index, tables)
         block = shard_block(campaign, tables, self._prepared.prescribed)
-        return ShardDone(spec, files, block, n_retraced=n_retraced)
+        return ShardDone(spec, files, block, n_retraced=n_retraced, failures=failure_causes(tables.episodes))
 
     def _shard(self, spec: ShardSpec) -> Shard:
         prescribed = self._prepared.prescribed
@@ -90,6 +94,11 @@ class ShardRunner:
         shard = self._loop.run(spec.first_episode, states, script)
         shard.cut_ins = rows
         return shard
+
+
+def failure_causes(episodes: pa.Table) -> Counter[str]:
+    """How often each cause failed an episode."""
+    return Counter(episodes.column("failure").drop_null().to_pylist())
 
 
 def shard_block(campaign: Campaign, tables: ShardTables, prescribed: PrescribedEpisodes | None = None) -> Block:

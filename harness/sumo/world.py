@@ -12,6 +12,8 @@ A speed that SUMO has already been told is not told again: it keeps it until the
 from __future__ import annotations
 
 import atexit
+import os
+import sys
 from collections import deque
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
@@ -92,8 +94,10 @@ class SumoWorld:
         return int(self.x.shape[0])
 
     def _start(self) -> None:
-        binary = [_gui_binary(), "--start", "--delay", "100"] if self._api is not libsumo else ["sumo"]
-        self._api.start([*binary, *self._arguments()])
+        if self._api is libsumo:
+            self._api.start(["sumo", *self._arguments()])
+        else:
+            _start_gui(self._api, self._arguments())
         self._running = SumoWorld._open = True
         atexit.register(self.close)
         self._populate()
@@ -276,6 +280,33 @@ def _gui_binary() -> str:
             "--gui", found="no sumo-gui", expected="the extra 'sumo'", mend="Install it: pip install 'harness[sumo]'."
         ) from None
     return str(Path(sumo.SUMO_HOME) / "bin" / "sumo-gui")
+
+
+def _start_gui(traci: Any, arguments: Sequence[str]) -> None:
+    """Start sumo-gui and connect to it.
+
+    Raises
+    ------
+    CampaignError
+        It is not installed, or has no screen to open its window on.
+    """
+    command = [_gui_binary(), "--start", "--delay", "100", *arguments]
+    display = os.environ.get("DISPLAY")
+    if sys.platform.startswith("linux") and not display:
+        raise _no_window("no screen (the environment variable DISPLAY is not set)")
+    try:
+        traci.start(command)
+    except (traci.TraCIException, traci.FatalTraCIError) as error:
+        raise _no_window(f"a sumo-gui that cannot be reached ({error}; DISPLAY is {display})") from error
+
+
+def _no_window(found: str) -> CampaignError:
+    return CampaignError(
+        "--gui",
+        found=found,
+        expected="a desktop that sumo-gui can open its window on",
+        mend="Start it from a desktop session (or with ssh -X), or write the motion to a file: --out FILE.csv.",
+    )
 
 
 def _disobeyed(where: str, found: float, expected: float) -> WorldDisagreementError:

@@ -12,6 +12,7 @@ from multiprocessing.connection import wait
 from pathlib import Path
 
 from harness.progress import Progress, SilentProgress
+from harness.records.folder import require_place
 from harness.validation.experiment import Experiment
 from harness.validation.judgement import Judgement, Subject, corrected, judge
 from harness.validation.results import write_results
@@ -54,6 +55,7 @@ def validate(
     progress : Progress, optional
     """
     progress = progress or SilentProgress()
+    require_place(folder)
     tested = list(subjects(experiment, progress))
     progress.stage("replications", len(tested) * experiment.replications)
     with _executor(workers) as executor:

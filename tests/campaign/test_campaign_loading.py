@@ -95,6 +95,13 @@ def test_a_mistake_is_named(load, text, path, line, words):
     assert all((error.found, error.expected, error.mend))
 
 
+def test_a_name_is_explained_in_words(tmp_path):
+    (tmp_path / "bad.yaml").write_text("name: a b\n")
+    with pytest.raises(CampaignError) as caught:
+        load_campaign(tmp_path / "bad.yaml")
+    assert caught.value.expected.startswith("a name of letters, digits, _ . and -, without spaces")
+
+
 def test_a_controller_keeps_its_parameters_as_they_are(load):
     # These fit the built-in IDM as well; tried as a union they would become its parameters, and be lost.
     av = load("av: {controller: 'a:B', parameters: {time_headway_s: 1.5}}").av

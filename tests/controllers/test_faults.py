@@ -111,12 +111,43 @@ def test_a_worker_killed_from_outside_is_not_the_controllers_fault(tmp_path, und
 def test_too_many_failures_end_the_campaign(fault, tmp_path, capsys):
     av = _misbehaving({5: fault, 6: fault})
     assert _run(tmp_path, av, "run.max_failed_share=0.005") == EXIT_TOO_MANY_FAILED
-    assert "run.max_failed_share" in capsys.readouterr().err
+    err = capsys.readouterr().err
+    assert "run.max_failed_share" in err
+    if fault == "raises":
+        assert "2 of 200 episodes failed, 2 of them with: step: ZeroDivisionError: no such thing" in err
 
 
 def test_a_constructor_that_raises_is_an_error_of_the_campaign(tmp_path, capsys):
     assert _run(tmp_path, _other("RaisesWhenMade")) == EXIT_BAD_INPUT
-    assert "RuntimeError: no licence" in capsys.readouterr().err
+    err = capsys.readouterr().err
+    assert err.startswith("error: av.controller\n")
+    assert "RuntimeError: no licence" in err
+    assert not (tmp_path / "run").exists()
+
+
+def test_parameters_that_a_constructor_does_not_take_are_blamed(tmp_path, capsys):
+    assert _run(tmp_path, _other("RaisesInClose", "{pth: x}")) == EXIT_BAD_INPUT
+    assert capsys.readouterr().err.startswith("error: av.parameters\n")
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ("av={controller: 'no_such_module:X'}", "cannot be imported"),
+        ("av={controller: 'tests.controllers.misbehaving:X'}", "no class X"),
+        (f"av={_other('RaisesWhenMade')}", "no licence"),
+        (f"av={_other('RaisesInClose', '{pth: x}')}", "pth"),
+        ("testing={method: shells, shells: {boundary: foo}}", "testing.shells.boundary"),
+    ],
+)
+def test_check_refuses_what_run_refuses(change, words, tmp_path, capsys):
+    (tmp_path / "c.yaml").write_text(SMALL.replace("testing: {method: forced}\n", ""))
+    complaints = []
+    for command in (["check"], ["run", "--out", str(tmp_path / "run")]):
+        assert main([*command, str(tmp_path / "c.yaml"), "--set", change]) == EXIT_BAD_INPUT
+        complaints.append(capsys.readouterr())
+    assert complaints[0] == complaints[1]
+    assert words in complaints[0].err
     assert not (tmp_path / "run").exists()
 
 

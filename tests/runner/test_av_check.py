@@ -11,6 +11,7 @@ from harness.runner.av_check import check_av
 
 MIXTURE_FILE = str(Path(__file__).parents[2] / "scenarios/overtaking_mixture.yaml")
 CONTROLLERS = '''
+import os
 import random
 
 
@@ -53,6 +54,18 @@ class Remembering(Base):
 
     def step(self, observation):
         return -0.01 * self.seen
+
+
+class Exits(Base):
+    """Ends the process in its third step."""
+
+    calls = 0
+
+    def step(self, observation):
+        self.calls += 1
+        if self.calls == 3:
+            os._exit(1)
+        return 0.0
 
 
 class Undefined(Base):
@@ -127,3 +140,20 @@ def test_the_command_line(check, capsys):
     assert json.loads(capsys.readouterr().out)["deterministic"] is True
     assert main(["av-check", MIXTURE_FILE, "--set", "av={}", "--set", "av.controller=not_there:X"]) == 2
     assert "cannot be imported" in capsys.readouterr().err
+
+
+def test_a_controller_that_ends_the_process_is_told(check, tmp_path, capfd):
+    arguments = ["--set", "av={}", "--set", "av.controller=checked_controllers:Exits", "--episodes", "6"]
+    assert main(["av-check", MIXTURE_FILE, *arguments]) == 3
+    out, err = capfd.readouterr()
+    assert out == ""
+    assert err.startswith(
+        "error: av.controller\n  found:    the controller ended the worker process (exit code 1), in "
+    )
+    assert "of step" in err
+
+
+def test_the_command_line_runs_a_controller_in_a_process_of_its_own(check, capfd):
+    arguments = ["--set", "av={}", "--set", "av.controller=checked_controllers:Undefined", "--episodes", "6"]
+    assert main(["av-check", MIXTURE_FILE, *arguments]) == 3
+    assert "nan" in capfd.readouterr().out

@@ -128,6 +128,29 @@ def test_a_worker_prepares_once_and_ends_with_its_parent(serve):
     assert events == ["prepared", "closed"]
 
 
+@pytest.mark.parametrize("lost", ["recv", "send"])
+def test_a_worker_ends_quietly_when_its_parent_was_killed(lost, campaign, tmp_path, monkeypatch):
+    def broken(*_: object) -> None:
+        raise BrokenPipeError if lost == "send" else ConnectionResetError
+
+    class Runner:
+        def __init__(self, *_: object) -> None: ...
+
+        def run(self, spec: ShardSpec, doomed: dict) -> int:
+            return spec.index
+
+        def close(self) -> None:
+            closed.append(True)
+
+    closed: list[bool] = []
+    pipe = Pipe(2)
+    monkeypatch.setattr(pipe, lost, broken)
+    monkeypatch.setattr(processes, "ShardRunner", Runner)
+    monkeypatch.setattr(signal, "signal", lambda *_: None)
+    processes.serve(pipe, campaign(), tmp_path, tmp_path / "black-box")
+    assert closed == ([True] if lost == "send" else [])
+
+
 def test_an_error_of_preparation_reaches_the_parent(serve):
     class Runner:
         def __init__(self, *_: object) -> None:

@@ -8,6 +8,7 @@ import sys
 import pytest
 
 from harness.cli import main
+from harness.records.folder import require_place
 from tests.runner.conftest import MIXTURE_FILE, SMALL, TWIN
 from tests.runner.stored_runs import copy_of, shard_files, truncate, unlike_columns
 
@@ -85,8 +86,8 @@ def test_a_refused_resumption_leaves_the_manifest(stored, capsys):
 
 CONTROLLER = """
 class Careful:
-    def start(self, episode, cut_in): pass
-    def step(self, observation): return {acceleration}
+    def start(self, episode): pass
+    def step(self, seen): return {acceleration}
     def close(self): pass
 """
 
@@ -108,6 +109,22 @@ def test_another_version_of_the_controller_is_refused(tmp_path, capsys, monkeypa
     assert main(["run", str(MIXTURE_FILE), "--out", str(out), *more]) == 0
 
 
+@pytest.mark.parametrize("place", ["file/run", "file/deeper/run", "/proc/run"])
+def test_a_folder_that_cannot_be_made(place, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").write_text("not a folder")
+    text = complaint_of(capsys, "run", MIXTURE_FILE, "--out", place, *SAME)
+    assert f"error: {place} found: a place where nothing can be written" in text
+    experiment = MIXTURE_FILE.parent / "validate/shells_panel.yaml"
+    for command in (("compare", MIXTURE_FILE, "--against", "av.model=fvdm"), ("validate", experiment, "--quiet")):
+        assert place in complaint_of(capsys, *command, "--out", place)
+
+
+def test_a_place_is_tried_without_leaving_anything(tmp_path):
+    require_place(tmp_path / "a" / "b")
+    assert list(tmp_path.iterdir()) == []
+
+
 # -- damaged records --
 
 
@@ -116,6 +133,36 @@ def test_a_truncated_shard(command, stored, capsys):
     broken = shard_files(stored)[2]
     truncate(broken)
     assert str(broken) in complaint_of(capsys, command, stored)
+
+
+@pytest.mark.parametrize("command", [["report"], ["replay", 150]])
+def test_a_missing_traces_file(command, stored, capsys, run_here, campaign, twin_run):
+    """Its episodes file says that the shard is finished: only without both the shard is made anew."""
+    gone = shard_files(stored, "traces")[1]
+    gone.unlink()
+    text = complaint_of(capsys, command[0], stored, *command[1:])
+    assert f"{gone} found: no such file" in text
+    assert "Delete all files of this shard" in text
+    for path in stored.glob(f"*/{gone.name}"):
+        path.unlink()
+    run_here(campaign(*TWIN), stored, resume=True)
+    assert unlike_columns(twin_run, stored) == []
+
+
+def test_missing_estimates_and_their_mend(stored, capsys, twin_run):
+    (stored / "estimates.json").unlink()
+    assert f"`harness estimate {stored} --write`" in complaint_of(capsys, "report", stored)
+    assert main(["estimate", str(stored), "--write", "--json"]) == 0
+    assert (stored / "estimates.json").read_text() == (twin_run / "estimates.json").read_text()
+
+
+def test_a_run_without_an_episode(stored, capsys):
+    path = stored / "manifest.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "n_episodes": 0, "shards": []}))
+    for command in (("estimate", stored), ("rnot", stored), ("replay", stored, 0)):
+        text = complaint_of(capsys, *command)
+        assert "has not finished an episode yet" in text
+        assert "--resume" in text
 
 
 def test_a_missing_shard(stored, capsys):
@@ -133,8 +180,8 @@ def test_resuming_with_a_truncated_shard_names_it_and_its_mend_works(
     truncate(broken)
     text = complaint_of(capsys, "run", MIXTURE_FILE, "--out", stored, *SAME, "--resume")
     assert str(broken) in text
-    assert "Delete it and its episodes file" in text
-    for path in {broken, shard_files(stored)[1]}:
+    assert "Delete all files of this shard" in text
+    for path in stored.glob(f"*/{broken.name}"):
         path.unlink()
     run_here(campaign(*TWIN), stored, resume=True)
     assert unlike_columns(twin_run, stored) == []
@@ -153,7 +200,11 @@ def test_a_missing_or_damaged_manifest_or_campaign(name, content, stored, capsys
     if content is not None:
         path.write_text(content)
     for command in (("estimate", stored), ("report", stored), ("replay", stored, 0)):
-        assert str(path) in complaint_of(capsys, *command)
+        text = complaint_of(capsys, *command)
+        assert str(path) in text
+        assert "Errno" not in text
+    if name == "manifest.json":
+        assert "Give a folder that `harness run` has written" in text
 
 
 def test_a_folder_that_is_not_there(tmp_path, capsys):

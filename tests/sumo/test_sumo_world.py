@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import libsumo
 import numpy as np
 import pytest
+import traci
 
 from harness.campaign.models import MOST_SUMO_CELLS
 from harness.episode.loop import EpisodeLoop, Keep, Shard
@@ -235,3 +236,18 @@ def test_a_cut_in_changes_only_its_own_cell(open_world):
     world.place(np.array([1]), x, v)
     assert libsumo.vehicle.getLaneIndex("BV1") == 1
     assert world.x[1, AV] == x[1, AV]
+
+
+def test_without_a_screen_the_gui_is_refused_in_words(monkeypatch, open_world):
+    monkeypatch.setattr("harness.sumo.world._gui_binary", lambda: "sumo-gui")
+    monkeypatch.delenv("DISPLAY", raising=False)
+    with pytest.raises(CampaignError, match="DISPLAY is not set"):
+        open_world(1, gui=True)
+
+    def ends_at_once(_):
+        raise traci.FatalTraCIError("Could not connect.")
+
+    monkeypatch.setenv("DISPLAY", ":99")
+    monkeypatch.setattr(traci, "start", ends_at_once)
+    with pytest.raises(CampaignError, match="DISPLAY is :99"):
+        open_world(1, gui=True)
