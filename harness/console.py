@@ -217,7 +217,7 @@ def print_pool(content: dict[str, Any]) -> None:
     from rich.console import Console  # noqa: PLC0415 - keeps --help fast
     from rich.table import Table  # noqa: PLC0415 - keeps --help fast
 
-    table = Table(title=f"Pool {content['pool']}: {content['n_paths']:,} paths, all their cut-ins")
+    table = Table(title=f"Pool {content['pool']}: {content['n_paths']:,} paths")
     for heading in ("surrogate", "crash rate per test", "std. error", "probability of its shell"):
         table.add_column(heading, justify="left" if heading == "surrogate" else "right")
     for entry in content["surrogates"]:
