@@ -17,7 +17,6 @@ from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE
 from harness.estimators import estimate_run
 from harness.progress import Progress, SilentProgress
 from harness.records.folder import SHELLS, TABLES, shard_file, write_json
-from harness.runner.interrupts import remembered_interrupt
 from harness.runner.manifest import Manifest, require_no_fewer, require_own_folder
 from harness.runner.prefix import Prefix
 from harness.runner.prepare import (
@@ -164,15 +163,14 @@ def _run_shards(
     progress.stage("episodes", campaign.stop.episodes, done=_episodes_on_disk(campaign, out))
     threading.Thread(target=import_module, args=("harness.report",), daemon=True).start()
     try:
-        with remembered_interrupt() as raise_if_interrupted:
-            for done in (done for specs in batches for done in pool.run(specs, stored)):
+        for specs in batches:
+            for done in pool.run(specs, stored):
                 stop = prefix.add(done)
                 progress.advance(0 if done.stored else done.spec.n_episodes)
                 progress.status(**prefix.figures)
                 if elapsed() - written > MANIFEST_INTERVAL_S:
                     written = elapsed()
                     manifest.write(prefix.specs, prefix.files, status="running", elapsed_s=written)
-                raise_if_interrupted()
                 if stop:
                     return
     except BaseException:

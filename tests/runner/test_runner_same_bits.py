@@ -92,6 +92,8 @@ def begin() -> Iterator[Callable[..., subprocess.Popen]]:
                     command,
                     cwd=MIXTURE_FILE.parents[1],
                     start_new_session=True,
+                    # A shell starts what runs in its background with Ctrl-C ignored, and children inherit that.
+                    preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # noqa: PLW1509 - no thread here
                     stdout=subprocess.DEVNULL,
                     stderr=stderr,
                 )
