@@ -20,7 +20,7 @@ FIRST = (
     "python3 -m venv .venv && .venv/bin/pip install -c requirements.lock -e . && "
     ".venv/bin/harness run scenarios/smoke.yaml --out runs/smoke"
 )
-SECOND = ".venv/bin/pip install -c requirements.lock -e '.[test]' && .venv/bin/python -m pytest"
+SECOND = ".venv/bin/pip install -c requirements.lock -e '.[test]' && .venv/bin/python -m pytest -n 2"
 
 _FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 _CODE_SPAN = re.compile(r"`(harness [^`\n]+)`")
