@@ -563,7 +563,10 @@ class Campaign(Section):
         needs = {
             "nde": (method == "nde", "testing.method nde"),
             "mixture_cv": (method == "episode_mixture", "testing.method episode_mixture"),
-            "scv": (self.records.moments != "none", "records.moments first_9 or all"),
+            "scv": (
+                method == "step_mixture" and self.records.moments != "none",
+                "testing.method step_mixture and records.moments first_9 or all",
+            ),
             "shells": (method == "shells", "testing.method shells"),
             "nade": (method != "shells", "another testing.method than shells"),
             "martingale": (False, "a stored run: never stop on regression residuals alone"),

@@ -27,6 +27,7 @@ from harness.errors import EXIT_BUDGET_SPENT
 SPENT = {
     "episodes": "stop.episodes was spent; raise it and go on with --resume",
     "pool": "all cut-ins that the pool keeps of a shell were tested; raise pool.cut_ins_per_shell and use a new folder",
+    "pool_error": "the pool's own error alone is wider; lower pool.relative_error and use a new folder",
 }
 """Why a campaign ended before its precision, and the mend."""
 

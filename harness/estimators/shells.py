@@ -115,11 +115,13 @@ class Shells:
     def _details(self, confidence: float) -> dict[str, Any]:
         design = self._design()
         failed_too = self.assumption_free(confidence, self.crashes + self.failed)
+        free = self.assumption_free(confidence)
         return {
             "n_failed": int(self.failed.sum()),
             "crash_rate_if_failed_had_crashed": failed_too.rate,
             "boundary": design.boundary,
             "pool": design.pool,
+            "rhw_from_pool": free.rhw_from_pool,
             "p_cut_in": design.p_cut_in,
             "p_impossible": design.p_impossible,
             "conditional": self._conditional(confidence),
@@ -138,6 +140,7 @@ class Shells:
             "ci_low": inside.low,
             "ci_high": inside.high,
             "rhw": inside.rhw,
+            "rhw_from_pool": inside.rhw_from_pool,
             "n_episodes": int(self.tests[: design.n_inside].sum()),
             "n_crashes": int(self.crashes[: design.n_inside].sum()),
             "n_episodes_outside": int(self.tests[outside].sum()),

@@ -34,6 +34,8 @@ def conditional_statement(estimate: Estimate) -> str | None:
         f"{found['crash_rate']:.3g} per test ({level} interval {found['ci_low']:.3g} to {found['ci_high']:.3g}), "
         f"estimated from {found['n_episodes']:,} tests ({found['n_crashes']:,} sampled crashes)."
     )
+    if all(shell["inside"] for shell in estimate.details["shells"]):
+        return f"{text} Nothing lies outside."
     if not found["n_episodes_outside"]:
         return f"{text} Nothing was tested outside: whether the assumption holds is not known."
     return (

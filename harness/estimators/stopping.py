@@ -78,7 +78,11 @@ class StopRule:
         Relative half-width at the last look.
     heaviest : float
         By how much of itself one more crash of the largest weight would have moved the last look's estimate.
+    pool_too_rough : bool
+        Always False: no pool is behind these estimates.
     """
+
+    pool_too_rough = False
 
     def __init__(
         self,

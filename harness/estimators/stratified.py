@@ -16,16 +16,22 @@ from harness.arrays import FloatArray, IntArray
 
 
 class Limits(NamedTuple):
-    """A rate with a lower and an upper limit."""
+    """A rate with a lower and an upper limit, and the half-width that the error of the p_s would leave for itself."""
 
     rate: float
     low: float
     high: float
+    from_pool: float
 
     @property
     def rhw(self) -> float:
         """Half of the interval's length over the rate; infinite at rate 0."""
         return (self.high - self.low) / 2.0 / self.rate if self.rate > 0.0 else float("inf")
+
+    @property
+    def rhw_from_pool(self) -> float:
+        """The part of `rhw` that more tests cannot take away; 0 at rate 0."""
+        return self.from_pool / self.rate if self.rate > 0.0 else 0.0
 
 
 def share_limits(crashes: IntArray, tests: IntArray, tail: float) -> tuple[FloatArray, FloatArray]:
@@ -48,11 +54,12 @@ def share_limits(crashes: IntArray, tests: IntArray, tail: float) -> tuple[Float
 
 
 def pool_variance(share: FloatArray, moments: FloatArray, rate: float, n_paths: int) -> float:
-    """Variance of Σ p_s c_s that comes from the pool's finite number of paths, an upper bound of it.
+    """Variance of Σ p_s c_s that comes from the pool's finite number of paths.
 
     A path contributes at most its whole probability in the part of the strata in which the vehicle crashes. If its
     crashes were spread over paths, the mean square would be Σ c_s c_t m_st; if they were the same paths in all strata,
-    Σ min(c_s, c_t) m_st. The latter is taken.
+    Σ min(c_s, c_t) m_st. The latter is taken: an upper bound for a vehicle whose crashes do not favour the paths of
+    largest probability within a shell. A stratum in which no crash was seen adds nothing.
     """
     worst = float((np.minimum(share[:, None], share[None, :]) * moments).sum())
     return max(worst - rate * rate, 0.0) / n_paths
@@ -78,4 +85,4 @@ def combined(
     pool = z * z * pool_variance(share, moments, rate, n_paths)
     down = np.sqrt(((p * (share - low)) ** 2).sum() + pool)
     up = np.sqrt(((p * (high - share)) ** 2).sum() + pool)
-    return Limits(rate, max(rate - float(down), 0.0), min(rate + float(up), 1.0))
+    return Limits(rate, max(rate - float(down), 0.0), min(rate + float(up), 1.0), float(np.sqrt(pool)))

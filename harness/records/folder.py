@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import tempfile
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -77,6 +78,43 @@ def require_place(folder: Path) -> None:
                 path.rmdir()
 
 
+@contextmanager
+def sole_use(folder: Path) -> Iterator[None]:
+    """Make a run folder and keep other processes from running into it; if it was new and stays empty, it goes again.
+
+    Raises
+    ------
+    RunFolderError
+        Another process is at it, or nothing can be written there.
+    """
+    require_place(folder)
+    new = [path for path in (folder, *folder.parents) if not path.exists()]
+    folder.mkdir(parents=True, exist_ok=True)
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        _lock(handle, folder)
+        yield
+    finally:
+        os.close(handle)
+        with suppress(OSError):
+            for path in new:
+                path.rmdir()
+
+
+def _lock(handle: int, folder: Path) -> None:
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise RunFolderError(
+            str(folder),
+            found="a folder into which another process is running a campaign",
+            expected="a folder for this process alone",
+            mend="Wait for the other one, or end it, or choose another folder with --out.",
+        ) from None
+    except OSError:
+        pass  # some network file systems cannot lock a folder
+
+
 def write_bytes(path: Path, content: bytes) -> None:
     """Write a file atomically."""
     write_atomically(path, lambda temporary: _write(temporary, content))
@@ -99,11 +137,15 @@ def write_json(path: Path, content: Any) -> None:
 def write_shard(folder: Path, index: int, tables: ShardTables) -> dict[str, str]:
     """Write a shard's tables; ``episodes`` last, so that its presence means that the shard is complete.
 
+    What an earlier, shorter round has left of the shard goes first, for the same reason.
+
     Returns
     -------
     dict
         Table name → path relative to the folder.
     """
+    for name in TABLES:
+        (folder / shard_file(name, index)).unlink(missing_ok=True)
     files = {}
     for name in reversed(TABLES):
         table = getattr(tables, name)

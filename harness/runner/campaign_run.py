@@ -6,17 +6,21 @@ import os
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal
+
+import pyarrow as pa
+import pyarrow.parquet as pq
 
 from harness.campaign.models import Campaign
 from harness.controllers.loading import controller_hash
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE
 from harness.estimators import estimate_run
 from harness.progress import Progress, SilentProgress
-from harness.records.folder import SHELLS, TABLES, shard_file, write_json
+from harness.records.folder import SHELLS, TABLES, shard_file, sole_use, write_json
 from harness.runner.manifest import Manifest, require_no_fewer, require_own_folder
 from harness.runner.prefix import Prefix
 from harness.runner.prepare import (
@@ -34,7 +38,7 @@ from harness.runner.table_accuracy import table_errors
 from harness.runner.worker import ShardDone, ShardSpec
 
 MANIFEST_INTERVAL_S = 5.0
-StoppedBy = Literal["rhw", "episodes", "pool"]
+StoppedBy = Literal["rhw", "episodes", "pool", "pool_error"]
 
 
 @dataclass(frozen=True)
@@ -48,8 +52,9 @@ class RunResult:
         The page ``report.html``.
     estimates : dict
         Content of ``estimates.json``.
-    stopped_by : {"rhw", "episodes", "pool"}
-        The asked precision, the budget, or the last cut-in that the pool holds of a shell that needs more.
+    stopped_by : {"rhw", "episodes", "pool", "pool_error"}
+        The asked precision, the budget, the last cut-in that the pool holds of a shell that needs more, or the pool's
+        own error, which alone is wider than the asked precision.
     exit_code : int
         0, or 4 when the budget or the pool was spent before the asked precision.
     """
@@ -90,9 +95,16 @@ def run_campaign(
     HarnessError
         The campaign, the folder or the AV is at fault; nothing that was finished is lost.
     """
-    started = time.monotonic()
-    progress = progress or SilentProgress()
     require_ready(campaign)
+    with sole_use(out):
+        return _run_alone(campaign, out, workers, progress or SilentProgress(), resume=resume, shorten=shorten)
+
+
+def _run_alone(
+    campaign: Campaign, out: Path, workers: int | None, progress: Progress, *, resume: bool, shorten: bool
+) -> RunResult:
+    """`run_campaign` in a folder that no other process uses."""
+    started = time.monotonic()
     controller = controller_hash(campaign.av)
     earlier = require_own_folder(out, content_hash(campaign), controller, resume=resume)
     if not shorten:
@@ -114,7 +126,7 @@ def run_campaign(
         require_same_pool(out, prepared)
         write_json(out / SHELLS, prepared.prescribed.design.to_json())
     retracing = Retracing(campaign, prepared.policy.environment)
-    rule = stop_rule(campaign)
+    rule = stop_rule(campaign, held=0 if earlier is None else int(earlier["n_episodes"]))
     prefix = Prefix(campaign, rule)
     batches = rounds(campaign, prepared.prescribed, prefix, rule)
     _run_shards(
@@ -124,8 +136,7 @@ def run_campaign(
         require_no_fewer(out, earlier, prefix.n_episodes)
         _discard_beyond(out, len(prefix.specs))
     elapsed = time.monotonic() - started
-    spent: StoppedBy = "episodes" if prefix.n_episodes >= campaign.stop.episodes else "pool"
-    stopped_by: StoppedBy = "rhw" if prefix.reached else spent
+    stopped_by = _stopped_by(campaign, prefix)
     retraced = retracing.summary(prefix.n_retraced)
     manifest.write(
         prefix.specs, prefix.files, status="done", elapsed_s=elapsed, stopped_by=stopped_by, retraced=retraced
@@ -139,6 +150,14 @@ def run_campaign(
     report = write_report(out)
     missed = campaign.stop.rhw is not None and not prefix.reached
     return RunResult(out, report, estimates, stopped_by, EXIT_BUDGET_SPENT if missed else EXIT_DONE)
+
+
+def _stopped_by(campaign: Campaign, prefix: Prefix) -> StoppedBy:
+    if prefix.reached:
+        return "rhw"
+    if prefix.n_episodes >= campaign.stop.episodes:
+        return "episodes"
+    return "pool_error" if prefix.pool_too_rough else "pool"
 
 
 def _run_shards(
@@ -158,21 +177,24 @@ def _run_shards(
     written = elapsed()
 
     def stored(spec: ShardSpec) -> ShardDone | None:
-        return stored_shard(out, campaign, spec, prepared.prescribed, retracing)
+        found = stored_shard(out, campaign, spec, prepared.prescribed, retracing)
+        if found is None:
+            manifest.forget_from(spec.index)
+        return found
 
-    progress.stage("episodes", campaign.stop.episodes, done=_episodes_on_disk(campaign, out))
+    progress.stage("episodes", campaign.stop.episodes, done=_episodes_on_disk(out))
     threading.Thread(target=import_module, args=("harness.report",), daemon=True).start()
     try:
-        for specs in batches:
-            for done in pool.run(specs, stored):
-                stop = prefix.add(done)
-                progress.advance(0 if done.stored else done.spec.n_episodes)
-                progress.status(**prefix.figures)
-                if elapsed() - written > MANIFEST_INTERVAL_S:
-                    written = elapsed()
-                    manifest.write(prefix.specs, prefix.files, status="running", elapsed_s=written)
-                if stop:
-                    return
+        for done in (done for specs in batches for done in pool.run(specs, stored)):
+            stop = prefix.add(done)
+            progress.advance(0 if done.stored else done.spec.n_episodes)
+            progress.status(**prefix.figures)
+            if elapsed() - written > MANIFEST_INTERVAL_S:
+                written = elapsed()
+                manifest.write(prefix.specs, prefix.files, status="running", elapsed_s=written)
+            if stop:
+                break
+        prefix.require_few_failed()
     except BaseException:
         manifest.write(prefix.specs, prefix.files, status="interrupted", elapsed_s=elapsed())
         raise
@@ -180,9 +202,13 @@ def _run_shards(
         pool.close()
 
 
-def _episodes_on_disk(campaign: Campaign, folder: Path) -> int:
+def _episodes_on_disk(folder: Path) -> int:
     """Episodes that an earlier run has finished, for the progress bar."""
-    return sum(1 for _ in (folder / "episodes").glob("shard-*.parquet")) * campaign.run.shard_size
+    n = 0
+    for path in (folder / "episodes").glob("shard-*.parquet"):
+        with suppress(OSError, pa.ArrowException):  # a damaged file is refused when its turn comes
+            n += pq.read_metadata(path).num_rows
+    return n
 
 
 def _discard_beyond(folder: Path, n_shards: int) -> None:

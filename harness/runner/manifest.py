@@ -120,6 +120,7 @@ class Manifest:
     ) -> None:
         self._folder = folder
         self._campaign = dump_campaign(campaign)
+        self._earlier = earlier
         self._n_kept = int((earlier or {}).get("n_episodes", 0))
         self._wall_time_s = float((earlier or {}).get("wall_time_s", 0.0))
         self._content: dict[str, Any] = {
@@ -136,6 +137,16 @@ class Manifest:
         }
         folder.mkdir(parents=True, exist_ok=True)
         self.write([], [], status="running")  # first: --resume knows a folder by its manifest
+
+    def forget_from(self, index: int) -> None:
+        """Cut what an earlier run has left before shard ``index``, which is to be made anew, longer or otherwise."""
+        if self._earlier is None or index >= len(self._earlier["shards"]):
+            return
+        shards = self._earlier["shards"][:index]
+        self._n_kept = sum(shard["n_episodes"] for shard in shards)
+        cut = {"status": "interrupted", "stopped_by": None, "n_episodes": self._n_kept, "shards": shards}
+        self._earlier = {**self._earlier, **cut}
+        write_json(self._folder / MANIFEST, self._earlier)
 
     def write(
         self,

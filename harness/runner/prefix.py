@@ -46,8 +46,19 @@ class Prefix:
         """Whether the asked precision was reached."""
         return self._rule.reached
 
+    @property
+    def pool_too_rough(self) -> bool:
+        """Whether the campaign stops because tests can no longer bring the asked precision."""
+        return self._rule.pool_too_rough
+
     def add(self, done: ShardDone) -> bool:
-        """Append a shard; True when the campaign is to stop."""
+        """Append a shard; True when the campaign is to stop.
+
+        Raises
+        ------
+        TooManyFailedError
+            More episodes failed than the campaign allows.
+        """
         self.specs.append(done.spec)
         self.files.append(done.files)
         self.sums.add(done.block)
@@ -56,15 +67,23 @@ class Prefix:
         self.n_crashes += int(done.block.crash.sum())
         self.n_failed += int(done.block.failed.sum())
         self._causes += done.failures
-        self._require_few_failed()
+        if self.n_episodes >= SMALLEST_FAILED_SAMPLE:
+            self.require_few_failed()
         if not self._rule.due(self.n_episodes):
             return False
         estimate = self.sums.result(self._campaign.stop.confidence)
         return self._rule.observe(self.n_episodes, estimate)
 
-    def _require_few_failed(self) -> None:
+    def require_few_failed(self) -> None:
+        """Refuse an answer from tests of which too many failed.
+
+        Raises
+        ------
+        TooManyFailedError
+            More episodes failed than the campaign allows.
+        """
         most = self._campaign.run.max_failed_share
-        if self.n_episodes >= SMALLEST_FAILED_SAMPLE and self.n_failed > most * self.n_episodes:
+        if self.n_failed > most * self.n_episodes:
             cause = "".join(f", {n} of them with: {why}" for why, n in self._causes.most_common(1))
             raise TooManyFailedError(
                 "run.max_failed_share",

@@ -60,6 +60,7 @@ def load(tmp_path):
         ("environment:\n  parameters: ndd-overtaking-2", "environment.parameters", 3, "Did you mean"),
         ("stop:\n  estimator: nde", "stop.estimator", 3, "testing.method nde"),
         ("stop:\n  estimator: scv\nrecords: {moments: none}", "stop.estimator", 3, "records.moments"),
+        ("stop:\n  estimator: scv\ntesting: {method: forced}", "stop.estimator", 3, "testing.method step_mixture and"),
         ("av:\n  controler: a:B", "av.controler", 3, "Did you mean 'controller'?"),
         ("av:\n  command: ./a", "av.command", 3, "belongs under av.traci"),
         ("av:\n  minGap: 2", "av.minGap", 3, "model, controller, sumo, traci, fmu"),

@@ -117,6 +117,16 @@ def test_too_many_failures_end_the_campaign(fault, tmp_path, capsys):
         assert "2 of 200 episodes failed, 2 of them with: step: ZeroDivisionError: no such thing" in err
 
 
+@pytest.mark.parametrize("bad", [{5: "raises", 6: "raises"}, {5: "ends_the_process", 6: "ends_the_process"}])
+def test_too_many_failures_of_a_short_campaign_are_no_answer_either(bad, tmp_path, capsys):
+    """Fewer tests than it takes to end a campaign halfway."""
+    short = ("stop.episodes=40", "run.max_failed_share=0.04")
+    assert _run(tmp_path, _misbehaving(bad), *short) == EXIT_TOO_MANY_FAILED
+    assert "2 of 40 episodes failed" in capsys.readouterr().err
+    assert not (tmp_path / "run/estimates.json").exists()
+    assert _run(tmp_path, _misbehaving(bad), *short[:1], "run.max_failed_share=0.05", "name=again") == EXIT_BAD_INPUT
+
+
 def test_a_constructor_that_raises_is_an_error_of_the_campaign(tmp_path, capsys):
     assert _run(tmp_path, _other("RaisesWhenMade")) == EXIT_BAD_INPUT
     err = capsys.readouterr().err

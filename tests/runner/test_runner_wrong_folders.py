@@ -8,9 +8,9 @@ import sys
 import pytest
 
 from harness.cli import main
-from harness.records.folder import require_place
+from harness.records.folder import require_place, sole_use
 from tests.runner.conftest import MIXTURE_FILE, SMALL, TWIN
-from tests.runner.stored_runs import copy_of, shard_files, truncate, unlike_columns
+from tests.runner.stored_runs import copy_of, manifest, shard_files, truncate, unlike_columns
 
 SAME = [word for override in (*SMALL, *TWIN) for word in ("--set", override)]
 
@@ -123,6 +123,23 @@ def test_a_folder_that_cannot_be_made(place, tmp_path, capsys, monkeypatch):
 def test_a_place_is_tried_without_leaving_anything(tmp_path):
     require_place(tmp_path / "a" / "b")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_two_processes_do_not_run_into_one_folder(stored, capsys, twin_run, tmp_path):
+    more = ("--resume", "--set", "stop.episodes=480")
+    with sole_use(stored):
+        text = complaint_of(capsys, "run", MIXTURE_FILE, "--out", stored, *SAME, *more)
+    assert f"{stored} found: a folder into which another process is running" in text
+    assert unlike_columns(twin_run, stored) == []
+    assert manifest(stored) == manifest(twin_run)
+
+
+def test_a_folder_in_which_nothing_was_run_goes_again(tmp_path):
+    (tmp_path / "there").mkdir()
+    for place in (tmp_path / "a" / "b", tmp_path / "there"):
+        with pytest.raises(ZeroDivisionError), sole_use(place):
+            _ = 1 / 0
+    assert [path.name for path in tmp_path.iterdir()] == ["there"]
 
 
 # -- damaged records --

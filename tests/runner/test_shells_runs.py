@@ -12,6 +12,9 @@ from harness.errors import CampaignError, RunFolderError
 from harness.pool.shells import ShellDesign
 from harness.runner import compare_campaigns
 from harness.runner.allocation import GROWTH, Allocation
+from harness.runner.campaign_run import _episodes_on_disk
+from harness.runner.manifest import Manifest
+from harness.runner.prefix import Prefix
 from harness.runner.rounds import round_specs
 from tests.pool.conftest import SMALL_POOL
 from tests.runner.stored_runs import copy_of, manifest, shard_files, stored_table, unlike_columns
@@ -74,6 +77,74 @@ def test_a_pool_that_is_used_up_ends_the_run(campaign, run_here, tmp_path):
     assert tests[-1] >= 100
     assert result.estimates["n_episodes"] < 1000
     assert any("raise pool.cut_ins_per_shell" in said for said in result.estimates["estimates"]["shells"]["warnings"])
+
+
+def test_a_pool_that_is_too_rough_ends_the_run(campaign, run_here, tmp_path):
+    """A vehicle that crashes often: after some thousand tests the pool's own error is most of the interval."""
+    often = ("av={model: constant, parameters: {acceleration_mps2: -1.0}}", "world.engine=twin", "stop.episodes=100000")
+    out = tmp_path / "run"
+    result = run_here(campaign(*SHELLS, *often, "stop.rhw=0.3"), out)
+    assert (result.exit_code, result.stopped_by) == (0, "rhw")
+    held = result.estimates["n_episodes"]
+    result = run_here(campaign(*SHELLS, *often, "stop.rhw=0.05"), out, resume=True)
+    assert (result.exit_code, result.stopped_by) == (4, "pool_error")
+    assert held < result.estimates["n_episodes"] < 20_000
+    details = result.estimates["estimates"]["shells"]["details"]
+    assert result.estimates["estimates"]["shells"]["rhw"] > details["rhw_from_pool"] > 0.05
+    fresh = run_here(campaign(*SHELLS, *often, "stop.rhw=0.05"), tmp_path / "fresh")
+    assert fresh.estimates["n_episodes"] == result.estimates["n_episodes"]
+    again = run_here(campaign(*SHELLS, *often, "stop.rhw=0.01"), out, resume=True)
+    assert again.stopped_by == "pool_error"
+    assert again.estimates["n_episodes"] >= result.estimates["n_episodes"], "what was tested is kept"
+
+
+SPENT, MORE = "stop.episodes=150", "stop.episodes=400"
+"""A budget that ends within a round: its last shards are not those of a run that goes on."""
+
+
+def test_a_shard_made_anew_keeps_no_file_of_the_old_one(campaign, run_here, tmp_path):
+    traced, untraced = ("records.traces=all",), ("records.traces=none", "records.trace_share=0")
+    out = tmp_path / "run"
+    run_here(campaign(*SHELLS, "world.engine=twin", SPENT, *traced), out)
+    before = {path.name: path.read_bytes() for path in shard_files(out)}
+    for _ in range(2):  # the second time all shards are taken over
+        run_here(campaign(*SHELLS, "world.engine=twin", MORE, *untraced), out, resume=True)
+    changed = [name for name, content in before.items() if (out / "episodes" / name).read_bytes() != content]
+    assert changed
+    assert {path.name for path in shard_files(out, "traces")} == set(before) - set(changed)
+    assert replay(out, 0).bit_equal
+
+
+def test_a_continuation_that_dies_leaves_a_manifest_that_is_true(campaign, run_here, tmp_path, monkeypatch):
+    """It dies just after it has put another shard in the place of an earlier one."""
+    out = tmp_path / "run"
+    run_here(campaign(*SHELLS, "world.engine=twin", SPENT), out)
+    before = {path.name: path.read_bytes() for path in shard_files(out)}
+
+    add = Prefix.add
+
+    def add_or_die(prefix, done):
+        if not done.stored:
+            raise KeyboardInterrupt
+        return add(prefix, done)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Prefix, "add", add_or_die)
+        patch.setattr(Manifest, "write", lambda *arguments, **options: None)  # a killed process writes no last word
+        with pytest.raises(KeyboardInterrupt):
+            run_here(campaign(*SHELLS, "world.engine=twin", MORE), out, resume=True)
+    assert any((out / "episodes" / name).read_bytes() != content for name, content in before.items())
+    shards = manifest(out)["shards"]
+    assert 0 < sum(shard["n_episodes"] for shard in shards) == manifest(out)["n_episodes"] < 150
+    assert all(
+        (out / shard["files"]["episodes"]).read_bytes() == before[f"shard-{shard['index']:06d}.parquet"]
+        for shard in shards
+    )
+    assert estimate(out)["n_episodes"] == manifest(out)["n_episodes"]
+
+
+def test_the_bar_begins_where_the_run_was(shells_run):
+    assert _episodes_on_disk(shells_run.folder) == shells_run.estimates["n_episodes"]
 
 
 def test_the_conditional_statement_alone_stays_inside(campaign, run_here, tmp_path):
