@@ -48,8 +48,16 @@ def system_error(error: OSError) -> HarnessError | None:
         return HarnessError(
             where,
             found="no space left",
-            expected="room for the records",
-            mend="Nothing finished is lost: free some space, then run the same command with --resume.",
+            expected="room for what is written there",
+            mend="Nothing finished is lost: free some space, then give the same command again (`run` with --resume).",
+        )
+    if error.errno in (errno.EFBIG, errno.EIO):
+        return HarnessError(
+            where,
+            found=f"a file that could not be written or read on ({error.strerror})",
+            expected="a sound disk, and no limit on the size of files (`ulimit -f`)",
+            mend="Nothing finished is lost: lift the limit or choose another disk, then give the same command again "
+            "(`run` with --resume).",
         )
     if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
         return HarnessError(

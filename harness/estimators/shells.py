@@ -69,9 +69,9 @@ class Shells:
         """Rate over all strata."""
         return self._limits(slice(None), (1.0 - confidence) / 2.0, crashes)
 
-    def conditional(self, confidence: float) -> Limits:
+    def conditional(self, confidence: float, crashes: IntArray | None = None) -> Limits:
         """Rate over the strata inside."""
-        return self._limits(slice(0, self._design().n_inside), (1.0 - confidence) / 2.0)
+        return self._limits(slice(0, self._design().n_inside), (1.0 - confidence) / 2.0, crashes)
 
     def _limits(self, strata: slice, tail: float, crashes: IntArray | None = None) -> Limits:
         design, counted = self._design(), self.crashes if crashes is None else crashes
@@ -129,11 +129,15 @@ class Shells:
         }
 
     def _conditional(self, confidence: float) -> dict[str, Any]:
-        """The statement given that there are no crashes outside, and what is known about those."""
+        """The statement given that there are no crashes outside, and what is known about those.
+
+        The bound counts failed tests as crashes: it is to hold for what may have happened in them.
+        """
         design = self._design()
         inside = self.conditional(confidence)
         outside = slice(design.n_inside, None)
-        _, high = share_limits(self.crashes[outside], self.tests[outside], 1.0 - confidence)
+        crashes_or_failed = self.crashes + self.failed
+        _, high = share_limits(crashes_or_failed[outside], self.tests[outside], 1.0 - confidence)
         crashes = int(self.crashes[outside].sum())
         return {
             "crash_rate": inside.rate,
@@ -143,8 +147,11 @@ class Shells:
             "rhw_from_pool": inside.rhw_from_pool,
             "n_episodes": int(self.tests[: design.n_inside].sum()),
             "n_crashes": int(self.crashes[: design.n_inside].sum()),
+            "n_failed": int(self.failed[: design.n_inside].sum()),
+            "crash_rate_if_failed_had_crashed": self.conditional(confidence, crashes_or_failed).rate,
             "n_episodes_outside": int(self.tests[outside].sum()),
             "n_crashes_outside": crashes,
+            "n_failed_outside": int(self.failed[outside].sum()),
             "refuted": crashes > 0,
             "upper_bound_outside": float((design.p[outside] * high).sum()),
         }

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 from harness.estimators.estimate import WIDEST_RHW, Estimate
 
 _PER_KM = 1e6
@@ -33,25 +36,31 @@ def conditional_statement(estimate: Estimate) -> str | None:
         f"If this vehicle crashes only where the surrogate {boundary} or a more careful one crashes, its crash rate is "
         f"{found['crash_rate']:.3g} per test ({level} interval {found['ci_low']:.3g} to {found['ci_high']:.3g}), "
         f"estimated from {found['n_episodes']:,} tests ({found['n_crashes']:,} sampled crashes)."
+        f"{_failed(found)}"
     )
     if all(shell["inside"] for shell in estimate.details["shells"]):
         return f"{text} Nothing lies outside."
     if not found["n_episodes_outside"]:
         return f"{text} Nothing was tested outside: whether the assumption holds is not known."
+    failed = found["n_failed_outside"]
+    counted = f", but {failed:,} of them FAILED and are counted as crashes here" if failed else ""
     return (
-        f"{text} There was no crash in {found['n_episodes_outside']:,} tests outside: with {level} confidence fewer "
-        f"than {found['upper_bound_outside']:.3g} crashes per test lie there."
+        f"{text} There was no crash in {found['n_episodes_outside']:,} tests outside{counted}: with {level} confidence "
+        f"fewer than {found['upper_bound_outside']:.3g} crashes per test lie there."
     )
 
 
 def failed_statement(estimate: Estimate) -> str:
     """What failed tests would change, as a sentence to follow the answer; empty without any."""
-    n_failed = estimate.details["n_failed"]
-    if not n_failed:
+    return _failed(estimate.details)
+
+
+def _failed(found: Mapping[str, Any]) -> str:
+    if not found["n_failed"]:
         return ""
     return (
-        f" Of these tests {n_failed:,} FAILED and count as no crash: had they crashed, the rate would be "
-        f"{estimate.details['crash_rate_if_failed_had_crashed']:.3g}."
+        f" Of these tests {found['n_failed']:,} FAILED and count as no crash: had they crashed, the rate would be "
+        f"{found['crash_rate_if_failed_had_crashed']:.3g}."
     )
 
 

@@ -22,13 +22,13 @@ from harness.pool.build import build_pool
 from harness.pool.cut_ins import CutIns, Pool, environment_hash
 from harness.pool.library import Library, load_library
 from harness.progress import Progress
-from harness.records.folder import write_atomically
+from harness.records.folder import require_place, write_atomically
 
-_FORMAT = 2
+_FORMAT = 3
 """Raise it when the meaning of a pool changes."""
 _MADE_BY = ("build.py", "cut_ins.py", "proposal.py")
 """Code that decides what is in a pool, beside the kernels."""
-_METADATA = b"harness_pool"
+_METADATA, _DIGEST = b"harness_pool", b"harness_pool_sha256"
 _STATE = ("v_bv_mps", "r1_m", "r1dot_mps", "r2_m", "r2dot_mps")
 
 
@@ -65,24 +65,32 @@ def campaign_pool(campaign: Campaign, progress: Progress | None = None) -> Pool:
     ------
     CampaignError
         The library's file is missing or wrong.
+    RunFolderError
+        The pool could not be kept.
     """
     environment, library = load_environment(campaign.environment), load_library(campaign.pool.library)
     key = pool_key(environment, library, campaign.pool)
-    path = pool_path(key)
-    if path.is_file():
-        try:
-            return read_pool(path)
-        except RunFolderError:
-            pass  # damaged: it is built again
+    if (cached := _cached(key)) is not None:
+        return cached
+    require_place(pool_path(key).parent, mend="Change its permissions, or name another place in HARNESS_CACHE_DIR.")
     pool = build_pool(environment, library, campaign.pool, key, progress)
-    write_pool(path, pool)
+    write_pool(pool_path(key), pool)
     return pool
 
 
 def cached_pool(campaign: Campaign) -> Pool | None:
     """The pool of a campaign if it has been built on this machine, else None."""
-    path = pool_path(campaign_pool_key(campaign))
-    return read_pool(path) if path.is_file() else None
+    return _cached(campaign_pool_key(campaign))
+
+
+def _cached(key: str) -> Pool | None:
+    """The pool kept under a key; None if there is none, or the file is damaged or of another key."""
+    path = pool_path(key)
+    try:
+        pool = read_pool(path) if path.is_file() else None
+    except RunFolderError:
+        return None
+    return pool if pool is not None and pool.key == key else None
 
 
 def write_pool(path: Path, pool: Pool) -> None:
@@ -101,15 +109,36 @@ def read_pool(path: Path) -> Pool:
     """
     try:
         table = pq.read_table(path, partitioning=None)
-        facts = json.loads((table.schema.metadata or {})[_METADATA])
-        return _pool(table, facts)
-    except (OSError, pa.ArrowException, KeyError, ValueError) as error:
+        return _pool(table, _sound_facts(table))
+    except (OSError, pa.ArrowException, KeyError, TypeError, ValueError) as error:
         raise RunFolderError(
             str(path),
             found=f"a file that is not a whole pool ({str(error).splitlines()[0] if str(error) else error!r})",
             expected="a pool that `harness pool` has written",
             mend="Delete it: it is built again when it is needed.",
         ) from error
+
+
+def _sound_facts(table: pa.Table) -> dict[str, Any]:
+    metadata = table.schema.metadata or {}
+    facts: dict[str, Any] = json.loads(metadata[_METADATA])
+    if facts["format"] != _FORMAT:
+        raise ValueError(f"a pool of format {facts['format']}, this version reads {_FORMAT}")
+    if metadata[_DIGEST].decode() != _digest(table, metadata[_METADATA]):
+        raise ValueError("its content has changed since it was written")
+    return facts
+
+
+def _digest(table: pa.Table, facts: bytes) -> str:
+    """Hash of all that a pool says: Parquet notices a truncated file, but hardly any flipped bit."""
+    digest = hashlib.sha256(facts)
+    for column in table.columns:
+        array = column.combine_chunks()
+        if isinstance(array, pa.ListArray):
+            digest.update(np.asarray(array.value_lengths()).tobytes())
+        values = array.flatten() if isinstance(array, pa.ListArray | pa.FixedSizeListArray) else array
+        digest.update(values.to_numpy(zero_copy_only=False).tobytes())
+    return digest.hexdigest()
 
 
 def _facts(pool: Pool) -> dict[str, Any]:
@@ -135,10 +164,10 @@ def _table(pool: Pool) -> pa.Table:
         "bv_maneuvers": (_prefixes(c.bv, c.n_bv), "BV's draws; 31 marks the cut-in"),
     }
     schema = pa.schema(
-        [pa.field(name, array.type, nullable=False, metadata={"doc": doc}) for name, (array, doc) in columns.items()],
-        metadata={_METADATA: json.dumps(_facts(pool))},
+        [pa.field(name, array.type, nullable=False, metadata={"doc": doc}) for name, (array, doc) in columns.items()]
     )
-    return pa.table([array for array, _ in columns.values()], schema=schema)
+    table, facts = pa.table([array for array, _ in columns.values()], schema=schema), json.dumps(_facts(pool)).encode()
+    return table.replace_schema_metadata({_METADATA: facts, _DIGEST: _digest(table, facts)})
 
 
 def _rows(values: np.ndarray) -> pa.Array:
@@ -160,8 +189,6 @@ def _padded(column: pa.ChunkedArray, width: int) -> tuple[np.ndarray, IntArray]:
 
 
 def _pool(table: pa.Table, facts: dict[str, Any]) -> Pool:
-    if facts["format"] != _FORMAT:
-        raise ValueError(f"format {facts['format']}")
     n_surrogates = len(facts["names"])
     bv_column = table.column("bv_maneuvers")
     width = int(np.asarray(bv_column.combine_chunks().value_lengths()).max(initial=0))

@@ -52,7 +52,7 @@ def write_atomically(path: Path, write: Callable[[Path], None]) -> None:
         temporary.unlink(missing_ok=True)
 
 
-def require_place(folder: Path) -> None:
+def require_place(folder: Path, *, mend: str = "Choose another place, or change its permissions.") -> None:
     """Refuse a folder in which nothing can be written, before work is spent on it; leaves it as it was.
 
     Raises
@@ -70,7 +70,7 @@ def require_place(folder: Path) -> None:
             str(folder),
             found=f"a place where nothing can be written ({error.strerror})",
             expected="a folder, or a place where one can be made",
-            mend="Choose another place, or change its permissions.",
+            mend=mend,
         ) from error
     finally:
         with suppress(OSError):

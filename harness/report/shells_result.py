@@ -8,7 +8,7 @@ from typing import Any
 
 from harness.errors import RunFolderError
 
-SHOWN_IN_SECTION = frozenset({"shells", "conditional", "boundary", "pool", "p_cut_in", "p_impossible"})
+SHOWN_IN_SECTION = frozenset({"shells", "conditional", "boundary", "pool", "p_cut_in", "p_impossible", "rhw_from_pool"})
 """Details of the estimate that have a place of their own on the page."""
 NEGLIGIBLE = 1e-9
 """Differences of this share, of P(cut-in) or of a squared width, come from rounding."""
@@ -56,6 +56,7 @@ class Conditional:
     n_tests: int
     n_tests_outside: int
     n_crashes_outside: int
+    n_failed_outside: int
     refuted: bool
     upper_bound_outside: float
 
@@ -162,6 +163,7 @@ def _conditional(content: dict[str, Any]) -> Conditional:
         n_tests=int(content["n_episodes"]),
         n_tests_outside=int(content["n_episodes_outside"]),
         n_crashes_outside=int(content["n_crashes_outside"]),
+        n_failed_outside=int(content["n_failed_outside"]),
         refuted=bool(content["refuted"]),
         upper_bound_outside=float(content["upper_bound_outside"]),
     )

@@ -9,7 +9,7 @@ from harness.campaign.models import Campaign
 from harness.criticality.tables import tables_cached
 from harness.environment.loading import load_environment
 from harness.importance.build import needs_tables
-from harness.pool.storage import campaign_pool_key, pool_path
+from harness.pool.storage import cached_pool
 from harness.runner.prepare import require_ready
 from harness.sumo.shim import shim_library
 from harness.vehicles.models import surrogate_records
@@ -56,8 +56,7 @@ def plan_campaign(campaign: Campaign) -> dict[str, Any]:
 
 def _tables(campaign: Campaign) -> str:
     if campaign.testing.method == "shells":
-        cached = pool_path(campaign_pool_key(campaign)).is_file()
-        return "pool of cut-ins: " + ("cached" if cached else f"to build ({POOL_S} on two cores)")
+        return "pool of cut-ins: " + ("cached" if cached_pool(campaign) else f"to build ({POOL_S} on two cores)")
     if not needs_tables(campaign):
         return "none needed"
     environment = load_environment(campaign.environment)

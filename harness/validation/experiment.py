@@ -13,6 +13,7 @@ from harness.campaign.models import (
     BuiltInParameters,
     Campaign,
     EstimatorName,
+    Method,
     Section,
     Whole,
     broken_rule,
@@ -31,7 +32,9 @@ class SuperPopulation(Section):
 
     paths: Whole = Field(65_536, ge=1024, le=1 << 22, description="paths that pools are drawn from, with replacement")
     reference_paths: Whole = Field(65_536, ge=1024, le=1 << 22, description="independent paths that the truth is from")
-    pool_paths: Whole = Field(16_384, ge=256, le=1 << 20, description="paths of each pool, as many as a real one has")
+    pool_paths: Whole = Field(
+        16_384, ge=256, le=1 << 20, description="paths of each pool; that of smoke.yaml has 32,768"
+    )
 
 
 class Fault(Section):
@@ -39,6 +42,20 @@ class Fault(Section):
 
     shell: Whole = Field(0, ge=0, description="stratum whose probability is wrong, from the most careful on")
     factor: float = Field(gt=0.0, description="wrong probability over the right one")
+
+
+_JUDGED: dict[Method, set[EstimatorName]] = {
+    "shells": {"shells"},
+    "nde": {"nde", "nade"},
+    "forced": {"nade"},
+    "step_mixture": {"nade", "scv", "martingale"},
+    "episode_mixture": {"nade", "mixture_cv", "martingale"},
+}
+
+
+def judged(method: Method, *, overtaking: bool) -> set[EstimatorName]:
+    """Estimators whose results can be judged; the chains' own records hold no replay."""
+    return _JUDGED[method] | ({"replay"} if overtaking and method != "shells" else set())
 
 
 class Experiment(Section):
@@ -122,20 +139,12 @@ class Experiment(Section):
     @model_validator(mode="after")
     def _estimators_belong_to_the_method(self) -> Self:
         method = self.campaign.testing.method
-        allowed: dict[str, set[str]] = {
-            "shells": {"shells"},
-            "nde": {"nde", "nade"},
-            "forced": {"nade"},
-            "step_mixture": {"nade", "scv", "martingale"},
-            "episode_mixture": {"nade", "mixture_cv", "martingale"},
-        }
-        if self.avs and method != "shells":  # the chains' own records hold no replay
-            allowed[method].add("replay")
-        if wrong := set(self.results) - allowed[method]:
+        allowed = judged(method, overtaking=bool(self.avs))
+        if wrong := set(self.results) - allowed:
             raise broken_rule(
                 "estimators",
                 found=", ".join(sorted(wrong)),
-                expected=f"for testing.method {method}: {', '.join(sorted(allowed[method]))}",
+                expected=f"for testing.method {method}: {', '.join(sorted(allowed))}",
                 mend="Change one of the two.",
             )
         if self.fault is not None and method != "shells":

@@ -65,7 +65,8 @@ class ShellCampaign:
             sums.add(_block(design, added, rng.binomial(added, share), n))
             n += int(added.sum())
             estimate = sums.result(campaign.stop.confidence)
-            if conditional is None and inside.observe(n, estimate):
+            inside.observe(n, estimate)
+            if conditional is None and inside.reached:
                 conditional = _conditional_row(estimate, replication, reached=True)
             if rule.observe(n, estimate):
                 break

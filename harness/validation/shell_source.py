@@ -9,6 +9,7 @@ import numpy as np
 
 from harness.arrays import FloatArray, IntArray
 from harness.campaign.models import AutomatedVehicle
+from harness.errors import CampaignError
 from harness.pool.cut_ins import CutIns, Pool, shells_of
 from harness.pool.library import Library
 from harness.pool.shells import ShellDesign, acceleration_limit, design_shells, shells_in_strata
@@ -116,13 +117,25 @@ def leave_out(library: Library, names: set[str], careful_first: tuple[str, ...])
     careful_first : tuple of str
         All surrogates, from careful to careless. The new boundary is the next more careful one that is left, or the
         next more careless one if none is.
+
+    Raises
+    ------
+    CampaignError
+        No surrogate is left but the envelope.
     """
     names = names - {library.envelope}
     if library.boundary in names:
         place = careful_first.index(library.boundary)
         candidates = [*reversed(careful_first[:place]), *careful_first[place + 1 :]]
-        next_one = next(name for name in candidates if name not in names and name != library.envelope)
-        library = library.model_copy(update={"boundary": next_one})
+        left = [name for name in candidates if name not in names and name != library.envelope]
+        if not left:
+            raise CampaignError(
+                "campaign.pool.library",
+                found=f"no surrogate but the envelope, without the vehicle's equals ({', '.join(sorted(names))})",
+                expected="one that can be the boundary",
+                mend="Add a surrogate to the library, or leave this vehicle out of the experiment.",
+            )
+        library = library.model_copy(update={"boundary": left[0]})
     return library.without(names)
 
 

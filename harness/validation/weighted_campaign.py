@@ -68,6 +68,7 @@ class TwinEpisodes:
         self._prepared = prepare(self._campaign)
         self._loop: EpisodeLoop = self._prepared.loop(TwinWorld(CELLS))
         self._moments = moments
+        self._n_martingale = len(campaign.surrogates) if "martingale" in estimators else 0
         self._surrogates = (
             SurrogateReplay(self._campaign, campaign_pool(self._campaign)) if "replay" in estimators else None
         )
@@ -81,6 +82,7 @@ class TwinEpisodes:
             tables.moments if self._moments else None,
             method=self._campaign.testing.method,
             alpha=mixture_weights(self._campaign),
+            n_martingale=self._n_martingale,
             surrogates=self._surrogates,
         )
 

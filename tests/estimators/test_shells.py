@@ -139,6 +139,19 @@ def test_what_lies_outside_nothing_is_said_to_be_nothing():
     assert estimate.details["conditional"]["rhw"] == estimate.rhw
 
 
+def test_failed_tests_outside_are_not_taken_for_safe_ones():
+    rows = [(0, True, False)] * 8 + [(0, False, True)] * 2 + [(2, False, False)] * 396 + [(2, False, True)] * 4
+    estimate = one_pass([from_rows(rows)], ("shells",)).headline_estimate
+    conditional = estimate.details["conditional"]
+    assert (conditional["n_failed"], conditional["n_failed_outside"]) == (2, 4)
+    assert conditional["crash_rate_if_failed_had_crashed"] == pytest.approx(1e-4)
+    assert conditional["upper_bound_outside"] == pytest.approx(P[2] * clopper_pearson(4, 400, 0.8)[1])
+    text = conditional_statement(estimate)
+    assert text is not None
+    assert "2 FAILED and count as no crash: had they crashed, the rate would be 0.0001." in text
+    assert "no crash in 400 tests outside, but 4 of them FAILED and are counted as crashes here: with" in text
+
+
 def test_two_statements():
     rows = [(0, True)] * 8 + [(0, False)] * 2 + [(1, True)] * 3 + [(1, False)] * 17 + [(2, False)] * 400
     found = one_pass([block([s for s, _ in rows], [c for _, c in rows])], ("shells", "nade", "nde")).estimates

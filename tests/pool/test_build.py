@@ -5,13 +5,22 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 
 from harness.campaign.models import Campaign
 from harness.errors import RunFolderError
 from harness.pool.proposal import NATURALISTIC_SHARE, fit_proposal
 from harness.pool.shells import Draws, design_shells, shells_in_strata
-from harness.pool.storage import campaign_pool, campaign_pool_key, pool_key, pool_path, read_pool, write_pool
+from harness.pool.storage import (
+    cached_pool,
+    campaign_pool,
+    campaign_pool_key,
+    pool_key,
+    pool_path,
+    read_pool,
+    write_pool,
+)
 from tests.chains.seed import SEED
 
 FORCED_RATE = 1.352e-7
@@ -100,6 +109,53 @@ def test_a_damaged_pool_is_named_and_built_again(campaign, pool, tmp_path, monke
     monkeypatch.setattr("harness.pool.storage.build_pool", lambda *_: pool)
     assert campaign_pool(campaign) is pool
     assert read_pool(path).key == pool.key
+
+
+def test_a_pool_in_which_a_bit_has_flipped_is_refused(pool, tmp_path):
+    path = tmp_path / "pool.parquet"
+    write_pool(path, pool)
+    sound = path.read_bytes()
+    rng = np.random.default_rng(SEED)
+    for at in rng.integers(4, len(sound) - 4, 60).tolist():
+        damaged = bytearray(sound)
+        damaged[at] ^= 1 << int(rng.integers(8))
+        path.write_bytes(damaged)
+        try:
+            again = read_pool(path)
+        except RunFolderError:
+            continue
+        # What is read all the same says the same: the bit belongs to a statistic or a name that nobody asks for.
+        for field in dataclasses.fields(pool.cut_ins):
+            assert np.array_equal(getattr(again.cut_ins, field.name), getattr(pool.cut_ins, field.name))
+        assert again.to_json() == pool.to_json()
+
+
+def test_a_pool_of_something_else_under_the_right_name_is_built_again(campaign, pool, tmp_path, monkeypatch):
+    monkeypatch.setenv("HARNESS_CACHE_DIR", str(tmp_path))
+    path = pool_path(campaign_pool_key(campaign))
+    write_pool(path, dataclasses.replace(pool, key="0" * 24))
+    assert cached_pool(campaign) is None
+    monkeypatch.setattr("harness.pool.storage.build_pool", lambda *_: pool)
+    assert campaign_pool(campaign) is pool
+    assert read_pool(path).key == pool.key
+
+
+@pytest.mark.parametrize("facts", [b"[]", b"{}", b"{", b'{"format": 2}'])
+def test_facts_that_are_not_a_pools_are_refused(facts, pool, tmp_path):
+    path = tmp_path / "pool.parquet"
+    write_pool(path, pool)
+    table = pq.read_table(path)
+    pq.write_table(table.replace_schema_metadata({**table.schema.metadata, b"harness_pool": facts}), path)
+    with pytest.raises(RunFolderError, match="not a whole pool"):
+        read_pool(path)
+
+
+def test_a_place_that_cannot_keep_a_pool_is_refused_before_it_is_built(campaign, tmp_path, monkeypatch):
+    (tmp_path / "pools").write_text("not a folder")
+    monkeypatch.setenv("HARNESS_CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr("harness.pool.storage.build_pool", lambda *_: pytest.fail("built in vain"))
+    with pytest.raises(RunFolderError, match="HARNESS_CACHE_DIR"):
+        campaign_pool(campaign)
 
 
 def test_draws_are_a_permutation_within_a_shell_and_follow_probabilities_outside(pool):

@@ -7,7 +7,10 @@ import json
 import pyarrow.parquet as pq
 import pytest
 
+from harness.campaign.models import Campaign
 from harness.cli import main
+from harness.validation.experiment import judged
+from harness.validation.weighted_campaign import TwinEpisodes, WeightedCampaign
 
 CHAINS = """
 format: validation-experiment
@@ -62,6 +65,16 @@ def test_the_online_rule_is_followed(folders):
     for row in rows:
         rhw = (row["ci_high"] - row["ci_low"]) / 2.0 / row["crash_rate"] if row["crash_rate"] else float("inf")
         assert row["reached"] == (rhw <= 0.5 and row["n_crashes"] > 0)
+
+
+@pytest.mark.parametrize("method", ["nde", "forced", "step_mixture", "episode_mixture"])
+def test_every_result_that_may_be_asked_for_is_given(method):
+    """But replay, whose pool takes long to build; at a level of lane changing at which crashes are frequent."""
+    settings = {"environment": {"lane_change_level": 1e3}, "testing": {"method": method}, "stop": {"episodes": 300}}
+    campaign = Campaign.model_validate({"name": "x", "world": {"engine": "twin"}, **settings})
+    estimators = sorted(judged(method, overtaking=True) - {"replay"})
+    rows = WeightedCampaign(campaign, TwinEpisodes(campaign, 5, estimators), estimators).run(range(2))
+    assert [row.result for row in rows] == [*estimators, *estimators]
 
 
 def test_weighted_methods_run_in_the_twin(tmp_path, capsys):

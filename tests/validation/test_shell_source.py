@@ -7,6 +7,7 @@ import pytest
 
 from harness.campaign.models import AutomatedVehicle, Environment, PoolSettings
 from harness.environment.loading import load_environment
+from harness.errors import CampaignError
 from harness.pool.build import build_pool
 from harness.pool.library import Library, load_library
 from harness.progress import SilentProgress
@@ -76,6 +77,8 @@ def test_the_envelope_stays_and_another_surrogate_becomes_the_boundary(library):
     assert reduced.envelope == "full-throttle-2"
     alone = leave_out(library, set(careful_first[:6]), careful_first)
     assert alone.boundary == "never-brakes"
+    with pytest.raises(CampaignError, match="no surrogate but the envelope"):
+        leave_out(library, set(careful_first), careful_first)
 
 
 def test_drawn_pools_scatter_around_the_population(library, population, drivers, avs):
