@@ -17,7 +17,7 @@ from pyarrow import csv, parquet
 from harness.campaign.loading import load_campaign
 from harness.campaign.models import EstimatorName
 from harness.cli import cli, main
-from harness.errors import RunFolderError, TooManyFailedError
+from harness.errors import EXIT_BAD_INPUT, RunFolderError, TooManyFailedError
 
 SCENARIOS = Path(__file__).parents[1] / "scenarios"
 SMOKE = str(SCENARIOS / "smoke.yaml")
@@ -262,7 +262,12 @@ def test_interrupt_says_how_to_go_on(calls, capsys, tmp_path):
 
 @pytest.mark.parametrize(
     ("number", "words"),
-    [(errno.ENOSPC, "free some space"), (errno.EDQUOT, "--resume"), (errno.EACCES, "permissions")],
+    [
+        (errno.ENOSPC, "free some space"),
+        (errno.EDQUOT, "--resume"),
+        (errno.EACCES, "permissions"),
+        (errno.EFBIG, "limit"),
+    ],
 )
 def test_errors_of_the_system_that_can_be_mended(calls, capsys, tmp_path, number, words):
     calls["stand_in"]("harness.runner.run_campaign", OSError(number, os.strerror(number), "episodes/0.parquet"))
@@ -273,8 +278,8 @@ def test_errors_of_the_system_that_can_be_mended(calls, capsys, tmp_path, number
 
 
 def test_defects_are_not_hidden(calls, tmp_path):
-    calls["stand_in"]("harness.runner.run_campaign", OSError(errno.EIO, "broken disk"))
-    with pytest.raises(OSError, match="broken disk"):
+    calls["stand_in"]("harness.runner.run_campaign", OSError(errno.EBADF, "closed too early"))
+    with pytest.raises(OSError, match="closed too early"):
         main(["run", SMOKE, "--out", str(tmp_path)])
     calls["stand_in"]("harness.runner.run_campaign", ZeroDivisionError())
     with pytest.raises(ZeroDivisionError):
@@ -297,7 +302,7 @@ def test_estimate_prints_a_table(calls, capsys, tmp_path):
 
 
 def test_estimate_closes_with_what_was_asked(calls, capsys, tmp_path):
-    assert main(["estimate", str(tmp_path), "-e", "nde"]) == 0
+    assert main(["estimate", str(tmp_path), "-e", "nde"]) == EXIT_BAD_INPUT  # these records do not allow it
     out = capsys.readouterr().out
     assert out.splitlines()[-1] == f"nde: {ESTIMATES['statements']['nde']}"
     assert ESTIMATES["statement"] not in out

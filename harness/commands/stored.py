@@ -23,7 +23,7 @@ from harness.console import (
     write_json,
     write_trace,
 )
-from harness.errors import WorldDisagreementError
+from harness.errors import EXIT_BAD_INPUT, WorldDisagreementError
 
 if TYPE_CHECKING:
     from harness.campaign.models import EstimatorName
@@ -49,7 +49,9 @@ if TYPE_CHECKING:
 @click.option("--pool", "pool_file", type=FILE, help="Pool of cut-ins to replay surrogates of. Default: the run's own.")
 @click.option("--write", is_flag=True, help="Replace DIR/estimates.json by the result.")
 @json_option
+@click.pass_context
 def estimate(
+    ctx: click.Context,
     folder: Path,
     *,
     estimators: Sequence[EstimatorName],
@@ -60,7 +62,8 @@ def estimate(
 ) -> None:
     """Estimate the crash rate again from the records in DIR, with any estimator.
 
-    Nothing is simulated in SUMO. An estimator that the records do not allow is shown with the reason.
+    Nothing is simulated in SUMO. An estimator that the records do not allow is shown with the reason; the exit code is
+    2 if they allow none of those asked for.
 
     'replay' puts surrogates in the AV's place, in the twin. It needs a pool of cut-ins, which is built (about half a
     minute) when 'replay' is asked for by name and it is not there yet.
@@ -79,6 +82,8 @@ def estimate(
         print_json(content)
     else:
         print_estimates(content, estimators)
+    if estimators and all(content["estimates"][name]["crash_rate"] is None for name in estimators):
+        ctx.exit(EXIT_BAD_INPUT)
 
 
 @click.command(

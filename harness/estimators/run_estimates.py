@@ -243,7 +243,7 @@ def stored_blocks(folder: Path, *, moments: bool) -> Iterator[Block]:
 
 def _stored_blocks(folder: Path, campaign: Campaign, manifest: dict[str, Any], wanted: _Wanted) -> Iterator[Block]:
     """Blocks of the episodes that count, in index order; a gap or too few of them is an error."""
-    n, n_counted, cap = 0, int(manifest["n_episodes"]), manifest.get("weight_cap")
+    n, n_counted = 0, int(manifest["n_episodes"])
     if n_counted == 0:
         raise no_episodes(folder)
     columns = list(MOMENT_COLUMNS) if wanted.moments else []
@@ -255,7 +255,6 @@ def _stored_blocks(folder: Path, campaign: Campaign, manifest: dict[str, Any], w
             moments,
             method=campaign.testing.method,
             alpha=mixture_weights(campaign),
-            weight_cap=cap,
             shells=shells,
             n_martingale=wanted.n_martingale,
             surrogates=wanted.surrogates if n < wanted.n_replayed else None,

@@ -8,7 +8,8 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from harness.records.folder import damaged, read_manifest, read_table
+from harness.errors import RunFolderError
+from harness.records.folder import MEND_SHARD, damaged, read_manifest, read_table
 
 
 def read_shards(
@@ -31,11 +32,18 @@ def read_shards(
     Raises
     ------
     RunFolderError
-        A file is missing or damaged.
+        A file is missing or damaged, or holds another number of episodes than the manifest says.
     """
     for shard in read_manifest(folder)["shards"]:
         files = shard["files"]
         episodes = read_table(folder / files["episodes"], episode_columns)
+        if episodes.num_rows != shard["n_episodes"]:
+            raise RunFolderError(
+                str(folder / files["episodes"]),
+                found=f"{episodes.num_rows} rows",
+                expected=f"{shard['n_episodes']} rows (manifest.json)",
+                mend=MEND_SHARD,
+            )
         moments = None
         if "moments" in files and moment_columns != []:
             moments = read_table(folder / files["moments"], moment_columns)

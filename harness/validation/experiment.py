@@ -32,9 +32,7 @@ class SuperPopulation(Section):
 
     paths: Whole = Field(65_536, ge=1024, le=1 << 22, description="paths that pools are drawn from, with replacement")
     reference_paths: Whole = Field(65_536, ge=1024, le=1 << 22, description="independent paths that the truth is from")
-    pool_paths: Whole = Field(
-        16_384, ge=256, le=1 << 20, description="paths of each pool; that of smoke.yaml has 32,768"
-    )
+    pool_paths: Whole = Field(16_384, ge=256, le=1 << 20, description="paths of each pool; smoke.yaml has 32,768")
 
 
 class Fault(Section):
