@@ -18,7 +18,7 @@ from harness.estimators.accumulator import require_episodes
 from harness.estimators.block import Block
 from harness.estimators.cross_fit import CrossFit
 from harness.estimators.estimate import Estimate
-from harness.estimators.weighted_sums import WeightedSums, weighted_estimate
+from harness.estimators.weighted_sums import FEW_FOR_RESIDUALS, WeightedSums, weighted_estimate
 
 RESIDUALS = (
     "the interval comes from regression residuals: what is left of the variance may sit in tests that have not been "
@@ -70,7 +70,7 @@ class Martingale:
         zeros = np.zeros(self._fit.n_columns)
         found = self._fit.result(zeros, np.diag(zeros))
         plain = self.sums.y.std_error(self.sums.n)
-        trusted = self.sums.is_settled()
+        trusted = self.sums.is_settled() and self.sums.n_effective() >= FEW_FOR_RESIDUALS
         own = trusted or found.std_error >= plain
         return weighted_estimate(
             self.sums,

@@ -21,11 +21,7 @@ from harness.estimators.block import Block
 from harness.estimators.estimate import Estimate
 from harness.estimators.third_moments import ThirdMoments
 from harness.estimators.triangular_factor import empty_factor, fold_rows
-from harness.estimators.weighted_sums import WeightedSums, weighted_estimate
-
-FEW_FOR_RESIDUALS = 300.0
-"""Effective crashes below which residuals claim too little: at 140 of them their 90 % interval covers 0.88, at 40 0.85
-(overtaking in the twin, 3,000 replications); the interval is then as wide as that of the plain mean."""
+from harness.estimators.weighted_sums import FEW_FOR_RESIDUALS, WeightedSums, weighted_estimate
 
 
 @dataclass(frozen=True)

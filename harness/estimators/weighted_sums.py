@@ -19,6 +19,10 @@ from harness.estimators.intervals import capped_mean_upper, skewed_distances
 
 FEW_CRASHES = 50
 FEW_EFFECTIVE = 30.0
+FEW_FOR_RESIDUALS = 300.0
+"""Effective crashes below which residuals of a regression claim too little; the interval is then as wide as that of the
+plain mean. Overtaking in the twin, 90 %: `mixture_cv` covers 0.88 at 140 of them, 0.85 at 40 (3,000 replications),
+`martingale` 0.87 at 160 (1,000 replications)."""
 LARGE_SHARE = 0.1
 
 
