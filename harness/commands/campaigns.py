@@ -23,13 +23,7 @@ from harness.console import (
     print_statements,
 )
 from harness.errors import EXIT_BUDGET_SPENT
-
-SPENT = {
-    "episodes": "stop.episodes was spent; raise it and go on with --resume",
-    "pool": "all cut-ins that the pool keeps of a shell were tested; raise pool.cut_ins_per_shell and use a new folder",
-    "pool_error": "the pool's own error alone is wider; lower pool.relative_error and use a new folder",
-}
-"""Why a campaign ended before its precision, and the mend."""
+from harness.stopped_by import MENDS
 
 
 @click.command(
@@ -112,7 +106,7 @@ def run(
     else:
         print_statements(result.estimates)
         if result.exit_code == EXIT_BUDGET_SPENT:
-            click.echo(f"Less precise than was asked for: {SPENT[result.stopped_by]}.")
+            click.echo(f"Less precise than was asked for: {MENDS[result.stopped_by]}.")
         click.echo(str(report_file))
         click.echo(str(result.folder / "estimates.json"))
     ctx.exit(result.exit_code)

@@ -21,6 +21,7 @@ from harness.report.number_format import (
 )
 from harness.report.run_folder import RunFolder
 from harness.report.summary import RunSummary
+from harness.stopped_by import MENDS
 
 
 @dataclass(frozen=True)
@@ -86,7 +87,9 @@ def _coverage_notes(run: RunFolder, summary: RunSummary) -> list[str]:
         rhw = run.headline["details"]["conditional"]["rhw"]
     if target is not None and (rhw is None or not rhw <= target):
         reached = "it is not defined without a crash" if rhw is None else f"it is {half_width(rhw)}"
-        notes.append(f"The asked relative half-width of {target:g} was not reached: {reached}.")
+        mend = MENDS.get(run.manifest.get("stopped_by") or "")
+        why = f" ({mend})" if mend else ""
+        notes.append(f"The asked relative half-width of {target:g} was not reached: {reached}{why}.")
     return notes
 
 

@@ -10,7 +10,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -36,9 +36,9 @@ from harness.runner.rounds import rounds, stop_rule
 from harness.runner.shards import ShardPool, stored_shard
 from harness.runner.table_accuracy import table_errors
 from harness.runner.worker import ShardDone, ShardSpec
+from harness.stopped_by import StoppedBy
 
 MANIFEST_INTERVAL_S = 5.0
-StoppedBy = Literal["rhw", "episodes", "pool", "pool_error"]
 
 
 @dataclass(frozen=True)
@@ -53,8 +53,7 @@ class RunResult:
     estimates : dict
         Content of ``estimates.json``.
     stopped_by : {"rhw", "episodes", "pool", "pool_error"}
-        The asked precision, the budget, the last cut-in that the pool holds of a shell that needs more, or the pool's
-        own error, which alone is wider than the asked precision.
+        See `harness.stopped_by`.
     exit_code : int
         0, or 4 when the budget or the pool was spent before the asked precision.
     """
