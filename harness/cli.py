@@ -38,8 +38,9 @@ def cli() -> None:
 
     A campaign is a YAML file that says which traffic meets which vehicle and when it is enough.
 
-    Exit codes: 0 done; 2 the campaign or the call is wrong; 3 too many episodes failed, or SUMO disagreed with the
-    formula; 4 the budget was spent before the asked precision; 130 interrupted.
+    Exit codes: 0 done; 2 the campaign or the call is wrong, or the records do not allow what was asked for; 3 too many
+    episodes failed, or SUMO disagreed with the formula; 4 the budget or the pool was spent before the asked precision;
+    130 interrupted.
     """
 
 

@@ -16,12 +16,17 @@ from harness.arrays import FloatArray, IntArray
 
 
 class Limits(NamedTuple):
-    """A rate with a lower and an upper limit, and the half-width that the error of the p_s would leave for itself."""
+    """A rate with a lower and an upper limit, and the half-width that the error of the p_s would leave for itself.
+
+    ``from_pool`` takes the shares as they were seen, ``from_pool_at_least`` their lower limits: one crash in a rarely
+    tested stratum, where paths are few, can make the former large for a while.
+    """
 
     rate: float
     low: float
     high: float
     from_pool: float
+    from_pool_at_least: float
 
     @property
     def rhw(self) -> float:
@@ -30,8 +35,13 @@ class Limits(NamedTuple):
 
     @property
     def rhw_from_pool(self) -> float:
-        """The part of `rhw` that more tests cannot take away; 0 at rate 0."""
+        """The pool's part of `rhw`; 0 at rate 0."""
         return self.from_pool / self.rate if self.rate > 0.0 else 0.0
+
+    @property
+    def rhw_from_pool_at_least(self) -> float:
+        """What more tests of the same pool will not take away; 0 at rate 0."""
+        return self.from_pool_at_least / self.rate if self.rate > 0.0 else 0.0
 
 
 def share_limits(crashes: IntArray, tests: IntArray, tail: float) -> tuple[FloatArray, FloatArray]:
@@ -85,4 +95,5 @@ def combined(
     pool = z * z * pool_variance(share, moments, rate, n_paths)
     down = np.sqrt(((p * (share - low)) ** 2).sum() + pool)
     up = np.sqrt(((p * (high - share)) ** 2).sum() + pool)
-    return Limits(rate, max(rate - float(down), 0.0), min(rate + float(up), 1.0), float(np.sqrt(pool)))
+    at_least = z * np.sqrt(pool_variance(low, moments, float(p @ low), n_paths))
+    return Limits(rate, max(rate - float(down), 0.0), min(rate + float(up), 1.0), float(np.sqrt(pool)), float(at_least))

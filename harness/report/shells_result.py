@@ -8,7 +8,9 @@ from typing import Any
 
 from harness.errors import RunFolderError
 
-SHOWN_IN_SECTION = frozenset({"shells", "conditional", "boundary", "pool", "p_cut_in", "p_impossible", "rhw_from_pool"})
+SHOWN_IN_SECTION = frozenset(
+    ("shells", "conditional", "boundary", "pool", "p_cut_in", "p_impossible", "rhw_from_pool", "rhw_from_pool_at_least")
+)
 """Details of the estimate that have a place of their own on the page."""
 NEGLIGIBLE = 1e-9
 """Differences of this share, of P(cut-in) or of a squared width, come from rounding."""

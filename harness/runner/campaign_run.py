@@ -154,9 +154,9 @@ def _run_alone(
 def _stopped_by(campaign: Campaign, prefix: Prefix) -> StoppedBy:
     if prefix.reached:
         return "rhw"
-    if prefix.n_episodes >= campaign.stop.episodes:
-        return "episodes"
-    return "pool_error" if prefix.pool_too_rough else "pool"
+    if prefix.pool_too_rough:  # whatever else is spent: more of it would not help
+        return "pool_error"
+    return "episodes" if prefix.n_episodes >= campaign.stop.episodes else "pool"
 
 
 def _run_shards(
@@ -176,15 +176,12 @@ def _run_shards(
     written = elapsed()
 
     def stored(spec: ShardSpec) -> ShardDone | None:
-        found = stored_shard(out, campaign, spec, prepared.prescribed, retracing)
-        if found is None:
-            manifest.forget_from(spec.index)
-        return found
+        return stored_shard(out, campaign, spec, prepared.prescribed, retracing)
 
     progress.stage("episodes", campaign.stop.episodes, done=_episodes_on_disk(out))
     threading.Thread(target=import_module, args=("harness.report",), daemon=True).start()
     try:
-        for done in (done for specs in batches for done in pool.run(specs, stored)):
+        for done in (done for specs in batches for done in pool.run(specs, stored, manifest)):
             stop = prefix.add(done)
             progress.advance(0 if done.stored else done.spec.n_episodes)
             progress.status(**prefix.figures)

@@ -97,7 +97,7 @@ def compare_campaigns(
     for side in SIDES:
         if not _is_done(out / side, n):
             longer = _exactly(campaigns[side], n)
-            run_campaign(longer, out / side, workers=workers, resume=True, progress=progress)
+            run_campaign(longer, out / side, workers=workers, resume=True, shorten=True, progress=progress)
     found = paired_difference(_pairs(campaigns, out), a.stop.confidence)
     content = _content(campaigns, stops, found, labels or (a.name, b.name))
     write_json(out / "compare.json", content)

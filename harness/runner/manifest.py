@@ -138,10 +138,16 @@ class Manifest:
         folder.mkdir(parents=True, exist_ok=True)
         self.write([], [], status="running")  # first: --resume knows a folder by its manifest
 
+    def is_replaced_by(self, spec: ShardSpec) -> bool:
+        """Whether a shard that is not taken over takes the place of one that an earlier run has left."""
+        if self._earlier is None or spec.index >= len(self._earlier["shards"]):
+            return False
+        shard = self._earlier["shards"][spec.index]
+        return bool(shard["n_episodes"] != spec.n_episodes) or (self._folder / shard["files"]["episodes"]).exists()
+
     def forget_from(self, index: int) -> None:
-        """Cut what an earlier run has left before shard ``index``, which is to be made anew, longer or otherwise."""
-        if self._earlier is None or index >= len(self._earlier["shards"]):
-            return
+        """Cut what an earlier run has left before shard ``index``, which is about to be replaced."""
+        assert self._earlier is not None
         shards = self._earlier["shards"][:index]
         self._n_kept = sum(shard["n_episodes"] for shard in shards)
         cut = {"status": "interrupted", "stopped_by": None, "n_episodes": self._n_kept, "shards": shards}

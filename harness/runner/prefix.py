@@ -48,7 +48,7 @@ class Prefix:
 
     @property
     def pool_too_rough(self) -> bool:
-        """Whether the campaign stops because tests can no longer bring the asked precision."""
+        """Whether no number of tests can bring the asked precision."""
         return self._rule.pool_too_rough
 
     def add(self, done: ShardDone) -> bool:

@@ -86,13 +86,13 @@ class RoundRule:
     def observe(self, n: int, estimate: Estimate) -> bool:
         """See `Rule`."""
         watched = estimate.details["conditional"] if self._conditional else {"rhw": estimate.rhw, **estimate.details}
-        self.rhw, from_pool = watched["rhw"], watched["rhw_from_pool"]
+        self.rhw = watched["rhw"]
         if self._target is None or estimate.n_crashes < self._min_crashes:
             return False
         self.reached = self.rhw <= self._target
-        hopeless = from_pool > self._target and from_pool**2 >= POOL_SHARE * self.rhw**2
-        self.pool_too_rough = hopeless and n >= self._held
-        return self.reached or self.pool_too_rough
+        self.pool_too_rough = watched["rhw_from_pool_at_least"] > self._target
+        hopeless = self.pool_too_rough and watched["rhw_from_pool"] ** 2 >= POOL_SHARE * self.rhw**2
+        return self.reached or (hopeless and n >= self._held)
 
 
 def stop_rule(campaign: Campaign, held: int = 0) -> StopRule | RoundRule:

@@ -19,6 +19,7 @@ from harness.errors import HarnessError, TooManyFailedError
 from harness.pool.prescribed import PrescribedEpisodes
 from harness.records.folder import TABLES, read_table, shard_file
 from harness.records.tables import ShardTables
+from harness.runner.manifest import Manifest
 from harness.runner.processes import WorkerProcess, first_to_answer
 from harness.runner.retrace import Retracing
 from harness.runner.worker import ShardDone, ShardSpec, failure_causes, shard_block
@@ -88,6 +89,7 @@ class _Job:
     spec: ShardSpec
     done: ShardDone | None
     deaths: int = 0
+    replaces: bool = False
     suspected: Call | None = None
     doomed: dict[int, Death] = field(default_factory=dict)
 
@@ -117,10 +119,14 @@ class ShardPool:
         for left in self._folder.glob(".black-box-*"):  # of an earlier run that was killed
             left.unlink()
 
-    def run(self, specs: Iterator[ShardSpec], stored: Callable[[ShardSpec], ShardDone | None]) -> Iterator[ShardDone]:
+    def run(
+        self, specs: Iterator[ShardSpec], stored: Callable[[ShardSpec], ShardDone | None], manifest: Manifest
+    ) -> Iterator[ShardDone]:
         """Finished shards in index order; those that ``stored`` knows are not run again.
 
-        Two shards per worker are under way or wait for their turn to be handed back: little is lost at the stop.
+        Two shards per worker are under way or wait for their turn to be handed back: little is lost at the stop. A
+        shard that replaces one of an earlier run is begun only when all before it have been handed back, so that the
+        stop rule has not been content before; only then the manifest forgets the earlier one.
 
         Raises
         ------
@@ -133,9 +139,14 @@ class ShardPool:
             for spec in islice(specs, 2 * self._n_workers + 1 - len(wanted)):
                 wanted.append(_Job(spec, stored(spec)))
                 if wanted[-1].done is None:
+                    wanted[-1].replaces = manifest.is_replaced_by(spec)
                     waiting.append(wanted[-1])
             if not wanted:
                 return
+            if wanted[0].replaces:
+                manifest.forget_from(wanted[0].spec.index)
+                for job in wanted:
+                    job.replaces = False  # the manifest lists none of them any more
             self._hand_out(waiting)
             while wanted[0].done is None:
                 self._collect(waiting)
@@ -144,7 +155,7 @@ class ShardPool:
 
     def _hand_out(self, waiting: deque[_Job]) -> None:
         """Give waiting shards to idle workers, of which there may be up to as many as were asked for."""
-        while waiting and len(self._busy) < self._n_workers:
+        while waiting and not waiting[0].replaces and len(self._busy) < self._n_workers:
             worker = self._idle.pop() if self._idle else WorkerProcess(self._campaign, self._folder)
             if worker.give(waiting[0].spec, waiting[0].doomed):
                 self._busy[worker] = waiting.popleft()

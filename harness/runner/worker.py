@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from multiprocessing import parent_process
 from pathlib import Path
 
 import pyarrow as pa
@@ -74,6 +75,8 @@ class ShardRunner:
         ------
         WorldDisagreementError
             The twin retraces an episode differently; nothing is written then.
+        OrphanError
+            The process that runs the campaign has been killed; nothing is written then either.
         """
         self._doomed.update(doomed or {})
         campaign = self._prepared.campaign
@@ -82,6 +85,7 @@ class ShardRunner:
         keep_traces = records.traces != "none" or records.trace_share > 0.0
         tables = shard_tables(shard, campaign.seed, keep_traces=keep_traces)
         n_retraced = self._retracing.check(tables.episodes)
+        _require_parent()
         files = write_shard(self._folder, spec.index, tables)
         block = shard_block(campaign, tables, self._prepared.prescribed)
         return ShardDone(spec, files, block, n_retraced=n_retraced, failures=failure_causes(tables.episodes))
@@ -94,6 +98,16 @@ class ShardRunner:
         shard = self._loop.run(spec.first_episode, states, script)
         shard.cut_ins = rows
         return shard
+
+
+class OrphanError(RuntimeError):
+    """The process that runs the campaign is gone, and another one may be at work in its folder."""
+
+
+def _require_parent() -> None:
+    parent = parent_process()
+    if parent is not None and not parent.is_alive():
+        raise OrphanError("the process that runs the campaign has been killed")
 
 
 def failure_causes(episodes: pa.Table) -> Counter[str]:

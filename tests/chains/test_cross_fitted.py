@@ -146,6 +146,19 @@ def test_stale_posteriors_do_not_cover():
     assert binomtest(wrong.covered(chain.crash_rate), 60, CONFIDENCE).pvalue < FALSE_ALARM
 
 
+@pytest.mark.parametrize(("n", "wide"), [(300, True), (20_000, False)])
+def test_martingale_terms_claim_nothing_below_three_hundred_effective_crashes(n, wide):
+    drawn = draw(frequent_decisive(), "episode_mixture", n, np.random.default_rng(SEED))
+    state, plain = Martingale(), Nade()
+    state.add(drawn)
+    plain.add(drawn)
+    found, mean = state.result(CONFIDENCE), plain.result(CONFIDENCE)
+    assert found.details["residual_std_error"] < mean.std_error
+    assert found.std_error == (mean.std_error if wide else found.details["residual_std_error"])
+    assert (mean.n_effective < 300.0) == wide
+    assert mean.n_crashes > 50
+
+
 def test_few_crashes_get_the_interval_of_the_plain_mean():
     few = replayed(np.random.default_rng(SEED), n=60)
     state, plain = Replay(), Nade()

@@ -7,6 +7,7 @@ import multiprocessing
 import os
 import pickle
 import signal
+from types import SimpleNamespace
 
 import pytest
 
@@ -14,7 +15,7 @@ from harness.cli import main
 from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, WorldDisagreementError
 from harness.runner import campaign_run, processes, shards
 from harness.runner.shards import WorkerLostError
-from harness.runner.worker import ShardSpec
+from harness.runner.worker import OrphanError, ShardRunner, ShardSpec
 from tests.runner import bad_workers
 from tests.runner.conftest import MIXTURE_FILE, SMALL, TWIN
 from tests.runner.stored_runs import copy_of, manifest, shard_files, unlike_columns
@@ -189,3 +190,14 @@ def test_an_error_that_cannot_be_pickled_reaches_the_parent_in_words(serve):
     (error,) = serve(Runner, 1)
     assert isinstance(error, RuntimeError)
     assert "ValueError: of a strange kind" in str(error)
+
+
+def test_a_worker_whose_parent_was_killed_writes_nothing(campaign, tmp_path, monkeypatch):
+    """Another process may be at work in the folder by then."""
+    gone = SimpleNamespace(is_alive=lambda: False)
+    runner = ShardRunner(campaign("world.engine=twin"), tmp_path)
+    monkeypatch.setattr("harness.runner.worker.parent_process", lambda: gone)
+    with pytest.raises(OrphanError):
+        runner.run(ShardSpec(0, 0, 20))
+    runner.close()
+    assert list(tmp_path.iterdir()) == []

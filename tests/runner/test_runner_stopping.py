@@ -62,6 +62,16 @@ def test_a_larger_rhw_than_was_reached_is_refused_and_costs_nothing(runs, run_he
     assert (out / "campaign.yaml").read_bytes() == (runs["tight"].folder / "campaign.yaml").read_bytes()
 
 
+def test_a_refused_resumption_costs_no_shorter_shard_either(run_here, campaign, tmp_path):
+    """The last shard of a spent budget would be replaced by a longer one; but the rule is content before it."""
+    out = tmp_path / "run"
+    run_here(campaign(*COMMON, "stop.rhw=null", "stop.episodes=130"), out)
+    before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+    with pytest.raises(RunFolderError, match="130 finished tests, of which"):
+        run_here(campaign(*COMMON, "stop.rhw=5", "stop.min_crashes=1"), out, resume=True)
+    assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
+
+
 def test_a_finished_run_resumed_as_it_is_does_nothing(runs, run_here, campaign, tmp_path):
     out = copy_of(runs["loose"].folder, tmp_path / "run")
     run_here(campaign(*COMMON, LOOSE), out, resume=True)

@@ -70,7 +70,7 @@ def test_a_budget_that_is_spent_is_exit_code_4(campaign, run_here, tmp_path):
 
 
 def test_a_pool_that_is_used_up_ends_the_run(campaign, run_here, tmp_path):
-    small = ("stop.rhw=0.001", "stop.episodes=100000", "pool.cut_ins_per_shell=100")
+    small = ("stop.rhw=0.1", "stop.episodes=100000", "pool.cut_ins_per_shell=100")
     result = run_here(campaign(*SHELLS, *small, "world.engine=twin"), tmp_path / "run")
     assert (result.exit_code, result.stopped_by) == (4, "pool")
     tests = [shell["n_episodes"] for shell in result.estimates["estimates"]["shells"]["details"]["shells"]]
@@ -82,20 +82,27 @@ def test_a_pool_that_is_used_up_ends_the_run(campaign, run_here, tmp_path):
 def test_a_pool_that_is_too_rough_ends_the_run(campaign, run_here, tmp_path):
     """A vehicle that crashes often: after some thousand tests the pool's own error is most of the interval."""
     often = ("av={model: constant, parameters: {acceleration_mps2: -1.0}}", "world.engine=twin", "stop.episodes=100000")
+    loose, tight = "stop.rhw=0.3", "stop.rhw=0.05"
     out = tmp_path / "run"
-    result = run_here(campaign(*SHELLS, *often, "stop.rhw=0.3"), out)
-    assert (result.exit_code, result.stopped_by) == (0, "rhw")
-    held = result.estimates["n_episodes"]
-    result = run_here(campaign(*SHELLS, *often, "stop.rhw=0.05"), out, resume=True)
+    assert run_here(campaign(*SHELLS, *often, loose), out).stopped_by == "rhw"
+    result = run_here(campaign(*SHELLS, *often, tight), out, resume=True)
     assert (result.exit_code, result.stopped_by) == (4, "pool_error")
-    assert held < result.estimates["n_episodes"] < 20_000
     details = result.estimates["estimates"]["shells"]["details"]
     assert result.estimates["estimates"]["shells"]["rhw"] > details["rhw_from_pool"] > 0.05
+    fresh = run_here(campaign(*SHELLS, *often, tight), tmp_path / "fresh")
+    assert fresh.estimates["n_episodes"] == result.estimates["n_episodes"] < 20_000
+
+
+def test_a_smaller_precision_that_the_pool_cannot_give_costs_no_test(campaign, run_here, tmp_path):
+    """The run has gone beyond the look at which it would have given up on the smaller one."""
+    often = ("av={model: constant, parameters: {acceleration_mps2: -1.0}}", "world.engine=twin", "stop.episodes=100000")
+    out = tmp_path / "run"
+    held = run_here(campaign(*SHELLS, *often, "stop.rhw=0.1"), out)
     fresh = run_here(campaign(*SHELLS, *often, "stop.rhw=0.05"), tmp_path / "fresh")
-    assert fresh.estimates["n_episodes"] == result.estimates["n_episodes"]
-    again = run_here(campaign(*SHELLS, *often, "stop.rhw=0.01"), out, resume=True)
-    assert again.stopped_by == "pool_error"
-    assert again.estimates["n_episodes"] >= result.estimates["n_episodes"], "what was tested is kept"
+    assert fresh.estimates["n_episodes"] < held.estimates["n_episodes"]
+    result = run_here(campaign(*SHELLS, *often, "stop.rhw=0.05"), out, resume=True)
+    assert result.stopped_by == "pool_error"
+    assert result.estimates["n_episodes"] == held.estimates["n_episodes"]
 
 
 SPENT, MORE = "stop.episodes=150", "stop.episodes=400"
