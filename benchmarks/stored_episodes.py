@@ -1,6 +1,6 @@
 """`harness estimate` over millions of stored episodes: time, memory, and the same numbers as in memory.
 
-    python -m benchmarks.stored_episodes /tmp/nade --episodes 1e7
+    python -m benchmarks.stored_episodes runs/ten-million --episodes 1e7
 
 makes a run of published NADE with the twin (unless the folder holds it already; some 650 bytes and 50 µs of one core
 per episode), measures `harness estimate` with all estimators in one pass, and compares the first shard, streamed in

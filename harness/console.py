@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import json
 import math
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -83,13 +82,6 @@ def usage_error(error: click.UsageError, context: click.Context) -> HarnessError
 def print_json(content: Any) -> None:
     """Print strict JSON (no NaN) on stdout."""
     click.echo(json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False))
-
-
-def write_json(file: Path, content: Any) -> None:
-    """Replace ``file`` by strict JSON, at once or not at all."""
-    unfinished = file.with_name(f".{file.name}.unfinished")
-    unfinished.write_text(json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False) + "\n", encoding="utf-8")
-    os.replace(unfinished, file)  # noqa: PTH105 - os.replace says what it does on every system
 
 
 def print_plan(plan: dict[str, Any]) -> None:

@@ -63,24 +63,20 @@ def last_share(stream):
     return re.findall(r"(\d+)%", stream.getvalue())[-1]
 
 
-def test_a_campaign_that_stops_on_precision_ends_at_all_of_its_work():
+@pytest.mark.parametrize(
+    ("watched", "share"),
+    [("rhw", "100"), ("half_width", "5")],
+    ids=["a campaign that stops on precision ends with all of its work", "else the share is that of the budget"],
+)
+def test_the_share_is_that_of_the_work_thought_necessary(watched, share):
     stream = Terminal()
     with RichProgress(0.05, 3_000, stream) as bar:
-        bar.stage("episodes", total=400_000)
+        bar.stage("episodes", total=200_000)
         bar.advance(5_000)
-        bar.status(crashes=1_500, rhw=0.2)
+        bar.status(crashes=1_500, **{watched: 0.2})
         bar.advance(5_000)
-        bar.status(crashes=3_280, rhw=0.036)
-    assert last_share(stream) == "100"
-
-
-def test_without_an_rhw_that_is_asked_for_the_share_is_that_of_the_budget():
-    stream = Terminal()
-    with RichProgress(0.05, 3_000, stream) as bar:
-        bar.stage("episodes", total=20_000)
-        bar.advance(5_000)
-        bar.status(crashes=3_280, half_width=0.036)
-    assert last_share(stream) == "25"
+        bar.status(crashes=3_280, **{watched: 0.036})
+    assert last_share(stream) == share
 
 
 def test_work_of_an_earlier_run_does_not_count_as_speed():
@@ -93,9 +89,11 @@ def test_work_of_an_earlier_run_does_not_count_as_speed():
 
 
 def test_figures_before_any_stage_are_no_error():
-    with RichProgress(stream=Terminal()) as bar:
+    stream = Terminal()
+    with RichProgress(stream=stream) as bar:
         bar.advance(1)
         bar.status(crashes=1)
+    assert "crashes" not in stream.getvalue()
 
 
 def test_a_bar_only_on_a_terminal(monkeypatch):

@@ -20,7 +20,6 @@ from harness.console import (
     print_estimates,
     print_json,
     print_required_tests,
-    write_json,
     write_trace,
 )
 from harness.errors import EXIT_BAD_INPUT, WorldDisagreementError
@@ -77,6 +76,8 @@ def estimate(
             folder, estimators=estimators or None, confidence=confidence, pool=pool_file, progress=bar
         )
     if write:
+        from harness.records.folder import write_json  # noqa: PLC0415 - keeps --help fast
+
         write_json(folder / "estimates.json", content)
     if as_json:
         print_json(content)

@@ -109,13 +109,12 @@ class Shells:
             largest_weight_share=float(np.max(y[self.crashes > 0], initial=0.0)) / free.rate if free.rate > 0 else 0.0,
             method=_METHOD + "; upper bound: the same, one-sided",
             warnings=tuple(self._warnings()),
-            details=self._details(confidence),
+            details=self._details(confidence, free),
         )
 
-    def _details(self, confidence: float) -> dict[str, Any]:
+    def _details(self, confidence: float, free: Limits) -> dict[str, Any]:
         design = self._design()
         failed_too = self.assumption_free(confidence, self.crashes + self.failed)
-        free = self.assumption_free(confidence)
         return {
             "n_failed": int(self.failed.sum()),
             "crash_rate_if_failed_had_crashed": failed_too.rate,

@@ -26,7 +26,7 @@ MEND_SHARD = (
     "Delete all files of this shard (in episodes/, moments/ and traces/) and run again with --resume: "
     "the same episodes are made anew."
 )
-"""A shard counts as finished by its episodes file: one of the others alone is not made again."""
+"""All files, because a missing traces file alone is not made again: whether traces are kept may change on --resume."""
 NO_RUN = "Give a folder that `harness run` has written."
 
 

@@ -76,4 +76,5 @@ def test_another_basis_of_scv_can_be_asked_for():
 def test_every_estimate_can_be_written_as_json(method):
     done = one_pass(blocks(CHAIN, method, [50], SEED))
     for estimate in done.estimates.values():
-        json.dumps(estimate.to_json(), allow_nan=False)
+        written = json.dumps(estimate.to_json(), allow_nan=False)  # raises where a number is not finite
+        assert json.loads(written)["crash_rate"] == getattr(estimate, "crash_rate", None)
