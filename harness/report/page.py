@@ -16,9 +16,12 @@ from harness.records.folder import write_bytes
 from harness.records.schemas import OUTCOMES
 from harness.report import number_format
 from harness.report.answer_plot import answer_plot
+from harness.report.contrast_plot import contrast_plot
 from harness.report.convergence_plot import convergence_plot
+from harness.report.crash_contrast import Contrast, band_in_words, crash_contrast
 from harness.report.crash_gallery import GalleryRow, crash_gallery
 from harness.report.crash_plot import crash_time_plot, impact_speed_plot
+from harness.report.cut_in_conditions import CONDITIONS
 from harness.report.cut_in_plot import cut_in_plot
 from harness.report.estimate_table import asked_of_conditional, estimate_table, in_unit, run_notes, target_rhw
 from harness.report.plot_style import RC, Plot, inline_svg, png, svg
@@ -29,10 +32,11 @@ from harness.report.shells_plot import shells_plot
 from harness.report.shells_result import SHOWN_IN_SECTION, ShellsResult, shells_result
 from harness.report.strata_plot import strata_plot
 from harness.report.summary import RunSummary, summarise
+from harness.report.telling_bands import RELABELINGS, SIGNIFICANT
 from harness.report.weight_plot import weight_plot
 
 PLOT_NAMES = re.compile(
-    r"(answer|shells|convergence|weights|strata|cut_ins|impact_speed|crash_time|crash-\d+)\.(png|svg)"
+    r"(answer|shells|convergence|weights|strata|contrast|cut_ins|impact_speed|crash_time|crash-\d+)\.(png|svg)"
 )
 
 
@@ -72,22 +76,28 @@ def write_report(folder: Path) -> Path:
     run = read_run_folder(folder)
     sizes = table_sizes(run)
     summary, shells = summarise(run), shells_result(run.estimates)
+    contrast = crash_contrast(run, shells)
     with matplotlib.style.context(["default", RC]):
         gallery = crash_gallery(run, summary)
-        files, figures = _rendered(_plots(run, summary, shells, gallery))
-    page = _page(run=run, summary=summary, shells=shells, sizes=sizes, gallery=gallery, figures=figures)
+        files, figures = _rendered(_plots(run, summary, shells, contrast, gallery))
+    page = _page(
+        run=run, summary=summary, shells=shells, contrast=contrast, sizes=sizes, gallery=gallery, figures=figures
+    )
     _write_plots(folder / "plots", files)
     write_bytes(folder / "report.html", page.encode("utf-8"))
     return folder / "report.html"
 
 
-def _plots(run: RunFolder, summary: RunSummary, shells: ShellsResult | None, gallery: list[GalleryRow]) -> list[Plot]:
+def _plots(
+    run: RunFolder, summary: RunSummary, shells: ShellsResult | None, contrast: Contrast, gallery: list[GalleryRow]
+) -> list[Plot]:
     # Within a shell all tests weigh the same and there is one control step, the cut-in: nothing to draw of either.
     drawn_by = [weight_plot(summary), strata_plot(summary)] if shells is None else [shells_plot(shells)]
     plots = [
         answer_plot(run.estimates),
         convergence_plot(run.estimates, target_rhw(run), of_conditional=asked_of_conditional(run)),
         *drawn_by,
+        contrast_plot(contrast),
         cut_in_plot(summary),
         impact_speed_plot(summary),
         crash_time_plot(summary),
@@ -112,6 +122,7 @@ def _page(
     run: RunFolder,
     summary: RunSummary,
     shells: ShellsResult | None,
+    contrast: Contrast,
     sizes: list[Any],
     gallery: list[GalleryRow],
     figures: dict[str, Figure],
@@ -129,6 +140,10 @@ def _page(
         run=run,
         summary=summary,
         shells=shells,
+        contrast=contrast,
+        conditions=CONDITIONS,
+        relabelings=RELABELINGS,
+        significant=SIGNIFICANT,
         outcomes=_outcomes(summary),
         sizes=sizes,
         gallery=gallery,
@@ -151,6 +166,7 @@ def _page(
 
 def _filters() -> dict[str, Callable[..., str]]:
     return {
+        "band_in_words": band_in_words,
         "number": number_format.number,
         "interval": number_format.interval,
         "count": number_format.count,

@@ -1,0 +1,121 @@
+"""What crashes have in common: the scan finds narrow bands, keeps its level, and the page says it in words."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.stats import binomtest
+from test_report_page import page_of
+
+from harness.report import telling_bands as scan
+from harness.report.contrast_plot import contrast_plot
+from harness.report.crash_contrast import Contrast, crash_contrast
+from harness.report.cut_in_conditions import CONDITIONS
+from harness.report.run_folder import read_run_folder
+from harness.report.shells_result import shells_result
+from harness.report.telling_bands import SIGNIFICANT, telling_bands
+
+Q = len(CONDITIONS)
+CRASH = np.arange(1_000) < 20
+
+
+def noise(rng, q=Q):
+    return rng.normal(0.0, 10.0, (q, CRASH.size))
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+def test_a_narrow_band_inside_the_range_comes_first(weighted):
+    rng = np.random.default_rng(1)
+    values = noise(rng)
+    values[3, CRASH] = rng.uniform(2.02, 2.48, 20)
+    weight = rng.lognormal(0.0, 1.0, CRASH.size) if weighted else np.ones(CRASH.size)
+    first, *others = telling_bands(values, CRASH, weight)
+    assert (first.quantity, first.low, first.high, first.n_crashes) == (3, 2.0, 2.5, 20)
+    assert first.crash_share == pytest.approx(1.0)
+    inside = (values[3] >= 2.0) & (values[3] <= 2.5) & ~CRASH
+    assert first.other_share == pytest.approx(weight[inside].sum() / weight[~CRASH].sum())
+    assert first.significant
+    assert not any(band.significant for band in others)
+
+
+def test_an_open_end_and_missing_and_infinite_values():
+    rng = np.random.default_rng(2)
+    values = noise(rng, 2)
+    values[1] = np.where(CRASH, rng.uniform(0.0, 1.0, CRASH.size), np.inf)
+    values[0, ::3] = np.nan
+    first = telling_bands(values, CRASH, np.ones(CRASH.size))[0]
+    assert (first.quantity, first.low) == (1, -np.inf)
+    assert first.high <= 1.0
+    assert first.other_share == 0.0
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+def test_chance_is_seldom_called_telling(weighted, monkeypatch):
+    """Over 200 worlds without any difference, p ≤ 0.1 must not come more often than in a tenth (level 1e-4)."""
+    monkeypatch.setattr(scan, "RELABELINGS", 39)
+    rng = np.random.default_rng(3)
+    low = 0
+    for _ in range(200):
+        weight = rng.lognormal(0.0, 1.5, CRASH.size) if weighted else np.ones(CRASH.size)
+        low += telling_bands(noise(rng, 4), CRASH, weight)[0].p_value <= 0.1
+    assert binomtest(low, 200, 0.1, alternative="greater").pvalue > 1e-4
+    assert low > 0
+
+
+def test_without_the_price_of_many_comparisons_chance_would_be_telling():
+    """The best of a thousand bands alone, judged by the usual limit of a likelihood ratio, nearly always «stands out»."""
+    rng = np.random.default_rng(4)
+    bins = np.stack([scan._bins(row) for row in noise(rng)])
+    best = scan._Cumulated(bins, np.ones(CRASH.size)).log_ratios(np.flatnonzero(CRASH)).max()
+    assert 2.0 * best > 6.63  # 1 % point of chi-squared with one degree of freedom
+
+
+def contrast_of(reports, name):
+    run = read_run_folder(reports[name])
+    return crash_contrast(run, shells_result(run.estimates))
+
+
+def words(page):
+    return " ".join(page.text.split())
+
+
+@pytest.mark.parametrize("name", ["full", "nde", "no_crashes", "nde_no_crashes", "failed"])
+def test_the_page_says_the_sentence(reports, name):
+    found = contrast_of(reports, name)
+    assert found.sentence in words(page_of(reports[name]))
+    assert not found.outside
+    assert ("nothing to compare" in found.sentence) == (found.n_crashes == 0)
+    assert (contrast_plot(found) is None) == (not found.telling)
+
+
+@pytest.mark.parametrize("name", ["shells", "shells_no_crashes", "shells_inside_only"])
+def test_without_crashes_outside_there_is_nothing_to_compare(reports, name):
+    found = contrast_of(reports, name)
+    assert found.sentence == "No test outside the boundary crashed, so there is nothing to compare."
+    assert found.sentence in words(page_of(reports[name]))
+
+
+def test_of_shells_only_the_outside_is_compared(reports):
+    run = read_run_folder(reports["shells_refuted"])
+    found, outside = contrast_of(reports, "shells_refuted"), shells_result(run.estimates).shells[-1]
+    assert found.outside
+    assert (found.n_crashes, found.n_others) == (outside.n_crashes, outside.n_tests - outside.n_crashes)
+    assert words(page_of(reports["shells_refuted"])).count(found.sentence) == 2
+
+
+def test_failed_tests_are_on_neither_side(reports):
+    found = contrast_of(reports, "failed")
+    episodes = read_run_folder(reports["failed"]).n_episodes
+    assert found.n_crashes + found.n_others <= episodes - 25
+
+
+def test_a_few_crashes_have_nothing_in_common():
+    few = Contrast(True, np.zeros((Q, 2)), np.zeros((Q, 50)), np.ones(2), np.ones(50), ())
+    assert few.sentence.startswith("With 2 crashes outside the boundary and 50 cut-ins")
+    assert SIGNIFICANT > 1.0 / (1.0 + scan.RELABELINGS)
+
+
+def test_estimators_without_a_value_take_one_line(reports):
+    text = words(page_of(reports["shells"]))
+    assert "No value" not in text
+    assert "6 more need other records than these: nde, nade, mixture_cv, scv, martingale, replay" in text
