@@ -208,6 +208,33 @@ def _two_digits(value: float) -> int:
     return round(value / size) * size
 
 
+LIMITS = {
+    "cut_in_ignores_the_av": "BV does not look at the AV at all (share `ignore_share` of all lane changes)",
+    "ttc_below_1.5_s": "time to collision at the cut-in below 1.5 s",
+    "ttc_below_0.5_s": "time to collision at the cut-in below 0.5 s",
+    "gap_below_5_m": "gap R2 at the cut-in below 5 m",
+    "gap_below_2_m": "gap R2 at the cut-in below 2 m",
+    "crash_within_1_s": "crash within one second of the cut-in",
+    "brakes-8_crashes_too": "braking at 8 m/s² from the next 0.1 s on does not help (shell `brakes-8`)",
+    "av_above_144_kmph": "AV faster than 144 km/h",
+}
+"""Figures of docs/limits.md, in words."""
+
+
+def limits_table() -> str:
+    """Table of what the crash rate of the default vehicle comes from, with its command."""
+    found = json.loads((FOLDER / "validation" / "limits.json").read_text(encoding="utf-8"))
+    rows = []
+    for name, words in LIMITS.items():
+        share, error = found["of_the_rate"][name]
+        rows.append((words, f"{share:.1%}", "–" if error is None else f"{error:.1%}"))
+    fast = found["of_the_tests"]["av_above_144_kmph"]
+    return _table(("cut-ins", "share of the crash rate", "± standard error"), rows) + (
+        f"\nOf the tests, {fast:.1%} have an AV faster than 144 km/h. Default vehicle, {found['crash_rate']:.3g} per test, "
+        f"{found['n_crashes']:,} sampled crashes. `{found['command']}` prints it; its first lines say how the run is made.\n"
+    )
+
+
 VALIDATED = ("shells_panel", "chains_shells", "chains_forced", "twin_forced_online")
 """Replication experiments that are shown line by line."""
 METHODS = {
@@ -289,6 +316,7 @@ def parts() -> dict[str, Callable[[], str]]:
     for name in VALIDATED:
         found[f"validated-{name}"] = lambda name=name: validated_table(name)
     found["validated-methods"] = methods_table
+    found["limits"] = limits_table
     return found
 
 

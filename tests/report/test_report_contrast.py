@@ -63,7 +63,7 @@ def test_chance_is_seldom_called_telling(weighted, monkeypatch):
 
 
 def test_without_the_price_of_many_comparisons_chance_would_be_telling():
-    """The best of a thousand bands alone, judged by the usual limit of a likelihood ratio, nearly always «stands out»."""
+    """The best of a thousand bands, judged by the usual limit of a likelihood ratio, «stands out» of mere noise."""
     rng = np.random.default_rng(4)
     bins = np.stack([scan._bins(row) for row in noise(rng)])
     best = scan._Cumulated(bins, np.ones(CRASH.size)).log_ratios(np.flatnonzero(CRASH)).max()
@@ -99,7 +99,8 @@ def test_of_shells_only_the_outside_is_compared(reports):
     run = read_run_folder(reports["shells_refuted"])
     found, outside = contrast_of(reports, "shells_refuted"), shells_result(run.estimates).shells[-1]
     assert found.outside
-    assert (found.n_crashes, found.n_others) == (outside.n_crashes, outside.n_tests - outside.n_crashes)
+    assert found.n_crashes == outside.n_crashes
+    assert 0 < found.n_others <= outside.n_tests - outside.n_crashes  # those that had a cut-in
     assert words(page_of(reports["shells_refuted"])).count(found.sentence) == 2
 
 

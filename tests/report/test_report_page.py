@@ -22,15 +22,15 @@ ALWAYS = {"answer", "convergence"}
 OF_WEIGHTS = {"weights"}
 OF_CRASHES = {"cut_ins", "impact_speed", "crash_time"}
 EXPECTED = {
-    "full": ALWAYS | OF_WEIGHTS | OF_CRASHES | {"strata"},
+    "full": ALWAYS | OF_WEIGHTS | OF_CRASHES | {"strata", "contrast"},
     "no_crashes": ALWAYS | OF_WEIGHTS | {"cut_ins"},
-    "no_traces": ALWAYS | OF_WEIGHTS | OF_CRASHES | {"strata"},
-    "no_moments": ALWAYS | OF_WEIGHTS | OF_CRASHES | {"strata"},
-    "nde": ALWAYS | OF_CRASHES,
+    "no_traces": ALWAYS | OF_WEIGHTS | OF_CRASHES | {"strata", "contrast"},
+    "no_moments": ALWAYS | OF_WEIGHTS | OF_CRASHES | {"strata", "contrast"},
+    "nde": ALWAYS | OF_CRASHES | {"contrast"},
     "nde_no_crashes": ALWAYS,
-    "failed": ALWAYS | OF_WEIGHTS | OF_CRASHES | {"strata"},
+    "failed": ALWAYS | OF_WEIGHTS | OF_CRASHES | {"strata", "contrast"},
     "shells": ALWAYS | OF_CRASHES | {"shells"},
-    "shells_refuted": ALWAYS | OF_CRASHES | {"shells"},
+    "shells_refuted": ALWAYS | OF_CRASHES | {"shells", "contrast"},
     "shells_no_crashes": ALWAYS | {"cut_ins", "shells"},
     "shells_inside_only": ALWAYS | OF_CRASHES | {"shells"},
 }

@@ -1,0 +1,69 @@
+"""What stopping costs shells when the vehicle has a rare hole: bias and coverage of campaigns on the default pool.
+
+    python -m benchmarks.shells_rare_hole [REPLICATIONS]
+
+The vehicle crashes as the default IDM does inside the boundary, and in a small share of the cut-ins outside. Shell
+probabilities are those of the pool and taken as exact, allocation, rounds, stop rule and estimator those of a campaign; the
+tests of a shell are replaced by a binomial number. Prints the table of docs/estimators.md.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from benchmarks.contenders import SCENARIOS
+from harness.arrays import FloatArray
+from harness.campaign.loading import load_campaign
+from harness.pool.shells import ShellDesign, design_shells
+from harness.pool.storage import campaign_pool
+from harness.validation.shell_campaign import FREE, ShellCampaign
+
+IDM = np.array([1.0, 1.0, 0.362, 0.0, 0.0, 0.0])
+"""Crash shares of the default IDM inside, from docs/limits.md's run: 1,086 of 3,000 tests crashed in the shell brakes-3."""
+HOLES = (0.0, 0.001, 0.003, 0.01)
+ASKED = ((0.3, 0.9), (0.3, 0.95), (0.3, 0.99), (0.1, 0.9))
+"""RHW and confidence."""
+SEED = 20_240
+
+
+@dataclass(frozen=True)
+class Fixed:
+    """A source of campaigns on one pool, without error of its own."""
+
+    design: ShellDesign
+    share: FloatArray
+
+    def draw(self, rng: np.random.Generator) -> tuple[ShellDesign, FloatArray]:
+        """The same each time."""
+        return self.design, self.share
+
+
+def main(replications: int) -> None:
+    """Print the table."""
+    settings = ["stop.min_crashes=null", "testing.shells.first_tests=12", "stop.episodes=1e6"]
+    pool = campaign_pool(load_campaign(SCENARIOS / "smoke.yaml", settings))
+    design = replace(design_shells(pool, limit_mps2=2.0), n_paths=10**12)
+    print("| crashes outside | asked RHW | confidence | median tests | bias | covers |")
+    print("| --- | --- | --- | --- | --- | --- |")
+    for rhw, confidence in ASKED:
+        campaign = load_campaign(
+            SCENARIOS / "smoke.yaml", [*settings, f"stop.rhw={rhw}", f"stop.confidence={confidence}"]
+        )
+        for hole in HOLES:
+            share = np.r_[IDM, hole]
+            truth = float(design.p @ share)
+            source = ShellCampaign(campaign, Fixed(design, share), SEED)
+            rows = [row for k in range(replications) for row in source.run(k) if row.result == FREE]
+            rate = np.array([row.crash_rate for row in rows])
+            error = rate.std(ddof=1) / truth / np.sqrt(replications)
+            covers = np.mean([row.ci_low <= truth <= row.ci_high for row in rows])
+            tests = np.median([row.n_tests for row in rows])
+            bias = f"{100 * (rate.mean() / truth - 1):+.1f} % ± {100 * error:.1f} %"
+            print(f"| {hole:.1%} | {rhw:g} | {confidence:g} | {tests:,.0f} | {bias} | {covers:.3f} |", flush=True)
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]) if len(sys.argv) > 1 else 2_000)
