@@ -3,8 +3,8 @@
     python -m benchmarks.shells_rare_hole [REPLICATIONS]
 
 The vehicle crashes as the default IDM does inside the boundary, and in a small share of the cut-ins outside. Shell
-probabilities are those of the pool and taken as exact, allocation, rounds, stop rule and estimator those of a campaign; the
-tests of a shell are replaced by a binomial number. Prints the table of docs/estimators.md.
+probabilities are those of the pool and taken as exact; allocation, rounds, stop rule and estimator are those of a
+campaign; the tests of a shell are replaced by a binomial number. Prints the table of docs/estimators.md.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from harness.pool.storage import campaign_pool
 from harness.validation.shell_campaign import FREE, ShellCampaign
 
 IDM = np.array([1.0, 1.0, 0.362, 0.0, 0.0, 0.0])
-"""Crash shares of the default IDM inside, from docs/limits.md's run: 1,086 of 3,000 tests crashed in the shell brakes-3."""
+"""Crash shares of the default IDM inside: in the run of docs/limits.md 1,086 of 3,000 tests crashed in brakes-3."""
 HOLES = (0.0, 0.001, 0.003, 0.01)
 ASKED = ((0.3, 0.9), (0.3, 0.95), (0.3, 0.99), (0.1, 0.9))
 """RHW and confidence."""
@@ -36,7 +36,7 @@ class Fixed:
     design: ShellDesign
     share: FloatArray
 
-    def draw(self, rng: np.random.Generator) -> tuple[ShellDesign, FloatArray]:
+    def draw(self, _: np.random.Generator) -> tuple[ShellDesign, FloatArray]:
         """The same each time."""
         return self.design, self.share
 

@@ -227,11 +227,13 @@ def limits_table() -> str:
     rows = []
     for name, words in LIMITS.items():
         share, error = found["of_the_rate"][name]
-        rows.append((words, f"{share:.1%}", "–" if error is None else f"{error:.1%}"))
+        shown = f"{share:.1%}" if share < 0.999 else "> 99.9%"
+        rows.append((words, shown, "–" if error is None else f"{error:.1%}"))
     fast = found["of_the_tests"]["av_above_144_kmph"]
     return _table(("cut-ins", "share of the crash rate", "± standard error"), rows) + (
-        f"\nOf the tests, {fast:.1%} have an AV faster than 144 km/h. Default vehicle, {found['crash_rate']:.3g} per test, "
-        f"{found['n_crashes']:,} sampled crashes. `{found['command']}` prints it; its first lines say how the run is made.\n"
+        f"\nOf the tests, {fast:.1%} have an AV faster than 144 km/h. Default vehicle, {found['crash_rate']:.3g} per "
+        f"test, {found['n_crashes']:,} sampled crashes. `{found['command']}` prints it; its docstring says how the run "
+        "is made.\n"
     )
 
 

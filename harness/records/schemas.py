@@ -64,7 +64,7 @@ def episodes_schema(n_importance: int, n_surrogates: int) -> pa.Schema:
             _field("av_distance_m", f8, "m", "distance that the AV drove in the episode"),
             _field("n_control_steps", pa.int16(), "1", "stratum l: steps drawn from an importance function"),
             _field("component", pa.int8(), "1", "importance function drawn (episode mixture), or shell, else -1"),
-            _field("log_weight", f8, "1", "log p(x_c) - log q_sampled(x_c); exactly 0 without control"),
+            _field("log_weight", f8, "1", "log p(x_c) - log q_sampled(x_c), 0 without control; of shells log p_s"),
             _field(
                 "log_p_cut_in", f8, "1", "log P(cut-in | path), where the method draws the path ahead", nullable=True
             ),

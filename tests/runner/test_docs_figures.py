@@ -1,0 +1,56 @@
+"""The lines of pandas in docs/records.md give the rate of every method; the figures of docs/limits.md come out again."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from benchmarks.limits import limits
+from tests.runner.test_shells_runs import SHELLS
+
+DOCS = Path(__file__).parents[2] / "docs"
+TWIN = ("world.engine=twin", "records.traces=none", "records.trace_share=0", "records.moments=none")
+METHODS = {
+    "shells": SHELLS,
+    "forced": ("testing.method=forced", "stop.episodes=1600"),
+    "nde": ("testing.method=nde", "environment.lane_change_level=1e4", "stop.episodes=8000", "run.shard_size=4000"),
+    "step_mixture": ("testing.method=step_mixture", "stop.episodes=400"),
+    "episode_mixture": ("testing.method=episode_mixture", "stop.episodes=400"),
+}
+MEAN = {"shells": "shells", "nde": "nde"}
+
+
+def lines():
+    (block,) = [
+        text
+        for text in re.findall(r"^```python\n(.*?)^```$", (DOCS / "records.md").read_text(), re.MULTILINE | re.DOTALL)
+        if "from_shells" in text
+    ]
+    return block
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_the_lines_in_the_docs_give_the_rate(method, campaign, run_here, tmp_path, capsys):
+    result = run_here(campaign(*METHODS[method], *TWIN), tmp_path / "run")
+    exec(lines().replace("runs/hard-braking", str(result.folder)), {})
+    rate = result.estimates["estimates"][MEAN.get(method, "nade")]["crash_rate"]
+    assert rate > 0.0
+    assert float(capsys.readouterr().out) == pytest.approx(rate, rel=1e-9)
+    tests = pd.read_parquet(result.folder / "episodes")
+    plain = (np.exp(tests.log_weight) * (tests.outcome == "crash")).mean()
+    assert (plain == pytest.approx(rate, rel=1e-9)) == (method != "shells")
+
+
+def test_the_figures_of_the_limits_come_out_of_another_run(campaign, run_here, tmp_path):
+    """A small pool and few tests: within six standard errors, and five per cent for the pool, of what is printed."""
+    found = limits(run_here(campaign(*SHELLS, *TWIN, "seed=5"), tmp_path / "run").folder)
+    printed = json.loads((DOCS / "validation" / "limits.json").read_text())
+    assert found["of_the_tests"] == printed["of_the_tests"]
+    assert found["of_the_rate"].keys() == printed["of_the_rate"].keys()
+    for name, (share, error) in found["of_the_rate"].items():
+        assert share == pytest.approx(printed["of_the_rate"][name][0], abs=6.0 * (error or 0.03) + 0.05), name
