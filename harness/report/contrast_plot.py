@@ -16,8 +16,8 @@ PANELS = 3
 BARS = 40
 TICKED_CRASHES = 60
 """Up to so many crashes each get a mark of their own below the bars."""
-SHOWN = (0.005, 0.995)
-"""Quantiles of all values between which a panel reaches: times to collision have no end."""
+OTHERS_SHOWN, CRASHES_SHOWN = (0.005, 0.995), (0.25, 0.75)
+"""Quantiles that a panel reaches at least; of crashes fewer, because some need a braking of hundreds of m/s²."""
 
 
 def contrast_plot(contrast: Contrast) -> Plot | None:
@@ -36,6 +36,7 @@ def contrast_plot(contrast: Contrast) -> Plot | None:
     names = ", ".join(CONDITIONS[band.quantity].name for band in bands)
     alt = f"Histograms among crashes and among tests without a crash: {names}. {contrast.sentence}"
     ticks = " Each mark at the foot is a crash." if contrast.n_crashes <= TICKED_CRASHES else ""
+    ticks += " What lies beyond a panel counts in its outermost bar."
     weighted = "" if contrast.outside else " Both are weighted to naturalistic driving."
     caption = (
         f"Orange: {count(contrast.n_crashes)} crashes; grey: {count(contrast.n_others)} tests without one. Shaded: the "
@@ -63,11 +64,13 @@ def _draw(axes: Axes, contrast: Contrast, band: Band) -> None:
 
 
 def _range(crashes: Floats, others: Floats, band: Band) -> tuple[float, float]:
-    """From and to which value a panel shows: nearly all of both groups, and the band."""
-    known = [row[np.isfinite(row)] for row in (crashes, others)]
+    """From and to which value a panel shows: nearly all tests without a crash, most crashes, and the band."""
     ends = [end for end in (band.low, band.high) if np.isfinite(end)]
-    low = min(*(float(np.quantile(row, SHOWN[0])) for row in known if row.size), *ends)
-    high = max(*(float(np.quantile(row, SHOWN[1])) for row in known if row.size), *ends)
+    for values, shown in ((others, OTHERS_SHOWN), (crashes, CRASHES_SHOWN)):
+        known = values[np.isfinite(values)]
+        if known.size:
+            ends += np.quantile(known, shown).tolist()
+    low, high = min(ends), max(ends)
     return (low, high) if high > low else (low - 0.5, low + 0.5)
 
 

@@ -1,4 +1,4 @@
-"""The lines of pandas in docs/records.md give the rate of every method; the figures of docs/limits.md come out again."""
+"""The pandas lines in docs/records.md give the rate of every method; the figures of docs/limits.md come out again."""
 
 from __future__ import annotations
 
