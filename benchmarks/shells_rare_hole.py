@@ -24,7 +24,7 @@ from harness.validation.shell_campaign import FREE, ShellCampaign
 IDM = np.array([1.0, 1.0, 0.362, 0.0, 0.0, 0.0])
 """Crash shares of the default IDM inside: in the run of docs/limits.md 1,086 of 3,000 tests crashed in brakes-3."""
 HOLES = (0.0, 0.001, 0.003, 0.01)
-ASKED = ((0.3, 0.9), (0.3, 0.95), (0.3, 0.99), (0.1, 0.9))
+ASKED = ((0.3, 0.9), (0.3, 0.95), (0.3, 0.99))
 """RHW and confidence."""
 SEED = 20_240
 

@@ -15,9 +15,9 @@ MOST_BINS = 40
 
 
 def strata_plot(summary: RunSummary) -> Plot | None:
-    """Draw sampled crashes and share of the estimate per number of control steps; None without crashes or control."""
+    """Draw sampled crashes and share of the estimate per number of control steps; None unless there are several."""
     used = summary.stratum_crash.used()
-    if used is None or used == (0, 1):
+    if used is None or used[1] - used[0] == 1:
         return None
     bins = summary.stratum_crash.bins(MOST_BINS)
     figure = new_figure(FULL_WIDTH_IN, 2.9)
