@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from harness.environment.initial_state import InitialStates
+from harness.episode.begin import place
 from tests.chains.seed import SEED
 from tests.environment.kernels import environment
 
@@ -117,3 +118,19 @@ def test_a_range_can_be_split_anywhere(parts, first, seed):
     starts = np.cumsum([0, *parts[:-1]])
     pieces = [sampler.draw(seed, first + int(start), n) for start, n in zip(starts, parts, strict=True)]
     assert whole.tobytes() == np.concatenate(pieces).tobytes()
+
+
+def test_only_the_rate_is_drawn_anew_where_time_to_collision_is_short(states):
+    """v_BV and R1 keep their laws: as docs/environment.md says, whole states are not discarded."""
+    numbers = environment().numbers.copy()
+    numbers["initial_state__r1dot_min_ttc_s"] = 1e-6  # no truncation
+    free = InitialStates(numbers).draw(SEED, 0, N)
+    np.testing.assert_array_equal(free[:, [0, 1, 3, 4]], states[:, [0, 1, 3, 4]])
+    assert (free[:, 2] < -free[:, 1] / 3.0).any()
+    assert not (states[:, 2] < -states[:, 1] / 3.0 - 1e-9).any()
+
+
+def test_lv_does_not_start_backwards():
+    x, v = np.zeros(3), np.zeros(3)
+    place(np.array([20.0, 100.0, -25.0, 50.0, -7.0]), x, v)
+    assert v.tolist() == [0.0, 20.0, 27.0]

@@ -1,6 +1,7 @@
 """The parameter file: every number says where it comes from, and a wrong file is an error that names the place."""
 
 import re
+from pathlib import Path
 
 import pytest
 from ruamel.yaml import YAML
@@ -21,6 +22,12 @@ def user_file(tmp_path, old, new, count=1):
     path = tmp_path / "mine.yaml"
     path.write_text(TEXT.replace(old, new, count), encoding="utf-8")
     return Environment(parameters=str(path))
+
+
+def test_the_page_and_the_file_tag_the_share_that_ignores_the_av_alike():
+    page = (Path(__file__).parents[2] / "docs/environment.md").read_text(encoding="utf-8")
+    (tag,) = re.findall(r"`ignore_share`\) is the share of lane changes that ignore the vehicle behind \[(\w+)\]", page)
+    assert tag == DATA["cut_in"]["ignore_share"]["source"]
 
 
 def test_every_number_says_where_it_comes_from():
