@@ -19,7 +19,7 @@ from harness.commands.stored import estimate, replay, report, rnot
 from harness.commands.studies import pool, validate
 from harness.commands.vehicles import av_check, compare, ladder
 from harness.console import show_error, show_interrupted, system_error, usage_error
-from harness.errors import EXIT_DONE, HarnessError
+from harness.errors import EXIT_DONE, HarnessError, shortened
 
 EXIT_INTERRUPTED = 130
 
@@ -65,8 +65,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except click.ClickException as error:
         if isinstance(error, click.UsageError) and error.ctx is not None and error.ctx.parent is not None:
             show_error(usage_error(error, error.ctx))
-        else:  # without a command, click shows the help
+        elif isinstance(error, click.exceptions.NoArgsIsHelpError):
             error.show()
+        else:
+            click.UsageError(shortened(error.message), getattr(error, "ctx", None)).show()
         return error.exit_code
     except (click.Abort, KeyboardInterrupt):
         show_interrupted(can_resume=_is_run(arguments))

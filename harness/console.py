@@ -42,7 +42,7 @@ def show_interrupted(*, can_resume: bool) -> None:
 
 def system_error(error: OSError) -> HarnessError | None:
     """Translate an error of the operating system that a user can mend; None for any other."""
-    where = str(error.filename or "disk")
+    where = str(error.filename or f"disk of the output folder, or of the cache {_cache_folder()}")
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return HarnessError(
             where,
@@ -66,6 +66,13 @@ def system_error(error: OSError) -> HarnessError | None:
             mend="Change its permissions, or choose another place.",
         )
     return None
+
+
+def _cache_folder() -> str:
+    """Where compiled kernels are kept: numba does not say of a file of its own which it was."""
+    from harness.compiled import cache_root  # noqa: PLC0415 - keeps --help fast
+
+    return str(cache_root())
 
 
 def usage_error(error: click.UsageError, context: click.Context) -> HarnessError:
