@@ -1,7 +1,8 @@
 """The command ``harness``.
 
 Results go to stdout or to files, progress and complaints to stderr. Exit codes: 0 done; 2 the campaign or the call is
-wrong; 3 too many episodes failed or the world disagreed; 4 budget spent before the asked precision; 130 interrupted.
+wrong; 3 too many episodes failed or the world disagreed; 4 budget spent before the asked precision; 130, 143 or 129
+interrupted by Ctrl-C, SIGTERM or SIGHUP.
 What does the work is imported inside each command, so that ``--help`` answers at once.
 """
 
@@ -19,9 +20,8 @@ from harness.commands.stored import estimate, replay, report, rnot
 from harness.commands.studies import pool, validate
 from harness.commands.vehicles import av_check, compare, ladder
 from harness.console import show_error, show_interrupted, system_error, usage_error
-from harness.errors import EXIT_DONE, HarnessError
-
-EXIT_INTERRUPTED = 130
+from harness.errors import EXIT_DONE, HarnessError, shortened
+from harness.interruption import Interruption, interruptible
 
 
 @click.group(
@@ -40,7 +40,7 @@ def cli() -> None:
 
     Exit codes: 0 done; 2 the campaign or the call is wrong, or the records do not allow what was asked for; 3 too many
     episodes failed, or SUMO disagreed with the formula; 4 the budget or the pool was spent before the asked precision;
-    130 interrupted.
+    130 interrupted by Ctrl-C, 143 by SIGTERM, 129 by SIGHUP: all three keep what is finished.
     """
 
 
@@ -56,6 +56,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     int
         Exit code; anything that is not a user's error is a defect and leaves as its own exception.
     """
+    with interruptible() as interruption:
+        return _main(arguments, interruption)
+
+
+def _main(arguments: Sequence[str] | None, interruption: Interruption) -> int:
     try:
         code = cli.main(args=None if arguments is None else list(arguments), prog_name="harness", standalone_mode=False)
         sys.stdout.flush()
@@ -65,26 +70,30 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except click.ClickException as error:
         if isinstance(error, click.UsageError) and error.ctx is not None and error.ctx.parent is not None:
             show_error(usage_error(error, error.ctx))
-        else:  # without a command, click shows the help
+        elif isinstance(error, click.exceptions.NoArgsIsHelpError):
             error.show()
+        else:
+            click.UsageError(shortened(error.message), getattr(error, "ctx", None)).show()
         return error.exit_code
     except (click.Abort, KeyboardInterrupt):
-        show_interrupted(can_resume=_is_run(arguments))
-        return EXIT_INTERRUPTED
-    except BrokenPipeError:
-        _discard_stdout()
-        return EXIT_DONE
+        return _end_early(arguments, interruption)
     except OSError as error:
+        if interruption.signal is not None:  # a terminal that is gone takes no last word
+            return _end_early(arguments, interruption)
         return _show_system_error(error)
     return code if isinstance(code, int) else EXIT_DONE
 
 
-def _is_run(arguments: Sequence[str] | None) -> bool:
-    command = sys.argv[1:2] if arguments is None else arguments[:1]
-    return "run" in command
+def _end_early(arguments: Sequence[str] | None, interruption: Interruption) -> int:
+    command = next(iter(sys.argv[1:2] if arguments is None else arguments[:1]), "")
+    show_interrupted(command, None if interruption.signal is None else interruption.signal.name)
+    return interruption.exit_code
 
 
 def _show_system_error(error: OSError) -> int:
+    if isinstance(error, BrokenPipeError):
+        _discard_stdout()
+        return EXIT_DONE
     known = system_error(error)
     if known is None:
         raise error

@@ -6,6 +6,7 @@ import errno
 import json
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -34,15 +35,22 @@ def show_error(error: HarnessError) -> None:
             click.echo(f"  {label + ':':<9} {getattr(part, label)}", err=True)
 
 
-def show_interrupted(*, can_resume: bool) -> None:
-    """Say that Ctrl-C arrived, and that nothing finished is lost."""
-    advice = " Finished shards are kept: the same command with --resume goes on." if can_resume else ""
-    click.echo(f"Interrupted.{advice}", err=True)
+_HOW_TO_GO_ON = {
+    "run": " Finished shards are kept: the same command with --resume goes on.",
+    "compare": " Finished shards are kept: the same command goes on.",
+}
+
+
+def show_interrupted(command: str, signal_name: str | None) -> None:
+    """Say that the user or the system asked for the end, and that nothing finished is lost."""
+    by = f" by {signal_name}" if signal_name not in (None, "SIGINT") else ""
+    with suppress(OSError):  # after SIGHUP there may be no terminal left
+        click.echo(f"Interrupted{by}.{_HOW_TO_GO_ON.get(command, '')}", err=True)
 
 
 def system_error(error: OSError) -> HarnessError | None:
     """Translate an error of the operating system that a user can mend; None for any other."""
-    where = str(error.filename or "disk")
+    where = str(error.filename or f"disk of the output folder, or of the cache {_cache_folder()}")
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return HarnessError(
             where,
@@ -66,6 +74,13 @@ def system_error(error: OSError) -> HarnessError | None:
             mend="Change its permissions, or choose another place.",
         )
     return None
+
+
+def _cache_folder() -> str:
+    """Where compiled kernels are kept: numba does not say of a file of its own which it was."""
+    from harness.compiled import cache_root  # noqa: PLC0415 - keeps --help fast
+
+    return str(cache_root())
 
 
 def usage_error(error: click.UsageError, context: click.Context) -> HarnessError:

@@ -6,12 +6,38 @@ Anything that is *not* a `HarnessError` is a defect of the harness itself and is
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 EXIT_DONE = 0
 EXIT_BAD_INPUT = 2
 EXIT_TOO_MANY_FAILED = 3
 EXIT_BUDGET_SPENT = 4
+
+LONGEST_PART = 400
+"""Characters of a part of a message: five lines of a terminal. What a user typed may be as long as they like."""
+LONGEST_ADVICE = 1200
+"""Advice may hold several commands."""
+
+
+def shortened(text: str, most: int = LONGEST_PART) -> str:
+    """The text, or its beginning with its full length where it is longer than ``most`` characters."""
+    if len(text) <= most:
+        return text
+    end = f"… ({len(text):,} characters)"
+    return text[: most - len(end)] + end
+
+
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Let an error of the system that is raised while ``path`` is written name it: a full disk by itself does not."""
+    try:
+        yield
+    except OSError as error:
+        error.filename = str(path)
+        raise
 
 
 class HarnessError(Exception):
@@ -22,17 +48,17 @@ class HarnessError(Exception):
     where : str
         YAML path (``testing.alpha``), file, or command-line option.
     found, expected, mend : str
-        What was found, what was expected, and what to do about it.
+        What was found, what was expected, and what to do about it. All are `shortened`: they may repeat what was given.
     """
 
     exit_code = EXIT_BAD_INPUT
 
     def __init__(self, where: str, *, found: str, expected: str, mend: str) -> None:
         super().__init__(where, found, expected, mend)
-        self.where = where
-        self.found = found
-        self.expected = expected
-        self.mend = mend
+        self.where = shortened(where)
+        self.found = shortened(found)
+        self.expected = shortened(expected)
+        self.mend = shortened(mend, LONGEST_ADVICE)
 
     def __reduce__(self) -> tuple[Any, ...]:
         # Errors travel from workers to the parent; pickle would call the class with positional arguments.

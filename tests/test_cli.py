@@ -277,6 +277,34 @@ def test_errors_of_the_system_that_can_be_mended(calls, capsys, tmp_path, number
     assert words in err
 
 
+def test_a_system_error_without_a_file_names_the_folders_it_may_be_in(calls, capsys, tmp_path, monkeypatch):
+    monkeypatch.setenv("HARNESS_CACHE_DIR", str(tmp_path / "cache"))
+    calls["stand_in"]("harness.runner.run_campaign", OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)))
+    assert main(["run", SMOKE, "--out", str(tmp_path)]) == 2
+    assert f"output folder, or of the cache {tmp_path}/cache" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["check", "x" * 10_000],
+        ["check", SMOKE, "--set", f"name={'x ' * 5_000}"],
+        ["check", SMOKE, "--set", f"{'x' * 10_000}=1"],
+        ["check", SMOKE, "--set", "x" * 10_000],
+        ["check", SMOKE, "--set", f"stop={'x' * 10_000}", "--set", f"av.model={'y' * 10_000}"],
+        ["check", SMOKE, "--av", "x" * 10_000],
+        ["check", SMOKE, "--" + "x" * 10_000],
+        ["x" * 10_000],
+        ["estimate", "x" * 10_000],
+    ],
+)
+def test_what_was_given_is_not_repeated_at_any_length(arguments, capsys):
+    assert main(arguments) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert max(map(len, lines)) < 1300
+    assert any("characters)" in line for line in lines)
+
+
 def test_defects_are_not_hidden(calls, tmp_path):
     calls["stand_in"]("harness.runner.run_campaign", OSError(errno.EBADF, "closed too early"))
     with pytest.raises(OSError, match="closed too early"):

@@ -13,7 +13,7 @@ from pydantic_core import ErrorDetails
 from harness.campaign.expectations import describe_expected, describe_found
 from harness.campaign.schema import Schema, SchemaView
 from harness.campaign.yaml_lines import YamlPath, dotted
-from harness.errors import CampaignError
+from harness.errors import CampaignError, shortened
 
 Place = Callable[[YamlPath], str]
 
@@ -26,6 +26,10 @@ class Problem:
     found: str
     expected: str
     mend: str
+
+    def __post_init__(self) -> None:
+        for part in ("where", "found", "expected", "mend"):
+            object.__setattr__(self, part, shortened(getattr(self, part)))
 
     def __str__(self) -> str:
         return f"{self.where}: found {self.found}; expected {self.expected}. {self.mend}"
@@ -49,7 +53,8 @@ class InvalidFileError(CampaignError):
             super().__init__(only.where, found=only.found, expected=only.expected, mend=only.mend)
         else:
             mend = "Mend each:\n" + "\n".join(f"  {problem}" for problem in self.problems)
-            super().__init__(path, found=f"{len(self.problems)} problems", expected="none", mend=mend)
+            super().__init__(path, found=f"{len(self.problems)} problems", expected="none", mend="")
+            self.mend = mend  # each of its lines is short
         self.path = path
 
     def __reduce__(self) -> tuple[type[InvalidFileError], tuple[str, tuple[Problem, ...]]]:

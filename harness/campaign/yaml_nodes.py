@@ -15,6 +15,45 @@ _NULLS = ("", "~", "null", "Null", "NULL")
 # Dates and the odd "=" have types of their own in YAML; here they are the text that was written.
 _TEXT_TAGS = tuple(_TAG + kind for kind in ("str", "timestamp", "value"))
 
+MOST_VALUES = 100_000
+"""Values of a document with every alias written out; the largest file that comes with the harness has 300."""
+DEEPEST = 50
+"""Levels of nesting, aliases written out; a campaign needs five."""
+TOO_DEEP = ("values nested too deeply", f"at most {DEEPEST} levels", "Close the brackets that were left open.")
+
+
+def require_bounded(root: Node, name: str) -> None:
+    """Refuse a document whose aliases multiply: a few lines can stand for more values than any memory holds.
+
+    Raises
+    ------
+    CampaignError
+        Written out, it has more than `MOST_VALUES` values or `DEEPEST` levels; the line is that where it first has.
+    """
+    known: dict[int, tuple[int, int]] = {}
+
+    def measure(node: Node) -> tuple[int, int]:
+        """Values and levels below a node; one that contains itself is left to `PlainData`."""
+        if id(node) in known:
+            return known[id(node)]
+        known[id(node)] = (1, 1)
+        inner = [measure(child) for child in _children(node)]
+        values, levels = 1 + sum(n for n, _ in inner), 1 + max((depth for _, depth in inner), default=0)
+        if values > MOST_VALUES or levels > DEEPEST:
+            many = (f"{values:,} values, aliases (*) written out", f"at most {MOST_VALUES:,}", "Delete aliases.")
+            found, expected, mend = many if values > MOST_VALUES else TOO_DEEP
+            raise CampaignError(f"{name}:{node.start_mark.line + 1}", found=found, expected=expected, mend=mend)
+        known[id(node)] = (values, levels)
+        return values, levels
+
+    measure(root)
+
+
+def _children(node: Node) -> list[Node]:
+    if isinstance(node, MappingNode):
+        return [part for pair in node.value for part in pair]
+    return list(node.value) if isinstance(node, SequenceNode) else []
+
 
 class PlainData:
     """Turns composed nodes into plain data; shared anchors become shared objects, so nothing blows up.
@@ -44,10 +83,7 @@ class PlainData:
         if id(node) in self._open:
             self._fail(node, "an anchor that contains itself", "a finite value", "Write the value out.")
         self._open.add(id(node))
-        try:
-            value = self._construct(node)
-        except RecursionError:
-            self._fail(node, "values nested too deeply", "a few levels", "Close the brackets that were left open.")
+        value = self._construct(node)
         self._done[id(node)] = value
         return value
 

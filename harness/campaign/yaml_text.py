@@ -6,21 +6,27 @@ unknown tag, a syntax error or an empty file is a `CampaignError` that names fil
 
 from __future__ import annotations
 
+import re
+import warnings
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
 from pydantic import BaseModel, ValidationError
 from ruamel.yaml import YAML
-from ruamel.yaml.error import MarkedYAMLError, YAMLError
+from ruamel.yaml.composer import MaxDepthExceededError
+from ruamel.yaml.error import MarkedYAMLError, ReusedAnchorWarning, YAMLError
 from ruamel.yaml.nodes import Node
 from ruamel.yaml.reader import ReaderError
 
 from harness.campaign.problems import invalid_file
 from harness.campaign.yaml_lines import Lines
-from harness.campaign.yaml_nodes import PlainData
+from harness.campaign.yaml_nodes import DEEPEST, TOO_DEEP, PlainData, require_bounded
 from harness.errors import CampaignError
 
 Model = TypeVar("Model", bound=BaseModel)
+
+LARGEST_FILE = 1_000_000
+"""Bytes of a YAML file that is read: a hundred times the largest that comes with the harness, some 25 s of reading."""
 
 _OPEN = "Look above for a [, { or quote that is not closed, and close it."
 _SYNTAX = {
@@ -146,7 +152,11 @@ def parse_value(text: str, where: str) -> Any:
 
 def _read_text(path: Path) -> str:
     try:
-        return path.read_text(encoding="utf-8-sig")
+        with path.open("rb") as file:
+            content = file.read(LARGEST_FILE + 1)  # not all of what may be a device without an end
+        if len(content) > LARGEST_FILE:
+            _fail(str(path), 1, f"more than {LARGEST_FILE:,} bytes", "a file of settings", "Is it the right file?")
+        return content.decode("utf-8-sig")
     except FileNotFoundError:
         found, mend = "no such file", "Check the spelling and the folder that you are in."
     except IsADirectoryError:
@@ -160,8 +170,15 @@ def _read_text(path: Path) -> str:
 
 def _compose(text: str, name: str) -> Node | None:
     parser = YAML(typ="safe", pure=True)
+    parser.max_depth = DEEPEST
     try:
-        root: Node | None = parser.compose(text)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", ReusedAnchorWarning)
+            root: Node | None = parser.compose(text)
+    except ReusedAnchorWarning as error:
+        _fail_at_anchor(error, name)
+    except MaxDepthExceededError as error:
+        _fail(name, error.problem_mark.line + 1, *TOO_DEEP)
     except MarkedYAMLError as error:
         _fail_at_mark(error, name)
     except ReaderError as error:
@@ -169,12 +186,21 @@ def _compose(text: str, name: str) -> Node | None:
         found = f"the character U+{ord(text[error.position]):04X}"
         _fail(name, line, found, "printable text", "Delete it; it is often left by a word processor.")
     except RecursionError:
-        _fail(name, 1, "values nested too deeply to read", "a few levels", "Close the brackets that were left open.")
+        _fail(name, 1, *TOO_DEEP)
     except (YAMLError, ValueError) as error:
         _fail(name, 1, str(error).splitlines()[0], "YAML 1.2", "Remove the directive or correct the syntax.")
     if parser.resolver.processing_version != (1, 2):
         _fail(name, 1, "a %YAML directive for another version", "YAML 1.2", "Delete the line that begins with %YAML.")
+    if root is not None:
+        require_bounded(root, name)
     return root
+
+
+def _fail_at_anchor(warning: ReusedAnchorWarning, name: str) -> NoReturn:
+    """The parser only warns, and prints the place: the last line number is that of the second anchor."""
+    first, second = re.findall(r"line (\d+), column", str(warning))[-2:]
+    found = f"an anchor (&) that line {first} has already"
+    _fail(name, int(second), found, "each anchor once", "Give one of the two another name.")
 
 
 def _fail_at_mark(error: MarkedYAMLError, name: str) -> NoReturn:

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from harness.arrays import IntArray
+from harness.errors import writing
 
 START = -1
 """Stands for the call of ``start``, which comes before step 0."""
@@ -42,7 +43,8 @@ class BlackBox:
     def __init__(self, path: Path | None) -> None:
         self._note: IntArray = np.array([_NONE, START], np.int64)
         if path is not None:
-            path.write_bytes(_FORMAT.pack(_NONE, START))
+            with writing(path):
+                path.write_bytes(_FORMAT.pack(_NONE, START))
             self._note = np.memmap(path, np.dtype("<i8"), "r+", shape=(2,))
 
     def enter(self, episode: int, step: int) -> None:

@@ -21,6 +21,7 @@ from harness.criticality.after_cut_in import LEVELS, build_after_cut_in, level_s
 from harness.criticality.before_cut_in import build_before_cut_in, naturalistic_pmf
 from harness.criticality.immediate import build_immediate
 from harness.environment.driving import Environment
+from harness.errors import writing
 from harness.vehicles.models import MODEL_FIELDS
 
 _FORMAT = 2
@@ -65,14 +66,15 @@ def _load(path: Path) -> Tables | None:
 
 
 def _save(path: Path, tables: Tables) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=path.parent, suffix=".tmp")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            np.savez(file, **tables._asdict())
-        Path(name).replace(path)
-    finally:
-        Path(name).unlink(missing_ok=True)
+    with writing(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(dir=path.parent, suffix=".tmp")
+        try:
+            with os.fdopen(handle, "wb") as file:
+                np.savez(file, **tables._asdict())
+            Path(name).replace(path)
+        finally:
+            Path(name).unlink(missing_ok=True)
 
 
 def _build_one(environment: Environment, driver: RecordArray, challenge: str) -> Tables:

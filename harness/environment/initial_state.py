@@ -29,7 +29,12 @@ class InitialStates:
         shape, location, scale = (float(n[f"initial_state__v_{k}"]) for k in ("shape", "location_mps", "scale_mps"))
         z = (self._v_grid - location) / scale
         cdf = special.ndtr(z) - 2.0 * special.owens_t(z, shape)  # of the skew normal distribution
-        self._v_cdf = (cdf - cdf[0]) / (cdf[-1] - cdf[0])
+        self._v_cdf: FloatArray = (cdf - cdf[0]) / (cdf[-1] - cdf[0])
+
+    @property
+    def speed_distribution(self) -> FloatArray:
+        """P(v_BV ≤ v) on a grid over the fit range."""
+        return self._v_cdf
 
     def draw(self, seed: int, first_episode: int, n_episodes: int) -> FloatArray:
         """States of consecutive episodes.

@@ -8,6 +8,7 @@ from harness.campaign.loading import names_a_file
 from harness.campaign.models import Environment as EnvironmentSection
 from harness.campaign.yaml_text import read_model
 from harness.environment.driving import Environment, build_environment
+from harness.environment.laws import require_sound_laws
 from harness.environment.parameters import SHIPPED_FOLDER, EnvironmentParameters, parameter_record
 
 
@@ -22,16 +23,21 @@ def load_parameters(section: EnvironmentSection) -> EnvironmentParameters:
     Raises
     ------
     CampaignError
-        The file is missing, is not YAML, or says something wrong; every place is named.
+        The file is missing, is not YAML, or says something wrong; every place is named. Or its laws give no
+        probabilities.
     """
-    return read_model(parameter_file(section.parameters), EnvironmentParameters)
+    file = parameter_file(section.parameters)
+    parameters = read_model(file, EnvironmentParameters)
+    require_sound_laws(_tabulated(section, parameters), str(file))
+    return parameters
 
 
 def load_environment(section: EnvironmentSection, parameters: EnvironmentParameters | None = None) -> Environment:
     """The environment of a campaign, with its tables."""
-    numbers = parameter_record(
-        parameters or load_parameters(section),
-        lane_change_level=section.lane_change_level,
-        hold_s=section.acceleration_hold_s,
+    return _tabulated(section, parameters or load_parameters(section))
+
+
+def _tabulated(section: EnvironmentSection, parameters: EnvironmentParameters) -> Environment:
+    return build_environment(
+        parameter_record(parameters, lane_change_level=section.lane_change_level, hold_s=section.acceleration_hold_s)
     )
-    return build_environment(numbers)

@@ -5,14 +5,19 @@ from __future__ import annotations
 import hashlib
 import json
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict
+from pydantic import AfterValidator, BaseModel, ConfigDict, model_validator
 
 from harness.arrays import RecordArray
+from harness.campaign.models import MAX_CONFIGURED_SPEED_MPS, broken_rule
+from harness.maneuvers import ACCELERATIONS_MPS2
+from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
 
 SHIPPED_FOLDER = Path(__file__).parent
+FIXED = {"step_s": STEP_S, "vehicle_length_m": VEHICLE_LENGTH_M}
+"""What the compiled motion and SUMO's network are made for: no file can change it, but campaigns' hashes contain it."""
 
 
 class _Frozen(BaseModel):
@@ -27,114 +32,188 @@ class Number(_Frozen):
     note: str = ""
 
 
-class Scenario(_Frozen):
-    """Time step, horizon and vehicles."""
+def _within(low: float, high: float) -> AfterValidator:
+    """Refuse a value outside of [low, high]."""
 
-    step_s: Number
-    duration_s: Number
-    vehicle_length_m: Number
+    def checked(number: Number) -> Number:
+        if low <= number.value <= high:
+            return number
+        raise broken_rule(
+            "value", found=f"{number.value:g}", expected=f"a number from {low:g} to {high:g}", mend="Correct the value."
+        )
+
+    return AfterValidator(checked)
+
+
+_HARDEST, _FASTEST = float(ACCELERATIONS_MPS2[0]), float(ACCELERATIONS_MPS2[-1])
+
+# Wide limits: what a law makes of its numbers is judged by `harness.environment.laws`.
+Coefficient = Annotated[Number, _within(-1000.0, 1000.0)]
+LogScale = Annotated[Number, _within(-50.0, 50.0)]
+Scale = Annotated[Number, _within(0.001, 1000.0)]
+Gain = Annotated[Number, _within(0.0, 100.0)]
+Gap = Annotated[Number, _within(0.0, 300.0)]  # 4 km of road hold two of them and 25 s at 100 m/s
+Speed = Annotated[Number, _within(0.0, MAX_CONFIGURED_SPEED_MPS)]
+Rate = Annotated[Number, _within(-MAX_CONFIGURED_SPEED_MPS, MAX_CONFIGURED_SPEED_MPS)]
+Acceleration = Annotated[Number, _within(_HARDEST, _FASTEST)]
+Braking = Annotated[Number, _within(0.0, 20.0)]
+Time = Annotated[Number, _within(0.0, 100.0)]
+Share = Annotated[Number, _within(0.0, 1.0)]
+DegreesOfFreedom = Annotated[Number, _within(2.0, 1000.0)]  # below 2 more than 1e-4 lies outside of the t table
+
+
+def _require_order(numbers: BaseModel, low: str, high: str, *, equal: bool) -> None:
+    """Refuse a lower end above its upper end."""
+    least, most = getattr(numbers, low).value, getattr(numbers, high).value
+    if least > most or (least == most and not equal):
+        raise broken_rule(
+            low,
+            found=f"{least:g}, with {high} {most:g}",
+            expected=f"a number {'of at most' if equal else 'below'} {high}",
+            mend="Change places, or correct one of them.",
+        )
+
+
+def _whole_steps(number: Number) -> Number:
+    steps = number.value / STEP_S
+    if abs(steps - round(steps)) < 1e-9:
+        return number
+    mend = f"The nearest one is {round(steps) * STEP_S:g}."
+    raise broken_rule("value", found=f"{number.value:g}", expected=f"a multiple of the {STEP_S:g} s step", mend=mend)
+
+
+class Scenario(_Frozen):
+    """Horizon of a test."""
+
+    duration_s: Annotated[Number, _within(1.0, 25.0), AfterValidator(_whole_steps)]
+    """At most 25 s: BV's free driving has 256 random numbers for each cut-in, and the road is 4 km long."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _nothing_that_is_fixed(cls, data: Any) -> Any:
+        for name in FIXED if isinstance(data, dict) else ():
+            if name in data:
+                raise broken_rule(
+                    name,
+                    found="a key that would change nothing",
+                    expected=f"no such key: motion is computed for {name} {FIXED[name]:g}",
+                    mend="Delete the line.",
+                )
+        return data
 
 
 class FitRange(_Frozen):
     """Where the fits hold; states outside are clamped to it."""
 
-    v_min_mps: Number
-    v_max_mps: Number
-    v_centre_mps: Number
-    v_scale_mps: Number
-    r1_min_m: Number
-    r1_max_m: Number
-    r1_centre_m: Number
-    r1_scale_m: Number
+    v_min_mps: Speed
+    v_max_mps: Speed
+    v_centre_mps: Speed
+    v_scale_mps: Scale
+    r1_min_m: Gap
+    r1_max_m: Gap
+    r1_centre_m: Gap
+    r1_scale_m: Scale
+
+    @model_validator(mode="after")
+    def _is_a_range(self) -> Self:
+        _require_order(self, "v_min_mps", "v_max_mps", equal=False)
+        _require_order(self, "r1_min_m", "r1_max_m", equal=False)
+        return self
 
 
 class InitialState(_Frozen):
     """Distribution of (v_BV, R1, R1dot, R2, R2dot)."""
 
-    v_location_mps: Number
-    v_scale_mps: Number
-    v_shape: Number
-    r1_shift_m: Number
-    r1_shift_u_m: Number
-    r1_log_mean: Number
-    r1_log_mean_u: Number
-    r1_log_sd: Number
-    r1_log_sd_u: Number
-    r1dot_df: Number
-    r1dot_location_mps: Number
-    r1dot_location_u: Number
-    r1dot_location_w: Number
-    r1dot_location_uw: Number
-    r1dot_location_uu: Number
-    r1dot_log_scale: Number
-    r1dot_log_scale_u: Number
-    r1dot_log_scale_w: Number
-    r1dot_log_scale_ww: Number
-    r1dot_min_ttc_s: Number
-    r2_min_m: Number
-    r2_max_m: Number
-    r2dot_min_mps: Number
-    r2dot_max_mps: Number
+    v_location_mps: Coefficient
+    v_scale_mps: Scale
+    v_shape: Coefficient
+    r1_shift_m: Coefficient
+    r1_shift_u_m: Coefficient
+    r1_log_mean: Coefficient
+    r1_log_mean_u: Coefficient
+    r1_log_sd: LogScale
+    r1_log_sd_u: LogScale
+    r1dot_df: DegreesOfFreedom
+    r1dot_location_mps: Coefficient
+    r1dot_location_u: Coefficient
+    r1dot_location_w: Coefficient
+    r1dot_location_uw: Coefficient
+    r1dot_location_uu: Coefficient
+    r1dot_log_scale: LogScale
+    r1dot_log_scale_u: LogScale
+    r1dot_log_scale_w: LogScale
+    r1dot_log_scale_ww: LogScale
+    r1dot_min_ttc_s: Annotated[Number, _within(0.1, 100.0)]
+    r2_min_m: Annotated[Number, _within(0.1, 300.0)]
+    r2_max_m: Gap
+    r2dot_min_mps: Rate
+    r2dot_max_mps: Rate
+
+    @model_validator(mode="after")
+    def _has_ranges(self) -> Self:
+        _require_order(self, "r2_min_m", "r2_max_m", equal=True)
+        _require_order(self, "r2dot_min_mps", "r2dot_max_mps", equal=True)
+        return self
 
 
 class FreeDriving(_Frozen):
     """Accelerations of LV, and of BV after its cut-in."""
 
-    df: Number
-    location_mps2: Number
-    log_scale: Number
-    log_scale_u: Number
-    log_scale_uu: Number
-    brake_logit: Number
-    brake_logit_u: Number
-    brake_slope_s2pm: Number
-    brake_max_mps2: Number
+    df: DegreesOfFreedom
+    location_mps2: Acceleration
+    log_scale: LogScale
+    log_scale_u: LogScale
+    log_scale_uu: LogScale
+    brake_logit: LogScale
+    brake_logit_u: LogScale
+    brake_slope_s2pm: LogScale
+    brake_max_mps2: Acceleration
 
 
 class CarFollowing(_Frozen):
     """Accelerations of BV behind LV."""
 
-    gain_rate_per_s: Number
-    gain_gap_per_s2: Number
-    median_gap_m: Number
-    median_gap_v: Number
-    median_gap_vv: Number
-    standstill_m: Number
-    smallest_gap_m: Number
-    closing_threshold_mps2: Number
-    closing_gain: Number
-    near_gap_m: Number
-    near_mean_max_mps2: Number
-    df: Number
-    log_scale: Number
-    log_scale_rate: Number
-    rate_cap_mps: Number
+    gain_rate_per_s: Gain
+    gain_gap_per_s2: Gain
+    median_gap_m: Coefficient
+    median_gap_v: Coefficient
+    median_gap_vv: Coefficient
+    standstill_m: Gap
+    smallest_gap_m: Scale
+    closing_threshold_mps2: Gain
+    closing_gain: Gain
+    near_gap_m: Gap
+    near_mean_max_mps2: Acceleration
+    df: DegreesOfFreedom
+    log_scale: LogScale
+    log_scale_rate: LogScale
+    rate_cap_mps: Speed
 
 
 class Guard(_Frozen):
     """What keeps BV off LV; part of p."""
 
-    lead_braking_mps2: Number
-    own_braking_mps2: Number
-    horizon_s: Number
-    margin_m: Number
+    lead_braking_mps2: Braking
+    own_braking_mps2: Annotated[Number, _within(0.1, 20.0)]
+    horizon_s: Annotated[Number, _within(0.0, 10.0)]
+    margin_m: Gap
 
 
 class CutIn(_Frozen):
     """Hazard of the cut-in."""
 
-    intercept: Number
-    u: Number
-    log_gap: Number
-    rate: Number
-    rate_squared: Number
-    u_squared: Number
-    rate_scale_mps: Number
-    rate_clamp_mps: Number
-    ignore_share: Number
-    accept_ttc_s: Number
-    accept_scale_s: Number
-    max_probability_1s: Number
+    intercept: Coefficient
+    u: Coefficient
+    log_gap: Coefficient
+    rate: Coefficient
+    rate_squared: Coefficient
+    u_squared: Coefficient
+    rate_scale_mps: Scale
+    rate_clamp_mps: Speed
+    ignore_share: Share
+    accept_ttc_s: Time
+    accept_scale_s: Scale
+    max_probability_1s: Annotated[Number, _within(1e-6, 0.5)]
 
 
 class EnvironmentParameters(_Frozen):
@@ -150,14 +229,29 @@ class EnvironmentParameters(_Frozen):
     guard: Guard
     cut_in: CutIn
 
+    @model_validator(mode="after")
+    def _av_has_a_speed(self) -> Self:
+        """An AV starts at v_BV - R2dot."""
+        slowest = self.fit_range.v_min_mps.value - self.initial_state.r2dot_max_mps.value
+        fastest = self.fit_range.v_max_mps.value - self.initial_state.r2dot_min_mps.value
+        if slowest < 0.0 or fastest > MAX_CONFIGURED_SPEED_MPS:
+            raise broken_rule(
+                "initial_state",
+                found=f"speeds of the AV (v_BV - R2dot) from {slowest:g} to {fastest:g} m/s",
+                expected=f"speeds from 0 to {MAX_CONFIGURED_SPEED_MPS:g} m/s",
+                mend="Narrow r2dot_min_mps and r2dot_max_mps, or v_min_mps and v_max_mps of fit_range.",
+            )
+        return self
+
     def values(self) -> dict[str, float]:
-        """Flat ``section__name`` → value, without provenance."""
-        return {
+        """Flat ``section__name`` → value, without provenance; what is fixed is among them."""
+        given = {
             f"{section}__{name}": number["value"]
             for section, numbers in self.model_dump().items()
             if isinstance(numbers, dict)
             for name, number in numbers.items()
         }
+        return {**{f"scenario__{name}": value for name, value in FIXED.items()}, **given}
 
     def content_hash(self) -> str:
         """Hash of the numbers alone: a corrected note does not change a campaign."""
@@ -173,11 +267,10 @@ def parameter_record(parameters: EnvironmentParameters, *, lane_change_level: fl
         One float64 field ``section__name`` per number, and ``level`` (of lane changing), ``hold_steps``, ``max_steps``.
     """
     numbers = parameters.values()
-    step_s = numbers["scenario__step_s"]
     extra = {
         "level": lane_change_level,
-        "hold_steps": round(hold_s / step_s),
-        "max_steps": round(numbers["scenario__duration_s"] / step_s),
+        "hold_steps": round(hold_s / STEP_S),
+        "max_steps": round(numbers["scenario__duration_s"] / STEP_S),
     }
     fields = [(name, "f8") for name in (*numbers, "level")] + [("hold_steps", "i8"), ("max_steps", "i8")]
     record = np.zeros(1, dtype=fields)

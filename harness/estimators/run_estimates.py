@@ -27,8 +27,9 @@ from harness.importance.build import importance_names, mixture_weights, needs_ta
 from harness.pool.shells import ShellDesign
 from harness.pool.surrogate_replay import PATH_COLUMNS, SurrogateReplay
 from harness.progress import Progress
-from harness.records.folder import SHELLS, no_episodes, read_json, read_manifest
+from harness.records.folder import SHELLS, no_episodes, read_json, read_manifest, require_schema
 from harness.records.reader import read_shards, stored_columns
+from harness.records.stored_manifest import StoredShells
 
 _FINISH = "Run `harness run` with --resume, which makes missing shards."
 
@@ -278,8 +279,10 @@ def read_shells(folder: Path) -> ShellDesign:
         The file is missing or damaged.
     """
     path = folder / SHELLS
+    content = read_json(path, mend=_FINISH)
+    require_schema(content, StoredShells, path, mend=_FINISH)
     try:
-        return ShellDesign.from_json(read_json(path, mend=_FINISH))
+        return ShellDesign.from_json(content)
     except (KeyError, TypeError, ValueError) as error:
         found = f"no complete description of shells ({error})"
         raise RunFolderError(str(path), found=found, expected="what the run has written", mend=_FINISH) from error

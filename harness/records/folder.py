@@ -13,8 +13,10 @@ from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
+from pydantic import BaseModel, ValidationError
 
-from harness.errors import RunFolderError
+from harness.errors import RunFolderError, shortened, writing
+from harness.records.stored_manifest import StoredManifest
 from harness.records.tables import ShardTables
 
 MANIFEST = "manifest.json"
@@ -40,16 +42,17 @@ def write_atomically(path: Path, write: Callable[[Path], None]) -> None:
 
     A full disk or a killed process leaves no half-written file under the final name.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=".", suffix=".part")
-    os.close(handle)
-    temporary = Path(name)
-    try:
-        write(temporary)
-        temporary.chmod(0o644)
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with writing(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(dir=path.parent, prefix=".", suffix=".part")
+        os.close(handle)
+        temporary = Path(name)
+        try:
+            write(temporary)
+            temporary.chmod(0o644)
+            temporary.replace(path)
+        finally:
+            temporary.unlink(missing_ok=True)
 
 
 def require_place(folder: Path, *, mend: str = "Choose another place, or change its permissions.") -> None:
@@ -200,18 +203,38 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     Raises
     ------
     RunFolderError
-        There is none, or it is not one that a run has written.
+        There is none, or it is not one that a run has written; see `StoredManifest`.
     """
     path, mend = folder / MANIFEST, NO_RUN
     if not path.exists():
         expected = "a run folder, which holds a manifest.json"
         raise RunFolderError(str(path), found="no such file: this is no run folder", expected=expected, mend=mend)
     content = read_json(path, mend=mend)
-    missing = [key for key in ("campaign_hash", "n_episodes", "shards") if key not in content]
-    if missing:
-        found = f"no {', '.join(missing)}"
-        raise RunFolderError(str(path), found=found, expected="the manifest of a run", mend=mend)
+    require_schema(content, StoredManifest, path, mend=mend)
     return content
+
+
+def require_schema(content: dict[str, Any], model: type[BaseModel], path: Path, *, mend: str) -> None:
+    """Refuse the content of a JSON file that is not what a run writes.
+
+    Raises
+    ------
+    RunFolderError
+        Names the first value that is wrong.
+    """
+    try:
+        model.model_validate(content)
+    except ValidationError as error:
+        wrong = error.errors(include_url=False)
+        where = ".".join(map(str, wrong[0]["loc"]))
+        more = f", and {len(wrong) - 1} more that do not fit" if len(wrong) > 1 else ""
+        missing = wrong[0]["type"] == "missing"
+        raise RunFolderError(
+            str(path),
+            found=f"no key {where}{more}" if missing else f"{where} {shortened(repr(wrong[0]['input']), 60)}{more}",
+            expected=f"what a run has written: {wrong[0]['msg'][:1].lower()}{wrong[0]['msg'][1:]}",
+            mend=mend,
+        ) from None
 
 
 def read_json(path: Path, *, mend: str) -> dict[str, Any]:
@@ -226,7 +249,7 @@ def read_json(path: Path, *, mend: str) -> dict[str, Any]:
         content = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise RunFolderError(str(path), found="no such file", expected="a JSON file of a run", mend=mend) from None
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise RunFolderError(str(path), found=str(error), expected="a JSON file of a run", mend=mend) from error
     if not isinstance(content, dict):
         raise RunFolderError(str(path), found=type(content).__name__, expected="a JSON object", mend=mend)

@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ruamel.yaml import YAML
-from ruamel.yaml.error import YAMLError
+from harness.campaign.dumping import written_out
+from harness.campaign.loading import load_campaign
+from harness.errors import CampaignError, RunFolderError
+from harness.records.folder import MANIFEST, NO_RUN, read_json, read_manifest, require_schema
+from harness.records.stored_manifest import Count, StoredManifest
+from harness.report.stored_estimates import StoredEstimates
 
-from harness.errors import RunFolderError
-from harness.records.folder import NO_RUN
 
-MANIFEST_KEYS = ("campaign_hash", "created", "versions", "seed", "shards", "n_episodes")
-ESTIMATES_KEYS = ("campaign", "campaign_hash", "lane_change_level", "confidence", "headline", "estimates", "statement")
+class ShownManifest(StoredManifest):
+    """A manifest with what the page shows of every run."""
+
+    created: str
+    versions: dict[str, str]
+    seed: Count
 
 
 @dataclass(frozen=True)
@@ -83,45 +88,25 @@ def read_run_folder(path: Path) -> RunFolder:
     RunFolderError
         If a file is missing, is not what its name says, or belongs to another campaign.
     """
-    manifest = _read_json(path / "manifest.json", MANIFEST_KEYS, mend=NO_RUN)
-    estimates = _read_json(
-        path / "estimates.json", ESTIMATES_KEYS, mend=f"Make it with `harness estimate {path} --write`."
-    )
+    manifest = read_manifest(path)
+    require_schema(manifest, ShownManifest, path / MANIFEST, mend=NO_RUN)
+    again = f"Make it with `harness estimate {path} --write`."
+    estimates = read_json(path / "estimates.json", mend=again)
+    require_schema(estimates, StoredEstimates, path / "estimates.json", mend=again)
     _check_belong_together(path, manifest, estimates)
     return RunFolder(path, _read_campaign(path / "campaign.yaml"), manifest, estimates, _shards(path, manifest))
 
 
-def _read_text(path: Path, mend: str) -> str:
-    try:
-        return path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise RunFolderError(str(path), found="no such file", expected="a finished run folder", mend=mend) from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise RunFolderError(str(path), found=str(error), expected="a readable text file", mend=mend) from error
-
-
-def _read_json(path: Path, keys: tuple[str, ...], mend: str) -> dict[str, Any]:
-    try:
-        content = json.loads(_read_text(path, mend))
-    except json.JSONDecodeError as error:
-        raise RunFolderError(str(path), found=f"broken JSON ({error})", expected="a JSON object", mend=mend) from error
-    missing = [key for key in keys if not isinstance(content, dict) or key not in content]
-    if missing:
-        raise RunFolderError(str(path), found=f"no key {missing[0]!r}", expected=f"the keys {list(keys)}", mend=mend)
-    result: dict[str, Any] = content
-    return result
-
-
 def _read_campaign(path: Path) -> dict[str, Any]:
-    mend = "Restore the file, or run the campaign again."
     try:
-        content = YAML(typ="safe", pure=True).load(_read_text(path, mend))
-    except YAMLError as error:
-        raise RunFolderError(str(path), found=f"broken YAML ({error})", expected="a campaign", mend=mend) from error
-    if not isinstance(content, dict) or not isinstance(content.get("testing"), dict):
-        found = "no section 'testing'" if isinstance(content, dict) else type(content).__name__
-        raise RunFolderError(str(path), found=found, expected="a campaign with all its sections", mend=mend)
-    return content
+        return written_out(load_campaign(path, check_files=False))
+    except CampaignError as error:
+        raise RunFolderError(
+            str(path),
+            found=error.found if error.where == str(path) else f"{error.found} ({error.where})",
+            expected="a campaign with all its sections, as the run has written it",
+            mend="Restore the file, or run the campaign again.",
+        ) from error
 
 
 def _check_belong_together(path: Path, manifest: dict[str, Any], estimates: dict[str, Any]) -> None:
@@ -143,21 +128,13 @@ def _check_belong_together(path: Path, manifest: dict[str, Any], estimates: dict
 
 
 def _shards(path: Path, manifest: dict[str, Any]) -> tuple[Shard, ...]:
-    try:
-        shards = [
-            Shard(
-                int(entry["index"]),
-                int(entry["first_episode"]),
-                int(entry["n_episodes"]),
-                {table: path / name for table, name in entry["files"].items() if name},
-            )
-            for entry in manifest["shards"]
-        ]
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise RunFolderError(
-            str(path / "manifest.json"),
-            found=f"a shard entry that cannot be read ({error!r})",
-            expected="index, first_episode, n_episodes and files per shard",
-            mend="Restore the file, or run the campaign again.",
-        ) from error
+    shards = [
+        Shard(
+            entry["index"],
+            entry["first_episode"],
+            entry["n_episodes"],
+            {table: path / name for table, name in entry["files"].items() if name},
+        )
+        for entry in manifest["shards"]
+    ]
     return tuple(sorted(shards, key=lambda shard: shard.first_episode))

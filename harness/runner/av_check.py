@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import signal
 import time
 from collections import Counter
 from contextlib import suppress
 from dataclasses import asdict, dataclass
-from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -22,9 +20,11 @@ from harness.controllers.time_limit import death_cause
 from harness.episode.loop import EpisodeLoop, Shard
 from harness.errors import EXIT_DONE, EXIT_TOO_MANY_FAILED, HarnessError
 from harness.estimators.estimate import finite_json
+from harness.interruption import leave_signals_to_parent
 from harness.outcomes import AV, CRASH, FAILED
 from harness.runner.prepare import Prepared, build_world, prepare
 from harness.runner.processes import fit_to_travel
+from harness.spawning import spawn_context
 from harness.vehicles.kinematics import STEP_S
 
 EPISODES = 48
@@ -171,7 +171,7 @@ def check_av_apart(campaign: Campaign, n_episodes: int = EPISODES) -> AvCheck:
     """
     if campaign.av.source not in ("controller", "fmu"):
         return check_av(campaign, n_episodes)
-    context = get_context("spawn")
+    context = spawn_context()
     ours, theirs = context.Pipe()
     with TemporaryDirectory(prefix="harness-av-check-") as folder:
         black_box = Path(folder) / "black-box"
@@ -194,7 +194,7 @@ def check_av_apart(campaign: Campaign, n_episodes: int = EPISODES) -> AvCheck:
 
 def _check_and_tell(connection: Connection, campaign: Campaign, n_episodes: int, black_box: Path) -> None:
     """What the child does; its parent alone answers to Ctrl-C."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    leave_signals_to_parent()
     try:
         answer: AvCheck | Exception = check_av(campaign, n_episodes, black_box=black_box)
     except Exception as error:  # noqa: BLE001 - whatever goes wrong here is the parent's to judge

@@ -15,8 +15,9 @@ from harness.estimators.difference import Difference, difference_statement, pair
 from harness.estimators.from_records import EPISODE_COLUMNS, block_from_tables
 from harness.importance.build import mixture_weights
 from harness.progress import Progress
-from harness.records.folder import MANIFEST, read_json, read_manifest, write_json
+from harness.records.folder import MANIFEST, read_json, read_manifest, require_schema, write_json
 from harness.records.reader import read_shards
+from harness.records.stored_manifest import StoredStops
 from harness.runner.campaign_run import run_campaign
 from harness.runner.manifest import require_own_folder
 from harness.runner.prepare import content_hash
@@ -156,11 +157,13 @@ class _Stops:
         }
         self._notes: dict[str, Any] = {}
         if self._file.exists():
-            self._notes = read_json(self._file, mend="Delete it: the stop rules are then run through again.")
+            mend = "Delete it: the stop rules are then run through again."
+            self._notes = read_json(self._file, mend=mend)
+            require_schema(self._notes, StoredStops, self._file, mend=mend)
 
     def known(self, side: Side) -> bool:
         """Whether an earlier call took this campaign to its stop, and its run is still there."""
-        note = self._notes.get(side, {})
+        note = self._notes.get(side) or {}
         same = all(note.get(key) == value for key, value in self._asked[side].items())
         manifest = self._folder / side / MANIFEST
         return (

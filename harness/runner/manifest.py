@@ -12,7 +12,7 @@ from typing import Any
 from harness.campaign.dumping import dump_campaign
 from harness.campaign.models import Campaign
 from harness.errors import RunFolderError
-from harness.records.folder import MANIFEST, read_json, require_place, write_json, write_text
+from harness.records.folder import MANIFEST, read_manifest, require_place, write_json, write_text
 from harness.runner.worker import ShardSpec
 
 _PACKAGES = ("harness", "libsumo", "numba", "llvmlite", "numpy", "scipy", "pyarrow")
@@ -69,7 +69,7 @@ def require_own_folder(
             expected="a new or empty folder, or one that a run has left",
             mend="Choose another folder with --out.",
         )
-    manifest = read_json(folder / MANIFEST, mend="Choose another folder with --out.")
+    manifest = read_manifest(folder)
     if manifest.get("campaign_hash") != content_hash:
         raise RunFolderError(
             str(folder),

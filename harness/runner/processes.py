@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import os
 import pickle
-import signal
 import traceback
 from collections.abc import Mapping, Sequence
 from itertools import count
-from multiprocessing import get_context
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 
 from harness.campaign.models import Campaign
 from harness.controllers.black_box import Call, Death, last_call
+from harness.interruption import leave_signals_to_parent
 from harness.runner.worker import ShardDone, ShardRunner, ShardSpec
+from harness.spawning import spawn_context
 
 CLOSING_S = 10.0
 """Time that a worker gets to release its controllers once all is done."""
@@ -33,7 +33,7 @@ class WorkerProcess:
 
     def __init__(self, campaign: Campaign, folder: Path) -> None:
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-        context = get_context("spawn")
+        context = spawn_context()
         self._black_box = folder / f".black-box-{next(_numbers)}"
         self.connection, theirs = context.Pipe()
         self._process = context.Process(target=serve, args=(theirs, campaign, folder, self._black_box), daemon=True)
@@ -95,9 +95,9 @@ def first_to_answer(workers: Sequence[WorkerProcess]) -> WorkerProcess:
 def serve(connection: Connection, campaign: Campaign, folder: Path, black_box: Path) -> None:
     """What the process does: prepare with the first shard, run shards until the parent is gone or has no more.
 
-    The parent alone answers to Ctrl-C.
+    The parent alone answers to Ctrl-C and to the end of the terminal.
     """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    leave_signals_to_parent()
     runner: ShardRunner | None = None
     while True:
         try:

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
-from multiprocessing.connection import wait
+from multiprocessing import parent_process
+from multiprocessing.connection import Connection, wait
 from pathlib import Path
 
+from harness.interruption import leave_signals_to_parent
 from harness.progress import Progress, SilentProgress
 from harness.records.folder import require_place
+from harness.spawning import spawn_context
 from harness.validation.experiment import Experiment
 from harness.validation.judgement import Judgement, Subject, corrected, judge
 from harness.validation.results import write_results
@@ -73,21 +76,32 @@ def validate(
     return done
 
 
-def _executor(workers: int | None) -> ProcessPoolExecutor:
+@contextmanager
+def _executor(workers: int | None) -> Iterator[ProcessPoolExecutor]:
+    """Worker processes that end at once when the work in the parent is interrupted or fails, or it is killed."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    context = multiprocessing.get_context("spawn")
-    return ProcessPoolExecutor(workers or os.cpu_count(), mp_context=context, initializer=end_with_parent)
+    context = spawn_context()
+    watched, held = context.Pipe(duplex=False)
+    with ProcessPoolExecutor(
+        workers or os.cpu_count(), mp_context=context, initializer=end_with_parent, initargs=(watched,)
+    ) as executor:
+        try:
+            yield executor
+        except BaseException:
+            held.close()  # or the executor would wait for minutes of work that nobody wants any more
+            raise
 
 
-def end_with_parent() -> None:
-    """Let this worker process end when its parent is killed; it would work on for minutes otherwise."""
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        threading.Thread(target=_end_after, args=(parent.sentinel,), daemon=True).start()
+def end_with_parent(watched: Connection) -> None:
+    """Let this worker process end when its parent closes the other end of the pipe, or is killed."""
+    leave_signals_to_parent()
+    parent = parent_process()
+    ends = [watched] if parent is None else [watched, parent.sentinel]
+    threading.Thread(target=_end_after, args=(ends,), daemon=True).start()
 
 
-def _end_after(sentinel: int) -> None:
-    wait([sentinel])
+def _end_after(ends: list[Connection | int]) -> None:
+    wait(ends)
     os._exit(1)
 
 

@@ -57,11 +57,11 @@ def test_anchors_and_merges(read):
     assert lines.line_of(["d", "b"]) == 1
 
 
-def test_repeated_anchors_stay_small(read):
+def test_repeated_anchors_are_shared(read):
     levels = ["a0: &a0 [x, x, x, x, x, x, x, x, x, x]"]
-    levels += [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 10)}]" for i in range(1, 30)]
+    levels += [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 10)}]" for i in range(1, 4)]
     data, _ = read("\n".join(levels))
-    assert data["a29"][0] is data["a29"][9]
+    assert data["a3"][0] is data["a3"][9]
 
 
 def test_lines_fall_back_to_the_nearest_ancestor(read):
@@ -160,3 +160,45 @@ def test_single_values():
         with pytest.raises(CampaignError) as caught:
             parse_value(text, "here")
         assert caught.value.where == "here"
+
+
+def multiplied(item, levels):
+    """Each level names the one below nine times."""
+    keys = [f"k{i}: " if item[0] == "{" else "" for i in range(9)]
+    above = [f"a{i}: &a{i} {item[0]}{', '.join(f'{key}*a{i - 1}' for key in keys)}{item[-1]}" for i in range(1, levels)]
+    return "\n".join([f"a0: &a0 {item}", *above])
+
+
+@pytest.mark.parametrize("text", [multiplied("[1]", 9), multiplied("{x: 1}", 9), multiplied("[1]", 30)])
+def test_aliases_that_multiply_are_refused_at_once(text, tmp_path):
+    path = tmp_path / "laughs.yaml"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(CampaignError, match=r"laughs\.yaml:\d+: found [\d,]+ values, aliases \(\*\) written out"):
+        read_yaml(path)
+
+
+def test_aliases_that_multiply_are_refused_in_an_override():
+    text = "{a: &a [1, 1, 1, 1, 1, 1, 1, 1, 1, 1], b: &b [*a, *a, *a, *a, *a, *a, *a, *a, *a, *a], "
+    for inner, outer in ("bc", "cd", "de", "ef"):
+        text += f"{outer}: &{outer} [" + ", ".join([f"*{inner}"] * 10) + "], "
+    with pytest.raises(CampaignError, match="aliases"):
+        parse_value(text + "}", "--set av.parameters")
+
+
+def test_aliases_that_nest_without_end_are_refused(tmp_path):
+    path = tmp_path / "deep.yaml"
+    path.write_text("a0: &a0 [1]\n" + "\n".join(f"a{i}: &a{i} [*a{i - 1}]" for i in range(1, 2000)), encoding="utf-8")
+    with pytest.raises(CampaignError, match="nested too deeply"):
+        read_yaml(path)
+
+
+def test_a_file_without_an_end_is_refused():
+    with pytest.raises(CampaignError, match="more than 1,000,000 bytes"):
+        read_yaml("/dev/zero")
+
+
+def test_an_anchor_given_twice_is_an_error_and_no_warning(tmp_path):
+    path = tmp_path / "anchors.yaml"
+    path.write_text("a: &x [1]\nb: *x\nc: &x [2]\n", encoding="utf-8")
+    with pytest.raises(CampaignError, match=r"anchors\.yaml:3: found an anchor \(&\) that line 1 has already"):
+        read_yaml(path)

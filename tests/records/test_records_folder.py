@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import pickle
 import resource
 import signal
 import stat
@@ -92,12 +93,15 @@ def test_a_real_limit_on_file_size_leaves_nothing(tmp_path, record):
     signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1024, before[1]))
     try:
-        with pytest.raises(OSError, match=r"[Ff]ile too large"):
+        with pytest.raises(OSError, match=r"[Ff]ile too large") as raised:
             write_shard(tmp_path, 0, tables)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
         signal.signal(signal.SIGXFSZ, handler)
     assert files_below(tmp_path) == set()
+    assert raised.value.filename == str(tmp_path / shard_file("traces", 0))  # the kernel alone names no file
+    sent = pickle.loads(pickle.dumps(raised.value))
+    assert (sent.errno, sent.filename) == (errno.EFBIG, raised.value.filename)  # also from a worker
     assert set(write_shard(tmp_path, 0, tables)) == {"episodes", "moments", "traces"}
 
 

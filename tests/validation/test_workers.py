@@ -7,9 +7,12 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 
 import pytest
+
+from harness.validation.run import _executor
 
 PARENT = """
 import os, time
@@ -39,7 +42,25 @@ def test_a_worker_ends_when_the_experiment_is_killed(tmp_path):
         worker = int(parent.stdout.readline())
         assert is_alive(worker)
         parent.send_signal(signal.SIGKILL)
+    assert_ends(worker)
+
+
+def assert_ends(worker):
     deadline = time.monotonic() + 20.0
     while is_alive(worker) and time.monotonic() < deadline:
         time.sleep(0.1)
     assert not is_alive(worker)
+
+
+def interrupt(futures):
+    with _executor(1) as executor:
+        assert executor.submit(os.getpid).result() != os.getpid()
+        futures.append(executor.submit(time.sleep, 60))
+        raise KeyboardInterrupt
+
+
+def test_an_interrupted_experiment_does_not_wait_for_its_workers():
+    futures = []
+    with pytest.raises(KeyboardInterrupt):
+        interrupt(futures)
+    assert isinstance(futures[0].exception(), BrokenProcessPool)  # not the minute of sleep

@@ -1,0 +1,117 @@
+"""What the JSON files of a run may hold; ``manifest.json`` comes checked from `harness.records.folder.read_manifest`.
+
+A key that is not named here is let through: later versions add some. One that is missing, as in older folders, is no
+error, but for the three without which nothing can be read.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Self
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from harness.stopped_by import StoppedBy
+
+Count = Annotated[int, Field(ge=0, lt=2**63)]
+ShardPath = Annotated[str, Field(pattern=r"^[a-z]+/[A-Za-z0-9_-]+\.parquet$")]
+
+
+class _Stored(BaseModel):
+    model_config = ConfigDict(extra="allow", strict=True, allow_inf_nan=False)
+
+
+class Files(_Stored):
+    """Files of a shard, by table."""
+
+    episodes: ShardPath
+    moments: ShardPath | None = None
+    traces: ShardPath | None = None
+
+
+class StoredShard(_Stored):
+    """A contiguous range of episodes, and its files by table."""
+
+    index: Count
+    first_episode: Count
+    n_episodes: Count
+    files: Files
+
+
+class Retraced(_Stored):
+    """How many episodes the twin has retraced in which columns, or why none."""
+
+    n_episodes: Count | None = None
+    compared: list[str] | None = None
+    reason: str | None = None
+
+
+class TableError(_Stored):
+    """A challenge table's value beside the same by Monte Carlo."""
+
+    surrogate: str
+    table: str
+    quantity: str
+    table_value: float
+    monte_carlo: float
+    std_error: float
+
+
+class StoredManifest(_Stored):
+    """The manifest of a run."""
+
+    campaign_hash: str
+    n_episodes: Count
+    shards: list[StoredShard]
+    name: str | None = None
+    created: str | None = None
+    seed: Count | None = None
+    engine: str | None = None
+    reproducible: bool | None = None
+    versions: dict[str, str] = {}
+    cpu: str | None = None
+    controller_sha256: str | None = None
+    workers: Count | None = None
+    status: str | None = None
+    stopped_by: StoppedBy | None = None
+    wall_time_s: float | None = None
+    distance_per_test_m: float | None = None
+    retraced: Retraced | None = None
+    table_errors: list[TableError] | None = None
+
+
+class StoredShells(_Stored):
+    """``shells.json``: the strata of a shells campaign, see `harness.pool.shells.ShellDesign`."""
+
+    pool: str
+    strata: list[str]
+    p: list[float]
+    moments: list[list[float]]
+    n_paths: Count
+    n_inside: Count
+    boundary: str
+    p_cut_in: float
+    p_impossible: float
+    available: list[Count] = []
+
+    @model_validator(mode="after")
+    def _of_one_size(self) -> Self:
+        n = len(self.strata)
+        if [len(self.p), len(self.moments), *map(len, self.moments)] != [n] * (n + 2):
+            raise ValueError("p and moments need a row for each of the strata")
+        return self
+
+
+class StoredStop(_Stored):
+    """Where one campaign of a comparison stopped by itself."""
+
+    campaign_hash: str
+    stop: dict[str, Any]
+    n_episodes: Count
+    stopped_by: StoppedBy
+
+
+class StoredStops(_Stored):
+    """``stops.json`` of a comparison."""
+
+    a: StoredStop | None = None
+    b: StoredStop | None = None

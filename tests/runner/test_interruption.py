@@ -1,0 +1,114 @@
+"""Signals end a run in order, with real processes: what is finished stays, and nobody works on."""
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.runner.stored_runs import manifest, shard_files
+
+SCENARIO = Path(__file__).parents[2] / "scenarios" / "overtaking_forced.yaml"
+OPTIONS = ("world.engine=twin", "stop.episodes=1000000000", "stop.rhw=null", "run.shard_size=500", "world.cells=16")
+CODES = {signal.SIGINT: 130, signal.SIGTERM: 143, signal.SIGHUP: 129}
+PATIENCE_S, POLL_S = 300.0, 0.01
+
+
+def begin(out: Path, *, ignored: tuple[int, ...] = ()) -> subprocess.Popen:
+    """`harness run` in a session of its own, with signals as a terminal leaves them, or ignored."""
+
+    def as_a_terminal() -> None:
+        for number in CODES:
+            signal.signal(number, signal.SIG_IGN if number in ignored else signal.SIG_DFL)
+
+    command = [sys.executable, "-m", "harness", "run", str(SCENARIO), "--out", str(out), "--workers", "2"]
+    for override in OPTIONS:
+        command += ["--set", override]
+    return subprocess.Popen(
+        command,
+        start_new_session=True,
+        preexec_fn=as_a_terminal,  # noqa: PLW1509 - no thread here
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def wait_for(process: subprocess.Popen, condition) -> None:
+    for _ in range(int(PATIENCE_S / POLL_S)):
+        if condition():
+            return
+        try:
+            process.wait(POLL_S)
+        except subprocess.TimeoutExpired:
+            continue
+        raise AssertionError(f"the run ended with {process.returncode}: {process.stderr.read()}")
+    raise AssertionError("too late")
+
+
+def finished(process: subprocess.Popen) -> tuple[int, str]:
+    """Exit code and stderr; the pipe ends only when no worker is left that holds it."""
+    try:
+        _, complaints = process.communicate(timeout=PATIENCE_S)
+    finally:
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+    return process.returncode, complaints
+
+
+@pytest.mark.parametrize(("number", "to_all"), [(signal.SIGTERM, False), (signal.SIGHUP, True), (signal.SIGINT, True)])
+def test_a_signal_ends_a_run_in_order(tmp_path, number, to_all):
+    out = tmp_path / "run"
+    process = begin(out)
+    wait_for(process, lambda: len(shard_files(out)) >= 8)  # at most five are under way, so some have been handed back
+    (os.killpg if to_all else os.kill)(process.pid, number)
+    code, complaints = finished(process)
+    assert code == CODES[number]
+    assert "the same command with --resume goes on" in complaints
+    assert "Traceback" not in complaints
+    assert manifest(out)["status"] == "interrupted"
+    assert manifest(out)["n_episodes"] >= 500
+    assert not list(out.glob(".black-box-*"))
+
+
+def test_what_is_ignored_stays_ignored(tmp_path):
+    """As under nohup; the end by SIGTERM shows that the run was alive."""
+    out = tmp_path / "run"
+    process = begin(out, ignored=(signal.SIGHUP, signal.SIGINT))
+    wait_for(process, lambda: len(shard_files(out)) >= 2)
+    os.killpg(process.pid, signal.SIGHUP)
+    os.killpg(process.pid, signal.SIGINT)
+    n = len(shard_files(out))
+    wait_for(process, lambda: len(shard_files(out)) >= n + 2)
+    process.send_signal(signal.SIGTERM)
+    assert finished(process)[0] == 143
+
+
+LAUNCH = """
+import os, signal, sys
+from multiprocessing import resource_tracker, util
+from harness.spawning import spawn_context
+
+def work():
+    pass
+
+def started_and_then(executable, command, handles):
+    start(executable, command, handles)
+    {deed}
+
+if __name__ == "__main__":
+    resource_tracker.ensure_running()
+    start, util.spawnv_passfds = util.spawnv_passfds, started_and_then
+    spawn_context().Process(target=work).start()
+"""
+
+
+@pytest.mark.parametrize("deed", ["os.kill(os.getpid(), signal.SIGKILL)", "os.killpg(0, signal.SIGINT); os._exit(0)"])
+def test_a_worker_whose_parent_dies_while_it_starts_is_silent(tmp_path, deed):
+    script = tmp_path / "parent.py"
+    script.write_text(LAUNCH.format(deed=deed), encoding="utf-8")
+    process = subprocess.Popen([sys.executable, str(script)], start_new_session=True, stderr=subprocess.PIPE, text=True)
+    _, complaints = finished(process)
+    assert complaints == ""

@@ -1,0 +1,166 @@
+"""JSON files of a run folder with wrong types or cut off: one clear error with exit code 2, never a traceback."""
+
+import copy
+import json
+import shutil
+
+import pytest
+
+from harness.cli import main
+from harness.errors import RunFolderError
+from harness.records.folder import read_manifest, require_schema
+from harness.records.stored_manifest import StoredShells, StoredStops
+from harness.report.run_folder import read_run_folder
+
+WRONG = [True, -1, 0.5, 10**400, "text", "\0", [1], {"x": 1}, [None], float("nan")]
+UNREAD = {"format", "n_equal"}
+"""Keys that no reader looks at."""
+
+
+@pytest.fixture(scope="module")
+def twin_folder(campaign, run, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("stored") / "run"
+    run(campaign("world.engine=twin", "stop.episodes=400"), folder, workers=1)
+    return folder
+
+
+@pytest.fixture
+def stored(twin_folder, tmp_path):
+    return shutil.copytree(twin_folder, tmp_path / "run")
+
+
+def places(content, path=()):
+    """Paths to all values, at any depth, with the values; of a list only the first."""
+    items = list(content.items()) if isinstance(content, dict) else list(enumerate(content))[:1]
+    for key, value in items:
+        yield (*path, key), value
+        if isinstance(value, dict | list):
+            yield from places(value, (*path, key))
+
+
+def replaced(content, path, value):
+    changed = copy.deepcopy(content)
+    inner = changed
+    for key in path[:-1]:
+        inner = inner[key]
+    inner[path[-1]] = value
+    return changed
+
+
+def is_number(value):
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def of_one_kind(a, b):
+    return type(a) is type(b) or (is_number(a) and is_number(b)) or None in (a, b)
+
+
+def complaint(folder):
+    try:
+        read_manifest(folder)
+    except RunFolderError as error:
+        return str(error)
+    return ""
+
+
+def test_every_value_of_another_kind_is_refused(stored):
+    path = stored / "manifest.json"
+    content = json.loads(path.read_text(encoding="utf-8"))
+    n_refused = 0
+    for place, value in places(content):
+        if place[-1] in UNREAD:
+            continue
+        for wrong in (wrong for wrong in WRONG if not of_one_kind(value, wrong)):
+            path.write_text(json.dumps(replaced(content, place, wrong)), encoding="utf-8")
+            said = complaint(stored)
+            assert str(path) in said, (place, wrong)
+            assert len(said) < 1500
+            n_refused += 1
+    assert n_refused > 300
+
+
+@pytest.mark.parametrize(
+    ("place", "wrong"),
+    [
+        (("n_episodes",), -1),
+        (("n_episodes",), 0.5),
+        (("n_episodes",), 10**400),
+        (("distance_per_test_m",), float("nan")),
+        (("shards", 0, "files", "episodes"), "../../etc/passwd"),
+        (("shards", 0, "files", "episodes"), "episodes/\0.parquet"),
+        (("shards", 0, "files", "episodes"), None),
+        (("shards",), None),
+        (("stopped_by",), "the moon"),
+    ],
+)
+def test_values_of_the_kind_that_no_run_writes_are_refused(stored, place, wrong):
+    path = stored / "manifest.json"
+    content = json.loads(path.read_text(encoding="utf-8"))
+    path.write_text(json.dumps(replaced(content, place, wrong)), encoding="utf-8")
+    assert complaint(stored)
+
+
+def test_a_manifest_cut_off_anywhere_is_refused(stored):
+    path = stored / "manifest.json"
+    whole = path.read_bytes().rstrip()
+    for n in range(len(whole)):
+        path.write_bytes(whole[:n])
+        with pytest.raises(RunFolderError):
+            read_manifest(stored)
+
+
+@pytest.mark.parametrize("broken", [{"shards": 5}, {"n_episodes": "many"}, {"shards": [{"files": []}]}, {"seed": {}}])
+@pytest.mark.parametrize("command", ["estimate", "report", "replay", "rnot", "run", "ladder"])
+def test_every_command_refuses_it_with_one_error(stored, capsys, command, broken):
+    path = stored / "manifest.json"
+    content = json.loads(path.read_text(encoding="utf-8"))
+    path.write_text(json.dumps({**content, **broken}), encoding="utf-8")
+    more = {
+        "replay": [str(stored), "0"],
+        "run": [str(stored / "campaign.yaml"), "--out", str(stored), "--resume"],
+        "ladder": [str(stored), "--out", str(stored / "ladder.yaml")],
+    }
+    assert main([command, *more.get(command, [str(stored)])]) == 2
+    err = capsys.readouterr().err
+    assert err.count("error:") == 1
+    assert "manifest.json" in err
+
+
+@pytest.mark.parametrize("command", ["estimate", "report", "replay", "rnot", "ladder"])
+def test_an_empty_campaign_in_a_run_folder_is_one_error(stored, capsys, command):
+    (stored / "campaign.yaml").write_text("{}", encoding="utf-8")
+    more = {"replay": ["0"], "ladder": ["--out", str(stored / "ladder.yaml")]}
+    assert main([command, str(stored), *more.get(command, [])]) == 2
+    err = capsys.readouterr().err
+    assert err.count("error:") == 1
+    assert "campaign.yaml" in err
+
+
+def test_estimates_of_wrong_types_are_refused(stored):
+    path = stored / "estimates.json"
+    content = json.loads(path.read_text(encoding="utf-8"))
+    for key in ("campaign", "headline", "estimates", "confidence", "lane_change_level", "convergence", "diagnostics"):
+        for wrong in ([1], "text" if key not in ("campaign", "headline") else 1, True):
+            path.write_text(json.dumps({**content, key: wrong}), encoding="utf-8")
+            with pytest.raises(RunFolderError, match=r"estimates\.json"):
+                read_run_folder(stored)
+
+
+SHELLS = {"pool": "k", "strata": ["a", "b"], "p": [0.1, 0.2], "moments": [[1, 2], [3, 4]], "n_paths": 3, "n_inside": 1,
+          "boundary": "a", "p_cut_in": 0.3, "p_impossible": 0.0, "available": [1, 2]}  # fmt: skip
+STOPS = {"a": {"campaign_hash": "x", "stop": {}, "n_episodes": 3, "stopped_by": "rhw"}}
+
+
+@pytest.mark.parametrize(
+    ("model", "content", "wrong"),
+    [
+        *((StoredShells, SHELLS, {key: {}}) for key in SHELLS),
+        (StoredShells, SHELLS, {"p": [0.1]}),
+        (StoredShells, SHELLS, {"moments": [[1, 2]]}),
+        *((StoredStops, STOPS, {"a": wrong}) for wrong in (1, [], {}, {**STOPS["a"], "n_episodes": "3"})),
+    ],
+)
+def test_shells_and_stops_are_checked(tmp_path, model, content, wrong):
+    require_schema(content, model, tmp_path, mend="")
+    with pytest.raises(RunFolderError):
+        require_schema({**content, **wrong}, model, tmp_path, mend="")
