@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,3 +16,12 @@ RecordArray: TypeAlias = NDArray[Any]
 """A structured array; its fields are described where its dtype is."""
 Record: TypeAlias = Any
 """One element of a structured array, as kernels see it: fields are attributes."""
+
+
+_Scalar = TypeVar("_Scalar", bound=np.generic)
+
+
+def read_only(array: NDArray[_Scalar]) -> NDArray[_Scalar]:
+    """The array itself, from now on closed to writing; views that are made of it later are closed, too."""
+    array.setflags(write=False)
+    return array

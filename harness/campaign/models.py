@@ -10,8 +10,10 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import shlex
 from collections.abc import Iterable
 from pathlib import Path
+from string import Formatter
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import (
@@ -214,6 +216,31 @@ class TraciProcess(Section):
     )
     connect_time_s: Positive = Field(60.0, le=3600.0, description="time that the program may take to connect")
     restarts: Whole = Field(3, ge=0, le=100, description="times that a program that ended is started again")
+    allow_public: bool = Field(
+        False, description="run also where the machine has a public address: SUMO's server listens on all of them"
+    )
+
+    @field_validator("command")
+    @classmethod
+    def _command_can_be_filled_in(cls, command: str) -> str:
+        try:
+            fields = [parts[1:] for parts in Formatter().parse(command) if parts[1] is not None]
+            wrong = [field for field in fields if field not in (("port", "", None), ("cells", "", None))]
+            problem = f"the field {wrong[0][0]!r}" if wrong else None if shlex.split(command) else "no word"
+        except ValueError as error:
+            problem = str(error)
+        if problem is not None:
+            raise broken_rule(
+                "",
+                found=f"{problem[:60]}, in {command[:200]!r}",
+                expected="a program and its arguments, with {port} and {cells} as they stand the only things in braces",
+                mend="Double a brace that is meant as itself: {{ and }}.",
+            )
+        return command
+
+    def words(self, port: int, cells: int) -> list[str]:
+        """The command, filled in, word by word."""
+        return shlex.split(self.command.format(port=port, cells=cells))
 
 
 class FmuController(Section):
@@ -274,6 +301,8 @@ class AutomatedVehicle(Section):
         content = self.model_dump()
         if self.fmu is not None and (file := Path(self.fmu.file)).is_file():
             content["fmu"]["file"] = hashlib.sha256(file.read_bytes()).hexdigest()
+        if self.traci is not None:
+            del content["traci"]["allow_public"]  # changes no test
         return content
 
     @model_validator(mode="before")

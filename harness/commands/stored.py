@@ -217,5 +217,5 @@ def replay(folder: Path, episode: int, *, out: Path | None, fcd: Path | None, gu
             f"episode {episode} of {folder}",
             found="a replay that differs from the stored trace",
             expected="the same bits",
-            mend="Compare versions and CPU in manifest.json with this machine's; bits are promised for equal ones.",
+            mend=str(result.suspects),
         )

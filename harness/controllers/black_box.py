@@ -1,7 +1,8 @@
-"""In which call of a controller a worker was when it died: sixteen bytes in a file that outlive the process."""
+"""In which call of a controller a process was when it died: a few bytes in a file that outlive the process."""
 
 from __future__ import annotations
 
+import os
 import struct
 from pathlib import Path
 from typing import NamedTuple
@@ -13,15 +14,24 @@ from harness.errors import writing
 
 START = -1
 """Stands for the call of ``start``, which comes before step 0."""
-_NONE = -1
-_FORMAT = struct.Struct("<qq")
+_FORMAT = struct.Struct("<qqq")
+_NONE = 0
+CONSTRUCTOR, OF_EPISODE, START_BATCH, STEP_BATCH, CLOSE = range(1, 6)
+_WORDS = {CONSTRUCTOR: "its constructor", START_BATCH: "start_batch", STEP_BATCH: "step_batch", CLOSE: "close"}
 
 
 class Call(NamedTuple):
-    """A call of a controller: episode and step, or `START`."""
+    """A call of a controller: its kind, and where it belongs to one episode, that and the step, or `START`."""
 
+    kind: int
     episode: int
     step: int
+
+    def __str__(self) -> str:
+        if self.kind != OF_EPISODE:
+            return _WORDS[self.kind]
+        where = "start" if self.step == START else f"the call of step {self.step}"
+        return f"{where} of episode {self.episode}"
 
 
 class Death(NamedTuple):
@@ -31,8 +41,21 @@ class Death(NamedTuple):
     cause: str
 
 
+class _Forks:
+    """Counts this process's `os.fork`; what starts programs (subprocess) does not pass here."""
+
+    n = 0
+
+    @classmethod
+    def add(cls) -> None:
+        cls.n += 1
+
+
+os.register_at_fork(after_in_parent=_Forks.add)
+
+
 class BlackBox:
-    """The worker's side: notes the call that is under way.
+    """Notes the call that is under way, and lets no copy of the process come back from one.
 
     Parameters
     ----------
@@ -41,26 +64,36 @@ class BlackBox:
     """
 
     def __init__(self, path: Path | None) -> None:
-        self._note: IntArray = np.array([_NONE, START], np.int64)
+        self._note: IntArray = np.zeros(3, np.int64)
+        self._forks = _Forks.n
         if path is not None:
             with writing(path):
-                path.write_bytes(_FORMAT.pack(_NONE, START))
-            self._note = np.memmap(path, np.dtype("<i8"), "r+", shape=(2,))
+                path.write_bytes(_FORMAT.pack(_NONE, 0, 0))
+            self._note = np.memmap(path, np.dtype("<i8"), "r+", shape=(3,))
+        self._pid = os.getpid()
 
-    def enter(self, episode: int, step: int) -> None:
+    def enter(self, kind: int, episode: int = 0, step: int = START) -> None:
         """Note a call before it is made."""
-        self._note[1] = step
-        self._note[0] = episode
+        self._note[1] = episode
+        self._note[2] = step
+        self._note[0] = kind
+        self._forks = _Forks.n
 
     def leave(self) -> None:
-        """The call has come back; a process that dies does not come here."""
+        """The call has come back; a process that dies does not come here, and one that was copied must not go on."""
+        if os.getpid() != self._pid:
+            os._exit(0)
         self._note[0] = _NONE
+
+    def misdeed(self) -> str | None:
+        """What a controller did in the last call that no controller may do, or None."""
+        return None if _Forks.n == self._forks else "copied the process (os.fork); start programs with subprocess"
 
 
 def last_call(path: Path) -> Call | None:
-    """The call that a dead worker was in, or None if it was not in a controller."""
+    """The call that a dead process was in, or None if it was not in a controller."""
     try:
-        episode, step = _FORMAT.unpack(path.read_bytes())
+        call = Call._make(_FORMAT.unpack(path.read_bytes()))
     except (OSError, struct.error):
         return None
-    return None if episode == _NONE else Call(episode, step)
+    return None if call.kind == _NONE else call

@@ -3,16 +3,25 @@
 from __future__ import annotations
 
 import math
+import signal
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 
-from harness.arrays import FloatArray, IntArray
+from harness.arrays import FloatArray, IntArray, read_only
 from harness.campaign.models import Limits
-from harness.controllers.black_box import START, BlackBox, Death
+from harness.controllers.black_box import (
+    CLOSE,
+    CONSTRUCTOR,
+    OF_EPISODE,
+    START,
+    START_BATCH,
+    STEP_BATCH,
+    BlackBox,
+    Death,
+)
 from harness.controllers.protocol import (
     BatchController,
     BatchObservation,
@@ -21,15 +30,12 @@ from harness.controllers.protocol import (
     Observation,
     VehicleController,
 )
-from harness.controllers.time_limit import StepTimeoutError, TimeLimit
+from harness.controllers.time_limit import TimeLimit
 from harness.random_stream import AV_DRAWS
 from harness.vehicles.kinematics import STEP_S
 
 Failures = dict[int, str]
 """Cell → cause."""
-
-FAULTS = (Exception, SystemExit, StepTimeoutError)
-"""What a user's code may raise; Ctrl-C is not its fault."""
 
 
 class ControllerHost(Protocol):
@@ -45,6 +51,12 @@ class ControllerHost(Protocol):
 
     def close(self) -> None:
         """Release all controllers."""
+
+
+def require_fault(error: BaseException) -> None:
+    """Let Ctrl-C pass. Workers and other children ignore it: there even KeyboardInterrupt is the controller's own."""
+    if isinstance(error, KeyboardInterrupt) and signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
+        raise error
 
 
 def cause_of(error: BaseException) -> str:
@@ -139,18 +151,19 @@ class VehicleHost:
 
     def _start(self, k: int, episode: int) -> str | None:
         random = episode_random(self._seed, episode)
-        self._black_box.enter(episode, START)
+        self._black_box.enter(OF_EPISODE, episode, START)
         self._time_limit.begin()
         try:
             controller = self._controllers[k] or self._make()
             self._controllers[k] = controller
             controller.start(EpisodeStart(episode, STEP_S, random))
-        except FAULTS as error:
+        except BaseException as error:  # noqa: BLE001 - whatever a user's code raises is its episode's end
+            require_fault(error)
             return cause_of(error)
         finally:
             self._time_limit.end()
             self._black_box.leave()
-        return None
+        return self._black_box.misdeed()
 
     def act(self, observation: BatchObservation) -> tuple[FloatArray, Failures]:
         """See `ControllerHost`."""
@@ -174,12 +187,13 @@ class VehicleHost:
 
     def _step(self, controller: VehicleController, episode: int, seen: list[Any]) -> tuple[float, str | None]:
         """Answer of a controller, and what is wrong with it."""
-        self._black_box.enter(episode, round(seen[0] / STEP_S))
+        self._black_box.enter(OF_EPISODE, episode, round(seen[0] / STEP_S))
         self._time_limit.begin()
         try:
             value = controller.step(_observation(*seen))
-            return value, wrong_answer(value, self._limits)
-        except FAULTS as error:
+            return value, self._black_box.misdeed() or wrong_answer(value, self._limits)
+        except BaseException as error:  # noqa: BLE001 - as in _start
+            require_fault(error)
             return 0.0, cause_of(error)
         finally:
             self._time_limit.end()
@@ -192,7 +206,7 @@ class VehicleHost:
     def _forget(self, k: int) -> None:
         """A controller that failed is not used again: its next episode gets a new one."""
         controller, self._controllers[k] = self._controllers[k], None
-        _close_quietly(controller, self._time_limit)
+        _close_quietly(controller, self._time_limit, self._black_box)
 
     def close(self) -> None:
         """See `ControllerHost`."""
@@ -202,15 +216,43 @@ class VehicleHost:
         self._time_limit.close()
 
 
-def _close_quietly(controller: VehicleController | BatchController | None, limit: TimeLimit) -> None:
+def made(make: Callable[[], Any], black_box: BlackBox) -> Any:
+    """A new controller.
+
+    Raises
+    ------
+    Exception
+        Whatever its constructor raises, as an `Exception`.
+    """
+    black_box.enter(CONSTRUCTOR)
+    try:
+        controller = make()
+    except Exception:
+        raise
+    except BaseException as error:
+        require_fault(error)
+        raise RuntimeError(cause_of(error)) from error
+    finally:
+        black_box.leave()
+    if (misdeed := black_box.misdeed()) is not None:
+        raise RuntimeError(misdeed)
+    return controller
+
+
+def _close_quietly(
+    controller: VehicleController | BatchController | None, limit: TimeLimit, black_box: BlackBox
+) -> None:
     if controller is None:
         return
-    with suppress(*FAULTS):  # it has already failed, or the run is over
-        limit.begin()
-        try:
-            controller.close()
-        finally:
-            limit.end()
+    black_box.enter(CLOSE)
+    limit.begin()
+    try:
+        controller.close()
+    except BaseException as error:  # noqa: BLE001 - it has already failed, or the run is over
+        require_fault(error)
+    finally:
+        limit.end()
+        black_box.leave()
 
 
 def _observation(
@@ -242,25 +284,34 @@ class BatchHost:
     """One controller object for all cells. A fault that cannot be laid at one cell's door fails all that were asked."""
 
     def __init__(
-        self, controller: BatchController, seed: int, limits: Limits, *, acts_before_cut_in: bool = False
+        self,
+        controller: BatchController,
+        seed: int,
+        limits: Limits,
+        *,
+        black_box: Path | None = None,
+        acts_before_cut_in: bool = False,
     ) -> None:
         self.acts_before_cut_in = acts_before_cut_in
         self._controller = controller
         self._seed = seed
         self._limits = limits
-        self._time_limit = TimeLimit(limits.step_time_s)
+        self._black_box = BlackBox(black_box)
+        self._time_limit = TimeLimit(limits.step_time_s, may_exit=black_box is not None)
 
     def start(self, cells: IntArray, episodes: IntArray) -> Failures:
         """See `ControllerHost`."""
         random = EpisodeRandom(self._seed, episodes.tolist())
-        _, wrong = self._call(lambda: self._controller.start_batch(cells.copy(), episodes.copy(), random))
+        given = read_only(cells.copy()), read_only(episodes.copy())
+        _, wrong = self._call(START_BATCH, lambda: self._controller.start_batch(*given, random))
         return {} if wrong is None else dict.fromkeys(cells.tolist(), f"start_batch: {wrong}")
 
     def act(self, observation: BatchObservation) -> tuple[FloatArray, Failures]:
         """See `ControllerHost`."""
-        n = observation.cell.size
-        cells = observation.cell.copy()  # the controller may write into what it is given
-        answer, wrong = self._call(lambda: np.array(self._controller.step_batch(observation), dtype=np.float64))
+        n, cells = observation.cell.size, observation.cell
+        answer, wrong = self._call(
+            STEP_BATCH, lambda: np.array(self._controller.step_batch(observation), dtype=np.float64)
+        )
         if wrong is None and answer.shape != (n,):
             wrong = f"returned an array of shape {answer.shape}, expected ({n},)"
         if wrong is not None:
@@ -273,19 +324,22 @@ class BatchHost:
             failures[int(cells[i])] = f"step_batch: {wrong_answer(float(answer[i]), self._limits)}"
         return answer, failures
 
-    def _call(self, call: Callable[[], Any]) -> tuple[Any, str | None]:
+    def _call(self, kind: int, call: Callable[[], Any]) -> tuple[Any, str | None]:
         """What a call of the controller returns, and what went wrong."""
         with self._time_limit:
+            self._black_box.enter(kind)
             self._time_limit.begin()
             try:
-                return call(), None
-            except FAULTS as error:
+                return call(), self._black_box.misdeed()
+            except BaseException as error:  # noqa: BLE001 - as of a `VehicleHost`
+                require_fault(error)
                 return None, cause_of(error)
             finally:
                 self._time_limit.end()
+                self._black_box.leave()
 
     def close(self) -> None:
         """See `ControllerHost`."""
         with self._time_limit:
-            _close_quietly(self._controller, self._time_limit)
+            _close_quietly(self._controller, self._time_limit, self._black_box)
         self._time_limit.close()

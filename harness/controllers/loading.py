@@ -6,15 +6,17 @@ import hashlib
 import importlib
 import sys
 from collections.abc import Callable, Mapping
+from copy import deepcopy
 from functools import partial
 from importlib.metadata import entry_points
 from inspect import signature
 from pathlib import Path
 from typing import Any
 
-from harness.campaign.models import AutomatedVehicle
-from harness.controllers.black_box import Death
-from harness.controllers.hosts import BatchHost, ControllerHost, VehicleHost, cause_of
+from harness.campaign.models import AutomatedVehicle, Campaign
+from harness.controllers.apart import AvEndedProcessError, has_foreign_code, run_apart
+from harness.controllers.black_box import BlackBox, Death
+from harness.controllers.hosts import BatchHost, ControllerHost, VehicleHost, cause_of, made
 from harness.errors import CampaignError
 
 GROUP = "harness.controllers"
@@ -86,11 +88,11 @@ def build_host(
     acts_early = av.before_cut_in == "controller"
     make: Callable[[], Any]
     if av.source == "controller":
-        make = constructor = _maker(av)
-        made = _make_first(constructor, av)
-        if callable(getattr(made, "step_batch", None)) and callable(getattr(made, "start_batch", None)):
-            return BatchHost(made, seed, av.limits, acts_before_cut_in=acts_early)
-        _require_vehicle_controller(made, str(av.controller))
+        make = _maker(av)
+        first = _make_first(make, av, BlackBox(black_box))
+        if callable(getattr(first, "step_batch", None)) and callable(getattr(first, "start_batch", None)):
+            return BatchHost(first, seed, av.limits, black_box=black_box, acts_before_cut_in=acts_early)
+        _require_vehicle_controller(first, str(av.controller))
     elif av.source == "fmu":
         from harness.controllers.fmu import fmu_maker  # noqa: PLC0415 - an extra
 
@@ -102,47 +104,64 @@ def build_host(
     )
 
 
-def require_controller(av: AutomatedVehicle) -> None:
-    """Find and make the AV's controller once, before anything is written.
+def require_controller(campaign: Campaign) -> str | None:
+    """Find and make the AV's controller once, before anything is written, in a process of its own.
+
+    Returns
+    -------
+    str or None
+        SHA-256 of the source file of its class; None for an AV without one, or without a source.
 
     Raises
     ------
     CampaignError
         The controller cannot be found or made, or is of neither kind.
     """
-    if av.source in ("controller", "fmu"):
-        host = build_host(av, n_cells=1, seed=0)
-        if host is not None:
-            host.close()
-
-
-def controller_hash(av: AutomatedVehicle) -> str | None:
-    """SHA-256 of the source file of the AV's controller class; None for an AV without one, or without a source."""
-    if av.source != "controller":
+    if not has_foreign_code(campaign):
         return None
-    module = sys.modules.get(getattr(controller_class(str(av.controller)), "__module__", ""))
+    try:
+        return run_apart(campaign, _source_of_made)
+    except AvEndedProcessError as error:
+        raise CampaignError(
+            error.where, found=error.found, expected="a controller that can be made", mend=error.mend
+        ) from error
+
+
+def _source_of_made(campaign: Campaign, *, black_box: Path | None = None) -> str | None:
+    av = campaign.av
+    host = build_host(av, n_cells=1, seed=0, black_box=black_box)
+    if host is not None:
+        host.close()
+    if av.controller is None:
+        return None
+    module = sys.modules.get(getattr(controller_class(av.controller), "__module__", ""))
     file = Path(getattr(module, "__file__", None) or "")
     return hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else None
 
 
-def _maker(av: AutomatedVehicle) -> partial[Any]:
-    parameters = av.parameters if isinstance(av.parameters, dict) else {}
-    return partial(controller_class(str(av.controller)), **parameters)
+def _maker(av: AutomatedVehicle) -> Callable[[], Any]:
+    """Makes controllers, each with parameters of its own: what one does to a list among them is nobody else's."""
+    make = controller_class(str(av.controller))
+    return lambda: make(**deepcopy(_parameters(av)))
 
 
-def _make_first(make: partial[Any], av: AutomatedVehicle) -> Any:
+def _parameters(av: AutomatedVehicle) -> dict[str, Any]:
+    return av.parameters if isinstance(av.parameters, dict) else {}
+
+
+def _make_first(make: Callable[[], Any], av: AutomatedVehicle, black_box: BlackBox) -> Any:
     """Make one controller, so that what its constructor refuses is an error of the campaign, not of every episode."""
     try:
-        return make()
-    except (Exception, SystemExit) as error:
-        if not _takes(make):
+        return made(make, black_box)
+    except Exception as error:
+        if not _takes(partial(controller_class(str(av.controller)), **_parameters(av))):
             raise CampaignError(
                 "av.parameters",
                 found=f"parameters that {av.controller} does not take ({cause_of(error)})",
                 expected="keyword arguments of the controller's constructor",
                 mend="Correct av.parameters, or the constructor.",
             ) from error
-        given = ", ".join(make.keywords) or "none"
+        given = ", ".join(_parameters(av)) or "none"
         raise CampaignError(
             "av.controller",
             found=f"{av.controller}, whose constructor raised {cause_of(error)}",

@@ -7,6 +7,7 @@ commands the AV alone.
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import deepcopy
 from typing import Any
 
 import numpy as np
@@ -87,7 +88,7 @@ class StepListenerController(TraciStyleController):
     def on_start(self, random: np.random.Generator) -> None:  # noqa: ARG002 - listeners know no randomness
         """Make the episode's listener."""
         self._remove()
-        self._listener = self._make(self._traci, **self._parameters)
+        self._listener = self._make(self._traci, **deepcopy(self._parameters))
 
     def on_step(self, traci: Traci, veh_id: str, time: float) -> None:  # noqa: ARG002 - a listener has its own
         """Call the listener with the time (s), as ``traci.simulationStep(time)`` would."""

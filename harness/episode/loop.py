@@ -79,12 +79,18 @@ class Shard:
     cut_ins: IntArray | None = None
 
 
-def traced_by_index(seed: int, episodes: IntArray, share: float) -> BoolArray:
-    """Which episodes are traced whatever their outcome: a hash of the index cannot depend on it."""
+def hash_of_index(seed: int, episodes: IntArray) -> FloatArray:
+    """A number in [0, 1) for each episode, which cannot depend on its outcome."""
     mixed = (episodes.astype(np.uint64) + np.uint64(seed)) * np.uint64(0x9E3779B97F4A7C15)
     mixed ^= mixed >> np.uint64(29)
     mixed *= np.uint64(0xBF58476D1CE4E5B9)
-    chosen: BoolArray = (mixed >> np.uint64(11)).astype(np.float64) / 2.0**53 < share
+    hashed: FloatArray = (mixed >> np.uint64(11)).astype(np.float64) / 2.0**53
+    return hashed
+
+
+def traced_by_index(seed: int, episodes: IntArray, share: float) -> BoolArray:
+    """Which episodes are traced whatever their outcome."""
+    chosen: BoolArray = hash_of_index(seed, episodes) < share
     return chosen
 
 
@@ -185,6 +191,10 @@ class EpisodeLoop:
             except AVLostError as lost:
                 ended += self._lose(str(lost), shard, always)
 
+    def beside(self, world: World) -> EpisodeLoop:
+        """Another loop with the same AV, policy and records, in a world of no more cells."""
+        return EpisodeLoop(world, self._policy, self._keep, self._av)
+
     def close(self) -> None:
         """Release what the AV's controllers hold; the loop runs no more."""
         if self._av is not None:
@@ -265,8 +275,7 @@ class EpisodeLoop:
             placed = exchange.placed[: exchange.counts[PLACED]]
             failures.update(av.start(placed, cells.cell["episode"][placed]))
         if n:
-            seen = first(self._observation, n)
-            cells.acceleration[seen.cell, AV], failed = av.act(seen)
+            cells.acceleration[self._observation.cell[:n], AV], failed = av.act(first(self._observation, n))
             failures.update({k: cause for k, cause in failed.items() if k not in failures})
         self._fail(failures, shard)
         command(world.x, world.v, cells, self._keep.any_trace)

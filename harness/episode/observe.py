@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from harness.arrays import FloatArray, IntArray
+from harness.arrays import FloatArray, IntArray, read_only
 from harness.compiled import compiled
 from harness.controllers.protocol import BatchObservation
 from harness.episode.cells import Cells, Results
@@ -28,10 +28,10 @@ def _rows(whole: IntArray, real: FloatArray) -> BatchObservation:
 
 
 def first(observation: BatchObservation, n: int) -> BatchObservation:
-    """The first ``n`` entries of every array, as copies that a controller may keep or change."""
+    """The first ``n`` entries of every array, as copies that a controller may keep, and that nobody can write into."""
     whole: Any = observation.cell.base
     real: Any = observation.time_s.base
-    return _rows(whole[:, :n].copy(), real[:, :n].copy())
+    return _rows(read_only(whole[:, :n].copy()), read_only(real[:, :n].copy()))
 
 
 @compiled

@@ -20,7 +20,14 @@ from harness.estimators.from_records import (
     block_from_tables,
 )
 from harness.estimators.one_pass import ESTIMATORS, PassResult, one_pass
-from harness.estimators.statement import SCOPE, conditional_statement, failed_statement, per_distance, statement
+from harness.estimators.statement import (
+    SCOPE,
+    conditional_statement,
+    failed_statement,
+    per_distance,
+    repeated_statement,
+    statement,
+)
 from harness.estimators.surrogates import MOST_UNASKED, PoolRequest, surrogates_of
 from harness.estimators.threads import read_ahead
 from harness.importance.build import importance_names, mixture_weights, needs_tables
@@ -46,6 +53,8 @@ class CampaignFacts:
         Names of the importance functions, in order.
     retraced : dict
         What the run says about the twin retracing its episodes.
+    repeated : dict
+        What the run says about tests that it ran twice.
     no_surrogates : str
         Why surrogates were not asked about the tests, where they were not.
     no_replay : str or None
@@ -59,6 +68,7 @@ class CampaignFacts:
     distance_per_test_m: float | None = None
     importance_names: tuple[str, ...] = ()
     retraced: dict[str, Any] | None = None
+    repeated: dict[str, Any] | None = None
     no_surrogates: str = "the blocks do not say what surrogates would have done"
     no_replay: str | None = None
 
@@ -112,7 +122,9 @@ def _statements(
 ) -> dict[str, str]:
     """What each estimator says, in a sentence; of one without a value, why."""
     return {
-        name: statement(found, facts.lane_change_level, distance_km) + failed_statement(found)
+        name: statement(found, facts.lane_change_level, distance_km)
+        + failed_statement(found)
+        + repeated_statement(facts.repeated)
         if isinstance(found, Estimate)
         else f"No crash rate from these records: {found.reason.rstrip('.')}."
         for name, found in estimates.items()
@@ -177,6 +189,7 @@ def estimate_run(
         distance_per_test_m=None if distance is None else float(distance),
         importance_names=importance_names(campaign),
         retraced=manifest.get("retraced"),
+        repeated=manifest.get("repeated"),
         no_surrogates=surrogates if isinstance(surrogates, str) else "",
         no_replay=_no_replay(surrogates, int(manifest["n_episodes"]), n_replayed),
     )

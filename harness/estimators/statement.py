@@ -94,3 +94,16 @@ def _width(rhw: float) -> str:
     if rhw > WIDEST_RHW:
         return "still open upwards: far wider than the rate"
     return f"relative half-width {rhw:.1%}"
+
+
+def repeated_statement(repeated: Mapping[str, Any] | None) -> str:
+    """What repeating some tests has shown, as a sentence to follow the answer; empty where none were repeated."""
+    if repeated is None or not repeated["n_episodes"]:
+        return ""
+    n, n_differing = repeated["n_episodes"], len(repeated["differing"])
+    if not n_differing:
+        return f" {n:,} tests were repeated: same bits."
+    return (
+        f" {n_differing:,} of {n:,} repeated tests DIFFERED: this vehicle is not reproducible; its tests cannot be "
+        "replayed, and depend on what ran beside and before them."
+    )

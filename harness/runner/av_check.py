@@ -4,27 +4,21 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from contextlib import suppress
 from dataclasses import asdict, dataclass
-from multiprocessing.connection import Connection
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 
 from harness.arrays import FloatArray
 from harness.campaign.models import AutomatedVehicle, Campaign
-from harness.controllers.black_box import START, Call, last_call
-from harness.controllers.time_limit import death_cause
+from harness.controllers.apart import has_foreign_code, run_apart
 from harness.episode.loop import EpisodeLoop, Shard
-from harness.errors import EXIT_DONE, EXIT_TOO_MANY_FAILED, HarnessError
+from harness.errors import EXIT_DONE, EXIT_TOO_MANY_FAILED
 from harness.estimators.estimate import finite_json
-from harness.interruption import leave_signals_to_parent
 from harness.outcomes import AV, CRASH, FAILED
 from harness.runner.prepare import Prepared, build_world, prepare
-from harness.runner.processes import fit_to_travel
-from harness.spawning import spawn_context
+from harness.runner.repeat import bits_of
 from harness.vehicles.kinematics import STEP_S
 
 EPISODES = 48
@@ -35,12 +29,6 @@ SHORTEST_TIMING_S = 0.3
 BRAKING_MPS2 = -0.1
 """What counts as a reaction to the cut-in."""
 AT_LIMIT_MPS2 = 1e-9
-
-
-class AvEndedProcessError(HarnessError):
-    """The AV's controller ended the process that looked at it."""
-
-    exit_code = EXIT_TOO_MANY_FAILED
 
 
 @dataclass(frozen=True)
@@ -152,7 +140,7 @@ def check_av(campaign: Campaign, n_episodes: int = EPISODES, *, black_box: Path 
         method=tested.testing.method,
         n_episodes=n_episodes,
         failures=dict(Counter(first.failures.values())),
-        differing=tuple(i for i in range(n_episodes) if _motion(first, i) != again[i]),
+        differing=tuple(i for i in range(n_episodes) if bits_of(first, i) != again[i]),
         limits_mps2=limits,
         behaviour=_behaviour(first, limits, early=tested.av.before_cut_in == "controller"),
         speed=Speed(1e6 * elapsed_s / steps, n_episodes / elapsed_s, 1e6 * idm_s / idm_steps, n_episodes / idm_s),
@@ -169,52 +157,9 @@ def check_av_apart(campaign: Campaign, n_episodes: int = EPISODES) -> AvCheck:
     AvEndedProcessError
         The controller ended the process; its last call is named.
     """
-    if campaign.av.source not in ("controller", "fmu"):
+    if not has_foreign_code(campaign):
         return check_av(campaign, n_episodes)
-    context = spawn_context()
-    ours, theirs = context.Pipe()
-    with TemporaryDirectory(prefix="harness-av-check-") as folder:
-        black_box = Path(folder) / "black-box"
-        child = context.Process(target=_check_and_tell, args=(theirs, campaign, n_episodes, black_box), daemon=True)
-        child.start()
-        theirs.close()  # or the child's death would not end the pipe
-        try:
-            answer: AvCheck | Exception = ours.recv()
-        except EOFError:
-            child.join()
-            raise _ended(campaign, child.exitcode, last_call(black_box)) from None
-        finally:
-            child.kill()
-            child.join()
-            ours.close()
-    if isinstance(answer, Exception):
-        raise answer
-    return answer
-
-
-def _check_and_tell(connection: Connection, campaign: Campaign, n_episodes: int, black_box: Path) -> None:
-    """What the child does; its parent alone answers to Ctrl-C."""
-    leave_signals_to_parent()
-    try:
-        answer: AvCheck | Exception = check_av(campaign, n_episodes, black_box=black_box)
-    except Exception as error:  # noqa: BLE001 - whatever goes wrong here is the parent's to judge
-        answer = fit_to_travel(error)
-    with suppress(OSError):  # the parent was killed: nobody is left to tell
-        connection.send(answer)
-
-
-def _ended(campaign: Campaign, exit_code: int | None, call: Call | None) -> AvEndedProcessError:
-    where = "while it was found or made, or in an array call"
-    if call is not None:
-        where = f"in episode {call.episode}, " + (
-            "in start" if call.step == START else f"in the call of step {call.step}"
-        )
-    return AvEndedProcessError(
-        f"av.{campaign.av.source}",
-        found=f"{death_cause(exit_code, campaign.av.limits.step_time_s)}, {where}",
-        expected="a controller that returns or raises",
-        mend="Look for os._exit, a crash of compiled code, or a shortage of memory; then check again.",
-    )
+    return run_apart(campaign, check_av, n_episodes)
 
 
 def _as_checked(campaign: Campaign) -> Campaign:
@@ -251,26 +196,20 @@ def _timed_run(prepared: Prepared, n_episodes: int, black_box: Path | None = Non
 
 def _run_in_another_order(
     prepared: Prepared, n_episodes: int, black_box: Path | None
-) -> dict[int, tuple[bytes, str | None]]:
+) -> dict[int, tuple[bytes, bytes, str | None]]:
     """Motion of every episode, run in other cells, the second half first."""
     world = build_world(prepared.campaign, OTHER_CELLS)
     loop: EpisodeLoop = prepared.loop(world, black_box=black_box)
     half = n_episodes // 2
-    found: dict[int, tuple[bytes, str | None]] = {}
+    found: dict[int, tuple[bytes, bytes, str | None]] = {}
     try:
         for begin, end in ((half, n_episodes), (0, half)):
             shard = loop.run(begin, prepared.states(begin, end - begin))
-            found.update({begin + row: _motion(shard, row) for row in range(end - begin)})
+            found.update({begin + row: bits_of(shard, row) for row in range(end - begin)})
     finally:
         loop.close()
         world.close()
     return found
-
-
-def _motion(shard: Shard, row: int) -> tuple[bytes, str | None]:
-    """Everything that moved in an episode, to the bit, and why it failed if it did."""
-    trace = shard.traces.get(row)
-    return b"" if trace is None else trace.tobytes(), shard.failures.get(row)
 
 
 def _limits(av: AutomatedVehicle) -> tuple[float, float]:

@@ -16,7 +16,6 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from harness.campaign.models import Campaign
-from harness.controllers.loading import controller_hash
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE
 from harness.estimators import estimate_run
 from harness.progress import Progress, SilentProgress
@@ -94,17 +93,25 @@ def run_campaign(
     HarnessError
         The campaign, the folder or the AV is at fault; nothing that was finished is lost.
     """
-    require_ready(campaign)
+    controller = require_ready(campaign)
     with sole_use(out):
-        return _run_alone(campaign, out, workers, progress or SilentProgress(), resume=resume, shorten=shorten)
+        return _run_alone(
+            campaign, out, workers, progress or SilentProgress(), controller, resume=resume, shorten=shorten
+        )
 
 
 def _run_alone(
-    campaign: Campaign, out: Path, workers: int | None, progress: Progress, *, resume: bool, shorten: bool
+    campaign: Campaign,
+    out: Path,
+    workers: int | None,
+    progress: Progress,
+    controller: str | None,
+    *,
+    resume: bool,
+    shorten: bool,
 ) -> RunResult:
-    """`run_campaign` in a folder that no other process uses."""
+    """`run_campaign` in a folder that no other process uses, with a controller of this hash."""
     started = time.monotonic()
-    controller = controller_hash(campaign.av)
     earlier = require_own_folder(out, content_hash(campaign), controller, resume=resume)
     if not shorten:
         require_no_fewer(out, earlier, campaign.stop.episodes)
@@ -138,7 +145,13 @@ def _run_alone(
     stopped_by = _stopped_by(campaign, prefix)
     retraced = retracing.summary(prefix.n_retraced)
     manifest.write(
-        prefix.specs, prefix.files, status="done", elapsed_s=elapsed, stopped_by=stopped_by, retraced=retraced
+        prefix.specs,
+        prefix.files,
+        status="done",
+        elapsed_s=elapsed,
+        stopped_by=stopped_by,
+        retraced=retraced,
+        repeated=prefix.repeated,
     )
     progress.stage("estimates and report", None)
     estimates = estimate_run(out)
@@ -187,15 +200,19 @@ def _run_shards(
             progress.status(**prefix.figures)
             if elapsed() - written > MANIFEST_INTERVAL_S:
                 written = elapsed()
-                manifest.write(prefix.specs, prefix.files, status="running", elapsed_s=written)
+                _note(manifest, prefix, "running", written)
             if stop:
                 break
         prefix.require_few_failed()
     except BaseException:
-        manifest.write(prefix.specs, prefix.files, status="interrupted", elapsed_s=elapsed())
+        _note(manifest, prefix, "interrupted", elapsed())
         raise
     finally:
         pool.close()
+
+
+def _note(manifest: Manifest, prefix: Prefix, status: str, elapsed_s: float) -> None:
+    manifest.write(prefix.specs, prefix.files, status=status, elapsed_s=elapsed_s, repeated=prefix.repeated)
 
 
 def _episodes_on_disk(folder: Path) -> int:

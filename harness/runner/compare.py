@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 from harness.campaign.models import Campaign
-from harness.controllers.loading import controller_hash
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, CampaignError, RunFolderError
 from harness.estimators.block import Block
 from harness.estimators.difference import Difference, difference_statement, paired_difference
@@ -20,7 +19,7 @@ from harness.records.reader import read_shards
 from harness.records.stored_manifest import StoredStops
 from harness.runner.campaign_run import run_campaign
 from harness.runner.manifest import require_own_folder
-from harness.runner.prepare import content_hash
+from harness.runner.prepare import content_hash, require_ready
 
 Side = Literal["a", "b"]
 SIDES: tuple[Side, Side] = ("a", "b")
@@ -86,7 +85,7 @@ def compare_campaigns(
     campaigns: dict[Side, Campaign] = {"a": a, "b": b}
     for side in SIDES:  # both, before either is touched
         campaign = campaigns[side]
-        require_own_folder(out / side, content_hash(campaign), controller_hash(campaign.av), resume=True)
+        require_own_folder(out / side, content_hash(campaign), require_ready(campaign), resume=True)
     stops = _Stops(out, campaigns)
     for side in SIDES:
         if not stops.known(side):

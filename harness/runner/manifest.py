@@ -13,6 +13,7 @@ from harness.campaign.dumping import dump_campaign
 from harness.campaign.models import Campaign
 from harness.errors import RunFolderError
 from harness.records.folder import MANIFEST, read_manifest, require_place, write_json, write_text
+from harness.runner.repeat import Repeated
 from harness.runner.worker import ShardSpec
 
 _PACKAGES = ("harness", "libsumo", "numba", "llvmlite", "numpy", "scipy", "pyarrow")
@@ -120,6 +121,7 @@ class Manifest:
     ) -> None:
         self._folder = folder
         self._campaign = dump_campaign(campaign)
+        self._reproducible = campaign.av.reproducible
         self._earlier = earlier
         self._n_kept = int((earlier or {}).get("n_episodes", 0))
         self._wall_time_s = float((earlier or {}).get("wall_time_s", 0.0))
@@ -130,7 +132,6 @@ class Manifest:
             "created": (earlier or {}).get("created") or datetime.now(UTC).isoformat(timespec="seconds"),
             "seed": campaign.seed,
             "engine": campaign.world.engine,
-            "reproducible": campaign.av.reproducible,
             "versions": versions(),
             "cpu": cpu_name(),
             **facts,
@@ -163,6 +164,7 @@ class Manifest:
         elapsed_s: float = 0.0,
         stopped_by: str | None = None,
         retraced: dict[str, Any] | None = None,
+        repeated: Repeated | None = None,
     ) -> None:
         """Record the contiguous prefix of finished shards.
 
@@ -182,6 +184,8 @@ class Manifest:
                 "status": status,
                 "stopped_by": stopped_by,
                 "retraced": retraced,
+                "reproducible": self._reproducible and not (repeated and repeated.differing),
+                "repeated": None if repeated is None else repeated.to_json(),
                 "wall_time_s": round(self._wall_time_s + elapsed_s, 3),
                 "n_episodes": n_episodes,
                 "shards": shards,

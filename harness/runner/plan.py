@@ -10,6 +10,7 @@ from harness.criticality.tables import tables_cached
 from harness.environment.loading import load_environment
 from harness.importance.build import needs_tables
 from harness.pool.storage import cached_pool
+from harness.runner.measured_cost import seconds_per_test
 from harness.runner.prepare import require_ready
 from harness.sumo.shim import shim_library
 from harness.vehicles.models import surrogate_records
@@ -33,7 +34,7 @@ def plan_campaign(campaign: Campaign) -> dict[str, Any]:
     -------
     dict
         ``episodes``, ``episodes_per_second_estimate`` (all cores), ``seconds_estimate``, ``tables`` (in words) and
-        ``disk_mb``.
+        ``disk_mb``; of an AV that is not built in ``av_ms_per_test``, measured, or in words why there is none.
 
     Raises
     ------
@@ -42,7 +43,12 @@ def plan_campaign(campaign: Campaign) -> dict[str, Any]:
     """
     require_ready(campaign)
     engine = "sumo with shim" if campaign.world.engine == "sumo" and shim_library() else campaign.world.engine
-    rate = EPISODES_PER_SECOND_PER_CORE[engine][campaign.testing.method] * (os.cpu_count() or 1)
+    per_core: float = EPISODES_PER_SECOND_PER_CORE[engine][campaign.testing.method]
+    measured = None if campaign.av.model is not None else seconds_per_test(campaign)
+    if isinstance(measured, float):
+        moved_by_sumo = campaign.av.source in ("sumo", "traci")
+        per_core = 1.0 / (measured + (0.0 if moved_by_sumo else 1.0 / per_core))
+    rate = _rounded(per_core * (os.cpu_count() or 1))
     moments = MOMENTS_PER_EPISODE[campaign.records.moments] if needs_tables(campaign) else 0
     episodes = campaign.stop.episodes
     return {
@@ -51,7 +57,17 @@ def plan_campaign(campaign: Campaign) -> dict[str, Any]:
         "seconds_estimate": round(episodes / rate),
         "tables": _tables(campaign),
         "disk_mb": round(episodes * (KB_PER_EPISODE + KB_PER_MOMENT * moments) / 1000.0, 1),
+        **(
+            {}
+            if measured is None
+            else {"av_ms_per_test": measured if isinstance(measured, str) else _rounded(1e3 * measured)}
+        ),
     }
+
+
+def _rounded(value: float) -> float:
+    """Two digits: more are not known."""
+    return float(f"{value:.2g}")
 
 
 def _tables(campaign: Campaign) -> str:

@@ -8,6 +8,7 @@ from harness.campaign.models import Campaign
 from harness.errors import TooManyFailedError
 from harness.estimators import accumulator
 from harness.estimators.accumulator import Accumulator
+from harness.runner.repeat import Repeated
 from harness.runner.rounds import Rule
 from harness.runner.shards import SMALLEST_FAILED_SAMPLE
 from harness.runner.worker import ShardDone, ShardSpec
@@ -20,6 +21,8 @@ class Prefix:
     ----------
     sums : Accumulator
         Of the estimator whose precision is watched.
+    repeated : Repeated or None
+        What repeating some of the first tests has shown, once it is known.
     """
 
     def __init__(self, campaign: Campaign, rule: Rule) -> None:
@@ -28,6 +31,7 @@ class Prefix:
         self.specs: list[ShardSpec] = []
         self.files: list[dict[str, str]] = []
         self.n_episodes = self.n_crashes = self.n_failed = self.n_retraced = 0
+        self.repeated: Repeated | None = None
         self._causes: Counter[str] = Counter()
 
     @property
@@ -67,6 +71,7 @@ class Prefix:
         self.n_crashes += int(done.block.crash.sum())
         self.n_failed += int(done.block.failed.sum())
         self._causes += done.failures
+        self.repeated = self.repeated or done.repeated
         if self.n_episodes >= SMALLEST_FAILED_SAMPLE:
             self.require_few_failed()
         if not self._rule.due(self.n_episodes):

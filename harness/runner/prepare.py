@@ -26,6 +26,7 @@ from harness.pool.storage import campaign_pool, campaign_pool_key, pool_path
 from harness.progress import Progress, SilentProgress
 from harness.records.folder import SHELLS, read_json
 from harness.sumo.av_type import av_type
+from harness.sumo.public_address import require_private
 from harness.vehicles.models import av_records, surrogate_records
 from harness.world import World
 
@@ -76,22 +77,30 @@ class Prepared:
         return EpisodeLoop(world, self.policy, keep, av)
 
 
-def require_ready(campaign: Campaign) -> None:
+def require_ready(campaign: Campaign) -> str | None:
     """Refuse what can be known to be wrong before anything is simulated or written.
+
+    Returns
+    -------
+    str or None
+        Hash of the source of the AV's controller (`require_controller`).
 
     Raises
     ------
     CampaignError
-        The AV's controller cannot be found or made, SUMO knows no such attribute of it, the environment's parameters
-        are wrong, or the surrogate library is wrong or lacks the boundary.
+        The AV's controller cannot be found or made, SUMO knows no such attribute of it, strangers could drive it, the
+        environment's parameters are wrong, or the surrogate library is wrong or lacks the boundary.
     """
-    require_controller(campaign.av)
+    source = require_controller(campaign)
     if campaign.av.sumo is not None:
         av_type(campaign.av.sumo)
+    if campaign.av.traci is not None:
+        require_private(campaign.av.traci)
     load_parameters(campaign.environment)
     if campaign.testing.method == "shells":
         library = load_library(campaign.pool.library)
         require_boundary(campaign.testing.shells.boundary or library.boundary, tuple(library.surrogates))
+    return source
 
 
 def content_hash(campaign: Campaign) -> str:

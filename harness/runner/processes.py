@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 import os
-import pickle
-import traceback
+import time
 from collections.abc import Mapping, Sequence
 from itertools import count
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 
 from harness.campaign.models import Campaign
+from harness.controllers.apart import LOOK_S, end_process, fit_to_travel, start_process
 from harness.controllers.black_box import Call, Death, last_call
-from harness.interruption import leave_signals_to_parent
 from harness.runner.worker import ShardDone, ShardRunner, ShardSpec
 from harness.spawning import spawn_context
 
 CLOSING_S = 10.0
 """Time that a worker gets to release its controllers once all is done."""
+CLOSING_LOOK_S = 0.05
 _numbers = count()
 
 
@@ -33,11 +33,9 @@ class WorkerProcess:
 
     def __init__(self, campaign: Campaign, folder: Path) -> None:
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-        context = spawn_context()
         self._black_box = folder / f".black-box-{next(_numbers)}"
-        self.connection, theirs = context.Pipe()
-        self._process = context.Process(target=serve, args=(theirs, campaign, folder, self._black_box), daemon=True)
-        self._process.start()
+        self.connection, theirs = spawn_context().Pipe()
+        self._process = start_process(serve, theirs, campaign, folder, self._black_box)
         theirs.close()  # or its death would not end the pipe
 
     def give(self, spec: ShardSpec, doomed: Mapping[int, Death]) -> bool:
@@ -57,20 +55,23 @@ class WorkerProcess:
             Whatever running the shard has raised.
         """
         try:
-            answer = self.connection.recv()
+            answer = self.connection.recv() if self.connection.poll() else None
         except (EOFError, OSError):
             return None
         if isinstance(answer, BaseException):
             raise answer
-        return answer  # type: ignore[no-any-return]
+        return answer
 
     def kill(self) -> int | None:
         """End it at once, whatever it does (files are written atomically); returns its exit code."""
-        self._process.kill()
-        self._process.join()
+        exit_code = end_process(self._process)
         self.connection.close()
         self._black_box.unlink(missing_ok=True)
-        return self._process.exitcode
+        return exit_code
+
+    def is_alive(self) -> bool:
+        """Whether it runs."""
+        return self._process.is_alive()
 
     def last_call(self) -> Call | None:
         """The controller's call that it is in, or has died in."""
@@ -82,22 +83,24 @@ class WorkerProcess:
 
     def wait(self) -> None:
         """Give a dismissed worker a little time; then end it."""
-        self._process.join(CLOSING_S)
+        until = time.monotonic() + CLOSING_S
+        while self.is_alive() and time.monotonic() < until:  # a copy of it may keep open what join() waits for
+            self._process.join(CLOSING_LOOK_S)
         self.kill()
 
 
 def first_to_answer(workers: Sequence[WorkerProcess]) -> WorkerProcess:
     """Wait until one of the workers has answered or died."""
-    ready = wait([worker.connection for worker in workers])[0]
-    return next(worker for worker in workers if worker.connection is ready)
+    while True:
+        dead = [worker for worker in workers if not worker.is_alive()]
+        ready = wait([worker.connection for worker in workers], 0.0 if dead else LOOK_S)
+        found = [worker for worker in workers if worker.connection in ready] or dead
+        if found:
+            return found[0]
 
 
 def serve(connection: Connection, campaign: Campaign, folder: Path, black_box: Path) -> None:
-    """What the process does: prepare with the first shard, run shards until the parent is gone or has no more.
-
-    The parent alone answers to Ctrl-C and to the end of the terminal.
-    """
-    leave_signals_to_parent()
+    """What the process does: prepare with the first shard, run shards until the parent is gone or has no more."""
     runner: ShardRunner | None = None
     while True:
         try:
@@ -115,14 +118,3 @@ def serve(connection: Connection, campaign: Campaign, folder: Path, black_box: P
             break
     if runner is not None:
         runner.close()
-
-
-def fit_to_travel(error: Exception) -> Exception:
-    """The error with its traceback as a note; in words where it cannot be pickled."""
-    text = "".join(traceback.format_exception(error))
-    error.add_note(f"In a worker process:\n{text}")
-    try:
-        pickle.loads(pickle.dumps(error))  # noqa: S301 - our own bytes
-    except Exception:  # noqa: BLE001 - exceptions fail to be pickled in many ways
-        return RuntimeError(text)
-    return error

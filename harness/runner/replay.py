@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +13,12 @@ import pyarrow.compute as pc
 
 from harness.campaign.loading import load_campaign
 from harness.campaign.models import Campaign
+from harness.controllers.apart import has_foreign_code, run_apart
+from harness.controllers.loading import require_controller
 from harness.errors import CampaignError, RunFolderError
 from harness.records.folder import no_episodes, read_manifest, read_table
 from harness.records.tables import shard_tables
+from harness.runner.manifest import cpu_name, versions
 from harness.runner.prepare import Prepared, build_world, content_hash, prepare, require_same_pool
 from harness.world import World
 
@@ -36,6 +40,8 @@ class ReplayResult:
         Whether the stored row, and the stored trace where there is one, were reproduced in every bit.
     compared : tuple of str
         Which tables were compared.
+    suspects : str or None
+        If it was not reproduced, what may be why.
     """
 
     outcome: str
@@ -43,10 +49,11 @@ class ReplayResult:
     trace: pa.Table
     bit_equal: bool | None
     compared: tuple[str, ...]
+    suspects: str | None = None
 
 
 def replay_episode(folder: Path, episode: int, *, gui: bool = False, fcd: Path | None = None) -> ReplayResult:
-    """Replay an episode of a run.
+    """Replay an episode of a run; a user's own code in a process of its own.
 
     Parameters
     ----------
@@ -77,32 +84,77 @@ def replay_episode(folder: Path, episode: int, *, gui: bool = False, fcd: Path |
             expected=f"campaign {manifest['campaign_hash']}, which made the records",
             mend="Restore campaign.yaml and the environment parameter file that it names.",
         )
-    prepared = prepare(campaign)
-    require_same_pool(folder, prepared)
-    world = _world(campaign, gui=gui, fcd=fcd)
-    try:
-        row, trace = _run_again(prepared, world, episode, stored["episodes"])
-    finally:
-        world.close()
+    replay = partial(run_apart, campaign, _replay) if has_foreign_code(campaign) else partial(_replay, campaign)
+    row, trace = replay(folder, episode, stored["episodes"], gui, fcd)
     equal = {name: _equal(name, table, stored.get(name)) for name, table in (("episodes", row), ("traces", trace))}
     compared = tuple(name for name, answer in equal.items() if answer is not None)
     first: dict[str, Any] = row.to_pylist()[0]
     bit_equal = all(equal[name] for name in compared) if compared else None
-    return ReplayResult(str(first["outcome"]), first, trace, bit_equal, compared)
+    suspects = None if bit_equal is not False else _suspects(manifest, campaign)
+    return ReplayResult(str(first["outcome"]), first, trace, bit_equal, compared, suspects)
+
+
+def _replay(
+    campaign: Campaign,
+    folder: Path,
+    episode: int,
+    stored: pa.Table,
+    gui: bool,
+    fcd: Path | None,
+    black_box: Path | None = None,
+) -> tuple[pa.Table, pa.Table]:
+    """Row and trace of the episode, run again."""
+    prepared = prepare(campaign)
+    require_same_pool(folder, prepared)
+    world = _world(campaign, gui=gui, fcd=fcd)
+    try:
+        return _run_again(prepared, world, episode, stored, black_box)
+    finally:
+        world.close()
+
+
+def _suspects(manifest: dict[str, Any], campaign: Campaign) -> str:
+    """What may have made a replay differ, by what the manifest knows."""
+    here = {**versions(), "CPU": cpu_name()}
+    there = {**manifest.get("versions", {}), "CPU": manifest.get("cpu")}
+    other = [f"{name} {there[name]} (here {here.get(name)})" for name in there if there[name] != here.get(name)]
+    found = [f"The run was made with {', '.join(other)}; bits are promised for equal ones."] if other else []
+    if manifest.get("controller_sha256") != require_controller(campaign):
+        found.append("The controller's source file has been changed since the run.")
+    elif campaign.av.model is None:
+        same = "Versions, CPU and the controller's source file are the run's. " if not other else ""
+        found.append(
+            f"{same}Or the vehicle does not do the same again: random numbers of its own, memory of earlier episodes, "
+            "or a file that it reads. `harness av-check` looks at that."
+        )
+    return " ".join(found) or "Versions and CPU are the run's: the records have been changed, or it is a defect."
 
 
 def _require_reproducible(manifest: dict[str, Any]) -> None:
-    if not manifest.get("reproducible", True):
+    if manifest.get("reproducible", True):
+        return
+    repeated = manifest.get("repeated")
+    if repeated:
         raise CampaignError(
-            "av.traci",
-            found="a run that is not reproducible: a program outside of the harness drove the AV",
-            expected="an AV that does the same again: model, controller, sumo or fmu",
-            mend="Look at the traces that the run has kept (records.traces: crash), or let the program write a log.",
+            "av",
+            found=f"a run that is not reproducible: {len(repeated['differing'])} of {repeated['n_episodes']} tests "
+            "that it repeated itself came out otherwise",
+            expected="an AV that does the same again, given the same observations and the same random stream",
+            mend="Draw only from the generator handed over in start, and keep nothing across episodes (`harness "
+            "av-check` tells whether that is so). The traces that the run has kept are what happened.",
         )
+    raise CampaignError(
+        "av.traci",
+        found="a run that is not reproducible: a program outside of the harness drove the AV",
+        expected="an AV that does the same again: model, controller, sumo or fmu",
+        mend="Look at the traces that the run has kept (records.traces: crash), or let the program write a log.",
+    )
 
 
-def _run_again(prepared: Prepared, world: World, episode: int, stored: pa.Table) -> tuple[pa.Table, pa.Table]:
-    loop = prepared.loop(world, traces="all")
+def _run_again(
+    prepared: Prepared, world: World, episode: int, stored: pa.Table, black_box: Path | None
+) -> tuple[pa.Table, pa.Table]:
+    loop = prepared.loop(world, traces="all", black_box=black_box)
     if prepared.prescribed is None:
         shard = loop.run(episode, prepared.states(episode, 1))
     else:

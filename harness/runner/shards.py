@@ -11,9 +11,10 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
+from scipy.special import bdtrc
 
 from harness.campaign.models import Campaign
-from harness.controllers.black_box import Call, Death
+from harness.controllers.black_box import OF_EPISODE, Call, Death
 from harness.controllers.time_limit import death_cause
 from harness.errors import HarnessError, TooManyFailedError
 from harness.pool.prescribed import PrescribedEpisodes
@@ -22,12 +23,15 @@ from harness.records.tables import ShardTables
 from harness.runner.manifest import Manifest
 from harness.runner.processes import WorkerProcess, first_to_answer
 from harness.runner.retrace import Retracing
-from harness.runner.worker import ShardDone, ShardSpec, failure_causes, shard_block
+from harness.runner.worker import ShardDone, ShardSpec, failure_causes, shard_block, stored_repeated
 
 ATTEMPTS = 3
 """A shard whose worker dies is given to another one, this many times in all."""
 SMALLEST_FAILED_SAMPLE = 200
 """Episodes before the share of failures can end a campaign."""
+SURELY_TOO_MANY = 1e-4
+"""Probability of so many deaths under the allowed share, below which a controller is refused: with the default share
+its third at the earliest, its seventh if it dies in all of 96 cells, some ten seconds into the run."""
 SENT_FROM_OUTSIDE = (-signal.SIGKILL, -signal.SIGTERM)
 """Ends that an operator or a shortage of memory brings: a controller is blamed only when its call is hit again."""
 
@@ -73,7 +77,8 @@ def stored_shard(
     kept = ShardTables(tables["episodes"], tables.get("moments"), tables.get("traces"))
     n_retraced = 0 if retracing is None else retracing.check(tables["episodes"])
     block, causes = shard_block(campaign, kept, prescribed), failure_causes(kept.episodes)
-    return ShardDone(spec, files, block, stored=True, n_retraced=n_retraced, failures=causes)
+    repeated = stored_repeated(kept.episodes)
+    return ShardDone(spec, files, block, stored=True, n_retraced=n_retraced, failures=causes, repeated=repeated)
 
 
 def _same_cut_ins(episodes: pa.Table, prescribed: PrescribedEpisodes, spec: ShardSpec) -> bool:
@@ -176,29 +181,37 @@ class ShardPool:
         waiting.appendleft(job)
         first_time = call != job.suspected
         job.suspected = call
-        if call is not None and not (exit_code in SENT_FROM_OUTSIDE and first_time):  # the controller's own doing
-            cause = death_cause(exit_code, self._campaign.av.limits.step_time_s)
+        cause = death_cause(exit_code, self._campaign.av.limits.step_time_s)
+        own = call is not None and not (exit_code in SENT_FROM_OUTSIDE and first_time)  # the controller's own doing
+        if own and call is not None and call.kind == OF_EPISODE:
             job.doomed[call.episode] = Death(call.step, cause)
             self._require_few_deaths(job)
             return
         job.deaths += 1
         if job.deaths == ATTEMPTS:
-            raise WorkerLostError(
-                f"shard {job.spec.index} (from episode {job.spec.first_episode})",
-                found=f"{ATTEMPTS} worker processes that died, the last with exit code {exit_code}",
-                expected="a worker that finishes the shard",
-                mend="Look for a memory limit (fewer --workers), then continue with --resume.",
-            )
+            raise self._lost(job, exit_code, f"{cause}, in {call}" if own else None)
+
+    def _lost(self, job: _Job, exit_code: int | None, blamed: str | None) -> WorkerLostError:
+        """What to say of a shard that no worker survives; ``blamed`` is what the controller did, if it did."""
+        found = f"{ATTEMPTS} worker processes that died, the last " + (
+            f"with exit code {exit_code}" if blamed is None else f"because {blamed}"
+        )
+        mend = "Look for a memory limit (fewer --workers), then continue with --resume."
+        if blamed is not None:
+            mend = "Mend the controller: look for os._exit, or a crash of compiled code (`harness av-check`)."
+        where = f"shard {job.spec.index} (from episode {job.spec.first_episode})"
+        return WorkerLostError(where, found=found, expected="a worker that finishes the shard", mend=mend)
 
     def _require_few_deaths(self, job: _Job) -> None:
         """Each death costs a new process: a controller that dies too often is not run to the end of its shard."""
-        most = self._campaign.run.max_failed_share * max(job.spec.n_episodes, SMALLEST_FAILED_SAMPLE)
-        if len(job.doomed) > most:
-            episode, death = next(reversed(job.doomed.items()))
+        share = self._campaign.run.max_failed_share
+        episode, death = next(reversed(job.doomed.items()))
+        n_deaths, n_begun = len(job.doomed), max(job.doomed) - job.spec.first_episode + 1
+        if float(bdtrc(n_deaths - 1, n_begun, share)) < SURELY_TOO_MANY:
             raise TooManyFailedError(
                 "run.max_failed_share",
-                found=f"{len(job.doomed)} episodes of shard {job.spec.index} that ended their worker process, "
-                f"the last of them episode {episode}: {death.cause}",
-                expected=f"a share of at most {self._campaign.run.max_failed_share:g}",
-                mend="Mend the controller, or raise the share to go on.",
+                found=f"{n_deaths} of the first {n_begun} episodes of shard {job.spec.index} ended their worker "
+                f"process, the last of them episode {episode}: {death.cause}",
+                expected=f"a share of at most {share:g}",
+                mend="Mend the controller (`harness av-check` looks at it in seconds), or raise the share to go on.",
             )

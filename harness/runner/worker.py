@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -12,6 +13,7 @@ import pyarrow as pa
 
 from harness.campaign.models import Campaign
 from harness.controllers.black_box import Death
+from harness.episode.cells import Script
 from harness.episode.loop import EpisodeLoop, Shard
 from harness.estimators.block import Block
 from harness.estimators.from_records import block_from_tables
@@ -20,7 +22,12 @@ from harness.pool.prescribed import Draw, PrescribedEpisodes
 from harness.records.folder import write_shard
 from harness.records.tables import ShardTables, shard_tables
 from harness.runner.prepare import Prepared, build_world, prepare
+from harness.runner.repeat import Repeated, chosen_rows, has_to_be_shown, repeat
 from harness.runner.retrace import Retracing
+from harness.twin import TwinWorld
+
+REPEATED = b"harness.repeated"
+"""Key in the metadata of an episodes file."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +42,10 @@ class ShardSpec:
 
 @dataclass(frozen=True)
 class ShardDone:
-    """A shard on disk: what the stop rule needs of it, how many episodes the twin has retraced, causes of failures."""
+    """A shard on disk: what the stop rule needs of it, how many episodes the twin has retraced, causes of failures.
+
+    ``repeated`` is None for a shard none of whose tests were run twice.
+    """
 
     spec: ShardSpec
     files: dict[str, str]
@@ -43,6 +53,7 @@ class ShardDone:
     stored: bool = False
     n_retraced: int = 0
     failures: Counter[str] = field(default_factory=Counter)
+    repeated: Repeated | None = None
 
 
 class ShardRunner:
@@ -85,10 +96,23 @@ class ShardRunner:
         keep_traces = records.traces != "none" or records.trace_share > 0.0
         tables = shard_tables(shard, campaign.seed, keep_traces=keep_traces)
         n_retraced = self._retracing.check(tables.episodes)
+        repeated = self._repeat(shard) if spec.index == 0 and has_to_be_shown(campaign) else None
         _require_parent()
-        files = write_shard(self._folder, spec.index, tables)
-        block = shard_block(campaign, tables, self._prepared.prescribed)
-        return ShardDone(spec, files, block, n_retraced=n_retraced, failures=failure_causes(tables.episodes))
+        files = write_shard(self._folder, spec.index, with_repeated(tables, repeated))
+        block, causes = shard_block(campaign, tables, self._prepared.prescribed), failure_causes(tables.episodes)
+        return ShardDone(spec, files, block, n_retraced=n_retraced, failures=causes, repeated=repeated)
+
+    def _repeat(self, shard: Shard) -> Repeated:
+        campaign = self._prepared.campaign
+        # The twin does one episode at little cost; an AV that SUMO moves has to be moved by SUMO again.
+        alone = self._loop if campaign.av.sumo is not None else self._loop.beside(TwinWorld(1))
+        rows = chosen_rows(shard, campaign.seed, acts_early=campaign.av.before_cut_in == "controller")
+
+        def again(row: int) -> Shard:
+            script = Script._make(column[row : row + 1] for column in shard.script)
+            return alone.run(shard.first_episode + row, shard.states[row : row + 1], script)
+
+        return repeat(shard, rows, again)
 
     def _shard(self, spec: ShardSpec) -> Shard:
         prescribed = self._prepared.prescribed
@@ -108,6 +132,23 @@ def _require_parent() -> None:
     parent = parent_process()
     if parent is not None and not parent.is_alive():
         raise OrphanError("the process that runs the campaign has been killed")
+
+
+def with_repeated(tables: ShardTables, repeated: Repeated | None) -> ShardTables:
+    """The tables, with what repeating showed in the file's own metadata: it is there with the shard, or not at all."""
+    if repeated is None:
+        return tables
+    metadata = {**(tables.episodes.schema.metadata or {}), REPEATED: json.dumps(repeated.to_json())}
+    return tables._replace(episodes=tables.episodes.replace_schema_metadata(metadata))
+
+
+def stored_repeated(episodes: pa.Table) -> Repeated | None:
+    """What `with_repeated` has put into a stored table."""
+    found = (episodes.schema.metadata or {}).get(REPEATED)
+    if found is None:
+        return None
+    content = json.loads(found)
+    return Repeated(content["n_episodes"], tuple(content["differing"]))
 
 
 def failure_causes(episodes: pa.Table) -> Counter[str]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shlex
 import signal
 import socket
 import subprocess
@@ -17,7 +16,7 @@ from typing import TypeVar
 from traci.exceptions import FatalTraCIError
 
 from harness.campaign.models import TraciProcess
-from harness.errors import CampaignError
+from harness.errors import CampaignError, WorldDisagreementError
 from harness.sumo.traci_connection import BatchConnection
 from harness.world import AVLostError
 
@@ -64,7 +63,7 @@ class ConnectedProgram:
         self._n_watched = 0
         try:
             self._connection = self._connect()
-            self._program = _start_program(av.command, self._port, n_cells)
+            self._program = _start_program(av, self._port, n_cells)
             self._await_program()
         except BaseException:
             self.close()
@@ -152,7 +151,10 @@ class ConnectedProgram:
             return 2
         here = f":{self._port:04X}"
         rows = (line.split() for line in _TCP_TABLE.read_text(encoding="ascii").splitlines()[1:])
-        return sum(1 for row in rows if row[1].endswith(here) and row[3] == _ESTABLISHED)
+        clients = [row for row in rows if row[1].endswith(here) and row[3] == _ESTABLISHED]
+        for _, own, theirs, *_ in clients:
+            _require_neighbour(own, theirs)
+        return len(clients)
 
     def _n_sockets(self) -> int:
         """Sockets that SUMO has open; 0 where the system does not say.
@@ -175,18 +177,30 @@ class ConnectedProgram:
                 _end(process)
 
 
-def _start_program(command: str, port: int, n_cells: int) -> subprocess.Popen[bytes]:
+def _start_program(av: TraciProcess, port: int, n_cells: int) -> subprocess.Popen[bytes]:
     try:
-        words = shlex.split(command.format(port=port, cells=n_cells))
+        words = av.words(port, n_cells)
         # What it prints belongs on the terminal, but stdout is for the harness's results.
         return subprocess.Popen(words, stdout=sys.stderr.fileno(), start_new_session=True)  # noqa: S603 - the user's own
-    except (OSError, ValueError, KeyError, IndexError) as error:
+    except (OSError, ValueError) as error:  # a null character in a word is a ValueError
         raise CampaignError(
             "av.traci.command",
-            found=f"{command} ({error})",
-            expected="a program that can be started, with {port} and {cells} the only things in braces",
+            found=f"{av.command} ({error})",
+            expected="a program that can be started",
             mend="Try it in a shell, in the folder in which you start the harness.",
         ) from error
+
+
+def _require_neighbour(own: str, theirs: str) -> None:
+    """Refuse a client of another machine; both ends as the table of connections writes them (proc(5), net/tcp)."""
+    address = socket.inet_ntoa(int(theirs.partition(":")[0], 16).to_bytes(4, sys.byteorder))
+    if not address.startswith("127.") and own.partition(":")[0] != theirs.partition(":")[0]:
+        raise WorldDisagreementError(
+            "SUMO's TraCI server",
+            found=f"a client at {address}",
+            expected="the program that av.traci.command starts, on this machine",
+            mend="Close this machine's ports to others, or let the program run here.",
+        )
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:

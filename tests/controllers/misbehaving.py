@@ -1,6 +1,7 @@
 """Controllers that are the built-in IDM until an episode in which they go wrong, in each in its own way."""
 
 import os
+import random
 import signal
 import sys
 import time
@@ -78,6 +79,27 @@ class Misbehaving(IDM):
         signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGALRM])
         time.sleep(3600)
 
+    def interrupts(self):
+        raise KeyboardInterrupt
+
+    def generator_exit(self):
+        raise GeneratorExit
+
+    def copies_the_process(self):
+        os.fork()
+        return 0.0
+
+    def copies_the_process_for_good(self):
+        if os.fork() == 0:
+            time.sleep(3600)
+        return 0.0
+
+    def copies_and_ends_the_process(self):
+        """What is left of it keeps the worker's pipe open."""
+        if os.fork() == 0:
+            time.sleep(3600)
+        os._exit(7)
+
     def ends_the_process(self):
         os._exit(7)
 
@@ -115,6 +137,50 @@ class RaisesWhenMade(IDM):
         raise RuntimeError("no licence")
 
 
+class EndsTheProcess(IDM):
+    """In every call of one name."""
+
+    def __init__(self, where):
+        super().__init__()
+        for name in ("start", "step", "start_batch", "step_batch", "close"):
+            if name == where:
+                setattr(self, name, lambda *_: os._exit(7))
+            elif name.endswith("batch") and where.endswith("batch"):
+                setattr(self, name, lambda *_: None)
+        if where == "constructor":
+            os._exit(7)
+
+
+class Prints(IDM):
+    def __init__(self):
+        super().__init__()
+        print("made, in Python")  # noqa: T201 - what it is for
+        os.write(1, b"made, below Python\n")
+
+    def start(self, episode):
+        print("started, in Python")  # noqa: T201 - what it is for
+        os.write(1, b"started, below Python\n")
+
+
+class Global(IDM):
+    """Draws from a stream of its own."""
+
+    def step(self, observation):
+        return super().step(observation) - 1e-9 * random.random()
+
+
+class ChangesItsParameters(IDM):
+    """Brakes harder with every episode of every instance that shares the list."""
+
+    def __init__(self, braking):
+        super().__init__()
+        self.braking = braking
+        self.braking.append(0.01)
+
+    def step(self, observation):
+        return -sum(self.braking)
+
+
 class RaisesInClose(IDM):
     def __init__(self, path):
         super().__init__()
@@ -138,7 +204,6 @@ class Batch:
 
     def step_batch(self, observation):
         answer = np.where(observation.episode == self.nan, np.nan, 0.0)
-        observation.cell[:] = 0  # its own copy
         if self.wrong_shape:
             self.wrong_shape = False
             return np.zeros((answer.size, 2))
@@ -146,3 +211,21 @@ class Batch:
 
     def close(self):
         pass
+
+
+class BatchThatWrites(Batch):
+    """Brakes harder the higher the speed, and then writes into what it was handed."""
+
+    def __init__(self, field):
+        super().__init__()
+        self.field = field
+
+    def start_batch(self, cells, episodes, random):
+        if self.field in ("cells", "episodes"):
+            {"cells": cells, "episodes": episodes}[self.field][:] = 0
+
+    def step_batch(self, observation):
+        answer = -0.1 * observation.speed_mps
+        if self.field in observation._fields:
+            getattr(observation, self.field)[:] = 0
+        return answer

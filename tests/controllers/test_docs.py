@@ -23,7 +23,7 @@ stop: {episodes: 60}
 run: {shard_size: 60}
 """
 RECIPES = [text for kind, text in BLOCKS if kind == "yaml"]
-BRAKES = [text for text in RECIPES if "Brakes" in text]
+FOLLOWS = [text for text in RECIPES if "Follows" in text]
 
 
 def named(recipe):
@@ -32,7 +32,7 @@ def named(recipe):
 
 def test_the_page_has_all_recipes():
     assert len(RECIPES) == 7
-    assert len(BRAKES) == 5
+    assert len(FOLLOWS) == 5
     assert sum(kind == "py" for kind, _ in BLOCKS) == 5
 
 
@@ -72,20 +72,20 @@ def per_vehicle(folder):
     return run(folder, RECIPES[0])
 
 
-@pytest.mark.parametrize("recipe", [text for text in BRAKES[1:] if "fmu:" not in text], ids=named)
+@pytest.mark.parametrize("recipe", [text for text in FOLLOWS[1:] if "fmu:" not in text], ids=named)
 def test_recipes_in_python_are_the_same_vehicle(recipe, folder, per_vehicle):
     assert run(folder, recipe) == per_vehicle
     assert {row["outcome"] for row in per_vehicle} >= {"crash", "timeout"}
 
 
 def test_the_fmu_is_that_vehicle_too(folder, per_vehicle):
-    (recipe,) = (text for text in BRAKES if "fmu:" in text)
+    (recipe,) = (text for text in FOLLOWS if "fmu:" in text)
     for row, other in zip(run(folder, recipe), per_vehicle, strict=True):
         assert row["outcome"] == other["outcome"]
         assert row["av_distance_m"] == pytest.approx(other["av_distance_m"], abs=1e-9)
 
 
-@pytest.mark.parametrize("recipe", [text for text in RECIPES if text not in BRAKES], ids=named)
+@pytest.mark.parametrize("recipe", [text for text in RECIPES if text not in FOLLOWS], ids=named)
 def test_the_other_recipes_run(recipe, folder):
     rows = run(folder, recipe)
     assert len(rows) == 60
@@ -103,7 +103,7 @@ def test_entry_points_are_found_by_name(folder, tmp_path, monkeypatch):
     (info / "entry_points.txt").write_text(f"[{group}]\n{name} = {target}\n")
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.syspath_prepend(folder)
-    assert controller_class(name).__name__ == "Brakes"
+    assert controller_class(name).__name__ == "Follows"
 
 
 def test_the_costs_are_within_what_was_promised():

@@ -4,12 +4,16 @@ import json
 import math
 from pathlib import Path
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from harness.campaign.loading import load_campaign
 from harness.cli import main
+from harness.controllers.loading import build_host
 from harness.errors import EXIT_BAD_INPUT, EXIT_DONE, EXIT_TOO_MANY_FAILED
+from harness.runner import processes
 
 ROOT = Path(__file__).parents[2]
 SMALL = """\
@@ -68,6 +72,10 @@ IN_PROCESS = {
     "shape": "step: returned Array, expected an acceleration in m/s2 as a number",
     "impossible": "step: asked for -99 m/s2, outside of av.limits (-15 to 10)",
     "exits": "step: SystemExit: 5",
+    "interrupts": "step: KeyboardInterrupt: ",
+    "generator_exit": "step: GeneratorExit: ",
+    "copies_the_process": "step: copied the process (os.fork); start programs with subprocess",
+    "copies_the_process_for_good": "step: copied the process (os.fork); start programs with subprocess",
     "hangs": f"step: StepTimeoutError: {LATE}",
     "hangs_and_swallows": f"step: StepTimeoutError: {LATE}",
     "hangs_in_start": f"start: StepTimeoutError: {LATE}",
@@ -75,6 +83,7 @@ IN_PROCESS = {
 OF_THE_PROCESS = {
     "ends_the_process": "step: the controller ended the worker process (exit code 7)",
     "ends_the_process_in_start": "start: the controller ended the worker process (exit code 7)",
+    "copies_and_ends_the_process": "step: the controller ended the worker process (exit code 7)",
     "crashes": "step: the controller ended the worker process (exit code -11)",
     "is_killed": "step: the controller ended the worker process (exit code -9)",
     "hangs_for_good": f"step: {LATE}, and the call could not be interrupted",
@@ -178,3 +187,69 @@ def test_a_batch_controllers_other_faults_fail_all_that_were_asked(tmp_path):
     causes = {row["failure"] for row in _episodes(tmp_path)} - {None}
     assert causes
     assert all("step_batch: returned an array of shape (" in cause for cause in causes)
+
+
+@pytest.mark.parametrize("where", ["constructor", "start", "step", "start_batch", "step_batch"])
+def test_a_controller_that_always_ends_its_process_is_named_after_a_few_workers(where, tmp_path, capsys, monkeypatch):
+    started = []
+    start = processes.start_process
+    monkeypatch.setattr(processes, "start_process", lambda *words: (started.append(words), start(*words))[1])
+    code = _run(tmp_path, _other("EndsTheProcess", f"{{where: {where}}}"), "run.max_failed_share=0.01")
+    err = capsys.readouterr().err
+    assert "the controller ended the worker process (exit code 7)" in err
+    assert "memory limit" not in err
+    if where == "constructor":
+        assert (code, "in its constructor" in err, len(started)) == (EXIT_BAD_INPUT, True, 0)
+        assert not (tmp_path / "run").exists()
+    else:
+        assert code == EXIT_TOO_MANY_FAILED
+        assert 2 <= len(started) <= 7
+        assert f"in {where}" in err or "run.max_failed_share" in err
+
+
+def test_a_process_that_ends_in_close_has_done_its_work(tmp_path, undisturbed):
+    assert _run(tmp_path, _other("EndsTheProcess", "{where: close}")) == EXIT_DONE
+    assert _episodes(tmp_path) == undisturbed
+
+
+@pytest.mark.parametrize("field", ["cell", "episode", "gap_m", "lv_speed_mps", "cells", "episodes"])
+def test_nothing_that_a_batch_controller_is_handed_can_be_written_into(field, tmp_path):
+    assert _run(tmp_path, _other("BatchThatWrites", f"{{field: {field}}}"), "run.max_failed_share=1") == EXIT_DONE
+    rows = [row for row in _episodes(tmp_path) if row["cut_in_step"] is not None]
+    call = "start_batch" if field in ("cells", "episodes") else "step_batch"
+    assert {row["failure"] for row in rows} == {f"{call}: ValueError: assignment destination is read-only"}
+
+
+def test_controllers_do_not_share_the_lists_among_their_parameters():
+    av = load_campaign(
+        ROOT / "scenarios/overtaking_forced.yaml", [f"av={_other('ChangesItsParameters', '{braking: [1.0]}')}"]
+    ).av
+    hosts = [build_host(av, n_cells=3, seed=1) for _ in range(2)]
+    for host in hosts:
+        assert host.start(np.arange(3), np.arange(3)) == {}
+        assert [controller.braking for controller in host._controllers] == [[1.0, 0.01]] * 3
+        host.close()
+    assert av.parameters == {"braking": [1.0]}
+
+
+@pytest.mark.parametrize("command", [["run"], ["check"], ["av-check", "--episodes", "4"]], ids=lambda words: words[0])
+def test_what_a_controller_prints_does_not_reach_stdout(command, tmp_path, capfd):
+    (tmp_path / "c.yaml").write_text(SMALL)
+    out = ["--out", str(tmp_path / "run"), "--workers", "1"] if command == ["run"] else []
+    assert main([*command, str(tmp_path / "c.yaml"), *out, "--json", "--set", f"av={_other('Prints')}"]) == EXIT_DONE
+    printed = capfd.readouterr()
+    json.loads(printed.out)
+    assert "made, in Python" in printed.err
+    assert "made, below Python" in printed.err
+    if command == ["run"]:
+        assert main(["replay", str(tmp_path / "run"), "3", "--json"]) == EXIT_DONE
+        printed = capfd.readouterr()
+        assert json.loads(printed.out)["bit_equal"] is True
+        assert "started, below Python" in printed.err
+
+
+def test_check_survives_a_controller_that_does_not(tmp_path, capsys):
+    (tmp_path / "c.yaml").write_text(SMALL)
+    av = f"av={_other('EndsTheProcess', '{where: step}')}"
+    assert main(["check", str(tmp_path / "c.yaml"), "--json", "--set", av]) == EXIT_DONE
+    assert "in the call of step 0 of episode 0" in json.loads(capsys.readouterr().out)["plan"]["av_ms_per_test"]

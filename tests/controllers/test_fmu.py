@@ -45,7 +45,7 @@ def load(folder, text):
 
 
 def check(fmu, tmp_path, text):
-    require_controller(load(tmp_path, f"{{file: '{fmu}', {text}}}").av)
+    require_controller(load(tmp_path, f"{{file: '{fmu}', {text}}}"))
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,89 @@
+"""A run repeats some of its own tests: good vehicles pass, others are found out, and replay knows."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from harness.campaign.loading import load_campaign
+from harness.errors import CampaignError
+from harness.records.folder import read_manifest
+from harness.runner import replay_episode
+from tests.runner.stored_runs import copy_of
+
+FORCED = Path(__file__).parents[2] / "scenarios/overtaking_forced.yaml"
+SMALL = ("world.engine=twin", "stop.rhw=null", "stop.episodes=400", "run.shard_size=100", "records.traces=none")
+GOOD = "{controller: 'examples.idm:IDM'}"
+BATCH = "{controller: 'examples.idm_batch:IDM'}"
+GLOBAL = "{controller: 'tests.controllers.misbehaving:Global'}"
+SUMO = "{sumo: {carFollowModel: ACC}}"
+ALL_SAME = {"n_episodes": 10, "differing": []}
+
+
+@pytest.fixture
+def run_av(run, tmp_path):
+    def run_one(av, *overrides, name="run", **options):
+        run(load_campaign(FORCED, [*SMALL, f"av={av}", *overrides]), tmp_path / name, **options)
+        return tmp_path / name
+
+    return run_one
+
+
+def statement(folder):
+    return json.loads((folder / "estimates.json").read_text())["statement"]
+
+
+@pytest.mark.parametrize(
+    ("av", "overrides"),
+    [(GOOD, ()), (BATCH, ("world.engine=sumo",)), (SUMO, ("world.engine=sumo", "world.cells=8"))],
+)
+def test_a_vehicle_that_does_the_same_again_is_said_to(av, overrides, run_av):
+    folder = run_av(av, *overrides, workers=1)
+    manifest = read_manifest(folder)
+    assert (manifest["repeated"], manifest["reproducible"]) == (ALL_SAME, True)
+    assert statement(folder).endswith("10 tests were repeated: same bits.")
+
+
+def test_a_vehicle_that_does_not_is_found_out_for_any_number_of_workers_and_after_a_resume(run_av, tmp_path):
+    folders = [run_av(GLOBAL, name=str(n), workers=n) for n in (1, 2)]
+    one, two = (read_manifest(folder) for folder in folders)
+    assert one["repeated"] == two["repeated"]
+    assert len(one["repeated"]["differing"]) == one["repeated"]["n_episodes"] == 10
+    assert (one["reproducible"], two["reproducible"]) == (False, False)
+    assert "10 of 10 repeated tests DIFFERED: this vehicle is not reproducible" in statement(folders[0])
+    with pytest.raises(CampaignError, match="10 of 10 tests that it repeated itself came out otherwise"):
+        replay_episode(folders[0], 3)
+    copied = copy_of(folders[0], tmp_path / "copy")
+    run_av(GLOBAL, "stop.episodes=500", name=copied.name, workers=1, resume=True)
+    longer = read_manifest(copied)
+    assert (longer["repeated"], longer["reproducible"], longer["n_episodes"]) == (one["repeated"], False, 500)
+
+
+def test_a_built_in_vehicle_need_not_show_anything(run_av):
+    folder = run_av("{model: idm}", workers=1)
+    manifest = read_manifest(folder)
+    assert (manifest["repeated"], manifest["reproducible"]) == (None, True)
+    assert "repeated" not in statement(folder)
+
+
+def test_a_short_run_repeats_two(run_av):
+    folder = run_av(GOOD, "stop.episodes=12", workers=1)
+    assert read_manifest(folder)["repeated"]["n_episodes"] == 2
+
+
+def test_a_replay_that_differs_names_what_it_knows(run_av):
+    folder = run_av(GOOD, workers=1)
+    manifest = read_manifest(folder)
+    path = folder / "estimates.json"
+    path.unlink()
+    (folder / "manifest.json").write_text(json.dumps({**manifest, "repeated": None}))
+    assert replay_episode(folder, 3).suspects is None
+    from harness.runner.replay import _suspects
+
+    campaign = load_campaign(folder / "campaign.yaml")
+    assert "the vehicle does not do the same again" in _suspects(manifest, campaign)
+    assert "source file has been changed" in _suspects({**manifest, "controller_sha256": "0"}, campaign)
+    assert "the run was made with" in _suspects({**manifest, "cpu": "Z80"}, campaign).lower()
+    assert "CPU Z80 (here" in _suspects({**manifest, "cpu": "Z80"}, campaign)
