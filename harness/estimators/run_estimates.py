@@ -20,7 +20,15 @@ from harness.estimators.from_records import (
     block_from_tables,
 )
 from harness.estimators.one_pass import ESTIMATORS, PassResult, one_pass
-from harness.estimators.statement import SCOPE, conditional_statement, failed_statement, per_distance, statement
+from harness.estimators.statement import (
+    SCOPE,
+    alarm_cautions,
+    conditional_statement,
+    failed_statement,
+    per_distance,
+    statement,
+    warned,
+)
 from harness.estimators.surrogates import MOST_UNASKED, PoolRequest, surrogates_of
 from harness.estimators.threads import read_ahead
 from harness.importance.build import importance_names, mixture_weights, needs_tables
@@ -45,6 +53,8 @@ class CampaignFacts:
         Names of the importance functions, in order.
     retraced : dict
         What the run says about the twin retracing its episodes.
+    ending : str or None
+        When the run ended and which condition decided, in a sentence; None while it goes on.
     no_surrogates : str
         Why surrogates were not asked about the tests, where they were not.
     no_replay : str or None
@@ -58,6 +68,7 @@ class CampaignFacts:
     distance_per_test_m: float | None = None
     importance_names: tuple[str, ...] = ()
     retraced: dict[str, Any] | None = None
+    ending: str | None = None
     no_surrogates: str = "the blocks do not say what surrogates would have done"
     no_replay: str | None = None
 
@@ -83,7 +94,8 @@ def estimate_blocks(
     best = done.headline_estimate
     estimates = {done.headline: best, **done.estimates, **refused}
     distance_km = None if facts.distance_per_test_m is None else facts.distance_per_test_m / 1000.0
-    statements = _statements(estimates, facts, distance_km)
+    alarm = _alarm(done, facts)
+    statements = _statements(estimates, facts, distance_km, alarm_cautions(alarm))
     content: dict[str, Any] = {
         "campaign": facts.name,
         "campaign_hash": facts.content_hash,
@@ -95,23 +107,27 @@ def estimate_blocks(
         "distance_per_test_km": distance_km,
         "crash_rate_per_1e6_km": None if distance_km is None else per_distance(best, distance_km),
         "estimates": {name: estimate.to_json() for name, estimate in estimates.items()},
-        "diagnostics": {**done.diagnostics.result(facts.importance_names), "alarm": _alarm(done, facts)},
+        "diagnostics": {**done.diagnostics.result(facts.importance_names), "alarm": alarm},
         "convergence": done.convergence,
         "statement": statements[done.headline],
         "statements": statements,
         "conditional_statement": conditional_statement(best),
         "scope": SCOPE,
+        "ending": facts.ending,
     }
     cleaned: dict[str, Any] = finite_json(content)
     return cleaned
 
 
 def _statements(
-    estimates: Mapping[EstimatorName, Estimate | Unavailable], facts: CampaignFacts, distance_km: float | None
+    estimates: Mapping[EstimatorName, Estimate | Unavailable],
+    facts: CampaignFacts,
+    distance_km: float | None,
+    alarm: Sequence[str],
 ) -> dict[str, str]:
-    """What each estimator says, in a sentence; of one without a value, why."""
+    """What each estimator says, what it must be warned of first; of one without a value, why."""
     return {
-        name: statement(found, facts.lane_change_level, distance_km) + failed_statement(found)
+        name: warned(alarm, statement(found, facts.lane_change_level, distance_km)) + failed_statement(found)
         if isinstance(found, Estimate)
         else f"No crash rate from these records: {found.reason.rstrip('.')}."
         for name, found in estimates.items()
@@ -176,6 +192,7 @@ def estimate_run(
         distance_per_test_m=None if distance is None else float(distance),
         importance_names=importance_names(campaign),
         retraced=manifest.get("retraced"),
+        ending=manifest.get("ending"),
         no_surrogates=surrogates if isinstance(surrogates, str) else "",
         no_replay=_no_replay(surrogates, int(manifest["n_episodes"]), n_replayed),
     )

@@ -150,8 +150,8 @@ class Manifest:
         assert self._earlier is not None
         shards = self._earlier["shards"][:index]
         self._n_kept = sum(shard["n_episodes"] for shard in shards)
-        cut = {"status": "interrupted", "stopped_by": None, "n_episodes": self._n_kept, "shards": shards}
-        self._earlier = {**self._earlier, **cut}
+        cut = {"status": "interrupted", "stopped_by": None, "ending": None, "n_episodes": self._n_kept}
+        self._earlier = {**self._earlier, **cut, "shards": shards}
         write_json(self._folder / MANIFEST, self._earlier)
 
     def write(
@@ -162,6 +162,7 @@ class Manifest:
         status: str,
         elapsed_s: float = 0.0,
         stopped_by: str | None = None,
+        ending: str | None = None,
         retraced: dict[str, Any] | None = None,
     ) -> None:
         """Record the contiguous prefix of finished shards.
@@ -181,6 +182,7 @@ class Manifest:
                 **self._content,
                 "status": status,
                 "stopped_by": stopped_by,
+                "ending": ending,
                 "retraced": retraced,
                 "wall_time_s": round(self._wall_time_s + elapsed_s, 3),
                 "n_episodes": n_episodes,
