@@ -104,7 +104,7 @@ def stopping(population: Population, replications: int, *, known: bool) -> str:
             found = population.campaign(rng, look - n, state)
             n = look
             seen = found.largest_weight_share * found.crash_rate * n
-            if rule.observe(n, found if known else replace(found, weight_cap=seen)):
+            if rule.observe(n, found if known else replace(found, weight_cap=seen, cautions=())):
                 break
         tests.append(n)
         rates.append(found.crash_rate)

@@ -174,14 +174,6 @@ def print_estimates(content: dict[str, Any], asked: Sequence[str] = ()) -> None:
         # Without the campaign's own estimator the reason is the answer, and comes last.
         for remark in [*entry.get("warnings", ()), *filter(None, [entry.get("reason") if answered else None])]:
             click.echo(f"{name}: {remark}")
-    if (alarm := content.get("diagnostics", {}).get("alarm", {})).get("raised"):
-        rates = alarm["surrogate_crash_rates"]
-        click.secho(
-            "ALARM: replayed surrogates do not crash as often as the pool says (p-value "
-            f"{min(rates['p_value_holm'], rates['p_value_jointly']):.1e}): weights, maneuvers, twin or pool are wrong. "
-            "See diagnostics.alarm.",
-            fg="red",
-        )
     if shells := shown.get("shells", {}).get("details", {}).get("shells"):
         console.print(_shells_table(shells))
     if answered:

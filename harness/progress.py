@@ -165,6 +165,8 @@ def _worded(name: str, figure: Figure) -> str:
     label = {"rhw": "RHW"}.get(name, name.replace("_", " "))
     if isinstance(figure, int):
         return f"{label} {figure:,}"
+    if figure == math.inf:
+        return f"{label} unknown"
     return f"{label} {figure:.2g}" if isinstance(figure, float) else f"{label} {figure}"
 
 

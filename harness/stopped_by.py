@@ -1,4 +1,4 @@
-"""What ended a campaign, and what to do when that was not the asked precision."""
+"""What ended a campaign, which condition decided when, and what to do when that was not the asked precision."""
 
 from __future__ import annotations
 
@@ -14,3 +14,29 @@ MENDS: dict[str, str] = {
     "pool_error": "the pool's own error alone is wider; lower pool.relative_error and use a new folder",
 }
 """Why a campaign ended before its precision, and the mend."""
+
+
+def ending(stopped_by: StoppedBy, n_episodes: int, waited_for: tuple[str, ...], *, precision_asked: bool) -> str:
+    """When a campaign ended and what decided it, in a sentence.
+
+    Parameters
+    ----------
+    stopped_by : {"rhw", "episodes", "pool", "pool_error"}
+    n_episodes : int
+        Tests that it took.
+    waited_for : tuple of str
+        Conditions that were missing when the stop rule last said no.
+    precision_asked : bool
+        Whether there was a stop rule, or only a budget.
+    """
+    after = f"Stopped after {n_episodes:,} tests"
+    conditions = " and ".join(waited_for)
+    if stopped_by == "rhw":
+        if not waited_for:
+            return f"{after}: every condition was met at the first look."
+        return f"{after}: the last condition to be met was {conditions}."
+    if precision_asked:
+        return f"{after} without {conditions}: {MENDS[stopped_by]}."
+    if stopped_by == "episodes":
+        return f"{after}: stop.episodes was all that was asked for."
+    return f"{after}: {MENDS[stopped_by]}."

@@ -22,8 +22,6 @@ from harness.console import (
     print_plan,
     print_statements,
 )
-from harness.errors import EXIT_BUDGET_SPENT
-from harness.stopped_by import MENDS
 
 
 @click.command(
@@ -106,8 +104,7 @@ def run(
         print_json(result.estimates)
     else:
         print_statements(result.estimates)
-        if result.exit_code == EXIT_BUDGET_SPENT:
-            click.echo(f"Less precise than was asked for: {MENDS[result.stopped_by]}.")
+        click.echo(result.ending)
         click.echo(str(report_file))
         click.echo(str(result.folder / "estimates.json"))
     ctx.exit(result.exit_code)

@@ -6,7 +6,7 @@ tests), the twin and SUMO all end here, so that an estimator cannot tell them ap
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -117,6 +117,14 @@ class Block:
         y = np.zeros(len(self))
         y[self.crash] = np.exp(self.log_weight[self.crash])
         return y
+
+    def failed_as_crashes(self) -> Block:
+        """The same episodes had every failed one crashed, each with the weight that it has on record.
+
+        That is the weight up to the step in which it failed. The step depends on nothing that comes after it, so that
+        the mean of these weights is the probability to fail, whatever the episodes were drawn by.
+        """
+        return replace(self, crash=self.crash | self.failed, failed=np.zeros_like(self.failed))
 
     def mixture_ratios(self) -> FloatArray:
         """q_j(x_c)/q_sampled(x_c) over whole episodes, shape (n, M); 0 where q_j cannot draw the episode."""

@@ -30,7 +30,7 @@ class Convergence:
                 "crash_rate": estimate.crash_rate,
                 "ci_low": estimate.ci_low,
                 "ci_high": estimate.ci_high,
-                "rhw": estimate.rhw,
+                "rhw": estimate.precision,
                 "n_crashes": estimate.n_crashes,
             }
         )

@@ -10,17 +10,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from copy import deepcopy
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from harness.estimators.accumulator import require_episodes
 from harness.estimators.block import Block
+from harness.estimators.both_ways import BothWays
 from harness.estimators.estimate import Estimate, finite_json
 from harness.estimators.exact_sum import MomentSums, SkewedSums
 from harness.estimators.intervals import capped_mean_upper, normal_half_width, skewed_distances
 from harness.estimators.nade import Nade
+from harness.estimators.statement import warned
 
 FEW_PAIRS = 50
 FEW_EFFECTIVE = 30.0
@@ -75,7 +78,7 @@ class Difference:
         return content
 
 
-class PairedSums:
+class _Pairs:
     """Exact sums over pairs of episodes; one pass, of bounded size."""
 
     def __init__(self) -> None:
@@ -144,7 +147,7 @@ class PairedSums:
             n_pairs=self.n,
             n_differing=self.n_differing,
             n_effective=self._n_effective(),
-            warnings=tuple(self._warnings(a, b)),
+            warnings=tuple(self._warnings()),
         )
 
     def _half_without_difference(self, confidence: float) -> float:
@@ -156,8 +159,8 @@ class PairedSums:
         squares = self._distance.squares.value()
         return self._distance.total.value() ** 2 / squares if squares > 0.0 else 0.0
 
-    def _warnings(self, a: Estimate, b: Estimate) -> list[str]:
-        found = [f"{name}: {text}" for name, estimate in (("A", a), ("B", b)) for text in estimate.warnings]
+    def _warnings(self) -> list[str]:
+        found = []
         if self.n_differing == 0:
             found.append("no pair of episodes differs: the interval is a bound, the vehicles may be equal")
         elif self.n_differing < FEW_PAIRS:
@@ -165,6 +168,59 @@ class PairedSums:
         elif self._n_effective() < FEW_EFFECTIVE:
             found.append(f"few large weights carry the difference (effective number {self._n_effective():.3g})")
         return found
+
+
+class PairedSums:
+    """Pairs of episodes, and from the first failed one on also the two ways in which A and B may be farthest apart.
+
+    The lower limit of A - B is that of a B whose failed tests have all crashed while none of A's has, the upper limit
+    the other way round (see `BothWays`).
+    """
+
+    def __init__(self) -> None:
+        self._each = (BothWays(Nade()), BothWays(Nade()))
+        self._seen = _Pairs()
+        self._farthest: tuple[_Pairs, _Pairs] | None = None
+
+    def add(self, a: Block, b: Block) -> None:
+        """Add pairs of episodes.
+
+        Raises
+        ------
+        ValueError
+            The blocks do not hold the same episodes.
+        """
+        if self._farthest is None and (a.failed.any() or b.failed.any()):
+            self._farthest = deepcopy(self._seen), deepcopy(self._seen)
+        self._seen.add(a, b)
+        if self._farthest is not None:
+            self._farthest[0].add(a, b.failed_as_crashes())
+            self._farthest[1].add(a.failed_as_crashes(), b)
+        for each, block in zip(self._each, (a, b), strict=True):
+            each.add(block)
+
+    def result(self, confidence: float) -> Difference:
+        """Rates, difference and ratio of the pairs so far.
+
+        Raises
+        ------
+        ValueError
+            No pair was added.
+        """
+        found = self._seen.result(confidence)
+        a, b = (each.result(confidence) for each in self._each)
+        warnings = (*(f"{name}: {text}" for name, of in (("A", a), ("B", b)) for text in of.warnings), *found.warnings)
+        found = replace(found, a=a, b=b, warnings=warnings)
+        if self._farthest is None:
+            return found
+        low, high = (pairs.result(confidence) for pairs in self._farthest)
+        return replace(
+            found,
+            ci_low=min(found.ci_low, low.ci_low),
+            ci_high=max(found.ci_high, high.ci_high),
+            ratio_low=low.ratio_low,
+            ratio_high=high.ratio_high,
+        )
 
 
 def _relative_error(a: float, b: float, variance_a: float, variance_b: float, covariance: float, n: int) -> float:
@@ -204,9 +260,21 @@ def difference_statement(found: Difference, name_a: str, name_b: str) -> str:
         verdict = "A crashes more often"
     elif found.n_differing and found.ci_high < 0.0:
         verdict = "A crashes less often"
-    return (
+    cautions = [f"{name}: {text}" for name, of in (("A", found.a), ("B", found.b)) for text in of.cautions]
+    return warned(
+        cautions,
         f"{rates}: {verdict}, A - B = {found.difference:.3g} ({level} {found.ci_low:.3g} to {found.ci_high:.3g})"
-        f"{_ratio(found)}, from {found.n_pairs:,} pairs of tests{_saved(found)}."
+        f"{_ratio(found)}, from {found.n_pairs:,} pairs of tests{_saved(found)}.{_failed(found)}",
+    )
+
+
+def _failed(found: Difference) -> str:
+    a, b = found.a.details["n_failed"], found.b.details["n_failed"]
+    if not a and not b:
+        return ""
+    return (
+        f" Of these tests A FAILED in {a:,} and B in {b:,}: each limit counts them as crashes or as none, whichever "
+        "takes it farther."
     )
 
 

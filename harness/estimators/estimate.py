@@ -35,7 +35,9 @@ class Estimate:
     method : str
         How rate, interval and upper bound were made, in words.
     warnings : tuple of str
-        Why the interval may mislead; empty if nothing is known to be wrong.
+        What a reader must know, the cautions first; empty if nothing is known to be wrong.
+    cautions : tuple of str
+        Why the interval may be wrong. A statement begins with them, and no precision is claimed beside them.
     details : dict
         What only this estimator has to say.
     """
@@ -54,11 +56,17 @@ class Estimate:
     method: str
     weight_cap: float = math.inf
     warnings: tuple[str, ...] = ()
+    cautions: tuple[str, ...] = ()
     details: dict[str, Any] = field(default_factory=dict)
 
+    @property
+    def precision(self) -> float:
+        """`rhw` as far as it says how precise the rate is: infinite where the interval may be wrong."""
+        return math.inf if self.cautions else self.rhw
+
     def to_json(self) -> dict[str, Any]:
-        """Plain JSON content; infinite and undefined numbers become null."""
-        content: dict[str, Any] = finite_json(asdict(self))
+        """Plain JSON content; infinite and undefined numbers become null, as does an RHW that says nothing."""
+        content: dict[str, Any] = finite_json({**asdict(self), "rhw": self.precision})
         return content
 
 

@@ -46,6 +46,5 @@ class Nade:
             confidence,
             third_moment=self.sums.y.third_moment(self.sums.n),
             method="mean of weighted crashes",
-            warnings=[],
             details={},
         )

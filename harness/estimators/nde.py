@@ -23,7 +23,6 @@ class Nde:
     def __init__(self) -> None:
         self.n = 0
         self.n_crashes = 0
-        self.n_failed = 0
 
     @classmethod
     def refusal(cls, block: Block) -> str | None:
@@ -36,13 +35,11 @@ class Nde:
         """Count one block."""
         self.n += len(block)
         self.n_crashes += int(np.count_nonzero(block.crash))
-        self.n_failed += int(np.count_nonzero(block.failed))
 
     def merge(self, other: Self) -> None:
         """Add the counts of other episodes."""
         self.n += other.n
         self.n_crashes += other.n_crashes
-        self.n_failed += other.n_failed
 
     def result(self, confidence: float) -> Estimate:
         """Share of crashes; its relative half-width is half the interval's length over the rate."""
@@ -63,9 +60,5 @@ class Nde:
             largest_weight_share=1.0 / self.n_crashes if self.n_crashes else 0.0,
             method="share of crashes; Clopper-Pearson interval and upper bound",
             weight_cap=1.0,
-            warnings=tuple(count_warnings(self.n_crashes, self.n_failed, self.n)),
-            details={
-                "n_failed": self.n_failed,
-                "crash_rate_if_failed_had_crashed": (self.n_crashes + self.n_failed) / self.n,
-            },
+            warnings=tuple(count_warnings(self.n_crashes)),
         )

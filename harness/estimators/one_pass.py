@@ -9,6 +9,7 @@ from typing import Any
 from harness.campaign.models import EstimatorName
 from harness.estimators.accumulator import Accumulator
 from harness.estimators.block import Block
+from harness.estimators.both_ways import BothWays
 from harness.estimators.convergence import Convergence
 from harness.estimators.diagnostics import Diagnostics
 from harness.estimators.estimate import Estimate, Unavailable
@@ -58,9 +59,9 @@ class PassResult:
     convergence: list[dict[str, Any]]
 
 
-def accumulator(name: EstimatorName) -> Accumulator:
+def accumulator(name: EstimatorName) -> BothWays:
     """Empty state of an estimator, for those who feed it themselves (the runner does, for stopping)."""
-    return _CLASSES[name]()
+    return BothWays(_CLASSES[name]())
 
 
 def one_pass(
@@ -68,7 +69,7 @@ def one_pass(
     names: Sequence[EstimatorName] = ESTIMATORS,
     *,
     confidence: float = 0.9,
-    make: Callable[[EstimatorName], Accumulator] = accumulator,
+    make: Callable[[EstimatorName], Accumulator] = lambda name: _CLASSES[name](),
 ) -> PassResult:
     """Feed every block to every estimator that can use it.
 
@@ -88,7 +89,7 @@ def one_pass(
     ValueError
         If there is no episode, or a block does not follow the one before.
     """
-    states: dict[EstimatorName, Accumulator] = {}
+    states: dict[EstimatorName, BothWays] = {}
     refusals: dict[EstimatorName, str] = {}
     diagnostics, convergence, own = Diagnostics(), Convergence(), None
     n = 0
@@ -114,14 +115,14 @@ def one_pass(
 
 def _choose(
     names: Sequence[EstimatorName], block: Block, make: Callable[[EstimatorName], Accumulator]
-) -> tuple[dict[EstimatorName, Accumulator], dict[EstimatorName, str]]:
+) -> tuple[dict[EstimatorName, BothWays], dict[EstimatorName, str]]:
     """Split into estimators that the records allow and reasons for those that they do not."""
-    states: dict[EstimatorName, Accumulator] = {}
+    states: dict[EstimatorName, BothWays] = {}
     refusals: dict[EstimatorName, str] = {}
     for name in names:
         reason = _CLASSES[name].refusal(block)
         if reason is None:
-            states[name] = make(name)
+            states[name] = BothWays(make(name))
         else:
             refusals[name] = reason
     return states, refusals

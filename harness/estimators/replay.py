@@ -92,8 +92,9 @@ class Replay:
         warnings = [RESIDUALS if trusted else PLAIN.format(what="crashes, or disagreements with the surrogates,")]
         if self.sums.method == "step_mixture":
             warnings.append(UNBOUNDED)
+        cautions = []
         if self.n_lost:
-            warnings.append(f"{self.n_lost} failed tests have no cut-in; surrogates count as not crashing in them")
+            cautions.append(f"{self.n_lost} failed tests have no cut-in, and surrogates count as not crashing in them")
         details: dict[str, Any] = {
             "pool": self._known.pool,
             "beta": dict(zip(self._known.names, beta.tolist(), strict=True)),
@@ -111,6 +112,7 @@ class Replay:
             third_moment=found.third_moment if own else self.sums.y.third_moment(self.sums.n),
             method="mean of weighted crashes with replayed surrogates of known crash rate, cross-fitted in ten folds",
             warnings=warnings,
+            cautions=cautions,
             details=details,
         )
 

@@ -23,6 +23,7 @@ from scipy.stats import norm
 
 from harness.arrays import BoolArray, FloatArray, IntArray
 from harness.estimators.block import Block
+from harness.estimators.both_ways import BothWays
 from harness.estimators.scv import Scv
 
 
@@ -132,44 +133,54 @@ def acceleration(reference: RequiredTests, other: RequiredTests) -> tuple[float,
 
 
 def plain_rhw(
-    crash_weights: FloatArray, n_tests: int, procedure: Procedure, done: Callable[[], None] = lambda: None
+    weights: FloatArray,
+    n_tests: int,
+    procedure: Procedure,
+    done: Callable[[], None] = lambda: None,
+    failed: BoolArray | bool = False,
 ) -> FloatArray:
     """RHW of the mean of Y on prefixes of shuffled tests, shape (s, g); infinite before the first crash.
 
     Tests without a crash only take up places, so that the places of the crashes are all that a shuffle has to draw: a
-    hundred million naturalistic tests cost no more than their crashes.
+    hundred million naturalistic tests cost no more than their crashes. Failed tests count as no crash in the lower
+    limit and as crashes in the upper one.
 
     Parameters
     ----------
-    crash_weights : (k,) float64
-        Y of the tests that crashed, in the order of the records.
+    weights : (k,) float64
+        Of the tests that crashed or failed, in the order of the records.
     n_tests : int
-        All tests, crashed or not.
+        All tests.
     procedure : Procedure
     done : callable
         Called after each shuffle.
+    failed : (k,) bool, optional
+        Which of the ``weights`` are of failed tests.
     """
     grid, z = procedure.grid(n_tests), procedure.z()
     # A unit that makes equal weights 1, whose sums are exact; the smallest squares would underflow besides.
-    y = crash_weights / np.max(crash_weights, initial=0.0) if len(crash_weights) else crash_weights
+    worst = weights / np.max(weights, initial=0.0) if len(weights) else weights
+    y = np.where(failed, 0.0, worst) if np.any(failed) else worst
     rhw = np.empty((procedure.n_shuffles, len(grid)))
     for shuffle in range(procedure.n_shuffles):
         _, places = _crash_places(procedure.seed, shuffle, n_tests, len(y))
         order = np.argsort(places)
-        n_crashes = np.searchsorted(places[order], grid)
-        total, squares = (np.concatenate([[0.0], np.cumsum(power[order])])[n_crashes] for power in (y, y * y))
-        rhw[shuffle] = _normal_rhw(grid, total, squares, z)
+        n_placed = np.searchsorted(places[order], grid)
+        total, below = _total_and_half_width(y[order], n_placed, grid, z)
+        most, above = (total, below) if y is worst else _total_and_half_width(worst[order], n_placed, grid, z)
+        rhw[shuffle] = ((most - total) + above + below) / 2.0 / total
         done()
     return rhw
 
 
-def _normal_rhw(n: IntArray, total: FloatArray, squares: FloatArray, z: float) -> FloatArray:
-    """z·sqrt(var/n)/mean from ΣY and ΣY², with the sample variance; infinite without a crash or a second test."""
+def _total_and_half_width(y: FloatArray, k: IntArray, n: IntArray, z: float) -> tuple[FloatArray, FloatArray]:
+    """ΣY of the first ``k`` values among ``n`` tests, and z times its standard error; infinite if nothing is known."""
+    total, squares = (np.concatenate([[0.0], np.cumsum(power)])[k] for power in (y, y * y))
     with np.errstate(divide="ignore", invalid="ignore"):
         variance = np.maximum(0.0, squares - total * total / n) / (n - 1)
-        rhw: FloatArray = z * np.sqrt(n * variance) / total
-    rhw[(total == 0.0) | (n < 2)] = np.inf
-    return rhw
+        half_width: FloatArray = z * np.sqrt(n * variance)
+    half_width[(total == 0.0) | (n < 2)] = np.inf
+    return total, half_width
 
 
 def scv_rhw(tests: Block, procedure: Procedure, done: Callable[[], None] = lambda: None) -> FloatArray:
@@ -186,8 +197,8 @@ def scv_rhw(tests: Block, procedure: Procedure, done: Callable[[], None] = lambd
     grid = procedure.grid(len(tests))
     rhw = np.empty((procedure.n_shuffles, len(grid)))
     for shuffle in range(procedure.n_shuffles):
-        order = _order(procedure.seed, shuffle, tests.crash)
-        state = Scv()
+        order = _order(procedure.seed, shuffle, tests.crash | tests.failed)
+        state = BothWays(Scv())
         for at, (start, stop) in enumerate(itertools.pairwise([0, *grid.tolist()])):
             state.add(_rows(tests, order[start:stop]))
             rhw[shuffle, at] = state.result(procedure.confidence).rhw
@@ -201,13 +212,13 @@ def _crash_places(seed: int, shuffle: int, n_tests: int, n_crashes: int) -> tupl
     return generator, generator.choice(n_tests, size=n_crashes, replace=False)
 
 
-def _order(seed: int, shuffle: int, crash: BoolArray) -> IntArray:
-    """Rows in the order of a shuffle, shape (n,): the crashes in their places, the other rows shuffled between them."""
-    n = len(crash)
-    generator, places = _crash_places(seed, shuffle, n, int(np.count_nonzero(crash)))
+def _order(seed: int, shuffle: int, placed: BoolArray) -> IntArray:
+    """Rows in the order of a shuffle, shape (n,): crashed and failed ones in their places, the others between them."""
+    n = len(placed)
+    generator, places = _crash_places(seed, shuffle, n, int(np.count_nonzero(placed)))
     order = np.full(n, -1, dtype=np.int64)
-    order[places] = np.flatnonzero(crash)
-    order[order < 0] = generator.permutation(np.flatnonzero(~crash))
+    order[places] = np.flatnonzero(placed)
+    order[order < 0] = generator.permutation(np.flatnonzero(~placed))
     return order
 
 

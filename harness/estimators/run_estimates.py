@@ -22,11 +22,13 @@ from harness.estimators.from_records import (
 from harness.estimators.one_pass import ESTIMATORS, PassResult, one_pass
 from harness.estimators.statement import (
     SCOPE,
+    alarm_cautions,
     conditional_statement,
     failed_statement,
     per_distance,
     repeated_statement,
     statement,
+    warned,
 )
 from harness.estimators.surrogates import MOST_UNASKED, PoolRequest, surrogates_of
 from harness.estimators.threads import read_ahead
@@ -55,6 +57,8 @@ class CampaignFacts:
         What the run says about the twin retracing its episodes.
     repeated : dict
         What the run says about tests that it ran twice.
+    ending : str or None
+        When the run ended and which condition decided, in a sentence; None while it goes on.
     no_surrogates : str
         Why surrogates were not asked about the tests, where they were not.
     no_replay : str or None
@@ -69,6 +73,7 @@ class CampaignFacts:
     importance_names: tuple[str, ...] = ()
     retraced: dict[str, Any] | None = None
     repeated: dict[str, Any] | None = None
+    ending: str | None = None
     no_surrogates: str = "the blocks do not say what surrogates would have done"
     no_replay: str | None = None
 
@@ -94,7 +99,8 @@ def estimate_blocks(
     best = done.headline_estimate
     estimates = {done.headline: best, **done.estimates, **refused}
     distance_km = None if facts.distance_per_test_m is None else facts.distance_per_test_m / 1000.0
-    statements = _statements(estimates, facts, distance_km)
+    alarm = _alarm(done, facts)
+    statements = _statements(estimates, facts, distance_km, alarm_cautions(alarm))
     content: dict[str, Any] = {
         "campaign": facts.name,
         "campaign_hash": facts.content_hash,
@@ -106,23 +112,27 @@ def estimate_blocks(
         "distance_per_test_km": distance_km,
         "crash_rate_per_1e6_km": None if distance_km is None else per_distance(best, distance_km),
         "estimates": {name: estimate.to_json() for name, estimate in estimates.items()},
-        "diagnostics": {**done.diagnostics.result(facts.importance_names), "alarm": _alarm(done, facts)},
+        "diagnostics": {**done.diagnostics.result(facts.importance_names), "alarm": alarm},
         "convergence": done.convergence,
         "statement": statements[done.headline],
         "statements": statements,
         "conditional_statement": conditional_statement(best),
         "scope": SCOPE,
+        "ending": facts.ending,
     }
     cleaned: dict[str, Any] = finite_json(content)
     return cleaned
 
 
 def _statements(
-    estimates: Mapping[EstimatorName, Estimate | Unavailable], facts: CampaignFacts, distance_km: float | None
+    estimates: Mapping[EstimatorName, Estimate | Unavailable],
+    facts: CampaignFacts,
+    distance_km: float | None,
+    alarm: Sequence[str],
 ) -> dict[str, str]:
-    """What each estimator says, in a sentence; of one without a value, why."""
+    """What each estimator says, what it must be warned of first; of one without a value, why."""
     return {
-        name: statement(found, facts.lane_change_level, distance_km)
+        name: warned(alarm, statement(found, facts.lane_change_level, distance_km))
         + failed_statement(found)
         + repeated_statement(facts.repeated)
         if isinstance(found, Estimate)
@@ -190,6 +200,7 @@ def estimate_run(
         importance_names=importance_names(campaign),
         retraced=manifest.get("retraced"),
         repeated=manifest.get("repeated"),
+        ending=manifest.get("ending"),
         no_surrogates=surrogates if isinstance(surrogates, str) else "",
         no_replay=_no_replay(surrogates, int(manifest["n_episodes"]), n_replayed),
     )

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from harness.arrays import FloatArray, IntArray
+from harness.arrays import BoolArray, FloatArray, IntArray
 from harness.campaign.loading import load_campaign
 from harness.errors import HarnessError
 from harness.estimators.block import Block
@@ -38,11 +38,15 @@ SCV_REMARK = (
 
 @dataclass(frozen=True)
 class _Run:
-    """Tests of a run, as far as the asked estimators read them; ``whole`` only where `scv` is to be fitted."""
+    """Tests of a run, as far as the asked estimators read them; ``whole`` only where `scv` is to be fitted.
+
+    ``weights`` (k,) are those of the tests that crashed or failed, ``failed`` (k,) says which have failed.
+    """
 
     folder: Path
     n_tests: int
-    crash_weights: FloatArray
+    weights: FloatArray
+    failed: BoolArray
     sample: Block
     whole: Block | None
 
@@ -97,16 +101,18 @@ def _read(folder: Path, *, with_ratios: bool) -> _Run:
             expected="tests that can change places: drawn by nde, forced, step_mixture or episode_mixture",
             mend="For shells the number of tests is what the run itself needed: see docs/shells.md.",
         )
-    weights, kept, sample, n = [], [], None, 0
+    weights, failed, kept, sample, n = [], [], [], None, 0
     for block in stored_blocks(folder, moments=with_ratios):
         sample = sample or block
-        weights.append(np.exp(block.log_weight[block.crash]))
+        counted = block.crash | block.failed
+        weights.append(np.exp(block.log_weight[counted]))
+        failed.append(block.failed[counted])
         n += len(block)
         if with_ratios and Scv.refusal(block) is None:
             kept.append(block)
     if sample is None:
         raise HarnessError(str(folder), found="no tests on record", expected="a run", mend="Run the campaign first.")
-    return _Run(folder, n, np.concatenate(weights), sample, joined(kept) if kept else None)
+    return _Run(folder, n, np.concatenate(weights), np.concatenate(failed), sample, joined(kept) if kept else None)
 
 
 def joined(blocks: Sequence[Block]) -> Block:
@@ -134,12 +140,12 @@ def _found(run: _Run, name: RnotEstimator, procedure: Procedure, progress: Progr
         assert run.whole is not None
         rhw = scv_rhw(run.whole, procedure, done)
     else:
-        rhw = plain_rhw(run.crash_weights, run.n_tests, procedure, done)
+        rhw = plain_rhw(run.weights, run.n_tests, procedure, done, run.failed)
     return required_tests(rhw, procedure.grid(run.n_tests), procedure.rhw)
 
 
 def _identity(run: _Run, name: RnotEstimator) -> dict[str, Any]:
-    tests = {"n_episodes": run.n_tests, "n_crashes": len(run.crash_weights)}
+    tests = {"n_episodes": run.n_tests, "n_crashes": int(np.count_nonzero(~run.failed))}
     return {"run": str(run.folder), "estimator": name, **tests}
 
 
@@ -172,6 +178,11 @@ def grid_in_words(grid: IntArray, ratio: float) -> str:
 
 def _remarks(run: _Run, name: RnotEstimator, found: RequiredTests, grid: IntArray, procedure: Procedure) -> list[str]:
     remarks, n_shuffles = [SCV_REMARK] if name == "scv" else [], procedure.n_shuffles
+    if run.failed.any():
+        remarks.append(
+            f"{np.count_nonzero(run.failed)} tests failed: the lower limit counts them as no crash, the upper one "
+            "as crashes"
+        )
     if found.is_lower_limit:
         remarks.append(
             f"{np.count_nonzero(found.never_reached)} of {n_shuffles} shuffles are above RHW {procedure.rhw:g} at "

@@ -27,9 +27,9 @@ from harness.estimators.threads import side_by_side
 from harness.estimators.weighted_sums import WeightedSums, weighted_estimate
 
 WARNING = (
-    "the published variance is not the variance of this estimator: columns centred by their sample means leave the "
-    "estimate equal to nade's, and var(Z) leaves out the error of those means, so the interval is too narrow; "
-    "use nade's interval (docs/scv-defect.md)"
+    "this interval is known to be too narrow; use nade's (docs/scv-defect.md). The published variance is not that of "
+    "this estimator: columns centred by their sample means leave the estimate equal to nade's, and var(Z) leaves out "
+    "the error of those means"
 )
 
 
@@ -118,6 +118,6 @@ class Scv:
             confidence,
             third_moment=None,
             method="sparse control variates as published (Algorithm 1)",
-            warnings=[WARNING],
+            cautions=[WARNING],
             details=details,
         )

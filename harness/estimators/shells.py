@@ -65,18 +65,24 @@ class Shells:
         self.crashes += other.crashes
         self.failed += other.failed
 
-    def assumption_free(self, confidence: float, crashes: IntArray | None = None) -> Limits:
+    def assumption_free(self, confidence: float) -> Limits:
         """Rate over all strata."""
-        return self._limits(slice(None), (1.0 - confidence) / 2.0, crashes)
+        return self._limits(slice(None), (1.0 - confidence) / 2.0)
 
-    def conditional(self, confidence: float, crashes: IntArray | None = None) -> Limits:
+    def conditional(self, confidence: float) -> Limits:
         """Rate over the strata inside."""
-        return self._limits(slice(0, self._design().n_inside), (1.0 - confidence) / 2.0, crashes)
+        return self._limits(slice(0, self._design().n_inside), (1.0 - confidence) / 2.0)
 
-    def _limits(self, strata: slice, tail: float, crashes: IntArray | None = None) -> Limits:
-        design, counted = self._design(), self.crashes if crashes is None else crashes
+    def _limits(self, strata: slice, tail: float) -> Limits:
+        design = self._design()
         return combined(
-            design.p[strata], counted[strata], self.tests[strata], design.moments[strata, strata], design.n_paths, tail
+            design.p[strata],
+            self.crashes[strata],
+            self.tests[strata],
+            design.moments[strata, strata],
+            design.n_paths,
+            tail,
+            self.failed[strata],
         )
 
     def _design(self) -> ShellDesign:
@@ -114,10 +120,7 @@ class Shells:
 
     def _details(self, confidence: float, free: Limits) -> dict[str, Any]:
         design = self._design()
-        failed_too = self.assumption_free(confidence, self.crashes + self.failed)
         return {
-            "n_failed": int(self.failed.sum()),
-            "crash_rate_if_failed_had_crashed": failed_too.rate,
             "boundary": design.boundary,
             "pool": design.pool,
             "rhw_from_pool": free.rhw_from_pool,
@@ -129,16 +132,16 @@ class Shells:
         }
 
     def _conditional(self, confidence: float) -> dict[str, Any]:
-        """The statement given that there are no crashes outside, and what is known about those.
-
-        The bound counts failed tests as crashes: it is to hold for what may have happened in them.
-        """
+        """The statement given that there are no crashes outside, and what is known about those."""
         design = self._design()
-        inside = self.conditional(confidence)
-        outside = slice(design.n_inside, None)
-        crashes_or_failed = self.crashes + self.failed
-        _, high = share_limits(crashes_or_failed[outside], self.tests[outside], 1.0 - confidence)
+        inside, within, outside = (
+            self.conditional(confidence),
+            slice(0, design.n_inside),
+            slice(design.n_inside, None),
+        )
+        _, high = share_limits(self.crashes[outside], self.tests[outside], 1.0 - confidence, self.failed[outside])
         crashes = int(self.crashes[outside].sum())
+        worst_share = (self.crashes + self.failed) / np.maximum(self.tests, 1)
         return {
             "crash_rate": inside.rate,
             "ci_low": inside.low,
@@ -149,7 +152,7 @@ class Shells:
             "n_episodes": int(self.tests[: design.n_inside].sum()),
             "n_crashes": int(self.crashes[: design.n_inside].sum()),
             "n_failed": int(self.failed[: design.n_inside].sum()),
-            "crash_rate_if_failed_had_crashed": self.conditional(confidence, crashes_or_failed).rate,
+            "crash_rate_if_failed_had_crashed": float(design.p[within] @ worst_share[within]),
             "n_episodes_outside": int(self.tests[outside].sum()),
             "n_crashes_outside": crashes,
             "n_failed_outside": int(self.failed[outside].sum()),
@@ -159,7 +162,7 @@ class Shells:
 
     def _shells(self, confidence: float) -> list[dict[str, Any]]:
         design = self._design()
-        low, high = share_limits(self.crashes, self.tests, (1.0 - confidence) / 2.0)
+        low, high = share_limits(self.crashes, self.tests, (1.0 - confidence) / 2.0, self.failed)
         return [
             {
                 "shell": name,
@@ -196,6 +199,4 @@ class Shells:
                 f"{crashes} crashes where {design.boundary} does not crash: the conditional statement does not hold "
                 "for this vehicle"
             )
-        if failed := int(self.failed.sum()):
-            found.append(f"{failed} of {self.tests.sum()} episodes failed; the estimate counts them as no crash")
         return found

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from harness.estimators.estimate import WIDEST_RHW, Estimate
@@ -59,13 +59,22 @@ def _failed(found: Mapping[str, Any]) -> str:
     if not found["n_failed"]:
         return ""
     return (
-        f" Of these tests {found['n_failed']:,} FAILED and count as no crash: had they crashed, the rate would be "
-        f"{found['crash_rate_if_failed_had_crashed']:.3g}."
+        f" Of these tests {found['n_failed']:,} FAILED: they count as no crash in the rate and as crashes in the upper "
+        f"limit. Had they all crashed, the rate would be {found['crash_rate_if_failed_had_crashed']:.3g}."
     )
 
 
+def warned(cautions: Iterable[str], text: str) -> str:
+    """The text, with what may be wrong about it first."""
+    return " ".join([*(f"WARNING: {caution.rstrip('.')}." for caution in cautions), text])
+
+
 def statement(estimate: Estimate, lane_change_level: float, distance_per_test_km: float | None) -> str:
-    """Rate, interval, number of tests and level, in words."""
+    """Why the interval may be wrong, if it may; then rate, interval, number of tests and level, in words."""
+    return warned(estimate.cautions, _answer(estimate, lane_change_level, distance_per_test_km))
+
+
+def _answer(estimate: Estimate, lane_change_level: float, distance_per_test_km: float | None) -> str:
     tests = (
         f"{estimate.n_episodes:,} overtaking tests at lane-change level {lane_change_level:g} "
         f"({estimate.n_crashes:,} sampled crashes)"
@@ -79,7 +88,7 @@ def statement(estimate: Estimate, lane_change_level: float, distance_per_test_km
         return f"{bound}."
     text = (
         f"The crash rate is {estimate.crash_rate:.3g} per test ({level} interval {estimate.ci_low:.3g} to "
-        f"{estimate.ci_high:.3g}, {_width(estimate.rhw)}), estimated from {tests}"
+        f"{estimate.ci_high:.3g}{_width(estimate)}), estimated from {tests}"
     )
     if distance_per_test_km:
         scaled = per_distance(estimate, distance_per_test_km)
@@ -88,12 +97,6 @@ def statement(estimate: Estimate, lane_change_level: float, distance_per_test_km
             f"({scaled['ci_low']:.3g} to {scaled['ci_high']:.3g})"
         )
     return f"{text}."
-
-
-def _width(rhw: float) -> str:
-    if rhw > WIDEST_RHW:
-        return "still open upwards: far wider than the rate"
-    return f"relative half-width {rhw:.1%}"
 
 
 def repeated_statement(repeated: Mapping[str, Any] | None) -> str:
@@ -107,3 +110,23 @@ def repeated_statement(repeated: Mapping[str, Any] | None) -> str:
         f" {n_differing:,} of {n:,} repeated tests DIFFERED: this vehicle is not reproducible; its tests cannot be "
         "replayed, and depend on what ran beside and before them."
     )
+
+
+def _width(estimate: Estimate) -> str:
+    if estimate.cautions:
+        return ""
+    if estimate.rhw > WIDEST_RHW:
+        return ", still open upwards: far wider than the rate"
+    return f", relative half-width {estimate.rhw:.1%}"
+
+
+def alarm_cautions(alarm: Mapping[str, Any]) -> list[str]:
+    """What a raised alarm (``diagnostics.alarm``) says about every estimate of the run; empty without one."""
+    if not alarm["raised"]:
+        return []
+    rates = alarm["surrogate_crash_rates"]
+    return [
+        "ALARM, replayed surrogates do not crash as often as the pool says (p-value "
+        f"{min(rates['p_value_holm'], rates['p_value_jointly']):.1e}): weights, maneuvers, twin or pool are wrong; see "
+        "diagnostics.alarm"
+    ]

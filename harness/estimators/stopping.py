@@ -75,7 +75,9 @@ class StopRule:
     reached : bool
         Whether the asked precision was reached; always False when none was asked.
     rhw : float
-        Relative half-width at the last look.
+        Relative half-width at the last look; infinite where the interval may be wrong.
+    waited_for : tuple of str
+        Conditions that were missing when a look last failed: what decided, or what is still missing.
     heaviest : float
         By how much of itself one more crash of the largest weight would have moved the last look's estimate.
     pool_too_rough : bool
@@ -97,6 +99,7 @@ class StopRule:
         self.looks = look_grid(campaign_stop.episodes, shard_size, ratio)
         self.reached = False
         self.rhw = self.heaviest = math.inf
+        self.waited_for: tuple[str, ...] = ()
         self._stop = campaign_stop
         self._min_crashes = campaign_stop.min_crashes or min_crashes
         self._n_seen = 0
@@ -129,13 +132,23 @@ class StopRule:
                 f"got n = {n} with an estimate of {estimate.n_episodes}"
             )
         self._n_seen += 1
-        self.rhw = estimate.rhw
+        self.rhw = estimate.precision
         total = n * estimate.crash_rate
         self.heaviest = estimate.weight_cap / total if total > 0.0 else math.inf
-        self._n_passes = self._n_passes + 1 if self._passes(estimate) else 0
-        self.reached = self._n_passes >= PASSES_NEEDED
-        return self.reached or self._n_seen == len(self.looks)
+        if self._stop.rhw is not None:
+            missing = self._missing(estimate, self._stop.rhw)
+            self._n_passes = 0 if missing else self._n_passes + 1
+            self.reached = self._n_passes >= PASSES_NEEDED
+            self.waited_for = missing or self.waited_for
+        last = self._n_seen == len(self.looks)
+        if last and self._n_passes and not self.reached:
+            self.waited_for = ("the same at a second look",)
+        return self.reached or last
 
-    def _passes(self, estimate: Estimate) -> bool:
-        precise = self._stop.rhw is not None and max(self.rhw, self.heaviest) <= self._stop.rhw
-        return precise and estimate.n_crashes >= self._min_crashes
+    def _missing(self, estimate: Estimate, target: float) -> tuple[str, ...]:
+        met = {
+            f"stop.rhw ({target:g})": self.rhw <= target,
+            f"stop.rhw ({target:g}) for one more crash of the largest possible weight": self.heaviest <= target,
+            f"stop.min_crashes ({self._min_crashes:,})": estimate.n_crashes >= self._min_crashes,
+        }
+        return tuple(condition for condition, is_met in met.items() if not is_met)

@@ -3,6 +3,9 @@
 Each share has its own exact (Clopper-Pearson) limits; they are combined by the method of variance estimates recovery
 (G. Y. Zou and A. Donner, Statistics in Medicine 27, 2008, 1693): the distance of each limit of the sum is the root of
 the summed squares of the terms' distances. A stratum without a crash widens the upper limit only.
+
+Tests that failed count as no crash in the rate and in every lower limit, as crashes in every upper one: the limits are
+monotone in each stratum's crashes, so that [L(k), U(k + f)] holds whatever the f failed tests would have come to.
 """
 
 from __future__ import annotations
@@ -44,7 +47,9 @@ class Limits(NamedTuple):
         return self.from_pool_at_least / self.rate if self.rate > 0.0 else 0.0
 
 
-def share_limits(crashes: IntArray, tests: IntArray, tail: float) -> tuple[FloatArray, FloatArray]:
+def share_limits(
+    crashes: IntArray, tests: IntArray, tail: float, failed: IntArray | int = 0
+) -> tuple[FloatArray, FloatArray]:
     """Clopper-Pearson limits of shares, each with the given tail probability; [0, 1] without a test.
 
     Parameters
@@ -52,14 +57,16 @@ def share_limits(crashes: IntArray, tests: IntArray, tail: float) -> tuple[Float
     crashes, tests : ndarray of int64, shape (S,)
     tail : float
         Probability left out at each end.
+    failed : ndarray of int64, shape (S,)
+        Tests that may have been crashes.
 
     Returns
     -------
     low, high : ndarray, shape (S,)
     """
-    k, n = crashes.astype(np.float64), tests.astype(np.float64)
+    k, worst, n = crashes.astype(np.float64), (crashes + failed).astype(np.float64), tests.astype(np.float64)
     low = np.where(k > 0, betaincinv(np.maximum(k, 0.5), n - k + 1.0, tail), 0.0)
-    high = np.where(k < n, betaincinv(k + 1.0, np.maximum(n - k, 0.5), 1.0 - tail), 1.0)
+    high = np.where(worst < n, betaincinv(worst + 1.0, np.maximum(n - worst, 0.5), 1.0 - tail), 1.0)
     return low, high
 
 
@@ -76,7 +83,13 @@ def pool_variance(share: FloatArray, moments: FloatArray, rate: float, n_paths: 
 
 
 def combined(
-    p: FloatArray, crashes: IntArray, tests: IntArray, moments: FloatArray, n_paths: int, tail: float
+    p: FloatArray,
+    crashes: IntArray,
+    tests: IntArray,
+    moments: FloatArray,
+    n_paths: int,
+    tail: float,
+    failed: IntArray | int = 0,
 ) -> Limits:
     """Rate Σ p_s c_s with limits that leave out ``tail`` at each end.
 
@@ -87,7 +100,12 @@ def combined(
     crashes, tests : ndarray of int64, shape (S,)
     moments, n_paths
         Of the pool, see `pool_variance`.
+    failed : ndarray of int64, shape (S,)
+        Tests that may have been crashes.
     """
+    if np.any(failed):
+        worst = combined(p, crashes + failed, tests, moments, n_paths, tail)
+        return combined(p, crashes, tests, moments, n_paths, tail)._replace(high=worst.high)
     share = crashes / np.maximum(tests, 1)
     low, high = share_limits(crashes, tests, tail)
     rate = float(p @ share)

@@ -1,12 +1,13 @@
 """Sums over weighted crashes Y = 1{crash}·weight that every estimator of a weighted mean shares.
 
-They hold what decides whether a mean of Y can be trusted: how many crashes carry it, how unevenly, which cap their
-weights have by design, and what failed episodes would have done to it.
+They hold what decides whether a mean of Y can be trusted: how many crashes carry it, how unevenly, and which cap
+their weights have by design.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from harness.arrays import FloatArray
 from harness.campaign.models import Method
 from harness.estimators.block import Block
 from harness.estimators.estimate import Estimate
-from harness.estimators.exact_sum import MomentSums, SkewedSums
+from harness.estimators.exact_sum import SkewedSums
 from harness.estimators.intervals import capped_mean_upper, skewed_distances
 
 FEW_CRASHES = 50
@@ -24,6 +25,10 @@ FEW_FOR_RESIDUALS = 300.0
 plain mean. Overtaking in the twin, 90 %: `mixture_cv` covers 0.88 at 140 of them, 0.85 at 40 (3,000 replications),
 `martingale` 0.87 at 140 (1,000 replications)."""
 LARGE_SHARE = 0.1
+OVERTURNS = 1.0
+"""One more crash of the largest known weight, over all those seen, from which on an interval is not to be trusted: a
+single test could double the rate. CALIBRATE"""
+UNBOUNDED = "the weights of these tests are unbounded: the true rate may lie far above this interval"
 
 
 class WeightedSums:
@@ -31,19 +36,17 @@ class WeightedSums:
 
     Attributes
     ----------
-    n, n_crashes, n_failed : int
-        Episodes, crashes and failed episodes so far.
+    n, n_crashes : int
+        Episodes and crashes so far.
     y : SkewedSums
-        ΣY, ΣY² and ΣY³, a failed episode counting as no crash.
+        ΣY, ΣY² and ΣY³.
     """
 
     def __init__(self) -> None:
         self.n = 0
         self.n_crashes = 0
-        self.n_failed = 0
         self.y = SkewedSums()
         self.method: Method | None = None
-        self._failed_weight = MomentSums()
         self._largest_y = 0.0
         self._largest_cut_in_log_weight = -math.inf
         self._largest_log_weight = -math.inf
@@ -57,10 +60,7 @@ class WeightedSums:
         self.method = block.method
         self.n += len(block)
         self.n_crashes += len(weights)
-        self.n_failed += int(np.count_nonzero(block.failed))
         self.y.add(weights)
-        if block.failed.any():
-            self._failed_weight.add(block.weights()[block.failed])
         self._largest_y = max(self._largest_y, _largest(weights))
         self._add_caps(block)
 
@@ -81,9 +81,7 @@ class WeightedSums:
         self.method = other.method if self.method is None else self.method
         self.n += other.n
         self.n_crashes += other.n_crashes
-        self.n_failed += other.n_failed
         self.y.merge(other.y)
-        self._failed_weight.merge(other._failed_weight)
         self._largest_y = max(self._largest_y, other._largest_y)
         self._largest_cut_in_log_weight = max(self._largest_cut_in_log_weight, other._largest_cut_in_log_weight)
         self._largest_log_weight = max(self._largest_log_weight, other._largest_log_weight)
@@ -133,47 +131,40 @@ class WeightedSums:
         """Whether there are enough crashes for limits from moments to mean what they say."""
         return self.n_crashes >= FEW_CRASHES and self.n_effective() >= FEW_EFFECTIVE
 
-    def details(self) -> dict[str, float | int]:
-        """Failed episodes counted the other way: as crashes with the weight they had."""
-        total = self.y.total.fraction() + self._failed_weight.total.fraction()
-        squares = self.y.squares.fraction() + self._failed_weight.squares.fraction()
-        variance = max(0.0, float(squares - total * total / self.n)) / max(1, self.n - 1)
-        return {
-            "n_failed": self.n_failed,
-            "crash_rate_if_failed_had_crashed": float(total) / self.n,
-            "std_error_if_failed_had_crashed": math.sqrt(variance / self.n),
-        }
-
-    def warnings(self) -> list[str]:
-        """Why a mean of these Y may mislead."""
-        found = count_warnings(self.n_crashes, self.n_failed, self.n)
-        if 0.0 < self.n_effective() < FEW_EFFECTIVE:
-            found.append(f"effective sample size {self.n_effective():.3g} is below 30: few weights carry the estimate")
-        if self.largest_share() > LARGE_SHARE:
-            found.append(f"one crash carries {self.largest_share():.0%} of the estimate")
+    def cautions(self) -> list[str]:
+        """Why an interval around a mean of these Y may be wrong."""
+        found = []
         if math.isfinite(self._design_cap) and self._largest_y > self._design_cap * (1.0 + 1e-9):
             found.append(
                 f"a crash weighs {self._largest_y:.6g}, more than the cap {self._design_cap:.6g} that the design "
                 "guarantees: the records contradict the campaign"
             )
-        if not math.isfinite(self._design_cap) and not self.is_settled():
-            found.append(f"the upper bound rests on {self.cap()[1]}, not on a cap guaranteed by design")
-        if self.method == "step_mixture":
+        if not math.isfinite(self.known_cap()):
+            found.append(UNBOUNDED)
+        elif self.n_crashes and (times := self.known_cap() / self.y.total.value()) > OVERTURNS:
             found.append(
-                "weights of the step mixture are not bounded: rare large weights may be missing, and neither the "
-                "sample variance nor the interval would show it"
+                f"one more crash of the largest possible weight would add {times:.3g} times this rate: the true rate "
+                "may lie far above this interval"
             )
         return found
 
+    def warnings(self) -> list[str]:
+        """What else a reader of a mean of these Y should know."""
+        found = count_warnings(self.n_crashes)
+        if 0.0 < self.n_effective() < FEW_EFFECTIVE:
+            found.append(f"effective sample size {self.n_effective():.3g} is below 30: few weights carry the estimate")
+        if self.largest_share() > LARGE_SHARE:
+            found.append(f"one crash carries {self.largest_share():.0%} of the estimate")
+        if not math.isfinite(self._design_cap) and not self.is_settled():
+            found.append(f"the upper bound rests on {self.cap()[1]}, not on a cap guaranteed by design")
+        return found
 
-def count_warnings(n_crashes: int, n_failed: int, n: int) -> list[str]:
-    """Warn of what matters to any estimator: too few crashes, failed episodes."""
-    found = []
-    if n_crashes < FEW_CRASHES:
-        found.append(f"only {n_crashes} crashes were sampled (below {FEW_CRASHES}): the interval is rough")
-    if n_failed:
-        found.append(f"{n_failed} of {n} episodes failed; the estimate counts them as no crash")
-    return found
+
+def count_warnings(n_crashes: int) -> list[str]:
+    """Warn of too few crashes, which matters to any estimator."""
+    if n_crashes >= FEW_CRASHES:
+        return []
+    return [f"only {n_crashes} crashes were sampled (below {FEW_CRASHES}): the interval is rough"]
 
 
 def weighted_estimate(
@@ -184,8 +175,9 @@ def weighted_estimate(
     *,
     third_moment: float | None,
     method: str,
-    warnings: list[str],
     details: dict[str, object],
+    warnings: Sequence[str] = (),
+    cautions: Sequence[str] = (),
 ) -> Estimate:
     """Estimate with an interval around `rate` that is as skewed as its error, and a one-sided upper bound.
 
@@ -200,8 +192,9 @@ def weighted_estimate(
     third_moment : float or None
         Third central moment of the error of ``rate``; None for a plain normal interval.
     method : str
-    warnings : list of str
     details : dict
+    warnings, cautions : sequence of str
+        The estimator's own.
     """
     cap, origin = sums.cap()
     hoeffding = capped_mean_upper(sums.mean(), cap, sums.n, confidence)
@@ -216,6 +209,7 @@ def weighted_estimate(
         bound = "upper bound: the same, one-sided"
     interval = "normal interval" if third_moment is None else "normal interval, widened for skewness (Hall)"
     half = (below + above) / 2.0
+    cautions = (*cautions, *sums.cautions())
     return Estimate(
         crash_rate=rate,
         std_error=std_error,
@@ -230,13 +224,14 @@ def weighted_estimate(
         largest_weight_share=sums.largest_share(),
         method=f"{method}; {interval}; {bound}",
         weight_cap=sums.known_cap(),
-        warnings=(*sums.warnings(), *_cap_warning(sums, half), *warnings),
-        details={"upper_bound_hoeffding": hoeffding, **sums.details(), **details},
+        cautions=cautions,
+        warnings=(*cautions, *sums.warnings(), *_cap_warning(sums, half), *warnings),
+        details={"upper_bound_hoeffding": hoeffding, **details},
     )
 
 
 def _cap_warning(sums: WeightedSums, half_width: float) -> list[str]:
-    """Warn where one unseen crash could overturn the interval."""
+    """Warn where one unseen crash would leave the interval; where it would overturn the rate, that is a caution."""
     move = sums.known_cap() / sums.n
     if not 0.0 < half_width < move < math.inf:
         return []

@@ -70,7 +70,7 @@ class ShellsResult:
     shells: tuple[Shell, ...]
     conditional: Conditional
     rate: float
-    high: float
+    rhw_from_pool: float
     boundary: str
     pool: str
     p_cut_in: float
@@ -98,10 +98,8 @@ class ShellsResult:
 
     @property
     def pool_half_width(self) -> float:
-        """What the pool's own error leaves open: the part of the upper limit that no shell accounts for."""
-        up = self.high - self.rate
-        square = up * up - math.fsum((s.high - s.contribution) ** 2 for s in self.shells)
-        return math.sqrt(square) if square > NEGLIGIBLE * up * up else 0.0
+        """What the pool's own error leaves open."""
+        return self.rhw_from_pool * self.rate
 
     def share_of_uncertainty(self, half_width: float) -> float:
         """Share in the sum of squared half-widths, which is what makes the interval of the rate."""
@@ -126,7 +124,7 @@ def shells_result(estimates: dict[str, Any]) -> ShellsResult | None:
             shells=tuple(_shell(content) for content in details["shells"]),
             conditional=_conditional(details["conditional"]),
             rate=float(head["crash_rate"]),
-            high=float(head["ci_high"]),
+            rhw_from_pool=float(details["rhw_from_pool"]),
             boundary=str(details["boundary"]),
             pool=str(details["pool"]),
             p_cut_in=float(details["p_cut_in"]),

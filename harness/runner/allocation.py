@@ -48,50 +48,53 @@ class Allocation:
     available: IntArray
     conditional_only: bool
 
-    def next_round(self, tests: IntArray, crashes: IntArray, budget: int) -> IntArray:
+    def next_round(self, tests: IntArray, crashes: IntArray, budget: int, failed: IntArray | int = 0) -> IntArray:
         """Tests to add per stratum, shape (S,); all 0 when no stratum or no budget is left.
 
         Parameters
         ----------
-        tests, crashes : ndarray, shape (S,)
-            So far.
+        tests, crashes, failed : ndarray, shape (S,)
+            So far. Failed tests widen the limits that are to be narrowed: they may have been crashes.
         budget : int
             Most tests to add.
         """
-        if self._used_up(tests, crashes):
+        failed = np.zeros_like(tests) + failed
+        if self._used_up(tests, crashes, failed):
             return np.zeros_like(tests)
-        active = self._active(tests, crashes) & (tests < self.available)
+        begun = self._active(tests, crashes, failed)
+        active = begun & (tests < self.available)
         wanted = np.where(active, np.maximum(self.first_tests - tests, 0), 0)
         if not wanted.any() and active.any():
-            size = max(SMALLEST_ROUND, int(np.ceil(tests[self._active(tests, crashes)].sum() * (GROWTH - 1.0))))
-            wanted = self._spread(min(size, budget), tests, crashes, active)
+            size = max(SMALLEST_ROUND, int(np.ceil(tests[begun].sum() * (GROWTH - 1.0))))
+            wanted = self._spread(min(size, budget), tests, crashes, failed, active)
         return _within(np.minimum(wanted, self.available - tests), budget)
 
-    def _used_up(self, tests: IntArray, crashes: IntArray) -> bool:
+    def _used_up(self, tests: IntArray, crashes: IntArray, failed: IntArray) -> bool:
         """Whether nearly all that is left to know lies in strata without further cut-ins."""
-        low, high = share_limits(crashes, tests, (1.0 - CONFIDENCE) / 2.0)
+        low, high = share_limits(crashes, tests, (1.0 - CONFIDENCE) / 2.0, failed)
         relevant = np.arange(tests.size) < (self.design.n_inside if self.conditional_only else tests.size)
         squares = np.where(relevant, (self.design.p * (high - low)) ** 2, 0.0)
         return bool(squares[tests >= self.available].sum() >= USED_UP_SHARE * squares.sum())
 
-    def _active(self, tests: IntArray, crashes: IntArray) -> BoolArray:
+    def _active(self, tests: IntArray, crashes: IntArray, failed: IntArray) -> BoolArray:
         inside = np.arange(tests.size) < self.design.n_inside
         if self.conditional_only:
             return inside
         d, s = self.design, slice(0, self.design.n_inside)
         tail = (1.0 - CONFIDENCE) / 2.0
-        known = combined(d.p[s], crashes[s], tests[s], d.moments[s, s], d.n_paths, tail).rhw <= CONDITIONAL_RHW
+        inner = combined(d.p[s], crashes[s], tests[s], d.moments[s, s], d.n_paths, tail, failed[s])
+        known = inner.rhw <= CONDITIONAL_RHW
         exhausted = bool(np.all(tests[s] >= self.available[s]))
         started = bool(np.any(tests[self.design.n_inside :] > 0))
         # Without this end a vehicle that crashes rarely inside, and often outside, would not be tested outside at all.
         spent = bool(tests[s].sum() >= MOST_FIRST_TESTS * self.first_tests * self.design.n_inside)
         return np.ones_like(inside) if known or exhausted or started or spent else inside
 
-    def _spread(self, size: int, tests: IntArray, crashes: IntArray, active: BoolArray) -> IntArray:
+    def _spread(self, size: int, tests: IntArray, crashes: IntArray, failed: IntArray, active: BoolArray) -> IntArray:
         """Give portions, one after the other, to where each narrows the sum of squared half-widths most."""
-        low, high = share_limits(crashes, tests, (1.0 - CONFIDENCE) / 2.0)
+        low, high = share_limits(crashes, tests, (1.0 - CONFIDENCE) / 2.0, failed)
         half_width = self.design.p * (high - low) / 2.0
-        gain = _Gain(half_width, (crashes == 0) | (crashes == tests), tests)
+        gain = _Gain(half_width, (crashes + failed == 0) | (crashes == tests), tests)
         room = np.where(active, self.available - tests, 0).tolist()
         given = [0] * tests.size
         portion = max(1, size // SHARES_PER_ROUND)

@@ -35,7 +35,7 @@ from harness.runner.rounds import rounds, stop_rule
 from harness.runner.shards import ShardPool, stored_shard
 from harness.runner.table_accuracy import table_errors
 from harness.runner.worker import ShardDone, ShardSpec
-from harness.stopped_by import StoppedBy
+from harness.stopped_by import StoppedBy, ending
 
 MANIFEST_INTERVAL_S = 5.0
 
@@ -53,6 +53,8 @@ class RunResult:
         Content of ``estimates.json``.
     stopped_by : {"rhw", "episodes", "pool", "pool_error"}
         See `harness.stopped_by`.
+    ending : str
+        When it ended and which condition decided, in a sentence.
     exit_code : int
         0, or 4 when the budget or the pool was spent before the asked precision.
     """
@@ -61,6 +63,7 @@ class RunResult:
     report: Path
     estimates: dict[str, Any]
     stopped_by: StoppedBy
+    ending: str
     exit_code: int
 
 
@@ -144,12 +147,15 @@ def _run_alone(
     elapsed = time.monotonic() - started
     stopped_by = _stopped_by(campaign, prefix)
     retraced = retracing.summary(prefix.n_retraced)
+    asked = campaign.stop.rhw is not None
+    ended = ending(stopped_by, prefix.n_episodes, prefix.waited_for, precision_asked=asked)
     manifest.write(
         prefix.specs,
         prefix.files,
         status="done",
         elapsed_s=elapsed,
         stopped_by=stopped_by,
+        ending=ended,
         retraced=retraced,
         repeated=prefix.repeated,
     )
@@ -160,8 +166,8 @@ def _run_alone(
     from harness.report import write_report  # noqa: PLC0415
 
     report = write_report(out)
-    missed = campaign.stop.rhw is not None and not prefix.reached
-    return RunResult(out, report, estimates, stopped_by, EXIT_BUDGET_SPENT if missed else EXIT_DONE)
+    missed = asked and not prefix.reached
+    return RunResult(out, report, estimates, stopped_by, ended, EXIT_BUDGET_SPENT if missed else EXIT_DONE)
 
 
 def _stopped_by(campaign: Campaign, prefix: Prefix) -> StoppedBy:

@@ -151,8 +151,8 @@ class Manifest:
         assert self._earlier is not None
         shards = self._earlier["shards"][:index]
         self._n_kept = sum(shard["n_episodes"] for shard in shards)
-        cut = {"status": "interrupted", "stopped_by": None, "n_episodes": self._n_kept, "shards": shards}
-        self._earlier = {**self._earlier, **cut}
+        cut = {"status": "interrupted", "stopped_by": None, "ending": None, "n_episodes": self._n_kept}
+        self._earlier = {**self._earlier, **cut, "shards": shards}
         write_json(self._folder / MANIFEST, self._earlier)
 
     def write(
@@ -163,6 +163,7 @@ class Manifest:
         status: str,
         elapsed_s: float = 0.0,
         stopped_by: str | None = None,
+        ending: str | None = None,
         retraced: dict[str, Any] | None = None,
         repeated: Repeated | None = None,
     ) -> None:
@@ -183,6 +184,7 @@ class Manifest:
                 **self._content,
                 "status": status,
                 "stopped_by": stopped_by,
+                "ending": ending,
                 "retraced": retraced,
                 "reproducible": self._reproducible and not (repeated and repeated.differing),
                 "repeated": None if repeated is None else repeated.to_json(),

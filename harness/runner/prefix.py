@@ -7,7 +7,7 @@ from collections import Counter
 from harness.campaign.models import Campaign
 from harness.errors import TooManyFailedError
 from harness.estimators import accumulator
-from harness.estimators.accumulator import Accumulator
+from harness.estimators.both_ways import BothWays
 from harness.runner.repeat import Repeated
 from harness.runner.rounds import Rule
 from harness.runner.shards import SMALLEST_FAILED_SAMPLE
@@ -19,7 +19,7 @@ class Prefix:
 
     Attributes
     ----------
-    sums : Accumulator
+    sums : BothWays
         Of the estimator whose precision is watched.
     repeated : Repeated or None
         What repeating some of the first tests has shown, once it is known.
@@ -27,7 +27,7 @@ class Prefix:
 
     def __init__(self, campaign: Campaign, rule: Rule) -> None:
         self._campaign, self._rule = campaign, rule
-        self.sums: Accumulator = accumulator(rule.estimator)
+        self.sums: BothWays = accumulator(rule.estimator)
         self.specs: list[ShardSpec] = []
         self.files: list[dict[str, str]] = []
         self.n_episodes = self.n_crashes = self.n_failed = self.n_retraced = 0
@@ -49,6 +49,11 @@ class Prefix:
     def reached(self) -> bool:
         """Whether the asked precision was reached."""
         return self._rule.reached
+
+    @property
+    def waited_for(self) -> tuple[str, ...]:
+        """Conditions that were missing when the stop rule last said no."""
+        return self._rule.waited_for
 
     @property
     def pool_too_rough(self) -> bool:

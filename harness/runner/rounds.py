@@ -14,7 +14,7 @@ import numpy as np
 from harness.arrays import IntArray
 from harness.campaign.models import Campaign, EstimatorName
 from harness.estimators import Shells, StopRule
-from harness.estimators.accumulator import Accumulator
+from harness.estimators.both_ways import BothWays
 from harness.estimators.estimate import Estimate
 from harness.pool.prescribed import Draw, PrescribedEpisodes
 from harness.runner.allocation import Allocation
@@ -33,6 +33,7 @@ class Rule(Protocol):
     rhw: float
     heaviest: float
     pool_too_rough: bool
+    waited_for: tuple[str, ...]
 
     def due(self, n: int) -> bool:
         """Whether to look after ``n`` episodes."""
@@ -46,7 +47,7 @@ class Rule(Protocol):
 class Counts(Protocol):
     """What rounds need of the finished prefix."""
 
-    sums: Accumulator
+    sums: BothWays
     n_episodes: int
 
 
@@ -65,6 +66,15 @@ class RoundRule:
     campaign : Campaign
     held : int
         Tests that the run folder holds: before them nothing is given up, whatever precision is asked for now.
+
+    Attributes
+    ----------
+    look : int
+        Number of tests at the end of the round, when to look.
+    of_first_tests : bool
+        Whether the round brings the tests that every shell gets before anything is decided about it.
+    waited_for : tuple of str
+        See `StopRule`.
     """
 
     estimator: EstimatorName = "shells"
@@ -73,11 +83,14 @@ class RoundRule:
         self._held = held
         self._target = campaign.stop.rhw
         self._min_crashes = campaign.min_crashes
+        self._first_tests = campaign.testing.shells.first_tests
         self._conditional = campaign.testing.shells.statement == "conditional"
         self.reached = self.pool_too_rough = False
         self.rhw = float("inf")
         self.heaviest = 0.0  # limits within shells allow for every crash that has not been seen
         self.look = 0
+        self.of_first_tests = False
+        self.waited_for: tuple[str, ...] = ()
 
     def due(self, n: int) -> bool:
         """See `Rule`."""
@@ -87,9 +100,20 @@ class RoundRule:
         """See `Rule`."""
         watched = estimate.details["conditional"] if self._conditional else {"rhw": estimate.rhw, **estimate.details}
         self.rhw = watched["rhw"]
-        if self._target is None or estimate.n_crashes < self._min_crashes:
+        if self._target is None:
             return False
-        self.reached = self.rhw <= self._target
+        met = {
+            f"stop.rhw ({self._target:g})": self.rhw <= self._target,
+            f"stop.min_crashes ({self._min_crashes:,})": estimate.n_crashes >= self._min_crashes,
+        }
+        missing = tuple(condition for condition, is_met in met.items() if not is_met)
+        if missing:
+            self.waited_for = missing
+        elif self.of_first_tests:
+            self.waited_for = (f"testing.shells.first_tests ({self._first_tests:,} of each shell)",)
+        if estimate.n_crashes < self._min_crashes:
+            return False
+        self.reached = not missing
         self.pool_too_rough = watched["rhw_from_pool_at_least"] > self._target
         hopeless = self.pool_too_rough and watched["rhw_from_pool"] ** 2 >= POOL_SHARE * self.rhw**2
         return self.reached or (hopeless and n >= self._held)
@@ -113,14 +137,15 @@ def rounds(
     allocation = Allocation(
         prescribed.design, shells.first_tests, prescribed.draws.available, shells.statement == "conditional"
     )
-    tests = crashes = np.zeros(prescribed.design.p.size, np.int64)
+    tests = crashes = failed = np.zeros(prescribed.design.p.size, np.int64)
     n_shards = 0
     while True:
-        if isinstance(prefix.sums, Shells) and prefix.n_episodes:
-            tests, crashes = prefix.sums.tests, prefix.sums.crashes
-        added = allocation.next_round(tests, crashes, campaign.stop.episodes - prefix.n_episodes)
+        if isinstance(prefix.sums.seen, Shells) and prefix.n_episodes:
+            tests, crashes, failed = prefix.sums.seen.tests, prefix.sums.seen.crashes, prefix.sums.seen.failed
+        added = allocation.next_round(tests, crashes, campaign.stop.episodes - prefix.n_episodes, failed)
         if not added.any():
             return
+        rule.of_first_tests = bool(np.any(tests[added > 0] < shells.first_tests))
         rule.look = prefix.n_episodes + int(added.sum())
         specs = round_specs(tests, added, n_shards, prefix.n_episodes, campaign.run.shard_size)
         n_shards += len(specs)

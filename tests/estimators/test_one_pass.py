@@ -23,7 +23,7 @@ def test_each_estimator_gets_what_it_would_get_alone(method):
     together = one_pass(iter(parts)).estimates
     for name, estimate in together.items():
         alone = accumulator(name)
-        reason = alone.refusal(parts[0])
+        reason = alone.seen.refusal(parts[0])
         if reason is not None:
             assert estimate == Unavailable(reason)
             assert estimate.to_json() == {"crash_rate": None, "reason": reason}

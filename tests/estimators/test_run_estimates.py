@@ -34,6 +34,7 @@ KEYS = {
     "statement",
     "statements",
     "conditional_statement",
+    "ending",
     "scope",
 }
 
@@ -118,7 +119,8 @@ def test_failed_tests_are_named_in_the_answer_itself(method):
     crashes = [True] * 4 + [False] * 196
     some = block(crashes, failed=[False] * 150 + [True] * 50, method=method, weight_cap=1.0)
     content = estimate_blocks([some], facts())
-    assert "50 FAILED and count as no crash: had they crashed, the rate would be 0.27" in content["statement"]
+    assert "50 FAILED: they count as no crash in the rate and as crashes in the upper limit." in content["statement"]
+    assert "Had they all crashed, the rate would be 0.27." in content["statement"]
     none = estimate_blocks([block(crashes, method=method, weight_cap=1.0)], facts())
     assert "FAILED" not in none["statement"]
 

@@ -148,7 +148,10 @@ def test_failed_tests_outside_are_not_taken_for_safe_ones():
     assert conditional["upper_bound_outside"] == pytest.approx(P[2] * clopper_pearson(4, 400, 0.8)[1])
     text = conditional_statement(estimate)
     assert text is not None
-    assert "2 FAILED and count as no crash: had they crashed, the rate would be 0.0001." in text
+    assert (
+        "2 FAILED: they count as no crash in the rate and as crashes in the upper limit. Had they all crashed" in text
+    )
+    assert "the rate would be 0.0001." in text
     assert "no crash in 400 tests outside, but 4 of them FAILED and are counted as crashes here: with" in text
 
 

@@ -24,7 +24,7 @@ SHARD = 200
 
 def passing(n: int, *, rhw: float = 0.01, n_crashes: int = 1_000):
     state = accumulator("nade")
-    state.add(block([True] * 4))
+    state.add(block([True] * 4, weight_cap=1.0))
     return replace(state.result(0.9), n_episodes=n, rhw=rhw, n_crashes=n_crashes, weight_cap=1.0)
 
 

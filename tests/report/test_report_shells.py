@@ -146,7 +146,6 @@ def test_shares_of_uncertainty_add_up_and_the_rest_is_the_pool(reports):
     shells = found.shells
     tests, crashes = (np.array([getattr(s, name) for s in shells]) for name in ("n_tests", "n_crashes"))
     limits = combined(P, crashes, tests, DESIGN.moments, DESIGN.n_paths, 0.05)
-    assert found.high == pytest.approx(limits.high, rel=1e-12)
     variance = pool_variance(crashes / tests, DESIGN.moments, limits.rate, DESIGN.n_paths)
     assert found.pool_half_width == pytest.approx(1.6448536 * variance**0.5, rel=1e-6)
     widths = [*(s.half_width for s in shells), found.pool_half_width]
