@@ -15,7 +15,8 @@ from harness.campaign.models import Campaign
 from harness.errors import CampaignError, RunFolderError
 from harness.records.folder import no_episodes, read_manifest, read_table
 from harness.records.tables import shard_tables
-from harness.runner.prepare import Prepared, build_world, content_hash, prepare, require_same_pool
+from harness.runner.prepare import Prepared, build_world, content_hash, prepare, require_same_pool, require_world
+from harness.sumo.system_libraries import require_libraries
 from harness.world import World
 
 _UNLIKE_BITS = ("episode", "seed", "failure")
@@ -65,6 +66,8 @@ def replay_episode(folder: Path, episode: int, *, gui: bool = False, fcd: Path |
         The folder is no run, or has no such episode.
     CampaignError
         The environment's parameter file has changed since, or the AV is not reproducible.
+    HarnessError
+        SUMO's system libraries are missing.
     """
     manifest = read_manifest(folder)
     _require_reproducible(manifest)
@@ -77,6 +80,10 @@ def replay_episode(folder: Path, episode: int, *, gui: bool = False, fcd: Path |
             expected=f"campaign {manifest['campaign_hash']}, which made the records",
             mend="Restore campaign.yaml and the environment parameter file that it names.",
         )
+    if gui or fcd is not None:
+        require_libraries()
+    else:
+        require_world(campaign)
     prepared = prepare(campaign)
     require_same_pool(folder, prepared)
     world = _world(campaign, gui=gui, fcd=fcd)
