@@ -22,7 +22,8 @@ _INSTALL: dict[str, tuple[tuple[str, ...], ...]] = {
     "apk": (("apk", "add", "--no-cache"),),
 }
 _ASK_NOTHING = ("env", "DEBIAN_FRONTEND=noninteractive", "LC_ALL=C")
-_LAST_WORDS = 3
+_QUOTED = 2
+"""Lines of each command that an error repeats."""
 
 
 def install_commands(missing: Sequence[SystemLibrary]) -> list[list[str]]:
@@ -56,7 +57,7 @@ def install(missing: Sequence[SystemLibrary], commands: Sequence[Sequence[str]])
     Raises
     ------
     HarnessError
-        The packages could not be installed; it repeats the package manager's last words.
+        The packages could not be installed; it repeats what the package manager complained about.
     """
     said: list[str] = []
     for command in commands:
@@ -64,19 +65,21 @@ def install(missing: Sequence[SystemLibrary], commands: Sequence[Sequence[str]])
         done = subprocess.run(  # noqa: S603 - our own words, and names from our own table
             command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False
         )
-        said += [line.strip() for line in done.stdout.splitlines() if line.strip()]
+        said += _complaints(done.stdout, failed=done.returncode != 0)
     if done.returncode:
         raise HarnessError(
             shlex.join(commands[-1]),
-            found=f"exit code {done.returncode}: {' | '.join(_complaints(said)[-_LAST_WORDS:])}",
+            found=f"exit code {done.returncode}: {' | '.join(said)}",
             expected="the packages installed",
             mend=f"See to what it says, or give your administrator the line for this system:\n{install_lines(missing)}",
         )
 
 
-def _complaints(said: Sequence[str]) -> Sequence[str]:
-    """The lines that say what went wrong: apt marks them, others end with them."""
-    return [line for line in said if line.startswith(("E:", "W:"))] or said
+def _complaints(said: str, *, failed: bool) -> list[str]:
+    """The lines that say what went wrong: apt marks them, the cause first; others end with them."""
+    lines = [line.strip() for line in said.splitlines() if line.strip()]
+    marked = [line for line in lines if line.startswith(("E:", "W:"))]
+    return marked[:_QUOTED] or (lines[-_QUOTED:] if failed else [])
 
 
 def require_libsumo() -> None:
