@@ -15,6 +15,7 @@ from collections.abc import Sequence
 import click
 
 from harness.commands.campaigns import check, run, schema
+from harness.commands.machine import setup
 from harness.commands.options import examples
 from harness.commands.stored import estimate, replay, report, rnot
 from harness.commands.studies import pool, validate
@@ -44,7 +45,7 @@ def cli() -> None:
     """
 
 
-for command in (check, av_check, run, compare, pool, ladder, estimate, rnot, report, replay, validate, schema):
+for command in (check, av_check, run, compare, pool, ladder, estimate, rnot, report, replay, validate, schema, setup):
     cli.add_command(command)
 
 

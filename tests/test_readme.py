@@ -18,7 +18,7 @@ README = ROOT / "README.md"
 PAGES = [README, ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").rglob("*.md"))]
 FIRST = (
     "python3 -m venv .venv && .venv/bin/pip install -c requirements.lock -e . && "
-    ".venv/bin/harness run scenarios/smoke.yaml --out runs/smoke"
+    ".venv/bin/harness setup && .venv/bin/harness run scenarios/smoke.yaml --out runs/smoke"
 )
 SECOND = ".venv/bin/pip install -c requirements.lock -e '.[test]' && .venv/bin/python -m pytest -n 2"
 

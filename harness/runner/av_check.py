@@ -17,7 +17,7 @@ from harness.episode.loop import EpisodeLoop, Shard
 from harness.errors import EXIT_DONE, EXIT_TOO_MANY_FAILED
 from harness.estimators.estimate import finite_json
 from harness.outcomes import AV, CRASH, FAILED
-from harness.runner.prepare import Prepared, build_world, prepare
+from harness.runner.prepare import Prepared, build_world, prepare, require_world
 from harness.runner.repeat import bits_of
 from harness.vehicles.kinematics import STEP_S
 
@@ -128,6 +128,7 @@ def check_av(campaign: Campaign, n_episodes: int = EPISODES, *, black_box: Path 
         The campaign is wrong, or the AV cannot be found, made or started.
     """
     tested = _as_checked(campaign)
+    require_world(tested)
     prepared = prepare(tested)
     first, elapsed_s, steps = _timed_run(prepared, n_episodes, black_box)
     again = _run_in_another_order(prepared, n_episodes, black_box)

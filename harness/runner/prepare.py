@@ -27,6 +27,7 @@ from harness.progress import Progress, SilentProgress
 from harness.records.folder import SHELLS, read_json
 from harness.sumo.av_type import av_type
 from harness.sumo.public_address import require_private
+from harness.sumo.system_libraries import require_libraries
 from harness.vehicles.models import av_records, surrogate_records
 from harness.world import World
 
@@ -90,7 +91,10 @@ def require_ready(campaign: Campaign) -> str | None:
     CampaignError
         The AV's controller cannot be found or made, SUMO knows no such attribute of it, strangers could drive it, the
         environment's parameters are wrong, or the surrogate library is wrong or lacks the boundary.
+    HarnessError
+        See `require_world`.
     """
+    require_world(campaign)
     source = require_controller(campaign)
     if campaign.av.sumo is not None:
         av_type(campaign.av.sumo)
@@ -101,6 +105,18 @@ def require_ready(campaign: Campaign) -> str | None:
         library = load_library(campaign.pool.library)
         require_boundary(campaign.testing.shells.boundary or library.boundary, tuple(library.surrogates))
     return source
+
+
+def require_world(campaign: Campaign) -> None:
+    """Refuse a machine on which the world that a campaign names cannot be opened, before anything is built for it.
+
+    Raises
+    ------
+    HarnessError
+        SUMO's system libraries are missing.
+    """
+    if campaign.world.engine == "sumo":
+        require_libraries()
 
 
 def content_hash(campaign: Campaign) -> str:

@@ -19,7 +19,8 @@ from harness.errors import CampaignError, RunFolderError
 from harness.records.folder import no_episodes, read_manifest, read_table
 from harness.records.tables import shard_tables
 from harness.runner.manifest import cpu_name, versions
-from harness.runner.prepare import Prepared, build_world, content_hash, prepare, require_same_pool
+from harness.runner.prepare import Prepared, build_world, content_hash, prepare, require_same_pool, require_world
+from harness.sumo.system_libraries import require_libraries
 from harness.world import World
 
 _UNLIKE_BITS = ("episode", "seed", "failure")
@@ -72,6 +73,8 @@ def replay_episode(folder: Path, episode: int, *, gui: bool = False, fcd: Path |
         The folder is no run, or has no such episode.
     CampaignError
         The environment's parameter file has changed since, or the AV is not reproducible.
+    HarnessError
+        SUMO's system libraries are missing.
     """
     manifest = read_manifest(folder)
     _require_reproducible(manifest)
@@ -84,6 +87,10 @@ def replay_episode(folder: Path, episode: int, *, gui: bool = False, fcd: Path |
             expected=f"campaign {manifest['campaign_hash']}, which made the records",
             mend="Restore campaign.yaml and the environment parameter file that it names.",
         )
+    if gui or fcd is not None:
+        require_libraries()
+    else:
+        require_world(campaign)
     replay = partial(run_apart, campaign, _replay) if has_foreign_code(campaign) else partial(_replay, campaign)
     row, trace = replay(folder, episode, stored["episodes"], gui, fcd)
     equal = {name: _equal(name, table, stored.get(name)) for name, table in (("episodes", row), ("traces", trace))}

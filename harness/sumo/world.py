@@ -18,7 +18,6 @@ from collections import deque
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
-import libsumo
 import numpy as np
 
 from harness.arrays import BoolArray, FloatArray, Int8Array, IntArray
@@ -26,7 +25,13 @@ from harness.errors import CampaignError, WorldDisagreementError
 from harness.outcomes import AV, BV, LV, VEHICLES
 from harness.sumo.network import EXACT_OPTIONS, PARKED_M, committed_file, network_file, parked
 from harness.sumo.shim import Shim, open_shim
+from harness.sumo.system_libraries import not_importable
 from harness.twin import advance
+
+try:
+    import libsumo
+except ImportError as error:
+    raise not_importable(str(error)) from error
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

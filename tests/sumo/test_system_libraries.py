@@ -1,0 +1,196 @@
+"""System libraries of SUMO: which they are, what is said where they are missing, and how they are installed."""
+
+import os
+import subprocess
+import sys
+from importlib import metadata
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from elftools.elf.elffile import ELFFile
+
+from harness.cli import main
+from harness.errors import EXIT_BAD_INPUT, HarnessError
+from harness.sumo import installing, system_libraries
+from harness.sumo.system_libraries import LIBRARIES, SystemLibrary, missing_libraries
+
+SMOKE = str(Path(__file__).parents[2] / "scenarios" / "smoke.yaml")
+NOWHERE = SystemLibrary("libnowhere.so.7", "libnowhere7", "nowhere-libs", "nowhere")
+ALWAYS_THERE = ("ld-linux", "libc.", "libdl.", "libgcc_s.", "libm.", "libpthread.", "libresolv.", "librt.")
+SUMO_RUN = ("run", SMOKE, "--set", "stop.episodes=200", "--set", "run.shard_size=200")
+
+
+def _is_elf(path):
+    if not path.is_file():
+        return False
+    with path.open("rb") as stream:
+        return stream.read(4) == b"\x7fELF"
+
+
+def _needed_of_the_system(package):
+    """Sonames that the shared libraries and programs of an installed package need and do not bring along."""
+    files = [Path(str(file.locate())) for file in metadata.files(package) or []]
+    elves = [path for path in files if _is_elf(path)]
+    needed = set()
+    for path in elves:
+        with path.open("rb") as stream:
+            dynamic = ELFFile(stream).get_section_by_name(".dynamic")
+            if dynamic is not None:
+                needed |= {tag.needed for tag in dynamic.iter_tags("DT_NEEDED")}
+    assert elves
+    return needed - {path.name for path in elves}
+
+
+@pytest.fixture
+def bare_machine(monkeypatch):
+    """A machine that lacks one library."""
+    monkeypatch.setattr(system_libraries, "LIBRARIES", (*LIBRARIES, NOWHERE))
+
+
+@pytest.fixture
+def programs(monkeypatch, tmp_path):
+    """The only programs of this machine, each noting how it was called; and who the user is."""
+    folder = tmp_path / "bin"
+    folder.mkdir()
+    monkeypatch.setenv("PATH", str(folder))
+    calls = tmp_path / "calls"
+    calls.touch()
+
+    def add(name, then="exit 0"):
+        (folder / name).write_text(f'#!/bin/sh\necho {name} "$@" >> {calls}\n{then}\n')
+        (folder / name).chmod(0o755)
+
+    add("env", 'shift 2; exec "$@"')
+    add.calls = lambda: [line for line in calls.read_text().splitlines() if not line.startswith("env ")]
+    add.user = lambda uid, terminal=False: (
+        monkeypatch.setattr(os, "geteuid", lambda: uid),
+        monkeypatch.setattr(sys, "stdin", SimpleNamespace(isatty=lambda: terminal)),
+    )
+    return add
+
+
+def test_the_list_is_what_the_wheels_need():
+    known = {library.soname for library in LIBRARIES}
+    needed = _needed_of_the_system("libsumo") | _needed_of_the_system("eclipse-sumo")
+    assert {soname for soname in needed if not soname.startswith(ALWAYS_THERE)} == known
+
+
+def test_nothing_is_missing_where_sumo_runs():
+    assert missing_libraries() == []
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("check", SMOKE),
+        (*SUMO_RUN, "--out", "runs/x"),
+        ("compare", SMOKE, "--set", "testing.method=forced", "--against", "av.model=fvdm", "--out", "runs/x"),
+        ("av-check", "sumo_av.yaml"),
+    ],
+    ids=lambda command: command[0],
+)
+def test_every_command_that_opens_sumo_names_what_is_missing(command, bare_machine, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("sumo_av.yaml").write_text("name: sumo-av\nav: {sumo: {carFollowModel: IDM}}\n")
+    assert main(command) == EXIT_BAD_INPUT
+    said = capsys.readouterr()
+    assert said.out == ""
+    for words in ("libnowhere.so.7", "harness setup", "libnowhere7", "dnf install -y nowhere-libs", "apk add nowhere"):
+        assert words in said.err
+    assert "libX11" not in said.err  # what is there needs no package
+    assert not any((tmp_path / "runs").rglob("*.*"))
+
+
+def test_a_stored_episode_is_not_replayed_there(tmp_path, monkeypatch, capsys):
+    run = str(tmp_path / "run")
+    assert main([*SUMO_RUN, "--workers", "1", "--out", run]) != EXIT_BAD_INPUT
+    monkeypatch.setattr(system_libraries, "LIBRARIES", (*LIBRARIES, NOWHERE))
+    capsys.readouterr()
+    assert main(["replay", run, "17"]) == EXIT_BAD_INPUT
+    assert "libnowhere7" in capsys.readouterr().err
+
+
+def test_the_twin_needs_none(bare_machine, capsys):
+    assert main(["check", SMOKE, "--set", "world.engine=twin"]) == 0
+    assert main(["av-check", SMOKE, "--episodes", "2"]) == 0  # it drives a built-in model in the twin
+
+
+def test_a_libsumo_that_does_not_load_for_another_reason_is_told_too():
+    code = "import sys; sys.modules['libsumo'] = None; import harness.sumo.build"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert "HarnessError: libsumo: found that it cannot be imported" in done.stderr
+
+
+def test_setup_does_nothing_where_nothing_is_missing(programs, capsys):
+    for name in ("sudo", "apt-get", "dnf", "apk"):
+        programs(name)
+    programs.user(1000)
+    assert main(["setup"]) == 0
+    assert main(["setup", "--dry-run"]) == 0
+    assert capsys.readouterr().out.splitlines() == ["SUMO's system libraries are there.", "Nothing to install."]
+    assert programs.calls() == []
+
+
+@pytest.mark.parametrize(
+    ("manager", "expected"),
+    [
+        (
+            "apt-get",
+            [
+                "apt-get update",
+                "apt-get -o DPkg::Lock::Timeout=300 install -y --no-install-recommends libnowhere7",
+            ],
+        ),
+        ("dnf", ["dnf install -y --setopt=install_weak_deps=False nowhere-libs"]),
+        ("apk", ["apk add --no-cache nowhere"]),
+    ],
+)
+def test_root_installs_without_sudo(manager, expected, bare_machine, programs, capsys):
+    programs(manager)
+    programs.user(0)
+    assert main(["setup", "--dry-run"]) == 0
+    assert [line.partition("LC_ALL=C ")[2] for line in capsys.readouterr().out.splitlines()] == expected
+    assert programs.calls() == []
+    assert main(["setup"]) == 0
+    assert programs.calls() == expected
+
+
+@pytest.mark.parametrize(("terminal", "sudo"), [(False, "sudo -n env"), (True, "sudo env")])
+def test_others_install_by_sudo_which_asks_only_at_a_terminal(terminal, sudo, bare_machine, programs):
+    programs("apk")
+    programs("sudo", 'while [ "$1" != apk ]; do shift; done; exec "$@"')
+    programs.user(1000, terminal=terminal)
+    assert main(["setup"]) == 0
+    asked, installed = programs.calls()
+    assert asked.startswith(f"{sudo} DEBIAN_FRONTEND=noninteractive")
+    assert installed == "apk add --no-cache nowhere"
+
+
+@pytest.mark.parametrize("available", [(), ("apt-get",)], ids=["no package manager", "no root, no sudo"])
+def test_where_nothing_can_be_installed_an_administrator_gets_the_line(available, bare_machine, programs, capsys):
+    for name in available:
+        programs(name)
+    programs.user(1000)
+    assert main(["setup"]) == EXIT_BAD_INPUT
+    said = capsys.readouterr().err
+    assert "apt-get update && apt-get install -y --no-install-recommends libnowhere7\n" in said
+    assert "dnf install -y nowhere-libs\n" in said
+    assert "apk add nowhere\n" in said
+    assert programs.calls() == []
+
+
+def test_a_package_manager_that_fails_is_quoted(bare_machine, programs, capsys):
+    update = 'if [ "$1" = update ]; then echo reading; echo "W: no mirror" >&2; exit 0; fi'
+    programs("apt-get", f'{update}; echo "E: no libnowhere7"; exit 100')
+    programs.user(0)
+    assert main(["setup"]) == EXIT_BAD_INPUT
+    said = capsys.readouterr().err
+    assert "exit code 100: W: no mirror | E: no libnowhere7\n" in said
+    assert "give your administrator" in said
+
+
+def test_setup_looks_whether_sumo_loads_in_the_end(monkeypatch):
+    monkeypatch.setattr(sys, "executable", "/bin/false")
+    with pytest.raises(HarnessError, match="cannot be imported: exit code 1"):
+        installing.require_libsumo()
