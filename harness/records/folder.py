@@ -197,15 +197,15 @@ def no_episodes(folder: Path) -> RunFolderError:
     )
 
 
-def read_manifest(folder: Path) -> dict[str, Any]:
-    """Read ``manifest.json`` of a run.
+def read_manifest(folder: Path, *, mend: str = NO_RUN) -> dict[str, Any]:
+    """Read ``manifest.json`` of a run; ``mend`` is the advice where it cannot be.
 
     Raises
     ------
     RunFolderError
         There is none, or it is not one that a run has written; see `StoredManifest`.
     """
-    path, mend = folder / MANIFEST, NO_RUN
+    path = folder / MANIFEST
     if not path.exists():
         expected = "a run folder, which holds a manifest.json"
         raise RunFolderError(str(path), found="no such file: this is no run folder", expected=expected, mend=mend)

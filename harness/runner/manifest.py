@@ -70,7 +70,7 @@ def require_own_folder(
             expected="a new or empty folder, or one that a run has left",
             mend="Choose another folder with --out.",
         )
-    manifest = read_manifest(folder)
+    manifest = read_manifest(folder, mend="Choose another folder with --out.")
     if manifest.get("campaign_hash") != content_hash:
         raise RunFolderError(
             str(folder),

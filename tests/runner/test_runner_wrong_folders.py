@@ -60,7 +60,9 @@ def test_a_folder_with_foreign_files(resume, tmp_path, capsys):
 
 def test_a_folder_with_somebody_elses_manifest(tmp_path, capsys):
     (tmp_path / "manifest.json").write_text('{"short_name": "a web page"}')
-    assert "another campaign" in complaint_of(capsys, "run", MIXTURE_FILE, "--out", tmp_path, *SAME, "--resume")
+    said = complaint_of(capsys, "run", MIXTURE_FILE, "--out", tmp_path, *SAME, "--resume")
+    assert "no key campaign_hash" in said
+    assert "another folder with --out" in said
     for command in (("estimate", tmp_path), ("report", tmp_path), ("replay", tmp_path, 0)):
         assert str(tmp_path) in complaint_of(capsys, *command)
 
