@@ -123,7 +123,7 @@ def main(replications: int) -> None:
         "| AV, method | tests | effective crashes | normal | Hall | as reported | its half-width over the normal one |"
     )
     print("| --- | --- | --- | --- | --- | --- | --- |")
-    rows = [(idm, (2_000, 6_300, 25_000, 100_000)), (careless, (400, 6_000)), (mixture, (400, 2_000))]
+    rows = [(idm, (500, 2_000, 6_300, 25_000, 100_000)), (careless, (400, 6_000)), (mixture, (400, 2_000))]
     for population, sizes in rows:
         for n in sizes:
             print(fixed(population, n, replications))

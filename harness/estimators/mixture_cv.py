@@ -98,7 +98,7 @@ class MixtureCv:
         freedom = self.sums.n - fit.rank
         variance = fit.residual_squares / freedom * fit.intercept_leverage if freedom > 0 else math.inf
         plain = self.sums.y.std_error(self.sums.n)
-        warnings, cautions = [], []
+        warnings = []
         std_error, third_moment = (
             math.sqrt(variance),
             self._cubes.of(np.array([*-fit.coefficients, 1.0])) / self.sums.n**3,
@@ -109,8 +109,6 @@ class MixtureCv:
                 f"fewer than {FEW_FOR_RESIDUALS:.0f} effective crashes: the interval is as wide as that of the plain "
                 "mean of weighted crashes"
             )
-        if fit.coefficients[0] < 0.0:
-            cautions.append("the regression's intercept is negative: too few crashes for control variates, use nade")
         return weighted_estimate(
             self.sums,
             float(fit.coefficients[0]),
@@ -119,7 +117,6 @@ class MixtureCv:
             third_moment=third_moment,
             method="mean of weighted crashes with the episode mixture's known-mean control variates",
             warnings=warnings,
-            cautions=cautions,
             details={
                 "beta": [float(value) for value in fit.coefficients[1:]],
                 "rank": fit.rank,

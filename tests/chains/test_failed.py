@@ -1,0 +1,93 @@
+"""What intervals are worth when a share of the crashes fails instead, by replication; counting these as safe must fail.
+
+Seeds are fixed. Each `binomtest` would reject a coverage of 0.90 with probability 1e-4; today's sibling, which takes a
+failed test for one without a crash, must miss at 1e-9.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import binomtest
+
+from harness.estimators.block import Block
+from harness.estimators.one_pass import _CLASSES, accumulator
+from harness.validation.chains.named import frequent_decisive
+from harness.validation.chains.sampler import draw
+from harness.validation.chains.shells import ChainShells
+
+from .coverage import replicate
+from .test_cross_fitted import WORLD, replayed
+
+REPLICATIONS = 300
+N = 2_000
+FAILING = 0.4
+CHAIN = frequent_decisive()
+METHODS = {"nde": "nde", "nade": "forced", "mixture_cv": "episode_mixture", "martingale": "episode_mixture"}
+
+
+def with_failures(block: Block, rng: np.random.Generator) -> Block:
+    failed = block.crash & (rng.random(len(block)) < FAILING)
+    return replace(block, crash=block.crash & ~failed, failed=failed)
+
+
+def drawn(name: str, rng: np.random.Generator) -> Block:
+    if name == "replay":
+        return replayed(rng)
+    n = 20 * N if name == "nde" else N
+    return draw(CHAIN, METHODS[name], n, rng)
+
+
+def low(covered: int) -> float:
+    return binomtest(covered, REPLICATIONS, 0.9, alternative="less").pvalue
+
+
+@pytest.mark.parametrize("name", [*METHODS, "replay"])
+def test_intervals_cover_whatever_failed_tests_would_have_come_to(name):
+    truth = WORLD.crash_rate if name == "replay" else CHAIN.crash_rate
+    make = {"both ways": lambda: accumulator(name), "as no crash": _CLASSES[name]}
+    found = replicate(lambda rng: with_failures(drawn(name, rng), rng), REPLICATIONS, 31, make)
+    assert low(found["both ways"].covered(truth)) > 1e-4
+    assert low(found["as no crash"].covered(truth)) < 1e-9
+
+
+def shells_block(rng: np.random.Generator) -> Block:
+    """Fixed numbers of tests in the shells of a pool that is exactly known."""
+    source = ChainShells(CHAIN, 20)
+    design, _ = source.draw(rng)
+    design = replace(design, p=source.shell_p, moments=np.outer(source.shell_p, source.shell_p))
+    component = np.repeat(np.arange(len(design.p)), 300)
+    share = source.crash_p / source.shell_p
+    n = len(component)
+    no = np.zeros(n, np.bool_)
+    crash = rng.random(n) < share[component]
+    return Block(
+        first_episode=0,
+        method="shells",
+        crash=crash,
+        failed=no,
+        cut_in=~no,
+        bv_lv_contact=no,
+        log_weight=np.zeros(n),
+        log_q=np.zeros((n, 0)),
+        alpha=np.zeros(0),
+        n_control_steps=np.ones(n, np.int64),
+        component=component,
+        shells=design,
+    )
+
+
+class FailedAsSafe(_CLASSES["shells"]):
+    """Mutant: today's shells, which forget that tests failed."""
+
+    def add(self, block: Block) -> None:
+        super().add(replace(block, failed=np.zeros_like(block.failed)))
+
+
+def test_shells_cover_too():
+    make = {"both ways": lambda: accumulator("shells"), "as no crash": FailedAsSafe}
+    found = replicate(lambda rng: with_failures(shells_block(rng), rng), REPLICATIONS, 32, make)
+    assert low(found["both ways"].covered(CHAIN.crash_rate)) > 1e-4
+    assert low(found["as no crash"].covered(CHAIN.crash_rate)) < 1e-9

@@ -1,0 +1,143 @@
+"""Failed tests: no crash in rate and lower limit, crashes in every upper limit, for every estimator."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from harness.estimators import ESTIMATORS, accumulator, one_pass
+from harness.estimators.block import Block
+from harness.estimators.both_ways import BothWays
+from harness.estimators.difference import difference_statement, paired_difference
+from harness.estimators.one_pass import _CLASSES
+from harness.estimators.required_tests import Procedure, plain_rhw, scv_rhw
+from harness.estimators.run_required_tests import joined
+from harness.validation.chains.named import overtaking
+from harness.validation.chains.sampler import blocks
+from tests.chains.seed import SEED
+from tests.chains.test_cross_fitted import replayed
+from tests.estimators.small_blocks import block
+from tests.estimators.test_shells import block as in_shells
+
+CHAIN = overtaking("short", skill=0.5, surrogates=[0.5, 0.2, 0.8], level=0.02, horizon=5)
+METHOD = {"nde": "nde", "nade": "forced", "mixture_cv": "episode_mixture"}
+
+
+def some_failed(parts: list[Block], share: float = 0.5, *, first: int = 1) -> list[Block]:
+    """The blocks with a share of the crashes failed instead, from block ``first`` on."""
+    rng = np.random.default_rng(SEED)
+    changed = []
+    for k, part in enumerate(parts):
+        failed = part.crash & (rng.random(len(part)) < share) & (k >= first)
+        changed.append(replace(part, crash=part.crash & ~failed, failed=failed))
+    return changed
+
+
+def drawn(name: str) -> list[Block]:
+    if name == "shells":
+        rng = np.random.default_rng(SEED)
+        shares = np.array([0.8, 0.3, 0.02])
+        parts = []
+        for k in range(4):
+            strata = rng.integers(0, 3, 200)
+            crash = rng.random(200) < shares[strata]
+            parts.append(in_shells(strata.tolist(), crash.tolist(), first=200 * k))
+        return parts
+    if name == "replay":
+        rngs = [np.random.default_rng([SEED, k]) for k in range(4)]
+        return [replace(replayed(rng, n=1_000, error=0.0), first_episode=1_000 * k) for k, rng in enumerate(rngs)]
+    size = 20_000 if name == "nde" else 1_000
+    return list(blocks(CHAIN, METHOD.get(name, "step_mixture"), [size] * 4, SEED))
+
+
+def fed(name: str, parts: list[Block]):
+    state = _CLASSES[name]()
+    for part in parts:
+        state.add(part)
+    return state.result(0.9)
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_lower_ends_without_upper_ends_with_the_failed_tests(name):
+    parts = some_failed(drawn(name))
+    found = one_pass(parts, (name,)).estimates[name]
+    seen = fed(name, [replace(part, failed=np.zeros_like(part.failed)) for part in parts])
+    worst = fed(name, [replace(part, crash=part.crash | part.failed, failed=part.failed & False) for part in parts])
+    assert (found.crash_rate, found.std_error, found.ci_low) == (seen.crash_rate, seen.std_error, seen.ci_low)
+    assert (found.n_crashes, found.n_effective) == (seen.n_crashes, seen.n_effective)
+    assert (found.ci_high, found.upper_bound) == (worst.ci_high, worst.upper_bound)
+    assert found.ci_high > seen.ci_high
+    assert found.rhw == (worst.ci_high - seen.ci_low) / 2.0 / seen.crash_rate
+    assert found.details["crash_rate_if_failed_had_crashed"] == worst.crash_rate
+    assert found.details["n_failed"] == sum(int(part.failed.sum()) for part in parts)
+    assert any("episodes failed" in warning for warning in found.warnings)
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_nothing_changes_where_nothing_fails(name):
+    parts = drawn(name)
+    found, seen = one_pass(parts, (name,)).estimates[name], fed(name, parts)
+    none = {"n_failed": 0, "crash_rate_if_failed_had_crashed": seen.crash_rate}
+    assert found == replace(seen, details={**none, **seen.details})
+
+
+def test_the_second_state_begins_with_the_first_failure():
+    state = BothWays(accumulator("nade").seen)
+    state.add(block([True, False], weight_cap=1.0))
+    assert state._worst is None
+    state.add(block([False, False], failed=[True, False], first_episode=2, weight_cap=1.0))
+    assert state._worst is not None
+    assert state._worst.sums.n == state.seen.sums.n == 4
+
+
+def test_a_failed_test_has_the_weight_that_it_had():
+    some = block([True, False, False], [-2.0, -1.0, 0.0], failed=[False, True, False])
+    assert one_pass([some], ("nade",)).headline_estimate.details["crash_rate_if_failed_had_crashed"] == pytest.approx(
+        (np.exp(-2.0) + np.exp(-1.0)) / 3.0
+    )
+
+
+def test_no_crash_but_failures_leave_no_small_upper_bound():
+    n = 2_000
+    some = block([False] * n, method="nde", failed=[k < 20 for k in range(n)], weight_cap=1.0)
+    found = one_pass([some], ("nde", "nade")).estimates
+    for estimate in found.values():
+        assert estimate.crash_rate == estimate.ci_low == 0.0
+        assert estimate.upper_bound > 20 / n
+        assert estimate.ci_high > 20 / n
+
+
+def test_a_difference_allows_for_the_worst_of_each_side():
+    """Of 2,000 tests A crashes in 200 and fails in 40, B crashes in 100 and fails in 60 others."""
+    k = np.arange(2_000)
+    a = block((k < 200).tolist(), method="nde", failed=((k >= 1000) & (k < 1040)).tolist(), weight_cap=1.0)
+    b = block((k < 100).tolist(), method="nde", failed=((k >= 1500) & (k < 1560)).tolist(), weight_cap=1.0)
+    none = np.zeros(2_000, np.bool_)
+
+    def between(of_a: Block, of_b: Block):
+        return paired_difference([(replace(of_a, failed=none), replace(of_b, failed=none))], 0.9)
+
+    halves = [slice(0, 900), slice(900, 2_000)]
+    found = paired_difference([(a.take(rows), b.take(rows)) for rows in halves], 0.9)
+    seen = between(a, b)
+    assert (found.difference, found.std_error, found.ratio) == (seen.difference, seen.std_error, seen.ratio)
+    assert found.ci_high == between(a.failed_as_crashes(), b).ci_high > seen.ci_high
+    assert found.ci_low == between(a, b.failed_as_crashes()).ci_low < seen.ci_low
+    assert found.ratio_high == between(a.failed_as_crashes(), b).ratio_high > seen.ratio_high
+    assert found.ratio_low == between(a, b.failed_as_crashes()).ratio_low < seen.ratio_low
+    assert found.a.ci_high > seen.a.ci_high
+    assert "A FAILED in 40 and B in 60" in difference_statement(found, "one", "other")
+
+
+def test_required_numbers_of_tests_grow_with_failures():
+    whole = joined(some_failed(list(blocks(CHAIN, "step_mixture", [500] * 4, SEED)), first=0))
+    counted = whole.crash | whole.failed
+    weights = np.exp(whole.log_weight[counted])
+    procedure = Procedure(n_shuffles=3, first=200, ratio=2.0)
+    with_failed = plain_rhw(weights, len(whole), procedure, failed=whole.failed[counted])
+    without = plain_rhw(np.where(whole.failed[counted], 0.0, weights), len(whole), procedure)
+    assert np.all(with_failed[:, -1] > 1.5 * without[:, -1])
+    forgotten = replace(whole, failed=np.zeros_like(whole.failed))
+    assert np.all(scv_rhw(whole, procedure)[:, -1] > scv_rhw(forgotten, procedure)[:, -1])
