@@ -184,8 +184,10 @@ def test_all_settings_are_listed_with_their_meaning(reports):
 
 def test_hostile_texts_are_escaped_and_no_formula(tmp_path):
     hostile = "<script>alert('x')</script>$\\frac{&"
-    folder = write_run(tmp_path / "run", replace(RECIPES["no_crashes"], n_episodes=300, name=hostile))
-    estimates = estimates_of(folder)
+    folder = write_run(tmp_path / "run", replace(RECIPES["no_crashes"], n_episodes=300))
+    campaign = json.loads((folder / "campaign.yaml").read_text())
+    (folder / "campaign.yaml").write_text(json.dumps(campaign | {"description": hostile}))
+    estimates = estimates_of(folder) | {"campaign": hostile}
     estimates["estimates"][hostile] = {**estimates["estimates"]["nade"], "warnings": [hostile]}
     estimates |= {"statement": hostile, "headline": hostile}
     (folder / "estimates.json").write_text(json.dumps(estimates))
