@@ -41,18 +41,15 @@ html_additional_pages = {"index": "redirect.html"}  # a host shows index.html fi
 html_copy_source = html_show_sourcelink = False
 html_show_copyright = html_show_sphinx = False
 
-# Pages are listed beside the text in the order in which these name them.
-_LISTS = {"README": ("docs/index", "CONTRIBUTING", "CHANGELOG"), "docs/index": ()}
+_TOP = ("docs/index", "CONTRIBUTING", "CHANGELOG")
 _PAGE = re.compile(r"\]\(([\w/-]+)\.md\)")
 
 
-def _list_pages(app: Sphinx, page: str, source: list[str]) -> None:
-    """Add the tables of contents, which a code host would show as code, to the two pages that have one."""
-    if page in _LISTS:
-        pages = _LISTS[page] or tuple(dict.fromkeys(_PAGE.findall(source[0])))
-        source[0] += (
-            "\n```{toctree}\n:hidden:\n\n" + "\n".join(f"/{p}" if _LISTS[page] else p for p in pages) + "\n```\n"
-        )
+def _list_pages(_app: Sphinx, page: str, source: list[str]) -> None:
+    """Add tables of contents, which a code host would show as code: the pages that docs/index.md names, in order."""
+    pages = {"README": _TOP, "docs/index": dict.fromkeys(_PAGE.findall(source[0]))}.get(page, ())
+    if pages:
+        source[0] += "\n".join(["\n```{toctree}", ":hidden:", "", *pages, "```\n"])
 
 
 def setup(app: Sphinx) -> None:
