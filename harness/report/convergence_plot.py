@@ -149,7 +149,7 @@ def _draw_rhw(axes: Axes, curve: dict[str, Floats], target_rhw: float | None) ->
     known = np.isfinite(curve["rhw"]) & (curve["rhw"] > 0.0)
     if not known.any():
         _head(axes, _RHW)
-        axes.text(0.5, 0.5, "not recorded", transform=axes.transAxes, ha="center", color=MUTED)
+        axes.text(0.5, 0.5, "not known", transform=axes.transAxes, ha="center", color=MUTED)
         return
     n, rhw = curve["n"][known], curve["rhw"][known]
     axes.set_yscale("log")

@@ -86,7 +86,7 @@ def _coverage_notes(run: RunFolder, summary: RunSummary) -> list[str]:
     if asked_of_conditional(run):
         rhw = run.headline["details"]["conditional"]["rhw"]
     if target is not None and (rhw is None or not rhw <= target):
-        reached = "it is not defined without a crash" if rhw is None else f"it is {half_width(rhw)}"
+        reached = "it is not known" if rhw is None else f"it is {half_width(rhw)}"
         mend = MENDS.get(run.manifest.get("stopped_by") or "")
         why = f" ({mend})" if mend else ""
         notes.append(f"The asked relative half-width of {target:g} was not reached: {reached}{why}.")

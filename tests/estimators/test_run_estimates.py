@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from harness.errors import HarnessError, RunFolderError
 from harness.estimators import CampaignFacts, estimate_blocks, estimate_run
+from harness.estimators.statement import alarm_cautions, warned
 from harness.validation.chains.named import overtaking
 from harness.validation.chains.sampler import blocks
 from tests.chains.seed import SEED
@@ -123,6 +125,40 @@ def test_failed_tests_are_named_in_the_answer_itself(method):
     assert "Had they all crashed, the rate would be 0.27." in content["statement"]
     none = estimate_blocks([block(crashes, method=method, weight_cap=1.0)], facts())
     assert "FAILED" not in none["statement"]
+
+
+def test_unbounded_weights_lead_the_sentence_and_claim_no_precision(tmp_path):
+    content = estimate_run(write_run(tmp_path, drawn("step_mixture")))
+    unbounded = "the weights of these tests are unbounded: the true rate may lie far above this interval"
+    assert content["statement"].startswith(f"WARNING: {unbounded}. The crash rate is")
+    assert content["statements"]["scv"].startswith("WARNING: this interval is known to be too narrow; use nade's")
+    for name in ("nade", "scv", "martingale"):
+        assert "half-width" not in content["statements"][name]
+        assert content["estimates"][name]["rhw"] is None
+        assert (
+            content["estimates"][name]["cautions"]
+            == content["estimates"][name]["warnings"][: 2 if name == "scv" else 1]
+        )
+    assert {point["rhw"] for point in content["convergence"]} == {None}
+
+
+@pytest.mark.parametrize(("n", "doubts"), [(2_000, True), (20_000, False)])
+def test_one_crash_that_could_double_the_rate_leads_the_sentence(n, doubts):
+    """60 crashes of weight 0.001; one of the largest weight, 0.1, would count as much as 100 of them."""
+    crashes = [True] * (60 * n // 2_000) + [False] * (n - 60 * n // 2_000)
+    some = block(crashes, [-6.9] * n, method="forced", log_p_cut_in=np.full(n, np.log(0.1)))
+    content = estimate_blocks([some], facts())
+    caution = "WARNING: one more crash of the largest possible weight would add 1.65 times this rate"
+    assert content["statement"].startswith(caution) == doubts
+    assert ("relative half-width" in content["statement"]) != doubts
+
+
+def test_a_raised_alarm_leads_every_sentence():
+    rates = {"p_value_holm": 1e-9, "p_value_jointly": 0.5}
+    (caution,) = alarm_cautions({"raised": True, "surrogate_crash_rates": rates})
+    assert warned([caution], "The crash rate is 1.").startswith("WARNING: ALARM, replayed surrogates do not crash")
+    assert "p-value 1.0e-09" in caution
+    assert alarm_cautions({"raised": False, "surrogate_crash_rates": {}}) == []
 
 
 def test_estimators_that_the_records_do_not_allow_are_there_with_the_reason(tmp_path):

@@ -1,0 +1,74 @@
+"""A run says which condition decided when it ended."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from harness.campaign.models import Stop
+from harness.estimators import StopRule
+from harness.stopped_by import ending
+from tests.estimators.test_stopping import passing
+
+
+def looked_at(looks: list[dict], **stop) -> StopRule:
+    rule = StopRule(Stop(episodes=200 * len(looks), rhw=0.3, **stop), "forced", 200)
+    for n, changes in zip(rule.looks, looks, strict=True):
+        if rule.observe(n, replace(passing(n), **changes)):
+            break
+    return rule
+
+
+FEW, WIDE, HEAVY = {"n_crashes": 5}, {"rhw": 0.4}, {"weight_cap": 1e9}
+WRONG = {"cautions": ("unbounded",)}
+
+
+@pytest.mark.parametrize(
+    ("looks", "reached", "waited_for"),
+    [
+        ([{}, {}], True, ()),
+        ([WIDE, FEW, {}, {}], True, ("stop.min_crashes (50)",)),
+        ([FEW, WIDE, {}, {}], True, ("stop.rhw (0.3)",)),
+        ([HEAVY, {}, {}], True, ("stop.rhw (0.3) for one more crash of the largest possible weight",)),
+        ([WIDE | FEW, WIDE | FEW], False, ("stop.rhw (0.3)", "stop.min_crashes (50)")),
+        ([WIDE, {}], False, ("the same at a second look",)),
+        ([WRONG, WRONG, WRONG], False, ("stop.rhw (0.3)",)),
+    ],
+)
+def test_the_rule_remembers_what_was_missing(looks, reached, waited_for):
+    rule = looked_at(looks, min_crashes=50)
+    assert (rule.reached, rule.waited_for) == (reached, waited_for)
+
+
+@pytest.mark.parametrize(
+    ("stopped_by", "waited_for", "asked", "sentence"),
+    [
+        ("rhw", ("stop.min_crashes (3,000)",), True, ": the last condition to be met was stop.min_crashes (3,000)."),
+        ("rhw", (), True, ": every condition was met at the first look."),
+        ("episodes", (), False, ": stop.episodes was all that was asked for."),
+        (
+            "episodes",
+            ("stop.rhw (0.1)", "stop.min_crashes (50)"),
+            True,
+            " without stop.rhw (0.1) and stop.min_crashes (50): stop.episodes was spent; raise it and go on with "
+            "--resume.",
+        ),
+        (
+            "pool_error",
+            ("stop.rhw (0.01)",),
+            True,
+            " without stop.rhw (0.01): the pool's own error alone is wider; lower pool.relative_error and use a new "
+            "folder.",
+        ),
+        (
+            "pool",
+            (),
+            False,
+            ": all cut-ins that the pool keeps of a shell were tested; raise pool.cut_ins_per_shell and use a new "
+            "folder.",
+        ),
+    ],
+)
+def test_every_end_has_its_sentence(stopped_by, waited_for, asked, sentence):
+    assert ending(stopped_by, 46_735, waited_for, precision_asked=asked) == "Stopped after 46,735 tests" + sentence
