@@ -71,6 +71,7 @@ class Result:
 class Replay:
     bit_equal: bool | None
     outcome: str = "crash"
+    suspects: str = "The controller's source file has been changed since the run."
     trace: pa.Table = field(
         default_factory=lambda: pa.table(
             {"step": pa.array([0, 1], pa.int16()), "vehicle": pa.array(["LV", "BV"]).dictionary_encode()}
@@ -425,7 +426,7 @@ def test_replay_that_differs_is_an_error(calls, capsys, tmp_path):
     assert main(["replay", str(tmp_path), "17"]) == 3
     out, err = capsys.readouterr()
     assert out == "episode 17: crash; NOT as stored\n"
-    assert "manifest.json" in err
+    assert "mend:     The controller's source file has been changed" in err
     calls["stand_in"]("harness.runner.replay_episode", Replay(bit_equal=None))
     assert main(["replay", str(tmp_path), "17"]) == 0
     assert "no stored trace" in capsys.readouterr().out

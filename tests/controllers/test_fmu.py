@@ -8,7 +8,7 @@ import pytest
 
 from harness.campaign.loading import load_campaign
 from harness.controllers import EpisodeStart, Neighbour, Observation
-from harness.controllers.loading import require_controller
+from harness.controllers.loading import build_host, require_controller
 from harness.errors import CampaignError
 from harness.runner.prepare import content_hash
 
@@ -110,7 +110,7 @@ def test_without_the_extra_its_name_is_said(fmu, tmp_path, monkeypatch):
 
     monkeypatch.setattr(builtins, "__import__", missing)
     with pytest.raises(CampaignError, match=r"pip install 'harness\[fmi\]'"):
-        check(fmu, tmp_path, "inputs: {speed_mps: x}, output: total")
+        build_host(load(tmp_path, f"{{file: '{fmu}', inputs: {{speed_mps: x}}, output: total}}").av, n_cells=1, seed=0)
 
 
 def test_the_path_is_relative_to_the_campaign_and_the_content_counts(fmu, tmp_path):

@@ -169,8 +169,11 @@ def test_an_episode_forgets_the_last_ones_command():
 
 
 class Twice:
-    def __init__(self, traci, speed, log):
-        self.traci, self.speed, self.log = traci, speed, log
+    log = []
+
+    def __init__(self, traci, speed, told):
+        self.traci, self.speed = traci, speed
+        told.append(speed)
 
     def step(self, t):
         self.log.append(t)
@@ -182,10 +185,11 @@ class Twice:
 
 
 def test_a_step_listener_is_removed_when_it_says_so():
-    log = []
-    controller = StepListenerController(f"{__name__}:Twice", speed=19.0, log=log)
+    log, told = Twice.log, []
+    controller = StepListenerController(f"{__name__}:Twice", speed=19.0, told=told)
     controller.start(start())
     assert [controller.step(seen(0.1 * i)) for i in range(3)] == pytest.approx([-10.0] * 3)
     assert log == [0.0, 0.1, "clean"]
     controller.close()
     assert log == [0.0, 0.1, "clean"]
+    assert told == []  # each episode's listener has parameters of its own
