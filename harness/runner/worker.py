@@ -94,8 +94,8 @@ class ShardRunner:
         prescribed = self._prepared.prescribed
         if prescribed is None:
             return self._loop.run(spec.first_episode, self._prepared.states(spec.first_episode, spec.n_episodes))
-        states, script, rows = prescribed.episodes(spec.draws)
-        shard = self._loop.run(spec.first_episode, states, script)
+        states, traffic, rows = prescribed.episodes(spec.draws)
+        shard = self._loop.run(spec.first_episode, states, traffic)
         shard.cut_ins = rows
         return shard
 
