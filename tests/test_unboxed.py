@@ -51,6 +51,8 @@ def test_kernels_read_every_kind_of_field_and_write_to_the_same_arrays():
     plain.inner.total[:] = 0.0
     assert add_up(for_kernels, 2.0) == 7
     assert plain.inner.total.tolist() == [6.0, 10.0, 14.0]
+    plain.numbers["count"] = 9
+    assert add_up(for_kernels, 0.0) == 9
 
 
 def test_it_keeps_alive_what_it_points_to():
