@@ -1,8 +1,11 @@
 """The cache of challenge tables: by content, read when there, built again when damaged."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+from harness.campaign.loading import load_campaign
 from harness.campaign.models import IDMParameters
 from harness.criticality import tables as cache
 from harness.criticality.tables import Tables, build_tables, table_path, tables_cached, tables_hash
@@ -92,10 +95,12 @@ def test_tables_are_mapped_and_nobody_can_write_to_them(folder, built):
             assert isinstance(mapped_by(table), np.memmap)
 
 
-def test_kernels_are_compiled_once_for_campaigns_with_and_without_tables(folder, built, smoke):
+def test_kernels_are_compiled_once_for_campaigns_with_and_without_tables(folder, built):
     """A read-only array is another type than a writable one."""
     tables = build_tables(environment(), DRIVER, "immediate")
-    naturalistic = build_importance(smoke("testing.method=nde"), None)
+    naturalistic = build_importance(
+        load_campaign(Path(__file__).parents[2] / "scenarios" / "overtaking_nde.yaml"), None
+    )
     for name, table in tables._asdict().items():
         assert getattr(naturalistic, name).flags.writeable == table.flags.writeable
 
