@@ -18,6 +18,7 @@ import numpy as np
 from benchmarks.one_at_a_time import OverTraci, in_libsumo, sumo_binary
 from harness.campaign.loading import load_campaign
 from harness.campaign.models import Campaign
+from harness.episode import loop
 from harness.episode.loop import Shard
 from harness.records.folder import write_shard
 from harness.records.tables import shard_tables
@@ -104,7 +105,8 @@ class WithParts(Recorded):
     def __init__(self, settings: Campaign, world: Callable[[Campaign], World]) -> None:
         super().__init__(settings, world)
         self._seconds: dict[str, float] = {}
-        self._time(self.loop, "_turn", "policy")
+        for kernel in ("refill", "decide", "respond", "command", "judge"):
+            self._time(loop, kernel, "policy")
         self._time(self.world, "place", "refill")
         self._time(self.world, "_contacts", "collisions")
         self._time(self, "write", "recording")
@@ -154,7 +156,7 @@ class Floor:
         wall_s = cpu_s = 0.0
         for i in range(rounds):
             world.x[:] = [250.0, 200.0, 100.0]
-            world.v[:] = self._prepared.states(first + i * cells, cells)[:, :1]
+            world.v[:] = self._prepared.states(first + i * cells, cells)["v_bv_mps"][:, None]
             world.place(np.arange(cells), world.x, world.v)
             wall, cpu = time.perf_counter(), time.process_time()
             for _ in range(FLOOR_STEPS):
@@ -182,7 +184,7 @@ class BareOneAtATime:
         """Full-length episodes at constant speed."""
         cell, nobody = np.zeros(1, np.int64), np.zeros(1, np.int8)
         for state in self._prepared.states(first, n):
-            x, v = np.array([[250.0, 200.0, 100.0]]), np.full((1, 3), state[0])
+            x, v = np.array([[250.0, 200.0, 100.0]]), np.full((1, 3), state["v_bv_mps"])
             self._world.place(cell, x, v)
             for _ in range(FLOOR_STEPS):
                 self._world.step(v, nobody)

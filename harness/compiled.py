@@ -25,6 +25,8 @@ KERNEL_SOURCES = (
     "maneuvers.py",
     "outcomes.py",
     "random_stream.py",
+    "state.py",
+    "unboxed.py",
     "environment/*.py",
     "vehicles/*.py",
     "controllers/protocol.py",

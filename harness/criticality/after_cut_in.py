@@ -136,7 +136,7 @@ def build_after_cut_in(environment: Environment, driver: RecordArray) -> tuple[F
     """
     speeds, gaps, rates = uniform_points(AFTER_V), quadratic_points(AFTER_R2), uniform_points(AFTER_RATE)
     shape = (speeds.size, gaps.size, rates.size)
-    hold = int(environment.numbers["hold_steps"][0])
+    hold = int(environment.numbers["hold_steps"])
     pmf = np.empty((speeds.size, N_ACCELERATIONS))
     free_driving_table(speeds, environment, pmf)
     after = np.empty((*shape, N_ACCELERATIONS, 3), np.float32)

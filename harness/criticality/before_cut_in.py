@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from harness.arrays import Float32Array, FloatArray
+from harness.arrays import Float32Array, FloatArray, RecordArray
 from harness.compiled import compiled_inline, compiled_threads
 from harness.criticality.grid import (
     BEFORE_R2,
@@ -55,7 +55,7 @@ def period_value(
     later: Float32Array,
 ) -> float:
     """Expected challenge per unit of OL over one hold period and after it, with a known acceleration."""
-    n = environment.numbers[0]
+    n = environment.numbers
     follower = speed - r2dot
     total = 0.0
     for i in range(n.hold_steps):
@@ -107,12 +107,12 @@ def backward_period(
 
 
 @compiled_threads
-def mean_car_following_pmf(states: FloatArray, environment: Environment, out: FloatArray) -> None:
-    """Car-following probabilities averaged over states (n, 5), written to ``out`` (31,)."""
+def mean_car_following_pmf(states: RecordArray, environment: Environment, out: FloatArray) -> None:
+    """Car-following probabilities averaged over states (n,), written to ``out`` (31,)."""
     one = np.empty(N_ACCELERATIONS)
     out[:] = 0.0
     for i in range(states.shape[0]):
-        car_following_pmf(states[i, 0], states[i, 1], states[i, 2], environment, one)
+        car_following_pmf(states[i], environment, one)
         for k in range(N_ACCELERATIONS):
             out[k] += one[k] / states.shape[0]
 
@@ -151,7 +151,7 @@ def build_before_cut_in(
         Challenge per unit of OL (dimensionless); zero at R2 = 0 and at the end of the episode.
     """
     speeds, gaps, rates = uniform_points(BEFORE_V), quadratic_points(BEFORE_R2), uniform_points(BEFORE_RATE)
-    hold, steps = int(environment.numbers["hold_steps"][0]), int(environment.numbers["max_steps"][0])
+    hold, steps = int(environment.numbers["hold_steps"]), int(environment.numbers["max_steps"])
     periods = -(-steps // hold)
     table = np.zeros((periods + 1, speeds.size, gaps.size, rates.size), np.float32)
     for period in range(periods - 1, -1, -1):

@@ -100,7 +100,7 @@ def build_immediate(environment: Environment, driver: RecordArray) -> tuple[Floa
     """Tables of one surrogate, in metres; the shapes are those of `build_after_cut_in`."""
     speeds, gaps, rates = uniform_points(AFTER_V), quadratic_points(AFTER_R2), uniform_points(AFTER_RATE)
     shape = (speeds.size, gaps.size, rates.size)
-    hold = int(environment.numbers["hold_steps"][0])
+    hold = int(environment.numbers["hold_steps"])
     value = np.empty((LEVELS + 1, *shape), np.float32)
     maneuvers = np.empty((*shape, N_ACCELERATIONS), np.float32)
 

@@ -1,4 +1,7 @@
-"""Challenge tables of a set of surrogates: built once, kept on disk under the hash of all that they depend on."""
+"""Challenge tables of a set of surrogates: built once, kept on disk under the hash of all that they depend on.
+
+They are mapped from there, read-only, so that all processes of a machine share one copy.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,6 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import NamedTuple
-from zipfile import BadZipFile
 
 import numpy as np
 
@@ -24,7 +26,7 @@ from harness.environment.driving import Environment
 from harness.errors import writing
 from harness.vehicles.models import MODEL_FIELDS
 
-_FORMAT = 2
+_FORMAT = 3
 """Raise it when the meaning of a table changes."""
 
 
@@ -41,37 +43,39 @@ class Tables(NamedTuple):
     before: Float32Array
 
 
-def tables_hash(environment: Environment, driver: RecordArray, challenge: str) -> str:
-    """Hash of what one surrogate's tables depend on; the level of lane changing is not among it."""
+def tables_hash(environment: Environment, drivers: RecordArray, challenge: str) -> str:
+    """Hash of what the surrogates' tables depend on; the level of lane changing is not among it."""
     numbers = {
-        name: environment.numbers[name][0].item() for name in environment.numbers.dtype.fields or () if name != "level"
+        name: environment.numbers[name].item() for name in environment.numbers.dtype.fields or () if name != "level"
     }
     axes = {name: list(value) for name, value in vars(grid).items() if isinstance(value, grid.Axis)}
-    surrogate = {name: driver[name][0].item() for name in MODEL_FIELDS}
-    content = json.dumps([_FORMAT, challenge, numbers, axes, surrogate, LEVELS], sort_keys=True)
+    surrogates = [[driver[name].item() for name in MODEL_FIELDS] for driver in drivers]
+    content = json.dumps([_FORMAT, challenge, numbers, axes, MODEL_FIELDS, surrogates, LEVELS], sort_keys=True)
     return hashlib.sha256(content.encode()).hexdigest()[:24]
 
 
-def table_path(environment: Environment, driver: RecordArray, challenge: str) -> Path:
-    """Where the tables of one surrogate are cached."""
-    return cache_root() / "tables" / f"{tables_hash(environment, driver, challenge)}.npz"
+def table_path(environment: Environment, drivers: RecordArray, challenge: str) -> Path:
+    """Where the tables of a set of surrogates are cached."""
+    return cache_root() / "tables" / f"{tables_hash(environment, drivers, challenge)}.npy"
 
 
 def _load(path: Path) -> Tables | None:
     try:
-        with path.open("rb") as file, np.load(file) as stored:  # a damaged file would be left open by np.load
-            return Tables(stored["value"], stored["maneuvers"], stored["before"])
-    except (OSError, ValueError, KeyError, EOFError, BadZipFile):
+        stored = np.asarray(np.load(path, mmap_mode="r"))  # a plain array: numba would take a memmap for something else
+        return Tables(*(stored[name][0] for name in Tables._fields))
+    except (OSError, ValueError, IndexError, EOFError):
         return None  # absent or damaged: it is built again
 
 
 def _save(path: Path, tables: Tables) -> None:
+    """Write the tables as the fields of one record: one file, in which each lies in one piece."""
+    dtype = [(name, table.dtype, table.shape) for name, table in zip(Tables._fields, tables, strict=True)]
     with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         handle, name = tempfile.mkstemp(dir=path.parent, suffix=".tmp")
         try:
             with os.fdopen(handle, "wb") as file:
-                np.savez(file, **tables._asdict())
+                np.save(file, np.array([tuple(tables)], dtype))
             Path(name).replace(path)
         finally:
             Path(name).unlink(missing_ok=True)
@@ -81,7 +85,7 @@ def _build_one(environment: Environment, driver: RecordArray, challenge: str) ->
     if challenge == "immediate":
         return Tables(*build_immediate(environment, driver), np.zeros((0, 2, 2, 2), np.float32))
     value, maneuvers = build_after_cut_in(environment, driver)
-    steps_per_level = level_steps(int(environment.numbers["hold_steps"][0]))
+    steps_per_level = level_steps(int(environment.numbers["hold_steps"]))
     before = build_before_cut_in(environment, value, naturalistic_pmf(environment), steps_per_level)
     return Tables(value, maneuvers, before)
 
@@ -98,29 +102,30 @@ def build_tables(
     challenge : str
         ``recursive`` or ``immediate``.
     done : callable
-        Called with 1 for every surrogate that is ready.
+        Called with the number of surrogates that have become ready.
 
     Returns
     -------
     Tables
-        With the surrogates as first axis.
+        Read-only, with the surrogates as first axis.
     """
+    path = table_path(environment, drivers, challenge)
+    tables = _load(path)
+    if tables is not None:
+        done(drivers.size)
+        return tables
 
     def one(j: int) -> Tables:
-        driver = drivers[j : j + 1]
-        path = table_path(environment, driver, challenge)
-        tables = _load(path)
-        if tables is None:
-            tables = _build_one(environment, driver, challenge)
-            _save(path, tables)
+        built = _build_one(environment, drivers[j : j + 1], challenge)
         done(1)
-        return tables
+        return built
 
     with ThreadPoolExecutor(os.cpu_count()) as threads:
         parts = list(threads.map(one, range(drivers.size)))
-    return Tables(*(np.stack(arrays) for arrays in zip(*parts, strict=True)))
+    _save(path, Tables(*(np.stack(arrays) for arrays in zip(*parts, strict=True))))
+    return build_tables(environment, drivers, challenge, lambda _: None)
 
 
 def tables_cached(environment: Environment, drivers: RecordArray, challenge: str) -> bool:
-    """Whether all tables are on disk."""
-    return all(table_path(environment, drivers[j : j + 1], challenge).exists() for j in range(drivers.size))
+    """Whether they are on disk."""
+    return table_path(environment, drivers, challenge).exists()

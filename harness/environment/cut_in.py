@@ -12,15 +12,16 @@ import math
 
 from harness.compiled import compiled_inline
 from harness.environment.driving import Environment, clamp, fit_u
+from harness.state import State
 
 
 @compiled_inline
-def opportunity(speed: float, r1: float, r1dot: float, environment: Environment) -> float:
+def opportunity(state: State, environment: Environment) -> float:
     """OL, the rate per one-second decision at which BV wants to leave its lane (before the level is limited)."""
-    n = environment.numbers[0]
-    u = fit_u(speed, environment)
-    gap = clamp(r1, n.fit_range__r1_min_m, n.fit_range__r1_max_m)
-    q = clamp(r1dot, -n.cut_in__rate_clamp_mps, n.cut_in__rate_clamp_mps) / n.cut_in__rate_scale_mps
+    n = environment.numbers
+    u = fit_u(state.v_bv_mps, environment)
+    gap = clamp(state.r1_m, n.fit_range__r1_min_m, n.fit_range__r1_max_m)
+    q = clamp(state.r1dot_mps, -n.cut_in__rate_clamp_mps, n.cut_in__rate_clamp_mps) / n.cut_in__rate_scale_mps
     exponent = (
         n.cut_in__intercept
         + n.cut_in__u * u
@@ -35,7 +36,7 @@ def opportunity(speed: float, r1: float, r1dot: float, environment: Environment)
 @compiled_inline
 def acceptance(r2: float, r2dot: float, environment: Environment) -> float:
     """Share of wished lane changes carried out in front of an AV that closes from R2 at -R2dot."""
-    n = environment.numbers[0]
+    n = environment.numbers
     if r2 <= 0.0:
         return 0.0
     accept = 1.0
@@ -48,6 +49,6 @@ def acceptance(r2: float, r2dot: float, environment: Environment) -> float:
 @compiled_inline
 def cut_in_hazard(opportunity_1s: float, accepted: float, environment: Environment) -> float:
     """Cumulative hazard -ln(1 - p) of one step."""
-    n = environment.numbers[0]
+    n = environment.numbers
     p_1s = min(opportunity_1s * accepted, n.cut_in__max_probability_1s)
     return float(-n.scenario__step_s * math.log1p(-p_1s))

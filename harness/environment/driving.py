@@ -11,38 +11,37 @@ from typing import NamedTuple
 
 import numpy as np
 
-from harness.arrays import FloatArray, RecordArray
+from harness.arrays import FloatArray, Record
 from harness.compiled import compiled_inline
 from harness.environment.student_t import t_cdf, t_table
 from harness.maneuvers import ACCELERATIONS_MPS2, N_ACCELERATIONS, acceleration, upper_edge
+from harness.state import State
 
 
 class Environment(NamedTuple):
     """All that kernels need of the environment.
 
-    ``numbers`` is the parameter record (shape (1,)); ``free_t`` and ``following_t`` are tables of Student's t;
+    ``numbers`` is the parameter record; ``free_t`` and ``following_t`` are tables of Student's t;
     ``brake_cumulative`` (31,) is the cumulative brake component of free driving.
     """
 
-    numbers: RecordArray
+    numbers: Record
     free_t: FloatArray
     following_t: FloatArray
     brake_cumulative: FloatArray
 
 
-def build_environment(numbers: RecordArray) -> Environment:
+def build_environment(numbers: Record) -> Environment:
     """Tables of an environment from its parameter record."""
-    n = numbers[0]
     braking = np.where(
-        n["free_driving__brake_max_mps2"] + 1e-9 >= ACCELERATIONS_MPS2,
-        np.exp(n["free_driving__brake_slope_s2pm"] * ACCELERATIONS_MPS2),
+        numbers["free_driving__brake_max_mps2"] + 1e-9 >= ACCELERATIONS_MPS2,
+        np.exp(numbers["free_driving__brake_slope_s2pm"] * ACCELERATIONS_MPS2),
         0.0,
     )
     cumulative = np.cumsum(braking) / braking.sum()
     cumulative[-1] = 1.0
-    return Environment(
-        numbers, t_table(float(n["free_driving__df"])), t_table(float(n["car_following__df"])), cumulative
-    )
+    free_t, following_t = (t_table(float(numbers[name])) for name in ("free_driving__df", "car_following__df"))
+    return Environment(numbers, free_t, following_t, cumulative)
 
 
 @compiled_inline
@@ -54,7 +53,7 @@ def clamp(x: float, low: float, high: float) -> float:
 @compiled_inline
 def fit_u(speed: float, environment: Environment) -> float:
     """U = (v - 30)/10 with v clamped to the fit range."""
-    n = environment.numbers[0]
+    n = environment.numbers
     v = clamp(speed, n.fit_range__v_min_mps, n.fit_range__v_max_mps)
     return float((v - n.fit_range__v_centre_mps) / n.fit_range__v_scale_mps)
 
@@ -62,7 +61,7 @@ def fit_u(speed: float, environment: Environment) -> float:
 @compiled_inline
 def free_driving_shape(speed: float, environment: Environment) -> tuple[float, float]:
     """Weight of the brake component, and 1/scale of the t component, at a speed."""
-    n = environment.numbers[0]
+    n = environment.numbers
     u = fit_u(speed, environment)
     log_scale = n.free_driving__log_scale + n.free_driving__log_scale_u * u + n.free_driving__log_scale_uu * (u * u)
     weight = 1.0 / (1.0 + math.exp(-(n.free_driving__brake_logit + n.free_driving__brake_logit_u * u)))
@@ -74,7 +73,7 @@ def free_driving_cdf(k: int, weight: float, inverse_scale: float, environment: E
     """P(A ≤ a_k) in free driving."""
     if k >= N_ACCELERATIONS - 1:
         return 1.0
-    z = (upper_edge(k) - environment.numbers[0].free_driving__location_mps2) * inverse_scale
+    z = (upper_edge(k) - environment.numbers.free_driving__location_mps2) * inverse_scale
     return float((1.0 - weight) * t_cdf(z, environment.free_t) + weight * environment.brake_cumulative[k])
 
 
@@ -104,10 +103,11 @@ def free_driving_pmf(speed: float, environment: Environment, out: FloatArray) ->
 
 
 @compiled_inline
-def car_following_mean(speed: float, r1: float, r1dot: float, environment: Environment) -> float:
+def car_following_mean(state: State, environment: Environment) -> float:
     """Mean acceleration (m/s²) of BV behind LV."""
-    n = environment.numbers[0]
-    v = clamp(speed, n.fit_range__v_min_mps, n.fit_range__v_max_mps)
+    n = environment.numbers
+    r1, r1dot = state.r1_m, state.r1dot_mps
+    v = clamp(state.v_bv_mps, n.fit_range__v_min_mps, n.fit_range__v_max_mps)
     gap = clamp(r1, n.fit_range__r1_min_m, n.fit_range__r1_max_m)
     median = (
         n.car_following__median_gap_m + n.car_following__median_gap_v * v + n.car_following__median_gap_vv * (v * v)
@@ -124,18 +124,18 @@ def car_following_mean(speed: float, r1: float, r1dot: float, environment: Envir
 
 
 @compiled_inline
-def guard_cap(r1: float, r1dot: float, environment: Environment) -> int:
+def guard_cap(state: State, environment: Environment) -> int:
     """Largest acceleration index that the guard allows.
 
     The largest a with R1 + R1dot h - (a + b_L) h²/2 - max(0, -R1dot + (a + b_L) h)²/(2 b) ≥ margin, or -4 m/s².
     """
-    n = environment.numbers[0]
+    n = environment.numbers
     h = n.guard__horizon_s
     k = N_ACCELERATIONS - 1
     while k > 0:
         closing_acceleration = acceleration(k) + n.guard__lead_braking_mps2
-        gap = r1 + r1dot * h - 0.5 * closing_acceleration * (h * h)
-        closing = max(0.0, closing_acceleration * h - r1dot)
+        gap = state.r1_m + state.r1dot_mps * h - 0.5 * closing_acceleration * (h * h)
+        closing = max(0.0, closing_acceleration * h - state.r1dot_mps)
         if gap - (closing * closing) / (2.0 * n.guard__own_braking_mps2) >= n.guard__margin_m:
             break
         k -= 1
@@ -153,17 +153,17 @@ def car_following_cdf(k: int, cap: int, mean: float, inverse_scale: float, envir
 @compiled_inline
 def car_following_inverse_scale(r1dot: float, environment: Environment) -> float:
     """1/scale (s²/m) of the car-following noise."""
-    n = environment.numbers[0]
+    n = environment.numbers
     rate = min(abs(r1dot), n.car_following__rate_cap_mps)
     return math.exp(-(n.car_following__log_scale + n.car_following__log_scale_rate * rate))
 
 
 @compiled_inline
-def draw_car_following(u: float, speed: float, r1: float, r1dot: float, environment: Environment) -> int:
+def draw_car_following(u: float, state: State, environment: Environment) -> int:
     """Acceleration index of BV behind LV by inversion of a uniform."""
-    mean = car_following_mean(speed, r1, r1dot, environment)
-    inverse_scale = car_following_inverse_scale(r1dot, environment)
-    cap = guard_cap(r1, r1dot, environment)
+    mean = car_following_mean(state, environment)
+    inverse_scale = car_following_inverse_scale(state.r1dot_mps, environment)
+    cap = guard_cap(state, environment)
     low, high = 0, cap
     while low < high:
         middle = (low + high) // 2
@@ -175,11 +175,11 @@ def draw_car_following(u: float, speed: float, r1: float, r1dot: float, environm
 
 
 @compiled_inline
-def car_following_pmf(speed: float, r1: float, r1dot: float, environment: Environment, out: FloatArray) -> None:
+def car_following_pmf(state: State, environment: Environment, out: FloatArray) -> None:
     """Probabilities of the 31 accelerations of BV behind LV, written to ``out`` (31,)."""
-    mean = car_following_mean(speed, r1, r1dot, environment)
-    inverse_scale = car_following_inverse_scale(r1dot, environment)
-    cap = guard_cap(r1, r1dot, environment)
+    mean = car_following_mean(state, environment)
+    inverse_scale = car_following_inverse_scale(state.r1dot_mps, environment)
+    cap = guard_cap(state, environment)
     below = 0.0
     for k in range(N_ACCELERATIONS):
         upto = car_following_cdf(k, cap, mean, inverse_scale, environment)

@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 from scipy import special
 
-from harness.arrays import FloatArray, RecordArray
+from harness.arrays import FloatArray, Record, RecordArray
 from harness.random_stream import INITIAL, uniforms
+from harness.state import STATE_COLUMNS, states_from
 
-N_STATE = 5
-V_BV, R1, R1DOT, R2, R2DOT = range(N_STATE)
 _GRID = 8001
 
 
@@ -18,12 +17,12 @@ class InitialStates:
 
     Parameters
     ----------
-    numbers : structured ndarray, shape (1,)
-        Parameter record of the environment.
+    numbers : record
+        Parameters of the environment.
     """
 
-    def __init__(self, numbers: RecordArray) -> None:
-        self._n = numbers[0]
+    def __init__(self, numbers: Record) -> None:
+        self._n = numbers
         n = self._n
         self._v_grid = np.linspace(n["fit_range__v_min_mps"], n["fit_range__v_max_mps"], _GRID)
         shape, location, scale = (float(n[f"initial_state__v_{k}"]) for k in ("shape", "location_mps", "scale_mps"))
@@ -36,32 +35,33 @@ class InitialStates:
         """P(v_BV ≤ v) on a grid over the fit range."""
         return self._v_cdf
 
-    def draw(self, seed: int, first_episode: int, n_episodes: int) -> FloatArray:
+    def draw(self, seed: int, first_episode: int, n_episodes: int) -> RecordArray:
         """States of consecutive episodes.
 
         Returns
         -------
-        ndarray of float64, shape (n_episodes, 5)
-            v_BV (m/s), R1 (m), R1dot (m/s), R2 (m), R2dot (m/s).
+        structured ndarray, shape (n_episodes,)
+            Of `STATE_DTYPE`.
         """
-        return self.from_uniforms(uniforms(seed, first_episode, n_episodes, INITIAL, N_STATE))
+        return self.from_uniforms(uniforms(seed, first_episode, n_episodes, INITIAL, len(STATE_COLUMNS)))
 
-    def from_uniforms(self, u: FloatArray) -> FloatArray:
-        """States from uniforms, shape (n, 5) → (n, 5)."""
-        n = self._n
-        v = np.interp(u[:, V_BV], self._v_cdf, self._v_grid)
-        r1 = self._gap(u[:, R1], v)
-        r1dot = self._rate(u[:, R1DOT], v, r1)
-        r2 = n["initial_state__r2_min_m"] + u[:, R2] * (n["initial_state__r2_max_m"] - n["initial_state__r2_min_m"])
+    def from_uniforms(self, u: FloatArray) -> RecordArray:
+        """States (n,) from uniforms (n, 5), one for each of their numbers."""
+        n, of = self._n, states_from(u.T)
+        v = np.interp(of["v_bv_mps"], self._v_cdf, self._v_grid)
+        r1 = self._gap(of["r1_m"], v)
+        r1dot = self._rate(of["r1dot_mps"], v, r1)
+        r2 = n["initial_state__r2_min_m"] + of["r2_m"] * (n["initial_state__r2_max_m"] - n["initial_state__r2_min_m"])
         span = n["initial_state__r2dot_max_mps"] - n["initial_state__r2dot_min_mps"]
-        r2dot = n["initial_state__r2dot_min_mps"] + u[:, R2DOT] * span
-        return np.column_stack([v, r1, r1dot, r2, r2dot])
+        r2dot = n["initial_state__r2dot_min_mps"] + of["r2dot_mps"] * span
+        return states_from([v, r1, r1dot, r2, r2dot])
 
-    def given_speed(self, speed: float, gap_u: FloatArray, rate_u: FloatArray) -> FloatArray:
-        """States at a fixed v_BV (m/s) from uniforms for R1 and R1dot, each (n,); columns v_BV, R1, R1dot: (n, 3)."""
+    def given_speed(self, speed: float, gap_u: FloatArray, rate_u: FloatArray) -> RecordArray:
+        """States (n,) at a fixed v_BV (m/s) from uniforms for R1 and R1dot, each (n,); the AV is nowhere."""
         v = np.full(gap_u.size, speed)
         r1 = self._gap(gap_u, v)
-        return np.column_stack([v, r1, self._rate(rate_u, v, r1)])
+        nowhere = np.full_like(v, np.nan)
+        return states_from([v, r1, self._rate(rate_u, v, r1), nowhere, nowhere])
 
     def _u(self, v: FloatArray) -> FloatArray:
         u: FloatArray = (v - self._n["fit_range__v_centre_mps"]) / self._n["fit_range__v_scale_mps"]

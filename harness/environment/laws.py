@@ -6,6 +6,7 @@ of a distribution, a share that rounds to zero.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from itertools import product
 
@@ -24,6 +25,7 @@ from harness.environment.driving import (
 from harness.environment.initial_state import InitialStates
 from harness.errors import CampaignError
 from harness.maneuvers import N_ACCELERATIONS
+from harness.state import State
 
 PROBABILITIES = np.array([2.0**-53, 1e-6, 1e-3, 0.01, 0.1, 0.5, 0.9, 0.99, 0.999, 1.0 - 1e-6, 1.0 - 2.0**-53])
 """Where quantiles are evaluated: the ends are the smallest and the largest uniform that is drawn, but zero."""
@@ -52,7 +54,7 @@ def require_sound_laws(environment: Environment, file: str) -> None:
     CampaignError
         Names the law, and the state in which it fails.
     """
-    n = environment.numbers[0]
+    n = environment.numbers
     speeds = np.linspace(n["fit_range__v_min_mps"], n["fit_range__v_max_mps"], 9)
     gaps = np.linspace(n["fit_range__r1_min_m"], n["fit_range__r1_max_m"], 9)
     _require_initial_states(environment, speeds, file)
@@ -84,7 +86,7 @@ def require_sound_laws(environment: Environment, file: str) -> None:
 
 
 def _require_initial_states(environment: Environment, speeds: FloatArray, file: str) -> None:
-    n = environment.numbers[0]
+    n = environment.numbers
     with np.errstate(all="ignore"):
         initial = InitialStates(environment.numbers)
         steps = np.diff(initial.speed_distribution)
@@ -96,7 +98,8 @@ def _require_initial_states(environment: Environment, speeds: FloatArray, file: 
         )
         for speed in speeds:
             states = initial.given_speed(speed, *(u.ravel() for u in np.meshgrid(PROBABILITIES, PROBABILITIES)))
-            r1, rate = states[: PROBABILITIES.size, 1], states[:, 2].reshape(PROBABILITIES.size, -1)
+            r1 = states["r1_m"][: PROBABILITIES.size]
+            rate = states["r1dot_mps"].reshape(PROBABILITIES.size, -1)
             inside = (r1 >= n["fit_range__r1_min_m"] - 1e-6) & (r1 <= n["fit_range__r1_max_m"] + 1e-6)
             rises = np.append(r1[2:] > r1[:-2], [True, True])  # pairs, because the outermost two may agree
             _require(
@@ -146,8 +149,9 @@ def _evaluate(
         accepted[j] = acceptance(approaches[j, 0], approaches[j, 1], environment)
     for i in range(states.shape[0]):
         speed, r1, r1dot = states[i]
+        state = State(speed, r1, r1dot, math.nan, math.nan)
         free_driving_pmf(speed, environment, free[i])
-        car_following_pmf(speed, r1, r1dot, environment, following[i])
+        car_following_pmf(state, environment, following[i])
         scales[i, 0] = 1.0 / free_driving_shape(speed, environment)[1]
         scales[i, 1] = 1.0 / car_following_inverse_scale(r1dot, environment)
-        chance[i] = opportunity(speed, r1, r1dot, environment)
+        chance[i] = opportunity(state, environment)

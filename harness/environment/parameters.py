@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, model_validator
 
-from harness.arrays import RecordArray
+from harness.arrays import Record
 from harness.campaign.models import MAX_CONFIGURED_SPEED_MPS, broken_rule
 from harness.maneuvers import ACCELERATIONS_MPS2
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
@@ -258,12 +258,12 @@ class EnvironmentParameters(_Frozen):
         return hashlib.sha256(json.dumps(self.values(), sort_keys=True).encode()).hexdigest()[:16]
 
 
-def parameter_record(parameters: EnvironmentParameters, *, lane_change_level: float, hold_s: float) -> RecordArray:
+def parameter_record(parameters: EnvironmentParameters, *, lane_change_level: float, hold_s: float) -> Record:
     """The numbers as the kernels read them.
 
     Returns
     -------
-    structured ndarray, shape (1,)
+    record
         One float64 field ``section__name`` per number, and ``level`` (of lane changing), ``hold_steps``, ``max_steps``.
     """
     numbers = parameters.values()
@@ -273,7 +273,7 @@ def parameter_record(parameters: EnvironmentParameters, *, lane_change_level: fl
         "max_steps": round(numbers["scenario__duration_s"] / STEP_S),
     }
     fields = [(name, "f8") for name in (*numbers, "level")] + [("hold_steps", "i8"), ("max_steps", "i8")]
-    record = np.zeros(1, dtype=fields)
+    record: Record = np.zeros(1, dtype=fields)[0]
     for name, value in {**numbers, **extra}.items():
-        record[name][0] = value
+        record[name] = value
     return record

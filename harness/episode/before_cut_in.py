@@ -7,37 +7,33 @@ import math
 from harness.arrays import FloatArray
 from harness.compiled import compiled_inline
 from harness.environment.cut_in import acceptance, cut_in_hazard, opportunity
-from harness.environment.driving import Environment, draw_car_following
-from harness.episode.cells import Cells, Results, Scratch
-from harness.episode.record import record_moment
-from harness.importance.functions import Importance, look_ahead, propose_cut_in
-from harness.importance.likelihood import accumulate
+from harness.environment.driving import draw_car_following
+from harness.episode.cells import Bench, Cells
+from harness.episode.record import record_moment, take_in
+from harness.importance.functions import look_ahead, propose_cut_in
 from harness.maneuvers import CUT_IN, STAY, acceleration
 from harness.outcomes import EPISODE_MIXTURE, FORCED, NDE, STEP_MIXTURE
 from harness.random_stream import BV_DRAWS, uniform
+from harness.state import State
 
 
 @compiled_inline
-def redraw_following(
-    k: int, seed: int, cells: Cells, scratch: Scratch, environment: Environment, importance: Importance
-) -> None:
+def redraw_following(k: int, state: State, bench: Bench) -> None:
     """BV's acceleration for the coming hold period, and what cutting in or staying would be worth during it."""
+    cells = bench.cells
     cell = cells.cell[k]
-    state = scratch.state
-    u = uniform(seed, cell.episode, BV_DRAWS, cell.n_bv)
-    cell.bv_maneuver = draw_car_following(u, state[0], state[1], state[2], environment)
+    u = uniform(bench.seed, cell.episode, BV_DRAWS, cell.n_bv)
+    cell.bv_maneuver = draw_car_following(u, state, bench.environment)
     cells.bv_path[k, cell.n_path] = cell.bv_maneuver
     cell.n_bv += 1
     cell.n_path += 1
-    if importance.settings[0].n_surrogates > 0:
+    if bench.importance.n_surrogates > 0:
         look_ahead(
-            state[0],
-            state[3],
-            state[4],
+            state,
             acceleration(cell.bv_maneuver),
             cell.step,
-            environment,
-            importance,
+            bench.environment,
+            bench.importance,
             cells.cut_challenge[k],
             cells.stay_challenge[k],
         )
@@ -75,55 +71,30 @@ def sampling_hazard(
 
 
 @compiled_inline
-def update_ratios(
-    k: int,
-    cut: bool,
-    p: float,
-    hazard: float,
-    critical: bool,
-    cells: Cells,
-    scratch: Scratch,
-    importance: Importance,
-) -> float:
+def update_ratios(k: int, cut: bool, p: float, hazard: float, critical: bool, bench: Bench) -> float:
     """Accumulate the likelihood ratios of the maneuver taken; returns q_α/p of the step."""
-    s = importance.settings[0]
-    cell = cells.cell[k]
-    if s.first == 1:
+    scratch, importance = bench.scratch, bench.importance
+    cell = bench.cells.cell[k]
+    if importance.first == 1:
         scratch.ratio[0] = forced_ratio(cell.hazard, cell.hazard + hazard, cell.hazard_total, cut)
-    for j in range(s.n_surrogates):
+    for j in range(importance.n_surrogates):
         q = scratch.q[j]
-        scratch.ratio[s.first + j] = (q / p if cut else (1.0 - q) / (1.0 - p)) if critical else 1.0
+        scratch.ratio[importance.first + j] = (q / p if cut else (1.0 - q) / (1.0 - p)) if critical else 1.0
         scratch.challenge[j] = scratch.challenge[j] if critical else 0.0
-    sampled = accumulate(
-        s.method,
-        s.first,
-        importance.alpha,
-        scratch.ratio,
-        scratch.challenge,
-        cell.log_sampled,
-        cells.log_ratio[k],
-        cells.martingale[k],
-        scratch.weight,
-    )
-    if s.method == STEP_MIXTURE:
-        cell.log_sampled += math.log(sampled)
-    return sampled
+    return take_in(k, bench)
 
 
 @compiled_inline
-def choose_lane(
-    k: int, cells: Cells, results: Results, scratch: Scratch, environment: Environment, importance: Importance
-) -> None:
-    """Stay or cut in, given the state in ``scratch``."""
-    s = importance.settings[0]
-    cell = cells.cell[k]
-    state = scratch.state
-    wish = opportunity(state[0], state[1], state[2], environment)
-    hazard = cut_in_hazard(wish, acceptance(state[3], state[4], environment), environment)
-    p = -math.expm1(-hazard) if s.method != NDE else 0.0  # only the likelihood ratios ask for it
+def choose_lane(k: int, state: State, bench: Bench) -> None:
+    """Stay or cut in."""
+    cells, scratch, environment, importance = bench.cells, bench.scratch, bench.environment, bench.importance
+    cell, method = cells.cell[k], importance.method
+    wish = opportunity(state, environment)
+    hazard = cut_in_hazard(wish, acceptance(state.r2_m, state.r2dot_mps, environment), environment)
+    p = -math.expm1(-hazard) if method != NDE else 0.0  # only the likelihood ratios ask for it
     critical = False
-    if s.n_surrogates > 0:
-        i = cell.step % environment.numbers[0].hold_steps
+    if importance.n_surrogates > 0:
+        i = cell.step % environment.numbers.hold_steps
         critical = propose_cut_in(
             p,
             wish,
@@ -133,28 +104,28 @@ def choose_lane(
             scratch.q,
             scratch.challenge,
         )
-    cell.clock += sampling_hazard(hazard, critical, s.method, cell.component, importance.alpha, scratch.q)
+    cell.clock += sampling_hazard(hazard, critical, method, cell.component, importance.alpha, scratch.q)
     cut = cell.clock >= cell.target
     sampled = 1.0
-    if critical or s.first == 1:
-        sampled = update_ratios(k, cut, p, hazard, critical, cells, scratch, importance)
+    if critical or importance.first == 1:
+        sampled = update_ratios(k, cut, p, hazard, critical, bench)
     cell.hazard += hazard
     if cut:
         begin_cut_in(k, cells, state)
-    if critical or (s.method == FORCED and cut):
+    if critical or (method == FORCED and cut):
         cell.n_control += 1
         exposure = p if cut else 1.0 - p
-        for j in range(s.n_surrogates):
+        for j in range(importance.n_surrogates):
             scratch.q[j] = scratch.q[j] if cut else 1.0 - scratch.q[j]
-        record_moment(k, CUT_IN if cut else STAY, exposure, exposure * sampled, cells, results, scratch)
+        record_moment(k, state, CUT_IN if cut else STAY, exposure, exposure * sampled, bench)
 
 
 @compiled_inline
-def begin_cut_in(k: int, cells: Cells, state: FloatArray) -> None:
+def begin_cut_in(k: int, cells: Cells, state: State) -> None:
     """BV moves to the right lane in this step."""
     cell = cells.cell[k]
     cell.cut_step = cell.step
-    cell.cut_r2, cell.cut_r2dot = state[3], state[4]
+    cell.cut_r2, cell.cut_r2dot = state.r2_m, state.r2dot_mps
     cells.cut_in[k] = 1
     cells.bv_path[k, cell.n_path] = CUT_IN
     cell.n_path += 1

@@ -10,8 +10,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from harness.arrays import BoolArray, FloatArray, Int8Array, IntArray, RecordArray
-from harness.maneuvers import N_ACCELERATIONS
+from harness.arrays import FloatArray, Int8Array, IntArray, RecordArray
+from harness.controllers.protocol import BatchObservation
+from harness.environment.driving import Environment
+from harness.episode.trajectory import Trajectory, empty_trajectory
+from harness.importance.functions import Importance
+from harness.maneuvers import N_ACCELERATIONS, max_draws
+from harness.state import STATE_COLUMNS
 
 _f8, _i8 = np.float64, np.int64
 
@@ -39,7 +44,6 @@ CELL_DTYPE = np.dtype(
         ("cut_r2", _f8),
         ("cut_r2dot", _f8),
         ("av_start", _f8),
-        ("buffer", _i8),  # which of the two trace buffers the running episode writes
     ]
 )
 
@@ -68,11 +72,7 @@ MOMENT_DTYPE = np.dtype(
         ("row", _i8),
         ("step", np.int16),
         ("maneuver", np.int8),
-        ("v_bv_mps", _f8),
-        ("r1_m", _f8),
-        ("r1dot_mps", _f8),
-        ("r2_m", _f8),
-        ("r2dot_mps", _f8),
+        *((name, _f8) for name in STATE_COLUMNS),
         ("p", _f8),
         ("q_sampled", _f8),
     ]
@@ -85,8 +85,9 @@ class Cells(NamedTuple):
     ``cell`` (K,) are `CELL_DTYPE` records. ``log_ratio`` (K, M) is L_j, ``martingale`` (K, J). ``cut_challenge`` and
     ``stay_challenge`` (K, hold, J) look ahead to the end of the hold period. ``lv_path``, ``bv_path`` (K, draws) hold
     maneuver indices. ``acceleration`` and ``speed`` (K, 3) are the commands for the coming step, ``cut_in`` (K,) says
-    whose BV changes lanes in it. ``trace`` (2 K, steps + 1, 3 vehicles, 3: x, v, a) is (2 K, 1, 3, 3) when not kept;
-    two per cell, so that an episode's motion can be fetched while the next one has begun.
+    whose BV changes lanes in it. ``trace`` (K, steps + 1, 3 vehicles, 3: x, v, a) is (K, 1, 3, 3) when not kept.
+    ``placed`` (K,) begins with the cells that have been refilled for the coming step, ``ended`` and ``ended_row`` (K,)
+    with those whose episode has ended, and its row.
     """
 
     cell: RecordArray
@@ -100,6 +101,9 @@ class Cells(NamedTuple):
     speed: FloatArray
     cut_in: Int8Array
     trace: FloatArray
+    placed: IntArray
+    ended: IntArray
+    ended_row: IntArray
 
 
 class Results(NamedTuple):
@@ -121,12 +125,7 @@ class Results(NamedTuple):
     moment_limit: int
 
 
-GIVEN, PLACED, ENDED, DISAGREEING = range(4)
-"""Entries of `Exchange.counts`: rows given out so far; cells refilled and episodes ended in this turn; a cell in which
-the world's collision flag and the crash criterion differ, or -1."""
-
-
-class Script(NamedTuple):
+class PrescribedTraffic(NamedTuple):
     """Episodes whose traffic is prescribed: what LV and BV do in each row of a shard; no rows if it is drawn.
 
     ``lv``, ``bv`` (rows, draws) int8 are maneuver indices as an episode records them, 31 in ``bv`` being the cut-in in
@@ -140,73 +139,67 @@ class Script(NamedTuple):
     log_weight: FloatArray
 
 
-def no_script() -> Script:
+def drawn_traffic() -> PrescribedTraffic:
     """For episodes that draw their own traffic."""
     none = np.zeros((0, 1), np.int8)
-    return Script(none, none, np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0))
-
-
-class Exchange(NamedTuple):
-    """What kernels and the Python loop tell each other between two steps of the world.
-
-    ``counts`` (4,); ``contact`` (K,) bool: the world's collision flags; ``ended`` (K,) int8: outcomes, or `RUNNING`;
-    ``ended_row`` (K,): their rows; ``placed`` (K,): refilled cells; ``previous`` (K,): the
-    AVs' accelerations in the last step (m/s²).
-    """
-
-    counts: IntArray
-    contact: BoolArray
-    ended: Int8Array
-    ended_row: IntArray
-    placed: IntArray
-    previous: FloatArray
-
-
-def empty_exchange(n_cells: int) -> Exchange:
-    """Exchange of K cells."""
-    return Exchange(
-        counts=np.zeros(4, np.int64),
-        contact=np.zeros(n_cells, np.bool_),
-        ended=np.zeros(n_cells, np.int8),
-        ended_row=np.zeros(n_cells, np.int64),
-        placed=np.zeros(n_cells, np.int64),
-        previous=np.zeros(n_cells),
-    )
+    return PrescribedTraffic(none, none, np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0))
 
 
 class Scratch(NamedTuple):
     """Room for what a kernel works out at one moment of one cell; kernels allocate nothing.
 
-    ``state`` (5,): v_BV, R1, R1dot, R2, R2dot. ``p`` (31,): exposure of the accelerations. ``q`` (J,) and
+    ``p`` (31,): exposure of the accelerations. ``q`` (J,) and
     ``q_acceleration`` (J, 31): importance functions; ``challenge`` (J,): V_j. ``ratio`` (M,): q_j/p of the maneuver
-    taken; ``weight`` (M,): predictive weights of the importance functions.
+    taken; ``weight`` (M,): predictive weights of the importance functions; ``path``: what lies ahead of an episode.
     """
 
-    state: FloatArray
     p: FloatArray
     q: FloatArray
     q_acceleration: FloatArray
     challenge: FloatArray
     ratio: FloatArray
     weight: FloatArray
+    path: Trajectory
 
 
-def empty_scratch(n_importance: int, n_surrogates: int) -> Scratch:
+def empty_scratch(environment: Environment, n_importance: int, n_surrogates: int) -> Scratch:
     """Scratch for M importance functions and J surrogates."""
     return Scratch(
-        state=np.zeros(5),
         p=np.zeros(N_ACCELERATIONS),
         q=np.zeros(n_surrogates),
         q_acceleration=np.zeros((n_surrogates, N_ACCELERATIONS)),
         challenge=np.zeros(n_surrogates),
         ratio=np.zeros(n_importance),
         weight=np.zeros(n_importance),
+        path=empty_trajectory(environment),
     )
 
 
-def max_draws(max_steps: int, hold_steps: int) -> int:
-    """Most maneuvers that one vehicle draws in an episode; the cut-in restarts BV's clock and is itself an entry."""
-    return -(-max_steps // hold_steps) + 2
+class Bench(NamedTuple):
+    """The test bench as kernels see it: all that the episodes of a shard are run with, and written to.
+
+    ``first_episode`` is the campaign index of row 0, ``states`` (rows,) are initial states. ``x``, ``v`` (K, 3) are the
+    world's positions (m) and speeds (m/s) of LV, BV, AV. ``driver`` is (1,) for a built-in AV, else (0,). ``passed_m``
+    is the R2 at which the AV has passed. ``observation`` is what a controller outside of the kernels sees, and
+    ``acts_before_cut_in`` whether it acts from the start; else from the step after the cut-in.
+    """
+
+    seed: int
+    first_episode: int
+    states: RecordArray
+    traffic: PrescribedTraffic
+    x: FloatArray
+    v: FloatArray
+    cells: Cells
+    results: Results
+    scratch: Scratch
+    environment: Environment
+    importance: Importance
+    driver: RecordArray
+    passed_m: float
+    keep_traces: bool
+    observation: BatchObservation
+    acts_before_cut_in: bool
 
 
 def idle_cells(
@@ -216,7 +209,7 @@ def idle_cells(
     draws = max_draws(max_steps, hold_steps)
     cell = np.zeros(n_cells, CELL_DTYPE)
     cell["row"] = -1
-    trace_shape = (2 * n_cells, max_steps + 1 if keep_traces else 1, 3, 3)
+    trace_shape = (n_cells, max_steps + 1 if keep_traces else 1, 3, 3)
     return Cells(
         cell=cell,
         log_ratio=np.zeros((n_cells, n_importance)),
@@ -229,6 +222,9 @@ def idle_cells(
         speed=np.zeros((n_cells, 3)),
         cut_in=np.zeros(n_cells, np.int8),
         trace=np.full(trace_shape, np.nan),
+        placed=np.zeros(n_cells, np.int64),
+        ended=np.zeros(n_cells, np.int64),
+        ended_row=np.zeros(n_cells, np.int64),
     )
 
 

@@ -1,4 +1,4 @@
-"""Run a range of episodes in a world: decide → respond → step → judge, until all have ended."""
+"""Run a range of episodes in a world: refill → decide → respond → command → step → judge, until all have ended."""
 
 from __future__ import annotations
 
@@ -11,29 +11,25 @@ import numpy as np
 from harness.arrays import BoolArray, FloatArray, IntArray, RecordArray
 from harness.controllers.protocol import BatchObservation
 from harness.environment.driving import Environment
+from harness.episode.begin import refill
 from harness.episode.cells import (
-    DISAGREEING,
-    ENDED,
-    GIVEN,
-    PLACED,
+    Bench,
     Cells,
-    Exchange,
+    PrescribedTraffic,
     Results,
-    Scratch,
-    Script,
-    empty_exchange,
+    drawn_traffic,
     empty_results,
     empty_scratch,
     idle_cells,
-    max_draws,
-    no_script,
     with_room_for_moments,
 )
-from harness.episode.kernels import PASSED_M, PASSED_UNDER_CONTROL_M, command, turn, turn_to_controller
-from harness.episode.observe import empty_observation, fail, first
+from harness.episode.kernels import PASSED_M, PASSED_UNDER_CONTROL_M, command, decide, judge, respond
+from harness.episode.observe import empty_observation, fail, first, observe
 from harness.errors import WorldDisagreementError
 from harness.importance.functions import Importance
-from harness.outcomes import AV, CRASH, FAILED, OUTCOMES, RUNNING
+from harness.maneuvers import max_draws
+from harness.outcomes import AV, CRASH, FAILED, OUTCOMES
+from harness.unboxed import unboxed
 from harness.vehicles.kinematics import STEP_S
 from harness.world import AVLostError, DrivingWorld, World
 
@@ -64,18 +60,19 @@ class Keep(NamedTuple):
 
 @dataclass
 class Shard:
-    """Everything that a range of episodes left behind.
+    """Everything that a range of episodes left behind, row by row; ``states`` (n,) are where they began.
 
     ``cut_ins`` (n,) are the rows of the pool that were prescribed, if any were.
     ``traces`` maps an episode's row to its (steps + 1, 3 vehicles, 3: x, v, a) motion, ``failures`` to the cause.
     """
 
     first_episode: int
-    states: FloatArray
+    states: RecordArray
     results: Results
+    traced: BoolArray
+    traffic: PrescribedTraffic = field(default_factory=drawn_traffic)
     traces: dict[int, FloatArray] = field(default_factory=dict)
     failures: dict[int, str] = field(default_factory=dict)
-    script: Script = field(default_factory=no_script)
     cut_ins: IntArray | None = None
 
 
@@ -128,37 +125,33 @@ class EpisodeLoop:
     """
 
     def __init__(self, world: World, policy: Policy, keep: Keep, av: ControlledAV | None = None) -> None:
-        n = policy.environment.numbers[0]
+        numbers, importance = policy.environment.numbers, policy.importance
         self._world = world
         self._policy = policy
         self._keep = keep
         self._av = av
         self._driving: DrivingWorld | None = world if isinstance(world, DrivingWorld) else None
-        self._max_steps = int(n["max_steps"])
-        self._hold_steps = int(n["hold_steps"])
-        self._n_surrogates = int(policy.importance.settings["n_surrogates"][0])
-        self._exchange: Exchange = empty_exchange(world.n_cells)
+        self._scratch = empty_scratch(policy.environment, importance.alpha.size, importance.n_surrogates)
         self._observation: BatchObservation = empty_observation(world.n_cells)
-        self._scratch: Scratch = empty_scratch(policy.importance.alpha.size, self._n_surrogates)
         self._cells: Cells = idle_cells(
             world.n_cells,
-            n_importance=policy.importance.alpha.size,
-            n_surrogates=self._n_surrogates,
-            max_steps=self._max_steps,
-            hold_steps=self._hold_steps,
+            n_importance=importance.alpha.size,
+            n_surrogates=importance.n_surrogates,
+            max_steps=int(numbers["max_steps"]),
+            hold_steps=int(numbers["hold_steps"]),
             keep_traces=keep.any_trace,
         )
 
-    def run(self, first_episode: int, states: FloatArray, script: Script | None = None) -> Shard:
+    def run(self, first_episode: int, states: RecordArray, traffic: PrescribedTraffic | None = None) -> Shard:
         """Run episodes ``first_episode … first_episode + n − 1``.
 
         Parameters
         ----------
         first_episode : int
             Campaign index of the first episode.
-        states : ndarray, shape (n, 5)
+        states : structured ndarray, shape (n,)
             Initial states.
-        script : Script, optional
+        traffic : PrescribedTraffic, optional
             What LV and BV do, where it is not drawn.
 
         Raises
@@ -166,30 +159,22 @@ class EpisodeLoop:
         WorldDisagreementError
             The world did something else than it was told.
         """
-        n_episodes = states.shape[0]
-        shard = Shard(first_episode, states, self._empty_results(n_episodes), script=script or no_script())
-        always = traced_by_index(self._policy.seed, first_episode + np.arange(n_episodes), self._keep.trace_share)
-        exchange, world, cells = self._exchange, self._world, self._cells
-        cells.cell["row"] = -1
-        exchange.counts[GIVEN] = 0
-        ended = 0
+        episodes = first_episode + np.arange(states.size)
+        traced = traced_by_index(self._policy.seed, episodes, self._keep.trace_share)
+        shard = Shard(first_episode, states, self._empty_results(states.size), traced, traffic or drawn_traffic())
+        self._cells.cell["row"] = -1
+        bench = self._bench(shard)
+        given = ended = 0
         while True:
-            shard.results = with_room_for_moments(shard.results, world.n_cells)
-            if self._av is None:
-                self._turn(shard)
-            else:
-                self._controlled_turn(shard, self._av)
-            if exchange.counts[ENDED]:
-                ended += int(exchange.counts[ENDED])
-                self._keep_traces(shard, always)
-            if ended == n_episodes:
+            bench = self._with_room(bench, shard)
+            placed = refill(bench, given)
+            decide(bench)
+            ended += self._respond(bench, shard, placed)
+            if ended == states.size:
                 return shard
-            try:
-                if exchange.counts[PLACED]:
-                    self._place(exchange.placed[: exchange.counts[PLACED]])
-                exchange.contact[:] = world.step(cells.speed, cells.cut_in)
-            except AVLostError as lost:
-                ended += self._lose(str(lost), shard, always)
+            command(bench)
+            ended += self._step_and_judge(bench, shard, placed)
+            given += placed
 
     def beside(self, world: World) -> EpisodeLoop:
         """Another loop with the same AV, policy and records, in a world of no more cells."""
@@ -200,130 +185,130 @@ class EpisodeLoop:
         if self._av is not None:
             self._av.close()
 
-    def _place(self, placed: IntArray) -> None:
-        if self._driving is not None:
-            self._driving.announce(placed, self._cells.cell["episode"][placed])
-        self._world.place(placed, self._world.x, self._world.v)
-
-    def _lose(self, cause: str, shard: Shard, always: BoolArray) -> int:
-        """Fail all running episodes and begin again; returns their number."""
-        running = np.flatnonzero(self._cells.cell["row"] >= 0)
-        self._exchange.counts[ENDED] = 0
-        self._exchange.ended[:] = RUNNING
-        self._exchange.contact[:] = False
-        self._fail(dict.fromkeys(running.tolist(), cause), shard)
-        self._keep_traces(shard, always)
-        if self._driving is not None:
-            self._driving.restart()
-        return int(running.size)
-
     def _empty_results(self, n_episodes: int) -> Results:
+        numbers, importance = self._policy.environment.numbers, self._policy.importance
         return empty_results(
             n_episodes,
-            n_importance=self._policy.importance.alpha.size,
-            n_surrogates=self._n_surrogates,
-            draws=max_draws(self._max_steps, self._hold_steps),
+            n_importance=importance.alpha.size,
+            n_surrogates=importance.n_surrogates,
+            draws=max_draws(int(numbers["max_steps"]), int(numbers["hold_steps"])),
             moment_limit=self._keep.moments,
             moment_capacity=16 * n_episodes,
         )
 
-    def _turn(self, shard: Shard) -> None:
-        policy, world, exchange = self._policy, self._world, self._exchange
-        turn(
-            policy.seed,
-            shard.first_episode,
-            shard.states,
-            world.x,
-            world.v,
-            self._cells,
-            shard.results,
-            self._scratch,
-            exchange,
-            policy.environment,
-            policy.importance,
-            shard.script,
-            policy.driver,
-            PASSED_UNDER_CONTROL_M if self._driving is not None and self._driving.acts_before_cut_in else PASSED_M,
-            self._keep.any_trace,
+    def _bench(self, shard: Shard) -> Bench:
+        """All that kernels need for a shard, in the form that they need it in."""
+        policy, controlled = self._policy, self._av or self._driving
+        early = controlled is not None and controlled.acts_before_cut_in
+        return unboxed(
+            Bench(
+                policy.seed,
+                shard.first_episode,
+                shard.states,
+                shard.traffic,
+                self._world.x,
+                self._world.v,
+                self._cells,
+                shard.results,
+                self._scratch,
+                policy.environment,
+                policy.importance,
+                policy.driver,
+                PASSED_UNDER_CONTROL_M if early else PASSED_M,
+                self._keep.any_trace,
+                self._observation,
+                early,
+            )
         )
-        self._require_agreement(shard)
 
-    def _controlled_turn(self, shard: Shard, av: ControlledAV) -> None:
-        """`_turn` with the user's controller in it."""
-        policy, world, exchange, cells = self._policy, self._world, self._exchange, self._cells
-        n = turn_to_controller(
-            policy.seed,
-            shard.first_episode,
-            shard.states,
-            world.x,
-            world.v,
-            cells,
-            shard.results,
-            self._scratch,
-            exchange,
-            policy.environment,
-            policy.importance,
-            shard.script,
-            PASSED_UNDER_CONTROL_M if av.acts_before_cut_in else PASSED_M,
-            self._keep.any_trace,
-            av.acts_before_cut_in,
-            self._observation,
-        )
-        self._require_agreement(shard)
-        failures: dict[int, str] = {}
-        if exchange.counts[PLACED]:
-            placed = exchange.placed[: exchange.counts[PLACED]]
-            failures.update(av.start(placed, cells.cell["episode"][placed]))
-        if n:
-            cells.acceleration[self._observation.cell[:n], AV], failed = av.act(first(self._observation, n))
+    def _with_room(self, bench: Bench, shard: Shard) -> Bench:
+        """The same, with room for the control steps that the coming step may bring."""
+        results = with_room_for_moments(shard.results, self._world.n_cells)
+        if results is shard.results:
+            return bench
+        shard.results = results
+        return self._bench(shard)
+
+    def _respond(self, bench: Bench, shard: Shard, placed: int) -> int:
+        """What the AVs do, the user's controller or a built-in one; returns how many controllers failed."""
+        if self._av is None:
+            if self._policy.driver.size:
+                respond(bench)
+            return 0
+        cells, failures = self._cells, dict[int, str]()
+        if placed:
+            refilled = cells.placed[:placed]
+            failures.update(self._av.start(refilled, cells.cell["episode"][refilled]))
+        if n := observe(bench):
+            acting = self._observation.cell[:n]
+            cells.acceleration[acting, AV], failed = self._av.act(first(self._observation, n))
             failures.update({k: cause for k, cause in failed.items() if k not in failures})
-        self._fail(failures, shard)
-        command(world.x, world.v, cells, self._keep.any_trace)
+        return self._fail(failures, bench, shard)
 
-    def _fail(self, failures: Mapping[int, str], shard: Shard) -> None:
-        """End episodes whose controller failed; the campaign goes on."""
-        if not failures:
-            return
-        world, exchange = self._world, self._exchange
-        failed = np.array(sorted(failures), np.int64)
-        rows = np.zeros_like(failed)
-        fail(failed, world.x, world.v, self._cells, shard.results, self._policy.importance, self._keep.any_trace, rows)
-        for k, row in zip(failed.tolist(), rows.tolist(), strict=True):
-            shard.failures[row] = failures[k]
-            exchange.ended[k], exchange.ended_row[k] = FAILED, row
-        exchange.counts[ENDED] += failed.size
+    def _step_and_judge(self, bench: Bench, shard: Shard, placed: int) -> int:
+        """Let the world take the step, and end what is over; returns how many episodes that are."""
+        cells = self._cells
+        try:
+            if placed:
+                self._place(cells.placed[:placed])
+            contact = self._world.step(cells.speed, cells.cut_in)
+        except AVLostError as lost:
+            return self._lose(str(lost), bench, shard)
+        ended = judge(bench, contact)
+        if ended < 0:
+            raise _disagreement(cells.cell[-1 - ended], bool(contact[-1 - ended]))
+        if ended:
+            self._keep_traces(ended, shard)
+        return ended
 
-    def _require_agreement(self, shard: Shard) -> None:
-        if self._exchange.counts[DISAGREEING] >= 0:
-            self._refuse(int(self._exchange.counts[DISAGREEING]), shard)
+    def _place(self, refilled: IntArray) -> None:
+        if self._driving is not None:
+            self._driving.announce(refilled, self._cells.cell["episode"][refilled])
+        self._world.place(refilled, self._world.x, self._world.v)
 
-    def _refuse(self, k: int, shard: Shard) -> None:
-        """SUMO's own collision flag and the crash criterion must name the same cells."""
-        episode, step = self._cells.cell[k][["episode", "step"]].tolist()
-        if self._exchange.ended[k] >= 0:  # the cell may have been refilled since
-            row = int(self._exchange.ended_row[k])
-            episode, step = shard.first_episode + row, shard.results.episode["n_steps"][row]
-        raise WorldDisagreementError(
-            f"episode {episode}, step {step}",
-            found="a collision that the positions do not show"
-            if self._exchange.contact[k]
-            else "no collision where the positions show one",
-            expected="a collision exactly when bumpers overlap by more than 1 mm",
-            mend="Please report this episode: its campaign.yaml and index reproduce it.",
-        )
+    def _lose(self, cause: str, bench: Bench, shard: Shard) -> int:
+        """Fail all running episodes and begin again; returns their number."""
+        running = np.flatnonzero(self._cells.cell["row"] >= 0)
+        lost = self._fail(dict.fromkeys(running.tolist(), cause), bench, shard)
+        if self._driving is not None:
+            self._driving.restart()
+        return lost
 
-    def _keep_traces(self, shard: Shard, always: BoolArray) -> None:
+    def _fail(self, failures: Mapping[int, str], bench: Bench, shard: Shard) -> int:
+        """End episodes whose controller failed, and go on; returns their number."""
+        if failures:
+            fail(bench, np.array(sorted(failures), np.int64))
+            for k, row in self._ended(len(failures)):
+                shard.failures[row] = failures[k]
+            self._keep_traces(len(failures), shard)
+        return len(failures)
+
+    def _ended(self, n: int) -> list[tuple[int, int]]:
+        """Cells whose episode has just ended, and its rows."""
+        return list(zip(self._cells.ended[:n].tolist(), self._cells.ended_row[:n].tolist(), strict=True))
+
+    def _keep_traces(self, n: int, shard: Shard) -> None:
+        """Copy the motion of those of the ``n`` episodes that have just ended which is to be kept."""
         if not self._keep.any_trace:
             return
-        cells, exchange = self._cells, self._exchange
-        for k in np.flatnonzero(exchange.ended >= 0):
-            row = int(exchange.ended_row[k])
+        for k, row in self._ended(n):
             episode = shard.results.episode[row]
-            if always[row] or _wanted(self._keep.traces, int(episode["outcome"]), int(episode["n_control_steps"])):
-                buffer = 2 * k + 1 - cells.cell["buffer"][k]
-                trace = shard.traces[row] = cells.trace[buffer, : int(episode["n_steps"]) + 1].copy()
+            if shard.traced[row] or _wanted(
+                self._keep.traces, int(episode["outcome"]), int(episode["n_control_steps"])
+            ):
+                trace = shard.traces[row] = self._cells.trace[k, : int(episode["n_steps"]) + 1].copy()
                 if self._driving is not None:  # nobody commanded what the AV did: its speeds say it
                     trace[:-1, AV, 2] = np.diff(trace[:, AV, 1]) / STEP_S
+
+
+def _disagreement(cell: np.void, contact: bool) -> WorldDisagreementError:
+    """SUMO's own collision flag and the crash criterion must name the same cells."""
+    return WorldDisagreementError(
+        f"episode {cell['episode']}, step {cell['step']}",
+        found="a collision that the positions do not show" if contact else "no collision where the positions show one",
+        expected="a collision exactly when bumpers overlap by more than 1 mm",
+        mend="Please report this episode: its campaign.yaml and index reproduce it.",
+    )
 
 
 def _wanted(policy: str, outcome: int, n_control_steps: int) -> bool:

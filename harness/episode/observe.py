@@ -10,9 +10,8 @@ import numpy as np
 from harness.arrays import FloatArray, IntArray, read_only
 from harness.compiled import compiled
 from harness.controllers.protocol import BatchObservation
-from harness.episode.cells import Cells, Results
-from harness.episode.record import record_episode
-from harness.importance.functions import Importance
+from harness.episode.cells import Bench
+from harness.episode.record import end_episode
 from harness.outcomes import AV, BV, FAILED, LV
 from harness.vehicles.kinematics import STEP_S, gap
 
@@ -35,29 +34,18 @@ def first(observation: BatchObservation, n: int) -> BatchObservation:
 
 
 @compiled
-def observe(
-    x: FloatArray, v: FloatArray, cells: Cells, acts_before_cut_in: bool, previous: FloatArray, out: BatchObservation
-) -> int:
-    """Write what the AVs that are to act see; returns their number.
-
-    Parameters
-    ----------
-    x, v : ndarray, shape (K, 3)
-        State of the world.
-    acts_before_cut_in : bool
-        Whether controllers act from the start; else from the step after the cut-in.
-    previous : ndarray, shape (K,)
-        Accelerations of the AVs in the last step (m/s²).
-    """
+def observe(bench: Bench) -> int:
+    """Write what the AVs that are to act see to ``bench.observation``; returns their number."""
+    x, v, cells, out = bench.x, bench.v, bench.cells, bench.observation
     n = 0
     for k in range(cells.cell.size):
         cell = cells.cell[k]
         followed = 0 <= cell.cut_step < cell.step
-        if cell.row < 0 or not (followed or acts_before_cut_in):
+        if cell.row < 0 or not (followed or bench.acts_before_cut_in):
             continue
         out.cell[n], out.episode[n], out.time_s[n] = k, cell.episode, cell.step * STEP_S
         out.position_m[n], out.speed_mps[n] = x[k, AV], v[k, AV]
-        out.acceleration_mps2[n] = previous[k] if cell.step > 0 else 0.0
+        out.acceleration_mps2[n] = cells.acceleration[k, AV]
         out.gap_m[n] = gap(x[k, BV], x[k, AV]) if followed else math.inf
         out.lead_speed_mps[n] = v[k, BV] if followed else math.nan
         out.bv_position_m[n], out.bv_speed_mps[n] = x[k, BV], v[k, BV]
@@ -68,26 +56,7 @@ def observe(
 
 
 @compiled
-def fail(
-    failed: IntArray,
-    x: FloatArray,
-    v: FloatArray,
-    cells: Cells,
-    results: Results,
-    importance: Importance,
-    keep_traces: bool,
-    rows: IntArray,
-) -> None:
-    """End the episodes of the given cells as failed, with the weight they have so far; ``rows`` gets their rows."""
-    for i in range(failed.size):
-        k = failed[i]
-        cell = cells.cell[k]
-        rows[i] = cell.row
-        if keep_traces:
-            for vehicle in range(3):
-                here = cells.trace[2 * k + cell.buffer, cell.step, vehicle]
-                here[0], here[1], here[2] = x[k, vehicle], v[k, vehicle], math.nan
-        record_episode(k, FAILED, x, v, cells, results, importance)
-        cells.cut_in[k] = 0
-        cell.row = -1
-        cell.buffer = 1 - cell.buffer
+def fail(bench: Bench, failed: IntArray) -> None:
+    """End the episodes of the given cells as failed, with the weight they have so far."""
+    for n in range(failed.size):
+        end_episode(failed[n], FAILED, n, bench)

@@ -12,18 +12,6 @@ from harness.importance.functions import Importance
 from harness.outcomes import EPISODE_MIXTURE, FORCED, METHODS, STEP_MIXTURE
 from harness.vehicles.kinematics import CONTACT_M
 
-_SETTINGS = np.dtype(
-    [
-        ("method", np.int64),
-        ("recursive", np.int64),
-        ("n_surrogates", np.int64),
-        ("first", np.int64),
-        ("steps_per_level", np.int64),
-        ("epsilon", np.float64),
-        ("threshold", np.float64),
-    ]
-)
-
 _ROUNDING_M = 1e-9
 """More than interpolation between gaps of up to a kilometre can lose."""
 
@@ -63,19 +51,19 @@ def build_importance(campaign: Campaign, tables: Tables | None) -> Importance:
         Challenge tables of its surrogates; not needed by ``nde`` and ``forced``.
     """
     method = METHODS.index(campaign.testing.method)
-    settings = np.zeros(1, _SETTINGS)
-    settings["method"] = method
-    settings["recursive"] = campaign.testing.challenge == "recursive"
-    settings["n_surrogates"] = len(campaign.surrogates) if needs_tables(campaign) else 0
-    settings["first"] = 1 if method in (FORCED, EPISODE_MIXTURE) else 0
-    settings["steps_per_level"] = level_steps(round(campaign.environment.acceleration_hold_s * 10))
-    settings["epsilon"] = campaign.testing.epsilon
-    settings["threshold"] = campaign.testing.criticality_threshold
-    alpha = np.array(mixture_weights(campaign), dtype=np.float64)
-    if tables is None:
-        return Importance(settings, alpha, _none(5), _none(5), _none(5), np.zeros((0, 1, 1, 1), np.bool_))
-    harmless = harmless_cells(tables.maneuvers, recursive=campaign.testing.challenge == "recursive")
-    return Importance(settings, alpha, tables.value, tables.maneuvers, tables.before, harmless)
+    recursive = campaign.testing.challenge == "recursive"
+    none = _none(5), _none(5), _none(5), np.zeros((0, 1, 1, 1), np.bool_)
+    return Importance(
+        method,
+        recursive,
+        len(campaign.surrogates) if needs_tables(campaign) else 0,
+        1 if method in (FORCED, EPISODE_MIXTURE) else 0,
+        level_steps(round(campaign.environment.acceleration_hold_s * 10)),
+        campaign.testing.epsilon,
+        campaign.testing.criticality_threshold,
+        np.array(mixture_weights(campaign), dtype=np.float64),
+        *(none if tables is None else (*tables, harmless_cells(tables.maneuvers, recursive=recursive))),
+    )
 
 
 def harmless_cells(maneuvers: Float32Array, *, recursive: bool) -> BoolArray:
@@ -99,4 +87,7 @@ def harmless_cells(maneuvers: Float32Array, *, recursive: bool) -> BoolArray:
 
 
 def _none(dimensions: int) -> Float32Array:
-    return np.zeros((0,) + (1,) * (dimensions - 1), np.float32)
+    """No table; read-only like those that are mapped, for kernels to be compiled once."""
+    none = np.zeros((0,) + (1,) * (dimensions - 1), np.float32)
+    none.flags.writeable = False
+    return none

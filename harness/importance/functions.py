@@ -11,28 +11,36 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from harness.arrays import BoolArray, Float32Array, FloatArray, RecordArray
+from harness.arrays import BoolArray, Float32Array, FloatArray
 from harness.compiled import compiled_inline
 from harness.criticality.before_cut_in import level_of
 from harness.criticality.grid import interpolate, interpolate_maneuvers, locate_after, locate_before
 from harness.environment.cut_in import acceptance
 from harness.environment.driving import Environment
 from harness.maneuvers import N_ACCELERATIONS
+from harness.state import State
 from harness.vehicles.kinematics import CONTACT_M, STEP_S, next_speed
 
 
 class Importance(NamedTuple):
     """All that kernels need to sample critical moments.
 
-    ``settings`` is a record (shape (1,)) with method, recursive, epsilon, threshold, steps_per_level, n_surrogates and
-    ``first`` (index of the first surrogate among the importance functions: 1 when the forced cut-in is component 0).
+    ``method`` is one of `harness.outcomes.METHODS`; ``recursive`` says which challenge; ``n_surrogates`` is 0 where
+    nobody is asked; ``first`` is the index of the first surrogate among the importance functions: 1 when the forced
+    cut-in is component 0. ``steps_per_level`` lie between two levels of ``value``.
     ``alpha`` (M,) are the mixture weights. ``value`` (J, levels + 1, v, R2, R2dot), ``maneuvers`` (J, v, R2, R2dot, 31)
     and ``before`` (J, redraw times + 1, v, R2, R2dot) are the challenge tables (see `harness.criticality.tables`).
     ``harmless`` (J, v - 1, R2 - 1, R2dot - 1) marks the grid cells after the cut-in in which no acceleration challenges
     a surrogate: most of what is driven lies there, and nothing needs to be interpolated.
     """
 
-    settings: RecordArray
+    method: int
+    recursive: bool
+    n_surrogates: int
+    first: int
+    steps_per_level: int
+    epsilon: float
+    threshold: float
     alpha: FloatArray
     value: Float32Array
     maneuvers: Float32Array
@@ -41,7 +49,7 @@ class Importance(NamedTuple):
 
 
 @compiled_inline
-def as_challenge(tabulated: float, recursive: int) -> float:
+def as_challenge(tabulated: float, recursive: bool) -> float:
     """Challenge from a table entry: a probability (recursive), or a smallest gap in metres (immediate)."""
     if recursive:
         return tabulated
@@ -50,9 +58,7 @@ def as_challenge(tabulated: float, recursive: int) -> float:
 
 @compiled_inline
 def look_ahead(
-    speed: float,
-    r2: float,
-    r2dot: float,
+    state: State,
     bv_acceleration: float,
     step: int,
     environment: Environment,
@@ -66,10 +72,9 @@ def look_ahead(
     ``cut_challenge`` (hold, J) receives C_j(s_i, cut_in); ``stay_challenge`` (hold, J) the challenge of staying per
     unit of OL (zero for the immediate challenge).
     """
-    n = environment.numbers[0]
-    s = importance.settings[0]
-    hold = n.hold_steps
-    follower = speed - r2dot
+    n, hold = environment.numbers, environment.numbers.hold_steps
+    speed, r2 = state.v_bv_mps, state.r2_m
+    follower = speed - state.r2dot_mps
     for i in range(hold):
         accepted = acceptance(r2, speed - follower, environment)
         passed = r2 <= 0.0
@@ -77,19 +82,19 @@ def look_ahead(
         r2 += (0.5 * (speed + after) - follower) * STEP_S
         speed = after
         where = locate_after(speed, r2, speed - follower)
-        level = level_of(step + i, n.max_steps, s.steps_per_level, importance.value.shape[1] - 1)
-        for j in range(s.n_surrogates):
+        level = level_of(step + i, n.max_steps, importance.steps_per_level, importance.value.shape[1] - 1)
+        for j in range(importance.n_surrogates):
             challenge = 0.0
             if not passed and level >= 0:
-                challenge = as_challenge(interpolate(importance.value[j, level], where), s.recursive)
+                challenge = as_challenge(interpolate(importance.value[j, level], where), importance.recursive)
             cut_challenge[i, j] = challenge
             stay_challenge[i, j] = STEP_S * accepted * challenge
-    if s.recursive == 0:
+    if not importance.recursive:
         stay_challenge[:, :] = 0.0
         return
     period = (step + hold) // hold
     where_end = locate_before(speed, r2, speed - follower)
-    for j in range(s.n_surrogates):
+    for j in range(importance.n_surrogates):
         later = 0.0
         if r2 > 0.0 and period < importance.before.shape[1]:
             later = interpolate(importance.before[j, period], where_end)
@@ -125,17 +130,16 @@ def propose_cut_in(
     bool
         Whether the moment is critical.
     """
-    s = importance.settings[0]
     critical = False
-    for j in range(s.n_surrogates):
-        staying = -math.expm1(-opportunity_1s * stay_challenge[j]) if s.recursive else 0.0
+    for j in range(importance.n_surrogates):
+        staying = -math.expm1(-opportunity_1s * stay_challenge[j]) if importance.recursive else 0.0
         cutting = p * cut_challenge[j]
         total = cutting + (1.0 - p) * staying
         v[j] = total
         q[j] = p
         if total > 0.0:
-            q[j] = s.epsilon * p + (1.0 - s.epsilon) * (cutting / total)
-        critical = critical or total > s.threshold
+            q[j] = importance.epsilon * p + (1.0 - importance.epsilon) * (cutting / total)
+        critical = critical or total > importance.threshold
     return critical
 
 
@@ -146,34 +150,25 @@ def is_harmless(j: int, where: tuple[int, float, int, float, int, float], import
 
 
 @compiled_inline
-def challenges_nobody(speed: float, r2: float, r2dot: float, importance: Importance) -> bool:
+def challenges_nobody(state: State, importance: Importance) -> bool:
     """Whether a state after the cut-in is seen to be uncritical without a look at any acceleration."""
-    where = locate_after(speed, r2, r2dot)
+    where = locate_after(state.v_bv_mps, state.r2_m, state.r2dot_mps)
     harmless = True
-    for j in range(importance.settings[0].n_surrogates):
+    for j in range(importance.n_surrogates):
         harmless = harmless and is_harmless(j, where, importance)
     return harmless
 
 
 @compiled_inline
-def propose_acceleration(
-    speed: float,
-    r2: float,
-    r2dot: float,
-    p: FloatArray,
-    importance: Importance,
-    q: FloatArray,
-    v: FloatArray,
-) -> bool:
+def propose_acceleration(state: State, p: FloatArray, importance: Importance, q: FloatArray, v: FloatArray) -> bool:
     """Probabilities of the 31 accelerations under every surrogate's importance function.
 
     ``p`` (31,) is the exposure; ``q`` (J, 31) and ``v`` (J,) receive the results. Returns whether the moment is
     critical.
     """
-    s = importance.settings[0]
-    where = locate_after(speed, r2, r2dot)
+    where = locate_after(state.v_bv_mps, state.r2_m, state.r2dot_mps)
     critical = False
-    for j in range(s.n_surrogates):
+    for j in range(importance.n_surrogates):
         if is_harmless(j, where, importance):
             v[j] = 0.0
             for m in range(N_ACCELERATIONS):
@@ -181,12 +176,14 @@ def propose_acceleration(
             continue
         interpolate_maneuvers(importance.maneuvers[j], where, q[j])
         for m in range(N_ACCELERATIONS):
-            q[j, m] = p[m] * as_challenge(q[j, m], s.recursive)
+            q[j, m] = p[m] * as_challenge(q[j, m], importance.recursive)
         total = 0.0
         for m in range(N_ACCELERATIONS):
             total += q[j, m]
         v[j] = total
-        critical = critical or total > s.threshold
+        critical = critical or total > importance.threshold
         for m in range(N_ACCELERATIONS):
-            q[j, m] = s.epsilon * p[m] + (1.0 - s.epsilon) * (q[j, m] / total) if total > 0.0 else p[m]
+            q[j, m] = (
+                importance.epsilon * p[m] + (1.0 - importance.epsilon) * (q[j, m] / total) if total > 0.0 else p[m]
+            )
     return critical

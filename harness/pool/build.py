@@ -11,14 +11,15 @@ import numpy as np
 from harness.arrays import BoolArray, FloatArray, Int8Array, IntArray, RecordArray
 from harness.campaign.models import PoolSettings
 from harness.environment.driving import Environment
-from harness.environment.initial_state import N_STATE, InitialStates
-from harness.episode.cells import max_draws
+from harness.environment.initial_state import InitialStates
+from harness.episode.trajectory import empty_trajectory
 from harness.pool.cut_ins import FAR_OFF, CutIns, Pool, environment_hash, shells_of
-from harness.pool.enumeration import STRIDE, empty_path, enumerate_cut_ins, write_pairs
+from harness.pool.enumeration import STRIDE, enumerate_cut_ins, write_pairs
 from harness.pool.library import Library
 from harness.pool.proposal import Proposal, fit_proposal
 from harness.progress import Progress, SilentProgress
 from harness.random_stream import DIAGNOSTIC, INITIAL, uniforms
+from harness.state import STATE_COLUMNS
 
 PILOT_PATHS = 2048
 ROUND_PATHS = 1024
@@ -40,13 +41,13 @@ KEEP_DRAW = 1
 class Enumerated:
     """Cut-ins of some paths.
 
-    ``weight`` (n,) is naturalistic over proposal density; ``state`` (n, 5); ``probability`` (n, steps) is that of the
+    ``weight`` (n,) is naturalistic over proposal density; ``state`` (n,); ``probability`` (n, steps) is that of the
     cut-ins that one in this step stands for; ``crashes`` (n, steps) one bit per surrogate, as the library orders them.
     """
 
     first: int
     weight: FloatArray
-    state: FloatArray
+    state: RecordArray
     probability: FloatArray
     crashes: IntArray
 
@@ -69,12 +70,10 @@ class Enumerator:
         proposal: Proposal | None = None,
         stride: int = STRIDE,
     ) -> None:
-        n = environment.numbers[0]
         self._environment, self._drivers, self._envelope = environment, drivers, envelope
         self._seed, self._proposal, self._stride = seed, proposal, stride
         self._states = InitialStates(environment.numbers)
-        self._max_steps = int(n["max_steps"])
-        self._draws = max_draws(self._max_steps, int(n["hold_steps"]))
+        self._max_steps = int(environment.numbers["max_steps"])
         # Compiled here, by one thread: of two that want a new kernel at once, the second would have to wait for
         # whatever else is compiled meanwhile.
         self._block(0, 0)
@@ -85,7 +84,7 @@ class Enumerator:
 
     def uniforms(self, first: int, n: int) -> FloatArray:
         """Uniforms of the initial states of consecutive paths, shape (n, 5)."""
-        return uniforms(self._seed, first, n, INITIAL, N_STATE)
+        return uniforms(self._seed, first, n, INITIAL, len(STATE_COLUMNS))
 
     def run(self, first: int, n: int, progress: Progress) -> list[Enumerated]:
         """Paths ``first … first + n - 1``, in blocks."""
@@ -106,19 +105,19 @@ class Enumerator:
         state = self._states.from_uniforms(u)
         probability = np.zeros((n, self._max_steps))
         crashes = np.zeros((n, self._max_steps), np.int64)
-        path = empty_path(self._max_steps, self._draws)
+        path = empty_trajectory(self._environment)
         where = self._environment, self._drivers, self._envelope
         enumerate_cut_ins(self._seed, first, state, *where, self._stride, offset, path, probability, crashes)
         return Enumerated(first, weight, state, probability, crashes)
 
     def pairs(
-        self, path: IntArray, step: IntArray, state: FloatArray
+        self, path: IntArray, step: IntArray, state: RecordArray
     ) -> tuple[Int8Array, Int8Array, IntArray, IntArray]:
         """Maneuvers of chosen (path, cut-in step) pairs: LV's and BV's (n, draws), and how many of each (n,)."""
-        n, draws = len(path), self._draws
+        room = empty_trajectory(self._environment)
+        n, draws = len(path), room.lv.size
         lv, bv = np.zeros((n, draws), np.int8), np.zeros((n, draws), np.int8)
         n_lv, n_bv = np.zeros(n, np.int64), np.zeros(n, np.int64)
-        room = empty_path(self._max_steps, draws)
         write_pairs(self._seed, path, step, state, self._environment, room, lv, bv, n_lv, n_bv)
         return lv, bv, n_lv, n_bv
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from harness.arrays import BoolArray, FloatArray, Int8Array, IntArray
+from harness.arrays import BoolArray, FloatArray, Int8Array, IntArray, RecordArray
 from harness.environment.driving import Environment
 from harness.pool.library import Library
 
@@ -28,7 +28,7 @@ class CutIns:
     ----------
     path, step, shell : ndarray of int64, shape (n,)
         Which path of the pool, cut-in step, and shell.
-    state : ndarray, shape (n, 5)
+    state : structured ndarray, shape (n,)
         Initial states.
     lv, bv : ndarray of int8, shape (n, draws)
         Maneuver indices as an episode records them; 31 marks the cut-in.
@@ -41,7 +41,7 @@ class CutIns:
     path: IntArray
     step: IntArray
     shell: IntArray
-    state: FloatArray
+    state: RecordArray
     lv: Int8Array
     bv: Int8Array
     n_lv: IntArray
@@ -127,7 +127,7 @@ class Pool:
 
 def environment_hash(environment: Environment) -> str:
     """Hash of all numbers of an environment, level of lane changing and hold time included."""
-    numbers = {name: environment.numbers[name][0].item() for name in environment.numbers.dtype.names or ()}
+    numbers = {name: environment.numbers[name].item() for name in environment.numbers.dtype.names or ()}
     return hashlib.sha256(json.dumps(numbers, sort_keys=True).encode()).hexdigest()[:24]
 
 

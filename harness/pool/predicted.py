@@ -14,10 +14,11 @@ from harness.arrays import BoolArray, FloatArray, IntArray, RecordArray
 from harness.campaign.models import Campaign
 from harness.environment.driving import Environment
 from harness.environment.loading import load_environment
+from harness.episode.trajectory import empty_trajectory
 from harness.errors import RunFolderError
 from harness.pool.library import LibraryDriver
 from harness.pool.replay import StoredPaths, replay_surrogates
-from harness.pool.surrogate_replay import PATH_COLUMNS, room_for, stored_paths
+from harness.pool.surrogate_replay import PATH_COLUMNS, stored_paths
 from harness.records.folder import MEND_SHARD, read_manifest, read_table
 from harness.vehicles.models import driver_records
 
@@ -139,7 +140,7 @@ def replay_drivers(folder: Path, campaign: Campaign, drivers: Sequence[LibraryDr
 def _who_crashes(stored: StoredPaths, environment: Environment, records: RecordArray) -> BoolArray:
     """Which drivers crash in stored tests, shape (n, D)."""
     bits = np.zeros(stored.cut_step.size, np.int64)
-    wrong = replay_surrogates(stored, environment, records, -1, room_for(environment), bits)
+    wrong = replay_surrogates(stored, environment, records, -1, empty_trajectory(environment), bits)
     if wrong >= 0:
         raise RunFolderError(
             f"episodes, episode {stored.first + wrong}",

@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from harness.arrays import FloatArray, IntArray
+from harness.arrays import IntArray, RecordArray
 from harness.campaign.models import Campaign
-from harness.episode.cells import Script
+from harness.episode.cells import PrescribedTraffic
 from harness.pool.cut_ins import Pool
 from harness.pool.shells import Draws, ShellDesign, acceleration_limit, design_shells, shells_in_strata
 
@@ -48,19 +48,19 @@ class PrescribedEpisodes:
         rows = [self.draws.take(draw.stratum, draw.first, draw.n) for draw in draws]
         return np.concatenate(rows), np.repeat([draw.stratum for draw in draws], [draw.n for draw in draws])
 
-    def episodes(self, draws: tuple[Draw, ...]) -> tuple[FloatArray, Script, IntArray]:
-        """Initial states (n, 5), script, and rows of the pool's cut-ins (n,)."""
+    def episodes(self, draws: tuple[Draw, ...]) -> tuple[RecordArray, PrescribedTraffic, IntArray]:
+        """Initial states (n,), traffic, and rows of the pool's cut-ins (n,)."""
         rows, stratum = self.rows(draws)
         return (*self.of_rows(rows, stratum), rows)
 
-    def of_rows(self, rows: IntArray, stratum: IntArray) -> tuple[FloatArray, Script]:
-        """Initial states (n, 5) and script of given cut-ins of the pool (n,), tested for given strata (n,)."""
+    def of_rows(self, rows: IntArray, stratum: IntArray) -> tuple[RecordArray, PrescribedTraffic]:
+        """Initial states (n,) and traffic of given cut-ins of the pool (n,), tested for given strata (n,)."""
         c = self._pool.cut_ins
-        script = Script(
+        traffic = PrescribedTraffic(
             lv=np.ascontiguousarray(c.lv[rows]),
             bv=np.ascontiguousarray(c.bv[rows]),
             cut_step=c.step[rows],
             component=stratum.astype(np.int64),
             log_weight=np.log(self.design.p[stratum]),
         )
-        return c.state[rows], script
+        return c.state[rows], traffic

@@ -23,13 +23,13 @@ from harness.pool.cut_ins import CutIns, Pool, environment_hash
 from harness.pool.library import Library, load_library
 from harness.progress import Progress
 from harness.records.folder import require_place, write_atomically
+from harness.state import STATE_COLUMNS, states_from
 
 _FORMAT = 3
 """Raise it when the meaning of a pool changes."""
 _MADE_BY = ("build.py", "cut_ins.py", "proposal.py")
 """Code that decides what is in a pool, beside the kernels."""
 _METADATA, _DIGEST = b"harness_pool", b"harness_pool_sha256"
-_STATE = ("v_bv_mps", "r1_m", "r1dot_mps", "r2_m", "r2dot_mps")
 
 
 def pool_key(environment: Environment, library: Library, settings: PoolSettings) -> str:
@@ -155,7 +155,7 @@ def _table(pool: Pool) -> pa.Table:
     kept = np.bincount(c.shell, minlength=pool.shell_p.size)
     columns: dict[str, tuple[pa.Array, str]] = {
         "path": (pa.array(c.path), "index of the path in the pool"),
-        **{name: (pa.array(c.state[:, i]), "initial state") for i, name in enumerate(_STATE)},
+        **{name: (pa.array(np.ascontiguousarray(c.state[name])), "initial state") for name in STATE_COLUMNS},
         "cut_in_step": (pa.array(c.step.astype(np.int16)), "step (0.1 s) in which BV cuts in"),
         "probability": (pa.array((pool.shell_p / np.maximum(kept, 1))[c.shell]), "P under the NDE that it stands for"),
         "shell": (pa.array(c.shell.astype(np.int8)), "first surrogate that crashes; the last shell: none does"),
@@ -199,7 +199,7 @@ def _pool(table: pa.Table, facts: dict[str, Any]) -> Pool:
         path=np.asarray(table.column("path")),
         step=np.asarray(table.column("cut_in_step")).astype(np.int64),
         shell=np.asarray(table.column("shell")).astype(np.int64),
-        state=np.column_stack([np.asarray(table.column(name)) for name in _STATE]),
+        state=states_from(np.asarray(table.column(name)) for name in STATE_COLUMNS),
         lv=lv,
         bv=bv,
         n_lv=n_lv,

@@ -13,14 +13,13 @@ from harness.arrays import BoolArray, FloatArray, Int8Array, IntArray
 from harness.campaign.models import Campaign
 from harness.environment.driving import Environment
 from harness.environment.loading import load_environment
-from harness.episode.cells import max_draws
+from harness.episode.trajectory import empty_trajectory
 from harness.errors import CampaignError, RunFolderError
 from harness.pool.cut_ins import Pool, environment_hash
-from harness.pool.enumeration import Path, empty_path
 from harness.pool.replay import StoredPaths, replay_surrogates
 from harness.records.folder import MEND_SHARD
+from harness.state import STATE_COLUMNS, states_from
 
-STATE_COLUMNS = ("v_bv_mps", "r1_m", "r1dot_mps", "r2_m", "r2dot_mps")
 PATH_COLUMNS = ("episode", *STATE_COLUMNS, "n_steps", "cut_in_step", "lv_maneuvers", "bv_maneuvers")
 """What of the episodes table determines LV's and BV's motion."""
 _PART = 512
@@ -102,7 +101,7 @@ class SurrogateReplay:
 
     def _replay(self, stored: StoredPaths) -> IntArray:
         bits = np.zeros(stored.cut_step.size, np.int64)
-        room = room_for(self._environment)
+        room = empty_trajectory(self._environment)
         wrong = replay_surrogates(stored, self._environment, self._drivers, self._envelope, room, bits)
         if wrong >= 0:
             raise RunFolderError(
@@ -133,12 +132,6 @@ def require_same_environment(environment: Environment, pool: Pool) -> None:
         )
 
 
-def room_for(environment: Environment) -> Path:
-    """Room for one path of an environment."""
-    max_steps, hold_steps = (int(environment.numbers[0][name]) for name in ("max_steps", "hold_steps"))
-    return empty_path(max_steps, max_draws(max_steps, hold_steps))
-
-
 def rows_of(stored: StoredPaths, begin: int, end: int) -> StoredPaths:
     """Some consecutive rows."""
     rows, edges = slice(begin, end), slice(begin, end + 1)
@@ -160,7 +153,7 @@ def stored_paths(episodes: pa.Table, seed: int) -> StoredPaths:
     return StoredPaths(
         seed=seed,
         first=int(episodes.column("episode")[0].as_py()),
-        state=np.column_stack([np.asarray(episodes.column(name)) for name in STATE_COLUMNS]),
+        state=states_from(np.asarray(episodes.column(name)) for name in STATE_COLUMNS),
         n_steps=np.asarray(episodes.column("n_steps")).astype(np.int64),
         cut_step=np.asarray(cut_step).astype(np.int64),
         lv=lv,

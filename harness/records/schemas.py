@@ -11,6 +11,7 @@ import pyarrow as pa
 
 from harness.maneuvers import CUT_IN, STAY
 from harness.outcomes import BV_LV_CONTACT, CRASH, FAILED, OUTCOMES, PASSED, TIMEOUT, VEHICLES
+from harness.state import STATE_COLUMNS
 
 __all__ = [
     "BV_LV_CONTACT",
@@ -32,6 +33,20 @@ def _field(name: str, kind: pa.DataType, unit: str, doc: str, *, nullable: bool 
     return pa.field(name, kind, nullable=nullable, metadata={"unit": unit, "doc": doc})
 
 
+def _state_fields(which: str = "") -> list[pa.Field]:
+    docs = (
+        "speed of BV",
+        "gap LV-BV, bumper to bumper",
+        "rate of R1: v_LV - v_BV",
+        "gap BV-AV, bumper to bumper",
+        "rate of R2: v_BV - v_AV",
+    )
+    return [
+        _field(name, pa.float64(), "m/s" if name.endswith("_mps") else "m", which + doc)
+        for name, doc in zip(STATE_COLUMNS, docs, strict=True)
+    ]
+
+
 def _per(n: int) -> pa.DataType:
     """List of one float64 per importance function or surrogate; Parquet has no fixed-size list of zero."""
     return pa.list_(pa.float64(), n) if n else pa.list_(pa.float64())
@@ -48,11 +63,7 @@ def episodes_schema(n_importance: int, n_surrogates: int) -> pa.Schema:
         [
             _field("episode", pa.int64(), "1", "index of the episode in the campaign"),
             _field("seed", pa.int64(), "1", "campaign seed; with the index it determines every random number"),
-            _field("v_bv_mps", f8, "m/s", "initial speed of BV"),
-            _field("r1_m", f8, "m", "initial gap LV-BV, bumper to bumper"),
-            _field("r1dot_mps", f8, "m/s", "initial rate of R1: v_LV - v_BV"),
-            _field("r2_m", f8, "m", "initial gap BV-AV, bumper to bumper"),
-            _field("r2dot_mps", f8, "m/s", "initial rate of R2: v_BV - v_AV"),
+            *_state_fields("initial "),
             _field("outcome", _outcome_type(), "", "crash, passed, timeout, bv_lv_contact or failed"),
             _field("n_steps", pa.int16(), "0.1 s", "steps simulated until the episode ended"),
             _field("cut_in_step", pa.int16(), "0.1 s", "step in which BV cut in, null without one", nullable=True),
@@ -87,11 +98,7 @@ def moments_schema(n_surrogates: int) -> pa.Schema:
         [
             _field("episode", pa.int64(), "1", "index of the episode"),
             _field("step", pa.int16(), "0.1 s", "step of the control"),
-            _field("v_bv_mps", f8, "m/s", "speed of BV"),
-            _field("r1_m", f8, "m", "gap LV-BV"),
-            _field("r1dot_mps", f8, "m/s", "rate of R1"),
-            _field("r2_m", f8, "m", "gap BV-AV"),
-            _field("r2dot_mps", f8, "m/s", "rate of R2"),
+            *_state_fields(),
             _field("maneuver", pa.int8(), "1", "0..30 acceleration, 31 cut_in, 32 stay"),
             _field("p", f8, "1", "exposure: probability under the NDE"),
             _field("q_sampled", f8, "1", "probability it was drawn with, given the shared history"),

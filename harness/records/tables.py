@@ -11,6 +11,7 @@ from harness.arrays import FloatArray, Int8Array
 from harness.episode.loop import Shard
 from harness.outcomes import OUTCOMES, VEHICLES
 from harness.records.schemas import episodes_schema, moments_schema, traces_schema
+from harness.state import STATE_COLUMNS
 
 
 class ShardTables(NamedTuple):
@@ -63,7 +64,7 @@ def episodes_table(shard: Shard, seed: int) -> pa.Table:
     columns = {
         "episode": pa.array(shard.first_episode + np.arange(n)),
         "seed": pa.array(np.full(n, seed, np.int64)),
-        **{name: pa.array(shard.states[:, i]) for i, name in enumerate(schema.names[2:7])},
+        **{name: pa.array(np.ascontiguousarray(shard.states[name])) for name in STATE_COLUMNS},
         "outcome": _names(e["outcome"], OUTCOMES),
         "cut_in_step": pa.array(e["cut_in_step"], mask=never),
         "log_weight": pa.array(e["log_weight"]),

@@ -20,12 +20,12 @@ from harness.records.stored_manifest import StoredStops
 from harness.runner.campaign_run import run_campaign
 from harness.runner.manifest import require_own_folder
 from harness.runner.prepare import content_hash, require_ready
+from harness.state import STATE_COLUMNS
 
 Side = Literal["a", "b"]
 SIDES: tuple[Side, Side] = ("a", "b")
 STOPS = "stops.json"
 MAY_DIFFER = frozenset({"av", "name", "description"})
-_STATE_COLUMNS = ("v_bv_mps", "r1_m", "r1dot_mps", "r2_m", "r2dot_mps")
 
 
 @dataclass(frozen=True)
@@ -192,10 +192,10 @@ def _exactly(campaign: Campaign, n_episodes: int) -> Campaign:
 
 
 def _pairs(campaigns: dict[Side, Campaign], out: Path) -> Iterator[tuple[Block, Block]]:
-    columns = [*EPISODE_COLUMNS, *_STATE_COLUMNS]
+    columns = [*EPISODE_COLUMNS, *STATE_COLUMNS]
     shards = (read_shards(out / side, episode_columns=columns, moment_columns=[]) for side in SIDES)
     for (of_a, _), (of_b, _) in zip(*shards, strict=True):
-        if any(of_a[name] != of_b[name] for name in _STATE_COLUMNS):
+        if any(of_a[name] != of_b[name] for name in STATE_COLUMNS):
             raise RunFolderError(
                 str(out),
                 found="episodes of one index that begin differently in a and b",

@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-from harness.arrays import FloatArray
+from harness.arrays import RecordArray
 from harness.campaign.models import Campaign
 from harness.controllers.black_box import Death
 from harness.controllers.loading import build_host, require_controller
@@ -17,6 +17,7 @@ from harness.environment.initial_state import InitialStates
 from harness.environment.loading import load_environment, load_parameters
 from harness.episode.begin import mean_test_distance
 from harness.episode.loop import MOMENT_LIMITS, EpisodeLoop, Keep, Policy
+from harness.episode.trajectory import empty_trajectory
 from harness.errors import RunFolderError
 from harness.importance.build import build_importance, needs_tables
 from harness.pool.library import load_library
@@ -47,8 +48,8 @@ class Prepared:
     tables: Tables | None
     prescribed: PrescribedEpisodes | None = None
 
-    def states(self, first_episode: int, n_episodes: int) -> FloatArray:
-        """Initial states of consecutive episodes, shape (n_episodes, 5)."""
+    def states(self, first_episode: int, n_episodes: int) -> RecordArray:
+        """Initial states of consecutive episodes, shape (n_episodes,)."""
         return self.initial_states.draw(self.campaign.seed, first_episode, n_episodes)
 
     def loop(
@@ -215,4 +216,4 @@ def distance_per_test_m(environment: Environment) -> float:
     Overtakings without cut-in: the others are too few (some 3e-5 at level 1) to matter.
     """
     states = InitialStates(environment.numbers).draw(DISTANCE_SEED, 0, DISTANCE_PATHS)
-    return float(mean_test_distance(DISTANCE_SEED, states, environment))
+    return float(mean_test_distance(DISTANCE_SEED, states, environment, empty_trajectory(environment)))

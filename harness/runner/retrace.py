@@ -15,10 +15,11 @@ import pyarrow as pa
 from harness.arrays import BoolArray, FloatArray, IntArray
 from harness.campaign.models import Campaign
 from harness.environment.driving import Environment
+from harness.episode.trajectory import empty_trajectory
 from harness.errors import WorldDisagreementError
 from harness.outcomes import CRASH, FAILED, OUTCOMES, RUNNING
-from harness.pool.replay import StoredPaths, Twin, retrace
-from harness.pool.surrogate_replay import room_for, stored_paths
+from harness.pool.replay import Retraced, StoredPaths, retrace
+from harness.pool.surrogate_replay import stored_paths
 from harness.vehicles.kinematics import STEP_S
 from harness.vehicles.models import av_records
 
@@ -45,7 +46,7 @@ class Retracing:
         self._reason = no_retracing(campaign)
         self._seed, self._environment = campaign.seed, environment
         self._driver = av_records(campaign.av)
-        self._room = room_for(environment)
+        self._room = empty_trajectory(environment)
 
     def check(self, episodes: pa.Table) -> int:
         """Retrace the rows of an episodes table; returns how many, all of them equal.
@@ -86,7 +87,7 @@ _Difference = tuple[BoolArray, np.ndarray, np.ndarray]
 """Which rows differ, what is stored, and what the twin says."""
 
 
-def _differences(episodes: pa.Table, stored: StoredPaths, twin: Twin, built_in: bool) -> dict[str, _Difference]:
+def _differences(episodes: pa.Table, stored: StoredPaths, twin: Retraced, built_in: bool) -> dict[str, _Difference]:
     """Per column what is to be equal."""
     outcome = _outcomes(episodes)
     r2, r2dot, impact, time = (
@@ -109,8 +110,8 @@ def _differences(episodes: pa.Table, stored: StoredPaths, twin: Twin, built_in: 
     }
 
 
-def _empty(n: int) -> Twin:
-    return Twin(np.zeros(n, np.int64), np.zeros(n, np.int64), np.zeros(n), np.zeros(n), np.zeros(n))
+def _empty(n: int) -> Retraced:
+    return Retraced(np.zeros(n, np.int64), np.zeros(n, np.int64), np.zeros(n), np.zeros(n), np.zeros(n))
 
 
 def _unlike(a: FloatArray, b: FloatArray) -> BoolArray:

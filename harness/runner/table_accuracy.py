@@ -44,9 +44,9 @@ def table_errors(campaign: Campaign, environment: Environment, tables: Tables | 
     if tables is None or campaign.testing.challenge == "immediate":
         return []
     drivers = surrogate_records(campaign.surrogates)
-    hashes = [tables_hash(environment, drivers[j : j + 1], "recursive") for j in range(drivers.size)]
-    level = float(environment.numbers["level"][0])
-    key = hashlib.sha256(json.dumps([hashes, list(campaign.surrogates), level, source_hash()]).encode()).hexdigest()
+    of_tables = tables_hash(environment, drivers, "recursive")
+    level = float(environment.numbers["level"])
+    key = hashlib.sha256(json.dumps([of_tables, list(campaign.surrogates), level, source_hash()]).encode()).hexdigest()
     path = cache_root() / "tables" / f"accuracy-{key[:24]}.json"
     if path.exists():
         found: list[dict[str, Any]] = json.loads(path.read_text(encoding="utf-8"))

@@ -13,7 +13,7 @@ import pyarrow as pa
 
 from harness.campaign.models import Campaign
 from harness.controllers.black_box import Death
-from harness.episode.cells import Script
+from harness.episode.cells import PrescribedTraffic
 from harness.episode.loop import EpisodeLoop, Shard
 from harness.estimators.block import Block
 from harness.estimators.from_records import block_from_tables
@@ -109,8 +109,8 @@ class ShardRunner:
         rows = chosen_rows(shard, campaign.seed, acts_early=campaign.av.before_cut_in == "controller")
 
         def again(row: int) -> Shard:
-            script = Script._make(column[row : row + 1] for column in shard.script)
-            return alone.run(shard.first_episode + row, shard.states[row : row + 1], script)
+            traffic = PrescribedTraffic._make(column[row : row + 1] for column in shard.traffic)
+            return alone.run(shard.first_episode + row, shard.states[row : row + 1], traffic)
 
         return repeat(shard, rows, again)
 
@@ -118,8 +118,8 @@ class ShardRunner:
         prescribed = self._prepared.prescribed
         if prescribed is None:
             return self._loop.run(spec.first_episode, self._prepared.states(spec.first_episode, spec.n_episodes))
-        states, script, rows = prescribed.episodes(spec.draws)
-        shard = self._loop.run(spec.first_episode, states, script)
+        states, traffic, rows = prescribed.episodes(spec.draws)
+        shard = self._loop.run(spec.first_episode, states, traffic)
         shard.cut_ins = rows
         return shard
 

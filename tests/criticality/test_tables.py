@@ -1,11 +1,15 @@
 """The cache of challenge tables: by content, read when there, built again when damaged."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+from harness.campaign.loading import load_campaign
 from harness.campaign.models import IDMParameters
 from harness.criticality import tables as cache
 from harness.criticality.tables import Tables, build_tables, table_path, tables_cached, tables_hash
+from harness.importance.build import build_importance
 from harness.vehicles.models import MODEL_FIELDS, driver_records
 from tests.environment.kernels import environment
 
@@ -33,6 +37,12 @@ def built(monkeypatch):
     return arguments
 
 
+def mapped_by(table):
+    while isinstance(table.base, np.ndarray):
+        table = table.base
+    return table
+
+
 def equal(one, other):
     return all(a.tobytes() == b.tobytes() and a.shape == b.shape for a, b in zip(one, other, strict=True))
 
@@ -44,13 +54,13 @@ def test_the_second_build_reads(folder, built):
     second = build_tables(environment(), DRIVER, "immediate")
     assert len(built) == 1
     assert equal(first, second)
-    assert [path.suffix for path in folder.iterdir()] == [".npz"]  # nothing half-written is left behind
+    assert [path.suffix for path in folder.iterdir()] == [".npy"]  # nothing half-written is left behind
 
 
-def test_another_surrogate_is_another_file(folder, built):
+def test_another_set_of_surrogates_is_another_file(folder, built):
     one = build_tables(environment(), DRIVER, "immediate")
     both = build_tables(environment(), np.concatenate([DRIVER, OTHER]), "immediate")
-    assert len(built) == 2
+    assert len(built) == 3
     assert len(list(folder.iterdir())) == 2
     assert equal([array[:1] for array in both], one)
     assert not equal([array[1:] for array in both], one)
@@ -60,7 +70,9 @@ def test_another_surrogate_is_another_file(folder, built):
 def test_a_truncated_file_is_built_again(folder, built, damage):
     first = build_tables(environment(), DRIVER, "immediate")
     path = table_path(environment(), DRIVER, "immediate")
-    path.write_bytes(damage(path.read_bytes()))
+    content = path.read_bytes()
+    path.unlink()  # the tables are mapped: a file that shrinks under them would take this process down
+    path.write_bytes(damage(content))
     assert equal(build_tables(environment(), DRIVER, "immediate"), first)
     assert equal(build_tables(environment(), DRIVER, "immediate"), first)
     assert len(built) == 2
@@ -71,6 +83,26 @@ def test_a_real_table_is_read_as_it_was_built(folder):
     first = build_tables(environment(), DRIVER, "immediate")
     assert equal(build_tables(environment(), DRIVER, "immediate"), first)
     assert first.value.shape[:2] == (1, 13)
+
+
+def test_tables_are_mapped_and_nobody_can_write_to_them(folder, built):
+    """Also those that have just been built: the process that built them shares them with its workers."""
+    for _ in range(2):
+        for table in build_tables(environment(), DRIVER, "immediate"):
+            assert type(table) is np.ndarray
+            assert table.flags.c_contiguous
+            assert not table.flags.writeable
+            assert isinstance(mapped_by(table), np.memmap)
+
+
+def test_kernels_are_compiled_once_for_campaigns_with_and_without_tables(folder, built):
+    """A read-only array is another type than a writable one."""
+    tables = build_tables(environment(), DRIVER, "immediate")
+    naturalistic = build_importance(
+        load_campaign(Path(__file__).parents[2] / "scenarios" / "overtaking_nde.yaml"), None
+    )
+    for name, table in tables._asdict().items():
+        assert getattr(naturalistic, name).flags.writeable == table.flags.writeable
 
 
 def test_progress_is_told_for_every_surrogate(folder, built):

@@ -13,6 +13,7 @@ from harness.compiled import compiled_threads
 from harness.environment import cut_in, driving
 from harness.environment.loading import load_environment
 from harness.environment.student_t import t_cdf
+from harness.state import State
 
 
 @functools.cache
@@ -31,18 +32,18 @@ def _free(speeds, env, u, pmf, drawn):
 @compiled_threads
 def _following(states, env, u, pmf, cap, drawn):
     for i in range(states.shape[0]):
-        v, r1, r1dot = states[i, 0], states[i, 1], states[i, 2]
-        driving.car_following_pmf(v, r1, r1dot, env, pmf[i])
-        cap[i] = driving.guard_cap(r1, r1dot, env)
+        state = State(states[i, 0], states[i, 1], states[i, 2], 0.0, 0.0)
+        driving.car_following_pmf(state, env, pmf[i])
+        cap[i] = driving.guard_cap(state, env)
         for j in range(u.size):
-            drawn[i, j] = driving.draw_car_following(u[j], v, r1, r1dot, env)
+            drawn[i, j] = driving.draw_car_following(u[j], state, env)
 
 
 @compiled_threads
 def _cut_in(states, env, out):
     for i in range(states.shape[0]):
         v, r1, r1dot, r2, r2dot = states[i]
-        out[i, 0] = cut_in.opportunity(v, r1, r1dot, env)
+        out[i, 0] = cut_in.opportunity(State(v, r1, r1dot, r2, r2dot), env)
         out[i, 1] = cut_in.acceptance(r2, r2dot, env)
         out[i, 2] = cut_in.cut_in_hazard(out[i, 0], out[i, 1], env)
 

@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from harness.environment.initial_state import InitialStates
-from harness.episode.begin import place
+from harness.episode.trajectory import place
+from harness.state import STATE_COLUMNS, State
 from tests.chains.seed import SEED
 from tests.environment.kernels import environment
 
@@ -41,27 +42,27 @@ def rate_distribution(v, r1):
 
 def test_speeds(states):
     """Check values of the fit: mean 30.14 m/s, sd 3.36 m/s (standard errors here 0.005 and 0.004)."""
-    assert states[:, 0].mean() == pytest.approx(30.14, abs=0.025)
-    assert states[:, 0].std() == pytest.approx(3.36, abs=0.025)
+    assert states["v_bv_mps"].mean() == pytest.approx(30.14, abs=0.025)
+    assert states["v_bv_mps"].std() == pytest.approx(3.36, abs=0.025)
 
 
 def test_gaps_at_30_mps(sampler):
     """Check values of the fit: median 35.0 m, 5 and 95 % at 16.4 and 88 m."""
     probabilities = np.array([0.05, 0.5, 0.95])
-    found = sampler.given_speed(30.0, probabilities, np.full(3, 0.5))[:, 1]
+    found = sampler.given_speed(30.0, probabilities, np.full(3, 0.5))["r1_m"]
     assert (np.abs(found - [16.4, 35.0, 88.0]) < [0.05, 0.1, 0.5]).all()
 
 
 def test_rates_at_30_mps(sampler):
     """Check values of the fit: mean 0.33 m/s, sd 1.32 m/s."""
     u = np.random.default_rng(SEED).random((2, 200_000))
-    found = sampler.given_speed(30.0, u[0], u[1])[:, 2]
+    found = sampler.given_speed(30.0, u[0], u[1])["r1dot_mps"]
     assert found.mean() == pytest.approx(0.33, abs=0.06)
     assert found.std() == pytest.approx(1.32, abs=0.06)
 
 
 def test_truncations(states):
-    v, r1, r1dot, r2, r2dot = states.T
+    v, r1, r1dot, r2, r2dot = (states[name] for name in STATE_COLUMNS)
     assert v.min() >= 20.0
     assert v.max() <= 40.0
     assert r1.min() >= 0.0
@@ -70,35 +71,35 @@ def test_truncations(states):
     assert ((r2dot >= -10.0) & (r2dot <= -5.0)).all()
     closing = r1dot < 0.0
     assert (r1[closing] / -r1dot[closing]).min() >= 3.0 - 1e-9
-    assert np.isfinite(states).all()
+    assert all(np.isfinite(states[name]).all() for name in STATE_COLUMNS)
 
 
 @pytest.mark.parametrize(
     ("column", "reference"),
-    [(3, stats.uniform(20.0, 80.0)), (4, stats.uniform(-10.0, 5.0))],
+    [("r2_m", stats.uniform(20.0, 80.0)), ("r2dot_mps", stats.uniform(-10.0, 5.0))],
     ids=["R2", "R2dot"],
 )
 def test_the_avs_part_is_uniform(states, column, reference):
-    assert stats.kstest(states[:, column], reference.cdf).pvalue > 1e-4
+    assert stats.kstest(states[column], reference.cdf).pvalue > 1e-4
 
 
 def test_speeds_are_skew_normal(states):
     free = stats.skewnorm(-2.41, 33.86, 5.174)
     low, high = free.cdf(20.0), free.cdf(40.0)
-    sample = states[:20_000, 0]
+    sample = states["v_bv_mps"][:20_000]
     assert stats.kstest(sample, lambda v: (free.cdf(v) - low) / (high - low)).pvalue > 1e-4
 
 
 def test_the_axes_are_drawn_independently_of_each_other(states):
     """R2 and R2dot know nothing of the rest; four standard errors of a correlation."""
-    correlation = np.corrcoef(states.T)
+    correlation = np.corrcoef([states[name] for name in STATE_COLUMNS])
     np.fill_diagonal(correlation, 0.0)
     assert np.abs(correlation[3:]).max() < 4.0 / np.sqrt(N)
 
 
 @given(inside_v, open_unit)
 def test_gaps_invert_their_distribution(v, probability):
-    found = InitialStates(environment().numbers).given_speed(v, np.array([probability]), np.array([0.5]))[0, 1]
+    found = InitialStates(environment().numbers).given_speed(v, np.array([probability]), np.array([0.5]))["r1_m"][0]
     free, low, high = gap_distribution(v)
     assert (free.cdf(found) - low) / (high - low) == pytest.approx(probability, abs=1e-9)
 
@@ -106,9 +107,9 @@ def test_gaps_invert_their_distribution(v, probability):
 @given(inside_v, open_unit, open_unit)
 def test_rates_invert_their_distribution_beyond_three_seconds_to_collision(v, gap_u, probability):
     state = InitialStates(environment().numbers).given_speed(v, np.array([gap_u]), np.array([probability]))[0]
-    free = rate_distribution(v, state[1])
-    low = free.cdf(-state[1] / 3.0)
-    assert (free.cdf(state[2]) - low) / (1.0 - low) == pytest.approx(probability, abs=1e-9)
+    free = rate_distribution(v, state["r1_m"])
+    low = free.cdf(-state["r1_m"] / 3.0)
+    assert (free.cdf(state["r1dot_mps"]) - low) / (1.0 - low) == pytest.approx(probability, abs=1e-9)
 
 
 @given(st.lists(st.integers(1, 40), min_size=1, max_size=8), st.integers(0, 2**40), st.integers(0, 2**62))
@@ -125,12 +126,13 @@ def test_only_the_rate_is_drawn_anew_where_time_to_collision_is_short(states):
     numbers = environment().numbers.copy()
     numbers["initial_state__r1dot_min_ttc_s"] = 1e-6  # no truncation
     free = InitialStates(numbers).draw(SEED, 0, N)
-    np.testing.assert_array_equal(free[:, [0, 1, 3, 4]], states[:, [0, 1, 3, 4]])
-    assert (free[:, 2] < -free[:, 1] / 3.0).any()
-    assert not (states[:, 2] < -states[:, 1] / 3.0 - 1e-9).any()
+    for name in ("v_bv_mps", "r1_m", "r2_m", "r2dot_mps"):
+        np.testing.assert_array_equal(free[name], states[name])
+    assert (free["r1dot_mps"] < -free["r1_m"] / 3.0).any()
+    assert not (states["r1dot_mps"] < -states["r1_m"] / 3.0 - 1e-9).any()
 
 
 def test_lv_does_not_start_backwards():
     x, v = np.zeros(3), np.zeros(3)
-    place(np.array([20.0, 100.0, -25.0, 50.0, -7.0]), x, v)
+    place(State(20.0, 100.0, -25.0, 50.0, -7.0), x, v)
     assert v.tolist() == [0.0, 20.0, 27.0]

@@ -40,8 +40,8 @@ def test_every_number_says_where_it_comes_from():
 def test_every_number_reaches_the_kernels():
     record = load_environment(Environment(lane_change_level=350.0, acceleration_hold_s=0.1)).numbers
     for section, name in NUMBERS:
-        assert record[f"{section}__{name}"][0] == DATA[section][name]["value"]
-    assert record[["level", "hold_steps", "max_steps"]][0].item() == (350.0, 1, 200)
+        assert record[f"{section}__{name}"] == DATA[section][name]["value"]
+    assert record[["level", "hold_steps", "max_steps"]].item() == (350.0, 1, 200)
 
 
 @pytest.mark.parametrize(
@@ -79,7 +79,7 @@ def test_a_missing_file_is_an_error(tmp_path):
 
 def test_a_users_number_is_used(tmp_path):
     changed = user_file(tmp_path, "  df: {value: 16.0, source: ndd}", "  df: {value: 1e1, source: user, note: ours}")
-    assert load_environment(changed).numbers["free_driving__df"][0] == 10.0
+    assert load_environment(changed).numbers["free_driving__df"] == 10.0
 
 
 def test_the_hash_is_that_of_the_numbers_alone(tmp_path):

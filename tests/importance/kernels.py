@@ -13,6 +13,7 @@ from harness.environment.driving import free_driving_pmf
 from harness.episode.after_cut_in import draw_from
 from harness.importance import functions, likelihood
 from harness.maneuvers import acceleration
+from harness.state import State
 
 
 class Proposals(NamedTuple):
@@ -30,18 +31,19 @@ class Proposals(NamedTuple):
 @compiled_threads
 def _after(states, environment, importance, p, q, v, critical):
     for i in range(states.shape[0]):
-        speed, r2, r2dot = states[i, 0], states[i, 3], states[i, 4]
+        speed, r1, r1dot, r2, r2dot = states[i]
         free_driving_pmf(speed, environment, p[i])
-        critical[i] = functions.propose_acceleration(speed, r2, r2dot, p[i], importance, q[i], v[i])
+        state = State(speed, r1, r1dot, r2, r2dot)
+        critical[i] = functions.propose_acceleration(state, p[i], importance, q[i], v[i])
 
 
 @compiled_threads
 def _before(states, maneuvers, steps, environment, importance, cut, stay, p, q, v, critical):
     for i in range(states.shape[0]):
         speed, r1, r1dot, r2, r2dot = states[i]
-        a = acceleration(maneuvers[i])
-        functions.look_ahead(speed, r2, r2dot, a, steps[i], environment, importance, cut[i], stay[i])
-        wish = opportunity(speed, r1, r1dot, environment)
+        state, a = State(speed, r1, r1dot, r2, r2dot), acceleration(maneuvers[i])
+        functions.look_ahead(state, a, steps[i], environment, importance, cut[i], stay[i])
+        wish = opportunity(state, environment)
         hazard = cut_in_hazard(wish, acceptance(r2, r2dot, environment), environment)
         p[i] = -np.expm1(-hazard)
         critical[i] = functions.propose_cut_in(p[i], wish, cut[i, 0], stay[i, 0], importance, q[i], v[i])
@@ -80,7 +82,7 @@ def after_cut_in(states, environment, importance) -> Proposals:
 
 def before_cut_in(states, maneuvers, steps, environment, importance) -> Proposals:
     """Proposals at redraw times before the cut-in, BV having drawn ``maneuvers`` (n,) in ``steps`` (n,)."""
-    n, j, hold = len(states), importance.value.shape[0], int(environment.numbers["hold_steps"][0])
+    n, j, hold = len(states), importance.value.shape[0], int(environment.numbers["hold_steps"])
     p, q, v, critical = np.empty(n), np.empty((n, j)), np.empty((n, j)), np.empty(n, np.bool_)
     cut, stay = np.empty((n, hold, j)), np.empty((n, hold, j))
     indices, times = np.asarray(maneuvers, np.int64), np.asarray(steps, np.int64)

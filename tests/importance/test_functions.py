@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from harness.maneuvers import CUT_IN, STAY
 from harness.outcomes import EPISODE_MIXTURE, STEP_MIXTURE
+from harness.state import STATE_COLUMNS
 from tests.episode.twin_runs import prepared, run
 from tests.importance.kernels import after_cut_in, before_cut_in, drawn
 
@@ -31,17 +32,14 @@ steps = st.integers(0, 19).map(lambda second: 10 * second)
 def policy_of(challenge, epsilon):
     """Environment and importance functions, at a level where cutting in is not always negligible."""
     policy = prepared("step_mixture", challenge, level=1e4).policy
-    importance_settings = policy.importance.settings.copy()
-    importance_settings["epsilon"] = epsilon
-    return policy.environment, policy.importance._replace(settings=importance_settings)
+    return policy.environment, policy.importance._replace(epsilon=epsilon)
 
 
 def recorded(challenge):
     """States, maneuvers and steps of BV's redraw times: before the cut-in, and after it."""
     done = run("step_mixture", challenge, n=4_000, moments="all")
     moment = done.moment
-    columns = ("v_bv_mps", "r1_m", "r1dot_mps", "r2_m", "r2dot_mps")
-    state = np.column_stack([moment[name] for name in columns])
+    state = np.column_stack([moment[name] for name in STATE_COLUMNS])
     before = np.isin(moment["maneuver"], (CUT_IN, STAY)) & (moment["step"] % 10 == 0)
     return done, state, before, moment["maneuver"] < CUT_IN
 
@@ -151,9 +149,7 @@ def test_a_higher_threshold_leaves_fewer_moments_critical():
     _, state, _, after = recorded("recursive")
     counts = []
     for threshold in (0.0, 1e-3, 0.5):
-        changed = importance.settings.copy()
-        changed["threshold"] = threshold
-        found = after_cut_in(state[after], environment, importance._replace(settings=changed))
+        found = after_cut_in(state[after], environment, importance._replace(threshold=threshold))
         np.testing.assert_array_equal(found.critical, (found.v > threshold).any(axis=1))
         counts.append(int(found.critical.sum()))
     assert counts[0] > counts[1] > counts[2] > 0

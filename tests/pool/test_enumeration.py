@@ -9,12 +9,12 @@ from scipy.stats import chisquare
 from harness.arrays import RecordArray
 from harness.campaign.models import PoolSettings
 from harness.environment.initial_state import InitialStates
-from harness.episode.cells import max_draws
 from harness.episode.loop import EpisodeLoop, Keep, Policy
+from harness.episode.trajectory import empty_trajectory
 from harness.importance.build import build_importance
 from harness.outcomes import CRASH
 from harness.pool.build import Enumerator
-from harness.pool.enumeration import STRIDE, empty_path, enumerate_cut_ins
+from harness.pool.enumeration import STRIDE, enumerate_cut_ins
 from harness.pool.library import load_library
 from harness.pool.prescribed import Draw, PrescribedEpisodes
 from harness.pool.shells import design_shells
@@ -29,12 +29,10 @@ NAMES = list(LIBRARY.surrogates)
 def enumerated(
     environment, n: int, envelope: int, drivers: RecordArray = LIBRARY.drivers, stride: int = 1, offset: int = 0
 ):
-    numbers = environment.numbers[0]
-    steps = int(numbers["max_steps"])
+    steps = int(environment.numbers["max_steps"])
     states = InitialStates(environment.numbers).draw(SEED, 0, n)
     probability, crashes = np.zeros((n, steps)), np.zeros((n, steps), np.int64)
-    path = empty_path(steps, max_draws(steps, int(numbers["hold_steps"])))
-    offsets = np.full(n, offset)
+    path, offsets = empty_trajectory(environment), np.full(n, offset)
     enumerate_cut_ins(SEED, 0, states, environment, drivers, envelope, stride, offsets, path, probability, crashes)
     return probability, crashes
 
@@ -63,15 +61,15 @@ def test_a_prescribed_episode_ends_as_the_pool_says(campaign, pool, environment,
     """LV's and BV's paths, the cut-in and the surrogate's answer, driven by the episode loop instead of the pool."""
     prescribed = PrescribedEpisodes(campaign, pool)
     shells = [Draw(s, 0, 60) for s in range(prescribed.design.p.size)]
-    states, script, rows = prescribed.episodes(tuple(shells))
+    states, traffic, rows = prescribed.episodes(tuple(shells))
     driver = LIBRARY.drivers[NAMES.index(surrogate)][None]
     policy = Policy(1, environment, build_importance(campaign, None), driver)
-    shard = EpisodeLoop(TwinWorld(16), policy, Keep(0, "none", 0.0)).run(0, states, script)
+    shard = EpisodeLoop(TwinWorld(16), policy, Keep(0, "none", 0.0)).run(0, states, traffic)
     episode = shard.results.episode
     crashed = episode["outcome"] == CRASH
     assert np.array_equal(crashed, pool.cut_ins.crashes[rows, pool.names.index(surrogate)])
     assert np.array_equal(episode["cut_in_step"], pool.cut_ins.step[rows])
-    assert np.allclose(episode["log_weight"], np.log(prescribed.design.p[script.component]), rtol=1e-15)
+    assert np.allclose(episode["log_weight"], np.log(prescribed.design.p[traffic.component]), rtol=1e-15)
 
 
 def test_the_probabilities_of_a_path_add_up_to_that_of_a_cut_in(environment):

@@ -21,7 +21,7 @@ from harness.vehicles.kinematics import CONTACT_M, VEHICLE_LENGTH_M, next_positi
 
 
 class Job(NamedTuple):
-    """A range of episodes to run in SUMO and to record: ``states`` (n, 5), or the campaign's own when None."""
+    """A range of episodes to run in SUMO and to record: ``states`` (n,), or the campaign's own when None."""
 
     campaign: Campaign
     n_episodes: int

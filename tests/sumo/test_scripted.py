@@ -6,16 +6,18 @@ import numpy as np
 import pytest
 
 from harness.environment.loading import load_environment
-from harness.episode.cells import Script
+from harness.episode.cells import PrescribedTraffic
 from harness.episode.loop import EpisodeLoop, Keep, Policy, Shard
+from harness.episode.trajectory import empty_trajectory
 from harness.importance.build import build_importance
 from harness.maneuvers import CUT_IN
 from harness.outcomes import BV_LV_CONTACT, CRASH, TIMEOUT
 from harness.pool.library import load_library
 from harness.pool.replay import replay_surrogates
-from harness.pool.surrogate_replay import room_for, stored_paths
+from harness.pool.surrogate_replay import stored_paths
 from harness.records.tables import episodes_table
 from harness.runner.retrace import Retracing
+from harness.state import STATE_DTYPE
 from harness.twin import TwinWorld
 from harness.vehicles.models import av_records
 
@@ -26,17 +28,18 @@ STATES = np.array(
         (21.0, 3.0, -4.0, 30.0, -8.0),  # in good time
         (21.0, 30.0, 0.0, 0.5, -8.0),  # in front of the AV's bumper
         (21.0, 0.3, -4.0, 0.5, -8.0),  # both at once
-    ]
+    ],
+    STATE_DTYPE,
 )
 OUTCOMES = [BV_LV_CONTACT, TIMEOUT, CRASH, BV_LV_CONTACT]
 
 
-def cut_in_at_once() -> Script:
+def cut_in_at_once() -> PrescribedTraffic:
     """In every row BV cuts in in the first step; after it nobody changes speed."""
     n = len(STATES)
     lv, bv = np.full((n, 22), KEEP_SPEED, np.int8), np.full((n, 22), KEEP_SPEED, np.int8)
     bv[:, 1] = CUT_IN
-    return Script(lv, bv, np.zeros(n, np.int64), np.zeros(n, np.int64), np.zeros(n))
+    return PrescribedTraffic(lv, bv, np.zeros(n, np.int64), np.zeros(n, np.int64), np.zeros(n))
 
 
 def run(world, smoke) -> Shard:
@@ -59,7 +62,7 @@ def test_contact_in_the_step_of_the_cut_in_is_retraced_and_no_surrogate_crashes(
     episodes = episodes_table(run(TwinWorld(4), smoke), campaign.seed)
     assert Retracing(campaign, environment).check(episodes) == len(STATES)
     crashes = np.full(len(STATES), -1, np.int64)
-    stored, room = stored_paths(episodes, campaign.seed), room_for(environment)
+    stored, room = stored_paths(episodes, campaign.seed), empty_trajectory(environment)
     assert replay_surrogates(stored, environment, library.drivers, -1, room, crashes) == -1
     everybody = 2 ** len(library.surrogates) - 1
     assert crashes.tolist()[::2] == [0, everybody]

@@ -13,6 +13,7 @@ import pytest
 
 from harness.episode.loop import Shard
 from harness.outcomes import AV, BV, BV_LV_CONTACT, CRASH, LV
+from harness.state import STATE_DTYPE
 from harness.twin import TwinWorld
 from tests.sumo.raw_getters import (
     Job,
@@ -31,9 +32,9 @@ PAIRS = [(0.5, -12.0), (1.0, -15.0), (0.2, -8.0), (3.0, -20.0)]
 
 
 def hopeless_starts() -> np.ndarray:
-    """Initial states (16, 5) from which BV runs into LV before AV is past."""
+    """Initial states (16,) from which BV runs into LV before AV is past."""
     rows = [(v, r1, r1dot, 60.0, -5.0) for v in (22.0, 28.0, 33.0, 37.5) for r1, r1dot in PAIRS]
-    return np.array(rows)
+    return np.array(rows, STATE_DTYPE)
 
 
 @pytest.fixture(scope="module")

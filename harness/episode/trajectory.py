@@ -1,0 +1,204 @@
+"""What happens around a cut-in, walked without a world: LV and BV before it, BV after it, and who runs into BV.
+
+Nobody's motion before the cut-in depends on the AV, which keeps its speed; nor does BV's after it. So a trajectory can
+be walked before the episode is run, or after it, with the same draws and the same arithmetic, and with any driver
+behind BV.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from harness.arrays import FloatArray, Int8Array, Record, RecordArray
+from harness.compiled import compiled_inline
+from harness.environment.cut_in import acceptance, cut_in_hazard, opportunity
+from harness.environment.driving import Environment, draw_car_following, draw_free_driving
+from harness.maneuvers import acceleration, max_draws
+from harness.outcomes import AV, BV, BV_LV_CONTACT, LV, PASSED, RUNNING
+from harness.random_stream import BV_DRAWS, BV_FREE_DRAWS, LV_DRAWS, uniform
+from harness.state import State
+from harness.vehicles.kinematics import CONTACT_M, VEHICLE_LENGTH_M, gap, next_position, next_speed
+from harness.vehicles.reaction import reacting_acceleration
+
+AV_START_M = 100.0
+NO_CRASH = -1
+
+
+class Trajectory(NamedTuple):
+    """Room for one; positions in m, speeds in m/s.
+
+    ``x``, ``v`` (3,) are the initial placement. ``lv``, ``bv`` (draws,) are maneuver indices before the cut-in,
+    ``x_lv``, ``x_bv``, ``x_av``, ``v_lv``, ``v_bv`` (steps + 1,) the motion without it, and ``hazard`` (steps,) that of
+    cutting in.
+    ``free`` (draws,) are BV's maneuvers after the cut-in, ``x_after``, ``v_after`` (steps + 1,) its motion.
+    """
+
+    x: FloatArray
+    v: FloatArray
+    lv: Int8Array
+    bv: Int8Array
+    x_lv: FloatArray
+    x_bv: FloatArray
+    x_av: FloatArray
+    v_lv: FloatArray
+    v_bv: FloatArray
+    hazard: FloatArray
+    free: Int8Array
+    x_after: FloatArray
+    v_after: FloatArray
+
+
+def empty_trajectory(environment: Environment) -> Trajectory:
+    """Room for a trajectory of an environment."""
+    max_steps, hold_steps = (int(environment.numbers[name]) for name in ("max_steps", "hold_steps"))
+    draws = max_draws(max_steps, hold_steps)
+    lengths = {"x": 3, "v": 3, "lv": draws, "bv": draws, "free": draws, "hazard": max_steps}
+    kinds = dict.fromkeys(("lv", "bv", "free"), np.int8)
+    return Trajectory._make(
+        np.zeros(lengths.get(name, max_steps + 1), kinds.get(name, np.float64)) for name in Trajectory._fields
+    )
+
+
+@compiled_inline
+def place(state: State, x: FloatArray, v: FloatArray) -> None:
+    """Positions and speeds (3,) of LV, BV, AV in an initial state."""
+    x[AV] = AV_START_M
+    x[BV] = AV_START_M + VEHICLE_LENGTH_M + state.r2_m
+    x[LV] = x[BV] + VEHICLE_LENGTH_M + state.r1_m
+    v[BV] = state.v_bv_mps
+    v[LV] = max(state.v_bv_mps + state.r1dot_mps, 0.0)
+    v[AV] = state.v_bv_mps - state.r2dot_mps
+
+
+@compiled_inline
+def state_in(step: int, path: Trajectory) -> State:
+    """State before the maneuvers of a step that has been walked."""
+    x, v = path.x_bv[step], path.v_bv[step]
+    return State(v, gap(path.x_lv[step], x), path.v_lv[step] - v, gap(x, path.x_av[step]), v - path.v[AV])
+
+
+@compiled_inline
+def end_in(step: int, path: Trajectory) -> int:
+    """How an episode without a cut-in ends in a step that has been walked, or `RUNNING`."""
+    if step > 0 and gap(path.x_lv[step], path.x_bv[step]) < CONTACT_M:
+        return BV_LV_CONTACT
+    if step > 0 and gap(path.x_bv[step], path.x_av[step]) <= 0.0:
+        return PASSED
+    return RUNNING
+
+
+@compiled_inline
+def walk(
+    state: State, seed: int, episode: int, known: int, until: int, environment: Environment, path: Trajectory
+) -> int:
+    """Walk from an initial state to a step, or to the end that an episode without cut-in finds; returns the step.
+
+    The first ``known`` maneuvers of LV and BV stand in ``path``; what comes after them is drawn, and written there.
+    """
+    hold_steps = environment.numbers.hold_steps
+    place(state, path.x, path.v)
+    path.x_lv[0], path.x_bv[0], path.x_av[0] = path.x[LV], path.x[BV], path.x[AV]
+    path.v_lv[0], path.v_bv[0] = path.v[LV], path.v[BV]
+    for step in range(until):
+        if end_in(step, path) != RUNNING:
+            return step
+        m = step // hold_steps
+        v_lv, v_bv = path.v_lv[step], path.v_bv[step]
+        if step % hold_steps == 0 and m >= known:
+            path.lv[m] = draw_free_driving(uniform(seed, episode, LV_DRAWS, m), v_lv, environment)
+            u = uniform(seed, episode, BV_DRAWS, m)
+            path.bv[m] = draw_car_following(u, state_in(step, path), environment)
+        after_lv, after_bv = next_speed(v_lv, acceleration(path.lv[m])), next_speed(v_bv, acceleration(path.bv[m]))
+        path.x_lv[step + 1] = next_position(path.x_lv[step], v_lv, after_lv)
+        path.x_bv[step + 1] = next_position(path.x_bv[step], v_bv, after_bv)
+        path.x_av[step + 1] = next_position(path.x_av[step], path.v[AV], path.v[AV])
+        path.v_lv[step + 1], path.v_bv[step + 1] = after_lv, after_bv
+    return until
+
+
+@compiled_inline
+def write_hazards(steps: int, environment: Environment, path: Trajectory) -> float:
+    """Write the cut-in hazard of each step that has been walked; returns their sum."""
+    total = 0.0
+    for step in range(steps):
+        state = state_in(step, path)
+        accepted = acceptance(state.r2_m, state.r2dot_mps, environment)
+        path.hazard[step] = cut_in_hazard(opportunity(state, environment), accepted, environment)
+        total += path.hazard[step]
+    return total
+
+
+@compiled_inline
+def leave(
+    cut: int,
+    until: int,
+    seed: int,
+    episode: int,
+    first_draw: int,
+    known: int,
+    environment: Environment,
+    path: Trajectory,
+) -> int:
+    """BV's motion from its cut-in in step ``cut`` to a step; returns how many maneuvers that takes.
+
+    The first ``known`` of them stand in ``path``; the others are drawn, ``first_draw`` being the index of the first.
+    """
+    hold_steps = environment.numbers.hold_steps
+    x, v = path.x_bv[cut], path.v_bv[cut]
+    a = acceleration(path.bv[cut // hold_steps])
+    draws = 0
+    for step in range(cut, until):
+        if step > cut and (step - cut - 1) % hold_steps == 0:
+            if draws >= known:
+                u = uniform(seed, episode, BV_FREE_DRAWS, first_draw + draws)
+                path.free[draws] = draw_free_driving(u, v, environment)
+            a = acceleration(path.free[draws])
+            draws += 1
+        v_after = next_speed(v, a)
+        x = next_position(x, v, v_after)
+        v = v_after
+        path.x_after[step + 1], path.v_after[step + 1] = x, v
+    return draws
+
+
+@compiled_inline
+def follow(driver: Record, late: int, cut: int, until: int, path: Trajectory) -> tuple[int, float]:
+    """Step after which a driver has run into BV, or `NO_CRASH`, and its speed (m/s) at the end.
+
+    It reacts ``late`` steps after its first chance.
+    """
+    x, v = path.x_av[cut], path.v[AV]
+    a = 0.0
+    for step in range(cut, until):
+        if step - cut > late:
+            a = reacting_acceleration(driver, a, v, path.v_after[step], gap(path.x_after[step], x))
+        v_after = next_speed(v, a)
+        x = next_position(x, v, v_after)
+        v = v_after
+        if gap(path.x_after[step + 1], x) < CONTACT_M:
+            return step + 1, v
+    return NO_CRASH, v
+
+
+@compiled_inline
+def crashes(driver: Record, cut: int, until: int, path: Trajectory) -> bool:
+    """Whether an attentive driver runs into BV."""
+    return follow(driver, driver.delay_steps, cut, until, path)[0] != NO_CRASH
+
+
+@compiled_inline
+def who_crashes(drivers: RecordArray, envelope: int, cut: int, until: int, path: Trajectory) -> int:
+    """One bit for each driver that runs into BV.
+
+    ``envelope`` is the driver that crashes wherever another one does: where it does not, nobody else is asked; -1 for
+    none.
+    """
+    if envelope >= 0 and not crashes(drivers[envelope], cut, until, path):
+        return 0
+    found = 0
+    for d in range(drivers.size):
+        if d == envelope or crashes(drivers[d], cut, until, path):
+            found |= 1 << d
+    return found
