@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from harness.progress import RichProgress, SilentProgress, episodes_left, terminal_progress
+from harness.progress import RichProgress, SilentProgress, _worded, episodes_left, terminal_progress
 
 
 class Terminal(io.StringIO):
@@ -109,3 +109,8 @@ def test_silence(capsys):
     silent.advance(1)
     silent.status(crashes=1)
     assert capsys.readouterr() == ("", "")
+
+
+def test_a_precision_that_is_not_known_is_not_shown_as_one():
+    assert _worded("half_width", float("inf")) == "half width unknown"
+    assert _worded("rhw", 0.25) == "RHW 0.25"

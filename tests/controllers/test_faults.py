@@ -1,7 +1,6 @@
 """A controller's fault ends its episode, with the cause in the row; nothing else changes."""
 
 import json
-import math
 from pathlib import Path
 
 import numpy as np
@@ -101,7 +100,7 @@ def test_a_fault_ends_its_episode_and_changes_no_other(faults, tmp_path, undistu
             fault = bad[row["episode"]]
             assert (row["outcome"], row["failure"]) == ("failed", faults[fault])
             assert row["n_steps"] == (0 if fault.endswith("_in_start") else without["cut_in_step"] + 3)
-            assert math.isfinite(row["log_weight"])
+            assert row["log_weight"] == row["log_p_cut_in"] == without["log_p_cut_in"]  # in start as well
         else:
             assert row == without
     assert not list((tmp_path / "run").glob(".*"))

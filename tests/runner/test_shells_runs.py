@@ -248,6 +248,25 @@ def test_rounds_grow_to_where_the_interval_is_widest():
     assert full.next_round(tests, np.array([200, 10, 0]), 100).sum() == 0
 
 
+def test_failed_tests_draw_further_tests_to_their_shell():
+    rule = Allocation(DESIGN, 12, MANY, conditional_only=True)
+    tests, crashes = np.array([400, 400, 0]), np.array([200, 0, 0])
+    without = rule.next_round(tests, crashes, 10**6)
+    with_failed = rule.next_round(tests, crashes, 10**6, np.array([0, 40, 0]))
+    assert with_failed[1] > without[1]
+    undecided = Allocation(DESIGN, 12, MANY, conditional_only=False)
+    few, all_of_a = np.array([40, 40, 0]), np.array([40, 0, 0])
+    assert undecided.next_round(few, all_of_a, 10**6)[2] == 12
+    assert undecided.next_round(few, all_of_a, 10**6, np.array([0, 20, 0]))[2] == 0
+
+
+def test_first_tests_that_are_enough_are_what_decided(campaign, run_here, tmp_path):
+    many = ("testing.shells.statement=conditional", "testing.shells.first_tests=100")
+    found = run_here(campaign(*SHELLS, "world.engine=twin", *many), tmp_path)
+    assert found.ending.endswith(": the last condition to be met was testing.shells.first_tests (100 of each shell).")
+    assert manifest(tmp_path)["ending"] == found.estimates["ending"] == found.ending
+
+
 def test_a_round_is_divided_into_shards_without_gap():
     specs = round_specs(np.array([12, 12, 100]), np.array([70, 0, 300]), 5, 124, 100)
     assert [spec.index for spec in specs] == list(range(5, 5 + len(specs)))
