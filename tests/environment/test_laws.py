@@ -9,6 +9,7 @@ from harness.campaign.models import Environment as EnvironmentSection
 from harness.environment.loading import load_parameters, parameter_file
 from harness.errors import CampaignError
 from harness.runner.prepare import prepare
+from harness.state import STATE_COLUMNS
 from harness.twin import TwinWorld
 
 TEXT = parameter_file("ndd-overtaking-1").read_text(encoding="utf-8")
@@ -43,7 +44,7 @@ def require_sane_tests(section):
     campaign = Campaign(name="mutant", environment=section, testing={"method": "forced"}, world={"engine": "twin"})
     prepared = prepare(campaign)
     states = prepared.states(0, EPISODES)
-    assert np.isfinite(states).all()
+    assert all(np.isfinite(states[name]).all() for name in STATE_COLUMNS)
     world = TwinWorld(16)
     episode = prepared.loop(world).run(0, states).results.episode
     weight = np.exp(episode["log_weight"])
