@@ -1,6 +1,6 @@
 """Crash rates from blocks of weighted tests: estimators, intervals, diagnostics, stopping.
 
-Each estimator is one file of the same shape (``accumulator``): add blocks, merge, ask for the result. ``one_pass``
+Each estimator is one file of the same shape (``accumulator``): add blocks, ask for the result. ``one_pass``
 feeds them all; ``run_estimates`` reads a stored run and writes the content of ``estimates.json``.
 """
 

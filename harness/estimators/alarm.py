@@ -68,20 +68,6 @@ class Alarm:
         self._known = known
         self._hits, self._sum, self._products = np.zeros(d), np.zeros(d), np.zeros((d, d))
 
-    def merge(self, other: Alarm) -> None:
-        """Add the sums over other tests."""
-        if other._known is None:
-            return
-        if self._known is None:
-            self._begin(other._known)
-        self.method = other.method
-        self.n += other.n
-        self.n_lost += other.n_lost
-        self._cap = max(self._cap, other._cap)
-        self._hits += other._hits
-        self._sum += other._sum
-        self._products += other._products
-
     def result(self) -> dict[str, Any]:
         """Means against known rates, and whether the alarm is raised.
 

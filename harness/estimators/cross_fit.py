@@ -75,14 +75,6 @@ class CrossFit:
             self._cubes[fold].add(_unjoined(design))
             fold_rows(self._factors[fold], design)
 
-    def merge(self, other: CrossFit) -> None:
-        """Add the tests behind other factors."""
-        self.n += other.n
-        for mine, theirs in zip(self._factors, other._factors, strict=True):
-            fold_rows(mine, theirs.copy(order="F"))
-        for mine_cubes, their_cubes in zip(self._cubes, other._cubes, strict=True):
-            mine_cubes.merge(their_cubes)
-
     def result(self, mean: FloatArray, covariance: FloatArray) -> CrossFitted:
         """Cross-fitted mean of Y.
 

@@ -9,7 +9,7 @@ of Y.
 
 from __future__ import annotations
 
-from typing import ClassVar, Self
+from typing import ClassVar
 
 import numpy as np
 
@@ -55,13 +55,6 @@ class Martingale:
         self.sums.add(block)
         self._fit = self._fit or CrossFit(block.martingale.shape[1])
         self._fit.add(block.first_episode, block.martingale, block.weighted_crashes())
-
-    def merge(self, other: Self) -> None:
-        """Add the rows behind the other's factors."""
-        self.sums.merge(other.sums)
-        if other._fit is not None:
-            self._fit = self._fit or CrossFit(other._fit.n_columns)
-            self._fit.merge(other._fit)
 
     def result(self, confidence: float) -> Estimate:
         """Mean of Y less the fitted martingale terms."""

@@ -7,7 +7,7 @@ luck of the draw. μ_k comes from the pool, with its own error.
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -65,16 +65,6 @@ class Replay:
         self._fit = self._fit or CrossFit(int(np.count_nonzero(used)))
         self._fit.add(block.first_episode, weighted_surrogates(block)[:, used], block.weighted_crashes())
         self._residuals.add(block)
-
-    def merge(self, other: Self) -> None:
-        """Add the rows behind the other's factors."""
-        self.sums.merge(other.sums)
-        self.n_lost += other.n_lost
-        self._residuals.merge(other._residuals)
-        if other._fit is not None and other._known is not None:
-            self._known = other._known
-            self._fit = self._fit or CrossFit(other._fit.n_columns)
-            self._fit.merge(other._fit)
 
     def result(self, confidence: float) -> Estimate:
         """Mean of Y less the fitted surprise of the surrogates, with the error of their rates."""
@@ -150,11 +140,6 @@ class ResidualSums:
 
     def _add(self, pattern: bytes, sums: FloatArray) -> None:
         self._sums[pattern] = self._sums.get(pattern, np.zeros(2)) + sums
-
-    def merge(self, other: ResidualSums) -> None:
-        """Add the sums over other tests."""
-        for pattern, sums in other._sums.items():
-            self._add(pattern, sums)
 
     def n_effective(self, beta: FloatArray) -> float:
         """(Σz²)²/Σz⁴ of the residuals z = W (1{crash} - βᵀf): how many tests carry what f does not explain."""

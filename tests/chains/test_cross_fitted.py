@@ -170,16 +170,3 @@ def test_few_crashes_get_the_interval_of_the_plain_mean():
     many = Replay()
     many.add(replayed(np.random.default_rng(SEED)))
     assert RESIDUALS in many.result(CONFIDENCE).warnings
-
-
-def test_merged_states_agree_with_one_pass():
-    whole = replayed(np.random.default_rng(SEED))
-    one, head, tail = Replay(), Replay(), Replay()
-    one.add(whole)
-    head.add(whole.take(slice(0, 700)))
-    tail.add(whole.take(slice(700, None)))
-    tail.merge(head)
-    a, b = one.result(CONFIDENCE), tail.result(CONFIDENCE)
-    assert a.crash_rate == pytest.approx(b.crash_rate, rel=1e-10)
-    assert a.std_error == pytest.approx(b.std_error, rel=1e-10)
-    assert a.details["n_effective_residuals"] == pytest.approx(b.details["n_effective_residuals"], rel=1e-9)

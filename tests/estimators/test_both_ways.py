@@ -123,10 +123,13 @@ def test_a_difference_allows_for_the_worst_of_each_side():
     found = paired_difference([(a.take(rows), b.take(rows)) for rows in halves], 0.9)
     seen = between(a, b)
     assert (found.difference, found.std_error, found.ratio) == (seen.difference, seen.std_error, seen.ratio)
-    assert found.ci_high == between(a.failed_as_crashes(), b).ci_high > seen.ci_high
-    assert found.ci_low == between(a, b.failed_as_crashes()).ci_low < seen.ci_low
-    assert found.ratio_high == between(a.failed_as_crashes(), b).ratio_high > seen.ratio_high
-    assert found.ratio_low == between(a, b.failed_as_crashes()).ratio_low < seen.ratio_low
+    high, low = between(a.failed_as_crashes(), b), between(a, b.failed_as_crashes())
+    assert found.ci_high == pytest.approx(high.ci_high, rel=1e-12)
+    assert found.ci_low == pytest.approx(low.ci_low, rel=1e-12)
+    assert found.ci_low < seen.ci_low < seen.ci_high < found.ci_high
+    assert found.ratio_high == pytest.approx(high.ratio_high, rel=1e-12)
+    assert found.ratio_low == pytest.approx(low.ratio_low, rel=1e-12)
+    assert found.ratio_low < seen.ratio_low < seen.ratio_high < found.ratio_high
     assert found.a.ci_high > seen.a.ci_high
     assert "A FAILED in 40 and B in 60" in difference_statement(found, "one", "other")
 

@@ -39,15 +39,6 @@ def test_means_are_those_of_numpy():
     assert result["n_cut_ins"] == cut_in.sum()
 
 
-def test_merging_gives_the_same_bits():
-    parts = list(blocks(CHAIN, "step_mixture", [700, 500, 300], SEED))
-    whole, head, tail = feed(parts).result(), feed(parts[:1]), feed(parts[1:])
-    fresh = Diagnostics()
-    fresh.merge(tail)
-    head.merge(fresh)
-    assert head.result() == whole
-
-
 def test_a_small_mean_weight_of_the_step_mixture_is_explained_not_failed():
     careless = feed([block([False] * 10, [-5.0] * 10)]).result()
     assert "still missing" in careless["heavy_tail"]

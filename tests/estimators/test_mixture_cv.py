@@ -56,20 +56,6 @@ def test_the_interval_is_as_skewed_as_the_residuals():
     assert above > 1.01 * normal_half_width(estimate.std_error, 0.9)
 
 
-def test_merged_states_agree_with_one_pass():
-    parts = list(blocks(CHAIN, "episode_mixture", [3_000, 2_000, 1_000], SEED))
-    whole = feed(parts).result(0.9)
-    head, tail = feed(parts[:1]), feed(parts[1:2])
-    tail.merge(feed(parts[2:]))
-    head.merge(tail)
-    backwards = feed(parts[::-1]).result(0.9)
-    for other in (head.result(0.9), backwards):
-        assert other.crash_rate == pytest.approx(whole.crash_rate, rel=1e-10)
-        assert other.std_error == pytest.approx(whole.std_error, rel=1e-10)
-        assert other.ci_high == pytest.approx(whole.ci_high, rel=1e-10)
-        assert other.n_effective == whole.n_effective
-
-
 def test_control_that_never_acted_leaves_the_plain_mean():
     state = feed([block([True, False, False, True], method="episode_mixture", weight_cap=1.0)])
     estimate = state.result(0.9)
