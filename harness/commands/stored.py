@@ -40,12 +40,12 @@ if TYPE_CHECKING:
     "--estimator",
     "-e",
     "estimators",
-    type=click.Choice(["nde", "nade", "mixture_cv", "scv", "shells", "martingale", "replay"]),
+    type=click.Choice(["nde", "nade", "mixture_cv", "scv", "shells"]),
     multiple=True,
     help="Only this one; may be given several times.",
 )
 @click.option("--confidence", type=click.FloatRange(0, 1, min_open=True, max_open=True), help="Level of intervals.")
-@click.option("--pool", "pool_file", type=FILE, help="Pool of cut-ins to replay surrogates of. Default: the run's own.")
+@click.option("--pool", "pool_file", type=FILE, help="Pool of cut-ins for the alarm.")
 @click.option("--write", is_flag=True, help="Replace DIR/estimates.json by the result.")
 @json_option
 @click.pass_context
@@ -64,17 +64,12 @@ def estimate(
     Nothing is simulated in SUMO. An estimator that the records do not allow is shown with the reason; the exit code is
     2 if they allow none of those asked for.
 
-    'replay' puts surrogates in the AV's place, in the twin. It needs a pool of cut-ins, which is built (about half a
-    minute) when 'replay' is asked for by name and it is not there yet.
+    For the alarm surrogates of a pool of cut-ins take the AV's place, in the twin: those of the run's own pool if it
+    has been built ('harness pool'), in the first 100,000 tests; with --pool those of that one, in all tests.
     """
-    from harness.estimators import estimate_run  # noqa: PLC0415 - keeps --help fast
-    from harness.progress import terminal_progress  # noqa: PLC0415 - keeps --help fast
+    from harness.runner import estimate_run  # noqa: PLC0415 - keeps --help fast
 
-    bar = terminal_progress() if "replay" in estimators else None
-    with bar or nullcontext():
-        content = estimate_run(
-            folder, estimators=estimators or None, confidence=confidence, pool=pool_file, progress=bar
-        )
+    content = estimate_run(folder, estimators=estimators or None, confidence=confidence, pool=pool_file)
     if write:
         from harness.records.folder import write_json  # noqa: PLC0415 - keeps --help fast
 

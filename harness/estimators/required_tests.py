@@ -238,6 +238,5 @@ def _rows(tests: Block, rows: IntArray) -> Block:
         first_ratios=tests.first_ratios[rows],
         log_p_cut_in=None,
         component=None,
-        martingale=None,
         surrogates_crash=None,
     )

@@ -24,9 +24,9 @@ from harness.estimators.required_tests import (
     required_tests,
     scv_rhw,
 )
-from harness.estimators.run_estimates import stored_blocks
 from harness.estimators.scv import Scv
 from harness.progress import Progress, SilentProgress
+from harness.runner.stored_blocks import stored_blocks
 
 RnotEstimator = Literal["nde", "nade", "scv"]
 _REFUSAL = {"nde": Nde.refusal, "nade": Nade.refusal, "scv": Scv.refusal}

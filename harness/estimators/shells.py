@@ -17,7 +17,7 @@ from harness.estimators.accumulator import require_episodes
 from harness.estimators.block import Block
 from harness.estimators.estimate import Estimate
 from harness.estimators.stratified import Limits, combined, pool_variance, share_limits
-from harness.pool.shells import ShellDesign
+from harness.strata import ShellDesign
 
 _METHOD = "crashes within shells of known probability; Clopper-Pearson limits per shell, combined (MOVER)"
 

@@ -22,8 +22,7 @@ FEW_CRASHES = 50
 FEW_EFFECTIVE = 30.0
 FEW_FOR_RESIDUALS = 300.0
 """Effective crashes below which residuals of a regression claim too little; the interval is then as wide as that of the
-plain mean. Overtaking in the twin, 90 %: `mixture_cv` covers 0.88 at 140 of them, 0.85 at 40 (3,000 replications),
-`martingale` 0.87 at 140 (1,000 replications)."""
+plain mean. Overtaking in the twin, 90 %: `mixture_cv` covers 0.88 at 140 of them, 0.85 at 40 (3,000 replications)."""
 LARGE_SHARE = 0.1
 OVERTURNS = 1.0
 """One more crash of the largest known weight, over all those seen, above which an interval is not to be trusted: a

@@ -42,18 +42,14 @@ class Fault(Section):
     factor: float = Field(gt=0.0, description="wrong probability over the right one")
 
 
-_JUDGED: dict[Method, set[EstimatorName]] = {
+JUDGED: dict[Method, set[EstimatorName]] = {
     "shells": {"shells"},
     "nde": {"nde", "nade"},
     "forced": {"nade"},
-    "step_mixture": {"nade", "scv", "martingale"},
-    "episode_mixture": {"nade", "mixture_cv", "martingale"},
+    "step_mixture": {"nade", "scv"},
+    "episode_mixture": {"nade", "mixture_cv"},
 }
-
-
-def judged(method: Method, *, overtaking: bool) -> set[EstimatorName]:
-    """Estimators whose results can be judged; the chains' own records hold no replay."""
-    return _JUDGED[method] | ({"replay"} if overtaking and method != "shells" else set())
+"""Estimators whose results can be judged."""
 
 
 class Experiment(Section):
@@ -137,12 +133,11 @@ class Experiment(Section):
     @model_validator(mode="after")
     def _estimators_belong_to_the_method(self) -> Self:
         method = self.campaign.testing.method
-        allowed = judged(method, overtaking=bool(self.avs))
-        if wrong := set(self.results) - allowed:
+        if wrong := set(self.results) - JUDGED[method]:
             raise broken_rule(
                 "estimators",
                 found=", ".join(sorted(wrong)),
-                expected=f"for testing.method {method}: {', '.join(sorted(allowed))}",
+                expected=f"for testing.method {method}: {', '.join(sorted(JUDGED[method]))}",
                 mend="Change one of the two.",
             )
         if self.fault is not None and method != "shells":

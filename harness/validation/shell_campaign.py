@@ -17,9 +17,9 @@ from harness.campaign.models import Campaign
 from harness.estimators import Shells
 from harness.estimators.block import Block
 from harness.estimators.estimate import Estimate
-from harness.pool.shells import ShellDesign
 from harness.runner.allocation import Allocation
 from harness.runner.rounds import RoundRule
+from harness.strata import ShellDesign
 from harness.validation.experiment import Fault
 from harness.validation.rows import Row, estimate_row
 from harness.validation.shell_source import ShellSource

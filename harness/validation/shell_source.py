@@ -12,7 +12,8 @@ from harness.campaign.models import AutomatedVehicle
 from harness.errors import CampaignError
 from harness.pool.cut_ins import CutIns, Pool, shells_of
 from harness.pool.library import Library
-from harness.pool.shells import ShellDesign, acceleration_limit, design_shells, shells_in_strata
+from harness.pool.shells import acceleration_limit, design_shells, shells_in_strata
+from harness.strata import ShellDesign
 from harness.validation.panel import Mixed
 from harness.validation.super_population import SuperPopulation
 

@@ -14,8 +14,6 @@ from harness.estimators import StopRule, accumulator
 from harness.estimators.block import Block
 from harness.estimators.from_records import block_from_tables
 from harness.importance.build import mixture_weights
-from harness.pool.storage import campaign_pool
-from harness.pool.surrogate_replay import SurrogateReplay
 from harness.records.tables import shard_tables
 from harness.runner.prepare import prepare
 from harness.twin import TwinWorld
@@ -57,7 +55,7 @@ class TwinEpisodes:
     campaign : Campaign
     seed : int
     estimators : sequence of str
-        What they need is kept. For ``replay`` surrogates come from the campaign's pool.
+        What they need is kept.
     """
 
     def __init__(self, campaign: Campaign, seed: int, estimators: Sequence[EstimatorName]) -> None:
@@ -68,10 +66,6 @@ class TwinEpisodes:
         self._prepared = prepare(self._campaign)
         self._loop: EpisodeLoop = self._prepared.loop(TwinWorld(CELLS))
         self._moments = moments
-        self._n_martingale = len(campaign.surrogates) if "martingale" in estimators else 0
-        self._surrogates = (
-            SurrogateReplay(self._campaign, campaign_pool(self._campaign)) if "replay" in estimators else None
-        )
 
     def block(self, first: int, n: int) -> Block:
         """See `EpisodeSource`."""
@@ -82,8 +76,6 @@ class TwinEpisodes:
             tables.moments if self._moments else None,
             method=self._campaign.testing.method,
             alpha=mixture_weights(self._campaign),
-            n_martingale=self._n_martingale,
-            surrogates=self._surrogates,
         )
 
 

@@ -17,7 +17,6 @@ from harness.estimators.run_required_tests import joined
 from harness.validation.chains.named import overtaking
 from harness.validation.chains.sampler import blocks
 from tests.chains.seed import SEED
-from tests.chains.test_cross_fitted import replayed
 from tests.estimators.small_blocks import block
 from tests.estimators.test_shells import block as in_shells
 
@@ -45,9 +44,6 @@ def drawn(name: str) -> list[Block]:
             crash = rng.random(200) < shares[strata]
             parts.append(in_shells(strata.tolist(), crash.tolist(), first=200 * k))
         return parts
-    if name == "replay":
-        rngs = [np.random.default_rng([SEED, k]) for k in range(4)]
-        return [replace(replayed(rng, n=1_000, error=0.0), first_episode=1_000 * k) for k, rng in enumerate(rngs)]
     size = 20_000 if name == "nde" else 1_000
     return list(blocks(CHAIN, METHOD.get(name, "step_mixture"), [size] * 4, SEED))
 

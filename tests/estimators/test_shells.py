@@ -17,7 +17,7 @@ from harness.estimators.estimate import finite_json
 from harness.estimators.intervals import clopper_pearson
 from harness.estimators.statement import conditional_statement, statement
 from harness.estimators.stratified import combined, pool_variance, share_limits
-from harness.pool.shells import ShellDesign
+from harness.strata import ShellDesign
 
 P = np.array([1e-4, 3e-4, 2e-2])
 EXACT = np.zeros((3, 3))

@@ -39,17 +39,13 @@ def draw(
     *,
     first_episode: int = 0,
     forget_cut_in: bool = False,
-    stale_posterior: bool = False,
 ) -> Block:
     """Draw n episodes: path before the cut-in ahead, then maneuvers and responses step by step.
 
-    `forget_cut_in` leaves the cut-in's own ratio out of the step mixture's weights, `stale_posterior` uses the
-    mixture's weights instead of the posterior ones in the martingale sums of the episode mixture: wrong on purpose, to
-    show that the tests notice.
+    `forget_cut_in` leaves the cut-in's own ratio out of the step mixture's weights: wrong on purpose, to show that the
+    tests notice.
     """
-    sampler = _Sampler(chain, method, n, rng, forget_cut_in)
-    sampler.stale_posterior = stale_posterior
-    return sampler.run(first_episode)
+    return _Sampler(chain, method, n, rng, forget_cut_in).run(first_episode)
 
 
 def approach_paths(chain: Chain, n: int, rng: np.random.Generator) -> IntArray:
@@ -83,9 +79,6 @@ class _Sampler:
         self.log_step = np.zeros(n)
         self.ratios = np.ones((n, MAX_CONTROL_STEPS, chain.n_surrogates))
         self.n_control = np.zeros(n, dtype=np.int64)
-        self.log_forced = np.zeros(n)
-        self.martingale = np.zeros((n, chain.n_surrogates))
-        self.stale_posterior = False
         self.after = np.full(n, -1)
         self.cut_in = np.zeros(n, dtype=bool)
 
@@ -113,7 +106,6 @@ class _Sampler:
             first_ratios=self.ratios if self.method == "step_mixture" else None,
             weight_cap=self._cap(),
             log_p_cut_in=self.log_p_cut if self.method in ("forced", "episode_mixture") else None,
-            martingale=self.martingale if self.method in ("step_mixture", "episode_mixture") else None,
         )
 
     def _step_before(self, t: int, rows: IntArray) -> None:
@@ -124,27 +116,24 @@ class _Sampler:
         later = self.p_cut_later[rows, t]
         forced_cut = np.divide(p[:, 1], later, out=np.zeros(len(rows)), where=later > 0.0)
         forced = np.stack([1.0 - forced_cut, forced_cut], axis=1)
-        critical, v = chain.proposals.critical_before[t, state], chain.proposals.value_before[:, t, state].T
-        cut = self._maneuver(rows, p, q, forced, critical, v) == 1
+        cut = self._maneuver(rows, p, q, forced, chain.proposals.critical_before[t, state]) == 1
         self.after[rows[cut]] = self._choose(chain.entry[state[cut]])
 
     def _step_after(self, t: int, rows: IntArray) -> None:
         chain, state = self.chain, self.after[rows]
         p = chain.exposure[state]
         q = np.moveaxis(chain.proposals.maneuver[:, t, state], 0, 1)
-        critical, v = chain.proposals.critical_after[t, state], chain.proposals.value_after[:, t, state].T
-        maneuver = self._maneuver(rows, p, q, p, critical, v)
+        maneuver = self._maneuver(rows, p, q, p, chain.proposals.critical_after[t, state])
         self.after[rows] = self._choose(chain.response[state, maneuver])
 
     def _maneuver(
-        self, rows: IntArray, p: FloatArray, q: FloatArray, forced: FloatArray, critical: BoolArray, v: FloatArray
+        self, rows: IntArray, p: FloatArray, q: FloatArray, forced: FloatArray, critical: BoolArray
     ) -> IntArray:
         """Draw from what the method says and keep the likelihood ratios; p (m, A), q (m, J, A)."""
         chosen = self._choose(self._sampled(rows, p, q, forced, critical))
         self.cut_in[rows] |= (self.after[rows] < 0) & (chosen == 1)
         if self.method in ("nde", "forced"):
             return chosen
-        self._add_martingale(rows, p, q, forced, critical, v, chosen)
         at = np.flatnonzero(critical)
         picked_p, picked_q = p[at, chosen[at]], q[at, :, chosen[at]]
         episode = rows[at]
@@ -158,35 +147,6 @@ class _Sampler:
             self.ratios[episode[kept], step[kept]] = (picked_q / mixed[:, None])[kept]
         self.n_control[episode] += 1
         return chosen
-
-    def _add_martingale(
-        self,
-        rows: IntArray,
-        p: FloatArray,
-        q: FloatArray,
-        forced: FloatArray,
-        critical: BoolArray,
-        v: FloatArray,
-        chosen: IntArray,
-    ) -> None:
-        """W_{t-1} V_j (q_j,t/q_alpha,t - 1) at critical steps; v (m, J)."""
-        each = np.arange(len(rows))
-        with np.errstate(divide="ignore"):
-            ratio = q[each, :, chosen] / p[each, chosen][:, None]
-            log_forced = np.log(forced[each, chosen] / p[each, chosen])
-        if self.method == "step_mixture":
-            weight, sampled = np.exp(self.log_step[rows]), ratio @ self.alpha
-        else:
-            so_far = np.column_stack([self.log_forced[rows], self.log_ratio[rows]]) + np.log(self.alpha)
-            log_sampled = logsumexp(so_far, axis=1)
-            posterior = self.alpha if self.stale_posterior else np.exp(so_far - log_sampled[:, None])
-            weight = np.exp(-log_sampled)
-            sampled = (posterior * np.column_stack([np.exp(log_forced), np.where(critical[:, None], ratio, 1.0)])).sum(
-                1
-            )
-        term = weight[:, None] * v * (ratio / sampled[:, None] - 1.0)
-        self.martingale[rows] += np.where(critical[:, None], term, 0.0)
-        self.log_forced[rows] += log_forced
 
     def _sampled(
         self, rows: IntArray, p: FloatArray, q: FloatArray, forced: FloatArray, critical: BoolArray

@@ -6,7 +6,7 @@ import numpy as np
 
 from harness.arrays import FloatArray
 from harness.pool.cut_ins import shells_of
-from harness.pool.shells import OUTSIDE, ShellDesign
+from harness.strata import OUTSIDE, ShellDesign
 from harness.validation.chains.chain import Chain
 from harness.validation.chains.outcomes import joint_outcomes
 from harness.validation.chains.sampler import approach_paths

@@ -2,44 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 from harness.campaign.models import Campaign
 from harness.errors import HarnessError
-from harness.pool.storage import cached_pool, campaign_pool, read_pool
+from harness.pool.storage import cached_pool, read_pool
 from harness.pool.surrogate_replay import PATH_COLUMNS, SurrogateReplay
-from harness.progress import Progress
 
 MOST_UNASKED = 100_000
 """Tests that are replayed without being asked to, for the alarm: some 30 µs each."""
 
 
-@dataclass(frozen=True)
-class PoolRequest:
-    """How far to go for a pool of cut-ins.
-
-    Attributes
-    ----------
-    file : Path or None
-        A pool to be used instead of the campaign's own.
-    build : bool
-        Whether to build the campaign's own if it is not cached.
-    progress : Progress or None
-        Follows the building.
-    """
-
-    file: Path | None = None
-    build: bool = False
-    progress: Progress | None = None
-
-    @property
-    def explicit(self) -> bool:
-        """Whether the replay was asked for."""
-        return self.build or self.file is not None
-
-
-def surrogates_of(campaign: Campaign, columns: set[str], request: PoolRequest) -> SurrogateReplay | str:
+def surrogates_of(campaign: Campaign, columns: set[str], file: Path | None = None) -> SurrogateReplay | str:
     """The surrogates of a campaign's pool, or the reason why they cannot be asked.
 
     Parameters
@@ -47,7 +21,8 @@ def surrogates_of(campaign: Campaign, columns: set[str], request: PoolRequest) -
     campaign : Campaign
     columns : set of str
         Names in the stored episodes table.
-    request : PoolRequest
+    file : Path, optional
+        A pool to be used instead of the campaign's own, which is used only if it has been built.
 
     Raises
     ------
@@ -56,17 +31,14 @@ def surrogates_of(campaign: Campaign, columns: set[str], request: PoolRequest) -
     """
     if reason := refusal(campaign, columns):
         return reason
+    if file is not None:
+        return SurrogateReplay(campaign, read_pool(file))
     try:
-        if request.file is not None:
-            return SurrogateReplay(campaign, read_pool(request.file))
-        pool = campaign_pool(campaign, request.progress) if request.build else cached_pool(campaign)
-        if pool is not None:
+        if (pool := cached_pool(campaign)) is not None:
             return SurrogateReplay(campaign, pool)
     except HarnessError as error:
-        if request.explicit:
-            raise
         return f"the pool of cut-ins cannot be used: {error}"
-    return "the pool of cut-ins has not been built here; `harness estimate DIR -e replay` builds it (about 15 s)"
+    return "the pool of cut-ins has not been built here; `harness pool DIR/campaign.yaml` builds it (about 15 s)"
 
 
 def refusal(campaign: Campaign, columns: set[str]) -> str | None:
