@@ -14,9 +14,9 @@ from scipy.stats import binomtest
 
 from harness.estimators.block import Block
 from harness.estimators.one_pass import _CLASSES, accumulator
-from harness.validation.chains.named import frequent_decisive
-from harness.validation.chains.sampler import draw
-from harness.validation.chains.shells import ChainShells
+from harness.studies.chains.named import frequent_decisive
+from harness.studies.chains.sampler import draw
+from harness.studies.chains.shells import ChainShells
 
 from .coverage import replicate
 

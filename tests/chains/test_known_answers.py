@@ -12,8 +12,8 @@ from scipy.stats import binomtest
 
 from harness.estimators import Estimate, one_pass
 from harness.estimators.nade import Nade
-from harness.validation.chains.named import frequent_decisive, panel, rare_decisive
-from harness.validation.chains.sampler import blocks
+from harness.studies.chains.named import frequent_decisive, panel, rare_decisive
+from harness.studies.chains.sampler import blocks
 
 from .seed import SEED
 

@@ -12,10 +12,10 @@ from harness.estimators.block import Block
 from harness.estimators.both_ways import BothWays
 from harness.estimators.difference import difference_statement, paired_difference
 from harness.estimators.one_pass import _CLASSES
-from harness.estimators.required_tests import Procedure, plain_rhw, scv_rhw
-from harness.estimators.run_required_tests import joined
-from harness.validation.chains.named import overtaking
-from harness.validation.chains.sampler import blocks
+from harness.studies.chains.named import overtaking
+from harness.studies.chains.sampler import blocks
+from harness.studies.required_tests import Procedure, plain_rhw, scv_rhw
+from harness.studies.run_required_tests import joined
 from tests.chains.seed import SEED
 from tests.estimators.small_blocks import block
 from tests.estimators.test_shells import block as in_shells

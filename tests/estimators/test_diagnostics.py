@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from harness.estimators.diagnostics import Diagnostics
-from harness.validation.chains.named import overtaking
-from harness.validation.chains.sampler import blocks
+from harness.studies.chains.named import overtaking
+from harness.studies.chains.sampler import blocks
 from tests.chains.seed import SEED
 
 from .small_blocks import block

@@ -12,8 +12,8 @@ from harness.errors import HarnessError, RunFolderError
 from harness.estimators import CampaignFacts, estimate_blocks
 from harness.estimators.statement import alarm_cautions, warned
 from harness.runner import estimate_run
-from harness.validation.chains.named import overtaking
-from harness.validation.chains.sampler import blocks
+from harness.studies.chains.named import overtaking
+from harness.studies.chains.sampler import blocks
 from tests.chains.seed import SEED
 
 from .run_folder import write_run

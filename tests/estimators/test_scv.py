@@ -11,8 +11,8 @@ from harness.estimators.nade import Nade
 from harness.estimators.scv import WARNING, Scv
 from harness.estimators.scv_columns import n_columns, product_columns, steps_used
 from harness.estimators.scv_stratum import CHUNK_ROWS, Stratum
-from harness.validation.chains.named import frequent_decisive, overtaking, panel
-from harness.validation.chains.sampler import blocks
+from harness.studies.chains.named import frequent_decisive, overtaking, panel
+from harness.studies.chains.sampler import blocks
 from tests.chains.seed import SEED
 
 from .scv_reference import algorithm_1

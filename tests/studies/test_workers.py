@@ -12,11 +12,11 @@ from pathlib import Path
 
 import pytest
 
-from harness.validation.run import _executor
+from harness.studies.run import _executor
 
 PARENT = """
 import os, time
-from harness.validation.run import _executor
+from harness.studies.run import _executor
 
 if __name__ == "__main__":
     with _executor(1) as executor:

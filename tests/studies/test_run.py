@@ -9,8 +9,8 @@ import pytest
 
 from harness.campaign.models import Campaign
 from harness.cli import main
-from harness.validation.experiment import JUDGED
-from harness.validation.weighted_campaign import TwinEpisodes, WeightedCampaign
+from harness.studies.experiment import JUDGED
+from harness.studies.weighted_campaign import TwinEpisodes, WeightedCampaign
 
 CHAINS = """
 format: validation-experiment

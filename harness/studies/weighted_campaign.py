@@ -16,10 +16,10 @@ from harness.estimators.from_records import block_from_tables
 from harness.importance.build import mixture_weights
 from harness.records.tables import shard_tables
 from harness.runner.prepare import prepare
+from harness.studies.chains.chain import Chain
+from harness.studies.chains.sampler import draw
+from harness.studies.rows import Row, estimate_row
 from harness.twin import TwinWorld
-from harness.validation.chains.chain import Chain
-from harness.validation.chains.sampler import draw
-from harness.validation.rows import Row, estimate_row
 
 CELLS = 1024
 REDRAWN = 5

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from harness.arrays import FloatArray, IntArray
-from harness.validation.chains.chain import Chain
+from harness.studies.chains.chain import Chain
 
 
 def joint_outcomes(chain: Chain) -> FloatArray:

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from harness.validation.chains.named import replayed
-from harness.validation.chains.outcomes import joint_outcomes
-from harness.validation.chains.shells import ChainShells
+from harness.studies.chains.named import replayed
+from harness.studies.chains.outcomes import joint_outcomes
+from harness.studies.chains.shells import ChainShells
 
 
 @pytest.fixture(params=replayed(), ids=lambda c: c.name)

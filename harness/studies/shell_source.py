@@ -14,8 +14,8 @@ from harness.pool.cut_ins import CutIns, Pool, shells_of
 from harness.pool.library import Library
 from harness.pool.shells import acceleration_limit, design_shells, shells_in_strata
 from harness.strata import ShellDesign
-from harness.validation.panel import Mixed
-from harness.validation.super_population import SuperPopulation
+from harness.studies.panel import Mixed
+from harness.studies.super_population import SuperPopulation
 
 EQUAL_RATE = 0.02
 """A surrogate whose crash rate is this close to the vehicle's counts as its equal."""

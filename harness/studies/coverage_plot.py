@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from harness.report.plot_style import BLUE, FULL_WIDTH_IN, GREY, INK, VERMILLION, Plot, new_figure
-from harness.validation.judgement import Judgement
+from harness.studies.judgement import Judgement
 
 
 def coverage_plot(judgements: Sequence[Judgement], confidence: float) -> Plot:

@@ -12,14 +12,14 @@ from pathlib import Path
 import pytest
 
 from harness.campaign.models import Campaign
-from harness.validation.chains.named import CHAINS, frequent_decisive, rare_decisive, replayed
-from harness.validation.chains.shells import ChainShells
-from harness.validation.experiment import Experiment, Fault, load_experiment
-from harness.validation.judgement import Judgement, Subject, corrected, judge
-from harness.validation.rows import Row, Rows
-from harness.validation.run import validate
-from harness.validation.shell_campaign import CONDITIONAL, FREE, ShellCampaign
-from harness.validation.weighted_campaign import ChainEpisodes, WeightedCampaign
+from harness.studies.chains.named import CHAINS, frequent_decisive, rare_decisive, replayed
+from harness.studies.chains.shells import ChainShells
+from harness.studies.experiment import Experiment, Fault, load_experiment
+from harness.studies.judgement import Judgement, Subject, corrected, judge
+from harness.studies.rows import Row, Rows
+from harness.studies.run import validate
+from harness.studies.shell_campaign import CONDITIONAL, FREE, ShellCampaign
+from harness.studies.weighted_campaign import ChainEpisodes, WeightedCampaign
 
 from .regression_stopping import RegressionStopping
 

@@ -20,9 +20,9 @@ from harness.estimators.estimate import Estimate
 from harness.runner.allocation import Allocation
 from harness.runner.rounds import RoundRule
 from harness.strata import ShellDesign
-from harness.validation.experiment import Fault
-from harness.validation.rows import Row, estimate_row
-from harness.validation.shell_source import ShellSource
+from harness.studies.experiment import Fault
+from harness.studies.rows import Row, estimate_row
+from harness.studies.shell_source import ShellSource
 
 FREE, CONDITIONAL = "shells", "shells, conditional"
 

@@ -12,7 +12,7 @@ from harness.campaign.models import AutomatedVehicle, BuiltInParameters, Reflexe
 from harness.errors import CampaignError
 from harness.pool.library import Library
 from harness.pool.shells import acceleration_limit
-from harness.validation.super_population import SuperPopulation
+from harness.studies.super_population import SuperPopulation
 from harness.vehicles.models import driver_records
 
 MOST_DRIVERS = 62

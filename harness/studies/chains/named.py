@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from harness.arrays import FloatArray
-from harness.validation.chains.chain import Chain
+from harness.studies.chains.chain import Chain
 
 N_APPROACH = 6
 N_DANGER = 4

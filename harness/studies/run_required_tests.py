@@ -16,7 +16,10 @@ from harness.estimators.block import Block
 from harness.estimators.estimate import finite_json
 from harness.estimators.nade import Nade
 from harness.estimators.nde import Nde
-from harness.estimators.required_tests import (
+from harness.estimators.scv import Scv
+from harness.progress import Progress, SilentProgress
+from harness.runner.stored_blocks import stored_blocks
+from harness.studies.required_tests import (
     Procedure,
     RequiredTests,
     acceleration,
@@ -24,9 +27,6 @@ from harness.estimators.required_tests import (
     required_tests,
     scv_rhw,
 )
-from harness.estimators.scv import Scv
-from harness.progress import Progress, SilentProgress
-from harness.runner.stored_blocks import stored_blocks
 
 RnotEstimator = Literal["nde", "nade", "scv"]
 _REFUSAL = {"nde": Nde.refusal, "nade": Nade.refusal, "scv": Scv.refusal}

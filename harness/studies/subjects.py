@@ -11,17 +11,17 @@ from harness.campaign.models import Campaign, EstimatorName
 from harness.environment.loading import load_environment
 from harness.pool.library import load_library
 from harness.progress import Progress
-from harness.validation.chains.named import CHAINS
-from harness.validation.chains.shells import ChainShells
-from harness.validation.experiment import Experiment
-from harness.validation.judgement import Subject
-from harness.validation.panel import Drivers
-from harness.validation.rows import Row
-from harness.validation.shell_campaign import ShellCampaign
-from harness.validation.shell_source import OvertakingShells, overtaking_shells
-from harness.validation.super_population import SuperPopulation, enumerate_paths
-from harness.validation.truth import truths
-from harness.validation.weighted_campaign import ChainEpisodes, EpisodeSource, TwinEpisodes, WeightedCampaign
+from harness.studies.chains.named import CHAINS
+from harness.studies.chains.shells import ChainShells
+from harness.studies.experiment import Experiment
+from harness.studies.judgement import Subject
+from harness.studies.panel import Drivers
+from harness.studies.rows import Row
+from harness.studies.shell_campaign import ShellCampaign
+from harness.studies.shell_source import OvertakingShells, overtaking_shells
+from harness.studies.super_population import SuperPopulation, enumerate_paths
+from harness.studies.truth import truths
+from harness.studies.weighted_campaign import ChainEpisodes, EpisodeSource, TwinEpisodes, WeightedCampaign
 
 
 class Repeated(Protocol):

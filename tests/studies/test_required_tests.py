@@ -11,7 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from harness.estimators.nade import Nade
-from harness.estimators.required_tests import (
+from harness.estimators.scv import Scv
+from harness.studies.chains.named import overtaking
+from harness.studies.chains.sampler import blocks
+from harness.studies.required_tests import (
     Procedure,
     RequiredTests,
     _order,
@@ -21,10 +24,7 @@ from harness.estimators.required_tests import (
     required_tests,
     scv_rhw,
 )
-from harness.estimators.run_required_tests import joined
-from harness.estimators.scv import Scv
-from harness.validation.chains.named import overtaking
-from harness.validation.chains.sampler import blocks
+from harness.studies.run_required_tests import joined
 from tests.chains.seed import SEED
 
 CHAIN = overtaking("two surrogates", skill=0.5, surrogates=[0.5, 0.2], level=0.02, horizon=6)

@@ -10,14 +10,13 @@ import numpy as np
 import pytest
 
 from harness.cli import main
-from harness.estimators.required_tests import Procedure, plain_rhw, required_tests, scv_rhw
-from harness.estimators.run_required_tests import SCV_REMARK, joined, required_tests_of_runs
-from harness.validation.chains.named import overtaking
-from harness.validation.chains.sampler import blocks
+from harness.studies.chains.named import overtaking
+from harness.studies.chains.sampler import blocks
+from harness.studies.required_tests import Procedure, plain_rhw, required_tests, scv_rhw
+from harness.studies.run_required_tests import SCV_REMARK, joined, required_tests_of_runs
 from tests.chains.seed import SEED
-
-from .run_folder import write_run
-from .small_blocks import block
+from tests.estimators.run_folder import write_run
+from tests.estimators.small_blocks import block
 
 CHAIN = overtaking("two surrogates", skill=0.5, surrogates=[0.5, 0.2], level=0.02, horizon=6)
 QUICK = Procedure(rhw=0.6, n_shuffles=5, ratio=1.3, seed=3)

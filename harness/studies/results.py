@@ -11,10 +11,10 @@ import pyarrow.parquet as pq
 
 from harness.records.folder import write_atomically, write_bytes, write_json
 from harness.report.plot_style import png
-from harness.validation.coverage_plot import coverage_plot
-from harness.validation.experiment import Experiment
-from harness.validation.judgement import Judgement, Subject
-from harness.validation.rows import Row
+from harness.studies.coverage_plot import coverage_plot
+from harness.studies.experiment import Experiment
+from harness.studies.judgement import Judgement, Subject
+from harness.studies.rows import Row
 
 RESULTS, REPLICATIONS, PLOT = "results.json", "replications.parquet", "coverage.png"
 TRUTH_OF_CHAINS = "exact, by backward induction"

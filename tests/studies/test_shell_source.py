@@ -11,9 +11,9 @@ from harness.errors import CampaignError
 from harness.pool.build import build_pool
 from harness.pool.library import Library, load_library
 from harness.progress import SilentProgress
-from harness.validation.panel import NO_ENVELOPE, Drivers
-from harness.validation.shell_source import equals, leave_out, overtaking_shells
-from harness.validation.super_population import enumerate_paths
+from harness.studies.panel import NO_ENVELOPE, Drivers
+from harness.studies.shell_source import equals, leave_out, overtaking_shells
+from harness.studies.super_population import enumerate_paths
 
 PATHS = 1024
 AVS = {

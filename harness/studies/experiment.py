@@ -21,7 +21,7 @@ from harness.campaign.models import (
 from harness.campaign.yaml_text import read_model
 from harness.errors import CampaignError
 from harness.estimators import headline
-from harness.validation.chains.named import CHAINS
+from harness.studies.chains.named import CHAINS
 
 AvName = Annotated[str, Field(pattern=NAME_PATTERN)]
 ChainName = str

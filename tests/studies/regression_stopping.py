@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from harness.validation.chains.chain import Chain
-from harness.validation.chains.outcomes import joint_outcomes
-from harness.validation.chains.sampler import approach_paths
-from harness.validation.rows import Row
+from harness.studies.chains.chain import Chain
+from harness.studies.chains.outcomes import joint_outcomes
+from harness.studies.chains.sampler import approach_paths
+from harness.studies.rows import Row
 
 Z = 1.6449
 FIRST_LOOK, GROWTH, LAST_LOOK = 40, 1.25, 20_000

@@ -10,8 +10,8 @@ import numpy as np
 from harness.arrays import IntArray
 from harness.environment.driving import Environment
 from harness.progress import Progress
-from harness.validation.panel import NO_ENVELOPE, Drivers, Mixed
-from harness.validation.super_population import SuperPopulation, enumerate_paths
+from harness.studies.panel import NO_ENVELOPE, Drivers, Mixed
+from harness.studies.super_population import SuperPopulation, enumerate_paths
 
 LARGEST_ERROR = 0.005
 """Relative standard error that a truth should have at most."""

@@ -7,9 +7,9 @@ import numpy as np
 from harness.arrays import FloatArray
 from harness.pool.cut_ins import shells_of
 from harness.strata import OUTSIDE, ShellDesign
-from harness.validation.chains.chain import Chain
-from harness.validation.chains.outcomes import joint_outcomes
-from harness.validation.chains.sampler import approach_paths
+from harness.studies.chains.chain import Chain
+from harness.studies.chains.outcomes import joint_outcomes
+from harness.studies.chains.sampler import approach_paths
 
 
 class ChainShells:
@@ -48,7 +48,7 @@ class ChainShells:
 
     @property
     def crashes_outside(self) -> float:
-        """See `harness.validation.shell_source.ShellSource`."""
+        """See `harness.studies.shell_source.ShellSource`."""
         return float(self.crash_p[-1]) / self._chain.crash_rate
 
     @property
@@ -62,7 +62,7 @@ class ChainShells:
         return self._exact(self._crash)
 
     def draw(self, rng: np.random.Generator) -> tuple[ShellDesign, FloatArray]:
-        """See `harness.validation.shell_source.ShellSource`."""
+        """See `harness.studies.shell_source.ShellSource`."""
         chain = self._chain
         path = approach_paths(chain, self._pool_paths, rng)
         hazard = chain.hazard[path]

@@ -8,8 +8,8 @@ from harness.campaign.models import AutomatedVehicle, Environment
 from harness.environment.loading import load_environment
 from harness.pool.library import load_library
 from harness.progress import SilentProgress
-from harness.validation.panel import Drivers
-from harness.validation.truth import Truth, combined, truths
+from harness.studies.panel import Drivers
+from harness.studies.truth import Truth, combined, truths
 
 
 def test_two_truths_are_weighted_by_their_precision():

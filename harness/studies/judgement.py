@@ -17,7 +17,7 @@ from scipy.stats import binomtest, norm
 from harness.arrays import FloatArray
 from harness.estimators.estimate import finite_json
 from harness.estimators.intervals import clopper_pearson
-from harness.validation.rows import Rows
+from harness.studies.rows import Rows
 
 COVERAGE_CONFIDENCE = 0.95
 SIGNIFICANCE = 0.05

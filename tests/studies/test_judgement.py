@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from harness.validation.judgement import Subject, corrected, holm, judge
-from harness.validation.rows import Row, Rows
+from harness.studies.judgement import Subject, corrected, holm, judge
+from harness.studies.rows import Row, Rows
 
 
 def rows(rates, half: float, tests: int = 100, outside: int = 0) -> Rows:

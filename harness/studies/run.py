@@ -16,12 +16,12 @@ from harness.interruption import leave_signals_to_parent
 from harness.progress import Progress, SilentProgress
 from harness.records.folder import require_place
 from harness.spawning import spawn_context
-from harness.validation.experiment import Experiment
-from harness.validation.judgement import Judgement, Subject, corrected, judge
-from harness.validation.results import write_results
-from harness.validation.rows import Row, Rows
-from harness.validation.shell_campaign import CONDITIONAL
-from harness.validation.subjects import Repeated, subjects
+from harness.studies.experiment import Experiment
+from harness.studies.judgement import Judgement, Subject, corrected, judge
+from harness.studies.results import write_results
+from harness.studies.rows import Row, Rows
+from harness.studies.shell_campaign import CONDITIONAL
+from harness.studies.subjects import Repeated, subjects
 
 TASKS_PER_SUBJECT = 8
 
