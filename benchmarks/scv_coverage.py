@@ -13,8 +13,8 @@ import numpy as np
 
 from harness.estimators.nade import Nade
 from harness.estimators.scv import Scv
-from harness.validation.chains.named import frequent_decisive, rare_decisive
-from harness.validation.chains.sampler import draw
+from harness.studies.chains.named import frequent_decisive, rare_decisive
+from harness.studies.chains.sampler import draw
 from tests.chains.coverage import replicate
 
 SETTINGS = [(frequent_decisive, 2_000), (frequent_decisive, 20_000), (rare_decisive, 2_000), (rare_decisive, 20_000)]

@@ -17,9 +17,10 @@ import numpy as np
 from benchmarks.contenders import SCENARIOS
 from harness.arrays import FloatArray
 from harness.campaign.loading import load_campaign
-from harness.pool.shells import ShellDesign, design_shells
+from harness.pool.shells import design_shells
 from harness.pool.storage import campaign_pool
-from harness.validation.shell_campaign import FREE, ShellCampaign
+from harness.strata import ShellDesign
+from harness.studies.shell_campaign import FREE, ShellCampaign
 
 IDM = np.array([1.0, 1.0, 0.362, 0.0, 0.0, 0.0])
 """Crash shares of the default IDM inside: in the run of docs/limits.md 1,086 of 3,000 tests crashed in brakes-3."""

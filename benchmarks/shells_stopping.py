@@ -14,9 +14,9 @@ from pathlib import Path
 
 from benchmarks.contenders import SCENARIOS
 from harness.campaign.models import Campaign, Stop
-from harness.validation import validate
-from harness.validation.experiment import Experiment, load_experiment
-from harness.validation.shell_campaign import FREE
+from harness.studies.experiment import Experiment, load_experiment
+from harness.studies.run import validate
+from harness.studies.shell_campaign import FREE
 
 BUDGET = 1_000_000
 

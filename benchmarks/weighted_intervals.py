@@ -21,7 +21,7 @@ from harness.estimators.estimate import Estimate
 from harness.estimators.intervals import hall_distances, normal_half_width
 from harness.estimators.nade import Nade
 from harness.estimators.stopping import StopRule
-from harness.validation.weighted_campaign import TwinEpisodes
+from harness.studies.weighted_campaign import TwinEpisodes
 
 CONFIDENCE = 0.9
 SEED = 77

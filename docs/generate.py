@@ -246,7 +246,6 @@ METHODS = {
     "twin_episode": "episode mixture, recursive challenge",
     "twin_forced": "forced cut-ins",
     "twin_forced_online": "forced cut-ins, online rule",
-    "twin_replay": "forced cut-ins, surrogates replayed",
     "shells_panel": "pool and shells, online rule",
 }
 """Experiments from which one vehicle (idm) is compared over methods."""

@@ -80,8 +80,8 @@ def compare(
 def estimate(
     folder: str | Path, *, estimators: Sequence[EstimatorName] | None = None, confidence: float | None = None
 ) -> dict[str, Any]:
-    """Estimate a stored run again (see `harness.estimators.estimate_run`)."""
-    from harness.estimators import estimate_run  # noqa: PLC0415
+    """Estimate a stored run again (see `harness.runner.estimate_run`)."""
+    from harness.runner import estimate_run  # noqa: PLC0415
 
     return estimate_run(Path(folder), estimators=estimators, confidence=confidence)
 

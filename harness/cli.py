@@ -17,8 +17,8 @@ import click
 from harness.commands.campaigns import check, run, schema
 from harness.commands.machine import setup
 from harness.commands.options import examples
-from harness.commands.stored import estimate, replay, report, rnot
-from harness.commands.studies import pool, validate
+from harness.commands.stored import estimate, replay, report
+from harness.commands.studies import pool, rnot, validate
 from harness.commands.vehicles import av_check, compare, ladder
 from harness.console import show_error, show_interrupted, system_error, usage_error
 from harness.errors import EXIT_DONE, HarnessError, shortened

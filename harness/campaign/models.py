@@ -46,7 +46,7 @@ Positive = Annotated[float, Field(gt=0.0)]
 Whole = Annotated[int, BeforeValidator(_whole)]
 SurrogateName = Annotated[str, Field(pattern=SURROGATE_PATTERN)]
 Method = Literal["nde", "forced", "step_mixture", "episode_mixture", "shells"]
-EstimatorName = Literal["nde", "nade", "mixture_cv", "scv", "shells", "martingale", "replay"]
+EstimatorName = Literal["nde", "nade", "mixture_cv", "scv", "shells"]
 
 MAX_CONFIGURED_SPEED_MPS = 60.0
 MOST_SUMO_CELLS = 256
@@ -598,8 +598,6 @@ class Campaign(Section):
             ),
             "shells": (method == "shells", "testing.method shells"),
             "nade": (method != "shells", "another testing.method than shells"),
-            "martingale": (False, "a stored run: never stop on regression residuals alone"),
-            "replay": (False, "a stored run: give it to `harness estimate`"),
         }
         available, need = needs.get(watched or "", (True, ""))
         if not available:

@@ -1,9 +1,8 @@
-"""Stored runs: estimate again, count the tests they needed, report again, see an episode again."""
+"""Stored runs: estimate again, report again, see an episode again."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,14 +18,12 @@ from harness.commands.options import (
 from harness.console import (
     print_estimates,
     print_json,
-    print_required_tests,
     write_trace,
 )
 from harness.errors import EXIT_BAD_INPUT, WorldDisagreementError
 
 if TYPE_CHECKING:
     from harness.campaign.models import EstimatorName
-    from harness.estimators.run_required_tests import RnotEstimator
 
 
 @click.command(
@@ -40,12 +37,12 @@ if TYPE_CHECKING:
     "--estimator",
     "-e",
     "estimators",
-    type=click.Choice(["nde", "nade", "mixture_cv", "scv", "shells", "martingale", "replay"]),
+    type=click.Choice(["nde", "nade", "mixture_cv", "scv", "shells"]),
     multiple=True,
     help="Only this one; may be given several times.",
 )
 @click.option("--confidence", type=click.FloatRange(0, 1, min_open=True, max_open=True), help="Level of intervals.")
-@click.option("--pool", "pool_file", type=FILE, help="Pool of cut-ins to replay surrogates of. Default: the run's own.")
+@click.option("--pool", "pool_file", type=FILE, help="Pool of cut-ins for the alarm.")
 @click.option("--write", is_flag=True, help="Replace DIR/estimates.json by the result.")
 @json_option
 @click.pass_context
@@ -64,17 +61,12 @@ def estimate(
     Nothing is simulated in SUMO. An estimator that the records do not allow is shown with the reason; the exit code is
     2 if they allow none of those asked for.
 
-    'replay' puts surrogates in the AV's place, in the twin. It needs a pool of cut-ins, which is built (about half a
-    minute) when 'replay' is asked for by name and it is not there yet.
+    For the alarm surrogates of a pool of cut-ins take the AV's place, in the twin: those of the run's own pool if it
+    has been built ('harness pool'), in the first 100,000 tests; with --pool those of that one, in all tests.
     """
-    from harness.estimators import estimate_run  # noqa: PLC0415 - keeps --help fast
-    from harness.progress import terminal_progress  # noqa: PLC0415 - keeps --help fast
+    from harness.runner import estimate_run  # noqa: PLC0415 - keeps --help fast
 
-    bar = terminal_progress() if "replay" in estimators else None
-    with bar or nullcontext():
-        content = estimate_run(
-            folder, estimators=estimators or None, confidence=confidence, pool=pool_file, progress=bar
-        )
+    content = estimate_run(folder, estimators=estimators or None, confidence=confidence, pool=pool_file)
     if write:
         from harness.records.folder import write_json  # noqa: PLC0415 - keeps --help fast
 
@@ -85,88 +77,6 @@ def estimate(
         print_estimates(content, estimators)
     if estimators and all(content["estimates"][name]["crash_rate"] is None for name in estimators):
         ctx.exit(EXIT_BAD_INPUT)
-
-
-@click.command(
-    short_help="How many tests the paper's procedure would ask for (RNoT, AAR).",
-    epilog=examples(
-        "harness rnot runs/nde runs/forced                     # and the acceleration of the second over the first",
-        "harness rnot runs/nade --rhw 0.1 --total 5000         # another threshold, and another end of the grid",
-        "harness rnot runs/nade -e nade -e scv --total 2000 --ratio 1.25   # minutes: a regression at each look",
-    ),
-)
-@click.argument("folders", metavar="RUN...", type=RUN_FOLDER, nargs=-1, required=True)
-@click.option(
-    "--rhw",
-    type=click.FloatRange(0, min_open=True),
-    default=0.3,
-    show_default=True,
-    help="Relative half-width to reach.",
-)
-@click.option(
-    "--confidence",
-    type=click.FloatRange(0, 1, min_open=True, max_open=True),
-    default=0.9,
-    show_default=True,
-    help="Level of the normal interval.",
-)
-@click.option("--shuffles", type=click.IntRange(min=1), default=200, show_default=True, help="Orderings of the tests.")
-@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Seed of the orderings.")
-@click.option("--first", type=click.IntRange(min=2), default=10, show_default=True, help="First look of the grid.")
-@click.option(
-    "--ratio",
-    type=click.FloatRange(1, min_open=True),
-    default=1.05,
-    show_default=True,
-    help="From one look to the next.",
-)
-@click.option("--total", type=click.IntRange(min=2), help="Last look. Default, and at most: all tests on record.")
-@click.option(
-    "--estimator",
-    "-e",
-    "estimators",
-    type=click.Choice(["nde", "nade", "scv"]),
-    multiple=True,
-    help="Whose RHW; may be given several times. Default: nde for naturalistic runs, else nade.",
-)
-@json_option
-def rnot(
-    folders: Sequence[Path],
-    *,
-    rhw: float,
-    confidence: float,
-    shuffles: int,
-    seed: int,
-    first: int,
-    ratio: float,
-    total: int | None,
-    estimators: Sequence[RnotEstimator],
-    as_json: bool,
-) -> None:
-    """Count the tests that each RUN needed, the way the paper counts them; nothing is simulated.
-
-    The tests of a run are shuffled. The required number of tests (RNoT) of a shuffle is the first look at which the
-    relative half-width is at most --rhw and stays so until the last look. Printed are its mean over all shuffles, its
-    5-95 % range, and the average acceleration ratio (AAR): the mean of the first row over that of each row.
-
-    Shuffles that are above --rhw at the last look count as that many tests; how many these are is printed, and the mean
-    is a lower limit then. Runs that draw from shells are refused: their tests cannot change places.
-
-    'scv' is computed only when asked for. It solves its regressions anew at each look of each shuffle, which takes
-    minutes: a larger --ratio and a smaller --total make it quicker. Its RHW rests on a variance that is too small.
-    """
-    from harness.estimators.required_tests import Procedure  # noqa: PLC0415 - keeps --help fast
-    from harness.estimators.run_required_tests import required_tests_of_runs  # noqa: PLC0415 - keeps --help fast
-    from harness.progress import terminal_progress  # noqa: PLC0415 - keeps --help fast
-
-    procedure = Procedure(rhw, confidence, shuffles, seed, first, ratio, total)
-    bar = terminal_progress()
-    with bar or nullcontext():
-        content = required_tests_of_runs(folders, procedure, estimators=estimators, progress=bar)
-    if as_json:
-        print_json(content)
-    else:
-        print_required_tests(content)
 
 
 @click.command(short_help="Write report.html of a run anew.", epilog=examples("harness report runs/smoke"))

@@ -1,10 +1,11 @@
-"""What lies behind results: the pool of cut-ins, and what intervals are worth."""
+"""What lies behind results: the pool of cut-ins, what intervals are worth, how many tests the paper would ask for."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import nullcontext
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
@@ -12,6 +13,7 @@ from harness.commands.options import (
     CAMPAIGN,
     FILE,
     FOLDER,
+    RUN_FOLDER,
     as_written,
     examples,
     json_option,
@@ -22,7 +24,11 @@ from harness.commands.options import (
 from harness.console import (
     print_json,
     print_pool,
+    print_required_tests,
 )
+
+if TYPE_CHECKING:
+    from harness.studies.run_required_tests import RnotEstimator
 
 
 @click.command(
@@ -91,14 +97,14 @@ def validate(
     Printed is a line per vehicle and result, with the columns below. The folder receives results.json,
     replications.parquet (one row each) and coverage.png.
     """
-    from harness.validation.experiment import load_experiment  # noqa: PLC0415 - keeps --help fast
+    from harness.studies.experiment import load_experiment  # noqa: PLC0415 - keeps --help fast
 
     experiment = load_experiment(experiment_file)
     if replications is not None:
         experiment = experiment.model_copy(update={"replications": replications})
     from harness.progress import terminal_progress  # noqa: PLC0415 - keeps --help fast
-    from harness.validation import validate as repeat  # noqa: PLC0415 - slow to import: only once the file is right
-    from harness.validation.results import RESULTS, table_lines  # noqa: PLC0415
+    from harness.studies.results import RESULTS, table_lines  # noqa: PLC0415
+    from harness.studies.run import validate as repeat  # noqa: PLC0415 - slow to import: only once the file is right
 
     bar = None if quiet else terminal_progress(None, 0)
     with bar or nullcontext():
@@ -109,3 +115,85 @@ def validate(
     for line in table_lines(done.judgements):
         click.echo(line)
     click.echo(str(folder / RESULTS))
+
+
+@click.command(
+    short_help="How many tests the paper's procedure would ask for (RNoT, AAR).",
+    epilog=examples(
+        "harness rnot runs/nde runs/forced                     # and the acceleration of the second over the first",
+        "harness rnot runs/nade --rhw 0.1 --total 5000         # another threshold, and another end of the grid",
+        "harness rnot runs/nade -e nade -e scv --total 2000 --ratio 1.25   # minutes: a regression at each look",
+    ),
+)
+@click.argument("folders", metavar="RUN...", type=RUN_FOLDER, nargs=-1, required=True)
+@click.option(
+    "--rhw",
+    type=click.FloatRange(0, min_open=True),
+    default=0.3,
+    show_default=True,
+    help="Relative half-width to reach.",
+)
+@click.option(
+    "--confidence",
+    type=click.FloatRange(0, 1, min_open=True, max_open=True),
+    default=0.9,
+    show_default=True,
+    help="Level of the normal interval.",
+)
+@click.option("--shuffles", type=click.IntRange(min=1), default=200, show_default=True, help="Orderings of the tests.")
+@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Seed of the orderings.")
+@click.option("--first", type=click.IntRange(min=2), default=10, show_default=True, help="First look of the grid.")
+@click.option(
+    "--ratio",
+    type=click.FloatRange(1, min_open=True),
+    default=1.05,
+    show_default=True,
+    help="From one look to the next.",
+)
+@click.option("--total", type=click.IntRange(min=2), help="Last look. Default, and at most: all tests on record.")
+@click.option(
+    "--estimator",
+    "-e",
+    "estimators",
+    type=click.Choice(["nde", "nade", "scv"]),
+    multiple=True,
+    help="Whose RHW; may be given several times. Default: nde for naturalistic runs, else nade.",
+)
+@json_option
+def rnot(
+    folders: Sequence[Path],
+    *,
+    rhw: float,
+    confidence: float,
+    shuffles: int,
+    seed: int,
+    first: int,
+    ratio: float,
+    total: int | None,
+    estimators: Sequence[RnotEstimator],
+    as_json: bool,
+) -> None:
+    """Count the tests that each RUN needed, the way the paper counts them; nothing is simulated.
+
+    The tests of a run are shuffled. The required number of tests (RNoT) of a shuffle is the first look at which the
+    relative half-width is at most --rhw and stays so until the last look. Printed are its mean over all shuffles, its
+    5-95 % range, and the average acceleration ratio (AAR): the mean of the first row over that of each row.
+
+    Shuffles that are above --rhw at the last look count as that many tests; how many these are is printed, and the mean
+    is a lower limit then. Runs that draw from shells are refused: their tests cannot change places.
+
+    'scv' is computed only when asked for. It solves its regressions anew at each look of each shuffle, which takes
+    minutes: a larger --ratio and a smaller --total make it quicker. Its RHW rests on a variance that is too small.
+    """
+    from harness.progress import terminal_progress  # noqa: PLC0415 - keeps --help fast
+    from harness.studies.required_tests import Procedure  # noqa: PLC0415 - keeps --help fast
+    from harness.studies.run_required_tests import required_tests_of_runs  # noqa: PLC0415 - keeps --help fast
+
+    procedure = Procedure(rhw, confidence, shuffles, seed, first, ratio, total)
+    bar = terminal_progress()
+    with bar or nullcontext():
+        content = required_tests_of_runs(folders, procedure, estimators=estimators, progress=bar)
+    if as_json:
+        print_json(content)
+    else:
+        print_required_tests(content)

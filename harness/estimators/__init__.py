@@ -1,14 +1,14 @@
 """Crash rates from blocks of weighted tests: estimators, intervals, diagnostics, stopping.
 
-Each estimator is one file of the same shape (``accumulator``): add blocks, merge, ask for the result. ``one_pass``
-feeds them all; ``run_estimates`` reads a stored run and writes the content of ``estimates.json``.
+Each estimator is one file of the same shape (``accumulator``): add blocks, ask for the result. ``one_pass``
+feeds them all; ``run_estimates`` makes the content of ``estimates.json``.
 """
 
 from harness.estimators.block import Block
 from harness.estimators.estimate import Estimate, Unavailable
 from harness.estimators.headline import headline
 from harness.estimators.one_pass import ESTIMATORS, accumulator, one_pass
-from harness.estimators.run_estimates import CampaignFacts, estimate_blocks, estimate_run
+from harness.estimators.run_estimates import CampaignFacts, estimate_blocks
 from harness.estimators.shells import Shells
 from harness.estimators.stopping import StopRule
 
@@ -22,7 +22,6 @@ __all__ = [
     "Unavailable",
     "accumulator",
     "estimate_blocks",
-    "estimate_run",
     "headline",
     "one_pass",
 ]

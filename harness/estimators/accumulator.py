@@ -1,8 +1,8 @@
-"""The shape that all estimators share: add blocks, merge, ask for the result."""
+"""The shape that all estimators share: add blocks, ask for the result."""
 
 from __future__ import annotations
 
-from typing import ClassVar, Protocol, Self
+from typing import ClassVar, Protocol
 
 from harness.campaign.models import EstimatorName
 from harness.estimators.block import Block
@@ -21,10 +21,6 @@ class Accumulator(Protocol):
 
     def add(self, block: Block) -> None:
         """Add the episodes of one block."""
-        ...
-
-    def merge(self, other: Self) -> None:
-        """Add the episodes that `other` has seen, which stays as it is."""
         ...
 
     def result(self, confidence: float) -> Estimate:

@@ -17,8 +17,7 @@ from scipy.special import chdtrc, ndtr
 from harness.arrays import FloatArray
 from harness.campaign.models import Method
 from harness.estimators.block import Block
-from harness.estimators.replay import weighted_surrogates
-from harness.pool.surrogate_replay import KnownRates
+from harness.strata import KnownRates
 
 LEVEL = 1e-4
 """Probability of a false alarm, of each of the two tests."""
@@ -54,7 +53,7 @@ class Alarm:
             return
         if self._known is None:
             self._begin(block.known_rates)
-        h = weighted_surrogates(block)
+        h = _weighted_surrogates(block)
         self.method = block.method
         self.n += len(block)
         self.n_lost += int(np.count_nonzero(block.failed & ~block.cut_in))
@@ -67,20 +66,6 @@ class Alarm:
         d = len(known.mu)
         self._known = known
         self._hits, self._sum, self._products = np.zeros(d), np.zeros(d), np.zeros((d, d))
-
-    def merge(self, other: Alarm) -> None:
-        """Add the sums over other tests."""
-        if other._known is None:
-            return
-        if self._known is None:
-            self._begin(other._known)
-        self.method = other.method
-        self.n += other.n
-        self.n_lost += other.n_lost
-        self._cap = max(self._cap, other._cap)
-        self._hits += other._hits
-        self._sum += other._sum
-        self._products += other._products
 
     def result(self) -> dict[str, Any]:
         """Means against known rates, and whether the alarm is raised.
@@ -147,6 +132,16 @@ class Alarm:
         exponent = [_relative_entropy(a / self._cap, b / self._cap) for a, b in zip(mean, nearest, strict=True)]
         bound: FloatArray = np.minimum(1.0, 2.0 * np.exp(-self.n * np.array(exponent)))
         return bound
+
+
+def _weighted_surrogates(block: Block) -> FloatArray:
+    """Weighted crashes W f_k of the surrogates, shape (n, D); 0 where none crashes, whatever the weight."""
+    crashes = block.surrogates_crash
+    assert crashes is not None
+    rows = crashes.any(axis=1)
+    values = np.zeros(crashes.shape)
+    values[rows] = np.exp(block.log_weight[rows])[:, None] * crashes[rows]
+    return values
 
 
 def _cap(block: Block) -> float:

@@ -12,8 +12,7 @@ import numpy as np
 
 from harness.arrays import BoolArray, FloatArray, IntArray
 from harness.campaign.models import Method
-from harness.pool.shells import ShellDesign
-from harness.pool.surrogate_replay import KnownRates
+from harness.strata import KnownRates, ShellDesign
 
 MAX_CONTROL_STEPS = 9
 """Control steps that sparse control variates are built from, at most ([paper] section VI-E)."""
@@ -50,8 +49,6 @@ class Block:
         Stratum of each test, where they are drawn from shells.
     shells : ShellDesign or None
         Those strata and their probabilities.
-    martingale : (n, J) float64 or None
-        Per surrogate the sum of martingale terms, of mean exactly 0; only where it was asked for.
     surrogates_crash : (n, D) bool or None
         Which surrogates of a pool would have crashed on the same traffic; only where it was asked for.
     known_rates : KnownRates or None
@@ -73,7 +70,6 @@ class Block:
     log_p_cut_in: FloatArray | None = None
     component: IntArray | None = None
     shells: ShellDesign | None = None
-    martingale: FloatArray | None = None
     surrogates_crash: BoolArray | None = None
     known_rates: KnownRates | None = None
 
@@ -95,10 +91,8 @@ class Block:
                 raise ValueError(f"Block.{name} has shape {array.shape}, expected {shape}")
         if self.first_ratios is not None and self.first_ratios.shape[:2] != (n, MAX_CONTROL_STEPS):
             raise ValueError(f"Block.first_ratios has shape {self.first_ratios.shape}, expected ({n}, 9, J)")
-        for name in ("martingale", "surrogates_crash"):
-            array = getattr(self, name)
-            if array is not None and array.shape[:1] != (n,):
-                raise ValueError(f"Block.{name} has shape {array.shape}, expected ({n}, …)")
+        if self.surrogates_crash is not None and self.surrogates_crash.shape[:1] != (n,):
+            raise ValueError(f"Block.surrogates_crash has shape {self.surrogates_crash.shape}, expected ({n}, D)")
         if np.any(self.crash & self.failed):
             raise ValueError("Block: an episode is both crashed and failed")
         if np.isnan(self.log_weight).any():

@@ -15,7 +15,7 @@ import numpy as np
 from harness.campaign.models import Method
 from harness.estimators.alarm import Alarm
 from harness.estimators.block import Block
-from harness.estimators.exact_sum import MomentSums
+from harness.estimators.moments import Moments
 
 NOTE = (
     "Diagnostics, never tests: each mean is 1 in expectation, except that of W·1{cut-in}, which is P(cut-in). Under "
@@ -28,7 +28,7 @@ CARELESS_MEAN = 0.5
 
 
 class Diagnostics:
-    """Exact sums of weights and ratios; add blocks, merge, ask for the result."""
+    """Running moments of weights and ratios; add blocks, ask for the result."""
 
     def __init__(self) -> None:
         self.n = 0
@@ -36,10 +36,10 @@ class Diagnostics:
         self.n_cut_ins = 0
         self.n_contacts = 0
         self.method: Method | None = None
-        self._weight = MomentSums()
-        self._cut_in = MomentSums()
-        self._contact = MomentSums()
-        self._ratios: list[MomentSums] = []
+        self._weight = Moments()
+        self._cut_in = Moments()
+        self._contact = Moments()
+        self._ratios: list[Moments] = []
         self.alarm = Alarm()
 
     def add(self, block: Block) -> None:
@@ -55,24 +55,9 @@ class Diagnostics:
         self._cut_in.add(weights[block.cut_in])
         self._contact.add(weights[block.bv_lv_contact])
         if block.method in ("step_mixture", "episode_mixture"):
-            self._ratios = self._ratios or [MomentSums() for _ in block.alpha]
+            self._ratios = self._ratios or [Moments() for _ in block.alpha]
             for sums, ratios in zip(self._ratios, block.mixture_ratios().T, strict=True):
                 sums.add(ratios)
-
-    def merge(self, other: Diagnostics) -> None:
-        """Add the sums over other episodes."""
-        self.method = other.method if self.method is None else self.method
-        self.alarm.merge(other.alarm)
-        self.n += other.n
-        self.n_failed += other.n_failed
-        self.n_cut_ins += other.n_cut_ins
-        self.n_contacts += other.n_contacts
-        self._weight.merge(other._weight)
-        self._cut_in.merge(other._cut_in)
-        self._contact.merge(other._contact)
-        self._ratios = self._ratios or [MomentSums() for _ in other._ratios]
-        for mine, theirs in zip(self._ratios, other._ratios, strict=False):
-            mine.merge(theirs)
 
     def result(self, importance_names: tuple[str, ...] = ()) -> dict[str, Any]:
         """Means with standard errors.
@@ -102,7 +87,7 @@ class Diagnostics:
             )
         return result
 
-    def _mean(self, sums: MomentSums) -> dict[str, float]:
+    def _mean(self, sums: Moments) -> dict[str, float]:
         if self.n == 0 or self.method == "shells":
             return {"mean": float("nan"), "std_error": float("inf")}
         return {"mean": sums.mean(self.n), "std_error": sums.std_error(self.n)}

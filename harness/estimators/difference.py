@@ -20,8 +20,8 @@ from harness.estimators.accumulator import require_episodes
 from harness.estimators.block import Block
 from harness.estimators.both_ways import BothWays
 from harness.estimators.estimate import Estimate, finite_json
-from harness.estimators.exact_sum import MomentSums, SkewedSums
 from harness.estimators.intervals import capped_mean_upper, normal_half_width, skewed_distances
+from harness.estimators.moments import Moments
 from harness.estimators.nade import Nade
 from harness.estimators.statement import warned
 
@@ -79,14 +79,14 @@ class Difference:
 
 
 class _Pairs:
-    """Exact sums over pairs of episodes; one pass, of bounded size."""
+    """Sums over pairs of episodes; one pass, of bounded size."""
 
     def __init__(self) -> None:
         self.n = 0
         self.n_differing = 0
         self._each = (Nade(), Nade())
-        self._difference = SkewedSums()
-        self._distance = MomentSums()
+        self._difference = Moments()
+        self._distance = Moments()
 
     def add(self, a: Block, b: Block) -> None:
         """Add pairs of episodes.
@@ -156,8 +156,8 @@ class _Pairs:
         return capped_mean_upper(0.0, cap, self.n, (1.0 + confidence) / 2.0)
 
     def _n_effective(self) -> float:
-        squares = self._distance.squares.value()
-        return self._distance.total.value() ** 2 / squares if squares > 0.0 else 0.0
+        squares = self._distance.squares
+        return self._distance.total**2 / squares if squares > 0.0 else 0.0
 
     def _warnings(self) -> list[str]:
         found = []

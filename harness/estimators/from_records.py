@@ -12,9 +12,8 @@ from harness.arrays import BoolArray, FloatArray, IntArray
 from harness.campaign.models import Method
 from harness.errors import RunFolderError
 from harness.estimators.block import MAX_CONTROL_STEPS, Block
-from harness.pool.shells import ShellDesign
-from harness.pool.surrogate_replay import SurrogateReplay
 from harness.records.folder import MEND_SHARD
+from harness.strata import ShellDesign
 
 EPISODE_COLUMNS = (
     "episode",
@@ -26,7 +25,6 @@ EPISODE_COLUMNS = (
     "log_q",
 )
 SHELL_COLUMNS = ("component",)
-MARTINGALE_COLUMN = "martingale"
 MOMENT_COLUMNS = ("episode", "q_sampled", "q")
 
 
@@ -38,8 +36,6 @@ def block_from_tables(
     alpha: Sequence[float],
     weight_cap: float | None = None,
     shells: ShellDesign | None = None,
-    n_martingale: int = 0,
-    surrogates: SurrogateReplay | None = None,
 ) -> Block:
     """Block of one shard.
 
@@ -58,10 +54,6 @@ def block_from_tables(
         Bound on Y that the design guarantees; 1 for ``nde`` and never above 1 for ``forced`` whatever is given.
     shells : ShellDesign, optional
         Strata of the campaign, if it draws from shells.
-    n_martingale : int
-        Surrogates whose martingale sums are wanted; the table needs `MARTINGALE_COLUMN` then.
-    surrogates : SurrogateReplay, optional
-        Surrogates to be asked about every episode; the table needs their `PATH_COLUMNS` then.
 
     Raises
     ------
@@ -92,9 +84,6 @@ def block_from_tables(
         log_p_cut_in=_log_p_cut_in(episodes, failed),
         component=None if shells is None else _column(episodes, "component").astype(np.int64),
         shells=shells,
-        martingale=_nested(episodes, MARTINGALE_COLUMN, n_martingale) if n_martingale else None,
-        surrogates_crash=None if surrogates is None else surrogates.crashes(episodes),
-        known_rates=None if surrogates is None else surrogates.known,
     )
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar, Self
+from typing import ClassVar
 
 import numpy as np
 
@@ -78,16 +78,6 @@ class MixtureCv:
         self._cubes = self._cubes or ThirdMoments(rows.shape[1])
         self._cubes.add(rows)
         fold_rows(self._factor, rows)
-
-    def merge(self, other: Self) -> None:
-        """Add the rows behind the other factor."""
-        self.sums.merge(other.sums)
-        if other._factor is not None:
-            self._factor = empty_factor(len(other._factor)) if self._factor is None else self._factor
-            fold_rows(self._factor, other._factor.copy(order="F"))
-        if other._cubes is not None and self._factor is not None:
-            self._cubes = self._cubes or ThirdMoments(len(self._factor))
-            self._cubes.merge(other._cubes)
 
     def result(self, confidence: float) -> Estimate:
         """Intercept of the regression, with the residual variance if crashes are many, else the plain mean's."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Self
+from typing import ClassVar
 
 from harness.campaign.models import EstimatorName
 from harness.estimators.accumulator import require_episodes
@@ -31,10 +31,6 @@ class Nade:
     def add(self, block: Block) -> None:
         """Add one block's weighted crashes."""
         self.sums.add(block)
-
-    def merge(self, other: Self) -> None:
-        """Add the sums over other episodes; exact, so any grouping gives the same bits."""
-        self.sums.merge(other.sums)
 
     def result(self, confidence: float) -> Estimate:
         """Mean of Y with its interval."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import ClassVar, Self
+from typing import ClassVar
 
 import numpy as np
 
@@ -35,11 +35,6 @@ class Nde:
         """Count one block."""
         self.n += len(block)
         self.n_crashes += int(np.count_nonzero(block.crash))
-
-    def merge(self, other: Self) -> None:
-        """Add the counts of other episodes."""
-        self.n += other.n
-        self.n_crashes += other.n_crashes
 
     def result(self, confidence: float) -> Estimate:
         """Share of crashes; its relative half-width is half the interval's length over the rate."""

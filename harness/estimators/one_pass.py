@@ -14,23 +14,19 @@ from harness.estimators.convergence import Convergence
 from harness.estimators.diagnostics import Diagnostics
 from harness.estimators.estimate import Estimate, Unavailable
 from harness.estimators.headline import headline
-from harness.estimators.martingale import Martingale
 from harness.estimators.mixture_cv import MixtureCv
 from harness.estimators.nade import Nade
 from harness.estimators.nde import Nde
-from harness.estimators.replay import Replay
 from harness.estimators.scv import Scv
 from harness.estimators.shells import Shells
 
-ESTIMATORS: tuple[EstimatorName, ...] = ("nde", "nade", "mixture_cv", "scv", "shells", "martingale", "replay")
+ESTIMATORS: tuple[EstimatorName, ...] = ("nde", "nade", "mixture_cv", "scv", "shells")
 _CLASSES: dict[EstimatorName, type[Accumulator]] = {
     "nde": Nde,
     "nade": Nade,
     "mixture_cv": MixtureCv,
     "scv": Scv,
     "shells": Shells,
-    "martingale": Martingale,
-    "replay": Replay,
 }
 
 

@@ -12,7 +12,7 @@ its claimed variance leaves out the error of the centring. See docs/scv-defect.m
 from __future__ import annotations
 
 import math
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -80,14 +80,6 @@ class Scv:
 
     def _stratum(self, level: int) -> Stratum:
         return self._strata.setdefault(level, Stratum(level, self.basis))
-
-    def merge(self, other: Self) -> None:
-        """Merge stratum by stratum."""
-        if other.basis != self.basis:
-            raise ValueError(f"cannot merge scv of basis {self.basis!r} with basis {other.basis!r}")
-        self.sums.merge(other.sums)
-        for level, stratum in sorted(other._strata.items()):
-            self._stratum(level).merge(stratum)
 
     def result(self, confidence: float) -> Estimate:
         """Algorithm 1's estimate and its published variance."""

@@ -74,15 +74,6 @@ class Stratum:
         self._y.append(y)
         self._n_waiting += len(y)
 
-    def merge(self, other: Stratum) -> None:
-        """Add the rows behind another stratum of the same level."""
-        if other._factor is not None:
-            self._factor = empty_factor(len(other._factor)) if self._factor is None else self._factor
-            fold_rows(self._factor, other._factor.copy(order="F"))
-        self.n += other.n - other._n_waiting
-        for first_ratios, y in zip(other._ratios, other._y, strict=True):
-            self.add(first_ratios, y)
-
     def _folded(self, factor: FloatArray | None) -> FloatArray:
         """Fold the waiting rows into `factor`, which is changed, or into a new one."""
         rows = self._waiting_rows()

@@ -7,7 +7,7 @@ refutes it.
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from harness.estimators.accumulator import require_episodes
 from harness.estimators.block import Block
 from harness.estimators.estimate import Estimate
 from harness.estimators.stratified import Limits, combined, pool_variance, share_limits
-from harness.pool.shells import ShellDesign
+from harness.strata import ShellDesign
 
 _METHOD = "crashes within shells of known probability; Clopper-Pearson limits per shell, combined (MOVER)"
 
@@ -54,16 +54,6 @@ class Shells:
     def _begin(self, design: ShellDesign) -> None:
         self.design = design
         self.tests, self.crashes, self.failed = (np.zeros(design.p.size, np.int64) for _ in range(3))
-
-    def merge(self, other: Self) -> None:
-        """Add the counts of other episodes."""
-        if other.design is None:
-            return
-        if self.design is None:
-            self._begin(other.design)
-        self.tests += other.tests
-        self.crashes += other.crashes
-        self.failed += other.failed
 
     def assumption_free(self, confidence: float) -> Limits:
         """Rate over all strata."""

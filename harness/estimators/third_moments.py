@@ -27,10 +27,6 @@ class ThirdMoments:
             part = rows[start : start + _ROWS_AT_ONCE]
             self._sums += (part[:, :, None] * part[:, None, :]).reshape(len(part), -1).T @ part
 
-    def merge(self, other: ThirdMoments) -> None:
-        """Add the rows behind the other sums."""
-        self._sums += other._sums
-
     def of(self, coefficients: FloatArray) -> float:
         """Σ (cᵀx)³ for coefficients c of shape (k,)."""
         return float(np.outer(coefficients, coefficients).ravel() @ self._sums @ coefficients)

@@ -15,15 +15,14 @@ from harness.arrays import FloatArray
 from harness.campaign.models import Method
 from harness.estimators.block import Block
 from harness.estimators.estimate import Estimate
-from harness.estimators.exact_sum import SkewedSums
 from harness.estimators.intervals import capped_mean_upper, skewed_distances
+from harness.estimators.moments import Moments
 
 FEW_CRASHES = 50
 FEW_EFFECTIVE = 30.0
 FEW_FOR_RESIDUALS = 300.0
 """Effective crashes below which residuals of a regression claim too little; the interval is then as wide as that of the
-plain mean. Overtaking in the twin, 90 %: `mixture_cv` covers 0.88 at 140 of them, 0.85 at 40 (3,000 replications),
-`martingale` 0.87 at 140 (1,000 replications)."""
+plain mean. Overtaking in the twin, 90 %: `mixture_cv` covers 0.88 at 140 of them, 0.85 at 40 (3,000 replications)."""
 LARGE_SHARE = 0.1
 OVERTURNS = 1.0
 """One more crash of the largest known weight, over all those seen, above which an interval is not to be trusted: a
@@ -33,20 +32,20 @@ UNBOUNDED = "the weights of these tests are unbounded: the true rate may lie far
 
 
 class WeightedSums:
-    """Exact sums of Y, and the largest weights; one pass, any order.
+    """Running moments of Y, and the largest weights; one pass.
 
     Attributes
     ----------
     n, n_crashes : int
         Episodes and crashes so far.
-    y : SkewedSums
-        ΣY, ΣY² and ΣY³.
+    y : Moments
+        Of Y = 1{crash}·weight.
     """
 
     def __init__(self) -> None:
         self.n = 0
         self.n_crashes = 0
-        self.y = SkewedSums()
+        self.y = Moments()
         self.method: Method | None = None
         self._largest_y = 0.0
         self._largest_cut_in_log_weight = -math.inf
@@ -77,31 +76,18 @@ class WeightedSums:
             path_cap = _largest(block.log_p_cut_in) - math.log(share)
             self._largest_log_path_cap = max(self._largest_log_path_cap, path_cap)
 
-    def merge(self, other: WeightedSums) -> None:
-        """Add the sums over other episodes."""
-        self.method = other.method if self.method is None else self.method
-        self.n += other.n
-        self.n_crashes += other.n_crashes
-        self.y.merge(other.y)
-        self._largest_y = max(self._largest_y, other._largest_y)
-        self._largest_cut_in_log_weight = max(self._largest_cut_in_log_weight, other._largest_cut_in_log_weight)
-        self._largest_log_weight = max(self._largest_log_weight, other._largest_log_weight)
-        self._largest_log_path_cap = max(self._largest_log_path_cap, other._largest_log_path_cap)
-        self._design_cap = max(self._design_cap, other._design_cap)
-        self._has_path_caps = self._has_path_caps and other._has_path_caps
-
     def mean(self) -> float:
         """ΣY/n."""
         return self.y.mean(self.n)
 
     def n_effective(self) -> float:
         """(ΣY)²/ΣY², 0 without a crash."""
-        squares = self.y.squares.value()
-        return self.y.total.value() ** 2 / squares if squares > 0.0 else 0.0
+        squares = self.y.squares
+        return self.y.total**2 / squares if squares > 0.0 else 0.0
 
     def largest_share(self) -> float:
         """Largest Y as a share of ΣY, 0 without a crash."""
-        total = self.y.total.value()
+        total = self.y.total
         return self._largest_y / total if total > 0.0 else 0.0
 
     def known_cap(self) -> float:
@@ -142,7 +128,7 @@ class WeightedSums:
             )
         if not math.isfinite(self.known_cap()):
             found.append(UNBOUNDED)
-        elif self.n_crashes and (times := self.known_cap() / self.y.total.value()) > OVERTURNS:
+        elif self.n_crashes and (times := self.known_cap() / self.y.total) > OVERTURNS:
             found.append(
                 f"one more crash of the largest possible weight would add {times:.3g} times this rate: the true rate "
                 "may lie far above this interval"

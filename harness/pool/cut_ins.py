@@ -113,13 +113,6 @@ class Pool:
         }
 
     @property
-    def ordinary(self) -> BoolArray:
-        """Which surrogates crash in the traffic that the boundary crashes in, and not in rare traffic of their own."""
-        relvar = np.diag(self.mu_covariance) * self.n_paths / self.mu**2
-        ordinary: BoolArray = relvar <= FAR_OFF * relvar[self.boundary]
-        return ordinary
-
-    @property
     def boundary(self) -> int:
         """Index of the outermost shell that the conditional statement keeps."""
         return self.names.index(self.library.boundary)

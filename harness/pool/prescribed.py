@@ -10,7 +10,8 @@ from harness.arrays import IntArray, RecordArray
 from harness.campaign.models import Campaign
 from harness.episode.cells import PrescribedTraffic
 from harness.pool.cut_ins import Pool
-from harness.pool.shells import Draws, ShellDesign, acceleration_limit, design_shells, shells_in_strata
+from harness.pool.shells import Draws, acceleration_limit, design_shells, shells_in_strata
+from harness.strata import ShellDesign
 
 
 @dataclass(frozen=True)

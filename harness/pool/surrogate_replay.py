@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import os
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 
 import numpy as np
 import pyarrow as pa
 
-from harness.arrays import BoolArray, FloatArray, Int8Array, IntArray
+from harness.arrays import BoolArray, Int8Array, IntArray
 from harness.campaign.models import Campaign
 from harness.environment.driving import Environment
 from harness.environment.loading import load_environment
@@ -19,36 +18,12 @@ from harness.pool.cut_ins import Pool, environment_hash
 from harness.pool.replay import StoredPaths, replay_surrogates
 from harness.records.folder import MEND_SHARD
 from harness.state import STATE_COLUMNS, states_from
+from harness.strata import KnownRates
 
 PATH_COLUMNS = ("episode", *STATE_COLUMNS, "n_steps", "cut_in_step", "lv_maneuvers", "bv_maneuvers")
 """What of the episodes table determines LV's and BV's motion."""
 _PART = 512
 """Episodes that a thread replays at a time."""
-
-
-@dataclass(frozen=True, eq=False)
-class KnownRates:
-    """Crash rates of surrogates as a pool knows them.
-
-    Attributes
-    ----------
-    pool : str
-        Its key.
-    names : tuple of str, length D
-        Surrogates from careful to careless.
-    mu : ndarray, shape (D,)
-        Crash rates per test.
-    covariance : ndarray, shape (D, D)
-        Of their errors.
-    ordinary : ndarray of bool, shape (D,)
-        Those that crash in the traffic that the boundary crashes in. The weighted crashes of others are few and heavy.
-    """
-
-    pool: str
-    names: tuple[str, ...]
-    mu: FloatArray
-    covariance: FloatArray
-    ordinary: BoolArray
 
 
 class SurrogateReplay:
@@ -72,7 +47,7 @@ class SurrogateReplay:
     def __init__(self, campaign: Campaign, pool: Pool) -> None:
         self._environment: Environment = load_environment(campaign.environment)
         require_same_environment(self._environment, pool)
-        self.known = KnownRates(pool.key, pool.names, pool.mu, pool.mu_covariance, pool.ordinary)
+        self.known = KnownRates(pool.key, pool.names, pool.mu, pool.mu_covariance)
         self._seed = campaign.seed
         names = list(pool.library.surrogates)
         self._drivers = pool.library.drivers

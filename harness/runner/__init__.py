@@ -5,6 +5,7 @@ from harness.runner.campaign_run import RunResult, run_campaign
 from harness.runner.compare import Comparison, compare_campaigns
 from harness.runner.plan import plan_campaign
 from harness.runner.replay import ReplayResult, replay_episode
+from harness.runner.stored_estimates import estimate_run
 
 __all__ = [
     "AvCheck",
@@ -13,6 +14,7 @@ __all__ = [
     "RunResult",
     "check_av",
     "compare_campaigns",
+    "estimate_run",
     "plan_campaign",
     "replay_episode",
     "run_campaign",

@@ -12,7 +12,7 @@ import numpy as np
 
 from harness.arrays import BoolArray, FloatArray, IntArray
 from harness.estimators.stratified import combined, share_limits
-from harness.pool.shells import ShellDesign
+from harness.strata import ShellDesign
 
 GROWTH = 1.25
 """Tests after a round over tests before it; also the distance of the looks at the result."""

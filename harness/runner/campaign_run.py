@@ -17,7 +17,6 @@ import pyarrow.parquet as pq
 
 from harness.campaign.models import Campaign
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE
-from harness.estimators import estimate_run
 from harness.progress import Progress, SilentProgress
 from harness.records.folder import SHELLS, TABLES, shard_file, sole_use, write_json
 from harness.runner.manifest import Manifest, require_no_fewer, require_own_folder
@@ -33,6 +32,7 @@ from harness.runner.prepare import (
 from harness.runner.retrace import Retracing
 from harness.runner.rounds import rounds, stop_rule
 from harness.runner.shards import ShardPool, stored_shard
+from harness.runner.stored_estimates import estimate_run
 from harness.runner.table_accuracy import table_errors
 from harness.runner.worker import ShardDone, ShardSpec
 from harness.stopped_by import StoppedBy, ending

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from harness.arrays import BoolArray, FloatArray
-from harness.validation.chains.chain import Chain
-from harness.validation.chains.sampler import mixture_weights
+from harness.studies.chains.chain import Chain
+from harness.studies.chains.sampler import mixture_weights
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.stats import binomtest
 
-from harness.validation.chains.named import frequent_decisive, overtaking, panel, rare_decisive
-from harness.validation.chains.sampler import draw
+from harness.studies.chains.named import frequent_decisive, overtaking, panel, rare_decisive
+from harness.studies.chains.sampler import draw
 
 from .enumeration import enumerate_episodes
 from .seed import SEED

@@ -15,8 +15,8 @@ from harness.estimators.mixture_cv import MixtureCv
 from harness.estimators.nade import Nade
 from harness.estimators.scv import Scv
 from harness.estimators.third_moments import ThirdMoments
-from harness.validation.chains.named import frequent_decisive, rare_decisive
-from harness.validation.chains.sampler import draw
+from harness.studies.chains.named import frequent_decisive, rare_decisive
+from harness.studies.chains.sampler import draw
 
 from .coverage import replicate
 from .single_choice import with_optimal_function

@@ -15,8 +15,8 @@ from scipy.stats import binomtest
 
 from harness.estimators.block import Block
 from harness.estimators.difference import Difference, PairedSums, difference_statement, paired_difference
-from harness.validation.chains.named import overtaking
-from harness.validation.chains.sampler import draw
+from harness.studies.chains.named import overtaking
+from harness.studies.chains.sampler import draw
 
 from .seed import SEED
 from .single_choice import with_optimal_function

@@ -7,7 +7,7 @@ import pytest
 
 from harness.estimators.mixture_cv import MixtureCv
 from harness.estimators.scv import Scv
-from harness.validation.chains.named import overtaking, rare_decisive
+from harness.studies.chains.named import overtaking, rare_decisive
 
 from .enumeration import enumerate_episodes
 from .seed import SEED

@@ -47,8 +47,6 @@ def episodes_table(block: Block) -> pa.Table:
         "log_p_cut_in": pa.nulls(n, pa.float64()) if block.log_p_cut_in is None else pa.array(block.log_p_cut_in),
         "log_q": pa.FixedSizeListArray.from_arrays(pa.array(block.log_q.ravel()), m) if m else _empty_lists(n),
     }
-    if block.martingale is not None:
-        columns["martingale"] = pa.FixedSizeListArray.from_arrays(pa.array(block.martingale.ravel()), 2)
     schema = episodes_schema(m, 2)
     return pa.table(columns, schema=pa.schema([schema.field(name) for name in columns]))
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from harness.estimators.diagnostics import Diagnostics
-from harness.validation.chains.named import overtaking
-from harness.validation.chains.sampler import blocks
+from harness.studies.chains.named import overtaking
+from harness.studies.chains.sampler import blocks
 from tests.chains.seed import SEED
 
 from .small_blocks import block
@@ -37,15 +37,6 @@ def test_means_are_those_of_numpy():
         assert found["mean"] == pytest.approx(values.mean(), rel=1e-12)
         assert found["std_error"] == pytest.approx(values.std(ddof=1) / np.sqrt(5_000), rel=1e-9)
     assert result["n_cut_ins"] == cut_in.sum()
-
-
-def test_merging_gives_the_same_bits():
-    parts = list(blocks(CHAIN, "step_mixture", [700, 500, 300], SEED))
-    whole, head, tail = feed(parts).result(), feed(parts[:1]), feed(parts[1:])
-    fresh = Diagnostics()
-    fresh.merge(tail)
-    head.merge(fresh)
-    assert head.result() == whole
 
 
 def test_a_small_mean_weight_of_the_step_mixture_is_explained_not_failed():

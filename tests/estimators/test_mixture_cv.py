@@ -7,8 +7,8 @@ import pytest
 
 from harness.estimators.intervals import normal_half_width, skewed_distances
 from harness.estimators.mixture_cv import MixtureCv
-from harness.validation.chains.named import panel
-from harness.validation.chains.sampler import blocks, draw
+from harness.studies.chains.named import panel
+from harness.studies.chains.sampler import blocks, draw
 from tests.chains.seed import SEED
 
 from .small_blocks import block
@@ -54,20 +54,6 @@ def test_the_interval_is_as_skewed_as_the_residuals():
     assert estimate.ci_high - estimate.crash_rate == pytest.approx(above, rel=1e-9)
     assert estimate.crash_rate - estimate.ci_low == pytest.approx(min(below, estimate.crash_rate), rel=1e-9)
     assert above > 1.01 * normal_half_width(estimate.std_error, 0.9)
-
-
-def test_merged_states_agree_with_one_pass():
-    parts = list(blocks(CHAIN, "episode_mixture", [3_000, 2_000, 1_000], SEED))
-    whole = feed(parts).result(0.9)
-    head, tail = feed(parts[:1]), feed(parts[1:2])
-    tail.merge(feed(parts[2:]))
-    head.merge(tail)
-    backwards = feed(parts[::-1]).result(0.9)
-    for other in (head.result(0.9), backwards):
-        assert other.crash_rate == pytest.approx(whole.crash_rate, rel=1e-10)
-        assert other.std_error == pytest.approx(whole.std_error, rel=1e-10)
-        assert other.ci_high == pytest.approx(whole.ci_high, rel=1e-10)
-        assert other.n_effective == whole.n_effective
 
 
 def test_control_that_never_acted_leaves_the_plain_mean():

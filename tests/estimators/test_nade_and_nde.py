@@ -38,17 +38,6 @@ def test_without_control_nade_is_the_share_of_crashes(crash):
     assert weighted_mean.crash_rate == plain.result(0.9).crash_rate == np.mean(crash)
 
 
-@given(weighted, weighted, weighted)
-def test_merging_in_any_grouping_and_order_gives_the_same_bits(a, b, c):
-    one = nade(as_block(a), as_block(b), as_block(c)).result(0.9)
-    left, right = nade(as_block(a)), nade(as_block(b))
-    right.merge(nade(as_block(c)))
-    left.merge(right)
-    assert left.result(0.9) == one
-    assert nade(as_block(c), as_block(a), as_block(b)).result(0.9) == one
-    assert nade(as_block(a + b + c)).result(0.9) == one
-
-
 @given(weighted)
 def test_is_the_mean_with_its_standard_error(rows):
     estimate = nade(as_block(rows)).result(0.9)

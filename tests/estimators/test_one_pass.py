@@ -9,8 +9,8 @@ import pytest
 
 from harness.estimators import ESTIMATORS, Estimate, Unavailable, accumulator, headline, one_pass
 from harness.estimators.scv import Scv
-from harness.validation.chains.named import overtaking
-from harness.validation.chains.sampler import blocks
+from harness.studies.chains.named import overtaking
+from harness.studies.chains.sampler import blocks
 from tests.chains.seed import SEED
 
 CHAIN = overtaking("short", skill=0.5, surrogates=[0.5, 0.2, 0.8], level=0.02, horizon=5)

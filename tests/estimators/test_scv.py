@@ -11,8 +11,8 @@ from harness.estimators.nade import Nade
 from harness.estimators.scv import WARNING, Scv
 from harness.estimators.scv_columns import n_columns, product_columns, steps_used
 from harness.estimators.scv_stratum import CHUNK_ROWS, Stratum
-from harness.validation.chains.named import frequent_decisive, overtaking, panel
-from harness.validation.chains.sampler import blocks
+from harness.studies.chains.named import frequent_decisive, overtaking, panel
+from harness.studies.chains.sampler import blocks
 from tests.chains.seed import SEED
 
 from .scv_reference import algorithm_1
@@ -60,22 +60,17 @@ def test_always_carries_its_warning():
     assert WARNING in feed(blocks(SMALL, "step_mixture", [100], SEED)).result(0.9).warnings
 
 
-def test_blocks_in_index_order_give_the_same_bits_however_they_are_cut():
+def test_how_blocks_are_cut_does_not_matter():
     (whole,) = blocks(SMALL, "step_mixture", [3 * CHUNK_ROWS], SEED)
     cuts = [0, 7, 1_000, CHUNK_ROWS, CHUNK_ROWS + 1, 3 * CHUNK_ROWS]
     parts = [whole.take(slice(a, b)) for a, b in itertools.pairwise(cuts)]
-    assert feed([whole]).result(0.9) == feed(parts).result(0.9)
-
-
-def test_merged_states_agree_with_one_pass():
-    parts = list(blocks(SMALL, "step_mixture", [9_000, 8_000, 1_000], SEED))
-    whole = feed(parts).result(0.9)
-    head, tail = feed(parts[:1]), feed(parts[1:2])
-    tail.merge(feed(parts[2:]))
-    head.merge(tail)
-    for other in (head.result(0.9), feed(parts[::-1]).result(0.9)):
-        assert other.crash_rate == pytest.approx(whole.crash_rate, rel=1e-12)
-        assert other.std_error == pytest.approx(whole.std_error, rel=1e-8)
+    one, cut = feed([whole]).result(0.9), feed(parts).result(0.9)
+    assert (cut.crash_rate, cut.std_error, cut.details["strata"]) == (
+        one.crash_rate,
+        one.std_error,
+        one.details["strata"],
+    )
+    assert cut.n_effective == pytest.approx(one.n_effective, rel=1e-12)
 
 
 def test_asking_leaves_the_state_as_it_is():
@@ -137,7 +132,12 @@ def test_large_blocks_on_threads_give_the_bits_of_small_ones():
     parts = list(blocks(panel()[1], "step_mixture", [9_000], SEED))
     assert len(parts) == 1
     pieces = [parts[0].take(slice(start, start + 500)) for start in range(0, 9_000, 500)]
-    assert feed(parts).result(0.9) == feed(pieces).result(0.9)
+    one, cut = feed(parts).result(0.9), feed(pieces).result(0.9)
+    assert (cut.crash_rate, cut.std_error, cut.details["strata"]) == (
+        one.crash_rate,
+        one.std_error,
+        one.details["strata"],
+    )
 
 
 def test_columns_are_products_in_the_order_of_vec():
@@ -172,5 +172,3 @@ def test_is_refused_without_moments_or_for_other_methods():
     assert "step mixture" in (Scv.refusal(block([True], method="forced")) or "")
     with pytest.raises(ValueError, match="first_ratios"):
         Scv().add(block([True]))
-    with pytest.raises(ValueError, match="cannot merge"):
-        Scv().merge(Scv(basis="full"))

@@ -8,17 +8,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import binom
 
-from harness.estimators import Estimate, Shells, one_pass
+from harness.estimators import Estimate, one_pass
 from harness.estimators.block import Block
 from harness.estimators.estimate import finite_json
 from harness.estimators.intervals import clopper_pearson
 from harness.estimators.statement import conditional_statement, statement
 from harness.estimators.stratified import combined, pool_variance, share_limits
-from harness.pool.shells import ShellDesign
+from harness.strata import ShellDesign
 
 P = np.array([1e-4, 3e-4, 2e-2])
 EXACT = np.zeros((3, 3))
@@ -57,18 +56,6 @@ counts = st.lists(st.tuples(st.integers(0, 2), st.booleans(), st.booleans()), mi
 def from_rows(rows, first: int = 0) -> Block:
     strata, crash, failed = zip(*rows, strict=True)
     return block(list(strata), [c and not f for c, f in zip(crash, failed, strict=True)], list(failed), first)
-
-
-@given(rows=counts, cut=st.integers(0, 30))
-def test_merging_and_order_do_not_matter(rows, cut):
-    whole, left, right, backwards = Shells(), Shells(), Shells(), Shells()
-    whole.add(from_rows(rows))
-    for part, state in ((rows[:cut], left), (rows[cut:], right)):
-        if part:
-            state.add(from_rows(part))
-    left.merge(right)
-    backwards.add(from_rows(rows[::-1]))
-    assert whole.result(0.9) == left.result(0.9) == backwards.result(0.9)
 
 
 def test_one_stratum_has_the_clopper_pearson_interval():

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from harness.campaign.models import Stop
 from harness.estimators import StopRule, accumulator
 from harness.estimators.stopping import LOOK_RATIO, look_grid
-from harness.validation.chains.named import frequent_decisive
-from harness.validation.chains.sampler import blocks
+from harness.studies.chains.named import frequent_decisive
+from harness.studies.chains.sampler import blocks
 from tests.chains.seed import SEED
 
 from .small_blocks import block

@@ -9,7 +9,7 @@ from synthetic_overtaking import Episodes
 
 from harness.estimators.block import Block
 from harness.estimators.run_estimates import CampaignFacts, estimate_blocks
-from harness.pool.shells import ShellDesign
+from harness.strata import ShellDesign
 
 P = np.array([4e-8, 9e-8, 3e-5])
 """Probabilities that are far apart: sums that ignore how often a shell was tested come out wrong by orders."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 
 from harness.cli import main
-from harness.estimators import estimate_run
+from harness.runner import estimate_run
 from tests.runner.stored_runs import copy_of
 
 

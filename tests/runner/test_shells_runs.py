@@ -9,13 +9,13 @@ import pytest
 
 from harness import estimate, replay
 from harness.errors import CampaignError, RunFolderError
-from harness.pool.shells import ShellDesign
 from harness.runner import compare_campaigns
 from harness.runner.allocation import GROWTH, Allocation
 from harness.runner.campaign_run import _episodes_on_disk
 from harness.runner.manifest import Manifest
 from harness.runner.prefix import Prefix
 from harness.runner.rounds import round_specs
+from harness.strata import ShellDesign
 from tests.pool.conftest import SMALL_POOL
 from tests.runner.stored_runs import copy_of, manifest, shard_files, stored_table, unlike_columns
 

@@ -1,0 +1,7 @@
+"""Studies of methods, apart from what a tester of a vehicle needs; only the command line leads here.
+
+``run`` repeats campaigns (`harness validate`): what an interval is worth is judged by repeating the whole campaign,
+never by itself. Everything random is drawn anew for each replication, the pool of cut-ins included. The truth is known:
+exactly for Markov chains, from an independent enumeration for overtaking in the twin. ``run_required_tests`` follows
+the procedure by which the paper compares methods (`harness rnot`).
+"""

@@ -1,0 +1,170 @@
+"""What a replication experiment is: a campaign to repeat, the vehicles or chains to repeat it with, and how often."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import Field, field_validator, model_validator
+
+from harness.campaign.models import (
+    NAME_PATTERN,
+    AutomatedVehicle,
+    BuiltInParameters,
+    Campaign,
+    EstimatorName,
+    Method,
+    Section,
+    Whole,
+    broken_rule,
+)
+from harness.campaign.yaml_text import read_model
+from harness.errors import CampaignError
+from harness.estimators import headline
+from harness.studies.chains.named import CHAINS
+
+AvName = Annotated[str, Field(pattern=NAME_PATTERN)]
+ChainName = str
+
+
+class SuperPopulation(Section):
+    """Paths enumerated once, that pools of all replications are drawn from; and others for the truth."""
+
+    paths: Whole = Field(65_536, ge=1024, le=1 << 22, description="paths that pools are drawn from, with replacement")
+    reference_paths: Whole = Field(65_536, ge=1024, le=1 << 22, description="independent paths that the truth is from")
+    pool_paths: Whole = Field(16_384, ge=256, le=1 << 20, description="paths of each pool; smoke.yaml has 32,768")
+
+
+class Fault(Section):
+    """A mistake made on purpose, to show that the experiment notices."""
+
+    shell: Whole = Field(0, ge=0, description="stratum whose probability is wrong, from the most careful on")
+    factor: float = Field(gt=0.0, description="wrong probability over the right one")
+
+
+JUDGED: dict[Method, set[EstimatorName]] = {
+    "shells": {"shells"},
+    "nde": {"nde", "nade"},
+    "forced": {"nade"},
+    "step_mixture": {"nade", "scv"},
+    "episode_mixture": {"nade", "mixture_cv"},
+}
+"""Estimators whose results can be judged."""
+
+
+class Experiment(Section):
+    """A replication experiment, as one YAML file describes it."""
+
+    format: Literal["validation-experiment"]
+    version: Literal[1]
+    name: str = Field(pattern=NAME_PATTERN)
+    description: str = ""
+    seed: Whole = Field(1, ge=0, lt=2**31)
+    replications: Whole = Field(2000, ge=2, le=1_000_000, description="independent repetitions for each vehicle")
+    campaign: Campaign = Field(description="what is repeated; its own av is replaced, stop.rhw null means a fixed n")
+    avs: dict[AvName, AutomatedVehicle] = Field(default_factory=dict, description="vehicles, overtaking in the twin")
+    chains: list[ChainName] = Field(default_factory=list, description="exact Markov chains, instead of avs")
+    estimators: list[EstimatorName] = Field(
+        default_factory=list, description="whose results are judged; the method's own when left out"
+    )
+    super_population: SuperPopulation = SuperPopulation()
+    fault: Fault | None = None
+
+    @property
+    def results(self) -> tuple[EstimatorName, ...]:
+        """Estimators to judge."""
+        return tuple(self.estimators) or (headline(self.campaign.testing.method),)
+
+    def subject(self, name: str) -> Campaign:
+        """The campaign with one of the vehicles."""
+        return self.campaign.model_copy(update={"av": self.avs[name]})
+
+    @field_validator("campaign", mode="before")
+    @classmethod
+    def _in_the_twin(cls, value: Any) -> Any:
+        if not isinstance(value, dict):
+            return value
+        world = value.get("world")
+        engine = world.get("engine", "twin") if isinstance(world, dict) else "twin"
+        return {"name": "replicated", **value, "world": {**(world or {}), "engine": engine}}
+
+    @model_validator(mode="after")
+    def _has_subjects(self) -> Self:
+        if bool(self.avs) == bool(self.chains):
+            raise broken_rule(
+                "avs",
+                found="both avs and chains" if self.avs else "neither avs nor chains",
+                expected="one of the two",
+                mend="Name vehicles under avs for overtaking in the twin, or exact chains under chains.",
+            )
+        for name in self.chains:
+            if name not in CHAINS:
+                raise broken_rule(
+                    "chains", found=f"'{name}'", expected=f"some of {', '.join(CHAINS)}", mend="Choose one of them."
+                )
+        return self
+
+    @model_validator(mode="after")
+    def _has_a_twin(self) -> Self:
+        if self.campaign.world.engine != "twin":
+            raise broken_rule(
+                "campaign.world.engine",
+                found=self.campaign.world.engine,
+                expected="twin: thousands of replications are not affordable in SUMO, whose records the twin's equal",
+                mend="Leave the key out.",
+            )
+        for name, av in self.avs.items():
+            if not isinstance(av.parameters, BuiltInParameters):
+                raise broken_rule(
+                    f"avs.{name}",
+                    found=f"an AV that av.{av.source} drives",
+                    expected="a built-in model (idm, fvdm, constant): replications run in the twin, which has no other",
+                    mend="Leave it out here, and test it in SUMO with `harness run`.",
+                )
+            if av.before_cut_in != "hold_speed":
+                raise broken_rule(
+                    f"avs.{name}.before_cut_in",
+                    found=av.before_cut_in,
+                    expected="hold_speed: paths before the cut-in are drawn ahead",
+                    mend="Leave the key out.",
+                )
+        return self
+
+    @model_validator(mode="after")
+    def _estimators_belong_to_the_method(self) -> Self:
+        method = self.campaign.testing.method
+        if wrong := set(self.results) - JUDGED[method]:
+            raise broken_rule(
+                "estimators",
+                found=", ".join(sorted(wrong)),
+                expected=f"for testing.method {method}: {', '.join(sorted(JUDGED[method]))}",
+                mend="Change one of the two.",
+            )
+        if self.fault is not None and method != "shells":
+            raise broken_rule("fault", found=f"a wrong shell for {method}", expected="method shells", mend="Delete it.")
+        return self
+
+
+def load_experiment(path: Path) -> Experiment:
+    """Read an experiment.
+
+    Raises
+    ------
+    CampaignError
+        The file cannot be read or says something wrong; the error names every place.
+    """
+    experiment = read_model(path, Experiment)
+    library = experiment.campaign.pool.library
+    if "/" in library or library.endswith((".yaml", ".yml")):
+        file = (path.parent / library).resolve()
+        if not file.is_file():
+            raise CampaignError(
+                f"{path}: campaign.pool.library",
+                found=f"{library}, but there is no file {file}",
+                expected="a surrogate library, or the name of a shipped one",
+                mend="Correct the path; it is relative to the folder of the experiment.",
+            )
+        pool = experiment.campaign.pool.model_copy(update={"library": str(file)})
+        campaign = experiment.campaign.model_copy(update={"pool": pool})
+        experiment = experiment.model_copy(update={"campaign": campaign})
+    return experiment

@@ -1,0 +1,242 @@
+"""The required number of tests (RNoT) as published: where, in shuffled tests, the relative half-width settles.
+
+[paper] section VI-E. For one ordering of the tests the RNoT is the first n after which the relative half-width
+RHW = z·sqrt(var/n)/estimate stays at or below a threshold; it is averaged over shuffles of the tests of one run. Where
+a shuffle is never above the threshold, the paper takes the n at which RHW is largest. The average acceleration ratio
+(AAR) of one method over another is the ratio of two averages.
+
+The RHW is looked at on a grid, up to a total; both belong to the answer, for "stays" can only mean "up to the total". A
+shuffle that is still above the threshold at the total counts as the total, which makes the average a lower limit.
+
+A shuffle is decided by the seed, its number, how many tests there are and which of them crashed: not by how they lie
+in shards, and not by the estimator, so that two estimators of one run see the same orderings.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.stats import norm
+
+from harness.arrays import BoolArray, FloatArray, IntArray
+from harness.estimators.block import Block
+from harness.estimators.both_ways import BothWays
+from harness.estimators.scv import Scv
+
+
+@dataclass(frozen=True)
+class Procedure:
+    """What the paper leaves to be chosen, and what it chose.
+
+    Attributes
+    ----------
+    rhw : float
+        Threshold; the paper's is 0.3.
+    confidence : float
+        Level of the normal interval; the paper's is 0.9.
+    n_shuffles : int
+        Orderings to average over; the paper's number is 200.
+    seed : int
+    first, ratio : int, float
+        Smallest prefix that is looked at, at least 2, and how much larger each next one is, above 1.
+    total : int or None
+        Largest prefix that is looked at; None, or more than there are tests, for all tests.
+    """
+
+    rhw: float = 0.3
+    confidence: float = 0.9
+    n_shuffles: int = 200
+    seed: int = 1
+    first: int = 10
+    ratio: float = 1.05
+    total: int | None = None
+
+    def grid(self, n_tests: int) -> IntArray:
+        """Prefixes to look at, shape (g,): rising, the last one being the total."""
+        total = n_tests if self.total is None else min(self.total, n_tests)
+        sizes, n = [], self.first
+        while n < total:
+            sizes.append(n)
+            n = max(n + 1, int(n * self.ratio))
+        return np.array([*sizes, total], dtype=np.int64)
+
+    def z(self) -> float:
+        """Quantile of the normal interval."""
+        return float(norm.isf((1.0 - self.confidence) / 2.0))
+
+
+@dataclass(frozen=True, eq=False)
+class RequiredTests:
+    """RNoT of every shuffle.
+
+    Attributes
+    ----------
+    n : (s,) int
+        RNoT; the total where the threshold is never reached.
+    never_reached : (s,) bool
+        Shuffles that are above the threshold at the total.
+    never_above : (s,) bool
+        Shuffles that are nowhere above it; their n is that of the largest RHW, the smaller one of equals.
+    """
+
+    n: IntArray
+    never_reached: BoolArray
+    never_above: BoolArray
+
+    @property
+    def mean(self) -> float:
+        """Average RNoT; a lower limit if `is_lower_limit`."""
+        return float(np.mean(self.n))
+
+    @property
+    def is_lower_limit(self) -> bool:
+        """Whether some shuffle would have needed more tests than the total."""
+        return bool(self.never_reached.any())
+
+    def quantile(self, share: float) -> int:
+        """Smallest RNoT that at least this share of the shuffles does not exceed."""
+        return int(np.quantile(self.n, share, method="inverted_cdf"))
+
+
+def required_tests(rhw: FloatArray, grid: IntArray, threshold: float) -> RequiredTests:
+    """Read the RNoT off the RHW of every shuffle.
+
+    Parameters
+    ----------
+    rhw : (s, g) float64
+        Per shuffle and prefix; infinite where nothing can be said. NaN counts as above any threshold.
+    grid : (g,) int
+        The prefixes, rising.
+    threshold : float
+    """
+    above = ~(rhw <= threshold)
+    never_above = np.asarray(~above.any(axis=1))
+    behind_last_above = above.shape[1] - np.argmax(above[:, ::-1], axis=1)
+    settled = np.minimum(behind_last_above, above.shape[1] - 1)
+    at = np.where(never_above, np.argmax(rhw, axis=1), settled)
+    return RequiredTests(grid[at], above[:, -1], never_above)
+
+
+def acceleration(reference: RequiredTests, other: RequiredTests) -> tuple[float, str]:
+    """AAR of `other` over `reference`, and which side of the truth it is on.
+
+    Returns
+    -------
+    (float, {"equal", "at least", "at most", "unknown"})
+        "unknown" where both averages are lower limits, whose ratio says nothing.
+    """
+    words = {(False, False): "equal", (True, False): "at least", (False, True): "at most", (True, True): "unknown"}
+    return reference.mean / other.mean, words[reference.is_lower_limit, other.is_lower_limit]
+
+
+def plain_rhw(
+    weights: FloatArray,
+    n_tests: int,
+    procedure: Procedure,
+    done: Callable[[], None] = lambda: None,
+    failed: BoolArray | bool = False,
+) -> FloatArray:
+    """RHW of the mean of Y on prefixes of shuffled tests, shape (s, g); infinite before the first crash.
+
+    Tests without a crash only take up places, so that the places of the crashes are all that a shuffle has to draw: a
+    hundred million naturalistic tests cost no more than their crashes. Failed tests count as no crash in the lower
+    limit and as crashes in the upper one.
+
+    Parameters
+    ----------
+    weights : (k,) float64
+        Of the tests that crashed or failed, in the order of the records.
+    n_tests : int
+        All tests.
+    procedure : Procedure
+    done : callable
+        Called after each shuffle.
+    failed : (k,) bool, optional
+        Which of the ``weights`` are of failed tests.
+    """
+    grid, z = procedure.grid(n_tests), procedure.z()
+    # A unit that makes equal weights 1, whose sums are exact; the smallest squares would underflow besides.
+    worst = weights / np.max(weights, initial=0.0) if len(weights) else weights
+    y = np.where(failed, 0.0, worst) if np.any(failed) else worst
+    rhw = np.empty((procedure.n_shuffles, len(grid)))
+    for shuffle in range(procedure.n_shuffles):
+        _, places = _crash_places(procedure.seed, shuffle, n_tests, len(y))
+        order = np.argsort(places)
+        n_placed = np.searchsorted(places[order], grid)
+        total, below = _total_and_half_width(y[order], n_placed, grid, z)
+        most, above = (total, below) if y is worst else _total_and_half_width(worst[order], n_placed, grid, z)
+        rhw[shuffle] = ((most - total) + above + below) / 2.0 / total
+        done()
+    return rhw
+
+
+def _total_and_half_width(y: FloatArray, k: IntArray, n: IntArray, z: float) -> tuple[FloatArray, FloatArray]:
+    """ΣY of the first ``k`` values among ``n`` tests, and z times its standard error; infinite if nothing is known."""
+    total, squares = (np.concatenate([[0.0], np.cumsum(power)])[k] for power in (y, y * y))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        variance = np.maximum(0.0, squares - total * total / n) / (n - 1)
+        half_width: FloatArray = z * np.sqrt(n * variance)
+    half_width[(total == 0.0) | (n < 2)] = np.inf
+    return total, half_width
+
+
+def scv_rhw(tests: Block, procedure: Procedure, done: Callable[[], None] = lambda: None) -> FloatArray:
+    """RHW that the published `scv` claims on prefixes of shuffled tests, shape (s, g): Algorithm 1 on each anew.
+
+    Parameters
+    ----------
+    tests : Block
+        All tests of a run in index order, with ``first_ratios``.
+    procedure : Procedure
+    done : callable
+        Called after each shuffle.
+    """
+    grid = procedure.grid(len(tests))
+    rhw = np.empty((procedure.n_shuffles, len(grid)))
+    for shuffle in range(procedure.n_shuffles):
+        order = _order(procedure.seed, shuffle, tests.crash | tests.failed)
+        state = BothWays(Scv())
+        for at, (start, stop) in enumerate(itertools.pairwise([0, *grid.tolist()])):
+            state.add(_rows(tests, order[start:stop]))
+            rhw[shuffle, at] = state.result(procedure.confidence).rhw
+        done()
+    return rhw
+
+
+def _crash_places(seed: int, shuffle: int, n_tests: int, n_crashes: int) -> tuple[np.random.Generator, IntArray]:
+    """Place of every crash in a shuffle, shape (k,), and the generator to go on with."""
+    generator = np.random.default_rng([seed, shuffle])
+    return generator, generator.choice(n_tests, size=n_crashes, replace=False)
+
+
+def _order(seed: int, shuffle: int, placed: BoolArray) -> IntArray:
+    """Rows in the order of a shuffle, shape (n,): crashed and failed ones in their places, the others between them."""
+    n = len(placed)
+    generator, places = _crash_places(seed, shuffle, n, int(np.count_nonzero(placed)))
+    order = np.full(n, -1, dtype=np.int64)
+    order[places] = np.flatnonzero(placed)
+    order[order < 0] = generator.permutation(np.flatnonzero(~placed))
+    return order
+
+
+def _rows(tests: Block, rows: IntArray) -> Block:
+    """Block of any rows in any order, as far as `scv` reads it; numbered anew, for the order is what is asked about."""
+    assert tests.first_ratios is not None
+    return replace(
+        tests,
+        first_episode=0,
+        crash=tests.crash[rows],
+        failed=tests.failed[rows],
+        cut_in=tests.cut_in[rows],
+        bv_lv_contact=tests.bv_lv_contact[rows],
+        log_weight=tests.log_weight[rows],
+        log_q=tests.log_q[rows],
+        n_control_steps=tests.n_control_steps[rows],
+        first_ratios=tests.first_ratios[rows],
+        log_p_cut_in=None,
+        component=None,
+        surrogates_crash=None,
+    )

@@ -1,0 +1,120 @@
+"""Run a replication experiment: repeat every campaign in worker processes, judge, write."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from multiprocessing import parent_process
+from multiprocessing.connection import Connection, wait
+from pathlib import Path
+
+from harness.interruption import leave_signals_to_parent
+from harness.progress import Progress, SilentProgress
+from harness.records.folder import require_place
+from harness.spawning import spawn_context
+from harness.studies.experiment import Experiment
+from harness.studies.judgement import Judgement, Subject, corrected, judge
+from harness.studies.results import write_results
+from harness.studies.rows import Row, Rows
+from harness.studies.shell_campaign import CONDITIONAL
+from harness.studies.subjects import Repeated, subjects
+
+TASKS_PER_SUBJECT = 8
+
+
+@dataclass(frozen=True)
+class ValidationResult:
+    """Outcome of an experiment.
+
+    Attributes
+    ----------
+    folder : Path
+        Where results.json, replications.parquet and the plot are.
+    subjects : tuple of Subject
+    judgements : tuple of Judgement
+    """
+
+    folder: Path
+    subjects: tuple[Subject, ...]
+    judgements: tuple[Judgement, ...]
+
+
+def validate(
+    experiment: Experiment, folder: Path, *, workers: int | None = None, progress: Progress | None = None
+) -> ValidationResult:
+    """Repeat, judge, and write the results.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    folder : Path
+        Made if it is not there; earlier results in it are replaced.
+    workers : int, optional
+        Processes; one per core by default. They change no bit.
+    progress : Progress, optional
+    """
+    progress = progress or SilentProgress()
+    require_place(folder)
+    tested = list(subjects(experiment, progress))
+    progress.stage("replications", len(tested) * experiment.replications)
+    with _executor(workers) as executor:
+        found = [_replicate(repeated, experiment.replications, executor, progress) for _, repeated in tested]
+    judgements: list[Judgement] = []
+    for (subject, _), rows in zip(tested, found, strict=True):
+        for result in dict.fromkeys(row.result for row in rows):
+            of_result = Rows.of([row for row in rows if row.result == result])
+            confidence = experiment.campaign.stop.confidence
+            judgements.append(judge(subject, result, of_result, confidence, conditional=result == CONDITIONAL))
+    known = tuple(subject for subject, _ in tested)
+    done = ValidationResult(folder, known, tuple(corrected(judgements)))
+    rows_by_subject = {subject.name: rows for subject, rows in zip(known, found, strict=True)}
+    write_results(folder, experiment, done.subjects, done.judgements, rows_by_subject)
+    return done
+
+
+@contextmanager
+def _executor(workers: int | None) -> Iterator[ProcessPoolExecutor]:
+    """Worker processes that end at once when the work in the parent is interrupted or fails, or it is killed."""
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    context = spawn_context()
+    watched, held = context.Pipe(duplex=False)
+    with ProcessPoolExecutor(
+        workers or os.cpu_count(), mp_context=context, initializer=end_with_parent, initargs=(watched,)
+    ) as executor:
+        try:
+            yield executor
+        except BaseException:
+            held.close()  # or the executor would wait for minutes of work that nobody wants any more
+            raise
+
+
+def end_with_parent(watched: Connection) -> None:
+    """Let this worker process end when its parent closes the other end of the pipe, or is killed."""
+    leave_signals_to_parent()
+    parent = parent_process()
+    ends = [watched] if parent is None else [watched, parent.sentinel]
+    threading.Thread(target=_end_after, args=(ends,), daemon=True).start()
+
+
+def _end_after(ends: list[Connection | int]) -> None:
+    wait(ends)
+    os._exit(1)
+
+
+def _replicate(repeated: Repeated, n: int, executor: ProcessPoolExecutor, progress: Progress) -> list[Row]:
+    rows: list[Row] = []
+    parts = list(_parts(n))
+    for part, found in zip(parts, executor.map(repeated.run, parts), strict=True):
+        rows += found
+        progress.advance(len(part))
+    return rows
+
+
+def _parts(n: int) -> Iterator[range]:
+    size = -(-n // TASKS_PER_SUBJECT)
+    for first in range(0, n, size):
+        yield range(first, min(first + size, n))

@@ -1,0 +1,77 @@
+"""Running moments: those of numpy, whatever the blocks, and of the zeros that were never added."""
+
+from __future__ import annotations
+
+import math
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from harness.estimators.moments import Moments
+
+
+def moments(*blocks: list[float]) -> Moments:
+    sums = Moments()
+    for values in blocks:
+        sums.add(np.array(values, dtype=np.float64))
+    return sums
+
+
+@given(st.lists(st.floats(-1e3, 1e3), min_size=2, max_size=40), st.integers(0, 40), st.integers(0, 40))
+def test_are_those_of_numpy_however_the_numbers_are_cut_and_whatever_zeros_are_left_out(values, cut, zeros):
+    sums = moments(values[:cut], values[cut:])
+    array = np.array([*values, *[0.0] * zeros])
+    n = len(array)
+    assert sums.total == pytest.approx(math.fsum(values), abs=1e-9)
+    assert sums.squares == pytest.approx(np.sum(array**2), rel=1e-12, abs=1e-300)
+    assert sums.mean(n) == pytest.approx(np.mean(array), abs=1e-12)
+    assert sums.variance(n) == pytest.approx(np.var(array, ddof=1), rel=1e-9, abs=1e-9)
+    expected = np.sum((array - array.mean()) ** 3) / n**3
+    assert sums.third_moment(n) == pytest.approx(expected, rel=1e-9, abs=1e-6)
+
+
+@pytest.mark.parametrize("size", [1, 10, 1_000])
+def test_weights_over_many_decades_keep_twelve_digits_in_blocks_of_any_size(size):
+    values = np.exp(np.random.default_rng(7).normal(-20.0, 3.0, 3_000))
+    sums, n = moments(*np.split(values, range(size, len(values), size))), 10 * len(values)
+    total, squares, cubes = (sum(Fraction(v) ** power for v in values.tolist()) for power in (1, 2, 3))
+    mean = total / n
+    assert sums.mean(n) == pytest.approx(float(mean), rel=1e-13)
+    assert sums.variance(n) == pytest.approx(float((squares - total * mean) / (n - 1)), rel=1e-12)
+    third = (cubes - 3 * mean * squares + 2 * n * mean**3) / n**3
+    assert sums.third_moment(n) == pytest.approx(float(third), rel=1e-12)
+
+
+def test_variance_keeps_its_digits_where_the_mean_is_large():
+    assert moments([2.0**25, 2.0**25 + 1.0], [2.0**25 + 2.0]).variance(3) == 1.0
+
+
+@given(st.floats(1e-12, 1e3), st.lists(st.integers(1, 20), min_size=2, max_size=5))
+def test_equal_numbers_have_no_variance(value, sizes):
+    assert moments([value] * sizes[0]).variance(sizes[0] + 1) > 0.0
+    assert moments(*([value] * size for size in sizes)).variance(sum(sizes)) <= 1e-28 * value**2
+
+
+def test_counts_are_exact():
+    assert moments([1.0, 0.0, -1.0, 1.0] * 7, [1.0] * 3).mean(1000) == 10 / 1000
+
+
+def test_infinite_and_undefined_numbers_decide_the_value():
+    for blocks in ([[1.0, math.inf]], [[1.0], [math.inf]], [[math.inf], [1.0], []]):
+        sums = moments(*blocks)
+        assert sums.mean(3) == sums.variance(3) == math.inf
+        assert sums.third_moment(3) == 0.0
+    assert math.isnan(moments([math.inf], [-math.inf]).total)
+
+
+def test_squares_that_overflow_leave_the_mean():
+    sums = moments([1e200], [0.0])
+    assert (sums.mean(2), sums.variance(2), sums.third_moment(2)) == (5e199, math.inf, 0.0)
+
+
+def test_nothing_has_no_spread():
+    assert (moments().mean(5), moments().variance(5), moments().third_moment(0)) == (0.0, 0.0, 0.0)
+    assert moments([1.0]).variance(1) == math.inf

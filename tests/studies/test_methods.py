@@ -1,0 +1,130 @@
+"""Shells and forced cut-ins pass the replication tests on exact chains; wrong methods fail the same tests.
+
+All seeds are fixed. A right method fails the small experiments with probability 5 % per family by the criterion itself,
+once and for all: with these seeds it passes. The wrong ones must fail at p < 1e-6.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from harness.campaign.models import Campaign
+from harness.studies.chains.named import CHAINS, frequent_decisive, rare_decisive, replayed
+from harness.studies.chains.shells import ChainShells
+from harness.studies.experiment import Experiment, Fault, load_experiment
+from harness.studies.judgement import Judgement, Subject, corrected, judge
+from harness.studies.rows import Row, Rows
+from harness.studies.run import validate
+from harness.studies.shell_campaign import CONDITIONAL, FREE, ShellCampaign
+from harness.studies.weighted_campaign import ChainEpisodes, WeightedCampaign
+
+from .regression_stopping import RegressionStopping
+
+ROOT = Path(__file__).parents[2]
+CONFIDENCE = 0.9
+LARGEST_BIAS = 0.01
+FEW, MANY = 100, 300
+
+
+def campaign(method: str, episodes: int) -> Campaign:
+    content = {"name": "x", "world": {"engine": "twin"}, "testing": {"method": method}, "stop": {"episodes": episodes}}
+    return Campaign.model_validate(content)
+
+
+def judged(runs: dict[str, list[Row]], result: str) -> list[Judgement]:
+    found = []
+    for name, rows in runs.items():
+        of_result = Rows.of([row for row in rows if row.result == result])
+        found.append(judge(Subject(name, CHAINS[name].crash_rate), result, of_result, CONFIDENCE))
+    return corrected(found)
+
+
+def shells(chain, replications: int, episodes: int, fault: Fault | None = None) -> list[Row]:
+    repeated = ShellCampaign(campaign("shells", episodes), ChainShells(chain, 2048), 5, fault)
+    return [row for r in range(replications) for row in repeated.run(r)]
+
+
+def weighted(chain, method: str, replications: int, episodes: int, *estimators: str) -> list[Row]:
+    subject = campaign(method, episodes)
+    return WeightedCampaign(subject, ChainEpisodes(chain, subject, 7), estimators).run(range(replications))
+
+
+def test_shells_cover_and_are_unbiased():
+    for one in judged({c.name: shells(c, FEW, 1000) for c in replayed()}, FREE):
+        assert not one.too_low
+        assert abs(one.bias) < 4.0 * one.bias_std_error
+
+
+def test_forced_cut_ins_cover_and_are_unbiased():
+    for one in judged({c.name: weighted(c, "forced", FEW, 3000, "nade") for c in replayed()}, "nade"):
+        assert not one.too_low
+        assert abs(one.bias) < 4.0 * one.bias_std_error
+
+
+def test_a_corrupted_shell_probability_is_caught():
+    """The first shell counts one and a half times: where it carries much of the rate, coverage breaks down."""
+    chain = CHAINS["good surrogates"]
+    (one,) = judged({chain.name: shells(chain, FEW, 3000, Fault(shell=0, factor=1.5))}, FREE)
+    assert one.too_low
+    assert one.p_value_holm < 1e-6
+    assert abs(one.bias) > max(LARGEST_BIAS, 8.0 * one.bias_std_error)
+
+
+@pytest.mark.parametrize("chain", [frequent_decisive(), rare_decisive()], ids=lambda c: c.name)
+def test_the_published_variance_is_caught(chain):
+    rows = {chain.name: weighted(chain, "step_mixture", FEW, 2000, "nade", "scv")}
+    (nade,), (scv,) = judged(rows, "nade"), judged(rows, "scv")
+    assert not nade.too_low
+    assert scv.too_low
+    assert scv.p_value_holm < 1e-6
+    assert scv.true_relvar > 1.5 * scv.claimed_relvar
+
+
+def test_stopping_on_regression_residuals_is_caught():
+    chain = CHAINS["good surrogates"]
+    (wrong,) = judged({chain.name: RegressionStopping(chain, 3).run(range(MANY))}, "regression")
+    assert wrong.too_low
+    assert wrong.p_value_holm < 1e-6
+
+
+COMMITTED = ["chains_shells", "chains_forced"]
+
+
+@pytest.mark.parametrize("name", COMMITTED)
+def test_committed_experiments_say_so_at_full_length(name):
+    content = json.loads((ROOT / "docs" / "validation" / f"{name}.json").read_text())
+    shipped = load_experiment(ROOT / "scenarios" / "validate" / f"{name}.yaml")
+    assert Experiment.model_validate(content["experiment"]) == shipped
+    judgements = [one for one in content["judgements"] if one["result"] != CONDITIONAL]
+    assert len(judgements) >= 4
+    for one in judgements:
+        assert one["replications"] >= 5000
+        assert abs(one["bias"]) <= LARGEST_BIAS
+        assert not one["coverage_too_low"]
+
+
+def test_the_committed_panel_meets_what_shells_promise():
+    content = json.loads((ROOT / "docs" / "validation" / "shells_panel.json").read_text())
+    shipped = load_experiment(ROOT / "scenarios" / "validate" / "shells_panel.yaml")
+    assert Experiment.model_validate(content["experiment"]) == shipped
+    assert content["largest_relative_error_of_truth"] <= 0.005
+    found = {(one["subject"], one["result"]): one for one in content["judgements"]}
+    assert set(found) == {(name, result) for name in shipped.avs for result in (FREE, CONDITIONAL)}
+    for (_, result), one in found.items():
+        assert one["replications"] >= 2000
+        assert not one["coverage_too_low"]
+        assert one["tests_median"] <= (5000 if result == FREE else 200)
+    assert not found["SM-II", CONDITIONAL]["assumption_met"]
+    assert found["SM-II", FREE]["alarm"] == found["never-brakes", FREE]["alarm"] == 1.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", COMMITTED)
+def test_committed_experiments_are_what_the_command_gives(name, tmp_path):
+    validate(load_experiment(ROOT / "scenarios" / "validate" / f"{name}.yaml"), tmp_path)
+    found = json.loads((tmp_path / "results.json").read_text())
+    committed = json.loads((ROOT / "docs" / "validation" / f"{name}.json").read_text())
+    assert found["judgements"] == committed["judgements"]

@@ -1,0 +1,71 @@
+"""Joint outcomes of a chain's vehicles against its own backward induction."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from harness.studies.chains.named import replayed
+from harness.studies.chains.outcomes import joint_outcomes
+from harness.studies.chains.shells import ChainShells
+
+
+@pytest.fixture(params=replayed(), ids=lambda c: c.name)
+def chain(request):
+    return request.param
+
+
+def given_a_cut_in(chain, response):
+    _, after = chain._values(response)
+    return np.stack([chain.entry @ after[t + 1] for t in range(chain.horizon)])
+
+
+def test_marginals_are_those_of_each_vehicle_alone(chain):
+    joint = joint_outcomes(chain)
+    np.testing.assert_allclose(joint.sum(axis=(2, 3)), 1.0, rtol=1e-12)
+    np.testing.assert_allclose(joint[..., 1].sum(axis=2), given_a_cut_in(chain, chain.response), atol=1e-14)
+    masks = np.arange(joint.shape[2])
+    for j, response in enumerate(chain.surrogate_responses):
+        crashes = joint[:, :, (masks >> j) & 1 == 1].sum(axis=(2, 3))
+        np.testing.assert_allclose(crashes, given_a_cut_in(chain, response), atol=1e-14)
+
+
+def test_own_noise_makes_outcomes_independent_given_the_maneuvers_only():
+    """With braking that never happens, the maneuvers are certain, and the joint outcome is a product."""
+    chain = replayed()[3]
+    certain = replace(chain, exposure=np.tile([1.0, 0.0], (len(chain.exposure), 1)))
+    joint = joint_outcomes(certain)[0, 4]  # entered in one state only
+    both = joint.reshape(-1, 2)
+    crash = joint[:, 1].sum()
+    np.testing.assert_allclose(both[:, 1], both.sum(axis=1) * crash, atol=1e-14)
+
+
+def test_with_shared_noise_the_more_skilled_crashes_only_where_the_less_skilled_does():
+    joint = joint_outcomes(replayed()[0]).sum(axis=3)  # skills 0.8, 0.65, 0.5
+    nested = {0b000, 0b100, 0b110, 0b111}
+    assert joint[:, :, [mask for mask in range(8) if mask not in nested]].max() < 1e-15
+
+
+def test_shells_add_up(chain):
+    source = ChainShells(chain, 512)
+    assert source.shell_p.sum() == pytest.approx(chain.cut_in_rate, rel=1e-11)
+    assert source.crash_p.sum() == pytest.approx(chain.crash_rate, rel=1e-11)
+
+
+def test_drawn_pools_scatter_around_the_exact_probabilities(chain):
+    source = ChainShells(chain, 512)
+    drawn = [source.draw(np.random.default_rng([1, k])) for k in range(200)]
+    p = np.array([design.p for design, _ in drawn])
+    crash = np.array([design.p * share for design, share in drawn])
+    for found, exact in ((p, source.shell_p), (crash, source.crash_p)):
+        error = found.std(axis=0) / np.sqrt(len(found))
+        assert np.all(np.abs(found.mean(axis=0) - exact) <= 4.5 * error + 1e-18)
+
+
+def test_maneuvers_that_depend_on_the_vehicle_are_refused(chain):
+    exposure = chain.exposure.copy()
+    exposure[0] = exposure[0, ::-1]
+    with pytest.raises(ValueError, match="depend on the danger"):
+        joint_outcomes(replace(chain, exposure=exposure))

@@ -1,0 +1,87 @@
+"""The command end to end: files, table, the same bits for any number of workers, and the twin's weighted methods."""
+
+from __future__ import annotations
+
+import json
+
+import pyarrow.parquet as pq
+import pytest
+
+from harness.campaign.models import Campaign
+from harness.cli import main
+from harness.studies.experiment import JUDGED
+from harness.studies.weighted_campaign import TwinEpisodes, WeightedCampaign
+
+CHAINS = """
+format: validation-experiment
+version: 1
+name: small
+seed: 4
+replications: 12
+chains: [good surrogates, strong noise]
+campaign: {testing: {method: shells}, stop: {rhw: 0.5, episodes: 3000}}
+super_population: {pool_paths: 256}
+"""
+TWIN = """
+format: validation-experiment
+version: 1
+name: twin
+replications: 16
+campaign:
+  environment: {lane_change_level: 1e4}
+  testing: {method: forced}
+  stop: {episodes: 500}
+super_population: {reference_paths: 1024}
+avs: {table-1: {}}
+"""
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory):
+    root = tmp_path_factory.mktemp("validate")
+    (root / "x.yaml").write_text(CHAINS)
+    for workers in ("1", "2"):
+        assert main(["validate", str(root / "x.yaml"), "--out", str(root / workers), "--workers", workers]) == 0
+    return root / "1", root / "2"
+
+
+def test_the_folder_holds_everything(folders):
+    content = json.loads((folders[0] / "results.json").read_text())
+    assert content["confidence"] == 0.9
+    assert [one["subject"] for one in content["judgements"]] == ["good surrogates"] * 2 + ["strong noise"] * 2
+    table = pq.read_table(folders[0] / "replications.parquet")
+    assert table.num_rows == 2 * 2 * 12
+    assert (folders[0] / "coverage.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_workers_change_no_bit(folders):
+    tables = [pq.read_table(folder / "replications.parquet") for folder in folders]
+    assert tables[0].equals(tables[1])
+    assert (folders[0] / "results.json").read_text() == (folders[1] / "results.json").read_text()
+
+
+def test_the_online_rule_is_followed(folders):
+    rows = pq.read_table(folders[0] / "replications.parquet").to_pylist()
+    for row in rows:
+        rhw = (row["ci_high"] - row["ci_low"]) / 2.0 / row["crash_rate"] if row["crash_rate"] else float("inf")
+        assert row["reached"] == (rhw <= 0.5 and row["n_crashes"] > 0)
+
+
+@pytest.mark.parametrize("method", ["nde", "forced", "step_mixture", "episode_mixture"])
+def test_every_result_that_may_be_asked_for_is_given(method):
+    """At a level of lane changing at which crashes are frequent."""
+    settings = {"environment": {"lane_change_level": 1e3}, "testing": {"method": method}, "stop": {"episodes": 300}}
+    campaign = Campaign.model_validate({"name": "x", "world": {"engine": "twin"}, **settings})
+    estimators = sorted(JUDGED[method])
+    rows = WeightedCampaign(campaign, TwinEpisodes(campaign, 5, estimators), estimators).run(range(2))
+    assert [row.result for row in rows] == [*estimators, *estimators]
+
+
+def test_weighted_methods_run_in_the_twin(tmp_path, capsys):
+    (tmp_path / "x.yaml").write_text(TWIN)
+    assert main(["validate", str(tmp_path / "x.yaml"), "--out", str(tmp_path / "out"), "--workers", "1"]) == 0
+    assert "table-1" in capsys.readouterr().out
+    (found,) = json.loads((tmp_path / "out" / "results.json").read_text())["judgements"]
+    assert found["result"] == "nade"
+    assert abs(found["bias"]) < 5.0 * found["bias_std_error"]
+    assert found["tests_median"] == 500

@@ -1,0 +1,115 @@
+"""Pools drawn from a small super-population: equals left out, boundary replaced, probabilities and shares kept."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from harness.campaign.models import AutomatedVehicle, Environment, PoolSettings
+from harness.environment.loading import load_environment
+from harness.errors import CampaignError
+from harness.pool.build import build_pool
+from harness.pool.library import Library, load_library
+from harness.progress import SilentProgress
+from harness.studies.panel import NO_ENVELOPE, Drivers
+from harness.studies.shell_source import equals, leave_out, overtaking_shells
+from harness.studies.super_population import enumerate_paths
+
+PATHS = 1024
+AVS = {
+    "own": {"model": "idm"},
+    "equal": {"model": "idm", "parameters": {"min_acceleration_mps2": -3.0}},
+    "late": {
+        "model": "idm",
+        "reaction": {"inattention_probability": 0.25, "inattention_delay_s": 1.5},
+    },
+    "attentive-late": {"model": "idm", "reaction": {"delay_s": 1.5}},
+}
+
+
+@pytest.fixture(scope="module")
+def library() -> Library:
+    return load_library("ladder-1")
+
+
+@pytest.fixture(scope="module")
+def avs():
+    return {name: AutomatedVehicle.model_validate(av) for name, av in AVS.items()}
+
+
+@pytest.fixture(scope="module")
+def drivers(library, avs):
+    return Drivers(library, avs)
+
+
+@pytest.fixture(scope="module")
+def population(drivers):
+    environment = load_environment(Environment())
+    return enumerate_paths(environment, drivers.records, drivers.envelope, 3, PATHS, SilentProgress())
+
+
+def test_the_cache_gives_the_same_back(drivers, population):
+    environment = load_environment(Environment())
+    again = enumerate_paths(environment, drivers.records, drivers.envelope, 3, PATHS, SilentProgress())
+    for name in ("cut_in", "path", "mass", "bits"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(population, name))
+
+
+def test_an_inattentive_vehicle_is_two_drivers_mixed(drivers, population):
+    mixed, early, late = (drivers.vehicles[name].crash_mass(population) for name in ("late", "own", "attentive-late"))
+    np.testing.assert_allclose(mixed, 0.75 * early + 0.25 * late, rtol=1e-12)
+    assert late.sum() > 1.5 * early.sum()
+
+
+def test_equals_are_found_and_left_out(library, drivers, population, avs):
+    vehicle = drivers.vehicles["equal"].crash_mass(population)
+    assert equals(library, population, vehicle) == {"brakes-3"}
+    source = overtaking_shells(library, population, avs["equal"], drivers.vehicles["equal"], 256)
+    assert source.left_out == ("brakes-3",)
+    assert "brakes-3" not in source.template.names
+    assert equals(library, population, drivers.vehicles["own"].crash_mass(population)) == set()
+
+
+def test_the_envelope_stays_and_another_surrogate_becomes_the_boundary(library):
+    careful_first = tuple(library.surrogates)
+    reduced = leave_out(library, {"brakes-2-late-1s", "full-throttle-2"}, careful_first)
+    assert reduced.boundary == "brakes-3-late-700ms"
+    assert reduced.envelope == "full-throttle-2"
+    alone = leave_out(library, set(careful_first[:6]), careful_first)
+    assert alone.boundary == "never-brakes"
+    with pytest.raises(CampaignError, match="no surrogate but the envelope"):
+        leave_out(library, set(careful_first), careful_first)
+
+
+def test_drawn_pools_scatter_around_the_population(library, population, drivers, avs):
+    source = overtaking_shells(library, population, avs["own"], drivers.vehicles["own"], 256)
+    assert source.shells.sum() == pytest.approx(population.cut_in.sum(), rel=1e-12)
+    assert source.crashing.sum() == pytest.approx(drivers.vehicles["own"].crash_mass(population).sum(), rel=1e-12)
+    drawn = [source.draw(np.random.default_rng([1, k])) for k in range(300)]
+    rates = np.array([design.p @ share for design, share in drawn])
+    exact = source.crashing.sum() / population.n_paths
+    assert abs(rates.mean() - exact) < 4.0 * rates.std() / np.sqrt(len(rates))
+    assert all(design.strata[-1] == "outside" and design.boundary == library.boundary for design, _ in drawn)
+
+
+def test_a_vehicle_that_accelerates_harder_has_no_envelope(library):
+    wild = AutomatedVehicle.model_validate({"model": "constant", "parameters": {"acceleration_mps2": 3.0}})
+    assert Drivers(library, {"wild": wild}).envelope == NO_ENVELOPE
+
+
+@pytest.mark.slow
+def test_real_pools_have_the_shells_of_drawn_ones(library, avs, drivers):
+    """A pool as a campaign builds it, from other paths: shell probabilities and their errors agree."""
+    environment = load_environment(Environment())
+    paths = 16_384
+    population = enumerate_paths(environment, drivers.records, drivers.envelope, 3, paths, SilentProgress())
+    source = overtaking_shells(library, population, avs["own"], drivers.vehicles["own"], paths)
+    real = build_pool(environment, library, PoolSettings(relative_error=0.01, seed=7), "real")
+    assert real.names == source.template.names
+    errors = [
+        np.sqrt(np.maximum(np.diag(pool.shell_moments) - pool.shell_p**2, 0.0) / n)
+        for pool, n in ((source.template, paths), (real, real.n_paths))
+    ]
+    assert np.all(np.abs(real.shell_p - source.template.shell_p) < 4.5 * np.hypot(*errors))
+    ratio = errors[1] * np.sqrt(real.n_paths) / (errors[0] * np.sqrt(paths))
+    assert np.all((ratio[:5] > 0.6) & (ratio[:5] < 1.6))  # inside; outside the aims differ
