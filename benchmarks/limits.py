@@ -20,10 +20,10 @@ import numpy as np
 import pandas as pd
 from scipy import special
 
+import harness
 from harness.campaign.loading import load_campaign
 from harness.environment.initial_state import InitialStates
 from harness.environment.loading import load_environment
-from harness.records.reader import read_shards
 
 FAST_MPS = 40.0
 """144 km/h: the end of the speeds that the traffic was fitted to."""
@@ -68,7 +68,7 @@ def shares_of_tests(numbers: Any) -> dict[str, float]:
 
 def limits(folder: Path) -> dict[str, Any]:
     """All figures."""
-    tests = pd.concat([table.to_pandas() for table, _ in read_shards(folder, moment_columns=[])], ignore_index=True)
+    tests = harness.read(folder).episodes()
     numbers = load_environment(load_campaign(folder / "campaign.yaml").environment).numbers
     estimate = json.loads((folder / "estimates.json").read_text(encoding="utf-8"))["estimates"]["shells"]
     careful = estimate["details"]["shells"][0]

@@ -7,6 +7,7 @@ The same as the command line, in a few lines of Python::
     campaign = harness.load_campaign("scenarios/smoke.yaml", ["stop.rhw=0.1"])
     result = harness.run(campaign, "runs/smoke", workers=2)
     print(result.estimates["statement"])
+    tests = harness.read("runs/smoke").episodes()
     harness.replay("runs/smoke", 17).outcome
 """
 
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from harness.campaign.models import Campaign, EstimatorName
     from harness.pool.refined_ladder import RefinedLadder
     from harness.progress import Progress
+    from harness.records.frames import StoredRun
     from harness.runner import AvCheck, Comparison, ReplayResult, RunResult
 
 __all__ = [
@@ -32,6 +34,7 @@ __all__ = [
     "estimate",
     "ladder",
     "load_campaign",
+    "read",
     "replay",
     "run",
     "write_report",
@@ -84,6 +87,13 @@ def estimate(
     from harness.runner import estimate_run  # noqa: PLC0415
 
     return estimate_run(Path(folder), estimators=estimators, confidence=confidence)
+
+
+def read(folder: str | Path) -> StoredRun:
+    """Tables of a stored run as pandas frames, with units and weights (see `harness.records.frames`)."""
+    from harness.records.frames import StoredRun  # noqa: PLC0415
+
+    return StoredRun(Path(folder))
 
 
 def write_report(folder: str | Path) -> Path:

@@ -32,14 +32,16 @@ def result(tmp_path_factory):
 
 
 def test_all_that_is_promised_is_there():
-    commands = {"av_check", "compare", "run", "estimate", "ladder", "replay", "write_report"}
+    commands = {"av_check", "compare", "run", "estimate", "ladder", "read", "replay", "write_report"}
     assert set(harness.__all__) == {"HarnessError", "load_campaign"} | commands
     for name in harness.__all__:
         assert inspect.getdoc(getattr(harness, name))
 
 
 def test_importing_it_loads_nothing_slow():
-    code = "import harness, sys; print(sorted({'numba', 'libsumo', 'pyarrow', 'matplotlib'} & set(sys.modules)))"
+    code = (
+        "import harness, sys; print(sorted({'numba', 'libsumo', 'pandas', 'pyarrow', 'matplotlib'} & set(sys.modules)))"
+    )
     root = MIXTURE_FILE.parents[1]
     done = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

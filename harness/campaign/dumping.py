@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from io import StringIO
+import math
 from typing import Any
 
-from ruamel.yaml import YAML
-from ruamel.yaml.nodes import ScalarNode
-from ruamel.yaml.representer import RoundTripRepresenter
-from ruamel.yaml.scalarstring import DoubleQuotedScalarString
+import yaml
 
 from harness.campaign.models import AV_SOURCES, Campaign, Section
 
@@ -16,18 +13,21 @@ _HEADER = """\
 # Campaign {name}, resolved: every value is written out, defaults included.
 # Lists of allowed keys and values: harness schema. Run it again: harness run THIS_FILE --out DIR
 """
-_NEVER_FOLD = 1_000_000
 
 
-class _Representer(RoundTripRepresenter):
-    """Writes ``null``; by itself the library leaves the place empty, which looks like something forgotten."""
+class _Dumper(yaml.SafeDumper):
+    """Quotes every text that is not a plain word: other YAML readers see numbers, dates and truth values in many."""
 
-    def represent_none(self, _: None) -> ScalarNode:
-        """Node of a missing value."""
-        return self.represent_scalar("tag:yaml.org,2002:null", "null")
+    def ignore_aliases(self, data: Any) -> bool:  # noqa: ARG002 - the library's signature
+        """Write every value out."""
+        return True
+
+    def represent_text(self, text: str) -> yaml.ScalarNode:
+        """Node of a text."""
+        return self.represent_scalar("tag:yaml.org,2002:str", text, style=None if _is_plain_word(text) else '"')
 
 
-_Representer.add_representer(type(None), _Representer.represent_none)
+_Dumper.add_representer(str, _Dumper.represent_text)
 
 
 def dump_campaign(campaign: Campaign) -> str:
@@ -41,7 +41,7 @@ def dump_campaign(campaign: Campaign) -> str:
     parts = [_HEADER.format(name=campaign.name)]
     for key, value in written_out(campaign).items():
         about = _about(campaign, key)
-        parts.append(f"\n# {about}\n{_yaml({key: value})}")
+        parts.append(f"\n# {about}\n{yaml_text({key: value})}")
     return "".join(parts)
 
 
@@ -60,24 +60,13 @@ def _about(campaign: Campaign, key: str) -> str:
     return text.splitlines()[0]
 
 
-def _yaml(data: dict[str, Any]) -> str:
-    writer = YAML()
-    writer.width = _NEVER_FOLD
-    # Escapes keep every character, control characters included, through any editor.
-    writer.allow_unicode = False
-    writer.Representer = _Representer
-    stream = StringIO()
-    writer.dump(_quoted(data), stream)
-    return stream.getvalue()
-
-
-def _quoted(value: Any) -> Any:
-    """Quote every text that is not a plain word, for other YAML readers see numbers, dates and truth values in many."""
-    if isinstance(value, dict):
-        return {_quoted(key): _quoted(item) for key, item in value.items()}
-    if isinstance(value, str) and not _is_plain_word(value):
-        return DoubleQuotedScalarString(value)
-    return value
+def yaml_text(data: Any, *, one_line: bool = False) -> str:
+    """YAML of plain data, which `harness.campaign.yaml_text` reads back as it is."""
+    # Escapes keep every character, control characters included, through any editor; math.inf never folds a line.
+    text: str = yaml.dump(
+        data, Dumper=_Dumper, sort_keys=False, allow_unicode=False, width=math.inf, default_flow_style=one_line
+    )
+    return text.removesuffix("...\n")  # after a value that is no mapping
 
 
 def _is_plain_word(text: str) -> bool:

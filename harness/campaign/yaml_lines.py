@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
-
-MERGE_TAG = "tag:yaml.org,2002:merge"
+from yaml.nodes import MappingNode, Node, SequenceNode
 
 YamlPath = Sequence[str | int]
 
@@ -24,7 +22,7 @@ class Lines:
     path : str
         Name of the document, for messages.
     root : Node or None
-        Composed document; None when nothing is known, which places every value on line 1.
+        Document, composed and constructed; None when nothing is known, which places every value on line 1.
     """
 
     def __init__(self, path: str, root: Node | None = None) -> None:
@@ -52,19 +50,7 @@ def _child(node: Node | None, part: str | int) -> tuple[Node, Node] | None:
     """Node that marks the line, and node of the value, of one step into ``node``."""
     if isinstance(node, SequenceNode) and isinstance(part, int) and part < len(node.value):
         return node.value[part], node.value[part]
-    if not isinstance(node, MappingNode):
-        return None
-    for key, value in node.value:
-        if key.tag != MERGE_TAG and isinstance(key, ScalarNode) and str(key.value) == str(part):
-            return key, value
-    for key, value in node.value:
-        if key.tag == MERGE_TAG:
-            for merged in merged_nodes(value):
-                if (found := _child(merged, part)) is not None:
-                    return found
+    if isinstance(node, MappingNode):
+        # The loader has put what ``<<`` merges before the mapping's own keys, which override it.
+        return next(((key, value) for key, value in reversed(node.value) if key.value == str(part)), None)
     return None
-
-
-def merged_nodes(value: Node) -> list[Node]:
-    """List the mappings behind a ``<<`` key: one, or a list of them."""
-    return list(value.value) if isinstance(value, SequenceNode) else [value]

@@ -1,78 +1,28 @@
 """Strict YAML 1.2: every value is what it looks like, and every value knows its line.
 
 ``1e-5`` is a number, ``12:30`` and ``no`` are strings, a date stays text. A key written twice, a second document, an
-unknown tag, a syntax error or an empty file is a `CampaignError` that names file and line; nothing passes silently.
+unknown tag, a syntax error or an empty file is a `CampaignError` that names file, line and column.
 """
 
 from __future__ import annotations
 
-import re
-import warnings
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
 from pydantic import BaseModel, ValidationError
-from ruamel.yaml import YAML
-from ruamel.yaml.composer import MaxDepthExceededError
-from ruamel.yaml.error import MarkedYAMLError, ReusedAnchorWarning, YAMLError
-from ruamel.yaml.nodes import Node
-from ruamel.yaml.reader import ReaderError
+from yaml.error import Mark, MarkedYAMLError
+from yaml.nodes import Node
+from yaml.reader import ReaderError
 
 from harness.campaign.problems import invalid_file
-from harness.campaign.yaml_lines import Lines
-from harness.campaign.yaml_nodes import DEEPEST, TOO_DEEP, PlainData, require_bounded
+from harness.campaign.yaml_lines import Lines, dotted
+from harness.campaign.yaml_loader import StrictLoader
 from harness.errors import CampaignError
 
 Model = TypeVar("Model", bound=BaseModel)
 
 LARGEST_FILE = 1_000_000
-"""Bytes of a YAML file that is read: a hundred times the largest that comes with the harness, some 25 s of reading."""
-
-_OPEN = "Look above for a [, { or quote that is not closed, and close it."
-_SYNTAX = {
-    "mapping values are not allowed": (
-        "a second 'key:' where a value should end",
-        "one 'key: value' per line",
-        "Indent the key like its neighbours; put a text with ': ' in it in quotes.",
-    ),
-    "could not find expected ':'": (
-        "a line without a colon just before here",
-        "'key: value', with a space after the colon",
-        "Add the colon, or indent the line if it belongs to the text above.",
-    ),
-    "found '<block mapping start>'": (
-        "a key whose indentation fits no line above",
-        "the same indentation for all keys of a section",
-        "Put the key exactly below its neighbours.",
-    ),
-    "found '?'": ("a key after a list", "another '- item', or the end of the list", "Add a dash, or indent the key."),
-    "found '-'": (
-        "a list item among keys",
-        "another 'key: value'",
-        "Indent the list below the key that it belongs to.",
-    ),
-    "sequence entries are not allowed": (
-        "a list item on the line of its key",
-        "the first '- item' on a line of its own",
-        "Begin a new line before the dash, or write [a, b].",
-    ),
-    "found '<scalar>'": (
-        "text after a closing quote",
-        "the end of the line",
-        "Put all of the value in the same quotes.",
-    ),
-    "found '<stream end>'": ("the end of the file", "a closing bracket", _OPEN),
-    "unexpected end of stream": ("the end of the file", "a closing quote", _OPEN),
-    "expected ',' or": ("something else inside brackets", "a comma or the closing bracket", _OPEN),
-    "found ']'": ("a ] that closes nothing", "a value", "Delete it, or write the [ that it belongs to."),
-    "found '}'": ("a } that closes nothing", "a value", "Delete it, or write the { that it belongs to."),
-    "cannot start any token": (
-        "a character that a value may not begin with",
-        "a value, or text in quotes",
-        "Put the text in quotes.",
-    ),
-}
-"""By a part of the parser's message: what was found and expected, and how to mend it."""
+"""Bytes of a YAML file that is read: a hundred times the largest that comes with the harness."""
 
 
 def read_yaml(path: str | Path) -> tuple[dict[str, Any], Lines]:
@@ -96,15 +46,14 @@ def read_yaml(path: str | Path) -> tuple[dict[str, Any], Lines]:
         The file is missing, a folder, not UTF-8, empty, not a mapping, not YAML, or says a key twice.
     """
     name = str(path)
-    root = _compose(_read_text(Path(path)), name)
+    data, root = _load(_read_text(Path(path)), name)
     if root is None:
         raise CampaignError(
             name, found="an empty file", expected="YAML keys and values", mend="Is it the right file, fully written?"
         )
-    data = PlainData(name).build(root)
     if not isinstance(data, dict):
         raise CampaignError(
-            f"{name}:{root.start_mark.line + 1}",
+            _place(name, root.start_mark),
             found=f"a {'list' if isinstance(data, list) else 'single value'} at the top level",
             expected="keys and values",
             mend="Write 'key: value' lines, without a dash before the first one.",
@@ -137,7 +86,7 @@ def parse_value(text: str, where: str) -> Any:
         ``text`` is empty or not YAML; the error names ``where``.
     """
     try:
-        root = _compose(text, where)
+        data, root = _load(text, where)
     except CampaignError as error:
         raise CampaignError(where, found=error.found, expected=error.expected, mend=error.mend) from None
     if root is None:
@@ -147,16 +96,16 @@ def parse_value(text: str, where: str) -> Any:
             expected="a value",
             mend="Write null if you mean none, '\"\"' for no text.",
         )
-    return PlainData(where).build(root)
+    return data
 
 
 def _read_text(path: Path) -> str:
     try:
         with path.open("rb") as file:
             content = file.read(LARGEST_FILE + 1)  # not all of what may be a device without an end
-        if len(content) > LARGEST_FILE:
-            _fail(str(path), 1, f"more than {LARGEST_FILE:,} bytes", "a file of settings", "Is it the right file?")
-        return content.decode("utf-8-sig")
+        if len(content) <= LARGEST_FILE:
+            return content.decode("utf-8-sig")
+        found, mend = f"more than {LARGEST_FILE:,} bytes", "Is it the right file?"
     except FileNotFoundError:
         found, mend = "no such file", "Check the spelling and the folder that you are in."
     except IsADirectoryError:
@@ -168,60 +117,38 @@ def _read_text(path: Path) -> str:
     raise CampaignError(str(path), found=found, expected="a readable YAML file in UTF-8", mend=mend)
 
 
-def _compose(text: str, name: str) -> Node | None:
-    parser = YAML(typ="safe", pure=True)
-    parser.max_depth = DEEPEST
+def _load(text: str, name: str) -> tuple[Any, Node | None]:
+    """Value of a text and, for the places of its parts, its composed document; None of both when it is empty."""
+    mark: Mark | None = None
+    trail: list[str | int] = []
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", ReusedAnchorWarning)
-            root: Node | None = parser.compose(text)
-    except ReusedAnchorWarning as error:
-        _fail_at_anchor(error, name)
-    except MaxDepthExceededError as error:
-        _fail(name, error.problem_mark.line + 1, *TOO_DEEP)
+        loader = StrictLoader(text)
+        try:
+            root = loader.get_single_node()
+            return (None if root is None else loader.construct_document(root)), root
+        finally:
+            mark, trail = loader.get_mark(), [part for part in loader.trail if part is not None]
     except MarkedYAMLError as error:
-        _fail_at_mark(error, name)
+        _fail_in_words(error, name, dotted(trail))
     except ReaderError as error:
-        line = text.count("\n", 0, error.position) + 1
-        found = f"the character U+{ord(text[error.position]):04X}"
-        _fail(name, line, found, "printable text", "Delete it; it is often left by a word processor.")
-    except RecursionError:
-        _fail(name, 1, *TOO_DEEP)
-    except (YAMLError, ValueError) as error:
-        _fail(name, 1, str(error).splitlines()[0], "YAML 1.2", "Remove the directive or correct the syntax.")
-    if parser.resolver.processing_version != (1, 2):
-        _fail(name, 1, "a %YAML directive for another version", "YAML 1.2", "Delete the line that begins with %YAML.")
-    if root is not None:
-        require_bounded(root, name)
-    return root
+        found = f"the character U+{error.character:04X}"
+        *above, before = text[: error.position].split("\n")
+        mark = Mark(name, error.position, len(above), len(before), text, error.position)
+    except (ValueError, OverflowError) as error:  # an escape or a version number that is out of all bounds
+        found = str(error).splitlines()[0]
+    raise CampaignError(_place(name, mark), found=found, expected="plain YAML 1.2", mend="Correct or delete it.")
 
 
-def _fail_at_anchor(warning: ReusedAnchorWarning, name: str) -> NoReturn:
-    """The parser only warns, and prints the place: the last line number is that of the second anchor."""
-    first, second = re.findall(r"line (\d+), column", str(warning))[-2:]
-    found = f"an anchor (&) that line {first} has already"
-    _fail(name, int(second), found, "each anchor once", "Give one of the two another name.")
-
-
-def _fail_at_mark(error: MarkedYAMLError, name: str) -> NoReturn:
+def _fail_in_words(error: MarkedYAMLError, name: str, path: str) -> NoReturn:
+    """Say it in the parser's words: what it was at, and since which line, then the problem."""
     mark = error.problem_mark or error.context_mark
-    # A mark prints itself over several lines; the first part of the first line is the problem proper.
-    problem = str(error.problem or error.context).splitlines()[0].split("   in ")[0].strip()
-    if "\\t" in problem:
-        _fail(name, mark.line + 1, "a tab", "spaces", "Indent with spaces only.")
-    if "another document" in problem:
-        _fail(name, mark.line + 1, "a second document (after ---)", "one document", "Keep one document per file.")
-    line, column = mark.line + 1, mark.column + 1
-    for part, (found, expected, mend) in _SYNTAX.items():
-        if part in problem:
-            raise CampaignError(f"{name}:{line}:{column}", found=found, expected=expected, mend=mend)
-    raise CampaignError(
-        f"{name}:{line}:{column}",
-        found=problem.removeprefix("found "),
-        expected="valid YAML",
-        mend="Check indentation, quotes and brackets near it.",
-    )
+    since = f" (line {error.context_mark.line + 1})" if error.context_mark else ""
+    found = ": ".join(filter(None, [error.context and error.context + since, error.problem]))
+    found = found.removeprefix("found ")
+    mend = str(error.note or "Check indentation, quotes and brackets at this place and just before it.")
+    where = f"{path} ({_place(name, mark)})" if path else _place(name, mark)
+    raise CampaignError(where, found=found, expected="plain YAML 1.2", mend=mend) from None
 
 
-def _fail(name: str, line: int, found: str, expected: str, mend: str) -> NoReturn:
-    raise CampaignError(f"{name}:{line}", found=found, expected=expected, mend=mend)
+def _place(name: str, mark: Mark | None) -> str:
+    return name if mark is None else f"{name}:{mark.line + 1}:{mark.column + 1}"

@@ -8,13 +8,12 @@ the tests that it was not fitted to.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from ruamel.yaml import YAML
 
+from harness.campaign.dumping import yaml_text
 from harness.campaign.loading import load_campaign
 from harness.campaign.models import Campaign, Reflexes
 from harness.errors import CampaignError, RunFolderError
@@ -225,14 +224,14 @@ def _text(refined: RefinedLadder, folder: Path) -> str:
         f"{refined.careless} brakes {100.0 * (1.0 - CARELESS_BRAKING):.0f} % less and "
         f"{CARELESS_DELAY_STEPS / 10.0:g} s later.",
     ]
-    drivers = [f"  {name}: {_flow(model.model_dump(exclude_unset=True))}" for name, model in library.surrogates.items()]
+    drivers = [f"  {name}: {_line(model.model_dump(exclude_unset=True))}" for name, model in library.surrogates.items()]
     return "\n".join(
         [
             *(f"# {line}".rstrip() for line in comment),
             "",
             f"format: {library.format}",
             f"version: {library.version}",
-            f"description: {_flow(library.description)}",
+            f"description: {_line(library.description)}",
             f"boundary: {library.boundary}",
             f"envelope: {library.envelope}",
             "surrogates:",
@@ -242,11 +241,5 @@ def _text(refined: RefinedLadder, folder: Path) -> str:
     )
 
 
-def _flow(value: Any) -> str:
-    """A value on one line of YAML."""
-    writer = YAML(typ="safe", pure=True)
-    writer.default_flow_style = True
-    writer.width = 1_000_000
-    stream = StringIO()
-    writer.dump(value, stream)
-    return stream.getvalue().removesuffix("...\n").strip()
+def _line(value: Any) -> str:
+    return yaml_text(value, one_line=True).strip()

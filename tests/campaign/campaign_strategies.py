@@ -1,5 +1,6 @@
 """Random campaigns that the JSON schema allows, for property tests."""
 
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -77,8 +78,8 @@ def _scalars(node: dict[str, Any]) -> st.SearchStrategy[Any]:
     if node["type"] == "number":
         bounds = {"exclude_min": "exclusiveMinimum" in node, "exclude_max": "exclusiveMaximum" in node}
         return st.floats(low, high, allow_nan=False, allow_infinity=False, **bounds)
-    if node["type"] == "null":
-        return st.none()
+    if node["type"] in ("null", "boolean"):
+        return st.none() if node["type"] == "null" else st.booleans()
     if "pattern" in node:
         return st.from_regex(node["pattern"], fullmatch=True)
     return st.text(min_size=node.get("minLength", 0), max_size=40)
@@ -96,6 +97,11 @@ def _obey_rules(data: dict[str, Any]) -> dict[str, Any]:
     fmu = (data.get("av") or {}).get("fmu")
     if fmu:
         fmu["file"] = str(Path(__file__).resolve())  # loading wants a file that exists, and makes its path absolute
+    traci = (data.get("av") or {}).get("traci")
+    if traci:
+        traci["command"] = shlex.join(
+            ["x", traci["command"].replace("{", "").replace("}", "")]
+        )  # words, nothing to fill in
     if "acceleration_hold_s" in environment:
         environment["acceleration_hold_s"] = round(environment["acceleration_hold_s"], 1)
     if testing.get("alpha") is not None:

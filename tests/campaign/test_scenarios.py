@@ -1,15 +1,14 @@
 """The shipped campaigns: valid for loader and editor, and no way of breaking them gives anything but a clear error."""
 
 import copy
-import io
 from pathlib import Path
 
 import jsonschema
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from ruamel.yaml import YAML
 
+from harness.campaign.dumping import yaml_text
 from harness.campaign.loading import load_campaign
 from harness.campaign.schema import campaign_schema
 from harness.campaign.yaml_text import read_yaml
@@ -56,9 +55,7 @@ def load(tmp_path_factory):
     file = tmp_path_factory.mktemp("mutated") / "mutated.yaml"
 
     def load_data(data):
-        stream = io.StringIO()
-        YAML(typ="safe", pure=True).dump(data, stream) if isinstance(data, dict) else stream.write(data)
-        file.write_bytes(stream.getvalue().encode("utf-8"))
+        file.write_text(yaml_text(data) if isinstance(data, dict) else data, encoding="utf-8")
         return load_campaign(file)
 
     return load_data

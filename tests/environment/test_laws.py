@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from ruamel.yaml import YAML
 
 from harness.campaign.models import Campaign
 from harness.campaign.models import Environment as EnvironmentSection
+from harness.campaign.yaml_text import read_yaml
 from harness.environment.loading import load_parameters, parameter_file
 from harness.errors import CampaignError
 from harness.runner.prepare import prepare
@@ -13,7 +13,7 @@ from harness.state import STATE_COLUMNS
 from harness.twin import TwinWorld
 
 TEXT = parameter_file("ndd-overtaking-1").read_text(encoding="utf-8")
-DATA = YAML(typ="safe").load(TEXT)
+DATA, _ = read_yaml(parameter_file("ndd-overtaking-1"))
 NUMBERS = [(section, name) for section, numbers in DATA.items() if isinstance(numbers, dict) for name in numbers]
 EPISODES = 40
 NOT_NUMBERS = [".nan", ".inf", "-.inf", "abc", "'1'", "true", "null", "[1]", "1" + "0" * 400]

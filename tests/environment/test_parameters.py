@@ -4,16 +4,16 @@ import re
 from pathlib import Path
 
 import pytest
-from ruamel.yaml import YAML
 
 from harness.campaign.models import Environment
+from harness.campaign.yaml_text import read_yaml
 from harness.environment.loading import load_environment, load_parameters, parameter_file
 from harness.environment.parameters import EnvironmentParameters
 from harness.errors import CampaignError
 
 SHIPPED = parameter_file("ndd-overtaking-1")
 TEXT = SHIPPED.read_text(encoding="utf-8")
-DATA = YAML(typ="safe").load(TEXT)
+DATA, _ = read_yaml(parameter_file("ndd-overtaking-1"))
 NUMBERS = [(section, name) for section, numbers in DATA.items() if isinstance(numbers, dict) for name in numbers]
 
 

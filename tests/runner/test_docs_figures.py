@@ -1,4 +1,4 @@
-"""The pandas lines in docs/records.md give the rate of every method; the figures of docs/limits.md come out again."""
+"""The weights of `harness.read` give the rate of every method, as docs/records.md has it; docs/limits.md too."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ import re
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
 
+import harness
 from benchmarks.limits import limits
 from tests.runner.test_shells_runs import SHELLS
 
@@ -25,25 +25,21 @@ METHODS = {
 MEAN = {"shells": "shells", "nde": "nde"}
 
 
-def lines():
-    (block,) = [
-        text
-        for text in re.findall(r"^```python\n(.*?)^```$", (DOCS / "records.md").read_text(), re.MULTILINE | re.DOTALL)
-        if "from_shells" in text
-    ]
-    return block
+LINES = "\n".join(re.findall(r"^```python\n(.*?)^```$", (DOCS / "records.md").read_text(), re.MULTILINE | re.DOTALL))
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_the_lines_in_the_docs_give_the_rate(method, campaign, run_here, tmp_path, capsys):
+def test_the_weights_give_the_rate_of_every_method(method, campaign, run_here, tmp_path, capsys):
     result = run_here(campaign(*METHODS[method], *TWIN), tmp_path / "run")
-    exec(lines().replace("runs/hard-braking", str(result.folder)), {})
     rate = result.estimates["estimates"][MEAN.get(method, "nade")]["crash_rate"]
     assert rate > 0.0
-    assert float(capsys.readouterr().out) == pytest.approx(rate, rel=1e-9)
-    tests = pd.read_parquet(result.folder / "episodes")
-    plain = (np.exp(tests.log_weight) * (tests.outcome == "crash")).mean()
+    tests = harness.read(result.folder).episodes(["outcome", "log_weight"])
+    crash = tests.outcome == "crash"
+    assert (tests.weight * crash).mean() == pytest.approx(rate, rel=1e-9)
+    plain = (np.exp(tests.log_weight) * crash).mean()
     assert (plain == pytest.approx(rate, rel=1e-9)) == (method != "shells")
+    exec(LINES.replace("runs/hard-braking", str(result.folder)), {})
+    assert float(capsys.readouterr().out.split()[-1]) == pytest.approx(rate, rel=1e-9)
 
 
 def test_the_figures_of_the_limits_come_out_of_another_run(campaign, run_here, tmp_path):

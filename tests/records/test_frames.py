@@ -1,0 +1,64 @@
+"""The tables of a run as pandas frames: units and meanings beside them, and one error for what is not there."""
+
+import math
+
+import pytest
+
+import harness
+from harness.errors import RunFolderError
+from harness.records.folder import write_json, write_shard
+from harness.records.schemas import moments_schema, traces_schema
+
+
+@pytest.fixture
+def folder(record, tmp_path):
+    """Two shards."""
+
+    def written(*overrides):
+        shards = []
+        for index in range(2):
+            tables = record(*overrides, first=40 * index, n=40).tables
+            files = write_shard(tmp_path, index, tables)
+            shards.append({"index": index, "first_episode": 40 * index, "n_episodes": 40, "files": files})
+        write_json(tmp_path / "manifest.json", {"campaign_hash": "x", "n_episodes": 80, "shards": shards})
+        return tmp_path
+
+    return written
+
+
+def test_frames_have_all_rows_and_say_what_columns_mean(folder):
+    run = harness.read(str(folder("records.traces=all", "records.moments=all")))
+    tests = run.episodes()
+    assert tests.episode.tolist() == list(range(80))
+    assert tests.attrs["unit"]["r1_m"] == "m"
+    assert tests.attrs["unit"].keys() == tests.attrs["doc"].keys() == set(tests.columns)
+    assert tests.weight.to_numpy() == pytest.approx([math.exp(log_weight) for log_weight in tests.log_weight])
+    assert list(run.moments().columns) == moments_schema(3).names
+    assert run.moments().attrs["unit"]["q_sampled"] == "1"
+    traces = run.traces()
+    assert list(traces.columns) == traces_schema().names
+    assert set(traces.vehicle) == {"LV", "BV", "AV"}
+    assert len(traces) == 3 * (tests.n_steps + 1).sum()
+
+
+def test_only_named_columns_are_read(folder):
+    tests = harness.read(folder()).episodes(["outcome"])
+    assert list(tests.columns) == ["outcome", "weight"]
+    assert tests.attrs["unit"].keys() == {"outcome", "weight"}
+
+
+def test_what_is_not_there_is_one_error(folder, tmp_path):
+    run = harness.read(folder("records.moments=none", "records.traces=none"))
+    for table in (run.moments, run.traces):
+        with pytest.raises(RunFolderError, match=f"no {table.__name__}.*records.{table.__name__}=all"):
+            table()
+    with pytest.raises(RunFolderError, match="no column 'nothing' in episodes"):
+        run.episodes(["nothing"])
+    (tmp_path / "episodes" / "shard-000001.parquet").unlink()
+    with pytest.raises(RunFolderError, match="no such file"):
+        run.episodes()
+    write_json(tmp_path / "manifest.json", {"campaign_hash": "x", "n_episodes": 0, "shards": []})
+    with pytest.raises(RunFolderError, match="not finished an episode"):
+        run.episodes()
+    with pytest.raises(RunFolderError, match="no run folder"):
+        harness.read(tmp_path / "episodes").episodes()
