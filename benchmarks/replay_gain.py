@@ -24,6 +24,7 @@ from harness.importance.build import mixture_weights, needs_tables
 from harness.pool.storage import campaign_pool
 from harness.pool.surrogate_replay import SurrogateReplay
 from harness.records.tables import episodes_table
+from harness.resolved import resolve
 from harness.runner.prepare import prepare
 from harness.twin import TwinWorld
 
@@ -45,7 +46,7 @@ def drive(av: AutomatedVehicle, method: Method, n: int) -> Block:
     """Tests of an AV, with surrogates asked about each."""
     plain = Campaign(name="gain", seed=SEED, av=av)
     campaign = plain.model_copy(update={"testing": plain.testing.model_copy(update={"method": method})})
-    ready = prepare(campaign)
+    ready = prepare(resolve(campaign))
     table = episodes_table(ready.loop(TwinWorld(256)).run(0, ready.states(0, n)), SEED)
     return block_from_tables(
         table,
@@ -53,7 +54,7 @@ def drive(av: AutomatedVehicle, method: Method, n: int) -> Block:
         method=method,
         alpha=mixture_weights(campaign),
         n_martingale=len(campaign.surrogates) if needs_tables(campaign) else 0,
-        surrogates=SurrogateReplay(campaign, campaign_pool(campaign)),
+        surrogates=SurrogateReplay(resolve(campaign), campaign_pool(resolve(campaign))),
     )
 
 

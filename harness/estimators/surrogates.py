@@ -10,6 +10,7 @@ from harness.errors import HarnessError
 from harness.pool.storage import cached_pool, campaign_pool, read_pool
 from harness.pool.surrogate_replay import PATH_COLUMNS, SurrogateReplay
 from harness.progress import Progress
+from harness.resolved import resolve
 
 MOST_UNASKED = 100_000
 """Tests that are replayed without being asked to, for the alarm: some 30 µs each."""
@@ -57,11 +58,12 @@ def surrogates_of(campaign: Campaign, columns: set[str], request: PoolRequest) -
     if reason := refusal(campaign, columns):
         return reason
     try:
+        resolved = resolve(campaign)
         if request.file is not None:
-            return SurrogateReplay(campaign, read_pool(request.file))
-        pool = campaign_pool(campaign, request.progress) if request.build else cached_pool(campaign)
+            return SurrogateReplay(resolved, read_pool(request.file))
+        pool = campaign_pool(resolved, request.progress) if request.build else cached_pool(resolved)
         if pool is not None:
-            return SurrogateReplay(campaign, pool)
+            return SurrogateReplay(resolved, pool)
     except HarnessError as error:
         if request.explicit:
             raise

@@ -10,15 +10,14 @@ import numpy as np
 import pyarrow as pa
 
 from harness.arrays import BoolArray, FloatArray, Int8Array, IntArray
-from harness.campaign.models import Campaign
 from harness.environment.driving import Environment
-from harness.environment.loading import load_environment
 from harness.episode.cells import max_draws
 from harness.errors import CampaignError, RunFolderError
 from harness.pool.cut_ins import Pool, environment_hash
 from harness.pool.enumeration import Path, empty_path
 from harness.pool.replay import StoredPaths, replay_surrogates
 from harness.records.folder import MEND_SHARD
+from harness.resolved import Resolved
 
 STATE_COLUMNS = ("v_bv_mps", "r1_m", "r1dot_mps", "r2_m", "r2dot_mps")
 PATH_COLUMNS = ("episode", *STATE_COLUMNS, "n_steps", "cut_in_step", "lv_maneuvers", "bv_maneuvers")
@@ -57,7 +56,7 @@ class SurrogateReplay:
 
     Parameters
     ----------
-    campaign : Campaign
+    resolved : Resolved
     pool : Pool
 
     Raises
@@ -70,11 +69,11 @@ class SurrogateReplay:
     known : KnownRates
     """
 
-    def __init__(self, campaign: Campaign, pool: Pool) -> None:
-        self._environment: Environment = load_environment(campaign.environment)
+    def __init__(self, resolved: Resolved, pool: Pool) -> None:
+        self._environment: Environment = resolved.environment
         require_same_environment(self._environment, pool)
         self.known = KnownRates(pool.key, pool.names, pool.mu, pool.mu_covariance, pool.ordinary)
-        self._seed = campaign.seed
+        self._seed = resolved.campaign.seed
         names = list(pool.library.surrogates)
         self._drivers = pool.library.drivers
         self._envelope = names.index(pool.library.envelope)

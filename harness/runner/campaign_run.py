@@ -20,11 +20,11 @@ from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE
 from harness.estimators import estimate_run
 from harness.progress import Progress, SilentProgress
 from harness.records.folder import SHELLS, TABLES, shard_file, sole_use, write_json
+from harness.resolved import Resolved
 from harness.runner.manifest import Manifest, require_no_fewer, require_own_folder
 from harness.runner.prefix import Prefix
 from harness.runner.prepare import (
     Prepared,
-    content_hash,
     distance_per_test_m,
     prepare,
     require_ready,
@@ -96,50 +96,71 @@ def run_campaign(
     HarnessError
         The campaign, the folder or the AV is at fault; nothing that was finished is lost.
     """
-    controller = require_ready(campaign)
+    return run_resolved(
+        require_ready(campaign), out, workers=workers, resume=resume, shorten=shorten, progress=progress
+    )
+
+
+def run_resolved(
+    resolved: Resolved,
+    out: Path,
+    *,
+    workers: int | None = None,
+    resume: bool = False,
+    shorten: bool = False,
+    progress: Progress | None = None,
+) -> RunResult:
+    """`run_campaign` of what `require_ready` has resolved."""
     with sole_use(out):
-        return _run_alone(
-            campaign, out, workers, progress or SilentProgress(), controller, resume=resume, shorten=shorten
-        )
+        return _run_alone(resolved, out, workers, progress or SilentProgress(), resume=resume, shorten=shorten)
 
 
 def _run_alone(
-    campaign: Campaign,
+    resolved: Resolved,
     out: Path,
     workers: int | None,
     progress: Progress,
-    controller: str | None,
     *,
     resume: bool,
     shorten: bool,
 ) -> RunResult:
-    """`run_campaign` in a folder that no other process uses, with a controller of this hash."""
+    """`run_resolved` in a folder that no other process uses."""
     started = time.monotonic()
-    earlier = require_own_folder(out, content_hash(campaign), controller, resume=resume)
+    campaign = resolved.campaign
+    earlier = require_own_folder(out, resolved.content_hash, resolved.controller_sha256, resume=resume)
     if not shorten:
         require_no_fewer(out, earlier, campaign.stop.episodes)
-    prepared = prepare(campaign, progress)
-    distance = distance_per_test_m(prepared.policy.environment)
+    prepared = prepare(resolved, progress)
+    distance = distance_per_test_m(resolved.environment)
     n_workers = workers or os.cpu_count() or 1
     manifest = Manifest(
         out,
         campaign,
-        prepared.content_hash,
+        resolved.content_hash,
         earlier,
-        controller_sha256=controller,
+        controller_sha256=resolved.controller_sha256,
         workers=n_workers,
         distance_per_test_m=distance,
-        table_errors=table_errors(campaign, prepared.policy.environment, prepared.tables),
+        table_errors=table_errors(campaign, resolved.environment, prepared.tables),
     )
     if prepared.prescribed is not None:
         require_same_pool(out, prepared)
         write_json(out / SHELLS, prepared.prescribed.design.to_json())
-    retracing = Retracing(campaign, prepared.policy.environment)
+    retracing = Retracing(resolved)
     rule = stop_rule(campaign, held=0 if earlier is None else int(earlier["n_episodes"]))
     prefix = Prefix(campaign, rule)
     batches = rounds(campaign, prepared.prescribed, prefix, rule)
     _run_shards(
-        prepared, out, n_workers, progress, manifest, lambda: time.monotonic() - started, prefix, batches, retracing
+        resolved,
+        prepared,
+        out,
+        n_workers,
+        progress,
+        manifest,
+        lambda: time.monotonic() - started,
+        prefix,
+        batches,
+        retracing,
     )
     if not shorten:
         require_no_fewer(out, earlier, prefix.n_episodes)
@@ -179,6 +200,7 @@ def _stopped_by(campaign: Campaign, prefix: Prefix) -> StoppedBy:
 
 
 def _run_shards(
+    resolved: Resolved,
     prepared: Prepared,
     out: Path,
     workers: int,
@@ -190,8 +212,8 @@ def _run_shards(
     retracing: Retracing,
 ) -> None:
     """Run shards until the stop rule is content; the manifest follows so that an interrupted run can be read."""
-    campaign = prepared.campaign
-    pool = ShardPool(campaign, out, workers)
+    campaign = resolved.campaign
+    pool = ShardPool(resolved, out, workers)
     written = elapsed()
 
     def stored(spec: ShardSpec) -> ShardDone | None:

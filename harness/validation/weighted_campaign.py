@@ -17,6 +17,7 @@ from harness.importance.build import mixture_weights
 from harness.pool.storage import campaign_pool
 from harness.pool.surrogate_replay import SurrogateReplay
 from harness.records.tables import shard_tables
+from harness.resolved import resolve
 from harness.runner.prepare import prepare
 from harness.twin import TwinWorld
 from harness.validation.chains.chain import Chain
@@ -65,13 +66,12 @@ class TwinEpisodes:
         kept = "first_9" if moments else "none"
         records = campaign.records.model_copy(update={"moments": kept, "traces": "none", "trace_share": 0.0})
         self._campaign = campaign.model_copy(update={"seed": seed, "records": records})
-        self._prepared = prepare(self._campaign)
+        resolved = resolve(self._campaign)
+        self._prepared = prepare(resolved)
         self._loop: EpisodeLoop = self._prepared.loop(TwinWorld(CELLS))
         self._moments = moments
         self._n_martingale = len(campaign.surrogates) if "martingale" in estimators else 0
-        self._surrogates = (
-            SurrogateReplay(self._campaign, campaign_pool(self._campaign)) if "replay" in estimators else None
-        )
+        self._surrogates = SurrogateReplay(resolved, campaign_pool(resolved)) if "replay" in estimators else None
 
     def block(self, first: int, n: int) -> Block:
         """See `EpisodeSource`."""

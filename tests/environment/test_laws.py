@@ -8,6 +8,7 @@ from harness.campaign.models import Campaign
 from harness.campaign.models import Environment as EnvironmentSection
 from harness.environment.loading import load_parameters, parameter_file
 from harness.errors import CampaignError
+from harness.resolved import resolve
 from harness.runner.prepare import prepare
 from harness.twin import TwinWorld
 
@@ -41,7 +42,7 @@ def refusal(section):
 def require_sane_tests(section):
     """Forced cut-ins run to a finite, sane crash rate."""
     campaign = Campaign(name="mutant", environment=section, testing={"method": "forced"}, world={"engine": "twin"})
-    prepared = prepare(campaign)
+    prepared = prepare(resolve(campaign))
     states = prepared.states(0, EPISODES)
     assert np.isfinite(states).all()
     world = TwinWorld(16)
