@@ -43,13 +43,6 @@ class WorkerLostError(HarnessError):
     exit_code = 3
 
 
-def shard_specs(campaign: Campaign) -> Iterator[ShardSpec]:
-    """All shards that the campaign may need, in order."""
-    size, total = campaign.run.shard_size, campaign.stop.episodes
-    for index, first in enumerate(range(0, total, size)):
-        yield ShardSpec(index, first, min(size, total - first))
-
-
 def stored_shard(
     folder: Path,
     campaign: Campaign,

@@ -18,7 +18,7 @@ from harness.runner.allocation import GROWTH, Allocation
 from harness.runner.campaign_run import _episodes_on_disk
 from harness.runner.manifest import Manifest
 from harness.runner.prefix import Prefix
-from harness.runner.rounds import round_specs
+from harness.runner.shell_planner import round_specs
 from tests.pool.conftest import SMALL_POOL
 from tests.runner.stored_runs import copy_of, manifest, shard_files, stored_table, unlike_columns
 
