@@ -22,6 +22,7 @@ from harness.episode import loop
 from harness.episode.loop import Shard
 from harness.records.folder import write_shard
 from harness.records.tables import shard_tables
+from harness.resolved import resolve
 from harness.runner.prepare import Prepared, prepare
 from harness.runner.shards import ShardPool
 from harness.runner.worker import ShardSpec
@@ -72,7 +73,7 @@ class Recorded:
     """Episodes of a campaign in some world, written to disk as the runner writes them."""
 
     def __init__(self, settings: Campaign, world: Callable[[Campaign], World]) -> None:
-        self.prepared: Prepared = prepare(settings)
+        self.prepared: Prepared = prepare(resolve(settings))
         self.world = world(settings)
         self.loop = self.prepared.loop(self.world)
         self.folder = Path(tempfile.mkdtemp(prefix="harness-benchmark-"))
@@ -146,7 +147,7 @@ class Floor:
     """SUMO's simulationStep alone: K cells whose vehicles keep an equal speed, nothing told, nothing read."""
 
     def __init__(self, settings: Campaign) -> None:
-        self._prepared = prepare(settings)
+        self._prepared = prepare(resolve(settings))
         self._world = SumoWorld(settings.world.cells, shim=False)
 
     def run(self, first: int, n: int) -> Work:
@@ -177,7 +178,7 @@ class BareOneAtATime:
     """The usual way with no policy, no checks and no records: speeds told and values read, as fast as it can be."""
 
     def __init__(self, settings: Campaign) -> None:
-        self._prepared = prepare(settings)
+        self._prepared = prepare(resolve(settings))
         self._world = in_libsumo()
 
     def run(self, first: int, n: int) -> Work:
@@ -202,7 +203,7 @@ class TwinAlone:
     """The twin without records."""
 
     def __init__(self, settings: Campaign) -> None:
-        self._prepared = prepare(settings)
+        self._prepared = prepare(resolve(settings))
         self._loop = self._prepared.loop(TwinWorld(TWIN_CELLS))
 
     def run(self, first: int, n: int) -> Work:

@@ -18,6 +18,7 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from harness.campaign.loading import load_campaign
+from harness.resolved import resolve
 from harness.runner.prepare import build_world, prepare
 from harness.sumo.world import SumoWorld
 
@@ -47,7 +48,7 @@ def external_process(n_episodes: int) -> float:
     client = f"{sys.executable} {ROOT}/examples/traci_client/idm_client.py --port {{port}} --cells {{cells}}"
     changes = [f"av={{traci: {{command: '{client}'}}}}", f"world.cells={CELLS}"]
     campaign = load_campaign(ROOT / "scenarios/overtaking_forced.yaml", changes)
-    prepared, world = prepare(campaign), build_world(campaign)
+    prepared, world = prepare(resolve(campaign)), build_world(campaign)
     loop = prepared.loop(world, traces="none")
     try:
         loop.run(0, prepared.states(0, CELLS))
@@ -72,7 +73,7 @@ def main() -> None:
         world = SumoWorld(96)
         loops, best = {}, dict.fromkeys(forms, float("inf"))
         for name, (av, _) in forms.items():
-            prepared = prepare(load_campaign(ROOT / "scenarios/overtaking_mixture.yaml", [f"av={av}"]))
+            prepared = prepare(resolve(load_campaign(ROOT / "scenarios/overtaking_mixture.yaml", [f"av={av}"])))
             loops[name] = prepared.loop(world, traces="none", black_box=Path(folder) / "black-box")
             loops[name].run(0, prepared.states(0, 96))
         states = prepared.states(0, given.episodes)

@@ -24,6 +24,7 @@ import numpy as np
 from harness.campaign.loading import load_campaign
 from harness.campaign.models import Campaign
 from harness.outcomes import BV_LV_CONTACT, CRASH
+from harness.resolved import resolve
 from harness.runner.prepare import Prepared, prepare
 from harness.twin import TwinWorld
 
@@ -33,7 +34,7 @@ CHUNK = 50_000
 
 @cache
 def _prepared(path: str, overrides: tuple[str, ...]) -> Prepared:
-    return prepare(_campaign(path, overrides))
+    return prepare(resolve(_campaign(path, overrides)))
 
 
 def _campaign(path: str, overrides: tuple[str, ...]) -> Campaign:
@@ -55,7 +56,7 @@ def sums_of(task: tuple[str, tuple[str, ...], int, int]) -> np.ndarray:
 def reference(path: str, overrides: Sequence[str], episodes: int, workers: int) -> dict[str, float]:
     """Rate and standard error over ``episodes`` episodes."""
     settings = (*overrides, "world.engine=twin", "records.moments=none", "records.traces=none", "stop.estimator=null")
-    prepare(_campaign(path, settings))  # tables and kernels are built once, before the workers start
+    prepare(resolve(_campaign(path, settings)))  # tables and kernels are built once, before the workers start
     tasks = [(path, settings, first, min(CHUNK, episodes - first)) for first in range(0, episodes, CHUNK)]
     with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
         total = sum(pool.map(sums_of, tasks), np.zeros(6))

@@ -19,6 +19,7 @@ from harness.arrays import FloatArray
 from harness.campaign.loading import load_campaign
 from harness.pool.shells import design_shells
 from harness.pool.storage import campaign_pool
+from harness.resolved import resolve
 from harness.strata import ShellDesign
 from harness.studies.shell_campaign import FREE, ShellCampaign
 
@@ -45,7 +46,7 @@ class Fixed:
 def main(replications: int) -> None:
     """Print the table."""
     settings = ["stop.min_crashes=null", "testing.shells.first_tests=12", "stop.episodes=1e6"]
-    pool = campaign_pool(load_campaign(SCENARIOS / "smoke.yaml", settings))
+    pool = campaign_pool(resolve(load_campaign(SCENARIOS / "smoke.yaml", settings)))
     design = replace(design_shells(pool, limit_mps2=2.0), n_paths=10**12)
     print("| crashes outside | asked RHW | confidence | median tests | bias | covers |")
     print("| --- | --- | --- | --- | --- | --- |")

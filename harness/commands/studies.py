@@ -53,10 +53,11 @@ def pool(campaign_file: Path, *, out: Path | None, overrides: Sequence[str], as_
     campaign = loaded(campaign_file, overrides)
     from harness.pool.storage import campaign_pool, write_pool  # noqa: PLC0415 - slow to import
     from harness.progress import terminal_progress  # noqa: PLC0415 - keeps --help fast
+    from harness.resolved import resolve  # noqa: PLC0415 - slow to import
 
     bar = terminal_progress()
     with bar or nullcontext():
-        found = campaign_pool(campaign, bar)
+        found = campaign_pool(resolve(campaign), bar)
     if out is not None:
         write_pool(out, found)
     if as_json:

@@ -14,7 +14,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
 
-from harness.campaign.models import Campaign
+from harness.campaign.models import AutomatedVehicle, Campaign
 from harness.controllers.black_box import last_call
 from harness.controllers.time_limit import death_cause
 from harness.errors import EXIT_TOO_MANY_FAILED, HarnessError
@@ -62,8 +62,8 @@ def has_foreign_code(campaign: Campaign) -> bool:
     return campaign.av.source in ("controller", "fmu")
 
 
-def run_apart(campaign: Campaign, work: Callable[..., _Answer], *arguments: Any) -> _Answer:
-    """``work(campaign, *arguments, black_box=…)`` in a process of its own.
+def run_apart(av: AutomatedVehicle, work: Callable[..., _Answer], *arguments: Any) -> _Answer:
+    """``work(*arguments, black_box=…)``, which runs an AV, in a process of its own.
 
     Raises
     ------
@@ -75,7 +75,7 @@ def run_apart(campaign: Campaign, work: Callable[..., _Answer], *arguments: Any)
     ours, theirs = spawn_context().Pipe()
     with TemporaryDirectory(prefix="harness-apart-") as folder:
         black_box = Path(folder) / "black-box"
-        child = start_process(_work_and_tell, theirs, work, campaign, arguments, black_box)
+        child = start_process(_work_and_tell, theirs, work, arguments, black_box)
         theirs.close()  # or the child's death would not end the pipe
         try:
             while not wait([ours], LOOK_S) and child.is_alive():
@@ -87,9 +87,9 @@ def run_apart(campaign: Campaign, work: Callable[..., _Answer], *arguments: Any)
             exit_code = end_process(child)
             ours.close()
         if answer is None:
-            cause, call = death_cause(exit_code, campaign.av.limits.step_time_s), last_call(black_box)
+            cause, call = death_cause(exit_code, av.limits.step_time_s), last_call(black_box)
             raise AvEndedProcessError(
-                f"av.{campaign.av.source}",
+                f"av.{av.source}",
                 found=f"{cause}, " + ("while it was found" if call is None else f"in {call}"),
                 expected="a controller that returns or raises",
                 mend="Look for os._exit, a crash of compiled code, or a shortage of memory; then check again.",
@@ -101,10 +101,10 @@ def run_apart(campaign: Campaign, work: Callable[..., _Answer], *arguments: Any)
 
 
 def _work_and_tell(
-    connection: Connection, work: Callable[..., Any], campaign: Campaign, arguments: tuple[Any, ...], black_box: Path
+    connection: Connection, work: Callable[..., Any], arguments: tuple[Any, ...], black_box: Path
 ) -> None:
     try:
-        answer = work(campaign, *arguments, black_box=black_box)
+        answer = work(*arguments, black_box=black_box)
     except Exception as error:  # noqa: BLE001 - whatever goes wrong here is the parent's to judge
         answer = fit_to_travel(error)
     with suppress(OSError):  # the parent was killed: nobody is left to tell

@@ -120,7 +120,7 @@ def require_controller(campaign: Campaign) -> str | None:
     if not has_foreign_code(campaign):
         return None
     try:
-        return run_apart(campaign, _source_of_made)
+        return run_apart(campaign.av, _source_of_made, campaign)
     except AvEndedProcessError as error:
         raise CampaignError(
             error.where, found=error.found, expected="a controller that can be made", mend=error.mend

@@ -13,16 +13,16 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from harness.arrays import IntArray
-from harness.campaign.models import Campaign, PoolSettings
+from harness.campaign.models import PoolSettings
 from harness.compiled import cache_root, source_hash
 from harness.environment.driving import Environment
-from harness.environment.loading import load_environment
 from harness.errors import RunFolderError
 from harness.pool.build import build_pool
 from harness.pool.cut_ins import CutIns, Pool, environment_hash
-from harness.pool.library import Library, load_library
+from harness.pool.library import Library
 from harness.progress import Progress
 from harness.records.folder import require_place, write_atomically
+from harness.resolved import Resolved
 from harness.state import STATE_COLUMNS, states_from
 
 _FORMAT = 3
@@ -53,12 +53,12 @@ def pool_path(key: str) -> Path:
     return cache_root() / "pools" / f"{key}.parquet"
 
 
-def campaign_pool_key(campaign: Campaign) -> str:
+def campaign_pool_key(resolved: Resolved) -> str:
     """Key of the pool that belongs to a campaign's environment and library."""
-    return pool_key(load_environment(campaign.environment), load_library(campaign.pool.library), campaign.pool)
+    return pool_key(resolved.environment, resolved.library, resolved.campaign.pool)
 
 
-def campaign_pool(campaign: Campaign, progress: Progress | None = None) -> Pool:
+def campaign_pool(resolved: Resolved, progress: Progress | None = None) -> Pool:
     """The pool of a campaign's environment and library, from the cache or built and cached.
 
     Raises
@@ -68,19 +68,18 @@ def campaign_pool(campaign: Campaign, progress: Progress | None = None) -> Pool:
     RunFolderError
         The pool could not be kept.
     """
-    environment, library = load_environment(campaign.environment), load_library(campaign.pool.library)
-    key = pool_key(environment, library, campaign.pool)
+    key = campaign_pool_key(resolved)
     if (cached := _cached(key)) is not None:
         return cached
     require_place(pool_path(key).parent, mend="Change its permissions, or name another place in HARNESS_CACHE_DIR.")
-    pool = build_pool(environment, library, campaign.pool, key, progress)
+    pool = build_pool(resolved.environment, resolved.library, resolved.campaign.pool, key, progress)
     write_pool(pool_path(key), pool)
     return pool
 
 
-def cached_pool(campaign: Campaign) -> Pool | None:
+def cached_pool(resolved: Resolved) -> Pool | None:
     """The pool of a campaign if it has been built on this machine, else None."""
-    return _cached(campaign_pool_key(campaign))
+    return _cached(campaign_pool_key(resolved))
 
 
 def _cached(key: str) -> Pool | None:

@@ -9,14 +9,13 @@ import numpy as np
 import pyarrow as pa
 
 from harness.arrays import BoolArray, Int8Array, IntArray
-from harness.campaign.models import Campaign
 from harness.environment.driving import Environment
-from harness.environment.loading import load_environment
 from harness.episode.trajectory import empty_trajectory
 from harness.errors import CampaignError, RunFolderError
 from harness.pool.cut_ins import Pool, environment_hash
 from harness.pool.replay import StoredPaths, replay_surrogates
 from harness.records.folder import MEND_SHARD
+from harness.resolved import Resolved
 from harness.state import STATE_COLUMNS, states_from
 from harness.strata import KnownRates
 
@@ -31,7 +30,7 @@ class SurrogateReplay:
 
     Parameters
     ----------
-    campaign : Campaign
+    resolved : Resolved
     pool : Pool
 
     Raises
@@ -44,11 +43,11 @@ class SurrogateReplay:
     known : KnownRates
     """
 
-    def __init__(self, campaign: Campaign, pool: Pool) -> None:
-        self._environment: Environment = load_environment(campaign.environment)
+    def __init__(self, resolved: Resolved, pool: Pool) -> None:
+        self._environment: Environment = resolved.environment
         require_same_environment(self._environment, pool)
         self.known = KnownRates(pool.key, pool.names, pool.mu, pool.mu_covariance)
-        self._seed = campaign.seed
+        self._seed = resolved.campaign.seed
         names = list(pool.library.surrogates)
         self._drivers = pool.library.drivers
         self._envelope = names.index(pool.library.envelope)

@@ -17,6 +17,7 @@ from harness.episode.loop import EpisodeLoop, Shard
 from harness.errors import EXIT_DONE, EXIT_TOO_MANY_FAILED
 from harness.estimators.estimate import finite_json
 from harness.outcomes import AV, CRASH, FAILED
+from harness.resolved import resolve
 from harness.runner.prepare import Prepared, build_world, prepare, require_world
 from harness.runner.repeat import bits_of
 from harness.vehicles.kinematics import STEP_S
@@ -129,11 +130,11 @@ def check_av(campaign: Campaign, n_episodes: int = EPISODES, *, black_box: Path 
     """
     tested = _as_checked(campaign)
     require_world(tested)
-    prepared = prepare(tested)
+    prepared = prepare(resolve(tested))
     first, elapsed_s, steps = _timed_run(prepared, n_episodes, black_box)
     again = _run_in_another_order(prepared, n_episodes, black_box)
     idm = tested.model_copy(update={"av": AutomatedVehicle(before_cut_in=tested.av.before_cut_in)})
-    _, idm_s, idm_steps = _timed_run(prepare(idm), n_episodes)
+    _, idm_s, idm_steps = _timed_run(prepare(resolve(idm)), n_episodes)
     limits = _limits(tested.av)
     return AvCheck(
         source=tested.av.source,
@@ -160,7 +161,7 @@ def check_av_apart(campaign: Campaign, n_episodes: int = EPISODES) -> AvCheck:
     """
     if not has_foreign_code(campaign):
         return check_av(campaign, n_episodes)
-    return run_apart(campaign, check_av, n_episodes)
+    return run_apart(campaign.av, check_av, campaign, n_episodes)
 
 
 def _as_checked(campaign: Campaign) -> Campaign:

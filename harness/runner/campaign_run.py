@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib import import_module
@@ -19,18 +19,18 @@ from harness.campaign.models import Campaign
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE
 from harness.progress import Progress, SilentProgress
 from harness.records.folder import SHELLS, TABLES, shard_file, sole_use, write_json
+from harness.resolved import Resolved
 from harness.runner.manifest import Manifest, require_no_fewer, require_own_folder
+from harness.runner.planner import Planner, planner_of
 from harness.runner.prefix import Prefix
 from harness.runner.prepare import (
     Prepared,
-    content_hash,
     distance_per_test_m,
     prepare,
     require_ready,
     require_same_pool,
 )
 from harness.runner.retrace import Retracing
-from harness.runner.rounds import rounds, stop_rule
 from harness.runner.shards import ShardPool, stored_shard
 from harness.runner.stored_estimates import estimate_run
 from harness.runner.table_accuracy import table_errors
@@ -96,59 +96,79 @@ def run_campaign(
     HarnessError
         The campaign, the folder or the AV is at fault; nothing that was finished is lost.
     """
-    controller = require_ready(campaign)
+    return run_resolved(
+        require_ready(campaign), out, workers=workers, resume=resume, shorten=shorten, progress=progress
+    )
+
+
+def run_resolved(
+    resolved: Resolved,
+    out: Path,
+    *,
+    workers: int | None = None,
+    resume: bool = False,
+    shorten: bool = False,
+    progress: Progress | None = None,
+) -> RunResult:
+    """`run_campaign` of what `require_ready` has resolved."""
     with sole_use(out):
-        return _run_alone(
-            campaign, out, workers, progress or SilentProgress(), controller, resume=resume, shorten=shorten
-        )
+        return _run_alone(resolved, out, workers, progress or SilentProgress(), resume=resume, shorten=shorten)
 
 
 def _run_alone(
-    campaign: Campaign,
+    resolved: Resolved,
     out: Path,
     workers: int | None,
     progress: Progress,
-    controller: str | None,
     *,
     resume: bool,
     shorten: bool,
 ) -> RunResult:
-    """`run_campaign` in a folder that no other process uses, with a controller of this hash."""
+    """`run_resolved` in a folder that no other process uses."""
     started = time.monotonic()
-    earlier = require_own_folder(out, content_hash(campaign), controller, resume=resume)
+    campaign = resolved.campaign
+    earlier = require_own_folder(out, resolved.content_hash, resolved.controller_sha256, resume=resume)
     if not shorten:
         require_no_fewer(out, earlier, campaign.stop.episodes)
-    prepared = prepare(campaign, progress)
-    distance = distance_per_test_m(prepared.policy.environment)
+    prepared = prepare(resolved, progress)
+    distance = distance_per_test_m(resolved.environment)
     n_workers = workers or os.cpu_count() or 1
     manifest = Manifest(
         out,
         campaign,
-        prepared.content_hash,
+        resolved.content_hash,
         earlier,
-        controller_sha256=controller,
+        controller_sha256=resolved.controller_sha256,
         workers=n_workers,
         distance_per_test_m=distance,
-        table_errors=table_errors(campaign, prepared.policy.environment, prepared.tables),
+        table_errors=table_errors(campaign, resolved.environment, prepared.tables),
     )
     if prepared.prescribed is not None:
         require_same_pool(out, prepared)
         write_json(out / SHELLS, prepared.prescribed.design.to_json())
-    retracing = Retracing(campaign, prepared.policy.environment)
-    rule = stop_rule(campaign, held=0 if earlier is None else int(earlier["n_episodes"]))
-    prefix = Prefix(campaign, rule)
-    batches = rounds(campaign, prepared.prescribed, prefix, rule)
+    retracing = Retracing(resolved)
+    planner = planner_of(campaign, prepared.prescribed, held=0 if earlier is None else int(earlier["n_episodes"]))
+    prefix = Prefix(campaign)
     _run_shards(
-        prepared, out, n_workers, progress, manifest, lambda: time.monotonic() - started, prefix, batches, retracing
+        resolved,
+        prepared,
+        out,
+        n_workers,
+        progress,
+        manifest,
+        lambda: time.monotonic() - started,
+        prefix,
+        planner,
+        retracing,
     )
     if not shorten:
         require_no_fewer(out, earlier, prefix.n_episodes)
         _discard_beyond(out, len(prefix.specs))
     elapsed = time.monotonic() - started
-    stopped_by = _stopped_by(campaign, prefix)
+    stopped_by = _stopped_by(campaign, planner, prefix.n_episodes)
     retraced = retracing.summary(prefix.n_retraced)
     asked = campaign.stop.rhw is not None
-    ended = ending(stopped_by, prefix.n_episodes, prefix.waited_for, precision_asked=asked)
+    ended = ending(stopped_by, prefix.n_episodes, planner.rule.waited_for, precision_asked=asked)
     manifest.write(
         prefix.specs,
         prefix.files,
@@ -166,19 +186,20 @@ def _run_alone(
     from harness.report import write_report  # noqa: PLC0415
 
     report = write_report(out)
-    missed = asked and not prefix.reached
+    missed = asked and not planner.rule.reached
     return RunResult(out, report, estimates, stopped_by, ended, EXIT_BUDGET_SPENT if missed else EXIT_DONE)
 
 
-def _stopped_by(campaign: Campaign, prefix: Prefix) -> StoppedBy:
-    if prefix.reached:
+def _stopped_by(campaign: Campaign, planner: Planner, n_episodes: int) -> StoppedBy:
+    if planner.rule.reached:
         return "rhw"
-    if prefix.pool_too_rough:  # whatever else is spent: more of it would not help
+    if planner.rule.pool_too_rough:  # whatever else is spent: more of it would not help
         return "pool_error"
-    return "episodes" if prefix.n_episodes >= campaign.stop.episodes else "pool"
+    return "episodes" if n_episodes >= campaign.stop.episodes else "pool"
 
 
 def _run_shards(
+    resolved: Resolved,
     prepared: Prepared,
     out: Path,
     workers: int,
@@ -186,12 +207,12 @@ def _run_shards(
     manifest: Manifest,
     elapsed: Callable[[], float],
     prefix: Prefix,
-    batches: Iterator[Iterator[ShardSpec]],
+    planner: Planner,
     retracing: Retracing,
 ) -> None:
     """Run shards until the stop rule is content; the manifest follows so that an interrupted run can be read."""
-    campaign = prepared.campaign
-    pool = ShardPool(campaign, out, workers)
+    campaign = resolved.campaign
+    pool = ShardPool(resolved, out, workers)
     written = elapsed()
 
     def stored(spec: ShardSpec) -> ShardDone | None:
@@ -200,10 +221,11 @@ def _run_shards(
     progress.stage("episodes", campaign.stop.episodes, done=_episodes_on_disk(out))
     threading.Thread(target=import_module, args=("harness.report",), daemon=True).start()
     try:
-        for done in (done for specs in batches for done in pool.run(specs, stored, manifest)):
-            stop = prefix.add(done)
+        for done in (done for specs in planner.rounds() for done in pool.run(specs, stored, manifest)):
+            prefix.add(done)
+            stop = planner.add(done.block)
             progress.advance(0 if done.stored else done.spec.n_episodes)
-            progress.status(**prefix.figures)
+            progress.status(**_figures(campaign, prefix.n_crashes, planner))
             if elapsed() - written > MANIFEST_INTERVAL_S:
                 written = elapsed()
                 _note(manifest, prefix, "running", written)
@@ -215,6 +237,17 @@ def _run_shards(
         raise
     finally:
         pool.close()
+
+
+def _figures(campaign: Campaign, n_crashes: int, planner: Planner) -> dict[str, int | float]:
+    """What a progress bar shows: crashes, and what the stop rule saw at its last look.
+
+    Only what a rule asks for is called ``rhw``: a bar reckons from it when the campaign will stop.
+    """
+    watched = "half_width" if campaign.stop.rhw is None else "rhw"
+    figures: dict[str, int | float] = {"crashes": n_crashes, watched: planner.rule.rhw}
+    weighted = campaign.testing.method in ("forced", "episode_mixture")
+    return figures | ({"heaviest": planner.rule.heaviest} if weighted else {})
 
 
 def _note(manifest: Manifest, prefix: Prefix, status: str, elapsed_s: float) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,9 +17,10 @@ from harness.progress import Progress
 from harness.records.folder import MANIFEST, read_json, read_manifest, require_schema, write_json
 from harness.records.reader import read_shards
 from harness.records.stored_manifest import StoredStops
-from harness.runner.campaign_run import run_campaign
+from harness.resolved import Resolved
+from harness.runner.campaign_run import run_resolved
 from harness.runner.manifest import require_own_folder
-from harness.runner.prepare import content_hash, require_ready
+from harness.runner.prepare import require_ready
 from harness.state import STATE_COLUMNS
 
 Side = Literal["a", "b"]
@@ -82,24 +83,23 @@ def compare_campaigns(
         ``out`` holds other runs.
     """
     require_comparable(a, b)
-    campaigns: dict[Side, Campaign] = {"a": a, "b": b}
-    for side in SIDES:  # both, before either is touched
-        campaign = campaigns[side]
-        require_own_folder(out / side, content_hash(campaign), require_ready(campaign), resume=True)
-    stops = _Stops(out, campaigns)
+    sides: dict[Side, Resolved] = {"a": require_ready(a), "b": require_ready(b)}
+    for side, of_side in sides.items():  # both, before either is touched
+        require_own_folder(out / side, of_side.content_hash, of_side.controller_sha256, resume=True)
+    stops = _Stops(out, sides)
     for side in SIDES:
         if not stops.known(side):
-            result = run_campaign(
-                campaigns[side], out / side, workers=workers, resume=True, shorten=True, progress=progress
+            result = run_resolved(
+                sides[side], out / side, workers=workers, resume=True, shorten=True, progress=progress
             )
             stops.note(side, int(result.estimates["n_episodes"]), result.stopped_by)
     n = max(stops.n_episodes(side) for side in SIDES)
     for side in SIDES:
         if not _is_done(out / side, n):
-            longer = _exactly(campaigns[side], n)
-            run_campaign(longer, out / side, workers=workers, resume=True, shorten=True, progress=progress)
-    found = paired_difference(_pairs(campaigns, out), a.stop.confidence)
-    content = _content(campaigns, stops, found, labels or (a.name, b.name))
+            longer = _exactly(sides[side], n)
+            run_resolved(longer, out / side, workers=workers, resume=True, shorten=True, progress=progress)
+    found = paired_difference(_pairs(a, b, out), a.stop.confidence)
+    content = _content(sides, stops, found, labels or (a.name, b.name))
     write_json(out / "compare.json", content)
     missed = a.stop.rhw is not None and any(stops.stopped_by(side) != "rhw" for side in SIDES)
     return Comparison(out, found, content, EXIT_BUDGET_SPENT if missed else EXIT_DONE)
@@ -147,12 +147,12 @@ def _differing(prefix: str, a: Any, b: Any) -> Iterator[tuple[str, Any, Any]]:
 class _Stops:
     """Where each campaign's own stop rule ended, kept in a file: a continued folder does not say it any more."""
 
-    def __init__(self, folder: Path, campaigns: dict[Side, Campaign]) -> None:
+    def __init__(self, folder: Path, sides: dict[Side, Resolved]) -> None:
         self._file = folder / STOPS
         self._folder = folder
         self._asked = {
-            side: {"campaign_hash": content_hash(campaign), "stop": campaign.stop.model_dump()}
-            for side, campaign in campaigns.items()
+            side: {"campaign_hash": of_side.content_hash, "stop": of_side.campaign.stop.model_dump()}
+            for side, of_side in sides.items()
         }
         self._notes: dict[str, Any] = {}
         if self._file.exists():
@@ -185,13 +185,13 @@ def _is_done(folder: Path, n_episodes: int) -> bool:
     return manifest.get("status") == "done" and manifest["n_episodes"] == n_episodes
 
 
-def _exactly(campaign: Campaign, n_episodes: int) -> Campaign:
+def _exactly(resolved: Resolved, n_episodes: int) -> Resolved:
     """The campaign with a fixed number of episodes instead of its stop rule; its episodes are the same."""
-    stop = campaign.stop.model_copy(update={"rhw": None, "episodes": n_episodes})
-    return campaign.model_copy(update={"stop": stop})
+    stop = resolved.campaign.stop.model_copy(update={"rhw": None, "episodes": n_episodes})
+    return replace(resolved, campaign=resolved.campaign.model_copy(update={"stop": stop}))
 
 
-def _pairs(campaigns: dict[Side, Campaign], out: Path) -> Iterator[tuple[Block, Block]]:
+def _pairs(a: Campaign, b: Campaign, out: Path) -> Iterator[tuple[Block, Block]]:
     columns = [*EPISODE_COLUMNS, *STATE_COLUMNS]
     shards = (read_shards(out / side, episode_columns=columns, moment_columns=[]) for side in SIDES)
     for (of_a, _), (of_b, _) in zip(*shards, strict=True):
@@ -202,21 +202,21 @@ def _pairs(campaigns: dict[Side, Campaign], out: Path) -> Iterator[tuple[Block, 
                 expected="the same random numbers in both",
                 mend="The two were run with different versions; choose another folder with --out.",
             )
-        a, b = (
+        block_a, block_b = (
             block_from_tables(table, None, method=campaign.testing.method, alpha=mixture_weights(campaign))
-            for table, campaign in ((of_a, campaigns["a"]), (of_b, campaigns["b"]))
+            for table, campaign in ((of_a, a), (of_b, b))
         )
-        yield a, b
+        yield block_a, block_b
 
 
 def _content(
-    campaigns: dict[Side, Campaign], stops: _Stops, found: Difference, labels: tuple[str, str]
+    of_sides: dict[Side, Resolved], stops: _Stops, found: Difference, labels: tuple[str, str]
 ) -> dict[str, Any]:
-    campaign = campaigns["a"]
+    campaign = of_sides["a"].campaign
     sides = {
         side: {
             "label": label,
-            "campaign_hash": content_hash(campaigns[side]),
+            "campaign_hash": of_sides[side].content_hash,
             "own_stop": {"n_episodes": stops.n_episodes(side), "stopped_by": stops.stopped_by(side)},
         }
         for side, label in zip(SIDES, labels, strict=True)

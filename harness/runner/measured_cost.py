@@ -43,7 +43,7 @@ def seconds_per_test(campaign: Campaign) -> float | str:
         The time, or why there is none.
     """
     try:
-        return run_apart(campaign, _measure)
+        return run_apart(campaign.av, _measure, campaign)
     except AvEndedProcessError as error:
         return f"not known: {error.found}"
 

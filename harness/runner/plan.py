@@ -7,13 +7,12 @@ from typing import Any
 
 from harness.campaign.models import Campaign
 from harness.criticality.tables import tables_cached
-from harness.environment.loading import load_environment
 from harness.importance.build import needs_tables
 from harness.pool.storage import cached_pool
+from harness.resolved import Resolved
 from harness.runner.measured_cost import seconds_per_test
 from harness.runner.prepare import require_ready
 from harness.sumo.shim import shim_library
-from harness.vehicles.models import surrogate_records
 
 EPISODES_PER_SECOND_PER_CORE = {
     "sumo": {"nde": 3500, "forced": 1500, "step_mixture": 1600, "episode_mixture": 2000, "shells": 1700},
@@ -41,7 +40,7 @@ def plan_campaign(campaign: Campaign) -> dict[str, Any]:
     CampaignError
         A run would refuse the campaign before it starts.
     """
-    require_ready(campaign)
+    resolved = require_ready(campaign)
     engine = "sumo with shim" if campaign.world.engine == "sumo" and shim_library() else campaign.world.engine
     per_core: float = EPISODES_PER_SECOND_PER_CORE[engine][campaign.testing.method]
     measured = None if campaign.av.model is not None else seconds_per_test(campaign)
@@ -55,7 +54,7 @@ def plan_campaign(campaign: Campaign) -> dict[str, Any]:
         "episodes": episodes,
         "episodes_per_second_estimate": rate,
         "seconds_estimate": round(episodes / rate),
-        "tables": _tables(campaign),
+        "tables": _tables(resolved),
         "disk_mb": round(episodes * (KB_PER_EPISODE + KB_PER_MOMENT * moments) / 1000.0, 1),
         **(
             {}
@@ -70,13 +69,13 @@ def _rounded(value: float) -> float:
     return float(f"{value:.2g}")
 
 
-def _tables(campaign: Campaign) -> str:
+def _tables(resolved: Resolved) -> str:
+    campaign = resolved.campaign
     if campaign.testing.method == "shells":
-        return "pool of cut-ins: " + ("cached" if cached_pool(campaign) else f"to build ({POOL_S} on two cores)")
+        return "pool of cut-ins: " + ("cached" if cached_pool(resolved) else f"to build ({POOL_S} on two cores)")
     if not needs_tables(campaign):
         return "none needed"
-    environment = load_environment(campaign.environment)
-    if tables_cached(environment, surrogate_records(campaign.surrogates), campaign.testing.challenge):
+    if tables_cached(resolved.environment, resolved.surrogates, campaign.testing.challenge):
         return "cached"
     seconds = 5 if campaign.environment.acceleration_hold_s >= 0.5 else 40
     return f"to build (about {seconds * len(campaign.surrogates)} s of one core)"

@@ -14,22 +14,20 @@ from harness.controllers.loading import build_host, require_controller
 from harness.criticality.tables import Tables, build_tables, tables_cached
 from harness.environment.driving import Environment
 from harness.environment.initial_state import InitialStates
-from harness.environment.loading import load_environment, load_parameters
 from harness.episode.begin import mean_test_distance
 from harness.episode.loop import MOMENT_LIMITS, EpisodeLoop, Keep, Policy
 from harness.episode.trajectory import empty_trajectory
 from harness.errors import RunFolderError
 from harness.importance.build import build_importance, needs_tables
-from harness.pool.library import load_library
 from harness.pool.prescribed import PrescribedEpisodes
 from harness.pool.shells import require_boundary
 from harness.pool.storage import campaign_pool, campaign_pool_key, pool_path
 from harness.progress import Progress, SilentProgress
 from harness.records.folder import SHELLS, read_json
+from harness.resolved import Resolved, resolve
 from harness.sumo.av_type import av_type
 from harness.sumo.public_address import require_private
 from harness.sumo.system_libraries import require_libraries
-from harness.vehicles.models import av_records, surrogate_records
 from harness.world import World
 
 DISTANCE_SEED = 20_000
@@ -42,7 +40,6 @@ class Prepared:
     """A campaign ready to run."""
 
     campaign: Campaign
-    content_hash: str
     policy: Policy
     initial_states: InitialStates
     tables: Tables | None
@@ -79,13 +76,8 @@ class Prepared:
         return EpisodeLoop(world, self.policy, keep, av)
 
 
-def require_ready(campaign: Campaign) -> str | None:
-    """Refuse what can be known to be wrong before anything is simulated or written.
-
-    Returns
-    -------
-    str or None
-        Hash of the source of the AV's controller (`require_controller`).
+def require_ready(campaign: Campaign) -> Resolved:
+    """Resolve a campaign; refuse what can be known to be wrong before anything is simulated or written.
 
     Raises
     ------
@@ -96,16 +88,16 @@ def require_ready(campaign: Campaign) -> str | None:
         See `require_world`.
     """
     require_world(campaign)
-    source = require_controller(campaign)
+    controller_sha256 = require_controller(campaign)
     if campaign.av.sumo is not None:
         av_type(campaign.av.sumo)
     if campaign.av.traci is not None:
         require_private(campaign.av.traci)
-    load_parameters(campaign.environment)
+    resolved = resolve(campaign, controller_sha256)
     if campaign.testing.method == "shells":
-        library = load_library(campaign.pool.library)
+        library = resolved.library
         require_boundary(campaign.testing.shells.boundary or library.boundary, tuple(library.surrogates))
-    return source
+    return resolved
 
 
 def require_world(campaign: Campaign) -> None:
@@ -120,48 +112,28 @@ def require_world(campaign: Campaign) -> None:
         require_libraries()
 
 
-def content_hash(campaign: Campaign) -> str:
-    """Hash of all that changes an episode's bits, the environment's numbers included."""
-    return campaign.content_hash(load_parameters(campaign.environment).content_hash())
-
-
-def prepare(campaign: Campaign, progress: Progress | None = None) -> Prepared:
-    """Load the environment and build (or read) the challenge tables or the pool of cut-ins.
-
-    Raises
-    ------
-    CampaignError
-        The environment's parameter file is wrong, or an attribute of an AV that SUMO drives.
-    """
+def prepare(resolved: Resolved, progress: Progress | None = None) -> Prepared:
+    """Build (or read) a campaign's challenge tables or its pool of cut-ins."""
     progress = progress or SilentProgress()
     prescribed: PrescribedEpisodes | None = None
-    parameters = load_parameters(campaign.environment)
-    environment = load_environment(campaign.environment, parameters)
+    campaign, environment = resolved.campaign, resolved.environment
     tables = None
     if needs_tables(campaign):
-        drivers = surrogate_records(campaign.surrogates)
-        challenge = campaign.testing.challenge
+        drivers, challenge = resolved.surrogates, campaign.testing.challenge
         progress.stage("criticality tables", len(drivers))
         with ThreadPoolExecutor(1) as thread:
             building = thread.submit(build_tables, environment, drivers, challenge, progress.advance)
             if not tables_cached(environment, drivers, challenge):
-                compile_kernels(campaign, environment)
+                compile_kernels(resolved)
             tables = building.result()
     if campaign.testing.method == "shells":
         with ThreadPoolExecutor(1) as thread:
-            pooling = thread.submit(campaign_pool, campaign, progress)
-            if not pool_path(campaign_pool_key(campaign)).is_file():
-                compile_kernels(campaign, environment)
+            pooling = thread.submit(campaign_pool, resolved, progress)
+            if not pool_path(campaign_pool_key(resolved)).is_file():
+                compile_kernels(resolved)
             prescribed = PrescribedEpisodes(campaign, pooling.result())
-    policy = Policy(campaign.seed, environment, build_importance(campaign, tables), av_records(campaign.av))
-    return Prepared(
-        campaign,
-        campaign.content_hash(parameters.content_hash()),
-        policy,
-        InitialStates(environment.numbers),
-        tables,
-        prescribed,
-    )
+    policy = Policy(campaign.seed, environment, build_importance(campaign, tables), resolved.av)
+    return Prepared(campaign, policy, InitialStates(environment.numbers), tables, prescribed)
 
 
 def require_same_pool(folder: Path, prepared: Prepared) -> None:
@@ -185,7 +157,7 @@ def require_same_pool(folder: Path, prepared: Prepared) -> None:
         )
 
 
-def compile_kernels(campaign: Campaign, environment: Environment) -> None:
+def compile_kernels(resolved: Resolved) -> None:
     """Compile what episodes will need, while threads build tables: neither waits for the other.
 
     Kernels are the same for all methods and worlds, so one naturalistic episode in the twin compiles them into the
@@ -193,8 +165,9 @@ def compile_kernels(campaign: Campaign, environment: Environment) -> None:
     """
     from harness.twin import TwinWorld  # noqa: PLC0415 - only a cold start needs it
 
+    campaign, environment = resolved.campaign, resolved.environment
     naturalistic = campaign.model_copy(update={"testing": campaign.testing.model_copy(update={"method": "nde"})})
-    policy = Policy(campaign.seed, environment, build_importance(naturalistic, None), av_records(campaign.av))
+    policy = Policy(campaign.seed, environment, build_importance(naturalistic, None), resolved.av)
     EpisodeLoop(TwinWorld(1), policy, Keep(0, "none", 0.0)).run(0, InitialStates(environment.numbers).draw(0, 0, 1))
     distance_per_test_m(environment)
 

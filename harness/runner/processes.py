@@ -9,9 +9,9 @@ from itertools import count
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 
-from harness.campaign.models import Campaign
 from harness.controllers.apart import LOOK_S, end_process, fit_to_travel, start_process
 from harness.controllers.black_box import Call, Death, last_call
+from harness.resolved import Resolved
 from harness.runner.worker import ShardDone, ShardRunner, ShardSpec
 from harness.spawning import spawn_context
 
@@ -26,16 +26,16 @@ class WorkerProcess:
 
     Parameters
     ----------
-    campaign : Campaign
+    resolved : Resolved
     folder : Path
         Run folder, where it writes.
     """
 
-    def __init__(self, campaign: Campaign, folder: Path) -> None:
+    def __init__(self, resolved: Resolved, folder: Path) -> None:
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
         self._black_box = folder / f".black-box-{next(_numbers)}"
         self.connection, theirs = spawn_context().Pipe()
-        self._process = start_process(serve, theirs, campaign, folder, self._black_box)
+        self._process = start_process(serve, theirs, resolved, folder, self._black_box)
         theirs.close()  # or its death would not end the pipe
 
     def give(self, spec: ShardSpec, doomed: Mapping[int, Death]) -> bool:
@@ -99,7 +99,7 @@ def first_to_answer(workers: Sequence[WorkerProcess]) -> WorkerProcess:
             return found[0]
 
 
-def serve(connection: Connection, campaign: Campaign, folder: Path, black_box: Path) -> None:
+def serve(connection: Connection, resolved: Resolved, folder: Path, black_box: Path) -> None:
     """What the process does: prepare with the first shard, run shards until the parent is gone or has no more."""
     runner: ShardRunner | None = None
     while True:
@@ -108,7 +108,7 @@ def serve(connection: Connection, campaign: Campaign, folder: Path, black_box: P
         except (EOFError, OSError):
             break
         try:
-            runner = runner or ShardRunner(campaign, folder, black_box)
+            runner = runner or ShardRunner(resolved, folder, black_box)
             answer: ShardDone | Exception = runner.run(spec, doomed)
         except Exception as error:  # noqa: BLE001 - whatever goes wrong here is the parent's to judge
             answer = fit_to_travel(error)

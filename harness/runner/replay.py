@@ -18,8 +18,9 @@ from harness.controllers.loading import require_controller
 from harness.errors import CampaignError, RunFolderError
 from harness.records.folder import no_episodes, read_manifest, read_table
 from harness.records.tables import shard_tables
+from harness.resolved import Resolved, resolve
 from harness.runner.manifest import cpu_name, versions
-from harness.runner.prepare import Prepared, build_world, content_hash, prepare, require_same_pool, require_world
+from harness.runner.prepare import Prepared, build_world, prepare, require_same_pool, require_world
 from harness.sumo.system_libraries import require_libraries
 from harness.world import World
 
@@ -80,10 +81,11 @@ def replay_episode(folder: Path, episode: int, *, gui: bool = False, fcd: Path |
     _require_reproducible(manifest)
     stored = _stored(folder, manifest, episode)
     campaign = load_campaign(folder / "campaign.yaml")
-    if content_hash(campaign) != manifest["campaign_hash"]:
+    resolved = resolve(campaign)
+    if resolved.content_hash != manifest["campaign_hash"]:
         raise CampaignError(
             str(folder / "campaign.yaml"),
-            found=f"campaign {content_hash(campaign)}",
+            found=f"campaign {resolved.content_hash}",
             expected=f"campaign {manifest['campaign_hash']}, which made the records",
             mend="Restore campaign.yaml and the environment parameter file that it names.",
         )
@@ -91,8 +93,8 @@ def replay_episode(folder: Path, episode: int, *, gui: bool = False, fcd: Path |
         require_libraries()
     else:
         require_world(campaign)
-    replay = partial(run_apart, campaign, _replay) if has_foreign_code(campaign) else partial(_replay, campaign)
-    row, trace = replay(folder, episode, stored["episodes"], gui, fcd)
+    replay = partial(run_apart, campaign.av, _replay) if has_foreign_code(campaign) else _replay
+    row, trace = replay(resolved, folder, episode, stored["episodes"], gui, fcd)
     equal = {name: _equal(name, table, stored.get(name)) for name, table in (("episodes", row), ("traces", trace))}
     compared = tuple(name for name, answer in equal.items() if answer is not None)
     first: dict[str, Any] = row.to_pylist()[0]
@@ -102,7 +104,7 @@ def replay_episode(folder: Path, episode: int, *, gui: bool = False, fcd: Path |
 
 
 def _replay(
-    campaign: Campaign,
+    resolved: Resolved,
     folder: Path,
     episode: int,
     stored: pa.Table,
@@ -111,9 +113,9 @@ def _replay(
     black_box: Path | None = None,
 ) -> tuple[pa.Table, pa.Table]:
     """Row and trace of the episode, run again."""
-    prepared = prepare(campaign)
+    prepared = prepare(resolved)
     require_same_pool(folder, prepared)
-    world = _world(campaign, gui=gui, fcd=fcd)
+    world = _world(resolved.campaign, gui=gui, fcd=fcd)
     try:
         return _run_again(prepared, world, episode, stored, black_box)
     finally:

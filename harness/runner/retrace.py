@@ -14,14 +14,13 @@ import pyarrow as pa
 
 from harness.arrays import BoolArray, FloatArray, IntArray
 from harness.campaign.models import Campaign
-from harness.environment.driving import Environment
 from harness.episode.trajectory import empty_trajectory
 from harness.errors import WorldDisagreementError
 from harness.outcomes import CRASH, FAILED, OUTCOMES, RUNNING
 from harness.pool.replay import Retraced, StoredPaths, retrace
 from harness.pool.surrogate_replay import stored_paths
+from harness.resolved import Resolved
 from harness.vehicles.kinematics import STEP_S
-from harness.vehicles.models import av_records
 
 
 def no_retracing(campaign: Campaign) -> str | None:
@@ -38,15 +37,14 @@ class Retracing:
 
     Parameters
     ----------
-    campaign : Campaign
-    environment : Environment
+    resolved : Resolved
     """
 
-    def __init__(self, campaign: Campaign, environment: Environment) -> None:
-        self._reason = no_retracing(campaign)
-        self._seed, self._environment = campaign.seed, environment
-        self._driver = av_records(campaign.av)
-        self._room = empty_trajectory(environment)
+    def __init__(self, resolved: Resolved) -> None:
+        self._reason = no_retracing(resolved.campaign)
+        self._seed, self._environment = resolved.campaign.seed, resolved.environment
+        self._driver = resolved.av
+        self._room = empty_trajectory(resolved.environment)
 
     def check(self, episodes: pa.Table) -> int:
         """Retrace the rows of an episodes table; returns how many, all of them equal.

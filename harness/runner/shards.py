@@ -20,6 +20,7 @@ from harness.errors import HarnessError, TooManyFailedError
 from harness.pool.prescribed import PrescribedEpisodes
 from harness.records.folder import TABLES, read_table, shard_file
 from harness.records.tables import ShardTables
+from harness.resolved import Resolved
 from harness.runner.manifest import Manifest
 from harness.runner.processes import WorkerProcess, first_to_answer
 from harness.runner.retrace import Retracing
@@ -40,13 +41,6 @@ class WorkerLostError(HarnessError):
     """Workers die again and again on the same shard."""
 
     exit_code = 3
-
-
-def shard_specs(campaign: Campaign) -> Iterator[ShardSpec]:
-    """All shards that the campaign may need, in order."""
-    size, total = campaign.run.shard_size, campaign.stop.episodes
-    for index, first in enumerate(range(0, total, size)):
-        yield ShardSpec(index, first, min(size, total - first))
 
 
 def stored_shard(
@@ -106,8 +100,8 @@ class ShardPool:
     process could keep, and no queue that Ctrl-C could leave half filled.
     """
 
-    def __init__(self, campaign: Campaign, folder: Path, workers: int) -> None:
-        self._campaign, self._folder = campaign, folder
+    def __init__(self, resolved: Resolved, folder: Path, workers: int) -> None:
+        self._resolved, self._campaign, self._folder = resolved, resolved.campaign, folder
         self._n_workers = workers
         self._idle: list[WorkerProcess] = []
         self._busy: dict[WorkerProcess, _Job] = {}
@@ -161,7 +155,7 @@ class ShardPool:
     def _hand_out(self, waiting: deque[_Job]) -> None:
         """Give waiting shards to idle workers, of which there may be up to as many as were asked for."""
         while waiting and not waiting[0].replaces and len(self._busy) < self._n_workers:
-            worker = self._idle.pop() if self._idle else WorkerProcess(self._campaign, self._folder)
+            worker = self._idle.pop() if self._idle else WorkerProcess(self._resolved, self._folder)
             if worker.give(waiting[0].spec, waiting[0].doomed):
                 self._busy[worker] = waiting.popleft()
             else:

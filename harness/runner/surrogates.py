@@ -8,6 +8,7 @@ from harness.campaign.models import Campaign
 from harness.errors import HarnessError
 from harness.pool.storage import cached_pool, read_pool
 from harness.pool.surrogate_replay import PATH_COLUMNS, SurrogateReplay
+from harness.resolved import resolve
 
 MOST_UNASKED = 100_000
 """Tests that are replayed without being asked to, for the alarm: some 30 µs each."""
@@ -31,11 +32,12 @@ def surrogates_of(campaign: Campaign, columns: set[str], file: Path | None = Non
     """
     if reason := refusal(campaign, columns):
         return reason
+    resolved = resolve(campaign)
     if file is not None:
-        return SurrogateReplay(campaign, read_pool(file))
+        return SurrogateReplay(resolved, read_pool(file))
     try:
-        if (pool := cached_pool(campaign)) is not None:
-            return SurrogateReplay(campaign, pool)
+        if (pool := cached_pool(resolved)) is not None:
+            return SurrogateReplay(resolved, pool)
     except HarnessError as error:
         return f"the pool of cut-ins cannot be used: {error}"
     return "the pool of cut-ins has not been built here; `harness pool DIR/campaign.yaml` builds it (about 15 s)"

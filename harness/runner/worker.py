@@ -21,6 +21,7 @@ from harness.importance.build import mixture_weights
 from harness.pool.prescribed import Draw, PrescribedEpisodes
 from harness.records.folder import write_shard
 from harness.records.tables import ShardTables, shard_tables
+from harness.resolved import Resolved
 from harness.runner.prepare import Prepared, build_world, prepare
 from harness.runner.repeat import Repeated, chosen_rows, has_to_be_shown, repeat
 from harness.runner.retrace import Retracing
@@ -61,19 +62,21 @@ class ShardRunner:
 
     Parameters
     ----------
-    campaign : Campaign
+    resolved : Resolved
     folder : Path
         Run folder.
     black_box : Path, optional
         File that tells the parent in which call of a controller the process died.
     """
 
-    def __init__(self, campaign: Campaign, folder: Path, black_box: Path | None = None) -> None:
+    def __init__(self, resolved: Resolved, folder: Path, black_box: Path | None = None) -> None:
         self._folder = folder
         self._doomed: dict[int, Death] = {}
-        self._prepared: Prepared = prepare(campaign)
-        self._retracing = Retracing(campaign, self._prepared.policy.environment)
-        self._loop: EpisodeLoop = self._prepared.loop(build_world(campaign), black_box=black_box, doomed=self._doomed)
+        self._prepared: Prepared = prepare(resolved)
+        self._retracing = Retracing(resolved)
+        self._loop: EpisodeLoop = self._prepared.loop(
+            build_world(resolved.campaign), black_box=black_box, doomed=self._doomed
+        )
 
     def close(self) -> None:
         """Release the AV's controllers."""

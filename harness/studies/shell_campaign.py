@@ -14,11 +14,9 @@ import numpy as np
 
 from harness.arrays import FloatArray, IntArray
 from harness.campaign.models import Campaign
-from harness.estimators import Shells
 from harness.estimators.block import Block
 from harness.estimators.estimate import Estimate
-from harness.runner.allocation import Allocation
-from harness.runner.rounds import RoundRule
+from harness.runner.shell_planner import RoundRule, ShellPlanner
 from harness.strata import ShellDesign
 from harness.studies.experiment import Fault
 from harness.studies.rows import Row, estimate_row
@@ -50,30 +48,24 @@ class ShellCampaign:
         return self._rows(_wrong(design, self._fault), share, rng, replication)
 
     def _rows(self, design: ShellDesign, share: FloatArray, rng: np.random.Generator, replication: int) -> list[Row]:
-        campaign, shells = self._campaign, self._campaign.testing.shells
-        available = np.full(design.p.size, campaign.pool.cut_ins_per_shell, np.int64)
-        allocation = Allocation(design, shells.first_tests, available, shells.statement == "conditional")
-        rule, inside = RoundRule(campaign), RoundRule(_conditional(campaign))
-        sums, conditional = Shells(), None
+        available = np.full(design.p.size, self._campaign.pool.cut_ins_per_shell, np.int64)
+        planner = ShellPlanner(self._campaign, design, available)
+        inside, conditional = RoundRule(_conditional(self._campaign)), None
         estimate: Estimate | None = None
-        n = 0
-        while True:
-            tests, crashes = (sums.tests, sums.crashes) if n else (np.zeros(design.p.size, np.int64),) * 2
-            added = allocation.next_round(tests, crashes, campaign.stop.episodes - n)
-            if not added.any():
-                break
-            sums.add(_block(design, added, rng.binomial(added, share), n))
-            n += int(added.sum())
-            estimate = sums.result(campaign.stop.confidence)
-            inside.observe(n, estimate)
-            if conditional is None and inside.reached:
-                conditional = _conditional_row(estimate, replication, reached=True)
-            if rule.observe(n, estimate):
-                break
+        enough = False
+        while not enough and (added := planner.next_round()).any():
+            n = int(planner.tests.sum())
+            enough = planner.add(_block(design, added, rng.binomial(added, share), n))
+            estimate = planner.estimate
+            if estimate is not None and conditional is None:
+                inside.observe(estimate)
+                if inside.reached:
+                    conditional = _conditional_row(estimate, replication, reached=True)
         if estimate is None:
             raise ValueError("the campaign has no tests")
         outside = int(estimate.details["conditional"]["n_crashes_outside"])
-        free = replace(estimate_row(FREE, replication, estimate, reached=rule.reached), n_crashes_outside=outside)
+        row = estimate_row(FREE, replication, estimate, reached=planner.rule.reached)
+        free = replace(row, n_crashes_outside=outside)
         return [free, conditional or _conditional_row(estimate, replication, reached=False)]
 
 

@@ -15,6 +15,7 @@ from harness.estimators.block import Block
 from harness.estimators.from_records import block_from_tables
 from harness.importance.build import mixture_weights
 from harness.records.tables import shard_tables
+from harness.resolved import resolve
 from harness.runner.prepare import prepare
 from harness.studies.chains.chain import Chain
 from harness.studies.chains.sampler import draw
@@ -63,7 +64,8 @@ class TwinEpisodes:
         kept = "first_9" if moments else "none"
         records = campaign.records.model_copy(update={"moments": kept, "traces": "none", "trace_share": 0.0})
         self._campaign = campaign.model_copy(update={"seed": seed, "records": records})
-        self._prepared = prepare(self._campaign)
+        resolved = resolve(self._campaign)
+        self._prepared = prepare(resolved)
         self._loop: EpisodeLoop = self._prepared.loop(TwinWorld(CELLS))
         self._moments = moments
 

@@ -6,6 +6,7 @@ import pytest
 from harness.campaign.loading import load_campaign
 from harness.errors import CampaignError
 from harness.outcomes import PASSED
+from harness.resolved import resolve
 from harness.runner.prepare import prepare
 from harness.twin import TwinWorld
 from tests.controllers.test_same_bits import ROOT
@@ -39,7 +40,7 @@ def load(method, *more):
 @pytest.mark.parametrize("method", ["nde", "step_mixture"])
 def test_a_controller_acts_from_the_first_step(method, monkeypatch):
     monkeypatch.chdir(ROOT)
-    prepared = prepare(load(method, "environment.lane_change_level=350"))
+    prepared = prepare(resolve(load(method, "environment.lane_change_level=350")))
     loop = prepared.loop(TwinWorld(32), traces="all")
     shard = loop.run(0, prepared.states(0, 300))
     loop.close()

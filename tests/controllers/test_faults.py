@@ -12,6 +12,7 @@ from harness.campaign.loading import load_campaign
 from harness.cli import main
 from harness.controllers.loading import build_host
 from harness.errors import EXIT_BAD_INPUT, EXIT_DONE, EXIT_TOO_MANY_FAILED
+from harness.resolved import resolve
 from harness.runner import processes
 from harness.runner.prepare import prepare
 from harness.twin import TwinWorld
@@ -216,7 +217,9 @@ def test_a_process_that_ends_in_close_has_done_its_work(tmp_path, undisturbed):
 @pytest.mark.parametrize("field", ["cell", "episode", "gap_m", "lv_speed_mps", "cells", "episodes"])
 def test_nothing_that_a_batch_controller_is_handed_can_be_written_into(field):
     av = _other("BatchThatWrites", f"{{field: {field}}}")
-    prepared = prepare(load_campaign(ROOT / "scenarios/overtaking_forced.yaml", [f"av={av}", "world.engine=twin"]))
+    prepared = prepare(
+        resolve(load_campaign(ROOT / "scenarios/overtaking_forced.yaml", [f"av={av}", "world.engine=twin"]))
+    )
     loop = prepared.loop(TwinWorld(8))
     shard = loop.run(0, prepared.states(0, 24))
     loop.close()

@@ -10,7 +10,7 @@ from harness.campaign.loading import load_campaign
 from harness.controllers import EpisodeStart, Neighbour, Observation
 from harness.controllers.loading import build_host, require_controller
 from harness.errors import CampaignError
-from harness.runner.prepare import content_hash
+from harness.resolved import resolve
 
 COUNTER = '''
 from pythonfmu import Fmi2Causality, Fmi2Slave, Real
@@ -121,7 +121,7 @@ def test_the_path_is_relative_to_the_campaign_and_the_content_counts(fmu, tmp_pa
         (tmp_path / name / "here.fmu").write_bytes(fmu.read_bytes() + more)
         campaign = load(tmp_path / name, text)
         assert campaign.av.fmu.file == str(tmp_path / name / "here.fmu")
-        hashes.append(content_hash(campaign))
+        hashes.append(resolve(campaign).content_hash)
     assert hashes[0] == hashes[1] != hashes[2]
 
 

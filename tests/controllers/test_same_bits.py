@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from harness.campaign.loading import load_campaign
+from harness.resolved import resolve
 from harness.runner.prepare import prepare
 from harness.twin import TwinWorld
 
@@ -41,7 +42,7 @@ def fmu_av(file, more=""):
 
 def run(av, *more, cells=32, first=0, n=EPISODES):
     overrides = [f"av={av}", "testing={method: forced}", "world.engine=twin", "stop.rhw=null", *more]
-    prepared = prepare(load_campaign(ROOT / "scenarios/overtaking_mixture.yaml", overrides))
+    prepared = prepare(resolve(load_campaign(ROOT / "scenarios/overtaking_mixture.yaml", overrides)))
     loop = prepared.loop(TwinWorld(cells), traces="all")
     try:
         return loop.run(first, prepared.states(first, n))

@@ -8,6 +8,7 @@ from harness.campaign.models import Environment as EnvironmentSection
 from harness.campaign.yaml_text import read_yaml
 from harness.environment.loading import load_parameters, parameter_file
 from harness.errors import CampaignError
+from harness.resolved import resolve
 from harness.runner.prepare import prepare
 from harness.state import STATE_COLUMNS
 from harness.twin import TwinWorld
@@ -42,7 +43,7 @@ def refusal(section):
 def require_sane_tests(section):
     """Forced cut-ins run to a finite, sane crash rate."""
     campaign = Campaign(name="mutant", environment=section, testing={"method": "forced"}, world={"engine": "twin"})
-    prepared = prepare(campaign)
+    prepared = prepare(resolve(campaign))
     states = prepared.states(0, EPISODES)
     assert all(np.isfinite(states[name]).all() for name in STATE_COLUMNS)
     world = TwinWorld(16)

@@ -18,6 +18,7 @@ from harness.campaign.models import (
 )
 from harness.episode.loop import Shard
 from harness.outcomes import CRASH
+from harness.resolved import resolve
 from harness.runner.prepare import Prepared, prepare
 from harness.twin import TwinWorld
 from tests.chains.seed import SEED
@@ -66,7 +67,7 @@ def prepared(method: str, challenge: str = "recursive", **settings) -> Prepared:
 
 @cache
 def _prepared(method, challenge, settings) -> Prepared:
-    return prepare(campaign(method, challenge, **dict(settings)))
+    return prepare(resolve(campaign(method, challenge, **dict(settings))))
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from harness.environment.driving import Environment
 from harness.environment.loading import load_environment
 from harness.pool.cut_ins import Pool
 from harness.pool.storage import campaign_pool
+from harness.resolved import resolve
 
 MIXTURE_FILE = Path(__file__).parents[2] / "scenarios" / "overtaking_mixture.yaml"
 SMALL_POOL = ("pool.relative_error=0.03", "pool.cut_ins_per_shell=1500")
@@ -29,4 +30,4 @@ def environment(campaign) -> Environment:
 
 @pytest.fixture(scope="session")
 def pool(campaign) -> Pool:
-    return campaign_pool(campaign)
+    return campaign_pool(resolve(campaign))

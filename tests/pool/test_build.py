@@ -22,6 +22,7 @@ from harness.pool.storage import (
     read_pool,
     write_pool,
 )
+from harness.resolved import resolve
 from tests.chains.seed import SEED
 
 FORCED_RATE = 1.352e-7
@@ -71,7 +72,7 @@ def test_one_surrogate_crashes_in_rare_traffic_of_its_own(pool):
 
 def test_the_same_settings_give_the_same_bits(campaign, pool, tmp_path, monkeypatch):
     monkeypatch.setenv("HARNESS_CACHE_DIR", str(tmp_path))
-    again = campaign_pool(campaign)
+    again = campaign_pool(resolve(campaign))
     for field in dataclasses.fields(pool.cut_ins):
         assert np.array_equal(getattr(pool.cut_ins, field.name), getattr(again.cut_ins, field.name))
     for name in ("mu", "mu_covariance", "shell_p", "shell_moments"):
@@ -85,7 +86,7 @@ def test_what_changes_a_pool_changes_its_key(campaign):
     library = load_library("ladder-1")
     other_level = campaign.environment.model_copy(update={"lane_change_level": 2.0})
     keys = {
-        campaign_pool_key(campaign),
+        campaign_pool_key(resolve(campaign)),
         pool_key(load_environment(other_level), library, campaign.pool),
         pool_key(load_environment(campaign.environment), library.without({"brakes-5"}), campaign.pool),
         pool_key(load_environment(campaign.environment), library, campaign.pool.model_copy(update={"seed": 2})),
@@ -103,13 +104,13 @@ def test_a_pool_is_read_as_it_was_written(pool, tmp_path):
 
 def test_a_damaged_pool_is_named_and_built_again(campaign, pool, tmp_path, monkeypatch):
     monkeypatch.setenv("HARNESS_CACHE_DIR", str(tmp_path))
-    path = pool_path(campaign_pool_key(campaign))
+    path = pool_path(campaign_pool_key(resolve(campaign)))
     write_pool(path, pool)
     path.write_bytes(path.read_bytes()[:1000])
     with pytest.raises(RunFolderError, match="not a whole pool"):
         read_pool(path)
     monkeypatch.setattr("harness.pool.storage.build_pool", lambda *_: pool)
-    assert campaign_pool(campaign) is pool
+    assert campaign_pool(resolve(campaign)) is pool
     assert read_pool(path).key == pool.key
 
 
@@ -134,11 +135,11 @@ def test_a_pool_in_which_a_bit_has_flipped_is_refused(pool, tmp_path):
 
 def test_a_pool_of_something_else_under_the_right_name_is_built_again(campaign, pool, tmp_path, monkeypatch):
     monkeypatch.setenv("HARNESS_CACHE_DIR", str(tmp_path))
-    path = pool_path(campaign_pool_key(campaign))
+    path = pool_path(campaign_pool_key(resolve(campaign)))
     write_pool(path, dataclasses.replace(pool, key="0" * 24))
-    assert cached_pool(campaign) is None
+    assert cached_pool(resolve(campaign)) is None
     monkeypatch.setattr("harness.pool.storage.build_pool", lambda *_: pool)
-    assert campaign_pool(campaign) is pool
+    assert campaign_pool(resolve(campaign)) is pool
     assert read_pool(path).key == pool.key
 
 
@@ -157,7 +158,7 @@ def test_a_place_that_cannot_keep_a_pool_is_refused_before_it_is_built(campaign,
     monkeypatch.setenv("HARNESS_CACHE_DIR", str(tmp_path))
     monkeypatch.setattr("harness.pool.storage.build_pool", lambda *_: pytest.fail("built in vain"))
     with pytest.raises(RunFolderError, match="HARNESS_CACHE_DIR"):
-        campaign_pool(campaign)
+        campaign_pool(resolve(campaign))
 
 
 def test_draws_are_a_permutation_within_a_shell_and_follow_probabilities_outside(pool):
@@ -193,4 +194,4 @@ def test_an_unknown_library_is_refused():
 
     campaign = Campaign(name="x", pool={"library": "ladder1"})
     with pytest.raises(CampaignError, match="Did you mean 'ladder-1'"):
-        campaign_pool(campaign)
+        campaign_pool(resolve(campaign))

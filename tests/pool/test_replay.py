@@ -23,6 +23,7 @@ from harness.pool.cut_ins import Pool
 from harness.pool.storage import campaign_pool
 from harness.pool.surrogate_replay import SurrogateReplay
 from harness.records.tables import episodes_table
+from harness.resolved import resolve
 from harness.runner.prepare import prepare
 from harness.twin import TwinWorld
 from tests.chains.seed import SEED
@@ -40,13 +41,13 @@ def campaign(method: str, **settings) -> Campaign:
 
 
 def drive(campaign: Campaign, n: int = N) -> tuple[Shard, pa.Table]:
-    ready = prepare(campaign)
+    ready = prepare(resolve(campaign))
     shard = ready.loop(TwinWorld(256)).run(0, ready.states(0, n))
     return shard, episodes_table(shard, campaign.seed)
 
 
 def replayed(campaign: Campaign, table: pa.Table, pool: Pool) -> Block:
-    surrogates = SurrogateReplay(campaign, pool)
+    surrogates = SurrogateReplay(resolve(campaign), pool)
     method = campaign.testing.method
     return block_from_tables(table, None, method=method, alpha=mixture_weights(campaign), surrogates=surrogates)
 
@@ -54,7 +55,7 @@ def replayed(campaign: Campaign, table: pa.Table, pool: Pool) -> Block:
 @pytest.fixture(scope="module")
 def forced() -> tuple[Campaign, pa.Table, Pool]:
     one = campaign("forced", av=LATE)
-    return one, drive(one)[1], campaign_pool(one)
+    return one, drive(one)[1], campaign_pool(resolve(one))
 
 
 def test_a_surrogate_that_is_the_av_crashes_where_the_av_did(forced):
@@ -74,7 +75,7 @@ def test_other_draws_after_the_end_do_not_change_what_was_driven(hold_s):
     shard, table = drive(one, 400)
     other = campaign("forced", av=AutomatedVehicle(), acceleration_hold_s=hold_s)
     _, longer = drive(other, 400)
-    pool = campaign_pool(one)
+    pool = campaign_pool(resolve(one))
     short, long = (replayed(c, t, pool).surrogates_crash for c, t in ((one, table), (other, longer)))
     assert np.count_nonzero(shard.results.episode["outcome"] == CRASH) > 100
     np.testing.assert_array_equal(short, long)
@@ -87,7 +88,7 @@ def test_other_draws_after_the_end_do_not_change_what_was_driven(hold_s):
 def test_weighted_crashes_of_surrogates_have_the_rates_of_the_pool(method, settings, n):
     one = campaign(method, **settings)
     alarm = Alarm()
-    alarm.add(replayed(one, drive(one, n)[1], campaign_pool(one)))
+    alarm.add(replayed(one, drive(one, n)[1], campaign_pool(resolve(one))))
     found = alarm.result()
     tested = [entry["z"] for entry in found["surrogates"] if entry["n_effective"] >= MANY_HITS]
     assert len(tested) >= 5
@@ -98,7 +99,7 @@ def test_weighted_crashes_of_surrogates_have_the_rates_of_the_pool(method, setti
 def test_the_step_mixture_is_shown_and_not_judged():
     one = campaign("step_mixture")
     alarm = Alarm()
-    alarm.add(replayed(one, drive(one)[1], campaign_pool(one)))
+    alarm.add(replayed(one, drive(one)[1], campaign_pool(resolve(one))))
     found = alarm.result()
     assert "not bounded" in found["no_verdict"]
     for entry in found["surrogates"]:  # of the right size, although no interval can be given
@@ -131,7 +132,7 @@ def test_too_few_crashes_are_judged_by_an_inequality(forced):
 def test_a_pool_of_another_environment_is_refused(forced):
     _, _, pool = forced
     with pytest.raises(CampaignError, match="a pool of another environment"):
-        SurrogateReplay(campaign("forced", lane_change_level=2.0), pool)
+        SurrogateReplay(resolve(campaign("forced", lane_change_level=2.0)), pool)
 
 
 def test_maneuvers_that_do_not_fit_are_refused(forced):
@@ -141,4 +142,4 @@ def test_maneuvers_that_do_not_fit_are_refused(forced):
     at = table.column_names.index("bv_maneuvers")
     damaged = table.set_column(at, table.schema.field(at), pa.array(paths, pa.list_(pa.int8())))
     with pytest.raises(RunFolderError, match="episode 7"):
-        SurrogateReplay(one, pool).crashes(damaged)
+        SurrogateReplay(resolve(one), pool).crashes(damaged)

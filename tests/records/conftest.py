@@ -12,6 +12,7 @@ from harness.campaign.loading import load_campaign
 from harness.campaign.models import Campaign
 from harness.episode.loop import Shard
 from harness.records.tables import ShardTables, shard_tables
+from harness.resolved import resolve
 from harness.runner.prepare import prepare
 from harness.twin import TwinWorld
 
@@ -30,7 +31,7 @@ def record() -> Callable[..., Recorded]:
 
     def recorded(*overrides: str, first: int = 0, n: int = 300, n_cells: int = 32) -> Recorded:
         campaign = load_campaign(MIXTURE_FILE, ["stop.rhw=null", *overrides])
-        prepared = prepare(campaign)
+        prepared = prepare(resolve(campaign))
         shard = prepared.loop(TwinWorld(n_cells)).run(first, prepared.states(first, n))
         keep = campaign.records.traces != "none" or campaign.records.trace_share > 0.0
         return Recorded(campaign, shard, shard_tables(shard, campaign.seed, keep_traces=keep))

@@ -10,6 +10,7 @@ import pytest
 from harness.campaign.loading import load_campaign
 from harness.campaign.models import Campaign
 from harness.controllers.black_box import Death
+from harness.resolved import Resolved
 from harness.runner import RunResult, run_campaign, shards
 from harness.runner.worker import ShardDone, ShardRunner, ShardSpec
 
@@ -39,8 +40,8 @@ def run() -> Callable[..., RunResult]:
 class WorkerInThisProcess:
     """Stands in for `WorkerProcess` where the tests are not about processes: spares starting one."""
 
-    def __init__(self, campaign: Campaign, folder: Path) -> None:
-        self._runner = ShardRunner(campaign, folder)
+    def __init__(self, resolved: Resolved, folder: Path) -> None:
+        self._runner = ShardRunner(resolved, folder)
 
     def give(self, spec: ShardSpec, doomed: Mapping[int, Death]) -> bool:
         self._done = self._runner.run(spec, doomed)

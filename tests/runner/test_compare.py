@@ -9,7 +9,6 @@ import pytest
 from harness.campaign.loading import load_campaign
 from harness.cli import main
 from harness.errors import CampaignError
-from harness.runner import campaign_run
 from harness.runner.compare import compare_campaigns, require_comparable
 
 FORCED = str(Path(__file__).parents[2] / "scenarios/overtaking_forced.yaml")
@@ -69,8 +68,7 @@ def test_what_is_finished_is_not_run_again(done, campaigns, monkeypatch):
     def never(*_arguments, **_options):
         raise AssertionError("ran again")
 
-    monkeypatch.setattr(campaign_run, "run_campaign", never)
-    monkeypatch.setattr("harness.runner.compare.run_campaign", never)
+    monkeypatch.setattr("harness.runner.compare.run_resolved", never)
     assert compare_campaigns(*campaigns, done.folder).content == done.content
 
 

@@ -9,9 +9,9 @@ import pytest
 from stored_runs import copy_of, manifest, shard_files, stored_table
 
 from harness.campaign.models import AutomatedVehicle, Campaign, IDMParameters, Reaction
-from harness.environment.loading import load_environment
 from harness.errors import WorldDisagreementError
 from harness.records.tables import episodes_table
+from harness.resolved import resolve
 from harness.runner.prepare import prepare
 from harness.runner.retrace import Retracing
 from harness.twin import TwinWorld
@@ -39,11 +39,11 @@ def of_av(method: str, av: AutomatedVehicle) -> Campaign:
 
 
 def retracing(one: Campaign) -> Retracing:
-    return Retracing(one, load_environment(one.environment))
+    return Retracing(resolve(one))
 
 
 def drive(one: Campaign) -> pa.Table:
-    ready = prepare(one)
+    ready = prepare(resolve(one))
     return episodes_table(ready.loop(TwinWorld(64)).run(0, ready.states(0, N)), one.seed)
 
 

@@ -13,6 +13,7 @@ import pytest
 
 from harness.cli import main
 from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, WorldDisagreementError
+from harness.resolved import resolve
 from harness.runner import campaign_run, processes, shards
 from harness.runner.shards import WorkerLostError
 from harness.runner.worker import OrphanError, ShardRunner, ShardSpec
@@ -195,7 +196,7 @@ def test_an_error_that_cannot_be_pickled_reaches_the_parent_in_words(serve):
 def test_a_worker_whose_parent_was_killed_writes_nothing(campaign, tmp_path, monkeypatch):
     """Another process may be at work in the folder by then."""
     gone = SimpleNamespace(is_alive=lambda: False)
-    runner = ShardRunner(campaign("world.engine=twin"), tmp_path)
+    runner = ShardRunner(resolve(campaign("world.engine=twin")), tmp_path)
     monkeypatch.setattr("harness.runner.worker.parent_process", lambda: gone)
     with pytest.raises(OrphanError):
         runner.run(ShardSpec(0, 0, 20))

@@ -6,6 +6,7 @@ import pytest
 
 from harness.campaign.loading import load_campaign
 from harness.errors import CampaignError, RunFolderError
+from harness.resolved import resolve
 from harness.runner.prepare import prepare
 from harness.twin import TwinWorld
 from tests.runner.conftest import MIXTURE_FILE, TWIN
@@ -49,7 +50,7 @@ def test_resuming_with_other_reflexes_is_refused(whole, campaign, run_here):
 @pytest.mark.parametrize("method", ["nde", "step_mixture"])
 def test_a_built_in_driver_keeps_its_speed_until_it_has_reacted(method):
     settings = (*TWIN, "stop.rhw=null", f"testing.method={method}", "environment.lane_change_level=3000", AV)
-    prepared = prepare(load_campaign(MIXTURE_FILE, settings))
+    prepared = prepare(resolve(load_campaign(MIXTURE_FILE, settings)))
     shard = prepared.loop(TwinWorld(16), traces="all").run(0, prepared.states(0, 200))
     rows = shard.results.episode
     assert (rows["cut_in_step"] >= 0).sum() >= 5

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import json
+from collections import Counter
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +17,7 @@ from harness.runner.allocation import GROWTH, Allocation
 from harness.runner.campaign_run import _episodes_on_disk
 from harness.runner.manifest import Manifest
 from harness.runner.prefix import Prefix
-from harness.runner.rounds import round_specs
+from harness.runner.shell_planner import round_specs
 from harness.strata import ShellDesign
 from tests.pool.conftest import SMALL_POOL
 from tests.runner.stored_runs import copy_of, manifest, shard_files, stored_table, unlike_columns
@@ -61,6 +64,20 @@ def test_continued_to_a_narrower_interval(shells_run, campaign, run_here, tmp_pa
     assert len(begun) < len(shard_files(out))
     assert all((out / "episodes" / name).read_bytes() == content for name, content in begun.items())
     assert [name for name in unlike_columns(shells_run.folder, out) if name != "estimates.json"] == []
+
+
+def test_what_a_campaign_names_is_read_once(campaign, run_here, tmp_path, monkeypatch):
+    """Also by the worker, which is this process here and is handed what has been read."""
+    opened, really_open = [], io.open
+
+    def noted(file, *arguments, **options):
+        opened.append(Path(str(file)).name)
+        return really_open(file, *arguments, **options)
+
+    monkeypatch.setattr(io, "open", noted)  # what pathlib opens files by
+    run_here(campaign(*SHELLS, "world.engine=twin", "stop.episodes=150"), tmp_path / "run")
+    named = Counter(name for name in opened if name in ("ndd-overtaking-1.yaml", "ladder-1.yaml"))
+    assert named == {"ndd-overtaking-1.yaml": 1, "ladder-1.yaml": 1}
 
 
 def test_a_budget_that_is_spent_is_exit_code_4(campaign, run_here, tmp_path):

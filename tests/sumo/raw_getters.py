@@ -16,6 +16,7 @@ import numpy as np
 from harness.campaign.models import Campaign
 from harness.episode.loop import Shard
 from harness.outcomes import AV, BV, BV_LV_CONTACT, CRASH, LV, VEHICLES
+from harness.resolved import resolve
 from harness.runner.prepare import prepare
 from harness.vehicles.kinematics import CONTACT_M, VEHICLE_LENGTH_M, next_position, next_speed
 
@@ -108,7 +109,7 @@ def _record(job: Job) -> dict[str, np.ndarray]:
 
 def run_episodes(job: Job, world) -> Shard:
     """Run the job's episodes in any world, all of them traced."""
-    prepared = prepare(job.campaign)
+    prepared = prepare(resolve(job.campaign))
     states = prepared.states(0, job.n_episodes) if job.states is None else job.states
     return prepared.loop(world, traces="all").run(0, states)
 

@@ -16,6 +16,7 @@ from harness.pool.library import load_library
 from harness.pool.replay import replay_surrogates
 from harness.pool.surrogate_replay import stored_paths
 from harness.records.tables import episodes_table
+from harness.resolved import resolve
 from harness.runner.retrace import Retracing
 from harness.state import STATE_DTYPE
 from harness.twin import TwinWorld
@@ -60,7 +61,7 @@ def test_contact_in_the_step_of_the_cut_in_is_retraced_and_no_surrogate_crashes(
     campaign = smoke("testing.method=shells")
     environment, library = load_environment(campaign.environment), load_library("ladder-1")
     episodes = episodes_table(run(TwinWorld(4), smoke), campaign.seed)
-    assert Retracing(campaign, environment).check(episodes) == len(STATES)
+    assert Retracing(resolve(campaign)).check(episodes) == len(STATES)
     crashes = np.full(len(STATES), -1, np.int64)
     stored, room = stored_paths(episodes, campaign.seed), empty_trajectory(environment)
     assert replay_surrogates(stored, environment, library.drivers, -1, room, crashes) == -1

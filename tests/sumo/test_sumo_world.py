@@ -15,6 +15,7 @@ from harness.campaign.models import MOST_SUMO_CELLS
 from harness.episode.loop import EpisodeLoop, Keep, Shard
 from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, WorldDisagreementError
 from harness.outcomes import AV, BV, CRASH, LV
+from harness.resolved import resolve
 from harness.runner.prepare import prepare
 from harness.sumo.network import network_file
 from harness.twin import TwinWorld
@@ -167,7 +168,7 @@ class NervousTwin(TwinWorld):
 
 
 def run_in(world, campaign) -> Shard:
-    prepared = prepare(campaign)
+    prepared = prepare(resolve(campaign))
     return EpisodeLoop(world, prepared.policy, Keep(0, "none", 0.0)).run(500, prepared.states(500, 60))
 
 
@@ -201,7 +202,7 @@ def test_a_collision_in_the_first_step_of_a_refilled_cell_is_flagged(open_world)
 
 
 def test_an_episode_after_many_others_is_the_same_as_in_a_fresh_simulation(smoke, open_world):
-    prepared = prepare(smoke())
+    prepared = prepare(resolve(smoke()))
     used = open_world(4)
     loop = prepared.loop(used, traces="all")
     loop.run(0, prepared.states(0, 100))
@@ -216,7 +217,7 @@ def test_an_episode_after_many_others_is_the_same_as_in_a_fresh_simulation(smoke
 
 @pytest.mark.parametrize("shim", [True, False])
 def test_fewer_episodes_than_cells_are_run(shim, smoke, open_world):
-    prepared = prepare(smoke())
+    prepared = prepare(resolve(smoke()))
     few = prepared.loop(open_world(8, shim=shim)).run(0, prepared.states(0, 3))
     assert (
         few.results.episode.tobytes()

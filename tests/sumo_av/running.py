@@ -8,6 +8,7 @@ from pathlib import Path
 
 from harness.campaign.models import AutomatedVehicle, Campaign, Limits, Records, Run, Stop, Testing, TraciProcess, World
 from harness.episode.loop import Shard
+from harness.resolved import resolve
 from harness.runner.prepare import build_world, prepare
 from harness.twin import TwinWorld
 
@@ -40,7 +41,7 @@ def program(*words: str | Path, connect_time_s: float = 60.0, restarts: int = 3,
 
 def run_in(world, av: AutomatedVehicle, ranges: Sequence[tuple[int, int]]) -> list[Shard]:
     """Run ranges (first episode, number) one after another in a world."""
-    prepared = prepare(campaign(av))
+    prepared = prepare(resolve(campaign(av)))
     loop = prepared.loop(world, traces="all")
     return [loop.run(first, prepared.states(first, n)) for first, n in ranges]
 

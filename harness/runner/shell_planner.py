@@ -1,56 +1,28 @@
-"""In which rounds a campaign's shards are run, and when its stop rule looks.
+"""Which shells a campaign tests next, and when it is enough.
 
-Most methods know all their episodes beforehand: one round. Shells decide from each round what the next one tests, so
-that a round is run to its end before the next begins, whatever the number of workers.
+Shells decide from each round what the next one tests, so that a round is run to its end before the next begins,
+whatever the number of workers; the result is looked at between rounds.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Protocol
 
 import numpy as np
 
 from harness.arrays import IntArray
-from harness.campaign.models import Campaign, EstimatorName
-from harness.estimators import Shells, StopRule
+from harness.campaign.models import Campaign
+from harness.estimators import Shells
+from harness.estimators.block import Block
 from harness.estimators.both_ways import BothWays
 from harness.estimators.estimate import Estimate
-from harness.pool.prescribed import Draw, PrescribedEpisodes
+from harness.pool.prescribed import Draw
 from harness.runner.allocation import Allocation
-from harness.runner.shards import shard_specs
 from harness.runner.worker import ShardSpec
+from harness.strata import ShellDesign
 
 MOST_SHARDS_PER_ROUND = 16
 SMALLEST_SHARD = 64
-
-
-class Rule(Protocol):
-    """When to look, and when to stop."""
-
-    estimator: EstimatorName
-    reached: bool
-    rhw: float
-    heaviest: float
-    pool_too_rough: bool
-    waited_for: tuple[str, ...]
-
-    def due(self, n: int) -> bool:
-        """Whether to look after ``n`` episodes."""
-        ...
-
-    def observe(self, n: int, estimate: Estimate) -> bool:
-        """Whether to stop after this look."""
-        ...
-
-
-class Counts(Protocol):
-    """What rounds need of the finished prefix."""
-
-    sums: BothWays
-    n_episodes: int
-
-
 POOL_SHARE = 0.5
 """Share of the squared width from the pool's own error above which more tests hardly narrow an interval."""
 
@@ -69,15 +41,11 @@ class RoundRule:
 
     Attributes
     ----------
-    look : int
-        Number of tests at the end of the round, when to look.
     of_first_tests : bool
         Whether the round brings the tests that every shell gets before anything is decided about it.
     waited_for : tuple of str
         See `StopRule`.
     """
-
-    estimator: EstimatorName = "shells"
 
     def __init__(self, campaign: Campaign, held: int = 0) -> None:
         self._held = held
@@ -88,16 +56,11 @@ class RoundRule:
         self.reached = self.pool_too_rough = False
         self.rhw = float("inf")
         self.heaviest = 0.0  # limits within shells allow for every crash that has not been seen
-        self.look = 0
         self.of_first_tests = False
         self.waited_for: tuple[str, ...] = ()
 
-    def due(self, n: int) -> bool:
-        """See `Rule`."""
-        return n == self.look
-
-    def observe(self, n: int, estimate: Estimate) -> bool:
-        """See `Rule`."""
+    def observe(self, estimate: Estimate) -> bool:
+        """Whether to stop at the end of a round, with this estimate from all tests so far."""
         watched = estimate.details["conditional"] if self._conditional else {"rhw": estimate.rhw, **estimate.details}
         self.rhw = watched["rhw"]
         if self._target is None:
@@ -116,40 +79,69 @@ class RoundRule:
         self.reached = not missing
         self.pool_too_rough = watched["rhw_from_pool_at_least"] > self._target
         hopeless = self.pool_too_rough and watched["rhw_from_pool"] ** 2 >= POOL_SHARE * self.rhw**2
-        return self.reached or (hopeless and n >= self._held)
+        return self.reached or (hopeless and estimate.n_episodes >= self._held)
 
 
-def stop_rule(campaign: Campaign, held: int = 0) -> StopRule | RoundRule:
-    """The rule that watches a campaign, whose folder holds ``held`` tests already."""
-    if campaign.testing.method == "shells":
-        return RoundRule(campaign, held)
-    return StopRule(campaign.stop, campaign.testing.method, campaign.run.shard_size, min_crashes=campaign.min_crashes)
+class ShellPlanner:
+    """Fed with finished tests in order; says what is tested next, and when it is enough.
 
+    Parameters
+    ----------
+    campaign : Campaign
+    design : ShellDesign
+    available : ndarray, shape (S,)
+        Most tests of each stratum.
+    held : int
+        See `RoundRule`.
 
-def rounds(
-    campaign: Campaign, prescribed: PrescribedEpisodes | None, prefix: Counts, rule: StopRule | RoundRule
-) -> Iterator[Iterator[ShardSpec]]:
-    """Shards of each round; the next round is asked for when ``prefix`` holds the last one."""
-    if prescribed is None or not isinstance(rule, RoundRule):
-        yield shard_specs(campaign)
-        return
-    shells = campaign.testing.shells
-    allocation = Allocation(
-        prescribed.design, shells.first_tests, prescribed.draws.available, shells.statement == "conditional"
-    )
-    tests = crashes = failed = np.zeros(prescribed.design.p.size, np.int64)
-    n_shards = 0
-    while True:
-        if isinstance(prefix.sums.seen, Shells) and prefix.n_episodes:
-            tests, crashes, failed = prefix.sums.seen.tests, prefix.sums.seen.crashes, prefix.sums.seen.failed
-        added = allocation.next_round(tests, crashes, campaign.stop.episodes - prefix.n_episodes, failed)
-        if not added.any():
-            return
-        rule.of_first_tests = bool(np.any(tests[added > 0] < shells.first_tests))
-        rule.look = prefix.n_episodes + int(added.sum())
-        specs = round_specs(tests, added, n_shards, prefix.n_episodes, campaign.run.shard_size)
-        n_shards += len(specs)
-        yield iter(specs)
+    Attributes
+    ----------
+    rule : RoundRule
+    estimate : Estimate or None
+        At the end of the last round.
+    """
+
+    def __init__(self, campaign: Campaign, design: ShellDesign, available: IntArray, held: int = 0) -> None:
+        shells = campaign.testing.shells
+        self.rule = RoundRule(campaign, held)
+        self.estimate: Estimate | None = None
+        self._campaign = campaign
+        self._allocation = Allocation(design, shells.first_tests, available, shells.statement == "conditional")
+        self._none = np.zeros(design.p.size, np.int64)
+        self._seen = Shells()
+        self._sums = BothWays(self._seen)
+        self._n_episodes = self._look = 0
+
+    @property
+    def tests(self) -> IntArray:
+        """Tests of each stratum so far, shape (S,)."""
+        return self._seen.tests if self._n_episodes else self._none
+
+    def next_round(self) -> IntArray:
+        """Tests to add per stratum, shape (S,); all 0 when no stratum or no budget is left."""
+        crashes, failed = (self._seen.crashes, self._seen.failed) if self._n_episodes else (self._none, self._none)
+        budget = self._campaign.stop.episodes - self._n_episodes
+        added = self._allocation.next_round(self.tests, crashes, budget, failed)
+        self.rule.of_first_tests = bool(np.any(self.tests[added > 0] < self._campaign.testing.shells.first_tests))
+        self._look = self._n_episodes + int(added.sum())
+        return added
+
+    def rounds(self) -> Iterator[Iterator[ShardSpec]]:
+        """Shards of each round; the next round is asked for when all of the last one have been added."""
+        n_shards = 0
+        while (added := self.next_round()).any():
+            specs = round_specs(self.tests, added, n_shards, self._n_episodes, self._campaign.run.shard_size)
+            n_shards += len(specs)
+            yield iter(specs)
+
+    def add(self, block: Block) -> bool:
+        """Add the tests of the next shard; True when the campaign is to stop."""
+        self._sums.add(block)
+        self._n_episodes += len(block)
+        if self._n_episodes != self._look:
+            return False
+        self.estimate = self._sums.result(self._campaign.stop.confidence)
+        return self.rule.observe(self.estimate)
 
 
 def round_specs(tests: IntArray, added: IntArray, index: int, first_episode: int, shard_size: int) -> list[ShardSpec]:

@@ -1,0 +1,69 @@
+"""A campaign with all that its names stand for: read once, near the door, and handed on; nothing reads a file again."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+from harness.arrays import RecordArray
+from harness.campaign.models import Campaign
+from harness.environment.driving import Environment
+from harness.environment.loading import load_environment, load_parameters
+from harness.pool.library import Library, load_library
+from harness.vehicles.models import av_records, surrogate_records
+
+
+@dataclass(frozen=True, eq=False)
+class Resolved:
+    """A campaign and the content of the files that it names.
+
+    Attributes
+    ----------
+    campaign : Campaign
+    environment : Environment
+    av : ndarray, shape (1,)
+        Record of a built-in AV; shape (0,) of any other.
+    surrogates : ndarray, shape (J,)
+        Records of the drivers that challenges are computed for.
+    content_hash : str
+        Of all that changes an episode's bits, the environment's numbers included.
+    controller_sha256 : str or None
+        Hash of the source of the AV's controller; None where there is none, or nobody has looked.
+    """
+
+    campaign: Campaign
+    environment: Environment
+    av: RecordArray
+    surrogates: RecordArray
+    content_hash: str
+    controller_sha256: str | None = None
+
+    @cached_property
+    def library(self) -> Library:
+        """The surrogates of pools; read when they are first asked for, as most campaigns never do.
+
+        Raises
+        ------
+        CampaignError
+            The library's file is missing or wrong.
+        """
+        return load_library(self.campaign.pool.library)
+
+
+def resolve(campaign: Campaign, controller_sha256: str | None = None) -> Resolved:
+    """Read what a campaign names.
+
+    Raises
+    ------
+    CampaignError
+        The environment's parameter file is missing or wrong.
+    """
+    parameters = load_parameters(campaign.environment)
+    return Resolved(
+        campaign,
+        load_environment(campaign.environment, parameters),
+        av_records(campaign.av),
+        surrogate_records(campaign.surrogates),
+        campaign.content_hash(parameters.content_hash()),
+        controller_sha256,
+    )
