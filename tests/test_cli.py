@@ -97,7 +97,7 @@ def calls(monkeypatch, tmp_path):
     stand_in("harness.runner.plan_campaign", {"episodes": 400_000, "tables": "to build (about 20 s)", "disk_mb": 12.5})
     stand_in("harness.runner.run_campaign", lambda _, folder: Result(folder, folder / "report.html"))
     stand_in("harness.report.write_report", lambda folder: folder / "report.html")
-    stand_in("harness.estimators.estimate_run", ESTIMATES)
+    stand_in("harness.runner.estimate_run", ESTIMATES)
     stand_in("harness.runner.replay_episode", Replay(bit_equal=True))
     seen["stand_in"] = stand_in
     return seen
@@ -250,7 +250,7 @@ def test_interrupt_says_how_to_go_on(calls, capsys, tmp_path):
     calls["stand_in"]("harness.runner.run_campaign", KeyboardInterrupt())
     assert main(["run", SMOKE, "--out", str(tmp_path)]) == 130
     assert "--resume" in capsys.readouterr().err
-    calls["stand_in"]("harness.estimators.estimate_run", KeyboardInterrupt())
+    calls["stand_in"]("harness.runner.estimate_run", KeyboardInterrupt())
     assert main(["estimate", str(tmp_path)]) == 130
     assert "--resume" not in capsys.readouterr().err
 
@@ -312,9 +312,9 @@ def test_defects_are_not_hidden(calls, tmp_path):
 def test_estimate_prints_a_table(calls, capsys, tmp_path):
     assert main(["estimate", str(tmp_path), "-e", "nade", "-e", "nde", "--confidence", "0.95"]) == 0
     out = capsys.readouterr().out
-    assert calls["harness.estimators.estimate_run"] == (
+    assert calls["harness.runner.estimate_run"] == (
         (tmp_path,),
-        {"estimators": ("nade", "nde"), "confidence": 0.95, "pool": None, "progress": None},
+        {"estimators": ("nade", "nde"), "confidence": 0.95, "pool": None},
     )
     row = next(line for line in out.splitlines() if "nade *" in line)
     assert all(text in row for text in ("1.2000e-07", "1.140e-07 to 1.260e-07", "0.050", "1,234.5", "1.20%"))
@@ -335,7 +335,7 @@ def test_estimate_closes_with_what_was_asked(calls, capsys, tmp_path):
 
 def test_estimate_without_a_crash_has_gaps(calls, capsys, tmp_path):
     entry = {**NADE, "crash_rate": 0.0, "rhw": None, "n_effective": None, "largest_weight_share": None}
-    calls["stand_in"]("harness.estimators.estimate_run", {**ESTIMATES, "estimates": {"nade": entry}})
+    calls["stand_in"]("harness.runner.estimate_run", {**ESTIMATES, "estimates": {"nade": entry}})
     assert main(["estimate", str(tmp_path)]) == 0
     assert "0.0000e+00" in capsys.readouterr().out
 

@@ -49,7 +49,8 @@ def drive(campaign: Campaign, n: int = N) -> tuple[Shard, pa.Table]:
 def replayed(campaign: Campaign, table: pa.Table, pool: Pool) -> Block:
     surrogates = SurrogateReplay(resolve(campaign), pool)
     method = campaign.testing.method
-    return block_from_tables(table, None, method=method, alpha=mixture_weights(campaign), surrogates=surrogates)
+    block = block_from_tables(table, None, method=method, alpha=mixture_weights(campaign))
+    return replace(block, surrogates_crash=surrogates.crashes(table), known_rates=surrogates.known)
 
 
 @pytest.fixture(scope="module")
