@@ -183,7 +183,7 @@ def test_wrong_campaign_leaves_nothing_behind(calls, capsys, tmp_path):
     [
         ("testin: {}", "testin", 2),
         ("testing:\n  epsilon: x", "testing.epsilon", 3),
-        ("stop:\n  rhw: 0.1\n  rhw: 0.2", "stop.rhw", 4),
+        ("stop:\n  rhw: 0.1\n  rhw: 0.2", "stop.rhw", "4:3"),
         ("av:\n  parameters:\n    desired_speed_mps: 300", "av.parameters.desired_speed_mps", 4),
         ("environment:\n  parameters: ./gone.yaml", "environment.parameters", 3),
         ("testing:\n  alpha: {SM-I: 0.5, SM-II: 0.2, SM-III: 0.2}", "testing.alpha", 3),

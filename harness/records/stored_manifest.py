@@ -56,6 +56,13 @@ class TableError(_Stored):
     std_error: float
 
 
+class Repeated(_Stored):
+    """What repeating some tests has shown; `harness.runner.repeat.Repeated`."""
+
+    n_episodes: Count
+    differing: list[Count]
+
+
 class StoredManifest(_Stored):
     """The manifest of a run."""
 
@@ -75,7 +82,9 @@ class StoredManifest(_Stored):
     stopped_by: StoppedBy | None = None
     wall_time_s: float | None = None
     distance_per_test_m: float | None = None
+    ending: str | None = None
     retraced: Retraced | None = None
+    repeated: Repeated | None = None
     table_errors: list[TableError] | None = None
 
 

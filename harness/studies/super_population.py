@@ -118,7 +118,7 @@ def _joined(parts: Sequence[SuperPopulation]) -> SuperPopulation:
 
 
 def _key(environment: Environment, drivers: RecordArray, envelope: int, seed: int, n_paths: int) -> str:
-    numbers = {name: environment.numbers[name][0].item() for name in environment.numbers.dtype.names or ()}
+    numbers = {name: environment.numbers[name].item() for name in environment.numbers.dtype.names or ()}
     content = [_FORMAT, source_hash(), numbers, drivers.tolist(), envelope, seed, n_paths]
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:24]
 
