@@ -66,7 +66,9 @@ def _kind(annotation: Any) -> str:
         return ", ".join(f"`{value}`" for value in get_args(annotation))
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return "section"
-    return {float: "number", int: "whole number", str: "text"}.get(annotation, str(annotation))
+    return {float: "number", int: "whole number", str: "text", bool: "`true` or `false`"}.get(
+        annotation, str(annotation)
+    )
 
 
 def _limits(field: FieldInfo) -> str:

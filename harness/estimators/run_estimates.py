@@ -16,6 +16,7 @@ from harness.estimators.statement import (
     conditional_statement,
     failed_statement,
     per_distance,
+    repeated_cautions,
     repeated_statement,
     statement,
     warned,
@@ -103,8 +104,9 @@ def _statements(
     alarm: Sequence[str],
 ) -> dict[str, str]:
     """What each estimator says, what it must be warned of first; of one without a value, why."""
+    first = [*alarm, *repeated_cautions(facts.repeated)]
     return {
-        name: warned(alarm, statement(found, facts.lane_change_level, distance_km))
+        name: warned(first, statement(found, facts.lane_change_level, distance_km))
         + failed_statement(found)
         + repeated_statement(facts.repeated)
         if isinstance(found, Estimate)

@@ -100,16 +100,21 @@ def _answer(estimate: Estimate, lane_change_level: float, distance_per_test_km: 
 
 
 def repeated_statement(repeated: Mapping[str, Any] | None) -> str:
-    """What repeating some tests has shown, as a sentence to follow the answer; empty where none were repeated."""
-    if repeated is None or not repeated["n_episodes"]:
+    """That repeated tests came out alike, as a sentence to follow the answer; empty where none did."""
+    if repeated is None or not repeated["n_episodes"] or repeated["differing"]:
         return ""
+    return f" {repeated['n_episodes']:,} of these tests were run a second time: same bits."
+
+
+def repeated_cautions(repeated: Mapping[str, Any] | None) -> list[str]:
+    """That repeated tests came out otherwise, which is to be said first; empty where none did."""
+    if repeated is None or not repeated["differing"]:
+        return []
     n, n_differing = repeated["n_episodes"], len(repeated["differing"])
-    if not n_differing:
-        return f" {n:,} tests were repeated: same bits."
-    return (
-        f" {n_differing:,} of {n:,} repeated tests DIFFERED: this vehicle is not reproducible; its tests cannot be "
-        "replayed, and depend on what ran beside and before them."
-    )
+    return [
+        f"{n_differing:,} of {n:,} tests that were run a second time DIFFERED: this vehicle is not reproducible; its tests "
+        "cannot be replayed, and depend on what ran beside and before them"
+    ]
 
 
 def _width(estimate: Estimate) -> str:

@@ -158,6 +158,7 @@ def _page(
         alarm=(run.estimates.get("diagnostics") or {}).get("alarm"),
         details=_details(run),
         table_errors=run.manifest.get("table_errors") or [],
+        reproducible=run.manifest.get("reproducible", True),
         settings=setting_sections(run.campaign, reproducible=run.manifest.get("reproducible")),
         folder=typed_folder(run.path),
         style=Markup(style),  # noqa: S704 - our own file

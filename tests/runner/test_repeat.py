@@ -43,7 +43,7 @@ def test_a_vehicle_that_does_the_same_again_is_said_to(av, overrides, run_av):
     folder = run_av(av, *overrides, workers=1)
     manifest = read_manifest(folder)
     assert (manifest["repeated"], manifest["reproducible"]) == (ALL_SAME, True)
-    assert statement(folder).endswith("10 tests were repeated: same bits.")
+    assert statement(folder).endswith("10 of these tests were run a second time: same bits.")
 
 
 def test_a_vehicle_that_does_not_is_found_out_for_any_number_of_workers_and_after_a_resume(run_av, tmp_path):
@@ -52,7 +52,7 @@ def test_a_vehicle_that_does_not_is_found_out_for_any_number_of_workers_and_afte
     assert one["repeated"] == two["repeated"]
     assert len(one["repeated"]["differing"]) == one["repeated"]["n_episodes"] == 10
     assert (one["reproducible"], two["reproducible"]) == (False, False)
-    assert "10 of 10 repeated tests DIFFERED: this vehicle is not reproducible" in statement(folders[0])
+    assert statement(folders[0]).startswith("WARNING: 10 of 10 tests that were run a second time DIFFERED")
     with pytest.raises(CampaignError, match="10 of 10 tests that it repeated itself came out otherwise"):
         replay_episode(folders[0], 3)
     copied = copy_of(folders[0], tmp_path / "copy")
