@@ -112,8 +112,8 @@ def repeated_cautions(repeated: Mapping[str, Any] | None) -> list[str]:
         return []
     n, n_differing = repeated["n_episodes"], len(repeated["differing"])
     return [
-        f"{n_differing:,} of {n:,} tests that were run a second time DIFFERED: this vehicle is not reproducible; its tests "
-        "cannot be replayed, and depend on what ran beside and before them"
+        f"{n_differing:,} of {n:,} tests that were run a second time DIFFERED: this vehicle is not reproducible; its "
+        "tests cannot be replayed, and depend on what ran beside and before them"
     ]
 
 
