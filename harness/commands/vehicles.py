@@ -31,7 +31,7 @@ from harness.console import (
     short_help="Look at the AV before a campaign is spent on it.",
     epilog=examples(
         "harness av-check scenarios/smoke.yaml",
-        "harness av-check scenarios/smoke.yaml --set av.model=null --set 'av.parameters={}' --set av.controller=my_av:MyAV",
+        "harness av-check scenarios/smoke.yaml --set av.model=null --set 'av.parameters={}' --set av.controller=m:MyAV",
     ),
 )
 @click.argument("campaign_file", metavar="CAMPAIGN", type=CAMPAIGN)
