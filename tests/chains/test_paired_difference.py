@@ -90,14 +90,17 @@ def test_vehicles_with_a_will_of_their_own_are_covered_too():
     assert binomtest(covered, REPLICATIONS, CONFIDENCE).pvalue > FALSE_ALARM
 
 
-def test_blocks_in_pieces_give_the_same_bits():
+def test_blocks_in_pieces_give_the_same():
     a, b = pair(0)
     pieces = [slice(0, 700), slice(700, N)]
     whole, parts = PairedSums(), PairedSums()
     whole.add(a, b)
     for rows in pieces:
         parts.add(a.take(rows), b.take(rows))
-    assert whole.result(0.9) == parts.result(0.9)
+    one, other = whole.result(0.9), parts.result(0.9)
+    for name in ("difference", "std_error", "ci_low", "ci_high", "ratio_low", "ratio_high", "n_effective"):
+        assert getattr(one, name) == pytest.approx(getattr(other, name), rel=1e-12), name
+    assert (one.n_pairs, one.n_differing) == (other.n_pairs, other.n_differing)
 
 
 def test_other_episodes_are_no_pairs():
