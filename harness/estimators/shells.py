@@ -7,7 +7,8 @@ refutes it.
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from dataclasses import asdict, dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -20,6 +21,72 @@ from harness.estimators.stratified import Limits, combined, pool_variance, share
 from harness.strata import ShellDesign
 
 _METHOD = "crashes within shells of known probability; Clopper-Pearson limits per shell, combined (MOVER)"
+
+
+@dataclass(frozen=True)
+class Shell:
+    """One shell: its probability per test, what was counted, and limits of the share of cut-ins that crash."""
+
+    shell: str
+    inside: bool
+    p: float
+    n_episodes: int
+    n_crashes: int
+    n_failed: int
+    crash_share: float
+    crash_share_low: float
+    crash_share_high: float
+    contribution: float
+
+    @property
+    def low(self) -> float:
+        """Lower limit of the contribution to the crash rate."""
+        return self.p * self.crash_share_low
+
+    @property
+    def high(self) -> float:
+        """Upper limit of the contribution to the crash rate."""
+        return self.p * self.crash_share_high
+
+    @property
+    def half_width(self) -> float:
+        """What this shell alone leaves open of the crash rate."""
+        return (self.high - self.low) / 2.0
+
+
+@dataclass(frozen=True)
+class Conditional:
+    """The rate given that there are no crashes outside the boundary, and what is known about those."""
+
+    crash_rate: float
+    ci_low: float
+    ci_high: float
+    rhw: float | None
+    rhw_from_pool: float
+    rhw_from_pool_at_least: float
+    n_episodes: int
+    n_crashes: int
+    n_failed: int
+    crash_rate_if_failed_had_crashed: float
+    n_episodes_outside: int
+    n_crashes_outside: int
+    n_failed_outside: int
+    refuted: bool
+    upper_bound_outside: float
+
+
+@dataclass(frozen=True)
+class ShellDetails:
+    """``details`` of the estimate: shells from careful to careless, and the pool that they come from."""
+
+    boundary: str
+    pool: str
+    rhw_from_pool: float
+    rhw_from_pool_at_least: float
+    p_cut_in: float
+    p_impossible: float
+    conditional: Conditional
+    shells: tuple[Shell, ...]
 
 
 class Shells:
@@ -105,69 +172,64 @@ class Shells:
             largest_weight_share=float(np.max(y[self.crashes > 0], initial=0.0)) / free.rate if free.rate > 0 else 0.0,
             method=_METHOD + "; upper bound: the same, one-sided",
             warnings=tuple(self._warnings()),
-            details=self._details(confidence, free),
+            details=asdict(self._details(confidence, free)),
         )
 
-    def _details(self, confidence: float, free: Limits) -> dict[str, Any]:
+    def _details(self, confidence: float, free: Limits) -> ShellDetails:
         design = self._design()
-        return {
-            "boundary": design.boundary,
-            "pool": design.pool,
-            "rhw_from_pool": free.rhw_from_pool,
-            "rhw_from_pool_at_least": free.rhw_from_pool_at_least,
-            "p_cut_in": design.p_cut_in,
-            "p_impossible": design.p_impossible,
-            "conditional": self._conditional(confidence),
-            "shells": self._shells(confidence),
-        }
-
-    def _conditional(self, confidence: float) -> dict[str, Any]:
-        """The statement given that there are no crashes outside, and what is known about those."""
-        design = self._design()
-        inside, within, outside = (
-            self.conditional(confidence),
-            slice(0, design.n_inside),
-            slice(design.n_inside, None),
+        return ShellDetails(
+            boundary=design.boundary,
+            pool=design.pool,
+            rhw_from_pool=free.rhw_from_pool,
+            rhw_from_pool_at_least=free.rhw_from_pool_at_least,
+            p_cut_in=design.p_cut_in,
+            p_impossible=design.p_impossible,
+            conditional=self._conditional(confidence),
+            shells=self._shells(confidence),
         )
+
+    def _conditional(self, confidence: float) -> Conditional:
+        design, free = self._design(), self.conditional(confidence)
+        inside, outside = slice(0, design.n_inside), slice(design.n_inside, None)
         _, high = share_limits(self.crashes[outside], self.tests[outside], 1.0 - confidence, self.failed[outside])
-        crashes = int(self.crashes[outside].sum())
         worst_share = (self.crashes + self.failed) / np.maximum(self.tests, 1)
-        return {
-            "crash_rate": inside.rate,
-            "ci_low": inside.low,
-            "ci_high": inside.high,
-            "rhw": inside.rhw,
-            "rhw_from_pool": inside.rhw_from_pool,
-            "rhw_from_pool_at_least": inside.rhw_from_pool_at_least,
-            "n_episodes": int(self.tests[: design.n_inside].sum()),
-            "n_crashes": int(self.crashes[: design.n_inside].sum()),
-            "n_failed": int(self.failed[: design.n_inside].sum()),
-            "crash_rate_if_failed_had_crashed": float(design.p[within] @ worst_share[within]),
-            "n_episodes_outside": int(self.tests[outside].sum()),
-            "n_crashes_outside": crashes,
-            "n_failed_outside": int(self.failed[outside].sum()),
-            "refuted": crashes > 0,
-            "upper_bound_outside": float((design.p[outside] * high).sum()),
-        }
+        n_crashes_outside = int(self.crashes[outside].sum())
+        return Conditional(
+            crash_rate=free.rate,
+            ci_low=free.low,
+            ci_high=free.high,
+            rhw=free.rhw,
+            rhw_from_pool=free.rhw_from_pool,
+            rhw_from_pool_at_least=free.rhw_from_pool_at_least,
+            n_episodes=int(self.tests[inside].sum()),
+            n_crashes=int(self.crashes[inside].sum()),
+            n_failed=int(self.failed[inside].sum()),
+            crash_rate_if_failed_had_crashed=float(design.p[inside] @ worst_share[inside]),
+            n_episodes_outside=int(self.tests[outside].sum()),
+            n_crashes_outside=n_crashes_outside,
+            n_failed_outside=int(self.failed[outside].sum()),
+            refuted=n_crashes_outside > 0,
+            upper_bound_outside=float((design.p[outside] * high).sum()),
+        )
 
-    def _shells(self, confidence: float) -> list[dict[str, Any]]:
+    def _shells(self, confidence: float) -> tuple[Shell, ...]:
         design = self._design()
         low, high = share_limits(self.crashes, self.tests, (1.0 - confidence) / 2.0, self.failed)
-        return [
-            {
-                "shell": name,
-                "inside": s < design.n_inside,
-                "p": float(design.p[s]),
-                "n_episodes": int(self.tests[s]),
-                "n_crashes": int(self.crashes[s]),
-                "n_failed": int(self.failed[s]),
-                "crash_share": float(self.crashes[s] / max(self.tests[s], 1)),
-                "crash_share_low": float(low[s]),
-                "crash_share_high": float(high[s]),
-                "contribution": float(design.p[s] * self.crashes[s] / max(self.tests[s], 1)),
-            }
+        return tuple(
+            Shell(
+                shell=name,
+                inside=s < design.n_inside,
+                p=float(design.p[s]),
+                n_episodes=int(self.tests[s]),
+                n_crashes=int(self.crashes[s]),
+                n_failed=int(self.failed[s]),
+                crash_share=float(self.crashes[s] / max(self.tests[s], 1)),
+                crash_share_low=float(low[s]),
+                crash_share_high=float(high[s]),
+                contribution=float(design.p[s] * self.crashes[s] / max(self.tests[s], 1)),
+            )
             for s, name in enumerate(design.strata)
-        ]
+        )
 
     def _warnings(self) -> list[str]:
         design = self._design()
