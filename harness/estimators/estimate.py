@@ -1,10 +1,20 @@
-"""What an estimator answers: an `Estimate`, or the reason why the records do not allow one."""
+"""What an estimator is and answers: `Accumulator`, `Estimate`; and how failed tests count, both ways, for all of them.
+
+What a failed test would have come to is not known. Had all of them ended without a crash, the crash rate would be one
+number, had all of them crashed, another, and the truth lies between. So an interval reaches from the lower limit of the
+first to the upper limit of the second: it covers wherever each of the two does.
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, field
-from typing import Any
+from copy import deepcopy
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, Protocol
+
+import numpy as np
+
+from harness.estimators.block import Block
 
 WIDEST_RHW = 10.0
 """Relative half-widths above are not given as a number: next to nothing is known, and the digits would mean nothing."""
@@ -72,13 +82,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Unavailable:
-    """An estimator that these records do not allow.
-
-    Attributes
-    ----------
-    reason : str
-        What is missing, and what would provide it.
-    """
+    """An estimator that these records do not allow: what is missing, and what would provide it."""
 
     reason: str
 
@@ -96,3 +100,72 @@ def finite_json(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
+
+
+class Accumulator(Protocol):
+    """One estimator's running state, of bounded size."""
+
+    @classmethod
+    def refusal(cls, block: Block) -> str | None:
+        """Why records like this block do not allow this estimator; None if they do."""
+        ...
+
+    def add(self, block: Block) -> None:
+        """Add the episodes of one block."""
+        ...
+
+    def result(self, confidence: float) -> Estimate:
+        """Estimate from the episodes so far, at least one, else ValueError; leaves the state as it is."""
+        ...
+
+
+def require_episodes(n: int) -> None:
+    """Refuse to estimate from nothing."""
+    if n < 1:
+        raise ValueError("an estimate needs at least one episode")
+
+
+class BothWays:
+    """An estimator that is fed twice from the first failed test on.
+
+    Parameters
+    ----------
+    seen : Accumulator
+        Empty; takes failed tests as no crash.
+    """
+
+    def __init__(self, seen: Accumulator) -> None:
+        self.seen = seen
+        self._worst: Accumulator | None = None  # until a test fails it would be the same
+        self._n_failed = 0
+
+    def add(self, block: Block) -> None:
+        """Add the episodes of one block."""
+        if self._worst is None and block.failed.any():
+            self._worst = deepcopy(self.seen)
+        self._n_failed += int(np.count_nonzero(block.failed))
+        self.seen.add(block)
+        if self._worst is not None:
+            self._worst.add(block.failed_as_crashes())
+
+    def result(self, confidence: float) -> Estimate:
+        """Rate and lower limit of what was seen, upper limits of the worst that it may have been."""
+        seen = self.seen.result(confidence)
+        worst = seen if self._worst is None else self._worst.result(confidence)
+        failures = {"n_failed": self._n_failed, "crash_rate_if_failed_had_crashed": worst.crash_rate}
+        seen = replace(seen, details={**failures, **seen.details})
+        if not self._n_failed:
+            return seen
+        high = max(seen.ci_high, worst.ci_high)
+        warning = (
+            f"{self._n_failed} of {seen.n_episodes} episodes failed; the rate and the lower limit count them as no "
+            "crash, the upper limits as crashes"
+        )
+        return replace(
+            seen,
+            ci_high=high,
+            upper_bound=max(seen.upper_bound, worst.upper_bound),
+            rhw=(high - seen.ci_low) / 2.0 / seen.crash_rate if seen.crash_rate > 0.0 else math.inf,
+            weight_cap=max(seen.weight_cap, worst.weight_cap),
+            warnings=(*seen.warnings, warning),
+        )

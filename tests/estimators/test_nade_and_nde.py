@@ -9,17 +9,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from harness.estimators.nade import Nade
-from harness.estimators.nde import Nde
+from harness.estimators.nade import Nade, Nde
 
-from .small_blocks import block
+from .small_blocks import block, fed
 
 
 def nade(*blocks) -> Nade:
-    state = Nade()
-    for each in blocks:
-        state.add(each)
-    return state
+    return fed(Nade(), blocks)
 
 
 outcomes = st.lists(st.booleans(), min_size=1, max_size=50)
@@ -32,10 +28,9 @@ def as_block(rows, **settings):
 
 @given(outcomes)
 def test_without_control_nade_is_the_share_of_crashes(crash):
-    plain = Nde()
-    plain.add(block(crash, method="nde", weight_cap=1.0))
-    weighted_mean = nade(block(crash, method="nde", weight_cap=1.0)).result(0.9)
-    assert weighted_mean.crash_rate == plain.result(0.9).crash_rate == np.mean(crash)
+    some = block(crash, method="nde", weight_cap=1.0)
+    plain = fed(Nde(), [some])
+    assert nade(some).result(0.9).crash_rate == plain.result(0.9).crash_rate == np.mean(crash)
 
 
 @given(weighted)

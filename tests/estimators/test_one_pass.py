@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from harness.estimators import ESTIMATORS, Estimate, Unavailable, accumulator, headline, one_pass
-from harness.estimators.scv import Scv
 from harness.studies.chains.named import overtaking
 from harness.studies.chains.sampler import blocks
 from tests.chains.seed import SEED
@@ -62,14 +61,6 @@ def test_a_gap_is_refused():
         one_pass([second])
     with pytest.raises(ValueError, match="at least one episode"):
         one_pass([])
-
-
-def test_another_basis_of_scv_can_be_asked_for():
-    parts = list(blocks(CHAIN, "step_mixture", [2_000], SEED))
-    found = one_pass(parts, ["scv"], make=lambda name: Scv("full") if name == "scv" else accumulator(name))
-    assert found.estimates["scv"].details["basis"] == "full"
-    assert set(found.estimates) == {"scv"}
-    assert found.headline == "nade"
 
 
 @pytest.mark.parametrize("method", METHODS)

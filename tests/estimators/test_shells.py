@@ -15,8 +15,8 @@ from harness.estimators import Estimate, one_pass
 from harness.estimators.block import Block
 from harness.estimators.estimate import finite_json
 from harness.estimators.intervals import clopper_pearson
+from harness.estimators.shells import combined, pool_variance
 from harness.estimators.statement import conditional_statement, statement
-from harness.estimators.stratified import combined, pool_variance, share_limits
 from harness.strata import ShellDesign
 
 P = np.array([1e-4, 3e-4, 2e-2])
@@ -62,13 +62,13 @@ def test_one_stratum_has_the_clopper_pearson_interval():
     one = np.array([0.25])
     for crashes in (0, 1, 7, 20):
         limits = combined(one, np.array([crashes]), np.array([20]), np.zeros((1, 1)), 1, 0.05)
-        low, high = clopper_pearson(crashes, 20, 0.9)
+        low, high = clopper_pearson(crashes, 20, 0.05)
         assert (limits.low, limits.high) == pytest.approx((0.25 * low, 0.25 * high), rel=1e-12, abs=1e-15)
 
 
 def test_limits_combine_as_written_down_by_hand():
     crashes, tests = np.array([5, 0, 0]), np.array([10, 10, 100])
-    low, high = share_limits(crashes, tests, 0.05)
+    low, high = clopper_pearson(crashes, tests, 0.05)
     limits = combined(P, crashes, tests, EXACT, 10**9, 0.05)
     assert limits.rate == pytest.approx(5e-5)
     assert limits.low == pytest.approx(5e-5 - 1e-4 * (0.5 - low[0]))
@@ -132,7 +132,7 @@ def test_failed_tests_outside_are_not_taken_for_safe_ones():
     conditional = estimate.details["conditional"]
     assert (conditional["n_failed"], conditional["n_failed_outside"]) == (2, 4)
     assert conditional["crash_rate_if_failed_had_crashed"] == pytest.approx(1e-4)
-    assert conditional["upper_bound_outside"] == pytest.approx(P[2] * clopper_pearson(4, 400, 0.8)[1])
+    assert conditional["upper_bound_outside"] == pytest.approx(P[2] * clopper_pearson(4, 400, 0.1)[1])
     text = conditional_statement(estimate)
     assert text is not None
     assert (
