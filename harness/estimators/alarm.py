@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from scipy.special import chdtrc, ndtr
 
-from harness.arrays import BoolArray, FloatArray
+from harness.arrays import FloatArray
 from harness.campaign.models import Method
 from harness.estimators.block import Block
 from harness.estimators.intervals import relative_entropy
@@ -31,7 +31,7 @@ _LOST = "{n} failed tests have no cut-in, and what surrogates would have done in
 
 
 class Alarm:
-    """Sums of the surrogates' weighted crashes."""
+    """Sums of the surrogates' weighted crashes W f_k, arrays of shape (D,)."""
 
     def __init__(self) -> None:
         self._n = self._n_lost = 0
@@ -44,7 +44,7 @@ class Alarm:
         """Add one block, if surrogates were asked about it."""
         if block.known_rates is None or block.surrogates_crash is None:
             return
-        h = _weighted_surrogates(block.surrogates_crash, block.log_weight)
+        h = np.where(block.surrogates_crash, block.weights()[:, None], 0.0)
         if self._known is None:
             d = h.shape[1]
             self._known, self._method = block.known_rates, block.method
@@ -113,14 +113,6 @@ class Alarm:
         exponent = [relative_entropy(a, b) if 0.0 < b < 1.0 and a <= 1.0 else 0.0 for a, b in shares]
         bound: FloatArray = np.minimum(1.0, 2.0 * np.exp(-self._n * np.array(exponent)))
         return bound
-
-
-def _weighted_surrogates(crashes: BoolArray, log_weight: FloatArray) -> FloatArray:
-    """Weighted crashes W f_k of the surrogates, shape (n, D); 0 where none crashes, whatever the weight."""
-    rows = crashes.any(axis=1)
-    values = np.zeros(crashes.shape)
-    values[rows] = np.exp(log_weight[rows])[:, None] * crashes[rows]
-    return values
 
 
 def _cap(block: Block) -> float:

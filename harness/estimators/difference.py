@@ -75,8 +75,7 @@ class Difference:
 
     def to_json(self) -> dict[str, Any]:
         """Plain JSON content; infinite and undefined numbers become null."""
-        content: dict[str, Any] = finite_json(asdict(self))
-        return content
+        return finite_json(asdict(self))
 
 
 def paired_difference(pairs: Iterable[tuple[Block, Block]], confidence: float) -> Difference:
@@ -94,28 +93,16 @@ def paired_difference(pairs: Iterable[tuple[Block, Block]], confidence: float) -
     ValueError
         There is no pair, or blocks do not hold the same episodes.
     """
-    each = BothWays(Nade()), BothWays(Nade())
-    seen = lowest = highest = _Pairs()  # one and the same until a test fails
-    for a, b in pairs:
-        if (a.first_episode, len(a)) != (b.first_episode, len(b)):
-            raise ValueError(f"episodes {a.first_episode}+{len(a)} and {b.first_episode}+{len(b)} are no pairs")
-        if lowest is seen and (a.failed.any() or b.failed.any()):
-            lowest, highest = deepcopy(seen), deepcopy(seen)
-        seen.add(a, b)
-        if lowest is not seen:
-            lowest.add(a, b.failed_as_crashes())
-            highest.add(a.failed_as_crashes(), b)
-        each[0].add(a)
-        each[1].add(b)
+    each, seen, lowest, highest = _summed(pairs)
     require_episodes(seen.n)
-    a_rate, b_rate = (one.result(confidence) for one in each)
+    a, b = (one.result(confidence) for one in each)
     at, low, high = (sums.limits(confidence) for sums in (seen, lowest, highest))
     variance, variance_a, variance_b, covariance = seen.variances()
     spread = math.sqrt(variance_a * variance_b)
-    own = (f"{name}: {text}" for name, of in (("A", a_rate), ("B", b_rate)) for text in of.warnings)
+    own = (f"{name}: {text}" for name, of in (("A", a), ("B", b)) for text in of.warnings)
     return Difference(
-        a=a_rate,
-        b=b_rate,
+        a=a,
+        b=b,
         difference=seen.difference.mean(seen.n),
         std_error=seen.difference.std_error(seen.n),
         ci_low=min(at[0], low[0]),
@@ -131,6 +118,24 @@ def paired_difference(pairs: Iterable[tuple[Block, Block]], confidence: float) -
         n_effective=seen.distance.n_effective,
         warnings=(*own, *seen.warnings()),
     )
+
+
+def _summed(pairs: Iterable[tuple[Block, Block]]) -> tuple[tuple[BothWays, BothWays], _Pairs, _Pairs, _Pairs]:
+    """Estimators of A and B, and pairs as seen, with A - B as low and as high as failed tests may have made it."""
+    each = BothWays(Nade()), BothWays(Nade())
+    seen = lowest = highest = _Pairs()  # one and the same until a test fails
+    for a, b in pairs:
+        if (a.first_episode, len(a)) != (b.first_episode, len(b)):
+            raise ValueError(f"episodes {a.first_episode}+{len(a)} and {b.first_episode}+{len(b)} are no pairs")
+        if lowest is seen and (a.failed.any() or b.failed.any()):
+            lowest, highest = deepcopy(seen), deepcopy(seen)
+        seen.add(a, b)
+        if lowest is not seen:
+            lowest.add(a, b.failed_as_crashes())
+            highest.add(a.failed_as_crashes(), b)
+        each[0].add(a)
+        each[1].add(b)
+    return each, seen, lowest, highest
 
 
 class _Pairs:

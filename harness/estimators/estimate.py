@@ -28,10 +28,8 @@ class Estimate:
     ----------
     crash_rate, std_error : float
         Crashes per test.
-    ci_low, ci_high : float
-        Two-sided interval at `confidence`.
-    upper_bound : float
-        One-sided bound at `confidence`; finite also when no crash was seen.
+    ci_low, ci_high, upper_bound : float
+        Two-sided interval and one-sided bound at `confidence`; finite also when no crash was seen.
     rhw : float
         Half-width of the interval relative to the rate; infinite when the rate is 0.
     n_episodes, n_crashes : int
@@ -76,8 +74,7 @@ class Estimate:
 
     def to_json(self) -> dict[str, Any]:
         """Plain JSON content; infinite and undefined numbers become null, as does an RHW that says nothing."""
-        content: dict[str, Any] = finite_json({**asdict(self), "rhw": self.precision})
-        return content
+        return finite_json({**asdict(self), "rhw": self.precision})
 
 
 @dataclass(frozen=True)
@@ -91,15 +88,17 @@ class Unavailable:
         return {"crash_rate": None, "reason": self.reason}
 
 
-def finite_json(value: Any) -> Any:
+def finite_json(content: dict[str, Any]) -> dict[str, Any]:
     """Copy of nested content with tuples as lists and non-finite numbers as null, which JSON cannot write."""
+    return {key: _finite(value) for key, value in content.items()}
+
+
+def _finite(value: Any) -> Any:
     if isinstance(value, dict):
-        return {key: finite_json(entry) for key, entry in value.items()}
+        return finite_json(value)
     if isinstance(value, list | tuple):
-        return [finite_json(entry) for entry in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
+        return [_finite(entry) for entry in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 class Accumulator(Protocol):

@@ -9,7 +9,7 @@ from typing import Any
 from harness.campaign.models import EstimatorName, Method
 from harness.estimators.block import Block
 from harness.estimators.diagnostics import Diagnostics
-from harness.estimators.estimate import Accumulator, BothWays, Estimate, Unavailable, finite_json, require_episodes
+from harness.estimators.estimate import Accumulator, BothWays, Estimate, Unavailable, require_episodes
 from harness.estimators.mixture_cv import MixtureCv
 from harness.estimators.nade import Nade, Nde
 from harness.estimators.scv import Scv
@@ -110,14 +110,11 @@ def one_pass(
 
 
 def _point(estimate: Estimate) -> dict[str, Any]:
-    point: dict[str, Any] = finite_json(
-        {
-            "n": estimate.n_episodes,
-            "crash_rate": estimate.crash_rate,
-            "ci_low": estimate.ci_low,
-            "ci_high": estimate.ci_high,
-            "rhw": estimate.precision,
-            "n_crashes": estimate.n_crashes,
-        }
-    )
-    return point
+    return {
+        "n": estimate.n_episodes,
+        "crash_rate": estimate.crash_rate,
+        "ci_low": estimate.ci_low,
+        "ci_high": estimate.ci_high,
+        "rhw": estimate.precision,
+        "n_crashes": estimate.n_crashes,
+    }

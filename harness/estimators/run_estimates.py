@@ -7,20 +7,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from harness.campaign.models import EstimatorName
+from harness.estimators import statement as say
 from harness.estimators.block import Block
 from harness.estimators.estimate import Estimate, Unavailable, finite_json
 from harness.estimators.one_pass import ESTIMATORS, one_pass
-from harness.estimators.statement import (
-    SCOPE,
-    alarm_cautions,
-    conditional_statement,
-    failed_statement,
-    per_distance,
-    repeated_cautions,
-    repeated_statement,
-    statement,
-    warned,
-)
 
 
 @dataclass(frozen=True)
@@ -78,8 +68,8 @@ def estimate_blocks(
         "retraced": facts.retraced or {"reason": "the run did not retrace its episodes"},
         "surrogate_crash_rates": rates,
     }
-    statements = _statements(estimates, facts, distance_km, alarm_cautions(alarm))
-    content: dict[str, Any] = finite_json(
+    statements = _statements(estimates, facts, distance_km, say.alarm_cautions(alarm))
+    return finite_json(
         {
             "campaign": facts.name,
             "campaign_hash": facts.content_hash,
@@ -89,18 +79,17 @@ def estimate_blocks(
             "n_crashes": best.n_crashes,
             "headline": done.headline,
             "distance_per_test_km": distance_km,
-            "crash_rate_per_1e6_km": None if distance_km is None else per_distance(best, distance_km),
+            "crash_rate_per_1e6_km": None if distance_km is None else say.per_distance(best, distance_km),
             "estimates": {name: estimate.to_json() for name, estimate in estimates.items()},
             "diagnostics": {**done.diagnostics.result(facts.importance_names), "alarm": alarm},
             "convergence": done.convergence,
             "statement": statements[done.headline],
             "statements": statements,
-            "conditional_statement": conditional_statement(best),
-            "scope": SCOPE,
+            "conditional_statement": say.conditional_statement(best),
+            "scope": say.SCOPE,
             "ending": facts.ending,
         }
     )
-    return content
 
 
 def _statements(
@@ -110,11 +99,11 @@ def _statements(
     alarm: Sequence[str],
 ) -> dict[str, str]:
     """What each estimator says, what it must be warned of first; of one without a value, why."""
-    first = [*alarm, *repeated_cautions(facts.repeated)]
+    first = [*alarm, *say.repeated_cautions(facts.repeated)]
     return {
-        name: warned(first, statement(found, facts.lane_change_level, distance_km))
-        + failed_statement(found.details)
-        + repeated_statement(facts.repeated)
+        name: say.warned(first, say.statement(found, facts.lane_change_level, distance_km))
+        + say.failed_statement(found.details)
+        + say.repeated_statement(facts.repeated)
         if isinstance(found, Estimate)
         else f"No crash rate from these records: {found.reason.rstrip('.')}."
         for name, found in estimates.items()

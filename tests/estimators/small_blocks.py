@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
 
 from harness.campaign.models import Method
 from harness.estimators.block import Block
+from harness.strata import ShellDesign
 
 State = TypeVar("State")
+SHELLS = ShellDesign(
+    pool="0" * 24, strata=("careful", "careless", "outside"), p=np.array([1e-4, 3e-4, 2e-2]), moments=np.zeros((3, 3)),
+    n_paths=10**9, n_inside=2, boundary="careless", p_cut_in=0.03, p_impossible=0.0096,
+)  # fmt: skip
+"""Shells of a pool that is known exactly."""
 
 
 def block(
@@ -35,6 +42,16 @@ def block(
         log_weight=np.array(log_weight if log_weight is not None else [0.0] * n, dtype=np.float64),
         **(usual | settings),
     )
+
+
+def in_shells(strata: list[int], crash: list[bool], failed: list[bool] | None = None, first: int = 0) -> Block:
+    """Tests drawn from `SHELLS`."""
+    n = len(strata)
+    design = {"component": np.array(strata, np.int64), "shells": SHELLS}
+    none = {"log_q": np.zeros((n, 0)), "alpha": np.zeros(0)}
+    log_weight = np.log(SHELLS.p)[strata]
+    some = block(crash, log_weight, failed=failed, method="shells", first_episode=first, **design, **none)
+    return replace(some, cut_in=np.ones(n, np.bool_))
 
 
 def fed(state: State, parts: Iterable[Block]) -> State:

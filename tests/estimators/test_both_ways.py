@@ -15,8 +15,7 @@ from harness.studies.chains.sampler import blocks
 from harness.studies.required_tests import Procedure, plain_rhw, scv_rhw
 from harness.studies.run_required_tests import joined
 from tests.chains.seed import SEED
-from tests.estimators.small_blocks import block, fed
-from tests.estimators.test_shells import block as in_shells
+from tests.estimators.small_blocks import block, fed, in_shells
 
 CHAIN = overtaking("short", skill=0.5, surrogates=[0.5, 0.2, 0.8], level=0.02, horizon=5)
 METHOD = {"nde": "nde", "nade": "forced", "mixture_cv": "episode_mixture"}
