@@ -46,10 +46,8 @@ def hall_distances(std_error: float, third_moment: float, tail: float) -> tuple[
 
     Parameters
     ----------
-    std_error : float
-        Of the estimate.
-    third_moment : float
-        Third central moment of the estimate's error; over std_error³ it is the skewness κ.
+    std_error, third_moment : float
+        Of the estimate; its error's third central moment over std_error³ is the skewness κ.
     tail : float
         Probability to be left out on each side, below 1/2.
     """
