@@ -11,7 +11,8 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, model_validator
 
 from harness.arrays import Record
-from harness.campaign.models import MAX_CONFIGURED_SPEED_MPS, broken_rule
+from harness.campaign.drivers import MAX_CONFIGURED_SPEED_MPS
+from harness.campaign.section import broken_rule
 from harness.maneuvers import ACCELERATIONS_MPS2
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import ClassVar, Protocol
 
-from harness.campaign.models import EstimatorName
 from harness.estimators.block import Block
 from harness.estimators.estimate import Estimate
+from harness.methods import EstimatorName
 
 
 class Accumulator(Protocol):

@@ -15,8 +15,8 @@ import numpy as np
 from scipy.special import chdtrc, ndtr
 
 from harness.arrays import FloatArray
-from harness.campaign.models import Method
 from harness.estimators.block import Block
+from harness.methods import Method
 from harness.strata import KnownRates
 
 LEVEL = 1e-4

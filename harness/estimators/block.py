@@ -11,7 +11,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from harness.arrays import BoolArray, FloatArray, IntArray
-from harness.campaign.models import Method
+from harness.methods import Method
 from harness.strata import KnownRates, ShellDesign
 
 MAX_CONTROL_STEPS = 9

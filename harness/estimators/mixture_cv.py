@@ -15,13 +15,13 @@ from typing import ClassVar
 import numpy as np
 
 from harness.arrays import FloatArray
-from harness.campaign.models import EstimatorName
 from harness.estimators.accumulator import require_episodes
 from harness.estimators.block import Block
 from harness.estimators.estimate import Estimate
 from harness.estimators.third_moments import ThirdMoments
 from harness.estimators.triangular_factor import empty_factor, fold_rows
 from harness.estimators.weighted_sums import FEW_FOR_RESIDUALS, WeightedSums, weighted_estimate
+from harness.methods import EstimatorName
 
 
 @dataclass(frozen=True)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from harness.campaign.models import EstimatorName
 from harness.estimators.accumulator import require_episodes
 from harness.estimators.block import Block
 from harness.estimators.estimate import Estimate
 from harness.estimators.weighted_sums import WeightedSums, weighted_estimate
+from harness.methods import EstimatorName
 
 
 class Nade:

@@ -7,12 +7,12 @@ from typing import ClassVar
 
 import numpy as np
 
-from harness.campaign.models import EstimatorName
 from harness.estimators.accumulator import require_episodes
 from harness.estimators.block import Block
 from harness.estimators.estimate import Estimate
 from harness.estimators.intervals import clopper_pearson, clopper_pearson_upper
 from harness.estimators.weighted_sums import count_warnings
+from harness.methods import EstimatorName
 
 
 class Nde:

@@ -6,21 +6,19 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from harness.campaign.models import EstimatorName
 from harness.estimators.accumulator import Accumulator
 from harness.estimators.block import Block
 from harness.estimators.both_ways import BothWays
 from harness.estimators.convergence import Convergence
 from harness.estimators.diagnostics import Diagnostics
 from harness.estimators.estimate import Estimate, Unavailable
-from harness.estimators.headline import headline
 from harness.estimators.mixture_cv import MixtureCv
 from harness.estimators.nade import Nade
 from harness.estimators.nde import Nde
 from harness.estimators.scv import Scv
 from harness.estimators.shells import Shells
+from harness.methods import ESTIMATORS, SAMPLING, EstimatorName
 
-ESTIMATORS: tuple[EstimatorName, ...] = ("nde", "nade", "mixture_cv", "scv", "shells")
 _CLASSES: dict[EstimatorName, type[Accumulator]] = {
     "nde": Nde,
     "nade": Nade,
@@ -93,7 +91,7 @@ def one_pass(
         if block.first_episode != n:
             raise ValueError(f"expected a block from episode {n} on, got one from {block.first_episode}")
         if own is None:
-            own = headline(block.method)
+            own = SAMPLING[block.method].headline
             states, refusals = _choose([*dict.fromkeys([own, *names])], block, make)
         n += len(block)
         diagnostics.add(block)

@@ -6,10 +6,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from harness.campaign.models import EstimatorName
 from harness.estimators.block import Block
 from harness.estimators.estimate import Estimate, Unavailable, finite_json
-from harness.estimators.one_pass import ESTIMATORS, PassResult, one_pass
+from harness.estimators.one_pass import PassResult, one_pass
 from harness.estimators.statement import (
     SCOPE,
     alarm_cautions,
@@ -21,6 +20,7 @@ from harness.estimators.statement import (
     statement,
     warned,
 )
+from harness.methods import ESTIMATORS, EstimatorName
 
 
 @dataclass(frozen=True)

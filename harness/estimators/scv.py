@@ -17,7 +17,6 @@ from typing import Any, ClassVar
 import numpy as np
 
 from harness.arrays import IntArray
-from harness.campaign.models import EstimatorName
 from harness.estimators.accumulator import require_episodes
 from harness.estimators.block import Block
 from harness.estimators.estimate import Estimate
@@ -25,6 +24,7 @@ from harness.estimators.scv_columns import Basis, n_columns
 from harness.estimators.scv_stratum import CHUNK_ROWS, Stratum
 from harness.estimators.threads import side_by_side
 from harness.estimators.weighted_sums import WeightedSums, weighted_estimate
+from harness.methods import EstimatorName
 
 WARNING = (
     "this interval is known to be too narrow; use nade's (docs/scv-defect.md). The published variance is not that of "

@@ -12,11 +12,11 @@ from typing import Any, ClassVar
 import numpy as np
 
 from harness.arrays import IntArray
-from harness.campaign.models import EstimatorName
 from harness.estimators.accumulator import require_episodes
 from harness.estimators.block import Block
 from harness.estimators.estimate import Estimate
 from harness.estimators.stratified import Limits, combined, pool_variance, share_limits
+from harness.methods import EstimatorName
 from harness.strata import ShellDesign
 
 _METHOD = "crashes within shells of known probability; Clopper-Pearson limits per shell, combined (MOVER)"

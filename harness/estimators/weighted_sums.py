@@ -12,11 +12,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from harness.arrays import FloatArray
-from harness.campaign.models import Method
 from harness.estimators.block import Block
 from harness.estimators.estimate import Estimate
 from harness.estimators.intervals import capped_mean_upper, skewed_distances
 from harness.estimators.moments import Moments
+from harness.methods import Method
 
 FEW_CRASHES = 50
 FEW_EFFECTIVE = 30.0

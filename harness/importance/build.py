@@ -9,7 +9,8 @@ from harness.campaign.models import Campaign
 from harness.criticality.after_cut_in import level_steps
 from harness.criticality.tables import Tables
 from harness.importance.functions import Importance
-from harness.outcomes import EPISODE_MIXTURE, FORCED, METHODS, STEP_MIXTURE
+from harness.methods import METHODS, SAMPLING
+from harness.outcomes import EPISODE_MIXTURE, FORCED, STEP_MIXTURE
 from harness.vehicles.kinematics import CONTACT_M
 
 _ROUNDING_M = 1e-9
@@ -18,13 +19,12 @@ _ROUNDING_M = 1e-9
 
 def needs_tables(campaign: Campaign) -> bool:
     """Whether the campaign's method looks at surrogates at all."""
-    return METHODS.index(campaign.testing.method) in (STEP_MIXTURE, EPISODE_MIXTURE)
+    return SAMPLING[campaign.testing.method].mixes
 
 
 def importance_names(campaign: Campaign) -> tuple[str, ...]:
     """Names of the importance functions, in the order of ``log_q``."""
-    method = METHODS.index(campaign.testing.method)
-    defensive = ("forced",) if method in (FORCED, EPISODE_MIXTURE) else ()
+    defensive = ("forced",) if SAMPLING[campaign.testing.method].forces else ()
     return defensive + (tuple(campaign.surrogates) if needs_tables(campaign) else ())
 
 
@@ -43,14 +43,14 @@ def mixture_weights(campaign: Campaign) -> tuple[float, ...]:
 
 def build_importance(campaign: Campaign, tables: Tables | None) -> Importance:
     """Importance functions of a campaign; ``nde`` and ``forced`` need no challenge tables."""
-    method = METHODS.index(campaign.testing.method)
+    method = campaign.testing.method
     recursive = campaign.testing.challenge == "recursive"
     none = _none(5), _none(5), _none(5), np.zeros((0, 1, 1, 1), np.bool_)
     return Importance(
-        method,
+        METHODS.index(method),
         recursive,
         len(campaign.surrogates) if needs_tables(campaign) else 0,
-        1 if method in (FORCED, EPISODE_MIXTURE) else 0,
+        1 if SAMPLING[method].forces else 0,
         level_steps(round(campaign.environment.acceleration_hold_s * 10)),
         campaign.testing.epsilon,
         campaign.testing.criticality_threshold,

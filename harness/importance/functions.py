@@ -25,7 +25,7 @@ from harness.vehicles.kinematics import CONTACT_M, STEP_S, next_speed
 class Importance(NamedTuple):
     """All that kernels need to sample critical moments.
 
-    ``method`` is one of `harness.outcomes.METHODS`; ``recursive`` says which challenge; ``n_surrogates`` is 0 where
+    ``method`` is one of `harness.methods.METHODS`; ``recursive`` says which challenge; ``n_surrogates`` is 0 where
     nobody is asked; ``first`` is the index of the first surrogate among the importance functions: 1 when the forced
     cut-in is component 0. ``steps_per_level`` lie between two levels of ``value``.
     ``alpha`` (M,) are the mixture weights. ``value`` (J, levels + 1, v, R2, R2dot), ``maneuvers`` (J, v, R2, R2dot, 31)

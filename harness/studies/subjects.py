@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Protocol
 
-from harness.campaign.models import Campaign, EstimatorName
+from harness.campaign.models import Campaign
 from harness.environment.loading import load_environment
+from harness.methods import EstimatorName
 from harness.pool.library import load_library
 from harness.progress import Progress
 from harness.studies.chains.named import CHAINS

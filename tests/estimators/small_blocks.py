@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from harness.campaign.models import Method
 from harness.estimators.block import Block
+from harness.methods import Method
 
 
 def block(
