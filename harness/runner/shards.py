@@ -17,7 +17,7 @@ from harness.campaign.models import Campaign
 from harness.controllers.black_box import OF_EPISODE, Call, Death
 from harness.controllers.time_limit import death_cause
 from harness.errors import HarnessError, TooManyFailedError
-from harness.pool.prescribed import PrescribedEpisodes
+from harness.pool.shells import PrescribedEpisodes
 from harness.records.folder import TABLES, read_table, shard_file, write_shard
 from harness.records.tables import ShardTables
 from harness.resolved import Resolved

@@ -16,7 +16,7 @@ from harness.estimators import Shells
 from harness.estimators.block import Block
 from harness.estimators.both_ways import BothWays
 from harness.estimators.estimate import Estimate
-from harness.pool.prescribed import Draw
+from harness.pool.shells import Draw
 from harness.runner.allocation import Allocation
 from harness.runner.worker import ShardSpec
 from harness.strata import ShellDesign

@@ -17,7 +17,7 @@ from harness.episode.loop import EpisodeLoop, Shard
 from harness.estimators.block import Block
 from harness.estimators.from_records import block_from_tables
 from harness.importance.build import mixture_weights
-from harness.pool.prescribed import Draw, PrescribedEpisodes
+from harness.pool.shells import Draw, PrescribedEpisodes
 from harness.records.folder import encoded
 from harness.records.tables import ShardTables, shard_tables
 from harness.resolved import Resolved

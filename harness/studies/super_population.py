@@ -19,8 +19,7 @@ import pyarrow.parquet as pq
 from harness.arrays import BoolArray, FloatArray, IntArray, RecordArray
 from harness.compiled import cache_root, source_hash
 from harness.environment.driving import Environment
-from harness.pool.build import PILOT_PATHS, Enumerated, Enumerator
-from harness.pool.proposal import fit_proposal
+from harness.pool.aimed_paths import PILOT_PATHS, EnumeratedPaths, Enumerator, contributions, fit_proposal
 from harness.progress import Progress
 from harness.records.folder import write_atomically
 
@@ -84,29 +83,19 @@ def enumerate_paths(
         return _read(file)
     pilot = Enumerator(environment, drivers, envelope, seed)
     progress.stage(f"super-population of seed {seed}", n_paths + PILOT_PATHS)
-    rates = np.concatenate([block.rates(drivers.size) for block in pilot.run(0, PILOT_PATHS, progress)])
-    aimed = pilot.aimed(fit_proposal(pilot.uniforms(0, PILOT_PATHS), _importance(rates)))
-    blocks: list[Enumerated] = []
+    rates = pilot.run(0, PILOT_PATHS, progress).rates(drivers.size)
+    aimed = pilot.aimed(fit_proposal(pilot.uniforms(0, PILOT_PATHS), contributions(rates)))
     parts = []
     for first in range(0, n_paths, CHUNK_PATHS):
-        blocks = aimed.run(PILOT_PATHS + first, min(CHUNK_PATHS, n_paths - first), progress)
-        parts.append(_compressed(blocks, first))
+        paths = aimed.run(PILOT_PATHS + first, min(CHUNK_PATHS, n_paths - first), progress)
+        parts.append(_compressed(paths, first))
     population = _joined(parts)
     _write(file, population)
     return population
 
 
-def _importance(rates: FloatArray) -> FloatArray:
-    """What a path contributes to the drivers' crash rates, each relative to its mean, shape (n,)."""
-    mean = rates.mean(0)
-    relative = rates / np.where(mean > 0.0, mean, 1.0)
-    importance: FloatArray = np.sqrt((relative * relative).sum(1))
-    return importance
-
-
-def _compressed(blocks: Sequence[Enumerated], first: int) -> SuperPopulation:
-    mass = np.concatenate([block.probability * block.weight[:, None] for block in blocks])
-    bits = np.concatenate([block.crashes for block in blocks])
+def _compressed(paths: EnumeratedPaths, first: int) -> SuperPopulation:
+    mass, bits = paths.mass, paths.crashes
     row, step = np.nonzero((bits != 0) & (mass > 0.0))
     return SuperPopulation(mass.sum(1), first + row.astype(np.int64), mass[row, step], bits[row, step])
 
