@@ -134,7 +134,7 @@ def judge(subject: Subject, result: str, rows: Rows, confidence: float, *, condi
     """
     truth, n = subject.crash_rate, rows.crash_rate.size
     covered = int(np.count_nonzero((rows.ci_low <= truth) & (truth <= rows.ci_high)))
-    low, high = clopper_pearson(covered, n, COVERAGE_CONFIDENCE)
+    low, high = map(float, clopper_pearson(covered, n, (1.0 - COVERAGE_CONFIDENCE) / 2.0))
     met = subject.meets_assumption or not conditional
     tests_5, median, tests_95 = (float(q) for q in np.quantile(rows.n_tests, [0.05, 0.5, 0.95]))
     relvar = float(np.mean((rows.crash_rate / truth - 1.0) ** 2))

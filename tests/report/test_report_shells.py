@@ -13,7 +13,7 @@ from synthetic_shells import DESIGN, P
 from test_report_page import estimates_of, page_of
 
 from harness.errors import RunFolderError
-from harness.estimators.stratified import combined, pool_variance
+from harness.estimators.shells import combined, pool_variance
 from harness.records.schemas import OUTCOMES
 from harness.report import write_report
 from harness.report.answer_plot import answer_plot
