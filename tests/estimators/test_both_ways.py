@@ -14,8 +14,7 @@ from harness.estimators.difference import difference_statement, paired_differenc
 from harness.estimators.one_pass import _CLASSES
 from harness.studies.chains.named import overtaking
 from harness.studies.chains.sampler import blocks
-from harness.studies.required_tests import Procedure, plain_rhw, scv_rhw
-from harness.studies.run_required_tests import joined
+from harness.studies.required_tests import Procedure, joined, plain_rhw, scv_rhw
 from tests.chains.seed import SEED
 from tests.estimators.small_blocks import block
 from tests.estimators.test_shells import block as in_shells
