@@ -12,8 +12,7 @@ from harness.estimators.block import Block
 from harness.estimators.difference import difference_statement, paired_difference
 from harness.studies.chains.named import overtaking
 from harness.studies.chains.sampler import blocks
-from harness.studies.required_tests import Procedure, plain_rhw, scv_rhw
-from harness.studies.run_required_tests import joined
+from harness.studies.required_tests import Procedure, joined, plain_rhw, scv_rhw
 from tests.chains.seed import SEED
 from tests.estimators.small_blocks import block, fed, in_shells
 
