@@ -6,10 +6,11 @@ Estimators have one shape (``estimate.Accumulator``): add blocks, ask for the re
 
 from harness.estimators.block import Block
 from harness.estimators.estimate import Estimate, Unavailable
-from harness.estimators.one_pass import ESTIMATORS, accumulator, headline, one_pass
+from harness.estimators.one_pass import accumulator, one_pass
 from harness.estimators.run_estimates import CampaignFacts, estimate_blocks
 from harness.estimators.shells import Shells
 from harness.estimators.stopping import StopRule
+from harness.methods import ESTIMATORS
 
 __all__ = [
     "ESTIMATORS",
@@ -21,6 +22,5 @@ __all__ = [
     "Unavailable",
     "accumulator",
     "estimate_blocks",
-    "headline",
     "one_pass",
 ]

@@ -15,9 +15,9 @@ import numpy as np
 from scipy.special import chdtrc, ndtr
 
 from harness.arrays import FloatArray
-from harness.campaign.models import Method
 from harness.estimators.block import Block
 from harness.estimators.intervals import relative_entropy
+from harness.methods import Method
 from harness.strata import KnownRates
 
 LEVEL = 1e-4

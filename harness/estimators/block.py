@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from harness.arrays import BoolArray, FloatArray, IntArray
-from harness.campaign.models import Method
+from harness.methods import Method
 from harness.strata import KnownRates, ShellDesign
 
 MAX_CONTROL_STEPS = 9

@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from harness.campaign.models import Method
 from harness.estimators.alarm import Alarm
 from harness.estimators.block import Block
 from harness.estimators.moments import Moments
+from harness.methods import Method
 
 NOTE = (
     "Diagnostics, never tests: each mean is 1 in expectation, except that of W·1{cut-in}, which is P(cut-in). Under "

@@ -9,9 +9,9 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from harness.arrays import BoolArray, FloatArray, IntArray
-from harness.campaign.models import Method
 from harness.errors import RunFolderError
 from harness.estimators.block import MAX_CONTROL_STEPS, Block
+from harness.methods import Method
 from harness.records.folder import MEND_SHARD
 from harness.strata import ShellDesign
 

@@ -6,7 +6,6 @@ from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from typing import Any
 
-from harness.campaign.models import EstimatorName, Method
 from harness.estimators.block import Block
 from harness.estimators.diagnostics import Diagnostics
 from harness.estimators.estimate import Accumulator, BothWays, Estimate, Unavailable, require_episodes
@@ -14,33 +13,22 @@ from harness.estimators.mixture_cv import MixtureCv
 from harness.estimators.nade import Nade, Nde
 from harness.estimators.scv import Scv
 from harness.estimators.shells import Shells
+from harness.methods import ESTIMATORS, SAMPLING, EstimatorName
 
-ESTIMATORS: dict[EstimatorName, type[Accumulator]] = {
+ACCUMULATORS: dict[EstimatorName, type[Accumulator]] = {
     "nde": Nde,
     "nade": Nade,
     "mixture_cv": MixtureCv,
     "scv": Scv,
     "shells": Shells,
 }
-_HEADLINES: dict[Method, EstimatorName] = {
-    "nde": "nde",
-    "forced": "nade",
-    "step_mixture": "nade",
-    "episode_mixture": "mixture_cv",
-    "shells": "shells",
-}
 SPACING = 1.01
 """Prefixes closer than 1 % are one dot on a logarithmic axis; thinning them keeps long campaigns' files small."""
 
 
-def headline(method: Method) -> EstimatorName:
-    """Estimator that answers a campaign's question: each method of drawing has its own."""
-    return _HEADLINES[method]
-
-
 def accumulator(name: EstimatorName) -> BothWays:
     """Empty state of an estimator, for those who feed it themselves (the runner does, for stopping)."""
-    return BothWays(ESTIMATORS[name]())
+    return BothWays(ACCUMULATORS[name]())
 
 
 @dataclass(frozen=True)
@@ -91,8 +79,8 @@ def one_pass(
         if block.first_episode != n:
             raise ValueError(f"expected a block from episode {n} on, got one from {block.first_episode}")
         if own is None:
-            own = headline(block.method)
-            refusals = {name: ESTIMATORS[name].refusal(block) for name in (own, *names)}
+            own = SAMPLING[block.method].headline
+            refusals = {name: ACCUMULATORS[name].refusal(block) for name in (own, *names)}
             states = {name: accumulator(name) for name, reason in refusals.items() if reason is None}
         n += len(block)
         diagnostics.add(block)

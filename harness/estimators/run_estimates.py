@@ -6,11 +6,11 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from harness.campaign.models import EstimatorName
 from harness.estimators import statement as say
 from harness.estimators.block import Block
 from harness.estimators.estimate import Estimate, Unavailable, finite_json
-from harness.estimators.one_pass import ESTIMATORS, one_pass
+from harness.estimators.one_pass import one_pass
+from harness.methods import ESTIMATORS, EstimatorName
 
 
 @dataclass(frozen=True)

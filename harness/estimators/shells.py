@@ -16,7 +16,8 @@ monotone in each stratum's crashes, so that [L(k), U(k + f)] holds whatever the 
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from dataclasses import asdict, dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import ndtri
@@ -97,6 +98,72 @@ def combined(
     return Limits(rate, max(rate - down, 0.0), min(rate + up, 1.0), math.sqrt(pool), at_least)
 
 
+@dataclass(frozen=True)
+class Shell:
+    """One shell: its probability per test, what was counted, and limits of the share of cut-ins that crash."""
+
+    shell: str
+    inside: bool
+    p: float
+    n_episodes: int
+    n_crashes: int
+    n_failed: int
+    crash_share: float
+    crash_share_low: float
+    crash_share_high: float
+    contribution: float
+
+    @property
+    def low(self) -> float:
+        """Lower limit of the contribution to the crash rate."""
+        return self.p * self.crash_share_low
+
+    @property
+    def high(self) -> float:
+        """Upper limit of the contribution to the crash rate."""
+        return self.p * self.crash_share_high
+
+    @property
+    def half_width(self) -> float:
+        """What this shell alone leaves open of the crash rate."""
+        return (self.high - self.low) / 2.0
+
+
+@dataclass(frozen=True)
+class Conditional:
+    """The rate given that there are no crashes outside the boundary, and what is known about those."""
+
+    crash_rate: float
+    ci_low: float
+    ci_high: float
+    rhw: float | None
+    rhw_from_pool: float
+    rhw_from_pool_at_least: float
+    n_episodes: int
+    n_crashes: int
+    n_failed: int
+    crash_rate_if_failed_had_crashed: float
+    n_episodes_outside: int
+    n_crashes_outside: int
+    n_failed_outside: int
+    refuted: bool
+    upper_bound_outside: float
+
+
+@dataclass(frozen=True)
+class ShellDetails:
+    """``details`` of the estimate: shells from careful to careless, and the pool that they come from."""
+
+    boundary: str
+    pool: str
+    rhw_from_pool: float
+    rhw_from_pool_at_least: float
+    p_cut_in: float
+    p_impossible: float
+    conditional: Conditional
+    shells: tuple[Shell, ...]
+
+
 class Shells:
     """Tests, crashes and failed tests of each stratum, arrays of shape (S,)."""
 
@@ -150,63 +217,65 @@ class Shells:
             method="crashes within shells of known probability; Clopper-Pearson limits per shell, combined (MOVER); "
             "upper bound: the same, one-sided",
             warnings=tuple(self._warnings()),
-            details={
-                "boundary": design.boundary,
-                "pool": design.pool,
-                **free.from_pool_relative(),
-                "p_cut_in": design.p_cut_in,
-                "p_impossible": design.p_impossible,
-                "conditional": self._conditional(confidence),
-                "shells": self._shells(tail),
-            },
+            details=asdict(
+                ShellDetails(
+                    boundary=design.boundary,
+                    pool=design.pool,
+                    **free.from_pool_relative(),
+                    p_cut_in=design.p_cut_in,
+                    p_impossible=design.p_impossible,
+                    conditional=self._conditional(confidence),
+                    shells=self._shells(tail),
+                )
+            ),
         )
 
     def _limits(self, strata: slice, tail: float) -> Limits:
         design, crashes, tests, failed = self._design, self.crashes[strata], self.tests[strata], self.failed[strata]
         return combined(design.p[strata], crashes, tests, design.moments[strata, strata], design.n_paths, tail, failed)
 
-    def _conditional(self, confidence: float) -> dict[str, Any]:
+    def _conditional(self, confidence: float) -> Conditional:
         """The statement given that there are no crashes outside, and what is known about those."""
         p, within, outside = self._design.p, slice(0, self._design.n_inside), slice(self._design.n_inside, None)
         inside = self._limits(within, (1.0 - confidence) / 2.0)
         _, high = clopper_pearson(self.crashes[outside], self.tests[outside], 1.0 - confidence, self.failed[outside])
         worst_share = (self.crashes + self.failed) / np.maximum(self.tests, 1)
         crashes_outside = int(self.crashes[outside].sum())
-        return {
-            "crash_rate": inside.rate,
-            "ci_low": inside.low,
-            "ci_high": inside.high,
-            "rhw": inside.rhw,
+        return Conditional(
+            crash_rate=inside.rate,
+            ci_low=inside.low,
+            ci_high=inside.high,
+            rhw=inside.rhw,
             **inside.from_pool_relative(),
-            "n_episodes": int(self.tests[within].sum()),
-            "n_crashes": int(self.crashes[within].sum()),
-            "n_failed": int(self.failed[within].sum()),
-            "crash_rate_if_failed_had_crashed": float(p[within] @ worst_share[within]),
-            "n_episodes_outside": int(self.tests[outside].sum()),
-            "n_crashes_outside": crashes_outside,
-            "n_failed_outside": int(self.failed[outside].sum()),
-            "refuted": crashes_outside > 0,
-            "upper_bound_outside": float((p[outside] * high).sum()),
-        }
+            n_episodes=int(self.tests[within].sum()),
+            n_crashes=int(self.crashes[within].sum()),
+            n_failed=int(self.failed[within].sum()),
+            crash_rate_if_failed_had_crashed=float(p[within] @ worst_share[within]),
+            n_episodes_outside=int(self.tests[outside].sum()),
+            n_crashes_outside=crashes_outside,
+            n_failed_outside=int(self.failed[outside].sum()),
+            refuted=crashes_outside > 0,
+            upper_bound_outside=float((p[outside] * high).sum()),
+        )
 
-    def _shells(self, tail: float) -> list[dict[str, Any]]:
+    def _shells(self, tail: float) -> tuple[Shell, ...]:
         p, share = self._design.p, self.crashes / np.maximum(self.tests, 1)
         low, high = clopper_pearson(self.crashes, self.tests, tail, self.failed)
-        return [
-            {
-                "shell": name,
-                "inside": s < self._design.n_inside,
-                "p": float(p[s]),
-                "n_episodes": int(self.tests[s]),
-                "n_crashes": int(self.crashes[s]),
-                "n_failed": int(self.failed[s]),
-                "crash_share": float(share[s]),
-                "crash_share_low": float(low[s]),
-                "crash_share_high": float(high[s]),
-                "contribution": float(p[s] * self.crashes[s] / max(self.tests[s], 1)),
-            }
+        return tuple(
+            Shell(
+                shell=name,
+                inside=s < self._design.n_inside,
+                p=float(p[s]),
+                n_episodes=int(self.tests[s]),
+                n_crashes=int(self.crashes[s]),
+                n_failed=int(self.failed[s]),
+                crash_share=float(share[s]),
+                crash_share_low=float(low[s]),
+                crash_share_high=float(high[s]),
+                contribution=float(p[s] * self.crashes[s] / max(self.tests[s], 1)),
+            )
             for s, name in enumerate(self._design.strata)
-        ]
+        )
 
     def _warnings(self) -> list[str]:
         design, found = self._design, []

@@ -19,9 +19,9 @@ from __future__ import annotations
 
 import math
 
-from harness.campaign.models import EstimatorName, Method, Stop
+from harness.campaign.models import Stop
 from harness.estimators.estimate import Estimate
-from harness.estimators.one_pass import headline
+from harness.methods import SAMPLING, EstimatorName, Method
 
 LOOK_RATIO = 1.1
 PASSES_NEEDED = 2
@@ -84,7 +84,7 @@ class StopRule:
         *,
         min_crashes: int = DEFAULT_MIN_CRASHES,
     ) -> None:
-        self.estimator: EstimatorName = campaign_stop.estimator or headline(method)
+        self.estimator: EstimatorName = campaign_stop.estimator or SAMPLING[method].headline
         self.looks = look_grid(campaign_stop.episodes, shard_size, ratio)
         self.reached = False
         self.rhw = self.heaviest = math.inf

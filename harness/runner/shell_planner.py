@@ -15,7 +15,7 @@ from harness.campaign.models import Campaign
 from harness.estimators import Shells
 from harness.estimators.block import Block
 from harness.estimators.estimate import BothWays, Estimate
-from harness.pool.prescribed import Draw
+from harness.pool.shells import Draw
 from harness.runner.allocation import Allocation
 from harness.runner.worker import ShardSpec
 from harness.strata import ShellDesign

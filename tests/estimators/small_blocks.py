@@ -6,8 +6,8 @@ from typing import TypeVar
 
 import numpy as np
 
-from harness.campaign.models import Method
 from harness.estimators.block import Block
+from harness.methods import Method
 from harness.strata import ShellDesign
 
 State = TypeVar("State")

@@ -5,7 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from harness.estimators import ESTIMATORS, Estimate, Unavailable, accumulator, headline, one_pass
+from harness.estimators import ESTIMATORS, Estimate, Unavailable, accumulator, one_pass
+from harness.methods import SAMPLING
 from harness.studies.chains.named import overtaking
 from harness.studies.chains.sampler import blocks
 from tests.chains.seed import SEED
@@ -29,7 +30,7 @@ def test_each_estimator_gets_what_it_would_get_alone(method):
             alone.add(part)
         assert estimate == alone.result(0.9)
     assert set(together) == set(ESTIMATORS)
-    assert isinstance(together[headline(method)], Estimate)
+    assert isinstance(together[SAMPLING[method].headline], Estimate)
 
 
 @pytest.mark.parametrize("method", METHODS)
