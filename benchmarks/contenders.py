@@ -20,7 +20,7 @@ from harness.campaign.loading import load_campaign
 from harness.campaign.models import Campaign
 from harness.episode import loop
 from harness.episode.loop import Shard
-from harness.records.folder import write_shard
+from harness.records.folder import encoded, write_shard
 from harness.records.tables import shard_tables
 from harness.resolved import resolve
 from harness.runner.prepare import Prepared, prepare
@@ -87,7 +87,7 @@ class Recorded(Contender):
         return Work(n, int(shard.results.episode["n_steps"].sum()), written)
 
     def write(self, shard: Shard) -> None:
-        write_shard(self.folder, 0, shard_tables(shard, self.prepared.campaign.seed, keep_traces=False))
+        write_shard(self.folder, 0, encoded(shard_tables(shard, self.prepared.campaign.seed, keep_traces=False)))
 
     def rows(self, n: int) -> bytes:
         episode = self.loop.run(0, self.prepared.states(0, n)).results.episode

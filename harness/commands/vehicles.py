@@ -20,10 +20,8 @@ from harness.commands.options import (
     set_option,
     written_file,
 )
-from harness.console import (
-    print_av_check,
-    print_json,
-)
+from harness.console import print_json
+from harness.console_tables import print_av_check
 
 
 @click.command(

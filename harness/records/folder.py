@@ -6,12 +6,13 @@ import fcntl
 import json
 import os
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from pydantic import BaseModel, ValidationError
 
@@ -137,8 +138,20 @@ def write_json(path: Path, content: Any) -> None:
     write_text(path, json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False) + "\n")
 
 
-def write_shard(folder: Path, index: int, tables: ShardTables) -> dict[str, str]:
-    """Write a shard's tables; ``episodes`` last, so that its presence means that the shard is complete.
+def encoded(tables: ShardTables) -> dict[str, bytes]:
+    """A shard's tables as Parquet files, by name: what a worker hands back."""
+    return {name: _parquet(table) for name in TABLES if (table := getattr(tables, name)) is not None}
+
+
+def _parquet(table: pa.Table) -> bytes:
+    sink = pa.BufferOutputStream()
+    pq.write_table(table, sink, compression=COMPRESSION)
+    content: bytes = sink.getvalue().to_pybytes()
+    return content
+
+
+def write_shard(folder: Path, index: int, shard: Mapping[str, bytes]) -> dict[str, str]:
+    """Write what `encoded` has made; ``episodes`` last, so that its presence means that the shard is complete.
 
     What an earlier, shorter round has left of the shard goes first, for the same reason.
 
@@ -151,27 +164,24 @@ def write_shard(folder: Path, index: int, tables: ShardTables) -> dict[str, str]
         (folder / shard_file(name, index)).unlink(missing_ok=True)
     files = {}
     for name in reversed(TABLES):
-        table = getattr(tables, name)
-        if table is not None:
+        if name in shard:
             files[name] = shard_file(name, index)
-            write_atomically(folder / files[name], lambda path, table=table: _write_parquet(path, table))  # type: ignore[misc]
+            write_bytes(folder / files[name], shard[name])
     return files
 
 
-def _write_parquet(path: Path, table: pa.Table) -> None:
-    pq.write_table(table, path, compression=COMPRESSION)
-
-
-def read_table(path: Path, columns: list[str] | None = None) -> pa.Table:
-    """Read one Parquet file of a run.
+def read_table(path: Path, columns: list[str] | None = None, rows: pc.Expression | None = None) -> pa.Table:
+    """Read one Parquet file of a run; row groups that cannot hold one of the asked ``rows`` are skipped.
 
     Raises
     ------
     RunFolderError
-        The file is missing or damaged.
+        The file is missing or damaged, or lacks a column.
     """
     try:
-        return pq.read_table(path, columns=columns, memory_map=False, partitioning=None)
+        if columns and (missing := sorted(set(columns).difference(pq.read_schema(path).names))):
+            raise pa.ArrowInvalid(f"no column {missing[0]!r}")
+        return pq.read_table(path, columns=columns, filters=rows, memory_map=False, partitioning=None)
     except (OSError, pa.ArrowException, KeyError) as error:
         raise damaged(path, error) from error
 

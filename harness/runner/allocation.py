@@ -11,7 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from harness.arrays import BoolArray, FloatArray, IntArray
-from harness.estimators.stratified import combined, share_limits
+from harness.estimators.intervals import clopper_pearson
+from harness.estimators.shells import combined
 from harness.strata import ShellDesign
 
 GROWTH = 1.25
@@ -71,7 +72,7 @@ class Allocation:
 
     def _used_up(self, tests: IntArray, crashes: IntArray, failed: IntArray) -> bool:
         """Whether nearly all that is left to know lies in strata without further cut-ins."""
-        low, high = share_limits(crashes, tests, (1.0 - CONFIDENCE) / 2.0, failed)
+        low, high = clopper_pearson(crashes, tests, (1.0 - CONFIDENCE) / 2.0, failed)
         relevant = np.arange(tests.size) < (self.design.n_inside if self.conditional_only else tests.size)
         squares = np.where(relevant, (self.design.p * (high - low)) ** 2, 0.0)
         return bool(squares[tests >= self.available].sum() >= USED_UP_SHARE * squares.sum())
@@ -92,7 +93,7 @@ class Allocation:
 
     def _spread(self, size: int, tests: IntArray, crashes: IntArray, failed: IntArray, active: BoolArray) -> IntArray:
         """Give portions, one after the other, to where each narrows the sum of squared half-widths most."""
-        low, high = share_limits(crashes, tests, (1.0 - CONFIDENCE) / 2.0, failed)
+        low, high = clopper_pearson(crashes, tests, (1.0 - CONFIDENCE) / 2.0, failed)
         half_width = self.design.p * (high - low) / 2.0
         gain = _Gain(half_width, (crashes + failed == 0) | (crashes == tests), tests)
         room = np.where(active, self.available - tests, 0).tolist()

@@ -17,6 +17,7 @@ import pyarrow.parquet as pq
 
 from harness.campaign.models import Campaign
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE
+from harness.methods import SAMPLING
 from harness.progress import Progress, SilentProgress
 from harness.records.folder import SHELLS, TABLES, shard_file, sole_use, write_json
 from harness.resolved import Resolved
@@ -246,7 +247,7 @@ def _figures(campaign: Campaign, n_crashes: int, planner: Planner) -> dict[str, 
     """
     watched = "half_width" if campaign.stop.rhw is None else "rhw"
     figures: dict[str, int | float] = {"crashes": n_crashes, watched: planner.rule.rhw}
-    weighted = campaign.testing.method in ("forced", "episode_mixture")
+    weighted = SAMPLING[campaign.testing.method].forces
     return figures | ({"heaviest": planner.rule.heaviest} if weighted else {})
 
 

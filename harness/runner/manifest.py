@@ -139,20 +139,20 @@ class Manifest:
         folder.mkdir(parents=True, exist_ok=True)
         self.write([], [], status="running")  # first: --resume knows a folder by its manifest
 
-    def is_replaced_by(self, spec: ShardSpec) -> bool:
-        """Whether a shard that is not taken over takes the place of one that an earlier run has left."""
-        if self._earlier is None or spec.index >= len(self._earlier["shards"]):
-            return False
-        shard = self._earlier["shards"][spec.index]
-        return bool(shard["n_episodes"] != spec.n_episodes) or (self._folder / shard["files"]["episodes"]).exists()
+    def forget_replaced(self, spec: ShardSpec) -> None:
+        """Cut what an earlier run has left before the shard that this one is about to take the place of, if it does.
 
-    def forget_from(self, index: int) -> None:
-        """Cut what an earlier run has left before shard ``index``, which is about to be replaced."""
-        assert self._earlier is not None
-        shards = self._earlier["shards"][:index]
-        self._n_kept = sum(shard["n_episodes"] for shard in shards)
+        One of the same size whose file is missing is only made anew.
+        """
+        earlier = [] if self._earlier is None else self._earlier["shards"]
+        if self._earlier is None or spec.index >= len(earlier):
+            return
+        shard = earlier[spec.index]
+        if shard["n_episodes"] == spec.n_episodes and not (self._folder / shard["files"]["episodes"]).exists():
+            return
+        self._n_kept = sum(shard["n_episodes"] for shard in earlier[: spec.index])
         cut = {"status": "interrupted", "stopped_by": None, "ending": None, "n_episodes": self._n_kept}
-        self._earlier = {**self._earlier, **cut, "shards": shards}
+        self._earlier = {**self._earlier, **cut, "shards": earlier[: spec.index]}
         write_json(self._folder / MANIFEST, self._earlier)
 
     def write(

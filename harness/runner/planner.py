@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from harness.campaign.models import Campaign
 from harness.estimators import StopRule, accumulator
 from harness.estimators.block import Block
-from harness.pool.prescribed import PrescribedEpisodes
+from harness.pool.shells import PrescribedEpisodes
 from harness.runner.shell_planner import ShellPlanner
 from harness.runner.worker import ShardSpec
 
@@ -53,4 +53,4 @@ def planner_of(campaign: Campaign, prescribed: PrescribedEpisodes | None, held: 
     """The planner of a campaign whose folder holds ``held`` tests already."""
     if prescribed is None:
         return FixedPlanner(campaign)
-    return ShellPlanner(campaign, prescribed.design, prescribed.draws.available, held)
+    return ShellPlanner(campaign, prescribed.design, prescribed.available, held)

@@ -28,14 +28,14 @@ class WorkerProcess:
     ----------
     resolved : Resolved
     folder : Path
-        Run folder, where it writes.
+        Run folder; a file in it tells which call of a controller the process is in.
     """
 
     def __init__(self, resolved: Resolved, folder: Path) -> None:
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
         self._black_box = folder / f".black-box-{next(_numbers)}"
         self.connection, theirs = spawn_context().Pipe()
-        self._process = start_process(serve, theirs, resolved, folder, self._black_box)
+        self._process = start_process(serve, theirs, resolved, self._black_box)
         theirs.close()  # or its death would not end the pipe
 
     def give(self, spec: ShardSpec, doomed: Mapping[int, Death]) -> bool:
@@ -63,7 +63,7 @@ class WorkerProcess:
         return answer
 
     def kill(self) -> int | None:
-        """End it at once, whatever it does (files are written atomically); returns its exit code."""
+        """End it at once, whatever it does; returns its exit code."""
         exit_code = end_process(self._process)
         self.connection.close()
         self._black_box.unlink(missing_ok=True)
@@ -99,7 +99,7 @@ def first_to_answer(workers: Sequence[WorkerProcess]) -> WorkerProcess:
             return found[0]
 
 
-def serve(connection: Connection, resolved: Resolved, folder: Path, black_box: Path) -> None:
+def serve(connection: Connection, resolved: Resolved, black_box: Path) -> None:
     """What the process does: prepare with the first shard, run shards until the parent is gone or has no more."""
     runner: ShardRunner | None = None
     while True:
@@ -108,7 +108,7 @@ def serve(connection: Connection, resolved: Resolved, folder: Path, black_box: P
         except (EOFError, OSError):
             break
         try:
-            runner = runner or ShardRunner(resolved, folder, black_box)
+            runner = runner or ShardRunner(resolved, black_box)
             answer: ShardDone | Exception = runner.run(spec, doomed)
         except Exception as error:  # noqa: BLE001 - whatever goes wrong here is the parent's to judge
             answer = fit_to_travel(error)

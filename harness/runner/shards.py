@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
 
@@ -17,8 +17,8 @@ from harness.campaign.models import Campaign
 from harness.controllers.black_box import OF_EPISODE, Call, Death
 from harness.controllers.time_limit import death_cause
 from harness.errors import HarnessError, TooManyFailedError
-from harness.pool.prescribed import PrescribedEpisodes
-from harness.records.folder import TABLES, read_table, shard_file
+from harness.pool.shells import PrescribedEpisodes
+from harness.records.folder import TABLES, read_table, shard_file, write_shard
 from harness.records.tables import ShardTables
 from harness.resolved import Resolved
 from harness.runner.manifest import Manifest
@@ -72,7 +72,7 @@ def stored_shard(
     n_retraced = 0 if retracing is None else retracing.check(tables["episodes"])
     block, causes = shard_block(campaign, kept, prescribed), failure_causes(kept.episodes)
     repeated = stored_repeated(kept.episodes)
-    return ShardDone(spec, files, block, stored=True, n_retraced=n_retraced, failures=causes, repeated=repeated)
+    return ShardDone(spec, block, files, stored=True, n_retraced=n_retraced, failures=causes, repeated=repeated)
 
 
 def _same_cut_ins(episodes: pa.Table, prescribed: PrescribedEpisodes, spec: ShardSpec) -> bool:
@@ -88,7 +88,6 @@ class _Job:
     spec: ShardSpec
     done: ShardDone | None
     deaths: int = 0
-    replaces: bool = False
     suspected: Call | None = None
     doomed: dict[int, Death] = field(default_factory=dict)
 
@@ -123,9 +122,8 @@ class ShardPool:
     ) -> Iterator[ShardDone]:
         """Finished shards in index order; those that ``stored`` knows are not run again.
 
-        Two shards per worker are under way or wait for their turn to be handed back: little is lost at the stop. A
-        shard that replaces one of an earlier run is begun only when all before it have been handed back, so that the
-        stop rule has not been content before; only then the manifest forgets the earlier one.
+        Two shards per worker are under way or wait for their turn to be handed back: little is lost at the stop. Each
+        is written when its turn comes, so that the stop rule has not been content before; nobody else writes.
 
         Raises
         ------
@@ -138,23 +136,25 @@ class ShardPool:
             for spec in islice(specs, 2 * self._n_workers + 1 - len(wanted)):
                 wanted.append(_Job(spec, stored(spec)))
                 if wanted[-1].done is None:
-                    wanted[-1].replaces = manifest.is_replaced_by(spec)
                     waiting.append(wanted[-1])
             if not wanted:
                 return
-            if wanted[0].replaces:
-                manifest.forget_from(wanted[0].spec.index)
-                for job in wanted:
-                    job.replaces = False  # the manifest lists none of them any more
             self._hand_out(waiting)
             while wanted[0].done is None:
                 self._collect(waiting)
                 self._hand_out(waiting)
-            yield wanted.popleft().done  # type: ignore[misc]
+            yield self._written(wanted.popleft().done, manifest)  # type: ignore[arg-type]
+
+    def _written(self, done: ShardDone, manifest: Manifest) -> ShardDone:
+        """The shard on disk; the manifest forgets what it takes the place of."""
+        if done.stored:
+            return done
+        manifest.forget_replaced(done.spec)
+        return replace(done, files=write_shard(self._folder, done.spec.index, done.parquet), parquet={})
 
     def _hand_out(self, waiting: deque[_Job]) -> None:
         """Give waiting shards to idle workers, of which there may be up to as many as were asked for."""
-        while waiting and not waiting[0].replaces and len(self._busy) < self._n_workers:
+        while waiting and len(self._busy) < self._n_workers:
             worker = self._idle.pop() if self._idle else WorkerProcess(self._resolved, self._folder)
             if worker.give(waiting[0].spec, waiting[0].doomed):
                 self._busy[worker] = waiting.popleft()

@@ -14,9 +14,8 @@ from harness.arrays import IntArray
 from harness.campaign.models import Campaign
 from harness.estimators import Shells
 from harness.estimators.block import Block
-from harness.estimators.both_ways import BothWays
-from harness.estimators.estimate import Estimate
-from harness.pool.prescribed import Draw
+from harness.estimators.estimate import BothWays, Estimate
+from harness.pool.shells import Draw
 from harness.runner.allocation import Allocation
 from harness.runner.worker import ShardSpec
 from harness.strata import ShellDesign

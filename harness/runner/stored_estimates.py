@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from harness.campaign.loading import load_campaign
-from harness.campaign.models import EstimatorName
 from harness.estimators import ESTIMATORS, CampaignFacts, estimate_blocks
 from harness.estimators.threads import read_ahead
 from harness.importance.build import importance_names
+from harness.methods import EstimatorName
 from harness.records.folder import read_manifest
 from harness.records.reader import stored_columns
 from harness.runner.stored_blocks import stored_blocks

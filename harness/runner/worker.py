@@ -6,7 +6,6 @@ import json
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from multiprocessing import parent_process
 from pathlib import Path
 
 import pyarrow as pa
@@ -18,8 +17,8 @@ from harness.episode.loop import EpisodeLoop, Shard
 from harness.estimators.block import Block
 from harness.estimators.from_records import block_from_tables
 from harness.importance.build import mixture_weights
-from harness.pool.prescribed import Draw, PrescribedEpisodes
-from harness.records.folder import write_shard
+from harness.pool.shells import Draw, PrescribedEpisodes
+from harness.records.folder import encoded
 from harness.records.tables import ShardTables, shard_tables
 from harness.resolved import Resolved
 from harness.runner.prepare import Prepared, build_world, prepare
@@ -43,14 +42,16 @@ class ShardSpec:
 
 @dataclass(frozen=True)
 class ShardDone:
-    """A shard on disk: what the stop rule needs of it, how many episodes the twin has retraced, causes of failures.
+    """A finished shard: what the stop rule needs of it, how many episodes the twin has retraced, causes of failures.
 
+    ``parquet`` holds its tables until they are written, ``files`` where they are from then on, relative to the folder.
     ``repeated`` is None for a shard none of whose tests were run twice.
     """
 
     spec: ShardSpec
-    files: dict[str, str]
     block: Block
+    files: dict[str, str] = field(default_factory=dict)
+    parquet: dict[str, bytes] = field(default_factory=dict)
     stored: bool = False
     n_retraced: int = 0
     failures: Counter[str] = field(default_factory=Counter)
@@ -58,19 +59,16 @@ class ShardDone:
 
 
 class ShardRunner:
-    """Runs shards of one campaign in one world, writing each to the run folder.
+    """Runs shards of one campaign in one world. It writes nothing: the process that runs the campaign does.
 
     Parameters
     ----------
     resolved : Resolved
-    folder : Path
-        Run folder.
     black_box : Path, optional
         File that tells the parent in which call of a controller the process died.
     """
 
-    def __init__(self, resolved: Resolved, folder: Path, black_box: Path | None = None) -> None:
-        self._folder = folder
+    def __init__(self, resolved: Resolved, black_box: Path | None = None) -> None:
         self._doomed: dict[int, Death] = {}
         self._prepared: Prepared = prepare(resolved)
         self._retracing = Retracing(resolved)
@@ -83,14 +81,12 @@ class ShardRunner:
         self._loop.close()
 
     def run(self, spec: ShardSpec, doomed: Mapping[int, Death] | None = None) -> ShardDone:
-        """Run a shard and write its tables; episodes in ``doomed`` fail before the call that ended a process.
+        """Run a shard; episodes in ``doomed`` fail before the call that ended a process.
 
         Raises
         ------
         WorldDisagreementError
-            The twin retraces an episode differently; nothing is written then.
-        OrphanError
-            The process that runs the campaign has been killed; nothing is written then either.
+            The twin retraces an episode differently.
         """
         self._doomed.update(doomed or {})
         campaign = self._prepared.campaign
@@ -100,10 +96,9 @@ class ShardRunner:
         tables = shard_tables(shard, campaign.seed, keep_traces=keep_traces)
         n_retraced = self._retracing.check(tables.episodes)
         repeated = self._repeat(shard) if spec.index == 0 and has_to_be_shown(campaign) else None
-        _require_parent()
-        files = write_shard(self._folder, spec.index, with_repeated(tables, repeated))
+        parquet = encoded(with_repeated(tables, repeated))
         block, causes = shard_block(campaign, tables, self._prepared.prescribed), failure_causes(tables.episodes)
-        return ShardDone(spec, files, block, n_retraced=n_retraced, failures=causes, repeated=repeated)
+        return ShardDone(spec, block, parquet=parquet, n_retraced=n_retraced, failures=causes, repeated=repeated)
 
     def _repeat(self, shard: Shard) -> Repeated:
         campaign = self._prepared.campaign
@@ -125,16 +120,6 @@ class ShardRunner:
         shard = self._loop.run(spec.first_episode, states, traffic)
         shard.cut_ins = rows
         return shard
-
-
-class OrphanError(RuntimeError):
-    """The process that runs the campaign is gone, and another one may be at work in its folder."""
-
-
-def _require_parent() -> None:
-    parent = parent_process()
-    if parent is not None and not parent.is_alive():
-        raise OrphanError("the process that runs the campaign has been killed")
 
 
 def with_repeated(tables: ShardTables, repeated: Repeated | None) -> ShardTables:

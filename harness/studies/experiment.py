@@ -7,20 +7,11 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
-from harness.campaign.models import (
-    NAME_PATTERN,
-    AutomatedVehicle,
-    BuiltInParameters,
-    Campaign,
-    EstimatorName,
-    Method,
-    Section,
-    Whole,
-    broken_rule,
-)
+from harness.campaign.models import AutomatedVehicle, BuiltInParameters, Campaign
+from harness.campaign.section import NAME_PATTERN, Section, Whole, broken_rule
 from harness.campaign.yaml_text import read_model
 from harness.errors import CampaignError
-from harness.estimators import headline
+from harness.methods import SAMPLING, EstimatorName
 from harness.studies.chains.named import CHAINS
 
 AvName = Annotated[str, Field(pattern=NAME_PATTERN)]
@@ -39,16 +30,6 @@ class Fault(Section):
 
     shell: Whole = Field(0, ge=0, description="stratum whose probability is wrong, from the most careful on")
     factor: float = Field(gt=0.0, description="wrong probability over the right one")
-
-
-JUDGED: dict[Method, set[EstimatorName]] = {
-    "shells": {"shells"},
-    "nde": {"nde", "nade"},
-    "forced": {"nade"},
-    "step_mixture": {"nade", "scv"},
-    "episode_mixture": {"nade", "mixture_cv"},
-}
-"""Estimators whose results can be judged."""
 
 
 class Experiment(Section):
@@ -72,7 +53,7 @@ class Experiment(Section):
     @property
     def results(self) -> tuple[EstimatorName, ...]:
         """Estimators to judge."""
-        return tuple(self.estimators) or (headline(self.campaign.testing.method),)
+        return tuple(self.estimators) or (SAMPLING[self.campaign.testing.method].headline,)
 
     def subject(self, name: str) -> Campaign:
         """The campaign with one of the vehicles."""
@@ -135,11 +116,12 @@ class Experiment(Section):
     @model_validator(mode="after")
     def _estimators_belong_to_the_method(self) -> Self:
         method = self.campaign.testing.method
-        if wrong := set(self.results) - JUDGED[method]:
+        judged = SAMPLING[method].estimators
+        if wrong := set(self.results).difference(judged):
             raise broken_rule(
                 "estimators",
                 found=", ".join(sorted(wrong)),
-                expected=f"for testing.method {method}: {', '.join(sorted(JUDGED[method]))}",
+                expected=f"for testing.method {method}: {', '.join(sorted(judged))}",
                 mend="Change one of the two.",
             )
         if self.fault is not None and method != "shells":

@@ -159,7 +159,7 @@ def judge(
     rates, tests, reached = columns["crash_rate"], columns["n_tests"], columns["reached"]
     truth, n = subject.crash_rate, len(rows)
     covered = int(np.count_nonzero((columns["ci_low"] <= truth) & (truth <= columns["ci_high"])))
-    low, high = clopper_pearson(covered, n, COVERAGE_CONFIDENCE)
+    low, high = map(float, clopper_pearson(covered, n, (1.0 - COVERAGE_CONFIDENCE) / 2.0))
     met = subject.meets_assumption or not conditional
     tests_5, median, tests_95 = (float(q) for q in np.quantile(tests, [0.05, 0.5, 0.95]))
     relvar = float(np.mean((rates / truth - 1.0) ** 2))

@@ -25,7 +25,7 @@ from scipy.stats import norm
 
 from harness.arrays import BoolArray, FloatArray, IntArray
 from harness.estimators.block import Block
-from harness.estimators.both_ways import BothWays
+from harness.estimators.estimate import BothWays
 from harness.estimators.scv import Scv
 
 

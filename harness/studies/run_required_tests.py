@@ -14,8 +14,7 @@ from harness.campaign.loading import load_campaign
 from harness.errors import HarnessError
 from harness.estimators.block import Block
 from harness.estimators.estimate import finite_json
-from harness.estimators.nade import Nade
-from harness.estimators.nde import Nde
+from harness.estimators.nade import Nade, Nde
 from harness.estimators.scv import Scv
 from harness.progress import Progress, SilentProgress
 from harness.runner.stored_blocks import stored_blocks

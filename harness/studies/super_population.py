@@ -23,9 +23,8 @@ from harness.campaign.models import AutomatedVehicle, BuiltInParameters, Reflexe
 from harness.compiled import cache_root, source_hash
 from harness.environment.driving import Environment
 from harness.errors import CampaignError
-from harness.pool.build import PILOT_PATHS, Enumerator
+from harness.pool.aimed_paths import PILOT_PATHS, Enumerator, contributions, fit_proposal
 from harness.pool.library import Library
-from harness.pool.proposal import fit_proposal
 from harness.pool.shells import acceleration_limit
 from harness.progress import Progress
 from harness.records.folder import write_atomically
@@ -156,27 +155,19 @@ def enumerate_paths(
         return _read(file)
     pilot = Enumerator(*asked)
     progress.stage(f"super-population of seed {seed}", n_paths + PILOT_PATHS)
-    rates = np.concatenate([block.rates(drivers.records.size) for block in pilot.run(0, PILOT_PATHS, progress)])
-    aimed = pilot.aimed(fit_proposal(pilot.uniforms(0, PILOT_PATHS), _importance(rates)))
+    rates = pilot.run(0, PILOT_PATHS, progress).rates(drivers.records.size)
+    aimed = pilot.aimed(fit_proposal(pilot.uniforms(0, PILOT_PATHS), contributions(rates)))
     population = _compressed(aimed, n_paths, progress)
     _write(file, population)
     return population
-
-
-def _importance(rates: FloatArray) -> FloatArray:
-    """What a path contributes to the drivers' crash rates, each relative to its mean, shape (n,)."""
-    mean = rates.mean(0)
-    relative = rates / np.where(mean > 0.0, mean, 1.0)
-    return np.asarray(np.sqrt((relative * relative).sum(1)))
 
 
 def _compressed(aimed: Enumerator, n_paths: int, progress: Progress) -> SuperPopulation:
     """Enumerate chunk by chunk, and keep the cut-ins with crashes of each."""
     parts = []
     for first in range(0, n_paths, CHUNK_PATHS):
-        blocks = aimed.run(PILOT_PATHS + first, min(CHUNK_PATHS, n_paths - first), progress)
-        mass = np.concatenate([block.probability * block.weight[:, None] for block in blocks])
-        bits = np.concatenate([block.crashes for block in blocks])
+        paths = aimed.run(PILOT_PATHS + first, min(CHUNK_PATHS, n_paths - first), progress)
+        mass, bits = paths.mass, paths.crashes
         row, step = np.nonzero((bits != 0) & (mass > 0.0))
         parts.append((mass.sum(1), first + row.astype(np.int64), mass[row, step], bits[row, step]))
     return SuperPopulation(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))

@@ -9,12 +9,13 @@ from typing import Protocol
 
 import numpy as np
 
-from harness.campaign.models import Campaign, EstimatorName, Method
+from harness.campaign.models import Campaign
 from harness.episode.loop import EpisodeLoop
 from harness.estimators import StopRule, accumulator
 from harness.estimators.block import Block
 from harness.estimators.from_records import block_from_tables
 from harness.importance.build import mixture_weights
+from harness.methods import EstimatorName, Method
 from harness.records.tables import shard_tables
 from harness.resolved import resolve
 from harness.runner.prepare import Prepared, prepare

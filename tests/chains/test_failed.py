@@ -13,11 +13,7 @@ import pytest
 from scipy.stats import binomtest
 
 from harness.estimators.block import Block
-from harness.estimators.mixture_cv import MixtureCv
-from harness.estimators.nade import Nade
-from harness.estimators.nde import Nde
-from harness.estimators.one_pass import accumulator
-from harness.estimators.shells import Shells
+from harness.estimators.one_pass import ESTIMATORS, accumulator
 from harness.studies.chains.named import frequent_decisive
 from harness.studies.chains.sampler import draw
 from harness.studies.chains.shells import ChainShells
@@ -28,7 +24,7 @@ REPLICATIONS = 300
 N = 2_000
 FAILING = 0.4
 CHAIN = frequent_decisive()
-METHODS = {"nde": ("nde", Nde), "nade": ("forced", Nade), "mixture_cv": ("episode_mixture", MixtureCv)}
+METHODS = {"nde": "nde", "nade": "forced", "mixture_cv": "episode_mixture"}
 
 
 def with_failures(block: Block, rng: np.random.Generator) -> Block:
@@ -48,8 +44,8 @@ def require_coverage(drawn, seed: int, name: str, wrong: type) -> None:
 
 @pytest.mark.parametrize("name", METHODS)
 def test_intervals_cover_whatever_failed_tests_would_have_come_to(name):
-    method, wrong = METHODS[name]
-    require_coverage(lambda rng: draw(CHAIN, method, 20 * N if name == "nde" else N, rng), 31, name, wrong)
+    n = 20 * N if name == "nde" else N
+    require_coverage(lambda rng: draw(CHAIN, METHODS[name], n, rng), 31, name, ESTIMATORS[name])
 
 
 def shells_block(rng: np.random.Generator) -> Block:
@@ -78,7 +74,7 @@ def shells_block(rng: np.random.Generator) -> Block:
     )
 
 
-class FailedAsSafe(Shells):
+class FailedAsSafe(ESTIMATORS["shells"]):
     """Mutant: today's shells, which forget that tests failed."""
 
     def add(self, block: Block) -> None:

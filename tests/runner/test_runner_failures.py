@@ -7,19 +7,21 @@ import multiprocessing
 import os
 import pickle
 import signal
-from types import SimpleNamespace
+from pathlib import Path
 
 import pytest
 
 from harness.cli import main
 from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, WorldDisagreementError
-from harness.resolved import resolve
+from harness.records import folder
 from harness.runner import campaign_run, processes, shards
 from harness.runner.shards import WorkerLostError
-from harness.runner.worker import OrphanError, ShardRunner, ShardSpec
+from harness.runner.worker import ShardSpec
 from tests.runner import bad_workers
 from tests.runner.conftest import MIXTURE_FILE, SMALL, TWIN
 from tests.runner.stored_runs import copy_of, manifest, shard_files, unlike_columns
+
+SHARDS_BEFORE_FAILURE = 3
 
 
 def test_a_shard_that_kills_every_worker_ends_the_run_and_is_named(run, campaign, tmp_path, monkeypatch):
@@ -48,14 +50,22 @@ def test_a_full_disk_is_said_in_words_and_the_run_can_be_resumed(
 ):
     out = tmp_path / "run"
     options = [word for override in (*SMALL, *TWIN) for word in ("--set", override)]
+    write = folder._write
+
+    def write_or_fail(path: Path, content: bytes) -> None:
+        if path.parent.name == "moments" and len(shard_files(out)) == SHARDS_BEFORE_FAILURE:
+            path.write_bytes(b"PAR1, and then the disk was full")
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+        write(path, content)
+
     with monkeypatch.context() as patch:
-        patch.setattr(processes, "serve", bad_workers.without_room)
+        patch.setattr(folder, "_write", write_or_fail)
         assert main(["run", str(MIXTURE_FILE), "--out", str(out), "--workers", "1", *options]) == 2
     complaint = capsys.readouterr().err
     assert "no space left" in complaint
     assert "--resume" in complaint
-    assert len(shard_files(out)) == bad_workers.SHARDS_BEFORE_FAILURE
-    assert manifest(out)["n_episodes"] == 80 * bad_workers.SHARDS_BEFORE_FAILURE
+    assert len(shard_files(out)) == SHARDS_BEFORE_FAILURE
+    assert manifest(out)["n_episodes"] == 80 * SHARDS_BEFORE_FAILURE
     assert manifest(out)["status"] == "interrupted"
     assert not list(out.rglob("*.part"))
     run_here(campaign(*TWIN), out, resume=True)
@@ -106,7 +116,7 @@ def serve(campaign, tmp_path, monkeypatch):
     def served(runner: type, n_shards: int) -> list:
         monkeypatch.setattr(processes, "ShardRunner", runner)
         pipe = Pipe(n_shards)
-        processes.serve(pipe, campaign(), tmp_path, tmp_path / "black-box")
+        processes.serve(pipe, campaign(), tmp_path / "black-box")
         return pipe.sent
 
     yield served
@@ -149,7 +159,7 @@ def test_a_worker_ends_quietly_when_its_parent_was_killed(lost, campaign, tmp_pa
     monkeypatch.setattr(pipe, lost, broken)
     monkeypatch.setattr(processes, "ShardRunner", Runner)
     monkeypatch.setattr(signal, "signal", lambda *_: None)
-    processes.serve(pipe, campaign(), tmp_path, tmp_path / "black-box")
+    processes.serve(pipe, campaign(), tmp_path / "black-box")
     assert closed == ([True] if lost == "send" else [])
 
 
@@ -191,14 +201,3 @@ def test_an_error_that_cannot_be_pickled_reaches_the_parent_in_words(serve):
     (error,) = serve(Runner, 1)
     assert isinstance(error, RuntimeError)
     assert "ValueError: of a strange kind" in str(error)
-
-
-def test_a_worker_whose_parent_was_killed_writes_nothing(campaign, tmp_path, monkeypatch):
-    """Another process may be at work in the folder by then."""
-    gone = SimpleNamespace(is_alive=lambda: False)
-    runner = ShardRunner(resolve(campaign("world.engine=twin")), tmp_path)
-    monkeypatch.setattr("harness.runner.worker.parent_process", lambda: gone)
-    with pytest.raises(OrphanError):
-        runner.run(ShardSpec(0, 0, 20))
-    runner.close()
-    assert list(tmp_path.iterdir()) == []

@@ -8,8 +8,8 @@ import numpy as np
 from scipy.special import logsumexp
 
 from harness.arrays import BoolArray, FloatArray, IntArray
-from harness.campaign.models import Method
 from harness.estimators.block import MAX_CONTROL_STEPS, Block
+from harness.methods import Method
 from harness.studies.chains.chain import Chain
 
 DEFENSIVE_SHARE = 0.1
