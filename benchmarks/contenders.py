@@ -223,15 +223,15 @@ class Workers:
 
     def __init__(self, settings: Campaign, workers: int) -> None:
         self._folder = Path(tempfile.mkdtemp(prefix="harness-benchmark-"))
-        self._pool = ShardPool(settings, self._folder, workers)
+        self._pool = ShardPool(resolve(settings), workers)
         self._workers = workers
 
     def run(self, first: int, n: int) -> Work:
         """Shards of 2,500 episodes, the same number for every worker."""
         n_shards = max(2, n // SHARD)
         specs = [ShardSpec(i, first + i * SHARD, SHARD) for i in range(n_shards)]
-        for _ in self._pool.run(iter(specs), lambda _: None):
-            pass
+        for done in self._pool.run(iter(specs), lambda _: None):
+            write_shard(self._folder, done.spec.index, done.parquet)
         return Work(n_shards * SHARD, 0)
 
     def rows(self, n: int) -> None:

@@ -8,18 +8,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from harness.commands.options import (
-    FILE,
-    RUN_FOLDER,
-    examples,
-    json_option,
-    written_file,
-)
-from harness.console import (
-    print_estimates,
-    print_json,
-    write_trace,
-)
+from harness.commands.options import FILE, RUN_FOLDER, examples, json_option, written_file
+from harness.console import print_estimates, print_json, write_trace
 from harness.errors import EXIT_BAD_INPUT, WorldDisagreementError
 
 if TYPE_CHECKING:

@@ -57,7 +57,7 @@ class TableError(_Stored):
 
 
 class Repeated(_Stored):
-    """What repeating some tests has shown; `harness.runner.repeat.Repeated`."""
+    """What repeating some tests has shown; `harness.runner.worker.Repeated`."""
 
     n_episodes: Count
     differing: list[Count]
@@ -89,8 +89,9 @@ class StoredManifest(_Stored):
 
 
 class StoredShells(_Stored):
-    """``shells.json``: the strata of a shells campaign, see `harness.pool.shells.ShellDesign`."""
+    """``shells.json``: the strata of a shells campaign, see `harness.strata.ShellDesign`."""
 
+    model_config = ConfigDict(extra="forbid")
     pool: str
     strata: list[str]
     p: list[float]
@@ -100,7 +101,7 @@ class StoredShells(_Stored):
     boundary: str
     p_cut_in: float
     p_impossible: float
-    available: list[Count] = []
+    available: list[Count]
 
     @model_validator(mode="after")
     def _of_one_size(self) -> Self:

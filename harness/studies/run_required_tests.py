@@ -18,7 +18,7 @@ from harness.estimators.nade import Nade
 from harness.estimators.nde import Nde
 from harness.estimators.scv import Scv
 from harness.progress import Progress, SilentProgress
-from harness.runner.stored_blocks import stored_blocks
+from harness.runner.stored_estimates import stored_blocks
 from harness.studies.required_tests import (
     Procedure,
     RequiredTests,
