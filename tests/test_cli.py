@@ -16,9 +16,9 @@ from click.testing import CliRunner
 from pyarrow import csv, parquet
 
 from harness.campaign.loading import load_campaign
-from harness.campaign.models import EstimatorName
 from harness.cli import cli, main
 from harness.errors import EXIT_BAD_INPUT, RunFolderError, TooManyFailedError
+from harness.methods import EstimatorName
 
 SCENARIOS = Path(__file__).parents[1] / "scenarios"
 SMOKE = str(SCENARIOS / "smoke.yaml")

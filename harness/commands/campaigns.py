@@ -20,7 +20,8 @@ from harness.commands.options import (
     set_option,
     workers_option,
 )
-from harness.console import print_json, print_plan, print_statements
+from harness.console import print_json, print_plan
+from harness.console_tables import print_statements
 
 
 @click.command(

@@ -21,7 +21,8 @@ from harness.commands.options import (
     set_option,
     written_file,
 )
-from harness.console import print_json, print_pool, print_required_tests
+from harness.console import print_json
+from harness.console_tables import print_pool, print_required_tests
 
 if TYPE_CHECKING:
     from harness.studies.run_required_tests import RnotEstimator

@@ -22,7 +22,8 @@ from harness.commands.options import (
     workers_option,
     written_file,
 )
-from harness.console import print_av_check, print_json
+from harness.console import print_json
+from harness.console_tables import print_av_check
 
 
 @click.command(

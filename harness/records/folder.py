@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from pydantic import BaseModel, ValidationError
 
@@ -174,16 +175,18 @@ def write_shard(folder: Path, index: int, shard: Mapping[str, bytes]) -> dict[st
     return shard_files(folder, index)
 
 
-def read_table(path: Path, columns: list[str] | None = None) -> pa.Table:
-    """Read one Parquet file of a run.
+def read_table(path: Path, columns: list[str] | None = None, rows: pc.Expression | None = None) -> pa.Table:
+    """Read one Parquet file of a run; row groups that cannot hold one of the asked ``rows`` are skipped.
 
     Raises
     ------
     RunFolderError
-        The file is missing or damaged.
+        The file is missing or damaged, or lacks a column.
     """
     try:
-        return pq.read_table(path, columns=columns, memory_map=False, partitioning=None)
+        if columns and (missing := sorted(set(columns).difference(pq.read_schema(path).names))):
+            raise pa.ArrowInvalid(f"no column {missing[0]!r}")
+        return pq.read_table(path, columns=columns, filters=rows, memory_map=False, partitioning=None)
     except (OSError, pa.ArrowException, KeyError) as error:
         raise damaged(path, error) from error
 

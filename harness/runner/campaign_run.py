@@ -18,6 +18,7 @@ import pyarrow.parquet as pq
 
 from harness.campaign.models import Campaign
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE
+from harness.methods import SAMPLING
 from harness.progress import Progress, SilentProgress
 from harness.records.folder import SHELLS, TABLES, shard_files, shards_on_disk, sole_use, write_json, write_shard
 from harness.resolved import Resolved
@@ -173,7 +174,7 @@ class _Run:
         """
         watched = "half_width" if self._campaign.stop.rhw is None else "rhw"
         figures: dict[str, int | float] = {"crashes": self.prefix.n_crashes, watched: self._planner.rule.rhw}
-        weighted = self._campaign.testing.method in ("forced", "episode_mixture")
+        weighted = SAMPLING[self._campaign.testing.method].forces
         return figures | ({"heaviest": self._planner.rule.heaviest} if weighted else {})
 
     def discard_uncounted(self) -> None:

@@ -19,10 +19,10 @@ from harness.arrays import BoolArray, IntArray
 from harness.campaign.models import Campaign
 from harness.estimators import Shells, StopRule, accumulator
 from harness.estimators.block import Block
-from harness.estimators.both_ways import BothWays
-from harness.estimators.estimate import Estimate
-from harness.estimators.stratified import combined, share_limits
-from harness.pool.prescribed import Draw, PrescribedEpisodes
+from harness.estimators.estimate import BothWays, Estimate
+from harness.estimators.intervals import clopper_pearson
+from harness.estimators.shells import combined
+from harness.pool.shells import Draw, PrescribedEpisodes
 from harness.runner.worker import ShardSpec
 from harness.strata import ShellDesign
 
@@ -148,7 +148,7 @@ def planner_of(campaign: Campaign, prescribed: PrescribedEpisodes | None, held: 
     """The planner of a campaign whose folder holds ``held`` tests already."""
     if prescribed is None:
         return FixedPlanner(campaign)
-    return ShellPlanner(campaign, prescribed.design, prescribed.draws.available, held)
+    return ShellPlanner(campaign, prescribed.design, prescribed.available, held)
 
 
 @dataclass(frozen=True)
@@ -194,7 +194,7 @@ class Allocation:
 
     def _used_up(self, tests: IntArray, crashes: IntArray, failed: IntArray) -> bool:
         """Whether nearly all that is left to know lies in strata without further cut-ins."""
-        low, high = share_limits(crashes, tests, _TAIL, failed)
+        low, high = clopper_pearson(crashes, tests, _TAIL, failed)
         relevant = np.arange(tests.size) < (self.design.n_inside if self.conditional_only else tests.size)
         squares = np.where(relevant, (self.design.p * (high - low)) ** 2, 0.0)
         return bool(squares[tests >= self.available].sum() >= USED_UP_SHARE * squares.sum())
@@ -218,7 +218,7 @@ class Allocation:
 
         A squared half-width shrinks as 1/n, or as 1/n² where shares are all 0 or 1.
         """
-        low, high = share_limits(crashes, tests, _TAIL, failed)
+        low, high = clopper_pearson(crashes, tests, _TAIL, failed)
         squares = ((self.design.p * (high - low) / 2.0) ** 2).tolist()
         powers = np.where((crashes + failed == 0) | (crashes == tests), 2, 1).tolist()
         so_far, room = tests.tolist(), np.where(active, self.available - tests, 0).tolist()

@@ -19,8 +19,7 @@ from harness.episode.loop import MOMENT_LIMITS, EpisodeLoop, Keep, Policy
 from harness.episode.trajectory import empty_trajectory
 from harness.errors import RunFolderError
 from harness.importance.build import build_importance, needs_tables
-from harness.pool.prescribed import PrescribedEpisodes
-from harness.pool.shells import require_boundary
+from harness.pool.shells import PrescribedEpisodes, require_boundary
 from harness.pool.storage import campaign_pool, campaign_pool_key, pool_path
 from harness.progress import Progress, SilentProgress
 from harness.records.folder import SHELLS, read_json

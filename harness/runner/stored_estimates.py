@@ -8,13 +8,14 @@ from pathlib import Path
 from typing import Any
 
 from harness.campaign.loading import load_campaign
-from harness.campaign.models import Campaign, EstimatorName
+from harness.campaign.models import Campaign
 from harness.errors import HarnessError, RunFolderError
 from harness.estimators import ESTIMATORS, CampaignFacts, estimate_blocks
 from harness.estimators.block import Block
 from harness.estimators.from_records import EPISODE_COLUMNS, MOMENT_COLUMNS, SHELL_COLUMNS, block_from_tables
 from harness.estimators.threads import read_ahead
 from harness.importance.build import importance_names, mixture_weights
+from harness.methods import EstimatorName
 from harness.pool.storage import cached_pool, read_pool
 from harness.pool.surrogate_replay import PATH_COLUMNS, SurrogateReplay
 from harness.records.folder import SHELLS, no_episodes, read_json, read_manifest, require_schema

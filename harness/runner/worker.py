@@ -28,7 +28,7 @@ from harness.estimators.block import Block
 from harness.estimators.from_records import block_from_tables
 from harness.importance.build import mixture_weights
 from harness.outcomes import FAILED
-from harness.pool.prescribed import Draw, PrescribedEpisodes
+from harness.pool.shells import Draw, PrescribedEpisodes
 from harness.records.folder import encoded
 from harness.records.tables import ShardTables, shard_tables
 from harness.resolved import Resolved

@@ -12,9 +12,9 @@ from scipy.stats import binomtest
 
 from harness.estimators.block import Block
 from harness.estimators.mixture_cv import MixtureCv
+from harness.estimators.moments import ThirdMoments
 from harness.estimators.nade import Nade
 from harness.estimators.scv import Scv
-from harness.estimators.third_moments import ThirdMoments
 from harness.studies.chains.named import frequent_decisive, rare_decisive
 from harness.studies.chains.sampler import draw
 

@@ -13,7 +13,7 @@ import pytest
 from scipy.stats import binomtest
 
 from harness.estimators.block import Block
-from harness.estimators.one_pass import _CLASSES, accumulator
+from harness.estimators.one_pass import ESTIMATORS, accumulator
 from harness.studies.chains.named import frequent_decisive
 from harness.studies.chains.sampler import draw
 from harness.studies.chains.shells import ChainShells
@@ -43,7 +43,7 @@ def low(covered: int) -> float:
 
 @pytest.mark.parametrize("name", METHODS)
 def test_intervals_cover_whatever_failed_tests_would_have_come_to(name):
-    make = {"both ways": lambda: accumulator(name), "as no crash": _CLASSES[name]}
+    make = {"both ways": lambda: accumulator(name), "as no crash": ESTIMATORS[name]}
     found = replicate(lambda rng: with_failures(drawn(name, rng), rng), REPLICATIONS, 31, make)
     assert low(found["both ways"].covered(CHAIN.crash_rate)) > 1e-4
     assert low(found["as no crash"].covered(CHAIN.crash_rate)) < 1e-9
@@ -75,7 +75,7 @@ def shells_block(rng: np.random.Generator) -> Block:
     )
 
 
-class FailedAsSafe(_CLASSES["shells"]):
+class FailedAsSafe(ESTIMATORS["shells"]):
     """Mutant: today's shells, which forget that tests failed."""
 
     def add(self, block: Block) -> None:

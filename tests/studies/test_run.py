@@ -9,7 +9,7 @@ import pytest
 
 from harness.campaign.models import Campaign
 from harness.cli import main
-from harness.studies.experiment import JUDGED
+from harness.methods import SAMPLING
 from harness.studies.weighted_campaign import TwinEpisodes, WeightedCampaign
 
 CHAINS = """
@@ -72,7 +72,7 @@ def test_every_result_that_may_be_asked_for_is_given(method):
     """At a level of lane changing at which crashes are frequent."""
     settings = {"environment": {"lane_change_level": 1e3}, "testing": {"method": method}, "stop": {"episodes": 300}}
     campaign = Campaign.model_validate({"name": "x", "world": {"engine": "twin"}, **settings})
-    estimators = sorted(JUDGED[method])
+    estimators = sorted(SAMPLING[method].estimators)
     rows = WeightedCampaign(campaign, TwinEpisodes(campaign, 5, estimators), estimators).run(range(2))
     assert [row.result for row in rows] == [*estimators, *estimators]
 

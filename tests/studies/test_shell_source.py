@@ -11,9 +11,8 @@ from harness.errors import CampaignError
 from harness.pool.build import build_pool
 from harness.pool.library import Library, load_library
 from harness.progress import SilentProgress
-from harness.studies.panel import NO_ENVELOPE, Drivers
 from harness.studies.shell_source import equals, leave_out, overtaking_shells
-from harness.studies.super_population import enumerate_paths
+from harness.studies.super_population import NO_ENVELOPE, Drivers, enumerate_paths
 
 PATHS = 1024
 AVS = {
@@ -39,18 +38,18 @@ def avs():
 
 @pytest.fixture(scope="module")
 def drivers(library, avs):
-    return Drivers(library, avs)
+    return Drivers.of(library, avs)
 
 
 @pytest.fixture(scope="module")
 def population(drivers):
     environment = load_environment(Environment())
-    return enumerate_paths(environment, drivers.records, drivers.envelope, 3, PATHS, SilentProgress())
+    return enumerate_paths(environment, drivers, 3, PATHS, SilentProgress())
 
 
 def test_the_cache_gives_the_same_back(drivers, population):
     environment = load_environment(Environment())
-    again = enumerate_paths(environment, drivers.records, drivers.envelope, 3, PATHS, SilentProgress())
+    again = enumerate_paths(environment, drivers, 3, PATHS, SilentProgress())
     for name in ("cut_in", "path", "mass", "bits"):
         np.testing.assert_array_equal(getattr(again, name), getattr(population, name))
 
@@ -87,14 +86,14 @@ def test_drawn_pools_scatter_around_the_population(library, population, drivers,
     assert source.crashing.sum() == pytest.approx(drivers.vehicles["own"].crash_mass(population).sum(), rel=1e-12)
     drawn = [source.draw(np.random.default_rng([1, k])) for k in range(300)]
     rates = np.array([design.p @ share for design, share in drawn])
-    exact = source.crashing.sum() / population.n_paths
+    exact = source.crashing.sum() / population.cut_in.size
     assert abs(rates.mean() - exact) < 4.0 * rates.std() / np.sqrt(len(rates))
     assert all(design.strata[-1] == "outside" and design.boundary == library.boundary for design, _ in drawn)
 
 
 def test_a_vehicle_that_accelerates_harder_has_no_envelope(library):
     wild = AutomatedVehicle.model_validate({"model": "constant", "parameters": {"acceleration_mps2": 3.0}})
-    assert Drivers(library, {"wild": wild}).envelope == NO_ENVELOPE
+    assert Drivers.of(library, {"wild": wild}).envelope == NO_ENVELOPE
 
 
 @pytest.mark.slow
@@ -102,7 +101,7 @@ def test_real_pools_have_the_shells_of_drawn_ones(library, avs, drivers):
     """A pool as a campaign builds it, from other paths: shell probabilities and their errors agree."""
     environment = load_environment(Environment())
     paths = 16_384
-    population = enumerate_paths(environment, drivers.records, drivers.envelope, 3, paths, SilentProgress())
+    population = enumerate_paths(environment, drivers, 3, paths, SilentProgress())
     source = overtaking_shells(library, population, avs["own"], drivers.vehicles["own"], paths)
     real = build_pool(environment, library, PoolSettings(relative_error=0.01, seed=7), "real")
     assert real.names == source.template.names

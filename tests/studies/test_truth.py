@@ -8,8 +8,7 @@ from harness.campaign.models import AutomatedVehicle, Environment
 from harness.environment.loading import load_environment
 from harness.pool.library import load_library
 from harness.progress import SilentProgress
-from harness.studies.panel import Drivers
-from harness.studies.truth import Truth, combined, truths
+from harness.studies.super_population import Drivers, Truth, combined, truths
 
 
 def test_two_truths_are_weighted_by_their_precision():
@@ -23,7 +22,7 @@ def test_imprecise_ones_are_enumerated_again_and_agree():
         "idm": AutomatedVehicle.model_validate({}),
         "wild": AutomatedVehicle.model_validate({"model": "constant", "parameters": {"acceleration_mps2": 0.0}}),
     }
-    drivers = Drivers(load_library("ladder-1"), avs)
+    drivers = Drivers.of(load_library("ladder-1"), avs)
     environment = load_environment(Environment())
     found = truths(environment, drivers, 3, 1024, SilentProgress())
     assert found["idm"].crash_rate == pytest.approx(1.343e-7, abs=4.0 * found["idm"].std_error)
