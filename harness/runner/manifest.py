@@ -100,13 +100,7 @@ def require_no_fewer(folder: Path, earlier: dict[str, Any], n_episodes: int) -> 
 
 
 class Prefix:
-    """Finished shards in order, from the first on; for the manifest also where their files are.
-
-    Attributes
-    ----------
-    repeated : Repeated or None
-        What repeating some of the first tests has shown, once it is known.
-    """
+    """Finished shards in order, from the first on, as the manifest lists them, and what is counted over them."""
 
     def __init__(self) -> None:
         self.shards: list[dict[str, Any]] = []
@@ -150,16 +144,8 @@ class Prefix:
 class Manifest:
     """Keeps ``manifest.json`` and ``campaign.yaml`` of a run folder true.
 
-    Parameters
-    ----------
-    folder : Path
-    resolved : Resolved
-    earlier : dict
-        See `require_own_folder`.
-    began : float
-        `time.monotonic` at the beginning of the run.
-    facts
-        More keys of the manifest.
+    ``earlier`` is what `require_own_folder` found, ``began`` `time.monotonic` at the run's beginning; ``facts`` are more
+    keys.
     """
 
     def __init__(

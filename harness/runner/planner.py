@@ -46,16 +46,7 @@ POOL_SHARE = 0.5
 
 
 class FixedPlanner:
-    """All tests are known beforehand, in one round; a stop rule looks at some of their shards.
-
-    Parameters
-    ----------
-    campaign : Campaign
-
-    Attributes
-    ----------
-    rule : StopRule
-    """
+    """All tests are known beforehand, in one round; a stop rule looks at some of their shards."""
 
     def __init__(self, campaign: Campaign) -> None:
         self._campaign = campaign
@@ -82,20 +73,8 @@ class FixedPlanner:
 class ShellPlanner:
     """Fed with finished tests in order; says what is tested next, and when it is enough.
 
-    Parameters
-    ----------
-    campaign : Campaign
-    design : ShellDesign
-    available : ndarray, shape (S,)
-        Most tests of each stratum.
-    held : int
-        See `RoundRule`.
-
-    Attributes
-    ----------
-    rule : RoundRule
-    estimate : Estimate or None
-        At the end of the last round.
+    ``available``, shape (S,), are the most tests of each stratum, ``held`` see `RoundRule`; ``estimate`` is that at the
+    end of the last round.
     """
 
     def __init__(self, campaign: Campaign, design: ShellDesign, available: IntArray, held: int = 0) -> None:
@@ -155,15 +134,8 @@ def planner_of(campaign: Campaign, prescribed: PrescribedEpisodes | None, held: 
 class Allocation:
     """How many tests each shell gets next.
 
-    Attributes
-    ----------
-    design : ShellDesign
-    first_tests : int
-        Tests of a stratum before anything is decided about it.
-    available : ndarray, shape (S,)
-        Most tests of each stratum.
-    conditional_only : bool
-        Whether what lies outside is never tested.
+    A stratum gets ``first_tests`` before anything is decided about it, and at most those ``available``, shape (S,).
+    With ``conditional_only`` what lies outside is never tested.
     """
 
     design: ShellDesign
@@ -299,14 +271,8 @@ class RoundRule:
 def round_specs(tests: IntArray, added: IntArray, index: int, first_episode: int, shard_size: int) -> list[ShardSpec]:
     """Divide a round into shards, each a range of the round's tests in the order of strata.
 
-    Parameters
-    ----------
-    tests, added : ndarray, shape (S,)
-        Draws taken so far, and those of the round.
-    index, first_episode : int
-        Of the first shard.
-    shard_size : int
-        Most episodes of a shard.
+    ``tests`` and ``added``, shape (S,), are draws taken so far and those of the round; ``index`` and ``first_episode``
+    are the first shard's, ``shard_size`` the most episodes of one.
     """
     total = int(added.sum())
     n_shards = max(-(-total // shard_size), min(MOST_SHARDS_PER_ROUND, total // SMALLEST_SHARD), 1)

@@ -56,17 +56,10 @@ class Prepared:
         black_box: Path | None = None,
         doomed: Mapping[int, Death] | None = None,
     ) -> EpisodeLoop:
-        """Episode loop in a world, recording what the campaign asks for.
+        """Episode loop in a world, recording what the campaign asks for, or other ``traces``.
 
-        Parameters
-        ----------
-        world : World
-        traces : str, optional
-            Instead of the campaign's ``records.traces``.
-        black_box : Path, optional
-            File that tells in which episode's controller a process died.
-        doomed : mapping, optional
-            Episodes known to kill the process; it may grow between two runs.
+        The file ``black_box`` tells in which episode's controller a process died; ``doomed`` are episodes known to kill
+        it, which may grow between two runs.
         """
         campaign, records = self.campaign, self.campaign.records
         keep = Keep(MOMENT_LIMITS[records.moments], traces or records.traces, records.trace_share)

@@ -73,14 +73,7 @@ def stored_shard(folder: Path, prepared: Prepared, retracing: Retracing, spec: S
 
 
 class WorkerProcess:
-    """A process that runs one shard after another, at the end of a pipe of its own.
-
-    Parameters
-    ----------
-    resolved : Resolved
-    black_box : Path
-        File that tells in which call of a controller it is.
-    """
+    """A process that runs one shard after another, at the end of a pipe of its own."""
 
     def __init__(self, resolved: Resolved, black_box: Path) -> None:
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

@@ -73,21 +73,9 @@ class Repeated:
 
 @dataclass(frozen=True)
 class ShardDone:
-    """A finished shard.
+    """A finished shard: what the stop rule needs of it, how many episodes the twin has retraced, causes of failures.
 
-    Attributes
-    ----------
-    spec : ShardSpec
-    block : Block
-        What the stop rule needs of it.
-    n_retraced : int
-        How many episodes the twin has retraced.
-    failures : Counter
-        Causes of failures.
-    repeated : Repeated or None
-        None for a shard none of whose tests were run twice.
-    parquet : dict
-        Its tables as Parquet files; empty where they are on disk already.
+    ``repeated`` is None where no test was run twice; ``parquet``, its tables as files, is empty where they are on disk.
     """
 
     spec: ShardSpec
@@ -122,11 +110,7 @@ def serve(connection: Connection, resolved: Resolved, black_box: Path) -> None:
 class ShardRunner:
     """Runs shards of one campaign in one world. It writes nothing: the process that runs the campaign does.
 
-    Parameters
-    ----------
-    resolved : Resolved
-    black_box : Path, optional
-        File that tells the parent in which call of a controller the process died.
+    The file ``black_box`` tells that process in which call of a controller this one died.
     """
 
     def __init__(self, resolved: Resolved, black_box: Path | None = None) -> None:
