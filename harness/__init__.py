@@ -21,7 +21,8 @@ from harness.errors import HarnessError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from harness.campaign.models import Campaign, EstimatorName
+    from harness.campaign.models import Campaign
+    from harness.methods import EstimatorName
     from harness.pool.refined_ladder import RefinedLadder
     from harness.progress import Progress
     from harness.records.frames import StoredRun

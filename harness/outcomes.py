@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from harness.methods import METHODS
+
 OUTCOMES = ("crash", "passed", "timeout", "bv_lv_contact", "failed")
 CRASH, PASSED, TIMEOUT, BV_LV_CONTACT, FAILED = range(len(OUTCOMES))
 RUNNING = -1
@@ -9,5 +11,4 @@ RUNNING = -1
 VEHICLES = ("LV", "BV", "AV")
 LV, BV, AV = range(len(VEHICLES))
 
-METHODS = ("nde", "forced", "step_mixture", "episode_mixture", "shells")
 NDE, FORCED, STEP_MIXTURE, EPISODE_MIXTURE, SHELLS = range(len(METHODS))

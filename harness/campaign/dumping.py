@@ -7,7 +7,9 @@ from typing import Any
 
 import yaml
 
-from harness.campaign.models import AV_SOURCES, Campaign, Section
+from harness.campaign.models import Campaign
+from harness.campaign.section import Section
+from harness.campaign.vehicle import AV_SOURCES
 
 _HEADER = """\
 # Campaign {name}, resolved: every value is written out, defaults included.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from harness.campaign.models import NAME_PATTERN, SURROGATE_PATTERN
+from harness.campaign.section import NAME_PATTERN, SURROGATE_PATTERN
 
 _UNITS = {"_mps2": "m/s²", "_mps": "m/s", "_per_s": "1/s", "_per_m": "1/m", "_s": "s", "_m": "m"}
 _LONGEST = 60

@@ -8,10 +8,11 @@ from typing import Annotated, Literal
 
 from pydantic import Field, ValidationError
 
-from harness.campaign.models import NAME_PATTERN, AutomatedVehicle, Section
+from harness.campaign.models import AutomatedVehicle
 from harness.campaign.overrides import Override
 from harness.campaign.problems import invalid_file
 from harness.campaign.schema import schema_of
+from harness.campaign.section import NAME_PATTERN, Section
 from harness.campaign.yaml_text import read_yaml
 from harness.errors import CampaignError
 

@@ -8,7 +8,8 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from harness.campaign.models import AV_SOURCES, Campaign, ConstantParameters, FVDMParameters, IDMParameters
+from harness.campaign.models import Campaign, ConstantParameters, FVDMParameters, IDMParameters
+from harness.campaign.vehicle import AV_SOURCES
 
 Schema = dict[str, Any]
 

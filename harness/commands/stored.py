@@ -8,22 +8,14 @@ from typing import TYPE_CHECKING
 
 import click
 
-from harness.commands.options import (
-    FILE,
-    RUN_FOLDER,
-    examples,
-    json_option,
-    written_file,
-)
-from harness.console import (
-    print_estimates,
-    print_json,
-    write_trace,
-)
+from harness.commands.options import FILE, RUN_FOLDER, examples, json_option, written_file
+from harness.console import print_json, write_trace
+from harness.console_tables import print_estimates
 from harness.errors import EXIT_BAD_INPUT, WorldDisagreementError
+from harness.methods import ESTIMATORS
 
 if TYPE_CHECKING:
-    from harness.campaign.models import EstimatorName
+    from harness.methods import EstimatorName
 
 
 @click.command(
@@ -37,7 +29,7 @@ if TYPE_CHECKING:
     "--estimator",
     "-e",
     "estimators",
-    type=click.Choice(["nde", "nade", "mixture_cv", "scv", "shells"]),
+    type=click.Choice(ESTIMATORS),
     multiple=True,
     help="Only this one; may be given several times.",
 )

@@ -1,16 +1,16 @@
 """Crash rates from blocks of weighted tests: estimators, intervals, diagnostics, stopping.
 
-Each estimator is one file of the same shape (``accumulator``): add blocks, ask for the result. ``one_pass``
-feeds them all; ``run_estimates`` makes the content of ``estimates.json``.
+Estimators have one shape (``estimate.Accumulator``): add blocks, ask for the result. ``one_pass`` feeds them all;
+``run_estimates`` makes the content of ``estimates.json``.
 """
 
 from harness.estimators.block import Block
 from harness.estimators.estimate import Estimate, Unavailable
-from harness.estimators.headline import headline
-from harness.estimators.one_pass import ESTIMATORS, accumulator, one_pass
+from harness.estimators.one_pass import accumulator, one_pass
 from harness.estimators.run_estimates import CampaignFacts, estimate_blocks
 from harness.estimators.shells import Shells
 from harness.estimators.stopping import StopRule
+from harness.methods import ESTIMATORS
 
 __all__ = [
     "ESTIMATORS",
@@ -22,6 +22,5 @@ __all__ = [
     "Unavailable",
     "accumulator",
     "estimate_blocks",
-    "headline",
     "one_pass",
 ]

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from harness.arrays import BoolArray, Float32Array
+from harness.arrays import BoolArray, Float32Array, read_only
 from harness.campaign.models import Campaign
 from harness.criticality.after_cut_in import level_steps
 from harness.criticality.tables import Tables
 from harness.importance.functions import Importance
-from harness.outcomes import EPISODE_MIXTURE, FORCED, METHODS, STEP_MIXTURE
+from harness.methods import METHODS, SAMPLING
+from harness.outcomes import EPISODE_MIXTURE, FORCED, STEP_MIXTURE
 from harness.vehicles.kinematics import CONTACT_M
 
 _ROUNDING_M = 1e-9
@@ -18,13 +19,12 @@ _ROUNDING_M = 1e-9
 
 def needs_tables(campaign: Campaign) -> bool:
     """Whether the campaign's method looks at surrogates at all."""
-    return METHODS.index(campaign.testing.method) in (STEP_MIXTURE, EPISODE_MIXTURE)
+    return SAMPLING[campaign.testing.method].mixes
 
 
 def importance_names(campaign: Campaign) -> tuple[str, ...]:
     """Names of the importance functions, in the order of ``log_q``."""
-    method = METHODS.index(campaign.testing.method)
-    defensive = ("forced",) if method in (FORCED, EPISODE_MIXTURE) else ()
+    defensive = ("forced",) if SAMPLING[campaign.testing.method].forces else ()
     return defensive + (tuple(campaign.surrogates) if needs_tables(campaign) else ())
 
 
@@ -42,22 +42,15 @@ def mixture_weights(campaign: Campaign) -> tuple[float, ...]:
 
 
 def build_importance(campaign: Campaign, tables: Tables | None) -> Importance:
-    """Importance functions of a campaign.
-
-    Parameters
-    ----------
-    campaign : Campaign
-    tables : Tables, optional
-        Challenge tables of its surrogates; not needed by ``nde`` and ``forced``.
-    """
-    method = METHODS.index(campaign.testing.method)
+    """Importance functions of a campaign; ``nde`` and ``forced`` need no challenge tables."""
+    method = campaign.testing.method
     recursive = campaign.testing.challenge == "recursive"
     none = _none(5), _none(5), _none(5), np.zeros((0, 1, 1, 1), np.bool_)
     return Importance(
-        method,
+        METHODS.index(method),
         recursive,
         len(campaign.surrogates) if needs_tables(campaign) else 0,
-        1 if method in (FORCED, EPISODE_MIXTURE) else 0,
+        1 if SAMPLING[method].forces else 0,
         level_steps(round(campaign.environment.acceleration_hold_s * 10)),
         campaign.testing.epsilon,
         campaign.testing.criticality_threshold,
@@ -69,15 +62,8 @@ def build_importance(campaign: Campaign, tables: Tables | None) -> Importance:
 def harmless_cells(maneuvers: Float32Array, *, recursive: bool) -> BoolArray:
     """Grid cells in which every acceleration has challenge 0, wherever in the cell it is interpolated.
 
-    Parameters
-    ----------
-    maneuvers : ndarray of float32, shape (J, v, R2, R2dot, 31)
-        Probabilities (recursive) or smallest gaps in metres (immediate).
-    recursive : bool
-
-    Returns
-    -------
-    ndarray of bool, shape (J, v - 1, R2 - 1, R2dot - 1)
+    ``maneuvers`` (J, v, R2, R2dot, 31) are probabilities (recursive) or smallest gaps in metres (immediate); the result
+    has shape (J, v - 1, R2 - 1, R2dot - 1).
     """
     cells: BoolArray = maneuvers.max(-1) == 0.0 if recursive else maneuvers.min(-1) > CONTACT_M + _ROUNDING_M
     for axis in (1, 2, 3):
@@ -88,6 +74,4 @@ def harmless_cells(maneuvers: Float32Array, *, recursive: bool) -> BoolArray:
 
 def _none(dimensions: int) -> Float32Array:
     """No table; read-only like those that are mapped, for kernels to be compiled once."""
-    none = np.zeros((0,) + (1,) * (dimensions - 1), np.float32)
-    none.flags.writeable = False
-    return none
+    return read_only(np.zeros((0,) + (1,) * (dimensions - 1), np.float32))

@@ -24,7 +24,7 @@ from harness.report.telling_bands import Band, telling_bands
 from harness.vehicles.kinematics import STEP_S
 
 MOST_CRASHES, MOST_OTHERS = 5_000, 20_000
-"""Tests compared, the first of each kind: tests come in random order, so that this is a fair sample."""
+"""Group compared, the first of each kind: tests come in random order, so that this is a fair sample."""
 FEWEST_CRASHES = 3
 """Fewer have nothing in common that chance would not give them."""
 PANELS = 3
@@ -35,8 +35,8 @@ OTHERS_SHOWN, CRASHES_SHOWN = (0.005, 0.995), (0.25, 0.75)
 """Quantiles that a panel reaches at least; of crashes fewer, because some need a braking of hundreds of m/s²."""
 
 
-class Tests:
-    """Tests of one kind: values of `CONDITIONS`, shape (Q, n), and what each stands for, shape (n,)."""
+class Group:
+    """Group of one kind: values of `CONDITIONS`, shape (Q, n), and what each stands for, shape (n,)."""
 
     def __init__(self) -> None:
         self.values: FloatArray = np.zeros((len(CONDITIONS), 0))
@@ -62,14 +62,14 @@ class Contrast:
     ----------
     outside : bool
         Whether only tests outside the boundary were compared.
-    crashes, others : Tests
+    crashes, others : Group
     bands : tuple of Band
         Empty where there is too little to compare.
     """
 
     outside: bool
-    crashes: Tests
-    others: Tests
+    crashes: Group
+    others: Group
     bands: tuple[Band, ...]
 
     @property
@@ -127,7 +127,7 @@ def crash_contrast(run: RunFolder) -> Contrast:
         If a shard is damaged.
     """
     first_outside = None if run.shells is None else run.shells.n_inside
-    crashes, others = Tests(), Tests()
+    crashes, others = Group(), Group()
     hold_steps = round(run.campaign.environment.acceleration_hold_s / STEP_S)
     for batch in run.episodes(*COLUMNS, "outcome", "component", "log_weight"):
         compared = pc.and_(pc.is_valid(batch.column("cut_in_step")), pc.invert(_ended(batch, FAILED)))

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from harness.arrays import FloatArray
-from harness.campaign.models import MOST_SUMO_CELLS
+from harness.campaign.testing import MOST_SUMO_CELLS
 from harness.errors import CampaignError
 from harness.outcomes import AV, BV, LV
 

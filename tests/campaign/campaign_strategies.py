@@ -6,8 +6,9 @@ from typing import Any
 
 from hypothesis import strategies as st
 
-from harness.campaign.models import AV_SOURCES, MOST_SUMO_CELLS
 from harness.campaign.schema import campaign_schema
+from harness.campaign.testing import MOST_SUMO_CELLS
+from harness.campaign.vehicle import AV_SOURCES
 
 SCHEMA = campaign_schema()
 BUILT_IN = {"idm": "IDM", "fvdm": "FVDM", "constant": "Constant"}

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from harness.arrays import BoolArray, FloatArray, IntArray
-from harness.campaign.models import Method
 from harness.estimators.block import Block
+from harness.methods import Method
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,7 +19,7 @@ from harness.importance.build import importance_names
 from harness.maneuvers import CUT_IN, STAY
 from harness.outcomes import VEHICLES
 from harness.records.schemas import episodes_schema, moments_schema, traces_schema
-from harness.runner.stored_blocks import stored_blocks
+from harness.runner.stored_estimates import stored_blocks
 from harness.strata import ShellDesign
 
 HASH = "0123456789abcdef"

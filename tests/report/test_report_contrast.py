@@ -8,7 +8,7 @@ from report_page import page_of
 from scipy.stats import binomtest
 
 from harness.report import telling_bands as scan
-from harness.report.crash_contrast import Contrast, Tests, contrast_plot, crash_contrast
+from harness.report.crash_contrast import Contrast, Group, contrast_plot, crash_contrast
 from harness.report.cut_in_conditions import CONDITIONS
 from harness.report.telling_bands import SIGNIFICANT, telling_bands
 
@@ -102,7 +102,7 @@ def test_failed_tests_are_on_neither_side(runs, contrast_of):
 
 
 def test_a_few_crashes_have_nothing_in_common():
-    crashes, others = Tests(), Tests()
+    crashes, others = Group(), Group()
     crashes.weight, others.weight = np.ones(2), np.ones(50)
     few = Contrast(True, crashes, others, ())
     assert few.sentence.startswith("With 2 crashes outside the boundary and 50 cut-ins")

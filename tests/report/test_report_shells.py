@@ -11,7 +11,7 @@ from report_page import edit, page_of
 from synthetic_run import DESIGN, RECIPES, P
 
 from harness.errors import RunFolderError
-from harness.estimators.stratified import combined, pool_variance
+from harness.estimators.shells import combined, pool_variance
 from harness.outcomes import OUTCOMES
 from harness.report import write_report
 from harness.report.answer_plot import answer_plot

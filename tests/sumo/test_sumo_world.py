@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import traci
 
-from harness.campaign.models import MOST_SUMO_CELLS
+from harness.campaign.testing import MOST_SUMO_CELLS
 from harness.episode.loop import EpisodeLoop, Keep, Shard
 from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, WorldDisagreementError
 from harness.outcomes import AV, BV, CRASH, LV

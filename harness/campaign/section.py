@@ -1,0 +1,68 @@
+"""What all sections of a campaign share: kinds of values, and how a rule between several of them is broken."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Annotated, Any
+
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic_core import PydanticCustomError
+
+NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_.-]*$"
+SURROGATE_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_-]*$"
+LARGEST_EXACT_WHOLE_FLOAT = 2.0**53
+
+
+def whole(value: Any) -> Any:
+    """Turn ``1e6`` into ``1000000``: YAML reads every number with an exponent as a float."""
+    if isinstance(value, float) and value.is_integer() and abs(value) <= LARGEST_EXACT_WHOLE_FLOAT:
+        return int(value)
+    return value
+
+
+Probability = Annotated[float, Field(ge=0.0, le=1.0)]
+Positive = Annotated[float, Field(gt=0.0)]
+Whole = Annotated[int, BeforeValidator(whole)]
+SurrogateName = Annotated[str, Field(pattern=SURROGATE_PATTERN)]
+
+
+def broken_rule(key: str, *, found: str, expected: str, mend: str) -> PydanticCustomError:
+    """Error for a rule between several values, in the four parts that the loader shows.
+
+    Parameters
+    ----------
+    key : str
+        Dotted path of the value to blame, seen from the section that states the rule; empty for the section itself.
+    found, expected, mend : str
+        As in `harness.errors.HarnessError`.
+    """
+    parts = {"key": key, "found": found, "expected": expected, "mend": mend}
+    where = "{key}: " if key else ""
+    return PydanticCustomError("broken_rule", where + "found {found}; expected {expected}. {mend}", parts)
+
+
+class Section(BaseModel):
+    """A section of the campaign: unknown keys are errors, values never change after loading."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+
+
+def _whole_steps(seconds: float) -> float:
+    """Refuse a time that is not a multiple of the 0.1 s step."""
+    steps = seconds * 10.0
+    if abs(steps - round(steps)) >= 1e-9:
+        raise broken_rule(
+            "",
+            found=f"{seconds:g} s",
+            expected="a multiple of the 0.1 s step",
+            mend=f"The nearest one is {round(steps) / 10.0:g}.",
+        )
+    return seconds
+
+
+StepTime = Annotated[float, AfterValidator(_whole_steps)]
+
+
+def listed(names: Iterable[str]) -> str:
+    """Names in a message."""
+    return ", ".join(names) or "none"

@@ -1,0 +1,131 @@
+"""How tests are simulated and drawn, what is kept of them, and when there are enough: all sections but the vehicle."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Literal
+
+from pydantic import BeforeValidator, Field, field_validator
+
+from harness.campaign.section import Positive, Probability, Section, StepTime, SurrogateName, Whole, broken_rule, whole
+from harness.methods import EstimatorName, Method
+
+MOST_SUMO_CELLS = 256
+"""Roads of the largest committed network."""
+
+
+class Environment(Section):
+    """The naturalistic driving environment."""
+
+    parameters: str = Field("ndd-overtaking-1", description="name of a shipped parameter file, or a path to your own")
+    lane_change_level: Positive = Field(
+        1.0,
+        le=1e8,
+        description="multiplies the cut-in hazard: 1 = dense-learning tables, 100 = a later table, about 350 = highD",
+    )
+    acceleration_hold_s: StepTime = Field(
+        1.0, ge=0.1, le=2.0, description="how long a drawn acceleration is held, in whole 0.1 s steps; 1.0 or 0.1"
+    )
+
+
+class Shells(Section):
+    """How tests are spread over the shells of the pool."""
+
+    boundary: SurrogateName | None = Field(
+        None, description="surrogate within which the conditional statement assumes all crashes; the library's own"
+    )
+    statement: Literal["assumption_free", "conditional"] = Field(
+        "assumption_free", description="what has to reach stop.rhw; conditional tests only within the boundary"
+    )
+    first_tests: Whole = Field(12, ge=1, le=10_000, description="tests of each shell before any is preferred")
+
+
+class Testing(Section):
+    """How maneuvers are drawn at critical moments."""
+
+    method: Method = Field(
+        "episode_mixture",
+        description="nde: no control; forced: cut-in time drawn given that one happens; step_mixture: published NADE; "
+        "episode_mixture: one importance function per episode, forced cut-in as defence; shells: cut-ins of a pool, "
+        "counted within shells of known probability",
+    )
+    challenge: Literal["immediate", "recursive"] = Field(
+        "recursive", description="immediate: crash if BV cuts in now (published); recursive: backward induction"
+    )
+    epsilon: Probability = Field(0.1, description="share of p in every importance function [paper]")
+    alpha: dict[SurrogateName, Probability] | None = Field(
+        None, description="mixture weight per surrogate, summing to 1; equal when left out"
+    )
+    defensive_share: float = Field(
+        0.1, gt=0.0, lt=1.0, description="alpha_0, share of forced cut-ins in the episode mixture"
+    )
+    criticality_threshold: float = Field(0.0, ge=0.0, lt=1.0, description="a moment is critical above it")
+    shells: Shells = Shells()
+
+    @field_validator("alpha")
+    @classmethod
+    def _alpha_sums_to_one(cls, alpha: dict[str, float] | None) -> dict[str, float] | None:
+        total = 1.0 if alpha is None else math.fsum(alpha.values())
+        if abs(total - 1.0) > 1e-9:
+            raise broken_rule(
+                "",
+                found=f"weights that sum to {total:.12g}",
+                expected="weights that sum to 1",
+                mend="Change them, or leave alpha out for equal weights.",
+            )
+        return alpha
+
+
+class PoolSettings(Section):
+    """The pool of cut-ins that shells, surrogate replay and the alarm on SUMO use; built once, in the twin."""
+
+    library: str = Field("ladder-1", description="name of a shipped surrogate library, or a path to your own")
+    relative_error: float = Field(
+        0.005,
+        ge=0.001,
+        le=0.2,
+        description="standard error of the surrogates' crash rates to reach, relative; four times as much for those "
+        "beyond the boundary, or that crash in rare traffic of their own",
+    )
+    cut_ins_per_shell: Whole = Field(
+        25_000, ge=100, le=1_000_000, description="cut-ins kept of each shell: the most tests that it can give"
+    )
+    seed: Whole = Field(1, ge=0, lt=2**63, description="every random number of the pool follows from it")
+
+
+class World(Section):
+    """Where episodes are simulated."""
+
+    engine: Literal["sumo", "twin"] = Field("sumo", description="sumo: libsumo; twin: the same dynamics in numba")
+    cells: Whole = Field(64, ge=1, le=4096, description="episodes simulated side by side; never changes a result")
+
+
+class Records(Section):
+    """What is kept of every episode."""
+
+    moments: Literal["all", "first_9", "none"] = Field("first_9", description="control steps kept; scv needs first_9")
+    traces: Literal["all", "crash", "critical", "none"] = Field("none", description="episodes whose motion is kept")
+    trace_share: Probability = Field(
+        0.0, description="share of episodes traced whatever their outcome, by a hash of the index"
+    )
+
+
+class Stop(Section):
+    """When the campaign is long enough."""
+
+    episodes: Whole = Field(100_000, ge=1, le=10**10, description="most episodes to run")
+    rhw: float | None = Field(
+        None, gt=0.0, lt=10.0, description="stop at this relative half-width of the interval; not for step_mixture"
+    )
+    confidence: float = Field(0.9, gt=0.0, lt=1.0, description="level of every interval")
+    estimator: EstimatorName | None = Field(None, description="whose RHW is watched; default: the method's own")
+    min_crashes: Annotated[int, Field(ge=1), BeforeValidator(whole)] | None = Field(
+        None, description="sampled crashes needed before RHW may stop the campaign; 100, with shells 1"
+    )
+
+
+class Run(Section):
+    """How the work is spread; nothing here changes a result."""
+
+    shard_size: Whole = Field(5_000, ge=1, le=1_000_000, description="episodes per file and per task")
+    max_failed_share: Probability = Field(0.01, description="stop with exit code 3 above this share of failures")

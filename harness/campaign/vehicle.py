@@ -1,0 +1,191 @@
+"""The automated vehicle under test: who drives it, how it reacts, what it may ask for."""
+
+from __future__ import annotations
+
+import hashlib
+import shlex
+from pathlib import Path
+from string import Formatter
+from typing import Any, Literal, Self
+
+from pydantic import Field, ValidationInfo, field_validator, model_validator
+from pydantic_core import PydanticKnownError
+
+from harness.campaign.drivers import PARAMETERS, BuiltInParameters, IDMParameters, Reaction
+from harness.campaign.section import Positive, Section, Whole, broken_rule, listed
+
+CONTROLLER_PATTERN = r"^([A-Za-z_][A-Za-z0-9_.]*:[A-Za-z_][A-Za-z0-9_]*|[A-Za-z0-9][A-Za-z0-9_.-]*)$"
+
+
+class Limits(Section):
+    """What an AV may ask for; beyond it an episode fails instead of being simulated with nonsense."""
+
+    min_acceleration_mps2: float = Field(
+        -15.0, ge=-50.0, le=0.0, description="hardest braking a controller may ask for"
+    )
+    max_acceleration_mps2: Positive = Field(10.0, le=50.0, description="hardest acceleration it may ask for")
+    step_time_s: Positive = Field(10.0, le=3600.0, description="time that one call of the controller may take")
+
+
+class TraciProcess(Section):
+    """The user's program, connected to a real SUMO as an ordinary TraCI client."""
+
+    command: str = Field(
+        min_length=1, description="starts the program; {port} and {cells} are filled in, e.g. './my_av --port {port}'"
+    )
+    connect_time_s: Positive = Field(60.0, le=3600.0, description="time that the program may take to connect")
+    restarts: Whole = Field(3, ge=0, le=100, description="times that a program that ended is started again")
+    allow_public: bool = Field(
+        False, description="run also where the machine has a public address: SUMO's server listens on all of them"
+    )
+
+    @field_validator("command")
+    @classmethod
+    def _command_can_be_filled_in(cls, command: str) -> str:
+        try:
+            fields = [parts[1:] for parts in Formatter().parse(command) if parts[1] is not None]
+            wrong = [field for field in fields if field not in (("port", "", None), ("cells", "", None))]
+            problem = f"the field {wrong[0][0]!r}" if wrong else None if shlex.split(command) else "no word"
+        except ValueError as error:
+            problem = str(error)
+        if problem is not None:
+            raise broken_rule(
+                "",
+                found=f"{problem[:60]}, in {command[:200]!r}",
+                expected="a program and its arguments, with {port} and {cells} as they stand the only things in braces",
+                mend="Double a brace that is meant as itself: {{ and }}.",
+            )
+        return command
+
+    def words(self, port: int, cells: int) -> list[str]:
+        """The command, filled in, word by word."""
+        return shlex.split(self.command.format(port=port, cells=cells))
+
+
+class FmuController(Section):
+    """An FMI 2.0 co-simulation FMU as controller."""
+
+    file: str = Field(min_length=1, description="path of the .fmu, relative to the campaign file")
+    inputs: dict[str, str] = Field(
+        description="FMU input variable for each observation: speed_mps, gap_m, lead_speed_mps, time_s, ..."
+    )
+    output: str = Field(min_length=1, description="FMU output variable that holds the acceleration, m/s2")
+    start_values: dict[str, float] = Field(default_factory=dict, description="values set before initialisation")
+
+
+AV_SOURCES = ("model", "controller", "sumo", "traci", "fmu")
+
+
+class AutomatedVehicle(Section):
+    """The automated vehicle under test: one of model, controller, sumo, traci and fmu."""
+
+    model: Literal["idm", "fvdm", "constant"] | None = Field(
+        None, description="built-in driver model; idm when nothing is named"
+    )
+    controller: str | None = Field(
+        None,
+        pattern=CONTROLLER_PATTERN,
+        examples=["my_package.my_module:MyController", "an_entry_point"],
+        description="your own: 'package.module:Class', or the name of an entry point in group harness.controllers",
+    )
+    sumo: dict[str, str | float] | None = Field(
+        None, description="SUMO drives it: carFollowModel and any other vType attribute"
+    )
+    traci: TraciProcess | None = Field(None, description="your program, in any language, as a TraCI client")
+    fmu: FmuController | None = Field(None, description="an FMI 2.0 co-simulation FMU")
+    parameters: BuiltInParameters | dict[str, Any] = Field(
+        default_factory=dict,
+        validate_default=True,
+        description="parameters of the built-in model (defaults where left out) or of the controller",
+    )
+    reaction: Reaction = Reaction()
+    before_cut_in: Literal["hold_speed", "controller"] = Field(
+        "hold_speed",
+        description="until the cut-in the AV keeps its speed [itsc], or its controller acts from the start",
+    )
+    limits: Limits = Limits()
+
+    @property
+    def source(self) -> str:
+        """Which of `AV_SOURCES` drives the AV."""
+        return next(name for name in AV_SOURCES if getattr(self, name) is not None)
+
+    @property
+    def reproducible(self) -> bool:
+        """Whether an episode runs again bit for bit: the harness cannot promise it for a program outside of it."""
+        return self.traci is None
+
+    def identity(self) -> dict[str, Any]:
+        """What the AV is, for the campaign's hash: an FMU counts by its content, wherever it lies."""
+        content = self.model_dump()
+        if self.fmu is not None and (file := Path(self.fmu.file)).is_file():
+            content["fmu"]["file"] = hashlib.sha256(file.read_bytes()).hexdigest()
+        if self.traci is not None:
+            del content["traci"]["allow_public"]  # changes no test
+        return content
+
+    @model_validator(mode="before")
+    @classmethod
+    def _idm_when_nothing_is_named(cls, data: Any) -> Any:
+        if not isinstance(data, dict) or any(data.get(name) is not None for name in AV_SOURCES):
+            return data
+        if forgotten := [name for name in AV_SOURCES if name in data]:
+            raise broken_rule(
+                forgotten[0],
+                found="nothing (null)",
+                expected=f"one of {', '.join(AV_SOURCES)}, with a value",
+                mend=f"Write a value after '{forgotten[0]}:', or delete the key for the built-in idm.",
+            )
+        return {**data, "model": "idm"}
+
+    @field_validator("parameters", mode="plain", json_schema_input_type=dict[str, Any])
+    @classmethod
+    def _parameters_follow_the_model(cls, value: Any, info: ValidationInfo) -> Any:
+        # Not by trial of a union: a controller's parameters that look like the IDM's would become those.
+        if "model" not in info.data:
+            # A wrong model is an error of its own; complaints about parameters of a guessed model would only confuse.
+            return IDMParameters()
+        if (model := info.data["model"]) is not None:
+            return PARAMETERS[model].model_validate(value)
+        if not isinstance(value, dict):
+            raise PydanticKnownError("dict_type")
+        return value
+
+    @model_validator(mode="after")
+    def _one_source(self) -> Self:
+        named = [name for name in AV_SOURCES if getattr(self, name) is not None]
+        if len(named) > 1:
+            raise broken_rule(
+                "",
+                found=" and ".join(named),
+                expected=f"one of {', '.join(AV_SOURCES)}",
+                mend="An AV has one driver: delete the others, or set them to null.",
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _parameters_have_a_reader(self) -> Self:
+        elsewhere = {
+            "sumo": "Write vType attributes under av.sumo itself.",
+            "traci": "Give them to your program in av.traci.command.",
+            "fmu": "Write them under av.fmu.start_values.",
+        }
+        if self.source in elsewhere and self.parameters:
+            raise broken_rule(
+                "parameters",
+                found=f"{listed(dict(self.parameters))}, which nothing reads",
+                expected=f"no parameters beside av.{self.source}",
+                mend=elsewhere[self.source],
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _only_a_built_in_model_is_slowed_down(self) -> Self:
+        if self.model is None and self.reaction != Reaction():
+            raise broken_rule(
+                "reaction",
+                found=f"a reaction beside av.{self.source}",
+                expected="a reaction only of a built-in model",
+                mend="Your own driver has its own delays: leave av.reaction out.",
+            )
+        return self
