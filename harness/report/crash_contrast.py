@@ -24,7 +24,7 @@ from harness.report.telling_bands import Band, telling_bands
 from harness.vehicles.kinematics import STEP_S
 
 MOST_CRASHES, MOST_OTHERS = 5_000, 20_000
-"""Group compared, the first of each kind: tests come in random order, so that this is a fair sample."""
+"""Tests compared, the first of each kind: tests come in random order, so that this is a fair sample."""
 FEWEST_CRASHES = 3
 """Fewer have nothing in common that chance would not give them."""
 PANELS = 3
@@ -36,7 +36,7 @@ OTHERS_SHOWN, CRASHES_SHOWN = (0.005, 0.995), (0.25, 0.75)
 
 
 class Group:
-    """Group of one kind: values of `CONDITIONS`, shape (Q, n), and what each stands for, shape (n,)."""
+    """Tests of one kind: values of `CONDITIONS`, shape (Q, n), and what each stands for, shape (n,)."""
 
     def __init__(self) -> None:
         self.values: FloatArray = np.zeros((len(CONDITIONS), 0))
