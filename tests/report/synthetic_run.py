@@ -23,6 +23,8 @@ from harness.runner.stored_estimates import stored_blocks
 from harness.strata import ShellDesign
 
 HASH = "0123456789abcdef"
+LARGEST_P_CUT_IN = 1e-6
+"""Made up: it bounds the weights by 1e-5, which none of these tests exceeds, so that there is a half-width to show."""
 P = np.array([4e-8, 9e-8, 3e-5])
 """Probabilities that are far apart: sums that ignore how often a shell was tested come out wrong by orders."""
 DESIGN = ShellDesign(
@@ -140,7 +142,7 @@ def _episodes_table(episodes: Episodes, rows: np.ndarray, recipe: RunRecipe) -> 
         "seed": 7,
         "cut_in_step": np.where(c["cut_in_step"] < 0, np.nan, c["cut_in_step"]),
         "pool_cut_in": rows if recipe.method == "shells" else None,
-        "log_p_cut_in": np.nan,
+        "log_p_cut_in": np.log(LARGEST_P_CUT_IN) if n_importance else np.nan,
         "log_q": list(episodes.log_q[rows, :n_importance]),
         "martingale": [np.zeros(max(n_importance - 1, 0))] * len(rows),
         "lv_maneuvers": [_drawn(episodes.lv_maneuvers[r], episodes.columns["n_steps"][r], -1) for r in rows],

@@ -112,7 +112,7 @@ def test_nothing_to_draw_without_any_rate():
     assert answer_plot(estimates(scv=None), None) is None
 
 
-@pytest.mark.parametrize("name", ["nde", "shells", "shells_inside_only"])
+@pytest.mark.parametrize("name", ["full", "shells", "shells_inside_only"])
 def test_legends_of_convergence_lie_outside_the_panels(runs, name):
     plot = convergence_plot(runs[name].estimates, 0.05)
     svg(plot)  # lays out
