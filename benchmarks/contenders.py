@@ -205,15 +205,15 @@ class Workers(Contender):
 
     def __init__(self, settings: Campaign, workers: int) -> None:
         self._folder = Path(tempfile.mkdtemp(prefix="harness-benchmark-"))
-        self._pool = ShardPool(settings, self._folder, workers)
+        self._pool = ShardPool(resolve(settings), workers)
         self._workers = workers
 
     def run(self, first: int, n: int) -> Work:
         # As many shards of 2,500 episodes for every worker.
         n_shards = max(2, n // SHARD)
         specs = [ShardSpec(i, first + i * SHARD, SHARD) for i in range(n_shards)]
-        for _ in self._pool.run(iter(specs), lambda _: None):
-            pass
+        for done in self._pool.run(iter(specs), lambda _: None):
+            write_shard(self._folder, done.spec.index, done.parquet)
         return Work(n_shards * SHARD, 0)
 
     def rows(self, n: int) -> None:  # starts the workers; their rows are on disk
