@@ -23,7 +23,6 @@ from harness.episode.loop import Shard
 from harness.records.folder import encoded, write_shard
 from harness.records.tables import shard_tables
 from harness.resolved import resolve
-from harness.runner.manifest import Manifest
 from harness.runner.prepare import Prepared, prepare
 from harness.runner.shards import ShardPool
 from harness.runner.worker import ShardSpec
@@ -206,16 +205,14 @@ class Workers(Contender):
 
     def __init__(self, settings: Campaign, workers: int) -> None:
         self._folder = Path(tempfile.mkdtemp(prefix="harness-benchmark-"))
-        resolved = resolve(settings)
-        self._manifest = Manifest(self._folder, settings, resolved.content_hash, None)
-        self._pool = ShardPool(resolved, self._folder, workers)
+        self._pool = ShardPool(resolve(settings), workers)
 
     def run(self, first: int, n: int) -> Work:
         # As many shards of 2,500 episodes for every worker.
         n_shards = max(2, n // SHARD)
         specs = [ShardSpec(i, first + i * SHARD, SHARD) for i in range(n_shards)]
-        for _ in self._pool.run(iter(specs), lambda _: None, self._manifest):
-            pass
+        for done in self._pool.run(iter(specs), lambda _: None):
+            write_shard(self._folder, done.spec.index, done.parquet)
         return Work(n_shards * SHARD, 0)
 
     def rows(self, n: int) -> None:  # starts the workers; their rows are on disk

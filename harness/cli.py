@@ -14,8 +14,7 @@ from collections.abc import Sequence
 
 import click
 
-from harness.commands.campaigns import check, run, schema
-from harness.commands.machine import setup
+from harness.commands.campaigns import check, run, schema, setup
 from harness.commands.options import examples
 from harness.commands.stored import estimate, replay, report
 from harness.commands.studies import pool, rnot, validate

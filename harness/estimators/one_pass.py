@@ -15,7 +15,7 @@ from harness.estimators.scv import Scv
 from harness.estimators.shells import Shells
 from harness.methods import ESTIMATORS, SAMPLING, EstimatorName
 
-_CLASSES: dict[EstimatorName, type[Accumulator]] = {
+ACCUMULATORS: dict[EstimatorName, type[Accumulator]] = {
     "nde": Nde,
     "nade": Nade,
     "mixture_cv": MixtureCv,
@@ -28,7 +28,7 @@ SPACING = 1.01
 
 def accumulator(name: EstimatorName) -> BothWays:
     """Empty state of an estimator, for those who feed it themselves (the runner does, for stopping)."""
-    return BothWays(_CLASSES[name]())
+    return BothWays(ACCUMULATORS[name]())
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ def one_pass(
             raise ValueError(f"expected a block from episode {n} on, got one from {block.first_episode}")
         if own is None:
             own = SAMPLING[block.method].headline
-            refusals = {name: _CLASSES[name].refusal(block) for name in (own, *names)}
+            refusals = {name: ACCUMULATORS[name].refusal(block) for name in (own, *names)}
             states = {name: accumulator(name) for name, reason in refusals.items() if reason is None}
         n += len(block)
         diagnostics.add(block)

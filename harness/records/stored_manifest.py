@@ -59,7 +59,7 @@ class TableError(Stored):
 
 
 class Repeated(Stored):
-    """What repeating some tests has shown; `harness.runner.repeat.Repeated`."""
+    """What repeating some tests has shown; `harness.runner.worker.Repeated`."""
 
     n_episodes: Count
     differing: list[Count]
@@ -91,8 +91,9 @@ class StoredManifest(Stored):
 
 
 class StoredShells(Stored):
-    """``shells.json``: the strata of a shells campaign, see `harness.pool.shells.ShellDesign`."""
+    """``shells.json``: the strata of a shells campaign, see `harness.strata.ShellDesign`."""
 
+    model_config = ConfigDict(extra="forbid")
     pool: str
     strata: list[str]
     p: list[float]
@@ -102,7 +103,7 @@ class StoredShells(Stored):
     boundary: str
     p_cut_in: float
     p_impossible: float
-    available: list[Count] = []
+    available: list[Count]
 
     @model_validator(mode="after")
     def _of_one_size(self) -> Self:

@@ -17,7 +17,7 @@ from harness.estimators.estimate import finite_json
 from harness.estimators.nade import Nade, Nde
 from harness.estimators.scv import Scv
 from harness.progress import Progress, SilentProgress
-from harness.runner.stored_blocks import stored_blocks
+from harness.runner.stored_estimates import stored_blocks
 from harness.studies.required_tests import (
     Procedure,
     RequiredTests,

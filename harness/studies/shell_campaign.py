@@ -17,7 +17,7 @@ from harness.arrays import FloatArray, IntArray
 from harness.campaign.models import Campaign
 from harness.estimators.block import Block
 from harness.estimators.estimate import Estimate
-from harness.runner.shell_planner import RoundRule, ShellPlanner
+from harness.runner.planner import RoundRule, ShellPlanner
 from harness.strata import ShellDesign
 from harness.studies.experiment import Fault
 from harness.studies.judgement import Row, estimate_row

@@ -1,7 +1,5 @@
 """Blocks by hand, for tests that need particular outcomes and weights, and estimators fed with blocks."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import replace
 from typing import TypeVar

@@ -1,15 +1,14 @@
 """Failed tests: no crash in rate and lower limit, crashes in every upper limit, for every estimator."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from harness.estimators import ESTIMATORS, one_pass
+from harness.estimators import one_pass
 from harness.estimators.block import Block
 from harness.estimators.difference import difference_statement, paired_difference
+from harness.estimators.one_pass import ACCUMULATORS
 from harness.studies.chains.named import overtaking
 from harness.studies.chains.sampler import blocks
 from harness.studies.required_tests import Procedure, joined, plain_rhw, scv_rhw
@@ -44,13 +43,13 @@ def drawn(name: str) -> list[Block]:
     return list(blocks(CHAIN, METHOD.get(name, "step_mixture"), [size] * 4, SEED))
 
 
-@pytest.mark.parametrize("name", ESTIMATORS)
+@pytest.mark.parametrize("name", ACCUMULATORS)
 def test_lower_ends_without_upper_ends_with_the_failed_tests(name):
     parts = some_failed(drawn(name))
     found = one_pass(parts, (name,)).estimates[name]
     as_safe = [replace(part, failed=np.zeros_like(part.failed)) for part in parts]
-    seen = fed(ESTIMATORS[name](), as_safe).result(0.9)
-    worst = fed(ESTIMATORS[name](), [part.failed_as_crashes() for part in parts]).result(0.9)
+    seen = fed(ACCUMULATORS[name](), as_safe).result(0.9)
+    worst = fed(ACCUMULATORS[name](), [part.failed_as_crashes() for part in parts]).result(0.9)
     assert (found.crash_rate, found.std_error, found.ci_low) == (seen.crash_rate, seen.std_error, seen.ci_low)
     assert (found.n_crashes, found.n_effective) == (seen.n_crashes, seen.n_effective)
     assert (found.ci_high, found.upper_bound) == (worst.ci_high, worst.upper_bound)
@@ -61,10 +60,10 @@ def test_lower_ends_without_upper_ends_with_the_failed_tests(name):
     assert any("episodes failed" in warning for warning in found.warnings)
 
 
-@pytest.mark.parametrize("name", ESTIMATORS)
+@pytest.mark.parametrize("name", ACCUMULATORS)
 def test_nothing_changes_where_nothing_fails(name):
     parts = drawn(name)
-    found, seen = one_pass(parts, (name,)).estimates[name], fed(ESTIMATORS[name](), parts).result(0.9)
+    found, seen = one_pass(parts, (name,)).estimates[name], fed(ACCUMULATORS[name](), parts).result(0.9)
     none = {"n_failed": 0, "crash_rate_if_failed_had_crashed": seen.crash_rate}
     assert found == replace(seen, details={**none, **seen.details})
 
