@@ -30,12 +30,17 @@ AVS = {
     "SM-II": AutomatedVehicle(model="fvdm", parameters=FVDMParameters(min_acceleration_mps2=-1.0)),
     "SM-III": AutomatedVehicle(model="fvdm", parameters=FVDMParameters(min_acceleration_mps2=-6.0)),
 }
+DEFAULT_SURROGATES = Campaign(name="default").surrogates
 SURROGATES = {
-    "default": Campaign(name="default").surrogates,
+    "default": DEFAULT_SURROGATES,
+    "two": {name: DEFAULT_SURROGATES[name] for name in ("SM-I", "SM-III")},  # immediate tables in half the time
     "SM-I": {"SM-I": IDM(model="idm")},
     "SM-III": {"SM-III": FVDM(model="fvdm", parameters=FVDMParameters(min_acceleration_mps2=-6.0))},
     "brakes with 2 g": {"hard": IDM(model="idm", parameters=IDMParameters(min_acceleration_mps2=-20.0))},
 }
+
+TWO = "surrogates={SM-I: {model: idm}, SM-III: {model: fvdm, parameters: {min_acceleration_mps2: -6.0}}}"
+"""The same two, as an override of a campaign's file."""
 
 
 def campaign(

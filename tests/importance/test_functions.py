@@ -16,7 +16,7 @@ from harness.state import STATE_COLUMNS
 from tests.episode.twin_runs import prepared, run
 from tests.importance.kernels import after_cut_in, before_cut_in, drawn
 
-CHALLENGES = ("immediate", "recursive")
+CHALLENGES = {"immediate": "two", "recursive": "default"}  # and the surrogates
 EPSILONS = (0.0, 0.1, 1.0)
 settings = pytest.mark.parametrize(
     ("challenge", "epsilon"), [(challenge, epsilon) for challenge in CHALLENGES for epsilon in EPSILONS]
@@ -31,13 +31,13 @@ steps = st.integers(0, 19).map(lambda second: 10 * second)
 
 def policy_of(challenge, epsilon):
     """Environment and importance functions, at a level where cutting in is not always negligible."""
-    policy = prepared("step_mixture", challenge, level=1e4).policy
+    policy = prepared("step_mixture", challenge, level=1e4, surrogates=CHALLENGES[challenge]).policy
     return policy.environment, policy.importance._replace(epsilon=epsilon)
 
 
 def recorded(challenge):
     """States, maneuvers and steps of BV's redraw times: before the cut-in, and after it."""
-    done = run("step_mixture", challenge, n=4_000, moments="all")
+    done = run("step_mixture", challenge, n=4_000, moments="all", surrogates=CHALLENGES[challenge])
     moment = done.moment
     state = np.column_stack([moment[name] for name in STATE_COLUMNS])
     before = np.isin(moment["maneuver"], (CUT_IN, STAY)) & (moment["step"] % 10 == 0)
