@@ -80,11 +80,11 @@ class StopRule:
         Conditions that were missing when a look last failed: what decided, or what is still missing.
     heaviest : float
         By how much of itself one more crash of the largest weight would have moved the last look's estimate.
-    pool_too_rough : bool
+    pool_error_above_target : bool
         Always False: no pool is behind these estimates.
     """
 
-    pool_too_rough = False
+    pool_error_above_target = False
 
     def __init__(
         self,

@@ -85,7 +85,10 @@ def predict(replayed: Replayed, driver: int) -> Prediction:
     av, other, weight = replayed.av, replayed.drivers[:, driver], replayed.weight
     rate, rate_driver, rate_both = (float(weight[who].sum()) for who in (av, other, av & other))
     return Prediction(
-        *(int(tests.sum()) for tests in (av & other, av & ~other, ~av & other, ~av & ~other)),
+        both=int((av & other).sum()),
+        only_av=int((av & ~other).sum()),
+        only_driver=int((~av & other).sum()),
+        neither=int((~av & ~other).sum()),
         crash_rate=rate,
         crash_rate_driver=rate_driver,
         caught=rate_both / rate if rate > 0.0 else None,

@@ -148,7 +148,7 @@ class PrescribedEpisodes:
             lv=np.ascontiguousarray(c.lv[rows]),
             bv=np.ascontiguousarray(c.bv[rows]),
             cut_step=c.step[rows],
-            component=stratum.astype(np.int64),
+            stratum=stratum.astype(np.int64),
             log_weight=np.log(self.design.p[stratum]),
         )
         return c.state[rows], traffic

@@ -194,7 +194,7 @@ def _run_alone(
 def _stopped_by(campaign: Campaign, planner: Planner, n_episodes: int) -> StoppedBy:
     if planner.rule.reached:
         return "rhw"
-    if planner.rule.pool_too_rough:  # whatever else is spent: more of it would not help
+    if planner.rule.pool_error_above_target:  # whatever else is spent: more of it would not help
         return "pool_error"
     return "episodes" if n_episodes >= campaign.stop.episodes else "pool"
 

@@ -19,7 +19,7 @@ import pyarrow.parquet as pq
 from harness.arrays import BoolArray, FloatArray, IntArray, RecordArray
 from harness.compiled import cache_root, source_hash
 from harness.environment.driving import Environment
-from harness.pool.aimed_paths import PILOT_PATHS, EnumeratedPaths, Enumerator, contributions, fit_proposal
+from harness.pool.aimed_paths import PILOT_PATHS, EnumeratedPaths, Enumerator
 from harness.progress import Progress
 from harness.records.folder import write_atomically
 
@@ -84,7 +84,7 @@ def enumerate_paths(
     pilot = Enumerator(environment, drivers, envelope, seed)
     progress.stage(f"super-population of seed {seed}", n_paths + PILOT_PATHS)
     rates = pilot.run(0, PILOT_PATHS, progress).rates(drivers.size)
-    aimed = pilot.aimed(fit_proposal(pilot.uniforms(0, PILOT_PATHS), contributions(rates)))
+    aimed = pilot.aimed(rates)
     parts = []
     for first in range(0, n_paths, CHUNK_PATHS):
         paths = aimed.run(PILOT_PATHS + first, min(CHUNK_PATHS, n_paths - first), progress)

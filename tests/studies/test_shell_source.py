@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from harness.campaign.models import AutomatedVehicle, Environment, PoolSettings
+from harness.campaign.models import AutomatedVehicle, EnvironmentSettings, PoolSettings
 from harness.environment.loading import load_environment
 from harness.errors import CampaignError
 from harness.pool.build import build_pool
@@ -44,12 +44,12 @@ def drivers(library, avs):
 
 @pytest.fixture(scope="module")
 def population(drivers):
-    environment = load_environment(Environment())
+    environment = load_environment(EnvironmentSettings())
     return enumerate_paths(environment, drivers.records, drivers.envelope, 3, PATHS, SilentProgress())
 
 
 def test_the_cache_gives_the_same_back(drivers, population):
-    environment = load_environment(Environment())
+    environment = load_environment(EnvironmentSettings())
     again = enumerate_paths(environment, drivers.records, drivers.envelope, 3, PATHS, SilentProgress())
     for name in ("cut_in", "path", "mass", "bits"):
         np.testing.assert_array_equal(getattr(again, name), getattr(population, name))
@@ -100,7 +100,7 @@ def test_a_vehicle_that_accelerates_harder_has_no_envelope(library):
 @pytest.mark.slow
 def test_real_pools_have_the_shells_of_drawn_ones(library, avs, drivers):
     """A pool as a campaign builds it, from other paths: shell probabilities and their errors agree."""
-    environment = load_environment(Environment())
+    environment = load_environment(EnvironmentSettings())
     paths = 16_384
     population = enumerate_paths(environment, drivers.records, drivers.envelope, 3, paths, SilentProgress())
     source = overtaking_shells(library, population, avs["own"], drivers.vehicles["own"], paths)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from harness.campaign.models import AutomatedVehicle, Environment
+from harness.campaign.models import AutomatedVehicle, EnvironmentSettings
 from harness.environment.loading import load_environment
 from harness.pool.library import load_library
 from harness.progress import SilentProgress
@@ -24,7 +24,7 @@ def test_imprecise_ones_are_enumerated_again_and_agree():
         "wild": AutomatedVehicle.model_validate({"model": "constant", "parameters": {"acceleration_mps2": 0.0}}),
     }
     drivers = Drivers(load_library("ladder-1"), avs)
-    environment = load_environment(Environment())
+    environment = load_environment(EnvironmentSettings())
     found = truths(environment, drivers, 3, 1024, SilentProgress())
     assert found["idm"].crash_rate == pytest.approx(1.343e-7, abs=4.0 * found["idm"].std_error)
     assert found["idm"].relative_error < 0.02  # once would leave some 2 %
