@@ -23,6 +23,7 @@ KERNEL_SOURCES = (
     "arrays.py",
     "compiled.py",
     "maneuvers.py",
+    "methods.py",
     "outcomes.py",
     "random_stream.py",
     "state.py",

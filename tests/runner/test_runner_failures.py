@@ -6,15 +6,14 @@ import errno
 import multiprocessing
 import os
 import pickle
-import signal
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from harness.cli import main
 from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, WorldDisagreementError
-from harness.records import folder
-from harness.runner import campaign_run, processes, shards
+from harness.runner import campaign_run, shards, worker
 from harness.runner.shards import WorkerLostError
 from harness.runner.worker import ShardSpec
 from tests.runner import bad_workers
@@ -25,7 +24,7 @@ SHARDS_BEFORE_FAILURE = 3
 
 
 def test_a_shard_that_kills_every_worker_ends_the_run_and_is_named(run, campaign, tmp_path, monkeypatch):
-    monkeypatch.setattr(processes, "serve", bad_workers.dying)
+    monkeypatch.setattr(shards, "serve", bad_workers.dying)
     monkeypatch.setattr(shards, "ATTEMPTS", 2)
     with pytest.raises(
         WorkerLostError, match=r"shard 0 \(from episode 0\): found 2 worker processes that died"
@@ -38,7 +37,7 @@ def test_a_shard_that_kills_every_worker_ends_the_run_and_is_named(run, campaign
 
 
 def test_a_disagreement_in_a_worker_ends_the_run_and_all_workers(run, campaign, tmp_path, monkeypatch):
-    monkeypatch.setattr(processes, "serve", bad_workers.disobedient)
+    monkeypatch.setattr(shards, "serve", bad_workers.disobedient)
     with pytest.raises(WorldDisagreementError, match="SUMO, BV3, m"):
         run(campaign(*TWIN), tmp_path, workers=2)
     assert manifest(tmp_path)["status"] == "interrupted"
@@ -50,16 +49,16 @@ def test_a_full_disk_is_said_in_words_and_the_run_can_be_resumed(
 ):
     out = tmp_path / "run"
     options = [word for override in (*SMALL, *TWIN) for word in ("--set", override)]
-    write = folder._write
+    write = Path.write_bytes
 
-    def write_or_fail(path: Path, content: bytes) -> None:
+    def write_or_fail(path: Path, content: bytes) -> int:
         if path.parent.name == "moments" and len(shard_files(out)) == SHARDS_BEFORE_FAILURE:
-            path.write_bytes(b"PAR1, and then the disk was full")
+            write(path, b"PAR1, and then the disk was full")
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
-        write(path, content)
+        return write(path, content)
 
     with monkeypatch.context() as patch:
-        patch.setattr(folder, "_write", write_or_fail)
+        patch.setattr(Path, "write_bytes", write_or_fail)
         assert main(["run", str(MIXTURE_FILE), "--out", str(out), "--workers", "1", *options]) == 2
     complaint = capsys.readouterr().err
     assert "no space left" in complaint
@@ -110,94 +109,76 @@ class Pipe:
 
 @pytest.fixture
 def serve(campaign, tmp_path, monkeypatch):
-    """Serve some shards with a runner of one's own; returns what was sent back."""
-    before = signal.getsignal(signal.SIGINT)
+    """Serve shards with stand-ins for preparing and running one; returns what was noted."""
 
-    def served(runner: type, n_shards: int) -> list:
-        monkeypatch.setattr(processes, "ShardRunner", runner)
-        pipe = Pipe(n_shards)
-        processes.serve(pipe, campaign(), tmp_path / "black-box")
-        return pipe.sent
+    def served(pipe: Pipe, run: Callable[[ShardSpec], object], prepare: Callable[[], None] = lambda: None) -> list[str]:
+        events = []
 
-    yield served
-    signal.signal(signal.SIGINT, before)
+        class Runner:
+            def __init__(self, *_: object) -> None:
+                prepare()
+                events.append("prepared")
+
+            def run(self, spec: ShardSpec, doomed: dict) -> object:
+                return run(spec)
+
+            def close(self) -> None:
+                events.append("closed")
+
+        monkeypatch.setattr(worker, "ShardRunner", Runner)
+        worker.serve(pipe, campaign(), tmp_path / "black-box")
+        return events
+
+    return served
+
+
+def index_of(spec: ShardSpec) -> int:
+    return spec.index
 
 
 def test_a_worker_prepares_once_and_ends_with_its_parent(serve):
-    events = []
-
-    class Runner:
-        def __init__(self, *_: object) -> None:
-            events.append("prepared")
-
-        def run(self, spec: ShardSpec, doomed: dict) -> int:
-            return spec.index
-
-        def close(self) -> None:
-            events.append("closed")
-
-    assert serve(Runner, 3) == [0, 1, 2]
-    assert events == ["prepared", "closed"]
+    pipe = Pipe(3)
+    assert serve(pipe, index_of) == ["prepared", "closed"]
+    assert pipe.sent == [0, 1, 2]
 
 
-@pytest.mark.parametrize("lost", ["recv", "send"])
-def test_a_worker_ends_quietly_when_its_parent_was_killed(lost, campaign, tmp_path, monkeypatch):
+@pytest.mark.parametrize(("lost", "error"), [("recv", ConnectionResetError), ("send", BrokenPipeError)])
+def test_a_worker_ends_quietly_when_its_parent_was_killed(lost, error, serve, monkeypatch):
     def broken(*_: object) -> None:
-        raise BrokenPipeError if lost == "send" else ConnectionResetError
+        raise error
 
-    class Runner:
-        def __init__(self, *_: object) -> None: ...
-
-        def run(self, spec: ShardSpec, doomed: dict) -> int:
-            return spec.index
-
-        def close(self) -> None:
-            closed.append(True)
-
-    closed: list[bool] = []
     pipe = Pipe(2)
     monkeypatch.setattr(pipe, lost, broken)
-    monkeypatch.setattr(processes, "ShardRunner", Runner)
-    monkeypatch.setattr(signal, "signal", lambda *_: None)
-    processes.serve(pipe, campaign(), tmp_path / "black-box")
-    assert closed == ([True] if lost == "send" else [])
+    assert serve(pipe, index_of) == (["prepared", "closed"] if lost == "send" else [])
 
 
 def test_an_error_of_preparation_reaches_the_parent(serve):
-    class Runner:
-        def __init__(self, *_: object) -> None:
-            raise CampaignError("world.cells", found="300", expected="at most 256", mend="Use fewer.")
+    def prepare() -> None:
+        raise CampaignError("world.cells", found="300", expected="at most 256", mend="Use fewer.")
 
-    (error,) = serve(Runner, 1)
+    pipe = Pipe(1)
+    serve(pipe, index_of, prepare)
+    (error,) = pipe.sent
     assert isinstance(error, CampaignError)
     assert str(error) == "world.cells: found 300; expected at most 256. Use fewer."
 
 
 def test_a_defect_reaches_the_parent_with_the_workers_traceback(serve):
-    class Runner:
-        def __init__(self, *_: object) -> None: ...
-
-        def close(self) -> None: ...
-
-        def run(self, spec: ShardSpec, doomed: dict) -> float:
-            return 1 / 0
-
-    (error,) = serve(Runner, 1)
+    pipe = Pipe(1)
+    serve(pipe, lambda spec: 1 / spec.index)
+    (error,) = pipe.sent
     assert isinstance(error, ZeroDivisionError)
-    assert "return 1 / 0" in pickle.loads(pickle.dumps(error)).__notes__[0]
+    assert "lambda spec: 1 / spec.index" in pickle.loads(pickle.dumps(error)).__notes__[0]
 
 
 def test_an_error_that_cannot_be_pickled_reaches_the_parent_in_words(serve):
-    class Runner:
-        def __init__(self, *_: object) -> None: ...
+    def run(_: ShardSpec) -> None:
+        error = ValueError("of a strange kind")
+        error.handle = lambda: None
+        raise error
 
-        def close(self) -> None: ...
-
-        def run(self, spec: ShardSpec, doomed: dict) -> None:
-            error = ValueError("of a strange kind")
-            error.handle = lambda: None
-            raise error
-
-    (error,) = serve(Runner, 1)
+    pipe = Pipe(1)
+    serve(pipe, run)
+    (error,) = pipe.sent
     assert isinstance(error, RuntimeError)
     assert "ValueError: of a strange kind" in str(error)

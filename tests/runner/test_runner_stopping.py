@@ -7,7 +7,7 @@ import json
 import pytest
 
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, RunFolderError
-from harness.runner.prefix import Prefix
+from harness.runner.manifest import Prefix
 from tests.runner.conftest import TWIN
 from tests.runner.stored_runs import copy_of, manifest, shard_files, stored_table, unlike_columns
 
@@ -97,9 +97,9 @@ def test_a_shard_is_written_when_all_before_it_are_in(campaign, run_here, tmp_pa
     """Whatever ends the run, the folder holds a prefix of its shards: here the worker is ahead by one."""
     counted, on_disk, add = [], [], Prefix.add
 
-    def noted(prefix, done):
-        add(prefix, done)
-        counted.append(len(prefix.specs))
+    def noted(prefix, done, files):
+        add(prefix, done, files)
+        counted.append(len(prefix.shards))
         on_disk.append(len(shard_files(tmp_path / "run")))
 
     monkeypatch.setattr(Prefix, "add", noted)
