@@ -35,10 +35,7 @@ AIMED_DRAW, OFFSET_DRAW = 0, 1
 class Proposal:
     """Product density on the unit cube, mixed with the uniform one.
 
-    Attributes
-    ----------
-    density : ndarray, shape (dimensions, N_BINS)
-        Density within each bin; its mean over the bins is 1.
+    ``density`` (dimensions, N_BINS) is that within each bin; its mean over the bins is 1.
     """
 
     density: FloatArray

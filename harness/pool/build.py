@@ -116,10 +116,7 @@ def _keep(
 ) -> tuple[IntArray, IntArray, IntArray]:
     """Systematic sample of cut-ins of every shell, with probability proportional to mass.
 
-    Returns
-    -------
-    path, step, shell : ndarray, shape (n,)
-        Row and column in ``mass``, and the shell, sorted by shell and path.
+    Path and step (row and column in ``mass``) and shell, each (n,), sorted by shell and path.
     """
     kept = []
     for s in range(n_shells):
