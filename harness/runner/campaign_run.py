@@ -108,13 +108,7 @@ class _Run:
     """A campaign on its way into a folder, in which nobody but this process writes."""
 
     def __init__(
-        self,
-        resolved: Resolved,
-        out: Path,
-        earlier: dict[str, Any],
-        workers: int,
-        progress: Progress,
-        began: float,
+        self, resolved: Resolved, out: Path, earlier: dict[str, Any], workers: int, progress: Progress, began: float
     ) -> None:
         self._resolved, self._campaign, self._out, self._progress = resolved, resolved.campaign, out, progress
         for left in out.rglob(".*.part"):  # of an earlier run that was killed
