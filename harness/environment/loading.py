@@ -6,7 +6,7 @@ from pathlib import Path
 
 from harness.campaign.loading import names_a_file
 from harness.campaign.models import Environment as EnvironmentSection
-from harness.campaign.yaml_text import read_model
+from harness.campaign.problems import read_model
 from harness.environment.driving import Environment, build_environment
 from harness.environment.laws import require_sound_laws
 from harness.environment.parameters import SHIPPED_FOLDER, EnvironmentParameters, parameter_record
