@@ -21,7 +21,7 @@ _CHECKED_EPISODES = 100
 
 
 class Measurement(NamedTuple):
-    """One measurement of a contender."""
+    """One measurement of a contender: what it did, wall time, and CPU time of all its processes."""
 
     episodes: int
     cell_steps: int
@@ -32,27 +32,19 @@ class Measurement(NamedTuple):
 
     @property
     def episodes_per_cpu_s(self) -> float:
-        """Finished episodes per second of one core."""
         return self.episodes / self.cpu_s
 
     @property
     def episodes_per_s(self) -> float:
-        """Finished episodes per second of wall time."""
         return self.episodes / self.wall_s
 
     @property
     def cpu_ns_per_cell_step(self) -> float:
-        """CPU time of one step of one episode."""
         return 1e9 * self.cpu_s / self.cell_steps if self.cell_steps else float("nan")
 
 
 class ContenderProcess:
-    """A contender that waits in its own process until it is told to run.
-
-    Parameters
-    ----------
-    name : str
-        One of `benchmarks.contenders.CONTENDERS`.
+    """A contender of `CONTENDERS` that waits in its own process until it is told to run.
 
     Raises
     ------

@@ -11,7 +11,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from harness.campaign.loading import load_campaign
 from harness.campaign.models import Campaign
 from harness.episode import loop
 from harness.episode.loop import Shard
-from harness.records.folder import write_shard
+from harness.records.folder import encoded, write_shard
 from harness.records.tables import shard_tables
 from harness.resolved import resolve
 from harness.runner.prepare import Prepared, prepare
@@ -38,10 +38,9 @@ SHARD = 2_500
 
 
 class Work(NamedTuple):
-    """What one measurement did.
+    """What one measurement did, with wall time by part where the contender knows it.
 
-    ``part_s`` is wall time by part where the contender knows it; ``timed_s`` are wall and CPU time of what counts,
-    where that is not everything.
+    ``timed_s`` are wall and CPU time of what counts, where that is not everything.
     """
 
     episodes: int
@@ -51,16 +50,19 @@ class Work(NamedTuple):
     timed_s: tuple[float, float] | None = None
 
 
-class Contender(Protocol):
+class Contender:
     """Something that runs episodes."""
 
     def run(self, first: int, n: int) -> Work:
         """Run episodes ``first … first + n − 1``."""
-        ...
+        raise NotImplementedError
 
-    def rows(self, n: int) -> bytes | None:
+    def rows(self, n: int) -> bytes | None:  # noqa: ARG002
         """Outcome, steps, cut-in step and weight of the first n episodes, to compare; None if there are none."""
-        ...
+        return None
+
+    def close(self) -> None:
+        """Close what was opened."""
 
 
 def campaign(name: str, **settings: object) -> Campaign:
@@ -69,7 +71,7 @@ def campaign(name: str, **settings: object) -> Campaign:
     return load_campaign(SCENARIOS / f"overtaking_{name}.yaml", [f"{key}={value}" for key, value in fixed.items()])
 
 
-class Recorded:
+class Recorded(Contender):
     """Episodes of a campaign in some world, written to disk as the runner writes them."""
 
     def __init__(self, settings: Campaign, world: Callable[[Campaign], World]) -> None:
@@ -79,23 +81,19 @@ class Recorded:
         self.folder = Path(tempfile.mkdtemp(prefix="harness-benchmark-"))
 
     def run(self, first: int, n: int) -> Work:
-        """Run and write a shard."""
         shard = self.loop.run(first, self.prepared.states(first, n))
         self.write(shard)
         written = sum(path.stat().st_size for path in self.folder.rglob("*.parquet"))
         return Work(n, int(shard.results.episode["n_steps"].sum()), written)
 
     def write(self, shard: Shard) -> None:
-        """Write the shard's tables over those of the one before."""
-        write_shard(self.folder, 0, shard_tables(shard, self.prepared.campaign.seed, keep_traces=False))
+        write_shard(self.folder, 0, encoded(shard_tables(shard, self.prepared.campaign.seed, keep_traces=False)))
 
     def rows(self, n: int) -> bytes:
-        """Bits of the first n episodes."""
         episode = self.loop.run(0, self.prepared.states(0, n)).results.episode
         return b"".join(episode[name].tobytes() for name in ("outcome", "n_steps", "cut_in_step", "log_weight"))
 
     def close(self) -> None:
-        """End the simulation and remove the records."""
         self.world.close()
         shutil.rmtree(self.folder)
 
@@ -122,7 +120,6 @@ class WithParts(Recorded):
         setattr(owner, method, _timed(getattr(owner, method), part, self._seconds))
 
     def run(self, first: int, n: int) -> Work:
-        """Run and write a shard, with the seconds of every part."""
         self._seconds.clear()
         started = time.perf_counter()
         work = super().run(first, n)
@@ -143,7 +140,7 @@ def _timed(function: Callable[..., object], part: str, seconds: dict[str, float]
     return call
 
 
-class Floor:
+class Floor(Contender):
     """SUMO's simulationStep alone: K cells whose vehicles keep an equal speed, nothing told, nothing read."""
 
     def __init__(self, settings: Campaign) -> None:
@@ -166,15 +163,11 @@ class Floor:
             cpu_s += time.process_time() - cpu
         return Work(rounds * cells, rounds * cells * FLOOR_STEPS, timed_s=(wall_s, cpu_s))
 
-    def rows(self, n: int) -> None:
-        """There are none."""
-
     def close(self) -> None:
-        """End the simulation."""
         self._world.close()
 
 
-class BareOneAtATime:
+class BareOneAtATime(Contender):
     """The usual way with no policy, no checks and no records: speeds told and values read, as fast as it can be."""
 
     def __init__(self, settings: Campaign) -> None:
@@ -191,15 +184,11 @@ class BareOneAtATime:
                 self._world.step(v, nobody)
         return Work(n, n * FLOOR_STEPS)
 
-    def rows(self, n: int) -> None:
-        """There are none."""
-
     def close(self) -> None:
-        """End the simulation."""
         self._world.close()
 
 
-class TwinAlone:
+class TwinAlone(Contender):
     """The twin without records."""
 
     def __init__(self, settings: Campaign) -> None:
@@ -207,50 +196,37 @@ class TwinAlone:
         self._loop = self._prepared.loop(TwinWorld(TWIN_CELLS))
 
     def run(self, first: int, n: int) -> Work:
-        """Run episodes and forget them."""
         shard = self._loop.run(first, self._prepared.states(first, n))
         return Work(n, int(shard.results.episode["n_steps"].sum()))
 
-    def rows(self, n: int) -> None:
-        """Nothing is kept."""
 
-    def close(self) -> None:
-        """Nothing is open."""
-
-
-class Workers:
+class Workers(Contender):
     """The runner's own worker processes, as `harness run` uses them."""
 
     def __init__(self, settings: Campaign, workers: int) -> None:
         self._folder = Path(tempfile.mkdtemp(prefix="harness-benchmark-"))
-        self._pool = ShardPool(settings, self._folder, workers)
+        self._pool = ShardPool(resolve(settings), workers)
         self._workers = workers
 
     def run(self, first: int, n: int) -> Work:
-        """Shards of 2,500 episodes, the same number for every worker."""
+        # As many shards of 2,500 episodes for every worker.
         n_shards = max(2, n // SHARD)
         specs = [ShardSpec(i, first + i * SHARD, SHARD) for i in range(n_shards)]
-        for _ in self._pool.run(iter(specs), lambda _: None):
-            pass
+        for done in self._pool.run(iter(specs), lambda _: None):
+            write_shard(self._folder, done.spec.index, done.parquet)
         return Work(n_shards * SHARD, 0)
 
-    def rows(self, n: int) -> None:
-        """Start the workers; their rows are on disk."""
+    def rows(self, n: int) -> None:  # starts the workers; their rows are on disk
         self.run(0, n)
 
     def close(self) -> None:
-        """End the workers and remove their records."""
         self._pool.close()
         shutil.rmtree(self._folder)
 
 
-def in_sumo(*, shim: bool) -> Callable[[Campaign], World]:
-    """The harness's SUMO world with or without the compiled shim."""
-
-    def build(settings: Campaign) -> World:
-        return SumoWorld(settings.world.cells, shim=shim)
-
-    return build
+def in_sumo(name: str, *, shim: bool, of: type[Recorded] = Recorded) -> Contender:
+    """A campaign in the harness's SUMO world, with or without the compiled shim."""
+    return of(campaign(name), lambda settings: SumoWorld(settings.world.cells, shim=shim))
 
 
 def missing(name: str) -> str | None:
@@ -263,14 +239,14 @@ def missing(name: str) -> str | None:
 
 
 CONTENDERS: dict[str, tuple[Callable[[], Contender], int]] = {
-    "harness": (lambda: Recorded(campaign("nade"), in_sumo(shim=False)), 5_000),
-    "harness+shim": (lambda: Recorded(campaign("nade"), in_sumo(shim=True)), 5_000),
+    "harness": (lambda: in_sumo("nade", shim=False), 5_000),
+    "harness+shim": (lambda: in_sumo("nade", shim=True), 5_000),
     "one-at-a-time": (lambda: Recorded(campaign("nade"), lambda _: in_libsumo()), 500),
     "bare one-at-a-time": (lambda: BareOneAtATime(campaign("nade")), 1_000),
     "traci": (lambda: Recorded(campaign("nade"), lambda _: OverTraci(sumo_binary())), 50),
     "floor": (lambda: Floor(campaign("nade")), 5_000),
-    "recursive": (lambda: Recorded(campaign("recursive"), in_sumo(shim=False)), 5_000),
-    "recursive+shim": (lambda: Recorded(campaign("recursive"), in_sumo(shim=True)), 5_000),
+    "recursive": (lambda: in_sumo("recursive", shim=False), 5_000),
+    "recursive+shim": (lambda: in_sumo("recursive", shim=True), 5_000),
     "twin nade": (lambda: TwinAlone(campaign("nade", **{"records.moments": "none"})), 50_000),
     "twin nde": (lambda: TwinAlone(campaign("nde")), 100_000),
     "twin recursive": (lambda: TwinAlone(campaign("recursive", **{"records.moments": "none"})), 40_000),
@@ -280,7 +256,7 @@ CONTENDERS: dict[str, tuple[Callable[[], Contender], int]] = {
     ),
     "1 worker": (lambda: Workers(campaign("nade"), 1), 5_000),
     "2 workers": (lambda: Workers(campaign("nade"), 2), 10_000),
-    "parts": (lambda: WithParts(campaign("nade"), in_sumo(shim=False)), 5_000),
-    "parts+shim": (lambda: WithParts(campaign("nade"), in_sumo(shim=True)), 5_000),
+    "parts": (lambda: in_sumo("nade", shim=False, of=WithParts), 5_000),
+    "parts+shim": (lambda: in_sumo("nade", shim=True, of=WithParts), 5_000),
 }
 """Name → how to build it, and episodes per measurement (about two seconds each)."""

@@ -11,13 +11,10 @@ from __future__ import annotations
 
 import time
 
-import numpy as np
-
 from harness import load_campaign
 from harness.environment.loading import load_environment
-from harness.pool.build import PILOT_PATHS, Enumerator
+from harness.pool.aimed_paths import PILOT_PATHS, Enumerator, contributions, fit_proposal
 from harness.pool.library import load_library
-from harness.pool.proposal import fit_proposal
 from harness.progress import SilentProgress
 
 PATHS = 8192
@@ -33,17 +30,16 @@ def main() -> None:
     before = names[: names.index(library.boundary) + 1]
     asked, envelope = (environment, library.drivers), names.index(library.envelope)
     pilot = Enumerator(*asked, envelope, SEED)
-    rates = np.concatenate([block.rates(len(names)) for block in pilot.run(0, PILOT_PATHS, SilentProgress())])
-    relative = rates[:, : len(before)] / rates[:, : len(before)].mean(0)
-    proposal = fit_proposal(pilot.uniforms(0, PILOT_PATHS), np.sqrt((relative**2).sum(1)))
+    rates = pilot.run(0, PILOT_PATHS, SilentProgress()).rates(len(names))[:, : len(before)]
+    proposal = fit_proposal(pilot.uniforms(0, PILOT_PATHS), contributions(rates))
     print("stride  ms/path  cost  " + "  ".join(before))
     first = 0.0
     for stride in STRIDES:
         enumerator = Enumerator(*asked, envelope, SEED, proposal, stride)
         begin = time.process_time()
-        blocks = enumerator.run(PILOT_PATHS, PATHS, SilentProgress())
+        paths = enumerator.run(PILOT_PATHS, PATHS, SilentProgress())
         milliseconds = (time.process_time() - begin) / PATHS * 1e3
-        rates = np.concatenate([block.rates(len(names)) for block in blocks])[:, : len(before)]
+        rates = paths.rates(len(names))[:, : len(before)]
         relvar = rates.var(0) / rates.mean(0) ** 2
         cost = milliseconds * relvar.max()
         first = first or cost

@@ -58,7 +58,7 @@ def main(replications: int) -> None:
             share = np.r_[IDM, hole]
             truth = float(design.p @ share)
             source = ShellCampaign(campaign, Fixed(design, share), SEED)
-            rows = [row for k in range(replications) for row in source.run(k) if row.result == FREE]
+            rows = [row for row in source.run(range(replications)) if row.result == FREE]
             rate = np.array([row.crash_rate for row in rows])
             error = rate.std(ddof=1) / truth / np.sqrt(replications)
             covers = np.mean([row.ci_low <= truth <= row.ci_high for row in rows])

@@ -24,20 +24,7 @@ class Start(NamedTuple):
 
 
 def start_up(name: str, cache: Path) -> Start:
-    """Run ``harness run`` on a shipped campaign, in a process that finds only the given cache.
-
-    Parameters
-    ----------
-    name : str
-        Campaign, for instance ``nade``.
-    cache : Path
-        Folder for kernels and tables; empty for a cold start.
-
-    Raises
-    ------
-    RuntimeError
-        The run failed.
-    """
+    """Run ``harness run`` on a shipped campaign, in a process that finds only this cache of kernels and tables."""
     with tempfile.TemporaryDirectory(prefix="harness-benchmark-") as scratch:
         out = Path(scratch) / "run"
         settings = ("run.shard_size=96", f"stop.episodes={2 * SHARD}", "stop.rhw=null")

@@ -13,7 +13,7 @@ import sys
 import numpy as np
 
 from harness.campaign.models import Stop
-from harness.estimators.nde import Nde
+from harness.estimators.nade import Nde
 from harness.estimators.stopping import StopRule
 
 RATE = 0.01

@@ -24,7 +24,7 @@ from benchmarks.contenders import SCENARIOS, TWIN_CELLS
 from harness.campaign.loading import load_campaign
 from harness.estimators import Block, one_pass
 from harness.estimators.from_records import EPISODE_COLUMNS, MOMENT_COLUMNS, block_from_tables
-from harness.estimators.scv_columns import product_columns
+from harness.estimators.scv import fill_product_columns, n_columns
 from harness.importance.build import mixture_weights
 from harness.records.reader import read_shards
 
@@ -88,7 +88,9 @@ def largest_difference(folder: Path) -> float:
 def _residuals(block: Block, y: np.ndarray, level: int) -> np.ndarray:
     """Z = Y - H·β of one stratum, by numpy's least squares on centred columns."""
     rows = block.n_control_steps == level
-    columns = product_columns(block.first_ratios[rows], int(level), "reduced")
+    ratios = block.first_ratios[rows]
+    columns = np.empty((len(ratios), n_columns(int(level), ratios.shape[2])), order="F")
+    fill_product_columns(ratios, int(level), columns)
     design = np.column_stack([np.ones(rows.sum()), columns - columns.mean(axis=0)])
     scale = np.linalg.norm(columns.mean(axis=0)) * np.sqrt(rows.sum())
     largest = np.linalg.norm(design, 2)

@@ -14,8 +14,7 @@ from collections.abc import Sequence
 
 import click
 
-from harness.commands.campaigns import check, run, schema
-from harness.commands.machine import setup
+from harness.commands.campaigns import check, run, schema, setup
 from harness.commands.options import examples
 from harness.commands.stored import estimate, replay, report
 from harness.commands.studies import pool, rnot, validate
@@ -50,20 +49,18 @@ for command in (check, av_check, run, compare, pool, ladder, estimate, rnot, rep
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line and turn every error that a user can cause into plain words.
+    """Run the command line and turn every error that a user can cause into plain words; returns the exit code.
 
-    Returns
-    -------
-    int
-        Exit code; anything that is not a user's error is a defect and leaves as its own exception.
+    Anything that is not a user's error is a defect and leaves as its own exception.
     """
+    arguments = sys.argv[1:] if arguments is None else list(arguments)
     with interruptible() as interruption:
         return _main(arguments, interruption)
 
 
-def _main(arguments: Sequence[str] | None, interruption: Interruption) -> int:
+def _main(arguments: list[str], interruption: Interruption) -> int:
     try:
-        code = cli.main(args=None if arguments is None else list(arguments), prog_name="harness", standalone_mode=False)
+        code = cli.main(arguments, prog_name="harness", standalone_mode=False)
         sys.stdout.flush()
     except HarnessError as error:
         show_error(error)
@@ -85,23 +82,18 @@ def _main(arguments: Sequence[str] | None, interruption: Interruption) -> int:
     return code if isinstance(code, int) else EXIT_DONE
 
 
-def _end_early(arguments: Sequence[str] | None, interruption: Interruption) -> int:
-    command = next(iter(sys.argv[1:2] if arguments is None else arguments[:1]), "")
-    show_interrupted(command, None if interruption.signal is None else interruption.signal.name)
+def _end_early(arguments: list[str], interruption: Interruption) -> int:
+    show_interrupted(next(iter(arguments), ""), None if interruption.signal is None else interruption.signal.name)
     return interruption.exit_code
 
 
 def _show_system_error(error: OSError) -> int:
     if isinstance(error, BrokenPipeError):
-        _discard_stdout()
+        # The reader of the pipe is gone: let the interpreter flush into nothing at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return EXIT_DONE
     known = system_error(error)
     if known is None:
         raise error
     show_error(known)
     return known.exit_code
-
-
-def _discard_stdout() -> None:
-    """Let the interpreter flush into nothing at exit: the reader of the pipe is gone."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

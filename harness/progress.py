@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import sys
 from types import TracebackType
-from typing import Protocol, Self, TextIO
+from typing import Self, TextIO
 
 from rich.console import Console
 from rich.progress import BarColumn, TaskID, TaskProgressColumn, TextColumn
@@ -14,10 +14,11 @@ from rich.progress import Progress as Bars
 Figure = float | int | str
 
 _BAR_WIDTH = 12  # leaves room for all figures on a terminal of 80 columns
+_RECKONED_WITH = ("rhw", "crashes", "heaviest")
 
 
-class Progress(Protocol):
-    """What the runner tells about its work. Nothing that is told here changes a result."""
+class Progress:
+    """What the runner tells about its work, and nobody shows. Nothing that is told here changes a result."""
 
     def stage(self, name: str, total: int | None, *, done: int = 0) -> None:
         """Begin a stage of ``total`` units (None: not known), ``done`` of which were finished by an earlier run."""
@@ -29,17 +30,8 @@ class Progress(Protocol):
         """Show figures beside the bar; ``crashes`` and ``rhw`` also give the time left."""
 
 
-class SilentProgress:
+class SilentProgress(Progress):
     """Shows nothing: for files, pipes, tests and the Python API."""
-
-    def stage(self, name: str, total: int | None, *, done: int = 0) -> None:
-        """Ignore it."""
-
-    def advance(self, n: int) -> None:
-        """Ignore it."""
-
-    def status(self, **figures: Figure) -> None:
-        """Ignore it."""
 
 
 def episodes_left(
@@ -48,8 +40,8 @@ def episodes_left(
     *,
     rhw: float | None = None,
     target_rhw: float | None = None,
-    crashes: int | None = None,
-    min_crashes: int = 0,
+    crashes: float | None = None,
+    min_crashes: float = 0,
     heaviest: float = 0.0,
 ) -> int:
     """Estimate how many more episodes a campaign needs until it stops.
@@ -66,7 +58,7 @@ def episodes_left(
     return max(math.ceil(min(needed, total)) - done, 0)
 
 
-class RichProgress:
+class RichProgress(Progress):
     """A bar on a terminal: share done, episodes per second, crashes so far, current RHW, time left.
 
     The share is that of the work which is thought necessary: a campaign that stops on precision ends at 100 %, however
@@ -78,8 +70,8 @@ class RichProgress:
         Relative half-width at which the campaign stops; without it the time left is that of the whole budget.
     min_crashes : int
         Crashes that it needs before it may stop.
-    stream : text stream
-        Where the bar is drawn; stderr, since stdout is for results.
+    stream : text stream, optional
+        Stderr by default, since stdout is for results.
     """
 
     def __init__(self, target_rhw: float | None = None, min_crashes: int = 0, stream: TextIO | None = None) -> None:
@@ -90,8 +82,7 @@ class RichProgress:
             TextColumn("{task.fields[figures]}"),
             console=Console(file=stream or sys.stderr),
         )
-        self._target_rhw = target_rhw
-        self._min_crashes = min_crashes
+        self._target_rhw, self._min_crashes = target_rhw, min_crashes
         self._task: TaskID | None = None
         self._figures: dict[str, Figure] = {}
         self._done_before = 0
@@ -126,12 +117,11 @@ class RichProgress:
 
     def _show(self) -> None:
         if self._task is not None:
-            worded = [_worded(name, figure) for name, figure in self._figures.items()]
-            done = int(self._bars.tasks[-1].completed)
-            n_left = None if self._budget is None else self._left(done, self._budget)
+            figures = [_worded(name, figure) for name, figure in self._figures.items()]
+            n_left = self._left()
             rate, left = self._pace(n_left)
-            total = None if n_left is None else done + n_left
-            self._bars.update(self._task, total=total, figures=" · ".join([*rate, *worded, *left]))
+            total = None if n_left is None else int(self._bars.tasks[-1].completed) + n_left
+            self._bars.update(self._task, total=total, figures=" · ".join([*rate, *figures, *left]))
 
     def _pace(self, n_left: int | None) -> tuple[list[str], list[str]]:
         """Rate, and time left, of what this run itself has done: an earlier run's share took no time now."""
@@ -142,18 +132,12 @@ class RichProgress:
         rate = [f"{rate_per_s:,.0f}/s" if rate_per_s >= 10 else f"{rate_per_s:.2g}/s"]
         return rate, [] if n_left is None else [f"{_clock(n_left / rate_per_s)} left"]
 
-    def _left(self, done: int, total: int) -> int:
-        rhw, crashes = self._figures.get("rhw"), self._figures.get("crashes")
-        heaviest = self._figures.get("heaviest")
-        return episodes_left(
-            done,
-            total,
-            rhw=float(rhw) if isinstance(rhw, float | int) else None,
-            target_rhw=self._target_rhw,
-            crashes=crashes if isinstance(crashes, int) else None,
-            min_crashes=self._min_crashes,
-            heaviest=float(heaviest) if isinstance(heaviest, float | int) else 0.0,
-        )
+    def _left(self) -> int | None:
+        if self._budget is None:
+            return None
+        known = {name: float(figure) for name, figure in self._figures.items() if name in _RECKONED_WITH}
+        done = int(self._bars.tasks[-1].completed)
+        return episodes_left(done, self._budget, target_rhw=self._target_rhw, min_crashes=self._min_crashes, **known)
 
 
 def terminal_progress(target_rhw: float | None = None, min_crashes: int = 0) -> RichProgress | None:

@@ -19,11 +19,9 @@ class Resolved:
 
     Attributes
     ----------
-    campaign : Campaign
-    environment : Environment
-    av : ndarray, shape (1,)
+    av : structured ndarray, shape (1,)
         Record of a built-in AV; shape (0,) of any other.
-    surrogates : ndarray, shape (J,)
+    surrogates : structured ndarray, shape (J,)
         Records of the drivers that challenges are computed for.
     content_hash : str
         Of all that changes an episode's bits, the environment's numbers included.

@@ -19,15 +19,8 @@ MENDS: dict[str, str] = {
 def ending(stopped_by: StoppedBy, n_episodes: int, waited_for: tuple[str, ...], *, precision_asked: bool) -> str:
     """When a campaign ended and what decided it, in a sentence.
 
-    Parameters
-    ----------
-    stopped_by : {"rhw", "episodes", "pool", "pool_error"}
-    n_episodes : int
-        Tests that it took.
-    waited_for : tuple of str
-        Conditions that were missing when the stop rule last said no.
-    precision_asked : bool
-        Whether there was a stop rule, or only a budget.
+    ``waited_for`` are the conditions that were missing when the stop rule last said no; without a ``precision_asked``
+    there was only a budget.
     """
     after = f"Stopped after {n_episodes:,} tests"
     conditions = " and ".join(waited_for)

@@ -22,24 +22,19 @@ class ShellDesign:
 
     Attributes
     ----------
-    pool : str
-        Key of the pool.
+    pool, n_paths : str, int
+        Key of the pool, and its number of paths.
     strata : tuple of str
         The surrogate that is the first to crash in each; the last is everything outside.
     p : ndarray, shape (S,)
         Probability per test that a cut-in of the stratum happens.
     moments : ndarray, shape (S, S)
         Mean product of a pool path's probabilities in two strata.
-    n_paths : int
-        Paths of the pool.
-    n_inside : int
-        Strata up to the boundary.
-    boundary : str
-        The most careless surrogate inside.
-    p_cut_in : float
-        Probability of a cut-in.
-    p_impossible : float
-        Part of it on which no vehicle within the envelope's acceleration can crash, and which is not tested.
+    n_inside, boundary : int, str
+        Strata up to the boundary, which is the most careless surrogate inside.
+    p_cut_in, p_impossible : float
+        Probability of a cut-in, and the part of it on which no vehicle within the envelope's acceleration can crash,
+        and which is not tested.
     available : tuple of int, length S
         Cut-ins that the pool has kept of each; empty if that is no limit.
     """
@@ -57,22 +52,15 @@ class ShellDesign:
 
     def to_json(self) -> dict[str, Any]:
         """Plain content for a file."""
-        content = asdict(self)
-        return {
-            **content,
-            "strata": list(self.strata),
-            "p": self.p.tolist(),
-            "moments": self.moments.tolist(),
-            "available": list(self.available),
-        }
+        lists = {name: np.array(getattr(self, name)).tolist() for name in ("strata", "p", "moments", "available")}
+        return asdict(self) | lists
 
     @classmethod
     def from_json(cls, content: dict[str, Any]) -> ShellDesign:
         """Back from `to_json`."""
         arrays = {name: np.array(content[name], dtype=np.float64) for name in ("p", "moments")}
-        return cls(
-            **{**content, **arrays, "strata": tuple(content["strata"]), "available": tuple(content["available"])}
-        )
+        tuples = {name: tuple(content[name]) for name in ("strata", "available")}
+        return cls(**(content | arrays | tuples))
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,10 +73,8 @@ class KnownRates:
         Its key.
     names : tuple of str, length D
         Surrogates from careful to careless.
-    mu : ndarray, shape (D,)
-        Crash rates per test.
-    covariance : ndarray, shape (D, D)
-        Of their errors.
+    mu, covariance : ndarray, shape (D,) and (D, D)
+        Crash rates per test, and the covariance of their errors.
     """
 
     pool: str

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from harness.progress import RichProgress, SilentProgress, _worded, episodes_left, terminal_progress
+from harness.progress import RichProgress, SilentProgress, episodes_left, terminal_progress
 
 
 class Terminal(io.StringIO):
@@ -111,6 +111,10 @@ def test_silence(capsys):
     assert capsys.readouterr() == ("", "")
 
 
-def test_a_precision_that_is_not_known_is_not_shown_as_one():
-    assert _worded("half_width", float("inf")) == "half width unknown"
-    assert _worded("rhw", 0.25) == "RHW 0.25"
+def test_a_precision_that_is_not_known_is_not_shown_as_one(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "120")
+    stream = Terminal()
+    with RichProgress(stream=stream) as bar:
+        bar.stage("episodes", total=10)
+        bar.status(half_width=float("inf"), rhw=0.25)
+    assert "half width unknown · RHW 0.25" in stream.getvalue()

@@ -1,7 +1,8 @@
-"""A campaign: check it, run it, and what it may say."""
+"""A campaign: check it, run it, and what it may say; before all, set up the machine."""
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
 from contextlib import nullcontext
 from pathlib import Path
@@ -15,7 +16,9 @@ from harness.commands.options import (
     examples,
     json_option,
     loaded,
+    quiet_option,
     set_option,
+    workers_option,
 )
 from harness.console import print_json, print_plan
 from harness.console_tables import print_statements
@@ -60,9 +63,9 @@ def check(campaign_file: Path, overrides: Sequence[str], av: str | None, *, as_j
 )
 @click.argument("campaign_file", metavar="CAMPAIGN", type=CAMPAIGN)
 @click.option("--out", "folder", type=FOLDER, required=True, help="Run folder; made if it is not there.")
-@click.option("--workers", type=click.IntRange(min=1), help="Processes that simulate. Default: one per core.")
+@workers_option
 @click.option("--resume", is_flag=True, help="Go on with what the run folder already holds.")
-@click.option("--quiet", is_flag=True, help="No progress bar. There is none either when stderr is not a terminal.")
+@quiet_option
 @av_option
 @set_option
 @json_option
@@ -118,3 +121,34 @@ def schema() -> None:
     from harness.campaign.schema import schema_text  # noqa: PLC0415 - keeps --help fast
 
     click.echo(schema_text(), nl=False)
+
+
+@click.command(
+    short_help="Install the system libraries that SUMO needs.",
+    epilog=examples(
+        "harness setup             # does and asks nothing where nothing is missing",
+        "harness setup --dry-run   # only print the commands",
+    ),
+)
+@click.option("--dry-run", is_flag=True, help="Print the commands that would be run, and run none.")
+def setup(*, dry_run: bool) -> None:
+    """Install the system libraries that SUMO needs, where they are missing: once per machine.
+
+    pip cannot install these few (X11, GL); a desktop has them. They are installed with apt-get, dnf or apk, directly as
+    root and else by sudo, which may ask for your password at a terminal. A campaign with world.engine twin needs none.
+
+    Exit code 2 says that they could not be installed; the message names the packages.
+    """
+    from harness.sumo.installing import install, install_commands, require_libsumo  # noqa: PLC0415 - keeps --help fast
+    from harness.sumo.system_libraries import missing_libraries  # noqa: PLC0415
+
+    missing = missing_libraries()
+    commands = install_commands(missing) if missing else []
+    if dry_run:
+        click.echo("\n".join(map(shlex.join, commands)) or "Nothing to install.")
+        return
+    if missing:
+        click.echo(f"Installing what SUMO needs: {shlex.join(commands[-1])}", err=True)
+        install(missing, commands)
+    require_libsumo()
+    click.echo("SUMO's system libraries are installed." if missing else "SUMO's system libraries are there.")

@@ -54,17 +54,18 @@ av_option = click.option(
     metavar="[PANEL.yaml:]NAME",
     help="Test this vehicle of a panel instead of the campaign's; a bare NAME is one of the shipped panel.",
 )
+workers_option = click.option(
+    "--workers", type=click.IntRange(min=1), help="Processes that simulate. Default: one per core."
+)
+quiet_option = click.option(
+    "--quiet", is_flag=True, help="No progress bar. There is none either when stderr is not a terminal."
+)
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON on stdout instead of text.")
 
 
-def as_written(heading: str, *lines: str) -> str:
+def examples(*lines: str, heading: str = "Examples:") -> str:
     """Lay out lines below a help text, kept as they are (the backspace is click's mark for that)."""
     return f"\b\n{heading}\n" + "\n".join(f"  {line}" for line in lines)
-
-
-def examples(*lines: str) -> str:
-    """Lay out examples below a help text."""
-    return as_written("Examples:", *lines)
 
 
 def loaded(campaign_file: Path, overrides: Sequence[str], av: str | None = None) -> Campaign:

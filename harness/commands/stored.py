@@ -8,13 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from harness.commands.options import (
-    FILE,
-    RUN_FOLDER,
-    examples,
-    json_option,
-    written_file,
-)
+from harness.commands.options import FILE, RUN_FOLDER, examples, json_option, written_file
 from harness.console import print_json, write_trace
 from harness.console_tables import print_estimates
 from harness.errors import EXIT_BAD_INPUT, WorldDisagreementError

@@ -14,10 +14,10 @@ from harness.commands.options import (
     FILE,
     FOLDER,
     RUN_FOLDER,
-    as_written,
     examples,
     json_option,
     loaded,
+    quiet_option,
     set_option,
     written_file,
 )
@@ -67,8 +67,7 @@ def pool(campaign_file: Path, *, out: Path | None, overrides: Sequence[str], as_
 
 @click.command(
     short_help="Repeat a campaign thousands of times: what are its intervals worth?",
-    epilog=as_written(
-        "Columns:",
+    epilog=examples(
         "truth        the crash rate that all replications should find",
         "bias         mean of the estimates relative to the truth, ± its standard error",
         "relvar true  mean squared error of the estimates, over the square of the truth",
@@ -77,6 +76,7 @@ def pool(campaign_file: Path, *, out: Path | None, overrides: Sequence[str], as_
         "p (Holm)     of so low a coverage if the intervals were right, for as many lines",
         "tests        that a campaign needed: median, 5 % and 95 % quantile",
         "alarm        share of replications with a crash outside the library's boundary",
+        heading="Columns:",
     )
     + "\n\n"
     + examples("harness validate scenarios/validate/shells_panel.yaml --out runs/shells_panel"),
@@ -85,7 +85,7 @@ def pool(campaign_file: Path, *, out: Path | None, overrides: Sequence[str], as_
 @click.option("--out", "folder", type=FOLDER, required=True, help="Folder of the results; made if it is not there.")
 @click.option("--replications", type=click.IntRange(min=2), help="Instead of the experiment's own number.")
 @click.option("--workers", type=click.IntRange(min=1), help="Processes. Default: one per core.")
-@click.option("--quiet", is_flag=True, help="No progress bar. There is none either when stderr is not a terminal.")
+@quiet_option
 @json_option
 def validate(
     experiment_file: Path, folder: Path, *, replications: int | None, workers: int | None, quiet: bool, as_json: bool

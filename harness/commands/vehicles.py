@@ -17,7 +17,9 @@ from harness.commands.options import (
     examples,
     json_option,
     loaded,
+    quiet_option,
     set_option,
+    workers_option,
     written_file,
 )
 from harness.console import print_json
@@ -86,8 +88,8 @@ def av_check(
 @click.option(
     "--against-av", metavar="[PANEL.yaml:]NAME", help="Vehicle that B has instead; with it B may be left out."
 )
-@click.option("--workers", type=click.IntRange(min=1), help="Processes that simulate. Default: one per core.")
-@click.option("--quiet", is_flag=True, help="No progress bar. There is none either when stderr is not a terminal.")
+@workers_option
+@quiet_option
 @av_option
 @set_option
 @json_option

@@ -15,16 +15,8 @@ import numpy as np
 
 from harness.arrays import Float32Array, FloatArray, RecordArray
 from harness.compiled import compiled_inline, compiled_threads
-from harness.criticality.grid import (
-    AFTER_R2,
-    AFTER_RATE,
-    AFTER_V,
-    interpolate,
-    locate_after,
-    quadratic_points,
-    uniform_points,
-)
-from harness.environment.driving import Environment, free_driving_pmf
+from harness.criticality.grid import AFTER, GridPoints, interpolate, locate, points_of, shape_of
+from harness.environment.driving import Environment, acceleration_pmf, free_driving
 from harness.maneuvers import N_ACCELERATIONS, acceleration
 from harness.vehicles.kinematics import CONTACT_M, STEP_S, next_speed
 from harness.vehicles.models import driver_acceleration
@@ -38,11 +30,9 @@ COLLIDED = -1.0
 def hold_period(
     speed: float, r2: float, r2dot: float, bv_acceleration: float, driver: RecordArray, steps: int
 ) -> tuple[float, float, float]:
-    """State after ``steps`` steps of a held acceleration, with the surrogate following.
+    """(v_BV, R2, R2dot) after ``steps`` steps of a held acceleration, with the surrogate following.
 
-    Returns
-    -------
-    (v_BV, R2, R2dot) in m/s, m, m/s; v_BV is `COLLIDED` if the surrogate hit BV.
+    v_BV is `COLLIDED` if the surrogate hit BV.
     """
     follower = speed - r2dot
     for _ in range(steps):
@@ -57,21 +47,16 @@ def hold_period(
 
 
 @compiled_threads
-def transitions(
-    driver: RecordArray, steps: int, speeds: FloatArray, gaps: FloatArray, rates: FloatArray, out: Float32Array
-) -> None:
-    """State one hold period later for every grid state and acceleration.
-
-    ``out`` has shape (v, R2, R2dot, 31, 3).
-    """
-    for i in range(speeds.size):
-        for j in range(gaps.size):
-            for k in range(rates.size):
+def transitions(driver: RecordArray, steps: int, points: GridPoints, out: Float32Array) -> None:
+    """State one hold period later for every grid state and acceleration; ``out`` (v, R2, R2dot, 31, 3)."""
+    for i in range(points.speed.size):
+        for j in range(points.r2.size):
+            for k in range(points.r2dot.size):
                 for m in range(N_ACCELERATIONS):
-                    v, r2, r2dot = hold_period(speeds[i], gaps[j], rates[k], acceleration(m), driver[0], steps)
-                    out[i, j, k, m, 0] = v
-                    out[i, j, k, m, 1] = r2
-                    out[i, j, k, m, 2] = r2dot
+                    v, r2, r2dot = hold_period(
+                        points.speed[i], points.r2[j], points.r2dot[k], acceleration(m), driver[0], steps
+                    )
+                    out[i, j, k, m, 0], out[i, j, k, m, 1], out[i, j, k, m, 2] = v, r2, r2dot
 
 
 @compiled_inline
@@ -79,7 +64,7 @@ def value_of(after: Float32Array, value: Float32Array) -> float:
     """1 if the pair collided, else the value of the state reached."""
     if after[0] == COLLIDED:
         return 1.0
-    return interpolate(value, locate_after(after[0], after[1], after[2]))
+    return interpolate(value, locate(AFTER, after[0], after[1], after[2]))
 
 
 @compiled_threads
@@ -111,7 +96,7 @@ def maneuver_challenge(after: Float32Array, value: Float32Array, out: Float32Arr
 def free_driving_table(speeds: FloatArray, environment: Environment, out: FloatArray) -> None:
     """Free-driving probabilities at grid speeds; ``out`` (v, 31)."""
     for i in range(speeds.size):
-        free_driving_pmf(speeds[i], environment, out[i])
+        acceleration_pmf(free_driving(speeds[i], environment), environment, out[i])
 
 
 def level_steps(hold_steps: int) -> int:
@@ -120,12 +105,7 @@ def level_steps(hold_steps: int) -> int:
 
 
 def build_after_cut_in(environment: Environment, driver: RecordArray) -> tuple[Float32Array, Float32Array]:
-    """Tables of one surrogate.
-
-    Parameters
-    ----------
-    environment : Environment
-    driver : structured ndarray, shape (1,)
+    """Tables of one surrogate, ``driver`` (1,).
 
     Returns
     -------
@@ -134,13 +114,12 @@ def build_after_cut_in(environment: Environment, driver: RecordArray) -> tuple[F
     maneuvers : ndarray of float32, shape (v, R2, R2dot, 31)
         C(s, a) with the longest remaining time.
     """
-    speeds, gaps, rates = uniform_points(AFTER_V), quadratic_points(AFTER_R2), uniform_points(AFTER_RATE)
-    shape = (speeds.size, gaps.size, rates.size)
+    points, shape = points_of(AFTER), shape_of(AFTER)
     hold = int(environment.numbers["hold_steps"])
-    pmf = np.empty((speeds.size, N_ACCELERATIONS))
-    free_driving_table(speeds, environment, pmf)
+    pmf = np.empty((points.speed.size, N_ACCELERATIONS))
+    free_driving_table(points.speed, environment, pmf)
     after = np.empty((*shape, N_ACCELERATIONS, 3), np.float32)
-    transitions(driver, hold, speeds, gaps, rates, after)
+    transitions(driver, hold, points, after)
     value = np.zeros((LEVELS + 1, *shape), np.float32)
     current, following = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
     for level in range(1, LEVELS + 1):

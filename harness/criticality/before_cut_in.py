@@ -16,18 +16,10 @@ import numpy as np
 
 from harness.arrays import Float32Array, FloatArray, RecordArray
 from harness.compiled import compiled_inline, compiled_threads
-from harness.criticality.grid import (
-    BEFORE_R2,
-    BEFORE_RATE,
-    BEFORE_V,
-    interpolate,
-    locate_after,
-    locate_before,
-    quadratic_points,
-    uniform_points,
-)
+from harness.criticality.after_cut_in import level_steps
+from harness.criticality.grid import AFTER, BEFORE, GridPoints, interpolate, locate, points_of, shape_of
 from harness.environment.cut_in import acceptance
-from harness.environment.driving import Environment, car_following_pmf
+from harness.environment.driving import Environment, acceleration_pmf, car_following
 from harness.environment.initial_state import InitialStates
 from harness.maneuvers import N_ACCELERATIONS, acceleration
 from harness.vehicles.kinematics import STEP_S, next_speed
@@ -66,9 +58,9 @@ def period_value(
         r2 += (0.5 * (speed + after) - follower) * STEP_S
         speed = after
         level = level_of(step + i, n.max_steps, steps_per_level, value.shape[0] - 1)
-        total += STEP_S * accepted * interpolate(value[level], locate_after(speed, r2, speed - follower))
+        total += STEP_S * accepted * interpolate(value[level], locate(AFTER, speed, r2, speed - follower))
     if r2 > 0.0:
-        total += interpolate(later, locate_before(speed, r2, speed - follower))
+        total += interpolate(later, locate(BEFORE, speed, r2, speed - follower))
     return total
 
 
@@ -79,29 +71,20 @@ def backward_period(
     environment: Environment,
     value: Float32Array,
     pmf: FloatArray,
-    speeds: FloatArray,
-    gaps: FloatArray,
-    rates: FloatArray,
+    points: GridPoints,
     later: Float32Array,
     out: Float32Array,
 ) -> None:
     """``out`` = G at ``step`` from ``later`` = G one hold period later; both (v, R2, R2dot)."""
-    for i in range(speeds.size):
-        for j in range(1, gaps.size):
-            for k in range(rates.size):
+    for i in range(points.speed.size):
+        for j in range(1, points.r2.size):
+            for k in range(points.r2dot.size):
+                v, r2, r2dot = points.speed[i], points.r2[j], points.r2dot[k]
                 total = 0.0
                 for m in range(N_ACCELERATIONS):
                     if pmf[i, m] > _NEGLIGIBLE:
                         total += pmf[i, m] * period_value(
-                            speeds[i],
-                            gaps[j],
-                            rates[k],
-                            acceleration(m),
-                            step,
-                            steps_per_level,
-                            environment,
-                            value,
-                            later,
+                            v, r2, r2dot, acceleration(m), step, steps_per_level, environment, value, later
                         )
                 out[i, j, k] = total
 
@@ -112,27 +95,24 @@ def mean_car_following_pmf(states: RecordArray, environment: Environment, out: F
     one = np.empty(N_ACCELERATIONS)
     out[:] = 0.0
     for i in range(states.shape[0]):
-        car_following_pmf(states[i], environment, one)
+        acceleration_pmf(car_following(states[i], environment), environment, one)
         for k in range(N_ACCELERATIONS):
             out[k] += one[k] / states.shape[0]
 
 
 def naturalistic_pmf(environment: Environment) -> FloatArray:
     """BV's accelerations at the grid speeds, averaged over (R1, R1dot): shape (v, 31)."""
-    speeds = uniform_points(BEFORE_V)
     side = (np.arange(24) + 0.5) / 24
     gap_u, rate_u = (axis.ravel() for axis in np.meshgrid(side, side, indexing="ij"))
     sampler = InitialStates(environment.numbers)
+    speeds = points_of(BEFORE).speed
     out = np.empty((speeds.size, N_ACCELERATIONS))
-    for i, speed in enumerate(speeds):
-        states = sampler.given_speed(float(speed), gap_u, rate_u)
-        mean_car_following_pmf(states, environment, out[i])
+    for i, speed in enumerate(speeds.tolist()):
+        mean_car_following_pmf(sampler.given_speed(speed, gap_u, rate_u), environment, out[i])
     return out
 
 
-def build_before_cut_in(
-    environment: Environment, value: Float32Array, pmf: FloatArray, steps_per_level: int
-) -> Float32Array:
+def build_before_cut_in(environment: Environment, value: Float32Array) -> Float32Array:
     """G of one surrogate at every redraw time.
 
     Parameters
@@ -140,31 +120,17 @@ def build_before_cut_in(
     environment : Environment
     value : ndarray of float32, shape (levels + 1, v, R2, R2dot)
         The surrogate's U after the cut-in.
-    pmf : ndarray, shape (v, 31)
-        From `naturalistic_pmf`.
-    steps_per_level : int
-        Steps between two levels of ``value``.
 
     Returns
     -------
     ndarray of float32, shape (redraw times + 1, v, R2, R2dot)
         Challenge per unit of OL (dimensionless); zero at R2 = 0 and at the end of the episode.
     """
-    speeds, gaps, rates = uniform_points(BEFORE_V), quadratic_points(BEFORE_R2), uniform_points(BEFORE_RATE)
+    points, pmf = points_of(BEFORE), naturalistic_pmf(environment)
     hold, steps = int(environment.numbers["hold_steps"]), int(environment.numbers["max_steps"])
     periods = -(-steps // hold)
-    table = np.zeros((periods + 1, speeds.size, gaps.size, rates.size), np.float32)
+    table = np.zeros((periods + 1, *shape_of(BEFORE)), np.float32)
     for period in range(periods - 1, -1, -1):
-        backward_period(
-            period * hold,
-            steps_per_level,
-            environment,
-            value,
-            pmf,
-            speeds,
-            gaps,
-            rates,
-            table[period + 1],
-            table[period],
-        )
+        later, out = table[period + 1], table[period]
+        backward_period(period * hold, level_steps(hold), environment, value, pmf, points, later, out)
     return table

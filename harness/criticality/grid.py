@@ -23,58 +23,61 @@ class Axis(NamedTuple):
     size: int
 
 
-AFTER_V = Axis(5.0, 5.0, 9)
-AFTER_R2 = Axis(0.0, 90.0 / 149.0**2, 150)
-AFTER_RATE = Axis(-24.0, 0.25, 121)
-BEFORE_V = Axis(20.0, 5.0, 5)
-BEFORE_R2 = Axis(0.0, 110.0 / 99.0**2, 100)
-BEFORE_RATE = Axis(-18.0, 1.0, 21)
+class Grid(NamedTuple):
+    """Axes of a table: v_BV (m/s), R2 (m), R2dot (m/s)."""
+
+    speed: Axis
+    r2: Axis
+    r2dot: Axis
 
 
-def uniform_points(axis: Axis) -> FloatArray:
-    """Grid points of a uniform axis, shape (size,)."""
-    points: FloatArray = axis.low + axis.step * np.arange(axis.size, dtype=np.float64)
-    return points
+class GridPoints(NamedTuple):
+    """Where a table has entries, by axis: v_BV (m/s), R2 (m), R2dot (m/s)."""
+
+    speed: FloatArray
+    r2: FloatArray
+    r2dot: FloatArray
 
 
-def quadratic_points(axis: Axis) -> FloatArray:
-    """Grid points of the R2 axis (m), shape (size,)."""
-    points: FloatArray = axis.step * np.arange(axis.size, dtype=np.float64) ** 2.0
-    return points
+AFTER = Grid(Axis(5.0, 5.0, 9), Axis(0.0, 90.0 / 149.0**2, 150), Axis(-24.0, 0.25, 121))
+BEFORE = Grid(Axis(20.0, 5.0, 5), Axis(0.0, 110.0 / 99.0**2, 100), Axis(-18.0, 1.0, 21))
+"""After the cut-in, and before it."""
+
+
+def shape_of(grid: Grid) -> tuple[int, int, int]:
+    """Shape of a table."""
+    return grid.speed.size, grid.r2.size, grid.r2dot.size
+
+
+def points_of(grid: Grid) -> GridPoints:
+    """Points of the axes."""
+    speed, r2dot = (axis.low + axis.step * np.arange(axis.size, dtype=np.float64) for axis in (grid.speed, grid.r2dot))
+    return GridPoints(speed, grid.r2.step * np.arange(grid.r2.size, dtype=np.float64) ** 2.0, r2dot)
 
 
 @compiled_inline
-def locate_uniform(x: float, low: float, step: float, size: int) -> tuple[int, float]:
+def locate_uniform(x: float, axis: Axis) -> tuple[int, float]:
     """Cell index and the weight of its upper end."""
-    position = min(max((x - low) / step, 0.0), size - 1.0)
-    i = min(int(position), size - 2)
+    position = min(max((x - axis.low) / axis.step, 0.0), axis.size - 1.0)
+    i = min(int(position), axis.size - 2)
     return i, position - i
 
 
 @compiled_inline
-def locate_quadratic(x: float, step: float, size: int) -> tuple[int, float]:
+def locate_quadratic(x: float, axis: Axis) -> tuple[int, float]:
     """Cell index and the weight of its upper end on the R2 axis (linear in R2)."""
-    i = min(int(math.sqrt(max(x, 0.0) / step)), size - 2)
-    low = step * (i * i)
-    weight = (x - low) / (step * (2.0 * i + 1.0))
+    i = min(int(math.sqrt(max(x, 0.0) / axis.step)), axis.size - 2)
+    low = axis.step * (i * i)
+    weight = (x - low) / (axis.step * (2.0 * i + 1.0))
     return i, min(max(weight, 0.0), 1.0)
 
 
 @compiled_inline
-def locate_after(v: float, r2: float, r2dot: float) -> tuple[int, float, int, float, int, float]:
-    """Where a state after the cut-in lies in the tables: three cell indices, each with the weight of its upper end."""
-    i, a = locate_uniform(v, AFTER_V.low, AFTER_V.step, AFTER_V.size)
-    j, b = locate_quadratic(r2, AFTER_R2.step, AFTER_R2.size)
-    k, c = locate_uniform(r2dot, AFTER_RATE.low, AFTER_RATE.step, AFTER_RATE.size)
-    return i, a, j, b, k, c
-
-
-@compiled_inline
-def locate_before(v: float, r2: float, r2dot: float) -> tuple[int, float, int, float, int, float]:
-    """Where a state before the cut-in lies in the tables."""
-    i, a = locate_uniform(v, BEFORE_V.low, BEFORE_V.step, BEFORE_V.size)
-    j, b = locate_quadratic(r2, BEFORE_R2.step, BEFORE_R2.size)
-    k, c = locate_uniform(r2dot, BEFORE_RATE.low, BEFORE_RATE.step, BEFORE_RATE.size)
+def locate(grid: Grid, v: float, r2: float, r2dot: float) -> tuple[int, float, int, float, int, float]:
+    """Where a state lies in the tables of a grid: three cell indices, each with the weight of its upper end."""
+    i, a = locate_uniform(v, grid.speed)
+    j, b = locate_quadratic(r2, grid.r2)
+    k, c = locate_uniform(r2dot, grid.r2dot)
     return i, a, j, b, k, c
 
 

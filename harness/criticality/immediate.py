@@ -15,7 +15,7 @@ import numpy as np
 from harness.arrays import Float32Array, FloatArray, Record, RecordArray
 from harness.compiled import compiled_inline, compiled_threads
 from harness.criticality.after_cut_in import LEVELS, level_steps
-from harness.criticality.grid import AFTER_R2, AFTER_RATE, AFTER_V, quadratic_points, uniform_points
+from harness.criticality.grid import AFTER, GridPoints, points_of, shape_of
 from harness.environment.driving import Environment
 from harness.maneuvers import N_ACCELERATIONS, acceleration
 from harness.vehicles.kinematics import STEP_S, next_speed
@@ -77,37 +77,35 @@ def roll_out(
     driver: RecordArray,
     hold: int,
     steps_per_level: int,
-    speeds: FloatArray,
-    gaps: FloatArray,
-    rates: FloatArray,
+    points: GridPoints,
     value: Float32Array,
     maneuvers: Float32Array,
 ) -> None:
     """Fill ``value`` (levels + 1, v, R2, R2dot) and ``maneuvers`` (v, R2, R2dot, 31) with smallest gaps (m)."""
     by_level = np.empty(value.shape[0])
-    for i in range(speeds.size):
-        for j in range(gaps.size):
-            for k in range(rates.size):
+    for i in range(points.speed.size):
+        for j in range(points.r2.size):
+            for k in range(points.r2dot.size):
+                v, r2, r2dot = points.speed[i], points.r2[j], points.r2dot[k]
                 for m in range(N_ACCELERATIONS):
-                    smallest_gaps(speeds[i], gaps[j], rates[k], m, hold, steps_per_level, driver[0], by_level)
+                    smallest_gaps(v, r2, r2dot, m, hold, steps_per_level, driver[0], by_level)
                     maneuvers[i, j, k, m] = by_level[-1]
                     if m == _KEEP_SPEED:
-                        for level in range(by_level.size):
-                            value[level, i, j, k] = by_level[level]
+                        value[:, i, j, k] = by_level
 
 
 def build_immediate(environment: Environment, driver: RecordArray) -> tuple[Float32Array, Float32Array]:
     """Tables of one surrogate, in metres; the shapes are those of `build_after_cut_in`."""
-    speeds, gaps, rates = uniform_points(AFTER_V), quadratic_points(AFTER_R2), uniform_points(AFTER_RATE)
-    shape = (speeds.size, gaps.size, rates.size)
+    points, shape = points_of(AFTER), shape_of(AFTER)
     hold = int(environment.numbers["hold_steps"])
     value = np.empty((LEVELS + 1, *shape), np.float32)
     maneuvers = np.empty((*shape, N_ACCELERATIONS), np.float32)
 
     def at_speed(i: int) -> None:
         here = slice(i, i + 1)
-        roll_out(driver, hold, level_steps(hold), speeds[here], gaps, rates, value[:, here], maneuvers[here])
+        part = points._replace(speed=points.speed[here])
+        roll_out(driver, hold, level_steps(hold), part, value[:, here], maneuvers[here])
 
     with ThreadPoolExecutor(os.cpu_count()) as threads:  # one surrogate may take as long as all others together
-        list(threads.map(at_speed, range(speeds.size)))
+        list(threads.map(at_speed, range(points.speed.size)))
     return value, maneuvers

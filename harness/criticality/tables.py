@@ -18,9 +18,9 @@ import numpy as np
 
 from harness.arrays import Float32Array, RecordArray
 from harness.compiled import cache_root
-from harness.criticality import grid
-from harness.criticality.after_cut_in import LEVELS, build_after_cut_in, level_steps
-from harness.criticality.before_cut_in import build_before_cut_in, naturalistic_pmf
+from harness.criticality.after_cut_in import LEVELS, build_after_cut_in
+from harness.criticality.before_cut_in import build_before_cut_in
+from harness.criticality.grid import AFTER, BEFORE
 from harness.criticality.immediate import build_immediate
 from harness.environment.driving import Environment
 from harness.errors import writing
@@ -48,9 +48,8 @@ def tables_hash(environment: Environment, drivers: RecordArray, challenge: str) 
     numbers = {
         name: environment.numbers[name].item() for name in environment.numbers.dtype.fields or () if name != "level"
     }
-    axes = {name: list(value) for name, value in vars(grid).items() if isinstance(value, grid.Axis)}
     surrogates = [[driver[name].item() for name in MODEL_FIELDS] for driver in drivers]
-    content = json.dumps([_FORMAT, challenge, numbers, axes, MODEL_FIELDS, surrogates, LEVELS], sort_keys=True)
+    content = json.dumps([_FORMAT, challenge, numbers, AFTER, BEFORE, MODEL_FIELDS, surrogates, LEVELS], sort_keys=True)
     return hashlib.sha256(content.encode()).hexdigest()[:24]
 
 
@@ -85,15 +84,13 @@ def _build_one(environment: Environment, driver: RecordArray, challenge: str) ->
     if challenge == "immediate":
         return Tables(*build_immediate(environment, driver), np.zeros((0, 2, 2, 2), np.float32))
     value, maneuvers = build_after_cut_in(environment, driver)
-    steps_per_level = level_steps(int(environment.numbers["hold_steps"]))
-    before = build_before_cut_in(environment, value, naturalistic_pmf(environment), steps_per_level)
-    return Tables(value, maneuvers, before)
+    return Tables(value, maneuvers, build_before_cut_in(environment, value))
 
 
 def build_tables(
     environment: Environment, drivers: RecordArray, challenge: str, done: Callable[[int], None] = lambda _: None
 ) -> Tables:
-    """Tables of all surrogates, from the cache where they are.
+    """Tables of all surrogates, read-only, from the cache if they are there.
 
     Parameters
     ----------
@@ -103,15 +100,9 @@ def build_tables(
         ``recursive`` or ``immediate``.
     done : callable
         Called with the number of surrogates that have become ready.
-
-    Returns
-    -------
-    Tables
-        Read-only, with the surrogates as first axis.
     """
     path = table_path(environment, drivers, challenge)
-    tables = _load(path)
-    if tables is not None:
+    if (tables := _load(path)) is not None:
         done(drivers.size)
         return tables
 

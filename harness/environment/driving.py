@@ -1,7 +1,10 @@
 """How LV and BV choose accelerations: free driving, car following, and the guard that keeps BV off LV.
 
-Both are distributions over the 31 accelerations. They are given as cumulative probabilities P(A ≤ a_k); the tails
-beyond the grid belong to its end points. Sampling inverts the same function that the probabilities are differences of.
+Both are distributions over the 31 accelerations, given as cumulative probabilities P(A ≤ a_k); the tails beyond the
+grid belong to its end points. Sampling inverts the same function that the probabilities are differences of.
+
+Student's t is a table: cubic Hermite interpolation of scipy's exact values and densities on a grid of 1/32 (absolute
+error below 1e-8, tested), so that a recorded probability *is* the probability that was sampled from.
 """
 
 from __future__ import annotations
@@ -10,25 +13,43 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from scipy import special
 
 from harness.arrays import FloatArray, Record
 from harness.compiled import compiled_inline
-from harness.environment.student_t import t_cdf, t_table
 from harness.maneuvers import ACCELERATIONS_MPS2, N_ACCELERATIONS, acceleration, upper_edge
 from harness.state import State
+
+FREE_DRIVING, CAR_FOLLOWING = 0, 1
+"""Which table of noise a law has."""
+_T_LIMIT = 64.0
+_T_PER_UNIT = 32.0
 
 
 class Environment(NamedTuple):
     """All that kernels need of the environment.
 
-    ``numbers`` is the parameter record; ``free_t`` and ``following_t`` are tables of Student's t;
-    ``brake_cumulative`` (31,) is the cumulative brake component of free driving.
+    ``numbers`` is the parameter record; ``noise_t`` (2, 4097, 2) are the tables of Student's t for free driving and car
+    following; ``brake_cumulative`` (31,) is the cumulative distribution of braking in free driving.
     """
 
     numbers: Record
-    free_t: FloatArray
-    following_t: FloatArray
+    noise_t: FloatArray
     brake_cumulative: FloatArray
+
+
+class AccelerationLaw(NamedTuple):
+    """P(A ≤ a_k) = (1 − b) T((e_k − mean) · inverse_scale) + b B_k for k < ``cap``, else 1; e_k is a bin's upper edge.
+
+    ``mean`` in m/s², ``inverse_scale`` in s²/m; T and B are ``noise_t[noise]`` and ``brake_cumulative`` of the
+    environment, ``brake_share`` is b. Numbers alone: what is compiled without reference counts must not return arrays.
+    """
+
+    noise: int
+    cap: int
+    mean: float
+    inverse_scale: float
+    brake_share: float
 
 
 def build_environment(numbers: Record) -> Environment:
@@ -40,8 +61,64 @@ def build_environment(numbers: Record) -> Environment:
     )
     cumulative = np.cumsum(braking) / braking.sum()
     cumulative[-1] = 1.0
-    free_t, following_t = (t_table(float(numbers[name])) for name in ("free_driving__df", "car_following__df"))
-    return Environment(numbers, free_t, following_t, cumulative)
+    noise_t = np.stack([t_table(float(numbers[name])) for name in ("free_driving__df", "car_following__df")])
+    return Environment(numbers, noise_t, cumulative)
+
+
+def t_table(df: float) -> FloatArray:
+    """Distribution function of Student's t on [-64, 64], and its derivative times the grid step: shape (4097, 2)."""
+    z = np.arange(-_T_LIMIT * _T_PER_UNIT, _T_LIMIT * _T_PER_UNIT + 1) / _T_PER_UNIT
+    peak = special.poch(0.5 * df, 0.5) / np.sqrt(df * np.pi)
+    density = peak * np.exp(-0.5 * (df + 1.0) * np.log1p(z * z / df))
+    return np.column_stack([special.stdtr(df, z), density / _T_PER_UNIT])
+
+
+@compiled_inline
+def t_cdf(z: float, table: FloatArray) -> float:
+    """P(T ≤ z); 0 and 1 outside of the table."""
+    position = (z + _T_LIMIT) * _T_PER_UNIT
+    if not position > 0.0:
+        return 0.0
+    if position >= table.shape[0] - 1:
+        return 1.0
+    i = int(position)
+    s = position - i
+    y0, y1 = table[i, 0], table[i + 1, 0]
+    d0, d1 = table[i, 1], table[i + 1, 1]
+    rise = y1 - y0
+    return float(y0 + s * (d0 + s * ((3.0 * rise - 2.0 * d0 - d1) + s * (d0 + d1 - 2.0 * rise))))
+
+
+@compiled_inline
+def cumulative_probability(k: int, law: AccelerationLaw, environment: Environment) -> float:
+    """P(A ≤ a_k)."""
+    if k >= law.cap:
+        return 1.0
+    noise = t_cdf((upper_edge(k) - law.mean) * law.inverse_scale, environment.noise_t[law.noise])
+    return float((1.0 - law.brake_share) * noise + law.brake_share * environment.brake_cumulative[k])
+
+
+@compiled_inline
+def draw_acceleration(u: float, law: AccelerationLaw, environment: Environment) -> int:
+    """Acceleration index by inversion of a uniform (bisection on the cumulative probabilities)."""
+    low, high = 0, law.cap
+    while low < high:
+        middle = (low + high) // 2
+        if cumulative_probability(middle, law, environment) > u:
+            high = middle
+        else:
+            low = middle + 1
+    return low
+
+
+@compiled_inline
+def acceleration_pmf(law: AccelerationLaw, environment: Environment, out: FloatArray) -> None:
+    """Probabilities of the 31 accelerations, written to ``out`` (31,)."""
+    below = 0.0
+    for k in range(N_ACCELERATIONS):
+        upto = cumulative_probability(k, law, environment)
+        out[k] = max(upto - below, 0.0)
+        below = upto
 
 
 @compiled_inline
@@ -59,47 +136,24 @@ def fit_u(speed: float, environment: Environment) -> float:
 
 
 @compiled_inline
-def free_driving_shape(speed: float, environment: Environment) -> tuple[float, float]:
-    """Weight of the brake component, and 1/scale of the t component, at a speed."""
+def free_driving(speed: float, environment: Environment) -> AccelerationLaw:
+    """Accelerations of LV, and of BV after its cut-in, at a speed."""
     n = environment.numbers
     u = fit_u(speed, environment)
     log_scale = n.free_driving__log_scale + n.free_driving__log_scale_u * u + n.free_driving__log_scale_uu * (u * u)
-    weight = 1.0 / (1.0 + math.exp(-(n.free_driving__brake_logit + n.free_driving__brake_logit_u * u)))
-    return weight, math.exp(-log_scale)
+    brake_share = 1.0 / (1.0 + math.exp(-(n.free_driving__brake_logit + n.free_driving__brake_logit_u * u)))
+    mean = n.free_driving__location_mps2
+    return AccelerationLaw(FREE_DRIVING, N_ACCELERATIONS - 1, mean, math.exp(-log_scale), brake_share)
 
 
 @compiled_inline
-def free_driving_cdf(k: int, weight: float, inverse_scale: float, environment: Environment) -> float:
-    """P(A ≤ a_k) in free driving."""
-    if k >= N_ACCELERATIONS - 1:
-        return 1.0
-    z = (upper_edge(k) - environment.numbers.free_driving__location_mps2) * inverse_scale
-    return float((1.0 - weight) * t_cdf(z, environment.free_t) + weight * environment.brake_cumulative[k])
-
-
-@compiled_inline
-def draw_free_driving(u: float, speed: float, environment: Environment) -> int:
-    """Acceleration index by inversion of a uniform (bisection on the cumulative probabilities)."""
-    weight, inverse_scale = free_driving_shape(speed, environment)
-    low, high = 0, N_ACCELERATIONS - 1
-    while low < high:
-        middle = (low + high) // 2
-        if free_driving_cdf(middle, weight, inverse_scale, environment) > u:
-            high = middle
-        else:
-            low = middle + 1
-    return low
-
-
-@compiled_inline
-def free_driving_pmf(speed: float, environment: Environment, out: FloatArray) -> None:
-    """Probabilities of the 31 accelerations in free driving, written to ``out`` (31,)."""
-    weight, inverse_scale = free_driving_shape(speed, environment)
-    below = 0.0
-    for k in range(N_ACCELERATIONS):
-        upto = free_driving_cdf(k, weight, inverse_scale, environment)
-        out[k] = max(upto - below, 0.0)
-        below = upto
+def car_following(state: State, environment: Environment) -> AccelerationLaw:
+    """Accelerations of BV behind LV: what the guard forbids is moved to its cap."""
+    n = environment.numbers
+    rate = min(abs(state.r1dot_mps), n.car_following__rate_cap_mps)
+    inverse_scale = math.exp(-(n.car_following__log_scale + n.car_following__log_scale_rate * rate))
+    cap, mean = guard_cap(state, environment), car_following_mean(state, environment)
+    return AccelerationLaw(CAR_FOLLOWING, cap, mean, inverse_scale, 0.0)
 
 
 @compiled_inline
@@ -140,48 +194,3 @@ def guard_cap(state: State, environment: Environment) -> int:
             break
         k -= 1
     return k
-
-
-@compiled_inline
-def car_following_cdf(k: int, cap: int, mean: float, inverse_scale: float, environment: Environment) -> float:
-    """P(A ≤ a_k) of BV behind LV: what the guard forbids is moved to its cap."""
-    if k >= cap:
-        return 1.0
-    return t_cdf((upper_edge(k) - mean) * inverse_scale, environment.following_t)
-
-
-@compiled_inline
-def car_following_inverse_scale(r1dot: float, environment: Environment) -> float:
-    """1/scale (s²/m) of the car-following noise."""
-    n = environment.numbers
-    rate = min(abs(r1dot), n.car_following__rate_cap_mps)
-    return math.exp(-(n.car_following__log_scale + n.car_following__log_scale_rate * rate))
-
-
-@compiled_inline
-def draw_car_following(u: float, state: State, environment: Environment) -> int:
-    """Acceleration index of BV behind LV by inversion of a uniform."""
-    mean = car_following_mean(state, environment)
-    inverse_scale = car_following_inverse_scale(state.r1dot_mps, environment)
-    cap = guard_cap(state, environment)
-    low, high = 0, cap
-    while low < high:
-        middle = (low + high) // 2
-        if car_following_cdf(middle, cap, mean, inverse_scale, environment) > u:
-            high = middle
-        else:
-            low = middle + 1
-    return low
-
-
-@compiled_inline
-def car_following_pmf(state: State, environment: Environment, out: FloatArray) -> None:
-    """Probabilities of the 31 accelerations of BV behind LV, written to ``out`` (31,)."""
-    mean = car_following_mean(state, environment)
-    inverse_scale = car_following_inverse_scale(state.r1dot_mps, environment)
-    cap = guard_cap(state, environment)
-    below = 0.0
-    for k in range(N_ACCELERATIONS):
-        upto = car_following_cdf(k, cap, mean, inverse_scale, environment)
-        out[k] = max(upto - below, 0.0)
-        below = upto

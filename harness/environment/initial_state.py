@@ -9,7 +9,7 @@ from harness.arrays import FloatArray, Record, RecordArray
 from harness.random_stream import INITIAL, uniforms
 from harness.state import STATE_COLUMNS, states_from
 
-_GRID = 8001
+_SPEED_POINTS = 8001
 
 
 class InitialStates:
@@ -19,36 +19,29 @@ class InitialStates:
     ----------
     numbers : record
         Parameters of the environment.
+
+    Attributes
+    ----------
+    speed_cdf : ndarray
+        P(v_BV ≤ v) on a grid over the fit range.
     """
 
     def __init__(self, numbers: Record) -> None:
-        self._n = numbers
-        n = self._n
-        self._v_grid = np.linspace(n["fit_range__v_min_mps"], n["fit_range__v_max_mps"], _GRID)
+        self._n = n = numbers
+        self._speeds = np.linspace(n["fit_range__v_min_mps"], n["fit_range__v_max_mps"], _SPEED_POINTS)
         shape, location, scale = (float(n[f"initial_state__v_{k}"]) for k in ("shape", "location_mps", "scale_mps"))
-        z = (self._v_grid - location) / scale
+        z = (self._speeds - location) / scale
         cdf = special.ndtr(z) - 2.0 * special.owens_t(z, shape)  # of the skew normal distribution
-        self._v_cdf: FloatArray = (cdf - cdf[0]) / (cdf[-1] - cdf[0])
-
-    @property
-    def speed_distribution(self) -> FloatArray:
-        """P(v_BV ≤ v) on a grid over the fit range."""
-        return self._v_cdf
+        self.speed_cdf: FloatArray = (cdf - cdf[0]) / (cdf[-1] - cdf[0])
 
     def draw(self, seed: int, first_episode: int, n_episodes: int) -> RecordArray:
-        """States of consecutive episodes.
-
-        Returns
-        -------
-        structured ndarray, shape (n_episodes,)
-            Of `STATE_DTYPE`.
-        """
+        """States of consecutive episodes, shape (n_episodes,)."""
         return self.from_uniforms(uniforms(seed, first_episode, n_episodes, INITIAL, len(STATE_COLUMNS)))
 
     def from_uniforms(self, u: FloatArray) -> RecordArray:
         """States (n,) from uniforms (n, 5), one for each of their numbers."""
         n, of = self._n, states_from(u.T)
-        v = np.interp(of["v_bv_mps"], self._v_cdf, self._v_grid)
+        v = np.interp(of["v_bv_mps"], self.speed_cdf, self._speeds)
         r1 = self._gap(of["r1_m"], v)
         r1dot = self._rate(of["r1dot_mps"], v, r1)
         r2 = n["initial_state__r2_min_m"] + of["r2_m"] * (n["initial_state__r2_max_m"] - n["initial_state__r2_min_m"])

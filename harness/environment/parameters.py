@@ -37,11 +37,10 @@ def _within(low: float, high: float) -> AfterValidator:
     """Refuse a value outside of [low, high]."""
 
     def checked(number: Number) -> Number:
-        if low <= number.value <= high:
-            return number
-        raise broken_rule(
-            "value", found=f"{number.value:g}", expected=f"a number from {low:g} to {high:g}", mend="Correct the value."
-        )
+        if not low <= number.value <= high:
+            expected = f"a number from {low:g} to {high:g}"
+            raise broken_rule("value", found=f"{number.value:g}", expected=expected, mend="Correct the value.")
+        return number
 
     return AfterValidator(checked)
 
@@ -64,7 +63,6 @@ DegreesOfFreedom = Annotated[Number, _within(2.0, 1000.0)]  # below 2 more than 
 
 
 def _require_order(numbers: BaseModel, low: str, high: str, *, equal: bool) -> None:
-    """Refuse a lower end above its upper end."""
     least, most = getattr(numbers, low).value, getattr(numbers, high).value
     if least > most or (least == most and not equal):
         raise broken_rule(
@@ -77,10 +75,10 @@ def _require_order(numbers: BaseModel, low: str, high: str, *, equal: bool) -> N
 
 def _whole_steps(number: Number) -> Number:
     steps = number.value / STEP_S
-    if abs(steps - round(steps)) < 1e-9:
-        return number
-    mend = f"The nearest one is {round(steps) * STEP_S:g}."
-    raise broken_rule("value", found=f"{number.value:g}", expected=f"a multiple of the {STEP_S:g} s step", mend=mend)
+    if abs(steps - round(steps)) >= 1e-9:
+        expected, mend = f"a multiple of the {STEP_S:g} s step", f"The nearest one is {round(steps) * STEP_S:g}."
+        raise broken_rule("value", found=f"{number.value:g}", expected=expected, mend=mend)
+    return number
 
 
 class Scenario(_Frozen):
@@ -232,7 +230,7 @@ class EnvironmentParameters(_Frozen):
 
     @model_validator(mode="after")
     def _av_has_a_speed(self) -> Self:
-        """An AV starts at v_BV - R2dot."""
+        """It starts at v_BV - R2dot."""
         slowest = self.fit_range.v_min_mps.value - self.initial_state.r2dot_max_mps.value
         fastest = self.fit_range.v_max_mps.value - self.initial_state.r2dot_min_mps.value
         if slowest < 0.0 or fastest > MAX_CONFIGURED_SPEED_MPS:
@@ -260,21 +258,12 @@ class EnvironmentParameters(_Frozen):
 
 
 def parameter_record(parameters: EnvironmentParameters, *, lane_change_level: float, hold_s: float) -> Record:
-    """The numbers as the kernels read them.
-
-    Returns
-    -------
-    record
-        One float64 field ``section__name`` per number, and ``level`` (of lane changing), ``hold_steps``, ``max_steps``.
-    """
-    numbers = parameters.values()
-    extra = {
-        "level": lane_change_level,
+    """The numbers as kernels read them: ``section__name``, lane-changing ``level``, ``hold_steps``, ``max_steps``."""
+    numbers = {**parameters.values(), "level": lane_change_level}
+    steps = {
         "hold_steps": round(hold_s / STEP_S),
         "max_steps": round(numbers["scenario__duration_s"] / STEP_S),
     }
-    fields = [(name, "f8") for name in (*numbers, "level")] + [("hold_steps", "i8"), ("max_steps", "i8")]
-    record: Record = np.zeros(1, dtype=fields)[0]
-    for name, value in {**numbers, **extra}.items():
-        record[name] = value
+    dtype = [*((name, "f8") for name in numbers), *((name, "i8") for name in steps)]
+    record: Record = np.array([(*numbers.values(), *steps.values())], dtype)[0]
     return record

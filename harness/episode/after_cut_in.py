@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from harness.arrays import FloatArray
 from harness.compiled import compiled_inline
-from harness.environment.driving import draw_free_driving, free_driving_pmf
+from harness.environment.driving import acceleration_pmf, draw_acceleration, free_driving
 from harness.episode.cells import Bench
 from harness.episode.record import record_moment, take_in
 from harness.importance.functions import challenges_nobody, propose_acceleration
@@ -39,15 +39,16 @@ def controlled_draw(k: int, u: float, state: State, bench: Bench) -> int:
     """Acceleration index at a redraw time that may be critical; accumulates the likelihood ratios."""
     cells, scratch, environment, importance = bench.cells, bench.scratch, bench.environment, bench.importance
     cell, p, q = cells.cell[k], scratch.p, scratch.q_acceleration
+    law = free_driving(state.v_bv_mps, environment)
     if challenges_nobody(state, importance):
-        return draw_free_driving(u, state.v_bv_mps, environment)
-    free_driving_pmf(state.v_bv_mps, environment, p)
+        return draw_acceleration(u, law, environment)
+    acceleration_pmf(law, environment, p)
     if not propose_acceleration(state, p, importance, q, scratch.challenge):
-        return draw_free_driving(u, state.v_bv_mps, environment)
+        return draw_acceleration(u, law, environment)
     if importance.method == STEP_MIXTURE or cell.component > 0:
         maneuver = draw_from(u, importance.method, cell.component, importance.alpha, q)
     else:
-        maneuver = draw_free_driving(u, state.v_bv_mps, environment)
+        maneuver = draw_acceleration(u, law, environment)
     if importance.first == 1:
         scratch.ratio[0] = 1.0
     for j in range(importance.n_surrogates):
@@ -67,7 +68,7 @@ def redraw_free(k: int, state: State, bench: Bench) -> None:
     if bench.importance.n_surrogates > 0:
         cell.bv_maneuver = controlled_draw(k, u, state, bench)
     else:
-        cell.bv_maneuver = draw_free_driving(u, state.v_bv_mps, bench.environment)
+        cell.bv_maneuver = draw_acceleration(u, free_driving(state.v_bv_mps, bench.environment), bench.environment)
     bench.cells.bv_path[k, cell.n_path] = cell.bv_maneuver
     cell.n_bv_free += 1
     cell.n_path += 1

@@ -7,7 +7,7 @@ import math
 from harness.arrays import FloatArray
 from harness.compiled import compiled_inline
 from harness.environment.cut_in import acceptance, cut_in_hazard, opportunity
-from harness.environment.driving import draw_car_following
+from harness.environment.driving import car_following, draw_acceleration
 from harness.episode.cells import Bench, Cells
 from harness.episode.record import record_moment, take_in
 from harness.importance.functions import look_ahead, propose_cut_in
@@ -23,7 +23,7 @@ def redraw_following(k: int, state: State, bench: Bench) -> None:
     cells = bench.cells
     cell = cells.cell[k]
     u = uniform(bench.seed, cell.episode, BV_DRAWS, cell.n_bv)
-    cell.bv_maneuver = draw_car_following(u, state, bench.environment)
+    cell.bv_maneuver = draw_acceleration(u, car_following(state, bench.environment), bench.environment)
     cells.bv_path[k, cell.n_path] = cell.bv_maneuver
     cell.n_bv += 1
     cell.n_path += 1

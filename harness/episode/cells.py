@@ -150,7 +150,7 @@ class Scratch(NamedTuple):
 
     ``p`` (31,): exposure of the accelerations. ``q`` (J,) and
     ``q_acceleration`` (J, 31): importance functions; ``challenge`` (J,): V_j. ``ratio`` (M,): q_j/p of the maneuver
-    taken; ``weight`` (M,): predictive weights of the importance functions; ``path``: what lies ahead of an episode.
+    taken; ``path``: what lies ahead of an episode.
     """
 
     p: FloatArray
@@ -158,7 +158,6 @@ class Scratch(NamedTuple):
     q_acceleration: FloatArray
     challenge: FloatArray
     ratio: FloatArray
-    weight: FloatArray
     path: Trajectory
 
 
@@ -170,7 +169,6 @@ def empty_scratch(environment: Environment, n_importance: int, n_surrogates: int
         q_acceleration=np.zeros((n_surrogates, N_ACCELERATIONS)),
         challenge=np.zeros(n_surrogates),
         ratio=np.zeros(n_importance),
-        weight=np.zeros(n_importance),
         path=empty_trajectory(environment),
     )
 

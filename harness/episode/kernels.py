@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from harness.arrays import BoolArray
 from harness.compiled import compiled, compiled_inline
-from harness.environment.driving import draw_free_driving
+from harness.environment.driving import draw_acceleration, free_driving
 from harness.episode.after_cut_in import redraw_free
 from harness.episode.before_cut_in import choose_lane, redraw_following
 from harness.episode.cells import Bench
@@ -43,7 +43,7 @@ def decide(bench: Bench) -> None:
         redraw = cell.step % hold_steps == 0
         if redraw:
             u = uniform(bench.seed, cell.episode, LV_DRAWS, cell.n_lv)
-            cell.lv_maneuver = draw_free_driving(u, bench.v[k, LV], bench.environment)
+            cell.lv_maneuver = draw_acceleration(u, free_driving(bench.v[k, LV], bench.environment), bench.environment)
             cells.lv_path[k, cell.n_lv] = cell.lv_maneuver
             cell.n_lv += 1
         if cell.cut_step < 0:

@@ -28,7 +28,6 @@ def take_in(k: int, bench: Bench) -> float:
         cell.log_sampled,
         cells.log_ratio[k],
         cells.martingale[k],
-        scratch.weight,
     )
     if importance.method == STEP_MIXTURE:
         cell.log_sampled += math.log(sampled)

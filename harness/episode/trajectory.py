@@ -14,7 +14,7 @@ import numpy as np
 from harness.arrays import FloatArray, Int8Array, Record, RecordArray
 from harness.compiled import compiled_inline
 from harness.environment.cut_in import acceptance, cut_in_hazard, opportunity
-from harness.environment.driving import Environment, draw_car_following, draw_free_driving
+from harness.environment.driving import Environment, car_following, draw_acceleration, free_driving
 from harness.maneuvers import acceleration, max_draws
 from harness.outcomes import AV, BV, BV_LV_CONTACT, LV, PASSED, RUNNING
 from harness.random_stream import BV_DRAWS, BV_FREE_DRAWS, LV_DRAWS, uniform
@@ -107,9 +107,10 @@ def walk(
         m = step // hold_steps
         v_lv, v_bv = path.v_lv[step], path.v_bv[step]
         if step % hold_steps == 0 and m >= known:
-            path.lv[m] = draw_free_driving(uniform(seed, episode, LV_DRAWS, m), v_lv, environment)
+            u = uniform(seed, episode, LV_DRAWS, m)
+            path.lv[m] = draw_acceleration(u, free_driving(v_lv, environment), environment)
             u = uniform(seed, episode, BV_DRAWS, m)
-            path.bv[m] = draw_car_following(u, state_in(step, path), environment)
+            path.bv[m] = draw_acceleration(u, car_following(state_in(step, path), environment), environment)
         after_lv, after_bv = next_speed(v_lv, acceleration(path.lv[m])), next_speed(v_bv, acceleration(path.bv[m]))
         path.x_lv[step + 1] = next_position(path.x_lv[step], v_lv, after_lv)
         path.x_bv[step + 1] = next_position(path.x_bv[step], v_bv, after_bv)
@@ -153,7 +154,7 @@ def leave(
         if step > cut and (step - cut - 1) % hold_steps == 0:
             if draws >= known:
                 u = uniform(seed, episode, BV_FREE_DRAWS, first_draw + draws)
-                path.free[draws] = draw_free_driving(u, v, environment)
+                path.free[draws] = draw_acceleration(u, free_driving(v, environment), environment)
             a = acceleration(path.free[draws])
             draws += 1
         v_after = next_speed(v, a)

@@ -1,7 +1,7 @@
 """Crash rates from blocks of weighted tests: estimators, intervals, diagnostics, stopping.
 
-Each estimator is one file of the same shape (``accumulator``): add blocks, ask for the result. ``one_pass``
-feeds them all; ``run_estimates`` makes the content of ``estimates.json``.
+Estimators have one shape (``estimate.Accumulator``): add blocks, ask for the result. ``one_pass`` feeds them all;
+``run_estimates`` makes the content of ``estimates.json``.
 """
 
 from harness.estimators.block import Block

@@ -6,7 +6,9 @@ tests), the twin and SUMO all end here, so that an estimator cannot tell them ap
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 
@@ -24,9 +26,7 @@ class Block:
 
     Attributes
     ----------
-    first_episode : int
-        Index of the first row.
-    method : {"nde", "forced", "step_mixture", "episode_mixture"}
+    method : str
         How the episodes were drawn.
     crash, failed, cut_in, bv_lv_contact : (n,) bool
         Outcomes. A failed episode is a row like any other and never a crash.
@@ -45,14 +45,10 @@ class Block:
         Bound on Y = 1{crash}·weight that the design guarantees for every episode, seen or not; None if there is none.
     log_p_cut_in : (n,) float64 or None
         log P(cut-in | path), where the method draws the path ahead. Bounds Y of that episode alone.
-    component : (n,) int or None
-        Stratum of each test, where they are drawn from shells.
-    shells : ShellDesign or None
-        Those strata and their probabilities.
-    surrogates_crash : (n, D) bool or None
-        Which surrogates of a pool would have crashed on the same traffic; only where it was asked for.
-    known_rates : KnownRates or None
-        Their crash rates.
+    component, shells : (n,) int, ShellDesign, or None
+        Stratum of each test, where they are drawn from shells, and what is known of the strata.
+    surrogates_crash, known_rates : (n, D) bool, KnownRates, or None
+        Which surrogates of a pool would have crashed on the same traffic, and their crash rates; only where asked for.
     """
 
     first_episode: int
@@ -75,24 +71,17 @@ class Block:
 
     def __post_init__(self) -> None:
         n = len(self.crash)
+        columns = ("failed", "cut_in", "bv_lv_contact", "log_weight", "n_control_steps", "log_p_cut_in", "component")
         expected = {
-            "failed": (n,),
-            "cut_in": (n,),
-            "bv_lv_contact": (n,),
-            "log_weight": (n,),
+            **dict.fromkeys(columns, (n,)),
             "log_q": (n, len(self.alpha)),
-            "n_control_steps": (n,),
-            "log_p_cut_in": (n,),
-            "component": (n,),
+            "first_ratios": (n, MAX_CONTROL_STEPS, None),
+            "surrogates_crash": (n, None),
         }
         for name, shape in expected.items():
             array = getattr(self, name)
-            if array is not None and array.shape != shape:
+            if array is not None and not _fits(array.shape, shape):
                 raise ValueError(f"Block.{name} has shape {array.shape}, expected {shape}")
-        if self.first_ratios is not None and self.first_ratios.shape[:2] != (n, MAX_CONTROL_STEPS):
-            raise ValueError(f"Block.first_ratios has shape {self.first_ratios.shape}, expected ({n}, 9, J)")
-        if self.surrogates_crash is not None and self.surrogates_crash.shape[:1] != (n,):
-            raise ValueError(f"Block.surrogates_crash has shape {self.surrogates_crash.shape}, expected ({n}, D)")
         if np.any(self.crash & self.failed):
             raise ValueError("Block: an episode is both crashed and failed")
         if np.isnan(self.log_weight).any():
@@ -112,6 +101,18 @@ class Block:
         y[self.crash] = np.exp(self.log_weight[self.crash])
         return y
 
+    def mixture_ratios(self) -> FloatArray:
+        """q_j(x_c)/q_sampled(x_c) over whole episodes, shape (n, M); 0 where q_j cannot draw the episode."""
+        with np.errstate(over="ignore"):
+            return np.exp(self.log_q + self.log_weight[:, None])
+
+    def log_path_cap(self) -> float:
+        """Log of the largest P(cut-in | path)/share of forced cut-ins, a bound on Y of these paths; inf if unknown."""
+        if self.log_p_cut_in is None or self.method not in ("forced", "episode_mixture"):
+            return math.inf
+        share = 1.0 if self.method == "forced" else float(self.alpha[0])
+        return float(np.max(self.log_p_cut_in, initial=-math.inf)) - math.log(share) if share else math.inf
+
     def failed_as_crashes(self) -> Block:
         """The same episodes had every failed one crashed, each with the weight that it has on record.
 
@@ -120,24 +121,15 @@ class Block:
         """
         return replace(self, crash=self.crash | self.failed, failed=np.zeros_like(self.failed))
 
-    def mixture_ratios(self) -> FloatArray:
-        """q_j(x_c)/q_sampled(x_c) over whole episodes, shape (n, M); 0 where q_j cannot draw the episode."""
-        with np.errstate(over="ignore"):
-            return np.exp(self.log_q + self.log_weight[:, None])
-
     def take(self, rows: slice) -> Block:
-        """Cut out the block of some consecutive rows.
-
-        Parameters
-        ----------
-        rows : slice
-            With step 1.
-        """
+        """Cut out the block of some consecutive rows, a slice with step 1."""
         start, stop, step = rows.indices(len(self))
         if step != 1:
             raise ValueError("a block holds consecutive episodes: the slice must have step 1")
-        values = {field.name: getattr(self, field.name) for field in fields(self)}
-        for name, value in values.items():
-            if name != "alpha" and isinstance(value, np.ndarray):
-                values[name] = value[start:stop]
-        return Block(**{**values, "first_episode": self.first_episode + start})
+        arrays = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "alpha"}
+        taken: dict[str, Any] = {k: array[start:stop] for k, array in arrays.items() if isinstance(array, np.ndarray)}
+        return replace(self, **taken, first_episode=self.first_episode + start)
+
+
+def _fits(shape: tuple[int, ...], expected: tuple[int | None, ...]) -> bool:
+    return len(shape) == len(expected) and all(n in (size, None) for size, n in zip(shape, expected, strict=True))

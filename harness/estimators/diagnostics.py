@@ -1,13 +1,12 @@
 """What the records say about the sampling itself: mean weight, mean ratios, failed tests, contacts of BV and LV.
 
 The mean of W = p/q_sampled over all episodes is 1 in expectation, and so is that of every q_j/q_sampled. They are
-**diagnostics, never tests**: for the step mixture the mean of W is carried by weights that hardly ever occur (the
-published NADE shows about 0.03 at 4e5 episodes, although it is unbiased), so a mean far from 1 does not say that
-something is wrong, but that the tests so far have not met the episodes that matter most.
+**diagnostics, never tests**: `NOTE` says why, in every report.
 """
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -31,16 +30,11 @@ class Diagnostics:
     """Running moments of weights and ratios; add blocks, ask for the result."""
 
     def __init__(self) -> None:
-        self.n = 0
-        self.n_failed = 0
-        self.n_cut_ins = 0
-        self.n_contacts = 0
+        self.n = self.n_failed = self.n_cut_ins = self.n_contacts = 0
         self.method: Method | None = None
-        self._weight = Moments()
-        self._cut_in = Moments()
-        self._contact = Moments()
-        self._ratios: list[Moments] = []
         self.alarm = Alarm()
+        self._weight, self._cut_in, self._contact = Moments(), Moments(), Moments()
+        self._ratios: list[Moments] = []
 
     def add(self, block: Block) -> None:
         """Add one block."""
@@ -60,34 +54,25 @@ class Diagnostics:
                 sums.add(ratios)
 
     def result(self, importance_names: tuple[str, ...] = ()) -> dict[str, Any]:
-        """Means with standard errors.
-
-        Parameters
-        ----------
-        importance_names : tuple of str
-            Names of the M importance functions, in order; numbered where left out.
-        """
+        """Means with standard errors; the M importance functions, in order, are numbered where names are left out."""
         names = importance_names or tuple(f"q_{j}" for j in range(len(self._ratios)))
         result: dict[str, Any] = {
             "mean_weight": self._mean(self._weight),
             "mean_weight_cut_in": self._mean(self._cut_in),
-            "mean_ratio": {
-                name: self._mean(sums) for name, sums in zip(names, self._ratios, strict=False) if self._ratios
-            },
+            "mean_ratio": {name: self._mean(sums) for name, sums in zip(names, self._ratios, strict=False)},
             "bv_lv_contact_share": self._mean(self._contact),
             "n_cut_ins": self.n_cut_ins,
             "n_bv_lv_contacts": self.n_contacts,
             "n_failed": self.n_failed,
             "note": NOTE_SHELLS if self.method == "shells" else NOTE,
         }
-        if self.n and self.method == "step_mixture" and self._weight.mean(self.n) < CARELESS_MEAN:
+        if self.method == "step_mixture" and (mean := self._weight.mean(self.n)) < CARELESS_MEAN:
             result["heavy_tail"] = (
-                f"the mean weight is {self._weight.mean(self.n):.3g} where 1 is expected: the episodes with large "
-                "weights are still missing"
+                f"the mean weight is {mean:.3g} where 1 is expected: the episodes with large weights are still missing"
             )
         return result
 
     def _mean(self, sums: Moments) -> dict[str, float]:
-        if self.n == 0 or self.method == "shells":
-            return {"mean": float("nan"), "std_error": float("inf")}
+        if self.method == "shells":
+            return {"mean": math.nan, "std_error": math.inf}
         return {"mean": sums.mean(self.n), "std_error": sums.std_error(self.n)}

@@ -1,10 +1,20 @@
-"""What an estimator answers: an `Estimate`, or the reason why the records do not allow one."""
+"""What an estimator is and answers: `Accumulator`, `Estimate`; and how failed tests count, both ways, for all of them.
+
+What a failed test would have come to is not known. Had all of them ended without a crash, the crash rate would be one
+number, had all of them crashed, another, and the truth lies between. So an interval reaches from the lower limit of the
+first to the upper limit of the second: it covers wherever each of the two does.
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, field
-from typing import Any
+from copy import deepcopy
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, Protocol
+
+import numpy as np
+
+from harness.estimators.block import Block
 
 WIDEST_RHW = 10.0
 """Relative half-widths above are not given as a number: next to nothing is known, and the digits would mean nothing."""
@@ -18,10 +28,8 @@ class Estimate:
     ----------
     crash_rate, std_error : float
         Crashes per test.
-    ci_low, ci_high : float
-        Two-sided interval at `confidence`.
-    upper_bound : float
-        One-sided bound at `confidence`; finite also when no crash was seen.
+    ci_low, ci_high, upper_bound : float
+        Two-sided interval and one-sided bound at `confidence`; finite also when no crash was seen.
     rhw : float
         Half-width of the interval relative to the rate; infinite when the rate is 0.
     n_episodes, n_crashes : int
@@ -66,19 +74,12 @@ class Estimate:
 
     def to_json(self) -> dict[str, Any]:
         """Plain JSON content; infinite and undefined numbers become null, as does an RHW that says nothing."""
-        content: dict[str, Any] = finite_json({**asdict(self), "rhw": self.precision})
-        return content
+        return finite_json({**asdict(self), "rhw": self.precision})
 
 
 @dataclass(frozen=True)
 class Unavailable:
-    """An estimator that these records do not allow.
-
-    Attributes
-    ----------
-    reason : str
-        What is missing, and what would provide it.
-    """
+    """An estimator that these records do not allow: what is missing, and what would provide it."""
 
     reason: str
 
@@ -87,12 +88,83 @@ class Unavailable:
         return {"crash_rate": None, "reason": self.reason}
 
 
-def finite_json(value: Any) -> Any:
+def finite_json(content: dict[str, Any]) -> dict[str, Any]:
     """Copy of nested content with tuples as lists and non-finite numbers as null, which JSON cannot write."""
+    return {key: _finite(value) for key, value in content.items()}
+
+
+def _finite(value: Any) -> Any:
     if isinstance(value, dict):
-        return {key: finite_json(entry) for key, entry in value.items()}
+        return finite_json(value)
     if isinstance(value, list | tuple):
-        return [finite_json(entry) for entry in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
+        return [_finite(entry) for entry in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+class Accumulator(Protocol):
+    """One estimator's running state, of bounded size."""
+
+    @classmethod
+    def refusal(cls, block: Block) -> str | None:
+        """Why records like this block do not allow this estimator; None if they do."""
+        ...
+
+    def add(self, block: Block) -> None:
+        """Add the episodes of one block."""
+        ...
+
+    def result(self, confidence: float) -> Estimate:
+        """Estimate from the episodes so far, at least one, else ValueError; leaves the state as it is."""
+        ...
+
+
+def require_episodes(n: int) -> None:
+    """Refuse to estimate from nothing."""
+    if n < 1:
+        raise ValueError("an estimate needs at least one episode")
+
+
+class BothWays:
+    """An estimator that is fed twice from the first failed test on.
+
+    Parameters
+    ----------
+    seen : Accumulator
+        Empty; takes failed tests as no crash.
+    """
+
+    def __init__(self, seen: Accumulator) -> None:
+        self.seen = seen
+        self._worst: Accumulator | None = None  # until a test fails it would be the same
+        self._n_failed = 0
+
+    def add(self, block: Block) -> None:
+        """Add the episodes of one block."""
+        if self._worst is None and block.failed.any():
+            self._worst = deepcopy(self.seen)
+        self._n_failed += int(np.count_nonzero(block.failed))
+        self.seen.add(block)
+        if self._worst is not None:
+            self._worst.add(block.failed_as_crashes())
+
+    def result(self, confidence: float) -> Estimate:
+        """Rate and lower limit of what was seen, upper limits of the worst that it may have been."""
+        seen = self.seen.result(confidence)
+        worst = seen if self._worst is None else self._worst.result(confidence)
+        failures = {"n_failed": self._n_failed, "crash_rate_if_failed_had_crashed": worst.crash_rate}
+        seen = replace(seen, details={**failures, **seen.details})
+        if not self._n_failed:
+            return seen
+        high = max(seen.ci_high, worst.ci_high)
+        warning = (
+            f"{self._n_failed} of {seen.n_episodes} episodes failed; the rate and the lower limit count them as no "
+            "crash, the upper limits as crashes"
+        )
+        return replace(
+            seen,
+            ci_high=high,
+            upper_bound=max(seen.upper_bound, worst.upper_bound),
+            rhw=(high - seen.ci_low) / 2.0 / seen.crash_rate if seen.crash_rate > 0.0 else math.inf,
+            weight_cap=max(seen.weight_cap, worst.weight_cap),
+            warnings=(*seen.warnings, warning),
+        )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import pyarrow as pa
@@ -15,15 +15,7 @@ from harness.methods import Method
 from harness.records.folder import MEND_SHARD
 from harness.strata import ShellDesign
 
-EPISODE_COLUMNS = (
-    "episode",
-    "outcome",
-    "cut_in_step",
-    "n_control_steps",
-    "log_weight",
-    "log_p_cut_in",
-    "log_q",
-)
+EPISODE_COLUMNS = ("episode", "outcome", "cut_in_step", "n_control_steps", "log_weight", "log_p_cut_in", "log_q")
 SHELL_COLUMNS = ("component",)
 MOMENT_COLUMNS = ("episode", "q_sampled", "q")
 
@@ -34,7 +26,6 @@ def block_from_tables(
     *,
     method: Method,
     alpha: Sequence[float],
-    weight_cap: float | None = None,
     shells: ShellDesign | None = None,
 ) -> Block:
     """Block of one shard.
@@ -50,64 +41,55 @@ def block_from_tables(
         ``testing.method`` of the campaign.
     alpha : sequence of float
         Mixture weights in the order of ``log_q``, M of them.
-    weight_cap : float, optional
-        Bound on Y that the design guarantees; 1 for ``nde`` and never above 1 for ``forced`` whatever is given.
     shells : ShellDesign, optional
-        Strata of the campaign, if it draws from shells.
+        Strata of the campaign, if it draws from shells; needs `SHELL_COLUMNS`.
 
     Raises
     ------
     RunFolderError
         If rows are missing, out of order, or contradict each other.
     """
-    index = _column(episodes, "episode").astype(np.int64)
-    first = _require_consecutive(index)
-    outcome_is = _outcome_is(episodes)
-    failed = outcome_is("failed")
-    n_control_steps = _column(episodes, "n_control_steps").astype(np.int64)
+    index = _integers(episodes, "episode")
+    _require_consecutive(index)
+    outcomes = episodes.column("outcome").unify_dictionaries().combine_chunks()
+    failed, n_control_steps = _ended(outcomes, "failed"), _integers(episodes, "n_control_steps")
     ratios = None
     if moments is not None and method == "step_mixture":
         ratios = _first_ratios(moments, index, np.where(failed, 0, n_control_steps))
     return Block(
-        first_episode=first,
+        first_episode=int(index[0]),
         method=method,
-        crash=outcome_is("crash"),
+        crash=_ended(outcomes, "crash"),
         failed=failed,
-        cut_in=np.asarray(pc.is_valid(episodes.column("cut_in_step"))).astype(np.bool_),
-        bv_lv_contact=outcome_is("bv_lv_contact"),
-        log_weight=_log_weights(episodes, failed, first),
+        cut_in=_known(episodes, "cut_in_step"),
+        bv_lv_contact=_ended(outcomes, "bv_lv_contact"),
+        log_weight=_log_weights(episodes, failed, int(index[0])),
         log_q=_nested(episodes, "log_q", len(alpha)),
         alpha=np.asarray(alpha, dtype=np.float64),
         n_control_steps=n_control_steps,
         first_ratios=ratios,
-        weight_cap=_design_cap(method, weight_cap),
+        weight_cap=1.0 if method == "nde" else None,
         log_p_cut_in=_log_p_cut_in(episodes, failed),
-        component=None if shells is None else _column(episodes, "component").astype(np.int64),
+        component=None if shells is None else _integers(episodes, "component"),
         shells=shells,
     )
 
 
-def _design_cap(method: Method, given: float | None) -> float | None:
-    """Bound on Y: a crash counts 1 under nde, P(cut-in | path) ≤ 1 under forced; else only what is given."""
-    if method == "nde":
-        return 1.0
-    if method == "forced" and given is not None:
-        return min(1.0, given)
-    return given
+def _damaged(where: str, found: str, expected: str) -> RunFolderError:
+    return RunFolderError(where, found=found, expected=expected, mend=MEND_SHARD)
 
 
-def _column(table: pa.Table, name: str) -> FloatArray:
-    return np.asarray(table.column(name).to_numpy())
+def _integers(table: pa.Table, name: str) -> IntArray:
+    return np.asarray(table.column(name).to_numpy()).astype(np.int64)
 
 
-def _outcome_is(episodes: pa.Table) -> Callable[[str], BoolArray]:
-    """Give a function from an outcome's name to the rows that ended with it, shape (n,)."""
-    column = episodes.column("outcome")
-    encoded = column if pa.types.is_dictionary(column.type) else column.dictionary_encode()
-    whole = encoded.unify_dictionaries().combine_chunks()
-    codes = np.asarray(whole.indices.to_numpy(zero_copy_only=False))
-    names = whole.dictionary.to_pylist()
-    return lambda name: codes == (names.index(name) if name in names else -1)
+def _known(table: pa.Table, name: str) -> BoolArray:
+    return np.asarray(pc.is_valid(table.column(name))).astype(np.bool_)
+
+
+def _ended(outcomes: pa.DictionaryArray, name: str) -> BoolArray:
+    """Rows that ended so, shape (n,)."""
+    return np.asarray(outcomes.indices.to_numpy() == outcomes.dictionary.index(name).as_py())
 
 
 def _nested(table: pa.Table, name: str, width: int) -> FloatArray:
@@ -124,76 +106,62 @@ def _nested(table: pa.Table, name: str, width: int) -> FloatArray:
     return values.reshape(table.num_rows, width)
 
 
-def _require_consecutive(index: IntArray) -> int:
+def _require_consecutive(index: IntArray) -> None:
     if len(index) == 0:
-        raise RunFolderError("episodes", found="no rows", expected="at least one episode per shard", mend=MEND_SHARD)
-    steps = np.diff(index)
-    if np.any(steps != 1):
-        at = int(np.argmax(steps != 1))
-        raise RunFolderError(
+        raise _damaged("episodes", "no rows", "at least one episode per shard")
+    gaps = np.diff(index) != 1
+    if gaps.any():
+        at = int(np.argmax(gaps))
+        raise _damaged(
             f"episodes, row {at + 1}",
-            found=f"episode {index[at + 1]} after episode {index[at]}",
-            expected="every episode once, in index order; a failed one is a row too",
-            mend=MEND_SHARD,
+            f"episode {index[at + 1]} after episode {index[at]}",
+            "every episode once, in index order; a failed one is a row too",
         )
-    return int(index[0])
 
 
 def _log_weights(episodes: pa.Table, failed: BoolArray, first: int) -> FloatArray:
     """Log weights; that of a failed episode may be unknown and is then 0, the weight of an uncontrolled test."""
-    log_weight = np.array(_column(episodes, "log_weight"), dtype=np.float64)
-    unknown = np.isnan(log_weight)
-    log_weight[unknown & failed] = 0.0
-    wrong = (unknown & ~failed) | np.isposinf(log_weight)
+    log_weight = np.array(episodes.column("log_weight").to_numpy(), dtype=np.float64)
+    log_weight[np.isnan(log_weight) & failed] = 0.0
+    wrong = np.isnan(log_weight) | np.isposinf(log_weight)
     if wrong.any():
         at = int(np.argmax(wrong))
-        raise RunFolderError(
-            f"episodes, episode {first + at}",
-            found=f"log_weight {log_weight[at]}",
-            expected="a number: every weight decides the crash rate",
-            mend=MEND_SHARD,
-        )
+        found, expected = f"log_weight {log_weight[at]}", "a number: every weight decides the crash rate"
+        raise _damaged(f"episodes, episode {first + at}", found, expected)
     return log_weight
 
 
 def _log_p_cut_in(episodes: pa.Table, failed: BoolArray) -> FloatArray | None:
     """Log P(cut-in | path) where every finished episode has it, else None."""
-    column = episodes.column("log_p_cut_in")
-    known = np.asarray(pc.is_valid(column)).astype(np.bool_)
-    if not np.all(known | failed):
+    if not np.all(_known(episodes, "log_p_cut_in") | failed):
         return None
-    return np.where(known, pc.fill_null(column, -np.inf).to_numpy(), -np.inf)
+    return np.asarray(pc.fill_null(episodes.column("log_p_cut_in"), -np.inf).to_numpy())
 
 
 def _first_ratios(moments: pa.Table, index: IntArray, n_control_steps: IntArray) -> FloatArray:
     """q_j/q_sampled of the first nine control steps of each episode, shape (n, 9, J); 1 beyond the last one."""
-    row = _column(moments, "episode").astype(np.int64) - index[0]
+    row = _integers(moments, "episode") - index[0]
     if len(row) and (row[0] < 0 or row[-1] >= len(index) or np.any(np.diff(row) < 0)):
-        raise RunFolderError(
+        raise _damaged(
             "moments",
-            found=f"rows of episodes {row.min() + index[0]} to {row.max() + index[0]}, or out of order",
-            expected=f"episodes {index[0]} to {index[-1]}, in order",
-            mend=MEND_SHARD,
+            f"rows of episodes {row.min() + index[0]} to {row.max() + index[0]}, or out of order",
+            f"episodes {index[0]} to {index[-1]}, in order",
         )
     counts = np.bincount(row, minlength=len(index))
-    _require_moments(counts, n_control_steps, int(index[0]))
+    _require_moments(counts, np.minimum(n_control_steps, MAX_CONTROL_STEPS), int(index[0]))
     rank = np.arange(len(row)) - (np.cumsum(counts) - counts)[row]
     n_surrogates = moments.schema.field("q").type.list_size
-    q = _nested(moments, "q", n_surrogates)
+    q, q_sampled = _nested(moments, "q", n_surrogates), moments.column("q_sampled").to_numpy()
     kept = rank < MAX_CONTROL_STEPS
     ratios = np.ones((len(index), MAX_CONTROL_STEPS, n_surrogates))
-    ratios[row[kept], rank[kept]] = q[kept] / _column(moments, "q_sampled")[kept, None]
+    ratios[row[kept], rank[kept]] = q[kept] / q_sampled[kept, None]
     return ratios
 
 
-def _require_moments(counts: IntArray, n_control_steps: IntArray, first: int) -> None:
+def _require_moments(counts: IntArray, needed: IntArray, first: int) -> None:
     """Each episode must have all its control steps on record, or its first nine."""
-    short = counts < np.minimum(n_control_steps, MAX_CONTROL_STEPS)
+    short = counts < needed
     if short.any():
         at = int(np.argmax(short))
-        raise RunFolderError(
-            f"moments, episode {first + at}",
-            found=f"{counts[at]} control steps",
-            expected=f"{min(int(n_control_steps[at]), MAX_CONTROL_STEPS)} as the episodes table says",
-            mend=MEND_SHARD,
-        )
+        expected = f"{needed[at]} as the episodes table says"
+        raise _damaged(f"moments, episode {first + at}", f"{counts[at]} control steps", expected)

@@ -4,32 +4,33 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+from numpy.typing import ArrayLike
 from scipy.optimize import brentq
 from scipy.special import betaincinv, ndtri
 
+from harness.arrays import FloatArray
 
-def clopper_pearson(n_crashes: int, n: int, confidence: float) -> tuple[float, float]:
-    """Exact two-sided interval for a binomial share.
+
+def clopper_pearson(
+    crashes: ArrayLike, tests: ArrayLike, tail: float, failed: ArrayLike = 0
+) -> tuple[FloatArray, FloatArray]:
+    """Exact limits of binomial shares, leaving out the probability ``tail`` at each end; [0, 1] without a test.
 
     Parameters
     ----------
-    n_crashes, n : int
-        Crashes among n tests, n ≥ 1.
-    confidence : float
-        Level; each side keeps half of the rest.
+    crashes, tests, failed : int or ndarray of int, shape (S,)
+        ``failed`` tests may have been crashes: only the upper limit counts them.
+
+    Returns
+    -------
+    low, high : ndarray, of the counts' shape
     """
-    tail = (1.0 - confidence) / 2.0
-    low = 0.0 if n_crashes == 0 else float(betaincinv(n_crashes, n - n_crashes + 1, tail))
-    return low, clopper_pearson_upper(n_crashes, n, 1.0 - tail)
-
-
-def clopper_pearson_upper(n_crashes: int, n: int, confidence: float) -> float:
-    """Exact one-sided upper bound for a binomial share; without a crash 1 - (1 - confidence)^(1/n)."""
-    if n_crashes == n:
-        return 1.0
-    if n_crashes == 0:
-        return -math.expm1(math.log1p(-confidence) / n)
-    return float(betaincinv(n_crashes + 1, n - n_crashes, confidence))
+    k, n = np.asarray(crashes, dtype=np.float64), np.asarray(tests, dtype=np.float64)
+    worst = k + np.asarray(failed)
+    low = np.where(k > 0, betaincinv(np.maximum(k, 0.5), n - k + 1.0, tail), 0.0)
+    high = np.where(worst < n, betaincinv(worst + 1.0, np.maximum(n - worst, 0.5), 1.0 - tail), 1.0)
+    return low, high
 
 
 def normal_half_width(std_error: float, confidence: float) -> float:
@@ -45,10 +46,8 @@ def hall_distances(std_error: float, third_moment: float, tail: float) -> tuple[
 
     Parameters
     ----------
-    std_error : float
-        Of the estimate.
-    third_moment : float
-        Third central moment of the estimate's error; over std_error³ it is the skewness κ.
+    std_error, third_moment : float
+        Of the estimate; its error's third central moment over std_error³ is the skewness κ.
     tail : float
         Probability to be left out on each side, below 1/2.
     """
@@ -60,22 +59,12 @@ def hall_distances(std_error: float, third_moment: float, tail: float) -> tuple[
 
 
 def skewed_distances(std_error: float, third_moment: float, tail: float) -> tuple[float, float]:
-    """Distances of the lower and the upper limit that are reported for an estimate whose error is skewed.
+    """Distances of the limits that are reported, below and above: the farther one of Hall's and the normal.
 
     A mean of rare large values is skewed: samples without the largest have both a mean and a standard error that are
     too small, so that normal limits miss the truth above. Hall's limits mend that. But their lower limit is nearer than
-    the normal one on the word of a skewness that is itself estimated, and misses too often. So each side keeps the
-    farther one of the two (measured in docs/estimators.md).
-
-    Parameters
-    ----------
-    std_error, third_moment, tail : float
-        See `hall_distances`.
-
-    Returns
-    -------
-    (float, float)
-        Both at least the normal distance.
+    the normal one on the word of a skewness that is itself estimated, and misses too often (measured in
+    docs/estimators.md). Parameters are those of `hall_distances`.
     """
     normal = -float(ndtri(tail)) * std_error
     below, above = hall_distances(std_error, third_moment, tail)
@@ -91,7 +80,7 @@ def _hall(z: float, skewness: float) -> float:
 
 
 def capped_mean_upper(mean: float, cap: float, n: int, confidence: float) -> float:
-    """One-sided upper bound for the mean of independent values in [0, cap], valid at every n.
+    """One-sided upper bound for the mean of n independent values in [0, cap], valid at every n, at most 1.
 
     It inverts Hoeffding's inequality in its relative-entropy form (W. Hoeffding, Probability inequalities for sums of
     bounded random variables, JASA 58, 1963, Theorem 1): P(mean ≤ x) ≤ exp(-n·KL(x/cap, μ/cap)) for x ≤ μ. For a mean
@@ -103,34 +92,24 @@ def capped_mean_upper(mean: float, cap: float, n: int, confidence: float) -> flo
         Observed mean, in [0, cap].
     cap : float
         Largest possible value; infinite if unknown, and then only the trivial bound 1 is left.
-    n : int
-        Number of values.
-    confidence : float
-        Level of the bound.
-
-    Returns
-    -------
-    float
-        At most 1, since the mean is a probability.
     """
     if not math.isfinite(cap):
         return 1.0
-    if mean <= 0.0:
-        return min(1.0, cap * clopper_pearson_upper(0, n, confidence))
-    share = mean / cap
-    if share >= 1.0:
-        return min(1.0, cap)
     needed = -math.log1p(-confidence) / n
-    almost_one = math.log1p(-(2.0**-53))
-    if _relative_entropy(share, almost_one) <= needed:
+    if mean <= 0.0:
+        return min(1.0, cap * -math.expm1(-needed))
+    share, almost_one = mean / cap, math.log1p(-(2.0**-53))
+    if share >= 1.0 or relative_entropy(share, almost_one) <= needed:
         return min(1.0, cap)
     log_bound = brentq(
-        lambda log_p: _relative_entropy(share, log_p) - needed, math.log(share), almost_one, xtol=1e-14, rtol=1e-13
+        lambda log_p: relative_entropy(share, log_p) - needed, math.log(share), almost_one, xtol=1e-14, rtol=1e-13
     )
     return min(1.0, cap * math.exp(float(log_bound)))
 
 
-def _relative_entropy(share: float, log_p: float) -> float:
-    """KL divergence of a coin with the given share from one with probability exp(log_p)."""
-    log_miss = math.log(-math.expm1(log_p)) if log_p < 0.0 else -math.inf
-    return share * (math.log(share) - log_p) + (1.0 - share) * (math.log1p(-share) - log_miss)
+def relative_entropy(share: float, log_p: float) -> float:
+    """KL divergence of a coin with a share in [0, 1] from one with probability exp(log_p), above 0 and below 1."""
+    hit = share * (math.log(share) - log_p) if share > 0.0 else 0.0
+    if share >= 1.0:
+        return hit
+    return hit + (1.0 - share) * (math.log1p(-share) - math.log(-math.expm1(log_p)))

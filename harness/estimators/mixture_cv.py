@@ -9,47 +9,20 @@ most min_j σ²_j/(n alpha_j) up to the estimation of β ([paper] Lemma 1, which
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import ClassVar
+from typing import NamedTuple
 
 import numpy as np
 
 from harness.arrays import FloatArray
-from harness.estimators.accumulator import require_episodes
 from harness.estimators.block import Block
-from harness.estimators.estimate import Estimate
-from harness.estimators.third_moments import ThirdMoments
+from harness.estimators.estimate import Estimate, require_episodes
+from harness.estimators.moments import ThirdMoments
 from harness.estimators.triangular_factor import empty_factor, fold_rows
 from harness.estimators.weighted_sums import FEW_FOR_RESIDUALS, WeightedSums, weighted_estimate
-from harness.methods import EstimatorName
-
-
-@dataclass(frozen=True)
-class Regression:
-    """Least squares of Y on [1, H], of the smallest norm where columns depend on each other.
-
-    Attributes
-    ----------
-    coefficients : (1 + M,) float64
-        Intercept, then β.
-    residual_squares : float
-        Residual sum of squares.
-    rank : int
-        Rank of [1, H].
-    intercept_leverage : float
-        Variance of the intercept per unit of residual variance, [(XᵀX)⁺]_00.
-    """
-
-    coefficients: FloatArray
-    residual_squares: float
-    rank: int
-    intercept_leverage: float
 
 
 class MixtureCv:
     """Triangular factor and third moments of [1, H, Y], at most (M + 2)³ numbers however many episodes."""
-
-    name: ClassVar[EstimatorName] = "mixture_cv"
 
     def __init__(self) -> None:
         self.sums = WeightedSums()
@@ -81,20 +54,16 @@ class MixtureCv:
 
     def result(self, confidence: float) -> Estimate:
         """Intercept of the regression, with the residual variance if crashes are many, else the plain mean's."""
-        require_episodes(self.sums.n)
+        n, y = self.sums.n, self.sums.y
+        require_episodes(n)
         assert self._factor is not None
         assert self._cubes is not None
-        fit = regress(self._factor, self.sums.n)
-        freedom = self.sums.n - fit.rank
-        variance = fit.residual_squares / freedom * fit.intercept_leverage if freedom > 0 else math.inf
-        plain = self.sums.y.std_error(self.sums.n)
-        warnings = []
-        std_error, third_moment = (
-            math.sqrt(variance),
-            self._cubes.of(np.array([*-fit.coefficients, 1.0])) / self.sums.n**3,
-        )
-        if self.sums.n_crashes and self.sums.n_effective() < FEW_FOR_RESIDUALS and std_error < plain:
-            std_error, third_moment = plain, self.sums.y.third_moment(self.sums.n)
+        fit = _regression(self._factor, n)
+        residual = std_error = math.sqrt(fit.variance)
+        third_moment = self._cubes.of(np.array([*-fit.coefficients, 1.0])) / n**3
+        plain, warnings = y.std_error(n), []
+        if self.sums.n_crashes and y.n_effective < FEW_FOR_RESIDUALS and residual < plain:
+            std_error, third_moment = plain, y.third_moment(n)
             warnings.append(
                 f"fewer than {FEW_FOR_RESIDUALS:.0f} effective crashes: the interval is as wide as that of the plain "
                 "mean of weighted crashes"
@@ -108,22 +77,30 @@ class MixtureCv:
             method="mean of weighted crashes with the episode mixture's known-mean control variates",
             warnings=warnings,
             details={
-                "beta": [float(value) for value in fit.coefficients[1:]],
+                "beta": fit.coefficients[1:].tolist(),
                 "rank": fit.rank,
-                "residual_std_error": math.sqrt(variance),
-                "plain_mean": self.sums.mean(),
+                "residual_std_error": residual,
+                "plain_mean": y.mean(n),
                 "plain_std_error": plain,
             },
         )
 
 
-def regress(factor: FloatArray, n: int) -> Regression:
-    """Solve the least squares of Y on [1, H] from the triangular factor of [1, H, Y].
+class _Regression(NamedTuple):
+    """Intercept and β, shape (1 + M,); rank of [1, H]; variance of the intercept from that of the residuals."""
+
+    coefficients: FloatArray
+    rank: int
+    variance: float
+
+
+def _regression(factor: FloatArray, n: int) -> _Regression:
+    """Least squares of Y on [1, H], of the smallest norm where columns depend on each other.
 
     Parameters
     ----------
     factor : (k, k) float64
-        Upper triangular factor, the ones first and Y last.
+        Upper triangular factor of [1, H, Y].
     n : int
         Rows behind the factor; it scales the tolerance for the rank (Σ_j alpha_j h_j = 0 always costs one).
     """
@@ -133,5 +110,7 @@ def regress(factor: FloatArray, n: int) -> Regression:
     projected = left.T @ target
     coefficients = right[kept].T @ (projected[kept] / singular[kept])
     residual_squares = float(factor[-1, -1] ** 2 + np.sum(projected[~kept] ** 2))
-    leverage = float(np.sum((right[kept, 0] / singular[kept]) ** 2))
-    return Regression(coefficients, residual_squares, int(np.count_nonzero(kept)), leverage)
+    leverage = float(np.sum((right[kept, 0] / singular[kept]) ** 2))  # of the intercept, [(XᵀX)⁺]_00
+    rank = int(np.count_nonzero(kept))
+    variance = residual_squares / (n - rank) * leverage if n > rank else math.inf
+    return _Regression(coefficients, rank, variance)

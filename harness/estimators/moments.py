@@ -1,4 +1,4 @@
-"""Mean and central moments of numbers that come in blocks, without the cancellation of Σx² - (Σx)²/n.
+"""Moments of numbers that come in blocks, without the cancellation of Σx² - (Σx)²/n.
 
 Moments of a block are joined to those before (T. F. Chan, G. H. Golub and R. J. LeVeque, The American Statistician 37,
 1983, 242; third moments: P. Pébay, Sandia report SAND2008-6212). How numbers are cut into blocks shows in the last
@@ -14,6 +14,8 @@ import numpy as np
 
 from harness.arrays import FloatArray
 
+_ROWS_AT_ONCE = 4096
+
 
 class _Central(NamedTuple):
     """Number of values, Σx (exact for counts), Σ(x - x̄)² and Σ(x - x̄)³."""
@@ -24,7 +26,6 @@ class _Central(NamedTuple):
     third: float = 0.0
 
     def joined(self, other: _Central) -> _Central:
-        """Give the moments of both together."""
         if not self.n or not other.n:
             return self if self.n else other
         n, total = self.n + other.n, self.total + other.total
@@ -70,6 +71,11 @@ class Moments:
         """Σx²."""
         return self._seen.second + self.total * (self.total / self._seen.n) if self._seen.n else 0.0
 
+    @property
+    def n_effective(self) -> float:
+        """(Σx)²/Σx², 0 where all numbers are."""
+        return self.total**2 / self.squares if self.squares > 0.0 else 0.0
+
     def _of(self, n: int) -> _Central:
         return self._seen.joined(_Central(n - self._seen.n))
 
@@ -83,10 +89,27 @@ class Moments:
         return second / (n - 1) if n > 1 and math.isfinite(second) else math.inf
 
     def std_error(self, n: int) -> float:
-        """Compute the standard error of the mean."""
+        """Of the mean."""
         return math.sqrt(self.variance(n) / n)
 
     def third_moment(self, n: int) -> float:
         """Third central moment of the mean, Σ(x - x̄)³/n³; 0 where it is not finite."""
         third = self._of(n).third / n**3 if n else 0.0
         return third if math.isfinite(third) else 0.0
+
+
+class ThirdMoments:
+    """Σ x_i x_j x_k over rows of k columns: the skewness of any linear combination of these is known afterwards."""
+
+    def __init__(self, n_columns: int) -> None:
+        self._sums: FloatArray = np.zeros((n_columns * n_columns, n_columns))
+
+    def add(self, rows: FloatArray) -> None:
+        """Add rows of shape (n, k)."""
+        for start in range(0, len(rows), _ROWS_AT_ONCE):
+            part = rows[start : start + _ROWS_AT_ONCE]
+            self._sums += (part[:, :, None] * part[:, None, :]).reshape(len(part), -1).T @ part
+
+    def of(self, coefficients: FloatArray) -> float:
+        """Σ (cᵀx)³ for coefficients c of shape (k,)."""
+        return float(np.outer(coefficients, coefficients).ravel() @ self._sums @ coefficients)

@@ -1,31 +1,34 @@
-"""All estimators from one pass over the blocks of a campaign."""
+"""All estimators from one pass over the blocks of a campaign; which there are, and which answers for which method."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from typing import Any
 
-from harness.estimators.accumulator import Accumulator
 from harness.estimators.block import Block
-from harness.estimators.both_ways import BothWays
-from harness.estimators.convergence import Convergence
 from harness.estimators.diagnostics import Diagnostics
-from harness.estimators.estimate import Estimate, Unavailable
+from harness.estimators.estimate import Accumulator, BothWays, Estimate, Unavailable, require_episodes
 from harness.estimators.mixture_cv import MixtureCv
-from harness.estimators.nade import Nade
-from harness.estimators.nde import Nde
+from harness.estimators.nade import Nade, Nde
 from harness.estimators.scv import Scv
 from harness.estimators.shells import Shells
 from harness.methods import ESTIMATORS, SAMPLING, EstimatorName
 
-_CLASSES: dict[EstimatorName, type[Accumulator]] = {
+ACCUMULATORS: dict[EstimatorName, type[Accumulator]] = {
     "nde": Nde,
     "nade": Nade,
     "mixture_cv": MixtureCv,
     "scv": Scv,
     "shells": Shells,
 }
+SPACING = 1.01
+"""Prefixes closer than 1 % are one dot on a logarithmic axis; thinning them keeps long campaigns' files small."""
+
+
+def accumulator(name: EstimatorName) -> BothWays:
+    """Empty state of an estimator, for those who feed it themselves (the runner does, for stopping)."""
+    return BothWays(ACCUMULATORS[name]())
 
 
 @dataclass(frozen=True)
@@ -36,14 +39,10 @@ class PassResult:
     ----------
     estimates : dict
         Per asked estimator an `Estimate`, or `Unavailable` with the reason.
-    headline : str
-        Name of the method's own estimator.
-    headline_estimate : Estimate
-        Its estimate, asked for or not.
-    diagnostics : Diagnostics
-        Sums of weights and ratios.
+    headline, headline_estimate : str, Estimate
+        The method's own estimator, asked for or not.
     convergence : list of dict
-        The headline estimate on growing prefixes.
+        The headline estimate on growing prefixes, for plots: block boundaries at least 1 % apart.
     """
 
     estimates: dict[EstimatorName, Estimate | Unavailable]
@@ -53,17 +52,8 @@ class PassResult:
     convergence: list[dict[str, Any]]
 
 
-def accumulator(name: EstimatorName) -> BothWays:
-    """Empty state of an estimator, for those who feed it themselves (the runner does, for stopping)."""
-    return BothWays(_CLASSES[name]())
-
-
 def one_pass(
-    blocks: Iterable[Block],
-    names: Sequence[EstimatorName] = ESTIMATORS,
-    *,
-    confidence: float = 0.9,
-    make: Callable[[EstimatorName], Accumulator] = lambda name: _CLASSES[name](),
+    blocks: Iterable[Block], names: Collection[EstimatorName] = ESTIMATORS, *, confidence: float = 0.9
 ) -> PassResult:
     """Feed every block to every estimator that can use it.
 
@@ -71,52 +61,48 @@ def one_pass(
     ----------
     blocks : iterable of Block
         Contiguous and in index order, from episode 0.
-    names : sequence of str
+    names : collection of str
         Estimators asked for.
     confidence : float
         Level of all intervals.
-    make : callable
-        Gives an empty accumulator by name; the place to ask for another basis of `scv`.
 
     Raises
     ------
     ValueError
         If there is no episode, or a block does not follow the one before.
     """
+    own: EstimatorName | None = None
     states: dict[EstimatorName, BothWays] = {}
-    refusals: dict[EstimatorName, str] = {}
-    diagnostics, convergence, own = Diagnostics(), Convergence(), None
-    n = 0
+    refusals: dict[EstimatorName, str | None] = {}
+    diagnostics, convergence, n = Diagnostics(), list[dict[str, Any]](), 0
     for block in blocks:
         if block.first_episode != n:
             raise ValueError(f"expected a block from episode {n} on, got one from {block.first_episode}")
         if own is None:
             own = SAMPLING[block.method].headline
-            states, refusals = _choose([*dict.fromkeys([own, *names])], block, make)
+            refusals = {name: ACCUMULATORS[name].refusal(block) for name in (own, *names)}
+            states = {name: accumulator(name) for name, reason in refusals.items() if reason is None}
         n += len(block)
         diagnostics.add(block)
         for state in states.values():
             state.add(block)
-        if convergence.due(n):
-            convergence.add(states[own].result(confidence))
-    if own is None or n == 0:
-        raise ValueError("an estimate needs at least one episode")
-    results: dict[EstimatorName, Estimate] = {name: state.result(confidence) for name, state in states.items()}
-    convergence.add(results[own])
-    estimates = {name: results[name] if name in results else Unavailable(refusals[name]) for name in names}
-    return PassResult(estimates, own, results[own], diagnostics, convergence.points())
+        if not convergence or n >= convergence[-1]["n"] * SPACING:
+            convergence.append(_point(states[own].result(confidence)))
+    require_episodes(n)
+    assert own is not None
+    results = {name: state.result(confidence) for name, state in states.items()}
+    if convergence[-1]["n"] != n:
+        convergence.append(_point(results[own]))
+    estimates = {name: results.get(name) or Unavailable(str(refusals[name])) for name in names}
+    return PassResult(estimates, own, results[own], diagnostics, convergence)
 
 
-def _choose(
-    names: Sequence[EstimatorName], block: Block, make: Callable[[EstimatorName], Accumulator]
-) -> tuple[dict[EstimatorName, BothWays], dict[EstimatorName, str]]:
-    """Split into estimators that the records allow and reasons for those that they do not."""
-    states: dict[EstimatorName, BothWays] = {}
-    refusals: dict[EstimatorName, str] = {}
-    for name in names:
-        reason = _CLASSES[name].refusal(block)
-        if reason is None:
-            states[name] = BothWays(make(name))
-        else:
-            refusals[name] = reason
-    return states, refusals
+def _point(estimate: Estimate) -> dict[str, Any]:
+    return {
+        "n": estimate.n_episodes,
+        "crash_rate": estimate.crash_rate,
+        "ci_low": estimate.ci_low,
+        "ci_high": estimate.ci_high,
+        "rhw": estimate.precision,
+        "n_crashes": estimate.n_crashes,
+    }

@@ -2,24 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from harness.estimators import statement as say
 from harness.estimators.block import Block
 from harness.estimators.estimate import Estimate, Unavailable, finite_json
-from harness.estimators.one_pass import PassResult, one_pass
-from harness.estimators.statement import (
-    SCOPE,
-    alarm_cautions,
-    conditional_statement,
-    failed_statement,
-    per_distance,
-    repeated_cautions,
-    repeated_statement,
-    statement,
-    warned,
-)
+from harness.estimators.one_pass import one_pass
 from harness.methods import ESTIMATORS, EstimatorName
 
 
@@ -56,7 +46,7 @@ class CampaignFacts:
 
 
 def estimate_blocks(
-    blocks: Iterable[Block], facts: CampaignFacts, *, estimators: Sequence[EstimatorName] | None = None
+    blocks: Iterable[Block], facts: CampaignFacts, *, estimators: Collection[EstimatorName] | None = None
 ) -> dict[str, Any]:
     """Estimates of blocks that cover a campaign's episodes, as JSON content.
 
@@ -65,36 +55,41 @@ def estimate_blocks(
     blocks : iterable of Block
         Contiguous and in index order.
     facts : CampaignFacts
-    estimators : sequence of str, optional
+    estimators : collection of str, optional
         Which to report beside the method's own; all by default.
     """
     done = one_pass(blocks, estimators or ESTIMATORS, confidence=facts.confidence)
     best = done.headline_estimate
     estimates = {done.headline: best, **done.estimates}
     distance_km = None if facts.distance_per_test_m is None else facts.distance_per_test_m / 1000.0
-    alarm = _alarm(done, facts)
-    statements = _statements(estimates, facts, distance_km, alarm_cautions(alarm))
-    content: dict[str, Any] = {
-        "campaign": facts.name,
-        "campaign_hash": facts.content_hash,
-        "lane_change_level": facts.lane_change_level,
-        "confidence": facts.confidence,
-        "n_episodes": best.n_episodes,
-        "n_crashes": best.n_crashes,
-        "headline": done.headline,
-        "distance_per_test_km": distance_km,
-        "crash_rate_per_1e6_km": None if distance_km is None else per_distance(best, distance_km),
-        "estimates": {name: estimate.to_json() for name, estimate in estimates.items()},
-        "diagnostics": {**done.diagnostics.result(facts.importance_names), "alarm": alarm},
-        "convergence": done.convergence,
-        "statement": statements[done.headline],
-        "statements": statements,
-        "conditional_statement": conditional_statement(best),
-        "scope": SCOPE,
-        "ending": facts.ending,
+    rates = done.diagnostics.alarm.result() or {"reason": facts.no_surrogates}
+    alarm = {
+        "raised": bool(rates.get("raised")),
+        "retraced": facts.retraced or {"reason": "the run did not retrace its episodes"},
+        "surrogate_crash_rates": rates,
     }
-    cleaned: dict[str, Any] = finite_json(content)
-    return cleaned
+    statements = _statements(estimates, facts, distance_km, say.alarm_cautions(alarm))
+    return finite_json(
+        {
+            "campaign": facts.name,
+            "campaign_hash": facts.content_hash,
+            "lane_change_level": facts.lane_change_level,
+            "confidence": facts.confidence,
+            "n_episodes": best.n_episodes,
+            "n_crashes": best.n_crashes,
+            "headline": done.headline,
+            "distance_per_test_km": distance_km,
+            "crash_rate_per_1e6_km": None if distance_km is None else say.per_distance(best, distance_km),
+            "estimates": {name: estimate.to_json() for name, estimate in estimates.items()},
+            "diagnostics": {**done.diagnostics.result(facts.importance_names), "alarm": alarm},
+            "convergence": done.convergence,
+            "statement": statements[done.headline],
+            "statements": statements,
+            "conditional_statement": say.conditional_statement(best),
+            "scope": say.SCOPE,
+            "ending": facts.ending,
+        }
+    )
 
 
 def _statements(
@@ -104,20 +99,12 @@ def _statements(
     alarm: Sequence[str],
 ) -> dict[str, str]:
     """What each estimator says, what it must be warned of first; of one without a value, why."""
-    first = [*alarm, *repeated_cautions(facts.repeated)]
+    first = [*alarm, *say.repeated_cautions(facts.repeated)]
     return {
-        name: warned(first, statement(found, facts.lane_change_level, distance_km))
-        + failed_statement(found)
-        + repeated_statement(facts.repeated)
+        name: say.warned(first, say.statement(found, facts.lane_change_level, distance_km))
+        + say.failed_statement(found.details)
+        + say.repeated_statement(facts.repeated)
         if isinstance(found, Estimate)
         else f"No crash rate from these records: {found.reason.rstrip('.')}."
         for name, found in estimates.items()
     }
-
-
-def _alarm(done: PassResult, facts: CampaignFacts) -> dict[str, Any]:
-    """Whether traffic, twin and pool belong together: what the run has retraced, and the surrogates' crash rates."""
-    alarm = done.diagnostics.alarm
-    rates = alarm.result() if alarm.asked else {"reason": facts.no_surrogates}
-    retraced = facts.retraced or {"reason": "the run did not retrace its episodes"}
-    return {"raised": bool(rates.get("raised")), "retraced": retraced, "surrogate_crash_rates": rates}

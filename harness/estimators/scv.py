@@ -1,9 +1,10 @@
 """`scv`: sparse control variates exactly as published ([paper] Algorithm 1), with the warning that they need.
 
 Episodes are stratified by their number of control steps l; within each stratum Y is regressed by SVD on the products
-of q_j/q_alpha, centred by the stratum's *sample* mean; the estimate is Σ_l n_l·intercept_l/n and its variance is that
-of the pooled residuals Z = Y - H·β. Each l is a stratum of its own, also above nine: there the columns come from the
-first nine control steps ([paper] section VI-E), but Algorithm 1 does not pool the strata.
+vec(Π_t q_{j_t}(a_t|s_t)/q_alpha(a_t|s_t)), centred by the stratum's *sample* mean; the estimate is
+Σ_l n_l·intercept_l/n and its variance is that of the pooled residuals Z = Y - H·β. Each j_t runs over 1 … J-1 (section
+IV-A would have J). Each l is a stratum of its own, also above nine: there the columns come from the first nine control
+steps (section VI-E), but Algorithm 1 does not pool the strata.
 
 Because sample-centred columns leave the intercept at the stratum's mean of Y, the estimate *is* that of `nade`, while
 its claimed variance leaves out the error of the centring. See docs/scv-defect.md.
@@ -12,40 +13,31 @@ its claimed variance leaves out the error of the centring. See docs/scv-defect.m
 from __future__ import annotations
 
 import math
-from typing import Any, ClassVar
+from typing import NamedTuple
 
 import numpy as np
 
-from harness.arrays import IntArray
-from harness.estimators.accumulator import require_episodes
-from harness.estimators.block import Block
-from harness.estimators.estimate import Estimate
-from harness.estimators.scv_columns import Basis, n_columns
-from harness.estimators.scv_stratum import CHUNK_ROWS, Stratum
+from harness.arrays import FloatArray, IntArray
+from harness.estimators.block import MAX_CONTROL_STEPS, Block
+from harness.estimators.estimate import Estimate, require_episodes
 from harness.estimators.threads import side_by_side
+from harness.estimators.triangular_factor import empty_factor, fold_rows
 from harness.estimators.weighted_sums import WeightedSums, weighted_estimate
-from harness.methods import EstimatorName
 
 WARNING = (
     "this interval is known to be too narrow; use nade's (docs/scv-defect.md). The published variance is not that of "
     "this estimator: columns centred by their sample means leave the estimate equal to nade's, and var(Z) leaves out "
     "the error of those means"
 )
+MAX_COLUMNS = 729
+"""Most columns of one stratum: J = 3 reaches 2^9 = 512, J = 4 3^6 = 729 at six steps, and uses no more steps then."""
+CHUNK_ROWS = 2_048
 
 
 class Scv:
-    """One `Stratum` per number of control steps.
+    """One `Stratum` per number of control steps."""
 
-    Parameters
-    ----------
-    basis : {"reduced", "full"}
-        j = 1 … J-1 as in Algorithm 1, or all J functions.
-    """
-
-    name: ClassVar[EstimatorName] = "scv"
-
-    def __init__(self, basis: Basis = "reduced") -> None:
-        self.basis = basis
+    def __init__(self) -> None:
         self.sums = WeightedSums()
         self._strata: dict[int, Stratum] = {}
 
@@ -60,49 +52,36 @@ class Scv:
 
     def add(self, block: Block) -> None:
         """Hand each episode to its stratum, in index order."""
-        if block.first_ratios is None:
+        first_ratios = block.first_ratios
+        if first_ratios is None:
             raise ValueError("scv needs Block.first_ratios in every block")
         self.sums.add(block)
-        y = block.weighted_crashes()
+        y, n_surrogates = block.weighted_crashes(), first_ratios.shape[2]
         order = np.argsort(block.n_control_steps, kind="stable")
-        strata, starts = np.unique(block.n_control_steps[order], return_index=True)
-        first_ratios = block.first_ratios
-        parts = list(zip(map(self._stratum, strata.tolist()), np.split(order, starts[1:]), strict=True))
-        n_surrogates = first_ratios.shape[2]
+        levels, starts = np.unique(block.n_control_steps[order], return_index=True)
+        parts = list(zip(levels.tolist(), np.split(order, starts[1:]), strict=True))
+        for level in levels.tolist():
+            self._strata.setdefault(level, Stratum(level))
         # The dearest first: else one thread would be left with it when the others have finished.
-        parts.sort(key=lambda part: -len(part[1]) * n_columns(part[0].level, n_surrogates, self.basis) ** 2)
+        parts.sort(key=lambda part: -len(part[1]) * n_columns(part[0], n_surrogates) ** 2)
 
-        def add(part: tuple[Stratum, IntArray]) -> None:
-            stratum, rows = part
-            stratum.add(first_ratios[rows], y[rows])
+        def add(part: tuple[int, IntArray]) -> None:
+            level, rows = part
+            self._strata[level].add(first_ratios[rows], y[rows])
 
         side_by_side(add, parts, worthwhile=len(block) >= CHUNK_ROWS)
 
-    def _stratum(self, level: int) -> Stratum:
-        return self._strata.setdefault(level, Stratum(level, self.basis))
-
     def result(self, confidence: float) -> Estimate:
         """Algorithm 1's estimate and its published variance."""
-        require_episodes(self.sums.n)
         n = self.sums.n
+        require_episodes(n)
         levels = sorted(self._strata)
-        fitted = side_by_side(lambda level: self._strata[level].fit(), levels, worthwhile=n >= CHUNK_ROWS)
-        fits = dict(zip(levels, fitted, strict=True))
-        rate = math.fsum(fit.n * fit.intercept for fit in fits.values()) / n
-        within = math.fsum(fit.residual_squares for fit in fits.values())
-        between = math.fsum(fit.n * (fit.intercept - rate) ** 2 for fit in fits.values())
+        fits = side_by_side(lambda level: self._strata[level].fit(), levels, worthwhile=n >= CHUNK_ROWS)
+        rate = math.fsum(fit.n * fit.intercept for fit in fits) / n
+        within = math.fsum(fit.residual_squares for fit in fits)
+        between = math.fsum(fit.n * (fit.intercept - rate) ** 2 for fit in fits)
         var_z = (within + between) / (n - 1) if n > 1 else math.inf
         var_y = self.sums.y.variance(n)
-        details: dict[str, Any] = {
-            "basis": self.basis,
-            "var_z": var_z,
-            "var_y": var_y,
-            "nade_std_error": math.sqrt(var_y / n),
-            "strata": [
-                {"n_control_steps": level, "n": fit.n, "columns": fit.n_columns, "rank": fit.rank}
-                for level, fit in fits.items()
-            ],
-        }
         return weighted_estimate(
             self.sums,
             rate,
@@ -111,5 +90,138 @@ class Scv:
             third_moment=None,
             method="sparse control variates as published (Algorithm 1)",
             cautions=[WARNING],
-            details=details,
+            details={
+                "basis": "reduced",
+                "var_z": var_z,
+                "var_y": var_y,
+                "nade_std_error": math.sqrt(var_y / n),
+                "strata": [
+                    {"n_control_steps": level, "n": fit.n, "columns": fit.n_columns, "rank": fit.rank}
+                    for level, fit in zip(levels, fits, strict=True)
+                ],
+            },
         )
+
+
+class StratumFit(NamedTuple):
+    """Regression of Y_l on H_l: episodes, columns, rank of the centred columns, η_l, and Σ(Z - η_l)²."""
+
+    n: int
+    n_columns: int
+    rank: int
+    intercept: float
+    residual_squares: float
+
+
+class Stratum:
+    """Episodes with `level` control steps: a triangular factor of [1, H, Y] and the rows that wait.
+
+    Episodes wait as compact rows (27 numbers for J = 3) until a chunk is full; only then are they expanded to up to 729
+    columns and folded into the factor. Chunks are cut by the count of the stratum's episodes alone, so the result does
+    not depend on how the episodes came in blocks, and small strata never hold a large factor.
+    """
+
+    def __init__(self, level: int) -> None:
+        self._level = level
+        self._n = self._n_waiting = 0
+        self._factor: FloatArray | None = None
+        self._ratios: list[FloatArray] = []
+        self._y: list[FloatArray] = []
+
+    def add(self, first_ratios: FloatArray, y: FloatArray) -> None:
+        """Add episodes of this stratum: ratios, shape (m, 9, J), and Y, shape (m,)."""
+        start = 0
+        while start < len(y):
+            stop = min(len(y), start + CHUNK_ROWS - self._n_waiting)
+            self._ratios.append(first_ratios[start:stop])
+            self._y.append(y[start:stop])
+            self._n_waiting += stop - start
+            if self._n_waiting == CHUNK_ROWS:
+                self._factor = self._folded(self._factor)
+                self._ratios, self._y, self._n_waiting = [], [], 0
+            start = stop
+        self._n += len(y)
+
+    def _folded(self, factor: FloatArray | None) -> FloatArray:
+        """Fold the waiting rows into `factor`, which is changed, or into a new one."""
+        rows = self._waiting_rows()
+        factor = empty_factor(rows.shape[1]) if factor is None else factor
+        fold_rows(factor, rows)
+        return factor
+
+    def _waiting_rows(self) -> FloatArray:
+        """Rows [1, H, Y] that wait, shape (m, d + 2), in Fortran order."""
+        first_ratios = np.concatenate(self._ratios)
+        rows = np.empty((self._n_waiting, n_columns(self._level, first_ratios.shape[2]) + 2), order="F")
+        rows[:, 0], rows[:, -1] = 1.0, np.concatenate(self._y)
+        fill_product_columns(first_ratios, self._level, rows[:, 1:-1])
+        return rows
+
+    def _with_waiting_rows(self) -> FloatArray:
+        """Triangular factor of all rows so far; the state stays as it is.
+
+        Fewer rows than columns have a factor of as many rows; the square one would be filled up with zeros, and its
+        decomposition would take hundreds of times as long.
+        """
+        if self._factor is not None:
+            return self._folded(self._factor.copy(order="F")) if self._ratios else self._factor
+        rows = self._waiting_rows()
+        return np.asarray(np.linalg.qr(rows, mode="r")) if rows.shape[0] < rows.shape[1] else self._folded(None)
+
+    def fit(self) -> StratumFit:
+        """Solve the regression by SVD of the centred columns' triangular factor.
+
+        The tolerance for the rank is the customary one of least-squares solvers, the larger dimension times machine
+        epsilon times the largest singular value; but never below what centring has rounded away, which grows with the
+        columns' means. Else columns that never vary would be fitted as if their rounding errors were data.
+        """
+        factor = self._with_waiting_rows()
+        intercept = float(factor[0, -1] / factor[0, 0])
+        last = factor.shape[1] - 1
+        centred, target = factor[1:last, 1:last], factor[1:last, last]
+        residual_squares = float(factor[last, last] ** 2) if len(factor) > last else 0.0
+        rank = 0
+        if centred.size:
+            left, singular, _ = np.linalg.svd(centred, full_matrices=False)
+            largest = max(singular[0], np.linalg.norm(factor[0, :-1]))
+            kept = singular > max(self._n, last - 1) * np.finfo(np.float64).eps * largest
+            rank = int(np.count_nonzero(kept))
+            residual_squares += float(np.sum((left[:, ~kept].T @ target) ** 2))
+        return StratumFit(self._n, last - 1, rank, intercept, residual_squares)
+
+
+def steps_used(n_control_steps: int, n_surrogates: int) -> int:
+    """Control steps that a stratum's columns are built from: nine at most, and no more than `MAX_COLUMNS` allow."""
+    steps = min(n_control_steps, MAX_CONTROL_STEPS)
+    while steps and (n_surrogates - 1) ** steps > MAX_COLUMNS:
+        steps -= 1
+    return steps
+
+
+def n_columns(n_control_steps: int, n_surrogates: int) -> int:
+    """Columns of a stratum: (J - 1)^steps, and none where nothing was controlled."""
+    steps = steps_used(n_control_steps, n_surrogates)
+    return int((n_surrogates - 1) ** steps) if steps else 0
+
+
+def fill_product_columns(first_ratios: FloatArray, n_control_steps: int, out: FloatArray) -> None:
+    """Write the columns of episodes of one stratum, not yet centred; the last step's j runs fastest.
+
+    Parameters
+    ----------
+    first_ratios : (m, 9, J) float64
+        q_j/q_alpha per control step.
+    n_control_steps : int
+        Stratum l of all m episodes.
+    out : (m, d) float64
+        In Fortran order, d = `n_columns`.
+    """
+    n_rows, _, n_surrogates = first_ratios.shape
+    if out.shape[1] == 0:
+        return
+    used = first_ratios[:, : steps_used(n_control_steps, n_surrogates), : n_surrogates - 1]
+    by_step = np.ascontiguousarray(np.moveaxis(used, 0, 2))
+    products: FloatArray = np.ones((1, n_rows))
+    for ratios in by_step[:-1]:
+        products = (products[:, None, :] * ratios[None, :, :]).reshape(-1, n_rows)
+    np.multiply(products[:, None, :], by_step[-1][None, :, :], out=out.T.reshape(len(products), -1, n_rows))

@@ -11,6 +11,11 @@ _PER_KM = 1e6
 SCOPE = "The interval is about sampling error in this environment, not about how well the environment matches the road."
 
 
+def warned(cautions: Iterable[str], text: str) -> str:
+    """The text, with what may be wrong about it first."""
+    return " ".join([*(f"WARNING: {caution.rstrip('.')}." for caution in cautions), text])
+
+
 def per_distance(estimate: Estimate, distance_per_test_km: float) -> dict[str, float]:
     """Crash rate and interval per 1e6 km of such overtaking driving."""
     scale = _PER_KM / distance_per_test_km
@@ -19,6 +24,50 @@ def per_distance(estimate: Estimate, distance_per_test_km: float) -> dict[str, f
         "ci_low": estimate.ci_low * scale,
         "ci_high": estimate.ci_high * scale,
     }
+
+
+def statement(estimate: Estimate, lane_change_level: float, distance_per_test_km: float | None) -> str:
+    """Why the interval may be wrong, if it may; then rate, interval, number of tests and level, in words."""
+    tests = (
+        f"{estimate.n_episodes:,} overtaking tests at lane-change level {lane_change_level:g} "
+        f"({estimate.n_crashes:,} sampled crashes)"
+    )
+    level, per_km = f"{estimate.confidence:.0%}", ""
+    if estimate.n_crashes == 0:
+        upper = estimate.upper_bound
+        if distance_per_test_km:
+            per_km = f", or {upper * _PER_KM / distance_per_test_km:.3g} per 1e6 km of such driving"
+        text = f"No crash was sampled in {tests}: with {level} confidence the rate is below {upper:.3g} per test"
+    else:
+        if distance_per_test_km:
+            scaled = per_distance(estimate, distance_per_test_km)
+            per_km = (
+                f"; that is {scaled['rate']:.3g} crashes per 1e6 km of such overtaking driving "
+                f"({scaled['ci_low']:.3g} to {scaled['ci_high']:.3g})"
+            )
+        text = (
+            f"The crash rate is {estimate.crash_rate:.3g} per test ({level} interval {estimate.ci_low:.3g} to "
+            f"{estimate.ci_high:.3g}{_width(estimate)}), estimated from {tests}"
+        )
+    return warned(estimate.cautions, f"{text}{per_km}.")
+
+
+def _width(estimate: Estimate) -> str:
+    if estimate.cautions:
+        return ""
+    if estimate.rhw > WIDEST_RHW:
+        return ", still open upwards: far wider than the rate"
+    return f", relative half-width {estimate.rhw:.1%}"
+
+
+def failed_statement(found: Mapping[str, Any]) -> str:
+    """What failed tests (``details``) would change, as a sentence to follow the answer; empty without any."""
+    if not found["n_failed"]:
+        return ""
+    return (
+        f" Of these tests {found['n_failed']:,} FAILED: they count as no crash in the rate and as crashes in the upper "
+        f"limit. Had they all crashed, the rate would be {found['crash_rate_if_failed_had_crashed']:.3g}."
+    )
 
 
 def conditional_statement(estimate: Estimate) -> str | None:
@@ -36,7 +85,7 @@ def conditional_statement(estimate: Estimate) -> str | None:
         f"If this vehicle crashes only where the surrogate {boundary} or a more careful one crashes, its crash rate is "
         f"{found['crash_rate']:.3g} per test ({level} interval {found['ci_low']:.3g} to {found['ci_high']:.3g}), "
         f"estimated from {found['n_episodes']:,} tests ({found['n_crashes']:,} sampled crashes)."
-        f"{_failed(found)}"
+        f"{failed_statement(found)}"
     )
     if all(shell["inside"] for shell in estimate.details["shells"]):
         return f"{text} Nothing lies outside."
@@ -48,55 +97,6 @@ def conditional_statement(estimate: Estimate) -> str | None:
         f"{text} There was no crash in {found['n_episodes_outside']:,} tests outside{counted}: with {level} confidence "
         f"fewer than {found['upper_bound_outside']:.3g} crashes per test lie there."
     )
-
-
-def failed_statement(estimate: Estimate) -> str:
-    """What failed tests would change, as a sentence to follow the answer; empty without any."""
-    return _failed(estimate.details)
-
-
-def _failed(found: Mapping[str, Any]) -> str:
-    if not found["n_failed"]:
-        return ""
-    return (
-        f" Of these tests {found['n_failed']:,} FAILED: they count as no crash in the rate and as crashes in the upper "
-        f"limit. Had they all crashed, the rate would be {found['crash_rate_if_failed_had_crashed']:.3g}."
-    )
-
-
-def warned(cautions: Iterable[str], text: str) -> str:
-    """The text, with what may be wrong about it first."""
-    return " ".join([*(f"WARNING: {caution.rstrip('.')}." for caution in cautions), text])
-
-
-def statement(estimate: Estimate, lane_change_level: float, distance_per_test_km: float | None) -> str:
-    """Why the interval may be wrong, if it may; then rate, interval, number of tests and level, in words."""
-    return warned(estimate.cautions, _answer(estimate, lane_change_level, distance_per_test_km))
-
-
-def _answer(estimate: Estimate, lane_change_level: float, distance_per_test_km: float | None) -> str:
-    tests = (
-        f"{estimate.n_episodes:,} overtaking tests at lane-change level {lane_change_level:g} "
-        f"({estimate.n_crashes:,} sampled crashes)"
-    )
-    level = f"{estimate.confidence:.0%}"
-    if estimate.n_crashes == 0:
-        upper = estimate.upper_bound
-        bound = f"No crash was sampled in {tests}: with {level} confidence the rate is below {upper:.3g} per test"
-        if distance_per_test_km:
-            bound += f", or {upper * _PER_KM / distance_per_test_km:.3g} per 1e6 km of such driving"
-        return f"{bound}."
-    text = (
-        f"The crash rate is {estimate.crash_rate:.3g} per test ({level} interval {estimate.ci_low:.3g} to "
-        f"{estimate.ci_high:.3g}{_width(estimate)}), estimated from {tests}"
-    )
-    if distance_per_test_km:
-        scaled = per_distance(estimate, distance_per_test_km)
-        text += (
-            f"; that is {scaled['rate']:.3g} crashes per 1e6 km of such overtaking driving "
-            f"({scaled['ci_low']:.3g} to {scaled['ci_high']:.3g})"
-        )
-    return f"{text}."
 
 
 def repeated_statement(repeated: Mapping[str, Any] | None) -> str:
@@ -115,14 +115,6 @@ def repeated_cautions(repeated: Mapping[str, Any] | None) -> list[str]:
         f"{n_differing:,} of {n:,} tests that were run a second time DIFFERED: this vehicle is not reproducible; its "
         "tests cannot be replayed, and depend on what ran beside and before them"
     ]
-
-
-def _width(estimate: Estimate) -> str:
-    if estimate.cautions:
-        return ""
-    if estimate.rhw > WIDEST_RHW:
-        return ", still open upwards: far wider than the rate"
-    return f", relative half-width {estimate.rhw:.1%}"
 
 
 def alarm_cautions(alarm: Mapping[str, Any]) -> list[str]:

@@ -29,16 +29,9 @@ DEFAULT_MIN_CRASHES = 100
 
 
 def look_grid(n_episodes: int, shard_size: int, ratio: float = LOOK_RATIO) -> tuple[int, ...]:
-    """Numbers of episodes at which a campaign is looked at, ascending; the last is `n_episodes`.
+    """Numbers of episodes at which a campaign is looked at, ascending.
 
-    Parameters
-    ----------
-    n_episodes : int
-        Most episodes of the campaign.
-    shard_size : int
-        All looks but the last are multiples of it.
-    ratio : float
-        Of the geometric grid, above 1.
+    The last is `n_episodes`, all others are multiples of ``shard_size``, nearest to a geometric grid of this ratio.
     """
     looks: list[int] = []
     target = float(shard_size)
@@ -59,10 +52,8 @@ class StopRule:
         The campaign's ``stop`` section.
     method : str
         ``testing.method``; decides whose interval is watched unless ``stop.estimator`` does.
-    shard_size : int
-        ``run.shard_size``.
-    ratio : float
-        Of the geometric grid of looks.
+    shard_size, ratio
+        See `look_grid`.
     min_crashes : int
         Floor on sampled crashes where ``stop.min_crashes`` says nothing.
 
@@ -80,11 +71,9 @@ class StopRule:
         Conditions that were missing when a look last failed: what decided, or what is still missing.
     heaviest : float
         By how much of itself one more crash of the largest weight would have moved the last look's estimate.
-    pool_too_rough : bool
-        Always False: no pool is behind these estimates.
     """
 
-    pool_too_rough = False
+    pool_too_rough = False  # no pool is behind these estimates
 
     def __init__(
         self,
@@ -100,24 +89,16 @@ class StopRule:
         self.reached = False
         self.rhw = self.heaviest = math.inf
         self.waited_for: tuple[str, ...] = ()
-        self._stop = campaign_stop
+        self._target = campaign_stop.rhw
         self._min_crashes = campaign_stop.min_crashes or min_crashes
-        self._n_seen = 0
-        self._n_passes = 0
+        self._n_seen = self._n_passes = 0
 
     def due(self, n: int) -> bool:
         """Whether `observe` wants the estimate of the first ``n`` episodes."""
         return self._n_seen < len(self.looks) and n == self.looks[self._n_seen]
 
     def observe(self, n: int, estimate: Estimate) -> bool:
-        """Whether to stop after the look at `n` episodes.
-
-        Parameters
-        ----------
-        n : int
-            The next of `looks`.
-        estimate : Estimate
-            Of `estimator`, from exactly the first n episodes.
+        """Whether to stop after the look at `n` episodes, the next of `looks`, with the estimate from exactly these.
 
         Raises
         ------
@@ -126,7 +107,7 @@ class StopRule:
         """
         if self.reached or self._n_seen == len(self.looks):
             raise ValueError("the campaign has already stopped")
-        if n != self.looks[self._n_seen] or estimate.n_episodes != n:
+        if not self.due(n) or estimate.n_episodes != n:
             raise ValueError(
                 f"expected the estimate of the first {self.looks[self._n_seen]} episodes, "
                 f"got n = {n} with an estimate of {estimate.n_episodes}"
@@ -135,8 +116,8 @@ class StopRule:
         self.rhw = estimate.precision
         total = n * estimate.crash_rate
         self.heaviest = estimate.weight_cap / total if total > 0.0 else math.inf
-        if self._stop.rhw is not None:
-            missing = self._missing(estimate, self._stop.rhw)
+        if self._target is not None:
+            missing = self._missing(estimate, self._target)
             self._n_passes = 0 if missing else self._n_passes + 1
             self.reached = self._n_passes >= PASSES_NEEDED
             self.waited_for = missing or self.waited_for

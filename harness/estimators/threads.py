@@ -9,6 +9,7 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
+from itertools import islice
 from typing import TypeVar
 
 from threadpoolctl import ThreadpoolController
@@ -18,41 +19,26 @@ _Result = TypeVar("_Result")
 
 
 @cache
-def _threads() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="estimators")
-
-
-@cache
-def _libraries() -> ThreadpoolController:
-    return ThreadpoolController()
+def _shared() -> tuple[ThreadPoolExecutor, ThreadpoolController]:
+    return ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="estimators"), ThreadpoolController()
 
 
 def side_by_side(
     function: Callable[[_Item], _Result], items: Sequence[_Item], *, worthwhile: bool = True
 ) -> list[_Result]:
-    """Results of a function that lets go of the interpreter lock, for independent items, in their order.
+    """Results, in order, of a function that lets go of the interpreter lock, for items independent of each other.
 
-    Parameters
-    ----------
-    function : callable
-    items : sequence
-    worthwhile : bool
-        False does it without threads: handing over a trifle costs more than doing it.
+    Without threads where that is not ``worthwhile``: handing over a trifle costs more than doing it.
     """
-    with _libraries().limit(limits=1, user_api="blas"):  # BLAS's own threads would wait for each other in busy loops
-        return list(_threads().map(function, items)) if worthwhile else [function(item) for item in items]
+    threads, libraries = _shared()
+    with libraries.limit(limits=1, user_api="blas"):  # BLAS's own threads would wait for each other in busy loops
+        return list(threads.map(function, items)) if worthwhile else [function(item) for item in items]
 
 
 def read_ahead(items: Iterator[_Item]) -> Iterator[_Item]:
     """The same items, the next one being made in a thread while the present one is in use."""
     with ThreadPoolExecutor(1, thread_name_prefix="read-ahead") as thread:
-        coming = thread.submit(_next, items)
-        while (following := coming.result()) is not None:
-            coming = thread.submit(_next, items)
+        coming = thread.submit(list, islice(items, 1))
+        while following := coming.result():
+            coming = thread.submit(list, islice(items, 1))
             yield following[0]
-
-
-def _next(items: Iterator[_Item]) -> tuple[_Item] | None:
-    for item in items:
-        return (item,)
-    return None

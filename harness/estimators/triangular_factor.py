@@ -16,8 +16,7 @@ from numba.extending import get_cython_function_address
 from harness.arrays import FloatArray
 
 _PANEL = 32
-_N_ARGUMENTS = 12
-_DTPQRT = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * _N_ARGUMENTS)(
+_DTPQRT = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 12)(
     get_cython_function_address("scipy.linalg.cython_lapack", "dtpqrt")
 )
 """LAPACK's own routine: scipy's Python wrapper of it keeps the interpreter lock, so that no two threads could fold."""
@@ -26,11 +25,6 @@ _DTPQRT = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * _N_ARGUMENTS)(
 def empty_factor(n_columns: int) -> FloatArray:
     """Factor of a matrix without rows, shape (k, k)."""
     return np.zeros((n_columns, n_columns), order="F")
-
-
-def short_factor(rows: FloatArray) -> FloatArray:
-    """Factor of fewer rows than columns, shape (m, k) like ``rows``: the further rows of a square one would be 0."""
-    return np.asarray(np.linalg.qr(rows, mode="r"))
 
 
 def fold_rows(factor: FloatArray, rows: FloatArray) -> None:
@@ -55,21 +49,10 @@ def fold_rows(factor: FloatArray, rows: FloatArray) -> None:
         return
     panel = min(_PANEL, k)
     reflectors, work = np.empty((panel, k), order="F"), np.empty(panel * k)
-    size, info = [ctypes.c_int(value) for value in (m, k, 0, panel)], ctypes.c_int()
-    n_rows, n_columns, rows_already_triangular, n_panel = map(ctypes.addressof, size)
-    _DTPQRT(
-        n_rows,
-        n_columns,
-        rows_already_triangular,
-        n_panel,
-        factor.ctypes.data,
-        n_columns,
-        rows.ctypes.data,
-        n_rows,
-        reflectors.ctypes.data,
-        n_panel,
-        work.ctypes.data,
-        ctypes.addressof(info),
-    )
+    sizes, info = [ctypes.c_int(value) for value in (m, k, 0, panel)], ctypes.c_int()
+    rows_, columns, rows_already_triangular, panel_ = map(ctypes.addressof, sizes)
+    a, b, t, scratch = (array.ctypes.data for array in (factor, rows, reflectors, work))
+    of_result = ctypes.addressof(info)
+    _DTPQRT(rows_, columns, rows_already_triangular, panel_, a, columns, b, rows_, t, panel_, scratch, of_result)
     if info.value != 0:
         raise ArithmeticError(f"LAPACK dtpqrt refused argument {-info.value}")

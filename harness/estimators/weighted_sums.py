@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -16,7 +17,6 @@ from harness.estimators.block import Block
 from harness.estimators.estimate import Estimate
 from harness.estimators.intervals import capped_mean_upper, skewed_distances
 from harness.estimators.moments import Moments
-from harness.methods import Method
 
 FEW_CRASHES = 50
 FEW_EFFECTIVE = 30.0
@@ -32,63 +32,33 @@ UNBOUNDED = "the weights of these tests are unbounded: the true rate may lie far
 
 
 class WeightedSums:
-    """Running moments of Y, and the largest weights; one pass.
-
-    Attributes
-    ----------
-    n, n_crashes : int
-        Episodes and crashes so far.
-    y : Moments
-        Of Y = 1{crash}·weight.
-    """
+    """Running moments ``y`` of Y, numbers of episodes and crashes, and the largest weights; one pass."""
 
     def __init__(self) -> None:
-        self.n = 0
-        self.n_crashes = 0
+        self.n = self.n_crashes = 0
         self.y = Moments()
-        self.method: Method | None = None
-        self._largest_y = 0.0
-        self._largest_cut_in_log_weight = -math.inf
-        self._largest_log_weight = -math.inf
-        self._largest_log_path_cap = -math.inf
-        self._design_cap = -math.inf
-        self._has_path_caps = True
+        self._largest_y = self._design_cap = self._log_path_cap = -math.inf
+        self._largest_log_weight = self._largest_cut_in_log_weight = -math.inf
 
     def add(self, block: Block) -> None:
         """Add the episodes of one block."""
         weights = np.exp(block.log_weight[block.crash])
-        self.method = block.method
         self.n += len(block)
         self.n_crashes += len(weights)
         self.y.add(weights)
-        self._largest_y = max(self._largest_y, _largest(weights))
-        self._add_caps(block)
-
-    def _add_caps(self, block: Block) -> None:
-        self._largest_log_weight = max(self._largest_log_weight, _largest(block.log_weight))
-        cut_in = block.log_weight[block.cut_in]
-        self._largest_cut_in_log_weight = max(self._largest_cut_in_log_weight, _largest(cut_in))
+        self._largest_y = _larger(self._largest_y, weights)
+        self._largest_log_weight = _larger(self._largest_log_weight, block.log_weight)
+        self._largest_cut_in_log_weight = _larger(self._largest_cut_in_log_weight, block.log_weight[block.cut_in])
         self._design_cap = max(self._design_cap, math.inf if block.weight_cap is None else block.weight_cap)
-        share = {"forced": 1.0, "episode_mixture": float(block.alpha[0]) if len(block.alpha) else 0.0}.get(block.method)
-        if block.log_p_cut_in is None or not share:
-            self._has_path_caps = False
-        else:
-            path_cap = _largest(block.log_p_cut_in) - math.log(share)
-            self._largest_log_path_cap = max(self._largest_log_path_cap, path_cap)
+        self._log_path_cap = max(self._log_path_cap, block.log_path_cap())
 
     def mean(self) -> float:
         """ΣY/n."""
         return self.y.mean(self.n)
 
-    def n_effective(self) -> float:
-        """(ΣY)²/ΣY², 0 without a crash."""
-        squares = self.y.squares
-        return self.y.total**2 / squares if squares > 0.0 else 0.0
-
     def largest_share(self) -> float:
         """Largest Y as a share of ΣY, 0 without a crash."""
-        total = self.y.total
-        return self._largest_y / total if total > 0.0 else 0.0
+        return self._largest_y / self.y.total if self.y.total > 0.0 else 0.0
 
     def known_cap(self) -> float:
         """Largest Y that the tests could have had, whatever the AV does; infinite where nothing bounds it.
@@ -98,8 +68,8 @@ class WeightedSums:
         """
         if math.isfinite(self._design_cap):
             return max(self._design_cap, self._largest_y)
-        if self._has_path_caps and math.isfinite(self._largest_log_path_cap):
-            return max(math.exp(self._largest_log_path_cap), self._largest_y)
+        if math.isfinite(self._log_path_cap):
+            return max(math.exp(self._log_path_cap), self._largest_y)
         return math.inf
 
     def cap(self) -> tuple[float, str]:
@@ -116,7 +86,7 @@ class WeightedSums:
 
     def is_settled(self) -> bool:
         """Whether there are enough crashes for limits from moments to mean what they say."""
-        return self.n_crashes >= FEW_CRASHES and self.n_effective() >= FEW_EFFECTIVE
+        return self.n_crashes >= FEW_CRASHES and self.y.n_effective >= FEW_EFFECTIVE
 
     def cautions(self) -> list[str]:
         """Why an interval around a mean of these Y may be wrong."""
@@ -135,15 +105,20 @@ class WeightedSums:
             )
         return found
 
-    def warnings(self) -> list[str]:
-        """What else a reader of a mean of these Y should know."""
-        found = count_warnings(self.n_crashes)
-        if 0.0 < self.n_effective() < FEW_EFFECTIVE:
-            found.append(f"effective sample size {self.n_effective():.3g} is below 30: few weights carry the estimate")
+    def warnings(self, half_width: float) -> list[str]:
+        """What else a reader of a mean of these Y should know, beside an interval of this half-width."""
+        found, effective, cap = count_warnings(self.n_crashes), self.y.n_effective, self.known_cap()
+        if 0.0 < effective < FEW_EFFECTIVE:
+            found.append(f"effective sample size {effective:.3g} is below 30: few weights carry the estimate")
         if self.largest_share() > LARGE_SHARE:
             found.append(f"one crash carries {self.largest_share():.0%} of the estimate")
         if not math.isfinite(self._design_cap) and not self.is_settled():
             found.append(f"the upper bound rests on {self.cap()[1]}, not on a cap guaranteed by design")
+        if 0.0 < half_width < cap / self.n < math.inf:  # where it would overturn the rate, there is a caution too
+            found.append(
+                f"one more crash of the largest weight that the design allows ({cap:.3g}) would move the estimate by "
+                f"{cap / self.n:.3g}, farther than the interval reaches: only more tests can rule that out"
+            )
         return found
 
 
@@ -162,7 +137,7 @@ def weighted_estimate(
     *,
     third_moment: float | None,
     method: str,
-    details: dict[str, object],
+    details: dict[str, Any],
     warnings: Sequence[str] = (),
     cautions: Sequence[str] = (),
 ) -> Estimate:
@@ -174,14 +149,10 @@ def weighted_estimate(
 
     Parameters
     ----------
-    sums : WeightedSums
-    rate, std_error, confidence : float
     third_moment : float or None
         Third central moment of the error of ``rate``; None for a plain normal interval.
-    method : str
-    details : dict
-    warnings, cautions : sequence of str
-        The estimator's own.
+    method, details, warnings, cautions
+        The estimator's own; see `Estimate`.
     """
     cap, origin = sums.cap()
     hoeffding = capped_mean_upper(sums.mean(), cap, sums.n, confidence)
@@ -208,29 +179,18 @@ def weighted_estimate(
         rhw=half / rate if rate > 0.0 else math.inf,
         n_episodes=sums.n,
         n_crashes=sums.n_crashes,
-        n_effective=sums.n_effective(),
+        n_effective=sums.y.n_effective,
         largest_weight_share=sums.largest_share(),
         method=f"{method}; {interval}; {bound}",
         weight_cap=sums.known_cap(),
         cautions=cautions,
-        warnings=(*cautions, *sums.warnings(), *_cap_warning(sums, half), *warnings),
+        warnings=(*cautions, *sums.warnings(half), *warnings),
         details={"upper_bound_hoeffding": hoeffding, **details},
     )
 
 
-def _cap_warning(sums: WeightedSums, half_width: float) -> list[str]:
-    """Warn where one unseen crash would leave the interval; where it would overturn the rate, that is a caution."""
-    move = sums.known_cap() / sums.n
-    if not 0.0 < half_width < move < math.inf:
-        return []
-    return [
-        f"one more crash of the largest weight that the design allows ({sums.known_cap():.3g}) would move the estimate "
-        f"by {move:.3g}, farther than the interval reaches: only more tests can rule that out"
-    ]
-
-
-def _largest(values: FloatArray) -> float:
-    return float(np.max(values, initial=-math.inf))
+def _larger(so_far: float, values: FloatArray) -> float:
+    return max(so_far, float(np.max(values, initial=-math.inf)))
 
 
 def _exp(log_value: float) -> float:

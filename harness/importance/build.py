@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from harness.arrays import BoolArray, Float32Array
+from harness.arrays import BoolArray, Float32Array, read_only
 from harness.campaign.models import Campaign
 from harness.criticality.after_cut_in import level_steps
 from harness.criticality.tables import Tables
@@ -42,14 +42,7 @@ def mixture_weights(campaign: Campaign) -> tuple[float, ...]:
 
 
 def build_importance(campaign: Campaign, tables: Tables | None) -> Importance:
-    """Importance functions of a campaign.
-
-    Parameters
-    ----------
-    campaign : Campaign
-    tables : Tables, optional
-        Challenge tables of its surrogates; not needed by ``nde`` and ``forced``.
-    """
+    """Importance functions of a campaign; ``nde`` and ``forced`` need no challenge tables."""
     method = campaign.testing.method
     recursive = campaign.testing.challenge == "recursive"
     none = _none(5), _none(5), _none(5), np.zeros((0, 1, 1, 1), np.bool_)
@@ -69,15 +62,8 @@ def build_importance(campaign: Campaign, tables: Tables | None) -> Importance:
 def harmless_cells(maneuvers: Float32Array, *, recursive: bool) -> BoolArray:
     """Grid cells in which every acceleration has challenge 0, wherever in the cell it is interpolated.
 
-    Parameters
-    ----------
-    maneuvers : ndarray of float32, shape (J, v, R2, R2dot, 31)
-        Probabilities (recursive) or smallest gaps in metres (immediate).
-    recursive : bool
-
-    Returns
-    -------
-    ndarray of bool, shape (J, v - 1, R2 - 1, R2dot - 1)
+    ``maneuvers`` (J, v, R2, R2dot, 31) are probabilities (recursive) or smallest gaps in metres (immediate); the result
+    has shape (J, v - 1, R2 - 1, R2dot - 1).
     """
     cells: BoolArray = maneuvers.max(-1) == 0.0 if recursive else maneuvers.min(-1) > CONTACT_M + _ROUNDING_M
     for axis in (1, 2, 3):
@@ -88,6 +74,4 @@ def harmless_cells(maneuvers: Float32Array, *, recursive: bool) -> BoolArray:
 
 def _none(dimensions: int) -> Float32Array:
     """No table; read-only like those that are mapped, for kernels to be compiled once."""
-    none = np.zeros((0,) + (1,) * (dimensions - 1), np.float32)
-    none.flags.writeable = False
-    return none
+    return read_only(np.zeros((0,) + (1,) * (dimensions - 1), np.float32))

@@ -14,7 +14,7 @@ from typing import NamedTuple
 from harness.arrays import BoolArray, Float32Array, FloatArray
 from harness.compiled import compiled_inline
 from harness.criticality.before_cut_in import level_of
-from harness.criticality.grid import interpolate, interpolate_maneuvers, locate_after, locate_before
+from harness.criticality.grid import AFTER, BEFORE, interpolate, interpolate_maneuvers, locate
 from harness.environment.cut_in import acceptance
 from harness.environment.driving import Environment
 from harness.maneuvers import N_ACCELERATIONS
@@ -81,7 +81,7 @@ def look_ahead(
         after = next_speed(speed, bv_acceleration)
         r2 += (0.5 * (speed + after) - follower) * STEP_S
         speed = after
-        where = locate_after(speed, r2, speed - follower)
+        where = locate(AFTER, speed, r2, speed - follower)
         level = level_of(step + i, n.max_steps, importance.steps_per_level, importance.value.shape[1] - 1)
         for j in range(importance.n_surrogates):
             challenge = 0.0
@@ -93,7 +93,7 @@ def look_ahead(
         stay_challenge[:, :] = 0.0
         return
     period = (step + hold) // hold
-    where_end = locate_before(speed, r2, speed - follower)
+    where_end = locate(BEFORE, speed, r2, speed - follower)
     for j in range(importance.n_surrogates):
         later = 0.0
         if r2 > 0.0 and period < importance.before.shape[1]:
@@ -114,21 +114,10 @@ def propose_cut_in(
     q: FloatArray,
     v: FloatArray,
 ) -> bool:
-    """Probability of ``cut_in`` under every surrogate's importance function.
+    """Probability of ``cut_in`` under every surrogate's importance function; returns whether the moment is critical.
 
-    Parameters
-    ----------
-    p : float
-        Exposure of ``cut_in``.
-    opportunity_1s : float
-        OL of the state, which turns ``stay_challenge`` (J,) into a probability.
-    q, v : ndarray, shape (J,)
-        Receive q_j(cut_in | s) and V_j(s).
-
-    Returns
-    -------
-    bool
-        Whether the moment is critical.
+    ``p`` is the exposure of ``cut_in``, ``opportunity_1s`` OL of the state, which turns ``stay_challenge`` (J,) into a
+    probability. ``q`` (J,) receives q_j(cut_in | s), ``v`` (J,) V_j(s).
     """
     critical = False
     for j in range(importance.n_surrogates):
@@ -144,18 +133,12 @@ def propose_cut_in(
 
 
 @compiled_inline
-def is_harmless(j: int, where: tuple[int, float, int, float, int, float], importance: Importance) -> bool:
-    """Whether no acceleration challenges surrogate ``j`` in the grid cell of `locate_after`."""
-    return bool(importance.harmless[j, where[0], where[2], where[4]])
-
-
-@compiled_inline
 def challenges_nobody(state: State, importance: Importance) -> bool:
     """Whether a state after the cut-in is seen to be uncritical without a look at any acceleration."""
-    where = locate_after(state.v_bv_mps, state.r2_m, state.r2dot_mps)
+    i, _, j, _, k, _ = locate(AFTER, state.v_bv_mps, state.r2_m, state.r2dot_mps)
     harmless = True
-    for j in range(importance.n_surrogates):
-        harmless = harmless and is_harmless(j, where, importance)
+    for surrogate in range(importance.n_surrogates):
+        harmless = harmless and importance.harmless[surrogate, i, j, k]
     return harmless
 
 
@@ -166,10 +149,10 @@ def propose_acceleration(state: State, p: FloatArray, importance: Importance, q:
     ``p`` (31,) is the exposure; ``q`` (J, 31) and ``v`` (J,) receive the results. Returns whether the moment is
     critical.
     """
-    where = locate_after(state.v_bv_mps, state.r2_m, state.r2dot_mps)
+    where = locate(AFTER, state.v_bv_mps, state.r2_m, state.r2dot_mps)
     critical = False
     for j in range(importance.n_surrogates):
-        if is_harmless(j, where, importance):
+        if importance.harmless[j, where[0], where[2], where[4]]:
             v[j] = 0.0
             for m in range(N_ACCELERATIONS):
                 q[j, m] = p[m]

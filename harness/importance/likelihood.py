@@ -33,31 +33,6 @@ def log_mixture(alpha: FloatArray, log_ratio: FloatArray) -> float:
 
 
 @compiled_inline
-def predictive_weights(method: int, alpha: FloatArray, log_ratio: FloatArray, out: FloatArray) -> None:
-    """Weights of the importance functions in the next step, given the shared history: ``out`` (M,), summing to 1."""
-    if method != EPISODE_MIXTURE:
-        for j in range(alpha.size):
-            out[j] = alpha[j]
-        return
-    total = log_mixture(alpha, log_ratio)
-    for j in range(alpha.size):
-        out[j] = alpha[j] * math.exp(log_ratio[j] - total)
-
-
-@compiled_inline
-def add_martingale(
-    weight_before: float, v: FloatArray, ratio: FloatArray, first: int, sampled: float, out: FloatArray
-) -> None:
-    """Add W_{t−1} V_j (q_{j,t}/q_{α,t} − 1) to ``out`` (J,).
-
-    ``ratio`` (M,) holds q_j/p of the maneuver taken, surrogates from index ``first`` on; ``sampled`` is q_α/p.
-    """
-    for j in range(v.size):
-        if v[j] > 0.0:
-            out[j] += weight_before * v[j] * (ratio[first + j] / sampled - 1.0)
-
-
-@compiled_inline
 def accumulate(
     method: int,
     first: int,
@@ -67,35 +42,21 @@ def accumulate(
     log_sampled: float,
     log_ratio: FloatArray,
     martingale: FloatArray,
-    weight: FloatArray,
 ) -> float:
-    """Take the maneuver of one step into an episode's likelihood ratios.
+    """Take the maneuver of one step into an episode's likelihood ratios; returns q_α/p, given the shared history.
 
-    Parameters
-    ----------
-    method, first : int
-        Sampling method; index of the first surrogate among the importance functions.
-    alpha, ratio : ndarray, shape (M,)
-        Mixture weights, and q_j/p of the maneuver taken.
-    v : ndarray, shape (J,)
-        V_j(s); 0 where the moment is not critical.
-    log_sampled : float
-        Step mixture: Σ log q_α/p of the steps before.
-    log_ratio, martingale : ndarray, shapes (M,) and (J,)
-        Updated.
-    weight : ndarray, shape (M,)
-        Scratch.
-
-    Returns
-    -------
-    float
-        q_α/p of the step, given the shared history.
+    ``ratio`` (M,) is q_j/p of the maneuver, surrogates from index ``first`` on; ``v`` (J,) is V_j(s), 0 where the
+    moment is not critical; ``log_sampled`` is the step mixture's Σ log q_α/p of the steps before. ``log_ratio`` (M,)
+    is updated, ``martingale`` (J,) increased by W_{t−1} V_j (q_{j,t}/q_{α,t} − 1).
     """
-    predictive_weights(method, alpha, log_ratio, weight)
     before = log_mixture(alpha, log_ratio) if method == EPISODE_MIXTURE else log_sampled
     sampled = 0.0
     for j in range(ratio.size):
-        sampled += weight[j] * ratio[j]
+        weight = alpha[j] * math.exp(log_ratio[j] - before) if method == EPISODE_MIXTURE else alpha[j]
+        sampled += weight * ratio[j]
         log_ratio[j] += math.log(ratio[j])
-    add_martingale(math.exp(-before), v, ratio, first, sampled, martingale)
+    weight_before = math.exp(-before)
+    for j in range(v.size):
+        if v[j] > 0.0:
+            martingale[j] += weight_before * v[j] * (ratio[first + j] / sampled - 1.0)
     return sampled

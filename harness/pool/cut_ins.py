@@ -56,25 +56,19 @@ class Pool:
     Attributes
     ----------
     key : str
-        Content hash of all that it was made from.
-    environment : str
-        Content hash of its environment, see `environment_hash`.
-    library : Library
+        Content hash of all that it was made from; ``environment`` is that of its environment.
     names : tuple of str, length D
         Surrogates from careful to careless, by crash rate.
     n_paths : int
         Paths that the probabilities come from.
     p_cut_in, p_cut_in_se : float
         Probability that BV cuts in in a test, and its standard error.
-    mu : ndarray, shape (D,)
-        Crash rates of the surrogates, per test.
-    mu_covariance : ndarray, shape (D, D)
-        Of their errors.
+    mu, mu_covariance : ndarray, shapes (D,) and (D, D)
+        Crash rates of the surrogates, per test, and the covariance of their errors.
     shell_p : ndarray, shape (D + 1,)
         Probability of each shell; the last is a cut-in on which no surrogate crashes.
     shell_moments : ndarray, shape (D + 1, D + 1)
         Mean product of a path's probabilities in two shells.
-    cut_ins : CutIns
     """
 
     key: str
@@ -91,13 +85,15 @@ class Pool:
     cut_ins: CutIns
 
     @property
-    def mu_se(self) -> FloatArray:
-        """Standard errors of the surrogates' crash rates, shape (D,)."""
-        return np.sqrt(np.diag(self.mu_covariance))
+    def boundary(self) -> int:
+        """Index of the outermost shell that the conditional statement keeps."""
+        return self.names.index(self.library.boundary)
 
     def to_json(self) -> dict[str, Any]:
         """What is known of surrogates and shells, as plain content."""
-        mu, se, p = self.mu.tolist(), self.mu_se.tolist(), self.shell_p.tolist()
+        p = self.shell_p.tolist()
+        columns = self.names, self.mu.tolist(), np.sqrt(np.diag(self.mu_covariance)).tolist(), p[:-1]
+        keys = "name", "crash_rate", "std_error", "shell_probability"
         return {
             "pool": self.key,
             "n_paths": self.n_paths,
@@ -105,17 +101,9 @@ class Pool:
             "p_cut_in_std_error": self.p_cut_in_se,
             "boundary": self.library.boundary,
             "envelope": self.library.envelope,
-            "surrogates": [
-                {"name": name, "crash_rate": mu[k], "std_error": se[k], "shell_probability": p[k]}
-                for k, name in enumerate(self.names)
-            ],
+            "surrogates": [dict(zip(keys, row, strict=True)) for row in zip(*columns, strict=True)],
             "no_surrogate_crashes": p[-1],
         }
-
-    @property
-    def boundary(self) -> int:
-        """Index of the outermost shell that the conditional statement keeps."""
-        return self.names.index(self.library.boundary)
 
 
 def environment_hash(environment: Environment) -> str:
@@ -127,12 +115,8 @@ def environment_hash(environment: Environment) -> str:
 def shells_of(crashes: IntArray, order: IntArray) -> Int8Array:
     """Shell of cut-ins: the place in the order of the first surrogate that crashes, D if none does.
 
-    Parameters
-    ----------
-    crashes : ndarray of int64, any shape
-        One bit per surrogate.
-    order : ndarray, shape (D,)
-        Bits from the most careful surrogate to the most careless.
+    ``crashes``, of any shape, has one bit per surrogate; ``order`` (D,) are the bits from the most careful surrogate to
+    the most careless.
     """
     shell = np.full(crashes.shape, len(order), np.int8)
     for place in reversed(range(len(order))):

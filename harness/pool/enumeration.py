@@ -15,7 +15,7 @@ import math
 
 from harness.arrays import FloatArray, Int8Array, IntArray, RecordArray
 from harness.compiled import compiled_threads
-from harness.environment.driving import Environment, draw_free_driving
+from harness.environment.driving import Environment, draw_acceleration, free_driving
 from harness.episode.trajectory import Trajectory, leave, walk, who_crashes, write_hazards
 from harness.maneuvers import CUT_IN, acceleration
 from harness.outcomes import LV
@@ -42,22 +42,14 @@ def enumerate_cut_ins(
     probability: FloatArray,
     crashes: IntArray,
 ) -> None:
-    """Every ``stride``-th cut-in of consecutive paths.
+    """Every ``stride``-th cut-in of consecutive paths, from index ``first`` and initial ``states`` (n,) on.
 
     Parameters
     ----------
-    seed, first : int
-        Pool seed, and index of the first path.
-    states : structured ndarray, shape (n,)
-        Initial states.
     drivers : structured ndarray, shape (D,)
-        At most 62 of them, without inattention.
-    envelope : int
-        See `harness.episode.trajectory.who_crashes`.
-    stride : int
-        Steps from one cut-in that is asked to the next; 1 for all.
+        At most 62 of them, without inattention; ``envelope`` as in `harness.episode.trajectory.who_crashes`.
     offset : ndarray of int64, shape (n,)
-        Step of each path's first one, less than ``stride``.
+        Step of each path's first cut-in that is asked, less than ``stride``.
     path : Trajectory
         Room to work in.
     probability : ndarray, shape (n, steps)
@@ -97,21 +89,10 @@ def write_pairs(
     n_lv: IntArray,
     n_bv: IntArray,
 ) -> None:
-    """Maneuvers of chosen (path, cut-in) pairs, as an episode records them.
+    """Maneuvers of chosen (path, cut-in step) pairs, ``indices`` and ``cuts`` (n,), as an episode records them.
 
-    Parameters
-    ----------
-    seed : int
-    indices, cuts : ndarray, shape (n,)
-        Path and cut-in step of each.
-    states : structured ndarray, shape (n,)
-        Initial states.
-    path : Trajectory
-        Room to work in.
-    lv, bv : ndarray of int8, shape (n, draws)
-        Receive the maneuvers; 31 marks the cut-in. LV goes on to draw, to the end of the episode.
-    n_lv, n_bv : ndarray, shape (n,)
-        Receive how many there are.
+    ``lv``, ``bv`` (n, draws) receive them, 31 marking the cut-in; ``n_lv``, ``n_bv`` (n,) how many there are. LV goes
+    on to draw, to the end of the episode. ``path`` is room to work in.
     """
     n = environment.numbers
     for i in range(indices.size):
@@ -130,5 +111,6 @@ def write_pairs(
         for step in range(n.max_steps):
             m = step // n.hold_steps
             if step % n.hold_steps == 0 and m >= before:
-                lv[i, m] = draw_free_driving(uniform(seed, indices[i], LV_DRAWS, m), v, environment)
+                u = uniform(seed, indices[i], LV_DRAWS, m)
+                lv[i, m] = draw_acceleration(u, free_driving(v, environment), environment)
             v = next_speed(v, acceleration(lv[i, m]))

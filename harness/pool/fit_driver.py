@@ -8,8 +8,11 @@ look alike at first sight, so both are tried together; the jerk limit is kept on
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
+from operator import attrgetter
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -23,7 +26,8 @@ from harness.vehicles.models import driver_records, expected_accelerations
 MOST_DELAY_STEPS = 20
 ROUGH_EVALUATIONS, LAST_EVALUATIONS = 6, 60
 FINALISTS = 3
-JERK_STARTS_MPS3 = (3.0, 8.0, 20.0)
+JERK_STARTS_MPS3 = ((3.0,), (8.0,), (20.0,))
+_NO_JERK_LIMIT = ((),)
 JERK_GAIN = 0.9
 """A jerk limit is kept if it brings the error down to this share, or below."""
 USUAL_DIFFERENCE_MPS2 = 0.5
@@ -82,36 +86,30 @@ def agreement(driver: LibraryIDM, observed: Observed) -> tuple[float, float]:
 
 
 def fit_driver(observed: Observed, max_acceleration_mps2: float) -> FittedDriver:
-    """The driver that is closest to what was observed.
-
-    Parameters
-    ----------
-    observed : Observed
-    max_acceleration_mps2 : float
-        The most that the driver may accelerate, that of a library's envelope.
-    """
-    plain, smooth = (_best(observed, max_acceleration_mps2, starts) for starts in ((None,), JERK_STARTS_MPS3))
+    """The driver that is closest to what was observed; it may accelerate as hard as a library's envelope at most."""
+    plain, smooth = (_best(observed, max_acceleration_mps2, starts) for starts in (_NO_JERK_LIMIT, JERK_STARTS_MPS3))
     plain_rms, smooth_rms = agreement(plain, observed)[0], agreement(smooth, observed)[0]
     driver = smooth if plain_rms > NOISE_FLOOR_MPS2 and smooth_rms < JERK_GAIN * plain_rms else plain
     return FittedDriver(driver, *agreement(driver, observed), observed.episode.size)
 
 
-def _best(observed: Observed, most: float, jerk_starts: tuple[float | None, ...]) -> LibraryIDM:
+def _best(observed: Observed, most: float, jerk_starts: Sequence[Sequence[float]]) -> LibraryIDM:
     """The best driver with a jerk limit, or without one."""
-    starts = [
-        (delay, [*_start(observed), *([] if jerk is None else [jerk])])
-        for delay in range(MOST_DELAY_STEPS + 1)
-        for jerk in jerk_starts
+    starts = [[*_start(observed), *jerk] for jerk in jerk_starts]
+    rough = [
+        _fit(observed, most, delay, start, ROUGH_EVALUATIONS)
+        for delay, start in product(range(MOST_DELAY_STEPS + 1), starts)
     ]
-    rough = sorted((_fit(observed, most, delay, start, ROUGH_EVALUATIONS) for delay, start in starts), key=_error)
-    return min((_fit(observed, most, fit[1], fit[2], LAST_EVALUATIONS) for fit in rough[:FINALISTS]), key=_error)[3]
+    finalists = sorted(rough, key=attrgetter("rms_mps2"))[:FINALISTS]
+    last = [_fit(observed, most, fit.delay, fit.numbers, LAST_EVALUATIONS) for fit in finalists]
+    return min(last, key=attrgetter("rms_mps2")).driver
 
 
-_Fit = tuple[float, int, list[float], LibraryIDM]
-
-
-def _error(fit: _Fit) -> float:
-    return fit[0]
+class _Fit(NamedTuple):
+    rms_mps2: float
+    delay: int
+    numbers: list[float]
+    driver: LibraryIDM
 
 
 def _start(observed: Observed) -> list[float]:
@@ -122,13 +120,11 @@ def _start(observed: Observed) -> list[float]:
 
 
 def _fit(observed: Observed, most: float, delay: int, start: list[float], evaluations: int) -> _Fit:
-    """Squared error, delay, numbers and driver after some evaluations from a start."""
-    bounds = [*_BOUNDS.values(), *([_JERK_BOUNDS_MPS3] if len(start) > len(_BOUNDS) else [])]
-    build = _builder(most, delay)
-    low, high = np.array(bounds).T
+    """The driver after some evaluations from a start."""
+    low, high = np.array([*_BOUNDS.values(), _JERK_BOUNDS_MPS3][: len(start)]).T
 
     def difference(numbers: FloatArray) -> FloatArray:
-        return expected(build(numbers), observed) - observed.acceleration
+        return expected(_driver(numbers.tolist(), most, delay), observed) - observed.acceleration
 
     result = least_squares(
         difference,
@@ -142,19 +138,12 @@ def _fit(observed: Observed, most: float, delay: int, start: list[float], evalua
         max_nfev=evaluations,
     )
     numbers = [float(f"{number:.4g}") for number in result.x]
-    driver = build(np.array(numbers))
-    return agreement(driver, observed)[0], delay, numbers, driver
+    driver = _driver(numbers, most, delay)
+    return _Fit(agreement(driver, observed)[0], delay, numbers, driver)
 
 
-def _builder(most: float, delay: int) -> Callable[[FloatArray], LibraryIDM]:
-    def build(numbers: FloatArray) -> LibraryIDM:
-        values = [float(number) for number in numbers]
-        parameters = dict(zip(_BOUNDS, values, strict=False))
-        jerk = values[len(_BOUNDS)] if len(values) > len(_BOUNDS) else None
-        return LibraryIDM(
-            model="idm",
-            parameters=IDMParameters(**parameters, max_acceleration_mps2=most),
-            reaction=Reflexes(delay_s=delay / 10.0, max_jerk_mps3=jerk),
-        )
-
-    return build
+def _driver(numbers: list[float], most: float, delay: int) -> LibraryIDM:
+    parameters = dict(zip(_BOUNDS, numbers, strict=False), max_acceleration_mps2=most)
+    jerk = numbers[len(_BOUNDS)] if len(numbers) > len(_BOUNDS) else None
+    reaction = Reflexes(delay_s=delay / 10.0, max_jerk_mps3=jerk)
+    return LibraryIDM(model="idm", parameters=IDMParameters(**parameters), reaction=reaction)

@@ -20,6 +20,7 @@ WINDOW_STEPS = 60
 """Steps after a cut-in that are looked at: within 6 s it is decided whether it was dangerous."""
 FEWEST_CUT_INS = 40
 _COLUMNS = ["episode", "step", "vehicle", "x_m", "v_mps", "a_mps2"]
+_SERIES = ("speed", "lead_speed", "gap", "acceleration")
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,8 +49,7 @@ class Observed:
         lengths = np.diff(self.begin)[cut_ins]
         begin = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64)
         rows = np.arange(begin[-1]) + np.repeat(self.begin[cut_ins] - begin[:-1], lengths)
-        series = (values[rows] for values in (self.speed, self.lead_speed, self.gap, self.acceleration))
-        return Observed(self.episode[cut_ins], begin, *series)
+        return Observed(self.episode[cut_ins], begin, *(getattr(self, name)[rows] for name in _SERIES))
 
 
 def read_observed(folder: Path, campaign: Campaign) -> Observed:
@@ -68,21 +68,20 @@ def read_observed(folder: Path, campaign: Campaign) -> Observed:
             "brake too little",
             mend="Run the campaign again with --set records.trace_share=0.2, or records.traces=all.",
         )
-    parts = [_shard(folder, shard["files"], campaign) for shard in read_manifest(folder)["shards"]]
-    observed = _joined([part for part in parts if part is not None])
-    n = 0 if observed is None else observed.episode.size
-    if observed is None or n < FEWEST_CUT_INS:
+    shards = [_shard(folder, shard["files"], campaign) for shard in read_manifest(folder)["shards"]]
+    parts = [part for part in shards if part is not None]
+    n = sum(part.episode.size for part in parts)
+    if n < FEWEST_CUT_INS:
         raise RunFolderError(
             str(folder),
             found=f"{n} cut-ins among the episodes traced whatever came of them",
             expected=f"at least {FEWEST_CUT_INS}: half to fit a driver to, half to check it",
             mend="Raise records.trace_share, or choose testing.method shells or forced, where every test has a cut-in.",
         )
-    return observed
+    return _joined(parts)
 
 
 def _shard(folder: Path, files: dict[str, str], campaign: Campaign) -> Observed | None:
-    """Observations of one shard; None without any."""
     episodes = read_table(folder / files["episodes"], ["episode", "cut_in_step", "failure"])
     index = np.asarray(episodes.column("episode")).astype(np.int64)
     cut = np.asarray(episodes.column("cut_in_step").fill_null(-1)).astype(np.int64)
@@ -97,7 +96,14 @@ def _shard(folder: Path, files: dict[str, str], campaign: Campaign) -> Observed 
 
 def _after_cut_ins(traces: pa.Table, index: IntArray, cut: IntArray) -> Observed:
     """Steps after the cut-ins of a shard whose episodes are ``index`` (k,), with cut-in steps (k,) or -1."""
-    _require_three_vehicles(traces)
+    names: BoolArray = np.asarray(traces.column("vehicle").cast(pa.string()).to_pylist()).reshape(-1, len(VEHICLES))
+    if not (names == np.array(VEHICLES)).all():
+        raise RunFolderError(
+            "traces",
+            found="rows in another order",
+            expected=f"{', '.join(VEHICLES)} of each step",
+            mend=MEND_SHARD,
+        )
     episode, step = (np.asarray(traces.column(name)).astype(np.int64)[:: len(VEHICLES)] for name in _COLUMNS[:2])
     x, v = (np.asarray(traces.column(name)).reshape(-1, len(VEHICLES)) for name in ("x_m", "v_mps"))
     a = traces.column("a_mps2").fill_null(np.nan).to_numpy().reshape(-1, len(VEHICLES))[:, AV]
@@ -109,25 +115,7 @@ def _after_cut_ins(traces: pa.Table, index: IntArray, cut: IntArray) -> Observed
     return Observed(found, begin, v[kept, AV], v[kept, BV], gap[kept], a[kept])
 
 
-def _require_three_vehicles(traces: pa.Table) -> None:
-    """Rows come in threes, LV, BV and AV of one step."""
-    names: BoolArray = np.asarray(traces.column("vehicle").cast(pa.string()).to_pylist()).reshape(-1, len(VEHICLES))
-    if not (names == np.array(VEHICLES)).all():
-        raise RunFolderError(
-            "traces",
-            found="rows in another order",
-            expected=f"{', '.join(VEHICLES)} of each step",
-            mend=MEND_SHARD,
-        )
-
-
-def _joined(parts: list[Observed]) -> Observed | None:
-    if not parts:
-        return None
-    offsets = np.cumsum([0, *(part.begin[-1] for part in parts)])
-    begin = [part.begin[:-1] + offset for part, offset in zip(parts, offsets[:-1].tolist(), strict=True)]
-    names = ("speed", "lead_speed", "gap", "acceleration")
-    series = (np.concatenate([getattr(part, name) for part in parts]) for name in names)
-    return Observed(
-        np.concatenate([part.episode for part in parts]), np.append(np.concatenate(begin), offsets[-1]), *series
-    )
+def _joined(parts: list[Observed]) -> Observed:
+    episode, *series = (np.concatenate([getattr(part, name) for part in parts]) for name in ("episode", *_SERIES))
+    lengths = np.concatenate([np.diff(part.begin) for part in parts])
+    return Observed(episode, np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64), *series)

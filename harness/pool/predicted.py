@@ -5,21 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
 
-from harness.arrays import BoolArray, FloatArray, IntArray, RecordArray
+from harness.arrays import BoolArray, FloatArray, IntArray
 from harness.campaign.models import Campaign
-from harness.environment.driving import Environment
 from harness.environment.loading import load_environment
-from harness.episode.trajectory import empty_trajectory
-from harness.errors import RunFolderError
 from harness.pool.library import LibraryDriver
-from harness.pool.replay import StoredPaths, replay_surrogates
-from harness.pool.surrogate_replay import PATH_COLUMNS, stored_paths
-from harness.records.folder import MEND_SHARD, read_manifest, read_table
+from harness.pool.surrogate_replay import PATH_COLUMNS, drivers_crash
+from harness.records.folder import read_manifest, read_table
 from harness.vehicles.models import driver_records
 
 _COLUMNS = [*PATH_COLUMNS, "outcome", "component", "log_weight"]
@@ -37,10 +32,8 @@ class Replayed:
         Likelihood ratio of the test; with shells the probability of its stratum.
     stratum : ndarray of int64, shape (n,)
         With shells, else 0.
-    av : ndarray of bool, shape (n,)
-        The AV crashed.
-    drivers : ndarray of bool, shape (n, D)
-        Each driver would have.
+    av, drivers : ndarray of bool, shapes (n,) and (n, D)
+        The AV crashed; each driver would have.
     """
 
     episode: IntArray
@@ -52,9 +45,7 @@ class Replayed:
     def apart_from(self, episodes: IntArray) -> Replayed:
         """All tests but some."""
         kept = ~np.isin(self.episode, episodes)
-        return Replayed(
-            self.episode[kept], self.probability[kept], self.stratum[kept], self.av[kept], self.drivers[kept]
-        )
+        return Replayed(*(values[kept] for values in vars(self).values()))
 
     @property
     def weight(self) -> FloatArray:
@@ -88,20 +79,13 @@ class Prediction:
     caught: float | None
     false_alarms: float | None
 
-    def to_json(self) -> dict[str, Any]:
-        """Plain content for a file."""
-        return dict(vars(self))
-
 
 def predict(replayed: Replayed, driver: int) -> Prediction:
     """How well one of the drivers predicts the AV's crashes in these tests."""
     av, other, weight = replayed.av, replayed.drivers[:, driver], replayed.weight
     rate, rate_driver, rate_both = (float(weight[who].sum()) for who in (av, other, av & other))
     return Prediction(
-        both=int((av & other).sum()),
-        only_av=int((av & ~other).sum()),
-        only_driver=int((~av & other).sum()),
-        neither=int((~av & ~other).sum()),
+        *(int(tests.sum()) for tests in (av & other, av & ~other, ~av & other, ~av & ~other)),
         crash_rate=rate,
         crash_rate_driver=rate_driver,
         caught=rate_both / rate if rate > 0.0 else None,
@@ -119,34 +103,17 @@ def replay_drivers(folder: Path, campaign: Campaign, drivers: Sequence[LibraryDr
     """
     environment = load_environment(campaign.environment)
     records = driver_records([model.parameters for model in drivers], [model.reaction for model in drivers])
-    in_shells = campaign.testing.method == "shells"
     parts = []
     for shard in read_manifest(folder)["shards"]:
         table = read_table(folder / shard["files"]["episodes"], _COLUMNS)
-        crashes = _who_crashes(stored_paths(table, campaign.seed), environment, records)
         outcome = np.array(table.column("outcome").cast(pa.string()).to_pylist())
         component = np.asarray(table.column("component")).astype(np.int64)
         columns = (
             np.asarray(table.column("episode")),
             np.exp(np.asarray(table.column("log_weight"))),
-            component if in_shells else np.zeros_like(component),
+            component if campaign.testing.method == "shells" else np.zeros_like(component),
             outcome == "crash",
-            crashes,
+            drivers_crash(table, campaign.seed, environment, records, -1),
         )
         parts.append([values[outcome != "failed"] for values in columns])
     return Replayed(*(np.concatenate(column) for column in zip(*parts, strict=True)))
-
-
-def _who_crashes(stored: StoredPaths, environment: Environment, records: RecordArray) -> BoolArray:
-    """Which drivers crash in stored tests, shape (n, D)."""
-    bits = np.zeros(stored.cut_step.size, np.int64)
-    wrong = replay_surrogates(stored, environment, records, -1, empty_trajectory(environment), bits)
-    if wrong >= 0:
-        raise RunFolderError(
-            f"episodes, episode {stored.first + wrong}",
-            found="maneuvers that do not fit its steps",
-            expected="the maneuvers that were driven: they determine the episode",
-            mend=MEND_SHARD,
-        )
-    found: BoolArray = ((bits[:, None] >> np.arange(records.size)) & 1).astype(np.bool_)
-    return found

@@ -8,6 +8,7 @@ the tests that it was not fitted to.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import chain, count
 from pathlib import Path
 from typing import Any
 
@@ -38,14 +39,11 @@ class RefinedLadder:
     Attributes
     ----------
     library : Library
-        With the drivers added.
-    name, careless : str
-        The fitted driver, and its more careless neighbour.
+        With the drivers added: ``name``, the fitted one, and its neighbour ``careless``.
     fitted : FittedDriver
         With its agreement in the cut-ins that it was fitted to.
     rms_mps2, explained : float
         Agreement of accelerations in ``n_checked`` other cut-ins.
-    n_checked : int
     prediction : Prediction
         Of crashes in all tests that it was not fitted to.
     """
@@ -81,13 +79,12 @@ class RefinedLadder:
             false = "" if p.false_alarms is None else f", with {100.0 * p.false_alarms:.1f} % false alarms"
             said.append(f"By weight it predicts {100.0 * p.caught:.1f} % of the AV's crash rate{false}.")
         if not self.predicted:
-            said.append(f"NOT PREDICTED: {self._what_is_not()}. Using this driver costs tests, not correctness.")
+            why = "the driver does not crash where the AV does"
+            if self.explained < ENOUGH:
+                why = "the driver does not describe how the AV accelerates, so that crashes in common say little "
+                why += "beyond these"
+            said.append(f"NOT PREDICTED: {why}. Using this driver costs tests, not correctness.")
         return said
-
-    def _what_is_not(self) -> str:
-        if self.explained >= ENOUGH:
-            return "the driver does not crash where the AV does"
-        return "the driver does not describe how the AV accelerates, so that crashes in common say little beyond these"
 
     def to_json(self) -> dict[str, Any]:
         """Plain content for a file."""
@@ -99,21 +96,14 @@ class RefinedLadder:
             "n_cut_ins_checked": self.n_checked,
             "rms_mps2": self.rms_mps2,
             "explained": self.explained,
-            "prediction": self.prediction.to_json(),
+            "prediction": vars(self.prediction),
             "predicted": self.predicted,
             "boundary": self.library.boundary,
         }
 
 
 def refine_ladder(folder: Path, out: Path) -> RefinedLadder:
-    """Fit a driver to the AV of a run, write the run's library with it, and see how well it predicts.
-
-    Parameters
-    ----------
-    folder : Path
-        Run folder.
-    out : Path
-        Library to write; must not be there yet.
+    """Fit a driver to the AV of a run, write the run's library with it to ``out``, and see how well it predicts.
 
     Raises
     ------
@@ -145,22 +135,17 @@ def _refined(
     folder: Path, campaign: Campaign, library: Library, fitted: FittedDriver, to_fit: Observed, to_check: Observed
 ) -> RefinedLadder:
     careless = more_careless(fitted.driver)
-    name, careless_name = _free_names(library)
+    names = _free_names(library)
     drivers: list[LibraryDriver] = [fitted.driver, careless, library.surrogates[library.boundary]]
     replayed = replay_drivers(folder, campaign, drivers).apart_from(to_fit.episode)
+    prediction, of_careless, of_boundary = (predict(replayed, driver) for driver in range(3))
     # The conditional statement is about vehicles inside the boundary: it must not lie within the AV's own neighbour.
-    beyond = predict(replayed, 1).crash_rate_driver > predict(replayed, 2).crash_rate_driver
-    added = {**library.surrogates, name: fitted.driver, careless_name: careless}
-    content = {**dict(library), "surrogates": added, "boundary": careless_name if beyond else library.boundary}
-    return RefinedLadder(
-        Library.model_validate(content),
-        name,
-        careless_name,
-        fitted,
-        *agreement(fitted.driver, to_check),
-        to_check.episode.size,
-        predict(replayed, 0),
-    )
+    beyond = of_careless.crash_rate_driver > of_boundary.crash_rate_driver
+    surrogates = {**library.surrogates, names[0]: fitted.driver, names[1]: careless}
+    boundary = names[1] if beyond else library.boundary
+    refined = Library.model_validate({**dict(library), "surrogates": surrogates, "boundary": boundary})
+    agreed = agreement(fitted.driver, to_check)
+    return RefinedLadder(refined, *names, fitted, *agreed, to_check.episode.size, prediction)
 
 
 def more_careless(driver: LibraryIDM) -> LibraryIDM:
@@ -187,12 +172,9 @@ def describe(driver: LibraryIDM) -> str:
 
 def _free_names(library: Library) -> tuple[str, str]:
     """Names for the two drivers that the library does not have yet."""
-    ending = ""
-    k = 1
-    while {f"fitted{ending}", f"fitted{ending}-careless"} & set(library.surrogates):
-        k += 1
-        ending = f"-{k}"
-    return f"fitted{ending}", f"fitted{ending}-careless"
+    endings = chain([""], (f"-{k}" for k in count(2)))
+    pairs = ((f"fitted{ending}", f"fitted{ending}-careless") for ending in endings)
+    return next(pair for pair in pairs if not set(pair) & set(library.surrogates))
 
 
 def _require_new(out: Path) -> None:
@@ -211,9 +193,7 @@ def _require_new(out: Path) -> None:
 
 def _text(refined: RefinedLadder, folder: Path) -> str:
     """The library as a file: what the new drivers were fitted to, then every driver on a line."""
-    manifest = read_manifest(folder)
-    library = refined.library
-    p = refined.prediction
+    manifest, library, p = read_manifest(folder), refined.library, refined.prediction
     comment = [
         f"Surrogate library with a driver fitted to the vehicle of campaign {manifest.get('name')}",
         f"({manifest['campaign_hash']}, {manifest['n_episodes']:,} tests), by `harness ladder`.",
@@ -225,20 +205,14 @@ def _text(refined: RefinedLadder, folder: Path) -> str:
         f"{CARELESS_DELAY_STEPS / 10.0:g} s later.",
     ]
     drivers = [f"  {name}: {_line(model.model_dump(exclude_unset=True))}" for name, model in library.surrogates.items()]
-    return "\n".join(
-        [
-            *(f"# {line}".rstrip() for line in comment),
-            "",
-            f"format: {library.format}",
-            f"version: {library.version}",
-            f"description: {_line(library.description)}",
-            f"boundary: {library.boundary}",
-            f"envelope: {library.envelope}",
-            "surrogates:",
-            *drivers,
-            "",
-        ]
-    )
+    head = [
+        f"format: {library.format}",
+        f"version: {library.version}",
+        f"description: {_line(library.description)}",
+        f"boundary: {library.boundary}",
+        f"envelope: {library.envelope}",
+    ]
+    return "\n".join([*(f"# {line}".rstrip() for line in comment), "", *head, "surrogates:", *drivers, ""])
 
 
 def _line(value: Any) -> str:

@@ -134,19 +134,10 @@ def retrace_episode(
 def retrace(
     stored: StoredPaths, environment: Environment, driver: RecordArray, path: Trajectory, twin: Retraced
 ) -> None:
-    """What the twin says of every stored episode.
+    """What the twin says of every stored episode of an AV that keeps its speed until the cut-in; ``twin`` receives it.
 
-    Parameters
-    ----------
-    stored : StoredPaths
-        Of an AV that keeps its speed until the cut-in.
-    environment : Environment
-    driver : structured ndarray, shape (1,) or (0,)
-        A built-in AV; nothing is known about another one after the cut-in.
-    path : Trajectory
-        Room to work in.
-    twin : Retraced
-        Receives the answer.
+    ``driver`` is (1,) for a built-in AV, else (0,): nothing is known about another one after the cut-in. ``path`` is
+    room to work in.
     """
     for i in range(stored.cut_step.size):
         retrace_episode(i, stored, environment, driver, path, twin)
@@ -161,25 +152,11 @@ def replay_surrogates(
     path: Trajectory,
     crashes: IntArray,
 ) -> int:
-    """Which surrogates would have crashed in each stored episode.
+    """Which surrogates would have crashed in each stored episode of an AV that keeps its speed until the cut-in.
 
-    Parameters
-    ----------
-    stored : StoredPaths
-        Of an AV that keeps its speed until the cut-in.
-    drivers : structured ndarray, shape (D,)
-        At most 62 of them, without inattention.
-    envelope : int
-        See `harness.episode.trajectory.who_crashes`.
-    path : Trajectory
-        Room to work in.
-    crashes : ndarray of int64, shape (n,)
-        Receives one bit per driver; none without a cut-in.
-
-    Returns
-    -------
-    int
-        Row of the first episode whose maneuvers do not fit its steps, or -1.
+    ``drivers`` (D,) are at most 62, without inattention; ``envelope`` as in `harness.episode.trajectory.who_crashes`.
+    ``crashes`` (n,) receives one bit per driver, none without a cut-in; ``path`` is room to work in. Returns the row
+    of the first episode whose maneuvers do not fit its steps, or -1.
     """
     max_steps = environment.numbers.max_steps
     for i in range(stored.cut_step.size):

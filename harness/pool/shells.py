@@ -1,4 +1,4 @@
-"""Shells as strata of a test campaign: which cut-ins belong together, their probability, the order of draws.
+"""Shells as strata of a test campaign: which cut-ins belong together, their probability, and the tests drawn from them.
 
 Shells up to the boundary are strata of their own. All beyond it is one stratum, *outside*: what a careful vehicle is
 tested for there is that nothing happens, and dividing a stratum without crashes only costs tests. A shell on which not
@@ -7,10 +7,13 @@ even the full-throttle envelope crashes is left out, with crash probability 0, i
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import numpy as np
 
-from harness.arrays import IntArray
-from harness.campaign.models import AutomatedVehicle, BuiltInParameters
+from harness.arrays import IntArray, RecordArray
+from harness.campaign.models import AutomatedVehicle, BuiltInParameters, Campaign
+from harness.episode.cells import PrescribedTraffic
 from harness.errors import CampaignError
 from harness.pool.cut_ins import Pool
 from harness.strata import OUTSIDE, ShellDesign
@@ -23,24 +26,6 @@ def acceleration_limit(av: AutomatedVehicle) -> float:
     if av.controller is not None or av.fmu is not None:
         return av.limits.max_acceleration_mps2
     return float("inf")
-
-
-def shells_in_strata(pool: Pool, boundary: int, limit_mps2: float) -> list[list[int]]:
-    """Which shells of the pool make up each stratum; empty shells belong to none.
-
-    Parameters
-    ----------
-    pool : Pool
-    boundary : int
-        Index of the outermost shell inside.
-    limit_mps2 : float
-        Hardest acceleration of the vehicle.
-    """
-    present = [s for s in range(pool.shell_p.size) if pool.shell_p[s] > 0.0]
-    tested = present if limit_mps2 > pool.library.envelope_mps2 else [s for s in present if s < len(pool.names)]
-    inside = [[s] for s in tested if s <= boundary]
-    outside = [s for s in tested if s > boundary]
-    return [*inside, outside] if outside else inside
 
 
 def require_boundary(name: str, surrogates: tuple[str, ...]) -> None:
@@ -58,6 +43,18 @@ def require_boundary(name: str, surrogates: tuple[str, ...]) -> None:
             expected=f"a surrogate of the library: {', '.join(surrogates)}",
             mend="Name one of them, or leave boundary out for the library's own.",
         )
+
+
+def shells_in_strata(pool: Pool, boundary: int, limit_mps2: float) -> list[list[int]]:
+    """Which shells of the pool make up each stratum; empty shells belong to none.
+
+    ``boundary`` is the index of the outermost shell inside, ``limit_mps2`` the vehicle's hardest acceleration.
+    """
+    present = [s for s in range(pool.shell_p.size) if pool.shell_p[s] > 0.0]
+    tested = present if limit_mps2 > pool.library.envelope_mps2 else [s for s in present if s < len(pool.names)]
+    inside = [[s] for s in tested if s <= boundary]
+    outside = [s for s in tested if s > boundary]
+    return [*inside, outside] if outside else inside
 
 
 def design_shells(pool: Pool, *, boundary: str | None = None, limit_mps2: float) -> ShellDesign:
@@ -96,38 +93,69 @@ def design_shells(pool: Pool, *, boundary: str | None = None, limit_mps2: float)
     )
 
 
-class Draws:
-    """The order in which a campaign takes cut-ins from each stratum: a random one, fixed by its seed.
+@dataclass(frozen=True)
+class Draw:
+    """Consecutive draws from one stratum."""
 
-    Within a shell cut-ins are taken without replacement. In a stratum of several shells the shell is drawn first, by
-    its probability; the order ends where a shell has no cut-in left.
+    stratum: int
+    first: int
+    n: int
 
-    Parameters
+
+class PrescribedEpisodes:
+    """The tests of a shells campaign.
+
+    Each stratum's cut-ins are taken in a random order that is fixed by the campaign's seed: within a shell without
+    replacement. In a stratum of several shells the shell is drawn first, by its probability; the order ends where a
+    shell has no cut-in left.
+
+    Attributes
     ----------
-    pool : Pool
-    groups : list of list of int
-        Shells of each stratum, see `shells_in_strata`.
-    seed : int
-        Campaign seed.
+    design : ShellDesign
     """
 
-    def __init__(self, pool: Pool, groups: list[list[int]], seed: int) -> None:
-        self._order = [_order(pool, group, seed, stratum) for stratum, group in enumerate(groups)]
+    def __init__(self, campaign: Campaign, pool: Pool) -> None:
+        limit = acceleration_limit(campaign.av)
+        design = design_shells(pool, boundary=campaign.testing.shells.boundary, limit_mps2=limit)
+        groups = shells_in_strata(pool, pool.names.index(design.boundary), limit)
+        self._cut_ins = pool.cut_ins
+        self._order = [_order(pool, group, campaign.seed, stratum) for stratum, group in enumerate(groups)]
+        self.design = replace(design, available=tuple(order.size for order in self._order))
 
     @property
     def available(self) -> IntArray:
         """How many draws each stratum allows, shape (S,)."""
-        return np.array([order.size for order in self._order], np.int64)
+        return np.array(self.design.available, np.int64)
 
-    def take(self, stratum: int, first: int, n: int) -> IntArray:
-        """Rows of the pool's cut-ins that are draws ``first … first + n - 1`` of a stratum, shape (n,)."""
-        rows = self._order[stratum][first : first + n]
-        if rows.size < n:
-            raise IndexError(f"stratum {stratum} allows {self._order[stratum].size} draws, {first + n} were asked for")
-        return rows
+    def rows(self, draws: tuple[Draw, ...]) -> tuple[IntArray, IntArray]:
+        """Rows of the pool's cut-ins, and their strata, shape (n,) each; IndexError beyond what a stratum allows."""
+        for draw in draws:
+            allowed, asked = self.design.available[draw.stratum], draw.first + draw.n
+            if asked > allowed:
+                raise IndexError(f"stratum {draw.stratum} allows {allowed} draws, {asked} were asked for")
+        rows = [self._order[draw.stratum][draw.first : draw.first + draw.n] for draw in draws]
+        return np.concatenate(rows), np.repeat([draw.stratum for draw in draws], [draw.n for draw in draws])
+
+    def episodes(self, draws: tuple[Draw, ...]) -> tuple[RecordArray, PrescribedTraffic, IntArray]:
+        """Initial states (n,), traffic, and rows of the pool's cut-ins (n,)."""
+        rows, stratum = self.rows(draws)
+        return (*self.of_rows(rows, stratum), rows)
+
+    def of_rows(self, rows: IntArray, stratum: IntArray) -> tuple[RecordArray, PrescribedTraffic]:
+        """Initial states (n,) and traffic of given cut-ins of the pool (n,), tested for given strata (n,)."""
+        c = self._cut_ins
+        traffic = PrescribedTraffic(
+            lv=np.ascontiguousarray(c.lv[rows]),
+            bv=np.ascontiguousarray(c.bv[rows]),
+            cut_step=c.step[rows],
+            component=stratum.astype(np.int64),
+            log_weight=np.log(self.design.p[stratum]),
+        )
+        return c.state[rows], traffic
 
 
 def _order(pool: Pool, group: list[int], seed: int, stratum: int) -> IntArray:
+    """Rows of the pool's cut-ins in the order in which a stratum, made of a group of shells, takes them."""
     rng = np.random.Generator(np.random.Philox(key=np.array([seed, stratum], np.uint64)))
     rows = [rng.permutation(np.flatnonzero(pool.cut_ins.shell == s)) for s in group]
     if len(rows) == 1:
@@ -136,14 +164,10 @@ def _order(pool: Pool, group: list[int], seed: int, stratum: int) -> IntArray:
     which = np.minimum(
         np.searchsorted(np.cumsum(p) / p.sum(), rng.random(sum(map(len, rows))), side="right"), len(rows) - 1
     )
-    rank = np.zeros(which.size, np.int64)
+    order, end = np.zeros(which.size, np.int64), which.size
     for s, members in enumerate(rows):
-        chosen = which == s
-        rank[chosen] = np.arange(chosen.sum())
-        rank[chosen & (rank >= len(members))] = -1
-    end = int(np.argmax(rank < 0)) if (rank < 0).any() else which.size
-    order = np.zeros(end, np.int64)
-    for s, members in enumerate(rows):
-        chosen = np.flatnonzero(which[:end] == s)
-        order[chosen] = members[rank[chosen]]
-    return order
+        chosen = np.flatnonzero(which == s)
+        order[chosen[: members.size]] = members[: chosen.size]
+        if chosen.size > members.size:
+            end = min(end, int(chosen[members.size]))
+    return order[:end]

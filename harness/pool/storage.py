@@ -27,22 +27,20 @@ from harness.state import STATE_COLUMNS, states_from
 
 _FORMAT = 3
 """Raise it when the meaning of a pool changes."""
-_MADE_BY = ("build.py", "cut_ins.py", "proposal.py")
+_MADE_BY = ("aimed_paths.py", "build.py", "cut_ins.py")
 """Code that decides what is in a pool, beside the kernels."""
 _METADATA, _DIGEST = b"harness_pool", b"harness_pool_sha256"
 
 
 def pool_key(environment: Environment, library: Library, settings: PoolSettings) -> str:
     """Hash of all that a pool depends on: environment, level of lane changing, library, settings, and code."""
-    drivers = {name: model.model_dump() for name, model in library.surrogates.items()}
-    roles = [library.boundary, library.envelope]
     content = [
         _FORMAT,
         source_hash(),
         *(hashlib.sha256((Path(__file__).parent / name).read_bytes()).hexdigest() for name in _MADE_BY),
         environment_hash(environment),
-        drivers,
-        roles,
+        {name: model.model_dump() for name, model in library.surrogates.items()},
+        [library.boundary, library.envelope],
         settings.model_dump(exclude={"library"}),
     ]
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:24]
@@ -63,8 +61,6 @@ def campaign_pool(resolved: Resolved, progress: Progress | None = None) -> Pool:
 
     Raises
     ------
-    CampaignError
-        The library's file is missing or wrong.
     RunFolderError
         The pool could not be kept.
     """
@@ -140,27 +136,21 @@ def _digest(table: pa.Table, facts: bytes) -> str:
     return digest.hexdigest()
 
 
-def _facts(pool: Pool) -> dict[str, Any]:
-    facts: dict[str, Any] = {"format": _FORMAT, "library": pool.library.model_dump()}
-    for field in fields(pool):
-        if field.name not in ("library", "cut_ins"):
-            value = getattr(pool, field.name)
-            facts[field.name] = value.tolist() if isinstance(value, np.ndarray) else value
-    return facts
-
-
 def _table(pool: Pool) -> pa.Table:
     c = pool.cut_ins
-    kept = np.bincount(c.shell, minlength=pool.shell_p.size)
+    probability = pool.shell_p / np.maximum(np.bincount(c.shell, minlength=pool.shell_p.size), 1)
     columns: dict[str, tuple[pa.Array, str]] = {
         "path": (pa.array(c.path), "index of the path in the pool"),
         **{name: (pa.array(np.ascontiguousarray(c.state[name])), "initial state") for name in STATE_COLUMNS},
         "cut_in_step": (pa.array(c.step.astype(np.int16)), "step (0.1 s) in which BV cuts in"),
-        "probability": (pa.array((pool.shell_p / np.maximum(kept, 1))[c.shell]), "P under the NDE that it stands for"),
+        "probability": (pa.array(probability[c.shell]), "P under the NDE that it stands for"),
         "shell": (pa.array(c.shell.astype(np.int8)), "first surrogate that crashes; the last shell: none does"),
-        "crashes": (_rows(c.crashes), "which surrogates crash, in the order of the metadata's names"),
-        "lv_maneuvers": (_prefixes(c.lv, c.n_lv), "LV's draws, one per hold period"),
-        "bv_maneuvers": (_prefixes(c.bv, c.n_bv), "BV's draws; 31 marks the cut-in"),
+        "crashes": (
+            pa.FixedSizeListArray.from_arrays(pa.array(c.crashes.ravel()), c.crashes.shape[1]),
+            "which surrogates crash, in the order of the metadata's names",
+        ),
+        "lv_maneuvers": (_lists(c.lv, c.n_lv), "LV's draws, one per hold period"),
+        "bv_maneuvers": (_lists(c.bv, c.n_bv), "BV's draws; 31 marks the cut-in"),
     }
     schema = pa.schema(
         [pa.field(name, array.type, nullable=False, metadata={"doc": doc}) for name, (array, doc) in columns.items()]
@@ -169,11 +159,13 @@ def _table(pool: Pool) -> pa.Table:
     return table.replace_schema_metadata({_METADATA: facts, _DIGEST: _digest(table, facts)})
 
 
-def _rows(values: np.ndarray) -> pa.Array:
-    return pa.FixedSizeListArray.from_arrays(pa.array(values.ravel()), values.shape[1])
+def _facts(pool: Pool) -> dict[str, Any]:
+    known = {name: value for name, value in vars(pool).items() if name not in ("library", "cut_ins")}
+    plain = {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in known.items()}
+    return {"format": _FORMAT, "library": pool.library.model_dump(), **plain}
 
 
-def _prefixes(values: np.ndarray, lengths: IntArray) -> pa.Array:
+def _lists(values: np.ndarray, lengths: IntArray) -> pa.Array:
     used = np.arange(values.shape[1]) < lengths[:, None]
     offsets = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32)
     return pa.ListArray.from_arrays(pa.array(offsets), pa.array(values[used]))
@@ -188,12 +180,11 @@ def _padded(column: pa.ChunkedArray, width: int) -> tuple[np.ndarray, IntArray]:
 
 
 def _pool(table: pa.Table, facts: dict[str, Any]) -> Pool:
-    n_surrogates = len(facts["names"])
     bv_column = table.column("bv_maneuvers")
     width = int(np.asarray(bv_column.combine_chunks().value_lengths()).max(initial=0))
     lv, n_lv = _padded(table.column("lv_maneuvers"), width)
     bv, n_bv = _padded(bv_column, width)
-    flat = table.column("crashes").combine_chunks().flatten()
+    crashes = table.column("crashes").combine_chunks().flatten().to_numpy(zero_copy_only=False)
     cut_ins = CutIns(
         path=np.asarray(table.column("path")),
         step=np.asarray(table.column("cut_in_step")).astype(np.int64),
@@ -203,17 +194,8 @@ def _pool(table: pa.Table, facts: dict[str, Any]) -> Pool:
         bv=bv,
         n_lv=n_lv,
         n_bv=n_bv,
-        crashes=np.asarray(flat.to_numpy(zero_copy_only=False)).reshape(-1, n_surrogates),
+        crashes=np.asarray(crashes).reshape(-1, len(facts["names"])),
     )
-    arrays = {name: np.array(facts[name]) for name in ("mu", "mu_covariance", "shell_p", "shell_moments")}
-    return Pool(
-        key=str(facts["key"]),
-        environment=str(facts["environment"]),
-        library=Library.model_validate(facts["library"]),
-        names=tuple(facts["names"]),
-        n_paths=int(facts["n_paths"]),
-        p_cut_in=float(facts["p_cut_in"]),
-        p_cut_in_se=float(facts["p_cut_in_se"]),
-        cut_ins=cut_ins,
-        **arrays,
-    )
+    known = {name: np.array(value) if isinstance(value, list) else value for name, value in facts.items()}
+    known |= {"library": Library.model_validate(facts["library"]), "names": tuple(facts["names"]), "cut_ins": cut_ins}
+    return Pool(**{field.name: known[field.name] for field in fields(Pool)})

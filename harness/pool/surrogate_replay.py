@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pyarrow as pa
 
-from harness.arrays import BoolArray, Int8Array, IntArray
+from harness.arrays import BoolArray, Int8Array, IntArray, RecordArray
 from harness.environment.driving import Environment
 from harness.episode.trajectory import empty_trajectory
 from harness.errors import CampaignError, RunFolderError
@@ -28,11 +28,6 @@ _PART = 512
 class SurrogateReplay:
     """The surrogates of a pool, in the place of a campaign's AV.
 
-    Parameters
-    ----------
-    resolved : Resolved
-    pool : Pool
-
     Raises
     ------
     CampaignError
@@ -44,57 +39,20 @@ class SurrogateReplay:
     """
 
     def __init__(self, resolved: Resolved, pool: Pool) -> None:
-        self._environment: Environment = resolved.environment
-        require_same_environment(self._environment, pool)
+        self._environment, self._seed = resolved.environment, resolved.campaign.seed
+        _require_same_environment(self._environment, pool)
         self.known = KnownRates(pool.key, pool.names, pool.mu, pool.mu_covariance)
-        self._seed = resolved.campaign.seed
         names = list(pool.library.surrogates)
-        self._drivers = pool.library.drivers
-        self._envelope = names.index(pool.library.envelope)
-        self._bits = np.array([names.index(name) for name in pool.names])
+        self._drivers, self._envelope = pool.library.drivers, names.index(pool.library.envelope)
+        self._order = [names.index(name) for name in pool.names]
 
     def crashes(self, episodes: pa.Table) -> BoolArray:
-        """Which surrogates would have crashed, shape (n, D), in the order of ``known.names``.
-
-        Parameters
-        ----------
-        episodes : pa.Table
-            Consecutive rows of the episodes table; needs `PATH_COLUMNS`.
-
-        Raises
-        ------
-        RunFolderError
-            An episode's maneuvers do not fit its steps.
-        """
-        stored = stored_paths(episodes, self._seed)
-        parts = [rows_of(stored, begin, begin + _PART) for begin in range(0, episodes.num_rows, _PART)]
-        with ThreadPoolExecutor(os.cpu_count()) as threads:
-            bits = np.concatenate(list(threads.map(self._replay, parts)))
-        found: BoolArray = ((bits[:, None] >> self._bits[None, :]) & 1).astype(np.bool_)
-        return found
-
-    def _replay(self, stored: StoredPaths) -> IntArray:
-        bits = np.zeros(stored.cut_step.size, np.int64)
-        room = empty_trajectory(self._environment)
-        wrong = replay_surrogates(stored, self._environment, self._drivers, self._envelope, room, bits)
-        if wrong >= 0:
-            raise RunFolderError(
-                f"episodes, episode {stored.first + wrong}",
-                found=f"maneuvers that do not lead to a cut-in in step {stored.cut_step[wrong]}",
-                expected="the maneuvers that were driven: they determine the episode",
-                mend=MEND_SHARD,
-            )
-        return bits
+        """Which surrogates would have crashed, shape (n, D), in the order of ``known.names``; see `drivers_crash`."""
+        return drivers_crash(episodes, self._seed, self._environment, self._drivers, self._envelope)[:, self._order]
 
 
-def require_same_environment(environment: Environment, pool: Pool) -> None:
-    """Refuse a pool of another environment: its crash rates would be those of other traffic.
-
-    Raises
-    ------
-    CampaignError
-        It is one.
-    """
+def _require_same_environment(environment: Environment, pool: Pool) -> None:
+    """Refuse a pool of another environment: its crash rates would be those of other traffic."""
     own = environment_hash(environment)
     if pool.environment != own:
         raise CampaignError(
@@ -106,8 +64,48 @@ def require_same_environment(environment: Environment, pool: Pool) -> None:
         )
 
 
-def rows_of(stored: StoredPaths, begin: int, end: int) -> StoredPaths:
-    """Some consecutive rows."""
+def drivers_crash(
+    episodes: pa.Table, seed: int, environment: Environment, drivers: RecordArray, envelope: int
+) -> BoolArray:
+    """Which drivers would have crashed in the place of the AV, shape (n, D).
+
+    Parameters
+    ----------
+    episodes : pa.Table
+        Consecutive rows of the episodes table; needs `PATH_COLUMNS`.
+    seed : int
+        Of the campaign.
+    drivers : structured ndarray, shape (D,)
+    envelope : int
+        See `harness.episode.trajectory.who_crashes`.
+
+    Raises
+    ------
+    RunFolderError
+        An episode's maneuvers do not fit its steps.
+    """
+    stored = stored_paths(episodes, seed)
+
+    def replayed(begin: int) -> IntArray:
+        part = _rows_of(stored, begin, begin + _PART)
+        bits = np.zeros(part.cut_step.size, np.int64)
+        wrong = replay_surrogates(part, environment, drivers, envelope, empty_trajectory(environment), bits)
+        if wrong >= 0:
+            raise RunFolderError(
+                f"episodes, episode {part.first + wrong}",
+                found=f"maneuvers that do not lead to a cut-in in step {part.cut_step[wrong]}",
+                expected="the maneuvers that were driven: they determine the episode",
+                mend=MEND_SHARD,
+            )
+        return bits
+
+    with ThreadPoolExecutor(os.cpu_count()) as threads:
+        bits = np.concatenate(list(threads.map(replayed, range(0, episodes.num_rows, _PART))))
+    found: BoolArray = ((bits[:, None] >> np.arange(drivers.size)) & 1).astype(np.bool_)
+    return found
+
+
+def _rows_of(stored: StoredPaths, begin: int, end: int) -> StoredPaths:
     rows, edges = slice(begin, end), slice(begin, end + 1)
     return stored._replace(
         first=stored.first + begin,
@@ -121,19 +119,14 @@ def rows_of(stored: StoredPaths, begin: int, end: int) -> StoredPaths:
 
 def stored_paths(episodes: pa.Table, seed: int) -> StoredPaths:
     """Initial states and maneuvers of consecutive rows of the episodes table; needs `PATH_COLUMNS`."""
-    cut_step = episodes.column("cut_in_step").fill_null(-1)
-    lv, lv_begin = _lists(episodes.column("lv_maneuvers"))
-    bv, bv_begin = _lists(episodes.column("bv_maneuvers"))
     return StoredPaths(
-        seed=seed,
-        first=int(episodes.column("episode")[0].as_py()),
-        state=states_from(np.asarray(episodes.column(name)) for name in STATE_COLUMNS),
-        n_steps=np.asarray(episodes.column("n_steps")).astype(np.int64),
-        cut_step=np.asarray(cut_step).astype(np.int64),
-        lv=lv,
-        lv_begin=lv_begin,
-        bv=bv,
-        bv_begin=bv_begin,
+        seed,
+        int(episodes.column("episode")[0].as_py()),
+        states_from(np.asarray(episodes.column(name)) for name in STATE_COLUMNS),
+        np.asarray(episodes.column("n_steps")).astype(np.int64),
+        np.asarray(episodes.column("cut_in_step").fill_null(-1)).astype(np.int64),
+        *_lists(episodes.column("lv_maneuvers")),
+        *_lists(episodes.column("bv_maneuvers")),
     )
 
 

@@ -6,12 +6,13 @@ import fcntl
 import json
 import os
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from pydantic import BaseModel, ValidationError
 
@@ -37,7 +38,18 @@ def shard_file(table: str, index: int) -> str:
     return f"{table}/shard-{index:06d}.parquet"
 
 
-def write_atomically(path: Path, write: Callable[[Path], None]) -> None:
+def shard_files(folder: Path, index: int) -> dict[str, str]:
+    """Paths of a shard's tables that are there, by table, relative to the run folder."""
+    files = {name: shard_file(name, index) for name in TABLES}
+    return {name: file for name, file in files.items() if (folder / file).exists()}
+
+
+def shards_on_disk(folder: Path, table: str) -> list[Path]:
+    """Files of a table, whether they count or not."""
+    return sorted((folder / table).glob("shard-*.parquet"))
+
+
+def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
     """Let ``write`` fill a temporary file beside ``path``, then put it in place.
 
     A full disk or a killed process leaves no half-written file under the final name.
@@ -120,11 +132,7 @@ def _lock(handle: int, folder: Path) -> None:
 
 def write_bytes(path: Path, content: bytes) -> None:
     """Write a file atomically."""
-    write_atomically(path, lambda temporary: _write(temporary, content))
-
-
-def _write(path: Path, content: bytes) -> None:
-    path.write_bytes(content)
+    write_atomically(path, lambda temporary: temporary.write_bytes(content))
 
 
 def write_text(path: Path, text: str) -> None:
@@ -137,41 +145,48 @@ def write_json(path: Path, content: Any) -> None:
     write_text(path, json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False) + "\n")
 
 
-def write_shard(folder: Path, index: int, tables: ShardTables) -> dict[str, str]:
-    """Write a shard's tables; ``episodes`` last, so that its presence means that the shard is complete.
+def encoded(tables: ShardTables) -> dict[str, bytes]:
+    """A shard's tables as Parquet files, by name: what a worker hands back."""
+    return {name: _parquet(table) for name, table in tables._asdict().items() if table is not None}
+
+
+def _parquet(table: pa.Table) -> bytes:
+    sink = pa.BufferOutputStream()
+    pq.write_table(table, sink, compression=COMPRESSION)
+    content: bytes = sink.getvalue().to_pybytes()
+    return content
+
+
+def write_shard(folder: Path, index: int, shard: Mapping[str, bytes]) -> dict[str, str]:
+    """Write what `encoded` has made; ``episodes`` last, so that its presence means that the shard is complete.
 
     What an earlier, shorter round has left of the shard goes first, for the same reason.
 
     Returns
     -------
     dict
-        Table name → path relative to the folder.
+        See `shard_files`.
     """
-    for name in TABLES:
-        (folder / shard_file(name, index)).unlink(missing_ok=True)
-    files = {}
+    for file in shard_files(folder, index).values():
+        (folder / file).unlink()
     for name in reversed(TABLES):
-        table = getattr(tables, name)
-        if table is not None:
-            files[name] = shard_file(name, index)
-            write_atomically(folder / files[name], lambda path, table=table: _write_parquet(path, table))  # type: ignore[misc]
-    return files
+        if name in shard:
+            write_bytes(folder / shard_file(name, index), shard[name])
+    return shard_files(folder, index)
 
 
-def _write_parquet(path: Path, table: pa.Table) -> None:
-    pq.write_table(table, path, compression=COMPRESSION)
-
-
-def read_table(path: Path, columns: list[str] | None = None) -> pa.Table:
-    """Read one Parquet file of a run.
+def read_table(path: Path, columns: list[str] | None = None, rows: pc.Expression | None = None) -> pa.Table:
+    """Read one Parquet file of a run; row groups that cannot hold one of the asked ``rows`` are skipped.
 
     Raises
     ------
     RunFolderError
-        The file is missing or damaged.
+        The file is missing or damaged, or lacks a column.
     """
     try:
-        return pq.read_table(path, columns=columns, memory_map=False, partitioning=None)
+        if columns and (missing := sorted(set(columns).difference(pq.read_schema(path).names))):
+            raise pa.ArrowInvalid(f"no column {missing[0]!r}")
+        return pq.read_table(path, columns=columns, filters=rows, memory_map=False, partitioning=None)
     except (OSError, pa.ArrowException, KeyError) as error:
         raise damaged(path, error) from error
 

@@ -69,7 +69,7 @@ class StoredRun:
         needed = None if asked is None else sorted(asked | {"log_weight", "component"})
         shards = read_shards(self.folder, episode_columns=needed, moment_columns=[])
         table = _one([episodes for episodes, _ in shards])
-        frame: pd.DataFrame = table.to_pandas()
+        frame = table.to_pandas()
         # The weight of a failed test, which counts as no crash, may be unknown.
         frame[_WEIGHT.name] = np.exp(frame["log_weight"].fillna(0.0))
         if (self.folder / SHELLS).is_file():
@@ -78,23 +78,11 @@ class StoredRun:
         return _described(shown, table.schema.append(_WEIGHT))
 
     def moments(self) -> pd.DataFrame:
-        """One row per control step that the campaign kept (``records.moments``).
-
-        Raises
-        ------
-        RunFolderError
-            As `episodes`, or there are none.
-        """
+        """One row per control step; a `RunFolderError` where the campaign kept none (``records.moments``)."""
         return self._kept("moments")
 
     def traces(self) -> pd.DataFrame:
-        """One row per step and vehicle of the episodes that were traced (``records.traces``, ``records.trace_share``).
-
-        Raises
-        ------
-        RunFolderError
-            As `episodes`, or there are none.
-        """
+        """One row per step and vehicle; a `RunFolderError` where nothing was traced (``records.traces``)."""
         return self._kept("traces")
 
     def _kept(self, name: str) -> pd.DataFrame:

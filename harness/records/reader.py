@@ -1,15 +1,17 @@
-"""Read the shards that count, in index order, one at a time."""
+"""Read the shards that count, in index order, one at a time: the one way to stored rows."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from harness.errors import RunFolderError
-from harness.records.folder import MEND_SHARD, damaged, read_manifest, read_table
+from harness.records.folder import MEND_SHARD, TABLES, damaged, read_manifest, read_table
 
 
 def read_shards(
@@ -50,6 +52,24 @@ def read_shards(
         yield episodes, moments
 
 
+def read_traces(folder: Path, episodes: Collection[int], columns: list[str]) -> pa.Table | None:
+    """Trace rows of a few episodes; None where none of them was traced.
+
+    Raises
+    ------
+    RunFolderError
+        A shard that could hold one of them is missing or damaged.
+    """
+    wanted = pc.field("episode").isin(sorted(episodes))
+    tables = []
+    for shard in read_manifest(folder)["shards"]:
+        held = range(shard["first_episode"], shard["first_episode"] + shard["n_episodes"])
+        if shard["files"].get("traces") and any(episode in held for episode in episodes):
+            tables.append(read_table(folder / shard["files"]["traces"], columns, wanted))
+    found = [table for table in tables if table.num_rows]
+    return pa.concat_tables(found).unify_dictionaries() if found else None
+
+
 def stored_columns(folder: Path) -> set[str]:
     """Columns of the episodes table of a run; none if it has no shard.
 
@@ -59,10 +79,37 @@ def stored_columns(folder: Path) -> set[str]:
         The first shard is missing or damaged.
     """
     shards = read_manifest(folder)["shards"]
-    if not shards:
-        return set()
-    path = folder / shards[0]["files"]["episodes"]
+    return set(_footer(folder / shards[0]["files"]["episodes"]).schema.to_arrow_schema().names) if shards else set()
+
+
+class TableSize(NamedTuple):
+    """How much of one table a run kept."""
+
+    table: str
+    n_files: int
+    n_rows: int
+    n_bytes: int
+
+
+def table_sizes(folder: Path) -> list[TableSize]:
+    """Files, rows and bytes per table.
+
+    Raises
+    ------
+    RunFolderError
+        A listed file is missing or damaged.
+    """
+    shards = read_manifest(folder)["shards"]
+    sizes = []
+    for table in TABLES:
+        files = [folder / shard["files"][table] for shard in shards if shard["files"].get(table)]
+        n_rows = sum(_footer(file).num_rows for file in files)
+        sizes.append(TableSize(table, len(files), n_rows, sum(file.stat().st_size for file in files)))
+    return sizes
+
+
+def _footer(path: Path) -> pq.FileMetaData:
     try:
-        return set(pq.read_schema(path).names)
+        return pq.read_metadata(path)
     except (OSError, pa.ArrowException) as error:
         raise damaged(path, error) from error

@@ -16,11 +16,13 @@ Count = Annotated[int, Field(ge=0, lt=2**63)]
 ShardPath = Annotated[str, Field(pattern=r"^[a-z]+/[A-Za-z0-9_-]+\.parquet$")]
 
 
-class _Stored(BaseModel):
+class Stored(BaseModel):
+    """Strict in the types of the keys that it names."""
+
     model_config = ConfigDict(extra="allow", strict=True, allow_inf_nan=False)
 
 
-class Files(_Stored):
+class Files(Stored):
     """Files of a shard, by table."""
 
     episodes: ShardPath
@@ -28,7 +30,7 @@ class Files(_Stored):
     traces: ShardPath | None = None
 
 
-class StoredShard(_Stored):
+class StoredShard(Stored):
     """A contiguous range of episodes, and its files by table."""
 
     index: Count
@@ -37,7 +39,7 @@ class StoredShard(_Stored):
     files: Files
 
 
-class Retraced(_Stored):
+class Retraced(Stored):
     """How many episodes the twin has retraced in which columns, or why none."""
 
     n_episodes: Count | None = None
@@ -45,7 +47,7 @@ class Retraced(_Stored):
     reason: str | None = None
 
 
-class TableError(_Stored):
+class TableError(Stored):
     """A challenge table's value beside the same by Monte Carlo."""
 
     surrogate: str
@@ -56,14 +58,14 @@ class TableError(_Stored):
     std_error: float
 
 
-class Repeated(_Stored):
-    """What repeating some tests has shown; `harness.runner.repeat.Repeated`."""
+class Repeated(Stored):
+    """What repeating some tests has shown; `harness.runner.worker.Repeated`."""
 
     n_episodes: Count
     differing: list[Count]
 
 
-class StoredManifest(_Stored):
+class StoredManifest(Stored):
     """The manifest of a run."""
 
     campaign_hash: str
@@ -88,9 +90,10 @@ class StoredManifest(_Stored):
     table_errors: list[TableError] | None = None
 
 
-class StoredShells(_Stored):
-    """``shells.json``: the strata of a shells campaign, see `harness.pool.shells.ShellDesign`."""
+class StoredShells(Stored):
+    """``shells.json``: the strata of a shells campaign, see `harness.strata.ShellDesign`."""
 
+    model_config = ConfigDict(extra="forbid")
     pool: str
     strata: list[str]
     p: list[float]
@@ -100,7 +103,7 @@ class StoredShells(_Stored):
     boundary: str
     p_cut_in: float
     p_impossible: float
-    available: list[Count] = []
+    available: list[Count]
 
     @model_validator(mode="after")
     def _of_one_size(self) -> Self:
@@ -110,7 +113,7 @@ class StoredShells(_Stored):
         return self
 
 
-class StoredStop(_Stored):
+class StoredStop(Stored):
     """Where one campaign of a comparison stopped by itself."""
 
     campaign_hash: str
@@ -119,7 +122,7 @@ class StoredStop(_Stored):
     stopped_by: StoppedBy
 
 
-class StoredStops(_Stored):
+class StoredStops(Stored):
     """``stops.json`` of a comparison."""
 
     a: StoredStop | None = None

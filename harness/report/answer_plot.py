@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
 
 from harness.report.number_format import exponent_of, interval, number, plain, with_interval
-from harness.report.plot_style import BLUE, FULL_WIDTH_IN, GREY, INK, MUTED, Plot, new_figure
-from harness.report.rate_axis import decades, scaled
-from harness.report.shells_result import shells_result
+from harness.report.plot_style import BLUE, FULL_WIDTH_IN, GREY, INK, MUTED, Plot, decades, new_figure, note, scaled
+from harness.report.run_folder import ShownShells, StoredEstimates
 
 LOG_AXIS_RATIO = 30.0
 
 
-@dataclass(frozen=True)
-class Interval:
+class Interval(NamedTuple):
     """One estimator's rate and interval, per test."""
 
     name: str
@@ -28,46 +24,40 @@ class Interval:
     is_headline: bool
 
 
-def answer_plot(estimates: dict[str, Any]) -> Plot | None:
-    """Draw the intervals of all estimators that have one; None when there is none."""
+def answer_plot(estimates: StoredEstimates, shells: ShownShells | None) -> Plot | None:
+    """Draw the intervals of all estimators that have one, the headline first; None when there is none.
+
+    Of a shells run also that of the conditional statement, unless its tests have refuted it.
+    """
     shown = _intervals(estimates)
+    if shells is not None and not shells.conditional.refuted:
+        inside = shells.conditional
+        shown.append(Interval("if none outside", inside.crash_rate, inside.ci_low, inside.ci_high, is_headline=False))
     if not shown:
         return None
     figure = new_figure(FULL_WIDTH_IN, 1.15 + 0.34 * len(shown))
     axes = figure.subplots()
     on_log = _set_scale(axes, shown)
-    left = axes.get_xlim()[0]
+    left = axes.get_xlim()[0] if on_log else 0.0
     for row, one in enumerate(shown):
-        _draw(axes, row, one, left if on_log else 0.0)
+        _draw(axes, row, one, left)
     _label(axes, shown, estimates, on_log)
-    _add_distance_axis(axes, estimates, on_log)
+    _add_distance_axis(axes, estimates.distance_per_test_km, on_log)
     headline = shown[0]
     alt = (
         f"Crash rate per test by estimator. {headline.name}: {number(headline.rate)}, interval "
         f"{interval(headline.low, headline.high)}."
     )
-    return Plot("answer", figure, alt, _caption(estimates, shown, on_log))
+    return Plot("answer", figure, alt, _caption(estimates, shown, on_log, of_shells=shells is not None))
 
 
-def _intervals(estimates: dict[str, Any]) -> list[Interval]:
-    headline = estimates["headline"]
+def _intervals(estimates: StoredEstimates) -> list[Interval]:
     rows = [
-        Interval(name, float(e["crash_rate"]), float(e["ci_low"]), float(e["ci_high"]), name == headline)
-        for name, e in estimates["estimates"].items()
-        if all(
-            isinstance(e.get(key), int | float) and math.isfinite(e[key]) for key in ("crash_rate", "ci_low", "ci_high")
-        )
+        Interval(name, e.crash_rate, e.ci_low, e.ci_high, name == estimates.headline)
+        for name, e in estimates.estimates.items()
+        if e.crash_rate is not None and e.ci_low is not None and e.ci_high is not None
     ]
-    return [*sorted(rows, key=lambda row: not row.is_headline), *_conditional(estimates)]
-
-
-def _conditional(estimates: dict[str, Any]) -> list[Interval]:
-    """Return the interval of the conditional statement of a shells run, unless its tests have refuted it."""
-    found = shells_result(estimates)
-    if found is None or found.conditional.refuted:
-        return []
-    inside = found.conditional
-    return [Interval("if none outside", inside.rate, inside.low, inside.high, is_headline=False)]
+    return sorted(rows, key=lambda row: not row.is_headline)
 
 
 def _set_scale(axes: Axes, shown: list[Interval]) -> bool:
@@ -98,12 +88,12 @@ def _draw(axes: Axes, row: int, one: Interval, left: float) -> None:
     if one.rate >= left and (one.rate > 0.0 or left == 0.0):
         axes.plot([one.rate], [row], "o", color=colour, markersize=8 if one.is_headline else 6, clip_on=False, zorder=3)
     text = with_interval(one.rate, one.low, one.high) if one.rate > 0.0 else f"0 (to {number(one.high)})"
-    axes.annotate(
+    note(
+        axes,
         text,
-        xy=(1.0, row),
+        (1.0, row),
+        (10, 0),
         xycoords=("axes fraction", "data"),
-        xytext=(10, 0),
-        textcoords="offset points",
         va="center",
         color=INK if one.is_headline else MUTED,
         fontweight="bold" if one.is_headline else "normal",
@@ -111,7 +101,7 @@ def _draw(axes: Axes, row: int, one: Interval, left: float) -> None:
     )
 
 
-def _label(axes: Axes, shown: list[Interval], estimates: dict[str, Any], on_log: bool) -> None:
+def _label(axes: Axes, shown: list[Interval], estimates: StoredEstimates, on_log: bool) -> None:
     axes.set_yticks(range(len(shown)), [one.name for one in shown])
     axes.tick_params(axis="y", length=0, pad=8, labelcolor=INK)
     axes.spines["left"].set_visible(False)
@@ -122,15 +112,14 @@ def _label(axes: Axes, shown: list[Interval], estimates: dict[str, Any], on_log:
         decades(axes.xaxis, *axes.get_xlim())
     else:
         unit = scaled(axes.xaxis, max(one.high for one in shown))
-    axes.set_xlabel(f"crash rate per test{unit} (lane-change level {plain(estimates['lane_change_level'])})")
+    axes.set_xlabel(f"crash rate per test{unit} (lane-change level {plain(estimates.lane_change_level)})")
 
 
-def _add_distance_axis(axes: Axes, estimates: dict[str, Any], on_log: bool) -> None:
+def _add_distance_axis(axes: Axes, distance_per_test_km: float | None, on_log: bool) -> None:
     """Second scale on top, per 1e6 km: the same interval in the unit that safety cases use."""
-    distance_km = estimates.get("distance_per_test_km")
-    if not isinstance(distance_km, int | float) or not distance_km > 0.0:
+    if distance_per_test_km is None or distance_per_test_km <= 0.0:
         return
-    factor = 1e6 / distance_km
+    factor = 1e6 / distance_per_test_km
     top = axes.secondary_xaxis("top", functions=(lambda x: np.multiply(x, factor), lambda x: np.divide(x, factor)))
     unit = ""
     if on_log:
@@ -141,24 +130,23 @@ def _add_distance_axis(axes: Axes, estimates: dict[str, Any], on_log: bool) -> N
     top.spines["top"].set_visible(True)
 
 
-def _caption(estimates: dict[str, Any], shown: list[Interval], on_log: bool) -> str:
-    level = f"{100.0 * float(estimates['confidence']):g} %"
+def _caption(estimates: StoredEstimates, shown: list[Interval], on_log: bool, *, of_shells: bool) -> str:
+    level = f"{100.0 * estimates.confidence:g} %"
     text = f"Point and {level} interval of each estimator, from the same tests; the headline ({shown[0].name}) in blue."
     if on_log:
         text += " The axis is logarithmic because they differ by orders of magnitude."
     if shown[0].rate == 0.0:
-        text += " No crash was sampled: the interval reaches from zero to the upper bound."
-    elif shells_result(estimates) is not None:
-        if len(shown) > 1:
-            text += " The other one holds if there are no crashes outside the boundary."
-    elif len(shown) > 1:
-        text += (
-            " Estimators that use the same tests are not independent: agreement among them is expected, not evidence."
-        )
-    return text
+        return text + " No crash was sampled: the interval reaches from zero to the upper bound."
+    if len(shown) == 1:
+        return text
+    if of_shells:
+        return text + " The other one holds if there are no crashes outside the boundary."
+    return text + (
+        " Estimators that use the same tests are not independent: agreement among them is expected, not evidence."
+    )
 
 
-def rate_exponent(estimates: dict[str, Any]) -> int:
+def rate_exponent(estimates: StoredEstimates) -> int:
     """Power of ten in which the rates of this run are best written."""
     shown = _intervals(estimates)
     return exponent_of(shown[0].rate or shown[0].high) if shown else 0

@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from matplotlib.axes import Axes
 
-from harness.errors import RunFolderError
-from harness.report.fine_histogram import Floats
+from harness.arrays import FloatArray
 from harness.report.number_format import count, number, percent, plain
-from harness.report.plot_style import BLUE, FULL_WIDTH_IN, GREY, INK, MUTED, VERMILLION, Plot, new_figure
-from harness.report.rate_axis import decades, scaled
+from harness.report.plot_style import (
+    BLUE,
+    FULL_WIDTH_IN,
+    GREY,
+    INK,
+    MUTED,
+    VERMILLION,
+    Plot,
+    decades,
+    new_figure,
+    note,
+    scaled,
+)
+from harness.report.run_folder import StoredEstimates, StoredPoint
 
 _WEIGHTED = (
     "Left, the band should narrow around a level line: a rate that still climbs, or drops between jumps, has not "
@@ -28,19 +37,17 @@ _RHW = "Relative half-width (RHW)"
 
 
 def convergence_plot(
-    estimates: dict[str, Any], target_rhw: float | None, *, of_conditional: bool = False
+    estimates: StoredEstimates, target_rhw: float | None, *, of_conditional: bool = False
 ) -> Plot | None:
     """Rate with its band, and RHW with its target, against tests; None without convergence records.
 
-    Parameters
-    ----------
-    of_conditional : bool
-        Whether the target is one for the conditional statement of a shells run, which convergence does not record.
+    ``of_conditional``: the target is one for the conditional statement of a shells run, which convergence does not
+    record.
     """
-    curve = _curve(estimates.get("convergence") or [])
+    curve = _curve(estimates.convergence or [])
     if curve["n"].size < 2:
         return None
-    confidence, level = percent(float(estimates["confidence"])), plain(float(estimates["lane_change_level"]))
+    confidence, level = percent(estimates.confidence), plain(estimates.lane_change_level)
     if not np.any(curve["crash_rate"] > 0.0):
         return _plot_without_crash(curve, confidence, level)
     figure = new_figure(FULL_WIDTH_IN, 3.5)
@@ -54,7 +61,7 @@ def convergence_plot(
         f"{number(curve['crash_rate'][-1])} after {count(curve['n'][-1])} tests. Right: relative half-width against "
         f"tests, ending at {number(curve['rhw'][-1])}."
     )
-    caption = _WEIGHTED if estimates["headline"] != "shells" else _SHELLS
+    caption = _WEIGHTED if estimates.headline != "shells" else _SHELLS
     if target_rhw is None:
         caption += " No RHW was asked for."
     elif of_conditional:
@@ -62,7 +69,7 @@ def convergence_plot(
     return Plot("convergence", figure, alt, caption)
 
 
-def _plot_without_crash(curve: dict[str, Floats], confidence: str, level: str) -> Plot:
+def _plot_without_crash(curve: dict[str, FloatArray], confidence: str, level: str) -> Plot:
     """Draw only the upper end of the interval: without a crash it is all that changes, and RHW is not defined."""
     figure = new_figure(FULL_WIDTH_IN, 2.9)
     axes = figure.subplots()
@@ -84,36 +91,22 @@ def _plot_without_crash(curve: dict[str, Floats], confidence: str, level: str) -
     return Plot("convergence", figure, alt, caption)
 
 
-def _label_tests(axes: Axes, curve: dict[str, Floats]) -> None:
+def _label_tests(axes: Axes, curve: dict[str, FloatArray]) -> None:
     axes.set_xscale("log")
     axes.set_xlim(curve["n"][0], curve["n"][-1])
     decades(axes.xaxis, *axes.get_xlim())
     axes.set_xlabel("tests")
 
 
-def _curve(points: list[dict[str, Any]]) -> dict[str, Floats]:
+def _curve(points: list[StoredPoint]) -> dict[str, FloatArray]:
     """Columns of the convergence records, shape (m,), missing values as NaN, sorted by tests."""
     names = ("n", "crash_rate", "ci_low", "ci_high", "rhw")
-    rows = [[_number(point, name) for name in names] for point in points]
-    table = np.array(rows, dtype=np.float64).reshape(-1, len(names))
+    table = np.array([[getattr(point, name) for name in names] for point in points], np.float64).reshape(-1, len(names))
     table = table[np.argsort(table[:, 0], kind="stable")]
     return dict(zip(names, table.T, strict=True))
 
 
-def _number(point: dict[str, Any], name: str) -> float:
-    """Return a value of a point, NaN where it is null; a point that lacks it altogether is an error, never a zero."""
-    key = "rate" if name == "crash_rate" and name not in point else name
-    if key not in point:
-        raise RunFolderError(
-            "estimates.json",
-            found=f"a convergence point without {name!r}",
-            expected="n, crash_rate, ci_low, ci_high and rhw in each",
-            mend="Make it again with `harness estimate DIR --write`.",
-        )
-    return np.nan if point[key] is None else float(point[key])
-
-
-def _draw_rate(axes: Axes, curve: dict[str, Floats], confidence: str, level: str) -> None:
+def _draw_rate(axes: Axes, curve: dict[str, FloatArray], confidence: str, level: str) -> None:
     n, rate, low, high = (curve[name] for name in ("n", "crash_rate", "ci_low", "ci_high"))
     axes.fill_between(n, low, high, color=BLUE, alpha=0.16, linewidth=0, label=f"{confidence} interval")
     axes.plot(n, rate, color=BLUE, label="estimate")
@@ -135,7 +128,7 @@ def _head(axes: Axes, title: str) -> None:
         )  # fmt: skip
 
 
-def _rate_limit(curve: dict[str, Floats]) -> float:
+def _rate_limit(curve: dict[str, FloatArray]) -> float:
     """Upper end of the rate axis: the last half of the curve fills it, the first wild intervals may leave it."""
     high = curve["ci_high"][np.isfinite(curve["ci_high"])]
     if not high.size:
@@ -144,7 +137,7 @@ def _rate_limit(curve: dict[str, Floats]) -> float:
     return 1.15 * max(min(settled, 3.0 * float(high[-1])), float(np.nanmax(curve["crash_rate"][-2:])), 1e-300)
 
 
-def _draw_rhw(axes: Axes, curve: dict[str, Floats], target_rhw: float | None) -> None:
+def _draw_rhw(axes: Axes, curve: dict[str, FloatArray], target_rhw: float | None) -> None:
     axes.set_ylabel("RHW")
     known = np.isfinite(curve["rhw"]) & (curve["rhw"] > 0.0)
     if not known.any():
@@ -164,6 +157,4 @@ def _draw_rhw(axes: Axes, curve: dict[str, Floats], target_rhw: float | None) ->
     decades(axes.yaxis, *axes.get_ylim())
     _head(axes, _RHW)
     axes.plot(n[-1:], rhw[-1:], "o", color=BLUE, markersize=5, clip_on=False)
-    axes.annotate(
-        f"{rhw[-1]:.3g}", (n[-1], rhw[-1]), xytext=(-7, -11), textcoords="offset points", ha="right", color=INK
-    )
+    note(axes, f"{rhw[-1]:.3g}", (n[-1], rhw[-1]), (-7, -11), ha="right", color=INK)

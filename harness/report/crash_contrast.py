@@ -12,14 +12,14 @@ from dataclasses import dataclass
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
+from matplotlib.axes import Axes
 
+from harness.arrays import FloatArray
 from harness.outcomes import CRASH, FAILED, OUTCOMES
 from harness.report.cut_in_conditions import COLUMNS, CONDITIONS, cut_in_conditions
-from harness.report.fine_histogram import Floats
-from harness.report.number_format import MINUS, count, percent
+from harness.report.number_format import count, decimal, percent
+from harness.report.plot_style import FULL_WIDTH_IN, GREY, MUTED, VERMILLION, Plot, new_figure, only_horizontal_grid
 from harness.report.run_folder import RunFolder
-from harness.report.shard_tables import episode_batches
-from harness.report.shells_result import ShellsResult
 from harness.report.telling_bands import Band, telling_bands
 from harness.vehicles.kinematics import STEP_S
 
@@ -27,6 +27,12 @@ MOST_CRASHES, MOST_OTHERS = 5_000, 20_000
 """Tests compared, the first of each kind: tests come in random order, so that this is a fair sample."""
 FEWEST_CRASHES = 3
 """Fewer have nothing in common that chance would not give them."""
+PANELS = 3
+BARS = 40
+TICKED_CRASHES = 60
+"""Up to so many crashes each get a mark of their own below the bars."""
+OTHERS_SHOWN, CRASHES_SHOWN = (0.005, 0.995), (0.25, 0.75)
+"""Quantiles that a panel reaches at least; of crashes fewer, because some need a braking of hundreds of m/s²."""
 
 
 @dataclass(frozen=True)
@@ -45,10 +51,10 @@ class Contrast:
     """
 
     outside: bool
-    crashes: Floats
-    others: Floats
-    crash_weight: Floats
-    other_weight: Floats
+    crashes: FloatArray
+    others: FloatArray
+    crash_weight: FloatArray
+    other_weight: FloatArray
     bands: tuple[Band, ...]
 
     @property
@@ -70,8 +76,13 @@ class Contrast:
     def sentence(self) -> str:
         """What to say about it, in words."""
         where = " outside the boundary" if self.outside else ""
+        if not self.n_crashes:
+            return f"No test{where} crashed, so there is nothing to compare."
         if not self.bands:
-            return self._too_few(where)
+            return (
+                f"With {count(self.n_crashes)} crashes{where} and {count(self.n_others)} cut-ins{where} without one, "
+                "nothing can be said about what crashes have in common."
+            )
         if not self.telling:
             return (
                 f"Nothing stands out: no quantity recorded at the cut-in tells {count(self.n_crashes)} crashes{where} "
@@ -91,18 +102,10 @@ class Contrast:
             f"{count(self.n_others)} tests there without a crash were like that."
         )
 
-    def _too_few(self, where: str) -> str:
-        if not self.n_crashes:
-            return f"No test{where} crashed, so there is nothing to compare."
-        return (
-            f"With {count(self.n_crashes)} crashes{where} and {count(self.n_others)} cut-ins{where} without one, "
-            "nothing can be said about what crashes have in common."
-        )
-
 
 def band_in_words(band: Band) -> str:
     """``30.0 to 30.5 m/s``, ``at most 7.9 m``."""
-    unit, low, high = CONDITIONS[band.quantity].unit, _tenths(band.low), _tenths(band.high)
+    unit, low, high = CONDITIONS[band.quantity].unit, decimal(band.low), decimal(band.high)
     if math.isinf(band.low):
         return f"any {unit}" if math.isinf(band.high) else f"at most {high} {unit}"
     if math.isinf(band.high):
@@ -110,11 +113,7 @@ def band_in_words(band: Band) -> str:
     return f"{low} {unit}" if band.low == band.high else f"{low} to {high} {unit}"
 
 
-def _tenths(value: float) -> str:
-    return f"{value:,.1f}".replace("-", MINUS)
-
-
-def crash_contrast(run: RunFolder, shells: ShellsResult | None) -> Contrast:
+def crash_contrast(run: RunFolder) -> Contrast:
     """Compare the tests of a run.
 
     Raises
@@ -122,20 +121,24 @@ def crash_contrast(run: RunFolder, shells: ShellsResult | None) -> Contrast:
     RunFolderError
         If a shard is damaged.
     """
-    n_inside = 0 if shells is None else sum(shell.inside for shell in shells.shells)
+    first_outside = None if run.shells is None else run.shells.n_inside
     crashes, others = _Rows(MOST_CRASHES), _Rows(MOST_OTHERS)
-    hold_steps = round(float(run.campaign["environment"]["acceleration_hold_s"]) / STEP_S)
-    for batch in episode_batches(run, (*COLUMNS, "outcome", "component", "log_weight")):
-        compared = _compared(batch, n_inside if shells else None)
-        for rows, wanted in ((crashes, True), (others, False)):
-            rows.add(batch.filter(pc.and_(compared, _crashed(batch, wanted))), hold_steps, weighted=shells is None)
+    hold_steps = round(run.campaign.environment.acceleration_hold_s / STEP_S)
+    for batch in run.episodes(*COLUMNS, "outcome", "component", "log_weight"):
+        compared = pc.and_(pc.is_valid(batch.column("cut_in_step")), pc.invert(_ended(batch, FAILED)))
+        if first_outside is not None:
+            compared = pc.and_(compared, pc.greater_equal(batch.column("component"), first_outside))
+        crashed = _ended(batch, CRASH)
+        for rows, wanted in ((crashes, crashed), (others, pc.invert(crashed))):
+            rows.add(batch.filter(pc.and_(compared, wanted)), hold_steps, weighted=run.shells is None)
         if crashes.full and others.full:
             break
     bands: list[Band] = []
-    if crashes.n >= FEWEST_CRASHES and others.n >= FEWEST_CRASHES:
-        crash = np.arange(crashes.n + others.n) < crashes.n
+    if min(crashes.weight.size, others.weight.size) >= FEWEST_CRASHES:
+        crash = np.arange(crashes.weight.size + others.weight.size) < crashes.weight.size
         bands = telling_bands(np.hstack([crashes.values, others.values]), crash, np.r_[crashes.weight, others.weight])
-    return Contrast(shells is not None, crashes.values, others.values, crashes.weight, others.weight, tuple(bands))
+    outside = run.shells is not None
+    return Contrast(outside, crashes.values, others.values, crashes.weight, others.weight, tuple(bands))
 
 
 class _Rows:
@@ -143,19 +146,15 @@ class _Rows:
 
     def __init__(self, most: int) -> None:
         self.most = most
-        self.values: Floats = np.zeros((len(CONDITIONS), 0))
-        self.weight: Floats = np.zeros(0)
-
-    @property
-    def n(self) -> int:
-        return self.weight.size
+        self.values: FloatArray = np.zeros((len(CONDITIONS), 0))
+        self.weight: FloatArray = np.zeros(0)
 
     @property
     def full(self) -> bool:
-        return self.n >= self.most
+        return self.weight.size >= self.most
 
     def add(self, batch: pa.RecordBatch, hold_steps: int, *, weighted: bool) -> None:
-        batch = batch.slice(0, self.most - self.n)
+        batch = batch.slice(0, self.most - self.weight.size)
         if not batch.num_rows:
             return
         log_weight = batch.column("log_weight").to_numpy(zero_copy_only=False)
@@ -163,18 +162,67 @@ class _Rows:
         self.weight = np.r_[self.weight, np.exp(log_weight) if weighted else np.ones(batch.num_rows)]
 
 
-def _compared(batch: pa.RecordBatch, first_outside: int | None) -> pa.Array:
-    """Rows with a cut-in that did not fail; of tests from shells those outside."""
-    valid = pc.and_(pc.is_valid(batch.column("cut_in_step")), pc.invert(_ended(batch, FAILED)))
-    return (
-        valid if first_outside is None else pc.and_(valid, pc.greater_equal(batch.column("component"), first_outside))
-    )
-
-
-def _crashed(batch: pa.RecordBatch, wanted: bool) -> pa.Array:
-    crashed = _ended(batch, CRASH)
-    return crashed if wanted else pc.invert(crashed)
-
-
 def _ended(batch: pa.RecordBatch, outcome: int) -> pa.Array:
     return pc.equal(batch.column("outcome").cast(pa.string()), OUTCOMES[outcome])
+
+
+def contrast_plot(contrast: Contrast) -> Plot | None:
+    """Draw one panel for each of the most telling quantities, its distribution among crashes and others with the band.
+
+    None where none stands out.
+    """
+    bands = contrast.telling[:PANELS]
+    if not bands:
+        return None
+    figure = new_figure(FULL_WIDTH_IN, 2.9)
+    panels = figure.subplots(1, max(len(bands), 2), squeeze=False)[0]
+    for axes, band in zip(panels, bands, strict=False):
+        _draw(axes, contrast, band)
+    for axes in panels[len(bands) :]:
+        axes.set_visible(False)
+    panels[0].set_ylabel("share, %")
+    panels[0].legend(loc="upper left", fontsize=8, labelcolor=MUTED, bbox_to_anchor=(0.0, 1.0))
+    names = ", ".join(CONDITIONS[band.quantity].name for band in bands)
+    alt = f"Histograms among crashes and among tests without a crash: {names}. {contrast.sentence}"
+    ticks = " Each mark at the foot is a crash." if contrast.n_crashes <= TICKED_CRASHES else ""
+    weighted = "" if contrast.outside else " Both are weighted to naturalistic driving."
+    caption = (
+        f"Orange: {count(contrast.n_crashes)} crashes; grey: {count(contrast.n_others)} tests without one. Shaded: the "
+        f"band in which crashes are most over-represented.{weighted}{ticks} What lies beyond a panel counts in its "
+        "outermost bar."
+    )
+    return Plot("contrast", figure, alt, caption)
+
+
+def _draw(axes: Axes, contrast: Contrast, band: Band) -> None:
+    crashes, others = contrast.crashes[band.quantity], contrast.others[band.quantity]
+    edges = np.linspace(*_range(crashes, others, band), BARS + 1)
+    axes.axvspan(max(band.low, edges[0]), min(band.high, edges[-1]), color=VERMILLION, alpha=0.15, linewidth=0)
+    grey = _shares(others, contrast.other_weight, edges)
+    axes.stairs(grey, edges, fill=True, color=GREY, alpha=0.6, label="no crash")
+    axes.stairs(_shares(crashes, contrast.crash_weight, edges), edges, color=VERMILLION, linewidth=1.5, label="crash")
+    if contrast.n_crashes <= TICKED_CRASHES:
+        seen = np.clip(crashes, edges[0], edges[-1])
+        axes.plot(seen, np.zeros_like(seen), "|", color=VERMILLION, markersize=7, clip_on=False)
+    axes.set_xlim(float(edges[0]), float(edges[-1]))
+    axes.set_ylim(0.0, 1.35 * axes.get_ylim()[1])
+    condition = CONDITIONS[band.quantity]
+    axes.set_xlabel(f"{condition.name}, {condition.unit}")
+    only_horizontal_grid(axes)
+
+
+def _range(crashes: FloatArray, others: FloatArray, band: Band) -> tuple[float, float]:
+    """From and to which value a panel shows: nearly all tests without a crash, most crashes, and the band."""
+    ends = [end for end in (band.low, band.high) if np.isfinite(end)]
+    for values, shown in ((others, OTHERS_SHOWN), (crashes, CRASHES_SHOWN)):
+        known = values[np.isfinite(values)]
+        if known.size:
+            ends += np.quantile(known, shown).tolist()
+    low, high = min(ends), max(ends)
+    return (low, high) if high > low else (low - 0.5, low + 0.5)
+
+
+def _shares(values: FloatArray, weight: FloatArray, edges: FloatArray) -> FloatArray:
+    known = ~np.isnan(values)
+    held, _ = np.histogram(np.clip(values[known], edges[0], edges[-1]), edges, weights=weight[known])
+    return 100.0 * held / max(float(weight.sum()), np.finfo(float).tiny)

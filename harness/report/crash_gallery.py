@@ -1,21 +1,31 @@
-"""The worst crashes: a table of them, and a time-space diagram of each that was traced."""
+"""The worst crashes: a row of the table for each, and of those that were traced a time-space diagram.
+
+The diagram shows where LV, BV and AV were, in a frame that moves with BV's initial speed, and how fast.
+"""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
+import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
+from matplotlib.axes import Axes
 
-from harness.report.number_format import number
-from harness.report.plot_style import Plot
+from harness.arrays import FloatArray
+from harness.outcomes import VEHICLES
+from harness.records.reader import read_traces
+from harness.report.number_format import decimal, number
+from harness.report.plot_style import HALF_WIDTH_IN, INK, VEHICLE_COLOURS, Plot, new_figure, note
 from harness.report.run_folder import RunFolder, typed_folder
-from harness.report.shard_tables import trace_rows
-from harness.report.shells_result import shells_result
-from harness.report.summary import RunSummary
-from harness.report.time_space_plot import TRACE_COLUMNS, time_space_plot, tracks_of
-from harness.report.worst_crashes import Crash
+from harness.report.summary import Crash, RunSummary
+from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
 
 SHOWN_PER_RANKING = 3
+SECONDS_BEFORE_CUT_IN = 2.0
+NAME_HEIGHT = 0.11
+"""Least distance of two names beside the speed panel, as a share of its height."""
 
 
 @dataclass(frozen=True)
@@ -45,49 +55,167 @@ def crash_gallery(run: RunFolder, summary: RunSummary) -> list[GalleryRow]:
         rankings.append((summary.outermost.crashes, "outermost"))
     elif not summary.all_weights_one:
         rankings.append((summary.heaviest.crashes, "weight"))
-    traces = trace_rows(run, {crash.episode for ranked, _ in rankings for crash in ranked}, TRACE_COLUMNS)
+    episodes = {crash.episode for ranked, _ in rankings for crash in ranked}
+    traces = read_traces(run.path, episodes, ["episode", "step", "vehicle", "lane", "x_m", "v_mps"])
     traced = set() if traces is None else set(traces.column("episode").unique().to_pylist())
     reasons: dict[Crash, list[str]] = {}
     for ranked, reason in rankings:
         chosen = sorted(enumerate(ranked, 1), key=lambda item: item[1].episode not in traced)[:SHOWN_PER_RANKING]
         for rank, crash in sorted(chosen, key=lambda item: item[0]):
             reasons.setdefault(crash, []).append(f"{reason} no. {rank}")
+    total = float(summary.log10_weight_crash.weight.sum())
     return [
         GalleryRow(
             crash=crash,
             reason=", ".join(why),
-            share_of_estimate=_share(crash, summary),
+            share_of_estimate=crash.weight / total if total > 0.0 else math.nan,
             component=component_name(run, crash.component),
-            command=replay_command(run, crash.episode),
+            command=f"harness replay {typed_folder(run.path)} {crash.episode}",
             plot=_diagram(run, summary, crash, traces) if crash.episode in traced else None,
         )
         for crash, why in reasons.items()
     ]
 
 
-def _diagram(run: RunFolder, summary: RunSummary, crash: Crash, traces: pa.Table) -> Plot:
-    worth = f"weight {number(crash.weight)}"
-    if summary.from_shells:
-        worth = f"in the shell {component_name(run, crash.component)}, adding {number(crash.weight)} to the rate"
-    return time_space_plot(crash, tracks_of(traces, crash.episode), worth=worth)
-
-
-def replay_command(run: RunFolder, episode: int) -> str:
-    """Return the shell command that runs an episode again, bit for bit."""
-    return f"harness replay {typed_folder(run.path)} {episode}"
-
-
 def component_name(run: RunFolder, component: int) -> str:
     """Name the shell of an episode, or the importance function it followed, of which the forced cut-in is the first."""
     if component < 0:
         return "–"
-    surrogates, shells = run.campaign.get("surrogates"), shells_result(run.estimates)
-    names = ["forced", *(surrogates if isinstance(surrogates, dict) else ())]
-    if shells is not None:
-        names = [shell.name for shell in shells.shells]
-    return str(names[component]) if component < len(names) else str(component)
+    names = ["forced", *run.campaign.surrogates] if run.shells is None else [s.shell for s in run.shells.shells]
+    return names[component] if component < len(names) else str(component)
 
 
-def _share(crash: Crash, summary: RunSummary) -> float:
-    total = float(summary.log10_weight_crash.weight.sum())
-    return crash.weight / total if total > 0.0 else float("nan")
+def _diagram(run: RunFolder, summary: RunSummary, crash: Crash, traces: pa.Table) -> Plot:
+    worth = f"weight {number(crash.weight)}"
+    if summary.from_shells:
+        worth = f"in the shell {component_name(run, crash.component)}, adding {number(crash.weight)} to the rate"
+    return time_space_plot(crash, _tracks(traces, crash.episode), worth=worth)
+
+
+@dataclass(frozen=True)
+class Track:
+    """One vehicle's motion; all of shape (n_steps,): time in s, front bumper in m, speed in m/s, lane (0 right)."""
+
+    time_s: FloatArray
+    x_m: FloatArray
+    v_mps: FloatArray
+    lane: FloatArray
+
+    def front_m(self, time_s: float, frame_mps: float) -> float:
+        """Front bumper in the moving frame at one time."""
+        return float(np.interp(time_s, self.time_s, self.x_m)) - frame_mps * time_s
+
+    def speed_mps(self, time_s: float) -> float:
+        """Speed at one time."""
+        return float(np.interp(time_s, self.time_s, self.v_mps))
+
+
+def _tracks(traces: pa.Table, episode: int) -> dict[str, Track]:
+    """Tracks of an episode by vehicle."""
+    rows = traces.filter(pc.equal(traces.column("episode"), episode))
+    tracks = {}
+    for vehicle in VEHICLES:
+        part = rows.filter(pc.equal(rows.column("vehicle").cast(pa.string()), vehicle)).sort_by("step")
+        columns = [part.column(name).to_numpy().astype(np.float64) for name in ("step", "x_m", "v_mps", "lane")]
+        tracks[vehicle] = Track(STEP_S * columns[0], *columns[1:])
+    return tracks
+
+
+def time_space_plot(crash: Crash, tracks: dict[str, Track], *, worth: str) -> Plot:
+    """Positions in a frame that moves with BV's initial speed, and speeds, with cut-in and crash marked.
+
+    ``worth`` ends the caption: what the crash means for the estimate.
+    """
+    figure = new_figure(HALF_WIDTH_IN, 4.7)
+    position, speed = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
+    frame_mps = float(tracks["BV"].v_mps[0])
+    for vehicle, track in tracks.items():
+        _draw_positions(position, vehicle, track, frame_mps)
+        speed.plot(track.time_s, track.v_mps, color=VEHICLE_COLOURS[vehicle])
+    for axes in (position, speed):
+        axes.axvline(crash.cut_in_time_s, color=INK, linewidth=0.9, linestyle=(0, (4, 3)))
+    place = ("data", "axes fraction")
+    note(position, "cut-in", (crash.cut_in_time_s, 0.0), (-4, 5), xycoords=place, ha="right", color=INK, fontsize=8)
+    _mark_crash(position, speed, crash.crash_time_s, tracks, frame_mps)
+    _label(position, speed, crash, tracks, frame_mps)
+    alt = (
+        f"Time-space diagram of episode {crash.episode}: BV cuts in at {decimal(crash.cut_in_time_s)} s, "
+        f"{decimal(crash.cut_in_r2_m)} m before the AV; the AV hits it at {decimal(crash.crash_time_s)} s with "
+        f"{decimal(crash.impact_speed_mps)} m/s."
+    )
+    caption = (
+        f"R2 = {decimal(crash.cut_in_r2_m)} m and R2dot = {decimal(crash.cut_in_r2dot_mps)} m/s at the cut-in, crash "
+        f"{decimal(crash.crash_time_s - crash.cut_in_time_s)} s later; {worth}."
+    )
+    return Plot(f"crash-{crash.episode:09d}", figure, alt, caption)
+
+
+def _draw_positions(axes: Axes, vehicle: str, track: Track, frame_mps: float) -> None:
+    """Draw the vehicle as a band from rear to front bumper; paler while it is on the left lane."""
+    front = track.x_m - frame_mps * track.time_s
+    rear, colour = front - VEHICLE_LENGTH_M, VEHICLE_COLOURS[vehicle]
+    for lane, alpha in ((1, 0.28), (0, 0.62)):
+        on_lane = track.lane == lane
+        # A band drawn over the mask alone would leave a gap of one step at the lane change.
+        on_lane = on_lane | np.r_[False, on_lane[:-1]] if lane == 1 else on_lane
+        axes.fill_between(track.time_s, rear, front, where=on_lane, color=colour, alpha=alpha, linewidth=0)
+    axes.plot(track.time_s, front, color=colour, linewidth=1.2)
+
+
+def _mark_crash(position: Axes, speed: Axes, time_s: float, tracks: dict[str, Track], frame_mps: float) -> None:
+    at_crash = tracks["AV"].front_m(time_s, frame_mps)
+    position.plot([time_s], [at_crash], "X", color=INK, markersize=9, clip_on=False, zorder=5)
+    ends = [tracks[vehicle].speed_mps(time_s) for vehicle in ("BV", "AV")]
+    speed.plot([time_s] * 2, ends, color=INK, linewidth=1.4, clip_on=False, zorder=4)
+
+
+def _label(position: Axes, speed: Axes, crash: Crash, tracks: dict[str, Track], frame_mps: float) -> None:
+    start = max(min(crash.cut_in_time_s - SECONDS_BEFORE_CUT_IN, crash.crash_time_s - 4.0), 0.0)
+    end = crash.crash_time_s + 0.06 * (crash.crash_time_s - start)
+    position.set_xlim(start, end)
+    _fit_height(position, tracks, frame_mps, start, crash.crash_time_s)
+    _name_vehicles(position, tracks, frame_mps, start)
+    position.set_title(f"Episode {crash.episode:,}: impact at {decimal(crash.impact_speed_mps)} m/s")
+    position.set_ylabel(f"position in a frame\nmoving at {frame_mps:.1f} m/s, m")
+    _name_speeds(speed, tracks, crash.crash_time_s)
+    speed.set_ylabel("speed, m/s")
+    speed.set_xlabel("time, s")
+    for axis in (speed.xaxis, speed.yaxis, position.yaxis):
+        axis.set_major_formatter(lambda value, _: f"{value:g}")
+
+
+def _fit_height(axes: Axes, tracks: dict[str, Track], frame_mps: float, start: float, end: float) -> None:
+    """Fit AV and BV; an LV far ahead may leave the panel rather than flatten what matters."""
+    fronts = {
+        vehicle: (track.x_m - frame_mps * track.time_s)[(track.time_s >= start) & (track.time_s <= end)]
+        for vehicle, track in tracks.items()
+    }
+    near = np.concatenate([fronts["BV"], fronts["AV"]])
+    low, high = float(near.min()) - VEHICLE_LENGTH_M, float(near.max())
+    high = max(high, min(float(fronts["LV"].max()), high + 1.5 * (high - low)))
+    margin = 0.07 * (high - low)
+    axes.set_ylim(low - margin, high + 2.0 * margin)
+
+
+def _name_vehicles(axes: Axes, tracks: dict[str, Track], frame_mps: float, start: float) -> None:
+    """Name each band at its left end; an LV beyond the panel is named at the panel's edge."""
+    top = axes.get_ylim()[1]
+    for vehicle, track in tracks.items():
+        front = track.front_m(start, frame_mps)
+        colour = VEHICLE_COLOURS[vehicle]
+        if front > top:
+            text = f"{vehicle}, {front - top:.0f} m further"
+            note(axes, text, (start, top), (5, -3), va="top", color=colour, fontweight="bold")
+        else:
+            note(axes, vehicle, (start, front), (5, 4), va="bottom", color=colour, fontweight="bold")
+
+
+def _name_speeds(axes: Axes, tracks: dict[str, Track], end: float) -> None:
+    """Name each line right of the panel, at its height at the crash; names of nearly equal speeds move apart."""
+    low, high = axes.get_ylim()
+    heights = {vehicle: track.speed_mps(end) for vehicle, track in tracks.items()}
+    lowest = -math.inf
+    for vehicle in sorted(heights, key=lambda name: heights[name]):
+        lowest = max((heights[vehicle] - low) / (high - low), lowest + NAME_HEIGHT)
+        style = {"color": VEHICLE_COLOURS[vehicle], "fontweight": "bold", "va": "center"}
+        note(axes, vehicle, (1.0, lowest), (4, 0), xycoords="axes fraction", annotation_clip=False, **style)

@@ -6,19 +6,18 @@ there follows from BV's and the recorded R2dot, whether it kept its speed or not
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import pyarrow as pa
 
-from harness.arrays import IntArray
+from harness.arrays import FloatArray, IntArray
 from harness.maneuvers import ACCELERATIONS_MPS2, CUT_IN
-from harness.report.fine_histogram import Floats
+from harness.report.run_folder import floats
 from harness.vehicles.kinematics import STEP_S
 
 
-@dataclass(frozen=True)
-class Condition:
+class Condition(NamedTuple):
     """A quantity at the cut-in: its name in a table, and in a sentence after «had»."""
 
     name: str
@@ -51,22 +50,13 @@ COLUMNS = (
 )
 
 
-def cut_in_conditions(batch: pa.RecordBatch, hold_steps: int) -> Floats:
-    """Values of `CONDITIONS`, shape (Q, n).
+def cut_in_conditions(batch: pa.RecordBatch, hold_steps: int) -> FloatArray:
+    """Values of `CONDITIONS`, shape (Q, n), in rows of the episodes table that all have a cut-in.
 
-    Parameters
-    ----------
-    batch : RecordBatch
-        Rows of the episodes table, `COLUMNS` at least, all of them with a cut-in.
-    hold_steps : int
-        Steps for which LV and BV hold an acceleration.
-
-    Returns
-    -------
-    ndarray
-        NaN where there is no such value: the acceleration after a cut-in that ended the test at once.
+    LV and BV hold an acceleration for ``hold_steps``. NaN where there is no such value: the acceleration after a cut-in
+    that ended the test at once.
     """
-    v_bv0, r1_0, r1dot0, r2, r2dot = (_floats(batch.column(name)) for name in (*COLUMNS[:3], *COLUMNS[4:6]))
+    v_bv0, r1_0, r1dot0, r2, r2dot = (floats(batch.column(name)) for name in (*COLUMNS[:3], *COLUMNS[4:6]))
     cut = batch.column("cut_in_step").to_numpy(zero_copy_only=False).astype(np.int64)
     lv, bv = (_draws(batch.column(name)) for name in COLUMNS[6:])
     x_lv, v_lv = _moved(np.maximum(v_bv0 + r1dot0, 0.0), lv, cut, hold_steps)
@@ -82,10 +72,6 @@ def cut_in_conditions(batch: pa.RecordBatch, hold_steps: int) -> Floats:
     )
 
 
-def _floats(column: pa.Array) -> Floats:
-    return np.asarray(column.cast(pa.float64()).to_numpy(zero_copy_only=False), dtype=np.float64)
-
-
 def _draws(column: pa.ListArray) -> IntArray:
     """Maneuver indices, shape (n, most draws), -1 beyond the last of a row."""
     lengths = column.value_lengths().to_numpy(zero_copy_only=False).astype(np.int64)
@@ -94,14 +80,14 @@ def _draws(column: pa.ListArray) -> IntArray:
     return drawn
 
 
-def _accelerations(draws: IntArray, which: IntArray) -> Floats:
+def _accelerations(draws: IntArray, which: IntArray) -> FloatArray:
     """Acceleration (m/s²) of one draw per row; NaN where it is none."""
     draw = np.take_along_axis(draws, np.minimum(which, draws.shape[1] - 1)[:, None], axis=1)[:, 0]
     known = (draw >= 0) & (draw < CUT_IN)
     return np.where(known, ACCELERATIONS_MPS2[np.where(known, draw, 0)], np.nan)
 
 
-def _moved(v: Floats, draws: IntArray, steps: IntArray, hold_steps: int) -> tuple[Floats, Floats]:
+def _moved(v: FloatArray, draws: IntArray, steps: IntArray, hold_steps: int) -> tuple[FloatArray, FloatArray]:
     """Distance (m) and speed (m/s) after ``steps`` steps, a draw held for ``hold_steps`` of them; nobody reverses."""
     x = np.zeros_like(v)
     for period in range(int(steps.max(initial=0)) // hold_steps + 1):

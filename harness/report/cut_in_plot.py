@@ -8,10 +8,10 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch, PathPatch
 from matplotlib.path import Path
 
-from harness.report.cut_in_grid import GridRange
-from harness.report.fine_histogram import Floats
+from harness.arrays import FloatArray, IntArray
+from harness.report.histograms import UsedCells
 from harness.report.number_format import count, number
-from harness.report.plot_style import BLUES, FULL_WIDTH_IN, MUTED, REDS, Plot, new_figure
+from harness.report.plot_style import BLUES, FULL_WIDTH_IN, MUTED, REDS, Plot, new_figure, note
 from harness.report.summary import RunSummary
 
 LEVELS_PER_DECADE = 2
@@ -21,7 +21,7 @@ TTC_LINES_S = (1.0, 2.0, 4.0, 8.0)
 
 def cut_in_plot(summary: RunSummary) -> Plot | None:
     """Four maps of (R2, R2dot) at the cut-in; None when BV never cut in."""
-    cells = summary.cut_in.range_used()
+    cells = summary.cut_in.used()
     if cells is None:
         return None
     maps = _maps(summary)
@@ -43,25 +43,21 @@ def cut_in_plot(summary: RunSummary) -> Plot | None:
     return Plot("cut_ins", figure, alt, _caption(summary))
 
 
-def _maps(summary: RunSummary) -> list[tuple[Floats, tuple[str, ...], str]]:
+def _maps(summary: RunSummary) -> list[tuple[FloatArray, tuple[str, ...], str]]:
     """Return values, colours and title per panel, row by row, leaving out what would only repeat or be empty."""
-    every, crashed = summary.cut_in, summary.cut_in_crash
+    shown = [(summary.cut_in, BLUES, "Cut-ins"), (summary.cut_in_crash, REDS, "Cut-ins that crash")]
     if summary.all_weights_one:
-        return [(every.count, BLUES, "Cut-ins"), (crashed.count, REDS, "Cut-ins that crash")]
-    maps: list[tuple[Floats, tuple[str, ...], str]]
-    maps = [(every.count, BLUES, "Cut-ins, sampled"), (every.weight, BLUES, "Cut-ins, weighted")]
-    if summary.n_crashes:
-        maps += [
-            (crashed.count, REDS, "Cut-ins that crash, sampled"),
-            (crashed.weight, REDS, "Cut-ins that crash, weighted"),
-        ]
-    return maps
+        return [(grid.count, ramp, title) for grid, ramp, title in shown]
+    return [
+        (values, ramp, f"{title}, {how}")
+        for grid, ramp, title in (shown if summary.n_crashes else shown[:1])
+        for values, how in ((grid.count, "sampled"), (grid.weight, "weighted"))
+    ]
 
 
-def _draw_map(axes: Axes, values: Floats, cells: GridRange, ramp: tuple[str, ...], title: str) -> None:
+def _draw_map(axes: Axes, values: FloatArray, cells: UsedCells, ramp: tuple[str, ...], title: str) -> None:
     """Fill the cells of each level as one path: small files, no seams, and colours that can follow the page."""
-    shown = values[cells.rows, cells.columns]
-    level = _levels(shown, len(ramp))
+    level = _levels(values[cells.place], len(ramp))
     for index, colour in enumerate(ramp):
         rows, columns = np.nonzero(level == index)
         if rows.size:
@@ -72,7 +68,7 @@ def _draw_map(axes: Axes, values: Floats, cells: GridRange, ramp: tuple[str, ...
     axes.set_title(title)
 
 
-def _levels(values: Floats, n_levels: int) -> Floats:
+def _levels(values: FloatArray, n_levels: int) -> FloatArray:
     """Colour index per cell, highest for the fullest cell, -1 for empty ones."""
     top = float(values.max())
     if top <= 0.0:
@@ -82,7 +78,7 @@ def _levels(values: Floats, n_levels: int) -> Floats:
     return np.where(values > 0.0, np.maximum(n_levels - 1 - below, 0), -1.0)
 
 
-def _cells_path(rows: np.ndarray, columns: np.ndarray, cells: GridRange) -> Path:
+def _cells_path(rows: IntArray, columns: IntArray, cells: UsedCells) -> Path:
     """One compound path of all cells, neighbours in a row merged into one rectangle."""
     starts = np.flatnonzero(np.r_[True, (np.diff(rows) != 0) | (np.diff(columns) != 1)])
     ends = np.r_[starts[1:], rows.size] - 1
@@ -95,7 +91,7 @@ def _cells_path(rows: np.ndarray, columns: np.ndarray, cells: GridRange) -> Path
     return Path(vertices, codes)
 
 
-def _draw_ttc_lines(axes: Axes, cells: GridRange) -> None:
+def _draw_ttc_lines(axes: Axes, cells: UsedCells) -> None:
     """Lines of equal time to collision R2/-R2dot, labelled where they leave the panel."""
     right, low = float(cells.r2_m[-1]), float(cells.r2dot_mps[0])
     for ttc_s in TTC_LINES_S:
@@ -105,9 +101,7 @@ def _draw_ttc_lines(axes: Axes, cells: GridRange) -> None:
         if y > float(cells.r2dot_mps[-1]) or x <= float(cells.r2_m[0]):
             continue
         offset, align = ((3, 3), "left") if at_bottom < 0.9 * right else ((-3, 12), "right")
-        axes.annotate(
-            f"{ttc_s:g} s", (x, y), xytext=offset, textcoords="offset points", ha=align, color=MUTED, fontsize=8
-        )
+        note(axes, f"{ttc_s:g} s", (x, y), offset, ha=align, color=MUTED, fontsize=8)
 
 
 def _add_key(figure: Figure, ramps: list[tuple[str, ...]]) -> None:
@@ -138,15 +132,15 @@ def _caption(summary: RunSummary) -> str:
     text = "Gap R2 and its rate R2dot (BV minus AV) when BV decides to cut in. "
     if summary.all_weights_one:
         text += f"Tests are naturalistic driving itself; there are {per_test} cut-ins per test."
-    elif summary.from_shells:
-        text += (
-            "Left, where the tests went; right, the same cut-ins with each shell counted by its probability, as they "
-            f"occur in naturalistic driving ({per_test} per test)."
-        )
     else:
+        how = (
+            "with each shell counted by its probability"
+            if summary.from_shells
+            else "weighted by their likelihood ratio"
+        )
         text += (
-            "Left, where the tests went; right, the same cut-ins weighted by their likelihood ratio, as they occur in "
-            f"naturalistic driving ({per_test} per test)."
+            f"Left, where the tests went; right, the same cut-ins {how}, as they occur in naturalistic driving "
+            f"({per_test} per test)."
         )
     text += " Dashed lines: equal time to collision. Colours step by a factor √10 below each map's fullest cell."
     if not summary.n_crashes:

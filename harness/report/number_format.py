@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 from harness.estimators.estimate import WIDEST_RHW
@@ -75,9 +76,9 @@ def fixed(value: float | None, exponent: int, reference: float, digits: int = 3)
     return f"{value / 10.0**exponent:,.{decimals}f}".replace("-", MINUS)
 
 
-def decimal(value: float, places: int = 1) -> str:
-    """Write a measured quantity with fixed decimals; a dash when it was not recorded."""
-    return MISSING if math.isnan(value) else f"{value:.{places}f}".replace("-", MINUS)
+def decimal(value: float) -> str:
+    """Write a measured quantity to a tenth; a dash when it was not recorded."""
+    return MISSING if math.isnan(value) else f"{value:,.1f}".replace("-", MINUS)
 
 
 def plain(value: float) -> str:
@@ -131,44 +132,36 @@ def size(n_bytes: float) -> str:
 
 
 def value(content: Any) -> str:
-    """Anything from a YAML or JSON file, written plainly."""
+    """Anything from a YAML or JSON file, written plainly; every digit of a number, so that it can be typed again."""
     if content is None:
         return MISSING
     if isinstance(content, bool):
         return "yes" if content else "no"
     if isinstance(content, int):
         return f"{content:,}" if abs(content) >= 10_000 else str(content)
-    if isinstance(content, float):
-        return setting(content)
+    return _listed(content, value) if isinstance(content, list) else str(content)
+
+
+def result(content: Any) -> str:
+    """Write a computed value: numbers rounded to four digits, everything else as `value` writes it."""
     if isinstance(content, list):
-        shown = ", ".join(value(item) for item in content[:12])
-        return f"{shown}, … ({len(content)} values)" if len(content) > 12 else shown
-    return str(content)
+        return _listed(content, result)
+    if isinstance(content, float):
+        return number(content, 4)
+    return count(content) if isinstance(content, int) and not isinstance(content, bool) else value(content)
 
 
-def setting(content: float) -> str:
-    """Write a number that somebody set: every digit of it, so that it can be typed again."""
-    return repr(content)
+def _listed(items: list[Any], written: Callable[[Any], str]) -> str:
+    shown = ", ".join(map(written, items[:12]))
+    return f"{shown}, … ({len(items)} values)" if len(items) > 12 else shown
 
 
 def sentence(text: str) -> str:
     """Write a phrase as a sentence: capital first, full stop last."""
     text = text.strip()
-    return text if not text else text[0].upper() + text[1:] + ("" if text[-1] in ".!?" else ".")
+    return text[:1].upper() + text[1:] + ("" if text[-1:] in ".!?" else ".")
 
 
 def signed_percent(share: float) -> str:
     """Write a relative difference with its sign: ``+1.2 %``."""
     return f"{100.0 * share:+.1f} %".replace("-", MINUS)
-
-
-def result(content: Any) -> str:
-    """Write a computed value: numbers rounded to four digits, everything else as `value` writes it."""
-    if isinstance(content, bool) or not isinstance(content, int | float | list):
-        return value(content)
-    if isinstance(content, int):
-        return count(content)
-    if isinstance(content, float):
-        return number(content, 4)
-    shown = ", ".join(result(item) for item in content[:12])
-    return f"{shown}, … ({len(content)} values)" if len(content) > 12 else shown

@@ -4,47 +4,58 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 import matplotlib.style
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from harness.records.folder import write_bytes
-from harness.records.schemas import OUTCOMES
+from harness.records.reader import table_sizes
 from harness.report import number_format
-from harness.report.answer_plot import answer_plot
-from harness.report.contrast_plot import contrast_plot
+from harness.report.answer_plot import answer_plot, rate_exponent
 from harness.report.convergence_plot import convergence_plot
-from harness.report.crash_contrast import Contrast, band_in_words, crash_contrast
+from harness.report.crash_contrast import Contrast, band_in_words, contrast_plot, crash_contrast
 from harness.report.crash_gallery import GalleryRow, crash_gallery
-from harness.report.crash_plot import crash_time_plot, impact_speed_plot
 from harness.report.cut_in_conditions import CONDITIONS
 from harness.report.cut_in_plot import cut_in_plot
-from harness.report.estimate_table import asked_of_conditional, estimate_table, in_unit, run_notes, target_rhw
+from harness.report.histogram_plots import crash_time_plot, impact_speed_plot, strata_plot, weight_plot
 from harness.report.plot_style import RC, Plot, inline_svg, png, svg
 from harness.report.run_folder import RunFolder, read_run_folder, typed_folder
-from harness.report.settings_table import flat, setting_sections
-from harness.report.shard_tables import table_sizes
 from harness.report.shells_plot import shells_plot
-from harness.report.shells_result import SHOWN_IN_SECTION, ShellsResult, shells_result
-from harness.report.strata_plot import strata_plot
 from harness.report.summary import RunSummary, summarise
+from harness.report.tables import RateUnit, details, diagnostics, outcome_rows, run_notes, setting_sections
 from harness.report.telling_bands import RELABELINGS, SIGNIFICANT
-from harness.report.weight_plot import weight_plot
 
 PLOT_NAMES = re.compile(
     r"(answer|shells|convergence|weights|strata|contrast|cut_ins|impact_speed|crash_time|crash-\d+)\.(png|svg)"
 )
+FILTERS: dict[str, Callable[..., str]] = {
+    written.__name__: written
+    for written in (
+        band_in_words,
+        number_format.coarse_percent,
+        number_format.count,
+        number_format.decimal,
+        number_format.duration,
+        number_format.half_width,
+        number_format.interval,
+        number_format.number,
+        number_format.percent,
+        number_format.plain,
+        number_format.result,
+        number_format.sentence,
+        number_format.signed_percent,
+        number_format.size,
+        number_format.value,
+    )
+}
 
 
-@dataclass(frozen=True)
-class Figure:
+class Figure(NamedTuple):
     """A plot as the template needs it: markup that is ours, texts that are escaped."""
 
-    name: str
     markup: Markup
     alt: str
     caption: str
@@ -74,28 +85,51 @@ def write_report(folder: Path) -> Path:
     """
     folder = Path(folder)
     run = read_run_folder(folder)
-    sizes = table_sizes(run)
-    summary, shells = summarise(run), shells_result(run.estimates)
-    contrast = crash_contrast(run, shells)
+    sizes = table_sizes(folder)
+    summary, contrast = summarise(run), crash_contrast(run)
     with matplotlib.style.context(["default", RC]):
         gallery = crash_gallery(run, summary)
-        files, figures = _rendered(_plots(run, summary, shells, contrast, gallery))
-    page = _page(
-        run=run, summary=summary, shells=shells, contrast=contrast, sizes=sizes, gallery=gallery, figures=figures
+        files, figures = _rendered(_plots(run, summary, contrast, gallery))
+    style = (Path(__file__).parent / "report.css").read_text(encoding="utf-8")
+    environment = Environment(
+        loader=PackageLoader("harness.report", "."),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters.update(FILTERS)
+    page = environment.get_template("report.html.j2").render(
+        run=run,
+        summary=summary,
+        contrast=contrast,
+        sizes=sizes,
+        gallery=gallery,
+        figures=figures,
+        conditions=CONDITIONS,
+        relabelings=RELABELINGS,
+        significant=SIGNIFICANT,
+        estimators=sorted(run.estimates.estimates.items(), key=lambda item: item[0] != run.estimates.headline),
+        unit=RateUnit(rate_exponent(run.estimates)),
+        outcomes=outcome_rows(summary),
+        notes=run_notes(run, summary),
+        diagnostics=diagnostics(run),
+        details=details(run),
+        settings=setting_sections(run.campaign, reproducible=run.manifest.get("reproducible")),
+        folder=typed_folder(folder),
+        style=Markup(style),  # noqa: S704 - our own file
     )
     _write_plots(folder / "plots", files)
     write_bytes(folder / "report.html", page.encode("utf-8"))
     return folder / "report.html"
 
 
-def _plots(
-    run: RunFolder, summary: RunSummary, shells: ShellsResult | None, contrast: Contrast, gallery: list[GalleryRow]
-) -> list[Plot]:
+def _plots(run: RunFolder, summary: RunSummary, contrast: Contrast, gallery: list[GalleryRow]) -> list[Plot]:
     # Within a shell all tests weigh the same and there is one control step, the cut-in: nothing to draw of either.
-    drawn_by = [weight_plot(summary), strata_plot(summary)] if shells is None else [shells_plot(shells)]
+    drawn_by = [weight_plot(summary), strata_plot(summary)] if run.shells is None else [shells_plot(run.shells)]
     plots = [
-        answer_plot(run.estimates),
-        convergence_plot(run.estimates, target_rhw(run), of_conditional=asked_of_conditional(run)),
+        answer_plot(run.estimates, run.shells),
+        convergence_plot(run.estimates, run.campaign.stop.rhw, of_conditional=run.asked_of_conditional),
         *drawn_by,
         contrast_plot(contrast),
         cut_in_plot(summary),
@@ -113,102 +147,8 @@ def _rendered(plots: list[Plot]) -> tuple[dict[str, bytes], dict[str, Figure]]:
         drawing = svg(plot)
         files[f"{plot.name}.svg"], files[f"{plot.name}.png"] = drawing, png(plot)
         # The SVG is matplotlib's own output, in which every text is escaped: the one place that is not autoescaped.
-        figures[plot.name] = Figure(plot.name, Markup(inline_svg(drawing)), plot.alt, plot.caption)  # noqa: S704
+        figures[plot.name] = Figure(Markup(inline_svg(drawing)), plot.alt, plot.caption)  # noqa: S704
     return files, figures
-
-
-def _page(
-    *,
-    run: RunFolder,
-    summary: RunSummary,
-    shells: ShellsResult | None,
-    contrast: Contrast,
-    sizes: list[Any],
-    gallery: list[GalleryRow],
-    figures: dict[str, Figure],
-) -> str:
-    environment = Environment(
-        loader=PackageLoader("harness.report", "."),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters.update(_filters())
-    style = (Path(__file__).parent / "report.css").read_text(encoding="utf-8")
-    return environment.get_template("report.html.j2").render(
-        run=run,
-        summary=summary,
-        shells=shells,
-        contrast=contrast,
-        conditions=CONDITIONS,
-        relabelings=RELABELINGS,
-        significant=SIGNIFICANT,
-        outcomes=_outcomes(summary),
-        sizes=sizes,
-        gallery=gallery,
-        figures=figures,
-        estimators=estimate_table(run.estimates),
-        in_unit=in_unit(run.estimates),
-        notes=run_notes(run, summary),
-        target_rhw=target_rhw(run),
-        asked_of_conditional=asked_of_conditional(run),
-        diagnostics=_diagnostics(run, shells),
-        retraced=run.manifest.get("retraced"),
-        alarm=(run.estimates.get("diagnostics") or {}).get("alarm"),
-        details=_details(run),
-        table_errors=run.manifest.get("table_errors") or [],
-        reproducible=run.manifest.get("reproducible", True),
-        settings=setting_sections(run.campaign, reproducible=run.manifest.get("reproducible")),
-        folder=typed_folder(run.path),
-        style=Markup(style),  # noqa: S704 - our own file
-    )
-
-
-def _filters() -> dict[str, Callable[..., str]]:
-    return {
-        "band_in_words": band_in_words,
-        "number": number_format.number,
-        "interval": number_format.interval,
-        "count": number_format.count,
-        "decimal": number_format.decimal,
-        "half_width": number_format.half_width,
-        "percent": number_format.percent,
-        "coarse_percent": number_format.coarse_percent,
-        "duration": number_format.duration,
-        "plain": number_format.plain,
-        "size": number_format.size,
-        "value": number_format.value,
-        "result": number_format.result,
-        "sentence": number_format.sentence,
-        "signed_percent": number_format.signed_percent,
-    }
-
-
-def _outcomes(summary: RunSummary) -> list[tuple[str, float, float, float]]:
-    """Per outcome: name, tests, share of the tests, how often it happens per naturalistic test."""
-    n = max(summary.n_episodes, 1)
-    return [
-        (name, float(summary.count[k]), float(summary.count[k]) / n, summary.per_test(float(summary.weight[k])))
-        for k, name in enumerate(OUTCOMES)
-    ]
-
-
-def _diagnostics(run: RunFolder, shells: ShellsResult | None) -> list[tuple[str, Any]]:
-    """Return sums of the run as (key, value); of shells without those about weights, which have none to say."""
-    content = run.estimates.get("diagnostics")
-    leaves = flat(content) if content else []
-    return leaves if shells is None else [(path, leaf) for path, leaf in leaves if leaf not in (None, {})]
-
-
-def _details(run: RunFolder) -> list[tuple[str, Any]]:
-    """Return what single estimators report about themselves and no other section shows, as (estimator.key, value)."""
-    found = {
-        name: {key: value for key, value in e["details"].items() if name != "shells" or key not in SHOWN_IN_SECTION}
-        for name, e in run.estimates["estimates"].items()
-        if e.get("details")
-    }
-    return flat(found) if found else []
 
 
 def _write_plots(folder: Path, files: dict[str, bytes]) -> None:

@@ -1,4 +1,4 @@
-"""One look for all plots, and their three forms: PNG, SVG file, and SVG inside the page.
+"""One look for all plots, axes that show small rates, and three forms: PNG, SVG file, and SVG inside the page.
 
 Inside the page the palette's colours become CSS variables, so that plots follow the page's light or dark scheme, and
 text stays text in the page's own typeface. Everything that would make two runs differ (dates, random ids) is fixed.
@@ -7,14 +7,19 @@ text stays text in the page's own typeface. Everything that would make two runs 
 from __future__ import annotations
 
 import io
+import math
 import re
 from dataclasses import dataclass
 from typing import Any
 
 import matplotlib as mpl
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+from harness.report.number_format import exponent_of, plain, power_of_ten
 
 INK, MUTED, GRID, PAPER = "#1c2126", "#5d6873", "#dde2e7", "#ffffff"
 BLUE, VERMILLION, GREEN, GREY = "#0067a8", "#c94f0a", "#00795a", "#8b95a0"
@@ -37,6 +42,7 @@ CSS_NAMES = {
 
 FULL_WIDTH_IN, HALF_WIDTH_IN = 8.6, 4.9
 PNG_DPI = 160
+FEW_DECADES = 1.7
 
 RC: dict[str, Any] = {
     "font.family": ["DejaVu Sans"],
@@ -106,6 +112,40 @@ def new_figure(width_in: float, height_in: float) -> Figure:
 def only_horizontal_grid(axes: Axes) -> None:
     """For bars and lines over a categorical or wide axis: vertical lines would add nothing."""
     axes.grid(visible=False, axis="x")
+
+
+def decades(axis: Axis, low: float, high: float) -> None:
+    """Label a logarithmic axis from ``low`` to ``high`` by powers of ten; also by 2 and 5 where it spans few."""
+    few = math.log10(high / low) < FEW_DECADES
+    axis.set_major_locator(LogLocator(base=10.0, subs=(1.0, 2.0, 5.0) if few else (1.0,), numticks=9))
+    axis.set_minor_locator(LogLocator(base=10.0, subs=tuple(range(2, 10)), numticks=99 if few else 9))
+    axis.set_minor_formatter(NullFormatter())
+    axis.set_major_formatter(FuncFormatter(lambda value, _: tick_label(value)))
+
+
+def tick_label(value: float) -> str:
+    """Plain digits from 0.01 to 9999, else ``10⁻⁷`` or ``2·10⁻⁷``."""
+    if value <= 0.0:
+        return ""
+    if 0.0099 < value < 9_999.5:
+        return f"{value:.3g}" if value < 1000.0 else f"{value:.0f}"
+    # log10 of a tick such as 1e-7 may come out just below -7.
+    exponent = math.floor(math.log10(value) + 1e-9)
+    mantissa = f"{value / 10.0**exponent:.3g}"
+    return power_of_ten(exponent) if mantissa == "1" else f"{mantissa}·{power_of_ten(exponent)}"
+
+
+def scaled(axis: Axis, largest: float) -> str:
+    """Label a linear axis in units of a power of ten; returns the text to append to the axis label."""
+    exponent = exponent_of(largest)
+    factor = 10.0**exponent
+    axis.set_major_formatter(FuncFormatter(lambda value, _: plain(float(f"{value / factor:.6g}"))))
+    return f", × {power_of_ten(exponent)}" if exponent else ""
+
+
+def note(axes: Axes, text: str, at: tuple[float, float], offset: tuple[float, float], **options: Any) -> None:
+    """Write a text at an offset, in points, from a place."""
+    axes.annotate(text, at, xytext=offset, textcoords="offset points", **options)
 
 
 def png(plot: Plot) -> bytes:

@@ -2,18 +2,29 @@
 
 from __future__ import annotations
 
+import math
 import os
 import shlex
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from harness.campaign.dumping import written_out
+import numpy as np
+import pyarrow as pa
+from pydantic import TypeAdapter, ValidationError
+
+from harness.arrays import FloatArray
 from harness.campaign.loading import load_campaign
+from harness.campaign.models import Campaign
 from harness.errors import CampaignError, RunFolderError
+from harness.estimators.shells import ShellDetails
 from harness.records.folder import MANIFEST, NO_RUN, read_json, read_manifest, require_schema
-from harness.records.stored_manifest import Count, StoredManifest
-from harness.report.stored_estimates import StoredEstimates
+from harness.records.reader import read_shards
+from harness.records.stored_manifest import Count, Stored, StoredManifest
+
+NEGLIGIBLE = 1e-9
+"""Differences of this share of P(cut-in) come from rounding."""
 
 
 class ShownManifest(StoredManifest):
@@ -24,25 +35,98 @@ class ShownManifest(StoredManifest):
     seed: Count
 
 
-@dataclass(frozen=True)
-class Shard:
-    """One contiguous range of episodes and the files that hold it, by table name."""
+class StoredEstimate(Stored):
+    """What the page reads of an estimate, or the reason why there is none."""
 
-    index: int
-    first_episode: int
-    n_episodes: int
-    files: dict[str, Path]
+    crash_rate: float | None
+    reason: str | None = None
+    ci_low: float | None = None
+    ci_high: float | None = None
+    upper_bound: float | None = None
+    rhw: float | None = None
+    n_episodes: int | None = None
+    n_crashes: int | None = None
+    n_effective: float | None = None
+    largest_weight_share: float | None = None
+    weight_cap: float | None = None
+    method: str | None = None
+    warnings: list[str] = []
+    details: dict[str, Any] = {}
+
+
+class StoredPoint(Stored):
+    """The headline estimate of the first ``n`` tests."""
+
+    n: float
+    crash_rate: float | None
+    ci_low: float | None
+    ci_high: float | None
+    rhw: float | None
+
+
+class StoredEstimates(Stored):
+    """What the page reads of ``estimates.json``."""
+
+    campaign: str
+    campaign_hash: str
+    lane_change_level: float
+    confidence: float
+    headline: str
+    estimates: dict[str, StoredEstimate]
+    statement: str
+    conditional_statement: str | None = None
+    n_episodes: int | None = None
+    distance_per_test_km: float | None = None
+    diagnostics: dict[str, Any] | None = None
+    convergence: list[StoredPoint] | None = None
+
+
+@dataclass(frozen=True)
+class ShownShells(ShellDetails):
+    """What the headline estimate of a shells run says about them."""
+
+    rate: float
+
+    @property
+    def p_tested(self) -> float:
+        """Probability of a cut-in that belongs to a shell."""
+        return math.fsum(shell.p for shell in self.shells)
+
+    @property
+    def nothing_left_out(self) -> bool:
+        """Whether every cut-in belongs to a shell; rounding may leave a trace of nothing."""
+        return self.p_impossible <= NEGLIGIBLE * self.p_cut_in
+
+    @property
+    def n_inside(self) -> int:
+        """Number of shells within the boundary, which come first."""
+        return sum(shell.inside for shell in self.shells)
+
+    @property
+    def has_outside(self) -> bool:
+        """Whether there are cut-ins beyond the boundary."""
+        return self.n_inside < len(self.shells)
+
+    @property
+    def pool_half_width(self) -> float:
+        """What the pool's own error leaves open of the rate."""
+        return self.rhw_from_pool * self.rate
+
+    def share_of_uncertainty(self, half_width: float) -> float:
+        """Share in the sum of squared half-widths, which is what makes the interval of the rate."""
+        squares = math.fsum(shell.half_width**2 for shell in self.shells) + self.pool_half_width**2
+        return half_width**2 / squares if squares > 0.0 else math.nan
 
 
 @dataclass(frozen=True)
 class RunFolder:
-    """A finished run: its campaign, manifest, estimates and the shards that count."""
+    """A finished run: its campaign, manifest and estimates; ``shells`` is None where tests were drawn otherwise."""
 
     path: Path
-    campaign: dict[str, Any]
+    campaign: Campaign
     manifest: dict[str, Any]
-    estimates: dict[str, Any]
-    shards: tuple[Shard, ...]
+    estimates: StoredEstimates
+    shells: ShownShells | None
 
     @property
     def n_episodes(self) -> int:
@@ -50,20 +134,34 @@ class RunFolder:
         return int(self.manifest["n_episodes"])
 
     @property
-    def method(self) -> str:
-        """How tests were drawn (``testing.method``); empty where the campaign does not say."""
-        testing = self.campaign.get("testing")
-        return str(testing.get("method", "")) if isinstance(testing, dict) else ""
+    def headline(self) -> StoredEstimate:
+        """The estimate that answers the campaign's question."""
+        return self.estimates.estimates[self.estimates.headline]
 
     @property
-    def headline(self) -> dict[str, Any]:
-        """The estimate that answers the campaign's question."""
-        chosen: dict[str, Any] = self.estimates["estimates"][self.estimates["headline"]]
-        return chosen
+    def asked_of_conditional(self) -> bool:
+        """Whether it is the conditional statement of a shells run that should reach ``stop.rhw``."""
+        testing = self.campaign.testing
+        return testing.method == "shells" and testing.shells.statement == "conditional"
 
-    def files(self, table: str) -> list[tuple[Shard, Path]]:
-        """Shards that have a file of this table (``episodes``, ``moments``, ``traces``)."""
-        return [(shard, shard.files[table]) for shard in self.shards if table in shard.files]
+    def episodes(self, *columns: str) -> Iterator[pa.RecordBatch]:
+        """Columns of the tests that count, shard by shard in index order.
+
+        Raises
+        ------
+        RunFolderError
+            If a shard is missing, damaged, misses a column, or holds another number of tests than the manifest says.
+        """
+        counted = self.n_episodes
+        for table, _ in read_shards(self.path, episode_columns=list(columns), moment_columns=[]):
+            for batch in table.slice(0, counted).combine_chunks().to_batches():
+                yield batch
+                counted -= batch.num_rows
+
+
+def floats(column: pa.Array) -> FloatArray:
+    """A column of numbers as an array, NaN where it is null."""
+    return np.asarray(column.cast(pa.float64()).to_numpy(zero_copy_only=False), dtype=np.float64)
 
 
 def typed_folder(folder: Path) -> str:
@@ -90,16 +188,14 @@ def read_run_folder(path: Path) -> RunFolder:
     """
     manifest = read_manifest(path)
     require_schema(manifest, ShownManifest, path / MANIFEST, mend=NO_RUN)
-    again = f"Make it with `harness estimate {path} --write`."
-    estimates = read_json(path / "estimates.json", mend=again)
-    require_schema(estimates, StoredEstimates, path / "estimates.json", mend=again)
-    _check_belong_together(path, manifest, estimates)
-    return RunFolder(path, _read_campaign(path / "campaign.yaml"), manifest, estimates, _shards(path, manifest))
+    estimates = _read_estimates(path, manifest["campaign_hash"])
+    shells = _shells(path, estimates.estimates[estimates.headline])
+    return RunFolder(path, _read_campaign(path / "campaign.yaml"), manifest, estimates, shells)
 
 
-def _read_campaign(path: Path) -> dict[str, Any]:
+def _read_campaign(path: Path) -> Campaign:
     try:
-        return written_out(load_campaign(path, check_files=False))
+        return load_campaign(path, check_files=False)
     except CampaignError as error:
         raise RunFolderError(
             str(path),
@@ -109,32 +205,38 @@ def _read_campaign(path: Path) -> dict[str, Any]:
         ) from error
 
 
-def _check_belong_together(path: Path, manifest: dict[str, Any], estimates: dict[str, Any]) -> None:
-    where, again = str(path / "estimates.json"), f"Make it again with `harness estimate {path} --write`."
-    if estimates["campaign_hash"] != manifest["campaign_hash"]:
+def _read_estimates(folder: Path, campaign_hash: str) -> StoredEstimates:
+    path, again = folder / "estimates.json", f"Make it again with `harness estimate {folder} --write`."
+    content = read_json(path, mend=again)
+    require_schema(content, StoredEstimates, path, mend=again)
+    estimates = StoredEstimates.model_validate(content)
+    if estimates.campaign_hash != campaign_hash:
         raise RunFolderError(
-            where,
-            found=f"estimates of campaign {estimates['campaign_hash']}",
-            expected=f"those of campaign {manifest['campaign_hash']} (manifest.json)",
+            str(path),
+            found=f"estimates of campaign {estimates.campaign_hash}",
+            expected=f"those of campaign {campaign_hash} (manifest.json)",
             mend=again,
         )
-    if estimates["headline"] not in estimates["estimates"]:
+    if estimates.headline not in estimates.estimates:
         raise RunFolderError(
-            where,
-            found=f"headline {estimates['headline']!r}, which is not among the estimates",
-            expected=f"one of {sorted(estimates['estimates'])}",
+            str(path),
+            found=f"headline {estimates.headline!r}, which is not among the estimates",
+            expected=f"one of {sorted(estimates.estimates)}",
             mend=again,
         )
+    return estimates
 
 
-def _shards(path: Path, manifest: dict[str, Any]) -> tuple[Shard, ...]:
-    shards = [
-        Shard(
-            entry["index"],
-            entry["first_episode"],
-            entry["n_episodes"],
-            {table: path / name for table, name in entry["files"].items() if name},
-        )
-        for entry in manifest["shards"]
-    ]
-    return tuple(sorted(shards, key=lambda shard: shard.first_episode))
+def _shells(folder: Path, headline: StoredEstimate) -> ShownShells | None:
+    if "shells" not in headline.details:
+        return None
+    try:
+        return TypeAdapter(ShownShells).validate_python({**headline.details, "rate": headline.crash_rate})
+    except ValidationError as error:
+        wrong = error.errors(include_url=False)[0]
+        raise RunFolderError(
+            str(folder / "estimates.json"),
+            found=f"no complete description of shells ({'.'.join(map(str, wrong['loc']))}: {wrong['msg']})",
+            expected="what `harness estimate` writes for a run with testing.method shells",
+            mend=f"Make it again with `harness estimate {folder} --write`.",
+        ) from error

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from matplotlib.axes import Axes
 
+from harness.estimators.shells import Shell
 from harness.report.number_format import coarse_percent, number, percent
-from harness.report.plot_style import BLUE, FULL_WIDTH_IN, GREY, INK, MUTED, VERMILLION, Plot, new_figure
-from harness.report.rate_axis import scaled
-from harness.report.shells_result import Shell, ShellsResult
+from harness.report.plot_style import BLUE, FULL_WIDTH_IN, GREY, INK, MUTED, VERMILLION, Plot, new_figure, note, scaled
+from harness.report.run_folder import ShownShells
 
 POOL = "pool’s own error"
 BAR = 0.62
@@ -15,13 +15,13 @@ VISIBLE = 0.005
 """Smallest share of an axis that a bar must have to show a colour."""
 
 
-def shells_plot(found: ShellsResult) -> Plot:
+def shells_plot(found: ShownShells) -> Plot:
     """Draw contribution with its limits (left) and half-width (right), from careful to careless."""
     n_rows = len(found.shells) + 1
     figure = new_figure(FULL_WIDTH_IN, 1.2 + 0.36 * n_rows)
     rates, widths = figure.subplots(1, 2, sharey=True, width_ratios=(3, 2))
     # An untested shell may hold anything up to its probability: it would flatten all others, and runs out instead.
-    tested = [shell for shell in found.shells if shell.n_tests] or list(found.shells)
+    tested = [shell for shell in found.shells if shell.n_episodes] or list(found.shells)
     limit = 1.12 * max(shell.high for shell in tested)
     for row, shell in enumerate(found.shells):
         _draw_rate(rates, row, shell, limit)
@@ -30,14 +30,14 @@ def shells_plot(found: ShellsResult) -> Plot:
     for row, half_width in enumerate(half_widths):
         _draw_width(widths, row, half_width, widest, found)
     _draw_boundary((rates, widths), found)
-    names = [*(shell.name for shell in found.shells), POOL]
+    names = [*(shell.shell for shell in found.shells), POOL]
     rates.set_yticks(range(n_rows), names)
     rates.set_ylim(n_rows - 0.4, -0.6)
     _label(rates, limit, "Where the rate comes from", "contribution to the crash rate")
     _label(widths, widest, "Where the uncertainty lies", "half-width")
     source, open_question = _source(found), _open_question(found, names, half_widths)
     alt = (
-        f"Bars per shell from {found.shells[0].name} to {found.shells[-1].name}: contribution to the crash rate with "
+        f"Bars per shell from {found.shells[0].shell} to {found.shells[-1].shell}: contribution to the crash rate with "
         f"limits, and half-width. {source} {open_question}"
     )
     caption = (
@@ -57,50 +57,28 @@ def _draw_rate(axes: Axes, row: int, shell: Shell, limit: float) -> None:
         axes.plot([end, end], [row - 0.14, row + 0.14], color=INK, linewidth=1.3, solid_capstyle="butt")
     if shell.high > limit:
         axes.plot([limit], [row], ">", color=INK, markersize=6, clip_on=False)
-        axes.annotate(
-            f"not tested: up to {number(shell.high)}",
-            (limit, row),
-            xytext=(-9, 5),
-            textcoords="offset points",
-            ha="right",
-            color=MUTED,
-            fontsize=8,
-        )
+        text = f"not tested: up to {number(shell.high)}"
+        note(axes, text, (limit, row), (-9, 5), ha="right", color=MUTED, fontsize=8)
 
 
-def _draw_width(axes: Axes, row: int, half_width: float, widest: float, found: ShellsResult) -> None:
+def _draw_width(axes: Axes, row: int, half_width: float, widest: float, found: ShownShells) -> None:
     axes.barh(row, min(half_width, widest), height=BAR, color=GREY)
     beyond = half_width > widest
-    axes.annotate(
-        coarse_percent(found.share_of_uncertainty(half_width)),
-        (min(half_width, widest), row),
-        xytext=(-5 if beyond else 5, 0),
-        textcoords="offset points",
-        va="center",
-        ha="right" if beyond else "left",
-        color=INK,
-        fontsize=8,
-    )
+    share = coarse_percent(found.share_of_uncertainty(half_width))
+    offset, align = ((-5, 0), "right") if beyond else ((5, 0), "left")
+    note(axes, share, (min(half_width, widest), row), offset, va="center", ha=align, color=INK, fontsize=8)
 
 
-def _draw_boundary(panels: tuple[Axes, Axes], found: ShellsResult) -> None:
+def _draw_boundary(panels: tuple[Axes, Axes], found: ShownShells) -> None:
     """Lines between inside and outside, and between the shells and the pool."""
-    n_inside = sum(shell.inside for shell in found.shells)
+    boundary = found.n_inside - 0.5
     for axes in panels:
         if found.has_outside:
-            axes.axhline(n_inside - 0.5, color=MUTED, linewidth=1.0, linestyle=(0, (4, 3)))
+            axes.axhline(boundary, color=MUTED, linewidth=1.0, linestyle=(0, (4, 3)))
         axes.axhline(len(found.shells) - 0.5, color=MUTED, linewidth=0.6)
     if found.has_outside:
-        panels[0].annotate(
-            f"outside {found.boundary} ↓",
-            (1.0, n_inside - 0.5),
-            xycoords=("axes fraction", "data"),
-            xytext=(-2, 2),
-            textcoords="offset points",
-            ha="right",
-            color=MUTED,
-            fontsize=8,
-        )
+        text, place = f"outside {found.boundary} ↓", ("axes fraction", "data")
+        note(panels[0], text, (1.0, boundary), (-2, 2), xycoords=place, ha="right", color=MUTED, fontsize=8)
 
 
 def _label(axes: Axes, limit: float, title: str, label: str) -> None:
@@ -111,7 +89,7 @@ def _label(axes: Axes, limit: float, title: str, label: str) -> None:
     axes.tick_params(axis="y", length=0, pad=8, labelcolor=INK)
 
 
-def _colours(found: ShellsResult, limit: float) -> str:
+def _colours(found: ShownShells, limit: float) -> str:
     """Name the colours that can be seen, none where all bars have one because there is no outside."""
     seen = {shell.inside for shell in found.shells if shell.contribution > VISIBLE * limit}
     if not found.has_outside or not seen:
@@ -121,14 +99,14 @@ def _colours(found: ShellsResult, limit: float) -> str:
     return "; all that can be seen (blue) lies inside the boundary" if True in seen else "; all lies outside (orange)"
 
 
-def _source(found: ShellsResult) -> str:
+def _source(found: ShownShells) -> str:
     if found.rate == 0.0:
         return "No shell contributes: no crash was sampled."
     most = max(found.shells, key=lambda shell: shell.contribution)
-    return f"Most of the rate comes from {most.name} ({percent(most.contribution / found.rate)})."
+    return f"Most of the rate comes from {most.shell} ({percent(most.contribution / found.rate)})."
 
 
-def _open_question(found: ShellsResult, names: list[str], half_widths: list[float]) -> str:
+def _open_question(found: ShownShells, names: list[str], half_widths: list[float]) -> str:
     widest = max(half_widths)
     name, share = names[half_widths.index(widest)], percent(found.share_of_uncertainty(widest))
     if name == POOL:

@@ -4,51 +4,72 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 
+from harness.arrays import BoolArray, FloatArray, IntArray
 from harness.errors import RunFolderError
-from harness.records.schemas import CRASH, FAILED, OUTCOMES
-from harness.report.cut_in_grid import CutInGrid
-from harness.report.fine_histogram import FineHistogram, Floats
-from harness.report.run_folder import RunFolder
-from harness.report.shard_tables import episode_batches
-from harness.report.shell_weights import log_scales
-from harness.report.worst_crashes import WorstCrashes
+from harness.outcomes import CRASH, FAILED, OUTCOMES
+from harness.report.histograms import CutInGrid, FineHistogram
+from harness.report.run_folder import RunFolder, floats
 from harness.vehicles.kinematics import STEP_S
 
-NUMBERS = (
-    "episode",
-    "log_weight",
-    "n_control_steps",
-    "component",
-    "v_bv_mps",
-    "cut_in_step",
-    "cut_in_r2_m",
-    "cut_in_r2dot_mps",
-    "crash_time_s",
-    "impact_speed_mps",
-)
-COLUMNS = (*NUMBERS, "outcome", "failure")
 MOST_CAUSES = 1_000
+CANDIDATES = 50
+"""Crashes kept per ranking: more than are shown, because with a share of traces only some of the worst have one."""
 
 
-def _weights() -> FineHistogram:
-    return FineHistogram(-80.0, 20.0, 0.02)
+@dataclass(frozen=True)
+class Crash:
+    """One crash as its row in ``episodes`` describes it; units as in the schema."""
+
+    episode: int
+    impact_speed_mps: float
+    crash_time_s: float
+    log_weight: float
+    cut_in_step: float
+    cut_in_r2_m: float
+    cut_in_r2dot_mps: float
+    component: int
+
+    @property
+    def weight(self) -> float:
+        """What this one crash adds to the sum that is the estimate: likelihood ratio, or p_s/n_s in a shell."""
+        return math.exp(self.log_weight)
+
+    @property
+    def cut_in_time_s(self) -> float:
+        """Time at the start of the step in which BV cut in."""
+        return STEP_S * self.cut_in_step
 
 
-def _seconds() -> FineHistogram:
-    return FineHistogram(0.0, 60.0, 0.1)
+NUMBERS = (*(column.name for column in fields(Crash)), "n_control_steps")
 
 
-def _strata() -> FineHistogram:
-    return FineHistogram(-0.5, 600.5, 1.0)
+class WorstCrashes:
+    """The first `CANDIDATES` crashes by one key, kept while streaming; ties go to the smaller episode index."""
+
+    def __init__(self, key: str) -> None:
+        self.key = key
+        self.crashes: list[Crash] = []
+
+    def add(self, columns: dict[str, FloatArray], is_crash: BoolArray) -> None:
+        """Offer a batch: ``columns`` by field name, each of shape (m,)."""
+        rows = np.flatnonzero(is_crash & np.isfinite(columns[self.key]))
+        best = rows[np.lexsort((columns["episode"][rows], -columns[self.key][rows]))[:CANDIDATES]]
+        self.crashes += [_crash(columns, int(row)) for row in best]
+        self.crashes.sort(key=lambda crash: (-getattr(crash, self.key), crash.episode))
+        del self.crashes[CANDIDATES:]
 
 
-@dataclass
+def _crash(columns: dict[str, FloatArray], row: int) -> Crash:
+    values: dict[str, Any] = {column.name: float(columns[column.name][row]) for column in fields(Crash)}
+    return Crash(**{**values, "episode": int(values["episode"]), "component": int(values["component"])})
+
+
 class RunSummary:
     """Counts, weight sums and histograms of a run.
 
@@ -59,11 +80,13 @@ class RunSummary:
     Attributes
     ----------
     log_scales : ndarray, shape (S,), optional
-        For tests that were drawn from shells: added to the recorded log-weight of each, see `shell_weights`.
+        For tests that were drawn from shells: added to the recorded log-weight of each, see `_log_scales`.
     count, weight : ndarray, shape (5,)
         Episodes and sum of weights per outcome, in the order of ``OUTCOMES``.
     causes : Counter of str
         Failed episodes per cause.
+    log_weight_range : tuple of float
+        Smallest and largest.
     log10_weight, log10_weight_crash : FineHistogram
         Of log10 of the weight, all episodes and crashes.
     stratum_crash, impact_speed_mps, crash_time_s, response_time_s : FineHistogram
@@ -74,22 +97,18 @@ class RunSummary:
         By impact speed, by weight, and (of tests from shells) from the most careless shell inwards.
     """
 
-    log_scales: Floats | None = None
-    count: Floats = field(default_factory=lambda: np.zeros(len(OUTCOMES)))
-    weight: Floats = field(default_factory=lambda: np.zeros(len(OUTCOMES)))
-    causes: Counter[str] = field(default_factory=Counter)
-    weights_seen: tuple[float, float] = (math.inf, -math.inf)
-    log10_weight: FineHistogram = field(default_factory=_weights)
-    log10_weight_crash: FineHistogram = field(default_factory=_weights)
-    stratum_crash: FineHistogram = field(default_factory=_strata)
-    impact_speed_mps: FineHistogram = field(default_factory=lambda: FineHistogram(0.0, 80.0, 0.1))
-    crash_time_s: FineHistogram = field(default_factory=_seconds)
-    response_time_s: FineHistogram = field(default_factory=_seconds)
-    cut_in: CutInGrid = field(default_factory=CutInGrid)
-    cut_in_crash: CutInGrid = field(default_factory=CutInGrid)
-    hardest: WorstCrashes = field(default_factory=lambda: WorstCrashes("impact_speed_mps"))
-    heaviest: WorstCrashes = field(default_factory=lambda: WorstCrashes("log_weight"))
-    outermost: WorstCrashes = field(default_factory=lambda: WorstCrashes("component"))
+    def __init__(self, log_scales: FloatArray | None = None) -> None:
+        self.log_scales = log_scales
+        self.count, self.weight = np.zeros(len(OUTCOMES)), np.zeros(len(OUTCOMES))
+        self.causes: Counter[str] = Counter()
+        self.log_weight_range = (math.inf, -math.inf)
+        self.log10_weight, self.log10_weight_crash = (FineHistogram(-80.0, 20.0, 0.02) for _ in range(2))
+        self.stratum_crash = FineHistogram(-0.5, 600.5, 1.0)
+        self.impact_speed_mps = FineHistogram(0.0, 80.0, 0.1)
+        self.crash_time_s, self.response_time_s = (FineHistogram(0.0, 60.0, 0.1) for _ in range(2))
+        self.cut_in, self.cut_in_crash = CutInGrid(), CutInGrid()
+        self.hardest, self.heaviest = WorstCrashes("impact_speed_mps"), WorstCrashes("log_weight")
+        self.outermost = WorstCrashes("component")
 
     @property
     def n_episodes(self) -> int:
@@ -102,9 +121,14 @@ class RunSummary:
         return int(self.count[CRASH])
 
     @property
+    def n_failed(self) -> int:
+        """Number of tests that failed."""
+        return int(self.count[FAILED])
+
+    @property
     def all_weights_one(self) -> bool:
         """Whether no maneuver was drawn from an importance function: plain naturalistic driving."""
-        return self.weights_seen == (0.0, 0.0)
+        return self.log_weight_range == (0.0, 0.0)
 
     @property
     def from_shells(self) -> bool:
@@ -115,60 +139,45 @@ class RunSummary:
         """How often per naturalistic test something happens whose weights add up to ``weight``."""
         return weight if self.from_shells else weight / max(self.n_episodes, 1)
 
-    def add(self, batch: pa.RecordBatch, outcome: npt.NDArray[np.int64]) -> None:
+    def add(self, batch: pa.RecordBatch, outcome: IntArray) -> None:
         """Add a batch whose outcomes are given as indices into ``OUTCOMES``."""
-        columns = {name: _floats(batch.column(name)) for name in NUMBERS}
+        columns = {name: floats(batch.column(name)) for name in NUMBERS}
         if self.log_scales is not None:
             columns["log_weight"] = columns["log_weight"] + self.log_scales[columns["component"].astype(np.int64)]
         valid, crash = outcome != FAILED, outcome == CRASH
-        log_weight = columns["log_weight"]
-        weight = np.where(valid, np.exp(log_weight), 0.0)
+        weight = np.where(valid, np.exp(columns["log_weight"]), 0.0)
         self.count += np.bincount(outcome, minlength=len(OUTCOMES))
         self.weight += np.bincount(outcome, weights=weight, minlength=len(OUTCOMES))
         self._add_causes(batch.column("failure"))
-        self._add_weights(log_weight, weight, valid, crash)
-        self._add_cut_ins(columns, weight, valid, crash)
+        self._add_weights(columns["log_weight"], weight, valid, crash)
+        for grid, rows in ((self.cut_in, valid), (self.cut_in_crash, crash)):
+            grid.add(columns["cut_in_r2_m"][rows], columns["cut_in_r2dot_mps"][rows], weight[rows])
         self._add_crashes(columns, weight, crash)
 
     def _add_causes(self, failure: pa.Array) -> None:
-        if failure.null_count == len(failure):
-            return
         for item in failure.drop_null().value_counts():
             cause = item["values"].as_py()
             # Causes may hold numbers and so be all different: memory stays bounded, the count per outcome is exact.
             if cause in self.causes or len(self.causes) < MOST_CAUSES:
                 self.causes[cause] += item["counts"].as_py()
 
-    def _add_weights(
-        self, log_weight: Floats, weight: Floats, valid: npt.NDArray[np.bool_], crash: npt.NDArray[np.bool_]
-    ) -> None:
-        if valid.any():
-            low, high = self.weights_seen
-            seen = log_weight[valid]
-            self.weights_seen = (min(low, float(seen.min())), max(high, float(seen.max())))
-        log10 = log_weight / math.log(10.0)
-        self.log10_weight.add(log10[valid], weight[valid])
-        self.log10_weight_crash.add(log10[crash], weight[crash])
+    def _add_weights(self, log_weight: FloatArray, weight: FloatArray, valid: BoolArray, crash: BoolArray) -> None:
+        low, high = self.log_weight_range
+        seen = log_weight[valid]
+        self.log_weight_range = (float(seen.min(initial=low)), float(seen.max(initial=high)))
+        for histogram, rows in ((self.log10_weight, valid), (self.log10_weight_crash, crash)):
+            histogram.add(log_weight[rows] / math.log(10.0), weight[rows])
 
-    def _add_cut_ins(
-        self, columns: dict[str, Floats], weight: Floats, valid: npt.NDArray[np.bool_], crash: npt.NDArray[np.bool_]
-    ) -> None:
-        for grid, rows in ((self.cut_in, valid), (self.cut_in_crash, crash)):
-            grid.add(columns["cut_in_r2_m"][rows], columns["cut_in_r2dot_mps"][rows], weight[rows])
-
-    def _add_crashes(self, columns: dict[str, Floats], weight: Floats, crash: npt.NDArray[np.bool_]) -> None:
-        response_time_s = columns["crash_time_s"] - STEP_S * columns["cut_in_step"]
+    def _add_crashes(self, columns: dict[str, FloatArray], weight: FloatArray, crash: BoolArray) -> None:
         for histogram, values in (
             (self.stratum_crash, columns["n_control_steps"]),
             (self.impact_speed_mps, columns["impact_speed_mps"]),
             (self.crash_time_s, columns["crash_time_s"]),
-            (self.response_time_s, response_time_s),
+            (self.response_time_s, columns["crash_time_s"] - STEP_S * columns["cut_in_step"]),
         ):
             histogram.add(values[crash], weight[crash])
-        self.hardest.add(columns, crash)
-        self.heaviest.add(columns, crash)
-        if self.from_shells:
-            self.outermost.add(columns, crash)
+        for ranking in (self.hardest, self.heaviest, self.outermost):
+            ranking.add(columns, crash)
 
 
 def summarise(run: RunFolder) -> RunSummary:
@@ -179,17 +188,34 @@ def summarise(run: RunFolder) -> RunSummary:
     RunFolderError
         If a shard is damaged or holds an unknown outcome.
     """
-    summary = RunSummary(log_scales(run) if run.method == "shells" else None)
-    for batch in episode_batches(run, COLUMNS):
+    summary = RunSummary(_log_scales(run) if run.campaign.testing.method == "shells" else None)
+    for batch in run.episodes(*NUMBERS, "outcome", "failure"):
         summary.add(batch, _outcome_index(batch.column("outcome"), run))
     return summary
 
 
-def _floats(column: pa.Array) -> Floats:
-    return np.asarray(column.cast(pa.float64()).to_numpy(zero_copy_only=False), dtype=np.float64)
+def _log_scales(run: RunFolder) -> FloatArray:
+    """Logarithm of 1/n_s per shell, shape (S,): it turns recorded weights p_s into ones that add up to probabilities.
+
+    A record carries log p_s, because it is written before anybody knows how many tests its shell will get. Weights
+    p_s/n_s add up to Σ p_s c_s; weights p_s would count a shell as often as it was tested. A shell without tests has
+    scale 0, and no test to use it.
+    """
+    tests: Counter[int] = Counter()
+    for batch in run.episodes("component"):
+        for item in batch.column("component").value_counts():
+            tests[item["values"].as_py()] += item["counts"].as_py()
+    if min(tests, default=0) < 0:
+        raise RunFolderError(
+            str(run.path / "episodes"),
+            found="a test without shell (component -1)",
+            expected="the shell that each test was drawn from",
+            mend="The records are not those of a run with testing.method shells: run the campaign again.",
+        )
+    return -np.log([float(max(tests[shell], 1)) for shell in range(max(tests, default=-1) + 1)])
 
 
-def _outcome_index(column: pa.Array, run: RunFolder) -> npt.NDArray[np.int64]:
+def _outcome_index(column: pa.Array, run: RunFolder) -> IntArray:
     encoded = column if isinstance(column, pa.DictionaryArray) else column.dictionary_encode()
     names = encoded.dictionary.to_pylist()
     unknown = sorted({str(name) for name in names} - set(OUTCOMES))

@@ -15,8 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import xlogy
 
-from harness.arrays import BoolArray, IntArray
-from harness.report.fine_histogram import Floats
+from harness.arrays import BoolArray, FloatArray, IntArray
 
 BINS = 50
 """Per quantity, equally full: a band that holds 2 % of all tests is a bin of its own."""
@@ -60,7 +59,7 @@ class Band:
         return self.p_value <= SIGNIFICANT
 
 
-def telling_bands(values: Floats, crash: BoolArray, weight: Floats) -> list[Band]:
+def telling_bands(values: FloatArray, crash: BoolArray, weight: FloatArray) -> list[Band]:
     """Best band of each quantity, the most telling first.
 
     Parameters
@@ -71,49 +70,36 @@ def telling_bands(values: Floats, crash: BoolArray, weight: Floats) -> list[Band
     weight : ndarray, shape (n,)
         What each test stands for; equal ones within a stratum.
     """
-    cumulated = _Cumulated(np.stack([_bins(row) for row in values]), weight)
-    observed = cumulated.log_ratios(np.flatnonzero(crash))
-    rng = np.random.Generator(np.random.Philox(key=SEED))
-    n_crashes = int(crash.sum())
-    largest = np.array(
-        [
-            cumulated.log_ratios(rng.choice(crash.size, n_crashes, replace=False, shuffle=False)).max()
-            for _ in range(RELABELINGS)
-        ]
-    )
+    scan = Scan(values, weight)
+    observed = scan.log_ratios(np.flatnonzero(crash))
     best, ratio = observed.argmax(axis=1), observed.max(axis=1)
-    found = []
-    for q in np.argsort(-ratio, kind="stable"):
+    rng = np.random.Generator(np.random.Philox(key=SEED))
+    relabeled = (rng.choice(crash.size, int(crash.sum()), replace=False, shuffle=False) for _ in range(RELABELINGS))
+    largest = np.array([scan.log_ratios(rows).max() for rows in relabeled])
+    bands = []
+    for q in np.argsort(-ratio, kind="stable").tolist():
+        low, high = _tight(values[q], crash & scan.inside(q, int(best[q])), crash, weight)
         p_value = (1 + int((largest >= ratio[q]).sum())) / (1 + RELABELINGS)
-        chosen = crash & cumulated.inside(int(q), int(best[q]))
-        low, high = _tight(values[q], chosen, crash, weight)
-        found.append(_band(int(q), low, high, values[q], crash, weight, p_value))
-    return found
+        bands.append(_band(q, low, high, values[q], crash, weight, p_value))
+    return bands
 
 
-def _bins(values: Floats) -> IntArray:
-    """Bin of each value, equally many in each; `BINS` where there is no value."""
-    known = values[~np.isnan(values)]
-    edges = np.quantile(known, np.arange(1, BINS) / BINS, method="inverted_cdf") if known.size else np.zeros(BINS - 1)
-    return np.where(np.isnan(values), BINS, np.searchsorted(edges, values, side="left"))
-
-
-class _Cumulated:
+class Scan:
     """Weights of all tests by bin, kept so that a relabeling only has to look at its crashes."""
 
-    def __init__(self, bins: IntArray, weight: Floats) -> None:
-        self._cell = bins + (BINS + 1) * np.arange(len(bins))[:, None]
+    def __init__(self, values: FloatArray, weight: FloatArray) -> None:
+        self._cell = np.stack([_bins(row) for row in values]) + (BINS + 1) * np.arange(len(values))[:, None]
         self._weight, self._square = weight, weight * weight
         self._all = self._upto(np.arange(weight.size))
         self._first, self._last = np.triu_indices(BINS + 1, 1)
 
-    def _upto(self, rows: IntArray) -> Floats:
+    def _upto(self, rows: IntArray) -> FloatArray:
         """Weight below each edge, shape (Q, BINS + 1)."""
         n, cell = len(self._cell), self._cell[:, rows].ravel()
         held = np.bincount(cell, np.tile(self._weight[rows], n), n * (BINS + 1)).reshape(n, BINS + 1)
         return np.pad(np.cumsum(held[:, :BINS], axis=1), ((0, 0), (1, 0)))
 
-    def log_ratios(self, crashes: IntArray) -> Floats:
+    def log_ratios(self, crashes: IntArray) -> FloatArray:
         """Log likelihood ratio of each band for each quantity, shape (Q, bands), if these rows were the crashes."""
         sums = [float(w[crashes].sum()) for w in (self._weight, self._square)]
         rest = [max(float(w.sum()) - s, 0.0) for w, s in zip((self._weight, self._square), sums, strict=True)]
@@ -130,7 +116,14 @@ class _Cumulated:
         return chosen
 
 
-def _share(part: Floats, whole: float) -> Floats:
+def _bins(values: FloatArray) -> IntArray:
+    """Bin of each value, equally many in each; `BINS` where there is no value."""
+    known = values[~np.isnan(values)]
+    edges = np.quantile(known, np.arange(1, BINS) / BINS, method="inverted_cdf") if known.size else np.zeros(BINS - 1)
+    return np.where(np.isnan(values), BINS, np.searchsorted(edges, values, side="left"))
+
+
+def _share(part: FloatArray, whole: float) -> FloatArray:
     return np.maximum(part, 0.0) / whole if whole > 0.0 else np.zeros_like(part)
 
 
@@ -139,20 +132,20 @@ def _effective(total: float, squares: float) -> float:
     return total * total / squares if squares > 0.0 else 0.0
 
 
-def _log_ratio(crash_share: Floats, other_share: Floats, n_crashes: float, n_others: float) -> Floats:
+def _log_ratio(crash_share: FloatArray, other_share: FloatArray, n_crashes: float, n_others: float) -> FloatArray:
     """Log likelihood ratio of bands with given shares of effective numbers; 0 where crashes are not more frequent."""
     c, o = n_crashes * crash_share, n_others * other_share
     ratio = _fit(c, o) + _fit(n_crashes - c, n_others - o) - _fit(np.array(n_crashes), np.array(n_others))
     return np.where(crash_share > other_share, ratio, 0.0)
 
 
-def _fit(crashes: Floats, others: Floats) -> Floats:
+def _fit(crashes: FloatArray, others: FloatArray) -> FloatArray:
     """Log likelihood of counts at their own share."""
     c, o = np.maximum(crashes, 0.0), np.maximum(others, 0.0)  # differences of sums may round below zero
     return np.asarray(xlogy(c, c) + xlogy(o, o) - xlogy(c + o, c + o), np.float64)
 
 
-def _tight(values: Floats, chosen: BoolArray, crash: BoolArray, weight: Floats) -> tuple[float, float]:
+def _tight(values: FloatArray, chosen: BoolArray, crash: BoolArray, weight: FloatArray) -> tuple[float, float]:
     """Ends of a band within its bins: the two of its crashes between which the likelihood ratio is largest."""
     if not chosen.any():
         return -math.inf, math.inf
@@ -170,13 +163,10 @@ def _tight(values: Floats, chosen: BoolArray, crash: BoolArray, weight: Floats) 
 
 
 def _band(
-    quantity: int, low: float, high: float, values: Floats, crash: BoolArray, weight: Floats, p_value: float
+    quantity: int, low: float, high: float, values: FloatArray, crash: BoolArray, weight: FloatArray, p_value: float
 ) -> Band:
     """A band as it is told: ends rounded outwards, and what lies between them."""
-    low, high = (
-        (math.floor(10.0 * low) / 10.0 if math.isfinite(low) else low),
-        (math.ceil(10.0 * high) / 10.0 if math.isfinite(high) else high),
-    )
+    low, high = float(np.floor(10.0 * low) / 10.0), float(np.ceil(10.0 * high) / 10.0)
     inside = (values >= low) & (values <= high)
     crash_share, other_share = (float(weight[inside & rows].sum() / weight[rows].sum()) for rows in (crash, ~crash))
     return Band(

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import time
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -19,7 +21,7 @@ from harness.estimators.estimate import finite_json
 from harness.outcomes import AV, CRASH, FAILED
 from harness.resolved import resolve
 from harness.runner.prepare import Prepared, build_world, prepare, require_world
-from harness.runner.repeat import bits_of
+from harness.runner.worker import Bits, bits_of
 from harness.vehicles.kinematics import STEP_S
 
 EPISODES = 48
@@ -74,15 +76,12 @@ class AvCheck:
     ----------
     source, engine, method : str
         Which AV, where it ran, and how cut-ins were brought about.
-    n_episodes : int
     failures : dict
         Cause → number of episodes of the first run that failed with it.
     differing : tuple of int
         Episodes whose motion was not the same bits in the two layouts.
     limits_mps2 : (float, float)
         Accelerations that count as its limits.
-    behaviour : Behaviour
-    speed : Speed
     """
 
     source: str
@@ -135,7 +134,8 @@ def check_av(campaign: Campaign, n_episodes: int = EPISODES, *, black_box: Path 
     again = _run_in_another_order(prepared, n_episodes, black_box)
     idm = tested.model_copy(update={"av": AutomatedVehicle(before_cut_in=tested.av.before_cut_in)})
     _, idm_s, idm_steps = _timed_run(prepare(resolve(idm)), n_episodes)
-    limits = _limits(tested.av)
+    own = tested.av.limits if isinstance(tested.av.parameters, dict) else tested.av.parameters
+    limits = own.min_acceleration_mps2, own.max_acceleration_mps2
     return AvCheck(
         source=tested.av.source,
         engine=tested.world.engine,
@@ -177,11 +177,20 @@ def _as_checked(campaign: Campaign) -> Campaign:
     return campaign.model_copy(update=alpha)
 
 
-def _timed_run(prepared: Prepared, n_episodes: int, black_box: Path | None = None) -> tuple[Shard, float, int]:
-    """First run of the episodes; the time is the shortest of several, which other processes disturb least."""
-    world = build_world(prepared.campaign)
+@contextmanager
+def _opened(prepared: Prepared, black_box: Path | None, n_cells: int | None = None) -> Iterator[EpisodeLoop]:
+    world = build_world(prepared.campaign, n_cells)
     loop = prepared.loop(world, black_box=black_box)
     try:
+        yield loop
+    finally:
+        loop.close()
+        world.close()
+
+
+def _timed_run(prepared: Prepared, n_episodes: int, black_box: Path | None = None) -> tuple[Shard, float, int]:
+    """First run of the episodes; the time is the shortest of several, which other processes disturb least."""
+    with _opened(prepared, black_box) as loop:
         loop.run(0, prepared.states(0, min(WARM_UP_EPISODES, n_episodes)))  # compiles
         states = prepared.states(0, n_episodes)
         began = time.perf_counter()
@@ -190,33 +199,18 @@ def _timed_run(prepared: Prepared, n_episodes: int, black_box: Path | None = Non
         while (again := time.perf_counter()) < until:
             loop.run(0, states)
             elapsed_s = min(elapsed_s, time.perf_counter() - again)
-    finally:
-        loop.close()
-        world.close()
     return shard, elapsed_s, max(1, int(shard.results.episode["n_steps"].sum()))
 
 
-def _run_in_another_order(
-    prepared: Prepared, n_episodes: int, black_box: Path | None
-) -> dict[int, tuple[bytes, bytes, str | None]]:
-    """Motion of every episode, run in other cells, the second half first."""
-    world = build_world(prepared.campaign, OTHER_CELLS)
-    loop: EpisodeLoop = prepared.loop(world, black_box=black_box)
+def _run_in_another_order(prepared: Prepared, n_episodes: int, black_box: Path | None) -> dict[int, Bits]:
+    """What every episode leaves when it is run in another cell, the second half first."""
     half = n_episodes // 2
-    found: dict[int, tuple[bytes, bytes, str | None]] = {}
-    try:
+    found: dict[int, Bits] = {}
+    with _opened(prepared, black_box, OTHER_CELLS) as loop:
         for begin, end in ((half, n_episodes), (0, half)):
             shard = loop.run(begin, prepared.states(begin, end - begin))
             found.update({begin + row: bits_of(shard, row) for row in range(end - begin)})
-    finally:
-        loop.close()
-        world.close()
     return found
-
-
-def _limits(av: AutomatedVehicle) -> tuple[float, float]:
-    own = av.limits if isinstance(av.parameters, dict) else av.parameters
-    return own.min_acceleration_mps2, own.max_acceleration_mps2
 
 
 def _behaviour(shard: Shard, limits: tuple[float, float], *, early: bool) -> Behaviour:
@@ -226,10 +220,11 @@ def _behaviour(shard: Shard, limits: tuple[float, float], *, early: bool) -> Beh
         cut = int(episode["cut_in_step"][row])
         if episode["outcome"][row] == FAILED:
             continue
+        commanded = trace[:-1, AV, 2]  # the last row commands nothing
         if early or cut >= 0:
-            acted.append(_accelerations(trace, 0 if early else cut + 1))
+            acted.append(commanded[0 if early else cut + 1 :])
         if cut >= 0:
-            reactions.append(_reaction_s(_accelerations(trace, cut + 1)))
+            reactions.append(_reaction_s(commanded[cut + 1 :]))
     a = np.concatenate([*acted, np.empty(0)])
     reaction = np.array(reactions)
     braked = np.isfinite(reaction)
@@ -245,12 +240,6 @@ def _behaviour(shard: Shard, limits: tuple[float, float], *, early: bool) -> Beh
         n_cut_ins=len(reactions),
         n_crashes=int(np.count_nonzero(episode["outcome"] == CRASH)),
     )
-
-
-def _accelerations(trace: FloatArray, begin: int) -> FloatArray:
-    """Commanded accelerations (m/s²) of the AV from a step on; the last row of a trace commands nothing."""
-    a: FloatArray = trace[begin:-1, AV, 2]
-    return a
 
 
 def _reaction_s(a: FloatArray) -> float:

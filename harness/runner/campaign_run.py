@@ -5,10 +5,11 @@ from __future__ import annotations
 import os
 import threading
 import time
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from importlib import import_module
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -19,26 +20,17 @@ from harness.campaign.models import Campaign
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE
 from harness.methods import SAMPLING
 from harness.progress import Progress, SilentProgress
-from harness.records.folder import SHELLS, TABLES, shard_file, sole_use, write_json
+from harness.records.folder import SHELLS, TABLES, shard_files, shards_on_disk, sole_use, write_json, write_shard
 from harness.resolved import Resolved
-from harness.runner.manifest import Manifest, require_no_fewer, require_own_folder
-from harness.runner.planner import Planner, planner_of
-from harness.runner.prefix import Prefix
-from harness.runner.prepare import (
-    Prepared,
-    distance_per_test_m,
-    prepare,
-    require_ready,
-    require_same_pool,
-)
+from harness.runner.manifest import SMALLEST_FAILED_SAMPLE, Manifest, Prefix, require_no_fewer, require_own_folder
+from harness.runner.planner import planner_of
+from harness.runner.prepare import distance_per_test_m, prepare, require_ready, require_same_pool
 from harness.runner.retrace import Retracing
 from harness.runner.shards import ShardPool, stored_shard
 from harness.runner.stored_estimates import estimate_run
 from harness.runner.table_accuracy import table_errors
-from harness.runner.worker import ShardDone, ShardSpec
+from harness.runner.worker import ShardDone
 from harness.stopped_by import StoppedBy, ending
-
-MANIFEST_INTERVAL_S = 5.0
 
 
 @dataclass(frozen=True)
@@ -69,7 +61,7 @@ class RunResult:
 
 
 def run_campaign(
-    campaign: Campaign,
+    campaign: Campaign | Resolved,
     out: Path,
     *,
     workers: int | None = None,
@@ -81,7 +73,8 @@ def run_campaign(
 
     Parameters
     ----------
-    campaign : Campaign
+    campaign : Campaign or Resolved
+        The latter from `require_ready`.
     out : Path
         New, empty, or (with ``resume``) the folder of this campaign.
     workers : int, optional
@@ -97,179 +90,129 @@ def run_campaign(
     HarnessError
         The campaign, the folder or the AV is at fault; nothing that was finished is lost.
     """
-    return run_resolved(
-        require_ready(campaign), out, workers=workers, resume=resume, shorten=shorten, progress=progress
-    )
-
-
-def run_resolved(
-    resolved: Resolved,
-    out: Path,
-    *,
-    workers: int | None = None,
-    resume: bool = False,
-    shorten: bool = False,
-    progress: Progress | None = None,
-) -> RunResult:
-    """`run_campaign` of what `require_ready` has resolved."""
+    began = time.monotonic()
+    resolved = campaign if isinstance(campaign, Resolved) else require_ready(campaign)
     with sole_use(out):
-        return _run_alone(resolved, out, workers, progress or SilentProgress(), resume=resume, shorten=shorten)
+        earlier = require_own_folder(out, resolved, resume=resume)
+        if not shorten:
+            require_no_fewer(out, earlier, resolved.campaign.stop.episodes)
+        run = _Run(resolved, out, earlier, workers or os.cpu_count() or 1, progress or SilentProgress(), began)
+        run.run_shards()
+        if not shorten:
+            require_no_fewer(out, earlier, run.prefix.n_episodes)
+            run.discard_uncounted()
+        return run.finish()
 
 
-def _run_alone(
-    resolved: Resolved,
-    out: Path,
-    workers: int | None,
-    progress: Progress,
-    *,
-    resume: bool,
-    shorten: bool,
-) -> RunResult:
-    """`run_resolved` in a folder that no other process uses."""
-    started = time.monotonic()
-    campaign = resolved.campaign
-    earlier = require_own_folder(out, resolved.content_hash, resolved.controller_sha256, resume=resume)
-    if not shorten:
-        require_no_fewer(out, earlier, campaign.stop.episodes)
-    prepared = prepare(resolved, progress)
-    distance = distance_per_test_m(resolved.environment)
-    n_workers = workers or os.cpu_count() or 1
-    manifest = Manifest(
-        out,
-        campaign,
-        resolved.content_hash,
-        earlier,
-        controller_sha256=resolved.controller_sha256,
-        workers=n_workers,
-        distance_per_test_m=distance,
-        table_errors=table_errors(campaign, resolved.environment, prepared.tables),
-    )
-    if prepared.prescribed is not None:
-        require_same_pool(out, prepared)
-        write_json(out / SHELLS, prepared.prescribed.design.to_json())
-    retracing = Retracing(resolved)
-    planner = planner_of(campaign, prepared.prescribed, held=0 if earlier is None else int(earlier["n_episodes"]))
-    prefix = Prefix(campaign)
-    _run_shards(
-        resolved,
-        prepared,
-        out,
-        n_workers,
-        progress,
-        manifest,
-        lambda: time.monotonic() - started,
-        prefix,
-        planner,
-        retracing,
-    )
-    if not shorten:
-        require_no_fewer(out, earlier, prefix.n_episodes)
-        _discard_beyond(out, len(prefix.specs))
-    elapsed = time.monotonic() - started
-    stopped_by = _stopped_by(campaign, planner, prefix.n_episodes)
-    retraced = retracing.summary(prefix.n_retraced)
-    asked = campaign.stop.rhw is not None
-    ended = ending(stopped_by, prefix.n_episodes, planner.rule.waited_for, precision_asked=asked)
-    manifest.write(
-        prefix.specs,
-        prefix.files,
-        status="done",
-        elapsed_s=elapsed,
-        stopped_by=stopped_by,
-        ending=ended,
-        retraced=retraced,
-        repeated=prefix.repeated,
-    )
-    progress.stage("estimates and report", None)
-    estimates = estimate_run(out)
-    write_json(out / "estimates.json", estimates)
-    # No worker loads matplotlib, and it has been loaded here while workers were busy.
-    from harness.report import write_report  # noqa: PLC0415
+class _Run:
+    """A campaign on its way into a folder, in which nobody but this process writes."""
 
-    report = write_report(out)
-    missed = asked and not planner.rule.reached
-    return RunResult(out, report, estimates, stopped_by, ended, EXIT_BUDGET_SPENT if missed else EXIT_DONE)
+    def __init__(
+        self,
+        resolved: Resolved,
+        out: Path,
+        earlier: dict[str, Any],
+        workers: int,
+        progress: Progress,
+        began: float,
+    ) -> None:
+        self._resolved, self._campaign, self._out, self._progress = resolved, resolved.campaign, out, progress
+        for left in out.rglob(".*.part"):  # of an earlier run that was killed
+            left.unlink()
+        prepared = prepare(resolved, progress)
+        self._manifest = Manifest(
+            out,
+            resolved,
+            earlier,
+            began=began,
+            workers=workers,
+            distance_per_test_m=distance_per_test_m(resolved.environment),
+            table_errors=table_errors(resolved, prepared.tables),
+        )
+        if prepared.prescribed is not None:
+            require_same_pool(out, prepared)
+            write_json(out / SHELLS, prepared.prescribed.design.to_json())
+        self._retracing = Retracing(resolved)
+        self._stored = partial(stored_shard, out, prepared, self._retracing)
+        self._planner = planner_of(self._campaign, prepared.prescribed, held=earlier["n_episodes"])
+        self._workers = ShardPool(resolved, workers)
+        self.prefix = Prefix()
 
+    def run_shards(self) -> None:
+        """Run shards until the stop rule is content; the manifest follows so that an interrupted run can be read."""
+        self._progress.stage("episodes", self._campaign.stop.episodes, done=episodes_on_disk(self._out))
+        threading.Thread(target=import_module, args=("harness.report",), daemon=True).start()
+        try:
+            rounds = (self._workers.run(specs, self._stored) for specs in self._planner.rounds())
+            for done in chain.from_iterable(rounds):
+                if self._is_enough(done):
+                    break
+            self.prefix.require_few_failed(self._campaign)
+        except BaseException:
+            self._manifest.write(self.prefix, "interrupted")
+            raise
+        finally:
+            self._workers.close()
 
-def _stopped_by(campaign: Campaign, planner: Planner, n_episodes: int) -> StoppedBy:
-    if planner.rule.reached:
-        return "rhw"
-    if planner.rule.pool_too_rough:  # whatever else is spent: more of it would not help
-        return "pool_error"
-    return "episodes" if n_episodes >= campaign.stop.episodes else "pool"
+    def _is_enough(self, done: ShardDone) -> bool:
+        """Take the next shard; True when the campaign is to stop."""
+        if done.parquet:
+            self._manifest.forget_replaced(done.spec)
+            write_shard(self._out, done.spec.index, done.parquet)
+        self.prefix.add(done, shard_files(self._out, done.spec.index))
+        self.prefix.require_few_failed(self._campaign, at_least=SMALLEST_FAILED_SAMPLE)
+        enough = self._planner.add(done.block)
+        self._progress.advance(done.spec.n_episodes if done.parquet else 0)
+        self._progress.status(**self._figures())
+        self._manifest.follow(self.prefix)
+        return enough
 
+    def _figures(self) -> dict[str, int | float]:
+        """What a progress bar shows: crashes, and what the stop rule saw at its last look.
 
-def _run_shards(
-    resolved: Resolved,
-    prepared: Prepared,
-    out: Path,
-    workers: int,
-    progress: Progress,
-    manifest: Manifest,
-    elapsed: Callable[[], float],
-    prefix: Prefix,
-    planner: Planner,
-    retracing: Retracing,
-) -> None:
-    """Run shards until the stop rule is content; the manifest follows so that an interrupted run can be read."""
-    campaign = resolved.campaign
-    pool = ShardPool(resolved, out, workers)
-    written = elapsed()
+        Only what a rule asks for is called ``rhw``: a bar reckons from it when the campaign will stop.
+        """
+        watched = "half_width" if self._campaign.stop.rhw is None else "rhw"
+        figures: dict[str, int | float] = {"crashes": self.prefix.n_crashes, watched: self._planner.rule.rhw}
+        weighted = SAMPLING[self._campaign.testing.method].forces
+        return figures | ({"heaviest": self._planner.rule.heaviest} if weighted else {})
 
-    def stored(spec: ShardSpec) -> ShardDone | None:
-        return stored_shard(out, campaign, spec, prepared.prescribed, retracing)
+    def discard_uncounted(self) -> None:
+        """Remove shards that an earlier, longer run has left beyond the stop."""
+        counted = {self._out / file for shard in self.prefix.shards for file in shard["files"].values()}
+        for path in {path for table in TABLES for path in shards_on_disk(self._out, table)} - counted:
+            path.unlink()
 
-    progress.stage("episodes", campaign.stop.episodes, done=_episodes_on_disk(out))
-    threading.Thread(target=import_module, args=("harness.report",), daemon=True).start()
-    try:
-        for done in (done for specs in planner.rounds() for done in pool.run(specs, stored, manifest)):
-            prefix.add(done)
-            stop = planner.add(done.block)
-            progress.advance(0 if done.stored else done.spec.n_episodes)
-            progress.status(**_figures(campaign, prefix.n_crashes, planner))
-            if elapsed() - written > MANIFEST_INTERVAL_S:
-                written = elapsed()
-                _note(manifest, prefix, "running", written)
-            if stop:
-                break
-        prefix.require_few_failed()
-    except BaseException:
-        _note(manifest, prefix, "interrupted", elapsed())
-        raise
-    finally:
-        pool.close()
+    def finish(self) -> RunResult:
+        """Write manifest, estimates and report."""
+        stop, rule, n = self._campaign.stop, self._planner.rule, self.prefix.n_episodes
+        stopped_by = self._stopped_by()
+        said = ending(stopped_by, n, rule.waited_for, precision_asked=stop.rhw is not None)
+        retraced = self._retracing.summary(self.prefix.n_retraced)
+        self._manifest.write(self.prefix, "done", stopped_by=stopped_by, ending=said, retraced=retraced)
+        self._progress.stage("estimates and report", None)
+        estimates = estimate_run(self._out)
+        write_json(self._out / "estimates.json", estimates)
+        # No worker loads matplotlib, and it has been loaded here while workers were busy.
+        from harness.report import write_report  # noqa: PLC0415
+
+        report = write_report(self._out)
+        missed = stop.rhw is not None and not rule.reached
+        return RunResult(self._out, report, estimates, stopped_by, said, EXIT_BUDGET_SPENT if missed else EXIT_DONE)
+
+    def _stopped_by(self) -> StoppedBy:
+        rule = self._planner.rule
+        if rule.reached:
+            return "rhw"
+        if rule.pool_too_rough:  # whatever else is spent: more of it would not help
+            return "pool_error"
+        return "episodes" if self.prefix.n_episodes >= self._campaign.stop.episodes else "pool"
 
 
-def _figures(campaign: Campaign, n_crashes: int, planner: Planner) -> dict[str, int | float]:
-    """What a progress bar shows: crashes, and what the stop rule saw at its last look.
-
-    Only what a rule asks for is called ``rhw``: a bar reckons from it when the campaign will stop.
-    """
-    watched = "half_width" if campaign.stop.rhw is None else "rhw"
-    figures: dict[str, int | float] = {"crashes": n_crashes, watched: planner.rule.rhw}
-    weighted = SAMPLING[campaign.testing.method].forces
-    return figures | ({"heaviest": planner.rule.heaviest} if weighted else {})
-
-
-def _note(manifest: Manifest, prefix: Prefix, status: str, elapsed_s: float) -> None:
-    manifest.write(prefix.specs, prefix.files, status=status, elapsed_s=elapsed_s, repeated=prefix.repeated)
-
-
-def _episodes_on_disk(folder: Path) -> int:
+def episodes_on_disk(folder: Path) -> int:
     """Episodes that an earlier run has finished, for the progress bar."""
     n = 0
-    for path in (folder / "episodes").glob("shard-*.parquet"):
+    for path in shards_on_disk(folder, "episodes"):
         with suppress(OSError, pa.ArrowException):  # a damaged file is refused when its turn comes
             n += pq.read_metadata(path).num_rows
     return n
-
-
-def _discard_beyond(folder: Path, n_shards: int) -> None:
-    """Remove what was run beyond the stop: a result must not depend on how many workers were ahead."""
-    last = {table: Path(shard_file(table, n_shards - 1)).name for table in TABLES}
-    for table in TABLES:
-        for path in sorted((folder / table).glob("shard-*.parquet")):
-            if path.name > last[table]:
-                path.unlink()
-        for path in (folder / table).glob(".*.part"):
-            path.unlink()

@@ -18,7 +18,7 @@ from harness.records.folder import MANIFEST, read_json, read_manifest, require_s
 from harness.records.reader import read_shards
 from harness.records.stored_manifest import StoredStops
 from harness.resolved import Resolved
-from harness.runner.campaign_run import run_resolved
+from harness.runner.campaign_run import RunResult, run_campaign
 from harness.runner.manifest import require_own_folder
 from harness.runner.prepare import require_ready
 from harness.state import STATE_COLUMNS
@@ -85,23 +85,24 @@ def compare_campaigns(
     require_comparable(a, b)
     sides: dict[Side, Resolved] = {"a": require_ready(a), "b": require_ready(b)}
     for side, of_side in sides.items():  # both, before either is touched
-        require_own_folder(out / side, of_side.content_hash, of_side.controller_sha256, resume=True)
+        require_own_folder(out / side, of_side, resume=True)
     stops = _Stops(out, sides)
-    for side in SIDES:
+
+    def run(side: Side, of_side: Resolved) -> RunResult:
+        return run_campaign(of_side, out / side, workers=workers, resume=True, shorten=True, progress=progress)
+
+    for side, of_side in sides.items():
         if not stops.known(side):
-            result = run_resolved(
-                sides[side], out / side, workers=workers, resume=True, shorten=True, progress=progress
-            )
+            result = run(side, of_side)
             stops.note(side, int(result.estimates["n_episodes"]), result.stopped_by)
-    n = max(stops.n_episodes(side) for side in SIDES)
-    for side in SIDES:
+    n = max(stops.of(side)["n_episodes"] for side in SIDES)
+    for side, of_side in sides.items():
         if not _is_done(out / side, n):
-            longer = _exactly(sides[side], n)
-            run_resolved(longer, out / side, workers=workers, resume=True, shorten=True, progress=progress)
+            run(side, _exactly(of_side, n))
     found = paired_difference(_pairs(a, b, out), a.stop.confidence)
     content = _content(sides, stops, found, labels or (a.name, b.name))
     write_json(out / "compare.json", content)
-    missed = a.stop.rhw is not None and any(stops.stopped_by(side) != "rhw" for side in SIDES)
+    missed = a.stop.rhw is not None and any(stops.of(side)["stopped_by"] != "rhw" for side in SIDES)
     return Comparison(out, found, content, EXIT_BUDGET_SPENT if missed else EXIT_DONE)
 
 
@@ -120,8 +121,8 @@ def require_comparable(a: Campaign, b: Campaign) -> None:
             expected="a method under which both AVs meet the same cut-ins",
             mend="Write --set testing.method=forced: the same cut-ins for both, and no assumption about either.",
         )
-    keys = MAY_DIFFER
-    apart = list(_differing("", a.model_dump(exclude=set(keys)), b.model_dump(exclude=set(keys))))
+    keys = set(MAY_DIFFER)
+    apart = list(_differing("", a.model_dump(exclude=keys), b.model_dump(exclude=keys)))
     if not apart:
         return
     where, of_a, of_b = apart[0]
@@ -148,8 +149,7 @@ class _Stops:
     """Where each campaign's own stop rule ended, kept in a file: a continued folder does not say it any more."""
 
     def __init__(self, folder: Path, sides: dict[Side, Resolved]) -> None:
-        self._file = folder / STOPS
-        self._folder = folder
+        self._folder, self._file = folder, folder / STOPS
         self._asked = {
             side: {"campaign_hash": of_side.content_hash, "stop": of_side.campaign.stop.model_dump()}
             for side, of_side in sides.items()
@@ -162,22 +162,17 @@ class _Stops:
 
     def known(self, side: Side) -> bool:
         """Whether an earlier call took this campaign to its stop, and its run is still there."""
-        note = self._notes.get(side) or {}
+        note, folder = self._notes.get(side) or {}, self._folder / side
         same = all(note.get(key) == value for key, value in self._asked[side].items())
-        manifest = self._folder / side / MANIFEST
-        return (
-            same and manifest.exists() and read_manifest(self._folder / side)["campaign_hash"] == note["campaign_hash"]
-        )
+        return same and (folder / MANIFEST).exists() and read_manifest(folder)["campaign_hash"] == note["campaign_hash"]
 
     def note(self, side: Side, n_episodes: int, stopped_by: str) -> None:
         self._notes[side] = {**self._asked[side], "n_episodes": n_episodes, "stopped_by": stopped_by}
         write_json(self._file, self._notes)
 
-    def n_episodes(self, side: Side) -> int:
-        return int(self._notes[side]["n_episodes"])
-
-    def stopped_by(self, side: Side) -> str:
-        return str(self._notes[side]["stopped_by"])
+    def of(self, side: Side) -> dict[str, Any]:
+        """How many tests it took, and what ended it."""
+        return {key: self._notes[side][key] for key in ("n_episodes", "stopped_by")}
 
 
 def _is_done(folder: Path, n_episodes: int) -> bool:
@@ -217,7 +212,7 @@ def _content(
         side: {
             "label": label,
             "campaign_hash": of_sides[side].content_hash,
-            "own_stop": {"n_episodes": stops.n_episodes(side), "stopped_by": stops.stopped_by(side)},
+            "own_stop": stops.of(side),
         }
         for side, label in zip(SIDES, labels, strict=True)
     }

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import platform
-from collections.abc import Sequence
+import time
+from collections import Counter
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
@@ -11,11 +12,14 @@ from typing import Any
 
 from harness.campaign.dumping import dump_campaign
 from harness.campaign.models import Campaign
-from harness.errors import RunFolderError
+from harness.errors import RunFolderError, TooManyFailedError
 from harness.records.folder import MANIFEST, read_manifest, require_place, write_json, write_text
-from harness.runner.repeat import Repeated
-from harness.runner.worker import ShardSpec
+from harness.resolved import Resolved
+from harness.runner.worker import Repeated, ShardDone, ShardSpec
 
+INTERVAL_S = 5.0
+SMALLEST_FAILED_SAMPLE = 200
+"""Episodes before the share of failures can end a campaign."""
 _PACKAGES = ("harness", "libsumo", "numba", "llvmlite", "numpy", "scipy", "pyarrow")
 
 
@@ -39,63 +43,46 @@ def cpu_name() -> str:
     return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.machine())
 
 
-def require_own_folder(
-    folder: Path, content_hash: str, controller: str | None, *, resume: bool
-) -> dict[str, Any] | None:
-    """Refuse a folder that holds something else; return the manifest of a run to be continued.
-
-    Parameters
-    ----------
-    folder : Path
-    content_hash : str
-        Of the campaign.
-    controller : str, optional
-        Hash of the AV's own code: one file may not mix two versions of it.
-    resume : bool
-        Whether to continue what the folder holds.
+def require_own_folder(folder: Path, resolved: Resolved, *, resume: bool) -> dict[str, Any]:
+    """Refuse a folder that holds something else; return the manifest of a run to be continued, or one without shards.
 
     Raises
     ------
     RunFolderError
         The folder cannot be written to, holds another campaign, this one without ``--resume`` or with another
-        controller, or files that are no run.
+        controller (one file may not mix two versions of it), or files that are no run.
     """
+
+    def refusal(found: str, expected: str, mend: str) -> RunFolderError:
+        return RunFolderError(str(folder), found=found, expected=expected, mend=mend)
+
     require_place(folder)
     if not folder.exists() or not any(folder.iterdir()):
-        return None
+        return {"n_episodes": 0, "shards": []}
+    elsewhere = "Choose another folder with --out."
     if not (folder / MANIFEST).exists():
-        raise RunFolderError(
-            str(folder),
-            found="a folder with other files",
-            expected="a new or empty folder, or one that a run has left",
-            mend="Choose another folder with --out.",
-        )
-    manifest = read_manifest(folder, mend="Choose another folder with --out.")
-    if manifest.get("campaign_hash") != content_hash:
-        raise RunFolderError(
-            str(folder),
-            found=f"another campaign ({manifest.get('name')}, {manifest.get('campaign_hash')})",
-            expected=f"a folder for this one ({content_hash})",
-            mend="Choose another folder with --out, or run the campaign.yaml that it holds.",
+        expected = "a new or empty folder, or one that a run has left"
+        raise refusal("a folder with other files", expected, elsewhere)
+    manifest = read_manifest(folder, mend=elsewhere)
+    if manifest["campaign_hash"] != resolved.content_hash:
+        raise refusal(
+            f"another campaign ({manifest.get('name')}, {manifest['campaign_hash']})",
+            f"a folder for this one ({resolved.content_hash})",
+            "Choose another folder with --out, or run the campaign.yaml that it holds.",
         )
     if not resume:
-        raise RunFolderError(
-            str(folder),
-            found="this campaign, already begun",
-            expected="a new or empty folder",
-            mend="Continue it with --resume, or choose another folder with --out.",
-        )
-    if manifest.get("controller_sha256") != controller:
-        raise RunFolderError(
-            str(folder),
-            found="tests of this campaign whose controller's source file has been changed since",
-            expected="the same controller for all tests of a run",
-            mend="Restore the file, or test the new controller in another folder with --out.",
+        mend = "Continue it with --resume, or choose another folder with --out."
+        raise refusal("this campaign, already begun", "a new or empty folder", mend)
+    if manifest.get("controller_sha256") != resolved.controller_sha256:
+        raise refusal(
+            "tests of this campaign whose controller's source file has been changed since",
+            "the same controller for all tests of a run",
+            "Restore the file, or test the new controller in another folder with --out.",
         )
     return manifest
 
 
-def require_no_fewer(folder: Path, earlier: dict[str, Any] | None, n_episodes: int) -> None:
+def require_no_fewer(folder: Path, earlier: dict[str, Any], n_episodes: int) -> None:
     """Refuse to throw away tests that an earlier run has finished.
 
     Raises
@@ -103,8 +90,7 @@ def require_no_fewer(folder: Path, earlier: dict[str, Any] | None, n_episodes: i
     RunFolderError
         The folder holds more tests than the stop rule that is asked for now would keep.
     """
-    held = 0 if earlier is None else int(earlier["n_episodes"])
-    if n_episodes < held:
+    if n_episodes < (held := earlier["n_episodes"]):
         raise RunFolderError(
             str(folder),
             found=f"{held:,} finished tests, of which the campaign as it is asked for now would keep {n_episodes:,}",
@@ -113,71 +99,117 @@ def require_no_fewer(folder: Path, earlier: dict[str, Any] | None, n_episodes: i
         )
 
 
+class Prefix:
+    """Finished shards in order, from the first on, as the manifest lists them, and what is counted over them."""
+
+    def __init__(self) -> None:
+        self.shards: list[dict[str, Any]] = []
+        self.n_episodes = self.n_crashes = self.n_failed = self.n_retraced = 0
+        self.repeated: Repeated | None = None
+        self._causes: Counter[str] = Counter()
+
+    def add(self, done: ShardDone, files: dict[str, str]) -> None:
+        """Append a shard that is on disk."""
+        spec = done.spec
+        self.shards.append(
+            {"index": spec.index, "first_episode": spec.first_episode, "n_episodes": spec.n_episodes, "files": files}
+        )
+        self.n_episodes += spec.n_episodes
+        self.n_retraced += done.n_retraced
+        self.n_crashes += int(done.block.crash.sum())
+        self.n_failed += int(done.block.failed.sum())
+        self._causes += done.failures
+        self.repeated = self.repeated or done.repeated
+
+    def require_few_failed(self, campaign: Campaign, *, at_least: int = 0) -> None:
+        """Refuse an answer from tests of which too many failed, once there are ``at_least`` so many.
+
+        Raises
+        ------
+        TooManyFailedError
+            More episodes failed than the campaign allows.
+        """
+        most = campaign.run.max_failed_share
+        if self.n_episodes >= at_least and self.n_failed > most * self.n_episodes:
+            cause = "".join(f", {n} of them with: {why}" for why, n in self._causes.most_common(1))
+            raise TooManyFailedError(
+                "run.max_failed_share",
+                found=f"{self.n_failed} of {self.n_episodes} episodes failed{cause}",
+                expected=f"a share of at most {most:g}",
+                mend="Mend the AV (`harness av-check` looks at it in seconds), or raise the share to go on. All causes "
+                "are in the column 'failure' of the episodes table.",
+            )
+
+
 class Manifest:
-    """Keeps ``manifest.json`` and ``campaign.yaml`` of a run folder true."""
+    """Keeps ``manifest.json`` and ``campaign.yaml`` of a run folder true.
+
+    ``earlier`` is what `require_own_folder` found, ``began`` `time.monotonic` at the run's beginning; ``facts`` are more
+    keys.
+    """
 
     def __init__(
-        self, folder: Path, campaign: Campaign, content_hash: str, earlier: dict[str, Any] | None, **facts: Any
+        self, folder: Path, resolved: Resolved, earlier: dict[str, Any], *, began: float, **facts: Any
     ) -> None:
-        self._folder = folder
+        campaign = resolved.campaign
+        self._folder, self._earlier = folder, earlier
         self._campaign = dump_campaign(campaign)
         self._reproducible = campaign.av.reproducible
-        self._earlier = earlier
-        self._n_kept = int((earlier or {}).get("n_episodes", 0))
-        self._wall_time_s = float((earlier or {}).get("wall_time_s", 0.0))
+        self._began = began - float(earlier.get("wall_time_s") or 0.0)
         self._content: dict[str, Any] = {
             "format": 1,
             "name": campaign.name,
-            "campaign_hash": content_hash,
-            "created": (earlier or {}).get("created") or datetime.now(UTC).isoformat(timespec="seconds"),
+            "campaign_hash": resolved.content_hash,
+            "created": earlier.get("created") or datetime.now(UTC).isoformat(timespec="seconds"),
             "seed": campaign.seed,
             "engine": campaign.world.engine,
             "versions": versions(),
             "cpu": cpu_name(),
+            "controller_sha256": resolved.controller_sha256,
             **facts,
         }
-        folder.mkdir(parents=True, exist_ok=True)
-        self.write([], [], status="running")  # first: --resume knows a folder by its manifest
+        self._written = began
+        self.write(Prefix(), "running")  # first: --resume knows a folder by its manifest
 
-    def is_replaced_by(self, spec: ShardSpec) -> bool:
-        """Whether a shard that is not taken over takes the place of one that an earlier run has left."""
-        if self._earlier is None or spec.index >= len(self._earlier["shards"]):
-            return False
-        shard = self._earlier["shards"][spec.index]
-        return bool(shard["n_episodes"] != spec.n_episodes) or (self._folder / shard["files"]["episodes"]).exists()
+    def forget_replaced(self, spec: ShardSpec) -> None:
+        """Cut what an earlier run has left before the shard that this one is about to take the place of, if it does.
 
-    def forget_from(self, index: int) -> None:
-        """Cut what an earlier run has left before shard ``index``, which is about to be replaced."""
-        assert self._earlier is not None
-        shards = self._earlier["shards"][:index]
-        self._n_kept = sum(shard["n_episodes"] for shard in shards)
-        cut = {"status": "interrupted", "stopped_by": None, "ending": None, "n_episodes": self._n_kept}
-        self._earlier = {**self._earlier, **cut, "shards": shards}
+        One of the same size whose file is missing is only made anew.
+        """
+        shards = self._earlier["shards"]
+        if spec.index >= len(shards):
+            return
+        shard = shards[spec.index]
+        if shard["n_episodes"] == spec.n_episodes and not (self._folder / shard["files"]["episodes"]).exists():
+            return
+        kept = shards[: spec.index]
+        cut = {"status": "interrupted", "stopped_by": None, "ending": None}
+        n_kept = sum(shard["n_episodes"] for shard in kept)
+        self._earlier = {**self._earlier, **cut, "n_episodes": n_kept, "shards": kept}
         write_json(self._folder / MANIFEST, self._earlier)
+
+    def follow(self, prefix: Prefix) -> None:
+        """Write it every few seconds, so that a run which goes on can be read."""
+        if time.monotonic() - self._written > INTERVAL_S:
+            self.write(prefix, "running")
 
     def write(
         self,
-        specs: Sequence[ShardSpec],
-        files: Sequence[dict[str, str]],
-        *,
+        prefix: Prefix,
         status: str,
-        elapsed_s: float = 0.0,
+        *,
         stopped_by: str | None = None,
         ending: str | None = None,
         retraced: dict[str, Any] | None = None,
-        repeated: Repeated | None = None,
     ) -> None:
         """Record the contiguous prefix of finished shards.
 
         While a run goes on and has not come as far as an earlier one, what that one has left stays true.
         """
-        n_episodes = sum(spec.n_episodes for spec in specs)
-        if status != "done" and n_episodes < self._n_kept:
+        self._written = time.monotonic()
+        if status != "done" and prefix.n_episodes < self._earlier["n_episodes"]:
             return
-        shards = [
-            {"index": spec.index, "first_episode": spec.first_episode, "n_episodes": spec.n_episodes, "files": file}
-            for spec, file in zip(specs, files, strict=True)
-        ]
+        repeated = prefix.repeated
         write_json(
             self._folder / MANIFEST,
             {
@@ -188,9 +220,9 @@ class Manifest:
                 "retraced": retraced,
                 "reproducible": self._reproducible and not (repeated and repeated.differing),
                 "repeated": None if repeated is None else repeated.to_json(),
-                "wall_time_s": round(self._wall_time_s + elapsed_s, 3),
-                "n_episodes": n_episodes,
-                "shards": shards,
+                "wall_time_s": round(self._written - self._began, 3),
+                "n_episodes": prefix.n_episodes,
+                "shards": prefix.shards,
             },
         )
         write_text(self._folder / "campaign.yaml", self._campaign)

@@ -1,28 +1,52 @@
-"""What a campaign tests next, and when it is enough: methods that know all their tests beforehand, and shells."""
+"""What a campaign tests next, why, and when it is enough.
+
+Most methods know all their tests beforehand. Shells decide from each round what the next one tests, so that a round is
+run to its end before the next begins, whatever the number of workers; the result is looked at between rounds. Rounds
+grow geometrically, to where they narrow the interval most. That depends on counts alone, not on the stop rule or on
+time: a run can be continued to a smaller RHW. First the strata inside the boundary are tested until the conditional
+statement is roughly known, some hundred tests; then all are.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
 
+import numpy as np
+
+from harness.arrays import BoolArray, IntArray
 from harness.campaign.models import Campaign
-from harness.estimators import StopRule, accumulator
+from harness.estimators import Shells, StopRule, accumulator
 from harness.estimators.block import Block
-from harness.pool.prescribed import PrescribedEpisodes
-from harness.runner.shell_planner import ShellPlanner
+from harness.estimators.estimate import BothWays, Estimate
+from harness.estimators.intervals import clopper_pearson
+from harness.estimators.shells import combined
+from harness.pool.shells import Draw, PrescribedEpisodes
 from harness.runner.worker import ShardSpec
+from harness.strata import ShellDesign
+
+GROWTH = 1.25
+"""Tests after a round over tests before it; also the distance of the looks at the result."""
+CONDITIONAL_RHW = 0.3
+"""Relative half-width of the conditional statement at which testing turns to what lies outside."""
+CONFIDENCE = 0.9
+"""Level at which widths are compared, whatever the campaign reports."""
+_TAIL = (1.0 - CONFIDENCE) / 2.0
+MOST_FIRST_TESTS = 4
+"""Testing turns to what lies outside after this many times the first tests, known or not."""
+SMALLEST_ROUND = 8
+SHARES_PER_ROUND = 32
+USED_UP_SHARE = 0.95
+"""Share of the squared widths that must lie in exhausted strata for the allocation to end."""
+MOST_SHARDS_PER_ROUND = 16
+SMALLEST_SHARD = 64
+POOL_SHARE = 0.5
+"""Share of the squared width from the pool's own error above which more tests hardly narrow an interval."""
 
 
 class FixedPlanner:
-    """All tests are known beforehand, in one round; a stop rule looks at some of their shards.
-
-    Parameters
-    ----------
-    campaign : Campaign
-
-    Attributes
-    ----------
-    rule : StopRule
-    """
+    """All tests are known beforehand, in one round; a stop rule looks at some of their shards."""
 
     def __init__(self, campaign: Campaign) -> None:
         self._campaign = campaign
@@ -32,7 +56,7 @@ class FixedPlanner:
         self._n_episodes = 0
 
     def rounds(self) -> Iterator[Iterator[ShardSpec]]:
-        """See `ShellPlanner`; all shards are one round."""
+        """See `ShellPlanner`."""
         size, total = self._campaign.run.shard_size, self._campaign.stop.episodes
         firsts = enumerate(range(0, total, size))
         yield (ShardSpec(index, first, min(size, total - first)) for index, first in firsts)
@@ -46,6 +70,56 @@ class FixedPlanner:
         return self.rule.observe(self._n_episodes, self._sums.result(self._campaign.stop.confidence))
 
 
+class ShellPlanner:
+    """Fed with finished tests in order; says what is tested next, and when it is enough.
+
+    ``available``, shape (S,), are the most tests of each stratum, ``held`` see `RoundRule`; ``estimate`` is that at the
+    end of the last round.
+    """
+
+    def __init__(self, campaign: Campaign, design: ShellDesign, available: IntArray, held: int = 0) -> None:
+        shells = campaign.testing.shells
+        self.rule = RoundRule(campaign, held)
+        self.estimate: Estimate | None = None
+        self._campaign = campaign
+        self._allocation = Allocation(design, shells.first_tests, available, shells.statement == "conditional")
+        self._none = np.zeros(design.p.size, np.int64)
+        self._seen = Shells()
+        self._sums = BothWays(self._seen)
+        self._n_episodes = self._look = 0
+
+    @property
+    def tests(self) -> IntArray:
+        """Tests of each stratum so far, shape (S,)."""
+        return self._seen.tests if self._n_episodes else self._none
+
+    def rounds(self) -> Iterator[Iterator[ShardSpec]]:
+        """Shards of each round; the next round is asked for when all of the last one have been added."""
+        n_shards = 0
+        while (added := self.next_round()).any():
+            specs = round_specs(self.tests, added, n_shards, self._n_episodes, self._campaign.run.shard_size)
+            n_shards += len(specs)
+            yield iter(specs)
+
+    def next_round(self) -> IntArray:
+        """Tests to add per stratum, shape (S,); all 0 when no stratum or no budget is left."""
+        crashes, failed = (self._seen.crashes, self._seen.failed) if self._n_episodes else (self._none, self._none)
+        budget = self._campaign.stop.episodes - self._n_episodes
+        added = self._allocation.next_round(self.tests, crashes, failed, budget)
+        self.rule.of_first_tests = bool(np.any(self.tests[added > 0] < self._campaign.testing.shells.first_tests))
+        self._look = self._n_episodes + int(added.sum())
+        return added
+
+    def add(self, block: Block) -> bool:
+        """Add the tests of the next shard; True when the campaign is to stop."""
+        self._sums.add(block)
+        self._n_episodes += len(block)
+        if self._n_episodes != self._look:
+            return False
+        self.estimate = self._sums.result(self._campaign.stop.confidence)
+        return self.rule.observe(self.estimate)
+
+
 Planner = FixedPlanner | ShellPlanner
 
 
@@ -53,4 +127,163 @@ def planner_of(campaign: Campaign, prescribed: PrescribedEpisodes | None, held: 
     """The planner of a campaign whose folder holds ``held`` tests already."""
     if prescribed is None:
         return FixedPlanner(campaign)
-    return ShellPlanner(campaign, prescribed.design, prescribed.draws.available, held)
+    return ShellPlanner(campaign, prescribed.design, prescribed.available, held)
+
+
+@dataclass(frozen=True)
+class Allocation:
+    """How many tests each shell gets next.
+
+    A stratum gets ``first_tests`` before anything is decided about it, and at most those ``available``, shape (S,).
+    With ``conditional_only`` what lies outside is never tested.
+    """
+
+    design: ShellDesign
+    first_tests: int
+    available: IntArray
+    conditional_only: bool
+
+    def next_round(self, tests: IntArray, crashes: IntArray, failed: IntArray, budget: int) -> IntArray:
+        """Tests to add per stratum, at most ``budget``; all 0 when no stratum or no budget is left.
+
+        Parameters
+        ----------
+        tests, crashes, failed : ndarray, shape (S,)
+            So far. Failed tests widen the limits that are to be narrowed: they may have been crashes.
+        """
+        if self._used_up(tests, crashes, failed):
+            return np.zeros_like(tests)
+        begun = self._begun(tests, crashes, failed)
+        active = begun & (tests < self.available)
+        wanted = np.where(active, np.maximum(self.first_tests - tests, 0), 0)
+        if not wanted.any() and active.any():
+            size = max(SMALLEST_ROUND, int(np.ceil(tests[begun].sum() * (GROWTH - 1.0))))
+            wanted = self._spread(min(size, budget), tests, crashes, failed, active)
+        # The budget cuts a round from the last stratum on.
+        allowed = np.minimum(np.cumsum(np.minimum(wanted, self.available - tests)), max(budget, 0))
+        added: IntArray = np.diff(allowed, prepend=0)
+        return added
+
+    def _used_up(self, tests: IntArray, crashes: IntArray, failed: IntArray) -> bool:
+        """Whether nearly all that is left to know lies in strata without further cut-ins."""
+        low, high = clopper_pearson(crashes, tests, _TAIL, failed)
+        relevant = np.arange(tests.size) < (self.design.n_inside if self.conditional_only else tests.size)
+        squares = np.where(relevant, (self.design.p * (high - low)) ** 2, 0.0)
+        return bool(squares[tests >= self.available].sum() >= USED_UP_SHARE * squares.sum())
+
+    def _begun(self, tests: IntArray, crashes: IntArray, failed: IntArray) -> BoolArray:
+        """Strata that it is time to test: those inside, and from some point on all."""
+        inside = np.arange(tests.size) < self.design.n_inside
+        if self.conditional_only:
+            return inside
+        d, s = self.design, slice(0, self.design.n_inside)
+        inner = combined(d.p[s], crashes[s], tests[s], d.moments[s, s], d.n_paths, _TAIL, failed[s])
+        known = inner.rhw <= CONDITIONAL_RHW
+        exhausted = bool(np.all(tests[s] >= self.available[s]))
+        started = bool(np.any(tests[d.n_inside :] > 0))
+        # Without this end a vehicle that crashes rarely inside, and often outside, would not be tested outside at all.
+        spent = bool(tests[s].sum() >= MOST_FIRST_TESTS * self.first_tests * d.n_inside)
+        return np.ones_like(inside) if known or exhausted or started or spent else inside
+
+    def _spread(self, size: int, tests: IntArray, crashes: IntArray, failed: IntArray, active: BoolArray) -> IntArray:
+        """Give portions, one after the other, to where each narrows the sum of squared half-widths most.
+
+        A squared half-width shrinks as 1/n, or as 1/n² where shares are all 0 or 1.
+        """
+        low, high = clopper_pearson(crashes, tests, _TAIL, failed)
+        squares = ((self.design.p * (high - low) / 2.0) ** 2).tolist()
+        powers = np.where((crashes + failed == 0) | (crashes == tests), 2, 1).tolist()
+        so_far, room = tests.tolist(), np.where(active, self.available - tests, 0).tolist()
+        given = [0] * tests.size
+
+        def gain(s: int) -> float:
+            """Fall of the squared half-width per further test of a stratum."""
+            if given[s] >= room[s]:
+                return -1.0
+            n = max(so_far[s] + given[s], 1)
+            return float(squares[s] * (max(so_far[s], 1) / n) ** powers[s] * powers[s] / n)
+
+        gains, left, portion = [gain(s) for s in range(tests.size)], size, max(1, size // SHARES_PER_ROUND)
+        while left > 0 and max(gains) >= 0.0:
+            best = gains.index(max(gains))
+            more = min(portion, left, room[best] - given[best])
+            given[best] += more
+            left -= more
+            gains[best] = gain(best)
+        return np.array(given, np.int64)
+
+
+class RoundRule:
+    """Looks after each round, and is content with one pass: looks are 1.25 apart, not 1.1.
+
+    That limits within shells are exact at a fixed number of tests says nothing about the number at which a rule stops;
+    that intervals cover there, and how far the rate is biased, is measured (docs/estimators.md).
+
+    Parameters
+    ----------
+    campaign : Campaign
+    held : int
+        Tests that the run folder holds: before them nothing is given up, whatever precision is asked for now.
+
+    Attributes
+    ----------
+    of_first_tests : bool
+        Whether the round brings the tests that every shell gets before anything is decided about it.
+    reached, rhw, heaviest, waited_for, pool_too_rough
+        See `StopRule`.
+    """
+
+    def __init__(self, campaign: Campaign, held: int = 0) -> None:
+        self._held = held
+        self._target = campaign.stop.rhw
+        self._min_crashes = campaign.min_crashes
+        self._first_tests = campaign.testing.shells.first_tests
+        self._conditional = campaign.testing.shells.statement == "conditional"
+        self.reached = self.pool_too_rough = False
+        self.rhw = float("inf")
+        self.heaviest = 0.0  # limits within shells allow for every crash that has not been seen
+        self.of_first_tests = False
+        self.waited_for: tuple[str, ...] = ()
+
+    def observe(self, estimate: Estimate) -> bool:
+        """Whether to stop at the end of a round, with this estimate from all tests so far."""
+        watched = estimate.details["conditional"] if self._conditional else {"rhw": estimate.rhw, **estimate.details}
+        self.rhw = watched["rhw"]
+        if self._target is None:
+            return False
+        met = {
+            f"stop.rhw ({self._target:g})": self.rhw <= self._target,
+            f"stop.min_crashes ({self._min_crashes:,})": estimate.n_crashes >= self._min_crashes,
+        }
+        missing = tuple(condition for condition, is_met in met.items() if not is_met)
+        if missing:
+            self.waited_for = missing
+        elif self.of_first_tests:
+            self.waited_for = (f"testing.shells.first_tests ({self._first_tests:,} of each shell)",)
+        if estimate.n_crashes < self._min_crashes:
+            return False
+        self.reached = not missing
+        self.pool_too_rough = watched["rhw_from_pool_at_least"] > self._target
+        hopeless = self.pool_too_rough and watched["rhw_from_pool"] ** 2 >= POOL_SHARE * self.rhw**2
+        return self.reached or (hopeless and estimate.n_episodes >= self._held)
+
+
+def round_specs(tests: IntArray, added: IntArray, index: int, first_episode: int, shard_size: int) -> list[ShardSpec]:
+    """Divide a round into shards, each a range of the round's tests in the order of strata.
+
+    ``tests`` and ``added``, shape (S,), are draws taken so far and those of the round; ``index`` and ``first_episode``
+    are the first shard's, ``shard_size`` the most episodes of one.
+    """
+    total = int(added.sum())
+    n_shards = max(-(-total // shard_size), min(MOST_SHARDS_PER_ROUND, total // SMALLEST_SHARD), 1)
+    edges = np.linspace(0, total, n_shards + 1).round().astype(np.int64).tolist()
+    ends = np.cumsum(added).tolist()
+    specs = []
+    for k, (low, high) in enumerate(pairwise(edges)):
+        draws = []
+        for s, (taken, begin, end) in enumerate(zip(tests.tolist(), [0, *ends], ends, strict=False)):
+            first, last = max(low, begin), min(high, end)
+            if first < last:
+                draws.append(Draw(s, taken + first - begin, last - first))
+        specs.append(ShardSpec(index + k, first_episode + low, high - low, tuple(draws)))
+    return specs

@@ -19,8 +19,7 @@ from harness.episode.loop import MOMENT_LIMITS, EpisodeLoop, Keep, Policy
 from harness.episode.trajectory import empty_trajectory
 from harness.errors import RunFolderError
 from harness.importance.build import build_importance, needs_tables
-from harness.pool.prescribed import PrescribedEpisodes
-from harness.pool.shells import require_boundary
+from harness.pool.shells import PrescribedEpisodes, require_boundary
 from harness.pool.storage import campaign_pool, campaign_pool_key, pool_path
 from harness.progress import Progress, SilentProgress
 from harness.records.folder import SHELLS, read_json
@@ -57,21 +56,13 @@ class Prepared:
         black_box: Path | None = None,
         doomed: Mapping[int, Death] | None = None,
     ) -> EpisodeLoop:
-        """Episode loop in a world, recording what the campaign asks for.
+        """Episode loop in a world, recording what the campaign asks for, or other ``traces``.
 
-        Parameters
-        ----------
-        world : World
-        traces : str, optional
-            Instead of the campaign's ``records.traces``.
-        black_box : Path, optional
-            File that tells in which episode's controller a process died.
-        doomed : mapping, optional
-            Episodes known to kill the process; it may grow between two runs.
+        The file ``black_box`` tells in which episode's controller a process died; ``doomed`` are episodes known to kill
+        it, which may grow between two runs.
         """
-        records = self.campaign.records
+        campaign, records = self.campaign, self.campaign.records
         keep = Keep(MOMENT_LIMITS[records.moments], traces or records.traces, records.trace_share)
-        campaign = self.campaign
         av = build_host(campaign.av, n_cells=world.n_cells, seed=campaign.seed, black_box=black_box, doomed=doomed)
         return EpisodeLoop(world, self.policy, keep, av)
 
@@ -85,7 +76,7 @@ def require_ready(campaign: Campaign) -> Resolved:
         The AV's controller cannot be found or made, SUMO knows no such attribute of it, strangers could drive it, the
         environment's parameters are wrong, or the surrogate library is wrong or lacks the boundary.
     HarnessError
-        See `require_world`.
+        SUMO's system libraries are missing.
     """
     require_world(campaign)
     controller_sha256 = require_controller(campaign)
@@ -101,13 +92,7 @@ def require_ready(campaign: Campaign) -> Resolved:
 
 
 def require_world(campaign: Campaign) -> None:
-    """Refuse a machine on which the world that a campaign names cannot be opened, before anything is built for it.
-
-    Raises
-    ------
-    HarnessError
-        SUMO's system libraries are missing.
-    """
+    """Refuse a machine on which SUMO's system libraries are missing, before anything is built for them."""
     if campaign.world.engine == "sumo":
         require_libraries()
 
@@ -115,19 +100,18 @@ def require_world(campaign: Campaign) -> None:
 def prepare(resolved: Resolved, progress: Progress | None = None) -> Prepared:
     """Build (or read) a campaign's challenge tables or its pool of cut-ins."""
     progress = progress or SilentProgress()
-    prescribed: PrescribedEpisodes | None = None
     campaign, environment = resolved.campaign, resolved.environment
-    tables = None
-    if needs_tables(campaign):
-        drivers, challenge = resolved.surrogates, campaign.testing.challenge
-        progress.stage("criticality tables", len(drivers))
-        with ThreadPoolExecutor(1) as thread:
+    tables: Tables | None = None
+    prescribed: PrescribedEpisodes | None = None
+    with ThreadPoolExecutor(1) as thread:
+        if needs_tables(campaign):
+            drivers, challenge = resolved.surrogates, campaign.testing.challenge
+            progress.stage("criticality tables", len(drivers))
             building = thread.submit(build_tables, environment, drivers, challenge, progress.advance)
             if not tables_cached(environment, drivers, challenge):
                 compile_kernels(resolved)
             tables = building.result()
-    if campaign.testing.method == "shells":
-        with ThreadPoolExecutor(1) as thread:
+        if campaign.testing.method == "shells":
             pooling = thread.submit(campaign_pool, resolved, progress)
             if not pool_path(campaign_pool_key(resolved)).is_file():
                 compile_kernels(resolved)

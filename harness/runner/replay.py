@@ -20,7 +20,7 @@ from harness.records.folder import no_episodes, read_manifest, read_table
 from harness.records.tables import shard_tables
 from harness.resolved import Resolved, resolve
 from harness.runner.manifest import cpu_name, versions
-from harness.runner.prepare import Prepared, build_world, prepare, require_same_pool, require_world
+from harness.runner.prepare import build_world, prepare, require_same_pool, require_world
 from harness.sumo.system_libraries import require_libraries
 from harness.world import World
 
@@ -94,13 +94,12 @@ def replay_episode(folder: Path, episode: int, *, gui: bool = False, fcd: Path |
     else:
         require_world(campaign)
     replay = partial(run_apart, campaign.av, _replay) if has_foreign_code(campaign) else _replay
-    row, trace = replay(resolved, folder, episode, stored["episodes"], gui, fcd)
-    equal = {name: _equal(name, table, stored.get(name)) for name, table in (("episodes", row), ("traces", trace))}
-    compared = tuple(name for name, answer in equal.items() if answer is not None)
-    first: dict[str, Any] = row.to_pylist()[0]
-    bit_equal = all(equal[name] for name in compared) if compared else None
-    suspects = None if bit_equal is not False else _suspects(manifest, campaign)
-    return ReplayResult(str(first["outcome"]), first, trace, bit_equal, compared, suspects)
+    again = replay(resolved, folder, episode, stored["episodes"], gui, fcd)
+    compared = tuple(name for name in again if name in stored and stored[name].num_rows)
+    bit_equal = all(_equal(again[name], stored[name]) for name in compared) if compared else None
+    row: dict[str, Any] = again["episodes"].to_pylist()[0]
+    why = None if bit_equal is not False else suspects(manifest, campaign)
+    return ReplayResult(str(row["outcome"]), row, again["traces"], bit_equal, compared, why)
 
 
 def _replay(
@@ -111,18 +110,26 @@ def _replay(
     gui: bool,
     fcd: Path | None,
     black_box: Path | None = None,
-) -> tuple[pa.Table, pa.Table]:
+) -> dict[str, pa.Table]:
     """Row and trace of the episode, run again."""
     prepared = prepare(resolved)
     require_same_pool(folder, prepared)
     world = _world(resolved.campaign, gui=gui, fcd=fcd)
     try:
-        return _run_again(prepared, world, episode, stored, black_box)
+        loop = prepared.loop(world, traces="all", black_box=black_box)
+        if prepared.prescribed is None:
+            shard = loop.run(episode, prepared.states(episode, 1))
+        else:
+            row, stratum = (np.asarray(stored[name]).astype(np.int64) for name in ("pool_cut_in", "component"))
+            shard = loop.run(episode, *prepared.prescribed.of_rows(row, stratum))
+            shard.cut_ins = row
     finally:
         world.close()
+    tables = shard_tables(shard, resolved.campaign.seed, keep_traces=True)
+    return {"episodes": tables.episodes, "traces": tables.traces}
 
 
-def _suspects(manifest: dict[str, Any], campaign: Campaign) -> str:
+def suspects(manifest: dict[str, Any], campaign: Campaign) -> str:
     """What may have made a replay differ, by what the manifest knows."""
     here = {**versions(), "CPU": cpu_name()}
     there = {**manifest.get("versions", {}), "CPU": manifest.get("cpu")}
@@ -160,20 +167,6 @@ def _require_reproducible(manifest: dict[str, Any]) -> None:
     )
 
 
-def _run_again(
-    prepared: Prepared, world: World, episode: int, stored: pa.Table, black_box: Path | None
-) -> tuple[pa.Table, pa.Table]:
-    loop = prepared.loop(world, traces="all", black_box=black_box)
-    if prepared.prescribed is None:
-        shard = loop.run(episode, prepared.states(episode, 1))
-    else:
-        row, stratum = (np.asarray(stored[name]).astype(np.int64) for name in ("pool_cut_in", "component"))
-        shard = loop.run(episode, *prepared.prescribed.of_rows(row, stratum))
-        shard.cut_ins = row
-    tables = shard_tables(shard, prepared.campaign.seed, keep_traces=True)
-    return tables.episodes, tables.traces
-
-
 def _world(campaign: Campaign, *, gui: bool, fcd: Path | None) -> World:
     if not gui and fcd is None:
         return build_world(campaign, n_cells=1)
@@ -199,18 +192,14 @@ def _stored(folder: Path, manifest: dict[str, Any], episode: int) -> dict[str, p
     )
 
 
-def _equal(name: str, again: pa.Table, stored: pa.Table | None) -> bool | None:
-    if stored is None or stored.num_rows == 0:
-        return None
-    columns = [column for column in again.column_names if name != "episodes" or column not in _UNLIKE_BITS]
-    return all(_plain(again[column]) == _plain(stored[column]) for column in columns)
+def _equal(again: pa.Table, stored: pa.Table) -> bool:
+    columns = [name for name in again.column_names if name not in _UNLIKE_BITS]
+    return all(_bits(again[name]) == _bits(stored[name]) for name in columns)
 
 
-def _plain(column: pa.ChunkedArray) -> list[Any]:
-    values: list[Any] = (
-        column.cast(column.type.value_type).to_pylist() if pa.types.is_dictionary(column.type) else column.to_pylist()
-    )
-    return [_hex(value) for value in values]
+def _bits(column: pa.ChunkedArray) -> list[Any]:
+    plain = column.cast(column.type.value_type) if pa.types.is_dictionary(column.type) else column
+    return [_hex(value) for value in plain.to_pylist()]
 
 
 def _hex(value: Any) -> Any:

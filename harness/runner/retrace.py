@@ -13,7 +13,6 @@ import numpy as np
 import pyarrow as pa
 
 from harness.arrays import BoolArray, FloatArray, IntArray
-from harness.campaign.models import Campaign
 from harness.episode.trajectory import empty_trajectory
 from harness.errors import WorldDisagreementError
 from harness.outcomes import CRASH, FAILED, OUTCOMES, RUNNING
@@ -23,26 +22,17 @@ from harness.resolved import Resolved
 from harness.vehicles.kinematics import STEP_S
 
 
-def no_retracing(campaign: Campaign) -> str | None:
-    """Why episodes of a campaign cannot be retraced; None if they can."""
-    if campaign.world.engine == "twin":
-        return "the episodes were simulated in the twin itself"
-    if campaign.av.before_cut_in == "controller":
-        return "the AV acted before the cut-in, and nothing on record says how"
-    return None
-
-
 class Retracing:
-    """Retraces shards of one campaign.
-
-    Parameters
-    ----------
-    resolved : Resolved
-    """
+    """Retraces shards of one campaign."""
 
     def __init__(self, resolved: Resolved) -> None:
-        self._reason = no_retracing(resolved.campaign)
-        self._seed, self._environment = resolved.campaign.seed, resolved.environment
+        campaign = resolved.campaign
+        self._reason: str | None = None
+        if campaign.world.engine == "twin":
+            self._reason = "the episodes were simulated in the twin itself"
+        elif campaign.av.before_cut_in == "controller":
+            self._reason = "the AV acted before the cut-in, and nothing on record says how"
+        self._seed, self._environment = campaign.seed, resolved.environment
         self._driver = resolved.av
         self._room = empty_trajectory(resolved.environment)
 
@@ -57,7 +47,8 @@ class Retracing:
         if self._reason is not None:
             return 0
         stored = stored_paths(episodes, self._seed)
-        twin = _empty(episodes.num_rows)
+        n = int(episodes.num_rows)
+        twin = Retraced(np.zeros(n, np.int64), np.zeros(n, np.int64), np.zeros(n), np.zeros(n), np.zeros(n))
         retrace(stored, self._environment, self._driver, self._room, twin)
         differing = _differences(episodes, stored, twin, self._driver.size > 0)
         for column, (wrong, in_sumo, in_twin) in differing.items():
@@ -69,7 +60,7 @@ class Retracing:
                     expected=f"{in_twin[row]}, to the last bit: the twin retraced its maneuvers",
                     mend="Please report this episode: its campaign.yaml and index reproduce it.",
                 )
-        return int(episodes.num_rows)
+        return n
 
     def summary(self, n: int) -> dict[str, Any]:
         """What manifest and estimates say: ``n`` episodes retraced, or why none could be."""
@@ -106,10 +97,6 @@ def _differences(episodes: pa.Table, stored: StoredPaths, twin: Retraced, built_
         "crash_time_s": (_unlike(time, at), time, at),
         "impact_speed_mps": (_unlike(impact, twin.impact) & crash, impact, twin.impact),
     }
-
-
-def _empty(n: int) -> Retraced:
-    return Retraced(np.zeros(n, np.int64), np.zeros(n, np.int64), np.zeros(n), np.zeros(n), np.zeros(n))
 
 
 def _unlike(a: FloatArray, b: FloatArray) -> BoolArray:

@@ -1,40 +1,43 @@
-"""The shards of a campaign: fixed ranges of episodes, run by worker processes, handed back in order."""
+"""The shards of a campaign: taken over from an earlier run, or run by worker processes; handed back in order."""
 
 from __future__ import annotations
 
+import os
 import signal
+import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import islice
+from itertools import count, islice
+from multiprocessing.connection import wait
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
-import pyarrow as pa
 from scipy.special import bdtrc
 
-from harness.campaign.models import Campaign
-from harness.controllers.black_box import OF_EPISODE, Call, Death
+from harness.controllers.apart import LOOK_S, end_process, start_process
+from harness.controllers.black_box import OF_EPISODE, Call, Death, last_call
 from harness.controllers.time_limit import death_cause
 from harness.errors import HarnessError, TooManyFailedError
-from harness.pool.prescribed import PrescribedEpisodes
-from harness.records.folder import TABLES, read_table, shard_file
+from harness.records.folder import read_table, shard_files
 from harness.records.tables import ShardTables
 from harness.resolved import Resolved
-from harness.runner.manifest import Manifest
-from harness.runner.processes import WorkerProcess, first_to_answer
+from harness.runner.prepare import Prepared
 from harness.runner.retrace import Retracing
-from harness.runner.worker import ShardDone, ShardSpec, failure_causes, shard_block, stored_repeated
+from harness.runner.worker import ShardDone, ShardSpec, finished, serve
+from harness.spawning import spawn_context
 
 ATTEMPTS = 3
 """A shard whose worker dies is given to another one, this many times in all."""
-SMALLEST_FAILED_SAMPLE = 200
-"""Episodes before the share of failures can end a campaign."""
 SURELY_TOO_MANY = 1e-4
 """Probability of so many deaths under the allowed share, below which a controller is refused: with the default share
 its third at the earliest, its seventh if it dies in all of 96 cells, some ten seconds into the run."""
 SENT_FROM_OUTSIDE = (-signal.SIGKILL, -signal.SIGTERM)
 """Ends that an operator or a shortage of memory brings: a controller is blamed only when its call is hit again."""
+CLOSING_S = 10.0
+"""Time that a worker gets to release its controllers once all is done."""
+CLOSING_LOOK_S = 0.05
 
 
 class WorkerLostError(HarnessError):
@@ -43,13 +46,7 @@ class WorkerLostError(HarnessError):
     exit_code = 3
 
 
-def stored_shard(
-    folder: Path,
-    campaign: Campaign,
-    spec: ShardSpec,
-    prescribed: PrescribedEpisodes | None = None,
-    retracing: Retracing | None = None,
-) -> ShardDone | None:
+def stored_shard(folder: Path, prepared: Prepared, retracing: Retracing, spec: ShardSpec) -> ShardDone | None:
     """A shard that an earlier run has finished, or None; retraced again.
 
     Raises
@@ -59,26 +56,90 @@ def stored_shard(
     WorldDisagreementError
         The twin retraces an episode differently.
     """
-    files = {name: shard_file(name, spec.index) for name in TABLES if (folder / shard_file(name, spec.index)).exists()}
+    campaign, prescribed = prepared.campaign, prepared.prescribed
+    files = shard_files(folder, spec.index)
     needed = {"episodes"} | ({"moments"} if campaign.records.moments != "none" else set())
-    if not needed <= set(files):
+    if not needed <= files.keys():
         return None
     tables = {name: read_table(folder / path) for name, path in files.items()}
-    if tables["episodes"].num_rows != spec.n_episodes:
-        return None  # the last shard of a smaller budget
-    if prescribed is not None and not _same_cut_ins(tables["episodes"], prescribed, spec):
-        return None  # the last round of a smaller budget
     kept = ShardTables(tables["episodes"], tables.get("moments"), tables.get("traces"))
-    n_retraced = 0 if retracing is None else retracing.check(tables["episodes"])
-    block, causes = shard_block(campaign, kept, prescribed), failure_causes(kept.episodes)
-    repeated = stored_repeated(kept.episodes)
-    return ShardDone(spec, files, block, stored=True, n_retraced=n_retraced, failures=causes, repeated=repeated)
+    if kept.episodes.num_rows != spec.n_episodes:
+        return None  # the last shard of a smaller budget
+    if prescribed is not None:
+        cut_ins = kept.episodes.column("pool_cut_in")
+        if cut_ins.null_count or not np.array_equal(cut_ins.to_numpy(), prescribed.rows(spec.draws)[0]):
+            return None  # the last round of a smaller budget
+    return finished(spec, kept, campaign, prescribed, retracing, {})
 
 
-def _same_cut_ins(episodes: pa.Table, prescribed: PrescribedEpisodes, spec: ShardSpec) -> bool:
-    rows, _ = prescribed.rows(spec.draws)
-    stored = episodes.column("pool_cut_in")
-    return stored.null_count == 0 and np.array_equal(stored.to_numpy(), rows)
+class WorkerProcess:
+    """A process that runs one shard after another, at the end of a pipe of its own."""
+
+    def __init__(self, resolved: Resolved, black_box: Path) -> None:
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+        self._black_box = black_box
+        self.connection, theirs = spawn_context().Pipe()
+        self._process = start_process(serve, theirs, resolved, black_box)
+        theirs.close()  # or its death would not end the pipe
+
+    def give(self, spec: ShardSpec, doomed: Mapping[int, Death]) -> bool:
+        """Give it a shard to run, with the episodes known to end a process; False if it is dead."""
+        try:
+            self.connection.send((spec, dict(doomed)))
+        except OSError:
+            return False
+        return True
+
+    def answer(self) -> ShardDone | None:
+        """The finished shard, or None if the process has died on it.
+
+        Raises
+        ------
+        Exception
+            Whatever running the shard has raised.
+        """
+        try:
+            answer = self.connection.recv() if self.connection.poll() else None
+        except (EOFError, OSError):
+            return None
+        if isinstance(answer, BaseException):
+            raise answer
+        return answer
+
+    def kill(self) -> int | None:
+        """End it at once, whatever it does; returns its exit code."""
+        exit_code = end_process(self._process)
+        self.connection.close()
+        return exit_code
+
+    def is_alive(self) -> bool:
+        """Whether it runs."""
+        return self._process.is_alive()
+
+    def last_call(self) -> Call | None:
+        """The controller's call that it is in, or has died in."""
+        return last_call(self._black_box)
+
+    def dismiss(self) -> None:
+        """Tell an idle worker that nothing more comes: it releases its controllers."""
+        self.connection.close()
+
+    def wait(self) -> None:
+        """Give a dismissed worker a little time; then end it."""
+        until = time.monotonic() + CLOSING_S
+        while self.is_alive() and time.monotonic() < until:  # a copy of it may keep open what join() waits for
+            self._process.join(CLOSING_LOOK_S)
+        self.kill()
+
+
+def first_to_answer(workers: Sequence[WorkerProcess]) -> WorkerProcess:
+    """Wait until one of the workers has answered or died."""
+    while True:
+        dead = [worker for worker in workers if not worker.is_alive()]
+        ready = wait([worker.connection for worker in workers], 0.0 if dead else LOOK_S)
+        found = [worker for worker in workers if worker.connection in ready] or dead
+        if found:
+            return found[0]
 
 
 @dataclass
@@ -88,21 +149,22 @@ class _Job:
     spec: ShardSpec
     done: ShardDone | None
     deaths: int = 0
-    replaces: bool = False
     suspected: Call | None = None
     doomed: dict[int, Death] = field(default_factory=dict)
 
 
 class ShardPool:
-    """Worker processes that run shards; one that dies takes nothing but its shard's unfinished work along.
+    """Worker processes that run shards; one that dies takes nothing but its unfinished shard along.
 
     Everything happens in the caller's thread and each worker has a pipe of its own. So there is no lock that a killed
     process could keep, and no queue that Ctrl-C could leave half filled.
     """
 
-    def __init__(self, resolved: Resolved, folder: Path, workers: int) -> None:
-        self._resolved, self._campaign, self._folder = resolved, resolved.campaign, folder
+    def __init__(self, resolved: Resolved, workers: int) -> None:
+        self._resolved, self._campaign = resolved, resolved.campaign
         self._n_workers = workers
+        self._black_boxes = TemporaryDirectory(prefix="harness-workers-")
+        self._numbers = count()
         self._idle: list[WorkerProcess] = []
         self._busy: dict[WorkerProcess, _Job] = {}
 
@@ -115,17 +177,12 @@ class ShardPool:
         for worker in self._idle:
             worker.wait()
         self._idle, self._busy = [], {}
-        for left in self._folder.glob(".black-box-*"):  # of an earlier run that was killed
-            left.unlink()
+        self._black_boxes.cleanup()
 
-    def run(
-        self, specs: Iterator[ShardSpec], stored: Callable[[ShardSpec], ShardDone | None], manifest: Manifest
-    ) -> Iterator[ShardDone]:
+    def run(self, specs: Iterator[ShardSpec], stored: Callable[[ShardSpec], ShardDone | None]) -> Iterator[ShardDone]:
         """Finished shards in index order; those that ``stored`` knows are not run again.
 
-        Two shards per worker are under way or wait for their turn to be handed back: little is lost at the stop. A
-        shard that replaces one of an earlier run is begun only when all before it have been handed back, so that the
-        stop rule has not been content before; only then the manifest forgets the earlier one.
+        Two shards per worker are under way or wait for their turn to be handed back: little is lost at the stop.
 
         Raises
         ------
@@ -138,14 +195,9 @@ class ShardPool:
             for spec in islice(specs, 2 * self._n_workers + 1 - len(wanted)):
                 wanted.append(_Job(spec, stored(spec)))
                 if wanted[-1].done is None:
-                    wanted[-1].replaces = manifest.is_replaced_by(spec)
                     waiting.append(wanted[-1])
             if not wanted:
                 return
-            if wanted[0].replaces:
-                manifest.forget_from(wanted[0].spec.index)
-                for job in wanted:
-                    job.replaces = False  # the manifest lists none of them any more
             self._hand_out(waiting)
             while wanted[0].done is None:
                 self._collect(waiting)
@@ -154,12 +206,15 @@ class ShardPool:
 
     def _hand_out(self, waiting: deque[_Job]) -> None:
         """Give waiting shards to idle workers, of which there may be up to as many as were asked for."""
-        while waiting and not waiting[0].replaces and len(self._busy) < self._n_workers:
-            worker = self._idle.pop() if self._idle else WorkerProcess(self._resolved, self._folder)
+        while waiting and len(self._busy) < self._n_workers:
+            worker = self._idle.pop() if self._idle else self._new_worker()
             if worker.give(waiting[0].spec, waiting[0].doomed):
                 self._busy[worker] = waiting.popleft()
             else:
                 worker.kill()  # it died while it was idle
+
+    def _new_worker(self) -> WorkerProcess:
+        return WorkerProcess(self._resolved, Path(self._black_boxes.name) / str(next(self._numbers)))
 
     def _collect(self, waiting: deque[_Job]) -> None:
         """Wait for one worker to finish its shard, or to die on it."""

@@ -2,19 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from harness.campaign.loading import load_campaign
+from harness.campaign.models import Campaign
+from harness.errors import HarnessError, RunFolderError
 from harness.estimators import ESTIMATORS, CampaignFacts, estimate_blocks
+from harness.estimators.block import Block
+from harness.estimators.from_records import EPISODE_COLUMNS, MOMENT_COLUMNS, SHELL_COLUMNS, block_from_tables
 from harness.estimators.threads import read_ahead
-from harness.importance.build import importance_names
+from harness.importance.build import importance_names, mixture_weights
 from harness.methods import EstimatorName
-from harness.records.folder import read_manifest
-from harness.records.reader import stored_columns
-from harness.runner.stored_blocks import stored_blocks
-from harness.runner.surrogates import MOST_UNASKED, surrogates_of
+from harness.pool.storage import cached_pool, read_pool
+from harness.pool.surrogate_replay import PATH_COLUMNS, SurrogateReplay
+from harness.records.folder import SHELLS, no_episodes, read_json, read_manifest, require_schema
+from harness.records.reader import read_shards, stored_columns
+from harness.records.stored_manifest import StoredShells
+from harness.resolved import resolve
+from harness.strata import ShellDesign
+
+MOST_UNASKED = 100_000
+"""Tests that are replayed without being asked to, for the alarm: some 30 µs each."""
+_FINISH = "Run `harness run` with --resume, which makes missing shards."
 
 
 def estimate_run(
@@ -72,3 +84,105 @@ def estimate_run(
         n_asked=MOST_UNASKED if pool is None else int(manifest["n_episodes"]),
     )
     return estimate_blocks(read_ahead(blocks), facts, estimators=estimators)
+
+
+def stored_blocks(
+    folder: Path, *, moments: bool, surrogates: SurrogateReplay | None = None, n_asked: int = 0
+) -> Iterator[Block]:
+    """Blocks of the tests that count, in index order; a gap or too few of them is an error.
+
+    Parameters
+    ----------
+    folder : Path
+        Run folder.
+    moments : bool
+        Whether to read the ratios of control steps, which `scv` needs, where there are any on record.
+    surrogates : SurrogateReplay, optional
+        Surrogates to be asked about the shards that begin within the first ``n_asked`` tests.
+
+    Raises
+    ------
+    HarnessError
+        If the folder is not a run, or its records are damaged or incomplete.
+    """
+    campaign = load_campaign(folder / "campaign.yaml", check_files=False)
+    n_counted = int(read_manifest(folder)["n_episodes"])
+    if n_counted == 0:
+        raise no_episodes(folder)
+    method, alpha = campaign.testing.method, mixture_weights(campaign)
+    shells = read_shells(folder) if method == "shells" else None
+    columns = [*EPISODE_COLUMNS, *(SHELL_COLUMNS if shells else ()), *(PATH_COLUMNS if surrogates else ())]
+    ratios = list(MOMENT_COLUMNS) if moments and method == "step_mixture" else []
+    n = 0
+    for episodes, steps in read_shards(folder, episode_columns=list(dict.fromkeys(columns)), moment_columns=ratios):
+        block = block_from_tables(episodes, steps, method=method, alpha=alpha, shells=shells)
+        if surrogates is not None and n < n_asked:
+            block = replace(block, surrogates_crash=surrogates.crashes(episodes), known_rates=surrogates.known)
+        if block.first_episode != n:
+            raise _incomplete(folder, f"a shard that begins at episode {block.first_episode}", f"episode {n}")
+        counted = block.take(slice(0, n_counted - n))
+        n += len(counted)
+        yield counted
+        if n == n_counted:
+            return
+    raise _incomplete(folder, f"{n} episodes on record", f"{n_counted} (manifest.json)")
+
+
+def read_shells(folder: Path) -> ShellDesign:
+    """Strata of a shells campaign.
+
+    Raises
+    ------
+    RunFolderError
+        The file is missing or damaged.
+    """
+    content = read_json(folder / SHELLS, mend=_FINISH)
+    require_schema(content, StoredShells, folder / SHELLS, mend=_FINISH)
+    return ShellDesign.from_json(content)
+
+
+def _incomplete(folder: Path, found: str, expected: str) -> RunFolderError:
+    return RunFolderError(str(folder), found=found, expected=expected, mend=_FINISH)
+
+
+def surrogates_of(campaign: Campaign, columns: set[str], file: Path | None = None) -> SurrogateReplay | str:
+    """The surrogates that can be asked about a stored run, or the reason why none can.
+
+    Parameters
+    ----------
+    campaign : Campaign
+    columns : set of str
+        Names in the stored episodes table.
+    file : Path, optional
+        A pool to be used instead of the campaign's own, which is used only if it has been built.
+
+    Raises
+    ------
+    HarnessError
+        The pool that was asked for is damaged or of another environment.
+    """
+    if reason := _refusal(campaign, columns):
+        return reason
+    resolved = resolve(campaign)
+    if file is not None:
+        return SurrogateReplay(resolved, read_pool(file))
+    try:
+        if (pool := cached_pool(resolved)) is not None:
+            return SurrogateReplay(resolved, pool)
+    except HarnessError as error:
+        return f"the pool of cut-ins cannot be used: {error}"
+    return "the pool of cut-ins has not been built here; `harness pool DIR/campaign.yaml` builds it (about 15 s)"
+
+
+def _refusal(campaign: Campaign, columns: set[str]) -> str | None:
+    """Why no surrogate can take the place of the AV in these records; None if one can."""
+    if campaign.testing.method == "shells":
+        return "needs weighted tests: those drawn from shells have used the surrogates' outcomes already"
+    if campaign.av.before_cut_in == "controller":
+        return (
+            "needs an AV that keeps its speed until the cut-in (av.before_cut_in: hold_speed): this one acted before "
+            "it, and where it was when BV cut in depends on that"
+        )
+    if missing := [name for name in PATH_COLUMNS if name not in columns]:
+        return f"needs the columns {', '.join(missing)} of the episodes table, which these records do not have"
+    return None

@@ -1,34 +1,52 @@
-"""What a worker process does: prepare once, then run one shard after another."""
+"""What a worker process does: prepare once, then run one shard after another.
+
+It also repeats a few of the first tests, to say whether the vehicle does the same again. What an episode brings about
+follows from the campaign's seed and the episode's index, as long as the AV keeps to its observations and to the random
+stream that it is given. Code that draws random numbers of its own, remembers earlier episodes, or shares state between
+cells does not; its tests cannot be replayed, and depend on what ran beside them.
+"""
 
 from __future__ import annotations
 
 import json
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from multiprocessing import parent_process
+from dataclasses import asdict, dataclass, field
+from multiprocessing.connection import Connection
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pyarrow as pa
 
 from harness.campaign.models import Campaign
+from harness.controllers.apart import fit_to_travel
 from harness.controllers.black_box import Death
 from harness.episode.cells import PrescribedTraffic
-from harness.episode.loop import EpisodeLoop, Shard
+from harness.episode.loop import EpisodeLoop, Shard, hash_of_index
 from harness.estimators.block import Block
 from harness.estimators.from_records import block_from_tables
 from harness.importance.build import mixture_weights
-from harness.pool.prescribed import Draw, PrescribedEpisodes
-from harness.records.folder import write_shard
+from harness.outcomes import FAILED
+from harness.pool.shells import Draw, PrescribedEpisodes
+from harness.records.folder import encoded
 from harness.records.tables import ShardTables, shard_tables
 from harness.resolved import Resolved
-from harness.runner.prepare import Prepared, build_world, prepare
-from harness.runner.repeat import Repeated, chosen_rows, has_to_be_shown, repeat
+from harness.runner.prepare import build_world, prepare
 from harness.runner.retrace import Retracing
 from harness.twin import TwinWorld
 
 REPEATED = b"harness.repeated"
-"""Key in the metadata of an episodes file."""
+"""Key in the metadata of an episodes file: what repeating showed is there with the shard, or not at all."""
+MOST_REPEATED, FEWEST_REPEATED = 10, 2
+ONE_OF = 10
+"""Ten tests of the first shard, less than 1 % from 1,000 tests on; of a shard below 100 tests a tenth, or two.
+
+Of a vehicle that is random in one of four tests, ten miss all with a probability of 6 %.
+"""
+
+
+Bits = tuple[bytes, bytes, str | None]
 
 
 @dataclass(frozen=True)
@@ -42,82 +60,88 @@ class ShardSpec:
 
 
 @dataclass(frozen=True)
-class ShardDone:
-    """A shard on disk: what the stop rule needs of it, how many episodes the twin has retraced, causes of failures.
+class Repeated:
+    """How many tests were run once more, and which of them (campaign indices) came out otherwise."""
 
-    ``repeated`` is None for a shard none of whose tests were run twice.
+    n_episodes: int
+    differing: tuple[int, ...]
+
+    def to_json(self) -> dict[str, Any]:
+        """As the manifest has it."""
+        return {**asdict(self), "differing": list(self.differing)}
+
+
+@dataclass(frozen=True)
+class ShardDone:
+    """A finished shard: what the stop rule needs of it, how many episodes the twin has retraced, causes of failures.
+
+    ``repeated`` is None where no test was run twice; ``parquet``, its tables as files, is empty where they are on disk.
     """
 
     spec: ShardSpec
-    files: dict[str, str]
     block: Block
-    stored: bool = False
-    n_retraced: int = 0
-    failures: Counter[str] = field(default_factory=Counter)
-    repeated: Repeated | None = None
+    n_retraced: int
+    failures: Counter[str]
+    repeated: Repeated | None
+    parquet: dict[str, bytes] = field(default_factory=dict)
+
+
+def serve(connection: Connection, resolved: Resolved, black_box: Path) -> None:
+    """Prepare with the first shard, run shards until the parent is gone or has no more."""
+    runner: ShardRunner | None = None
+    while True:
+        try:
+            spec, doomed = connection.recv()
+        except (EOFError, OSError):
+            break
+        try:
+            runner = runner or ShardRunner(resolved, black_box)
+            answer: ShardDone | Exception = runner.run(spec, doomed)
+        except Exception as error:  # noqa: BLE001 - whatever goes wrong here is the parent's to judge
+            answer = fit_to_travel(error)
+        try:
+            connection.send(answer)
+        except OSError:  # the parent was killed: nobody is left to tell
+            break
+    if runner is not None:
+        runner.close()
 
 
 class ShardRunner:
-    """Runs shards of one campaign in one world, writing each to the run folder.
+    """Runs shards of one campaign in one world. It writes nothing: the process that runs the campaign does.
 
-    Parameters
-    ----------
-    resolved : Resolved
-    folder : Path
-        Run folder.
-    black_box : Path, optional
-        File that tells the parent in which call of a controller the process died.
+    The file ``black_box`` tells that process in which call of a controller this one died.
     """
 
-    def __init__(self, resolved: Resolved, folder: Path, black_box: Path | None = None) -> None:
-        self._folder = folder
+    def __init__(self, resolved: Resolved, black_box: Path | None = None) -> None:
         self._doomed: dict[int, Death] = {}
-        self._prepared: Prepared = prepare(resolved)
+        self._prepared = prepare(resolved)
         self._retracing = Retracing(resolved)
-        self._loop: EpisodeLoop = self._prepared.loop(
-            build_world(resolved.campaign), black_box=black_box, doomed=self._doomed
-        )
+        world = build_world(resolved.campaign)
+        self._loop: EpisodeLoop = self._prepared.loop(world, black_box=black_box, doomed=self._doomed)
 
     def close(self) -> None:
         """Release the AV's controllers."""
         self._loop.close()
 
     def run(self, spec: ShardSpec, doomed: Mapping[int, Death] | None = None) -> ShardDone:
-        """Run a shard and write its tables; episodes in ``doomed`` fail before the call that ended a process.
+        """Run a shard; episodes in ``doomed`` fail before the call that ended a process.
 
         Raises
         ------
         WorldDisagreementError
-            The twin retraces an episode differently; nothing is written then.
-        OrphanError
-            The process that runs the campaign has been killed; nothing is written then either.
+            The twin retraces an episode differently.
         """
         self._doomed.update(doomed or {})
-        campaign = self._prepared.campaign
-        shard = self._shard(spec)
-        records = campaign.records
-        keep_traces = records.traces != "none" or records.trace_share > 0.0
+        campaign, prescribed = self._prepared.campaign, self._prepared.prescribed
+        shard = self._run(spec)
+        keep_traces = campaign.records.traces != "none" or campaign.records.trace_share > 0.0
         tables = shard_tables(shard, campaign.seed, keep_traces=keep_traces)
-        n_retraced = self._retracing.check(tables.episodes)
-        repeated = self._repeat(shard) if spec.index == 0 and has_to_be_shown(campaign) else None
-        _require_parent()
-        files = write_shard(self._folder, spec.index, with_repeated(tables, repeated))
-        block, causes = shard_block(campaign, tables, self._prepared.prescribed), failure_causes(tables.episodes)
-        return ShardDone(spec, files, block, n_retraced=n_retraced, failures=causes, repeated=repeated)
+        if spec.index == 0 and _has_to_repeat(campaign):
+            tables = tables._replace(episodes=_with_repeated(tables.episodes, self._repeat(shard)))
+        return finished(spec, tables, campaign, prescribed, self._retracing, encoded(tables))
 
-    def _repeat(self, shard: Shard) -> Repeated:
-        campaign = self._prepared.campaign
-        # The twin does one episode at little cost; an AV that SUMO moves has to be moved by SUMO again.
-        alone = self._loop if campaign.av.sumo is not None else self._loop.beside(TwinWorld(1))
-        rows = chosen_rows(shard, campaign.seed, acts_early=campaign.av.before_cut_in == "controller")
-
-        def again(row: int) -> Shard:
-            traffic = PrescribedTraffic._make(column[row : row + 1] for column in shard.traffic)
-            return alone.run(shard.first_episode + row, shard.states[row : row + 1], traffic)
-
-        return repeat(shard, rows, again)
-
-    def _shard(self, spec: ShardSpec) -> Shard:
+    def _run(self, spec: ShardSpec) -> Shard:
         prescribed = self._prepared.prescribed
         if prescribed is None:
             return self._loop.run(spec.first_episode, self._prepared.states(spec.first_episode, spec.n_episodes))
@@ -126,46 +150,73 @@ class ShardRunner:
         shard.cut_ins = rows
         return shard
 
-
-class OrphanError(RuntimeError):
-    """The process that runs the campaign is gone, and another one may be at work in its folder."""
-
-
-def _require_parent() -> None:
-    parent = parent_process()
-    if parent is not None and not parent.is_alive():
-        raise OrphanError("the process that runs the campaign has been killed")
-
-
-def with_repeated(tables: ShardTables, repeated: Repeated | None) -> ShardTables:
-    """The tables, with what repeating showed in the file's own metadata: it is there with the shard, or not at all."""
-    if repeated is None:
-        return tables
-    metadata = {**(tables.episodes.schema.metadata or {}), REPEATED: json.dumps(repeated.to_json())}
-    return tables._replace(episodes=tables.episodes.replace_schema_metadata(metadata))
+    def _repeat(self, shard: Shard) -> Repeated:
+        """Run some tests again, alone and after all the others."""
+        campaign = self._prepared.campaign
+        # The twin does one episode at little cost; an AV that SUMO moves has to be moved by SUMO again.
+        alone = self._loop if campaign.av.sumo is not None else self._loop.beside(TwinWorld(1))
+        rows = _rows_to_repeat(shard, campaign.seed, acts_early=campaign.av.before_cut_in == "controller")
+        differing = []
+        for row in rows:
+            traffic = PrescribedTraffic._make(column[row : row + 1] for column in shard.traffic)
+            again = alone.run(shard.first_episode + row, shard.states[row : row + 1], traffic)
+            if bits_of(shard, row) != bits_of(again, 0):
+                differing.append(shard.first_episode + row)
+        return Repeated(len(rows), tuple(sorted(differing)))
 
 
-def stored_repeated(episodes: pa.Table) -> Repeated | None:
-    """What `with_repeated` has put into a stored table."""
+def finished(
+    spec: ShardSpec,
+    tables: ShardTables,
+    campaign: Campaign,
+    prescribed: PrescribedEpisodes | None,
+    retracing: Retracing,
+    parquet: dict[str, bytes],
+) -> ShardDone:
+    """What is to be known of a shard's tables, after the twin has retraced them."""
+    n_retraced = retracing.check(tables.episodes)
+    block = block_from_tables(
+        tables.episodes,
+        tables.moments if campaign.stop.estimator == "scv" else None,
+        method=campaign.testing.method,
+        alpha=mixture_weights(campaign),
+        shells=None if prescribed is None else prescribed.design,
+    )
+    failures = Counter(tables.episodes.column("failure").drop_null().to_pylist())
+    return ShardDone(spec, block, n_retraced, failures, _repeated_of(tables.episodes), parquet)
+
+
+def _has_to_repeat(campaign: Campaign) -> bool:
+    """Whether a vehicle must show that it does the same again: built-in models do, and outside programs need not."""
+    return campaign.av.model is None and campaign.av.traci is None
+
+
+def _rows_to_repeat(shard: Shard, seed: int, *, acts_early: bool) -> list[int]:
+    """Rows by a hash of their index, among those in which the AV had to act."""
+    episode = shard.results.episode
+    acted = (episode["outcome"] != FAILED) & (acts_early | (episode["cut_in_step"] >= 0))
+    rows = np.flatnonzero(acted)
+    order = np.argsort(hash_of_index(seed, shard.first_episode + rows), kind="stable")
+    n = min(MOST_REPEATED, max(FEWEST_REPEATED, episode.size // ONE_OF))
+    return [int(row) for row in rows[order[:n]]]
+
+
+def bits_of(shard: Shard, row: int) -> Bits:
+    """Everything that a test has left: its record, its motion where that was kept, and why it failed if it did."""
+    trace = shard.traces.get(row)
+    record = shard.results.episode[row].tobytes()
+    return record, b"" if trace is None else trace.tobytes(), shard.failures.get(row)
+
+
+def _with_repeated(episodes: pa.Table, repeated: Repeated) -> pa.Table:
+    metadata = {**(episodes.schema.metadata or {}), REPEATED: json.dumps(repeated.to_json())}
+    return episodes.replace_schema_metadata(metadata)
+
+
+def _repeated_of(episodes: pa.Table) -> Repeated | None:
+    """What `_with_repeated` has put into a table."""
     found = (episodes.schema.metadata or {}).get(REPEATED)
     if found is None:
         return None
     content = json.loads(found)
     return Repeated(content["n_episodes"], tuple(content["differing"]))
-
-
-def failure_causes(episodes: pa.Table) -> Counter[str]:
-    """How often each cause failed an episode."""
-    return Counter(episodes.column("failure").drop_null().to_pylist())
-
-
-def shard_block(campaign: Campaign, tables: ShardTables, prescribed: PrescribedEpisodes | None = None) -> Block:
-    """What the stop rule's estimator sees of a shard."""
-    moments = tables.moments if campaign.stop.estimator == "scv" else None
-    return block_from_tables(
-        tables.episodes,
-        moments,
-        method=campaign.testing.method,
-        alpha=mixture_weights(campaign),
-        shells=None if prescribed is None else prescribed.design,
-    )

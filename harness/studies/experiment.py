@@ -15,7 +15,6 @@ from harness.methods import SAMPLING, EstimatorName
 from harness.studies.chains.named import CHAINS
 
 AvName = Annotated[str, Field(pattern=NAME_PATTERN)]
-ChainName = str
 
 
 class SuperPopulation(Section):
@@ -44,7 +43,7 @@ class Experiment(Section):
     replications: Whole = Field(2000, ge=2, le=1_000_000, description="independent repetitions for each vehicle")
     campaign: Campaign = Field(description="what is repeated; its own av is replaced, stop.rhw null means a fixed n")
     avs: dict[AvName, AutomatedVehicle] = Field(default_factory=dict, description="vehicles, overtaking in the twin")
-    chains: list[ChainName] = Field(default_factory=list, description="exact Markov chains, instead of avs")
+    chains: list[str] = Field(default_factory=list, description="exact Markov chains, instead of avs")
     estimators: list[EstimatorName] = Field(
         default_factory=list, description="whose results are judged; the method's own when left out"
     )
@@ -60,14 +59,19 @@ class Experiment(Section):
         """The campaign with one of the vehicles."""
         return self.campaign.model_copy(update={"av": self.avs[name]})
 
+    def seed_of(self, place: int) -> int:
+        """Seed of a subject's own, by its place in the file."""
+        return self.seed * 1000 + place
+
     @field_validator("campaign", mode="before")
     @classmethod
     def _in_the_twin(cls, value: Any) -> Any:
         if not isinstance(value, dict):
             return value
-        world = value.get("world")
-        engine = world.get("engine", "twin") if isinstance(world, dict) else "twin"
-        return {"name": "replicated", **value, "world": {**(world or {}), "engine": engine}}
+        world = value.get("world") or {}
+        if isinstance(world, dict):
+            world = {"engine": "twin", **world}
+        return {"name": "replicated", **value, "world": world}
 
     @model_validator(mode="after")
     def _has_subjects(self) -> Self:
@@ -78,11 +82,9 @@ class Experiment(Section):
                 expected="one of the two",
                 mend="Name vehicles under avs for overtaking in the twin, or exact chains under chains.",
             )
-        for name in self.chains:
-            if name not in CHAINS:
-                raise broken_rule(
-                    "chains", found=f"'{name}'", expected=f"some of {', '.join(CHAINS)}", mend="Choose one of them."
-                )
+        if unknown := [name for name in self.chains if name not in CHAINS]:
+            expected = f"some of {', '.join(CHAINS)}"
+            raise broken_rule("chains", found=f"'{unknown[0]}'", expected=expected, mend="Choose one of them.")
         return self
 
     @model_validator(mode="after")
@@ -136,17 +138,17 @@ def load_experiment(path: Path) -> Experiment:
         The file cannot be read or says something wrong; the error names every place.
     """
     experiment = read_model(path, Experiment)
-    library = experiment.campaign.pool.library
-    if "/" in library or library.endswith((".yaml", ".yml")):
-        file = (path.parent / library).resolve()
-        if not file.is_file():
-            raise CampaignError(
-                f"{path}: campaign.pool.library",
-                found=f"{library}, but there is no file {file}",
-                expected="a surrogate library, or the name of a shipped one",
-                mend="Correct the path; it is relative to the folder of the experiment.",
-            )
-        pool = experiment.campaign.pool.model_copy(update={"library": str(file)})
-        campaign = experiment.campaign.model_copy(update={"pool": pool})
-        experiment = experiment.model_copy(update={"campaign": campaign})
-    return experiment
+    campaign = experiment.campaign
+    library = campaign.pool.library
+    if "/" not in library and not library.endswith((".yaml", ".yml")):
+        return experiment
+    file = (path.parent / library).resolve()
+    if not file.is_file():
+        raise CampaignError(
+            f"{path}: campaign.pool.library",
+            found=f"{library}, but there is no file {file}",
+            expected="a surrogate library, or the name of a shipped one",
+            mend="Correct the path; it is relative to the folder of the experiment.",
+        )
+    pool = campaign.pool.model_copy(update={"library": str(file)})
+    return experiment.model_copy(update={"campaign": campaign.model_copy(update={"pool": pool})})

@@ -8,16 +8,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
 import numpy as np
 from scipy.stats import binomtest, norm
 
-from harness.arrays import FloatArray
-from harness.estimators.estimate import finite_json
+from harness.estimators.estimate import Estimate, finite_json
 from harness.estimators.intervals import clopper_pearson
-from harness.studies.rows import Rows
 
 COVERAGE_CONFIDENCE = 0.95
 SIGNIFICANCE = 0.05
@@ -27,12 +25,43 @@ WANTED_RHW = 0.3
 
 
 @dataclass(frozen=True)
+class Row:
+    """What one replication of a campaign reported, and nothing that only the experimenter knows.
+
+    Attributes
+    ----------
+    result : str
+        Estimator, or one of the two statements of shells.
+    reached : bool
+        Whether the asked precision was reached; False when none was asked.
+    n_crashes_outside : int
+        Crashes beyond the boundary; 0 where there are no shells.
+    """
+
+    result: str
+    replication: int
+    n_tests: int
+    n_crashes: int
+    crash_rate: float
+    std_error: float
+    ci_low: float
+    ci_high: float
+    reached: bool
+    n_crashes_outside: int = 0
+
+
+def estimate_row(result: str, replication: int, found: Estimate, *, reached: bool, outside: int = 0) -> Row:
+    """Row of an estimate with one interval."""
+    numbers = found.crash_rate, found.std_error, found.ci_low, found.ci_high
+    return Row(result, replication, found.n_episodes, found.n_crashes, *numbers, reached, outside)
+
+
+@dataclass(frozen=True)
 class Subject:
     """What the experimenter knows about a vehicle or a chain.
 
     Attributes
     ----------
-    name : str
     crash_rate, std_error : float
         The truth, and how well it is known.
     crashes_outside : float
@@ -62,16 +91,12 @@ class Judgement:
 
     Attributes
     ----------
-    subject, result : str
-    replications : int
-    truth : float
     assumption_met : bool
         False only for the conditional statement of a vehicle that crashes outside; its coverage is then not judged.
     bias, bias_std_error : float
         Of the mean estimate, relative to the truth.
     true_relvar, claimed_relvar : float
         Variance over the squared truth: of the estimates around the truth, and the mean that they claim.
-    covered : int
     coverage, coverage_low, coverage_high : float
         Share of intervals that hold the truth, with its own exact 95 % interval.
     p_value, p_value_holm : float or None
@@ -79,10 +104,8 @@ class Judgement:
     tests_median, tests_5, tests_95 : float
     tests_for_wanted_rhw : float or None
         Tests for RHW 0.3 by the true variance at this number of tests; None if the number was not fixed.
-    reached : float
-        Share of replications that reached the precision asked for.
-    alarm : float
-        Share of replications in which a crash was seen outside.
+    reached, alarm : float
+        Share of replications that reached the precision asked for, and in which a crash was seen outside.
     """
 
     subject: str
@@ -118,37 +141,40 @@ class Judgement:
         return content
 
 
-def judge(subject: Subject, result: str, rows: Rows, confidence: float, *, conditional: bool = False) -> Judgement:
+def judge(
+    subject: Subject, result: str, rows: Sequence[Row], confidence: float, *, conditional: bool = False
+) -> Judgement:
     """Judge one method on one vehicle; `corrected` then fills in the corrected p-values.
 
     Parameters
     ----------
-    subject : Subject
-    result : str
-        Name of the estimator or statement.
-    rows : Rows
+    rows : sequence of Row
+        Of this vehicle and result.
     confidence : float
         Nominal coverage.
     conditional : bool
         Whether the statement holds only for vehicles that meet the assumption.
     """
-    truth, n = subject.crash_rate, rows.crash_rate.size
-    covered = int(np.count_nonzero((rows.ci_low <= truth) & (truth <= rows.ci_high)))
-    low, high = clopper_pearson(covered, n, COVERAGE_CONFIDENCE)
+    columns = {field.name: np.array([getattr(row, field.name) for row in rows]) for field in fields(Row)}
+    rates, tests, reached = columns["crash_rate"], columns["n_tests"], columns["reached"]
+    truth, n = subject.crash_rate, len(rows)
+    covered = int(np.count_nonzero((columns["ci_low"] <= truth) & (truth <= columns["ci_high"])))
+    low, high = map(float, clopper_pearson(covered, n, (1.0 - COVERAGE_CONFIDENCE) / 2.0))
     met = subject.meets_assumption or not conditional
-    tests_5, median, tests_95 = (float(q) for q in np.quantile(rows.n_tests, [0.05, 0.5, 0.95]))
-    relvar = float(np.mean((rows.crash_rate / truth - 1.0) ** 2))
-    fixed = not rows.reached.any() and bool(np.all(rows.n_tests == rows.n_tests[0]))
+    tests_5, median, tests_95 = (float(q) for q in np.quantile(tests, [0.05, 0.5, 0.95]))
+    relvar = float(np.mean((rates / truth - 1.0) ** 2))
+    fixed = not reached.any() and bool(np.all(tests == tests[0]))
+    z = float(norm.isf((1.0 - confidence) / 2.0))
     return Judgement(
         subject=subject.name,
         result=result,
         replications=n,
         truth=truth,
         assumption_met=met,
-        bias=float(rows.crash_rate.mean()) / truth - 1.0,
-        bias_std_error=_std_error(rows.crash_rate) / truth,
+        bias=float(rates.mean()) / truth - 1.0,
+        bias_std_error=float(rates.std(ddof=1)) / math.sqrt(n) / truth,
         true_relvar=relvar,
-        claimed_relvar=float(np.mean(rows.std_error**2)) / truth**2,
+        claimed_relvar=float(np.mean(columns["std_error"] ** 2)) / truth**2,
         covered=covered,
         coverage=covered / n,
         coverage_low=low,
@@ -158,37 +184,25 @@ def judge(subject: Subject, result: str, rows: Rows, confidence: float, *, condi
         tests_median=median,
         tests_5=tests_5,
         tests_95=tests_95,
-        tests_for_wanted_rhw=_tests_for(WANTED_RHW, relvar * median, confidence) if fixed else None,
-        reached=float(rows.reached.mean()),
-        alarm=float(np.mean(rows.n_crashes_outside > 0)),
+        tests_for_wanted_rhw=(z / WANTED_RHW) ** 2 * (relvar * median) if fixed else None,
+        reached=float(reached.mean()),
+        alarm=float(np.mean(columns["n_crashes_outside"] > 0)),
     )
-
-
-def _std_error(values: FloatArray) -> float:
-    return float(values.std(ddof=1)) / math.sqrt(values.size)
-
-
-def _tests_for(rhw: float, relvar_per_test: float, confidence: float) -> float:
-    z = float(norm.isf((1.0 - confidence) / 2.0))
-    return (z / rhw) ** 2 * relvar_per_test
 
 
 def corrected(judgements: Sequence[Judgement]) -> list[Judgement]:
     """The same with p-values corrected over all subjects, for each result by itself."""
-    found = {}
-    for result in dict.fromkeys(one.result for one in judgements):
-        family = [one for one in judgements if one.result == result and one.p_value is not None]
-        for one, p in zip(family, holm([one.p_value or 0.0 for one in family]), strict=True):
-            found[one.subject, result] = p
-    return [Judgement(**{**asdict(one), "p_value_holm": found.get((one.subject, one.result))}) for one in judgements]
+    found: dict[tuple[str, str], float] = {}
+    for result in {one.result for one in judgements}:
+        known = {one.subject: one.p_value for one in judgements if one.result == result and one.p_value is not None}
+        found |= {(name, result): p for name, p in zip(known, holm(list(known.values())), strict=True)}
+    return [replace(one, p_value_holm=found.get((one.subject, one.result))) for one in judgements]
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
     """Holm's corrected p-values, in the order given."""
     order = np.argsort(p_values, kind="stable")
-    adjusted = np.zeros(len(p_values))
-    largest = 0.0
-    for rank, place in enumerate(order.tolist()):
-        largest = max(largest, min(1.0, (len(p_values) - rank) * p_values[place]))
-        adjusted[place] = largest
-    return [float(p) for p in adjusted]
+    raised = np.minimum(1.0, np.arange(len(order), 0, -1) * np.array(p_values)[order])
+    adjusted = np.zeros(len(order))
+    adjusted[order] = np.maximum.accumulate(raised)
+    return adjusted.tolist()

@@ -15,15 +15,17 @@ in shards, and not by the estimator, so that two estimators of one run see the s
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.stats import norm
 
 from harness.arrays import BoolArray, FloatArray, IntArray
 from harness.estimators.block import Block
-from harness.estimators.both_ways import BothWays
+from harness.estimators.estimate import BothWays
 from harness.estimators.scv import Scv
 
 
@@ -33,13 +35,8 @@ class Procedure:
 
     Attributes
     ----------
-    rhw : float
-        Threshold; the paper's is 0.3.
-    confidence : float
-        Level of the normal interval; the paper's is 0.9.
-    n_shuffles : int
-        Orderings to average over; the paper's number is 200.
-    seed : int
+    rhw, confidence, n_shuffles : float, float, int
+        Threshold, level of the normal interval and orderings to average over; the defaults are the paper's.
     first, ratio : int, float
         Smallest prefix that is looked at, at least 2, and how much larger each next one is, above 1.
     total : int or None
@@ -88,12 +85,12 @@ class RequiredTests:
 
     @property
     def mean(self) -> float:
-        """Average RNoT; a lower limit if `is_lower_limit`."""
+        """Average RNoT."""
         return float(np.mean(self.n))
 
     @property
     def is_lower_limit(self) -> bool:
-        """Whether some shuffle would have needed more tests than the total."""
+        """Whether some shuffle would have needed more tests than the total, and the mean is a lower limit."""
         return bool(self.never_reached.any())
 
     def quantile(self, share: float) -> int:
@@ -121,13 +118,7 @@ def required_tests(rhw: FloatArray, grid: IntArray, threshold: float) -> Require
 
 
 def acceleration(reference: RequiredTests, other: RequiredTests) -> tuple[float, str]:
-    """AAR of `other` over `reference`, and which side of the truth it is on.
-
-    Returns
-    -------
-    (float, {"equal", "at least", "at most", "unknown"})
-        "unknown" where both averages are lower limits, whose ratio says nothing.
-    """
+    """AAR of `other` over `reference`, and which side of the truth it is on ("unknown": both are lower limits)."""
     words = {(False, False): "equal", (True, False): "at least", (False, True): "at most", (True, True): "unknown"}
     return reference.mean / other.mean, words[reference.is_lower_limit, other.is_lower_limit]
 
@@ -186,21 +177,15 @@ def _total_and_half_width(y: FloatArray, k: IntArray, n: IntArray, z: float) -> 
 def scv_rhw(tests: Block, procedure: Procedure, done: Callable[[], None] = lambda: None) -> FloatArray:
     """RHW that the published `scv` claims on prefixes of shuffled tests, shape (s, g): Algorithm 1 on each anew.
 
-    Parameters
-    ----------
-    tests : Block
-        All tests of a run in index order, with ``first_ratios``.
-    procedure : Procedure
-    done : callable
-        Called after each shuffle.
+    ``tests`` are all tests of a run in index order, with ``first_ratios``; ``done`` is called after each shuffle.
     """
     grid = procedure.grid(len(tests))
     rhw = np.empty((procedure.n_shuffles, len(grid)))
     for shuffle in range(procedure.n_shuffles):
-        order = _order(procedure.seed, shuffle, tests.crash | tests.failed)
+        order = shuffled(procedure.seed, shuffle, tests.crash | tests.failed)
         state = BothWays(Scv())
         for at, (start, stop) in enumerate(itertools.pairwise([0, *grid.tolist()])):
-            state.add(_rows(tests, order[start:stop]))
+            state.add(rows_of(tests, order[start:stop]))
             rhw[shuffle, at] = state.result(procedure.confidence).rhw
         done()
     return rhw
@@ -212,7 +197,7 @@ def _crash_places(seed: int, shuffle: int, n_tests: int, n_crashes: int) -> tupl
     return generator, generator.choice(n_tests, size=n_crashes, replace=False)
 
 
-def _order(seed: int, shuffle: int, placed: BoolArray) -> IntArray:
+def shuffled(seed: int, shuffle: int, placed: BoolArray) -> IntArray:
     """Rows in the order of a shuffle, shape (n,): crashed and failed ones in their places, the others between them."""
     n = len(placed)
     generator, places = _crash_places(seed, shuffle, n, int(np.count_nonzero(placed)))
@@ -222,21 +207,20 @@ def _order(seed: int, shuffle: int, placed: BoolArray) -> IntArray:
     return order
 
 
-def _rows(tests: Block, rows: IntArray) -> Block:
-    """Block of any rows in any order, as far as `scv` reads it; numbered anew, for the order is what is asked about."""
-    assert tests.first_ratios is not None
-    return replace(
-        tests,
-        first_episode=0,
-        crash=tests.crash[rows],
-        failed=tests.failed[rows],
-        cut_in=tests.cut_in[rows],
-        bv_lv_contact=tests.bv_lv_contact[rows],
-        log_weight=tests.log_weight[rows],
-        log_q=tests.log_q[rows],
-        n_control_steps=tests.n_control_steps[rows],
-        first_ratios=tests.first_ratios[rows],
-        log_p_cut_in=None,
-        component=None,
-        surrogates_crash=None,
-    )
+def rows_of(tests: Block, rows: IntArray) -> Block:
+    """Block of any rows in any order; numbered anew, for the order is what is asked about."""
+    taken: dict[str, Any] = {name: column[rows] for name, column in _columns(tests).items()}
+    return replace(tests, first_episode=0, **taken)
+
+
+def joined(blocks: Sequence[Block]) -> Block:
+    """One block of consecutive ones."""
+    parts = [_columns(block) for block in blocks]
+    whole: dict[str, Any] = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    return replace(blocks[0], **whole)
+
+
+def _columns(block: Block) -> dict[str, NDArray[Any]]:
+    """All arrays that have a row for each test."""
+    values = {field.name: getattr(block, field.name) for field in fields(Block) if field.name != "alpha"}
+    return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}

@@ -1,4 +1,4 @@
-"""Run a replication experiment: repeat every campaign in worker processes, judge, write."""
+"""Run a replication experiment: repeat the campaign of each vehicle or chain in worker processes, judge, write."""
 
 from __future__ import annotations
 
@@ -12,31 +12,31 @@ from multiprocessing import parent_process
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 
+from harness.environment.loading import load_environment
 from harness.interruption import leave_signals_to_parent
+from harness.pool.library import load_library
 from harness.progress import Progress, SilentProgress
 from harness.records.folder import require_place
 from harness.spawning import spawn_context
+from harness.studies.chains.named import CHAINS
+from harness.studies.chains.shells import ChainShells
 from harness.studies.experiment import Experiment
-from harness.studies.judgement import Judgement, Subject, corrected, judge
+from harness.studies.judgement import Judgement, Row, Subject, corrected, judge
 from harness.studies.results import write_results
-from harness.studies.rows import Row, Rows
-from harness.studies.shell_campaign import CONDITIONAL
-from harness.studies.subjects import Repeated, subjects
+from harness.studies.shell_campaign import CONDITIONAL, ShellCampaign
+from harness.studies.shell_source import overtaking_shells
+from harness.studies.super_population import Drivers, enumerate_paths, truths
+from harness.studies.weighted_campaign import ChainEpisodes, TwinEpisodes, WeightedCampaign
 
 TASKS_PER_SUBJECT = 8
+
+Repeated = ShellCampaign | WeightedCampaign
+"""A campaign that can be repeated, in any process."""
 
 
 @dataclass(frozen=True)
 class ValidationResult:
-    """Outcome of an experiment.
-
-    Attributes
-    ----------
-    folder : Path
-        Where results.json, replications.parquet and the plot are.
-    subjects : tuple of Subject
-    judgements : tuple of Judgement
-    """
+    """Outcome of an experiment; ``folder`` is where results.json, replications.parquet and the plot are."""
 
     folder: Path
     subjects: tuple[Subject, ...]
@@ -59,31 +59,64 @@ def validate(
     """
     progress = progress or SilentProgress()
     require_place(folder)
-    tested = list(subjects(experiment, progress))
+    tested = list(_chains(experiment) if experiment.chains else _vehicles(experiment, progress))
     progress.stage("replications", len(tested) * experiment.replications)
-    with _executor(workers) as executor:
-        found = [_replicate(repeated, experiment.replications, executor, progress) for _, repeated in tested]
-    judgements: list[Judgement] = []
-    for (subject, _), rows in zip(tested, found, strict=True):
-        for result in dict.fromkeys(row.result for row in rows):
-            of_result = Rows.of([row for row in rows if row.result == result])
-            confidence = experiment.campaign.stop.confidence
-            judgements.append(judge(subject, result, of_result, confidence, conditional=result == CONDITIONAL))
-    known = tuple(subject for subject, _ in tested)
-    done = ValidationResult(folder, known, tuple(corrected(judgements)))
-    rows_by_subject = {subject.name: rows for subject, rows in zip(known, found, strict=True)}
-    write_results(folder, experiment, done.subjects, done.judgements, rows_by_subject)
-    return done
+    with worker_processes(workers) as executor:
+        rows = [_replicate(repeated, experiment.replications, executor, progress) for _, repeated in tested]
+    found = [(subject, of_subject) for (subject, _), of_subject in zip(tested, rows, strict=True)]
+    judgements = corrected([one for subject, of_subject in found for one in _judge(experiment, subject, of_subject)])
+    write_results(folder, experiment, judgements, found)
+    return ValidationResult(folder, tuple(subject for subject, _ in found), tuple(judgements))
+
+
+def _judge(experiment: Experiment, subject: Subject, rows: list[Row]) -> Iterator[Judgement]:
+    for result in dict.fromkeys(row.result for row in rows):
+        of_result = [row for row in rows if row.result == result]
+        confidence = experiment.campaign.stop.confidence
+        yield judge(subject, result, of_result, confidence, conditional=result == CONDITIONAL)
+
+
+def _chains(experiment: Experiment) -> Iterator[tuple[Subject, Repeated]]:
+    campaign, method = experiment.campaign, experiment.campaign.testing.method
+    for place, name in enumerate(experiment.chains):
+        chain, seed = CHAINS[name], experiment.seed_of(place)
+        if method == "shells":
+            source = ChainShells(chain, experiment.super_population.pool_paths)
+            subject = Subject(name, chain.crash_rate, crashes_outside=source.crashes_outside)
+            yield subject, ShellCampaign(campaign, source, seed, experiment.fault)
+        else:
+            episodes = ChainEpisodes(chain, method, seed)
+            yield Subject(name, chain.crash_rate), WeightedCampaign(campaign, episodes, experiment.results)
+
+
+def _vehicles(experiment: Experiment, progress: Progress) -> Iterator[tuple[Subject, Repeated]]:
+    campaign, size, seed = experiment.campaign, experiment.super_population, experiment.seed
+    environment, library = load_environment(campaign.environment), load_library(campaign.pool.library)
+    drivers, pools = Drivers.of(library, experiment.avs), None
+    if campaign.testing.method == "shells":
+        pools = enumerate_paths(environment, drivers, seed, size.paths, progress)
+    known = truths(environment, drivers, seed + 1, size.reference_paths, progress)
+    for place, (name, av) in enumerate(experiment.avs.items()):
+        tested, own_seed, truth = experiment.subject(name), experiment.seed_of(place), known[name]
+        if pools is None:
+            episodes = TwinEpisodes(tested, own_seed, experiment.results)
+            repeated: Repeated = WeightedCampaign(tested, episodes, experiment.results)
+            yield Subject(name, truth.crash_rate, truth.std_error), repeated
+        else:
+            source = overtaking_shells(library, pools, av, drivers.vehicles[name], size.pool_paths)
+            facts = source.crashes_outside, source.left_out, source.template.library.boundary
+            repeated = ShellCampaign(tested, source, own_seed, experiment.fault)
+            yield Subject(name, truth.crash_rate, truth.std_error, *facts), repeated
 
 
 @contextmanager
-def _executor(workers: int | None) -> Iterator[ProcessPoolExecutor]:
+def worker_processes(workers: int | None) -> Iterator[ProcessPoolExecutor]:
     """Worker processes that end at once when the work in the parent is interrupted or fails, or it is killed."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     context = spawn_context()
     watched, held = context.Pipe(duplex=False)
     with ProcessPoolExecutor(
-        workers or os.cpu_count(), mp_context=context, initializer=end_with_parent, initargs=(watched,)
+        workers or os.cpu_count(), mp_context=context, initializer=_end_with_parent, initargs=(watched,)
     ) as executor:
         try:
             yield executor
@@ -92,7 +125,7 @@ def _executor(workers: int | None) -> Iterator[ProcessPoolExecutor]:
             raise
 
 
-def end_with_parent(watched: Connection) -> None:
+def _end_with_parent(watched: Connection) -> None:
     """Let this worker process end when its parent closes the other end of the pipe, or is killed."""
     leave_signals_to_parent()
     parent = parent_process()
@@ -107,14 +140,9 @@ def _end_after(ends: list[Connection | int]) -> None:
 
 def _replicate(repeated: Repeated, n: int, executor: ProcessPoolExecutor, progress: Progress) -> list[Row]:
     rows: list[Row] = []
-    parts = list(_parts(n))
+    size = -(-n // TASKS_PER_SUBJECT)
+    parts = [range(first, min(first + size, n)) for first in range(0, n, size)]
     for part, found in zip(parts, executor.map(repeated.run, parts), strict=True):
         rows += found
         progress.advance(len(part))
     return rows
-
-
-def _parts(n: int) -> Iterator[range]:
-    size = -(-n // TASKS_PER_SUBJECT)
-    for first in range(0, n, size):
-        yield range(first, min(first + size, n))

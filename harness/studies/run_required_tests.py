@@ -3,26 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
-from harness.arrays import BoolArray, FloatArray, IntArray
+from harness.arrays import BoolArray, FloatArray
 from harness.campaign.loading import load_campaign
 from harness.errors import HarnessError
 from harness.estimators.block import Block
 from harness.estimators.estimate import finite_json
-from harness.estimators.nade import Nade
-from harness.estimators.nde import Nde
+from harness.estimators.nade import Nade, Nde
 from harness.estimators.scv import Scv
 from harness.progress import Progress, SilentProgress
-from harness.runner.stored_blocks import stored_blocks
+from harness.runner.stored_estimates import stored_blocks
 from harness.studies.required_tests import (
     Procedure,
     RequiredTests,
     acceleration,
+    joined,
     plain_rhw,
     required_tests,
     scv_rhw,
@@ -80,7 +80,8 @@ def required_tests_of_runs(
     rows = []
     for folder in folders:
         run = _read(folder, with_ratios="scv" in estimators)
-        for name in dict.fromkeys(estimators or [_plain_name(run)]):
+        plain: RnotEstimator = "nde" if run.sample.method == "nde" else "nade"
+        for name in dict.fromkeys(estimators or [plain]):
             told.stage(f"{folder.name} {name}", procedure.n_shuffles)
             found = _found(run, name, procedure, told)
             if isinstance(found, RequiredTests):
@@ -115,19 +116,6 @@ def _read(folder: Path, *, with_ratios: bool) -> _Run:
     return _Run(folder, n, np.concatenate(weights), np.concatenate(failed), sample, joined(kept) if kept else None)
 
 
-def joined(blocks: Sequence[Block]) -> Block:
-    """One block of consecutive ones."""
-    values = {field.name: getattr(blocks[0], field.name) for field in fields(Block)}
-    for name, value in values.items():
-        if name != "alpha" and isinstance(value, np.ndarray):
-            values[name] = np.concatenate([getattr(block, name) for block in blocks])
-    return Block(**values)
-
-
-def _plain_name(run: _Run) -> RnotEstimator:
-    return "nde" if run.sample.method == "nde" else "nade"
-
-
 def _found(run: _Run, name: RnotEstimator, procedure: Procedure, progress: Progress) -> RequiredTests | str:
     """RNoT, or the reason why there is none."""
     if reason := _REFUSAL[name](run.sample):
@@ -156,7 +144,7 @@ def _row(
     ratio, side = acceleration(reference, found)
     return {
         **_identity(run, name),
-        "grid": grid_in_words(grid, procedure.ratio),
+        "grid": f"{grid[0]:,} to {grid[-1]:,} by {procedure.ratio - 1.0:.3g} n ({len(grid)} looks)",
         "grid_points": len(grid),
         "total": int(grid[-1]),
         "mean": found.mean,
@@ -167,16 +155,11 @@ def _row(
         "never_above": int(np.count_nonzero(found.never_above)),
         "aar": None if side == "unknown" else ratio,
         "aar_is": side,
-        "remarks": _remarks(run, name, found, grid, procedure),
+        "remarks": _remarks(run, name, found, int(grid[-1]), procedure),
     }
 
 
-def grid_in_words(grid: IntArray, ratio: float) -> str:
-    """Say where the grid begins, how it goes on and where it ends."""
-    return f"{grid[0]:,} to {grid[-1]:,} by {ratio - 1.0:.3g} n ({len(grid)} looks)"
-
-
-def _remarks(run: _Run, name: RnotEstimator, found: RequiredTests, grid: IntArray, procedure: Procedure) -> list[str]:
+def _remarks(run: _Run, name: RnotEstimator, found: RequiredTests, total: int, procedure: Procedure) -> list[str]:
     remarks, n_shuffles = [SCV_REMARK] if name == "scv" else [], procedure.n_shuffles
     if run.failed.any():
         remarks.append(
@@ -186,7 +169,7 @@ def _remarks(run: _Run, name: RnotEstimator, found: RequiredTests, grid: IntArra
     if found.is_lower_limit:
         remarks.append(
             f"{np.count_nonzero(found.never_reached)} of {n_shuffles} shuffles are above RHW {procedure.rhw:g} at "
-            f"{grid[-1]:,} tests and count as {grid[-1]:,}: the mean is a lower limit"
+            f"{total:,} tests and count as {total:,}: the mean is a lower limit"
         )
     if found.never_above.any():
         remarks.append(

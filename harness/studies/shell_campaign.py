@@ -7,8 +7,9 @@ scatters no more than that.
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import Any
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 
@@ -16,41 +17,42 @@ from harness.arrays import FloatArray, IntArray
 from harness.campaign.models import Campaign
 from harness.estimators.block import Block
 from harness.estimators.estimate import Estimate
-from harness.runner.shell_planner import RoundRule, ShellPlanner
+from harness.runner.planner import RoundRule, ShellPlanner
 from harness.strata import ShellDesign
 from harness.studies.experiment import Fault
-from harness.studies.rows import Row, estimate_row
-from harness.studies.shell_source import ShellSource
+from harness.studies.judgement import Row, estimate_row
 
 FREE, CONDITIONAL = "shells", "shells, conditional"
 
 
+class ShellSource(Protocol):
+    """Where the pools of replications come from."""
+
+    def draw(self, rng: np.random.Generator) -> tuple[ShellDesign, FloatArray]:
+        """A new pool: its strata, and the vehicle's share of crashes (S,) in each."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
 class ShellCampaign:
-    """A shells campaign to replicate.
+    """A shells campaign to replicate; its stop rule, statement and first tests are used."""
 
-    Parameters
-    ----------
-    campaign : Campaign
-        Its stop rule, statement and first tests are used.
-    source : ShellSource
-    seed : int
-    fault : Fault, optional
-        Mistake to make.
-    """
+    campaign: Campaign
+    source: ShellSource
+    seed: int
+    fault: Fault | None = None
 
-    def __init__(self, campaign: Campaign, source: ShellSource, seed: int, fault: Fault | None = None) -> None:
-        self._campaign, self._source, self._seed, self._fault = campaign, source, seed, fault
+    def run(self, replications: range) -> list[Row]:
+        """Rows of both statements for each replication."""
+        return [row for replication in replications for row in self._replicate(replication)]
 
-    def run(self, replication: int) -> list[Row]:
-        """Rows of both statements."""
-        rng = np.random.default_rng([self._seed, replication])
-        design, share = self._source.draw(rng)
-        return self._rows(_wrong(design, self._fault), share, rng, replication)
-
-    def _rows(self, design: ShellDesign, share: FloatArray, rng: np.random.Generator, replication: int) -> list[Row]:
-        available = np.full(design.p.size, self._campaign.pool.cut_ins_per_shell, np.int64)
-        planner = ShellPlanner(self._campaign, design, available)
-        inside, conditional = RoundRule(_conditional(self._campaign)), None
+    def _replicate(self, replication: int) -> Iterator[Row]:
+        rng = np.random.default_rng([self.seed, replication])
+        design, share = self.source.draw(rng)
+        design = _wrong(design, self.fault)
+        available = np.full(design.p.size, self.campaign.pool.cut_ins_per_shell, np.int64)
+        planner = ShellPlanner(self.campaign, design, available)
+        inside, conditional = RoundRule(_conditional(self.campaign)), None
         estimate: Estimate | None = None
         enough = False
         while not enough and (added := planner.next_round()).any():
@@ -64,9 +66,8 @@ class ShellCampaign:
         if estimate is None:
             raise ValueError("the campaign has no tests")
         outside = int(estimate.details["conditional"]["n_crashes_outside"])
-        row = estimate_row(FREE, replication, estimate, reached=planner.rule.reached)
-        free = replace(row, n_crashes_outside=outside)
-        return [free, conditional or _conditional_row(estimate, replication, reached=False)]
+        yield estimate_row(FREE, replication, estimate, reached=planner.rule.reached, outside=outside)
+        yield conditional or _conditional_row(estimate, replication, reached=False)
 
 
 def _conditional(campaign: Campaign) -> Campaign:
@@ -85,8 +86,8 @@ def _wrong(design: ShellDesign, fault: Fault | None) -> ShellDesign:
 def _block(design: ShellDesign, added: IntArray, crashes: IntArray, first: int) -> Block:
     """What the records of a round become: within a stratum the crashes come first, which no estimator can see."""
     component = np.repeat(np.arange(added.size), added)
-    rank = np.arange(component.size) - np.repeat(np.cumsum(added) - added, added)
     n = component.size
+    rank = np.arange(n) - np.repeat(np.cumsum(added) - added, added)
     none = np.zeros(n, np.bool_)
     return Block(
         first_episode=first,
@@ -105,20 +106,17 @@ def _block(design: ShellDesign, added: IntArray, crashes: IntArray, first: int) 
 
 
 def _conditional_row(estimate: Estimate, replication: int, *, reached: bool) -> Row:
-    found: dict[str, Any] = estimate.details["conditional"]
+    found = estimate.details["conditional"]
     shells = [shell for shell in estimate.details["shells"] if shell["inside"] and shell["n_episodes"]]
     variance = sum(
         shell["p"] ** 2 * shell["crash_share"] * (1.0 - shell["crash_share"]) / shell["n_episodes"] for shell in shells
     )
+    reported = {name: found[name] for name in ("n_crashes", "crash_rate", "ci_low", "ci_high", "n_crashes_outside")}
     return Row(
         CONDITIONAL,
         replication,
-        found["n_episodes"],
-        found["n_crashes"],
-        found["crash_rate"],
-        float(np.sqrt(variance)),
-        found["ci_low"],
-        found["ci_high"],
-        reached,
-        found["n_crashes_outside"],
+        n_tests=found["n_episodes"],
+        std_error=float(np.sqrt(variance)),
+        reached=reached,
+        **reported,
     )

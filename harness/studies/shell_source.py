@@ -1,9 +1,8 @@
-"""Pools drawn anew: the strata that a campaign would see, and the share of crashes in each that its pool holds."""
+"""Pools of overtaking drawn anew: the strata that a campaign would see, and the share of crashes in each."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 
@@ -14,36 +13,20 @@ from harness.pool.cut_ins import CutIns, Pool, shells_of
 from harness.pool.library import Library
 from harness.pool.shells import acceleration_limit, design_shells, shells_in_strata
 from harness.strata import ShellDesign
-from harness.studies.panel import Mixed
-from harness.studies.super_population import SuperPopulation
+from harness.studies.super_population import Mixed, SuperPopulation
 
 EQUAL_RATE = 0.02
 """A surrogate whose crash rate is this close to the vehicle's counts as its equal."""
 
 
-class ShellSource(Protocol):
-    """Where the pools of replications come from."""
-
-    @property
-    def crashes_outside(self) -> float:
-        """Share of the vehicle's crash rate that lies beyond the boundary."""
-        ...
-
-    def draw(self, rng: np.random.Generator) -> tuple[ShellDesign, FloatArray]:
-        """A new pool: its strata, and the vehicle's share of crashes (S,) in each."""
-        ...
-
-
 @dataclass(frozen=True, eq=False)
 class OvertakingShells:
-    """Pools of one vehicle, with its equals left out of the library.
+    """Pools of one vehicle, with its equals left out of the library; see `harness.studies.shell_campaign.ShellSource`.
 
     Attributes
     ----------
     template : Pool
         Pool without cut-ins, whose probabilities each draw replaces.
-    boundary : str
-        Surrogate up to which strata are inside.
     left_out : tuple of str
         The vehicle's equals.
     limit_mps2 : float
@@ -53,25 +36,19 @@ class OvertakingShells:
     """
 
     template: Pool
-    boundary: str
     left_out: tuple[str, ...]
     limit_mps2: float
     shells: FloatArray
     crashing: FloatArray
 
     @property
-    def groups(self) -> list[list[int]]:
-        """Shells of each stratum."""
-        return shells_in_strata(self.template, self.template.names.index(self.boundary), self.limit_mps2)
-
-    @property
     def crashes_outside(self) -> float:
-        """See `ShellSource`."""
+        """Share of the vehicle's crash rate that lies beyond the boundary."""
         by_shell = self.crashing.sum(0)
-        return float(by_shell[self.template.names.index(self.boundary) + 1 :].sum() / by_shell.sum())
+        return float(by_shell[self.template.boundary + 1 :].sum() / by_shell.sum())
 
     def draw(self, rng: np.random.Generator) -> tuple[ShellDesign, FloatArray]:
-        """See `ShellSource`."""
+        """A new pool: its strata, and the vehicle's share of crashes (S,) in each."""
         rows = rng.integers(0, len(self.shells), self.template.n_paths)
         drawn = self.shells[rows]
         pool = replace(
@@ -80,29 +57,20 @@ class OvertakingShells:
             shell_moments=drawn.T @ drawn / len(rows),
             p_cut_in=float(drawn.sum(1).mean()),
         )
-        design = design_shells(pool, boundary=self.boundary, limit_mps2=self.limit_mps2)
+        design = design_shells(pool, limit_mps2=self.limit_mps2)
         crash_p = self.crashing[rows].mean(0)
-        groups = shells_in_strata(pool, pool.names.index(self.boundary), self.limit_mps2)
+        groups = shells_in_strata(pool, pool.boundary, self.limit_mps2)
         share = np.array([crash_p[group].sum() / pool.shell_p[group].sum() for group in groups])
         return design, np.clip(share, 0.0, 1.0)
 
 
-def equals(library: Library, population: SuperPopulation, vehicle: FloatArray) -> set[str]:
-    """Surrogates that crash on the same cut-ins as a vehicle, or nearly as often.
-
-    Parameters
-    ----------
-    library : Library
-        Its drivers are the first of the population's.
-    population : SuperPopulation
-    vehicle : ndarray, shape (m,)
-        Mass of cut-ins on which the vehicle crashes.
-    """
-    rate = vehicle.sum()
+def equals(library: Library, population: SuperPopulation, crashing: FloatArray) -> set[str]:
+    """Surrogates that crash on the same cut-ins as a vehicle (its mass of them, shape (m,)), or nearly as often."""
+    rate = crashing.sum()
     found = set()
     for driver, name in enumerate(library.surrogates):
         mass = population.mass * population.crashes(driver)
-        if abs(mass.sum() / rate - 1.0) <= EQUAL_RATE or np.array_equal(mass, vehicle):
+        if abs(mass.sum() / rate - 1.0) <= EQUAL_RATE or np.array_equal(mass, crashing):
             found.add(name)
     return found
 
@@ -110,14 +78,15 @@ def equals(library: Library, population: SuperPopulation, vehicle: FloatArray) -
 def leave_out(library: Library, names: set[str], careful_first: tuple[str, ...]) -> Library:
     """The library without a vehicle's equals; the envelope stays, and another surrogate takes over as boundary.
 
+    That is the next more careful one that is left, or the next more careless one if none is.
+
     Parameters
     ----------
     library : Library
     names : set of str
         What to leave out.
     careful_first : tuple of str
-        All surrogates, from careful to careless. The new boundary is the next more careful one that is left, or the
-        next more careless one if none is.
+        All surrogates, from careful to careless.
 
     Raises
     ------
@@ -143,43 +112,33 @@ def leave_out(library: Library, names: set[str], careful_first: tuple[str, ...])
 def overtaking_shells(
     library: Library, population: SuperPopulation, av: AutomatedVehicle, vehicle: Mixed, pool_paths: int
 ) -> OvertakingShells:
-    """Source of a vehicle's pools.
-
-    Parameters
-    ----------
-    library : Library
-        Its drivers are the first of the population's.
-    population : SuperPopulation
-    av : AutomatedVehicle
-    vehicle : Mixed
-        The same vehicle as drivers of the population.
-    pool_paths : int
-        Paths of a pool.
-    """
+    """Source of a vehicle's pools; the library's drivers are the first of the population's."""
     bit = {name: driver for driver, name in enumerate(library.surrogates)}
     rate = {name: float(population.mass[population.crashes(driver)].sum()) for name, driver in bit.items()}
     careful_first = tuple(sorted(bit, key=rate.__getitem__))
     crashing = vehicle.crash_mass(population)
-    left_out = equals(library, population, crashing)
-    reduced = leave_out(library, left_out, careful_first)
+    reduced = leave_out(library, equals(library, population, crashing), careful_first)
     names = tuple(name for name in careful_first if name in reduced.surrogates)
     shell = shells_of(population.bits, np.array([bit[name] for name in names]))
-    columns = range(len(names) + 1)
-    shells = np.column_stack([population.by_path(population.mass * (shell == s)) for s in columns])
+
+    def by_shell(mass: FloatArray) -> FloatArray:
+        return np.column_stack([population.by_path(mass * (shell == s)) for s in range(len(names) + 1)])
+
+    shells = by_shell(population.mass)
     shells[:, -1] = np.maximum(population.cut_in - shells[:, :-1].sum(1), 0.0)
     return OvertakingShells(
         template=_template(reduced, names, shells, pool_paths),
-        boundary=reduced.boundary,
         left_out=tuple(name for name in careful_first if name not in reduced.surrogates),
         limit_mps2=acceleration_limit(av),
         shells=shells,
-        crashing=np.column_stack([population.by_path(crashing * (shell == s)) for s in columns]),
+        crashing=by_shell(crashing),
     )
 
 
 def _template(library: Library, names: tuple[str, ...], shells: FloatArray, n_paths: int) -> Pool:
     d = len(names)
     none: IntArray = np.zeros(0, np.int64)
+    no_draws = np.zeros((0, 0), np.int8)
     return Pool(
         key="drawn",
         environment="drawn",
@@ -197,8 +156,8 @@ def _template(library: Library, names: tuple[str, ...], shells: FloatArray, n_pa
             step=none,
             shell=none,
             state=np.zeros((0, 5)),
-            lv=np.zeros((0, 0), np.int8),
-            bv=np.zeros((0, 0), np.int8),
+            lv=no_draws,
+            bv=no_draws,
             n_lv=none,
             n_bv=none,
             crashes=np.zeros((0, d), np.bool_),

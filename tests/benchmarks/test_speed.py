@@ -7,8 +7,7 @@ import pytest
 from benchmarks.contender_process import Measurement, descendants_cpu_s
 from benchmarks.contenders import CONTENDERS, Recorded, campaign
 from benchmarks.one_at_a_time import in_libsumo
-from benchmarks.speed import require_equal_rows
-from benchmarks.speed_page import RATES, RATIOS, Ratio, ratio
+from benchmarks.speed import RATES, RATIOS, Ratio, ratio, require_equal_rows
 from harness.twin import TwinWorld
 
 

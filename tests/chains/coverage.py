@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from harness.arrays import FloatArray
-from harness.estimators.accumulator import Accumulator
 from harness.estimators.block import Block
+from harness.estimators.estimate import Accumulator
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ import pytest
 from scipy.stats import binomtest
 
 from harness.estimators.block import Block
-from harness.estimators.difference import Difference, PairedSums, difference_statement, paired_difference
+from harness.estimators.difference import Difference, difference_statement, paired_difference
 from harness.studies.chains.named import overtaking
 from harness.studies.chains.sampler import draw
 
@@ -93,11 +93,8 @@ def test_vehicles_with_a_will_of_their_own_are_covered_too():
 def test_blocks_in_pieces_give_the_same():
     a, b = pair(0)
     pieces = [slice(0, 700), slice(700, N)]
-    whole, parts = PairedSums(), PairedSums()
-    whole.add(a, b)
-    for rows in pieces:
-        parts.add(a.take(rows), b.take(rows))
-    one, other = whole.result(0.9), parts.result(0.9)
+    one = paired_difference([(a, b)], 0.9)
+    other = paired_difference([(a.take(rows), b.take(rows)) for rows in pieces], 0.9)
     for name in ("difference", "std_error", "ci_low", "ci_high", "ratio_low", "ratio_high", "n_effective"):
         assert getattr(one, name) == pytest.approx(getattr(other, name), rel=1e-12), name
     assert (one.n_pairs, one.n_differing) == (other.n_pairs, other.n_differing)
@@ -106,7 +103,7 @@ def test_blocks_in_pieces_give_the_same():
 def test_other_episodes_are_no_pairs():
     a, b = pair(0)
     with pytest.raises(ValueError, match="no pairs"):
-        PairedSums().add(a, b.take(slice(1, N)))
+        paired_difference([(a, b.take(slice(1, N)))], 0.9)
 
 
 def test_equal_vehicles_have_a_bound_and_not_a_zero_width():

@@ -70,7 +70,7 @@ def test_theorem_3_with_sample_means_the_claim_is_zero_but_the_error_is_not():
     world = with_optimal_function()
     rates = []
     for k in range(50):
-        state = Scv(basis="full")
+        state = Scv()
         state.add(world.draw("step_mixture", 2_000, np.random.default_rng([SEED, k])))
         estimate = state.result(0.9)
         rates.append(estimate.crash_rate)

@@ -7,16 +7,15 @@ small error on average over states near the edge, no bias, and a small error at 
 import numpy as np
 import pytest
 
-from harness.criticality import grid
+from harness.criticality.grid import AFTER, points_of
 from tests.chains.seed import SEED
 from tests.criticality import simulation
 from tests.criticality.kernels import after_cut_in
+from tests.environment.kernels import free_driving
 from tests.episode.twin_runs import prepared
 
 each_surrogate = pytest.mark.parametrize("j", range(3), ids=simulation.SURROGATES)
-SPEEDS = grid.uniform_points(grid.AFTER_V)
-GAPS = grid.quadratic_points(grid.AFTER_R2)
-RATES = grid.uniform_points(grid.AFTER_RATE)
+POINTS = points_of(AFTER)
 
 
 @pytest.fixture(scope="module")
@@ -49,9 +48,9 @@ def test_at_grid_points(tables, j):
     rng = np.random.default_rng(SEED)
     value = tables.value[j, -1]
     open_cases = np.argwhere((value > 0.02) & (value < 0.98))
-    open_cases = open_cases[(SPEEDS[open_cases[:, 0]] >= 20.0) & (SPEEDS[open_cases[:, 0]] <= 40.0)]
-    chosen = open_cases[rng.choice(len(open_cases), 30, replace=False)]
-    states = np.column_stack([SPEEDS[chosen[:, 0]], GAPS[chosen[:, 1]], RATES[chosen[:, 2]]])
+    usual = (POINTS.speed[open_cases[:, 0]] >= 20.0) & (POINTS.speed[open_cases[:, 0]] <= 40.0)
+    chosen = rng.choice(open_cases[usual], 30, replace=False)
+    states = np.column_stack([points[index] for points, index in zip(POINTS, chosen.T, strict=True)])
     found = simulated(simulation.SURROGATES[j], states, 12, 1_000, rng)
     error = value[tuple(chosen.T)] - found
     assert np.abs(error).mean() < 0.07
@@ -89,9 +88,7 @@ def test_what_idm_fears(tables):
 @each_surrogate
 def test_maneuvers_average_to_the_next_level(tables, j):
     """Σ_a p(a|v) C(s, a) is U with one hold period more than the last level: not less, and hardly more."""
-    from tests.environment.kernels import free_driving
-
-    pmf = free_driving(SPEEDS)[0]
+    pmf = free_driving(POINTS.speed)[0]
     mean = np.einsum("vm,vgrm->vgr", pmf, tables.maneuvers[j].astype(float))
     assert (mean - tables.value[j, -1] >= -1e-5).all()
     assert (mean - tables.value[j, -1]).mean() < 0.01

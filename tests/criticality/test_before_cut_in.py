@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from harness.criticality import grid
+from harness.criticality.grid import BEFORE, points_of
 from harness.environment.cut_in import acceptance
 from tests.criticality import simulation
 from tests.environment.kernels import environment
@@ -33,9 +33,9 @@ def test_less_than_if_every_cut_in_crashed(tables, j):
 
     Accelerations average out to within a few per cent; a tenth is left for them.
     """
-    gaps = grid.quadratic_points(grid.BEFORE_R2)
+    _, gaps, rates = points_of(BEFORE)
     for k, rate in ((10, -8.0), (13, -5.0)):
-        assert grid.uniform_points(grid.BEFORE_RATE)[k] == rate
+        assert rates[k] == rate
         for g in (40, 70, 99):
             times = np.arange(0.0, min(20.0, gaps[g] / -rate), 0.1)
             left = sum(0.1 * acceptance(gaps[g] + rate * t, rate, environment()) for t in times)

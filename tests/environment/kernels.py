@@ -12,7 +12,6 @@ from harness.campaign.models import Environment as EnvironmentSection
 from harness.compiled import compiled_threads
 from harness.environment import cut_in, driving
 from harness.environment.loading import load_environment
-from harness.environment.student_t import t_cdf
 from harness.state import State
 
 
@@ -24,19 +23,21 @@ def environment(level=1.0, hold_s=1.0):
 @compiled_threads
 def _free(speeds, env, u, pmf, drawn):
     for i in range(speeds.size):
-        driving.free_driving_pmf(speeds[i], env, pmf[i])
+        law = driving.free_driving(speeds[i], env)
+        driving.acceleration_pmf(law, env, pmf[i])
         for j in range(u.size):
-            drawn[i, j] = driving.draw_free_driving(u[j], speeds[i], env)
+            drawn[i, j] = driving.draw_acceleration(u[j], law, env)
 
 
 @compiled_threads
 def _following(states, env, u, pmf, cap, drawn):
     for i in range(states.shape[0]):
         state = State(states[i, 0], states[i, 1], states[i, 2], 0.0, 0.0)
-        driving.car_following_pmf(state, env, pmf[i])
-        cap[i] = driving.guard_cap(state, env)
+        law = driving.car_following(state, env)
+        driving.acceleration_pmf(law, env, pmf[i])
+        cap[i] = law.cap
         for j in range(u.size):
-            drawn[i, j] = driving.draw_car_following(u[j], state, env)
+            drawn[i, j] = driving.draw_acceleration(u[j], law, env)
 
 
 @compiled_threads
@@ -51,7 +52,7 @@ def _cut_in(states, env, out):
 @compiled_threads
 def _t_cdf(z, table, out):
     for i in range(z.size):
-        out[i] = t_cdf(z[i], table)
+        out[i] = driving.t_cdf(z[i], table)
 
 
 def free_driving(speeds, u=()):

@@ -1,4 +1,4 @@
-"""Accelerations of LV and BV: probabilities against the formulas, draws against the probabilities, the guard.
+"""Accelerations of LV and BV: probabilities against the formulas, draws against the probabilities, noise, the guard.
 
 Chi-square tests have fixed seeds and an error probability of 1e-4 each.
 """
@@ -9,10 +9,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
+from harness.environment.driving import t_table
 from harness.maneuvers import ACCELERATIONS_MPS2
 from tests.chains.seed import SEED
 from tests.environment import formulas
-from tests.environment.kernels import car_following, free_driving
+from tests.environment.kernels import car_following, environment, free_driving, t_distribution
 
 speeds = st.floats(0.0, 60.0)
 gaps = st.floats(-0.001, 200.0)
@@ -26,6 +27,7 @@ STATES = [
     (38.0, 8.0, 0.0),
 ]
 N_DRAWS = 200_000
+DEGREES_OF_FREEDOM = [1.5, 3.39, 4.98, 16.0, 200.0]
 
 
 def chi_square_p(drawn, pmf):
@@ -114,3 +116,28 @@ def test_the_chi_square_would_notice_another_speed():
     """The check has teeth: draws at 30 m/s are not those of 31 m/s."""
     drawn = free_driving(30.0, uniforms_for_draws())[1][0]
     assert chi_square_p(drawn, free_driving(31.0)[0][0]) < 1e-8
+
+
+# -- Student's t as a table --
+
+
+@pytest.mark.parametrize("df", DEGREES_OF_FREEDOM)
+def test_noise_is_within_1e_8_of_scipys_and_rises_from_0_to_1(df):
+    table = t_table(df)
+    z = np.concatenate([np.random.default_rng(0).uniform(-70.0, 70.0, 200_000), np.linspace(-4.0, 4.0, 20_001)])
+    z.sort()
+    found, within = t_distribution(z, table), np.abs(z) <= 64.0
+    assert np.abs(found - stats.t.cdf(z, df))[within].max() < 1e-8
+    assert (np.diff(found) >= 0.0).all()
+    assert t_distribution(np.array([-np.inf, -64.1, 64.1, np.inf]), table).tolist() == [0.0, 0.0, 1.0, 1.0]
+
+
+def test_the_environment_has_the_tables_of_its_noises():
+    np.testing.assert_array_equal(environment().noise_t, [t_table(16.0), t_table(3.39)])
+
+
+def test_a_table_without_slopes_would_be_noticed():
+    table = t_table(3.39)
+    table[:, 1] = 0.0
+    z = np.linspace(-4.0, 4.0, 20_001)
+    assert np.abs(t_distribution(z, table) - stats.t.cdf(z, 3.39)).max() > 1e-4

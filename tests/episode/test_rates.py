@@ -6,8 +6,6 @@ are cut at one half a second and 3 % of tests crash, so that plain simulation in
 
 import pytest
 
-from harness.campaign.models import IDM, IDMParameters
-from tests.episode import twin_runs
 from tests.episode.twin_runs import Mean, run
 
 RAISED = 1e6
@@ -16,9 +14,6 @@ REGULAR = {
     "forced": ("forced", "recursive", 40_000),
     "step/recursive": ("step_mixture", "recursive", 20_000),
     "episode/recursive": ("episode_mixture", "recursive", 20_000),
-}
-twin_runs.SURROGATES["brakes with 2 g"] = {
-    "hard": IDM(model="idm", parameters=IDMParameters(min_acceleration_mps2=-20.0))
 }
 
 

@@ -1,11 +1,21 @@
-"""Blocks by hand, for tests that need particular outcomes and weights."""
+"""Blocks by hand, for tests that need particular outcomes and weights, and estimators fed with blocks."""
 
-from __future__ import annotations
+from collections.abc import Iterable
+from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 
 from harness.estimators.block import Block
 from harness.methods import Method
+from harness.strata import ShellDesign
+
+State = TypeVar("State")
+SHELLS = ShellDesign(
+    pool="0" * 24, strata=("careful", "careless", "outside"), p=np.array([1e-4, 3e-4, 2e-2]), moments=np.zeros((3, 3)),
+    n_paths=10**9, n_inside=2, boundary="careless", p_cut_in=0.03, p_impossible=0.0096,
+)  # fmt: skip
+"""Shells of a pool that is known exactly."""
 
 
 def block(
@@ -19,6 +29,7 @@ def block(
 ) -> Block:
     """Episodes with the given outcomes; those with a crash have a cut-in."""
     n = len(crash)
+    usual = {"log_q": np.zeros((n, 2)), "alpha": np.array([0.5, 0.5]), "n_control_steps": np.ones(n, dtype=np.int64)}
     return Block(
         first_episode=first_episode,
         method=method,
@@ -27,8 +38,22 @@ def block(
         cut_in=np.array(crash, dtype=bool),
         bv_lv_contact=np.zeros(n, dtype=bool),
         log_weight=np.array(log_weight if log_weight is not None else [0.0] * n, dtype=np.float64),
-        log_q=settings.pop("log_q", np.zeros((n, 2))),
-        alpha=settings.pop("alpha", np.array([0.5, 0.5])),
-        n_control_steps=settings.pop("n_control_steps", np.ones(n, dtype=np.int64)),
-        **settings,
+        **(usual | settings),
     )
+
+
+def in_shells(strata: list[int], crash: list[bool], failed: list[bool] | None = None, first: int = 0) -> Block:
+    """Tests drawn from `SHELLS`."""
+    n = len(strata)
+    design = {"component": np.array(strata, np.int64), "shells": SHELLS}
+    none = {"log_q": np.zeros((n, 0)), "alpha": np.zeros(0)}
+    log_weight = np.log(SHELLS.p)[strata]
+    some = block(crash, log_weight, failed=failed, method="shells", first_episode=first, **design, **none)
+    return replace(some, cut_in=np.ones(n, np.bool_))
+
+
+def fed(state: State, parts: Iterable[Block]) -> State:
+    """The estimator once it has been given all parts."""
+    for part in parts:
+        state.add(part)
+    return state

@@ -1,24 +1,19 @@
 """Failed tests: no crash in rate and lower limit, crashes in every upper limit, for every estimator."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from harness.estimators import ESTIMATORS, accumulator, one_pass
+from harness.estimators import one_pass
 from harness.estimators.block import Block
-from harness.estimators.both_ways import BothWays
 from harness.estimators.difference import difference_statement, paired_difference
-from harness.estimators.one_pass import _CLASSES
+from harness.estimators.one_pass import ACCUMULATORS
 from harness.studies.chains.named import overtaking
 from harness.studies.chains.sampler import blocks
-from harness.studies.required_tests import Procedure, plain_rhw, scv_rhw
-from harness.studies.run_required_tests import joined
+from harness.studies.required_tests import Procedure, joined, plain_rhw, scv_rhw
 from tests.chains.seed import SEED
-from tests.estimators.small_blocks import block
-from tests.estimators.test_shells import block as in_shells
+from tests.estimators.small_blocks import block, fed, in_shells
 
 CHAIN = overtaking("short", skill=0.5, surrogates=[0.5, 0.2, 0.8], level=0.02, horizon=5)
 METHOD = {"nde": "nde", "nade": "forced", "mixture_cv": "episode_mixture"}
@@ -48,19 +43,13 @@ def drawn(name: str) -> list[Block]:
     return list(blocks(CHAIN, METHOD.get(name, "step_mixture"), [size] * 4, SEED))
 
 
-def fed(name: str, parts: list[Block]):
-    state = _CLASSES[name]()
-    for part in parts:
-        state.add(part)
-    return state.result(0.9)
-
-
-@pytest.mark.parametrize("name", ESTIMATORS)
+@pytest.mark.parametrize("name", ACCUMULATORS)
 def test_lower_ends_without_upper_ends_with_the_failed_tests(name):
     parts = some_failed(drawn(name))
     found = one_pass(parts, (name,)).estimates[name]
-    seen = fed(name, [replace(part, failed=np.zeros_like(part.failed)) for part in parts])
-    worst = fed(name, [replace(part, crash=part.crash | part.failed, failed=part.failed & False) for part in parts])
+    as_safe = [replace(part, failed=np.zeros_like(part.failed)) for part in parts]
+    seen = fed(ACCUMULATORS[name](), as_safe).result(0.9)
+    worst = fed(ACCUMULATORS[name](), [part.failed_as_crashes() for part in parts]).result(0.9)
     assert (found.crash_rate, found.std_error, found.ci_low) == (seen.crash_rate, seen.std_error, seen.ci_low)
     assert (found.n_crashes, found.n_effective) == (seen.n_crashes, seen.n_effective)
     assert (found.ci_high, found.upper_bound) == (worst.ci_high, worst.upper_bound)
@@ -71,21 +60,12 @@ def test_lower_ends_without_upper_ends_with_the_failed_tests(name):
     assert any("episodes failed" in warning for warning in found.warnings)
 
 
-@pytest.mark.parametrize("name", ESTIMATORS)
+@pytest.mark.parametrize("name", ACCUMULATORS)
 def test_nothing_changes_where_nothing_fails(name):
     parts = drawn(name)
-    found, seen = one_pass(parts, (name,)).estimates[name], fed(name, parts)
+    found, seen = one_pass(parts, (name,)).estimates[name], fed(ACCUMULATORS[name](), parts).result(0.9)
     none = {"n_failed": 0, "crash_rate_if_failed_had_crashed": seen.crash_rate}
     assert found == replace(seen, details={**none, **seen.details})
-
-
-def test_the_second_state_begins_with_the_first_failure():
-    state = BothWays(accumulator("nade").seen)
-    state.add(block([True, False], weight_cap=1.0))
-    assert state._worst is None
-    state.add(block([False, False], failed=[True, False], first_episode=2, weight_cap=1.0))
-    assert state._worst is not None
-    assert state._worst.sums.n == state.seen.sums.n == 4
 
 
 def test_a_failed_test_has_the_weight_that_it_had():

@@ -1,6 +1,6 @@
 """Means of weights and ratios: right where they are known, never more than a diagnostic."""
 
-from __future__ import annotations
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,21 +10,14 @@ from harness.studies.chains.named import overtaking
 from harness.studies.chains.sampler import blocks
 from tests.chains.seed import SEED
 
-from .small_blocks import block
+from .small_blocks import block, fed
 
 CHAIN = overtaking("short", skill=0.5, surrogates=[0.5, 0.2], level=0.02, horizon=5)
 
 
-def feed(parts) -> Diagnostics:
-    state = Diagnostics()
-    for part in parts:
-        state.add(part)
-    return state
-
-
 def test_means_are_those_of_numpy():
     parts = list(blocks(CHAIN, "episode_mixture", [3_000, 2_000], SEED))
-    result = feed(parts).result(("forced", "one", "two"))
+    result = fed(Diagnostics(), parts).result(("forced", "one", "two"))
     weights = np.concatenate([part.weights() for part in parts])
     cut_in = np.concatenate([part.cut_in for part in parts])
     ratios = np.concatenate([part.mixture_ratios() for part in parts])
@@ -40,22 +33,20 @@ def test_means_are_those_of_numpy():
 
 
 def test_a_small_mean_weight_of_the_step_mixture_is_explained_not_failed():
-    careless = feed([block([False] * 10, [-5.0] * 10)]).result()
+    careless = fed(Diagnostics(), [block([False] * 10, [-5.0] * 10)]).result()
     assert "still missing" in careless["heavy_tail"]
     assert "never tests" in careless["note"]
-    assert "heavy_tail" not in feed([block([False] * 10)]).result()
-    assert "heavy_tail" not in feed([block([False] * 10, [-5.0] * 10, method="forced")]).result()
+    assert "heavy_tail" not in fed(Diagnostics(), [block([False] * 10)]).result()
+    assert "heavy_tail" not in fed(Diagnostics(), [block([False] * 10, [-5.0] * 10, method="forced")]).result()
 
 
 def test_contacts_are_weighted_and_failures_counted():
-    from dataclasses import replace
-
     base = block([False] * 4, [-1.0, 0.0, 0.0, 0.0], failed=[False, True, False, False])
-    result = feed([replace(base, bv_lv_contact=np.array([True, False, False, False]))]).result()
+    result = fed(Diagnostics(), [replace(base, bv_lv_contact=np.array([True, False, False, False]))]).result()
     assert result["bv_lv_contact_share"]["mean"] == pytest.approx(np.exp(-1.0) / 4)
     assert (result["n_failed"], result["n_bv_lv_contacts"]) == (1, 1)
 
 
 def test_weights_that_overflow_do_not_stop_the_estimate():
-    result = feed([block([False, False], [800.0, 0.0])]).result()
+    result = fed(Diagnostics(), [block([False, False], [800.0, 0.0])]).result()
     assert result["mean_weight"]["mean"] == np.inf

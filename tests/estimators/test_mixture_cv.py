@@ -1,7 +1,5 @@
 """Control variates against an ordinary least-squares solver with explicit columns."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -11,16 +9,9 @@ from harness.studies.chains.named import panel
 from harness.studies.chains.sampler import blocks, draw
 from tests.chains.seed import SEED
 
-from .small_blocks import block
+from .small_blocks import block, fed
 
 CHAIN = panel()[0]
-
-
-def feed(parts) -> MixtureCv:
-    state = MixtureCv()
-    for part in parts:
-        state.add(part)
-    return state
 
 
 def reference(parts) -> tuple[float, float]:
@@ -36,7 +27,7 @@ def reference(parts) -> tuple[float, float]:
 
 def test_is_the_intercept_of_least_squares():
     parts = list(blocks(CHAIN, "episode_mixture", [4_000, 1_000, 3_000], SEED))
-    estimate = feed(parts).result(0.9)
+    estimate = fed(MixtureCv(), parts).result(0.9)
     rate, std_error = reference(parts)
     assert estimate.crash_rate == pytest.approx(rate, rel=1e-11)
     assert estimate.std_error == pytest.approx(std_error, rel=1e-9)
@@ -46,7 +37,7 @@ def test_is_the_intercept_of_least_squares():
 
 def test_the_interval_is_as_skewed_as_the_residuals():
     parts = list(blocks(CHAIN, "episode_mixture", [400, 100], SEED))
-    estimate = feed(parts).result(0.9)
+    estimate = fed(MixtureCv(), parts).result(0.9)
     y = np.concatenate([part.weighted_crashes() for part in parts])
     h = np.concatenate([part.mixture_ratios() for part in parts]) - 1.0
     residuals = y - estimate.crash_rate - h @ estimate.details["beta"]
@@ -57,7 +48,7 @@ def test_the_interval_is_as_skewed_as_the_residuals():
 
 
 def test_control_that_never_acted_leaves_the_plain_mean():
-    state = feed([block([True, False, False, True], method="episode_mixture", weight_cap=1.0)])
+    state = fed(MixtureCv(), [block([True, False, False, True], method="episode_mixture", weight_cap=1.0)])
     estimate = state.result(0.9)
     assert estimate.crash_rate == pytest.approx(0.5, rel=1e-14)
     assert estimate.details["rank"] == 1
@@ -66,13 +57,13 @@ def test_control_that_never_acted_leaves_the_plain_mean():
 
 def test_fewer_tests_than_columns_claim_no_precision():
     one = draw(CHAIN, "episode_mixture", 1, np.random.default_rng(SEED))
-    assert feed([one]).result(0.9).std_error == np.inf
+    assert fed(MixtureCv(), [one]).result(0.9).std_error == np.inf
 
 
 def test_a_component_that_cannot_draw_an_episode_counts_minus_one():
     part = draw(CHAIN, "episode_mixture", 500, np.random.default_rng(SEED))
     assert np.all(part.mixture_ratios()[~part.cut_in, 0] == 0.0)
-    assert np.isfinite(feed([part]).result(0.9).crash_rate)
+    assert np.isfinite(fed(MixtureCv(), [part]).result(0.9).crash_rate)
 
 
 @pytest.mark.parametrize("method", ["nde", "forced", "step_mixture"])

@@ -1,7 +1,5 @@
 """Plain means: identities, failed episodes both ways, what is said when little is known."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -9,17 +7,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from harness.estimators.nade import Nade
-from harness.estimators.nde import Nde
+from harness.estimators.nade import Nade, Nde
 
-from .small_blocks import block
+from .small_blocks import block, fed
 
 
 def nade(*blocks) -> Nade:
-    state = Nade()
-    for each in blocks:
-        state.add(each)
-    return state
+    return fed(Nade(), blocks)
 
 
 outcomes = st.lists(st.booleans(), min_size=1, max_size=50)
@@ -32,10 +26,9 @@ def as_block(rows, **settings):
 
 @given(outcomes)
 def test_without_control_nade_is_the_share_of_crashes(crash):
-    plain = Nde()
-    plain.add(block(crash, method="nde", weight_cap=1.0))
-    weighted_mean = nade(block(crash, method="nde", weight_cap=1.0)).result(0.9)
-    assert weighted_mean.crash_rate == plain.result(0.9).crash_rate == np.mean(crash)
+    some = block(crash, method="nde", weight_cap=1.0)
+    plain = fed(Nde(), [some])
+    assert nade(some).result(0.9).crash_rate == plain.result(0.9).crash_rate == np.mean(crash)
 
 
 @given(weighted)
@@ -62,21 +55,17 @@ def test_the_cap_comes_from_the_design_then_from_the_paths_then_from_weights():
     paths = np.log([1e-3, 2e-3])
     known = nade(block([True, False], [-7.0, 0.0], method="forced", weight_cap=5e-3, log_p_cut_in=paths))
     driven = nade(block([True, False], [-7.0, 0.0], method="forced", log_p_cut_in=paths))
+    alpha = np.array([0.1, 0.9])
+    mixed = nade(block([True, False], [-7.0, 0.0], method="episode_mixture", alpha=alpha, log_p_cut_in=paths))
     seen = nade(block([True, False], [-7.0, 0.0], method="step_mixture"))
     assert known.sums.cap() == (5e-3, "the weight cap known by design")
     assert driven.sums.cap()[0] == pytest.approx(2e-3)
+    assert mixed.sums.cap()[0] == pytest.approx(2e-3 / 0.1)  # over the defensive share
     assert seen.sums.cap()[0] == pytest.approx(math.exp(-7.0))
     assert not any("upper bound rests" in w for w in known.result(0.9).warnings)
     for unknown in (driven, seen):
         assert any("upper bound rests" in w for w in unknown.result(0.9).warnings)
         assert unknown.sums.cap()[1] in unknown.result(0.9).method
-
-
-def test_the_episode_mixture_divides_the_paths_cap_by_the_defensive_share():
-    state = nade(
-        block([True], [-7.0], method="episode_mixture", alpha=np.array([0.1, 0.9]), log_p_cut_in=np.log([1e-3]))
-    )
-    assert state.sums.cap()[0] == pytest.approx(1e-2)
 
 
 def test_a_weight_above_the_designs_cap_is_an_alarm():

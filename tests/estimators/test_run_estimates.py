@@ -1,7 +1,5 @@
 """The whole way from a run folder to the content of ``estimates.json``."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 
@@ -22,24 +20,10 @@ from .small_blocks import block
 CHAIN = overtaking("two surrogates", skill=0.5, surrogates=[0.5, 0.2], level=0.02, horizon=6)
 SIZES = [600, 600, 300]
 KEYS = {
-    "campaign",
-    "campaign_hash",
-    "lane_change_level",
-    "confidence",
-    "n_episodes",
-    "n_crashes",
-    "headline",
-    "distance_per_test_km",
-    "crash_rate_per_1e6_km",
-    "estimates",
-    "diagnostics",
-    "convergence",
-    "statement",
-    "statements",
-    "conditional_statement",
-    "ending",
-    "scope",
-}
+    "campaign", "campaign_hash", "lane_change_level", "confidence", "n_episodes", "n_crashes", "headline",
+    "distance_per_test_km", "crash_rate_per_1e6_km", "estimates", "diagnostics", "convergence", "statement",
+    "statements", "conditional_statement", "ending", "scope",
+}  # fmt: skip
 
 
 def drawn(method: str):
@@ -80,34 +64,24 @@ def test_a_stored_run_gives_what_blocks_in_memory_give(tmp_path, method, headlin
     assert json.loads(json.dumps(content, allow_nan=False)) == memory
 
 
-def test_rates_per_distance_scale_with_the_distance_of_a_test(tmp_path):
-    content = estimate_run(write_run(tmp_path, drawn("forced"), distance_per_test_m=400.0))
-    rate = content["estimates"]["nade"]["crash_rate"]
-    assert content["distance_per_test_km"] == 0.4
-    assert content["crash_rate_per_1e6_km"]["rate"] == pytest.approx(rate / 0.4 * 1e6)
-    assert "per 1e6 km" in content["statement"]
-    assert "lane-change level 3" in content["statement"]
-    assert "not about how well the environment matches the road" in content["scope"]
-
-
-def test_each_estimator_has_its_sentence(tmp_path):
-    content = estimate_run(write_run(tmp_path, drawn("forced")))
-    assert set(content["statements"]) == set(content["estimates"])
-    assert content["statements"]["nade"] == content["statement"]
-    assert content["statements"]["nde"].startswith("No crash rate from these records: ")
-    assert content["estimates"]["nde"]["reason"].rstrip(".") in content["statements"]["nde"]
-
-
-def test_an_unknown_distance_says_nothing_per_kilometre(tmp_path):
-    content = estimate_run(write_run(tmp_path, drawn("forced")))
-    assert content["crash_rate_per_1e6_km"] is None
-    assert "km" not in content["statement"]
+def test_each_estimator_has_its_sentence_with_rates_per_distance_where_that_is_known():
+    unknown, known = (estimate_blocks(drawn("forced"), facts(distance_per_test_m=of)) for of in (None, 400.0))
+    assert unknown["crash_rate_per_1e6_km"] is None
+    assert "km" not in unknown["statement"]
+    assert known["distance_per_test_km"] == 0.4
+    assert known["crash_rate_per_1e6_km"]["rate"] == pytest.approx(known["estimates"]["nade"]["crash_rate"] / 0.4 * 1e6)
+    assert "per 1e6 km" in known["statement"]
+    assert "lane-change level 3" in known["statement"]
+    assert "not about how well the environment matches the road" in known["scope"]
+    assert set(known["statements"]) == set(known["estimates"])
+    assert known["statements"]["nade"] == known["statement"]
+    assert known["statements"]["nde"].startswith("No crash rate from these records: ")
+    assert known["estimates"]["nde"]["reason"].rstrip(".") in known["statements"]["nde"]
 
 
 def test_without_a_crash_the_statement_gives_the_upper_bound():
-    content = estimate_blocks(
-        [block([False] * 200, method="forced", weight_cap=1e-4)], facts(distance_per_test_m=400.0)
-    )
+    none = block([False] * 200, method="forced", weight_cap=1e-4)
+    content = estimate_blocks([none], facts(distance_per_test_m=400.0))
     upper = content["estimates"]["nade"]["upper_bound"]
     assert f"below {upper:.3g} per test" in content["statement"]
     assert f"{upper / 0.4 * 1e6:.3g} per 1e6 km" in content["statement"]
@@ -126,18 +100,16 @@ def test_failed_tests_are_named_in_the_answer_itself(method):
     assert "FAILED" not in none["statement"]
 
 
-def test_unbounded_weights_lead_the_sentence_and_claim_no_precision(tmp_path):
-    content = estimate_run(write_run(tmp_path, drawn("step_mixture")))
+def test_unbounded_weights_lead_the_sentence_and_claim_no_precision():
+    content = estimate_blocks(drawn("step_mixture"), facts())
     unbounded = "the weights of these tests are unbounded: the true rate may lie far above this interval"
     assert content["statement"].startswith(f"WARNING: {unbounded}. The crash rate is")
     assert content["statements"]["scv"].startswith("WARNING: this interval is known to be too narrow; use nade's")
     for name in ("nade", "scv"):
         assert "half-width" not in content["statements"][name]
         assert content["estimates"][name]["rhw"] is None
-        assert (
-            content["estimates"][name]["cautions"]
-            == content["estimates"][name]["warnings"][: 2 if name == "scv" else 1]
-        )
+        cautions = content["estimates"][name]["cautions"]
+        assert cautions == content["estimates"][name]["warnings"][: 2 if name == "scv" else 1]
     assert {point["rhw"] for point in content["convergence"]} == {None}
 
 
@@ -182,16 +154,15 @@ def test_only_the_prefix_that_counts_is_estimated(tmp_path):
     assert content["convergence"][-1]["n"] == 700
 
 
-def test_missing_episodes_are_an_error(tmp_path):
-    folder = write_run(tmp_path, drawn("forced"), n_episodes=5_000)
-    with pytest.raises(RunFolderError, match="1500 episodes on record"):
-        estimate_run(folder)
-
-
-def test_a_shard_missing_in_between_is_an_error(tmp_path):
+@pytest.mark.parametrize(
+    ("kept", "n_episodes", "text"),
+    [((0, 1, 2), 5_000, "1500 episodes on record"), ((0, 2), 900, "begins at episode 1200")],
+    ids=["too few episodes", "a shard missing in between"],
+)
+def test_missing_episodes_are_an_error(tmp_path, kept, n_episodes, text):
     parts = drawn("forced")
-    with pytest.raises(RunFolderError, match="begins at episode 1200"):
-        estimate_run(write_run(tmp_path, [parts[0], parts[2]]))
+    with pytest.raises(RunFolderError, match=text):
+        estimate_run(write_run(tmp_path, [parts[k] for k in kept], n_episodes=n_episodes))
 
 
 def test_a_folder_that_is_no_run_is_an_error(tmp_path):

@@ -9,7 +9,7 @@ import numpy as np
 
 from harness.compiled import compiled_threads
 from harness.environment.cut_in import acceptance, cut_in_hazard, opportunity
-from harness.environment.driving import free_driving_pmf
+from harness.environment.driving import acceleration_pmf, free_driving
 from harness.episode.after_cut_in import draw_from
 from harness.importance import functions, likelihood
 from harness.maneuvers import acceleration
@@ -32,7 +32,7 @@ class Proposals(NamedTuple):
 def _after(states, environment, importance, p, q, v, critical):
     for i in range(states.shape[0]):
         speed, r1, r1dot, r2, r2dot = states[i]
-        free_driving_pmf(speed, environment, p[i])
+        acceleration_pmf(free_driving(speed, environment), environment, p[i])
         state = State(speed, r1, r1dot, r2, r2dot)
         critical[i] = functions.propose_acceleration(state, p[i], importance, q[i], v[i])
 
@@ -57,12 +57,9 @@ def _draws(u, method, component, alpha, q, out):
 
 @compiled_threads
 def _accumulate(method, first, alpha, ratios, v, log_ratio, martingale, sampled):
-    weight = np.empty(alpha.size)
     log_sampled = 0.0
     for t in range(ratios.shape[0]):
-        sampled[t] = likelihood.accumulate(
-            method, first, alpha, ratios[t], v[t], log_sampled, log_ratio, martingale, weight
-        )
+        sampled[t] = likelihood.accumulate(method, first, alpha, ratios[t], v[t], log_sampled, log_ratio, martingale)
         log_sampled += np.log(sampled[t])
 
 

@@ -10,9 +10,9 @@ import pytest
 
 from harness.campaign.models import Campaign
 from harness.errors import RunFolderError
+from harness.pool.aimed_paths import NATURALISTIC_SHARE, fit_proposal
 from harness.pool.cut_ins import FAR_OFF
-from harness.pool.proposal import NATURALISTIC_SHARE, fit_proposal
-from harness.pool.shells import Draws, design_shells, shells_in_strata
+from harness.pool.shells import Draw, PrescribedEpisodes
 from harness.pool.storage import (
     cached_pool,
     campaign_pool,
@@ -161,20 +161,20 @@ def test_a_place_that_cannot_keep_a_pool_is_refused_before_it_is_built(campaign,
         campaign_pool(resolve(campaign))
 
 
-def test_draws_are_a_permutation_within_a_shell_and_follow_probabilities_outside(pool):
-    design = design_shells(pool, limit_mps2=2.0)
-    groups = shells_in_strata(pool, pool.boundary, 2.0)
-    draws = Draws(pool, groups, SEED)
-    assert draws.available[0] == (pool.cut_ins.shell == 0).sum()
-    first = draws.take(0, 0, int(draws.available[0]))
-    assert sorted(first) == np.flatnonzero(pool.cut_ins.shell == 0).tolist()
-    outside = draws.take(design.n_inside, 0, 500)
+def test_draws_are_a_permutation_within_a_shell_and_follow_probabilities_outside(campaign, pool):
+    prescribed = PrescribedEpisodes(campaign, pool)
+    within, outermost = np.flatnonzero(pool.cut_ins.shell == 0), prescribed.design.n_inside
+    assert prescribed.available[0] == within.size
+    rows, stratum = prescribed.rows((Draw(0, 0, within.size), Draw(outermost, 0, 500)))
+    assert sorted(rows[: within.size]) == within.tolist()
+    assert np.array_equal(np.unique(stratum), [0, outermost])
+    outside = rows[within.size :]
     assert len(set(outside.tolist())) == 500
-    share = (pool.cut_ins.shell[outside] == groups[-1][0]).mean()
-    p = pool.shell_p[groups[-1][0]] / pool.shell_p[groups[-1]].sum()
+    beyond = pool.shell_p[pool.boundary + 1 : -1]
+    share, p = (pool.cut_ins.shell[outside] == pool.boundary + 1).mean(), beyond[0] / beyond.sum()
     assert abs(share - p) < 4.0 * np.sqrt(p * (1.0 - p) / 500)  # misses with probability 6e-5
     with pytest.raises(IndexError):
-        draws.take(0, int(draws.available[0]), 1)
+        prescribed.rows((Draw(0, within.size, 1),))
 
 
 def test_weights_of_a_proposal_make_up_for_its_aim():

@@ -13,11 +13,10 @@ from harness.episode.loop import EpisodeLoop, Keep, Policy
 from harness.episode.trajectory import empty_trajectory
 from harness.importance.build import build_importance
 from harness.outcomes import CRASH
-from harness.pool.build import Enumerator
+from harness.pool.aimed_paths import Enumerator
 from harness.pool.enumeration import STRIDE, enumerate_cut_ins
 from harness.pool.library import load_library
-from harness.pool.prescribed import Draw, PrescribedEpisodes
-from harness.pool.shells import design_shells
+from harness.pool.shells import Draw, PrescribedEpisodes, design_shells
 from harness.progress import SilentProgress
 from harness.twin import TwinWorld
 from tests.chains.seed import SEED
@@ -92,8 +91,8 @@ def test_a_stride_asks_the_same_cut_ins_and_each_stands_for_as_many(environment)
 
 
 def test_blocks_use_every_offset_about_equally(environment):
-    blocks = Enumerator(environment, LIBRARY.drivers, NAMES.index(LIBRARY.envelope), 5).run(0, 2048, SilentProgress())
-    asked = np.concatenate([block.probability for block in blocks]) > 0.0
+    paths = Enumerator(environment, LIBRARY.drivers, NAMES.index(LIBRARY.envelope), 5).run(0, 2048, SilentProgress())
+    asked = paths.probability > 0.0
     offsets = [np.flatnonzero(row) % STRIDE for row in asked if row.any()]
     assert all(np.unique(found).size == 1 for found in offsets)
     counts = np.bincount([found[0] for found in offsets], minlength=STRIDE)
@@ -105,9 +104,8 @@ def test_the_number_of_cores_changes_no_bit(environment, monkeypatch):
     many = enumerator.run(0, 512, SilentProgress())
     monkeypatch.setattr("os.cpu_count", lambda: 1)
     one = enumerator.run(0, 512, SilentProgress())
-    for a, b in zip(many, one, strict=True):
-        assert np.array_equal(a.probability, b.probability)
-        assert np.array_equal(a.crashes, b.crashes)
+    assert np.array_equal(many.probability, one.probability)
+    assert np.array_equal(many.crashes, one.crashes)
 
 
 def test_strata_of_a_vehicle_that_may_accelerate_harder_include_what_the_envelope_survives(pool):

@@ -6,7 +6,7 @@ import numpy as np
 
 from harness.compiled import compiled_threads
 from harness.environment.cut_in import acceptance, cut_in_hazard, opportunity
-from harness.environment.driving import Environment, draw_car_following, draw_free_driving
+from harness.environment.driving import Environment, car_following, draw_acceleration, free_driving
 from harness.maneuvers import acceleration
 from harness.random_stream import BV_DRAWS, LV_DRAWS, uniform
 from harness.state import State
@@ -26,8 +26,9 @@ def _hazards(seed: int, states: np.ndarray, environment: Environment, out: np.nd
                 break
             draw, held = divmod(step, environment.numbers.hold_steps)
             if held == 0:
-                a_lv = acceleration(draw_free_driving(uniform(seed, i, LV_DRAWS, draw), v_lv, environment))
-                a_bv = acceleration(draw_car_following(uniform(seed, i, BV_DRAWS, draw), now, environment))
+                u_lv, u_bv = uniform(seed, i, LV_DRAWS, draw), uniform(seed, i, BV_DRAWS, draw)
+                a_lv = acceleration(draw_acceleration(u_lv, free_driving(v_lv, environment), environment))
+                a_bv = acceleration(draw_acceleration(u_bv, car_following(now, environment), environment))
             accepted = acceptance(now.r2_m, now.r2dot_mps, environment)
             out[i] += cut_in_hazard(opportunity(now, environment), accepted, environment)
             after_lv, after_bv = next_speed(v_lv, a_lv), next_speed(v_bv, a_bv)

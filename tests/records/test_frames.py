@@ -6,7 +6,7 @@ import pytest
 
 import harness
 from harness.errors import RunFolderError
-from harness.records.folder import write_json, write_shard
+from harness.records.folder import encoded, write_json, write_shard
 from harness.records.schemas import moments_schema, traces_schema
 
 
@@ -18,7 +18,7 @@ def folder(record, tmp_path):
         shards = []
         for index in range(2):
             tables = record(*overrides, first=40 * index, n=40).tables
-            files = write_shard(tmp_path, index, tables)
+            files = write_shard(tmp_path, index, encoded(tables))
             shards.append({"index": index, "first_episode": 40 * index, "n_episodes": 40, "files": files})
         write_json(tmp_path / "manifest.json", {"campaign_hash": "x", "n_episodes": 80, "shards": shards})
         return tmp_path

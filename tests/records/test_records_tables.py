@@ -9,7 +9,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from harness.records.folder import read_table, write_shard
+from harness.records.folder import encoded, read_table, write_shard
 from harness.records.schemas import OUTCOMES, episodes_schema, moments_schema, traces_schema
 
 METHODS = {"nde": (0, 0), "forced": (1, 0), "step_mixture": (3, 3), "episode_mixture": (4, 3)}
@@ -24,7 +24,7 @@ def mixture(record):
 @pytest.mark.parametrize("method", METHODS)
 def test_written_files_have_the_committed_schemas_with_units(method, record, tmp_path):
     recorded = record(f"testing.method={method}", "records.traces=all", n=40)
-    files = write_shard(tmp_path, 3, recorded.tables)
+    files = write_shard(tmp_path, 3, encoded(recorded.tables))
     n_importance, n_surrogates = METHODS[method]
     expected = {
         "episodes": episodes_schema(n_importance, n_surrogates),
@@ -158,7 +158,7 @@ def test_records_kept_change_nothing_else(mixture, record):
 
 
 def test_what_is_read_is_what_was_written(mixture, tmp_path):
-    files = write_shard(tmp_path, 0, mixture.tables)
+    files = write_shard(tmp_path, 0, encoded(mixture.tables))
     for name, table in mixture.tables._asdict().items():
         assert read_table(tmp_path / files[name]).equals(table)
     assert read_table(tmp_path / files["episodes"], ["log_weight"]).column_names == ["log_weight"]

@@ -8,19 +8,19 @@ import shutil
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from harness.report.estimate_table import run_notes
+from harness.report.shells_result import shells_result
 from synthetic_run import RECIPES
 from synthetic_shells import DESIGN, P
 from test_report_page import estimates_of, page_of
 
 from harness.errors import RunFolderError
-from harness.estimators.stratified import combined, pool_variance
+from harness.estimators.shells import combined, pool_variance
 from harness.records.schemas import OUTCOMES
 from harness.report import write_report
 from harness.report.answer_plot import answer_plot
-from harness.report.estimate_table import run_notes
 from harness.report.run_folder import read_run_folder
 from harness.report.shells_plot import POOL, shells_plot
-from harness.report.shells_result import shells_result
 from harness.report.summary import RunSummary, summarise
 
 SHELLS = [name for name, recipe in RECIPES.items() if recipe.method == "shells"]

@@ -68,7 +68,7 @@ def test_what_is_finished_is_not_run_again(done, campaigns, monkeypatch):
     def never(*_arguments, **_options):
         raise AssertionError("ran again")
 
-    monkeypatch.setattr("harness.runner.compare.run_resolved", never)
+    monkeypatch.setattr("harness.runner.compare.run_campaign", never)
     assert compare_campaigns(*campaigns, done.folder).content == done.content
 
 

@@ -10,7 +10,7 @@ import pytest
 from harness.campaign.loading import load_campaign
 from harness.errors import CampaignError
 from harness.records.folder import read_manifest
-from harness.runner import replay_episode
+from harness.runner.replay import replay_episode, suspects
 from tests.runner.stored_runs import copy_of
 
 FORCED = Path(__file__).parents[2] / "scenarios/overtaking_forced.yaml"
@@ -80,10 +80,8 @@ def test_a_replay_that_differs_names_what_it_knows(run_av):
     path.unlink()
     (folder / "manifest.json").write_text(json.dumps({**manifest, "repeated": None}))
     assert replay_episode(folder, 3).suspects is None
-    from harness.runner.replay import _suspects
-
     campaign = load_campaign(folder / "campaign.yaml")
-    assert "the vehicle does not do the same again" in _suspects(manifest, campaign)
-    assert "source file has been changed" in _suspects({**manifest, "controller_sha256": "0"}, campaign)
-    assert "the run was made with" in _suspects({**manifest, "cpu": "Z80"}, campaign).lower()
-    assert "CPU Z80 (here" in _suspects({**manifest, "cpu": "Z80"}, campaign)
+    assert "the vehicle does not do the same again" in suspects(manifest, campaign)
+    assert "source file has been changed" in suspects({**manifest, "controller_sha256": "0"}, campaign)
+    assert "the run was made with" in suspects({**manifest, "cpu": "Z80"}, campaign).lower()
+    assert "CPU Z80 (here" in suspects({**manifest, "cpu": "Z80"}, campaign)

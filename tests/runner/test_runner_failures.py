@@ -6,24 +6,25 @@ import errno
 import multiprocessing
 import os
 import pickle
-import signal
-from types import SimpleNamespace
+from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 
 from harness.cli import main
 from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, WorldDisagreementError
-from harness.resolved import resolve
-from harness.runner import campaign_run, processes, shards
+from harness.runner import campaign_run, shards, worker
 from harness.runner.shards import WorkerLostError
-from harness.runner.worker import OrphanError, ShardRunner, ShardSpec
+from harness.runner.worker import ShardSpec
 from tests.runner import bad_workers
 from tests.runner.conftest import MIXTURE_FILE, SMALL, TWIN
 from tests.runner.stored_runs import copy_of, manifest, shard_files, unlike_columns
 
+SHARDS_BEFORE_FAILURE = 3
+
 
 def test_a_shard_that_kills_every_worker_ends_the_run_and_is_named(run, campaign, tmp_path, monkeypatch):
-    monkeypatch.setattr(processes, "serve", bad_workers.dying)
+    monkeypatch.setattr(shards, "serve", bad_workers.dying)
     monkeypatch.setattr(shards, "ATTEMPTS", 2)
     with pytest.raises(
         WorkerLostError, match=r"shard 0 \(from episode 0\): found 2 worker processes that died"
@@ -36,7 +37,7 @@ def test_a_shard_that_kills_every_worker_ends_the_run_and_is_named(run, campaign
 
 
 def test_a_disagreement_in_a_worker_ends_the_run_and_all_workers(run, campaign, tmp_path, monkeypatch):
-    monkeypatch.setattr(processes, "serve", bad_workers.disobedient)
+    monkeypatch.setattr(shards, "serve", bad_workers.disobedient)
     with pytest.raises(WorldDisagreementError, match="SUMO, BV3, m"):
         run(campaign(*TWIN), tmp_path, workers=2)
     assert manifest(tmp_path)["status"] == "interrupted"
@@ -48,14 +49,22 @@ def test_a_full_disk_is_said_in_words_and_the_run_can_be_resumed(
 ):
     out = tmp_path / "run"
     options = [word for override in (*SMALL, *TWIN) for word in ("--set", override)]
+    write = Path.write_bytes
+
+    def write_or_fail(path: Path, content: bytes) -> int:
+        if path.parent.name == "moments" and len(shard_files(out)) == SHARDS_BEFORE_FAILURE:
+            write(path, b"PAR1, and then the disk was full")
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+        return write(path, content)
+
     with monkeypatch.context() as patch:
-        patch.setattr(processes, "serve", bad_workers.without_room)
+        patch.setattr(Path, "write_bytes", write_or_fail)
         assert main(["run", str(MIXTURE_FILE), "--out", str(out), "--workers", "1", *options]) == 2
     complaint = capsys.readouterr().err
     assert "no space left" in complaint
     assert "--resume" in complaint
-    assert len(shard_files(out)) == bad_workers.SHARDS_BEFORE_FAILURE
-    assert manifest(out)["n_episodes"] == 80 * bad_workers.SHARDS_BEFORE_FAILURE
+    assert len(shard_files(out)) == SHARDS_BEFORE_FAILURE
+    assert manifest(out)["n_episodes"] == 80 * SHARDS_BEFORE_FAILURE
     assert manifest(out)["status"] == "interrupted"
     assert not list(out.rglob("*.part"))
     run_here(campaign(*TWIN), out, resume=True)
@@ -100,105 +109,76 @@ class Pipe:
 
 @pytest.fixture
 def serve(campaign, tmp_path, monkeypatch):
-    """Serve some shards with a runner of one's own; returns what was sent back."""
-    before = signal.getsignal(signal.SIGINT)
+    """Serve shards with stand-ins for preparing and running one; returns what was noted."""
 
-    def served(runner: type, n_shards: int) -> list:
-        monkeypatch.setattr(processes, "ShardRunner", runner)
-        pipe = Pipe(n_shards)
-        processes.serve(pipe, campaign(), tmp_path, tmp_path / "black-box")
-        return pipe.sent
+    def served(pipe: Pipe, run: Callable[[ShardSpec], object], prepare: Callable[[], None] = lambda: None) -> list[str]:
+        events = []
 
-    yield served
-    signal.signal(signal.SIGINT, before)
+        class Runner:
+            def __init__(self, *_: object) -> None:
+                prepare()
+                events.append("prepared")
+
+            def run(self, spec: ShardSpec, doomed: dict) -> object:
+                return run(spec)
+
+            def close(self) -> None:
+                events.append("closed")
+
+        monkeypatch.setattr(worker, "ShardRunner", Runner)
+        worker.serve(pipe, campaign(), tmp_path / "black-box")
+        return events
+
+    return served
+
+
+def index_of(spec: ShardSpec) -> int:
+    return spec.index
 
 
 def test_a_worker_prepares_once_and_ends_with_its_parent(serve):
-    events = []
-
-    class Runner:
-        def __init__(self, *_: object) -> None:
-            events.append("prepared")
-
-        def run(self, spec: ShardSpec, doomed: dict) -> int:
-            return spec.index
-
-        def close(self) -> None:
-            events.append("closed")
-
-    assert serve(Runner, 3) == [0, 1, 2]
-    assert events == ["prepared", "closed"]
+    pipe = Pipe(3)
+    assert serve(pipe, index_of) == ["prepared", "closed"]
+    assert pipe.sent == [0, 1, 2]
 
 
-@pytest.mark.parametrize("lost", ["recv", "send"])
-def test_a_worker_ends_quietly_when_its_parent_was_killed(lost, campaign, tmp_path, monkeypatch):
+@pytest.mark.parametrize(("lost", "error"), [("recv", ConnectionResetError), ("send", BrokenPipeError)])
+def test_a_worker_ends_quietly_when_its_parent_was_killed(lost, error, serve, monkeypatch):
     def broken(*_: object) -> None:
-        raise BrokenPipeError if lost == "send" else ConnectionResetError
+        raise error
 
-    class Runner:
-        def __init__(self, *_: object) -> None: ...
-
-        def run(self, spec: ShardSpec, doomed: dict) -> int:
-            return spec.index
-
-        def close(self) -> None:
-            closed.append(True)
-
-    closed: list[bool] = []
     pipe = Pipe(2)
     monkeypatch.setattr(pipe, lost, broken)
-    monkeypatch.setattr(processes, "ShardRunner", Runner)
-    monkeypatch.setattr(signal, "signal", lambda *_: None)
-    processes.serve(pipe, campaign(), tmp_path, tmp_path / "black-box")
-    assert closed == ([True] if lost == "send" else [])
+    assert serve(pipe, index_of) == (["prepared", "closed"] if lost == "send" else [])
 
 
 def test_an_error_of_preparation_reaches_the_parent(serve):
-    class Runner:
-        def __init__(self, *_: object) -> None:
-            raise CampaignError("world.cells", found="300", expected="at most 256", mend="Use fewer.")
+    def prepare() -> None:
+        raise CampaignError("world.cells", found="300", expected="at most 256", mend="Use fewer.")
 
-    (error,) = serve(Runner, 1)
+    pipe = Pipe(1)
+    serve(pipe, index_of, prepare)
+    (error,) = pipe.sent
     assert isinstance(error, CampaignError)
     assert str(error) == "world.cells: found 300; expected at most 256. Use fewer."
 
 
 def test_a_defect_reaches_the_parent_with_the_workers_traceback(serve):
-    class Runner:
-        def __init__(self, *_: object) -> None: ...
-
-        def close(self) -> None: ...
-
-        def run(self, spec: ShardSpec, doomed: dict) -> float:
-            return 1 / 0
-
-    (error,) = serve(Runner, 1)
+    pipe = Pipe(1)
+    serve(pipe, lambda spec: 1 / spec.index)
+    (error,) = pipe.sent
     assert isinstance(error, ZeroDivisionError)
-    assert "return 1 / 0" in pickle.loads(pickle.dumps(error)).__notes__[0]
+    assert "lambda spec: 1 / spec.index" in pickle.loads(pickle.dumps(error)).__notes__[0]
 
 
 def test_an_error_that_cannot_be_pickled_reaches_the_parent_in_words(serve):
-    class Runner:
-        def __init__(self, *_: object) -> None: ...
+    def run(_: ShardSpec) -> None:
+        error = ValueError("of a strange kind")
+        error.handle = lambda: None
+        raise error
 
-        def close(self) -> None: ...
-
-        def run(self, spec: ShardSpec, doomed: dict) -> None:
-            error = ValueError("of a strange kind")
-            error.handle = lambda: None
-            raise error
-
-    (error,) = serve(Runner, 1)
+    pipe = Pipe(1)
+    serve(pipe, run)
+    (error,) = pipe.sent
     assert isinstance(error, RuntimeError)
     assert "ValueError: of a strange kind" in str(error)
-
-
-def test_a_worker_whose_parent_was_killed_writes_nothing(campaign, tmp_path, monkeypatch):
-    """Another process may be at work in the folder by then."""
-    gone = SimpleNamespace(is_alive=lambda: False)
-    runner = ShardRunner(resolve(campaign("world.engine=twin")), tmp_path)
-    monkeypatch.setattr("harness.runner.worker.parent_process", lambda: gone)
-    with pytest.raises(OrphanError):
-        runner.run(ShardSpec(0, 0, 20))
-    runner.close()
-    assert list(tmp_path.iterdir()) == []

@@ -7,6 +7,8 @@ import json
 import pytest
 
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, RunFolderError
+from harness.runner.manifest import Prefix
+from tests.runner.conftest import TWIN
 from tests.runner.stored_runs import copy_of, manifest, shard_files, stored_table, unlike_columns
 
 LOOSE, TIGHT = "stop.rhw=0.3", "stop.rhw=0.15"
@@ -89,3 +91,17 @@ def test_a_spent_budget_is_exit_code_4_and_can_be_enlarged(runs, run_here, campa
     result = run_here(campaign(*COMMON, LOOSE), out, resume=True)
     assert (result.exit_code, result.stopped_by) == (EXIT_DONE, "rhw")
     assert unlike_columns(runs["loose"].folder, out) == []
+
+
+def test_a_shard_is_written_when_all_before_it_are_in(campaign, run_here, tmp_path, monkeypatch):
+    """Whatever ends the run, the folder holds a prefix of its shards: here the worker is ahead by one."""
+    counted, on_disk, add = [], [], Prefix.add
+
+    def noted(prefix, done, files):
+        add(prefix, done, files)
+        counted.append(len(prefix.shards))
+        on_disk.append(len(shard_files(tmp_path / "run")))
+
+    monkeypatch.setattr(Prefix, "add", noted)
+    run_here(campaign(*TWIN), tmp_path / "run")
+    assert on_disk == counted == [1, 2, 3, 4, 5]

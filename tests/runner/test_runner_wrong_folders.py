@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -147,11 +148,12 @@ def test_a_folder_in_which_nothing_was_run_goes_again(tmp_path):
 # -- damaged records --
 
 
-@pytest.mark.parametrize("command", ["estimate", "report"])
-def test_a_truncated_shard(command, stored, capsys):
-    broken = shard_files(stored)[2]
-    truncate(broken)
-    assert str(broken) in complaint_of(capsys, command, stored)
+@pytest.mark.parametrize("damage", [truncate, Path.unlink])
+def test_a_truncated_or_missing_shard(damage, stored, capsys):
+    broken = shard_files(stored)[1]
+    damage(broken)
+    for command in (("estimate", stored), ("report", stored), ("replay", stored, 150)):
+        assert str(broken) in complaint_of(capsys, *command)
 
 
 @pytest.mark.parametrize("command", [["report"], ["replay", 150]])
@@ -182,13 +184,6 @@ def test_a_run_without_an_episode(stored, capsys):
         text = complaint_of(capsys, *command)
         assert "has not finished an episode yet" in text
         assert "--resume" in text
-
-
-def test_a_missing_shard(stored, capsys):
-    broken = shard_files(stored)[1]
-    broken.unlink()
-    assert str(broken) in complaint_of(capsys, "estimate", stored)
-    assert str(broken) in complaint_of(capsys, "replay", stored, 150)
 
 
 @pytest.mark.parametrize("table", ["episodes", "moments", "traces"])

@@ -13,11 +13,9 @@ import pytest
 from harness import estimate, replay
 from harness.errors import CampaignError, RunFolderError
 from harness.runner import compare_campaigns
-from harness.runner.allocation import GROWTH, Allocation
-from harness.runner.campaign_run import _episodes_on_disk
-from harness.runner.manifest import Manifest
-from harness.runner.prefix import Prefix
-from harness.runner.shell_planner import round_specs
+from harness.runner.campaign_run import episodes_on_disk
+from harness.runner.manifest import Manifest, Prefix
+from harness.runner.planner import GROWTH, Allocation, round_specs
 from harness.strata import ShellDesign
 from tests.pool.conftest import SMALL_POOL
 from tests.runner.stored_runs import copy_of, manifest, shard_files, stored_table, unlike_columns
@@ -147,10 +145,10 @@ def test_a_continuation_that_dies_leaves_a_manifest_that_is_true(campaign, run_h
 
     add = Prefix.add
 
-    def add_or_die(prefix, done):
-        if not done.stored:
+    def add_or_die(prefix, done, files):
+        if done.parquet:
             raise KeyboardInterrupt
-        return add(prefix, done)
+        add(prefix, done, files)
 
     with monkeypatch.context() as patch:
         patch.setattr(Prefix, "add", add_or_die)
@@ -168,7 +166,7 @@ def test_a_continuation_that_dies_leaves_a_manifest_that_is_true(campaign, run_h
 
 
 def test_the_bar_begins_where_the_run_was(shells_run):
-    assert _episodes_on_disk(shells_run.folder) == shells_run.estimates["n_episodes"]
+    assert episodes_on_disk(shells_run.folder) == shells_run.estimates["n_episodes"]
 
 
 def test_the_conditional_statement_alone_stays_inside(campaign, run_here, tmp_path):
@@ -241,40 +239,40 @@ DESIGN = ShellDesign(
     pool="0" * 24, strata=("a", "b", "outside"), p=np.array([1e-7, 2e-7, 3e-5]), moments=np.zeros((3, 3)),
     n_paths=10**9, n_inside=2, boundary="b", p_cut_in=4e-5, p_impossible=0.0,
 )  # fmt: skip
-MANY = np.full(3, 10_000)
+MANY, NONE = np.full(3, 10_000), np.zeros(3, int)
 
 
 def test_what_lies_inside_is_tested_first():
     rule = Allocation(DESIGN, 12, MANY, conditional_only=False)
-    assert rule.next_round(np.zeros(3, int), np.zeros(3, int), 10**6).tolist() == [12, 12, 0]
-    assert rule.next_round(np.array([12, 12, 0]), np.array([6, 0, 0]), 10**6)[2] == 0
-    assert rule.next_round(np.array([400, 400, 0]), np.array([200, 0, 0]), 10**6).tolist() == [0, 0, 12]
-    hopeless = rule.next_round(np.array([48, 48, 0]), np.zeros(3, int), 10**6)
+    assert rule.next_round(NONE, NONE, NONE, 10**6).tolist() == [12, 12, 0]
+    assert rule.next_round(np.array([12, 12, 0]), np.array([6, 0, 0]), NONE, 10**6)[2] == 0
+    assert rule.next_round(np.array([400, 400, 0]), np.array([200, 0, 0]), NONE, 10**6).tolist() == [0, 0, 12]
+    hopeless = rule.next_round(np.array([48, 48, 0]), NONE, NONE, 10**6)
     assert hopeless.tolist() == [0, 0, 12]
 
 
 def test_rounds_grow_to_where_the_interval_is_widest():
     rule = Allocation(DESIGN, 12, MANY, conditional_only=False)
     tests = np.array([400, 400, 800])
-    added = rule.next_round(tests, np.array([200, 10, 0]), 10**6)
+    added = rule.next_round(tests, np.array([200, 10, 0]), NONE, 10**6)
     assert added.sum() == np.ceil((GROWTH - 1.0) * tests.sum())
     assert added[2] > 0.9 * added.sum()
-    assert rule.next_round(tests, np.array([200, 10, 0]), 7).sum() == 7
-    assert rule.next_round(tests, np.array([200, 10, 0]), 0).sum() == 0
+    assert rule.next_round(tests, np.array([200, 10, 0]), NONE, 7).sum() == 7
+    assert rule.next_round(tests, np.array([200, 10, 0]), NONE, 0).sum() == 0
     full = Allocation(DESIGN, 12, tests, conditional_only=False)
-    assert full.next_round(tests, np.array([200, 10, 0]), 100).sum() == 0
+    assert full.next_round(tests, np.array([200, 10, 0]), NONE, 100).sum() == 0
 
 
 def test_failed_tests_draw_further_tests_to_their_shell():
     rule = Allocation(DESIGN, 12, MANY, conditional_only=True)
     tests, crashes = np.array([400, 400, 0]), np.array([200, 0, 0])
-    without = rule.next_round(tests, crashes, 10**6)
-    with_failed = rule.next_round(tests, crashes, 10**6, np.array([0, 40, 0]))
+    without = rule.next_round(tests, crashes, NONE, 10**6)
+    with_failed = rule.next_round(tests, crashes, np.array([0, 40, 0]), 10**6)
     assert with_failed[1] > without[1]
     undecided = Allocation(DESIGN, 12, MANY, conditional_only=False)
     few, all_of_a = np.array([40, 40, 0]), np.array([40, 0, 0])
-    assert undecided.next_round(few, all_of_a, 10**6)[2] == 12
-    assert undecided.next_round(few, all_of_a, 10**6, np.array([0, 20, 0]))[2] == 0
+    assert undecided.next_round(few, all_of_a, NONE, 10**6)[2] == 12
+    assert undecided.next_round(few, all_of_a, np.array([0, 20, 0]), 10**6)[2] == 0
 
 
 def test_first_tests_that_are_enough_are_what_decided(campaign, run_here, tmp_path):

@@ -2,7 +2,6 @@
 
 import copy
 import json
-import shutil
 
 import pytest
 
@@ -11,22 +10,16 @@ from harness.errors import RunFolderError
 from harness.records.folder import read_manifest, require_schema
 from harness.records.stored_manifest import StoredShells, StoredStops
 from harness.report.run_folder import read_run_folder
+from tests.runner.stored_runs import copy_of
 
 WRONG = [True, -1, 0.5, 10**400, "text", "\0", [1], {"x": 1}, [None], float("nan")]
 UNREAD = {"format", "n_equal"}
 """Keys that no reader looks at."""
 
 
-@pytest.fixture(scope="module")
-def twin_folder(campaign, run, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("stored") / "run"
-    run(campaign("world.engine=twin", "stop.episodes=400"), folder, workers=1)
-    return folder
-
-
 @pytest.fixture
-def stored(twin_folder, tmp_path):
-    return shutil.copytree(twin_folder, tmp_path / "run")
+def stored(twin_run, tmp_path):
+    return copy_of(twin_run, tmp_path / "run")
 
 
 def places(content, path=()):

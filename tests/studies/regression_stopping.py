@@ -10,9 +10,9 @@ from __future__ import annotations
 import numpy as np
 
 from harness.studies.chains.chain import Chain
-from harness.studies.chains.outcomes import joint_outcomes
 from harness.studies.chains.sampler import approach_paths
-from harness.studies.rows import Row
+from harness.studies.chains.shells import joint_outcomes
+from harness.studies.judgement import Row
 
 Z = 1.6449
 FIRST_LOOK, GROWTH, LAST_LOOK = 40, 1.25, 20_000
@@ -26,7 +26,6 @@ class RegressionStopping:
         self._chain, self._seed = chain, seed
         joint = joint_outcomes(chain)
         self._cumulative = np.cumsum(joint.reshape(chain.horizon, len(chain.start), -1), axis=2)
-        self._mu = np.array([chain.surrogate_rate(j) for j in range(chain.n_surrogates)])
 
     def draw(self, n: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         """Y (n,) and W·f_k − μ_k (n, J)."""
@@ -40,7 +39,7 @@ class RegressionStopping:
         which = (self._cumulative[t, path[np.arange(n), t]] <= rng.random(n)[:, None]).sum(axis=1)
         which = np.minimum(which, self._cumulative.shape[2] - 1)
         bits = (which[:, None] // 2 >> np.arange(chain.n_surrogates)) & 1
-        return weight * (which % 2), weight[:, None] * bits - self._mu
+        return weight * (which % 2), weight[:, None] * bits - chain.surrogate_rates
 
     def run(self, replications: range) -> list[Row]:
         return [self._one(r) for r in replications]

@@ -41,6 +41,7 @@ def test_shipped_experiments_are_right(file):
         ("chains: [rare]\nestimators: [scv]\n" + SHELLS, "estimators", "scv"),
         ("chains: [rare]\nfault: {factor: 2.0}\ncampaign: {testing: {method: forced}}\n", "fault", "forced"),
         ("chains: [rare]\ncampaign: {world: {engine: sumo}}\n", "campaign.world.engine", "sumo"),
+        ("chains: [rare]\ncampaign: {world: twin}\n", "campaign.world", "twin"),
         ("chains: [rare]\ncampaign: {pool: {library: ./none.yaml}}\n", "campaign.pool.library", "no file"),
     ],
 )

@@ -5,14 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from harness.studies.judgement import Subject, corrected, holm, judge
-from harness.studies.rows import Row, Rows
+from harness.studies.judgement import Row, Subject, corrected, holm, judge
 
 
-def rows(rates, half: float, tests: int = 100, outside: int = 0) -> Rows:
-    return Rows.of(
-        [Row("x", k, tests, 5, r, half / 1.6449, r - half, r + half, False, outside) for k, r in enumerate(rates)]
-    )
+def rows(rates, half: float, tests: int = 100, outside: int = 0) -> list[Row]:
+    return [Row("x", k, tests, 5, r, half / 1.6449, r - half, r + half, False, outside) for k, r in enumerate(rates)]
 
 
 def test_holm_as_in_a_worked_example():
@@ -55,7 +52,7 @@ def test_a_conditional_statement_is_not_judged_where_it_does_not_hold():
 
 
 def test_the_number_of_tests_is_described_by_its_quantiles():
-    of = Rows.of([Row("x", k, k, 1, 1.0, 0.1, 0.9, 1.1, True) for k in range(1, 102)])
+    of = [Row("x", k, k, 1, 1.0, 0.1, 0.9, 1.1, True) for k in range(1, 102)]
     found = judge(Subject("a", 1.0), "x", of, 0.9)
     assert (found.tests_5, found.tests_median, found.tests_95) == (6.0, 51.0, 96.0)
     assert found.tests_for_wanted_rhw is None

@@ -15,8 +15,7 @@ from harness.campaign.models import Campaign
 from harness.studies.chains.named import CHAINS, frequent_decisive, rare_decisive, replayed
 from harness.studies.chains.shells import ChainShells
 from harness.studies.experiment import Experiment, Fault, load_experiment
-from harness.studies.judgement import Judgement, Subject, corrected, judge
-from harness.studies.rows import Row, Rows
+from harness.studies.judgement import Judgement, Row, Subject, corrected, judge
 from harness.studies.run import validate
 from harness.studies.shell_campaign import CONDITIONAL, FREE, ShellCampaign
 from harness.studies.weighted_campaign import ChainEpisodes, WeightedCampaign
@@ -37,19 +36,18 @@ def campaign(method: str, episodes: int) -> Campaign:
 def judged(runs: dict[str, list[Row]], result: str) -> list[Judgement]:
     found = []
     for name, rows in runs.items():
-        of_result = Rows.of([row for row in rows if row.result == result])
+        of_result = [row for row in rows if row.result == result]
         found.append(judge(Subject(name, CHAINS[name].crash_rate), result, of_result, CONFIDENCE))
     return corrected(found)
 
 
 def shells(chain, replications: int, episodes: int, fault: Fault | None = None) -> list[Row]:
-    repeated = ShellCampaign(campaign("shells", episodes), ChainShells(chain, 2048), 5, fault)
-    return [row for r in range(replications) for row in repeated.run(r)]
+    return ShellCampaign(campaign("shells", episodes), ChainShells(chain, 2048), 5, fault).run(range(replications))
 
 
 def weighted(chain, method: str, replications: int, episodes: int, *estimators: str) -> list[Row]:
     subject = campaign(method, episodes)
-    return WeightedCampaign(subject, ChainEpisodes(chain, subject, 7), estimators).run(range(replications))
+    return WeightedCampaign(subject, ChainEpisodes(chain, method, 7), estimators).run(range(replications))
 
 
 def test_shells_cover_and_are_unbiased():

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from harness.studies.chains.named import replayed
-from harness.studies.chains.outcomes import joint_outcomes
-from harness.studies.chains.shells import ChainShells
+from harness.studies.chains.shells import ChainShells, joint_outcomes
 
 
 @pytest.fixture(params=replayed(), ids=lambda c: c.name)
@@ -18,7 +17,7 @@ def chain(request):
 
 
 def given_a_cut_in(chain, response):
-    _, after = chain._values(response)
+    _, after = chain.values(response)
     return np.stack([chain.entry @ after[t + 1] for t in range(chain.horizon)])
 
 

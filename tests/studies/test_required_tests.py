@@ -17,14 +17,14 @@ from harness.studies.chains.sampler import blocks
 from harness.studies.required_tests import (
     Procedure,
     RequiredTests,
-    _order,
-    _rows,
     acceleration,
+    joined,
     plain_rhw,
     required_tests,
+    rows_of,
     scv_rhw,
+    shuffled,
 )
-from harness.studies.run_required_tests import joined
 from tests.chains.seed import SEED
 
 CHAIN = overtaking("two surrogates", skill=0.5, surrogates=[0.5, 0.2], level=0.02, horizon=6)
@@ -133,18 +133,18 @@ def test_the_width_on_a_prefix_is_that_of_its_mean_and_sample_variance():
     grid = procedure.grid(800)
     rhw = plain_rhw(tests.weighted_crashes()[tests.crash], 800, procedure)
     for shuffle in range(procedure.n_shuffles):
-        y = tests.weighted_crashes()[_order(procedure.seed, shuffle, tests.crash)]
+        y = tests.weighted_crashes()[shuffled(procedure.seed, shuffle, tests.crash)]
         for at, n in enumerate(grid):
             mean, error = np.mean(y[:n]), np.std(y[:n], ddof=1) / np.sqrt(n)
             expected = procedure.z() * error / mean if mean else np.inf
             assert rhw[shuffle, at] == pytest.approx(expected, rel=1e-9)
-        assert sorted(_order(procedure.seed, shuffle, tests.crash)) == list(range(800))
+        assert sorted(shuffled(procedure.seed, shuffle, tests.crash)) == list(range(800))
 
 
 def test_places_of_crashes_are_uniform():
     """Each of 5 tests, 2 crashed, must come first in a fifth of 5,000 shuffles: within 5 standard deviations (1e-5)."""
     crash = np.array([True, False, False, True, False])
-    first = np.bincount([_order(1, shuffle, crash)[0] for shuffle in range(5_000)], minlength=5)
+    first = np.bincount([shuffled(1, shuffle, crash)[0] for shuffle in range(5_000)], minlength=5)
     assert np.abs(first - 1_000).max() < 5 * np.sqrt(5_000 * 0.2 * 0.8)
 
 
@@ -174,10 +174,10 @@ def test_algorithm_1_grown_look_by_look_is_algorithm_1_on_each_prefix():
     procedure = replace(QUICK, ratio=3.0, n_shuffles=2)
     grown = scv_rhw(tests, procedure)
     for shuffle in range(2):
-        order = _order(procedure.seed, shuffle, tests.crash)
+        order = shuffled(procedure.seed, shuffle, tests.crash)
         for at, n in enumerate(procedure.grid(3_000)):
             anew = Scv()
-            anew.add(_rows(tests, order[:n]))
+            anew.add(rows_of(tests, order[:n]))
             assert grown[shuffle, at] == anew.result(procedure.confidence).rhw
 
 

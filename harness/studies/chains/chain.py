@@ -17,22 +17,16 @@ class Chain:
 
     Attributes
     ----------
-    start : (G,)
-        Distribution of the first state.
-    approach : (G, G)
-        Transition when staying.
-    hazard : (G,)
-        p(cut_in | state).
-    entry : (G, D + 2)
-        State after a cut-in.
+    start, approach : (G,), (G, G)
+        Distribution of the first state; transition when staying.
+    hazard, entry : (G,), (G, D + 2)
+        p(cut_in | state); state after a cut-in.
     exposure : (D, A)
         p(a | state) after the cut-in.
-    response : (D, A, D + 2)
-        What the vehicle under test does.
-    surrogate_responses : (J, D, A, D + 2)
-        What its stand-ins do.
+    response, surrogate_responses : (D, A, D + 2), (J, D, A, D + 2)
+        What the vehicle under test does, and what its stand-ins do.
     noise : {"own", "shared", "opposite"}
-        How the noise of a surrogate that is replayed goes with that of the vehicle, see `outcomes`.
+        How the noise of a surrogate that is replayed goes with that of the vehicle, see `joint_outcomes`.
     """
 
     name: str
@@ -59,18 +53,14 @@ class Chain:
         return int(self.entry.shape[1]) - 1
 
     @cached_property
-    def true_value(self) -> tuple[FloatArray, FloatArray]:
-        """Crash probability by time and state, before and after the cut-in."""
-        return self._values(self.response)
-
-    @cached_property
     def crash_rate(self) -> float:
         """μ, by backward induction."""
-        return float(self.start @ self.true_value[0][0])
+        return float(self.start @ self.values(self.response)[0][0])
 
-    def surrogate_rate(self, j: int) -> float:
-        """Crash rate that surrogate j would have as the vehicle under test."""
-        return float(self.start @ self._values(self.surrogate_responses[j])[0][0])
+    @cached_property
+    def surrogate_rates(self) -> FloatArray:
+        """Crash rates that the surrogates would have as vehicles under test, shape (J,)."""
+        return np.array([self.start @ self.values(response)[0][0] for response in self.surrogate_responses])
 
     @cached_property
     def cut_in_rate(self) -> float:
@@ -100,7 +90,7 @@ class Chain:
             before = staying + cutting
         return float(self.start @ before) - self.crash_rate**2
 
-    def _values(self, response: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def values(self, response: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Crash probability by time and state: before (T + 1, G) and after the cut-in (T + 1, D + 2)."""
         before = np.zeros((self.horizon + 1, len(self.start)))
         after = np.zeros((self.horizon + 1, self.crashed + 1))
@@ -114,36 +104,32 @@ class Chain:
     @cached_property
     def proposals(self) -> Proposals:
         """q_j at every time and state."""
-        shape_before = (self.n_surrogates, self.horizon, len(self.start))
-        cut = np.empty(shape_before)
-        maneuver = np.empty((self.n_surrogates, self.horizon, *self.exposure.shape))
-        value_before, value_after = np.zeros(shape_before), np.zeros((*shape_before[:2], len(self.exposure)))
-        critical_before = np.zeros(shape_before[1:], dtype=bool)
-        critical_after = np.zeros((self.horizon, len(self.exposure)), dtype=bool)
+        shape = self.n_surrogates, self.horizon
+        cut, maneuver = np.empty((*shape, len(self.start))), np.empty((*shape, *self.exposure.shape))
+        critical_before = np.zeros(cut.shape[1:], dtype=bool)
+        critical_after = np.zeros(maneuver.shape[1:3], dtype=bool)
+        p = np.stack([1.0 - self.hazard, self.hazard], axis=1)
         for j, response in enumerate(self.surrogate_responses):
-            before, after = self._values(response)
+            before, after = self.values(response)
             for t in range(self.horizon):
                 stay = self.approach @ before[t + 1] * (self.challenge == "recursive")
                 challenge = np.stack([stay, self.entry @ after[t + 1]], axis=1)
-                p = np.stack([1.0 - self.hazard, self.hazard], axis=1)
                 q, v = importance_function(p, challenge, self.epsilon)
-                cut[j, t], critical_before[t], value_before[j, t] = q[:, 1], critical_before[t] | (v > 0.0), v
+                cut[j, t] = q[:, 1]
+                critical_before[t] |= v > 0.0
                 maneuver[j, t], v = importance_function(self.exposure, response @ after[t + 1], self.epsilon)
                 critical_after[t] |= v > 0.0
-                value_after[j, t] = v
-        return Proposals(cut, maneuver, critical_before, critical_after, value_before, value_after)
+        return Proposals(cut, maneuver, critical_before, critical_after)
 
 
 @dataclass(frozen=True, eq=False)
 class Proposals:
-    """q_j(cut_in | t, state) of shape (J, T, G), q_j(a | t, state) of shape (J, T, D, A), where they act, and V_j."""
+    """q_j(cut_in | t, state) of shape (J, T, G), q_j(a | t, state) of shape (J, T, D, A), and where they act."""
 
     cut: FloatArray
     maneuver: FloatArray
     critical_before: BoolArray
     critical_after: BoolArray
-    value_before: FloatArray
-    value_after: FloatArray
 
 
 def importance_function(p: FloatArray, challenge: FloatArray, epsilon: float) -> tuple[FloatArray, FloatArray]:

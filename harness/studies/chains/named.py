@@ -12,6 +12,7 @@ from harness.studies.chains.chain import Chain
 N_APPROACH = 6
 N_DANGER = 4
 P_BRAKE = 0.05
+NOISE = 0.02
 
 
 def overtaking(
@@ -25,79 +26,72 @@ def overtaking(
         name=name,
         horizon=horizon,
         start=np.array([0.0, 0.0, 0.0, 0.2, 0.3, 0.5]),
-        approach=_approach(),
+        approach=_approach(closer=0.5, wait=0.35, back=0.15),
         hazard=level * np.array([0.0, 1.0, 0.9, 0.7, 0.4, 0.2]),
         entry=_entry(),
         exposure=np.tile([1.0 - P_BRAKE, P_BRAKE], (N_DANGER, 1)),
-        response=response(skill),
-        surrogate_responses=np.stack([response(s) for s in surrogates]),
+        response=_skilled(skill),
+        surrogate_responses=np.stack([_skilled(s) for s in surrogates]),
         **settings,
     )
 
 
-def _approach() -> FloatArray:
+def decisive(name: str, *, skill: float, surrogates: list[float], level: float, horizon: int, brake: float) -> Chain:
+    """Chain in which maneuvers decide nearly everything: little noise, hard braking after a certain approach."""
+    return Chain(
+        name=name,
+        horizon=horizon,
+        start=np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0]),
+        approach=_approach(closer=0.9, wait=0.1, back=0.0),
+        hazard=level * np.array([0.0, 1.0, 1.0, 1.0, 1.0, 1.0]),
+        entry=_entry(),
+        exposure=np.tile([1.0 - brake, brake], (N_DANGER, 1)),
+        response=_decisive(skill),
+        surrogate_responses=np.stack([_decisive(s) for s in surrogates]),
+    )
+
+
+def _approach(closer: float, wait: float, back: float) -> FloatArray:
     """State 0 is passed; the others come closer, wait, or fall back."""
     table = np.zeros((N_APPROACH, N_APPROACH))
     table[0, 0] = 1.0
     for g in range(1, N_APPROACH):
-        table[g, g - 1] += 0.5
-        table[g, g] += 0.35
-        table[g, min(g + 1, N_APPROACH - 1)] += 0.15
+        table[g, g - 1] += closer
+        table[g, g] += wait
+        table[g, min(g + 1, N_APPROACH - 1)] += back
     return table
 
 
 def _entry() -> FloatArray:
     """The closer the cut-in, the more danger; cutting in at the largest distance is safe."""
     table = np.zeros((N_APPROACH, N_DANGER + 2))
-    table[0, N_DANGER] = 1.0
-    table[1, [3, 2]] = 0.6, 0.4
-    table[2, [2, 1]] = 0.6, 0.4
-    table[3, [1, 0]] = 0.6, 0.4
+    table[[0, 5], N_DANGER] = 1.0
     table[4, 0] = 1.0
-    table[5, N_DANGER] = 1.0
+    for g, states in ((1, [3, 2]), (2, [2, 1]), (3, [1, 0])):
+        table[g, states] = 0.6, 0.4
     return table
 
 
-def response(skill: float) -> FloatArray:
-    """Danger goes down with skill, up without it, faster while the BV brakes (maneuver 1)."""
+def _skilled(skill: float) -> FloatArray:
+    """Danger goes down with skill, up without it, faster while the BV brakes."""
+    moves = (skill, (1.0 - skill) * 0.2), (skill * 0.4, (1.0 - skill) * 0.8)
+    return _response(*((down, 1.0 - down - up, up) for down, up in moves))
+
+
+def _decisive(skill: float) -> FloatArray:
+    """Little noise: danger falls by skill while the BV keeps on, and rises while it brakes."""
+    down = skill * (1.0 - NOISE)
+    return _response((down, 1.0 - down, 0.0), (0.0, NOISE, 1.0 - NOISE))
+
+
+def _response(*moves: tuple[float, float, float]) -> FloatArray:
+    """Probabilities that danger falls, stays or rises, while the BV keeps on (maneuver 0) and while it brakes (1)."""
     table = np.zeros((N_DANGER, 2, N_DANGER + 2))
+    ladder = [N_DANGER, *range(N_DANGER), N_DANGER + 1]  # safe, danger from low to high, crashed
     for d in range(N_DANGER):
-        for braking, (escape, worsen) in enumerate(((1.0, 0.2), (0.4, 0.8))):
-            down, up = skill * escape, (1.0 - skill) * worsen
-            table[d, braking, d - 1 if d > 0 else N_DANGER] += down
-            table[d, braking, d + 1 if d < N_DANGER - 1 else N_DANGER + 1] += up
-            table[d, braking, d] += 1.0 - down - up
+        for maneuver, probabilities in enumerate(moves):
+            table[d, maneuver, ladder[d : d + 3]] = probabilities
     return table
-
-
-def decisive_response(skill: float, noise: float) -> FloatArray:
-    """A vehicle with little noise: danger falls by skill while the BV keeps on, and rises while it brakes."""
-    table = np.zeros((N_DANGER, 2, N_DANGER + 2))
-    for d in range(N_DANGER):
-        table[d, 0, d - 1 if d > 0 else N_DANGER] += skill * (1.0 - noise)
-        table[d, 0, d] += 1.0 - skill * (1.0 - noise)
-        table[d, 1, d + 1 if d < N_DANGER - 1 else N_DANGER + 1] += 1.0 - noise
-        table[d, 1, d] += noise
-    return table
-
-
-def decisive(name: str, *, skill: float, surrogates: list[float], level: float, horizon: int, brake: float) -> Chain:
-    """Chain in which maneuvers decide nearly everything: little noise, hard braking after a certain approach."""
-    approach = np.zeros((N_APPROACH, N_APPROACH))
-    approach[0, 0] = 1.0
-    for g in range(1, N_APPROACH):
-        approach[g, g - 1], approach[g, g] = 0.9, 0.1
-    return Chain(
-        name=name,
-        horizon=horizon,
-        start=np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0]),
-        approach=approach,
-        hazard=level * np.array([0.0, 1.0, 1.0, 1.0, 1.0, 1.0]),
-        entry=_entry(),
-        exposure=np.tile([1.0 - brake, brake], (N_DANGER, 1)),
-        response=decisive_response(skill, 0.02),
-        surrogate_responses=np.stack([decisive_response(s, 0.02) for s in surrogates]),
-    )
 
 
 def panel() -> list[Chain]:

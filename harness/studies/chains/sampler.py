@@ -66,14 +66,12 @@ def _choose(p: FloatArray, rng: np.random.Generator) -> IntArray:
 
 class _Sampler:
     def __init__(self, chain: Chain, method: Method, n: int, rng: np.random.Generator, forget_cut_in: bool) -> None:
-        self.chain, self.method, self.n, self.rng = chain, method, n, rng
-        self.forget_cut_in = forget_cut_in
+        self.chain, self.method, self.n, self.rng, self.forget_cut_in = chain, method, n, rng, forget_cut_in
         self.alpha = mixture_weights(chain, method)
         self.path = approach_paths(chain, n, rng)
-        survival = np.log1p(-chain.hazard[self.path])
-        log_none = np.cumsum(survival[:, ::-1], axis=1)[:, ::-1]
-        self.p_cut_later = -np.expm1(log_none)
-        self.component = rng.choice(len(self.alpha), size=n, p=self.alpha) if len(self.alpha) else None
+        stay = np.log1p(-chain.hazard[self.path])
+        self.p_cut_later = -np.expm1(np.cumsum(stay[:, ::-1], axis=1)[:, ::-1])
+        self.component = rng.choice(len(self.alpha), size=n, p=self.alpha) if len(self.alpha) else np.empty(0, np.int64)
         self.log_p_cut = np.log(np.maximum(self.p_cut_later[:, 0], np.finfo(float).tiny))
         self.log_ratio = np.zeros((n, chain.n_surrogates))
         self.log_step = np.zeros(n)
@@ -82,29 +80,25 @@ class _Sampler:
         self.after = np.full(n, -1)
         self.cut_in = np.zeros(n, dtype=bool)
 
-    def _choose(self, p: FloatArray) -> IntArray:
-        return _choose(p, self.rng)
-
     def run(self, first_episode: int) -> Block:
         for t in range(self.chain.horizon):
-            before = np.flatnonzero(~self.cut_in)
             after = np.flatnonzero(self.cut_in & (self.after < self.chain.crashed - 1))
-            self._step_before(t, before)
+            self._step_before(t, np.flatnonzero(~self.cut_in))
             self._step_after(t, after)
-        log_q = self._log_q()
+        log_q, none = self._log_q(), np.zeros(self.n, dtype=bool)
         return Block(
             first_episode=first_episode,
             method=self.method,
             crash=self.after == self.chain.crashed,
-            failed=np.zeros(self.n, dtype=bool),
+            failed=none,
             cut_in=self.cut_in,
-            bv_lv_contact=np.zeros(self.n, dtype=bool),
+            bv_lv_contact=none,
             log_weight=self._log_weight(log_q),
             log_q=log_q,
             alpha=self.alpha,
             n_control_steps=self.n_control,
             first_ratios=self.ratios if self.method == "step_mixture" else None,
-            weight_cap=self._cap(),
+            weight_cap=self._caps().get(self.method),
             log_p_cut_in=self.log_p_cut if self.method in ("forced", "episode_mixture") else None,
         )
 
@@ -117,20 +111,20 @@ class _Sampler:
         forced_cut = np.divide(p[:, 1], later, out=np.zeros(len(rows)), where=later > 0.0)
         forced = np.stack([1.0 - forced_cut, forced_cut], axis=1)
         cut = self._maneuver(rows, p, q, forced, chain.proposals.critical_before[t, state]) == 1
-        self.after[rows[cut]] = self._choose(chain.entry[state[cut]])
+        self.after[rows[cut]] = _choose(chain.entry[state[cut]], self.rng)
 
     def _step_after(self, t: int, rows: IntArray) -> None:
         chain, state = self.chain, self.after[rows]
         p = chain.exposure[state]
         q = np.moveaxis(chain.proposals.maneuver[:, t, state], 0, 1)
         maneuver = self._maneuver(rows, p, q, p, chain.proposals.critical_after[t, state])
-        self.after[rows] = self._choose(chain.response[state, maneuver])
+        self.after[rows] = _choose(chain.response[state, maneuver], self.rng)
 
     def _maneuver(
         self, rows: IntArray, p: FloatArray, q: FloatArray, forced: FloatArray, critical: BoolArray
     ) -> IntArray:
         """Draw from what the method says and keep the likelihood ratios; p (m, A), q (m, J, A)."""
-        chosen = self._choose(self._sampled(rows, p, q, forced, critical))
+        chosen = _choose(self._sampled(rows, p, q, forced, critical), self.rng)
         self.cut_in[rows] |= (self.after[rows] < 0) & (chosen == 1)
         if self.method in ("nde", "forced"):
             return chosen
@@ -151,15 +145,14 @@ class _Sampler:
     def _sampled(
         self, rows: IntArray, p: FloatArray, q: FloatArray, forced: FloatArray, critical: BoolArray
     ) -> FloatArray:
-        if self.method == "nde":
-            return p
-        if self.method == "forced":
-            return forced
-        if self.method == "step_mixture":
-            return np.where(critical[:, None], np.einsum("mja,j->ma", q, self.alpha), p)
+        match self.method:
+            case "nde":
+                return p
+            case "forced":
+                return forced
+            case "step_mixture":
+                return np.where(critical[:, None], np.einsum("mja,j->ma", q, self.alpha), p)
         candidates = np.concatenate([forced[:, None, :], q], axis=1)
-        if self.component is None:
-            raise ValueError(f"{self.method} draws no component")
         return candidates[np.arange(len(rows)), self.component[rows]]
 
     def _log_q(self) -> FloatArray:
@@ -177,10 +170,6 @@ class _Sampler:
             return self.log_step
         return -logsumexp(log_q + np.log(self.alpha), axis=1) if len(self.alpha) else np.zeros(self.n)
 
-    def _cap(self) -> float | None:
-        caps = {
-            "nde": 1.0,
-            "forced": self.chain.cut_in_cap,
-            "episode_mixture": self.chain.cut_in_cap / DEFENSIVE_SHARE,
-        }
-        return caps.get(self.method)
+    def _caps(self) -> dict[Method, float]:
+        cap = self.chain.cut_in_cap
+        return {"nde": 1.0, "forced": cap, "episode_mixture": cap / DEFENSIVE_SHARE}

@@ -1,0 +1,186 @@
+"""Paths enumerated where crashes are: importance sampling in the five uniforms that an initial state is made from.
+
+Each uniform gets a piecewise constant density of its own, fitted to a pilot run, as in Lepage's VEGAS (J. Comput.
+Phys. 27, 1978, 192), mixed with a share of the naturalistic density that bounds every weight.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from harness.arrays import FloatArray, Int8Array, IntArray, RecordArray
+from harness.environment.driving import Environment
+from harness.environment.initial_state import InitialStates
+from harness.episode.trajectory import empty_trajectory
+from harness.pool.enumeration import STRIDE, enumerate_cut_ins, write_pairs
+from harness.progress import Progress
+from harness.random_stream import DIAGNOSTIC, INITIAL, uniforms
+from harness.state import STATE_COLUMNS
+
+PILOT_PATHS = 2048
+BLOCK_PATHS = 256
+N_BINS = 16
+NATURALISTIC_SHARE = 0.2
+"""Weights are at most its inverse."""
+AIMED_DRAW, OFFSET_DRAW = 0, 1
+"""Draws of a path within the diagnostic stream."""
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """Product density on the unit cube, mixed with the uniform one.
+
+    Attributes
+    ----------
+    density : ndarray, shape (dimensions, N_BINS)
+        Density within each bin; its mean over the bins is 1.
+    """
+
+    density: FloatArray
+
+    def map(self, u: FloatArray, choice: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Points (n, dimensions) drawn from the proposal, and their weights (n,): naturalistic density over its own.
+
+        ``u`` (n, dimensions) are uniforms, and ``choice`` (n,) those that decide which points stay naturalistic.
+        """
+        edges = np.linspace(0.0, 1.0, N_BINS + 1)
+        aimed = choice >= NATURALISTIC_SHARE
+        points = u.copy()
+        density = np.ones(len(u))
+        for d, levels in enumerate(self.density):
+            cumulative = np.concatenate([[0.0], np.cumsum(levels) / N_BINS])
+            cumulative[-1] = 1.0
+            points[aimed, d] = np.interp(u[aimed, d], cumulative, edges)
+            density *= levels[_bin_of(points[:, d])]
+        weights: FloatArray = 1.0 / (NATURALISTIC_SHARE + (1.0 - NATURALISTIC_SHARE) * density)
+        return points, weights
+
+
+def fit_proposal(u: FloatArray, contribution: FloatArray) -> Proposal:
+    """Proposal from the uniforms (n, dimensions) of a naturalistic pilot run, and what each point contributes (n,).
+
+    The best density of one variable is the root of the contribution's mean square within each bin.
+    """
+    density = np.ones((u.shape[1], N_BINS))
+    for d in range(u.shape[1]):
+        bins = _bin_of(u[:, d])
+        counts = np.bincount(bins, minlength=N_BINS)
+        squares = np.bincount(bins, contribution * contribution, minlength=N_BINS) / np.maximum(counts, 1)
+        root = np.sqrt(squares)
+        smooth = np.convolve(np.concatenate([root[:1], root, root[-1:]]), [0.25, 0.5, 0.25], "valid")
+        if smooth.sum() > 0.0:
+            density[d] = smooth * (N_BINS / smooth.sum())
+    return Proposal(density)
+
+
+def _bin_of(u: FloatArray) -> IntArray:
+    return np.minimum((u * N_BINS).astype(np.int64), N_BINS - 1)
+
+
+def contributions(rates: FloatArray, share: FloatArray | float = 1.0) -> FloatArray:
+    """What each path adds to all rates together, each relative to its mean, shape (n,).
+
+    ``rates`` (n, columns) are those of the paths; a column counts by its ``share``.
+    """
+    mean = rates.mean(0)
+    relative = rates / np.where(mean > 0.0, mean, 1.0)
+    found: FloatArray = np.sqrt((relative * relative * share).sum(1))
+    return found
+
+
+@dataclass(frozen=True)
+class EnumeratedPaths:
+    """Cut-ins of some paths.
+
+    ``weight`` (n,) is naturalistic over proposal density; ``state`` (n,); ``probability`` (n, steps) is that of the
+    cut-ins that one in this step stands for; ``crashes`` (n, steps) one bit per surrogate, as the library orders them.
+    """
+
+    weight: FloatArray
+    state: RecordArray
+    probability: FloatArray
+    crashes: IntArray
+
+    @property
+    def mass(self) -> FloatArray:
+        """Weighted probability of each cut-in, shape (n, steps)."""
+        return self.probability * self.weight[:, None]
+
+    def rates(self, n_surrogates: int) -> FloatArray:
+        """Per path: its weighted probability that each surrogate crashes, and of a cut-in; shape (n, D + 1)."""
+        mass = self.mass
+        columns = [(mass * ((self.crashes >> d) & 1)).sum(1) for d in range(n_surrogates)]
+        return np.column_stack([*columns, mass.sum(1)])
+
+
+def joined(parts: Sequence[EnumeratedPaths]) -> EnumeratedPaths:
+    """Consecutive paths in one."""
+    return EnumeratedPaths(
+        *(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(EnumeratedPaths))
+    )
+
+
+class Enumerator:
+    """Enumerates consecutive paths of one environment, on all cores; the number of cores changes no bit."""
+
+    def __init__(
+        self,
+        environment: Environment,
+        drivers: RecordArray,
+        envelope: int,
+        seed: int,
+        proposal: Proposal | None = None,
+        stride: int = STRIDE,
+    ) -> None:
+        self._environment, self._drivers, self._envelope = environment, drivers, envelope
+        self._seed, self._proposal, self._stride = seed, proposal, stride
+        self._states = InitialStates(environment.numbers)
+        # Compiled here, by one thread: of two that want a new kernel at once, the second would have to wait for
+        # whatever else is compiled meanwhile.
+        self._block(0, 0)
+
+    def aimed(self, proposal: Proposal) -> Enumerator:
+        """The same, with initial states drawn from a proposal."""
+        return Enumerator(self._environment, self._drivers, self._envelope, self._seed, proposal, self._stride)
+
+    def uniforms(self, first: int, n: int) -> FloatArray:
+        """Uniforms of the initial states of consecutive paths, shape (n, 5)."""
+        return uniforms(self._seed, first, n, INITIAL, len(STATE_COLUMNS))
+
+    def run(self, first: int, n: int, progress: Progress) -> EnumeratedPaths:
+        """Paths ``first … first + n - 1``; ``n`` is a multiple of `BLOCK_PATHS`."""
+        blocks = []
+        with ThreadPoolExecutor(os.cpu_count()) as threads:
+            for block in threads.map(self._block, range(first, first + n, BLOCK_PATHS)):
+                blocks.append(block)
+                progress.advance(BLOCK_PATHS)
+        return joined(blocks)
+
+    def _block(self, first: int, n: int = BLOCK_PATHS) -> EnumeratedPaths:
+        u, weight = self.uniforms(first, n), np.ones(n)
+        drawn = uniforms(self._seed, first, n, DIAGNOSTIC, 2)
+        offset = (drawn[:, OFFSET_DRAW] * self._stride).astype(np.int64)
+        if self._proposal is not None:
+            u, weight = self._proposal.map(u, drawn[:, AIMED_DRAW])
+        state, max_steps = self._states.from_uniforms(u), int(self._environment.numbers["max_steps"])
+        probability, crashes = np.zeros((n, max_steps)), np.zeros((n, max_steps), np.int64)
+        path = empty_trajectory(self._environment)
+        where = self._environment, self._drivers, self._envelope
+        enumerate_cut_ins(self._seed, first, state, *where, self._stride, offset, path, probability, crashes)
+        return EnumeratedPaths(weight, state, probability, crashes)
+
+    def pairs(
+        self, path: IntArray, step: IntArray, state: RecordArray
+    ) -> tuple[Int8Array, Int8Array, IntArray, IntArray]:
+        """Maneuvers of chosen (path, cut-in step) pairs: LV's and BV's (n, draws), and how many of each (n,)."""
+        room = empty_trajectory(self._environment)
+        n, draws = len(path), room.lv.size
+        lv, bv = np.zeros((n, draws), np.int8), np.zeros((n, draws), np.int8)
+        n_lv, n_bv = np.zeros(n, np.int64), np.zeros(n, np.int64)
+        write_pairs(self._seed, path, step, state, self._environment, room, lv, bv, n_lv, n_bv)
+        return lv, bv, n_lv, n_bv
