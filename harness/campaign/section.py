@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import Annotated, Any
+from collections.abc import Iterable, Sequence
+from typing import Annotated, Any, Self
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 from pydantic_core import PydanticCustomError
@@ -45,6 +45,11 @@ class Section(BaseModel):
     """A section of the campaign: unknown keys are errors, values never change after loading."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+
+    def replaced(self, path: Sequence[str], value: Any) -> Self:
+        """A copy with another value at a path such as ``("av", "fmu", "file")``, not validated."""
+        key, *rest = path
+        return self.model_copy(update={key: getattr(self, key).replaced(rest, value) if rest else value})
 
 
 def _whole_steps(seconds: float) -> float:

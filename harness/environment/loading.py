@@ -16,7 +16,7 @@ import numpy as np
 from harness.arrays import BoolArray, FloatArray
 from harness.campaign.loading import names_a_file
 from harness.campaign.models import EnvironmentSettings
-from harness.campaign.yaml_text import read_model
+from harness.campaign.problems import read_model
 from harness.compiled import compiled_threads
 from harness.environment.cut_in import acceptance, opportunity
 from harness.environment.driving import Environment, acceleration_pmf, build_environment, car_following, free_driving

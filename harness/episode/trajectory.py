@@ -20,7 +20,7 @@ from harness.outcomes import AV, BV, BV_LV_CONTACT, LV, PASSED, RUNNING
 from harness.random_stream import BV_DRAWS, BV_FREE_DRAWS, LV_DRAWS, uniform
 from harness.state import State
 from harness.vehicles.kinematics import CONTACT_M, VEHICLE_LENGTH_M, gap, next_position, next_speed
-from harness.vehicles.reaction import reacting_acceleration
+from harness.vehicles.models import reacting_acceleration
 
 AV_START_M = 100.0
 NO_CRASH = -1

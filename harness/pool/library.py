@@ -11,8 +11,8 @@ from pydantic import Field, model_validator
 from harness.arrays import RecordArray
 from harness.campaign.loading import names_a_file
 from harness.campaign.models import FVDM, IDM, Constant, Reflexes
+from harness.campaign.problems import read_model
 from harness.campaign.section import Section, SurrogateName, broken_rule
-from harness.campaign.yaml_text import read_model
 from harness.errors import CampaignError
 from harness.vehicles.models import driver_records
 
