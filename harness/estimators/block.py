@@ -45,7 +45,7 @@ class Block:
         Bound on Y = 1{crash}·weight that the design guarantees for every episode, seen or not; None if there is none.
     log_p_cut_in : (n,) float64 or None
         log P(cut-in | path), where the method draws the path ahead. Bounds Y of that episode alone.
-    component, shells : (n,) int, ShellDesign, or None
+    stratum, shells : (n,) int, ShellDesign, or None
         Stratum of each test, where they are drawn from shells, and what is known of the strata.
     surrogates_crash, known_rates : (n, D) bool, KnownRates, or None
         Which surrogates of a pool would have crashed on the same traffic, and their crash rates; only where asked for.
@@ -64,14 +64,14 @@ class Block:
     first_ratios: FloatArray | None = None
     weight_cap: float | None = None
     log_p_cut_in: FloatArray | None = None
-    component: IntArray | None = None
+    stratum: IntArray | None = None
     shells: ShellDesign | None = None
     surrogates_crash: BoolArray | None = None
     known_rates: KnownRates | None = None
 
     def __post_init__(self) -> None:
         n = len(self.crash)
-        columns = ("failed", "cut_in", "bv_lv_contact", "log_weight", "n_control_steps", "log_p_cut_in", "component")
+        columns = ("failed", "cut_in", "bv_lv_contact", "log_weight", "n_control_steps", "log_p_cut_in", "stratum")
         expected = {
             **dict.fromkeys(columns, (n,)),
             "log_q": (n, len(self.alpha)),
