@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from harness.arrays import BoolArray, FloatArray, IntArray
-from harness.methods import Method
+from harness.methods import SAMPLING, Method
 from harness.strata import KnownRates, ShellDesign
 
 MAX_CONTROL_STEPS = 9
@@ -108,9 +108,9 @@ class Block:
 
     def log_path_cap(self) -> float:
         """Log of the largest P(cut-in | path)/share of forced cut-ins, a bound on Y of these paths; inf if unknown."""
-        if self.log_p_cut_in is None or self.method not in ("forced", "episode_mixture"):
+        if self.log_p_cut_in is None or not SAMPLING[self.method].forces:
             return math.inf
-        share = 1.0 if self.method == "forced" else float(self.alpha[0])
+        share = float(self.alpha[0]) if SAMPLING[self.method].mixes else 1.0  # the defensive component is the first
         return float(np.max(self.log_p_cut_in, initial=-math.inf)) - math.log(share) if share else math.inf
 
     def failed_as_crashes(self) -> Block:

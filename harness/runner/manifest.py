@@ -144,8 +144,8 @@ class Prefix:
 class Manifest:
     """Keeps ``manifest.json`` and ``campaign.yaml`` of a run folder true.
 
-    ``earlier`` is what `require_own_folder` found, ``began`` `time.monotonic` at the run's beginning; ``facts`` are more
-    keys.
+    ``earlier`` is what `require_own_folder` found, ``began`` `time.monotonic` at the run's beginning; ``facts`` are
+    more keys.
     """
 
     def __init__(

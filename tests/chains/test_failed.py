@@ -13,7 +13,7 @@ import pytest
 from scipy.stats import binomtest
 
 from harness.estimators.block import Block
-from harness.estimators.one_pass import ESTIMATORS, accumulator
+from harness.estimators.one_pass import ACCUMULATORS, accumulator
 from harness.studies.chains.named import frequent_decisive
 from harness.studies.chains.sampler import draw
 from harness.studies.chains.shells import ChainShells
@@ -45,7 +45,7 @@ def require_coverage(drawn, seed: int, name: str, wrong: type) -> None:
 @pytest.mark.parametrize("name", METHODS)
 def test_intervals_cover_whatever_failed_tests_would_have_come_to(name):
     n = 20 * N if name == "nde" else N
-    require_coverage(lambda rng: draw(CHAIN, METHODS[name], n, rng), 31, name, ESTIMATORS[name])
+    require_coverage(lambda rng: draw(CHAIN, METHODS[name], n, rng), 31, name, ACCUMULATORS[name])
 
 
 def shells_block(rng: np.random.Generator) -> Block:
@@ -74,7 +74,7 @@ def shells_block(rng: np.random.Generator) -> Block:
     )
 
 
-class FailedAsSafe(ESTIMATORS["shells"]):
+class FailedAsSafe(ACCUMULATORS["shells"]):
     """Mutant: today's shells, which forget that tests failed."""
 
     def add(self, block: Block) -> None:

@@ -15,6 +15,7 @@ from harness.episode.loop import Shard
 from harness.outcomes import AV, BV, BV_LV_CONTACT, CRASH, LV
 from harness.state import STATE_DTYPE
 from harness.twin import TwinWorld
+from tests.episode.twin_runs import TWO
 from tests.sumo.raw_getters import (
     Job,
     Motion,
@@ -40,7 +41,7 @@ def hopeless_starts() -> np.ndarray:
 @pytest.fixture(scope="module")
 def jobs(smoke) -> dict[str, Job]:
     forced, weak = "testing.method=forced", "av.parameters.min_acceleration_mps2=-1"
-    published = ("testing.method=step_mixture", "testing.challenge=immediate")
+    published = ("testing.method=step_mixture", "testing.challenge=immediate", TWO)
     draw_often = "environment.acceleration_hold_s=0.1"
     return {
         MIXTURE: Job(smoke(), 800, 64),
