@@ -201,15 +201,8 @@ class Campaign(Section):
         return tuple(self.testing.alpha[name] for name in self.surrogates)
 
     def content_hash(self, environment_parameters: str) -> str:
-        """Hash of everything that changes an episode's bits.
+        """Hash of everything that changes an episode's bits, that of the environment's parameters included.
 
-        Parameters
-        ----------
-        environment_parameters : str
-            Hash of the environment parameter file in use.
-
-        Notes
-        -----
         Cells, workers, stop rule, trace policy and names are left out, so that a campaign can be continued to a
         smaller RHW or with other resources.
         """

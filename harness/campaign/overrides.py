@@ -83,15 +83,7 @@ def _lay_over(data: dict[str, Any], override: Override) -> None:
 
 
 class Places:
-    """Says where a value was written: in the file, or by an override.
-
-    Parameters
-    ----------
-    lines : Lines
-        Lines of the file.
-    overrides : sequence of Override
-        In the order in which they were applied.
-    """
+    """Says where a value was written: in the file, or by one of the overrides, in the order they were applied in."""
 
     def __init__(self, lines: Lines, overrides: Sequence[Override]) -> None:
         self._lines = lines

@@ -68,11 +68,5 @@ def panel_av(text: str) -> AutomatedVehicle:
 
 
 def av_override(text: str) -> Override:
-    """``--av``: the vehicle's section in place of the campaign's own, with nothing written that the panel leaves out.
-
-    Raises
-    ------
-    CampaignError
-        As `panel_av`.
-    """
+    """``--av``: the vehicle's section in place of the campaign's own, with only what the panel writes."""
     return Override(("av",), panel_av(text).model_dump(exclude_unset=True), text, flag="--av")

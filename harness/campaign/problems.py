@@ -32,15 +32,7 @@ _PATTERNS = {
 
 
 class InvalidFileError(CampaignError):
-    """A file with one or more problems, each with its own place.
-
-    Parameters
-    ----------
-    path : str
-        The file.
-    problems : sequence of CampaignError
-        At least one.
-    """
+    """A file with one or more problems, each with its own place."""
 
     def __init__(self, path: str, problems: Sequence[CampaignError]) -> None:
         first, *more = self.problems = tuple(problems)
@@ -69,13 +61,7 @@ def read_model(path: str | Path, model: type[Model]) -> Model:
 
 
 def validated(data: Any, model: type[Model], path: str, place: Place) -> Model:
-    """Data of a file as a model.
-
-    Raises
-    ------
-    InvalidFileError
-        They do not fit.
-    """
+    """Data of a file as a model; an `InvalidFileError` names every place where they do not fit."""
     try:
         return model.model_validate(data)
     except ValidationError as error:

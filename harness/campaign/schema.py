@@ -89,11 +89,6 @@ class SchemaView:
     """Finds what a JSON schema says about one place of a document.
 
     Understands what pydantic writes: references, optional values, unions told apart by a key, ``if``/``then``.
-
-    Parameters
-    ----------
-    root : dict
-        JSON schema of the whole document.
     """
 
     def __init__(self, root: Schema) -> None:

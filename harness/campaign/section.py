@@ -27,14 +27,9 @@ SurrogateName = Annotated[str, Field(pattern=SURROGATE_PATTERN)]
 
 
 def broken_rule(key: str, *, found: str, expected: str, mend: str) -> PydanticCustomError:
-    """Error for a rule between several values, in the four parts that the loader shows.
+    """Error for a rule between several values, in the parts of a `harness.errors.HarnessError`.
 
-    Parameters
-    ----------
-    key : str
-        Dotted path of the value to blame, seen from the section that states the rule; empty for the section itself.
-    found, expected, mend : str
-        As in `harness.errors.HarnessError`.
+    ``key`` is the dotted path of the value to blame, seen from the section that states the rule; empty for the section.
     """
     parts = {"key": key, "found": found, "expected": expected, "mend": mend}
     where = "{key}: " if key else ""

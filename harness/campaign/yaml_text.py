@@ -29,15 +29,7 @@ def dotted(where: YamlPath) -> str:
 
 
 class Lines:
-    """Where each value of a YAML document was written.
-
-    Parameters
-    ----------
-    path : str
-        Name of the document, for messages.
-    root : Node
-        Document, composed and constructed.
-    """
+    """Where each value of a YAML document was written, which is composed and constructed at ``root``."""
 
     def __init__(self, path: str, root: Node) -> None:
         self.path = path

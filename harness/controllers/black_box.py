@@ -47,13 +47,7 @@ os.register_at_fork(after_in_parent=lambda: _forks.append(None))
 
 
 class BlackBox:
-    """Notes the call that is under way, and lets no copy of the process come back from one.
-
-    Parameters
-    ----------
-    path : Path, optional
-        File; without one the notes go nowhere.
-    """
+    """Notes the call that is under way in a file, if any, and lets no copy of the process come back from one."""
 
     def __init__(self, path: Path | None) -> None:
         self._note: IntArray = np.zeros(3, np.int64)

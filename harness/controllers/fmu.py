@@ -172,14 +172,7 @@ def _reference(where: str, name: str, description: Any, causalities: Sequence[st
 
 
 class FmuVehicleController:
-    """One instance of an FMU.
-
-    Parameters
-    ----------
-    wiring : Wiring
-    folder : Path
-        Where the FMU is unpacked.
-    """
+    """One instance of an FMU, which is unpacked in ``folder``."""
 
     def __init__(self, wiring: Wiring, folder: Path) -> None:
         self._wiring = wiring

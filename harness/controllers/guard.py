@@ -30,11 +30,7 @@ def cause_of(error: BaseException) -> str:
 class Guard:
     """Makes the calls of a host's controllers, inside of ``with guard.time_limit``.
 
-    Parameters
-    ----------
-    limits : Limits
-    black_box : Path, optional
-        File where the call that is under way is noted, so that the parent knows it should the process die.
+    The call under way is noted in the file ``black_box``, if any, so that the parent knows it should the process die.
     """
 
     def __init__(self, limits: Limits, black_box: Path | None) -> None:

@@ -55,19 +55,9 @@ class EpisodeRandom(Sequence[np.random.Generator]):
 
 
 class VehicleHost:
-    """One controller object per cell.
+    """One controller object per cell, made by ``make``.
 
-    Parameters
-    ----------
-    make : callable
-        Makes a controller.
-    n_cells, seed : int
-    limits : Limits
-    black_box : Path, optional
-        See `Guard`.
-    doomed : mapping, optional
-        Episodes that are known to kill the process: they fail just before the call that did. It may grow.
-    acts_before_cut_in : bool
+    ``doomed`` are episodes that are known to kill the process: they fail just before the call that did. It may grow.
     """
 
     def __init__(

@@ -48,14 +48,7 @@ DRIVER_DTYPE = np.dtype(
 
 
 def driver_records(drivers: Sequence[BuiltInParameters], reactions: Sequence[Reflexes] | None = None) -> RecordArray:
-    """Parameters of driver models as kernels read them, shape (number of drivers,).
-
-    Parameters
-    ----------
-    drivers : sequence of parameters
-    reactions : sequence of Reflexes, optional
-        One for each driver; all react at once by default.
-    """
+    """Parameters of driver models as kernels read them, shape (number of drivers,); by default all react at once."""
     kinds = {IDMParameters: IDM_KIND, FVDMParameters: FVDM_KIND, ConstantParameters: CONSTANT_KIND}
     records = np.zeros(len(drivers), dtype=DRIVER_DTYPE)
     for record, driver, reaction in zip(records, drivers, reactions or [Reflexes()] * len(drivers), strict=True):
