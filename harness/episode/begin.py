@@ -8,20 +8,12 @@ from harness.arrays import FloatArray, RecordArray
 from harness.compiled import compiled, compiled_inline, compiled_threads
 from harness.environment.driving import Environment
 from harness.episode.cells import Bench
-from harness.episode.trajectory import Trajectory, place, walk, write_hazards
+from harness.episode.trajectory import Trajectory, place, walk, walk_without_cut_in
 from harness.outcomes import AV, EPISODE_MIXTURE, FORCED, SHELLS
 from harness.random_stream import CUT_IN, uniform
-from harness.state import State
 
 COMPONENT_DRAW, CUT_IN_DRAW = 0, 1
 """Indices within the cut-in stream."""
-
-
-@compiled_inline
-def path_hazard(state: State, seed: int, episode: int, environment: Environment, path: Trajectory) -> tuple[float, int]:
-    """Cumulative cut-in hazard of the path that LV and BV take when no cut-in happens, and its length in steps."""
-    steps = walk(state, seed, episode, 0, environment.numbers.max_steps, environment, path)
-    return write_hazards(steps, environment, path), steps
 
 
 @compiled_inline
@@ -52,7 +44,7 @@ def begin_cell(k: int, row: int, bench: Bench) -> None:
     cells.log_ratio[k, :] = 0.0
     cells.martingale[k, :] = 0.0
     if method == SHELLS:
-        cell.component, cell.log_sampled = bench.traffic.component[row], -bench.traffic.log_weight[row]
+        cell.component, cell.log_sampled = bench.traffic.stratum[row], -bench.traffic.log_weight[row]
         return
     forced = method == FORCED
     if method == EPISODE_MIXTURE:
@@ -60,7 +52,7 @@ def begin_cell(k: int, row: int, bench: Bench) -> None:
         forced = cell.component == 0
     u = uniform(seed, episode, CUT_IN, CUT_IN_DRAW)
     if method in (FORCED, EPISODE_MIXTURE):
-        total, _ = path_hazard(bench.states[row], seed, episode, bench.environment, bench.scratch.path)
+        _, total = walk_without_cut_in(bench.states[row], seed, episode, bench.environment, bench.scratch.path)
         cell.hazard_total = total
         p_cut_in = -math.expm1(-total)
         cell.log_p_cut_in = math.log(p_cut_in)

@@ -129,13 +129,13 @@ class PrescribedTraffic(NamedTuple):
     """Episodes whose traffic is prescribed: what LV and BV do in each row of a shard; no rows if it is drawn.
 
     ``lv``, ``bv`` (rows, draws) int8 are maneuver indices as an episode records them, 31 in ``bv`` being the cut-in in
-    step ``cut_step`` (rows,). ``component`` (rows,) is the shell and ``log_weight`` (rows,) its log probability.
+    step ``cut_step`` (rows,). ``stratum`` (rows,) is the shell and ``log_weight`` (rows,) its log probability.
     """
 
     lv: Int8Array
     bv: Int8Array
     cut_step: IntArray
-    component: IntArray
+    stratum: IntArray
     log_weight: FloatArray
 
 

@@ -14,7 +14,7 @@ from harness.outcomes import AV, BV, BV_LV_CONTACT, CRASH, LV, PASSED, RUNNING, 
 from harness.random_stream import LV_DRAWS, uniform
 from harness.state import State
 from harness.vehicles.kinematics import CONTACT_M, gap, next_speed
-from harness.vehicles.reaction import reacting_acceleration, reaction_steps
+from harness.vehicles.models import reacting_acceleration, reaction_steps
 
 PASSED_M, PASSED_UNDER_CONTROL_M = 0.0, -10.0
 """R2 at which the AV has passed BV: at once if it holds its speed, with a margin if its controller acts."""

@@ -20,7 +20,7 @@ from harness.outcomes import AV, BV, BV_LV_CONTACT, LV, PASSED, RUNNING
 from harness.random_stream import BV_DRAWS, BV_FREE_DRAWS, LV_DRAWS, uniform
 from harness.state import State
 from harness.vehicles.kinematics import CONTACT_M, VEHICLE_LENGTH_M, gap, next_position, next_speed
-from harness.vehicles.reaction import reacting_acceleration
+from harness.vehicles.models import reacting_acceleration
 
 AV_START_M = 100.0
 NO_CRASH = -1
@@ -120,15 +120,18 @@ def walk(
 
 
 @compiled_inline
-def write_hazards(steps: int, environment: Environment, path: Trajectory) -> float:
-    """Write the cut-in hazard of each step that has been walked; returns their sum."""
+def walk_without_cut_in(
+    state: State, seed: int, episode: int, environment: Environment, path: Trajectory
+) -> tuple[int, float]:
+    """Walk to the end, writing the cut-in hazard of each step; returns the number of steps, and the sum of hazards."""
+    steps = walk(state, seed, episode, 0, environment.numbers.max_steps, environment, path)
     total = 0.0
     for step in range(steps):
         state = state_in(step, path)
         accepted = acceptance(state.r2_m, state.r2dot_mps, environment)
         path.hazard[step] = cut_in_hazard(opportunity(state, environment), accepted, environment)
         total += path.hazard[step]
-    return total
+    return steps, total
 
 
 @compiled_inline

@@ -153,7 +153,7 @@ class ConnectedProgram:
         rows = (line.split() for line in _TCP_TABLE.read_text(encoding="ascii").splitlines()[1:])
         clients = [row for row in rows if row[1].endswith(here) and row[3] == _ESTABLISHED]
         for _, own, theirs, *_ in clients:
-            _require_neighbour(own, theirs)
+            require_neighbour(own, theirs)
         return len(clients)
 
     def _n_sockets(self) -> int:
@@ -191,7 +191,7 @@ def _start_program(av: TraciProcess, port: int, n_cells: int) -> subprocess.Pope
         ) from error
 
 
-def _require_neighbour(own: str, theirs: str) -> None:
+def require_neighbour(own: str, theirs: str) -> None:
     """Refuse a client of another machine; both ends as the table of connections writes them (proc(5), net/tcp)."""
     address = socket.inet_ntoa(int(theirs.partition(":")[0], 16).to_bytes(4, sys.byteorder))
     if not address.startswith("127.") and own.partition(":")[0] != theirs.partition(":")[0]:

@@ -53,11 +53,11 @@ def shells_block(rng: np.random.Generator) -> Block:
     source = ChainShells(CHAIN, 20)
     design, _ = source.draw(rng)
     design = replace(design, p=source.shell_p, moments=np.outer(source.shell_p, source.shell_p))
-    component = np.repeat(np.arange(len(design.p)), 300)
+    stratum = np.repeat(np.arange(len(design.p)), 300)
     share = source.crash_p / source.shell_p
-    n = len(component)
+    n = len(stratum)
     no = np.zeros(n, np.bool_)
-    crash = rng.random(n) < share[component]
+    crash = rng.random(n) < share[stratum]
     return Block(
         first_episode=0,
         method="shells",
@@ -69,7 +69,7 @@ def shells_block(rng: np.random.Generator) -> Block:
         log_q=np.zeros((n, 0)),
         alpha=np.zeros(0),
         n_control_steps=np.ones(n, np.int64),
-        component=component,
+        stratum=stratum,
         shells=design,
     )
 

@@ -10,7 +10,7 @@ from harness.campaign.models import (
     IDM,
     AutomatedVehicle,
     Campaign,
-    Environment,
+    EnvironmentSettings,
     FVDMParameters,
     IDMParameters,
     Records,
@@ -59,7 +59,7 @@ def campaign(
     return Campaign(
         name="test",
         seed=seed,
-        environment=Environment(lane_change_level=level, acceleration_hold_s=hold_s),
+        environment=EnvironmentSettings(lane_change_level=level, acceleration_hold_s=hold_s),
         av=AVS[av],
         surrogates=SURROGATES[surrogates],
         testing=Testing(method=method, challenge=challenge, epsilon=epsilon, criticality_threshold=threshold),
