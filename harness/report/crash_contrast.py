@@ -56,15 +56,9 @@ class Group:
 
 @dataclass(frozen=True)
 class Contrast:
-    """Two groups of tests and the quantities that tell them apart, the most telling first.
+    """Two groups of tests, all or only those outside the boundary, and the quantities that tell them apart.
 
-    Attributes
-    ----------
-    outside : bool
-        Whether only tests outside the boundary were compared.
-    crashes, others : Group
-    bands : tuple of Band
-        Empty where there is too little to compare.
+    The most telling comes first; there is none where there is too little to compare.
     """
 
     outside: bool
