@@ -23,7 +23,7 @@ import pyarrow as pa
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-from harness.campaign.models import Campaign, Environment
+from harness.campaign.models import Campaign, EnvironmentSettings
 from harness.environment.loading import load_parameters
 from harness.records.schemas import episodes_schema, moments_schema, traces_schema
 
@@ -150,7 +150,7 @@ def columns_table(schema: pa.Schema) -> str:
 
 def environment_table() -> str:
     """Numbers of the shipped environment, by section and source."""
-    parameters = load_parameters(Environment())
+    parameters = load_parameters(EnvironmentSettings())
     rows = []
     for section, numbers in parameters:
         if not isinstance(numbers, BaseModel):

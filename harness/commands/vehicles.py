@@ -41,13 +41,7 @@ from harness.console_tables import print_av_check
 @json_option
 @click.pass_context
 def av_check(
-    ctx: click.Context,
-    campaign_file: Path,
-    *,
-    episodes: int,
-    av: str | None,
-    overrides: Sequence[str],
-    as_json: bool,
+    ctx: click.Context, campaign_file: Path, *, episodes: int, av: str | None, overrides: Sequence[str], as_json: bool
 ) -> None:
     """Run a few dozen cut-ins with the AV of CAMPAIGN, twice, and say what it is like.
 

@@ -70,7 +70,7 @@ def block_from_tables(
         first_ratios=ratios,
         weight_cap=1.0 if method == "nde" else None,
         log_p_cut_in=_log_p_cut_in(episodes, failed),
-        component=None if shells is None else _integers(episodes, "component"),
+        stratum=None if shells is None else _integers(episodes, "component"),
         shells=shells,
     )
 

@@ -108,13 +108,7 @@ class _Run:
     """A campaign on its way into a folder, in which nobody but this process writes."""
 
     def __init__(
-        self,
-        resolved: Resolved,
-        out: Path,
-        earlier: dict[str, Any],
-        workers: int,
-        progress: Progress,
-        began: float,
+        self, resolved: Resolved, out: Path, earlier: dict[str, Any], workers: int, progress: Progress, began: float
     ) -> None:
         self._resolved, self._campaign, self._out, self._progress = resolved, resolved.campaign, out, progress
         for left in out.rglob(".*.part"):  # of an earlier run that was killed
@@ -204,7 +198,7 @@ class _Run:
         rule = self._planner.rule
         if rule.reached:
             return "rhw"
-        if rule.pool_too_rough:  # whatever else is spent: more of it would not help
+        if rule.pool_error_above_target:  # whatever else is spent: more of it would not help
             return "pool_error"
         return "episodes" if self.prefix.n_episodes >= self._campaign.stop.episodes else "pool"
 

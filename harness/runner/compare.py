@@ -209,11 +209,7 @@ def _content(
 ) -> dict[str, Any]:
     campaign = of_sides["a"].campaign
     sides = {
-        side: {
-            "label": label,
-            "campaign_hash": of_sides[side].content_hash,
-            "own_stop": stops.of(side),
-        }
+        side: {"label": label, "campaign_hash": of_sides[side].content_hash, "own_stop": stops.of(side)}
         for side, label in zip(SIDES, labels, strict=True)
     }
     return {

@@ -59,10 +59,7 @@ def _errors_of(j: int, resolved: Resolved, tables: Tables) -> list[dict[str, Any
     shard = _run_surrogate(j, resolved, tables)
     episode = shard.results.episode
     y = np.where(episode["outcome"] == CRASH, np.exp(episode["log_weight"]), 0.0)
-    quantities = {
-        "before the cut-in": "mean of V_j(s_0)",
-        "after the cut-in": "mean of W V_j(s) at BV's first redraw",
-    }
+    quantities = {"before the cut-in": "mean of V_j(s_0)", "after the cut-in": "mean of W V_j(s) at BV's first redraw"}
     return [
         {
             "surrogate": name,

@@ -13,7 +13,7 @@ import pytest
 from scipy.stats import binomtest
 
 from harness.estimators.block import Block
-from harness.estimators.one_pass import ESTIMATORS, accumulator
+from harness.estimators.one_pass import ACCUMULATORS, accumulator
 from harness.studies.chains.named import frequent_decisive
 from harness.studies.chains.sampler import draw
 from harness.studies.chains.shells import ChainShells
@@ -45,7 +45,7 @@ def require_coverage(drawn, seed: int, name: str, wrong: type) -> None:
 @pytest.mark.parametrize("name", METHODS)
 def test_intervals_cover_whatever_failed_tests_would_have_come_to(name):
     n = 20 * N if name == "nde" else N
-    require_coverage(lambda rng: draw(CHAIN, METHODS[name], n, rng), 31, name, ESTIMATORS[name])
+    require_coverage(lambda rng: draw(CHAIN, METHODS[name], n, rng), 31, name, ACCUMULATORS[name])
 
 
 def shells_block(rng: np.random.Generator) -> Block:
@@ -53,11 +53,11 @@ def shells_block(rng: np.random.Generator) -> Block:
     source = ChainShells(CHAIN, 20)
     design, _ = source.draw(rng)
     design = replace(design, p=source.shell_p, moments=np.outer(source.shell_p, source.shell_p))
-    component = np.repeat(np.arange(len(design.p)), 300)
+    stratum = np.repeat(np.arange(len(design.p)), 300)
     share = source.crash_p / source.shell_p
-    n = len(component)
+    n = len(stratum)
     no = np.zeros(n, np.bool_)
-    crash = rng.random(n) < share[component]
+    crash = rng.random(n) < share[stratum]
     return Block(
         first_episode=0,
         method="shells",
@@ -69,12 +69,12 @@ def shells_block(rng: np.random.Generator) -> Block:
         log_q=np.zeros((n, 0)),
         alpha=np.zeros(0),
         n_control_steps=np.ones(n, np.int64),
-        component=component,
+        stratum=stratum,
         shells=design,
     )
 
 
-class FailedAsSafe(ESTIMATORS["shells"]):
+class FailedAsSafe(ACCUMULATORS["shells"]):
     """Mutant: today's shells, which forget that tests failed."""
 
     def add(self, block: Block) -> None:

@@ -36,8 +36,7 @@ def statement(folder):
 
 
 @pytest.mark.parametrize(
-    ("av", "overrides"),
-    [(GOOD, ()), (BATCH, ("world.engine=sumo",)), (SUMO, ("world.engine=sumo", "world.cells=8"))],
+    ("av", "overrides"), [(GOOD, ()), (BATCH, ("world.engine=sumo",)), (SUMO, ("world.engine=sumo", "world.cells=8"))]
 )
 def test_a_vehicle_that_does_the_same_again_is_said_to(av, overrides, run_av):
     folder = run_av(av, *overrides, workers=1)

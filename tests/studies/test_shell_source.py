@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from harness.campaign.models import AutomatedVehicle, Environment, PoolSettings
+from harness.campaign.models import AutomatedVehicle, EnvironmentSettings, PoolSettings
 from harness.environment.loading import load_environment
 from harness.errors import CampaignError
 from harness.pool.build import build_pool
@@ -15,7 +15,7 @@ from harness.studies.shell_source import equals, leave_out, overtaking_shells
 from harness.studies.super_population import NO_ENVELOPE, Drivers, Truth, combined, enumerate_paths, truths
 
 PATHS = 1024
-ENVIRONMENT = load_environment(Environment())
+ENVIRONMENT = load_environment(EnvironmentSettings())
 LIBRARY = load_library("ladder-1")
 AVS = {
     name: AutomatedVehicle.model_validate(av)
