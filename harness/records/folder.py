@@ -184,9 +184,12 @@ def read_table(path: Path, columns: list[str] | None = None, rows: pc.Expression
         The file is missing or damaged, or lacks a column.
     """
     try:
-        if columns and (missing := sorted(set(columns).difference(pq.read_schema(path).names))):
-            raise pa.ArrowInvalid(f"no column {missing[0]!r}")
-        return pq.read_table(path, columns=columns, filters=rows, memory_map=False, partitioning=None)
+        if rows is not None:
+            return pq.read_table(path, columns=columns, filters=rows, memory_map=False, partitioning=None)
+        with pq.ParquetFile(path) as file:  # a millisecond faster than read_table, which matters with many shards
+            if missing := sorted(set(columns or ()).difference(file.schema_arrow.names)):
+                raise pa.ArrowInvalid(f"no column {missing[0]!r}")
+            return file.read(columns)
     except (OSError, pa.ArrowException, KeyError) as error:
         raise damaged(path, error) from error
 
