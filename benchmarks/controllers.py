@@ -44,7 +44,7 @@ def fmu_form(folder: Path) -> tuple[str, float]:
 
 
 def external_process(n_episodes: int) -> float:
-    """Full-length (20 s) episodes per second of the example client, which shares one SUMO server with the harness."""
+    """Full-length (20 s) episodes per second of the example client on one SUMO server with the harness."""
     client = f"{sys.executable} {ROOT}/examples/traci_client/idm_client.py --port {{port}} --cells {{cells}}"
     changes = [f"av={{traci: {{command: '{client}'}}}}", f"world.cells={CELLS}"]
     campaign = load_campaign(ROOT / "scenarios/overtaking_forced.yaml", changes)

@@ -13,7 +13,7 @@ import time
 
 from harness import load_campaign
 from harness.environment.loading import load_environment
-from harness.pool.aimed_paths import PILOT_PATHS, Enumerator, contributions, fit_proposal
+from harness.pool.aimed_paths import PILOT_PATHS, Enumerator
 from harness.pool.library import load_library
 from harness.progress import SilentProgress
 
@@ -30,12 +30,11 @@ def main() -> None:
     before = names[: names.index(library.boundary) + 1]
     asked, envelope = (environment, library.drivers), names.index(library.envelope)
     pilot = Enumerator(*asked, envelope, SEED)
-    rates = pilot.run(0, PILOT_PATHS, SilentProgress()).rates(len(names))[:, : len(before)]
-    proposal = fit_proposal(pilot.uniforms(0, PILOT_PATHS), contributions(rates))
+    pilot_rates = pilot.run(0, PILOT_PATHS, SilentProgress()).rates(len(names))[:, : len(before)]
     print("stride  ms/path  cost  " + "  ".join(before))
     first = 0.0
     for stride in STRIDES:
-        enumerator = Enumerator(*asked, envelope, SEED, proposal, stride)
+        enumerator = Enumerator(*asked, envelope, SEED, stride=stride).aimed(pilot_rates)
         begin = time.process_time()
         paths = enumerator.run(PILOT_PATHS, PATHS, SilentProgress())
         milliseconds = (time.process_time() - begin) / PATHS * 1e3

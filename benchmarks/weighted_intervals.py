@@ -34,15 +34,7 @@ SM_II = {"model": "fvdm", "parameters": {"min_acceleration_mps2": -1.0}}
 
 @dataclass(frozen=True, eq=False)
 class Population:
-    """Weighted crashes of many tests.
-
-    Attributes
-    ----------
-    name : str
-    weights : ndarray, shape (crashes,)
-    crash_share, rate, cap : float
-        Of tests; mean of Y; largest weight by design.
-    """
+    """Weighted crashes of many tests: their share of the tests, mean of Y, and the largest weight by design."""
 
     name: str
     weights: FloatArray

@@ -15,6 +15,7 @@ import math
 import re
 import types
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any, Union, get_args, get_origin
 
@@ -22,7 +23,7 @@ import pyarrow as pa
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-from harness.campaign.models import Campaign, Environment
+from harness.campaign.models import Campaign, EnvironmentSettings
 from harness.environment.loading import load_parameters
 from harness.records.schemas import episodes_schema, moments_schema, traces_schema
 
@@ -64,7 +65,7 @@ def _kind(annotation: Any) -> str:
         return "mapping"
     if str(origin) == "typing.Literal":
         return ", ".join(f"`{value}`" for value in get_args(annotation))
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+    if _is_section(annotation):
         return "section"
     return {float: "number", int: "whole number", str: "text", bool: "`true` or `false`"}.get(
         annotation, str(annotation)
@@ -74,13 +75,8 @@ def _kind(annotation: Any) -> str:
 def _limits(field: FieldInfo) -> str:
     """Limits of a number, from its own constraints and those of its annotated type."""
     signs = {"ge": "≥", "gt": ">", "le": "≤", "lt": "<"}
-    found = [
-        f"{sign} {getattr(rule, name):g}"
-        for name, sign in signs.items()
-        for rule in field.metadata
-        if getattr(rule, name, None) is not None
-    ]
-    return ", ".join(found)
+    rules = [(sign, getattr(rule, name, None)) for name, sign in signs.items() for rule in field.metadata]
+    return ", ".join(f"{sign} {limit:g}" for sign, limit in rules if limit is not None)
 
 
 def _default(field: FieldInfo) -> str:
@@ -94,8 +90,7 @@ def _default(field: FieldInfo) -> str:
     return "see below" if isinstance(value, BaseModel | dict) else f"`{value}`"
 
 
-def settings_table(section: type[BaseModel]) -> str:
-    """Table of a section's keys."""
+def _settings_table(section: type[BaseModel]) -> str:
     rows = []
     for name, field in section.model_fields.items():
         kind = ", ".join(filter(None, [_kind(field.annotation), _limits(field)]))
@@ -104,38 +99,41 @@ def settings_table(section: type[BaseModel]) -> str:
     return _table(("key", "value", "default", "meaning"), rows)
 
 
-def sections(annotation: Any, path: str = "") -> Iterator[tuple[str, type[BaseModel]]]:
+def _is_section(annotation: Any) -> bool:
+    return isinstance(annotation, type) and issubclass(annotation, BaseModel)
+
+
+def _sections(annotation: Any, path: str = "") -> Iterator[tuple[str, type[BaseModel]]]:
     """Every section of a campaign with its dotted path, unions and mappings looked through."""
-    if not (isinstance(annotation, type) and issubclass(annotation, BaseModel)):
+    if not _is_section(annotation):
         inner = [option for option in get_args(annotation) if not isinstance(option, str)]
-        models = [option for option in inner if isinstance(option, type) and issubclass(option, BaseModel)]
+        models = [option for option in inner if _is_section(option)]
         below = f"{path}.NAME" if get_origin(annotation) is dict else path
         for option in inner:
-            yield from sections(option, below if len(models) < 2 else f"{path} ({option.__name__})")
+            yield from _sections(option, below if len(models) < 2 else f"{path} ({option.__name__})")
         return
     yield path, annotation
     for name, field in annotation.model_fields.items():
-        yield from sections(field.annotation, f"{path}.{name}".lstrip("."))
+        yield from _sections(field.annotation, f"{path}.{name}".lstrip("."))
 
 
 def settings_reference() -> str:
     """All sections, each with a heading and its table; one that was shown already is only named."""
     shown: dict[type[BaseModel], str] = {}
     text = []
-    for path, section in sections(Campaign):
+    for path, section in _sections(Campaign):
         text.append(f"### {f'`{path}`' if path else 'Top level'}\n\n")
         if section in shown:
             text.append(f"As `{shown[section]}`.\n\n")
             continue
         shown[section] = path
-        text.append(f"{_own_words(section)}\n\n{settings_table(section)}\n")
+        text.append(f"{_own_words(section)}\n\n{_settings_table(section)}\n")
     return "\n" + "".join(text)
 
 
 def _own_words(annotation: Any) -> str:
     """First line of a section's docstring."""
-    is_section = isinstance(annotation, type) and issubclass(annotation, BaseModel)
-    return str(annotation.__doc__).strip().splitlines()[0] if is_section else ""
+    return str(annotation.__doc__).strip().splitlines()[0] if _is_section(annotation) else ""
 
 
 def columns_table(schema: pa.Schema) -> str:
@@ -152,7 +150,7 @@ def columns_table(schema: pa.Schema) -> str:
 
 def environment_table() -> str:
     """Numbers of the shipped environment, by section and source."""
-    parameters = load_parameters(Environment())
+    parameters = load_parameters(EnvironmentSettings())
     rows = []
     for section, numbers in parameters:
         if not isinstance(numbers, BaseModel):
@@ -164,45 +162,42 @@ def environment_table() -> str:
     return _table(("section", "source", "numbers"), rows)
 
 
-def _result(name: str) -> dict[str, Any] | None:
+def _result(name: str) -> dict[str, Any]:
     path = _ELSEWHERE.get(name, FOLDER / "validation" / f"{name}.json")
-    return json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
+    return dict(json.loads(path.read_text(encoding="utf-8")))
 
 
 def results_table(names: tuple[str, ...]) -> str:
-    """Table of long runs, the commands below it; one that has not been made yet says so."""
+    """Table of long runs, the commands below it; ratios are to the run of the episode mixture."""
     head = ("run", "tests", "crashes", "crash rate", "std. error", "ratio", "relvar", "tests for RHW 0.3")
     head = (*head, "P(cut-in)", "BV–LV")
-    yardstick = next((found for name in names if "episode" in name and (found := _result(name))), None)
-    rows, commands = [], []
-    for name in names:
-        found = _result(name)
-        if found is None:
-            rows.append((name, *("not yet run",) + ("",) * (len(head) - 2)))
-            continue
-        rows.append((name, *_result_cells(found, yardstick)))
-        commands.append(f"- {name}: `{found['command']}` ({found['seconds']:,.0f} s)")
+    runs = {name: _result(name) for name in names}
+    yardstick = next(found for name, found in runs.items() if "episode" in name)
+    rows = [(name, *_result_cells(found, yardstick)) for name, found in runs.items()]
+    commands = [f"- {name}: `{found['command']}` ({found['seconds']:,.0f} s)" for name, found in runs.items()]
     return _table(head, rows) + "\n" + "\n".join(commands) + "\n"
 
 
-def _ratio(found: dict[str, Any], yardstick: dict[str, Any] | None) -> str:
+def _ratio(found: dict[str, Any], yardstick: dict[str, Any]) -> str:
     """Rate over that of the yardstick, with its standard error."""
-    if yardstick is None or found == yardstick:
-        return "1" if yardstick else "–"
+    if found == yardstick:
+        return "1"
     ratio = found["crash_rate"] / yardstick["crash_rate"]
     return f"{ratio:.3f} ± {ratio * math.hypot(found['relative_error'], yardstick['relative_error']):.3f}"
 
 
-def _result_cells(found: dict[str, Any], yardstick: dict[str, Any] | None) -> Iterator[str]:
-    yield f"{found['n_episodes']:,}"
-    yield f"{found['n_crashes']:,}"
-    yield f"{found['crash_rate']:.4g}"
-    yield f"{found['relative_error']:.2%}"
-    yield _ratio(found, yardstick)
-    yield f"{found['relvar']:.3g}"
-    yield f"{_two_digits(found['relvar'] * RELVAR_TO_TESTS):,}"
-    yield f"{found['mean_weight_cut_in']:.3g}"
-    yield f"{found['mean_weight_contact']:.2g}"
+def _result_cells(found: dict[str, Any], yardstick: dict[str, Any]) -> tuple[str, ...]:
+    return (
+        f"{found['n_episodes']:,}",
+        f"{found['n_crashes']:,}",
+        f"{found['crash_rate']:.4g}",
+        f"{found['relative_error']:.2%}",
+        _ratio(found, yardstick),
+        f"{found['relvar']:.3g}",
+        f"{_two_digits(found['relvar'] * RELVAR_TO_TESTS):,}",
+        f"{found['mean_weight_cut_in']:.3g}",
+        f"{found['mean_weight_contact']:.2g}",
+    )
 
 
 def _two_digits(value: float) -> int:
@@ -225,7 +220,7 @@ LIMITS = {
 
 def limits_table() -> str:
     """Table of what the crash rate of the default vehicle comes from, with its command."""
-    found = json.loads((FOLDER / "validation" / "limits.json").read_text(encoding="utf-8"))
+    found = _result("limits")
     rows = []
     for name, words in LIMITS.items():
         share, error = found["of_the_rate"][name]
@@ -259,11 +254,8 @@ def _command(name: str) -> str:
 
 def validated_table(name: str) -> str:
     """Table of a replication experiment, with its command."""
-    found = _result(name)
-    if found is None:
-        return f"Not yet run: {_command(name)}\n"
     head = ("vehicle or chain", "statement", "true rate", "bias", "coverage", "p (Holm)", "tests", "5–95 %", "alarm")
-    return _table(head, [_validated_cells(one) for one in found["judgements"]]) + f"\n{_command(name)}\n"
+    return _table(head, [_validated_cells(one) for one in _result(name)["judgements"]]) + f"\n{_command(name)}\n"
 
 
 def _validated_cells(one: dict[str, Any]) -> tuple[str, ...]:
@@ -284,54 +276,51 @@ def _validated_cells(one: dict[str, Any]) -> tuple[str, ...]:
 def methods_table() -> str:
     """Table of methods on the default vehicle, all by replication."""
     head = ("method", "estimator", "replications × tests", "bias", "true relvar", "claimed relvar", "coverage")
-    rows, commands = [], []
-    for name, words in METHODS.items():
-        found = _result(name)
-        if found is None:
-            rows.append((words, "not yet run", *("",) * len(head)))
-            continue
-        rows += [(words, *_method_cells(one)) for one in found["judgements"] if one["subject"] == "idm"]
-        commands.append(f"- {words}: {_command(name)}")
+    rows = [
+        (words, *_method_cells(one))
+        for name, words in METHODS.items()
+        for one in _result(name)["judgements"]
+        if one["subject"] == "idm"
+    ]
+    commands = [f"- {words}: {_command(name)}" for name, words in METHODS.items()]
     return _table((*head, "tests for RHW 0.3", "as claimed"), rows) + "\n" + "\n".join(commands) + "\n"
 
 
-def _method_cells(one: dict[str, Any]) -> Iterator[str]:
-    tests = one["tests_median"]
-    needed = one["tests_for_wanted_rhw"]
-    yield f"`{one['result']}`"
-    yield f"{one['replications']:,} × {tests:,.0f}"
-    yield f"{one['bias']:+.1%} ± {one['bias_std_error']:.1%}"
-    yield f"{one['true_relvar'] * tests:.3g}"
-    yield f"{one['claimed_relvar'] * tests:.3g}"
-    yield f"{one['coverage']:.3f}"
-    yield f"{tests:,.0f} (median)" if needed is None else f"{_two_digits(needed):,}"
+def _method_cells(one: dict[str, Any]) -> tuple[str, ...]:
+    tests, needed = one["tests_median"], one["tests_for_wanted_rhw"]
     claimed = one["claimed_relvar"] * tests * RELVAR_TO_TESTS
-    yield "–" if needed is None or claimed <= 0.0 else f"{_two_digits(claimed):,}"
+    return (
+        f"`{one['result']}`",
+        f"{one['replications']:,} × {tests:,.0f}",
+        f"{one['bias']:+.1%} ± {one['bias_std_error']:.1%}",
+        f"{one['true_relvar'] * tests:.3g}",
+        f"{one['claimed_relvar'] * tests:.3g}",
+        f"{one['coverage']:.3f}",
+        f"{tests:,.0f} (median)" if needed is None else f"{_two_digits(needed):,}",
+        "–" if needed is None or claimed <= 0.0 else f"{_two_digits(claimed):,}",
+    )
 
 
-def parts() -> dict[str, Callable[[], str]]:
-    """All generated parts by name."""
-    found: dict[str, Callable[[], str]] = {"settings": settings_reference, "environment": environment_table}
-    for name, schema in SCHEMAS.items():
-        found[f"columns-{name}"] = lambda schema=schema: columns_table(schema)
-    for name, results in RESULTS.items():
-        found[f"results-{name}"] = lambda results=results: results_table(results)
-    for name in VALIDATED:
-        found[f"validated-{name}"] = lambda name=name: validated_table(name)
-    found["validated-methods"] = methods_table
-    found["limits"] = limits_table
-    return found
+PARTS: dict[str, Callable[[], str]] = {
+    "settings": settings_reference,
+    "environment": environment_table,
+    "validated-methods": methods_table,
+    "limits": limits_table,
+    **{f"columns-{name}": partial(columns_table, schema) for name, schema in SCHEMAS.items()},
+    **{f"results-{name}": partial(results_table, results) for name, results in RESULTS.items()},
+    **{f"validated-{name}": partial(validated_table, name) for name in VALIDATED},
+}
+"""All generated parts by name."""
 
 
 def regenerate(text: str) -> str:
     """A page with its generated parts made anew."""
-    known = parts()
-    return _PART.sub(lambda match: match[1] + known[match[2]]() + match[3], text)
+    return _PART.sub(lambda match: match[1] + PARTS[match[2]]() + match[3], text)
 
 
 def pages() -> Iterator[Path]:
     """Pages that have generated parts."""
-    yield from (page for page in sorted(FOLDER.rglob("*.md")) if "<!-- generated:" in page.read_text(encoding="utf-8"))
+    return (page for page in sorted(FOLDER.rglob("*.md")) if "<!-- generated:" in page.read_text(encoding="utf-8"))
 
 
 def main() -> int:

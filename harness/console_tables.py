@@ -43,14 +43,9 @@ def _defined(value: float, style: str = ".2f") -> str:
 
 
 def print_estimates(content: dict[str, Any], asked: Sequence[str] = ()) -> None:
-    """Print estimates as a table, with warnings and reasons below and the answer in a sentence last.
+    """Print ``estimates.json`` as a table, with warnings and reasons below and the answer in a sentence last.
 
-    Parameters
-    ----------
-    content : dict
-        As in ``estimates.json``.
-    asked : sequence of str
-        Estimators to show; all by default. What is said in the end is about them.
+    ``asked`` are the estimators to show, all by default. What is said in the end is about them.
     """
     shown = {name: entry for name, entry in content["estimates"].items() if not asked or name in asked}
     title = f"{content['campaign']}: {content['n_crashes']:,} crashes in {content['n_episodes']:,} tests"

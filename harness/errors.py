@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -62,14 +63,11 @@ class HarnessError(Exception):
 
     def __reduce__(self) -> tuple[Any, ...]:
         # Errors travel from workers to the parent; pickle would call the class with positional arguments.
-        return _rebuild, (type(self), self.where, self.found, self.expected, self.mend)
+        words = {"found": self.found, "expected": self.expected, "mend": self.mend}
+        return partial(type(self), self.where, **words), ()
 
     def __str__(self) -> str:
         return f"{self.where}: found {self.found}; expected {self.expected}. {self.mend}"
-
-
-def _rebuild(kind: type[HarnessError], where: str, found: str, expected: str, mend: str) -> HarnessError:
-    return kind(where, found=found, expected=expected, mend=mend)
 
 
 class CampaignError(HarnessError):

@@ -39,6 +39,22 @@ def test_worked_examples_name_what_is_in_the_file(row):
     assert [name for name in names if not re.search(rf"\b{re.escape(name)}\b", text)] == []
 
 
+@pytest.mark.parametrize(
+    ("folder", "imported", "may"),
+    [
+        ("harness", "harness.studies", ("harness/studies/", "harness/commands/")),
+        ("harness", "tests", ()),
+        ("benchmarks", "tests", ()),
+    ],
+)
+def test_imports_lead_where_they_should(folder, imported, may):
+    """Only the command line leads to studies, and nothing that is not a test to tests."""
+    wrong = re.compile(rf"^\s*(?:from|import) {re.escape(imported)}\b", re.MULTILINE)
+    files = [path.relative_to(ROOT).as_posix() for path in (ROOT / folder).rglob("*.py")]
+    found = [file for file in files if wrong.search((ROOT / file).read_text(encoding="utf-8"))]
+    assert [file for file in found if not file.startswith(may)] == []
+
+
 def test_there_are_four_worked_examples():
     _, _, examples = CONTRIBUTING.partition("## Four worked examples")
     assert len(re.findall(r"^### ", examples, re.MULTILINE)) == 4

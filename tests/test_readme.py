@@ -1,6 +1,5 @@
 """What a stranger meets first is true: commands, links, Python lines, generated tables."""
 
-import importlib.util
 import os
 import re
 import shlex
@@ -11,6 +10,7 @@ from pathlib import Path
 import click
 import pytest
 
+from docs import generate
 from harness.cli import cli
 
 ROOT = Path(__file__).parent.parent
@@ -43,13 +43,6 @@ def _commands():
         text = campaign.read_text(encoding="utf-8").replace("\\\n#", " ")
         for line in re.findall(r"^# +(harness \S.*)$", text, re.MULTILINE):
             yield pytest.param(re.split(r"\s{3,}", line)[0], id=f"{campaign.name}: {line[:60]}")
-
-
-def _generator():
-    spec = importlib.util.spec_from_file_location("generate", ROOT / "docs" / "generate.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 def test_readme_has_the_two_commands_once_each():
@@ -125,7 +118,6 @@ def test_python_lines_run(tmp_path):
 
 
 def test_generated_parts_are_current():
-    generate = _generator()
     stale = [
         page.name
         for page in generate.pages()
@@ -135,7 +127,6 @@ def test_generated_parts_are_current():
 
 
 def test_every_long_run_is_in_the_table():
-    generate = _generator()
     shown = {name for names in generate.RESULTS.values() for name in names}
     shown |= {*generate.VALIDATED, *generate.METHODS, "limits"}
     assert {path.stem for path in (ROOT / "docs/validation").glob("*.json")} <= shown

@@ -41,34 +41,31 @@ def test_the_rule_remembers_what_was_missing(looks, reached, waited_for):
     assert (rule.reached, rule.waited_for) == (reached, waited_for)
 
 
+POOL_SPENT = "all cut-ins that the pool keeps of a shell were tested; raise pool.cut_ins_per_shell and use a new folder"
+BOTH = ("stop.rhw (0.1)", "stop.min_crashes (50)")
+
+
 @pytest.mark.parametrize(
-    ("stopped_by", "waited_for", "asked", "sentence"),
+    ("stopped_by", "waited_for", "sentence"),
     [
-        ("rhw", ("stop.min_crashes (3,000)",), True, ": the last condition to be met was stop.min_crashes (3,000)."),
-        ("rhw", (), True, ": every condition was met at the first look."),
-        ("episodes", (), False, ": stop.episodes was all that was asked for."),
+        ("rhw", BOTH[1:], ": the last condition to be met was stop.min_crashes (50)."),
+        ("rhw", (), ": every condition was met at the first look."),
+        ("episodes", None, ": stop.episodes was all that was asked for."),
         (
             "episodes",
-            ("stop.rhw (0.1)", "stop.min_crashes (50)"),
-            True,
+            BOTH,
             " without stop.rhw (0.1) and stop.min_crashes (50): stop.episodes was spent; raise it and go on with "
             "--resume.",
         ),
         (
             "pool_error",
-            ("stop.rhw (0.01)",),
-            True,
-            " without stop.rhw (0.01): the pool's own error alone is wider; lower pool.relative_error and use a new "
+            BOTH[:1],
+            " without stop.rhw (0.1): the pool's own error alone is wider; lower pool.relative_error and use a new "
             "folder.",
         ),
-        (
-            "pool",
-            (),
-            False,
-            ": all cut-ins that the pool keeps of a shell were tested; raise pool.cut_ins_per_shell and use a new "
-            "folder.",
-        ),
+        ("pool", None, f": {POOL_SPENT}."),
     ],
 )
-def test_every_end_has_its_sentence(stopped_by, waited_for, asked, sentence):
-    assert ending(stopped_by, 46_735, waited_for, precision_asked=asked) == "Stopped after 46,735 tests" + sentence
+def test_every_end_has_its_sentence(stopped_by, waited_for, sentence):
+    said = ending(stopped_by, 46_735, waited_for or (), precision_asked=waited_for is not None)
+    assert said == "Stopped after 46,735 tests" + sentence

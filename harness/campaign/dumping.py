@@ -33,13 +33,7 @@ _Dumper.add_representer(str, _Dumper.represent_text)
 
 
 def dump_campaign(campaign: Campaign) -> str:
-    """YAML text of a campaign; `harness.campaign.loading.load_campaign` reads an equal campaign from it.
-
-    Parameters
-    ----------
-    campaign : Campaign
-        Any campaign; a relative ``environment.parameters`` stays relative.
-    """
+    """YAML text of a campaign; `harness.campaign.loading.load_campaign` reads an equal campaign from it."""
     parts = [_HEADER.format(name=campaign.name)]
     for key, value in written_out(campaign).items():
         about = _about(campaign, key)

@@ -6,13 +6,10 @@ import difflib
 from collections.abc import Sequence
 from pathlib import Path
 
-from pydantic import ValidationError
-
 from harness.campaign.models import Campaign
 from harness.campaign.overrides import Places, apply_overrides, parse_override
 from harness.campaign.panel import av_override
-from harness.campaign.problems import Place, invalid_file
-from harness.campaign.schema import campaign_schema
+from harness.campaign.problems import validated
 from harness.campaign.yaml_text import read_yaml
 from harness.errors import CampaignError
 
@@ -52,15 +49,36 @@ def load_campaign(
     """
     data, lines = read_yaml(path)
     changes = [*([] if av is None else [av_override(av)]), *map(parse_override, overrides)]
-    data = apply_overrides(data, changes)
     place = Places(lines, changes)
-    try:
-        campaign = Campaign.model_validate(data)
-    except ValidationError as error:
-        raise invalid_file(error, path=str(path), data=data, schema=campaign_schema(), place=place) from None
-    campaign = _with_absolute_fmu(campaign, Path(path).parent, place, check_files=check_files)
-    campaign = _with_absolute_library(campaign, Path(path).parent, place, check_files=check_files)
-    return _with_absolute_paths(campaign, Path(path).parent, place, check_files=check_files)
+    campaign = validated(apply_overrides(data, changes), Campaign, str(path), place)
+    for where, (name, expected) in _named_files(campaign).items():
+        file = (Path(path).parent / Path(name).expanduser()).resolve()
+        if check_files and not file.is_file():
+            raise CampaignError(
+                place(where),
+                found=f"{name}, but there is no file {file}",
+                expected=expected,
+                mend="Correct the path; it is relative to the folder of the campaign file.",
+            )
+        campaign = campaign.replaced(where, str(file))
+    name = campaign.environment.parameters
+    if check_files and not names_a_file(name) and name not in shipped_parameters():
+        raise _unknown_parameters(name, place(("environment", "parameters")))
+    return campaign
+
+
+def _named_files(campaign: Campaign) -> dict[tuple[str, ...], tuple[str, str]]:
+    """Files that a campaign names: by their place in it the name and what it has to be."""
+    fmu, library, parameters = campaign.av.fmu, campaign.pool.library, campaign.environment.parameters
+    files: dict[tuple[str, ...], tuple[str, str]] = {}
+    if fmu is not None:
+        files["av", "fmu", "file"] = fmu.file, "an FMI 2.0 co-simulation FMU"
+    if names_a_file(library):
+        files["pool", "library"] = library, "a surrogate library, or the name of a shipped one"
+    if names_a_file(parameters):
+        expected = f"a parameter file, or the name of a shipped one: {', '.join(shipped_parameters())}"
+        files["environment", "parameters"] = parameters, expected
+    return files
 
 
 def shipped_parameters() -> list[str]:
@@ -71,55 +89,6 @@ def shipped_parameters() -> list[str]:
 def names_a_file(parameters: str) -> bool:
     """Tell a path to a parameter file from the name of a shipped one."""
     return parameters.endswith((".yaml", ".yml")) or "/" in parameters
-
-
-def _with_absolute_paths(campaign: Campaign, folder: Path, place: Place, *, check_files: bool) -> Campaign:
-    parameters = campaign.environment.parameters
-    where = place(("environment", "parameters"))
-    if not names_a_file(parameters):
-        if check_files and parameters not in shipped_parameters():
-            raise _unknown_parameters(parameters, where)
-        return campaign
-    file = (folder / Path(parameters).expanduser()).resolve()
-    if check_files and not file.is_file():
-        raise CampaignError(
-            where,
-            found=f"{parameters}, but there is no file {file}",
-            expected=f"a parameter file, or the name of a shipped one: {', '.join(shipped_parameters())}",
-            mend="Correct the path; it is relative to the folder of the campaign file.",
-        )
-    environment = campaign.environment.model_copy(update={"parameters": str(file)})
-    return campaign.model_copy(update={"environment": environment})
-
-
-def _with_absolute_fmu(campaign: Campaign, folder: Path, place: Place, *, check_files: bool) -> Campaign:
-    fmu = campaign.av.fmu
-    if fmu is None:
-        return campaign
-    file = (folder / Path(fmu.file).expanduser()).resolve()
-    if check_files and not file.is_file():
-        raise CampaignError(
-            place(("av", "fmu", "file")),
-            found=f"{fmu.file}, but there is no file {file}",
-            expected="an FMI 2.0 co-simulation FMU",
-            mend="Correct the path; it is relative to the folder of the campaign file.",
-        )
-    av = campaign.av.model_copy(update={"fmu": fmu.model_copy(update={"file": str(file)})})
-    return campaign.model_copy(update={"av": av})
-
-
-def _with_absolute_library(campaign: Campaign, folder: Path, place: Place, *, check_files: bool) -> Campaign:
-    if not names_a_file(campaign.pool.library):
-        return campaign
-    file = (folder / Path(campaign.pool.library).expanduser()).resolve()
-    if check_files and not file.is_file():
-        raise CampaignError(
-            place(("pool", "library")),
-            found=f"{campaign.pool.library}, but there is no file {file}",
-            expected="a surrogate library, or the name of a shipped one",
-            mend="Correct the path; it is relative to the folder of the campaign file.",
-        )
-    return campaign.model_copy(update={"pool": campaign.pool.model_copy(update={"library": str(file)})})
 
 
 def _unknown_parameters(parameters: str, where: str) -> CampaignError:

@@ -27,7 +27,16 @@ from harness.campaign.drivers import (
     default_surrogates,
 )
 from harness.campaign.section import NAME_PATTERN, Section, SurrogateName, Whole, broken_rule, listed
-from harness.campaign.testing import MOST_SUMO_CELLS, Environment, PoolSettings, Records, Run, Stop, Testing, World
+from harness.campaign.testing import (
+    MOST_SUMO_CELLS,
+    EnvironmentSettings,
+    PoolSettings,
+    Records,
+    Run,
+    Stop,
+    Testing,
+    World,
+)
 from harness.campaign.vehicle import AutomatedVehicle, FmuController, Limits, TraciProcess
 from harness.methods import METHODS, SAMPLING
 
@@ -39,7 +48,7 @@ __all__ = [
     "Campaign",
     "Constant",
     "ConstantParameters",
-    "Environment",
+    "EnvironmentSettings",
     "FVDMParameters",
     "FmuController",
     "IDMParameters",
@@ -62,7 +71,7 @@ class Campaign(Section):
     name: str = Field(pattern=NAME_PATTERN, description="short name of letters, digits, _ . and -, used in reports")
     description: str = Field("", description="what this campaign is for, in a sentence")
     seed: Whole = Field(1, ge=0, lt=2**63, description="every random number follows from it")
-    environment: Environment = Environment()
+    environment: EnvironmentSettings = EnvironmentSettings()
     av: AutomatedVehicle = AutomatedVehicle()
     surrogates: dict[SurrogateName, DriverModel] = Field(
         default_factory=default_surrogates, description="stand-ins for the unknown AV, by name"
@@ -192,15 +201,8 @@ class Campaign(Section):
         return tuple(self.testing.alpha[name] for name in self.surrogates)
 
     def content_hash(self, environment_parameters: str) -> str:
-        """Hash of everything that changes an episode's bits.
+        """Hash of everything that changes an episode's bits, that of the environment's parameters included.
 
-        Parameters
-        ----------
-        environment_parameters : str
-            Hash of the environment parameter file in use.
-
-        Notes
-        -----
         Cells, workers, stop rule, trace policy and names are left out, so that a campaign can be continued to a
         smaller RHW or with other resources.
         """

@@ -6,10 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from harness.campaign.expectations import describe_found
-from harness.campaign.models import Campaign
-from harness.campaign.yaml_lines import Lines, YamlPath, dotted
-from harness.campaign.yaml_text import parse_value
+from harness.campaign.drivers import default_surrogates
+from harness.campaign.problems import describe_found
+from harness.campaign.yaml_text import Lines, YamlPath, dotted, parse_value
 from harness.errors import CampaignError
 
 
@@ -60,14 +59,9 @@ def apply_overrides(data: dict[str, Any], overrides: Sequence[Override]) -> dict
     for override in overrides:
         if override.path[0] == "surrogates" and len(override.path) > 1 and "surrogates" not in changed:
             # The file leaves the surrogates to their default: changing one must not drop the others.
-            changed["surrogates"] = _default_surrogates()
+            changed["surrogates"] = {name: driver.model_dump() for name, driver in default_surrogates().items()}
         _lay_over(changed, override)
     return changed
-
-
-def _default_surrogates() -> dict[str, Any]:
-    defaults: dict[str, Any] = Campaign(name="defaults").model_dump()["surrogates"]
-    return defaults
 
 
 def _lay_over(data: dict[str, Any], override: Override) -> None:
@@ -89,15 +83,7 @@ def _lay_over(data: dict[str, Any], override: Override) -> None:
 
 
 class Places:
-    """Says where a value was written: in the file, or by an override.
-
-    Parameters
-    ----------
-    lines : Lines
-        Lines of the file.
-    overrides : sequence of Override
-        In the order in which they were applied.
-    """
+    """Says where a value was written: in the file, or by one of the overrides, in the order they were applied in."""
 
     def __init__(self, lines: Lines, overrides: Sequence[Override]) -> None:
         self._lines = lines

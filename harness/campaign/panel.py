@@ -6,14 +6,12 @@ import difflib
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from harness.campaign.models import AutomatedVehicle
 from harness.campaign.overrides import Override
-from harness.campaign.problems import invalid_file
-from harness.campaign.schema import schema_of
+from harness.campaign.problems import read_model
 from harness.campaign.section import NAME_PATTERN, Section
-from harness.campaign.yaml_text import read_yaml
 from harness.errors import CampaignError
 
 _CHECKOUT = Path(__file__).parents[2] / "scenarios"
@@ -40,13 +38,12 @@ def load_panel(path: str | Path = SHIPPED_PANEL) -> Panel:
     CampaignError
         The file cannot be read or says something wrong; the error names every place.
     """
-    data, lines = read_yaml(path)
-    try:
-        panel = Panel.model_validate(data)
-    except ValidationError as error:
-        raise invalid_file(error, path=str(path), data=data, schema=schema_of(Panel), place=lines.place) from None
-    avs = {name: _with_absolute_fmu(av, Path(path).parent) for name, av in panel.avs.items()}
-    return panel.model_copy(update={"avs": avs})
+    panel = read_model(path, Panel)
+    for name, av in panel.avs.items():
+        if av.fmu is not None:
+            file = (Path(path).parent / Path(av.fmu.file).expanduser()).resolve()
+            panel = panel.replaced(("avs",), panel.avs | {name: av.replaced(("fmu", "file"), str(file))})
+    return panel
 
 
 def panel_av(text: str) -> AutomatedVehicle:
@@ -71,18 +68,5 @@ def panel_av(text: str) -> AutomatedVehicle:
 
 
 def av_override(text: str) -> Override:
-    """``--av``: the vehicle's section in place of the campaign's own, with nothing written that the panel leaves out.
-
-    Raises
-    ------
-    CampaignError
-        As `panel_av`.
-    """
+    """``--av``: the vehicle's section in place of the campaign's own, with only what the panel writes."""
     return Override(("av",), panel_av(text).model_dump(exclude_unset=True), text, flag="--av")
-
-
-def _with_absolute_fmu(av: AutomatedVehicle, folder: Path) -> AutomatedVehicle:
-    if av.fmu is None:
-        return av
-    file = str((folder / Path(av.fmu.file).expanduser()).resolve())
-    return av.model_copy(update={"fmu": av.fmu.model_copy(update={"file": file})})

@@ -8,7 +8,8 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from harness.campaign.models import Campaign, ConstantParameters, FVDMParameters, IDMParameters
+from harness.campaign.drivers import PARAMETERS
+from harness.campaign.models import Campaign
 from harness.campaign.vehicle import AV_SOURCES
 
 Schema = dict[str, Any]
@@ -21,12 +22,15 @@ def campaign_schema() -> Schema:
 
 
 def schema_of(model: type[BaseModel]) -> Schema:
-    """JSON schema of a file that holds vehicles: a campaign, or a panel."""
+    """JSON schema of a file: a campaign, a panel of vehicles, or parameters of an environment."""
     schema = model.model_json_schema()
-    for parameters in (IDMParameters, FVDMParameters, ConstantParameters):
-        schema["$defs"].setdefault(parameters.__name__, parameters.model_json_schema())
+    av = schema.get("$defs", {}).get("AutomatedVehicle")
+    if av is not None:
+        for parameters in PARAMETERS.values():
+            schema["$defs"].setdefault(parameters.__name__, parameters.model_json_schema())
     _tidy(schema)
-    _tell_sources_apart(schema["$defs"]["AutomatedVehicle"])
+    if av is not None:
+        _tell_sources_apart(av)
     return schema
 
 
@@ -85,11 +89,6 @@ class SchemaView:
     """Finds what a JSON schema says about one place of a document.
 
     Understands what pydantic writes: references, optional values, unions told apart by a key, ``if``/``then``.
-
-    Parameters
-    ----------
-    root : dict
-        JSON schema of the whole document.
     """
 
     def __init__(self, root: Schema) -> None:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import Annotated, Any
+from collections.abc import Iterable, Sequence
+from typing import Annotated, Any, Self
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 from pydantic_core import PydanticCustomError
@@ -27,14 +27,9 @@ SurrogateName = Annotated[str, Field(pattern=SURROGATE_PATTERN)]
 
 
 def broken_rule(key: str, *, found: str, expected: str, mend: str) -> PydanticCustomError:
-    """Error for a rule between several values, in the four parts that the loader shows.
+    """Error for a rule between several values, in the parts of a `harness.errors.HarnessError`.
 
-    Parameters
-    ----------
-    key : str
-        Dotted path of the value to blame, seen from the section that states the rule; empty for the section itself.
-    found, expected, mend : str
-        As in `harness.errors.HarnessError`.
+    ``key`` is the dotted path of the value to blame, seen from the section that states the rule; empty for the section.
     """
     parts = {"key": key, "found": found, "expected": expected, "mend": mend}
     where = "{key}: " if key else ""
@@ -45,6 +40,11 @@ class Section(BaseModel):
     """A section of the campaign: unknown keys are errors, values never change after loading."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+
+    def replaced(self, path: Sequence[str], value: Any) -> Self:
+        """A copy with another value at a path such as ``("av", "fmu", "file")``, not validated."""
+        key, *rest = path
+        return self.model_copy(update={key: getattr(self, key).replaced(rest, value) if rest else value})
 
 
 def _whole_steps(seconds: float) -> float:

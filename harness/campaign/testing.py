@@ -14,7 +14,7 @@ MOST_SUMO_CELLS = 256
 """Roads of the largest committed network."""
 
 
-class Environment(Section):
+class EnvironmentSettings(Section):
     """The naturalistic driving environment."""
 
     parameters: str = Field("ndd-overtaking-1", description="name of a shipped parameter file, or a path to your own")
@@ -28,7 +28,7 @@ class Environment(Section):
     )
 
 
-class Shells(Section):
+class ShellSettings(Section):
     """How tests are spread over the shells of the pool."""
 
     boundary: SurrogateName | None = Field(
@@ -60,7 +60,7 @@ class Testing(Section):
         0.1, gt=0.0, lt=1.0, description="alpha_0, share of forced cut-ins in the episode mixture"
     )
     criticality_threshold: float = Field(0.0, ge=0.0, lt=1.0, description="a moment is critical above it")
-    shells: Shells = Shells()
+    shells: ShellSettings = ShellSettings()
 
     @field_validator("alpha")
     @classmethod

@@ -6,23 +6,60 @@ unknown tag, a syntax error or an empty file is a `CampaignError` that names fil
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NoReturn, TypeVar
+from typing import Any, NoReturn
 
-from pydantic import BaseModel, ValidationError
 from yaml.error import Mark, MarkedYAMLError
-from yaml.nodes import Node
+from yaml.nodes import MappingNode, Node, SequenceNode
 from yaml.reader import ReaderError
 
-from harness.campaign.problems import invalid_file
-from harness.campaign.yaml_lines import Lines, dotted
 from harness.campaign.yaml_loader import StrictLoader
 from harness.errors import CampaignError
 
-Model = TypeVar("Model", bound=BaseModel)
-
 LARGEST_FILE = 1_000_000
 """Bytes of a YAML file that is read: a hundred times the largest that comes with the harness."""
+
+YamlPath = Sequence[str | int]
+
+
+def dotted(where: YamlPath) -> str:
+    """``testing.alpha``, the way a path is written in messages and after ``--set``."""
+    return ".".join(map(str, where))
+
+
+class Lines:
+    """Where each value of a YAML document was written, which is composed and constructed at ``root``."""
+
+    def __init__(self, path: str, root: Node) -> None:
+        self.path = path
+        self._root = root
+
+    def line_of(self, where: YamlPath) -> int:
+        """Line, from 1, of the value at ``where``, or of its nearest ancestor that is in the file."""
+        node, line = self._root, 1
+        for part in where:
+            found = _child(node, part)
+            if found is None:
+                break
+            mark, node = found
+            line = mark.start_mark.line + 1
+        return line
+
+    def place(self, where: YamlPath) -> str:
+        """``testing.alpha (smoke.yaml:12)``, or just file and line for the whole document."""
+        spot = f"{self.path}:{self.line_of(where)}"
+        return f"{dotted(where)} ({spot})" if where else spot
+
+
+def _child(node: Node, part: str | int) -> tuple[Node, Node] | None:
+    """Node that marks the line, and node of the value, of one step into ``node``."""
+    if isinstance(node, SequenceNode) and isinstance(part, int) and part < len(node.value):
+        return node.value[part], node.value[part]
+    if isinstance(node, MappingNode):
+        # The loader has put what ``<<`` merges before the mapping's own keys, which override it.
+        return next(((key, value) for key, value in reversed(node.value) if key.value == str(part)), None)
+    return None
 
 
 def read_yaml(path: str | Path) -> tuple[dict[str, Any], Lines]:
@@ -59,22 +96,6 @@ def read_yaml(path: str | Path) -> tuple[dict[str, Any], Lines]:
             mend="Write 'key: value' lines, without a dash before the first one.",
         )
     return data, Lines(name, root)
-
-
-def read_model(path: str | Path, model: type[Model]) -> Model:
-    """Read a YAML file into a pydantic model, such as an environment's parameters.
-
-    Raises
-    ------
-    CampaignError
-        As `read_yaml`; or the content does not fit ``model``, with every problem's path and line.
-    """
-    data, lines = read_yaml(path)
-    try:
-        return model.model_validate(data)
-    except ValidationError as error:
-        schema = model.model_json_schema()
-        raise invalid_file(error, path=str(path), data=data, schema=schema, place=lines.place) from None
 
 
 def parse_value(text: str, where: str) -> Any:

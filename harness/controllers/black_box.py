@@ -41,31 +41,17 @@ class Death(NamedTuple):
     cause: str
 
 
-class _Forks:
-    """Counts this process's `os.fork`; what starts programs (subprocess) does not pass here."""
-
-    n = 0
-
-    @classmethod
-    def add(cls) -> None:
-        cls.n += 1
-
-
-os.register_at_fork(after_in_parent=_Forks.add)
+_forks: list[None] = []
+"""One entry for each `os.fork` of this process; what starts programs (subprocess) does not pass here."""
+os.register_at_fork(after_in_parent=lambda: _forks.append(None))
 
 
 class BlackBox:
-    """Notes the call that is under way, and lets no copy of the process come back from one.
-
-    Parameters
-    ----------
-    path : Path, optional
-        File; without one the notes go nowhere.
-    """
+    """Notes the call that is under way in a file, if any, and lets no copy of the process come back from one."""
 
     def __init__(self, path: Path | None) -> None:
         self._note: IntArray = np.zeros(3, np.int64)
-        self._forks = _Forks.n
+        self._forks = len(_forks)
         if path is not None:
             with writing(path):
                 path.write_bytes(_FORMAT.pack(_NONE, 0, 0))
@@ -77,7 +63,7 @@ class BlackBox:
         self._note[1] = episode
         self._note[2] = step
         self._note[0] = kind
-        self._forks = _Forks.n
+        self._forks = len(_forks)
 
     def leave(self) -> None:
         """The call has come back; a process that dies does not come here, and one that was copied must not go on."""
@@ -87,7 +73,7 @@ class BlackBox:
 
     def misdeed(self) -> str | None:
         """What a controller did in the last call that no controller may do, or None."""
-        return None if _Forks.n == self._forks else "copied the process (os.fork); start programs with subprocess"
+        return None if len(_forks) == self._forks else "copied the process (os.fork); start programs with subprocess"
 
 
 def last_call(path: Path) -> Call | None:

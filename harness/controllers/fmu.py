@@ -17,7 +17,7 @@ from pathlib import Path
 from tempfile import mkdtemp
 from typing import Any
 
-from harness.campaign.models import AutomatedVehicle, FmuController
+from harness.campaign.models import FmuController
 from harness.compiled import cache_root
 from harness.controllers.protocol import EpisodeStart, Observation, VehicleController
 from harness.errors import CampaignError
@@ -53,7 +53,7 @@ class Wiring:
     only_one_per_process: bool
 
 
-def fmu_maker(av: AutomatedVehicle) -> Callable[[], VehicleController]:
+def fmu_maker(fmu: FmuController) -> Callable[[], VehicleController]:
     """What makes a controller for a cell.
 
     Raises
@@ -61,21 +61,19 @@ def fmu_maker(av: AutomatedVehicle) -> Callable[[], VehicleController]:
     CampaignError
         fmpy is not installed, the file is no FMI 2.0 co-simulation FMU, or ``av.fmu`` does not fit its variables.
     """
-    if av.fmu is None:
-        raise ValueError("an AV without av.fmu")
     fmpy = _fmpy()
     try:
-        folder = _unpacked(Path(av.fmu.file))
+        folder = _unpacked(Path(fmu.file))
         description = fmpy.read_model_description(str(folder))
     except Exception as error:
         raise CampaignError(
             "av.fmu.file",
-            found=f"{av.fmu.file}, which cannot be read ({' '.join(str(error).split())[:300]})",
+            found=f"{fmu.file}, which cannot be read ({' '.join(str(error).split())[:300]})",
             expected="an FMI 2.0 co-simulation FMU",
             mend="Export it again, and try 'fmpy validate' on it.",
         ) from error
-    _require_co_simulation(av.fmu.file, description)
-    wiring = wire(av.fmu, description)
+    _require_co_simulation(fmu.file, description)
+    wiring = wire(fmu, description)
     made: list[FmuVehicleController] = []
 
     def make() -> VehicleController:
@@ -174,14 +172,7 @@ def _reference(where: str, name: str, description: Any, causalities: Sequence[st
 
 
 class FmuVehicleController:
-    """One instance of an FMU.
-
-    Parameters
-    ----------
-    wiring : Wiring
-    folder : Path
-        Where the FMU is unpacked.
-    """
+    """One instance of an FMU, which is unpacked in ``folder``."""
 
     def __init__(self, wiring: Wiring, folder: Path) -> None:
         self._wiring = wiring
@@ -205,22 +196,18 @@ class FmuVehicleController:
             self.close()
 
     def _begin(self, time_s: float) -> None:
+        from fmpy.fmi2 import FMU2Slave  # noqa: PLC0415 - an extra
+
         if self._fmu is None:
-            self._fmu = self._instance()
+            wiring = self._wiring
+            self._fmu = FMU2Slave(guid=wiring.guid, modelIdentifier=wiring.identifier, unzipDirectory=str(self._folder))
+            self._fmu.instantiate()
         self._fmu.setupExperiment(startTime=time_s)
         if self._wiring.start_references:
             self._fmu.setReal(self._wiring.start_references, self._wiring.start_values)
         self._fmu.enterInitializationMode()
         self._fmu.exitInitializationMode()
         self._begun = True
-
-    def _instance(self) -> Any:
-        from fmpy.fmi2 import FMU2Slave  # noqa: PLC0415 - an extra
-
-        wiring = self._wiring
-        fmu = FMU2Slave(guid=wiring.guid, modelIdentifier=wiring.identifier, unzipDirectory=str(self._folder))
-        fmu.instantiate()
-        return fmu
 
     def step(self, observation: Observation) -> float:
         """Inputs, ``doStep`` over 0.1 s, output (m/s²)."""

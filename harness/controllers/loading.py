@@ -15,8 +15,9 @@ from typing import Any
 
 from harness.campaign.models import AutomatedVehicle, Campaign
 from harness.controllers.apart import AvEndedProcessError, has_foreign_code, run_apart
-from harness.controllers.black_box import BlackBox, Death
-from harness.controllers.hosts import BatchHost, ControllerHost, VehicleHost, cause_of, made
+from harness.controllers.black_box import CONSTRUCTOR, BlackBox, Death
+from harness.controllers.guard import cause_of, require_fault
+from harness.controllers.hosts import BatchHost, ControllerHost, VehicleHost
 from harness.errors import CampaignError
 
 GROUP = "harness.controllers"
@@ -93,10 +94,10 @@ def build_host(
         if callable(getattr(first, "step_batch", None)) and callable(getattr(first, "start_batch", None)):
             return BatchHost(first, seed, av.limits, black_box=black_box, acts_before_cut_in=acts_early)
         _require_vehicle_controller(first, str(av.controller))
-    elif av.source == "fmu":
+    elif av.fmu is not None:
         from harness.controllers.fmu import fmu_maker  # noqa: PLC0415 - an extra
 
-        make = fmu_maker(av)
+        make = fmu_maker(av.fmu)
     else:
         return None
     return VehicleHost(
@@ -152,7 +153,7 @@ def _parameters(av: AutomatedVehicle) -> dict[str, Any]:
 def _make_first(make: Callable[[], Any], av: AutomatedVehicle, black_box: BlackBox) -> Any:
     """Make one controller, so that what its constructor refuses is an error of the campaign, not of every episode."""
     try:
-        return made(make, black_box)
+        return _made(make, black_box)
     except Exception as error:
         if not _takes(partial(controller_class(str(av.controller)), **_parameters(av))):
             raise CampaignError(
@@ -168,6 +169,23 @@ def _make_first(make: Callable[[], Any], av: AutomatedVehicle, black_box: BlackB
             expected="a controller that can be made",
             mend=f"Mend its constructor, or what it needs; av.parameters given to it: {given}.",
         ) from error
+
+
+def _made(make: Callable[[], Any], black_box: BlackBox) -> Any:
+    """A new controller; whatever its constructor raises is an `Exception`."""
+    black_box.enter(CONSTRUCTOR)
+    try:
+        controller = make()
+    except Exception:
+        raise
+    except BaseException as error:
+        require_fault(error)
+        raise RuntimeError(cause_of(error)) from error
+    finally:
+        black_box.leave()
+    if (misdeed := black_box.misdeed()) is not None:
+        raise RuntimeError(misdeed)
+    return controller
 
 
 def _takes(make: partial[Any]) -> bool:

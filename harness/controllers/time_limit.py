@@ -23,11 +23,7 @@ class StepTimeoutError(BaseException):
 class TimeLimit:
     """Limits each of the calls made inside the block; signals need the main thread, where workers run controllers.
 
-    Parameters
-    ----------
-    seconds : float
-    may_exit : bool
-        Whether a call that the exception does not end (compiled code, a bare ``except``) may end the process.
+    With ``may_exit`` a call that the exception does not end (compiled code, a bare ``except``) ends the process.
 
     Examples
     --------

@@ -6,9 +6,11 @@ Names, units and answers are those of the ``traci`` package 1.28; docs/controlle
 from __future__ import annotations
 
 import math
-from typing import Any, NoReturn, Protocol
+from collections.abc import Callable, Iterator
+from typing import Any
 
 from harness.controllers.protocol import Observation
+from harness.controllers.traci_refusals import WOULD_MOVE, Domain, TraCIException
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
 
 VEH_ID = "AV"
@@ -18,80 +20,27 @@ MAX_SPEED_MPS = 100.0
 HEADING_DEGREES = 90.0
 _ROUNDING = 1e-9
 
-_MOVES = "it would move vehicles past the harness and invalidate the likelihood ratios"
-_STEPS = "the harness itself starts, steps and ends the simulation"
-_EXACT = "it has no effect here: what the AV is told it does exactly, as under speed mode 32"
-_WHY = {
-    "setSpeedMode": _EXACT,
-    "setLaneChangeMode": "it has no effect here: the AV stays on its lane",
-    "addStepListener": "name the listener in the campaign: see StepListenerController",
-    "changeLane": "the AV stays on its lane; " + _MOVES,
-}
-_REFUSED_BEGINNINGS = ("set", "add", "remove", "move", "change", "reroute", "openGap", "replace", "insert", "resume")
-_REFUSED_OF_SIMULATION = (
-    *("start", "init", "connect", "switch", "setOrder", "close"),
-    *("load", "loadState", "saveState", "simulationStep", "step", "executeMove", "addStepListener"),
-)
+
+def _same_for_all(value: Any, about: str) -> Callable[[VehicleDomain, str], Any]:
+    """A question that has the same answer for every vehicle of the cell."""
+
+    def answer(self: VehicleDomain, vehID: str) -> Any:
+        self.getLaneIndex(vehID)
+        return value
+
+    answer.__doc__ = about
+    return answer
 
 
-class TraCIException(Exception):  # noqa: N818 - TraCI's own name
-    """A command or question that TraCI, or the harness, does not answer."""
-
-
-class _Plan(Protocol):
-    """What a command asks of the coming steps."""
-
-    def next_acceleration(self, speed: float) -> float | None:
-        """Acceleration (m/s²) from the present speed (m/s), or None when the command is over."""
-
-
-class _Hold:
-    """``setSpeed``: this speed until further notice."""
-
-    def __init__(self, speed: float) -> None:
-        self._speed = speed
-
-    def next_acceleration(self, speed: float) -> float | None:
-        return (self._speed - speed) / STEP_S
-
-
-class _Accelerate:
-    """``setAcceleration``: for whole steps, and a share of a last one."""
-
-    def __init__(self, acceleration: float, duration: float) -> None:
-        self._acceleration = acceleration
-        self._steps_left = duration / STEP_S
-
-    def next_acceleration(self, speed: float) -> float | None:  # noqa: ARG002 - one protocol for all plans
-        left = self._steps_left
-        if left < _ROUNDING:
-            return None
-        self._steps_left = left - 1.0
-        return self._acceleration if left > 1.0 - _ROUNDING else self._acceleration * left
-
-
-class _Approach:
-    """``slowDown``: to a speed, linearly, in a time."""
-
-    def __init__(self, start: float, target: float, duration: float) -> None:
-        self._start, self._target = start, target
-        self._steps = max(duration / STEP_S, 1.0)
-        self._done = 0
-
-    def next_acceleration(self, speed: float) -> float | None:
-        if self._done > self._steps - _ROUNDING:
-            return None
-        self._done += 1
-        share = min(1.0, self._done / self._steps)
-        return (self._start + (self._target - self._start) * share - speed) / STEP_S
-
-
-class VehicleDomain:
+class VehicleDomain(Domain):
     """``traci.vehicle`` of one cell."""
+
+    _path = "traci.vehicle"
 
     def __init__(self) -> None:
         self.legacy_leader = True
-        self._plan: _Plan | None = None
+        self._plan: Iterator[float] = iter(())
+        """Accelerations (m/s²) of the coming steps; empty without a command."""
         self._accel = self._decel = math.inf
         self._speed: dict[str, float] = {}
         self._position: dict[str, float] = {}
@@ -112,13 +61,8 @@ class VehicleDomain:
 
     def next_acceleration(self) -> float:
         """What the AV is told for the coming step (m/s²); without a command it keeps its speed."""
-        if self._plan is None:
-            return 0.0
-        acceleration = self._plan.next_acceleration(self._speed[VEH_ID])
-        if acceleration is None:
-            self._plan = None
-            return 0.0
-        return min(max(acceleration, -self._decel), self._accel)
+        acceleration = next(self._plan, None)
+        return 0.0 if acceleration is None else min(max(acceleration, -self._decel), self._accel)
 
     def _of(self, table: dict[str, Any], vehID: str) -> Any:
         try:
@@ -158,35 +102,12 @@ class VehicleDomain:
         """Road and lane index."""
         return f"{ROAD}_{self.getLaneIndex(vehID)}"
 
-    def getRoadID(self, vehID: str) -> str:
-        """The cell's road."""
-        self.getLaneIndex(vehID)
-        return ROAD
-
-    def getAngle(self, vehID: str) -> float:
-        """Heading (degrees, 90 is along x)."""
-        self.getLaneIndex(vehID)
-        return HEADING_DEGREES
-
-    def getLength(self, vehID: str) -> float:
-        """Length (m)."""
-        self.getLaneIndex(vehID)
-        return VEHICLE_LENGTH_M
-
-    def getMinGap(self, vehID: str) -> float:
-        """MinGap (m): zero, so that gaps are bumper to bumper."""
-        self.getLaneIndex(vehID)
-        return 0.0
-
-    def getMaxSpeed(self, vehID: str) -> float:
-        """Speed (m/s) that the vehicle type allows."""
-        self.getLaneIndex(vehID)
-        return MAX_SPEED_MPS
-
-    def getTypeID(self, vehID: str) -> str:
-        """Vehicle type."""
-        self.getLaneIndex(vehID)
-        return "exact"
+    getRoadID = _same_for_all(ROAD, "The cell's road.")
+    getAngle = _same_for_all(HEADING_DEGREES, "Heading (degrees, 90 is along x).")
+    getLength = _same_for_all(VEHICLE_LENGTH_M, "Length (m).")
+    getMinGap = _same_for_all(0.0, "MinGap (m): zero, so that gaps are bumper to bumper.")
+    getMaxSpeed = _same_for_all(MAX_SPEED_MPS, "Speed (m/s) that the vehicle type allows.")
+    getTypeID = _same_for_all("exact", "Vehicle type.")
 
     def getAccel(self, vehID: str) -> float:
         """Bound that `setAccel` has put on commands (m/s²), infinite without."""
@@ -226,14 +147,14 @@ class VehicleDomain:
     def setSpeed(self, vehID: str, speed: float) -> None:
         """Drive at this speed (m/s) from the next step on until told otherwise; -1 releases."""
         self._require_own(vehID, "setSpeed")
-        self._plan = None if speed < 0.0 else _Hold(_finite(speed))
+        self._plan = iter(()) if speed < 0.0 else self._hold(_finite(speed))
 
     def setAcceleration(self, vehID: str, acceleration: float, duration: float) -> None:
         """Accelerate (m/s²) for a duration (s)."""
         self._require_own(vehID, "setAcceleration")
         if duration < 0.0:
             raise TraCIException("Duration must not be negative.")
-        self._plan = _Accelerate(_finite(acceleration), duration)
+        self._plan = self._accelerate(_finite(acceleration), duration)
 
     def slowDown(self, vehID: str, speed: float, duration: float) -> None:
         """Change speed linearly to a value (m/s) in a duration (s)."""
@@ -242,7 +163,26 @@ class VehicleDomain:
             raise TraCIException("Speed must not be negative.")
         if duration < 0.0:
             raise TraCIException("Invalid time interval.")
-        self._plan = _Approach(self._speed[VEH_ID], _finite(speed), duration)
+        self._plan = self._approach(self._speed[VEH_ID], _finite(speed), duration)
+
+    def _hold(self, speed: float) -> Iterator[float]:
+        """Until further notice."""
+        while True:
+            yield (speed - self._speed[VEH_ID]) / STEP_S
+
+    def _accelerate(self, acceleration: float, duration: float) -> Iterator[float]:
+        """For whole steps, and a share of a last one."""
+        left = duration / STEP_S
+        while left >= _ROUNDING:
+            yield acceleration if left > 1.0 - _ROUNDING else acceleration * left
+            left -= 1.0
+
+    def _approach(self, start: float, target: float, duration: float) -> Iterator[float]:
+        steps, done = max(duration / STEP_S, 1.0), 0
+        while done <= steps - _ROUNDING:
+            done += 1
+            share = min(1.0, done / steps)
+            yield (start + (target - start) * share - self._speed[VEH_ID]) / STEP_S
 
     def setAccel(self, vehID: str, accel: float) -> None:
         """Bound the acceleration (m/s²) that later commands lead to."""
@@ -257,14 +197,15 @@ class VehicleDomain:
     def _require_own(self, vehID: str, name: str, why: str = "") -> None:
         if vehID != VEH_ID:
             self._of(self._lane, vehID)
-            raise TraCIException(f"vehicle.{name}('{vehID}') is refused: {why or _MOVES}. Commands are for 'AV' only.")
+            raise TraCIException(
+                f"vehicle.{name}('{vehID}') is refused: {why or WOULD_MOVE}. Commands are for 'AV' only."
+            )
 
-    def __getattr__(self, name: str) -> Any:
-        return _unknown(self, "traci.vehicle", name)
 
-
-class SimulationDomain:
+class SimulationDomain(Domain):
     """``traci.simulation`` of one cell."""
+
+    _path = "traci.simulation"
 
     def __init__(self) -> None:
         self.time_s = 0.0
@@ -277,14 +218,12 @@ class SimulationDomain:
         """Step (s)."""
         return STEP_S
 
-    def __getattr__(self, name: str) -> Any:
-        return _unknown(self, "traci.simulation", name)
 
-
-class Traci:
+class Traci(Domain):
     """What stands for the module ``traci``: one episode of one cell."""
 
     TraCIException = TraCIException
+    _path = "traci"
 
     def __init__(self) -> None:
         self.vehicle = VehicleDomain()
@@ -304,30 +243,8 @@ class Traci:
         """Whether `getLeader` answers None (as 1.28 does by default) or ``("", -1.0)`` when nobody is ahead."""
         self.vehicle.legacy_leader = enabled
 
-    def __getattr__(self, name: str) -> Any:
-        return _unknown(self, "traci", name)
-
 
 def _finite(value: float) -> float:
     if not math.isfinite(value):
         raise TraCIException(f"{value} is no command for a vehicle.")
     return value
-
-
-def _unknown(domain: object, path: str, name: str) -> Any:
-    """A function that says why it is refused, for those that would do harm; an error that lists what there is."""
-    if name.startswith("_"):
-        raise AttributeError(name)
-    why = _WHY.get(name)
-    if why is None and name in _REFUSED_OF_SIMULATION:
-        why = _STEPS
-    if why is None and name.startswith(_REFUSED_BEGINNINGS):
-        why = _MOVES
-    if why is None:
-        there = ", ".join(entry for entry in dir(domain) if not entry.startswith("_") and entry != "see")
-        raise AttributeError(f"{path} has no {name} here; it has {there}")
-
-    def refused(*_arguments: Any, **_named: Any) -> NoReturn:
-        raise TraCIException(f"{path}.{name} is refused: {why}.")
-
-    return refused

@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 
 from harness.controllers.protocol import EpisodeStart, Observation
-from harness.controllers.traci_facade import VEH_ID, Traci, TraCIException
+from harness.controllers.traci_facade import VEH_ID, Traci
+from harness.controllers.traci_refusals import TraCIException
 
 __all__ = ["StepListenerController", "TraCIException", "TraciStyleController"]
 

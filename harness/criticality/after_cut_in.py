@@ -15,7 +15,7 @@ import numpy as np
 
 from harness.arrays import Float32Array, FloatArray, RecordArray
 from harness.compiled import compiled_inline, compiled_threads
-from harness.criticality.grid import AFTER, GridPoints, interpolate, locate, points_of, shape_of
+from harness.criticality.grid import AFTER, GridPoints, interpolate, locate, points_of, shape_of, state_at
 from harness.environment.driving import Environment, acceleration_pmf, free_driving
 from harness.maneuvers import N_ACCELERATIONS, acceleration
 from harness.vehicles.kinematics import CONTACT_M, STEP_S, next_speed
@@ -49,14 +49,11 @@ def hold_period(
 @compiled_threads
 def transitions(driver: RecordArray, steps: int, points: GridPoints, out: Float32Array) -> None:
     """State one hold period later for every grid state and acceleration; ``out`` (v, R2, R2dot, 31, 3)."""
-    for i in range(points.speed.size):
-        for j in range(points.r2.size):
-            for k in range(points.r2dot.size):
-                for m in range(N_ACCELERATIONS):
-                    v, r2, r2dot = hold_period(
-                        points.speed[i], points.r2[j], points.r2dot[k], acceleration(m), driver[0], steps
-                    )
-                    out[i, j, k, m, 0], out[i, j, k, m, 1], out[i, j, k, m, 2] = v, r2, r2dot
+    for i, j, k in np.ndindex(out.shape[:3]):
+        v, r2, r2dot = state_at(points, i, j, k)
+        for m in range(N_ACCELERATIONS):
+            after = hold_period(v, r2, r2dot, acceleration(m), driver[0], steps)
+            out[i, j, k, m, 0], out[i, j, k, m, 1], out[i, j, k, m, 2] = after
 
 
 @compiled_inline
@@ -70,26 +67,19 @@ def value_of(after: Float32Array, value: Float32Array) -> float:
 @compiled_threads
 def backward_step(after: Float32Array, pmf: FloatArray, value: Float32Array, out: Float32Array) -> None:
     """One induction step: ``out`` = U_{i+1} from ``value`` = U_i; ``pmf`` (v, 31)."""
-    n_v, n_gap, n_rate = value.shape
-    for i in range(n_v):
-        for j in range(n_gap):
-            for k in range(n_rate):
-                total = 0.0
-                for m in range(N_ACCELERATIONS):
-                    if pmf[i, m] > 0.0:
-                        total += pmf[i, m] * value_of(after[i, j, k, m], value)
-                out[i, j, k] = total
+    for i, j, k in np.ndindex(out.shape):
+        total = 0.0
+        for m in range(N_ACCELERATIONS):
+            if pmf[i, m] > 0.0:
+                total += pmf[i, m] * value_of(after[i, j, k, m], value)
+        out[i, j, k] = total
 
 
 @compiled_threads
 def maneuver_challenge(after: Float32Array, value: Float32Array, out: Float32Array) -> None:
     """C(s, a) for the 31 accelerations; ``out`` has shape (v, R2, R2dot, 31)."""
-    n_v, n_gap, n_rate = value.shape
-    for i in range(n_v):
-        for j in range(n_gap):
-            for k in range(n_rate):
-                for m in range(N_ACCELERATIONS):
-                    out[i, j, k, m] = value_of(after[i, j, k, m], value)
+    for i, j, k, m in np.ndindex(out.shape):
+        out[i, j, k, m] = value_of(after[i, j, k, m], value)
 
 
 @compiled_threads

@@ -17,7 +17,7 @@ import numpy as np
 from harness.arrays import Float32Array, FloatArray, RecordArray
 from harness.compiled import compiled_inline, compiled_threads
 from harness.criticality.after_cut_in import level_steps
-from harness.criticality.grid import AFTER, BEFORE, GridPoints, interpolate, locate, points_of, shape_of
+from harness.criticality.grid import AFTER, BEFORE, GridPoints, interpolate, locate, points_of, shape_of, state_at
 from harness.environment.cut_in import acceptance
 from harness.environment.driving import Environment, acceleration_pmf, car_following
 from harness.environment.initial_state import InitialStates
@@ -76,17 +76,14 @@ def backward_period(
     out: Float32Array,
 ) -> None:
     """``out`` = G at ``step`` from ``later`` = G one hold period later; both (v, R2, R2dot)."""
-    for i in range(points.speed.size):
-        for j in range(1, points.r2.size):
-            for k in range(points.r2dot.size):
-                v, r2, r2dot = points.speed[i], points.r2[j], points.r2dot[k]
-                total = 0.0
-                for m in range(N_ACCELERATIONS):
-                    if pmf[i, m] > _NEGLIGIBLE:
-                        total += pmf[i, m] * period_value(
-                            v, r2, r2dot, acceleration(m), step, steps_per_level, environment, value, later
-                        )
-                out[i, j, k] = total
+    for i, j, k in np.ndindex(out.shape):
+        v, r2, r2dot = state_at(points, i, j, k)
+        total = 0.0
+        for m in range(N_ACCELERATIONS):
+            if pmf[i, m] > _NEGLIGIBLE:
+                a = acceleration(m)
+                total += pmf[i, m] * period_value(v, r2, r2dot, a, step, steps_per_level, environment, value, later)
+        out[i, j, k] = total
 
 
 @compiled_threads

@@ -15,7 +15,7 @@ import numpy as np
 from harness.arrays import Float32Array, FloatArray, Record, RecordArray
 from harness.compiled import compiled_inline, compiled_threads
 from harness.criticality.after_cut_in import LEVELS, level_steps
-from harness.criticality.grid import AFTER, GridPoints, points_of, shape_of
+from harness.criticality.grid import AFTER, GridPoints, points_of, shape_of, state_at
 from harness.environment.driving import Environment
 from harness.maneuvers import N_ACCELERATIONS, acceleration
 from harness.vehicles.kinematics import STEP_S, next_speed
@@ -83,15 +83,12 @@ def roll_out(
 ) -> None:
     """Fill ``value`` (levels + 1, v, R2, R2dot) and ``maneuvers`` (v, R2, R2dot, 31) with smallest gaps (m)."""
     by_level = np.empty(value.shape[0])
-    for i in range(points.speed.size):
-        for j in range(points.r2.size):
-            for k in range(points.r2dot.size):
-                v, r2, r2dot = points.speed[i], points.r2[j], points.r2dot[k]
-                for m in range(N_ACCELERATIONS):
-                    smallest_gaps(v, r2, r2dot, m, hold, steps_per_level, driver[0], by_level)
-                    maneuvers[i, j, k, m] = by_level[-1]
-                    if m == _KEEP_SPEED:
-                        value[:, i, j, k] = by_level
+    for i, j, k, m in np.ndindex(maneuvers.shape):
+        v, r2, r2dot = state_at(points, i, j, k)
+        smallest_gaps(v, r2, r2dot, m, hold, steps_per_level, driver[0], by_level)
+        maneuvers[i, j, k, m] = by_level[-1]
+        if m == _KEEP_SPEED:
+            value[:, i, j, k] = by_level
 
 
 def build_immediate(environment: Environment, driver: RecordArray) -> tuple[Float32Array, Float32Array]:

@@ -80,7 +80,8 @@ def _save(path: Path, tables: Tables) -> None:
             Path(name).unlink(missing_ok=True)
 
 
-def _build_one(environment: Environment, driver: RecordArray, challenge: str) -> Tables:
+def build_one(environment: Environment, driver: RecordArray, challenge: str) -> Tables:
+    """Tables of one surrogate, ``driver`` (1,), without its axis."""
     if challenge == "immediate":
         return Tables(*build_immediate(environment, driver), np.zeros((0, 2, 2, 2), np.float32))
     value, maneuvers = build_after_cut_in(environment, driver)
@@ -107,7 +108,7 @@ def build_tables(
         return tables
 
     def one(j: int) -> Tables:
-        built = _build_one(environment, drivers[j : j + 1], challenge)
+        built = build_one(environment, drivers[j : j + 1], challenge)
         done(1)
         return built
 

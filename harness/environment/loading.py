@@ -1,15 +1,43 @@
-"""Load an environment: a shipped parameter file or the user's own, validated, as kernels read it."""
+"""Load an environment: a shipped parameter file or the user's own, validated, as kernels read it.
+
+Each number may be in order and still a law give no probability: an exponent that overflows, a range that holds nothing
+of a distribution, a share that rounds to zero. So what the numbers imply is evaluated once, on a grid over the fit
+range, before anything rests on it.
+"""
 
 from __future__ import annotations
 
+import math
+from itertools import product
 from pathlib import Path
 
+import numpy as np
+
+from harness.arrays import BoolArray, FloatArray
 from harness.campaign.loading import names_a_file
-from harness.campaign.models import Environment as EnvironmentSection
-from harness.campaign.yaml_text import read_model
-from harness.environment.driving import Environment, build_environment
-from harness.environment.laws import require_sound_laws
+from harness.campaign.models import EnvironmentSettings
+from harness.campaign.problems import read_model
+from harness.compiled import compiled_threads
+from harness.environment.cut_in import acceptance, opportunity
+from harness.environment.driving import Environment, acceleration_pmf, build_environment, car_following, free_driving
+from harness.environment.initial_state import InitialStates
 from harness.environment.parameters import SHIPPED_FOLDER, EnvironmentParameters, parameter_record
+from harness.errors import CampaignError
+from harness.maneuvers import N_ACCELERATIONS
+from harness.state import State
+
+PROBABILITIES = np.array([2.0**-53, 1e-6, 1e-3, 0.01, 0.1, 0.5, 0.9, 0.99, 0.999, 1.0 - 1e-6, 1.0 - 2.0**-53])
+"""Where quantiles are evaluated: the ends are the smallest and the largest uniform that is drawn, but zero."""
+RARE = PROBABILITIES.size - 2
+FASTEST_LV_MPS = 100.0
+"""Speed limit of SUMO's lanes; LV may exceed it in one of a million tests."""
+SCALES_MPS2 = (1e-3, 50.0)
+"""Noise far below the 0.2 m/s² bins is none; above 50 m/s² nearly all of it lies beyond the grid of accelerations."""
+SMALLEST_CHANCE = 1e-200
+"""Products of chances over a path must not round to zero: the forced cut-in divides by them."""
+RATES_MPS = np.linspace(-40.0, 40.0, 9)
+AV_GAPS_M = (0.1, 1.0, 10.0, 50.0, 300.0)
+_IN_STATE = " at v = {:.3g} m/s, R1 = {:.3g} m, R1dot = {:.3g} m/s"
 
 
 def parameter_file(name: str) -> Path:
@@ -17,27 +45,127 @@ def parameter_file(name: str) -> Path:
     return Path(name) if names_a_file(name) else SHIPPED_FOLDER / f"{name}.yaml"
 
 
-def load_parameters(section: EnvironmentSection) -> EnvironmentParameters:
+def load_parameters(settings: EnvironmentSettings) -> EnvironmentParameters:
     """The numbers that a campaign's environment names.
 
     Raises
     ------
     CampaignError
-        The file is missing, is not YAML, or says something wrong; every place is named. Or its laws give no
-        probabilities.
+        The file is missing or wrong, every place being named, or its laws give no probabilities.
     """
-    file = parameter_file(section.parameters)
+    file = parameter_file(settings.parameters)
     parameters = read_model(file, EnvironmentParameters)
-    require_sound_laws(_tabulated(section, parameters), str(file))
+    require_sound_laws(load_environment(settings, parameters), str(file))
     return parameters
 
 
-def load_environment(section: EnvironmentSection, parameters: EnvironmentParameters | None = None) -> Environment:
-    """The environment of a campaign, with its tables."""
-    return _tabulated(section, parameters or load_parameters(section))
+def load_environment(settings: EnvironmentSettings, parameters: EnvironmentParameters | None = None) -> Environment:
+    """The environment of a campaign, with its tables; ``parameters`` are read unless they are given."""
+    level, hold_s = settings.lane_change_level, settings.acceleration_hold_s
+    given = parameters or load_parameters(settings)
+    return build_environment(parameter_record(given, lane_change_level=level, hold_s=hold_s))
 
 
-def _tabulated(section: EnvironmentSection, parameters: EnvironmentParameters) -> Environment:
-    return build_environment(
-        parameter_record(parameters, lane_change_level=section.lane_change_level, hold_s=section.acceleration_hold_s)
+def require_sound_laws(environment: Environment, file: str) -> None:
+    """Refuse an environment whose laws give something else than probabilities and finite states.
+
+    Raises
+    ------
+    CampaignError
+        Names the law and the parameter ``file``, and the state in which it fails.
+    """
+    n = environment.numbers
+    speeds = np.linspace(n["fit_range__v_min_mps"], n["fit_range__v_max_mps"], 9)
+    gaps = np.linspace(n["fit_range__r1_min_m"], n["fit_range__r1_max_m"], 9)
+    with np.errstate(all="ignore"):
+        _require_initial_states(environment, speeds, file)
+    states = np.array(list(product(speeds, gaps, RATES_MPS)))
+    approaches = np.array(list(product(AV_GAPS_M, RATES_MPS)))
+    pmf, scale = np.empty((2, len(states), N_ACCELERATIONS)), np.empty((2, len(states)))
+    chance, accepted = np.empty(len(states)), np.empty(len(approaches))
+    _evaluate(states, approaches, environment, pmf, scale, chance, accepted)
+    for law, section in enumerate(("free_driving", "car_following")):
+        where, total = f"{section} ({file})", pmf[law].sum(axis=1)
+        limits = "a scale from {:g} to {:g} m/s²".format(*SCALES_MPS2)
+        inside = (scale[law] >= SCALES_MPS2[0]) & (scale[law] <= SCALES_MPS2[1])
+        _require(inside, where, "noise of scale {:.3g} m/s²" + _IN_STATE, (scale[law], *states.T), limits)
+        whole = (pmf[law] >= 0.0).all(axis=1) & (np.abs(total - 1.0) < 1e-9)
+        _require(whole, where, "probabilities that sum to {:.12g}" + _IN_STATE, (total, *states.T), "a sum of 1")
+    _require(
+        (accepted > 0.0) & (accepted <= 1.0),
+        f"cut_in.accept_scale_s and cut_in.ignore_share ({file})",
+        "a share of {:.3g} accepted at R2 = {:g} m, R2dot = {:g} m/s",
+        (accepted, *approaches.T),
+        "a share above 0 and at most 1",
     )
+    possible = np.isfinite(chance) & (chance * accepted.min() > SMALLEST_CHANCE)
+    wish = "a wish to change lanes of {:.3g}" + _IN_STATE
+    _require(possible, f"cut_in ({file})", wish, (chance, *states.T), "a finite number above 0")
+
+
+def _require_initial_states(environment: Environment, speeds: FloatArray, file: str) -> None:
+    n = environment.numbers
+    initial = InitialStates(n)
+    _require(
+        np.diff(initial.speed_cdf) >= -1e-9,  # rounding shows where next to nothing of the distribution is left
+        f"initial_state.v_location_mps, v_scale_mps and v_shape ({file})",
+        "no speed within the fit range",
+        (),
+        "a distribution of v_BV that reaches into it",
+    )
+    for speed in speeds:
+        states = initial.given_speed(speed, *(u.ravel() for u in np.meshgrid(PROBABILITIES, PROBABILITIES)))
+        r1 = states["r1_m"][: PROBABILITIES.size]
+        rate = states["r1dot_mps"].reshape(PROBABILITIES.size, -1)
+        inside = (r1 >= n["fit_range__r1_min_m"] - 1e-6) & (r1 <= n["fit_range__r1_max_m"] + 1e-6)
+        rises = np.append(r1[2:] > r1[:-2], [True, True])  # pairs, because the outermost two may agree
+        _require(
+            inside & rises,
+            f"initial_state.r1_* ({file})",
+            f"R1 = {{:.3g}} m in the {{:.6g}} quantile at v = {speed:g} m/s",
+            (r1, PROBABILITIES),
+            f"gaps spread within the fit range, {n['fit_range__r1_min_m']:g} to {n['fit_range__r1_max_m']:g} m",
+        )
+        fast = np.where(np.isfinite(rate).all(axis=0), speed + rate[RARE], np.inf)
+        _require(
+            fast <= FASTEST_LV_MPS,
+            f"initial_state.r1dot_* ({file})",
+            f"LV at {{:.3g}} m/s in one of a million tests, at v = {speed:g} m/s, R1 = {{:.3g}} m",
+            (fast, r1),
+            f"rates that are finite, and an LV of at most {FASTEST_LV_MPS:g} m/s in all but one of a million",
+        )
+
+
+def _require(sound: BoolArray, where: str, found: str, values: tuple[FloatArray, ...], expected: str) -> None:
+    """Refuse a law that is not sound (n,) everywhere; ``found`` formats the ``values`` (n,) where it first fails."""
+    if not sound.all():
+        first = int(np.argmin(sound))
+        raise CampaignError(
+            where,
+            found=found.format(*(value[first] for value in values)),
+            expected=expected,
+            mend="The numbers are allowed one by one, but not together: correct those of this law.",
+        )
+
+
+@compiled_threads
+def _evaluate(
+    states: FloatArray,
+    approaches: FloatArray,
+    environment: Environment,
+    pmf: FloatArray,
+    scale: FloatArray,
+    chance: FloatArray,
+    accepted: FloatArray,
+) -> None:
+    """All laws in states (n, 3) of v_BV, R1, R1dot and approaches (m, 2) of R2, R2dot, as kernels evaluate them."""
+    for j in range(approaches.shape[0]):
+        accepted[j] = acceptance(approaches[j, 0], approaches[j, 1], environment)
+    for i in range(states.shape[0]):
+        speed, r1, r1dot = states[i]
+        state = State(speed, r1, r1dot, math.nan, math.nan)
+        free, following = free_driving(speed, environment), car_following(state, environment)
+        acceleration_pmf(free, environment, pmf[0, i])
+        acceleration_pmf(following, environment, pmf[1, i])
+        scale[0, i], scale[1, i] = 1.0 / free.inverse_scale, 1.0 / following.inverse_scale
+        chance[i] = opportunity(state, environment)

@@ -47,7 +47,7 @@ def _within(low: float, high: float) -> AfterValidator:
 
 _HARDEST, _FASTEST = float(ACCELERATIONS_MPS2[0]), float(ACCELERATIONS_MPS2[-1])
 
-# Wide limits: what a law makes of its numbers is judged by `harness.environment.laws`.
+# Wide limits: what a law makes of its numbers is judged by `harness.environment.loading`.
 Coefficient = Annotated[Number, _within(-1000.0, 1000.0)]
 LogScale = Annotated[Number, _within(-50.0, 50.0)]
 Scale = Annotated[Number, _within(0.001, 1000.0)]

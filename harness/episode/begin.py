@@ -4,70 +4,15 @@ from __future__ import annotations
 
 import math
 
-from harness.arrays import FloatArray, RecordArray
-from harness.compiled import compiled, compiled_inline, compiled_threads
-from harness.environment.driving import Environment
+from harness.arrays import FloatArray
+from harness.compiled import compiled, compiled_inline
 from harness.episode.cells import Bench
-from harness.episode.trajectory import Trajectory, place, walk, write_hazards
+from harness.episode.trajectory import place, walk_without_cut_in
 from harness.outcomes import AV, EPISODE_MIXTURE, FORCED, SHELLS
 from harness.random_stream import CUT_IN, uniform
-from harness.state import State
 
 COMPONENT_DRAW, CUT_IN_DRAW = 0, 1
 """Indices within the cut-in stream."""
-
-
-@compiled_inline
-def path_hazard(state: State, seed: int, episode: int, environment: Environment, path: Trajectory) -> tuple[float, int]:
-    """Cumulative cut-in hazard of the path that LV and BV take when no cut-in happens, and its length in steps."""
-    steps = walk(state, seed, episode, 0, environment.numbers.max_steps, environment, path)
-    return write_hazards(steps, environment, path), steps
-
-
-@compiled_inline
-def draw_component(u: float, alpha: FloatArray) -> int:
-    """Index of the importance function that this episode follows."""
-    total = 0.0
-    for j in range(alpha.size - 1):
-        total += alpha[j]
-        if u < total:
-            return j
-    return alpha.size - 1
-
-
-@compiled_inline
-def begin_cell(k: int, row: int, bench: Bench) -> None:
-    """Reset cell ``k`` for the episode of a row."""
-    cells, method = bench.cells, bench.importance.method
-    seed, episode = bench.seed, bench.first_episode + row
-    cell = cells.cell[k]
-    cell.row, cell.episode, cell.step, cell.cut_step, cell.component = row, episode, 0, -1, -1
-    cell.lv_maneuver = cell.bv_maneuver = cell.n_lv = cell.n_bv = cell.n_bv_free = cell.n_path = cell.n_control = 0
-    cell.clock = cell.hazard = cell.log_sampled = 0.0
-    cell.hazard_total = cell.log_p_cut_in = math.nan
-    cell.min_ttc = math.inf
-    cell.cut_r2 = cell.cut_r2dot = math.nan
-    cell.av_start = bench.x[k, AV]
-    cells.acceleration[k, AV] = 0.0
-    cells.log_ratio[k, :] = 0.0
-    cells.martingale[k, :] = 0.0
-    if method == SHELLS:
-        cell.component, cell.log_sampled = bench.traffic.component[row], -bench.traffic.log_weight[row]
-        return
-    forced = method == FORCED
-    if method == EPISODE_MIXTURE:
-        cell.component = draw_component(uniform(seed, episode, CUT_IN, COMPONENT_DRAW), bench.importance.alpha)
-        forced = cell.component == 0
-    u = uniform(seed, episode, CUT_IN, CUT_IN_DRAW)
-    if method in (FORCED, EPISODE_MIXTURE):
-        total, _ = path_hazard(bench.states[row], seed, episode, bench.environment, bench.scratch.path)
-        cell.hazard_total = total
-        p_cut_in = -math.expm1(-total)
-        cell.log_p_cut_in = math.log(p_cut_in)
-        if forced:
-            cell.target = min(-math.log1p(-u * p_cut_in), total)
-            return
-    cell.target = -math.log1p(-u)
 
 
 @compiled
@@ -88,11 +33,47 @@ def refill(bench: Bench, given: int) -> int:
     return n
 
 
-@compiled_threads
-def mean_test_distance(seed: int, states: RecordArray, environment: Environment, path: Trajectory) -> float:
-    """Mean distance (m) that the AV drives in an overtaking without cut-in; ``path`` is room to work in."""
+@compiled_inline
+def begin_cell(k: int, row: int, bench: Bench) -> None:
+    """Reset cell ``k`` for the episode of a row."""
+    cells, method = bench.cells, bench.importance.method
+    seed, episode = bench.seed, bench.first_episode + row
+    cell = cells.cell[k]
+    cell.row, cell.episode, cell.step, cell.cut_step, cell.component = row, episode, 0, -1, -1
+    cell.lv_maneuver = cell.bv_maneuver = cell.n_lv = cell.n_bv = cell.n_bv_free = cell.n_path = cell.n_control = 0
+    cell.clock = cell.hazard = cell.log_sampled = 0.0
+    cell.hazard_total = cell.log_p_cut_in = math.nan
+    cell.min_ttc = math.inf
+    cell.cut_r2 = cell.cut_r2dot = math.nan
+    cell.av_start = bench.x[k, AV]
+    cells.acceleration[k, AV] = 0.0
+    cells.log_ratio[k, :] = 0.0
+    cells.martingale[k, :] = 0.0
+    if method == SHELLS:
+        cell.component, cell.log_sampled = bench.traffic.stratum[row], -bench.traffic.log_weight[row]
+        return
+    forced = method == FORCED
+    if method == EPISODE_MIXTURE:
+        cell.component = draw_component(uniform(seed, episode, CUT_IN, COMPONENT_DRAW), bench.importance.alpha)
+        forced = cell.component == 0
+    u = uniform(seed, episode, CUT_IN, CUT_IN_DRAW)
+    if method in (FORCED, EPISODE_MIXTURE):
+        environment, path = bench.environment, bench.scratch.path
+        _, cell.hazard_total = walk_without_cut_in(bench.states[row], seed, episode, environment, path)
+        p_cut_in = -math.expm1(-cell.hazard_total)
+        cell.log_p_cut_in = math.log(p_cut_in)
+        if forced:
+            cell.target = min(-math.log1p(-u * p_cut_in), cell.hazard_total)
+            return
+    cell.target = -math.log1p(-u)
+
+
+@compiled_inline
+def draw_component(u: float, alpha: FloatArray) -> int:
+    """Index of the importance function that this episode follows."""
     total = 0.0
-    for i in range(states.size):
-        steps = walk(states[i], seed, i, 0, environment.numbers.max_steps, environment, path)
-        total += path.v[AV] * (0.1 * steps)
-    return float(total / states.size)
+    for j in range(alpha.size - 1):
+        total += alpha[j]
+        if u < total:
+            return j
+    return alpha.size - 1

@@ -110,7 +110,7 @@ class Alarm:
         slack = KNOWN_ERRORS * np.sqrt(np.diag(known.covariance))
         nearest = np.clip(mean, known.mu - slack, known.mu + slack)
         shares = zip(mean / self._cap, nearest / self._cap, strict=True)
-        exponent = [relative_entropy(a, b) if 0.0 < b < 1.0 and a <= 1.0 else 0.0 for a, b in shares]
+        exponent = [relative_entropy(a, math.log(b)) if 0.0 < b < 1.0 and a <= 1.0 else 0.0 for a, b in shares]
         bound: FloatArray = np.minimum(1.0, 2.0 * np.exp(-self._n * np.array(exponent)))
         return bound
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from harness.arrays import BoolArray, FloatArray, IntArray
-from harness.methods import Method
+from harness.methods import SAMPLING, Method
 from harness.strata import KnownRates, ShellDesign
 
 MAX_CONTROL_STEPS = 9
@@ -45,7 +45,7 @@ class Block:
         Bound on Y = 1{crash}·weight that the design guarantees for every episode, seen or not; None if there is none.
     log_p_cut_in : (n,) float64 or None
         log P(cut-in | path), where the method draws the path ahead. Bounds Y of that episode alone.
-    component, shells : (n,) int, ShellDesign, or None
+    stratum, shells : (n,) int, ShellDesign, or None
         Stratum of each test, where they are drawn from shells, and what is known of the strata.
     surrogates_crash, known_rates : (n, D) bool, KnownRates, or None
         Which surrogates of a pool would have crashed on the same traffic, and their crash rates; only where asked for.
@@ -64,14 +64,14 @@ class Block:
     first_ratios: FloatArray | None = None
     weight_cap: float | None = None
     log_p_cut_in: FloatArray | None = None
-    component: IntArray | None = None
+    stratum: IntArray | None = None
     shells: ShellDesign | None = None
     surrogates_crash: BoolArray | None = None
     known_rates: KnownRates | None = None
 
     def __post_init__(self) -> None:
         n = len(self.crash)
-        columns = ("failed", "cut_in", "bv_lv_contact", "log_weight", "n_control_steps", "log_p_cut_in", "component")
+        columns = ("failed", "cut_in", "bv_lv_contact", "log_weight", "n_control_steps", "log_p_cut_in", "stratum")
         expected = {
             **dict.fromkeys(columns, (n,)),
             "log_q": (n, len(self.alpha)),
@@ -108,9 +108,9 @@ class Block:
 
     def log_path_cap(self) -> float:
         """Log of the largest P(cut-in | path)/share of forced cut-ins, a bound on Y of these paths; inf if unknown."""
-        if self.log_p_cut_in is None or self.method not in ("forced", "episode_mixture"):
+        if self.log_p_cut_in is None or not SAMPLING[self.method].forces:
             return math.inf
-        share = 1.0 if self.method == "forced" else float(self.alpha[0])
+        share = float(self.alpha[0]) if SAMPLING[self.method].mixes else 1.0  # the defensive component is the first
         return float(np.max(self.log_p_cut_in, initial=-math.inf)) - math.log(share) if share else math.inf
 
     def failed_as_crashes(self) -> Block:

@@ -14,7 +14,7 @@ import numpy as np
 from harness.estimators.alarm import Alarm
 from harness.estimators.block import Block
 from harness.estimators.moments import Moments
-from harness.methods import Method
+from harness.methods import SAMPLING, Method
 
 NOTE = (
     "Diagnostics, never tests: each mean is 1 in expectation, except that of W·1{cut-in}, which is P(cut-in). Under "
@@ -48,7 +48,7 @@ class Diagnostics:
         self._weight.add(weights)
         self._cut_in.add(weights[block.cut_in])
         self._contact.add(weights[block.bv_lv_contact])
-        if block.method in ("step_mixture", "episode_mixture"):
+        if SAMPLING[block.method].mixes:
             self._ratios = self._ratios or [Moments() for _ in block.alpha]
             for sums, ratios in zip(self._ratios, block.mixture_ratios().T, strict=True):
                 sums.add(ratios)

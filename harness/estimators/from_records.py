@@ -51,17 +51,18 @@ def block_from_tables(
     """
     index = _integers(episodes, "episode")
     _require_consecutive(index)
-    failed, n_control_steps = _ended(episodes, "failed"), _integers(episodes, "n_control_steps")
+    outcomes = episodes.column("outcome").unify_dictionaries().combine_chunks()
+    failed, n_control_steps = _ended(outcomes, "failed"), _integers(episodes, "n_control_steps")
     ratios = None
     if moments is not None and method == "step_mixture":
         ratios = _first_ratios(moments, index, np.where(failed, 0, n_control_steps))
     return Block(
         first_episode=int(index[0]),
         method=method,
-        crash=_ended(episodes, "crash"),
+        crash=_ended(outcomes, "crash"),
         failed=failed,
         cut_in=_known(episodes, "cut_in_step"),
-        bv_lv_contact=_ended(episodes, "bv_lv_contact"),
+        bv_lv_contact=_ended(outcomes, "bv_lv_contact"),
         log_weight=_log_weights(episodes, failed, int(index[0])),
         log_q=_nested(episodes, "log_q", len(alpha)),
         alpha=np.asarray(alpha, dtype=np.float64),
@@ -69,7 +70,7 @@ def block_from_tables(
         first_ratios=ratios,
         weight_cap=1.0 if method == "nde" else None,
         log_p_cut_in=_log_p_cut_in(episodes, failed),
-        component=None if shells is None else _integers(episodes, "component"),
+        stratum=None if shells is None else _integers(episodes, "component"),
         shells=shells,
     )
 
@@ -86,9 +87,9 @@ def _known(table: pa.Table, name: str) -> BoolArray:
     return np.asarray(pc.is_valid(table.column(name))).astype(np.bool_)
 
 
-def _ended(episodes: pa.Table, outcome: str) -> BoolArray:
-    """Rows that ended with this outcome, shape (n,)."""
-    return np.asarray(pc.equal(episodes.column("outcome"), outcome)).astype(np.bool_)
+def _ended(outcomes: pa.DictionaryArray, name: str) -> BoolArray:
+    """Rows that ended so, shape (n,)."""
+    return np.asarray(outcomes.indices.to_numpy() == outcomes.dictionary.index(name).as_py())
 
 
 def _nested(table: pa.Table, name: str, width: int) -> FloatArray:

@@ -46,10 +46,8 @@ def hall_distances(std_error: float, third_moment: float, tail: float) -> tuple[
 
     Parameters
     ----------
-    std_error : float
-        Of the estimate.
-    third_moment : float
-        Third central moment of the estimate's error; over std_error³ it is the skewness κ.
+    std_error, third_moment : float
+        Of the estimate; its error's third central moment over std_error³ is the skewness κ.
     tail : float
         Probability to be left out on each side, below 1/2.
     """
@@ -100,21 +98,18 @@ def capped_mean_upper(mean: float, cap: float, n: int, confidence: float) -> flo
     needed = -math.log1p(-confidence) / n
     if mean <= 0.0:
         return min(1.0, cap * -math.expm1(-needed))
-    share, almost_one = mean / cap, 1.0 - 2.0**-53
-    if share >= almost_one or relative_entropy(share, almost_one) <= needed:
+    share, almost_one = mean / cap, math.log1p(-(2.0**-53))
+    if share >= 1.0 or relative_entropy(share, almost_one) <= needed:
         return min(1.0, cap)
     log_bound = brentq(
-        lambda log_p: relative_entropy(share, math.exp(log_p)) - needed,
-        math.log(share),
-        math.log(almost_one),
-        xtol=1e-14,
-        rtol=1e-13,
+        lambda log_p: relative_entropy(share, log_p) - needed, math.log(share), almost_one, xtol=1e-14, rtol=1e-13
     )
     return min(1.0, cap * math.exp(float(log_bound)))
 
 
-def relative_entropy(share: float, p: float) -> float:
-    """KL divergence of a coin with a share in [0, 1] from one with probability p, strictly between 0 and 1."""
-    hit = share * math.log(share / p) if share > 0.0 else 0.0
-    miss = (1.0 - share) * (math.log1p(-share) - math.log1p(-p)) if share < 1.0 else 0.0
-    return hit + miss
+def relative_entropy(share: float, log_p: float) -> float:
+    """KL divergence of a coin with a share in [0, 1] from one with probability exp(log_p), above 0 and below 1."""
+    hit = share * (math.log(share) - log_p) if share > 0.0 else 0.0
+    if share >= 1.0:
+        return hit
+    return hit + (1.0 - share) * (math.log1p(-share) - math.log(-math.expm1(log_p)))

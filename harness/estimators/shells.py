@@ -175,21 +175,21 @@ class Shells:
     @classmethod
     def refusal(cls, block: Block) -> str | None:
         """Shells must have been drawn from, and their probabilities be known."""
-        if block.shells is None or block.component is None:
+        if block.shells is None or block.stratum is None:
             return f"tests must be drawn from shells (testing.method shells), these were drawn by {block.method}"
         return None
 
     def add(self, block: Block) -> None:
         """Count one block."""
-        if block.shells is None or block.component is None:
+        if block.shells is None or block.stratum is None:
             raise ValueError("the block has no shells")
         n_strata = block.shells.p.size
         if not self.tests.size:
             self._design = block.shells
             self.tests, self.crashes, self.failed = np.zeros((3, n_strata), np.int64)
-        self.tests += np.bincount(block.component, minlength=n_strata)
-        self.crashes += np.bincount(block.component[block.crash], minlength=n_strata)
-        self.failed += np.bincount(block.component[block.failed], minlength=n_strata)
+        self.tests += np.bincount(block.stratum, minlength=n_strata)
+        self.crashes += np.bincount(block.stratum[block.crash], minlength=n_strata)
+        self.failed += np.bincount(block.stratum[block.failed], minlength=n_strata)
 
     def result(self, confidence: float) -> Estimate:
         """Assumption-free estimate; the conditional one is among its details."""

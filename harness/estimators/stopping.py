@@ -73,7 +73,7 @@ class StopRule:
         By how much of itself one more crash of the largest weight would have moved the last look's estimate.
     """
 
-    pool_too_rough = False  # no pool is behind these estimates
+    pool_error_above_target = False  # no pool is behind these estimates
 
     def __init__(
         self,

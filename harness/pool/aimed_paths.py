@@ -35,10 +35,7 @@ AIMED_DRAW, OFFSET_DRAW = 0, 1
 class Proposal:
     """Product density on the unit cube, mixed with the uniform one.
 
-    Attributes
-    ----------
-    density : ndarray, shape (dimensions, N_BINS)
-        Density within each bin; its mean over the bins is 1.
+    ``density`` (dimensions, N_BINS) is that within each bin; its mean over the bins is 1.
     """
 
     density: FloatArray
@@ -95,27 +92,20 @@ def contributions(rates: FloatArray, share: FloatArray | float = 1.0) -> FloatAr
 
 @dataclass(frozen=True)
 class EnumeratedPaths:
-    """Cut-ins of some paths.
+    """Initial states (n,) of some paths, and their cut-ins.
 
-    ``weight`` (n,) is naturalistic over proposal density; ``state`` (n,); ``probability`` (n, steps) is that of the
-    cut-ins that one in this step stands for; ``crashes`` (n, steps) one bit per surrogate, as the library orders them.
+    ``mass`` (n, steps) is the probability of the cut-ins that one in this step stands for, times the naturalistic over
+    the proposal's density of the path; ``crashes`` (n, steps) has one bit per surrogate, as the library orders them.
     """
 
-    weight: FloatArray
     state: RecordArray
-    probability: FloatArray
+    mass: FloatArray
     crashes: IntArray
-
-    @property
-    def mass(self) -> FloatArray:
-        """Weighted probability of each cut-in, shape (n, steps)."""
-        return self.probability * self.weight[:, None]
 
     def rates(self, n_surrogates: int) -> FloatArray:
         """Per path: its weighted probability that each surrogate crashes, and of a cut-in; shape (n, D + 1)."""
-        mass = self.mass
-        columns = [(mass * ((self.crashes >> d) & 1)).sum(1) for d in range(n_surrogates)]
-        return np.column_stack([*columns, mass.sum(1)])
+        columns = [(self.mass * ((self.crashes >> d) & 1)).sum(1) for d in range(n_surrogates)]
+        return np.column_stack([*columns, self.mass.sum(1)])
 
 
 def joined(parts: Sequence[EnumeratedPaths]) -> EnumeratedPaths:
@@ -144,8 +134,9 @@ class Enumerator:
         # whatever else is compiled meanwhile.
         self._block(0, 0)
 
-    def aimed(self, proposal: Proposal) -> Enumerator:
-        """The same, with initial states drawn from a proposal."""
+    def aimed(self, rates: FloatArray, share: FloatArray | float = 1.0) -> Enumerator:
+        """The same, aimed at what contributes to the rates (n, columns) of its first paths; see `contributions`."""
+        proposal = fit_proposal(self.uniforms(0, len(rates)), contributions(rates, share))
         return Enumerator(self._environment, self._drivers, self._envelope, self._seed, proposal, self._stride)
 
     def uniforms(self, first: int, n: int) -> FloatArray:
@@ -172,7 +163,7 @@ class Enumerator:
         path = empty_trajectory(self._environment)
         where = self._environment, self._drivers, self._envelope
         enumerate_cut_ins(self._seed, first, state, *where, self._stride, offset, path, probability, crashes)
-        return EnumeratedPaths(weight, state, probability, crashes)
+        return EnumeratedPaths(state, probability * weight[:, None], crashes)
 
     def pairs(
         self, path: IntArray, step: IntArray, state: RecordArray

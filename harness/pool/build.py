@@ -7,7 +7,7 @@ import numpy as np
 from harness.arrays import BoolArray, FloatArray, Int8Array, IntArray
 from harness.campaign.models import PoolSettings
 from harness.environment.driving import Environment
-from harness.pool.aimed_paths import PILOT_PATHS, EnumeratedPaths, Enumerator, contributions, fit_proposal, joined
+from harness.pool.aimed_paths import PILOT_PATHS, EnumeratedPaths, Enumerator, joined
 from harness.pool.cut_ins import FAR_OFF, CutIns, Pool, environment_hash, shells_of
 from harness.pool.library import Library
 from harness.progress import Progress, SilentProgress
@@ -36,7 +36,7 @@ def build_pool(
     rates = pilot.run(0, PILOT_PATHS, progress).rates(len(names))
     careful = _careful(rates, names.index(library.boundary))
     share = np.where(careful, 1.0, CARELESS_SHARE)
-    aimed = pilot.aimed(fit_proposal(pilot.uniforms(0, PILOT_PATHS), contributions(rates, share)))
+    aimed = pilot.aimed(rates, share)
     paths = _until_known(aimed, rates, careful, settings, progress)
     return _pool(paths, aimed, library, settings, key, environment_hash(environment))
 
@@ -116,10 +116,7 @@ def _keep(
 ) -> tuple[IntArray, IntArray, IntArray]:
     """Systematic sample of cut-ins of every shell, with probability proportional to mass.
 
-    Returns
-    -------
-    path, step, shell : ndarray, shape (n,)
-        Row and column in ``mass``, and the shell, sorted by shell and path.
+    Path and step (row and column in ``mass``) and shell, each (n,), sorted by shell and path.
     """
     kept = []
     for s in range(n_shells):

@@ -22,20 +22,10 @@ own, which few paths meet: paths aimed there would be lost for all others."""
 class CutIns:
     """A weighted sample of cut-ins, each with the paths of LV and BV before and after it.
 
-    Within a shell all have the same probability.
-
-    Attributes
-    ----------
-    path, step, shell : ndarray of int64, shape (n,)
-        Which path of the pool, cut-in step, and shell.
-    state : structured ndarray, shape (n,)
-        Initial states.
-    lv, bv : ndarray of int8, shape (n, draws)
-        Maneuver indices as an episode records them; 31 marks the cut-in.
-    n_lv, n_bv : ndarray of int64, shape (n,)
-        How many of them are used.
-    crashes : ndarray of bool, shape (n, D)
-        Which surrogates crash, in the pool's order.
+    Within a shell all have the same probability. ``path``, ``step``, ``shell`` (n,): which path of the pool, cut-in
+    step, and shell; ``state`` (n,): initial states. ``lv``, ``bv`` (n, draws): maneuver indices as an episode records
+    them, 31 marking the cut-in; ``n_lv``, ``n_bv`` (n,): how many of them are used. ``crashes`` (n, D): which
+    surrogates crash, in the pool's order.
     """
 
     path: IntArray

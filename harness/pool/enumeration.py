@@ -16,7 +16,7 @@ import math
 from harness.arrays import FloatArray, Int8Array, IntArray, RecordArray
 from harness.compiled import compiled_threads
 from harness.environment.driving import Environment, draw_acceleration, free_driving
-from harness.episode.trajectory import Trajectory, leave, walk, who_crashes, write_hazards
+from harness.episode.trajectory import Trajectory, leave, walk, walk_without_cut_in, who_crashes
 from harness.maneuvers import CUT_IN, acceleration
 from harness.outcomes import LV
 from harness.random_stream import LV_DRAWS, uniform
@@ -62,8 +62,7 @@ def enumerate_cut_ins(
     probability[:, :] = 0.0
     crashes[:, :] = 0
     for i in range(states.size):
-        steps = walk(states[i], seed, first + i, 0, max_steps, environment, path)
-        write_hazards(steps, environment, path)
+        steps, _ = walk_without_cut_in(states[i], seed, first + i, environment, path)
         hazard = 0.0
         for cut in range(steps):
             before = hazard

@@ -21,8 +21,7 @@ from harness.arrays import FloatArray
 from harness.campaign.models import IDMParameters, Reflexes
 from harness.pool.library import LibraryIDM
 from harness.pool.observed import Observed
-from harness.vehicles.models import driver_records
-from harness.vehicles.observed import expected_accelerations
+from harness.vehicles.models import driver_records, expected_accelerations
 
 MOST_DELAY_STEPS = 20
 ROUGH_EVALUATIONS, LAST_EVALUATIONS = 6, 60
@@ -50,17 +49,10 @@ _JERK_BOUNDS_MPS3 = (0.5, 100.0)
 
 @dataclass(frozen=True)
 class FittedDriver:
-    """A driver, and how well its accelerations are those that were observed.
+    """A driver, and how well its accelerations are those in the cut-ins that it was fitted to.
 
-    Attributes
-    ----------
-    driver : LibraryIDM
-    rms_mps2 : float
-        Root mean square difference of the accelerations.
-    explained : float
-        Share of the variance of the observed accelerations that it explains; negative where their mean does better.
-    n_cut_ins : int
-        That it was fitted to.
+    ``rms_mps2`` is the root mean square difference, ``explained`` the share of the variance of the observed
+    accelerations that it explains: negative where their mean does better.
     """
 
     driver: LibraryIDM

@@ -9,12 +9,14 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from harness.arrays import RecordArray
+from harness.campaign.loading import names_a_file
 from harness.campaign.models import FVDM, IDM, Constant, Reflexes
+from harness.campaign.problems import read_model
 from harness.campaign.section import Section, SurrogateName, broken_rule
-from harness.campaign.yaml_text import read_model
 from harness.errors import CampaignError
 from harness.vehicles.models import driver_records
 
+SHIPPED_FOLDER = Path(__file__).parent
 MOST_SURROGATES = 60
 """Outcomes of a cut-in are bits of one integer."""
 
@@ -133,14 +135,6 @@ class Library(Section):
         return self
 
 
-SHIPPED_FOLDER = Path(__file__).parent
-
-
-def shipped_libraries() -> list[str]:
-    """Names of the libraries that come with the harness."""
-    return sorted(file.stem for file in SHIPPED_FOLDER.glob("*.yaml"))
-
-
 def load_library(name: str) -> Library:
     """Read a shipped library by name, or a file by its path.
 
@@ -149,14 +143,15 @@ def load_library(name: str) -> Library:
     CampaignError
         There is none of that name, or the file is wrong; every place is named.
     """
-    if name.endswith((".yaml", ".yml")) or "/" in name:
+    if names_a_file(name):
         return read_model(Path(name), Library)
-    if name not in shipped_libraries():
-        close = difflib.get_close_matches(name, shipped_libraries(), n=1)
+    shipped = sorted(file.stem for file in SHIPPED_FOLDER.glob("*.yaml"))
+    if name not in shipped:
+        close = difflib.get_close_matches(name, shipped, n=1)
         raise CampaignError(
             "pool.library",
             found=f"'{name}', which is not shipped",
-            expected=f"the name of a shipped library: {', '.join(shipped_libraries())}; or a path that ends in .yaml",
+            expected=f"the name of a shipped library: {', '.join(shipped)}; or a path that ends in .yaml",
             mend=f"Did you mean '{close[0]}'?" if close else "For a file of your own write its path: ./mine.yaml.",
         )
     return read_model(SHIPPED_FOLDER / f"{name}.yaml", Library)

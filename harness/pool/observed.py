@@ -27,14 +27,9 @@ _SERIES = ("speed", "lead_speed", "gap", "acceleration")
 class Observed:
     """Cut-ins and what the AV did in the steps after them, one cut-in after another.
 
-    Attributes
-    ----------
-    episode : ndarray of int64, shape (m,)
-        Index in the campaign, ascending.
-    begin : ndarray of int64, shape (m + 1,)
-        Where each cut-in's steps begin, its cut-in step first; and the end.
-    speed, lead_speed, gap, acceleration : ndarray, shape (n,)
-        AV's and BV's speed (m/s), bumper-to-bumper gap (m), and the AV's acceleration (m/s²).
+    ``episode`` (m,) is the index in the campaign, ascending; ``begin`` (m + 1,) says where each cut-in's steps begin,
+    its cut-in step first, and the end. ``speed``, ``lead_speed``, ``gap``, ``acceleration`` (n,) are the AV's and BV's
+    speed (m/s), the bumper-to-bumper gap (m), and the AV's acceleration (m/s²).
     """
 
     episode: IntArray

@@ -24,16 +24,9 @@ _COLUMNS = [*PATH_COLUMNS, "outcome", "component", "log_weight"]
 class Replayed:
     """Stored tests, failed ones left out, and who crashes in them.
 
-    Attributes
-    ----------
-    episode : ndarray of int64, shape (n,)
-        Index in the campaign.
-    probability : ndarray, shape (n,)
-        Likelihood ratio of the test; with shells the probability of its stratum.
-    stratum : ndarray of int64, shape (n,)
-        With shells, else 0.
-    av, drivers : ndarray of bool, shapes (n,) and (n, D)
-        The AV crashed; each driver would have.
+    ``episode`` (n,) is the index in the campaign; ``probability`` (n,) the likelihood ratio, with shells the
+    probability of the test's ``stratum`` (n,), which is 0 without; ``av`` (n,) says whether the AV crashed, ``drivers``
+    (n, D) whether each driver would have.
     """
 
     episode: IntArray
@@ -58,16 +51,9 @@ class Replayed:
 class Prediction:
     """Crashes of the AV against those of a driver, by number and by weight.
 
-    Attributes
-    ----------
-    both, only_av, only_driver, neither : int
-        Tests.
-    crash_rate, crash_rate_driver : float
-        Weighted, per test.
-    caught : float or None
-        Share of the AV's crash rate in tests in which the driver crashes too; None without a crash of the AV.
-    false_alarms : float or None
-        Share of the driver's crash rate in tests in which the AV does not crash; None without a crash of the driver.
+    Crash rates are weighted, per test. ``caught`` is the share of the AV's crash rate in tests in which the driver
+    crashes too, None without a crash of the AV; ``false_alarms`` the share of the driver's in tests in which the AV
+    does not crash, None without a crash of the driver.
     """
 
     both: int
@@ -85,7 +71,10 @@ def predict(replayed: Replayed, driver: int) -> Prediction:
     av, other, weight = replayed.av, replayed.drivers[:, driver], replayed.weight
     rate, rate_driver, rate_both = (float(weight[who].sum()) for who in (av, other, av & other))
     return Prediction(
-        *(int(tests.sum()) for tests in (av & other, av & ~other, ~av & other, ~av & ~other)),
+        both=int((av & other).sum()),
+        only_av=int((av & ~other).sum()),
+        only_driver=int((~av & other).sum()),
+        neither=int((~av & ~other).sum()),
         crash_rate=rate,
         crash_rate_driver=rate_driver,
         caught=rate_both / rate if rate > 0.0 else None,

@@ -96,7 +96,7 @@ class RefinedLadder:
             "n_cut_ins_checked": self.n_checked,
             "rms_mps2": self.rms_mps2,
             "explained": self.explained,
-            "prediction": vars(self.prediction),
+            "prediction": dict(vars(self.prediction)),
             "predicted": self.predicted,
             "boundary": self.library.boundary,
         }

@@ -29,13 +29,7 @@ def acceleration_limit(av: AutomatedVehicle) -> float:
 
 
 def require_boundary(name: str, surrogates: tuple[str, ...]) -> None:
-    """Refuse a boundary that is none of the surrogates.
-
-    Raises
-    ------
-    CampaignError
-        There is no such surrogate.
-    """
+    """Refuse a boundary that is none of the surrogates, with a CampaignError."""
     if name not in surrogates:
         raise CampaignError(
             "testing.shells.boundary",
@@ -58,20 +52,10 @@ def shells_in_strata(pool: Pool, boundary: int, limit_mps2: float) -> list[list[
 
 
 def design_shells(pool: Pool, *, boundary: str | None = None, limit_mps2: float) -> ShellDesign:
-    """Strata of a campaign.
+    """Strata of a campaign; see `acceleration_limit`.
 
-    Parameters
-    ----------
-    pool : Pool
-    boundary : str, optional
-        Surrogate up to which strata are inside; the library's by default.
-    limit_mps2 : float
-        See `acceleration_limit`.
-
-    Raises
-    ------
-    CampaignError
-        The pool knows no such surrogate.
+    ``boundary`` is the surrogate up to which strata are inside, the library's by default; CampaignError if the pool
+    knows no such surrogate.
     """
     name = boundary or pool.library.boundary
     require_boundary(name, pool.names)
@@ -148,7 +132,7 @@ class PrescribedEpisodes:
             lv=np.ascontiguousarray(c.lv[rows]),
             bv=np.ascontiguousarray(c.bv[rows]),
             cut_step=c.step[rows],
-            component=stratum.astype(np.int64),
+            stratum=stratum.astype(np.int64),
             log_weight=np.log(self.design.p[stratum]),
         )
         return c.state[rows], traffic

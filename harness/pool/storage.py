@@ -196,6 +196,8 @@ def _pool(table: pa.Table, facts: dict[str, Any]) -> Pool:
         n_bv=n_bv,
         crashes=np.asarray(crashes).reshape(-1, len(facts["names"])),
     )
-    known = {name: np.array(value) if isinstance(value, list) else value for name, value in facts.items()}
+    known: dict[str, Any] = {
+        name: np.array(value) if isinstance(value, list) else value for name, value in facts.items()
+    }
     known |= {"library": Library.model_validate(facts["library"]), "names": tuple(facts["names"]), "cut_ins": cut_ins}
     return Pool(**{field.name: known[field.name] for field in fields(Pool)})

@@ -67,17 +67,10 @@ def _require_same_environment(environment: Environment, pool: Pool) -> None:
 def drivers_crash(
     episodes: pa.Table, seed: int, environment: Environment, drivers: RecordArray, envelope: int
 ) -> BoolArray:
-    """Which drivers would have crashed in the place of the AV, shape (n, D).
+    """Which drivers (D,) would have crashed in the place of the AV, shape (n, D).
 
-    Parameters
-    ----------
-    episodes : pa.Table
-        Consecutive rows of the episodes table; needs `PATH_COLUMNS`.
-    seed : int
-        Of the campaign.
-    drivers : structured ndarray, shape (D,)
-    envelope : int
-        See `harness.episode.trajectory.who_crashes`.
+    ``episodes`` are consecutive rows of the episodes table, with `PATH_COLUMNS`, ``seed`` is that of the campaign, and
+    ``envelope`` as in `harness.episode.trajectory.who_crashes`.
 
     Raises
     ------

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 
 from harness.report.number_format import exponent_of, interval, number, plain, with_interval
 from harness.report.plot_style import BLUE, FULL_WIDTH_IN, GREY, INK, MUTED, Plot, decades, new_figure, note, scaled
@@ -107,11 +108,7 @@ def _label(axes: Axes, shown: list[Interval], estimates: StoredEstimates, on_log
     axes.spines["left"].set_visible(False)
     axes.grid(visible=False, axis="y")
     axes.set_ylim(len(shown) - 0.4, -0.6)
-    unit = ""
-    if on_log:
-        decades(axes.xaxis, *axes.get_xlim())
-    else:
-        unit = scaled(axes.xaxis, max(one.high for one in shown))
+    unit = _scaled(axes.xaxis, axes.get_xlim(), max(one.high for one in shown), on_log)
     axes.set_xlabel(f"crash rate per test{unit} (lane-change level {plain(estimates.lane_change_level)})")
 
 
@@ -121,13 +118,17 @@ def _add_distance_axis(axes: Axes, distance_per_test_km: float | None, on_log: b
         return
     factor = 1e6 / distance_per_test_km
     top = axes.secondary_xaxis("top", functions=(lambda x: np.multiply(x, factor), lambda x: np.divide(x, factor)))
-    unit = ""
-    if on_log:
-        decades(top.xaxis, *(factor * end for end in axes.get_xlim()))
-    else:
-        unit = scaled(top.xaxis, axes.get_xlim()[1] * factor)
+    low, high = (factor * end for end in axes.get_xlim())
+    unit = _scaled(top.xaxis, (low, high), high, on_log)
     top.set_xlabel(f"crashes per 10⁶ km of such overtaking driving{unit}")
     top.spines["top"].set_visible(True)
+
+
+def _scaled(axis: Axis, ends: tuple[float, float], largest: float, on_log: bool) -> str:
+    if on_log:
+        decades(axis, *ends)
+        return ""
+    return scaled(axis, largest)
 
 
 def _caption(estimates: StoredEstimates, shown: list[Interval], on_log: bool, *, of_shells: bool) -> str:

@@ -35,37 +35,36 @@ OTHERS_SHOWN, CRASHES_SHOWN = (0.005, 0.995), (0.25, 0.75)
 """Quantiles that a panel reaches at least; of crashes fewer, because some need a braking of hundreds of m/s²."""
 
 
+class Group:
+    """Tests of one kind: values of `CONDITIONS`, shape (Q, n), and what each stands for, shape (n,)."""
+
+    def __init__(self) -> None:
+        self.values: FloatArray = np.zeros((len(CONDITIONS), 0))
+        self.weight: FloatArray = np.zeros(0)
+
+    @property
+    def n(self) -> int:
+        """Number of tests."""
+        return self.weight.size
+
+    def add(self, rows: pa.RecordBatch, hold_steps: int, *, weighted: bool) -> None:
+        """Add rows of the episodes table, all of them with a cut-in."""
+        log_weight = rows.column("log_weight").to_numpy(zero_copy_only=False)
+        self.values = np.hstack([self.values, cut_in_conditions(rows, hold_steps)])
+        self.weight = np.r_[self.weight, np.exp(log_weight) if weighted else np.ones(rows.num_rows)]
+
+
 @dataclass(frozen=True)
 class Contrast:
-    """Two groups of tests and the quantities that tell them apart, the most telling first.
+    """Two groups of tests, all or only those outside the boundary, and the quantities that tell them apart.
 
-    Attributes
-    ----------
-    outside : bool
-        Whether only tests outside the boundary were compared.
-    crashes, others : ndarray, shape (Q, n)
-        Values of `CONDITIONS`.
-    crash_weight, other_weight : ndarray, shape (n,)
-    bands : tuple of Band
-        Empty where there is too little to compare.
+    The most telling comes first; there is none where there is too little to compare.
     """
 
     outside: bool
-    crashes: FloatArray
-    others: FloatArray
-    crash_weight: FloatArray
-    other_weight: FloatArray
+    crashes: Group
+    others: Group
     bands: tuple[Band, ...]
-
-    @property
-    def n_crashes(self) -> int:
-        """Crashes compared."""
-        return self.crash_weight.size
-
-    @property
-    def n_others(self) -> int:
-        """Tests without a crash compared."""
-        return self.other_weight.size
 
     @property
     def telling(self) -> tuple[Band, ...]:
@@ -76,17 +75,17 @@ class Contrast:
     def sentence(self) -> str:
         """What to say about it, in words."""
         where = " outside the boundary" if self.outside else ""
-        if not self.n_crashes:
+        if not self.crashes.n:
             return f"No test{where} crashed, so there is nothing to compare."
         if not self.bands:
             return (
-                f"With {count(self.n_crashes)} crashes{where} and {count(self.n_others)} cut-ins{where} without one, "
+                f"With {count(self.crashes.n)} crashes{where} and {count(self.others.n)} cut-ins{where} without one, "
                 "nothing can be said about what crashes have in common."
             )
         if not self.telling:
             return (
-                f"Nothing stands out: no quantity recorded at the cut-in tells {count(self.n_crashes)} crashes{where} "
-                f"from {count(self.n_others)} cut-ins{where} without a crash better than chance would (p = "
+                f"Nothing stands out: no quantity recorded at the cut-in tells {count(self.crashes.n)} crashes{where} "
+                f"from {count(self.others.n)} cut-ins{where} without a crash better than chance would (p = "
                 f"{self.bands[0].p_value:.2g} for the most telling)."
             )
         first = self.telling[0]
@@ -96,10 +95,10 @@ class Contrast:
                 f"{percent(first.crash_share)} of the crash rate comes from cut-ins with {had}; "
                 f"{percent(first.other_share)} of all cut-ins without a crash are like that."
             )
-        of = "All" if first.n_crashes == self.n_crashes else f"{count(first.n_crashes)} of"
+        of = "All" if first.n_crashes == self.crashes.n else f"{count(first.n_crashes)} of"
         return (
-            f"{of} {count(self.n_crashes)} crashes{where} happened with {had}; {percent(first.other_share)} of the "
-            f"{count(self.n_others)} tests there without a crash were like that."
+            f"{of} {count(self.crashes.n)} crashes{where} happened with {had}; {percent(first.other_share)} of the "
+            f"{count(self.others.n)} tests there without a crash were like that."
         )
 
 
@@ -122,44 +121,24 @@ def crash_contrast(run: RunFolder) -> Contrast:
         If a shard is damaged.
     """
     first_outside = None if run.shells is None else run.shells.n_inside
-    crashes, others = _Rows(MOST_CRASHES), _Rows(MOST_OTHERS)
+    crashes, others = Group(), Group()
     hold_steps = round(run.campaign.environment.acceleration_hold_s / STEP_S)
     for batch in run.episodes(*COLUMNS, "outcome", "component", "log_weight"):
         compared = pc.and_(pc.is_valid(batch.column("cut_in_step")), pc.invert(_ended(batch, FAILED)))
         if first_outside is not None:
             compared = pc.and_(compared, pc.greater_equal(batch.column("component"), first_outside))
         crashed = _ended(batch, CRASH)
-        for rows, wanted in ((crashes, crashed), (others, pc.invert(crashed))):
-            rows.add(batch.filter(pc.and_(compared, wanted)), hold_steps, weighted=run.shells is None)
-        if crashes.full and others.full:
+        for tests, most, wanted in ((crashes, MOST_CRASHES, crashed), (others, MOST_OTHERS, pc.invert(crashed))):
+            rows = batch.filter(pc.and_(compared, wanted)).slice(0, most - tests.n)
+            if rows.num_rows:
+                tests.add(rows, hold_steps, weighted=first_outside is None)
+        if crashes.n == MOST_CRASHES and others.n == MOST_OTHERS:
             break
     bands: list[Band] = []
-    if min(crashes.weight.size, others.weight.size) >= FEWEST_CRASHES:
-        crash = np.arange(crashes.weight.size + others.weight.size) < crashes.weight.size
+    if min(crashes.n, others.n) >= FEWEST_CRASHES:
+        crash = np.arange(crashes.n + others.n) < crashes.n
         bands = telling_bands(np.hstack([crashes.values, others.values]), crash, np.r_[crashes.weight, others.weight])
-    outside = run.shells is not None
-    return Contrast(outside, crashes.values, others.values, crashes.weight, others.weight, tuple(bands))
-
-
-class _Rows:
-    """The first tests of one kind, with their weights."""
-
-    def __init__(self, most: int) -> None:
-        self.most = most
-        self.values: FloatArray = np.zeros((len(CONDITIONS), 0))
-        self.weight: FloatArray = np.zeros(0)
-
-    @property
-    def full(self) -> bool:
-        return self.weight.size >= self.most
-
-    def add(self, batch: pa.RecordBatch, hold_steps: int, *, weighted: bool) -> None:
-        batch = batch.slice(0, self.most - self.weight.size)
-        if not batch.num_rows:
-            return
-        log_weight = batch.column("log_weight").to_numpy(zero_copy_only=False)
-        self.values = np.hstack([self.values, cut_in_conditions(batch, hold_steps)])
-        self.weight = np.r_[self.weight, np.exp(log_weight) if weighted else np.ones(batch.num_rows)]
+    return Contrast(first_outside is not None, crashes, others, tuple(bands))
 
 
 def _ended(batch: pa.RecordBatch, outcome: int) -> pa.Array:
@@ -184,10 +163,10 @@ def contrast_plot(contrast: Contrast) -> Plot | None:
     panels[0].legend(loc="upper left", fontsize=8, labelcolor=MUTED, bbox_to_anchor=(0.0, 1.0))
     names = ", ".join(CONDITIONS[band.quantity].name for band in bands)
     alt = f"Histograms among crashes and among tests without a crash: {names}. {contrast.sentence}"
-    ticks = " Each mark at the foot is a crash." if contrast.n_crashes <= TICKED_CRASHES else ""
+    ticks = " Each mark at the foot is a crash." if contrast.crashes.n <= TICKED_CRASHES else ""
     weighted = "" if contrast.outside else " Both are weighted to naturalistic driving."
     caption = (
-        f"Orange: {count(contrast.n_crashes)} crashes; grey: {count(contrast.n_others)} tests without one. Shaded: the "
+        f"Orange: {count(contrast.crashes.n)} crashes; grey: {count(contrast.others.n)} tests without one. Shaded: the "
         f"band in which crashes are most over-represented.{weighted}{ticks} What lies beyond a panel counts in its "
         "outermost bar."
     )
@@ -195,13 +174,13 @@ def contrast_plot(contrast: Contrast) -> Plot | None:
 
 
 def _draw(axes: Axes, contrast: Contrast, band: Band) -> None:
-    crashes, others = contrast.crashes[band.quantity], contrast.others[band.quantity]
+    crashes, others = (tests.values[band.quantity] for tests in (contrast.crashes, contrast.others))
     edges = np.linspace(*_range(crashes, others, band), BARS + 1)
     axes.axvspan(max(band.low, edges[0]), min(band.high, edges[-1]), color=VERMILLION, alpha=0.15, linewidth=0)
-    grey = _shares(others, contrast.other_weight, edges)
+    grey = _shares(others, contrast.others.weight, edges)
     axes.stairs(grey, edges, fill=True, color=GREY, alpha=0.6, label="no crash")
-    axes.stairs(_shares(crashes, contrast.crash_weight, edges), edges, color=VERMILLION, linewidth=1.5, label="crash")
-    if contrast.n_crashes <= TICKED_CRASHES:
+    axes.stairs(_shares(crashes, contrast.crashes.weight, edges), edges, color=VERMILLION, linewidth=1.5, label="crash")
+    if contrast.crashes.n <= TICKED_CRASHES:
         seen = np.clip(crashes, edges[0], edges[-1])
         axes.plot(seen, np.zeros_like(seen), "|", color=VERMILLION, markersize=7, clip_on=False)
     axes.set_xlim(float(edges[0]), float(edges[-1]))

@@ -38,16 +38,8 @@ CONDITIONS = (
     Condition("BV acceleration at the cut-in", "a BV acceleration at the cut-in", "m/s²"),
     Condition("BV acceleration after the cut-in", "a BV acceleration right after the cut-in", "m/s²"),
 )
-COLUMNS = (
-    "v_bv_mps",
-    "r1_m",
-    "r1dot_mps",
-    "cut_in_step",
-    "cut_in_r2_m",
-    "cut_in_r2dot_mps",
-    "lv_maneuvers",
-    "bv_maneuvers",
-)
+NUMBERS = ("v_bv_mps", "r1_m", "r1dot_mps", "cut_in_r2_m", "cut_in_r2dot_mps")
+COLUMNS = (*NUMBERS, "cut_in_step", "lv_maneuvers", "bv_maneuvers")
 
 
 def cut_in_conditions(batch: pa.RecordBatch, hold_steps: int) -> FloatArray:
@@ -56,9 +48,9 @@ def cut_in_conditions(batch: pa.RecordBatch, hold_steps: int) -> FloatArray:
     LV and BV hold an acceleration for ``hold_steps``. NaN where there is no such value: the acceleration after a cut-in
     that ended the test at once.
     """
-    v_bv0, r1_0, r1dot0, r2, r2dot = (floats(batch.column(name)) for name in (*COLUMNS[:3], *COLUMNS[4:6]))
+    v_bv0, r1_0, r1dot0, r2, r2dot = (floats(batch.column(name)) for name in NUMBERS)
     cut = batch.column("cut_in_step").to_numpy(zero_copy_only=False).astype(np.int64)
-    lv, bv = (_draws(batch.column(name)) for name in COLUMNS[6:])
+    lv, bv = (_draws(batch.column(name)) for name in ("lv_maneuvers", "bv_maneuvers"))
     x_lv, v_lv = _moved(np.maximum(v_bv0 + r1dot0, 0.0), lv, cut, hold_steps)
     x_bv, v_bv = _moved(v_bv0, bv, cut, hold_steps)
     closing = np.maximum(-r2dot, 0.0)

@@ -84,22 +84,15 @@ RC: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class Plot:
-    """A drawn plot with what a reader needs beside it.
-
-    Attributes
-    ----------
-    name : str
-        File name without suffix; also seeds the ids inside the SVG.
-    alt : str
-        What the plot shows, in words, for those who cannot see it.
-    caption : str
-        What to read from it.
-    """
+    """A drawn plot with what a reader needs beside it."""
 
     name: str
+    """File name without suffix; also seeds the ids inside the SVG."""
     figure: Figure
     alt: str
+    """What the plot shows, in words, for those who cannot see it."""
     caption: str
+    """What to read from it."""
 
 
 def new_figure(width_in: float, height_in: float) -> Figure:

@@ -23,9 +23,6 @@ from harness.records.folder import MANIFEST, NO_RUN, read_json, read_manifest, r
 from harness.records.reader import read_shards
 from harness.records.stored_manifest import Count, Stored, StoredManifest
 
-NEGLIGIBLE = 1e-9
-"""Differences of this share of P(cut-in) come from rounding."""
-
 
 class ShownManifest(StoredManifest):
     """A manifest with what the page shows of every run."""
@@ -86,16 +83,6 @@ class ShownShells(ShellDetails):
     """What the headline estimate of a shells run says about them."""
 
     rate: float
-
-    @property
-    def p_tested(self) -> float:
-        """Probability of a cut-in that belongs to a shell."""
-        return math.fsum(shell.p for shell in self.shells)
-
-    @property
-    def nothing_left_out(self) -> bool:
-        """Whether every cut-in belongs to a shell; rounding may leave a trace of nothing."""
-        return self.p_impossible <= NEGLIGIBLE * self.p_cut_in
 
     @property
     def n_inside(self) -> int:

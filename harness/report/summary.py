@@ -85,14 +85,8 @@ class RunSummary:
         Episodes and sum of weights per outcome, in the order of ``OUTCOMES``.
     causes : Counter of str
         Failed episodes per cause.
-    log_weight_range : tuple of float
-        Smallest and largest.
-    log10_weight, log10_weight_crash : FineHistogram
-        Of log10 of the weight, all episodes and crashes.
-    stratum_crash, impact_speed_mps, crash_time_s, response_time_s : FineHistogram
-        Of crashes: number of control steps, impact speed, time of the crash, time from cut-in to crash.
-    cut_in, cut_in_crash : CutInGrid
-        All cut-ins, and those that ended in a crash.
+    stratum_crash, response_time_s : FineHistogram
+        Of crashes: number of control steps, time from cut-in to crash.
     hardest, heaviest, outermost : WorstCrashes
         By impact speed, by weight, and (of tests from shells) from the most careless shell inwards.
     """

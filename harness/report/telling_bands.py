@@ -29,20 +29,10 @@ SEED = 20_240
 
 @dataclass(frozen=True)
 class Band:
-    """The band of one quantity in which crashes are most over-represented.
+    """The band of one quantity (by index) in which crashes are most over-represented.
 
-    Attributes
-    ----------
-    quantity : int
-        Index of the quantity.
-    low, high : float
-        Ends, rounded outwards to a tenth; infinite where no test lies beyond.
-    crash_share, other_share : float
-        Share of the crashes, and of the tests without a crash, in it, by weight.
-    n_crashes : int
-        Crashes in it.
-    p_value : float
-        Over all bands and quantities.
+    Its ends are rounded outwards to a tenth, and infinite where no test lies beyond. The shares of the crashes and of
+    the tests without a crash in it are by weight; the p-value is over all bands and quantities.
     """
 
     quantity: int

@@ -198,7 +198,7 @@ class _Run:
         rule = self._planner.rule
         if rule.reached:
             return "rhw"
-        if rule.pool_too_rough:  # whatever else is spent: more of it would not help
+        if rule.pool_error_above_target:  # whatever else is spent: more of it would not help
             return "pool_error"
         return "episodes" if self.prefix.n_episodes >= self._campaign.stop.episodes else "pool"
 

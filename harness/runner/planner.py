@@ -229,7 +229,7 @@ class RoundRule:
     ----------
     of_first_tests : bool
         Whether the round brings the tests that every shell gets before anything is decided about it.
-    reached, rhw, heaviest, waited_for, pool_too_rough
+    reached, rhw, heaviest, waited_for, pool_error_above_target
         See `StopRule`.
     """
 
@@ -239,7 +239,7 @@ class RoundRule:
         self._min_crashes = campaign.min_crashes
         self._first_tests = campaign.testing.shells.first_tests
         self._conditional = campaign.testing.shells.statement == "conditional"
-        self.reached = self.pool_too_rough = False
+        self.reached = self.pool_error_above_target = False
         self.rhw = float("inf")
         self.heaviest = 0.0  # limits within shells allow for every crash that has not been seen
         self.of_first_tests = False
@@ -263,8 +263,8 @@ class RoundRule:
         if estimate.n_crashes < self._min_crashes:
             return False
         self.reached = not missing
-        self.pool_too_rough = watched["rhw_from_pool_at_least"] > self._target
-        hopeless = self.pool_too_rough and watched["rhw_from_pool"] ** 2 >= POOL_SHARE * self.rhw**2
+        self.pool_error_above_target = watched["rhw_from_pool_at_least"] > self._target
+        hopeless = self.pool_error_above_target and watched["rhw_from_pool"] ** 2 >= POOL_SHARE * self.rhw**2
         return self.reached or (hopeless and estimate.n_episodes >= self._held)
 
 

@@ -8,8 +8,8 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import Field, field_validator, model_validator
 
 from harness.campaign.models import AutomatedVehicle, BuiltInParameters, Campaign
+from harness.campaign.problems import read_model
 from harness.campaign.section import NAME_PATTERN, Section, Whole, broken_rule
-from harness.campaign.yaml_text import read_model
 from harness.errors import CampaignError
 from harness.methods import SAMPLING, EstimatorName
 from harness.studies.chains.named import CHAINS

@@ -85,14 +85,14 @@ def _wrong(design: ShellDesign, fault: Fault | None) -> ShellDesign:
 
 def _block(design: ShellDesign, added: IntArray, crashes: IntArray, first: int) -> Block:
     """What the records of a round become: within a stratum the crashes come first, which no estimator can see."""
-    component = np.repeat(np.arange(added.size), added)
-    n = component.size
+    stratum = np.repeat(np.arange(added.size), added)
+    n = stratum.size
     rank = np.arange(n) - np.repeat(np.cumsum(added) - added, added)
     none = np.zeros(n, np.bool_)
     return Block(
         first_episode=first,
         method="shells",
-        crash=rank < crashes[component],
+        crash=rank < crashes[stratum],
         failed=none,
         cut_in=~none,
         bv_lv_contact=none,
@@ -100,7 +100,7 @@ def _block(design: ShellDesign, added: IntArray, crashes: IntArray, first: int) 
         log_q=np.zeros((n, 0)),
         alpha=np.zeros(0),
         n_control_steps=np.zeros(n, np.int64),
-        component=component,
+        stratum=stratum,
         shells=design,
     )
 

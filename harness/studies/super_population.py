@@ -23,7 +23,7 @@ from harness.campaign.models import AutomatedVehicle, BuiltInParameters, Reflexe
 from harness.compiled import cache_root, source_hash
 from harness.environment.driving import Environment
 from harness.errors import CampaignError
-from harness.pool.aimed_paths import PILOT_PATHS, Enumerator, contributions, fit_proposal
+from harness.pool.aimed_paths import PILOT_PATHS, Enumerator
 from harness.pool.library import Library
 from harness.pool.shells import acceleration_limit
 from harness.progress import Progress
@@ -156,7 +156,7 @@ def enumerate_paths(
     pilot = Enumerator(*asked)
     progress.stage(f"super-population of seed {seed}", n_paths + PILOT_PATHS)
     rates = pilot.run(0, PILOT_PATHS, progress).rates(drivers.records.size)
-    aimed = pilot.aimed(fit_proposal(pilot.uniforms(0, PILOT_PATHS), contributions(rates)))
+    aimed = pilot.aimed(rates)
     population = _compressed(aimed, n_paths, progress)
     _write(file, population)
     return population

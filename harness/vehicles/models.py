@@ -1,4 +1,7 @@
-"""Longitudinal driver models that AVs and surrogates share: IDM, FVDM, and one that does not look ahead.
+"""Longitudinal driver models that AVs and surrogates share, and how a driver lags behind its model.
+
+The models are IDM, FVDM, and one that does not look ahead. A driver may react late, change its acceleration slowly, or
+not look: it keeps its speed until it reacts to the cut-in; then its model decides, as fast as its jerk limit allows.
 
 Only + − × ÷ √ and explicit products are used (and ``math.tanh``, inside compiled code alone), so that every caller gets
 the same bits.
@@ -11,7 +14,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from harness.arrays import Record, RecordArray
+from harness.arrays import FloatArray, IntArray, Record, RecordArray
 from harness.campaign.models import (
     FVDM,
     IDM,
@@ -23,7 +26,9 @@ from harness.campaign.models import (
     Reaction,
     Reflexes,
 )
-from harness.compiled import compiled_inline
+from harness.compiled import compiled_inline, compiled_threads
+from harness.random_stream import AV_DRAWS, uniform
+from harness.vehicles.kinematics import STEP_S
 
 IDM_KIND, FVDM_KIND, CONSTANT_KIND = 0, 1, 2
 SMALLEST_GAP_M = 0.1
@@ -43,14 +48,7 @@ DRIVER_DTYPE = np.dtype(
 
 
 def driver_records(drivers: Sequence[BuiltInParameters], reactions: Sequence[Reflexes] | None = None) -> RecordArray:
-    """Parameters of driver models as kernels read them, shape (number of drivers,).
-
-    Parameters
-    ----------
-    drivers : sequence of parameters
-    reactions : sequence of Reflexes, optional
-        One for each driver; all react at once by default.
-    """
+    """Parameters of driver models as kernels read them, shape (number of drivers,); by default all react at once."""
     kinds = {IDMParameters: IDM_KIND, FVDMParameters: FVDM_KIND, ConstantParameters: CONSTANT_KIND}
     records = np.zeros(len(drivers), dtype=DRIVER_DTYPE)
     for record, driver, reaction in zip(records, drivers, reactions or [Reflexes()] * len(drivers), strict=True):
@@ -118,3 +116,49 @@ def driver_acceleration(driver: Record, speed: float, lead_speed: float, gap: fl
     else:
         a = fvdm_acceleration(driver, speed, lead_speed, fvdm_shape(driver, seen))
     return float(min(max(a, driver.min_acceleration_mps2), driver.max_acceleration_mps2))
+
+
+@compiled_inline
+def reaction_steps(driver: Record, seed: int, episode: int) -> int:
+    """Steps that pass after the cut-in before the driver reacts, its inattention in this episode included."""
+    if driver.inattention_probability > 0.0 and uniform(seed, episode, AV_DRAWS, 0) < driver.inattention_probability:
+        return int(driver.delay_steps + driver.inattention_steps)
+    return int(driver.delay_steps)
+
+
+@compiled_inline
+def reacting_acceleration(driver: Record, previous: float, speed: float, lead_speed: float, gap: float) -> float:
+    """Acceleration (m/s²) of a driver that has reacted; ``previous`` is that of the step before, 0 until then."""
+    wanted = driver_acceleration(driver, speed, lead_speed, gap)
+    change = driver.max_jerk_mps3 * STEP_S
+    return float(min(max(wanted, previous - change), previous + change))
+
+
+@compiled_threads
+def expected_accelerations(
+    driver: RecordArray, begin: IntArray, speed: FloatArray, lead_speed: FloatArray, gap: FloatArray, out: FloatArray
+) -> None:
+    """Accelerations of a driver that sees what was seen, but remembers its own acceleration.
+
+    Starting from the observed acceleration of the step before, a driver that hardly changes it would seem to explain
+    any vehicle.
+
+    Parameters
+    ----------
+    driver : structured ndarray, shape (1,)
+        Without inattention.
+    begin : ndarray, shape (m + 1,)
+        Where each cut-in's steps begin, the cut-in step first; and the end.
+    speed, lead_speed : ndarray, shape (n,)
+        Of the vehicle, and of the one that cut in (m/s).
+    gap : ndarray, shape (n,)
+        Bumper to bumper (m).
+    out : ndarray, shape (n,)
+        Receives accelerations (m/s²).
+    """
+    for e in range(begin.size - 1):
+        a = 0.0
+        for i in range(begin[e], begin[e + 1]):
+            if i - begin[e] > driver[0].delay_steps:
+                a = reacting_acceleration(driver[0], a, speed[i], lead_speed[i], gap[i])
+            out[i] = a

@@ -5,7 +5,7 @@ import os
 import pytest
 
 from benchmarks.contender_process import Measurement, descendants_cpu_s
-from benchmarks.contenders import CONTENDERS, Recorded, campaign
+from benchmarks.contenders import CONTENDERS, Recorded, Workers, campaign
 from benchmarks.one_at_a_time import in_libsumo
 from benchmarks.speed import RATES, RATIOS, Ratio, ratio, require_equal_rows
 from harness.twin import TwinWorld
@@ -25,7 +25,17 @@ def test_one_episode_at_a_time_runs_the_episodes_of_the_twin():
     twin = Recorded(settings, lambda _: TwinWorld(5))
     assert rows == twin.rows(12)
     assert rows != twin.rows(11)
+    assert twin.run(0, 12).bytes_written > 0
     twin.close()
+
+
+def test_workers_are_those_of_a_run(monkeypatch):
+    monkeypatch.setattr("benchmarks.contenders.SHARD", 20)
+    workers = Workers(campaign("nde", **{"world.engine": "twin", "records.moments": "none"}), 1)
+    try:
+        assert workers.run(0, 40).episodes == 40
+    finally:
+        workers.close()
 
 
 def test_a_ratio_is_the_median_of_ratios_within_rounds():

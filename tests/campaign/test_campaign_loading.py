@@ -72,6 +72,7 @@ def load(tmp_path):
         ("av:\n  controller: a:B\n  parameters: [1]", "av.parameters", 4, "names, each with its value"),
         ("av:\n  sumo: ACC", "av.sumo", 3, "names, each with its value"),
         ("av:\n  sumo:\n    carFollowModel: ACC\n    minGap: true", "av.sumo.minGap", 5, "text or a number"),
+        ("av:\n  controller: a:B\n  parameters: {x: 1}\n  epsilom: 1", "av.epsilom", 5, "Delete it"),
         ("av:\n  sumo: {tau: 1}\n  parameters: {tau: 1}", "av.parameters", 4, "under av.sumo itself"),
         ("av:\n  sumo: {tau: 1}\nworld: {engine: twin}", "world.engine", 4, "Write engine: sumo"),
         ("av:\n  traci: {command: ''}", "av.traci.command", 3, "starts the program"),

@@ -6,7 +6,7 @@ import jsonschema
 import pytest
 
 from harness.campaign.models import Campaign
-from harness.campaign.schema import SchemaView, campaign_schema, schema_text
+from harness.campaign.schema import campaign_schema, schema_text
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
 
@@ -60,26 +60,3 @@ def test_schema_refuses_what_the_loader_refuses(wrong):
 def test_schema_allows_every_source(av):
     jsonschema.validate({"name": "x", "av": av}, campaign_schema())
     Campaign.model_validate({"name": "x", "av": av})
-
-
-def test_view_follows_models_and_tags():
-    view = SchemaView(campaign_schema())
-    data = {"av": {"model": "fvdm"}, "surrogates": {"A": {"model": "idm", "parameters": {"time_headway_s": 1}}}}
-    assert view.at(("av", "parameters", "max_speed_mps"), data)["maximum"] == 60.0
-    assert view.at(("av", "parameters", "time_headway_s"), data) == {}
-    assert view.at(("av", "parameters", "time_headway_s"), {})["maximum"] == 10.0
-    assert view.at(("stop", "rhw"), {})["nullable"]
-    assert view.at(("av", "parameters", "x"), {"av": {"controller": "a:B"}}) == {}
-    assert view.path_of(("av", "sumo", "minGap", "float"), {"av": {"sumo": {"minGap": True}}})[-1] == "minGap"
-    loc = ("surrogates", "A", "idm", "parameters", "time_headway_s")
-    assert view.path_of(loc, data) == ("surrogates", "A", "parameters", "time_headway_s")
-    assert view.path_of(("surrogates", "a.b", "[key]"), data) == ("surrogates", "a.b")
-
-
-def test_view_finds_keys_anywhere():
-    view = SchemaView(campaign_schema())
-    assert list(view.paths_of_key("epsilon")) == ["testing.epsilon"]
-    assert set(view.paths_of_key("kappa_per_s")) == {
-        "av.parameters.kappa_per_s",
-        "surrogates.NAME.parameters.kappa_per_s",
-    }

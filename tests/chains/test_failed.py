@@ -13,7 +13,7 @@ import pytest
 from scipy.stats import binomtest
 
 from harness.estimators.block import Block
-from harness.estimators.one_pass import ESTIMATORS, accumulator
+from harness.estimators.one_pass import ACCUMULATORS, accumulator
 from harness.studies.chains.named import frequent_decisive
 from harness.studies.chains.sampler import draw
 from harness.studies.chains.shells import ChainShells
@@ -32,21 +32,20 @@ def with_failures(block: Block, rng: np.random.Generator) -> Block:
     return replace(block, crash=block.crash & ~failed, failed=failed)
 
 
-def drawn(name: str, rng: np.random.Generator) -> Block:
-    n = 20 * N if name == "nde" else N
-    return draw(CHAIN, METHODS[name], n, rng)
-
-
-def low(covered: int) -> float:
-    return binomtest(covered, REPLICATIONS, 0.9, alternative="less").pvalue
+def require_coverage(drawn, seed: int, name: str, wrong: type) -> None:
+    """Of the estimator by name; counting failed tests as safe must not cover."""
+    make = {"both ways": lambda: accumulator(name), "as no crash": wrong}
+    found = replicate(lambda rng: with_failures(drawn(rng), rng), REPLICATIONS, seed, make)
+    covered = [one.covered(CHAIN.crash_rate) for one in found.values()]
+    right_p, wrong_p = (binomtest(count, REPLICATIONS, 0.9, alternative="less").pvalue for count in covered)
+    assert right_p > 1e-4
+    assert wrong_p < 1e-9
 
 
 @pytest.mark.parametrize("name", METHODS)
 def test_intervals_cover_whatever_failed_tests_would_have_come_to(name):
-    make = {"both ways": lambda: accumulator(name), "as no crash": ESTIMATORS[name]}
-    found = replicate(lambda rng: with_failures(drawn(name, rng), rng), REPLICATIONS, 31, make)
-    assert low(found["both ways"].covered(CHAIN.crash_rate)) > 1e-4
-    assert low(found["as no crash"].covered(CHAIN.crash_rate)) < 1e-9
+    n = 20 * N if name == "nde" else N
+    require_coverage(lambda rng: draw(CHAIN, METHODS[name], n, rng), 31, name, ACCUMULATORS[name])
 
 
 def shells_block(rng: np.random.Generator) -> Block:
@@ -54,11 +53,11 @@ def shells_block(rng: np.random.Generator) -> Block:
     source = ChainShells(CHAIN, 20)
     design, _ = source.draw(rng)
     design = replace(design, p=source.shell_p, moments=np.outer(source.shell_p, source.shell_p))
-    component = np.repeat(np.arange(len(design.p)), 300)
+    stratum = np.repeat(np.arange(len(design.p)), 300)
     share = source.crash_p / source.shell_p
-    n = len(component)
+    n = len(stratum)
     no = np.zeros(n, np.bool_)
-    crash = rng.random(n) < share[component]
+    crash = rng.random(n) < share[stratum]
     return Block(
         first_episode=0,
         method="shells",
@@ -70,12 +69,12 @@ def shells_block(rng: np.random.Generator) -> Block:
         log_q=np.zeros((n, 0)),
         alpha=np.zeros(0),
         n_control_steps=np.ones(n, np.int64),
-        component=component,
+        stratum=stratum,
         shells=design,
     )
 
 
-class FailedAsSafe(ESTIMATORS["shells"]):
+class FailedAsSafe(ACCUMULATORS["shells"]):
     """Mutant: today's shells, which forget that tests failed."""
 
     def add(self, block: Block) -> None:
@@ -83,7 +82,4 @@ class FailedAsSafe(ESTIMATORS["shells"]):
 
 
 def test_shells_cover_too():
-    make = {"both ways": lambda: accumulator("shells"), "as no crash": FailedAsSafe}
-    found = replicate(lambda rng: with_failures(shells_block(rng), rng), REPLICATIONS, 32, make)
-    assert low(found["both ways"].covered(CHAIN.crash_rate)) > 1e-4
-    assert low(found["as no crash"].covered(CHAIN.crash_rate)) < 1e-9
+    require_coverage(shells_block, 32, "shells", FailedAsSafe)

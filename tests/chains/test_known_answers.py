@@ -40,28 +40,17 @@ def test_nde(chain):
 
 
 @everywhere
-def test_forced(chain):
-    found = estimates(chain, "forced")
-    assert set(found) == {"nade"}
-    assert standard_errors_off(chain, found["nade"]) < 4.0
-    assert found["nade"].upper_bound > found["nade"].crash_rate
-
-
-@everywhere
-def test_step_mixture(chain):
-    found = estimates(chain, "step_mixture")
-    true_error = math.sqrt(chain.step_mixture_variance / sum(SIZES))
-    assert set(found) == {"nade", "scv"}
-    assert standard_errors_off(chain, found["nade"], true_error) < 4.0
-    assert standard_errors_off(chain, found["scv"], true_error) < 4.0
-
-
-@everywhere
-def test_episode_mixture(chain):
-    found = estimates(chain, "episode_mixture")
-    assert set(found) == {"nade", "mixture_cv"}
-    assert standard_errors_off(chain, found["nade"]) < 4.0
-    assert standard_errors_off(chain, found["mixture_cv"]) < 4.0
+@pytest.mark.parametrize(
+    ("method", "names"),
+    [("forced", ["nade"]), ("step_mixture", ["nade", "scv"]), ("episode_mixture", ["nade", "mixture_cv"])],
+)
+def test_weighted_methods(chain, method, names):
+    found = estimates(chain, method)
+    known_error = math.sqrt(chain.step_mixture_variance / sum(SIZES)) if method == "step_mixture" else None
+    assert set(found) == set(names)
+    for name in names:
+        assert standard_errors_off(chain, found[name], known_error) < 4.0
+        assert found[name].upper_bound > found[name].crash_rate
 
 
 @everywhere

@@ -128,7 +128,7 @@ def test_the_path_is_relative_to_the_campaign_and_the_content_counts(fmu, tmp_pa
 def test_instances_are_apart_and_an_episode_forgets_the_last(fmu, tmp_path):
     from harness.controllers.fmu import fmu_maker
 
-    make = fmu_maker(load(tmp_path, f"{{file: '{fmu}', inputs: {{speed_mps: x}}, output: total}}").av)
+    make = fmu_maker(load(tmp_path, f"{{file: '{fmu}', inputs: {{speed_mps: x}}, output: total}}").av.fmu)
     first, second = make(), make()
 
     def step(controller, time_s):

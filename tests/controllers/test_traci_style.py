@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from harness.controllers import EpisodeStart, Neighbour, Observation
-from harness.controllers.traci_facade import Traci, TraCIException
+from harness.controllers.traci_facade import Traci
+from harness.controllers.traci_refusals import TraCIException
 from harness.controllers.traci_style import StepListenerController, TraciStyleController
 
 

@@ -33,7 +33,7 @@ def built(monkeypatch):
         numbers = np.array([driver[name][0] for name in MODEL_FIELDS], np.float32)
         return Tables(np.full((13, 9, 150, 12), numbers.sum(), np.float32), np.outer(numbers, numbers), numbers)
 
-    monkeypatch.setattr(cache, "_build_one", build_one)
+    monkeypatch.setattr(cache, "build_one", build_one)
     return arguments
 
 

@@ -8,7 +8,7 @@ import functools
 
 import numpy as np
 
-from harness.campaign.models import Environment as EnvironmentSection
+from harness.campaign.models import EnvironmentSettings
 from harness.compiled import compiled_threads
 from harness.environment import cut_in, driving
 from harness.environment.loading import load_environment
@@ -17,7 +17,7 @@ from harness.state import State
 
 @functools.cache
 def environment(level=1.0, hold_s=1.0):
-    return load_environment(EnvironmentSection(lane_change_level=level, acceleration_hold_s=hold_s))
+    return load_environment(EnvironmentSettings(lane_change_level=level, acceleration_hold_s=hold_s))
 
 
 @compiled_threads

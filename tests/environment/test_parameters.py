@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from harness.campaign.models import Campaign, Environment
+from harness.campaign.models import Campaign, EnvironmentSettings
 from harness.campaign.yaml_text import read_yaml
-from harness.environment.laws import require_sound_laws
-from harness.environment.loading import load_environment, load_parameters, parameter_file
+from harness.environment.loading import load_environment, load_parameters, parameter_file, require_sound_laws
 from harness.environment.parameters import EnvironmentParameters
 from harness.errors import CampaignError
 from harness.resolved import resolve
@@ -37,7 +36,7 @@ def mine(tmp_path):
     def environment(text):
         path = tmp_path / "mine.yaml"
         path.write_text(text, encoding="utf-8")
-        return Environment(parameters=str(path))
+        return EnvironmentSettings(parameters=str(path))
 
     return environment
 
@@ -79,7 +78,7 @@ def test_every_number_says_where_it_comes_from():
 
 
 def test_every_number_reaches_the_kernels():
-    record = load_environment(Environment(lane_change_level=350.0, acceleration_hold_s=0.1)).numbers
+    record = load_environment(EnvironmentSettings(lane_change_level=350.0, acceleration_hold_s=0.1)).numbers
     for section, name in NUMBERS:
         assert record[f"{section}__{name}"] == DATA[section][name]["value"]
     assert record[["level", "hold_steps", "max_steps"]].item() == (350.0, 1, 200)
@@ -91,7 +90,7 @@ def test_a_users_number_is_used(mine):
 
 
 def test_the_hash_is_that_of_the_numbers_alone(mine):
-    assert load_parameters(Environment()).content_hash() == "838b5235175d4be5"  # as of the first version
+    assert load_parameters(EnvironmentSettings()).content_hash() == "838b5235175d4be5"  # as of the first version
     noted = load_parameters(mine(edited(DF, "  df: {value: 16.0, source: user, note: checked}")))
     assert noted.content_hash() == "838b5235175d4be5"
     other = load_parameters(mine(edited(DF, "  df: {value: 16.000000001, source: ndd}")))
@@ -122,7 +121,7 @@ def test_a_wrong_file_names_the_place(mine, old, new, named):
 
 
 def test_a_missing_file_is_an_error(tmp_path):
-    assert "no such file" in refusal(Environment(parameters=str(tmp_path / "none.yaml")))
+    assert "no such file" in refusal(EnvironmentSettings(parameters=str(tmp_path / "none.yaml")))
 
 
 @pytest.mark.parametrize("text", NOT_NUMBERS)
@@ -180,7 +179,7 @@ def sound_environment(section, name, value):
     data = copy.deepcopy(DATA)
     data[section][name]["value"] = value
     try:
-        environment = load_environment(Environment(), EnvironmentParameters.model_validate(data))
+        environment = load_environment(EnvironmentSettings(), EnvironmentParameters.model_validate(data))
         require_sound_laws(environment, "mine.yaml")
     except (ValidationError, CampaignError):
         return None

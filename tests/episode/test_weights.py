@@ -55,9 +55,9 @@ def test_components_are_drawn_by_their_weights():
     assert (np.abs(counts - N * done.alpha) < 4.0 * np.sqrt(N * done.alpha)).all()
 
 
-@pytest.mark.parametrize("challenge", ["immediate", "recursive"])
-def test_moments_of_the_step_mixture_multiply_to_its_weights(challenge):
-    done = run("step_mixture", challenge, **ALL)
+@pytest.mark.parametrize(("challenge", "surrogates"), [("immediate", "two"), ("recursive", "default")])
+def test_moments_of_the_step_mixture_multiply_to_its_weights(challenge, surrogates):
+    done = run("step_mixture", challenge, surrogates=surrogates, **ALL)
     assert (np.bincount(done.moment["row"], minlength=4_000) == done.episode["n_control_steps"]).all()
     sampled = done.summed(log(done.moment["q_sampled"]) - log(done.moment["p"]))
     np.testing.assert_allclose(done.log_weight, -sampled, rtol=0, atol=1e-10)
@@ -116,7 +116,7 @@ def test_forced_episodes_weigh_what_their_path_says():
 
 def test_without_control_the_weight_is_exactly_one():
     assert (run("nde", n=400_000).log_weight == 0.0).all()
-    published = run("step_mixture", "immediate", n=4_000, moments="all")
+    published = run("step_mixture", "immediate", n=4_000, moments="all", surrogates="two")
     uncritical = published.episode["n_control_steps"] == 0
     assert uncritical.sum() > 20
     assert (published.log_weight[uncritical] == 0.0).all()

@@ -6,11 +6,10 @@ from functools import cache, cached_property
 import numpy as np
 
 from harness.campaign.models import (
-    FVDM,
     IDM,
     AutomatedVehicle,
     Campaign,
-    Environment,
+    EnvironmentSettings,
     FVDMParameters,
     IDMParameters,
     Records,
@@ -30,11 +29,16 @@ AVS = {
     "SM-II": AutomatedVehicle(model="fvdm", parameters=FVDMParameters(min_acceleration_mps2=-1.0)),
     "SM-III": AutomatedVehicle(model="fvdm", parameters=FVDMParameters(min_acceleration_mps2=-6.0)),
 }
+DEFAULT_SURROGATES = Campaign(name="default").surrogates
 SURROGATES = {
-    "default": Campaign(name="default").surrogates,
+    "default": DEFAULT_SURROGATES,
+    "two": {name: DEFAULT_SURROGATES[name] for name in ("SM-I", "SM-III")},  # immediate tables in half the time
     "SM-I": {"SM-I": IDM(model="idm")},
-    "SM-III": {"SM-III": FVDM(model="fvdm", parameters=FVDMParameters(min_acceleration_mps2=-6.0))},
+    "brakes with 2 g": {"hard": IDM(model="idm", parameters=IDMParameters(min_acceleration_mps2=-20.0))},
 }
+
+TWO = "surrogates={SM-I: {model: idm}, SM-III: {model: fvdm, parameters: {min_acceleration_mps2: -6.0}}}"
+"""The same two, as an override of a campaign's file."""
 
 
 def campaign(
@@ -53,7 +57,7 @@ def campaign(
     return Campaign(
         name="test",
         seed=seed,
-        environment=Environment(lane_change_level=level, acceleration_hold_s=hold_s),
+        environment=EnvironmentSettings(lane_change_level=level, acceleration_hold_s=hold_s),
         av=AVS[av],
         surrogates=SURROGATES[surrogates],
         testing=Testing(method=method, challenge=challenge, epsilon=epsilon, criticality_threshold=threshold),

@@ -1,7 +1,5 @@
 """A run folder written from blocks of a chain, with the columns that estimates need and the real schemas' types."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Blocks by hand, for tests that need particular outcomes and weights, and estimators fed with blocks."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import replace
 from typing import TypeVar
@@ -47,7 +45,7 @@ def block(
 def in_shells(strata: list[int], crash: list[bool], failed: list[bool] | None = None, first: int = 0) -> Block:
     """Tests drawn from `SHELLS`."""
     n = len(strata)
-    design = {"component": np.array(strata, np.int64), "shells": SHELLS}
+    design = {"stratum": np.array(strata, np.int64), "shells": SHELLS}
     none = {"log_q": np.zeros((n, 0)), "alpha": np.zeros(0)}
     log_weight = np.log(SHELLS.p)[strata]
     some = block(crash, log_weight, failed=failed, method="shells", first_episode=first, **design, **none)

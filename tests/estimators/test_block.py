@@ -1,7 +1,5 @@
 """A block refuses what would quietly give a wrong rate."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

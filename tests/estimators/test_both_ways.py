@@ -1,7 +1,5 @@
 """Failed tests: no crash in rate and lower limit, crashes in every upper limit, for every estimator."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Means of weights and ratios: right where they are known, never more than a diagnostic."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Arrow tables into blocks: the same numbers come back, and damaged tables name the place."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Intervals against scipy and by exact enumeration of their coverage."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Control variates against an ordinary least-squares solver with explicit columns."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Running moments: those of numpy, whatever the blocks, and of the zeros that were never added."""
 
-from __future__ import annotations
-
 import math
 from fractions import Fraction
 

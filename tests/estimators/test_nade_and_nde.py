@@ -1,7 +1,5 @@
 """Plain means: identities, failed episodes both ways, what is said when little is known."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

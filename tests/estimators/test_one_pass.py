@@ -1,7 +1,5 @@
 """One pass feeds all estimators, keeps the order, and follows the headline on growing prefixes."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The whole way from a run folder to the content of ``estimates.json``."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

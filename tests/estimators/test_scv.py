@@ -1,7 +1,5 @@
 """The published estimator: equal to an independent solution, equal to nade, and warned of."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

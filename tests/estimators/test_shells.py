@@ -1,7 +1,5 @@
 """Shells: exact limits per stratum, combined; counts that merge; statements that say what they rest on."""
 
-from __future__ import annotations
-
 import itertools
 import json
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Stopping: looks are declared beforehand, two passes are needed, the same data stop at the same place."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from dataclasses import replace
@@ -101,16 +99,12 @@ def test_the_same_campaign_stops_at_the_same_test(method):
 
     def stopped_at(n_ready: int) -> tuple[int, float]:
         rule = StopRule(Stop(episodes=40_000, rhw=0.2, min_crashes=30), method, SHARD)
-        state, n, look = accumulator(rule.estimator), 0, iter(rule.looks)
-        due = next(look)
+        state, n = accumulator(rule.estimator), 0
         for part in blocks(frequent_decisive(), method, [SHARD] * n_ready, SEED):
             state.add(part)
             n += len(part)
-            if n == due:
-                estimate = state.result(0.9)
-                if rule.observe(n, estimate):
-                    return n, estimate.crash_rate
-                due = next(look)
+            if rule.due(n) and rule.observe(n, estimate := state.result(0.9)):
+                return n, estimate.crash_rate
         raise AssertionError("the prefix was too short")
 
     first = stopped_at(200)

@@ -4,8 +4,6 @@ Seeds are fixed, so that the outcome is too. The right rule's `binomtest` would 
 probability 1e-4; the wrong one must fail at 1e-9.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -10,13 +10,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from harness.criticality.grid import interpolate, interpolate_maneuvers
+from harness.importance.build import harmless_cells
+from harness.importance.functions import as_challenge
 from harness.maneuvers import CUT_IN, STAY
 from harness.outcomes import EPISODE_MIXTURE, STEP_MIXTURE
 from harness.state import STATE_COLUMNS
+from harness.vehicles.kinematics import CONTACT_M
 from tests.episode.twin_runs import prepared, run
 from tests.importance.kernels import after_cut_in, before_cut_in, drawn
 
-CHALLENGES = ("immediate", "recursive")
+CHALLENGES = {"immediate": "two", "recursive": "default"}  # and the surrogates
 EPSILONS = (0.0, 0.1, 1.0)
 settings = pytest.mark.parametrize(
     ("challenge", "epsilon"), [(challenge, epsilon) for challenge in CHALLENGES for epsilon in EPSILONS]
@@ -31,13 +35,13 @@ steps = st.integers(0, 19).map(lambda second: 10 * second)
 
 def policy_of(challenge, epsilon):
     """Environment and importance functions, at a level where cutting in is not always negligible."""
-    policy = prepared("step_mixture", challenge, level=1e4).policy
+    policy = prepared("step_mixture", challenge, level=1e4, surrogates=CHALLENGES[challenge]).policy
     return policy.environment, policy.importance._replace(epsilon=epsilon)
 
 
 def recorded(challenge):
     """States, maneuvers and steps of BV's redraw times: before the cut-in, and after it."""
-    done = run("step_mixture", challenge, n=4_000, moments="all")
+    done = run("step_mixture", challenge, n=4_000, moments="all", surrogates=CHALLENGES[challenge])
     moment = done.moment
     state = np.column_stack([moment[name] for name in STATE_COLUMNS])
     before = np.isin(moment["maneuver"], (CUT_IN, STAY)) & (moment["step"] % 10 == 0)
@@ -168,3 +172,50 @@ def test_draws_follow_the_mixture_or_the_component(component):
     by_component = np.bincount(drawn(u, EPISODE_MIXTURE, component, alpha, q), minlength=31) / u.size
     np.testing.assert_allclose(by_component, q[component - 1], rtol=0, atol=1.001e-5)
     assert np.abs(by_step - by_component).max() > 1e-3
+
+
+# -- grid cells that are skipped: those, and only those, in which interpolation could find no challenge --
+
+SHAPE = (1, 3, 4, 5, 31)
+
+
+def scattered(recursive):
+    """Many harmless values, and here and there one that just is not."""
+    rng = np.random.default_rng(20261121)
+    rare = rng.random(SHAPE) < 1.0 / 400.0
+    if recursive:
+        return np.where(rare, np.nextafter(0, 1, dtype=np.float32), 0.0).astype(np.float32)
+    near = (CONTACT_M + rng.exponential(1.0, SHAPE)).astype(np.float32)
+    return np.where(rare, np.float32(CONTACT_M - 1e-6), np.maximum(near, np.float32(CONTACT_M + 1e-6)))
+
+
+@pytest.mark.parametrize("recursive", [True, False])
+def test_harmless_cells_have_no_challenge_wherever_they_are_read(recursive):
+    table = scattered(recursive)
+    harmless = harmless_cells(table, recursive=recursive)
+    rng = np.random.default_rng(1)
+    out = np.empty(31)
+    found = np.argwhere(harmless[0])
+    assert 5 < len(found) < harmless.size
+    for i, g, k in found:
+        for a, b, c in [*rng.random((20, 3)), (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)]:
+            interpolate_maneuvers(table[0], (i, a, g, b, k, c), out)
+            assert [as_challenge(value, recursive) for value in out] == [0.0] * 31
+
+
+@pytest.mark.parametrize("recursive", [True, False])
+def test_a_cell_with_one_challenging_corner_is_not_harmless(recursive):
+    table = scattered(recursive)
+    harmless = harmless_cells(table, recursive=recursive)[0]
+    challenging = np.any(table[0] > 0.0 if recursive else table[0] < CONTACT_M, axis=-1)
+    for i, g, k in np.ndindex(harmless.shape):
+        assert harmless[i, g, k] == (not challenging[i : i + 2, g : g + 2, k : k + 2].any())
+
+
+def test_all_maneuvers_at_once_are_interpolated_as_each_alone():
+    table = np.random.default_rng(2).normal(size=SHAPE).astype(np.float32)[0]
+    where = (1, 0.3, 2, 0.9, 0, 0.123)
+    together = np.empty(31)
+    interpolate_maneuvers(table, where, together)
+    alone = [interpolate(np.ascontiguousarray(table[..., m]), where) for m in range(31)]
+    assert together.tolist() == alone

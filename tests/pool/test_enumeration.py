@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy.stats import chisquare
 
-from harness.arrays import RecordArray
 from harness.campaign.models import PoolSettings
 from harness.environment.initial_state import InitialStates
 from harness.episode.loop import EpisodeLoop, Keep, Policy
@@ -20,30 +19,31 @@ from harness.pool.shells import Draw, PrescribedEpisodes, design_shells
 from harness.progress import SilentProgress
 from harness.twin import TwinWorld
 from tests.chains.seed import SEED
+from tests.pool.walked import p_cut_in_of_paths
 
 LIBRARY = load_library("ladder-1")
 NAMES = list(LIBRARY.surrogates)
 
 
-def enumerated(
-    environment, n: int, envelope: int, drivers: RecordArray = LIBRARY.drivers, stride: int = 1, offset: int = 0
-):
+ENVELOPE = NAMES.index(LIBRARY.envelope)
+
+
+def enumerated(environment, n: int, envelope: int = ENVELOPE, stride: int = 1, offset: int = 0):
     steps = int(environment.numbers["max_steps"])
-    states = InitialStates(environment.numbers).draw(SEED, 0, n)
+    states, offsets = InitialStates(environment.numbers).draw(SEED, 0, n), np.full(n, offset)
     probability, crashes = np.zeros((n, steps)), np.zeros((n, steps), np.int64)
-    path, offsets = empty_trajectory(environment), np.full(n, offset)
-    enumerate_cut_ins(SEED, 0, states, environment, drivers, envelope, stride, offsets, path, probability, crashes)
+    asked = environment, LIBRARY.drivers, envelope, stride, offsets
+    enumerate_cut_ins(SEED, 0, states, *asked, empty_trajectory(environment), probability, crashes)
     return probability, crashes
 
 
 def test_full_throttle_crashes_wherever_anyone_does(environment):
     probability, crashes = enumerated(environment, 150, -1)
-    envelope = NAMES.index(LIBRARY.envelope)
     someone = crashes != 0
     assert someone.sum() > 5_000
-    assert np.all((crashes[someone] >> envelope) & 1 == 1)
+    assert np.all((crashes[someone] >> ENVELOPE) & 1 == 1)
     assert np.any((crashes == 0) & (probability > 0.0))  # there are cut-ins that nobody can make a crash of
-    with_shortcut = enumerated(environment, 150, envelope)
+    with_shortcut = enumerated(environment, 150)
     assert np.array_equal(with_shortcut[0], probability)
     assert np.array_equal(with_shortcut[1], crashes)
 
@@ -68,31 +68,28 @@ def test_a_prescribed_episode_ends_as_the_pool_says(campaign, pool, environment,
     crashed = episode["outcome"] == CRASH
     assert np.array_equal(crashed, pool.cut_ins.crashes[rows, pool.names.index(surrogate)])
     assert np.array_equal(episode["cut_in_step"], pool.cut_ins.step[rows])
-    assert np.allclose(episode["log_weight"], np.log(prescribed.design.p[traffic.component]), rtol=1e-15)
+    assert np.allclose(episode["log_weight"], np.log(prescribed.design.p[traffic.stratum]), rtol=1e-15)
 
 
 def test_the_probabilities_of_a_path_add_up_to_that_of_a_cut_in(environment):
     """Against an independent walk of the same path: 1 - exp(-hazard)."""
-    from tests.pool.walked import p_cut_in_of_paths
-
-    probability, _ = enumerated(environment, 40, NAMES.index(LIBRARY.envelope))
+    probability, _ = enumerated(environment, 40)
     expected = p_cut_in_of_paths(SEED, InitialStates(environment.numbers).draw(SEED, 0, 40), environment)
     assert np.allclose(probability.sum(1), expected, rtol=1e-12, atol=0.0)
 
 
 def test_a_stride_asks_the_same_cut_ins_and_each_stands_for_as_many(environment):
     """Over all offsets every cut-in is asked once, with the same answer, so that any sum has the same mean."""
-    envelope = NAMES.index(LIBRARY.envelope)
-    probability, crashes = enumerated(environment, 40, envelope)
-    strided = [enumerated(environment, 40, envelope, stride=STRIDE, offset=offset) for offset in range(STRIDE)]
+    probability, crashes = enumerated(environment, 40)
+    strided = [enumerated(environment, 40, stride=STRIDE, offset=offset) for offset in range(STRIDE)]
     assert np.array_equal(np.sum([p for p, _ in strided], axis=0), STRIDE * probability)
     assert np.array_equal(np.sum([c for _, c in strided], axis=0), crashes)
     assert np.max([p > 0.0 for p, _ in strided], axis=0).sum() > 1000
 
 
 def test_blocks_use_every_offset_about_equally(environment):
-    paths = Enumerator(environment, LIBRARY.drivers, NAMES.index(LIBRARY.envelope), 5).run(0, 2048, SilentProgress())
-    asked = paths.probability > 0.0
+    paths = Enumerator(environment, LIBRARY.drivers, ENVELOPE, 5).run(0, 2048, SilentProgress())
+    asked = paths.mass > 0.0
     offsets = [np.flatnonzero(row) % STRIDE for row in asked if row.any()]
     assert all(np.unique(found).size == 1 for found in offsets)
     counts = np.bincount([found[0] for found in offsets], minlength=STRIDE)
@@ -100,11 +97,11 @@ def test_blocks_use_every_offset_about_equally(environment):
 
 
 def test_the_number_of_cores_changes_no_bit(environment, monkeypatch):
-    enumerator = Enumerator(environment, LIBRARY.drivers, NAMES.index(LIBRARY.envelope), PoolSettings().seed)
+    enumerator = Enumerator(environment, LIBRARY.drivers, ENVELOPE, PoolSettings().seed)
     many = enumerator.run(0, 512, SilentProgress())
     monkeypatch.setattr("os.cpu_count", lambda: 1)
     one = enumerator.run(0, 512, SilentProgress())
-    assert np.array_equal(many.probability, one.probability)
+    assert np.array_equal(many.mass, one.mass)
     assert np.array_equal(many.crashes, one.crashes)
 
 

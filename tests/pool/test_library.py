@@ -38,3 +38,8 @@ def test_surrogates_can_be_left_out_but_not_those_with_a_role():
     assert list(library.without({"brakes-5"}).surrogates) == [n for n in library.surrogates if n != "brakes-5"]
     with pytest.raises(ValueError, match="boundary"):
         library.without({library.boundary})
+
+
+def test_an_unknown_library_is_refused():
+    with pytest.raises(CampaignError, match="Did you mean 'ladder-1'"):
+        load_library("ladder1")

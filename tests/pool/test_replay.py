@@ -6,6 +6,7 @@ Four standard errors miss with a probability of 6e-5 per surrogate and method.
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -53,6 +54,13 @@ def replayed(campaign: Campaign, table: pa.Table, pool: Pool) -> Block:
     return replace(block, surrogates_crash=surrogates.crashes(table), known_rates=surrogates.known)
 
 
+def alarmed(*asked) -> dict[str, Any]:
+    """What the alarm says of episodes, see `replayed`."""
+    alarm = Alarm()
+    alarm.add(replayed(*asked))
+    return alarm.result()
+
+
 @pytest.fixture(scope="module")
 def forced() -> tuple[Campaign, pa.Table, Pool]:
     one = campaign("forced", av=LATE)
@@ -88,9 +96,7 @@ def test_other_draws_after_the_end_do_not_change_what_was_driven(hold_s):
 )
 def test_weighted_crashes_of_surrogates_have_the_rates_of_the_pool(method, settings, n):
     one = campaign(method, **settings)
-    alarm = Alarm()
-    alarm.add(replayed(one, drive(one, n)[1], campaign_pool(resolve(one))))
-    found = alarm.result()
+    found = alarmed(one, drive(one, n)[1], campaign_pool(resolve(one)))
     tested = [entry["z"] for entry in found["surrogates"] if entry["n_effective"] >= MANY_HITS]
     assert len(tested) >= 5
     assert np.max(np.abs(tested)) < 4.0
@@ -99,9 +105,7 @@ def test_weighted_crashes_of_surrogates_have_the_rates_of_the_pool(method, setti
 
 def test_the_step_mixture_is_shown_and_not_judged():
     one = campaign("step_mixture")
-    alarm = Alarm()
-    alarm.add(replayed(one, drive(one)[1], campaign_pool(resolve(one))))
-    found = alarm.result()
+    found = alarmed(one, drive(one)[1], campaign_pool(resolve(one)))
     assert "not bounded" in found["no_verdict"]
     for entry in found["surrogates"]:  # of the right size, although no interval can be given
         assert 0.5 < entry["mean"] / entry["mu"] < 2.0
@@ -114,18 +118,14 @@ def test_one_corrupted_rate_raises_the_alarm(forced, name, factor):
     mu = pool.mu.copy()
     mu[pool.names.index(name)] *= factor
     for rates, raised in ((pool.mu, False), (mu, True)):
-        alarm = Alarm()
-        alarm.add(replayed(one, table, replace(pool, mu=rates)))
-        assert alarm.result()["raised"] == raised
+        assert alarmed(one, table, replace(pool, mu=rates))["raised"] == raised
 
 
 def test_too_few_crashes_are_judged_by_an_inequality(forced):
     """A hundred times the rate cannot be missed in a few hundred tests, normal or not."""
     one, table, pool = forced
     for factor, raised in ((1.0, False), (1_000.0, True)):
-        alarm = Alarm()
-        alarm.add(replayed(one, table.slice(0, 300), replace(pool, mu=pool.mu * [factor, *[1] * 7])))
-        found = alarm.result()
+        found = alarmed(one, table.slice(0, 300), replace(pool, mu=pool.mu * [factor, *[1] * 7]))
         assert found["surrogates"][0]["z"] is None
         assert found["raised"] == raised
 

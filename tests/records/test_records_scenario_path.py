@@ -8,6 +8,7 @@ import pytest
 from harness.maneuvers import CUT_IN, acceleration
 from harness.outcomes import AV, BV, LV
 from harness.vehicles.kinematics import VEHICLE_LENGTH_M, next_position, next_speed
+from tests.episode.twin_runs import TWO
 
 STEP_PER_S = 10
 
@@ -48,7 +49,7 @@ def redriven(row: dict, hold_steps: int, start_m: float) -> dict[int, tuple[np.n
         (),
         ("testing.method=forced",),
         ("testing.method=nde",),
-        ("testing.method=step_mixture", "testing.challenge=immediate"),
+        ("testing.method=step_mixture", "testing.challenge=immediate", TWO),
         ("testing.method=forced", "environment.acceleration_hold_s=0.1"),
         ("testing.method=forced", "environment.acceleration_hold_s=0.7"),
     ],

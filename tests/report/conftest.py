@@ -7,6 +7,7 @@ import pytest
 from synthetic_run import RECIPES, write_run
 
 from harness.report import write_report
+from harness.report.run_folder import RunFolder, read_run_folder
 
 
 @pytest.fixture(scope="session")
@@ -17,6 +18,12 @@ def reports(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         folders[name] = write_run(tmp_path_factory.mktemp(name) / "run", recipe)
         write_report(folders[name])
     return folders
+
+
+@pytest.fixture(scope="session")
+def runs(reports: dict[str, Path]) -> dict[str, RunFolder]:
+    """The same folders, read."""
+    return {name: read_run_folder(folder) for name, folder in reports.items()}
 
 
 @pytest.fixture

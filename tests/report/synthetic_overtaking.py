@@ -13,8 +13,9 @@ import numpy as np
 STEP_S = 0.1
 N_STEPS = 200
 LENGTH_M = 5.0
-N_COMPONENTS, N_SURROGATES = 3, 2
-ALPHA = np.array([0.1, 0.45, 0.45])
+N_COMPONENTS = 4
+ALPHA = np.array([0.1, 0.3, 0.3, 0.3])
+"""Of the campaign's default mixture: forced cut-ins, then three surrogates."""
 
 
 @dataclass
@@ -41,9 +42,8 @@ def hazards(r2: np.ndarray, r2dot: np.ndarray, level: float) -> tuple[np.ndarray
     p_1s = np.minimum(level * 1e-5 * (0.01 + 0.99 * accept), 0.5)
     p = np.where(r2 > 0.0, 1.0 - (1.0 - p_1s) ** 0.1, 0.0)
     ttc = np.minimum(ttc, 60.0)
-    careful = 0.08 / (1.0 + np.exp((ttc - 3.0) / 0.4))
-    careless = 0.08 / (1.0 + np.exp((ttc - 4.5) / 0.6))
-    q = np.stack([np.full_like(p, 0.01), 0.9 * careful + 0.1 * p, 0.9 * careless + 0.1 * p], axis=1)
+    surrogates = [0.08 / (1.0 + np.exp((ttc - at_s) / (0.13 * at_s))) for at_s in (3.0, 3.7, 4.5)]
+    q = np.stack([np.full_like(p, 0.01), *(0.9 * challenge + 0.1 * p for challenge in surrogates)], axis=1)
     return p, np.where(p[:, None] > 0.0, q, 0.0)
 
 

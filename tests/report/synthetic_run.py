@@ -8,56 +8,60 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
-from scipy import stats
-from synthetic_overtaking import N_SURROGATES, STEP_S, Episodes, simulate
-from synthetic_shells import put_into_shells, shells_estimates
+from synthetic_overtaking import N_COMPONENTS, Episodes, simulate
 
 from harness.campaign.models import Campaign
-from harness.estimators.run_estimates import CampaignFacts
-from harness.records.schemas import CUT_IN, STAY, VEHICLES, episodes_schema, moments_schema, traces_schema
+from harness.estimators.run_estimates import CampaignFacts, estimate_blocks
+from harness.importance.build import importance_names
+from harness.maneuvers import CUT_IN, STAY
+from harness.outcomes import VEHICLES
+from harness.records.schemas import episodes_schema, moments_schema, traces_schema
+from harness.runner.stored_estimates import stored_blocks
+from harness.strata import ShellDesign
 
 HASH = "0123456789abcdef"
+LARGEST_P_CUT_IN = 1e-6
+"""Made up: it bounds the weights by 1e-5, which none of these tests exceeds, so that there is a half-width to show."""
+P = np.array([4e-8, 9e-8, 3e-5])
+"""Probabilities that are far apart: sums that ignore how often a shell was tested come out wrong by orders."""
+DESIGN = ShellDesign(
+    pool="c0ffee" * 4, strata=("brakes-hard", "brakes-late", "outside"), p=P, moments=np.diag(P * P) * 3.0,
+    n_paths=4_000, n_inside=2, boundary="brakes-late", p_cut_in=3.3e-5, p_impossible=2.87e-6,
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
 class RunRecipe:
-    """What the run folder should look like."""
+    """What the run folder should look like; crashes outside the boundary may be ``safe``, ``crashes``, ``untested``."""
 
     method: str = "episode_mixture"
-    n_episodes: int = 3_000
-    shard_size: int = 1_000
+    n_episodes: int = 1_500
+    shard_size: int = 500
     crashes: bool = True
     traces: str = "crash"
     moments: bool = True
     n_failed: int = 0
     level: float = 1.0
-    seed: int = 7
-    name: str = "synthetic"
     target_rhw: float | None = 0.1
     outside: str = "safe"
     statement: str = "assumption_free"
 
-    @property
-    def controlled(self) -> bool:
-        """Whether maneuvers were drawn from importance functions."""
-        return self.method not in {"nde", "shells"}
-
 
 RECIPES = {
-    "full": RunRecipe(),
-    "no_crashes": RunRecipe(crashes=False, n_episodes=1_500),
-    "no_traces": RunRecipe(traces="none", n_episodes=1_500),
-    "no_moments": RunRecipe(moments=False, n_episodes=1_500),
+    "full": RunRecipe(n_episodes=3_000, shard_size=1_000),
+    "no_crashes": RunRecipe(crashes=False),
+    "bare": RunRecipe(traces="none", moments=False),
     "nde": RunRecipe(method="nde", level=2e6, n_episodes=3_000, target_rhw=None),
-    "nde_no_crashes": RunRecipe(method="nde", n_episodes=1_500, traces="none"),
-    "failed": RunRecipe(n_failed=25, n_episodes=1_500, traces="none"),
-    "shells": RunRecipe(method="shells", moments=False, n_episodes=1_500, n_failed=5),
-    "shells_refuted": RunRecipe(method="shells", moments=False, n_episodes=1_500, outside="crashes"),
-    "shells_no_crashes": RunRecipe(method="shells", moments=False, n_episodes=1_500, crashes=False, traces="none"),
+    "nde_no_crashes": RunRecipe(method="nde", traces="none"),
+    "failed": RunRecipe(n_failed=25, traces="none"),
+    "shells": RunRecipe(method="shells", moments=False, traces="none", n_failed=5),
+    "shells_refuted": RunRecipe(method="shells", moments=False, outside="crashes"),
+    "shells_no_crashes": RunRecipe(method="shells", moments=False, crashes=False, traces="none"),
     "shells_inside_only": RunRecipe(
-        method="shells", moments=False, n_episodes=1_500, traces="none", outside="untested", statement="conditional"
+        method="shells", moments=False, traces="none", outside="untested", statement="conditional"
     ),
 }
 
@@ -65,18 +69,21 @@ RECIPES = {
 def write_run(folder: Path, recipe: RunRecipe) -> Path:
     """Write the folder and return it."""
     drawn = recipe.method != "nde"
-    episodes = simulate(recipe.n_episodes, seed=recipe.seed, level=recipe.level, controlled=drawn)
+    episodes = simulate(recipe.n_episodes, seed=7, level=recipe.level, controlled=drawn)
     if not recipe.crashes:
         _let_every_crash_time_out(episodes)
     _let_some_fail(episodes, recipe.n_failed)
     if recipe.method == "shells":
-        put_into_shells(episodes, outside=recipe.outside, seed=recipe.seed)
+        _put_into_shells(episodes, outside=recipe.outside)
     for table in ("episodes", "moments", "traces"):
         (folder / table).mkdir(parents=True)
     shards = [_write_shard(folder, episodes, recipe, first) for first in range(0, recipe.n_episodes, recipe.shard_size)]
-    (folder / "campaign.yaml").write_text(json.dumps(_campaign(recipe)))
-    (folder / "manifest.json").write_text(json.dumps(_manifest(recipe, shards, episodes)))
-    (folder / "estimates.json").write_text(json.dumps(_estimates(recipe, episodes)))
+    campaign, distance_m = _campaign(recipe), float(episodes.columns["av_distance_m"].mean())
+    (folder / "campaign.yaml").write_text(campaign.model_dump_json())
+    (folder / "manifest.json").write_text(json.dumps(_manifest(recipe, shards, distance_m)))
+    (folder / "shells.json").write_text(json.dumps(DESIGN.to_json()))
+    facts = CampaignFacts("synthetic", HASH, recipe.level, 0.9, distance_m, importance_names(campaign))
+    (folder / "estimates.json").write_text(json.dumps(estimate_blocks(stored_blocks(folder, moments=False), facts)))
     return folder
 
 
@@ -92,8 +99,21 @@ def _let_some_fail(episodes: Episodes, n_failed: int) -> None:
     rows = np.linspace(0, len(c["outcome"]) - 1, n_failed).astype(int)
     c["outcome"][rows] = "failed"
     c["log_weight"][rows] = 0.0
-    for name in ("crash_time_s", "impact_speed_mps"):
-        c[name][rows] = np.nan
+    c["crash_time_s"][rows] = c["impact_speed_mps"][rows] = np.nan
+
+
+def _put_into_shells(episodes: Episodes, *, outside: str) -> None:
+    """Draw a shell for each episode."""
+    c = episodes.columns
+    n = len(c["outcome"])
+    rng = np.random.default_rng(7)
+    shell, inside = rng.choice(3, n, p=(0.2, 0.3, 0.5)), rng.choice(2, n)
+    if outside == "untested":
+        shell = inside
+    elif outside == "safe":
+        shell = np.where(c["outcome"] == "crash", inside, shell)
+    c["component"], c["log_weight"] = shell, np.log(P)[shell]
+    c["n_control_steps"] = np.ones(n, dtype=int)
 
 
 def _write_shard(folder: Path, episodes: Episodes, recipe: RunRecipe, first: int) -> dict[str, Any]:
@@ -110,110 +130,89 @@ def _write_shard(folder: Path, episodes: Episodes, recipe: RunRecipe, first: int
     return {"index": index, "first_episode": first, "n_episodes": len(rows), "files": files}
 
 
+def _table(columns: dict[str, Any], schema: pa.Schema) -> pa.Table:
+    return pa.Table.from_pandas(pd.DataFrame(columns), schema=schema, preserve_index=False)
+
+
 def _episodes_table(episodes: Episodes, rows: np.ndarray, recipe: RunRecipe) -> pa.Table:
-    n_importance, n_surrogates = (N_SURROGATES + 1, N_SURROGATES) if recipe.controlled else (0, 0)
-    schema = episodes_schema(n_importance, n_surrogates)
-    columns: dict[str, Any] = {name: values[rows] for name, values in episodes.columns.items()}
-    columns |= {
+    n_importance = N_COMPONENTS if recipe.method == "episode_mixture" else 0
+    c = {name: values[rows] for name, values in episodes.columns.items()}
+    columns = c | {
         "episode": rows,
-        "seed": np.full(len(rows), recipe.seed),
-        "pool_cut_in": [int(r) if recipe.method == "shells" else None for r in rows],
-        "log_p_cut_in": np.full(len(rows), np.nan),
-        "log_q": [list(map(float, episodes.log_q[r][:n_importance])) for r in rows],
-        "martingale": [[0.0] * n_surrogates for _ in rows],
+        "seed": 7,
+        "cut_in_step": np.where(c["cut_in_step"] < 0, np.nan, c["cut_in_step"]),
+        "pool_cut_in": rows if recipe.method == "shells" else None,
+        "log_p_cut_in": np.log(LARGEST_P_CUT_IN) if n_importance else np.nan,
+        "log_q": list(episodes.log_q[rows, :n_importance]),
+        "martingale": [np.zeros(max(n_importance - 1, 0))] * len(rows),
         "lv_maneuvers": [_drawn(episodes.lv_maneuvers[r], episodes.columns["n_steps"][r], -1) for r in rows],
         "bv_maneuvers": [
             _drawn(episodes.bv_maneuvers[r], episodes.columns["n_steps"][r], episodes.columns["cut_in_step"][r])
             for r in rows
         ],
-        "failure": ["the world lost vehicle AV" if o == "failed" else None for o in columns["outcome"]],
-        "cut_in_step": [None if step < 0 else int(step) for step in columns["cut_in_step"]],
+        "failure": ["the world lost vehicle AV" if outcome == "failed" else None for outcome in c["outcome"]],
     }
-    return pa.Table.from_arrays([_array(columns[field.name], field) for field in schema], schema=schema)
+    return _table(columns, episodes_schema(n_importance, max(n_importance - 1, 0)))
 
 
 def _drawn(maneuvers: np.ndarray, n_steps: int, cut_in_step: int) -> list[int]:
-    drawn = [int(m) for m in maneuvers[: -(-int(n_steps) // 10)]]
+    drawn = maneuvers[: -(-int(n_steps) // 10)].tolist()
     if cut_in_step >= 0:
         drawn.insert(int(cut_in_step) // 10 + 1, CUT_IN)
     return drawn
 
 
-def _array(values: Any, field: pa.Field) -> pa.Array:
-    if pa.types.is_floating(field.type) and field.nullable:
-        return pa.array(np.asarray(values, dtype=float), field.type, from_pandas=True)
-    if pa.types.is_dictionary(field.type):
-        return pa.array([str(v) for v in values]).dictionary_encode().cast(field.type)
-    return pa.array(values if isinstance(values, list) else np.asarray(values).tolist(), field.type)
-
-
 def _moments_table(episodes: Episodes, rows: np.ndarray) -> pa.Table:
-    schema = moments_schema(N_SURROGATES)
-    c = episodes.columns
-    content = []
-    for r in rows[:200]:
-        for step in range(min(int(c["n_control_steps"][r]), 9)):
-            x, v = episodes.x_m[r, step], episodes.v_mps[r, step]
-            content.append({
-                "episode": int(r), "step": step, "v_bv_mps": v[1], "r1_m": x[0] - 5.0 - x[1], "r1dot_mps": v[0] - v[1],
-                "r2_m": x[1] - 5.0 - x[2], "r2dot_mps": v[1] - v[2],
-                "maneuver": CUT_IN if c["cut_in_step"][r] == step else STAY,
-                "p": 0.999, "q_sampled": 0.99, "q": [0.99] * N_SURROGATES, "v": [1e-4] * N_SURROGATES,
-            })  # fmt: skip
-    return pa.Table.from_pylist(content, schema=schema)
+    """The first control step of each episode."""
+    c, x, v = episodes.columns, episodes.x_m[rows, 0], episodes.v_mps[rows, 0]
+    n = len(rows)
+    columns = {
+        "episode": rows, "step": 0, "v_bv_mps": v[:, 1], "r1_m": x[:, 0] - 5.0 - x[:, 1],
+        "r1dot_mps": v[:, 0] - v[:, 1],
+        "r2_m": x[:, 1] - 5.0 - x[:, 2], "r2dot_mps": v[:, 1] - v[:, 2],
+        "maneuver": np.where(c["cut_in_step"][rows] == 0, CUT_IN, STAY), "p": 0.999, "q_sampled": 0.99,
+        "q": [[0.99] * (N_COMPONENTS - 1)] * n, "v": [[1e-4] * (N_COMPONENTS - 1)] * n,
+    }  # fmt: skip
+    return _table(columns, moments_schema(N_COMPONENTS - 1))
 
 
 def _traces_table(episodes: Episodes, rows: np.ndarray) -> pa.Table:
-    schema = traces_schema()
-    crashed = rows[episodes.columns["outcome"][rows] == "crash"]
-    columns: dict[str, list[Any]] = {name: [] for name in schema.names}
-    for r in crashed:
+    parts = []
+    for r in rows[episodes.columns["outcome"][rows] == "crash"]:
         n = int(episodes.columns["n_steps"][r]) + 1
-        cut_in = int(episodes.columns["cut_in_step"][r])
-        for k, vehicle in enumerate(VEHICLES):
-            steps = np.arange(n)
-            lane = np.ones(n) if vehicle == "LV" else np.zeros(n) if vehicle == "AV" else (steps <= cut_in).astype(int)
-            v = episodes.v_mps[r, :n, k]
-            columns["episode"] += [int(r)] * n
-            columns["step"] += steps.tolist()
-            columns["vehicle"] += [vehicle] * n
-            columns["lane"] += lane.astype(int).tolist()
-            columns["x_m"] += episodes.x_m[r, :n, k].tolist()
-            columns["v_mps"] += v.tolist()
-            columns["a_mps2"] += [*(np.diff(v) / STEP_S).tolist(), None]
-    arrays = [
-        pa.array(columns[f.name], pa.string()).dictionary_encode().cast(f.type)
-        if pa.types.is_dictionary(f.type)
-        else pa.array(columns[f.name], f.type)
-        for f in schema
-    ]
-    return pa.Table.from_arrays(arrays, schema=schema)
+        step, vehicle = np.repeat(np.arange(n), len(VEHICLES)), np.tile(VEHICLES, n)
+        on_left = (vehicle == "LV") | ((vehicle == "BV") & (step <= episodes.columns["cut_in_step"][r]))
+        parts.append(
+            pd.DataFrame({
+                "episode": r, "step": step, "vehicle": vehicle, "lane": on_left.astype(int),
+                "x_m": episodes.x_m[r, :n].ravel(), "v_mps": episodes.v_mps[r, :n].ravel(), "a_mps2": np.nan,
+            })
+        )  # fmt: skip
+    return _table(pd.concat(parts), traces_schema()) if parts else traces_schema().empty_table()
 
 
-def _campaign(recipe: RunRecipe) -> dict[str, Any]:
-    campaign = Campaign.model_validate(
+def _campaign(recipe: RunRecipe) -> Campaign:
+    return Campaign.model_validate(
         {
             "name": "synthetic",
             "description": "Synthetic overtaking tests that exercise the report.",
-            "seed": recipe.seed,
+            "seed": 7,
             "environment": {"lane_change_level": recipe.level},
-            "testing": {"method": recipe.method}
-            | ({"shells": {"statement": recipe.statement}} if recipe.method == "shells" else {}),
+            "testing": {"method": recipe.method, "shells": {"statement": recipe.statement}},
             "records": {"traces": recipe.traces, "moments": "first_9" if recipe.moments else "none"},
             "stop": {"episodes": recipe.n_episodes, "rhw": recipe.target_rhw},
         }
     )
-    return campaign.model_dump(mode="json") | {"name": recipe.name}
 
 
-def _manifest(recipe: RunRecipe, shards: list[dict[str, Any]], episodes: Episodes) -> dict[str, Any]:
+def _manifest(recipe: RunRecipe, shards: list[dict[str, Any]], distance_m: float) -> dict[str, Any]:
     return {
         "campaign_hash": HASH,
         "created": "2025-01-02T03:04:05Z",
         "versions": {"harness": "0.1.0", "python": "3.11.9", "numpy": "2.1.0", "libsumo": "1.28.0"},
-        "seed": recipe.seed,
+        "seed": 7,
         "shards": shards,
-        "distance_per_test_m": float(episodes.columns["av_distance_m"].mean()),
+        "distance_per_test_m": distance_m,
         "cpu": "Synthetic CPU @ 3.0 GHz",
         "n_episodes": recipe.n_episodes,
         "stopped_by": "episodes",
@@ -222,87 +221,5 @@ def _manifest(recipe: RunRecipe, shards: list[dict[str, Any]], episodes: Episode
         "table_errors": [
             {"surrogate": "SM-I", "table": "after the cut-in", "quantity": "crash probability", "table_value": 3.21e-5,
              "monte_carlo": 3.18e-5, "std_error": 2.1e-7},
-            {"surrogate": "SM-II", "table": "before the cut-in", "quantity": "crash probability",
-             "table_value": 8.05e-6, "monte_carlo": 7.96e-6, "std_error": 6.0e-8},
-        ] if recipe.controlled else [],
+        ] if recipe.method == "episode_mixture" else [],
     }  # fmt: skip
-
-
-def _normal(y: np.ndarray) -> dict[str, Any]:
-    n, rate = len(y), float(y.mean())
-    error = float(y.std(ddof=1) / np.sqrt(n))
-    half = 1.6448536 * error
-    upper = float(-np.log(0.1) * max(y.max(), 1e-5) / n) if rate == 0.0 else rate + 1.2815516 * error
-    return {
-        "crash_rate": rate, "std_error": error, "ci_low": max(rate - half, 0.0),
-        "ci_high": rate + half if rate else upper,
-        "upper_bound": upper, "confidence": 0.9, "rhw": half / rate if rate else None, "n_episodes": n,
-        "n_crashes": int((y > 0).sum()), "n_effective": float(y.sum() ** 2 / (y**2).sum()) if rate else 0.0,
-        "largest_weight_share": float(y.max() / y.sum()) if rate else None, "method": "normal", "warnings": [],
-        "details": {},
-    }  # fmt: skip
-
-
-def _clopper_pearson(crash: np.ndarray) -> dict[str, Any]:
-    n, k = len(crash), int(crash.sum())
-    low = float(stats.beta.ppf(0.05, k, n - k + 1)) if k else 0.0
-    high = float(stats.beta.ppf(0.95, k + 1, n - k))
-    return _normal(crash.astype(float)) | {
-        "ci_low": low, "ci_high": high, "upper_bound": float(stats.beta.ppf(0.9, k + 1, n - k)),
-        "method": "Clopper-Pearson", "rhw": (high - low) / 2.0 / (k / n) if k else None,
-    }  # fmt: skip
-
-
-def _estimates(recipe: RunRecipe, episodes: Episodes) -> dict[str, Any]:
-    c = episodes.columns
-    if recipe.method == "shells":
-        facts = CampaignFacts(recipe.name, HASH, recipe.level, 0.9, float(c["av_distance_m"].mean()))
-        return shells_estimates(episodes, facts)
-    valid, crash = c["outcome"] != "failed", c["outcome"] == "crash"
-    y = np.where(crash, np.exp(c["log_weight"]), 0.0)[valid]
-    nade = _normal(y)
-    if recipe.method == "nde":
-        found = {"nde": _clopper_pearson(crash[valid]), "nade": nade}
-        found |= {
-            name: {"crash_rate": None, "reason": "no importance function was used"} for name in ("mixture_cv", "scv")
-        }
-        headline = "nde"
-    else:
-        cv = {**nade, "method": "normal, control variates", "details": {"n_control_variates": 3}}
-        scv_warning = "Algorithm 1 estimates the means of its columns from the same tests: its interval is too narrow."
-        found = {
-            "nade": nade,
-            "mixture_cv": cv,
-            "scv": {**nade, "warnings": [scv_warning]} if recipe.moments
-            else {"crash_rate": None, "reason": "records.moments is none; scv needs first_9"},
-            "nde": {"crash_rate": None, "reason": "tests were drawn from an importance function"},
-        }  # fmt: skip
-        headline = "mixture_cv"
-    best, km = found[headline], float(c["av_distance_m"].mean()) / 1000.0
-    return {
-        "campaign": recipe.name, "campaign_hash": HASH, "lane_change_level": recipe.level, "confidence": 0.9,
-        "n_episodes": int(valid.sum()), "n_crashes": int(crash.sum()), "headline": headline, "distance_per_test_km": km,
-        "crash_rate_per_1e6_km": {"rate": best["crash_rate"] * 1e6 / km, "ci_low": best["ci_low"] * 1e6 / km,
-                                  "ci_high": best["ci_high"] * 1e6 / km},
-        "estimates": found, "diagnostics": {"mean_weight_of_cut_ins": 3.1e-5, "p_cut_in": {"twin": 2.8e-5, "z": 0.4}},
-        "convergence": _convergence(y), "statement": _statement(best, km, recipe.level),
-    }  # fmt: skip
-
-
-def _convergence(y: np.ndarray) -> list[dict[str, Any]]:
-    sizes = np.unique(np.geomspace(min(100, len(y)), len(y), 40).astype(int))
-    points = [{"n": int(n)} | _normal(y[:n]) for n in sizes]
-    return [{key: p[key] for key in ("n", "crash_rate", "ci_low", "ci_high", "rhw", "n_crashes")} for p in points]
-
-
-def _statement(best: dict[str, Any], km: float, level: float) -> str:
-    if not best["crash_rate"]:
-        return (
-            f"No crash was seen in {best['n_episodes']:,} tests: the AV crashes less often than "
-            f"{best['upper_bound']:.2e} times per test, with 90 % confidence, at lane-change level {level:g}."
-        )
-    return (
-        f"The AV crashes {best['crash_rate']:.3g} times per overtaking test (90 % interval {best['ci_low']:.3g} to "
-        f"{best['ci_high']:.3g}), that is {best['crash_rate'] * 1e6 / km:.3g} times per 1e6 km of such driving, at "
-        f"lane-change level {level:g}."
-    )

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from report_page import page_of
 from scipy.stats import binomtest
-from test_report_page import page_of
 
 from harness.report import telling_bands as scan
-from harness.report.contrast_plot import contrast_plot
-from harness.report.crash_contrast import Contrast, crash_contrast
+from harness.report.crash_contrast import Contrast, Group, contrast_plot, crash_contrast
 from harness.report.cut_in_conditions import CONDITIONS
-from harness.report.run_folder import read_run_folder
-from harness.report.shells_result import shells_result
 from harness.report.telling_bands import SIGNIFICANT, telling_bands
 
 Q = len(CONDITIONS)
@@ -65,58 +62,48 @@ def test_chance_is_seldom_called_telling(weighted, monkeypatch):
 def test_without_the_price_of_many_comparisons_chance_would_be_telling():
     """The best of a thousand bands, judged by the usual limit of a likelihood ratio, «stands out» of mere noise."""
     rng = np.random.default_rng(4)
-    bins = np.stack([scan._bins(row) for row in noise(rng)])
-    best = scan._Cumulated(bins, np.ones(CRASH.size)).log_ratios(np.flatnonzero(CRASH)).max()
+    best = scan.Scan(noise(rng), np.ones(CRASH.size)).log_ratios(np.flatnonzero(CRASH)).max()
     assert 2.0 * best > 6.63  # 1 % point of chi-squared with one degree of freedom
 
 
-def contrast_of(reports, name):
-    run = read_run_folder(reports[name])
-    return crash_contrast(run, shells_result(run.estimates))
-
-
-def words(page):
-    return " ".join(page.text.split())
+@pytest.fixture
+def contrast_of(runs):
+    return lambda name: crash_contrast(runs[name])
 
 
 @pytest.mark.parametrize("name", ["full", "nde", "no_crashes", "nde_no_crashes", "failed"])
-def test_the_page_says_the_sentence(reports, name):
-    found = contrast_of(reports, name)
-    assert found.sentence in words(page_of(reports[name]))
+def test_the_page_says_the_sentence(runs, contrast_of, name):
+    found = contrast_of(name)
+    assert found.sentence in page_of(runs[name].path).words
     assert not found.outside
-    assert ("nothing to compare" in found.sentence) == (found.n_crashes == 0)
+    assert ("nothing to compare" in found.sentence) == (found.crashes.n == 0)
     assert (contrast_plot(found) is None) == (not found.telling)
 
 
 @pytest.mark.parametrize("name", ["shells", "shells_no_crashes", "shells_inside_only"])
-def test_without_crashes_outside_there_is_nothing_to_compare(reports, name):
-    found = contrast_of(reports, name)
+def test_without_crashes_outside_there_is_nothing_to_compare(runs, contrast_of, name):
+    found = contrast_of(name)
     assert found.sentence == "No test outside the boundary crashed, so there is nothing to compare."
-    assert found.sentence in words(page_of(reports[name]))
+    assert found.sentence in page_of(runs[name].path).words
 
 
-def test_of_shells_only_the_outside_is_compared(reports):
-    run = read_run_folder(reports["shells_refuted"])
-    found, outside = contrast_of(reports, "shells_refuted"), shells_result(run.estimates).shells[-1]
+def test_of_shells_only_the_outside_is_compared(runs, contrast_of):
+    found, outside = contrast_of("shells_refuted"), runs["shells_refuted"].shells.shells[-1]
     assert found.outside
-    assert found.n_crashes == outside.n_crashes
-    assert 0 < found.n_others <= outside.n_tests - outside.n_crashes  # those that had a cut-in
-    assert words(page_of(reports["shells_refuted"])).count(found.sentence) == 2
+    assert found.crashes.n == outside.n_crashes
+    assert 0 < found.others.n <= outside.n_episodes - outside.n_crashes  # those that had a cut-in
+    assert page_of(runs["shells_refuted"].path).words.count(found.sentence) == 2
 
 
-def test_failed_tests_are_on_neither_side(reports):
-    found = contrast_of(reports, "failed")
-    episodes = read_run_folder(reports["failed"]).n_episodes
-    assert found.n_crashes + found.n_others <= episodes - 25
+def test_failed_tests_are_on_neither_side(runs, contrast_of):
+    found = contrast_of("failed")
+    episodes = runs["failed"].n_episodes
+    assert found.crashes.n + found.others.n <= episodes - 25
 
 
 def test_a_few_crashes_have_nothing_in_common():
-    few = Contrast(True, np.zeros((Q, 2)), np.zeros((Q, 50)), np.ones(2), np.ones(50), ())
+    crashes, others = Group(), Group()
+    crashes.weight, others.weight = np.ones(2), np.ones(50)
+    few = Contrast(True, crashes, others, ())
     assert few.sentence.startswith("With 2 crashes outside the boundary and 50 cut-ins")
     assert SIGNIFICANT > 1.0 / (1.0 + scan.RELABELINGS)
-
-
-def test_estimators_without_a_value_take_one_line(reports):
-    text = words(page_of(reports["shells"]))
-    assert "No value" not in text
-    assert "4 more need other records than these: nde, nade, mixture_cv, scv" in text

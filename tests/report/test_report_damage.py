@@ -1,19 +1,15 @@
 from __future__ import annotations
 
-import json
 import re
 from pathlib import Path
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from report_page import edit
 
 from harness.errors import RunFolderError
 from harness.report import write_report
-
-
-def edit(path: Path, **changes) -> None:
-    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
 
 
 def truncate(path: Path) -> None:
@@ -94,28 +90,23 @@ def test_a_broken_file_is_named(run_folder, name, content):
         write_report(run_folder)
 
 
-def test_estimates_of_another_campaign_are_refused(run_folder):
-    edit(run_folder / "estimates.json", campaign_hash="feedfeedfeedfeed")
-    with pytest.raises(RunFolderError, match="feedfeedfeedfeed"):
-        write_report(run_folder)
-
-
-def test_an_unknown_headline_is_refused(run_folder):
-    edit(run_folder / "estimates.json", headline="oracle")
-    with pytest.raises(RunFolderError, match="oracle"):
-        write_report(run_folder)
-
-
-def test_a_convergence_point_without_rate_is_refused_not_drawn_as_zero(run_folder):
-    points = json.loads((run_folder / "estimates.json").read_text())["convergence"]
-    edit(run_folder / "estimates.json", convergence=[{k: v for k, v in p.items() if k != "crash_rate"} for p in points])
-    with pytest.raises(RunFolderError, match=r"without 'crash_rate'"):
-        write_report(run_folder)
-
-
-def test_a_shard_entry_without_files_is_refused(run_folder):
-    edit(run_folder / "manifest.json", shards=[{"index": 0, "first_episode": 0, "n_episodes": 1}])
-    with pytest.raises(RunFolderError, match=r"manifest\.json"):
+@pytest.mark.parametrize(
+    ("name", "changes", "match"),
+    [
+        ("estimates.json", {"campaign_hash": "feedfeedfeedfeed"}, "feedfeedfeedfeed"),
+        ("estimates.json", {"headline": "oracle"}, "oracle"),
+        # An absent rate is refused, not drawn as zero.
+        (
+            "estimates.json",
+            {"convergence": [{"n": 1, "ci_low": 0, "ci_high": 1, "rhw": 1}]},
+            r"convergence\.0\.crash_rate",
+        ),
+        ("manifest.json", {"shards": [{"index": 0, "first_episode": 0, "n_episodes": 1}]}, r"manifest\.json"),
+    ],
+)
+def test_what_no_run_has_written_is_refused(run_folder, name, changes, match):
+    edit(run_folder / name, **changes)
+    with pytest.raises(RunFolderError, match=match):
         write_report(run_folder)
 
 

@@ -5,7 +5,7 @@ import math
 import pytest
 
 from harness.report import number_format as f
-from harness.report.rate_axis import tick_label
+from harness.report.plot_style import tick_label
 
 
 @pytest.mark.parametrize(

@@ -1,31 +1,31 @@
+"""The page of each kind of run: what it says, that it is self-contained, and that it comes out the same again."""
+
 from __future__ import annotations
 
 import json
 import re
 import shutil
 from dataclasses import replace
-from html.parser import HTMLParser
 from pathlib import Path
 from xml.etree import ElementTree
 
 import matplotlib.pyplot as plt
 import pytest
+from report_page import edit, page_of
 from synthetic_run import RECIPES, write_run
 
 from harness.report import write_report
-from harness.report.estimate_table import run_notes
-from harness.report.run_folder import read_run_folder
+from harness.report.run_folder import read_run_folder, typed_folder
 from harness.report.summary import summarise
+from harness.report.tables import run_notes
 
-VOID = {"meta", "br", "link", "img", "hr", "input"}
 ALWAYS = {"answer", "convergence"}
 OF_WEIGHTS = {"weights"}
 OF_CRASHES = {"cut_ins", "impact_speed", "crash_time"}
 EXPECTED = {
     "full": ALWAYS | OF_WEIGHTS | OF_CRASHES | {"strata", "contrast"},
     "no_crashes": ALWAYS | OF_WEIGHTS | {"cut_ins"},
-    "no_traces": ALWAYS | OF_WEIGHTS | OF_CRASHES | {"strata", "contrast"},
-    "no_moments": ALWAYS | OF_WEIGHTS | OF_CRASHES | {"strata", "contrast"},
+    "bare": ALWAYS | OF_WEIGHTS | OF_CRASHES | {"strata", "contrast"},
     "nde": ALWAYS | OF_CRASHES | {"contrast"},
     "nde_no_crashes": ALWAYS,
     "failed": ALWAYS | OF_WEIGHTS | OF_CRASHES | {"strata", "contrast"},
@@ -36,48 +36,13 @@ EXPECTED = {
 }
 
 
-class Page(HTMLParser):
-    """Checks nesting while it reads, and collects text, ids, links and attributes."""
-
-    def __init__(self, html: str) -> None:
-        super().__init__()
-        self.open: list[str] = []
-        self.text = ""
-        self.ids: list[str] = []
-        self.attributes: list[tuple[str, str, str]] = []
-        self.feed(html)
-        self.close()
-        assert self.open == []
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        if tag not in VOID:
-            self.open.append(tag)
-        self.attributes += [(tag, name, value or "") for name, value in attrs]
-        self.ids += [value or "" for name, value in attrs if name == "id"]
-
-    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.attributes += [(tag, name, value or "") for name, value in attrs]
-        self.ids += [value or "" for name, value in attrs if name == "id"]
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self.open
-        assert self.open.pop() == tag
-
-    def handle_data(self, data: str) -> None:
-        self.text += data
+@pytest.fixture(params=RECIPES)
+def report(request, reports):
+    return reports[request.param]
 
 
-def page_of(folder: Path) -> Page:
-    return Page((folder / "report.html").read_text(encoding="utf-8"))
-
-
-def estimates_of(folder: Path) -> dict:
-    return json.loads((folder / "estimates.json").read_text())
-
-
-@pytest.mark.parametrize("name", RECIPES)
-def test_page_has_statement_estimators_and_level(reports, name):
-    page, estimates = page_of(reports[name]), estimates_of(reports[name])
+def test_page_has_statement_estimators_and_level(report):
+    page, estimates = page_of(report), json.loads((report / "estimates.json").read_text())
     assert estimates["statement"] in page.text
     for estimator, content in estimates["estimates"].items():
         assert estimator in page.text
@@ -87,10 +52,8 @@ def test_page_has_statement_estimators_and_level(reports, name):
     assert f"lane-change level {estimates['lane_change_level']:g}" in page.text
 
 
-@pytest.mark.parametrize("name", RECIPES)
-def test_page_is_self_contained_with_unique_ids_and_no_dead_links(reports, name):
-    html = (reports[name] / "report.html").read_text(encoding="utf-8")
-    page = Page(html)
+def test_page_is_self_contained_with_unique_ids_and_no_dead_links(report):
+    html, page = (report / "report.html").read_text(encoding="utf-8"), page_of(report)
     assert "://" not in html
     assert len(page.ids) == len(set(page.ids))
     for tag, attribute, value in page.attributes:
@@ -115,9 +78,8 @@ def test_exactly_the_plots_that_make_sense_exist_as_png_and_svg(reports, name):
     assert {path.suffix for path in folder.iterdir()} == {".png", ".svg"}
 
 
-@pytest.mark.parametrize("name", RECIPES)
-def test_every_plot_has_alt_text_and_caption(reports, name):
-    html = (reports[name] / "report.html").read_text(encoding="utf-8")
+def test_every_plot_has_alt_text_and_caption(report):
+    html = (report / "report.html").read_text(encoding="utf-8")
     figures = re.findall(r"<figure.*?</figure>", html, flags=re.DOTALL)
     assert figures
     for figure in figures:
@@ -134,7 +96,7 @@ def test_worst_crashes_have_diagrams_and_replay_commands(reports):
 
 
 def test_without_traces_the_page_says_how_to_get_them(reports):
-    page = page_of(reports["no_traces"])
+    page = page_of(reports["bare"])
     assert not [name for name in page.ids if name.startswith("plot-crash-")]
     assert "--set records.traces=crash" in page.text
     assert "harness replay run" in page.text
@@ -161,18 +123,19 @@ def test_failed_episodes_are_counted_and_explained(reports):
 
 
 def test_rhw_that_was_not_reached_and_stale_estimates_are_said(run_folder):
-    estimates = estimates_of(run_folder) | {"n_episodes": 2_000}
-    estimates["estimates"][estimates["headline"]]["rhw"] = 0.7
-    (run_folder / "estimates.json").write_text(json.dumps(estimates))
+    estimates = edit(run_folder / "estimates.json", n_episodes=2_000)["estimates"]
+    estimates["mixture_cv"]["rhw"] = 0.7
+    edit(run_folder / "estimates.json", estimates=estimates)
     run = read_run_folder(run_folder)
-    notes = run_notes(run, summarise(run))
-    assert any(
-        note.startswith(
-            "The asked relative half-width of 0.1 was not reached: it is 0.700 (stop.episodes was spent; raise"
-        )
-        for note in notes
-    )
-    assert any("cover 2,000 tests but the records hold 3,000" in note for note in notes)
+    notes = "\n".join(run_notes(run, summarise(run)))
+    assert "asked relative half-width of 0.1 was not reached: it is 0.700 (stop.episodes was spent; raise" in notes
+    assert "cover 2,000 tests but the records hold 3,000" in notes
+
+
+def test_estimators_without_a_value_take_one_line(reports):
+    text = page_of(reports["shells"]).words
+    assert "No value" not in text
+    assert "4 more need other records than these: nde, nade, mixture_cv, scv" in text
 
 
 def test_all_settings_are_listed_with_their_meaning(reports):
@@ -185,12 +148,10 @@ def test_all_settings_are_listed_with_their_meaning(reports):
 def test_hostile_texts_are_escaped_and_no_formula(tmp_path):
     hostile = "<script>alert('x')</script>$\\frac{&"
     folder = write_run(tmp_path / "run", replace(RECIPES["no_crashes"], n_episodes=300))
-    campaign = json.loads((folder / "campaign.yaml").read_text())
-    (folder / "campaign.yaml").write_text(json.dumps(campaign | {"description": hostile}))
-    estimates = estimates_of(folder) | {"campaign": hostile}
-    estimates["estimates"][hostile] = {**estimates["estimates"]["nade"], "warnings": [hostile]}
-    estimates |= {"statement": hostile, "headline": hostile}
-    (folder / "estimates.json").write_text(json.dumps(estimates))
+    edit(folder / "campaign.yaml", description=hostile)
+    path = folder / "estimates.json"
+    estimates = edit(path, campaign=hostile, statement=hostile, headline=hostile)["estimates"]
+    edit(path, estimates=estimates | {hostile: {**estimates["nade"], "warnings": [hostile]}})
     write_report(folder)
     html = (folder / "report.html").read_text(encoding="utf-8")
     assert "<script" not in html
@@ -232,3 +193,31 @@ def test_plots_of_an_earlier_report_go_but_other_files_stay(rerun):
 def test_no_figure_leaks_and_the_page_is_returned(rerun):
     assert rerun["new_figures"] == set()
     assert rerun["returned"] == rerun["folder"] / "report.html"
+
+
+def test_a_folder_below_the_working_directory_is_named_by_its_path(reports, tmp_path, monkeypatch):
+    shutil.copytree(reports["bare"], tmp_path / "runs/my run")
+    monkeypatch.chdir(tmp_path)
+    write_report(tmp_path / "runs/my run")
+    page = page_of(tmp_path / "runs/my run")
+    assert "harness replay 'runs/my run' " in page.text
+    assert "harness run 'runs/my run'/campaign.yaml --out again" in page.text
+    assert str(tmp_path) not in page.text
+
+
+def test_any_other_folder_goes_by_its_name_and_the_page_says_what_that_is(reports):
+    text = page_of(reports["full"]).words
+    assert "harness report run " in text
+    assert "run is the folder (DIR) that this page lies in" in text
+    assert str(reports["full"].parent) not in text
+
+
+@pytest.mark.parametrize(("typed", "shown"), [("runs/a", "runs/a"), ("runs/../runs/a/", "runs/a"), ("link", "link")])
+def test_typed_folder(typed, shown, tmp_path, monkeypatch):
+    (tmp_path / "here/runs/a").mkdir(parents=True)
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "here/link").symlink_to(tmp_path / "elsewhere")
+    monkeypatch.chdir(tmp_path / "here")
+    assert typed_folder(tmp_path / "here" / typed) == shown
+    assert typed_folder(tmp_path / "elsewhere") == "elsewhere"
+    assert typed_folder(tmp_path / "here") == "."

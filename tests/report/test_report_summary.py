@@ -2,25 +2,18 @@
 
 from __future__ import annotations
 
-import json
-
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from report_page import edit
 
-from harness.records.schemas import OUTCOMES
-from harness.report import shard_tables
+from harness.outcomes import OUTCOMES
 from harness.report.crash_gallery import crash_gallery
-from harness.report.fine_histogram import FineHistogram
+from harness.report.histograms import FineHistogram
 from harness.report.run_folder import read_run_folder
-from harness.report.summary import summarise
-
-
-@pytest.fixture(scope="module")
-def run(reports):
-    return read_run_folder(reports["full"])
+from harness.report.summary import NUMBERS, RunSummary, summarise
 
 
 @pytest.fixture(scope="module")
@@ -29,8 +22,8 @@ def table(reports):
 
 
 @pytest.fixture(scope="module")
-def summary(run):
-    return summarise(run)
+def summary(runs):
+    return summarise(runs["full"])
 
 
 def test_counts_and_weights_by_outcome(summary, table):
@@ -45,8 +38,8 @@ def test_histograms_hold_every_crash_with_its_weight(summary, table):
     total = np.exp(crash.log_weight).sum()
     for name in ("log10_weight_crash", "stratum_crash", "impact_speed_mps", "crash_time_s", "response_time_s"):
         bins = getattr(summary, name).bins(30)
-        assert bins.count.sum() == len(crash)
-        assert bins.weight.sum() == pytest.approx(total, rel=1e-12)
+        assert bins.counts.sum() == len(crash)
+        assert bins.weights.sum() == pytest.approx(total, rel=1e-12)
 
 
 def test_strata_are_exact(summary, table):
@@ -59,11 +52,11 @@ def test_strata_are_exact(summary, table):
 
 def test_cut_in_grid_agrees_with_numpy(summary, table):
     cuts = table.dropna(subset=["cut_in_r2_m"])
-    cells = summary.cut_in.range_used()
+    cells = summary.cut_in.used()
     expected, _, _ = np.histogram2d(
         cuts.cut_in_r2dot_mps, cuts.cut_in_r2_m, bins=[cells.r2dot_mps, cells.r2_m], weights=np.exp(cuts.log_weight)
     )
-    np.testing.assert_allclose(summary.cut_in.weight[cells.rows, cells.columns], expected, rtol=1e-9)
+    np.testing.assert_allclose(summary.cut_in.weight[cells.place], expected, rtol=1e-9)
 
 
 @pytest.mark.parametrize(("ranking", "key"), [("hardest", "impact_speed_mps"), ("heaviest", "log_weight")])
@@ -73,25 +66,22 @@ def test_worst_crashes_are_the_worst(summary, table, ranking, key):
     assert [c.episode for c in kept] == crash.episode.head(len(kept)).tolist()
 
 
-def test_batch_size_does_not_matter(run, summary, monkeypatch):
-    monkeypatch.setattr(shard_tables, "BATCH_ROWS", 37)
-    other = summarise(run)
+def test_batch_size_does_not_matter(runs, summary):
+    other = RunSummary()
+    for batch in runs["full"].episodes(*NUMBERS, "outcome", "failure"):
+        outcome = np.array([OUTCOMES.index(str(name)) for name in batch.column("outcome").to_pylist()])
+        for first in range(0, batch.num_rows, 37):
+            other.add(batch.slice(first, 37), outcome[first : first + 37])
     np.testing.assert_array_equal(other.count, summary.count)
     np.testing.assert_allclose(other.weight, summary.weight, rtol=1e-12)
     assert other.hardest.crashes == summary.hardest.crashes
 
 
-def test_only_the_prefix_that_counts_is_read(run_folder):
-    manifest = json.loads((run_folder / "manifest.json").read_text())
-    (run_folder / "manifest.json").write_text(json.dumps(manifest | {"n_episodes": 1_234}))
-    assert summarise(read_run_folder(run_folder)).n_episodes == 1_234
-
-
-def test_unlisted_shards_do_not_count(run_folder):
-    manifest = json.loads((run_folder / "manifest.json").read_text())
-    changed = manifest | {"n_episodes": 2_000, "shards": manifest["shards"][:2]}
-    (run_folder / "manifest.json").write_text(json.dumps(changed))
-    assert summarise(read_run_folder(run_folder)).n_episodes == 2_000
+@pytest.mark.parametrize(("n_episodes", "n_shards"), [(1_234, 3), (2_000, 2)])
+def test_only_the_prefix_that_counts_and_listed_shards_are_read(run_folder, n_episodes, n_shards):
+    shards = edit(run_folder / "manifest.json")["shards"]
+    edit(run_folder / "manifest.json", n_episodes=n_episodes, shards=shards[:n_shards])
+    assert summarise(read_run_folder(run_folder)).n_episodes == n_episodes
 
 
 def test_gallery_prefers_traced_crashes_where_few_are_traced(run_folder, summary):
@@ -110,10 +100,10 @@ def test_merging_fine_bins_loses_nothing_and_keeps_the_limit(values, most):
     histogram = FineHistogram(0.0, 10.0, 0.1)
     histogram.add(np.array(values), np.full(len(values), 0.5))
     bins = histogram.bins(most)
-    assert bins.count.sum() == len(values)
-    assert bins.weight.sum() == pytest.approx(0.5 * len(values))
-    assert bins.count.size <= most
-    assert bins.edges.size == bins.count.size + 1
+    assert bins.counts.sum() == len(values)
+    assert bins.weights.sum() == pytest.approx(0.5 * len(values))
+    assert bins.counts.size <= most
+    assert bins.edges.size == bins.counts.size + 1
     inside = np.clip(values, 0.0, 9.9999)
     assert bins.edges[0] <= inside.min() + 1e-6
     assert inside.max() <= bins.edges[-1] + 1e-6

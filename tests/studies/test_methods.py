@@ -50,14 +50,13 @@ def weighted(chain, method: str, replications: int, episodes: int, *estimators: 
     return WeightedCampaign(subject, ChainEpisodes(chain, method, 7), estimators).run(range(replications))
 
 
-def test_shells_cover_and_are_unbiased():
-    for one in judged({c.name: shells(c, FEW, 1000) for c in replayed()}, FREE):
-        assert not one.too_low
-        assert abs(one.bias) < 4.0 * one.bias_std_error
-
-
-def test_forced_cut_ins_cover_and_are_unbiased():
-    for one in judged({c.name: weighted(c, "forced", FEW, 3000, "nade") for c in replayed()}, "nade"):
+@pytest.mark.parametrize(
+    ("result", "repeated"),
+    [(FREE, lambda chain: shells(chain, FEW, 1000)), ("nade", lambda c: weighted(c, "forced", FEW, 3000, "nade"))],
+    ids=["shells", "forced"],
+)
+def test_right_methods_cover_and_are_unbiased(result, repeated):
+    for one in judged({chain.name: repeated(chain) for chain in replayed()}, result):
         assert not one.too_low
         assert abs(one.bias) < 4.0 * one.bias_std_error
 

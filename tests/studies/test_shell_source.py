@@ -1,55 +1,68 @@
-"""Pools drawn from a small super-population: equals left out, boundary replaced, probabilities and shares kept."""
+"""A small super-population: its truths, and pools drawn from it with equals left out and the boundary replaced."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from harness.campaign.models import AutomatedVehicle, Environment, PoolSettings
+from harness.campaign.models import AutomatedVehicle, EnvironmentSettings, PoolSettings
 from harness.environment.loading import load_environment
 from harness.errors import CampaignError
 from harness.pool.build import build_pool
-from harness.pool.library import Library, load_library
+from harness.pool.library import load_library
 from harness.progress import SilentProgress
 from harness.studies.shell_source import equals, leave_out, overtaking_shells
-from harness.studies.super_population import NO_ENVELOPE, Drivers, enumerate_paths
+from harness.studies.super_population import NO_ENVELOPE, Drivers, Truth, combined, enumerate_paths, truths
 
 PATHS = 1024
+ENVIRONMENT = load_environment(EnvironmentSettings())
+LIBRARY = load_library("ladder-1")
 AVS = {
-    "own": {"model": "idm"},
-    "equal": {"model": "idm", "parameters": {"min_acceleration_mps2": -3.0}},
-    "late": {
-        "model": "idm",
-        "reaction": {"inattention_probability": 0.25, "inattention_delay_s": 1.5},
-    },
-    "attentive-late": {"model": "idm", "reaction": {"delay_s": 1.5}},
+    name: AutomatedVehicle.model_validate(av)
+    for name, av in {
+        "own": {"model": "idm"},
+        "equal": {"model": "idm", "parameters": {"min_acceleration_mps2": -3.0}},
+        "late": {"model": "idm", "reaction": {"inattention_probability": 0.25, "inattention_delay_s": 1.5}},
+        "attentive-late": {"model": "idm", "reaction": {"delay_s": 1.5}},
+        "wild": {"model": "constant", "parameters": {"acceleration_mps2": 0.0}},
+        "faster": {"model": "constant", "parameters": {"acceleration_mps2": 3.0}},
+    }.items()
 }
 
 
-@pytest.fixture(scope="module")
-def library() -> Library:
-    return load_library("ladder-1")
+def drivers_of(*names) -> Drivers:
+    return Drivers.of(LIBRARY, {name: AVS[name] for name in names})
 
 
 @pytest.fixture(scope="module")
-def avs():
-    return {name: AutomatedVehicle.model_validate(av) for name, av in AVS.items()}
+def drivers():
+    return drivers_of("own", "equal", "late", "attentive-late")
 
 
-@pytest.fixture(scope="module")
-def drivers(library, avs):
-    return Drivers.of(library, avs)
+def enumerated(drivers, paths=PATHS):
+    return enumerate_paths(ENVIRONMENT, drivers, 3, paths, SilentProgress())
 
 
 @pytest.fixture(scope="module")
 def population(drivers):
-    environment = load_environment(Environment())
-    return enumerate_paths(environment, drivers, 3, PATHS, SilentProgress())
+    return enumerated(drivers)
+
+
+def test_two_truths_are_weighted_by_their_precision():
+    one = combined(Truth(1.0, 0.1), Truth(2.0, 0.2))
+    assert one.crash_rate == pytest.approx(1.2)
+    assert one.std_error == pytest.approx(0.1 * 0.8**0.5)
+
+
+def test_imprecise_truths_are_enumerated_again_and_agree():
+    found = truths(ENVIRONMENT, drivers_of("own", "wild"), 3, PATHS, SilentProgress())
+    assert found["own"].crash_rate == pytest.approx(1.343e-7, abs=4.0 * found["own"].std_error)
+    assert found["own"].relative_error < 0.02  # once would leave some 2 %
+    assert found["wild"].crash_rate == pytest.approx(2.43e-5, abs=4.0 * found["wild"].std_error)
 
 
 def test_the_cache_gives_the_same_back(drivers, population):
-    environment = load_environment(Environment())
-    again = enumerate_paths(environment, drivers, 3, PATHS, SilentProgress())
+    again = enumerated(drivers)
     for name in ("cut_in", "path", "mass", "bits"):
         np.testing.assert_array_equal(getattr(again, name), getattr(population, name))
 
@@ -60,50 +73,49 @@ def test_an_inattentive_vehicle_is_two_drivers_mixed(drivers, population):
     assert late.sum() > 1.5 * early.sum()
 
 
-def test_equals_are_found_and_left_out(library, drivers, population, avs):
+def test_equals_are_found_and_left_out(drivers, population):
     vehicle = drivers.vehicles["equal"].crash_mass(population)
-    assert equals(library, population, vehicle) == {"brakes-3"}
-    source = overtaking_shells(library, population, avs["equal"], drivers.vehicles["equal"], 256)
+    assert equals(LIBRARY, population, vehicle) == {"brakes-3"}
+    source = overtaking_shells(LIBRARY, population, AVS["equal"], drivers.vehicles["equal"], 256)
     assert source.left_out == ("brakes-3",)
     assert "brakes-3" not in source.template.names
-    assert equals(library, population, drivers.vehicles["own"].crash_mass(population)) == set()
+    assert equals(LIBRARY, population, drivers.vehicles["own"].crash_mass(population)) == set()
 
 
-def test_the_envelope_stays_and_another_surrogate_becomes_the_boundary(library):
-    careful_first = tuple(library.surrogates)
-    reduced = leave_out(library, {"brakes-2-late-1s", "full-throttle-2"}, careful_first)
+def test_the_envelope_stays_and_another_surrogate_becomes_the_boundary():
+    careful_first = tuple(LIBRARY.surrogates)
+    reduced = leave_out(LIBRARY, {"brakes-2-late-1s", "full-throttle-2"}, careful_first)
     assert reduced.boundary == "brakes-3-late-700ms"
     assert reduced.envelope == "full-throttle-2"
-    alone = leave_out(library, set(careful_first[:6]), careful_first)
+    alone = leave_out(LIBRARY, set(careful_first[:6]), careful_first)
     assert alone.boundary == "never-brakes"
     with pytest.raises(CampaignError, match="no surrogate but the envelope"):
-        leave_out(library, set(careful_first), careful_first)
+        leave_out(LIBRARY, set(careful_first), careful_first)
 
 
-def test_drawn_pools_scatter_around_the_population(library, population, drivers, avs):
-    source = overtaking_shells(library, population, avs["own"], drivers.vehicles["own"], 256)
+def test_drawn_pools_scatter_around_the_population(drivers, population):
+    source = overtaking_shells(LIBRARY, population, AVS["own"], drivers.vehicles["own"], 256)
     assert source.shells.sum() == pytest.approx(population.cut_in.sum(), rel=1e-12)
     assert source.crashing.sum() == pytest.approx(drivers.vehicles["own"].crash_mass(population).sum(), rel=1e-12)
     drawn = [source.draw(np.random.default_rng([1, k])) for k in range(300)]
     rates = np.array([design.p @ share for design, share in drawn])
     exact = source.crashing.sum() / population.cut_in.size
     assert abs(rates.mean() - exact) < 4.0 * rates.std() / np.sqrt(len(rates))
-    assert all(design.strata[-1] == "outside" and design.boundary == library.boundary for design, _ in drawn)
+    assert all(design.strata[-1] == "outside" and design.boundary == LIBRARY.boundary for design, _ in drawn)
 
 
-def test_a_vehicle_that_accelerates_harder_has_no_envelope(library):
-    wild = AutomatedVehicle.model_validate({"model": "constant", "parameters": {"acceleration_mps2": 3.0}})
-    assert Drivers.of(library, {"wild": wild}).envelope == NO_ENVELOPE
+def test_a_vehicle_that_accelerates_harder_has_no_envelope(drivers):
+    assert drivers.envelope >= 0
+    assert drivers_of("faster").envelope == NO_ENVELOPE
 
 
 @pytest.mark.slow
-def test_real_pools_have_the_shells_of_drawn_ones(library, avs, drivers):
+def test_real_pools_have_the_shells_of_drawn_ones(drivers):
     """A pool as a campaign builds it, from other paths: shell probabilities and their errors agree."""
-    environment = load_environment(Environment())
     paths = 16_384
-    population = enumerate_paths(environment, drivers, 3, paths, SilentProgress())
-    source = overtaking_shells(library, population, avs["own"], drivers.vehicles["own"], paths)
-    real = build_pool(environment, library, PoolSettings(relative_error=0.01, seed=7), "real")
+    population = enumerated(drivers, paths)
+    source = overtaking_shells(LIBRARY, population, AVS["own"], drivers.vehicles["own"], paths)
+    real = build_pool(ENVIRONMENT, LIBRARY, PoolSettings(relative_error=0.01, seed=7), "real")
     assert real.names == source.template.names
     errors = [
         np.sqrt(np.maximum(np.diag(pool.shell_moments) - pool.shell_p**2, 0.0) / n)

@@ -7,16 +7,9 @@ import subprocess
 import sys
 
 import pytest
-from pythonfmu.builder import FmuBuilder
 
+from tests.controllers.test_same_bits import fmu, fmu_av  # noqa: F401 - a fixture
 from tests.sumo_av.running import EXAMPLE, ROOT
-
-
-@pytest.fixture(scope="module")
-def fmu(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("fmu")
-    file = FmuBuilder.build_FMU(ROOT / "examples/idm_fmu.py", dest=folder, project_files=[ROOT / "examples/idm.py"])
-    return f"{{fmu: {{file: '{file}', inputs: {{speed_mps: v, lead_speed_mps: v_lead, gap_m: gap}}, output: a}}}}"
 
 
 def check(av: str, *overrides: str, episodes: int = 6) -> tuple[int, dict]:
@@ -45,8 +38,8 @@ def test_a_program():
     assert found["behaviour"]["min_acceleration_mps2"] == pytest.approx(-4.0)
 
 
-def test_an_fmu(fmu):
-    code, found = check(fmu)
+def test_an_fmu(fmu):  # noqa: F811 - the fixture
+    code, found = check(fmu_av(fmu))
     assert (code, found["deterministic"], found["failures"]) == (0, True, {})
     assert found["behaviour"]["min_acceleration_mps2"] == pytest.approx(-4.0)
 

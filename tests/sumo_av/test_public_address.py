@@ -46,10 +46,10 @@ def test_permission_to_be_public_is_no_other_vehicle():
 
 
 def test_a_client_of_another_machine_ends_the_run():
-    program._require_neighbour("0100007F:B267", "0100007F:A6BC")
-    program._require_neighbour("0A01A8C0:B267", "0A01A8C0:A6BC")  # this machine, by its own address
+    program.require_neighbour("0100007F:B267", "0100007F:A6BC")
+    program.require_neighbour("0A01A8C0:B267", "0A01A8C0:A6BC")  # this machine, by its own address
     with pytest.raises(WorldDisagreementError, match="a client at"):
-        program._require_neighbour("0A01A8C0:B267", "0B01A8C0:A6BC")
+        program.require_neighbour("0A01A8C0:B267", "0B01A8C0:A6BC")
 
 
 @pytest.mark.parametrize(
