@@ -6,7 +6,6 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from stored_runs import copy_of, manifest, shard_files, stored_table
 
 from harness.campaign.models import AutomatedVehicle, Campaign, IDMParameters, Reaction
 from harness.errors import WorldDisagreementError
@@ -16,6 +15,7 @@ from harness.runner.prepare import prepare
 from harness.runner.retrace import Retracing
 from harness.twin import TwinWorld
 from tests.chains.seed import SEED
+from tests.runner.stored_runs import copy_of, manifest, shard_files, stored_table
 
 N = 600
 AVS = {
