@@ -22,12 +22,7 @@ def test_the_hazard_is_the_formula(v, r1, r1dot, r2, r2dot, level):
     assert accepted == pytest.approx(formulas.acceptance(r2, r2dot), rel=1e-12)
     p_1s = wish * accepted
     assert -np.expm1(-hazard) == pytest.approx(formulas.step_probability(p_1s), rel=1e-9, abs=1e-16)
-
-
-@given(speeds, gaps, rates, av_gaps, rates, levels)
-def test_never_above_one_half_a_second(v, r1, r1dot, r2, r2dot, level):
-    hazard = cut_in_terms((v, r1, r1dot, r2, r2dot), level)[0, 2]
-    assert 0.0 <= hazard <= 0.1 * np.log(2.0) * (1.0 + 1e-15)
+    assert 0.0 <= hazard <= 0.1 * np.log(2.0) * (1.0 + 1e-15)  # never above one half a second
 
 
 def test_ten_steps_make_one_decision():

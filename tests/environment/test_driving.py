@@ -1,7 +1,4 @@
-"""Accelerations of LV and BV: probabilities against the formulas, draws against the probabilities, noise, the guard.
-
-Chi-square tests have fixed seeds and an error probability of 1e-4 each.
-"""
+"""Accelerations of LV and BV: probabilities against the formulas, draws against the probabilities, noise, the guard."""
 
 import numpy as np
 import pytest
@@ -11,7 +8,6 @@ from scipy import stats
 
 from harness.environment.driving import t_table
 from harness.maneuvers import ACCELERATIONS_MPS2
-from tests.chains.seed import SEED
 from tests.environment import formulas
 from tests.environment.kernels import car_following, environment, free_driving, t_distribution
 
@@ -26,24 +22,8 @@ STATES = [
     (20.0, 110.0, 6.0),
     (38.0, 8.0, 0.0),
 ]
-N_DRAWS = 200_000
+UNIFORMS = (np.arange(100_000) + 0.5) / 100_000
 DEGREES_OF_FREEDOM = [1.5, 3.39, 4.98, 16.0, 200.0]
-
-
-def chi_square_p(drawn, pmf):
-    """p-value of draws against probabilities; bins with fewer than ten expected draws are pooled."""
-    counts = np.bincount(drawn, minlength=31)
-    expected = pmf * drawn.size
-    rare = expected < 10.0
-    observed = np.append(counts[~rare], counts[rare].sum())
-    wanted = np.append(expected[~rare], expected[rare].sum())
-    used = wanted > 0.0
-    assert observed[~used].sum() == 0
-    return stats.chisquare(observed[used], wanted[used]).pvalue if used.sum() > 1 else 1.0
-
-
-def uniforms_for_draws():
-    return np.random.default_rng(SEED).random(N_DRAWS)
 
 
 def test_the_grid():
@@ -82,40 +62,34 @@ def test_the_guard_caps_at_the_largest_safe_acceleration(r1, r1dot):
 
 def test_the_guard_binds_where_it_should():
     close, far = (30.0, 3.0, -4.0), (30.0, 80.0, 0.0)
-    _, caps, drawn = car_following([close, far], uniforms_for_draws())
+    _, caps, drawn = car_following([close, far], UNIFORMS)
     assert caps.tolist() == [0, 30]
     assert (drawn[0] == 0).all()
     assert np.unique(drawn[1]).size > 10
 
 
-@pytest.mark.parametrize("speed", [15.0, 22.0, 30.0, 38.0, 45.0])
-def test_free_driving_draws_follow_the_probabilities(speed):
-    pmf, drawn = free_driving(speed, uniforms_for_draws())
-    assert chi_square_p(drawn[0], pmf[0]) > 1e-4
+def largest_difference(drawn, pmf):
+    """Equal steps of the uniform give every acceleration its probability to within one step, 1e-5."""
+    assert (np.diff(drawn) >= 0).all()
+    return np.abs(np.bincount(drawn, minlength=31) / UNIFORMS.size - pmf).max()
+
+
+@pytest.mark.parametrize("speed", [15.0, 20.0, 22.0, 24.0, 28.0, 30.0, 33.0, 38.0, 45.0])
+def test_free_driving_draws_invert_the_distribution(speed):
+    pmf, drawn = free_driving(speed, UNIFORMS)
+    assert largest_difference(drawn[0], pmf[0]) < 1.001e-5
 
 
 @pytest.mark.parametrize("state", STATES)
-def test_car_following_draws_follow_the_probabilities(state):
-    pmf, cap, drawn = car_following(state, uniforms_for_draws())
-    assert chi_square_p(drawn[0], pmf[0]) > 1e-4
+def test_car_following_draws_invert_the_distribution(state):
+    pmf, cap, drawn = car_following(state, UNIFORMS)
+    assert largest_difference(drawn[0], pmf[0]) < 1.001e-5
     assert drawn.max() <= cap[0]
 
 
-@pytest.mark.parametrize("state", STATES)
-def test_draws_invert_the_distribution(state):
-    """Equal steps of the uniform give every acceleration its probability to within one step."""
-    u = (np.arange(100_000) + 0.5) / 100_000
-    pmf, _, drawn = car_following(state, u)
-    free_pmf, free = free_driving(state[0], u)
-    for probabilities, indices in ((pmf[0], drawn[0]), (free_pmf[0], free[0])):
-        assert (np.diff(indices) >= 0).all()
-        np.testing.assert_allclose(np.bincount(indices, minlength=31) / u.size, probabilities, rtol=0, atol=1.001e-5)
-
-
-def test_the_chi_square_would_notice_another_speed():
+def test_another_speed_would_be_noticed():
     """The check has teeth: draws at 30 m/s are not those of 31 m/s."""
-    drawn = free_driving(30.0, uniforms_for_draws())[1][0]
-    assert chi_square_p(drawn, free_driving(31.0)[0][0]) < 1e-8
+    assert largest_difference(free_driving(30.0, UNIFORMS)[1][0], free_driving(31.0)[0][0]) > 1e-3
 
 
 # -- Student's t as a table --

@@ -65,13 +65,19 @@ def late(run):
     return run(LATE, TWIN, ALL)
 
 
+@pytest.fixture(scope="module")
+def ladder(late, tmp_path_factory):
+    """What came of the late driver's run, and the library that was written."""
+    out = tmp_path_factory.mktemp("library") / "mine.yaml"
+    return refine_ladder(late[0], out), out
+
+
 def reflexes(driver):
     return driver.reaction.delay_s, driver.reaction.max_jerk_mps3
 
 
-def test_a_late_driver_is_found_again_and_predicts_every_crash(late, tmp_path):
-    folder, _, _ = late
-    refined = refine_ladder(folder, tmp_path / "mine.yaml")
+def test_a_late_driver_is_found_again_and_predicts_every_crash(ladder):
+    refined, _ = ladder
     assert reflexes(refined.fitted.driver) == (0.6, None)
     assert refined.fitted.driver.parameters.min_acceleration_mps2 == pytest.approx(-5.0, abs=0.05)
     assert refined.explained > 0.999
@@ -82,10 +88,9 @@ def test_a_late_driver_is_found_again_and_predicts_every_crash(late, tmp_path):
     assert refined.n_checked + refined.fitted.n_cut_ins == 140
 
 
-def test_sumo_and_twin_give_the_same_ladder(run, late, tmp_path):
+def test_sumo_and_twin_give_the_same_ladder(run, ladder, tmp_path):
     folder, _, _ = run(LATE, ALL)
-    sumo, twin = (refine_ladder(place, tmp_path / f"{place.parent.name}.yaml") for place in (folder, late[0]))
-    assert sumo.to_json() == twin.to_json()
+    assert refine_ladder(folder, tmp_path / "sumo.yaml").to_json() == ladder[0].to_json()
 
 
 def test_a_jerk_limit_is_told_from_a_delay(run, tmp_path):
@@ -105,23 +110,20 @@ def test_white_noise_is_reported_as_not_predicted(run, tmp_path):
     assert "# NOT PREDICTED" in (tmp_path / "mine.yaml").read_text()
 
 
-def test_the_library_is_the_runs_with_two_drivers_more(late, tmp_path):
-    folder, campaign, _ = late
-    out = tmp_path / "mine.yaml"
-    refined = refine_ladder(folder, out)
+def test_the_library_is_the_runs_with_two_drivers_more(late, ladder):
+    refined, out = ladder
     library, before = load_library(str(out)), load_library("ladder-1")
     assert library == refined.library
     assert library.surrogates.keys() - before.surrogates.keys() == {"fitted", "fitted-careless"}
     assert all(library.surrogates[name] == model for name, model in before.surrogates.items())
     assert library.boundary == before.boundary
     text = out.read_text()
-    assert f"campaign {campaign.name}" in text
+    assert f"campaign {late[1].name}" in text
     assert "reacts after 0.6 s" in text
 
 
-def test_a_second_ladder_finds_new_names(run, late, tmp_path):
-    refine_ladder(late[0], tmp_path / "first.yaml")
-    folder, _, _ = run(LATE, TWIN, ALL, f"pool.library={tmp_path / 'first.yaml'}")
+def test_a_second_ladder_finds_new_names(run, ladder, tmp_path):
+    folder, _, _ = run(LATE, TWIN, ALL, f"pool.library={ladder[1]}")
     second = refine_ladder(folder, tmp_path / "second.yaml")
     assert (second.name, second.careless) == ("fitted-2", "fitted-2-careless")
     assert {"fitted", "fitted-careless", "fitted-2"} <= load_library(str(tmp_path / "second.yaml")).surrogates.keys()
