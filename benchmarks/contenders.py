@@ -15,7 +15,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from benchmarks.one_at_a_time import OverTraci, in_libsumo, sumo_binary
+from benchmarks.one_at_a_time import OverTraci, in_libsumo
 from harness.campaign.loading import load_campaign
 from harness.campaign.models import Campaign
 from harness.episode import loop
@@ -26,6 +26,7 @@ from harness.resolved import resolve
 from harness.runner.prepare import Prepared, prepare
 from harness.runner.shards import ShardPool
 from harness.runner.worker import ShardSpec
+from harness.sumo.network import sumo_program
 from harness.sumo.shim import shim_library
 from harness.sumo.world import SumoWorld
 from harness.twin import TwinWorld
@@ -255,7 +256,7 @@ def in_sumo(*, shim: bool) -> Callable[[Campaign], World]:
 
 def missing(name: str) -> str | None:
     """Why a contender cannot run here, in words; None if it can."""
-    if name == "traci" and sumo_binary() is None:
+    if name == "traci" and sumo_program("sumo") is None:
         return "no sumo binary: pip install 'harness[sumo]'"
     if "shim" in name and shim_library() is None:
         return "no compiled shim: it is built at installation where there is a C++ compiler (pip install -e .)"
@@ -267,7 +268,7 @@ CONTENDERS: dict[str, tuple[Callable[[], Contender], int]] = {
     "harness+shim": (lambda: Recorded(campaign("nade"), in_sumo(shim=True)), 5_000),
     "one-at-a-time": (lambda: Recorded(campaign("nade"), lambda _: in_libsumo()), 500),
     "bare one-at-a-time": (lambda: BareOneAtATime(campaign("nade")), 1_000),
-    "traci": (lambda: Recorded(campaign("nade"), lambda _: OverTraci(sumo_binary())), 50),
+    "traci": (lambda: Recorded(campaign("nade"), lambda _: OverTraci(sumo_program("sumo"))), 50),
     "floor": (lambda: Floor(campaign("nade")), 5_000),
     "recursive": (lambda: Recorded(campaign("recursive"), in_sumo(shim=False)), 5_000),
     "recursive+shim": (lambda: Recorded(campaign("recursive"), in_sumo(shim=True)), 5_000),

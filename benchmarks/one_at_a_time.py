@@ -129,13 +129,3 @@ class OverTraci(OneAtATime):
         """End the simulation and its server."""
         super().close()
         self._server.wait()
-
-
-def sumo_binary() -> Path | None:
-    """The ``sumo`` of the extra ``harness[sumo]``, or None where it is not installed."""
-    try:
-        import sumo  # noqa: PLC0415 - an extra
-    except ImportError:
-        return None
-    binary = Path(sumo.SUMO_HOME) / "bin" / "sumo"
-    return binary if binary.exists() else None

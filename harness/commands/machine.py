@@ -25,8 +25,12 @@ def setup(*, dry_run: bool) -> None:
 
     Exit code 2 says that they could not be installed; the message names the packages.
     """
-    from harness.sumo.installing import install, install_commands, require_libsumo  # noqa: PLC0415 - keeps --help fast
-    from harness.sumo.system_libraries import missing_libraries  # noqa: PLC0415
+    from harness.sumo.system_libraries import (  # noqa: PLC0415 - keeps --help fast
+        install,
+        install_commands,
+        missing_libraries,
+        require_libsumo,
+    )
 
     missing = missing_libraries()
     commands = install_commands(missing) if missing else []

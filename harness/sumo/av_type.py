@@ -83,23 +83,19 @@ def av_type(sumo: Mapping[str, str | float]) -> dict[str, str | float]:
     for name, value in sumo.items():
         if name not in ATTRIBUTES:
             close = difflib.get_close_matches(name, ATTRIBUTES, n=1, cutoff=0.5)
-            raise CampaignError(
-                f"av.sumo.{name}",
-                found=f"the unknown attribute '{name}'",
-                expected="an attribute of SUMO's vType that matters to a vehicle on a straight road",
-                mend=f"Did you mean '{close[0]}'?" if close else "SUMO's documentation of vType lists them.",
-            )
+            mend = f"Did you mean '{close[0]}'?" if close else "SUMO's documentation of vType lists them."
+            expected = "an attribute of SUMO's vType that matters to a vehicle on a straight road"
+            raise _wrong(name, f"the unknown attribute '{name}'", expected, mend)
         if isinstance(value, bool):
-            raise _wrong(name, str(value), "a number or a text", "SUMO writes 1 and 0.")
+            raise _wrong(name, value, "a number or a text", "SUMO writes 1 and 0.")
     model = sumo.get("carFollowModel", DEFAULTS["carFollowModel"])
     if model not in MODELS:
         close = difflib.get_close_matches(str(model), MODELS, n=1, cutoff=0.3)
         mend = f"Did you mean '{close[0]}'?" if close else "Choose one of them."
-        raise _wrong("carFollowModel", str(model), f"one of {', '.join(MODELS)}", mend)
-    if sumo.get("length", VEHICLE_LENGTH_M) != VEHICLE_LENGTH_M:
-        raise _wrong(
-            "length", str(sumo["length"]), f"{VEHICLE_LENGTH_M:g} m, as everywhere in the scenario", "Delete the key."
-        )
+        raise _wrong("carFollowModel", model, f"one of {', '.join(MODELS)}", mend)
+    length = sumo.get("length", VEHICLE_LENGTH_M)
+    if length != VEHICLE_LENGTH_M:
+        raise _wrong("length", length, f"{VEHICLE_LENGTH_M:g} m, as everywhere in the scenario", "Delete the key.")
     return {**DEFAULTS, **sumo, "length": VEHICLE_LENGTH_M}
 
 
@@ -119,25 +115,21 @@ def recyclable(sumo: Mapping[str, str | float]) -> bool:
 
 def type_xml(sumo: Mapping[str, str | float]) -> str:
     """An additional file with the type."""
-    written = " ".join(f"{name}={quoteattr(_text(value))}" for name, value in av_type(sumo).items())
+    written = " ".join(f"{name}={quoteattr(str(value))}" for name, value in av_type(sumo).items())
     return f'<additional>\n    <vType id="{TYPE_NAME}" {written}/>\n</additional>\n'
 
 
 def refused(sumo: Mapping[str, str | float], message: str) -> CampaignError:
     """The error for a type that SUMO itself refuses, naming the attribute that SUMO's message names."""
-    named = max((name for name in av_type(sumo) if name.lower() in message.lower()), key=len, default="")
-    value = f"{av_type(sumo)[named]}, " if named else "values "
+    attributes = av_type(sumo)
+    named = max((name for name in attributes if name.lower() in message.lower()), key=len, default="")
     return CampaignError(
         f"av.sumo.{named}" if named else "av.sumo",
-        found=f"{value}which SUMO refuses",
+        found=f"{attributes[named]}, which SUMO refuses" if named else "values which SUMO refuses",
         expected="a vType that SUMO accepts",
         mend=f"SUMO says: {message}",
     )
 
 
-def _text(value: str | float) -> str:
-    return value if isinstance(value, str) else repr(value)
-
-
-def _wrong(name: str, found: str, expected: str, mend: str) -> CampaignError:
-    return CampaignError(f"av.sumo.{name}", found=found, expected=expected, mend=mend)
+def _wrong(name: str, found: str | float, expected: str, mend: str) -> CampaignError:
+    return CampaignError(f"av.sumo.{name}", found=str(found), expected=expected, mend=mend)

@@ -14,15 +14,9 @@ from harness.world import World
 def build_sumo_world(
     campaign: Campaign, n_cells: int | None = None, *, gui: bool = False, options: Sequence[str] = ()
 ) -> World:
-    """World for a campaign with engine ``sumo``.
+    """World for a campaign with engine ``sumo``, with ``world.cells`` cells or another number.
 
-    Parameters
-    ----------
-    campaign : Campaign
-    n_cells : int, optional
-        Instead of ``world.cells``. An AV whose SUMO model keeps hidden state gets one cell in any case.
-    gui, options
-        See `SumoWorld`.
+    An AV whose SUMO model keeps hidden state gets one cell in any case; ``gui`` and ``options``: see `SumoWorld`.
 
     Raises
     ------

@@ -9,9 +9,10 @@ from __future__ import annotations
 import os
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -19,10 +20,11 @@ from harness.arrays import BoolArray, FloatArray, Int8Array, IntArray
 from harness.outcomes import AV
 from harness.random_stream import AV_DRAWS
 from harness.sumo.av_type import TYPE_NAME, refused, type_xml
+from harness.sumo.network import OBEY
 from harness.sumo.world import SumoWorld
 
-OBEY, SUMO_DECIDES = 0, 31
-"""Speed modes: commands are taken as they are; or all of SUMO's own checks hold (its default)."""
+SUMO_DECIDES = 31
+"""Speed mode in which all of SUMO's own checks hold: its default."""
 RELEASE = -1.0
 """The speed that, commanded, gives a vehicle back to its model."""
 
@@ -37,8 +39,8 @@ class DrivenWorld(SumoWorld):
         vType attributes (``av.sumo``); see `harness.sumo.av_type`.
     acts_before_cut_in : bool
         Release the AV at the start of an episode already.
-    gui, shim, options
-        See `SumoWorld`.
+    options
+        Those of `SumoWorld`.
 
     Raises
     ------
@@ -47,33 +49,31 @@ class DrivenWorld(SumoWorld):
     """
 
     def __init__(
-        self,
-        n_cells: int,
-        av: Mapping[str, str | float],
-        *,
-        acts_before_cut_in: bool = False,
-        gui: bool = False,
-        shim: bool = True,
-        options: Sequence[str] = (),
+        self, n_cells: int, av: Mapping[str, str | float], *, acts_before_cut_in: bool = False, **options: Any
     ) -> None:
         self.acts_before_cut_in = acts_before_cut_in
         self._released: BoolArray = np.zeros(n_cells, np.bool_)
         self._wanted: FloatArray = np.zeros((n_cells, 3))
-        with tempfile.TemporaryDirectory(prefix="harness-av-") as folder:
-            self._type_file = Path(folder) / "av.add.xml"
-            said = Path(folder) / "stderr"
-            self._xml = type_xml(av)
-            self._type_file.write_text(self._xml, encoding="utf-8")
+        self._xml = type_xml(av)
+        with self._written_type() as folder:
+            said = folder / "stderr"
             try:
                 with _stderr_to(said):
-                    super().__init__(n_cells, gui=gui, shim=shim, options=options)
+                    super().__init__(n_cells, **options)
             except Exception as error:
-                messages = [
-                    line for line in said.read_text(encoding="utf-8").splitlines() if line.startswith("Error: ")
-                ]
+                lines = said.read_text(encoding="utf-8").splitlines()
+                messages = [line.removeprefix("Error: ") for line in lines if line.startswith("Error: ")]
                 if not messages:
                     raise
-                raise refused(av, messages[0].removeprefix("Error: ")) from error
+                raise refused(av, messages[0]) from error
+
+    @contextmanager
+    def _written_type(self) -> Iterator[Path]:
+        """A folder with the file of the AV's type, for as long as SUMO reads it."""
+        with tempfile.TemporaryDirectory(prefix="harness-av-") as folder:
+            self._type_file = Path(folder) / "av.add.xml"
+            self._type_file.write_text(self._xml, encoding="utf-8")
+            yield Path(folder)
 
     def _type_files(self) -> list[Path]:
         return [*super()._type_files(), self._type_file]
@@ -121,38 +121,18 @@ class FreshWorld(DrivenWorld):
     """One cell, and for every episode a simulation of its own, seeded with the campaign's seed and the episode.
 
     For types whose vehicles keep hidden state or draw random numbers: slower, and the same again in any order.
-
-    Parameters
-    ----------
-    av : mapping
-    seed : int
-        Campaign seed.
-    acts_before_cut_in, gui, options
-        See `DrivenWorld`.
     """
 
-    def __init__(
-        self,
-        av: Mapping[str, str | float],
-        seed: int,
-        *,
-        acts_before_cut_in: bool = False,
-        gui: bool = False,
-        options: Sequence[str] = (),
-    ) -> None:
+    def __init__(self, av: Mapping[str, str | float], seed: int, **options: Any) -> None:
         self._seed = seed
         self._sumo_seed = 0
-        super().__init__(1, av, acts_before_cut_in=acts_before_cut_in, gui=gui, options=options)
+        super().__init__(1, av, **options)
 
     def announce(self, cells: IntArray, episodes: IntArray) -> None:  # noqa: ARG002 - there is one cell
         """Load a new simulation for the coming episode."""
         self._sumo_seed = sumo_seed(self._seed, int(episodes[0]))
-        with tempfile.TemporaryDirectory(prefix="harness-av-") as folder:
-            self._type_file = Path(folder) / "av.add.xml"
-            self._type_file.write_text(self._xml, encoding="utf-8")
-            self._api.load(self._arguments())
-        self._populate()
-        self._told[:] = 0.0
+        with self._written_type():
+            self.load_again()
 
     def _arguments(self) -> list[str]:
         return [*super()._arguments(), "--seed", str(self._sumo_seed)]

@@ -5,23 +5,26 @@ from __future__ import annotations
 import os
 import signal
 import socket
+import struct
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import TypeVar
 
+import traci.constants as tc
+from traci.connection import Connection
 from traci.exceptions import FatalTraCIError
 
 from harness.campaign.models import TraciProcess
 from harness.errors import CampaignError, WorldDisagreementError
-from harness.sumo.traci_connection import BatchConnection
+from harness.sumo.network import sumo_program
 from harness.world import AVLostError
 
-PROGRAM_ORDER, HARNESS_ORDER = 1, 2
-"""Order in which SUMO serves its clients within a step: the harness has the last word."""
+HARNESS_ORDER = 2
+"""SUMO serves its clients in this order within a step, and the program is 1: the harness has the last word."""
 _POLL_S = 0.02
 _ESTABLISHED = "01"
 _TCP_TABLE = Path("/proc/net/tcp")
@@ -29,19 +32,47 @@ _TCP_TABLE = Path("/proc/net/tcp")
 _Answer = TypeVar("_Answer")
 
 
-class ConnectedProgram:
-    """SUMO as a server with two clients: the user's program and the harness.
+class BatchConnection(Connection):  # type: ignore[misc] # traci has no types
+    """`traci.connection.Connection`, with one round trip for all commanded speeds instead of one for each.
 
-    Parameters
-    ----------
-    av : TraciProcess
-        ``av.traci``.
-    n_cells : int
-        Fills ``{cells}`` in the command.
-    sumo_arguments : sequence of str
-        SUMO's command line.
-    step_time_s : float
-        Time that a step may take (``av.limits.step_time_s``).
+    The step itself travels alone: with two clients SUMO would send the answers to what precedes it to the wrong one.
+    """
+
+    def __init__(self, port: int) -> None:
+        self._socket: socket.socket | None
+        super().__init__("127.0.0.1", port, None, None, traceGetters=False)
+
+    def limit(self, seconds: float) -> None:
+        """Give up on an answer after this time; the connection is then closed."""
+        if self._socket is not None:
+            self._socket.settimeout(seconds)
+
+    def drop(self) -> None:
+        """Close without waiting for an answer."""
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+
+    def set_speeds(self, names: Sequence[str], speeds: Sequence[float]) -> None:
+        """Command vehicles (n,) to speeds (m/s)."""
+        if not names:
+            return
+        command, variable = tc.CMD_SET_VEHICLE_VARIABLE, tc.VAR_SPEED
+        parts = []
+        for name, speed in zip(names, speeds, strict=True):
+            encoded = name.encode()
+            body = struct.pack("!BBi", command, variable, len(encoded)) + encoded
+            body += struct.pack("!Bd", tc.TYPE_DOUBLE, speed)
+            parts.append(struct.pack("!B", len(body) + 1) + body)
+            self._queue.append(command)
+        self._string += b"".join(parts)
+        self._sendExact()
+
+
+class ConnectedProgram:
+    """SUMO as a server with two clients: the user's program (``av.traci``) and the harness with its ``connection``.
+
+    A step may take ``step_time_s`` (``av.limits.step_time_s``).
 
     Raises
     ------
@@ -55,32 +86,18 @@ class ConnectedProgram:
         self._av = av
         self._step_time_s = step_time_s
         self._port = _free_port()
-        server = [_sumo_binary(), *sumo_arguments, "--remote-port", str(self._port), "--num-clients", "2"]
-        quiet = subprocess.DEVNULL
-        self._program: subprocess.Popen[bytes] | None = None
-        self._server = subprocess.Popen(server, stdout=quiet, stderr=quiet, start_new_session=True)  # noqa: S603
-        self._connection: BatchConnection | None = None
         self._n_watched = 0
-        try:
-            self._connection = self._connect()
+        server = [str(_server_program()), *sumo_arguments, "--remote-port", str(self._port), "--num-clients", "2"]
+        quiet = subprocess.DEVNULL
+        with ExitStack() as ending:
+            self._server = subprocess.Popen(server, stdout=quiet, stderr=quiet, start_new_session=True)  # noqa: S603
+            ending.callback(_end, self._server)
+            self.connection = self._connect()
+            ending.callback(self.connection.drop)
             self._program = _start_program(av, self._port, n_cells)
+            ending.callback(_end, self._program)
             self._await_program()
-        except BaseException:
-            self.close()
-            raise
-
-    @property
-    def connection(self) -> BatchConnection:
-        """The harness's own connection.
-
-        Raises
-        ------
-        AVLostError
-            There is none yet.
-        """
-        if self._connection is None:
-            raise AVLostError("SUMO's TraCI server did not start")
-        return self._connection
+            self._ending = ending.pop_all()
 
     def _connect(self) -> BatchConnection:
         until = time.monotonic() + self._av.connect_time_s
@@ -108,7 +125,7 @@ class ConnectedProgram:
         Raises
         ------
         AVLostError
-            No answer within ``seconds`` (default: the time of a step), the program has ended, or is not connected.
+            No answer in time (default: that of a step), the program has ended, or is not connected.
         """
         limit = seconds or self._step_time_s
         began = time.monotonic()
@@ -125,24 +142,18 @@ class ConnectedProgram:
         self._n_watched = self._n_sockets()
 
     def require_connected(self) -> None:
-        """See to it, after a step, that the program was there to act in it.
-
-        Raises
-        ------
-        AVLostError
-            It was not.
-        """
+        """Raise `AVLostError` if the program was not there, after a step, to act in it."""
         if self._n_sockets() < self._n_watched:
             raise AVLostError(self._how_it_ended())
         self._require_running("in the middle of the run")
 
     def _require_running(self, when: str) -> None:
-        if self._program is not None and (code := self._program.poll()) is not None:
+        if (code := self._program.poll()) is not None:
             raise AVLostError(f"the program ended {when}, {_exit_words(code)}")
 
     def _how_it_ended(self) -> str:
-        with suppress(subprocess.TimeoutExpired, AttributeError):
-            return f"the program ended, {_exit_words(self._program.wait(1.0))}"  # type: ignore[union-attr]
+        with suppress(subprocess.TimeoutExpired):
+            return f"the program ended, {_exit_words(self._program.wait(1.0))}"
         return "the program closed its connection, but goes on running"
 
     def _n_connected(self) -> int:
@@ -170,11 +181,7 @@ class ConnectedProgram:
 
     def close(self) -> None:
         """End both processes."""
-        if self._connection is not None:
-            self._connection.drop()
-        for process in (self._program, self._server):
-            if process is not None:
-                _end(process)
+        self._ending.close()
 
 
 def _start_program(av: TraciProcess, port: int, n_cells: int) -> subprocess.Popen[bytes]:
@@ -220,15 +227,10 @@ def _free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-def _sumo_binary() -> str:
-    try:
-        import sumo  # noqa: PLC0415 - an extra
-    except ImportError:
-        found = None
-    else:
-        found = Path(str(getattr(sumo, "SUMO_HOME", ""))) / "bin" / "sumo"
-    if found is None or not found.exists():
+def _server_program() -> Path:
+    program = sumo_program("sumo")
+    if program is None:
         raise CampaignError(
             "av.traci", found="no SUMO server", expected="the extra 'sumo'", mend="pip install 'harness[sumo]'."
         )
-    return str(found)
+    return program

@@ -31,13 +31,7 @@ def own_addresses() -> set[str]:
 
 
 def require_private(program: TraciProcess) -> None:
-    """Refuse to open a TraCI server where the internet can reach it.
-
-    Raises
-    ------
-    CampaignError
-        The machine has an address that is reachable from everywhere, and the campaign does not say that this is right.
-    """
+    """Refuse to open a TraCI server where the internet can reach it, unless the campaign says that this is right."""
     public = sorted(address for address in own_addresses() if ipaddress.ip_address(address).is_global)
     if public and not program.allow_public:
         raise CampaignError(

@@ -9,6 +9,7 @@ import ctypes
 import os
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,7 +26,7 @@ def shim_library() -> Path | None:
     return next(iter(sorted(Path(__file__).parent.glob("_shim*.so"))), None)
 
 
-def open_shim(names: Sequence[str]) -> Shim | None:
+def open_shim(names: Sequence[str], told: FloatArray, x: FloatArray, v: FloatArray) -> Shim | None:
     """Shim for the given vehicles, or None: not built, switched off, or another libsumo than it knows."""
     path = shim_library()
     if path is None:
@@ -48,28 +49,33 @@ def open_shim(names: Sequence[str]) -> Shim | None:
     handle = library.shim_open(inner.__file__.encode(), encoded, ctypes.c_long(len(names)))
     if not handle:
         return None
-    shim = Shim(library, handle, len(names))
+    shim = Shim(library, handle, Arrays(told, x, v, np.zeros(x.size), np.zeros(x.size)))
     shim.find_vehicles()
     return shim
 
 
-class Shim:
-    """Vehicles of one simulation, told, read and compared in one call.
+class Arrays(NamedTuple):
+    """Speed (m/s) that each vehicle was last told, where it should be after the coming step, and where SUMO says it is.
 
-    Attributes
-    ----------
-    position, speed : ndarray, shape (n,)
-        Positions (m) and speeds (m/s) that SUMO reported after the last step.
+    All have as many elements as there are vehicles, and stay where they are for as long as the shim is used.
     """
 
-    def __init__(self, library: ctypes.CDLL, handle: int, n: int) -> None:
+    told: FloatArray
+    x: FloatArray
+    v: FloatArray
+    position: FloatArray
+    speed: FloatArray
+
+
+class Shim:
+    """Vehicles of one simulation, told, read and compared in one call."""
+
+    def __init__(self, library: ctypes.CDLL, handle: int, arrays: Arrays) -> None:
+        self.arrays = arrays
         self._library = library
         self._handle: int | None = handle
-        self._step = library.shim_step
-        self.position: FloatArray = np.zeros(n)
-        self.speed: FloatArray = np.zeros(n)
-        self._given: tuple[FloatArray, ...] = ()
-        self._addresses: tuple[int, ...] = ()
+        self._addresses = [array.ctypes.data for array in arrays]  # to ask for them takes longer than the call
+        self._wanted, self._wanted_address = arrays.told, self._addresses[0]
 
     def find_vehicles(self) -> None:
         """Look the vehicles up again: those of an earlier simulation in this process are gone.
@@ -80,29 +86,30 @@ class Shim:
             There is no such vehicle.
         """
         if self._library.shim_find_vehicles(self._handle):
-            raise RuntimeError(self._library.shim_error(self._handle).decode())
+            raise self._error()
 
-    def step(self, speed: FloatArray, told: FloatArray, x: FloatArray, v: FloatArray) -> bool:
-        """Tell changed speeds (noting them in ``told``), simulate one step, read all positions and speeds.
+    def step(self, wanted: FloatArray) -> bool:
+        """Tell the speeds that differ from ``told`` (noting them there), simulate one step, read all vehicles.
 
         Returns
         -------
         bool
-            Whether every position and speed is the wanted one, ``x`` and ``v``, in every bit.
+            Whether every position and speed is that of ``x`` and ``v``, in every bit.
 
         Raises
         ------
         RuntimeError
             SUMO raised an error, or a vehicle has left the road.
         """
-        given = (speed, told, x, v)
-        if [*map(id, given)] != [*map(id, self._given)]:  # to ask for six addresses takes longer than the call
-            self._given = given
-            self._addresses = tuple(array.ctypes.data for array in (*given, self.position, self.speed))
-        answer: int = self._step(self._handle, *self._addresses)
+        if wanted is not self._wanted:
+            self._wanted, self._wanted_address = wanted, wanted.ctypes.data
+        answer: int = self._library.shim_step(self._handle, self._wanted_address, *self._addresses)
         if answer == _FAILED:
-            raise RuntimeError(self._library.shim_error(self._handle).decode())
+            raise self._error()
         return answer == _OBEYED
+
+    def _error(self) -> RuntimeError:
+        return RuntimeError(self._library.shim_error(self._handle).decode())
 
     def close(self) -> None:
         """Forget the vehicles."""

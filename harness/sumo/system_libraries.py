@@ -1,13 +1,17 @@
-"""Shared libraries that SUMO's wheels expect of the system: its window toolkit is linked even where no window opens.
+"""Shared libraries that SUMO's wheels expect of the system: which they are, which are missing, and their installation.
 
 The wheels bring the others along (policy manylinux_2_28, PEP 600, names what they may leave out). The list is what the
 files of libsumo 1.28.0 and of eclipse-sumo 1.28.0 need and do not bring, the C library and the compiler's runtime
-aside; a test reads it from the installed files.
+aside; a test reads it from the installed files. SUMO's window toolkit is linked even where no window opens.
 """
 
 from __future__ import annotations
 
 import ctypes
+import os
+import shlex
+import shutil
+import subprocess
 import sys
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -34,6 +38,18 @@ LIBRARIES = (
     SystemLibrary("libz.so.1", "zlib1g", "zlib", "zlib"),
     SystemLibrary("libstdc++.so.6", "libstdc++6", "libstdc++", "libstdc++"),
 )
+_INSTALL: dict[str, tuple[tuple[str, ...], ...]] = {
+    # Ubuntu's own updates hold the lock for some minutes after a first start: wait instead of failing.
+    "apt": (
+        ("apt-get", "update"),
+        ("apt-get", "-o", "DPkg::Lock::Timeout=300", "install", "-y", "--no-install-recommends"),
+    ),
+    "dnf": (("dnf", "install", "-y", "--setopt=install_weak_deps=False"),),
+    "apk": (("apk", "add", "--no-cache"),),
+}
+_ASK_NOTHING = ("env", "DEBIAN_FRONTEND=noninteractive", "LC_ALL=C")
+_QUOTED = 2
+"""Lines of each command that an error repeats."""
 
 
 def missing_libraries() -> list[SystemLibrary]:
@@ -52,26 +68,72 @@ def _loads(soname: str) -> bool:
 
 
 def require_libraries() -> None:
-    """Refuse a machine that SUMO cannot be loaded on.
+    """Refuse a machine that SUMO cannot be loaded on, naming the packages that are missing."""
+    missing = missing_libraries()
+    if missing:
+        raise _cannot_load(missing, "Run `harness setup`, which installs them")
+
+
+def install_commands(missing: Sequence[SystemLibrary]) -> list[list[str]]:
+    """Commands that install the packages of missing libraries here; all but the last prepare the last.
 
     Raises
     ------
     HarnessError
-        Libraries are missing; it names their packages.
+        No package manager that is known, or neither root nor sudo.
     """
-    missing = missing_libraries()
-    if missing:
-        raise cannot_load(missing, "Run `harness setup`, which installs them")
+    manager = next((name for name, commands in _INSTALL.items() if shutil.which(commands[0][0])), None)
+    if manager is None:
+        raise _cannot_load(missing, "None of apt-get, dnf and apk is here: install them as this system does")
+    root: list[str] = []
+    if os.geteuid() != 0:
+        if shutil.which("sudo") is None:
+            raise _cannot_load(missing, "You are not root and there is no sudo: run `harness setup` as root")
+        root = ["sudo"] if sys.stdin.isatty() else ["sudo", "-n"]  # nobody is there to type a password
+    *before, last = _INSTALL[manager]
+    packages = [getattr(library, manager) for library in missing]
+    return [[*root, *_ASK_NOTHING, *command] for command in (*before, (*last, *packages))]
 
 
-def cannot_load(missing: Sequence[SystemLibrary], advice: str) -> HarnessError:
-    """Error that names the missing libraries, and what an administrator is to type."""
-    return HarnessError(
-        "system libraries of SUMO",
-        found=f"no {', '.join(library.soname for library in missing)}",
-        expected="the shared libraries that libsumo needs of the system",
-        mend=f"{advice}, or give your administrator the line for this system:\n{install_lines(missing)}",
-    )
+def install(missing: Sequence[SystemLibrary], commands: Sequence[Sequence[str]]) -> None:
+    """Run the commands of `install_commands`, silently unless the last fails.
+
+    Raises
+    ------
+    HarnessError
+        The packages could not be installed; it repeats what the package manager complained about.
+    """
+    said: list[str] = []
+    for command in commands:
+        # Standard input is left out, so that nothing waits for an answer; sudo asks at the terminal itself.
+        done = subprocess.run(  # noqa: S603 - our own words, and names from our own table
+            command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False
+        )
+        said += _complaints(done.stdout, failed=done.returncode != 0)
+    if done.returncode:
+        raise HarnessError(
+            shlex.join(commands[-1]),
+            found=f"exit code {done.returncode}: {' | '.join(said)}",
+            expected="the packages installed",
+            mend="See to what it says, or give your administrator the line for this system:\n"
+            f"{_install_lines(missing)}",
+        )
+
+
+def _complaints(said: str, *, failed: bool) -> list[str]:
+    """The lines that say what went wrong: apt marks them, the cause first; others end with them."""
+    lines = [line.strip() for line in said.splitlines() if line.strip()]
+    marked = [line for line in lines if line.startswith(("E:", "W:"))]
+    return marked[:_QUOTED] or (lines[-_QUOTED:] if failed else [])
+
+
+def require_libsumo() -> None:
+    """Import libsumo in a process of its own: what this one's loader did not find before, it may not look for again."""
+    command = [sys.executable, "-c", "import libsumo"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603 - our own words
+    if done.returncode:
+        words = done.stderr.strip().splitlines()
+        raise not_importable(words[-1] if words else f"exit code {done.returncode}")
 
 
 def not_importable(words: str) -> HarnessError:
@@ -85,8 +147,16 @@ def not_importable(words: str) -> HarnessError:
     )
 
 
-def install_lines(libraries: Sequence[SystemLibrary]) -> str:
-    """Command lines for an administrator, one per package manager."""
+def _cannot_load(missing: Sequence[SystemLibrary], advice: str) -> HarnessError:
+    return HarnessError(
+        "system libraries of SUMO",
+        found=f"no {', '.join(library.soname for library in missing)}",
+        expected="the shared libraries that libsumo needs of the system",
+        mend=f"{advice}, or give your administrator the line for this system:\n{_install_lines(missing)}",
+    )
+
+
+def _install_lines(libraries: Sequence[SystemLibrary]) -> str:
     apt, dnf, apk = (" ".join(getattr(library, manager) for library in libraries) for manager in ("apt", "dnf", "apk"))
     return (
         f"    Debian, Ubuntu:  apt-get update && apt-get install -y --no-install-recommends {apt}\n"

@@ -8,6 +8,7 @@ the harness leaves the AV alone: its position and speed are read. LV and BV are 
 from __future__ import annotations
 
 import atexit
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,18 +18,16 @@ from traci.exceptions import TraCIException
 from harness.arrays import BoolArray, FloatArray, Int8Array, IntArray
 from harness.campaign.models import TraciProcess
 from harness.errors import WorldDisagreementError
-from harness.outcomes import AV, BV, LV, VEHICLES
-from harness.sumo.network import EXACT_OPTIONS, PARKED_M, committed_file, network_file, parked
-from harness.sumo.program import ConnectedProgram
+from harness.outcomes import AV, BV, LV
+from harness.sumo.network import LEFT, NEVER_PLAN_S, OBEY, PLAN_NOW_S, RIGHT, Cells
+from harness.sumo.program import BatchConnection, ConnectedProgram
 from harness.twin import advance
 from harness.world import AVLostError
 
-LEFT, RIGHT = 1, 0
-NEVER_PLAN_S, PLAN_NOW_S = 1000.0, 0.1
 _SUBSCRIBED = (tc.VAR_LANEPOSITION, tc.VAR_SPEED, tc.VAR_LANE_INDEX)
 
 
-class TraciWorld:
+class TraciWorld(Cells):
     """World whose AVs are driven by a connected program; see `harness.world.World` and `harness.world.DrivingWorld`.
 
     Parameters
@@ -42,25 +41,16 @@ class TraciWorld:
     """
 
     def __init__(self, n_cells: int, av: TraciProcess, step_time_s: float, *, acts_before_cut_in: bool = False) -> None:
+        super().__init__(n_cells)
         self.acts_before_cut_in = acts_before_cut_in
-        self.x: FloatArray = parked(n_cells)
-        self.v: FloatArray = np.zeros((n_cells, 3))
         self._av = av
         self._step_time_s = step_time_s
         self._restarts_left = av.restarts
-        self._names = [[f"{vehicle}{k}" for vehicle in VEHICLES] for k in range(n_cells)]
-        self._flat = [name for cell in self._names for name in cell]
-        self._cell_of = {name: k for k, cell in enumerate(self._names) for name in cell}
         self._released: BoolArray = np.zeros(n_cells, np.bool_)
         self._on_right: BoolArray = np.zeros(n_cells, np.bool_)
         self._program: ConnectedProgram | None = None
         self._given_up = ""
         atexit.register(self.close)
-
-    @property
-    def n_cells(self) -> int:
-        """K."""
-        return int(self.x.shape[0])
 
     def announce(self, cells: IntArray, episodes: IntArray) -> None:  # noqa: ARG002 - the program is not told
         """See `harness.world.DrivingWorld`; SUMO and the program are started with the first episodes.
@@ -73,49 +63,34 @@ class TraciWorld:
         if self._given_up:
             raise AVLostError(self._given_up)
         if self._program is None:
-            files = ["-n", str(network_file(self.n_cells)), "-a", str(committed_file("vehicles.add.xml"))]
-            self._program = ConnectedProgram(self._av, self.n_cells, [*files, *EXACT_OPTIONS], self._step_time_s)
-            self._program.answer(self._populate, self._av.connect_time_s)
+            self._program = ConnectedProgram(self._av, self.n_cells, self._arguments(), self._step_time_s)
+            self._program.answer(self._begin, self._av.connect_time_s)
             self._program.watch()
-            idle = np.setdiff1d(np.arange(self.n_cells), cells)  # a program begun again knows nothing of the last one
-            self.x[idle], self.v[idle] = parked(idle.size), 0.0
+            self._park(np.setdiff1d(np.arange(self.n_cells), cells))  # a program begun again knows nothing of the last
 
-    def _populate(self) -> None:
-        """Park the vehicles of all cells, step once so that they exist, and subscribe to them."""
-        api = self._api
-        for k, names in enumerate(self._names):
-            api.route.add(f"cell{k}", [f"cell{k}"])
-            for vehicle, name in enumerate(names):
-                lane, position = str(RIGHT if vehicle == AV else LEFT), str(PARKED_M[vehicle])
-                api.vehicle.add(name, f"cell{k}", typeID="exact", departLane=lane, departPos=position)
-                self._move(k, vehicle, PARKED_M[vehicle], 0.0)
-                api.vehicle.setLaneChangeMode(name, 0)
-        api.simulationStep()
+    def _begin(self) -> None:
+        """Park the vehicles of all cells, and subscribe to them."""
+        api = self._running().connection
+        self._populate(api)
         for name in self._flat:
             api.vehicle.subscribe(name, _SUBSCRIBED)
-
-    @property
-    def _api(self) -> Any:
-        return self._running().connection
 
     def _running(self) -> ConnectedProgram:
         if self._program is None:
             raise AVLostError(self._given_up or "the program is not running")
         return self._program
 
-    def _move(self, k: int, vehicle: int, x: float, v: float) -> None:
-        name, to = self._names[k][vehicle], self._api.vehicle
-        to.setSpeedMode(name, 0)
-        to.moveTo(name, f"cell{k}_{RIGHT if vehicle == AV else LEFT}", x)
-        to.setPreviousSpeed(name, v)
-        to.setSpeed(name, v)
+    def _move(self, to: Any, k: int, vehicle: int, x: float, v: float) -> None:
+        to.setSpeedMode(self._names[k][vehicle], OBEY)  # whatever the program has made of it
+        super()._move(to, k, vehicle, x, v)
 
     def place(self, cells: IntArray, x: FloatArray, v: FloatArray) -> None:
         """See `harness.world.World`; the AVs of these cells are taken back under command."""
         program = self._running()
+        to = program.connection.vehicle
         for k in cells.tolist():
             for vehicle in (LV, BV, AV):
-                program.answer(lambda k=k, i=vehicle: self._move(k, i, float(x[k, i]), float(v[k, i])))  # type: ignore[misc]
+                program.answer(partial(self._move, to, k, vehicle, float(x[k, vehicle]), float(v[k, vehicle])))
         self.x[cells], self.v[cells] = x[cells], v[cells]
         self._released[cells] = self.acts_before_cut_in
         self._on_right[cells] = False
@@ -130,37 +105,36 @@ class TraciWorld:
         WorldDisagreementError
             A vehicle that the harness commands is not where it should be.
         """
-        program, api = self._running(), self._api
+        program = self._running()
+        api = program.connection
         changing = np.flatnonzero(cut_in).tolist()
         commanded = np.ones((self.n_cells, 3), np.bool_)
         commanded[self._released, AV] = False
-        told = np.flatnonzero(commanded)
         try:
-            program.answer(lambda: self._command(told, speed, changing))
+            program.answer(lambda: self._command(api, commanded, speed, changing))
             program.answer(api.simulationStep)
             program.require_connected()
-            contact = program.answer(self._contacts)
+            contact = program.answer(lambda: self._contacts(api.simulation.getCollisions))
         except TraCIException as error:
             raise _meddled("a vehicle of the harness", str(error), "a vehicle that is there") from error
         self._on_right[changing] = True
-        self._read(speed, commanded)
+        self._read(api.vehicle.getAllSubscriptionResults(), speed, commanded)
         for k in changing:
-            program.answer(lambda k=k: api.vehicle.setActionStepLength(self._names[k][BV], NEVER_PLAN_S, True))  # type: ignore[misc]
+            program.answer(partial(api.vehicle.setActionStepLength, self._names[k][BV], NEVER_PLAN_S, True))
         self._released[changing] = True
         return contact
 
-    def _command(self, told: IntArray, speed: FloatArray, changing: list[int]) -> None:
-        vehicle = self._api.vehicle
+    def _command(self, api: BatchConnection, commanded: BoolArray, speed: FloatArray, changing: list[int]) -> None:
         for k in changing:
-            vehicle.setActionStepLength(self._names[k][BV], PLAN_NOW_S, True)
-            vehicle.changeLane(self._names[k][BV], RIGHT, 0.0)
-        self._api.set_speeds([self._flat[i] for i in told.tolist()], speed.ravel()[told].tolist())
+            api.vehicle.setActionStepLength(self._names[k][BV], PLAN_NOW_S, True)
+            api.vehicle.changeLane(self._names[k][BV], RIGHT, 0.0)
+        told = np.flatnonzero(commanded)
+        api.set_speeds([self._flat[i] for i in told.tolist()], speed.ravel()[told].tolist())
 
-    def _read(self, speed: FloatArray, commanded: BoolArray) -> None:
+    def _read(self, found: dict[str, Any], speed: FloatArray, commanded: BoolArray) -> None:
         """Compare what was commanded with where it is, and take over where the program's AVs are."""
         x, v = self.x.copy(), self.v.copy()
         advance(x, v, speed)
-        found = self._api.vehicle.getAllSubscriptionResults()
         read = np.array([[found[name][variable] for variable in _SUBSCRIBED] for name in self._flat])
         position, speed_read, lane = read.reshape(self.n_cells, 3, 3).transpose(2, 0, 1)
         wanted_lane = np.full((self.n_cells, 3), LEFT)
@@ -177,12 +151,6 @@ class TraciWorld:
             k, vehicle = wrong[0].tolist()
             where = f"{self._names[k][vehicle]}, {quantity}"
             raise _meddled(where, repr(float(found[k, vehicle])), f"{float(wanted[k, vehicle])!r}, as commanded")
-
-    def _contacts(self) -> BoolArray:
-        contact = np.zeros(self.n_cells, np.bool_)
-        for collision in self._api.simulation.getCollisions():
-            contact[self._cell_of[collision.collider]] = True
-        return contact
 
     def restart(self) -> None:
         """See `harness.world.DrivingWorld`; once the restarts are used up, all further episodes fail."""

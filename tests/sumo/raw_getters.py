@@ -15,10 +15,9 @@ import numpy as np
 
 from harness.campaign.models import Campaign
 from harness.episode.loop import Shard
-from harness.outcomes import AV, BV, BV_LV_CONTACT, CRASH, LV, VEHICLES
+from harness.outcomes import BV_LV_CONTACT, CRASH, VEHICLES
 from harness.resolved import resolve
 from harness.runner.prepare import prepare
-from harness.vehicles.kinematics import CONTACT_M, VEHICLE_LENGTH_M, next_position, next_speed
 
 
 class Job(NamedTuple):
@@ -50,7 +49,7 @@ def record_in_another_process(jobs: dict[str, Job], folder: Path) -> dict[str, d
     """Run jobs in one spawned process; name → arrays that the getters gave."""
     child = get_context("spawn").Process(target=_record_all, args=(jobs, folder))
     child.start()
-    child.join(300)
+    child.join(600)
     if child.exitcode != 0:
         child.kill()
         raise AssertionError(f"the recording process ended with {child.exitcode}")
@@ -139,20 +138,6 @@ def motions_computed(shard: Shard) -> list[Motion]:
         contact = (int(result["n_steps"]),) if result["outcome"] in (CRASH, BV_LV_CONTACT) else ()
         motions.append(Motion(trace[..., 0], trace[..., 1], lane, contact, trace[:-1, :, 2]))
     return motions
-
-
-def motion_of(x: np.ndarray, v: np.ndarray, lane: np.ndarray, acceleration: np.ndarray) -> Motion:
-    """Motion (by `next_speed` and `next_position`) from an initial state (3,), (3,) under accelerations (steps, 3)."""
-    xs, vs = [x], [v]
-    for a in acceleration:
-        vs.append(np.array([next_speed(vs[-1][i], a[i]) for i in range(3)]))
-        xs.append(np.array([next_position(xs[-1][i], vs[-2][i], vs[-1][i]) for i in range(3)]))
-    x, v = np.array(xs), np.array(vs)
-    bumper_gap = np.where(
-        lane[:, 1] == 0, x[:, BV] - VEHICLE_LENGTH_M - x[:, AV], x[:, LV] - VEHICLE_LENGTH_M - x[:, BV]
-    )
-    touching = bumper_gap < CONTACT_M
-    return Motion(x, v, lane, tuple(np.flatnonzero(touching).tolist()), acceleration)
 
 
 def same_bits(a: np.ndarray, b: np.ndarray) -> bool:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pickle
 import sys
-from types import SimpleNamespace
+from collections.abc import Callable
+from pathlib import Path
 
 import libsumo
 import numpy as np
@@ -20,27 +21,35 @@ from harness.runner.prepare import prepare
 from harness.sumo.network import network_file
 from harness.twin import TwinWorld
 
-
-def apart(n_cells: int) -> tuple[np.ndarray, np.ndarray]:
-    """Positions and speeds (n_cells, 3) of vehicles that do not meet."""
-    return np.tile([300.0, 200.0, 100.0], (n_cells, 1)), np.tile([30.0, 28.0, 35.0], (n_cells, 1))
+X, V = (np.tile(values, (8, 1)) for values in ([300.0, 200.0, 100.0], [30.0, 28.0, 35.0]))
+"""Positions and speeds of vehicles that do not meet."""
 
 
-def drive(world, v: np.ndarray, *, steps: int) -> None:
+@pytest.fixture
+def driving(open_world) -> Callable:
+    """Make a world of so many cells, all placed at X and V."""
+
+    def make(n_cells: int, **options):
+        world = open_world(n_cells, **options)
+        world.place(np.arange(n_cells), X[:n_cells], V[:n_cells])
+        return world
+
+    return make
+
+
+def drive(world, *, steps: int = 1) -> None:
     for _ in range(steps):
-        world.step(v, np.zeros(len(v), np.int8))
+        world.step(V[: world.n_cells], np.zeros(world.n_cells, np.int8))
 
 
 # -- one simulation per process --
 
 
-def test_a_second_simulation_is_refused_and_the_first_goes_on(open_world):
-    world = open_world(2)
+def test_a_second_simulation_is_refused_and_the_first_goes_on(open_world, driving):
+    world = driving(2)
     with pytest.raises(CampaignError, match="already runs in this process"):
         open_world(2)
-    x, v = apart(2)
-    world.place(np.arange(2), x, v)
-    world.step(v, np.zeros(2, np.int8))
+    drive(world)
     assert world.x[1, LV] == pytest.approx(303.0)
 
 
@@ -51,14 +60,12 @@ def test_after_closing_another_world_may_be_opened(open_world):
     assert len(libsumo.vehicle.getIDList()) == 9
 
 
-def test_closing_a_world_twice_leaves_the_next_one_alone(open_world):
+def test_closing_a_world_twice_leaves_the_next_one_alone(open_world, driving):
     first = open_world(2)
     first.close()
-    second = open_world(2)
+    second = driving(2)
     first.close()
-    x, v = apart(2)
-    second.place(np.arange(2), x, v)
-    second.step(v, np.zeros(2, np.int8))
+    drive(second)
     with pytest.raises(CampaignError, match="already runs"):
         open_world(2)
 
@@ -70,11 +77,24 @@ def test_more_cells_than_the_largest_network_has_are_refused():
 
 def test_without_its_extra_the_gui_is_refused_in_words(open_world, monkeypatch):
     monkeypatch.setitem(sys.modules, "sumo", None)
-    api = SimpleNamespace(vehicle=libsumo.vehicle)
-    monkeypatch.setitem(sys.modules, "traci", api)
     with pytest.raises(CampaignError, match=r"--gui: found no sumo-gui; expected the extra 'sumo'"):
         open_world(1, gui=True)
     assert open_world(1).n_cells == 1
+
+
+def test_without_a_screen_the_gui_is_refused_in_words(monkeypatch, open_world):
+    monkeypatch.setattr("harness.sumo.gui.sumo_program", Path)
+    monkeypatch.delenv("DISPLAY", raising=False)
+    with pytest.raises(CampaignError, match="DISPLAY is not set"):
+        open_world(1, gui=True)
+
+    def ends_at_once(_):
+        raise traci.FatalTraCIError("Could not connect.")
+
+    monkeypatch.setenv("DISPLAY", ":99")
+    monkeypatch.setattr(traci, "start", ends_at_once)
+    with pytest.raises(CampaignError, match="DISPLAY is :99"):
+        open_world(1, gui=True)
 
 
 # -- a world that disobeys --
@@ -82,15 +102,13 @@ def test_without_its_extra_the_gui_is_refused_in_words(open_world, monkeypatch):
 
 @pytest.mark.parametrize("shim", [True, False])
 @pytest.mark.parametrize("victim", ["LV0", "BV3", "AV7"])
-def test_a_vehicle_one_unit_in_the_last_place_off_is_noticed_at_once(victim, shim, open_world):
-    world = open_world(8, shim=shim)
-    x, v = apart(8)
-    world.place(np.arange(8), x, v)
-    world.step(v, np.zeros(8, np.int8))
+def test_a_vehicle_one_unit_in_the_last_place_off_is_noticed_at_once(victim, shim, driving):
+    world = driving(8, shim=shim)
+    drive(world)
     lane = libsumo.vehicle.getLaneID(victim)
     libsumo.vehicle.moveTo(victim, lane, np.nextafter(libsumo.vehicle.getLanePosition(victim), 1e9))
     with pytest.raises(WorldDisagreementError, match=f"{victim}, m: found ") as raised:
-        world.step(v, np.zeros(8, np.int8))
+        drive(world)
     assert raised.value.exit_code == EXIT_TOO_MANY_FAILED
     found, expected = raised.value.found, raised.value.expected.split(",")[0]
     assert float.fromhex(found) == np.nextafter(float.fromhex(expected), np.inf)
@@ -98,19 +116,15 @@ def test_a_vehicle_one_unit_in_the_last_place_off_is_noticed_at_once(victim, shi
 
 @pytest.mark.parametrize("shim", [True, False])
 @pytest.mark.parametrize("victim", ["LV1", "BV0", "AV2"])
-def test_a_speed_one_unit_in_the_last_place_off_is_noticed_within_ten_steps(victim, shim, open_world):
+def test_a_speed_one_unit_in_the_last_place_off_is_noticed_within_ten_steps(victim, shim, driving):
     """So small a difference does not show in a position of some 100 m; the speed itself is asked for now and then."""
-    world = open_world(3, shim=shim)
-    x, v = apart(3)
-    world.place(np.arange(3), x, v)
+    world = driving(3, shim=shim)
     libsumo.vehicle.setSpeed(victim, np.nextafter(libsumo.vehicle.getSpeed(victim), 0.0))
     with pytest.raises(WorldDisagreementError, match=f"{victim}, m"):
-        drive(world, v, steps=10)
+        drive(world, steps=10)
 
 
-def test_a_speed_that_was_not_set_at_placement_is_noticed(open_world, monkeypatch):
-    world = open_world(3)
-    x, v = apart(3)
+def test_a_speed_that_was_not_set_at_placement_is_noticed(driving, monkeypatch):
     set_previous = libsumo.vehicle.setPreviousSpeed
     monkeypatch.setattr(
         libsumo.vehicle,
@@ -118,26 +132,23 @@ def test_a_speed_that_was_not_set_at_placement_is_noticed(open_world, monkeypatc
         lambda name, speed: set_previous(name, np.nextafter(speed, 0.0) if name == "AV1" else speed),
     )
     with pytest.raises(WorldDisagreementError, match="AV1, m/s"):
-        world.place(np.arange(3), x, v)
+        driving(3)
 
 
-def test_a_vehicle_that_was_not_put_where_it_belongs_is_noticed(open_world, monkeypatch):
-    world = open_world(4)
-    x, v = apart(4)
+def test_a_vehicle_that_was_not_put_where_it_belongs_is_noticed(driving, monkeypatch):
+    world, x = driving(4), X[:4].copy()
     move_to = libsumo.vehicle.moveTo
     monkeypatch.setattr(libsumo.vehicle, "moveTo", lambda name, *at: None if name == "BV2" else move_to(name, *at))
     x[:, BV] = 222.0
     with pytest.raises(WorldDisagreementError, match="BV2, m"):
-        world.place(np.arange(4), x, v)
+        world.place(np.arange(4), x, V[:4])
 
 
-def test_a_lane_change_that_does_not_happen_is_noticed(open_world, monkeypatch):
-    world = open_world(4)
-    x, v = apart(4)
-    world.place(np.arange(4), x, v)
+def test_a_lane_change_that_does_not_happen_is_noticed(driving, monkeypatch):
+    world = driving(4)
     monkeypatch.setattr(libsumo.vehicle, "changeLane", lambda *arguments: None)
     with pytest.raises(WorldDisagreementError, match="BV2, lane"):
-        world.step(v, np.array([0, 0, 1, 0], np.int8))
+        world.step(V[:4], np.array([0, 0, 1, 0], np.int8))
 
 
 def test_a_disagreement_survives_the_way_from_a_worker_to_its_parent():
@@ -225,30 +236,13 @@ def test_fewer_episodes_than_cells_are_run(shim, smoke, open_world):
     )
 
 
-def test_a_cut_in_changes_only_its_own_cell(open_world):
-    world = open_world(4)
-    x, v = apart(4)
-    world.place(np.arange(4), x, v)
-    world.step(v, np.array([0, 1, 0, 0], np.int8))
+def test_a_cut_in_changes_only_its_own_cell(driving):
+    world = driving(4)
+    world.step(V[:4], np.array([0, 1, 0, 0], np.int8))
     lanes = {name: libsumo.vehicle.getLaneIndex(name) for name in libsumo.vehicle.getIDList()}
     assert lanes == {
         f"{name}{k}": int(name != "AV" and (name, k) != ("BV", 1)) for name in ("LV", "BV", "AV") for k in range(4)
     }
-    world.place(np.array([1]), x, v)
+    world.place(np.array([1]), X, V)
     assert libsumo.vehicle.getLaneIndex("BV1") == 1
-    assert world.x[1, AV] == x[1, AV]
-
-
-def test_without_a_screen_the_gui_is_refused_in_words(monkeypatch, open_world):
-    monkeypatch.setattr("harness.sumo.world._gui_binary", lambda: "sumo-gui")
-    monkeypatch.delenv("DISPLAY", raising=False)
-    with pytest.raises(CampaignError, match="DISPLAY is not set"):
-        open_world(1, gui=True)
-
-    def ends_at_once(_):
-        raise traci.FatalTraCIError("Could not connect.")
-
-    monkeypatch.setenv("DISPLAY", ":99")
-    monkeypatch.setattr(traci, "start", ends_at_once)
-    with pytest.raises(CampaignError, match="DISPLAY is :99"):
-        open_world(1, gui=True)
+    assert world.x[1, AV] == X[1, AV]
