@@ -8,6 +8,7 @@ file that a function stands in and would keep a caller compiled with yesterday's
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import os
 from collections.abc import Callable
@@ -63,7 +64,7 @@ os.environ["NUMBA_CACHE_DIR"] = str(cache_root() / f"kernels-{source_hash()}")
 
 import numba  # noqa: E402  (its settings are read at import)
 
-_njit: Any = numba.njit
+_njit: Any = functools.partial(numba.njit, fastmath=False, error_model="numpy")
 """Untyped, because ``_nrt`` is not among the options that numba's own types know."""
 
 
@@ -73,17 +74,17 @@ def compiled(function: _Function) -> _Function:
     Kernels allocate nothing: scratch arrays come from the caller. So reference counts can be left out; counting those
     of the arrays that travel in named tuples took two thirds of the time.
     """
-    result: _Function = _njit(function, cache=True, fastmath=False, error_model="numpy", _nrt=False)
+    result: _Function = _njit(function, cache=True, _nrt=False)
     return result
 
 
 def compiled_inline(function: _Function) -> _Function:
     """Compile a small function that is meant to be inlined into kernels by LLVM; not cached on its own."""
-    result: _Function = _njit(function, fastmath=False, error_model="numpy", forceinline=True, _nrt=False)
+    result: _Function = _njit(function, forceinline=True, _nrt=False)
     return result
 
 
 def compiled_threads(function: _Function) -> _Function:
     """Compile a kernel that may allocate and lets go of the interpreter lock, so that threads run side by side."""
-    result: _Function = _njit(function, cache=True, fastmath=False, error_model="numpy", nogil=True)
+    result: _Function = _njit(function, cache=True, nogil=True)
     return result

@@ -23,8 +23,3 @@ def acceleration(maneuver: int) -> float:
 def upper_edge(maneuver: int) -> float:
     """Upper edge (m/s²) of the 0.2-wide bin that maneuver index 0 … 29 stands for; the last bin has none."""
     return (maneuver - 20) / 5.0 + 0.1
-
-
-def max_draws(max_steps: int, hold_steps: int) -> int:
-    """Most maneuvers that one vehicle draws in an episode; the cut-in restarts BV's clock and is itself an entry."""
-    return -(-max_steps // hold_steps) + 2

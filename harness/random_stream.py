@@ -41,17 +41,7 @@ def _multiply_high(a: np.uint64, b: np.uint64) -> np.uint64:
 def philox_block(
     key0: np.uint64, key1: np.uint64, c0: np.uint64, c1: np.uint64, c2: np.uint64, c3: np.uint64
 ) -> tuple[np.uint64, np.uint64, np.uint64, np.uint64]:
-    """Four 64-bit words of Philox4x64-10 for one counter.
-
-    Parameters
-    ----------
-    key0, key1, c0, c1, c2, c3 : uint64
-        Key and counter words.
-
-    Returns
-    -------
-    tuple of four uint64
-    """
+    """Four 64-bit words of Philox4x64-10 for the words of one key and counter."""
     for _ in range(10):
         high0 = _multiply_high(_M0, c0)
         low0 = _M0 * c0
@@ -65,13 +55,7 @@ def philox_block(
 
 @compiled_inline
 def uniform(seed: int, episode: int, stream: int, index: int) -> float:
-    """One uniform in [0, 1) with 53 random bits.
-
-    Parameters
-    ----------
-    seed, episode, stream, index : int
-        Campaign seed, episode, stream (one of the constants above), and which number of that stream.
-    """
+    """One uniform in [0, 1) with 53 random bits: number ``index`` of an episode's stream."""
     i = np.uint64(index)
     w0, w1, w2, w3 = philox_block(
         np.uint64(seed), np.uint64(0), i >> np.uint64(2), np.uint64(episode), np.uint64(stream), np.uint64(0)
@@ -95,13 +79,7 @@ def _fill_uniforms(seed: int, first_episode: int, stream: int, out: FloatArray) 
 
 
 def uniforms(seed: int, first_episode: int, n_episodes: int, stream: int, count: int) -> FloatArray:
-    """Uniforms of consecutive episodes.
-
-    Returns
-    -------
-    ndarray of float64, shape (n_episodes, count)
-        In [0, 1), row i for episode ``first_episode + i``.
-    """
+    """Uniforms in [0, 1), shape (n_episodes, count): row i for episode ``first_episode + i``."""
     out = np.empty((n_episodes, count))
     _fill_uniforms(seed, first_episode, stream, out)
     return out

@@ -10,10 +10,7 @@ from harness.arrays import BoolArray, FloatArray, Int8Array, IntArray
 class World(Protocol):
     """K cells, each with LV, BV and AV on a two-lane road of its own.
 
-    Attributes
-    ----------
-    x, v : ndarray, shape (K, 3)
-        Positions of the front bumpers (m) and speeds (m/s) of LV, BV, AV, as the world reports them.
+    ``x``, ``v`` (K, 3) are front bumpers' positions (m) and speeds (m/s) of LV, BV, AV, as the world reports them.
     """
 
     x: FloatArray
@@ -32,19 +29,10 @@ class World(Protocol):
         ...
 
     def step(self, speed: FloatArray, cut_in: Int8Array) -> BoolArray:
-        """Advance all cells by one step.
+        """Advance all cells to the speeds (m/s, shape (K, 3)) at the end of the step.
 
-        Parameters
-        ----------
-        speed : ndarray, shape (K, 3)
-            Speeds (m/s) at the end of the step.
-        cut_in : ndarray of int8, shape (K,)
-            Whose BV moves to the right lane in this step.
-
-        Returns
-        -------
-        ndarray of bool, shape (K,)
-            Cells in which vehicles on the same lane have come into contact in this step.
+        ``cut_in`` (K,) says whose BV moves to the right lane in this step. Returns the cells (K,) in which vehicles on
+        the same lane have come into contact in it.
         """
         ...
 

@@ -39,7 +39,7 @@ Failures = dict[int, str]
 
 
 class ControllerHost(Protocol):
-    """What the episode loop calls (it knows it as `harness.episode.loop.ControlledAV`)."""
+    """What the episode loop calls: an AV controller outside of the kernels."""
 
     acts_before_cut_in: bool
 

@@ -4,35 +4,33 @@ from __future__ import annotations
 
 import math
 
-from harness.arrays import FloatArray, RecordArray
-from harness.compiled import compiled, compiled_inline, compiled_threads
-from harness.environment.driving import Environment
+from harness.arrays import FloatArray
+from harness.compiled import compiled, compiled_inline
 from harness.episode.cells import Bench
-from harness.episode.trajectory import Trajectory, place, walk, write_hazards
+from harness.episode.trajectory import place, walk, write_hazards
 from harness.outcomes import AV, EPISODE_MIXTURE, FORCED, SHELLS
 from harness.random_stream import CUT_IN, uniform
-from harness.state import State
 
 COMPONENT_DRAW, CUT_IN_DRAW = 0, 1
 """Indices within the cut-in stream."""
 
 
-@compiled_inline
-def path_hazard(state: State, seed: int, episode: int, environment: Environment, path: Trajectory) -> tuple[float, int]:
-    """Cumulative cut-in hazard of the path that LV and BV take when no cut-in happens, and its length in steps."""
-    steps = walk(state, seed, episode, 0, environment.numbers.max_steps, environment, path)
-    return write_hazards(steps, environment, path), steps
+@compiled
+def refill(bench: Bench, given: int) -> int:
+    """Give every idle cell the next episode of the shard, of which ``given`` rows have been given before.
 
-
-@compiled_inline
-def draw_component(u: float, alpha: FloatArray) -> int:
-    """Index of the importance function that this episode follows."""
-    total = 0.0
-    for j in range(alpha.size - 1):
-        total += alpha[j]
-        if u < total:
-            return j
-    return alpha.size - 1
+    The world's ``x`` and ``v`` receive their placement, ``cells.placed`` their cells; returns how many there are.
+    """
+    n = 0
+    for k in range(bench.cells.cell.size):
+        if given + n == bench.states.size:
+            break
+        if bench.cells.cell[k].row < 0:
+            place(bench.states[given + n], bench.x[k], bench.v[k])
+            begin_cell(k, given + n, bench)
+            bench.cells.placed[n] = k
+            n += 1
+    return n
 
 
 @compiled_inline
@@ -60,39 +58,23 @@ def begin_cell(k: int, row: int, bench: Bench) -> None:
         forced = cell.component == 0
     u = uniform(seed, episode, CUT_IN, CUT_IN_DRAW)
     if method in (FORCED, EPISODE_MIXTURE):
-        total, _ = path_hazard(bench.states[row], seed, episode, bench.environment, bench.scratch.path)
-        cell.hazard_total = total
-        p_cut_in = -math.expm1(-total)
+        environment, path = bench.environment, bench.scratch.path
+        steps = walk(bench.states[row], seed, episode, 0, environment.numbers.max_steps, environment, path)
+        cell.hazard_total = write_hazards(steps, environment, path)
+        p_cut_in = -math.expm1(-cell.hazard_total)
         cell.log_p_cut_in = math.log(p_cut_in)
         if forced:
-            cell.target = min(-math.log1p(-u * p_cut_in), total)
+            cell.target = min(-math.log1p(-u * p_cut_in), cell.hazard_total)
             return
     cell.target = -math.log1p(-u)
 
 
-@compiled
-def refill(bench: Bench, given: int) -> int:
-    """Give every idle cell the next episode of the shard, of which ``given`` rows have been given before.
-
-    The world's ``x`` and ``v`` receive their placement, ``cells.placed`` their cells; returns how many there are.
-    """
-    n = 0
-    for k in range(bench.cells.cell.size):
-        if given + n == bench.states.size:
-            break
-        if bench.cells.cell[k].row < 0:
-            place(bench.states[given + n], bench.x[k], bench.v[k])
-            begin_cell(k, given + n, bench)
-            bench.cells.placed[n] = k
-            n += 1
-    return n
-
-
-@compiled_threads
-def mean_test_distance(seed: int, states: RecordArray, environment: Environment, path: Trajectory) -> float:
-    """Mean distance (m) that the AV drives in an overtaking without cut-in; ``path`` is room to work in."""
+@compiled_inline
+def draw_component(u: float, alpha: FloatArray) -> int:
+    """Index of the importance function that this episode follows."""
     total = 0.0
-    for i in range(states.size):
-        steps = walk(states[i], seed, i, 0, environment.numbers.max_steps, environment, path)
-        total += path.v[AV] * (0.1 * steps)
-    return float(total / states.size)
+    for j in range(alpha.size - 1):
+        total += alpha[j]
+        if u < total:
+            return j
+    return alpha.size - 1

@@ -11,12 +11,15 @@ from typing import NamedTuple
 import numpy as np
 
 from harness.arrays import FloatArray, Int8Array, IntArray, RecordArray
+from harness.compiled import compiled_inline
 from harness.controllers.protocol import BatchObservation
 from harness.environment.driving import Environment
-from harness.episode.trajectory import Trajectory, empty_trajectory
+from harness.episode.trajectory import Trajectory, empty_trajectory, lengths
 from harness.importance.functions import Importance
-from harness.maneuvers import N_ACCELERATIONS, max_draws
-from harness.state import STATE_COLUMNS
+from harness.maneuvers import N_ACCELERATIONS
+from harness.outcomes import AV, BV, LV
+from harness.state import STATE_COLUMNS, State
+from harness.vehicles.kinematics import gap
 
 _f8, _i8 = np.float64, np.int64
 
@@ -106,6 +109,29 @@ class Cells(NamedTuple):
     ended_row: IntArray
 
 
+def idle_cells(n_cells: int, environment: Environment, importance: Importance, *, keep_traces: bool) -> Cells:
+    """K cells without an episode."""
+    max_steps, hold_steps, draws = lengths(environment)
+    cell = np.zeros(n_cells, CELL_DTYPE)
+    cell["row"] = -1
+    return Cells(
+        cell=cell,
+        log_ratio=np.zeros((n_cells, importance.alpha.size)),
+        martingale=np.zeros((n_cells, importance.n_surrogates)),
+        cut_challenge=np.zeros((n_cells, hold_steps, importance.n_surrogates)),
+        stay_challenge=np.zeros((n_cells, hold_steps, importance.n_surrogates)),
+        lv_path=np.zeros((n_cells, draws), np.int8),
+        bv_path=np.zeros((n_cells, draws), np.int8),
+        acceleration=np.zeros((n_cells, 3)),
+        speed=np.zeros((n_cells, 3)),
+        cut_in=np.zeros(n_cells, np.int8),
+        trace=np.full((n_cells, max_steps + 1 if keep_traces else 1, 3, 3), np.nan),
+        placed=np.zeros(n_cells, np.int64),
+        ended=np.zeros(n_cells, np.int64),
+        ended_row=np.zeros(n_cells, np.int64),
+    )
+
+
 class Results(NamedTuple):
     """Rows of a shard: ``episode`` (n,) `EPISODE_DTYPE`, and what has a length beside it.
 
@@ -123,6 +149,37 @@ class Results(NamedTuple):
     moment_v: FloatArray
     moment_count: IntArray
     moment_limit: int
+
+
+def empty_results(
+    n_episodes: int, environment: Environment, importance: Importance, *, moment_limit: int, capacity: int
+) -> Results:
+    """Buffers for a shard of ``n_episodes`` with room for ``capacity`` control steps."""
+    draws, n_surrogates = lengths(environment)[2], importance.n_surrogates
+    return Results(
+        episode=np.zeros(n_episodes, EPISODE_DTYPE),
+        log_q=np.zeros((n_episodes, importance.alpha.size)),
+        martingale=np.zeros((n_episodes, n_surrogates)),
+        lv_path=np.zeros((n_episodes, draws), np.int8),
+        bv_path=np.zeros((n_episodes, draws), np.int8),
+        moment=np.zeros(capacity, MOMENT_DTYPE),
+        moment_q=np.zeros((capacity, n_surrogates)),
+        moment_v=np.zeros((capacity, n_surrogates)),
+        moment_count=np.zeros(1, np.int64),
+        moment_limit=moment_limit,
+    )
+
+
+def with_more_room(results: Results, capacity: int) -> Results:
+    """The same results with room for more control steps."""
+
+    def grown(old: RecordArray) -> RecordArray:
+        new = np.zeros((capacity, *old.shape[1:]), old.dtype)
+        new[: old.shape[0]] = old
+        return new
+
+    moment, moment_q, moment_v = map(grown, (results.moment, results.moment_q, results.moment_v))
+    return results._replace(moment=moment, moment_q=moment_q, moment_v=moment_v)
 
 
 class PrescribedTraffic(NamedTuple):
@@ -148,9 +205,9 @@ def drawn_traffic() -> PrescribedTraffic:
 class Scratch(NamedTuple):
     """Room for what a kernel works out at one moment of one cell; kernels allocate nothing.
 
-    ``p`` (31,): exposure of the accelerations. ``q`` (J,) and
-    ``q_acceleration`` (J, 31): importance functions; ``challenge`` (J,): V_j. ``ratio`` (M,): q_j/p of the maneuver
-    taken; ``weight`` (M,): predictive weights of the importance functions; ``path``: what lies ahead of an episode.
+    ``p`` (31,): exposure of the accelerations. ``q`` (J,) and ``q_acceleration`` (J, 31): importance functions;
+    ``challenge`` (J,): V_j. ``ratio`` (M,): q_j/p of the maneuver taken; ``weight`` (M,): predictive weights of the
+    importance functions; ``path``: what lies ahead of an episode.
     """
 
     p: FloatArray
@@ -162,8 +219,9 @@ class Scratch(NamedTuple):
     path: Trajectory
 
 
-def empty_scratch(environment: Environment, n_importance: int, n_surrogates: int) -> Scratch:
-    """Scratch for M importance functions and J surrogates."""
+def empty_scratch(environment: Environment, importance: Importance) -> Scratch:
+    """Room for M importance functions and J surrogates."""
+    n_importance, n_surrogates = importance.alpha.size, importance.n_surrogates
     return Scratch(
         p=np.zeros(N_ACCELERATIONS),
         q=np.zeros(n_surrogates),
@@ -202,70 +260,8 @@ class Bench(NamedTuple):
     acts_before_cut_in: bool
 
 
-def idle_cells(
-    n_cells: int, *, n_importance: int, n_surrogates: int, max_steps: int, hold_steps: int, keep_traces: bool
-) -> Cells:
-    """K cells without an episode."""
-    draws = max_draws(max_steps, hold_steps)
-    cell = np.zeros(n_cells, CELL_DTYPE)
-    cell["row"] = -1
-    trace_shape = (n_cells, max_steps + 1 if keep_traces else 1, 3, 3)
-    return Cells(
-        cell=cell,
-        log_ratio=np.zeros((n_cells, n_importance)),
-        martingale=np.zeros((n_cells, n_surrogates)),
-        cut_challenge=np.zeros((n_cells, hold_steps, n_surrogates)),
-        stay_challenge=np.zeros((n_cells, hold_steps, n_surrogates)),
-        lv_path=np.zeros((n_cells, draws), np.int8),
-        bv_path=np.zeros((n_cells, draws), np.int8),
-        acceleration=np.zeros((n_cells, 3)),
-        speed=np.zeros((n_cells, 3)),
-        cut_in=np.zeros(n_cells, np.int8),
-        trace=np.full(trace_shape, np.nan),
-        placed=np.zeros(n_cells, np.int64),
-        ended=np.zeros(n_cells, np.int64),
-        ended_row=np.zeros(n_cells, np.int64),
-    )
-
-
-def empty_results(
-    n_episodes: int,
-    *,
-    n_importance: int,
-    n_surrogates: int,
-    draws: int,
-    moment_limit: int,
-    moment_capacity: int,
-) -> Results:
-    """Buffers for a shard of ``n_episodes``."""
-    capacity = moment_capacity if moment_limit else 0
-    return Results(
-        episode=np.zeros(n_episodes, EPISODE_DTYPE),
-        log_q=np.zeros((n_episodes, n_importance)),
-        martingale=np.zeros((n_episodes, n_surrogates)),
-        lv_path=np.zeros((n_episodes, draws), np.int8),
-        bv_path=np.zeros((n_episodes, draws), np.int8),
-        moment=np.zeros(capacity, MOMENT_DTYPE),
-        moment_q=np.zeros((capacity, n_surrogates)),
-        moment_v=np.zeros((capacity, n_surrogates)),
-        moment_count=np.zeros(1, np.int64),
-        moment_limit=moment_limit,
-    )
-
-
-def with_room_for_moments(results: Results, more: int) -> Results:
-    """The same results, their moment buffers doubled if fewer than ``more`` places are left."""
-    if not results.moment_limit or results.moment_count[0] + more <= results.moment.size:
-        return results
-    size = 2 * results.moment.size + more
-    return results._replace(
-        moment=_grown(results.moment, size),
-        moment_q=_grown(results.moment_q, size),
-        moment_v=_grown(results.moment_v, size),
-    )
-
-
-def _grown(old: RecordArray, size: int) -> RecordArray:
-    new = np.zeros((size, *old.shape[1:]), old.dtype)
-    new[: old.shape[0]] = old
-    return new
+@compiled_inline
+def state_of(k: int, bench: Bench) -> State:
+    """State of cell ``k`` from the world's positions and speeds."""
+    x, v = bench.x, bench.v
+    return State(v[k, BV], gap(x[k, LV], x[k, BV]), v[k, LV] - v[k, BV], gap(x[k, BV], x[k, AV]), v[k, BV] - v[k, AV])

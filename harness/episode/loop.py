@@ -4,36 +4,37 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
 from harness.arrays import BoolArray, FloatArray, IntArray, RecordArray
-from harness.controllers.protocol import BatchObservation
+from harness.controllers.hosts import ControllerHost
 from harness.environment.driving import Environment
 from harness.episode.begin import refill
 from harness.episode.cells import (
     Bench,
-    Cells,
     PrescribedTraffic,
     Results,
     drawn_traffic,
     empty_results,
     empty_scratch,
     idle_cells,
-    with_room_for_moments,
+    with_more_room,
 )
-from harness.episode.kernels import PASSED_M, PASSED_UNDER_CONTROL_M, command, decide, judge, respond
-from harness.episode.observe import empty_observation, fail, first, observe
+from harness.episode.decide import decide
+from harness.episode.judge import PASSED_M, PASSED_UNDER_CONTROL_M, fail, judge
+from harness.episode.respond import command, empty_observation, first, observe, respond
 from harness.errors import WorldDisagreementError
 from harness.importance.functions import Importance
-from harness.maneuvers import max_draws
-from harness.outcomes import AV, CRASH, FAILED, OUTCOMES
+from harness.outcomes import AV, CRASH, FAILED
 from harness.unboxed import unboxed
 from harness.vehicles.kinematics import STEP_S
 from harness.world import AVLostError, DrivingWorld, World
 
 MOMENT_LIMITS = {"all": 32767, "first_9": 9, "none": 0}
+CONTROL_STEPS = 16
+"""Of an episode, for which a shard has room at first; more is made where they are more."""
 
 
 class Policy(NamedTuple):
@@ -56,6 +57,12 @@ class Keep(NamedTuple):
     def any_trace(self) -> bool:
         """Whether motion has to be buffered at all."""
         return self.traces != "none" or self.trace_share > 0.0
+
+    def wants(self, outcome: int, n_control_steps: int) -> bool:
+        """Whether to keep the motion of an episode that ended so."""
+        if self.traces in ("crash", "critical"):
+            return outcome in (CRASH, FAILED) or (self.traces == "critical" and n_control_steps > 0)
+        return self.traces == "all"
 
 
 @dataclass
@@ -91,56 +98,19 @@ def traced_by_index(seed: int, episodes: IntArray, share: float) -> BoolArray:
     return chosen
 
 
-class ControlledAV(Protocol):
-    """An AV controller outside of the kernels (see `harness.controllers.hosts`)."""
-
-    @property
-    def acts_before_cut_in(self) -> bool:
-        """Whether it acts from the start of an episode, or from the step after the cut-in."""
-        ...
-
-    def start(self, cells: IntArray, episodes: IntArray) -> Mapping[int, str]:
-        """Begin episodes; returns the cells that failed, with the cause."""
-        ...
-
-    def act(self, observation: BatchObservation) -> tuple[FloatArray, Mapping[int, str]]:
-        """Accelerations (m/s²) of the observed AVs, and the cells that failed, with the cause."""
-        ...
-
-    def close(self) -> None:
-        """Release all controllers."""
-
-
 class EpisodeLoop:
-    """K cells of a world, fed with episodes of one campaign.
+    """K idle cells of a world, fed with episodes of one campaign; ``av`` is a controller outside of the kernels."""
 
-    Parameters
-    ----------
-    world : World
-        Where vehicles move; its cells are all idle.
-    policy : Policy
-    keep : Keep
-    av : ControlledAV, optional
-        A controller outside of the kernels.
-    """
-
-    def __init__(self, world: World, policy: Policy, keep: Keep, av: ControlledAV | None = None) -> None:
-        numbers, importance = policy.environment.numbers, policy.importance
+    def __init__(self, world: World, policy: Policy, keep: Keep, av: ControllerHost | None = None) -> None:
+        environment, importance = policy.environment, policy.importance
         self._world = world
         self._policy = policy
         self._keep = keep
         self._av = av
         self._driving: DrivingWorld | None = world if isinstance(world, DrivingWorld) else None
-        self._scratch = empty_scratch(policy.environment, importance.alpha.size, importance.n_surrogates)
-        self._observation: BatchObservation = empty_observation(world.n_cells)
-        self._cells: Cells = idle_cells(
-            world.n_cells,
-            n_importance=importance.alpha.size,
-            n_surrogates=importance.n_surrogates,
-            max_steps=int(numbers["max_steps"]),
-            hold_steps=int(numbers["hold_steps"]),
-            keep_traces=keep.any_trace,
-        )
+        self._scratch = empty_scratch(environment, importance)
+        self._observation = empty_observation(world.n_cells)
+        self._cells = idle_cells(world.n_cells, environment, importance, keep_traces=keep.any_trace)
 
     def run(self, first_episode: int, states: RecordArray, traffic: PrescribedTraffic | None = None) -> Shard:
         """Run episodes ``first_episode … first_episode + n − 1``.
@@ -159,22 +129,20 @@ class EpisodeLoop:
         WorldDisagreementError
             The world did something else than it was told.
         """
-        episodes = first_episode + np.arange(states.size)
-        traced = traced_by_index(self._policy.seed, episodes, self._keep.trace_share)
-        shard = Shard(first_episode, states, self._empty_results(states.size), traced, traffic or drawn_traffic())
-        self._cells.cell["row"] = -1
+        shard = self._empty_shard(first_episode, states, traffic or drawn_traffic())
         bench = self._bench(shard)
         given = ended = 0
         while True:
-            bench = self._with_room(bench, shard)
             placed = refill(bench, given)
-            decide(bench)
+            recorded = decide(bench)
             ended += self._respond(bench, shard, placed)
             if ended == states.size:
                 return shard
             command(bench)
             ended += self._step_and_judge(bench, shard, placed)
             given += placed
+            if recorded > shard.results.moment.size - self._world.n_cells:
+                bench = self._with_more_room(shard)
 
     def beside(self, world: World) -> EpisodeLoop:
         """Another loop with the same AV, policy and records, in a world of no more cells."""
@@ -185,16 +153,15 @@ class EpisodeLoop:
         if self._av is not None:
             self._av.close()
 
-    def _empty_results(self, n_episodes: int) -> Results:
-        numbers, importance = self._policy.environment.numbers, self._policy.importance
-        return empty_results(
-            n_episodes,
-            n_importance=importance.alpha.size,
-            n_surrogates=importance.n_surrogates,
-            draws=max_draws(int(numbers["max_steps"]), int(numbers["hold_steps"])),
-            moment_limit=self._keep.moments,
-            moment_capacity=16 * n_episodes,
+    def _empty_shard(self, first_episode: int, states: RecordArray, traffic: PrescribedTraffic) -> Shard:
+        policy, keep = self._policy, self._keep
+        self._cells.cell["row"] = -1
+        room = CONTROL_STEPS * states.size + self._world.n_cells
+        results = empty_results(
+            states.size, policy.environment, policy.importance, moment_limit=keep.moments, capacity=room
         )
+        traced = traced_by_index(policy.seed, first_episode + np.arange(states.size), keep.trace_share)
+        return Shard(first_episode, states, results, traced, traffic)
 
     def _bench(self, shard: Shard) -> Bench:
         """All that kernels need for a shard, in the form that they need it in."""
@@ -202,31 +169,28 @@ class EpisodeLoop:
         early = controlled is not None and controlled.acts_before_cut_in
         return unboxed(
             Bench(
-                policy.seed,
-                shard.first_episode,
-                shard.states,
-                shard.traffic,
-                self._world.x,
-                self._world.v,
-                self._cells,
-                shard.results,
-                self._scratch,
-                policy.environment,
-                policy.importance,
-                policy.driver,
-                PASSED_UNDER_CONTROL_M if early else PASSED_M,
-                self._keep.any_trace,
-                self._observation,
-                early,
+                seed=policy.seed,
+                first_episode=shard.first_episode,
+                states=shard.states,
+                traffic=shard.traffic,
+                x=self._world.x,
+                v=self._world.v,
+                cells=self._cells,
+                results=shard.results,
+                scratch=self._scratch,
+                environment=policy.environment,
+                importance=policy.importance,
+                driver=policy.driver,
+                passed_m=PASSED_UNDER_CONTROL_M if early else PASSED_M,
+                keep_traces=self._keep.any_trace,
+                observation=self._observation,
+                acts_before_cut_in=early,
             )
         )
 
-    def _with_room(self, bench: Bench, shard: Shard) -> Bench:
-        """The same, with room for the control steps that the coming step may bring."""
-        results = with_room_for_moments(shard.results, self._world.n_cells)
-        if results is shard.results:
-            return bench
-        shard.results = results
+    def _with_more_room(self, shard: Shard) -> Bench:
+        """The bench of the same shard with room for twice as many control steps."""
+        shard.results = with_more_room(shard.results, 2 * shard.results.moment.size)
         return self._bench(shard)
 
     def _respond(self, bench: Bench, shard: Shard, placed: int) -> int:
@@ -242,16 +206,19 @@ class EpisodeLoop:
         if n := observe(bench):
             acting = self._observation.cell[:n]
             cells.acceleration[acting, AV], failed = self._av.act(first(self._observation, n))
-            failures.update({k: cause for k, cause in failed.items() if k not in failures})
+            failures = {**failed, **failures}
         return self._fail(failures, bench, shard)
 
     def _step_and_judge(self, bench: Bench, shard: Shard, placed: int) -> int:
         """Let the world take the step, and end what is over; returns how many episodes that are."""
-        cells = self._cells
+        cells, world = self._cells, self._world
         try:
             if placed:
-                self._place(cells.placed[:placed])
-            contact = self._world.step(cells.speed, cells.cut_in)
+                refilled = cells.placed[:placed]
+                if self._driving is not None:
+                    self._driving.announce(refilled, cells.cell["episode"][refilled])
+                world.place(refilled, world.x, world.v)
+            contact = world.step(cells.speed, cells.cut_in)
         except AVLostError as lost:
             return self._lose(str(lost), bench, shard)
         ended = judge(bench, contact)
@@ -260,11 +227,6 @@ class EpisodeLoop:
         if ended:
             self._keep_traces(ended, shard)
         return ended
-
-    def _place(self, refilled: IntArray) -> None:
-        if self._driving is not None:
-            self._driving.announce(refilled, self._cells.cell["episode"][refilled])
-        self._world.place(refilled, self._world.x, self._world.v)
 
     def _lose(self, cause: str, bench: Bench, shard: Shard) -> int:
         """Fail all running episodes and begin again; returns their number."""
@@ -275,7 +237,7 @@ class EpisodeLoop:
         return lost
 
     def _fail(self, failures: Mapping[int, str], bench: Bench, shard: Shard) -> int:
-        """End episodes whose controller failed, and go on; returns their number."""
+        """End episodes whose controller failed (cell → cause), and go on; returns their number."""
         if failures:
             fail(bench, np.array(sorted(failures), np.int64))
             for k, row in self._ended(len(failures)):
@@ -293,9 +255,7 @@ class EpisodeLoop:
             return
         for k, row in self._ended(n):
             episode = shard.results.episode[row]
-            if shard.traced[row] or _wanted(
-                self._keep.traces, int(episode["outcome"]), int(episode["n_control_steps"])
-            ):
+            if shard.traced[row] or self._keep.wants(int(episode["outcome"]), int(episode["n_control_steps"])):
                 trace = shard.traces[row] = self._cells.trace[k, : int(episode["n_steps"]) + 1].copy()
                 if self._driving is not None:  # nobody commanded what the AV did: its speeds say it
                     trace[:-1, AV, 2] = np.diff(trace[:, AV, 1]) / STEP_S
@@ -309,14 +269,3 @@ def _disagreement(cell: np.void, contact: bool) -> WorldDisagreementError:
         expected="a collision exactly when bumpers overlap by more than 1 mm",
         mend="Please report this episode: its campaign.yaml and index reproduce it.",
     )
-
-
-def _wanted(policy: str, outcome: int, n_control_steps: int) -> bool:
-    if policy == "crash":
-        return outcome in (CRASH, FAILED)
-    if policy == "critical":
-        return outcome in (CRASH, FAILED) or n_control_steps > 0
-    return policy == "all"
-
-
-__all__ = ["MOMENT_LIMITS", "OUTCOMES", "EpisodeLoop", "Keep", "Policy", "Shard", "traced_by_index"]

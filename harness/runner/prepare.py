@@ -14,9 +14,8 @@ from harness.controllers.loading import build_host, require_controller
 from harness.criticality.tables import Tables, build_tables, tables_cached
 from harness.environment.driving import Environment
 from harness.environment.initial_state import InitialStates
-from harness.episode.begin import mean_test_distance
 from harness.episode.loop import MOMENT_LIMITS, EpisodeLoop, Keep, Policy
-from harness.episode.trajectory import empty_trajectory
+from harness.episode.trajectory import empty_trajectory, mean_test_distance
 from harness.errors import RunFolderError
 from harness.importance.build import build_importance, needs_tables
 from harness.pool.prescribed import PrescribedEpisodes

@@ -1,6 +1,6 @@
 """The recorded path determines the episode: initial state and maneuvers, replayed in plain Python, give it again.
 
-Bit for bit in positions and speeds, with IDM, motion and clocks written out a second time.
+Bit for bit in positions, speeds and accelerations, with IDM, motion and clocks written out a second time.
 """
 
 import math
@@ -12,12 +12,7 @@ from harness.maneuvers import CUT_IN
 from harness.outcomes import BV_LV_CONTACT, CRASH, PASSED, TIMEOUT
 from tests.episode.twin_runs import run
 
-METHODS = {
-    "nde": {"level": 1e6},
-    "forced": {},
-    "step_mixture": {},
-    "episode_mixture": {},
-}
+METHODS = {"nde": {"level": 1e6}, "forced": {}, "step_mixture": {}, "episode_mixture": {}}
 N = 300
 
 
@@ -37,13 +32,13 @@ def moved(x, v, a):
 
 
 def replayed(state, lv_path, bv_path, hold):
-    """Motion (steps + 1, 3, 2: x, v), outcome and cut-in step."""
+    """Motion (steps + 1, 3, 3: x, v, a), outcome and cut-in step."""
     v_bv, r1, r1dot, r2, r2dot = state
     x = [100.0 + 5.0 + r2 + 5.0 + r1, 100.0 + 5.0 + r2, 100.0]
     v = [max(v_bv + r1dot, 0.0), v_bv, v_bv - r2dot]
     lv, bv = iter(lv_path), iter(bv_path)
     upcoming = next(bv)
-    cut_step, motion = -1, [list(zip(x, v, strict=True))]
+    cut_step, motion = -1, []
     for step in range(200):
         a_av = idm(v[2], v[1], x[1] - 5.0 - x[2]) if cut_step >= 0 else 0.0
         if step % hold == 0:
@@ -54,14 +49,14 @@ def replayed(state, lv_path, bv_path, hold):
         # The path does not say in which step of a period the cut-in was: the caller hands it over.
         if upcoming == CUT_IN and cut_step < 0 and (yield step):
             cut_step, upcoming = step, next(bv, None)
-        moves = [moved(*one) for one in zip(x, v, (a_lv, a_bv, a_av), strict=True)]
-        x, v = [m[0] for m in moves], [m[1] for m in moves]
-        motion.append(list(zip(x, v, strict=True)))
+        motion.append(list(zip(x, v, (a_lv, a_bv, a_av), strict=True)))
+        x, v = zip(*(moved(*one) for one in motion[-1]), strict=True)
         outcome = ended(x, cut_step >= 0)
         if outcome is not None:
             break
     else:
         outcome = TIMEOUT
+    motion.append(list(zip(x, v, [math.nan] * 3, strict=True)))
     return np.array(motion), outcome, cut_step
 
 
@@ -95,7 +90,7 @@ def test_replay_in_plain_python(method, hold_s):
     for row in range(N):
         motion, outcome, cut_step = replay(done, row, round(hold_s * 10))
         trace = done.shard.traces[row]
-        np.testing.assert_array_equal(trace[:, :, :2], motion)
+        np.testing.assert_array_equal(trace, motion)
         assert outcome == done.episode["outcome"][row]
         assert cut_step == done.episode["cut_in_step"][row]
         assert len(motion) == done.episode["n_steps"][row] + 1
@@ -110,7 +105,7 @@ def test_a_path_with_one_other_maneuver_would_be_noticed():
     path = done.shard.results.lv_path[row]
     path[0] += 1
     try:
-        assert not np.array_equal(done.shard.traces[row][:, :, :2], replay(done, row, 10)[0])
+        assert not np.array_equal(done.shard.traces[row], replay(done, row, 10)[0], equal_nan=True)
     finally:
         path[0] -= 1
 

@@ -6,7 +6,6 @@ from functools import cache, cached_property
 import numpy as np
 
 from harness.campaign.models import (
-    FVDM,
     IDM,
     AutomatedVehicle,
     Campaign,
@@ -33,7 +32,7 @@ AVS = {
 SURROGATES = {
     "default": Campaign(name="default").surrogates,
     "SM-I": {"SM-I": IDM(model="idm")},
-    "SM-III": {"SM-III": FVDM(model="fvdm", parameters=FVDMParameters(min_acceleration_mps2=-6.0))},
+    "brakes with 2 g": {"hard": IDM(model="idm", parameters=IDMParameters(min_acceleration_mps2=-20.0))},
 }
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from harness.compiled import compiled_threads
 from harness.environment.cut_in import acceptance, cut_in_hazard, opportunity
 from harness.environment.driving import free_driving_pmf
-from harness.episode.after_cut_in import draw_from
+from harness.episode.control import draw_from
 from harness.importance import functions, likelihood
 from harness.maneuvers import acceleration
 from harness.state import State

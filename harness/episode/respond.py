@@ -1,0 +1,83 @@
+"""What AVs do in the coming step, or see if a user's controller is to say it; and the speeds commanded to all."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from harness.arrays import FloatArray, IntArray, read_only
+from harness.compiled import compiled
+from harness.controllers.protocol import BatchObservation
+from harness.episode.cells import Bench
+from harness.outcomes import AV, BV, LV
+from harness.vehicles.kinematics import STEP_S, gap, next_speed
+from harness.vehicles.reaction import reacting_acceleration, reaction_steps
+
+
+@compiled
+def respond(bench: Bench) -> None:
+    """Acceleration of a built-in AV wherever it has been cut in on; it acts from the step after the cut-in at most."""
+    x, v, cells, driver = bench.x, bench.v, bench.cells, bench.driver
+    for k in range(cells.cell.size):
+        cell = cells.cell[k]
+        if cell.row < 0 or cell.cut_step < 0:
+            continue
+        if cell.step - cell.cut_step > reaction_steps(driver[0], bench.seed, cell.episode):
+            cells.acceleration[k, AV] = reacting_acceleration(
+                driver[0], cells.acceleration[k, AV], v[k, AV], v[k, BV], gap(x[k, BV], x[k, AV])
+            )
+
+
+@compiled
+def observe(bench: Bench) -> int:
+    """Write what the AVs that are to act see to ``bench.observation``; returns their number."""
+    x, v, cells, out = bench.x, bench.v, bench.cells, bench.observation
+    n = 0
+    for k in range(cells.cell.size):
+        cell = cells.cell[k]
+        followed = 0 <= cell.cut_step < cell.step
+        if cell.row < 0 or not (followed or bench.acts_before_cut_in):
+            continue
+        out.cell[n], out.episode[n], out.time_s[n] = k, cell.episode, cell.step * STEP_S
+        out.position_m[n], out.speed_mps[n] = x[k, AV], v[k, AV]
+        out.acceleration_mps2[n] = cells.acceleration[k, AV]
+        out.gap_m[n] = gap(x[k, BV], x[k, AV]) if followed else math.inf
+        out.lead_speed_mps[n] = v[k, BV] if followed else math.nan
+        out.bv_position_m[n], out.bv_speed_mps[n] = x[k, BV], v[k, BV]
+        out.bv_lane[n] = 0 if followed else 1
+        out.lv_position_m[n], out.lv_speed_mps[n] = x[k, LV], v[k, LV]
+        n += 1
+    return n
+
+
+def empty_observation(n_cells: int) -> BatchObservation:
+    """Room for the observations of K cells: rows of one array of whole numbers and of one of floats."""
+    return _rows(np.zeros((3, n_cells), np.int64), np.zeros((10, n_cells)))
+
+
+def first(observation: BatchObservation, n: int) -> BatchObservation:
+    """The first ``n`` entries of every array, as copies that a controller may keep, and that nobody can write into."""
+    whole: Any = observation.cell.base
+    real: Any = observation.time_s.base
+    return _rows(read_only(whole[:, :n].copy()), read_only(real[:, :n].copy()))
+
+
+def _rows(whole: IntArray, real: FloatArray) -> BatchObservation:
+    cell, episode, bv_lane = whole
+    return BatchObservation._make([cell, episode, *real[:8], bv_lane, *real[8:]])
+
+
+@compiled
+def command(bench: Bench) -> None:
+    """Turn accelerations into the speeds at the end of the step; idle cells stand still."""
+    x, v, cells = bench.x, bench.v, bench.cells
+    for k in range(cells.cell.size):
+        running = cells.cell[k].row >= 0
+        for vehicle in range(3):
+            a = cells.acceleration[k, vehicle]
+            cells.speed[k, vehicle] = next_speed(v[k, vehicle], a) if running else 0.0
+            if bench.keep_traces and running:
+                here = cells.trace[k, cells.cell[k].step, vehicle]
+                here[0], here[1], here[2] = x[k, vehicle], v[k, vehicle], a
