@@ -1,4 +1,9 @@
-"""A call of a user's code: noted in the black box, limited in time, and its faults put in words."""
+"""A call of a user's code: noted in the black box, limited in time, and its faults put in words.
+
+Whatever goes wrong, an exception, NaN, an answer outside of av.limits or one too late, ends the episode as failed, with
+these words in its row; its controller is dropped (of a batch only the cells fail), and the run goes on until failed
+tests exceed run.max_failed_share.
+"""
 
 from __future__ import annotations
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from harness.compiled import compiled, compiled_inline
 from harness.environment.driving import car_following, draw_acceleration, free_driving
 from harness.episode.cells import Bench, state_of
-from harness.episode.control import begin_cut_in, choose_lane, controlled_draw
+from harness.episode.critical_moment import begin_cut_in, choose_lane, controlled_draw
 from harness.importance.functions import look_ahead
 from harness.maneuvers import acceleration
 from harness.outcomes import BV, LV

@@ -6,17 +6,14 @@ import math
 
 from harness.arrays import BoolArray, FloatArray, Int8Array, IntArray
 from harness.compiled import compiled, compiled_inline
-from harness.episode.cells import Bench, Cells, state_of
-from harness.importance.functions import Importance
-from harness.importance.likelihood import log_mixture
+from harness.episode.cells import Bench, state_of
+from harness.importance.likelihood import log_weight
 from harness.outcomes import (
     AV,
     BV,
     BV_LV_CONTACT,
     CRASH,
-    EPISODE_MIXTURE,
     FAILED,
-    FORCED,
     PASSED,
     RUNNING,
     TIMEOUT,
@@ -90,7 +87,9 @@ def end_episode(k: int, outcome: int, n: int, bench: Bench) -> None:
     row.impact_speed_mps = v[k, AV] - v[k, BV] if outcome == CRASH else math.nan
     row.av_distance_m = bench.x[k, AV] - cell.av_start
     row.n_control_steps, row.component = cell.n_control, cell.component
-    row.log_weight, row.log_p_cut_in = log_weight(k, cells, bench.importance), cell.log_p_cut_in
+    method, alpha = bench.importance.method, bench.importance.alpha
+    row.log_weight = log_weight(method, alpha, cells.log_ratio[k], cell.log_sampled, cell.log_p_cut_in)
+    row.log_p_cut_in = cell.log_p_cut_in
     row.n_lv, row.n_bv = cell.n_lv, cell.n_path
     copy_row(cells.log_ratio[k], results.log_q[cell.row])
     copy_row(cells.martingale[k], results.martingale[cell.row])
@@ -103,17 +102,6 @@ def end_episode(k: int, outcome: int, n: int, bench: Bench) -> None:
     cells.ended[n], cells.ended_row[n] = k, cell.row
     cells.cut_in[k] = 0
     cell.row = -1
-
-
-@compiled_inline
-def log_weight(k: int, cells: Cells, importance: Importance) -> float:
-    """Log p(x_c) − log q_sampled(x_c) of a finished episode; exactly 0 without control."""
-    method = importance.method
-    if method == FORCED:
-        return float(cells.cell[k].log_p_cut_in)
-    if method == EPISODE_MIXTURE:
-        return -log_mixture(importance.alpha, cells.log_ratio[k])
-    return float(-cells.cell[k].log_sampled)
 
 
 @compiled_inline

@@ -1,4 +1,4 @@
-"""Likelihood ratios of an episode, accumulated step by step.
+"""Likelihood ratios and the weight of an episode.
 
 Per importance function j the logarithm L_j = Σ log(q_j/p) over the control steps so far is kept. The probability that a
 step was sampled with, *given the shared history*, is the mixture Σ_j w_j q_j with
@@ -6,7 +6,8 @@ step was sampled with, *given the shared history*, is the mixture Σ_j w_j q_j w
 * step mixture: w_j = α_j in every step;
 * episode mixture: the posterior weights w_j ∝ α_j exp(L_j). The drawn component itself is not part of the history.
 
-Hence log q_sampled/p accumulates to Σ log Σ_j α_j q_j/p (step), or to log Σ_j α_j exp(L_j) (episode).
+Hence log q_sampled/p accumulates to Σ log Σ_j α_j q_j/p (step), or to log Σ_j α_j exp(L_j) (episode). Forced cut-ins
+and shells know it at the beginning of the episode (`harness.episode.begin`): P(cut-in | path), and the shell's p_s.
 """
 
 from __future__ import annotations
@@ -15,7 +16,21 @@ import math
 
 from harness.arrays import FloatArray
 from harness.compiled import compiled_inline
-from harness.outcomes import EPISODE_MIXTURE
+from harness.outcomes import EPISODE_MIXTURE, FORCED
+
+
+@compiled_inline
+def log_weight(method: int, alpha: FloatArray, log_ratio: FloatArray, log_sampled: float, log_p_cut_in: float) -> float:
+    """Log p(x_c) − log q_sampled(x_c) of a finished episode; exactly 0 without control.
+
+    ``alpha``, ``log_ratio`` (M,) are weights and L_j of the importance functions; ``log_sampled`` is Σ log q_α/p of the
+    step mixture, or −log p_s of the shell; ``log_p_cut_in`` is the path's, log P(cut-in | path).
+    """
+    if method == FORCED:
+        return log_p_cut_in
+    if method == EPISODE_MIXTURE:
+        return -log_mixture(alpha, log_ratio)
+    return -log_sampled
 
 
 @compiled_inline
@@ -60,3 +75,17 @@ def accumulate(
         if v[j] > 0.0:
             martingale[j] += weight_before * v[j] * (ratio[first + j] / sampled - 1.0)
     return sampled
+
+
+@compiled_inline
+def forced_ratio(before: float, after: float, total: float, cut: bool) -> float:
+    """q/p of a step under the forced cut-in: P(the step | a cut-in will come)/P(the step).
+
+    ``before`` and ``after`` are the hazards accumulated until and including the step, ``total`` that of the path.
+    """
+    coming = -math.expm1(before - total)
+    if coming <= 0.0:  # nothing was left of the path's hazard: the ratio so far is 0 and stays it
+        return 1.0
+    if cut:
+        return 1.0 / coming
+    return -math.expm1(min(after - total, 0.0)) / coming

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from harness.campaign.models import Campaign
 from harness.sumo.av_type import recyclable
-from harness.sumo.driven_world import DrivenWorld, FreshWorld
+from harness.sumo.sumo_av_world import FreshWorld, SumoAvWorld
 from harness.sumo.world import SumoWorld
 from harness.world import World
 
@@ -33,5 +33,5 @@ def build_sumo_world(
     if av.sumo is None:
         return SumoWorld(cells, gui=gui, options=options)
     if recyclable(av.sumo):
-        return DrivenWorld(cells, av.sumo, acts_before_cut_in=early, gui=gui, options=options)
+        return SumoAvWorld(cells, av.sumo, acts_before_cut_in=early, gui=gui, options=options)
     return FreshWorld(av.sumo, campaign.seed, acts_before_cut_in=early, gui=gui, options=options)

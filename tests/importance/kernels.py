@@ -10,7 +10,7 @@ import numpy as np
 from harness.compiled import compiled_threads
 from harness.environment.cut_in import acceptance, cut_in_hazard, opportunity
 from harness.environment.driving import acceleration_pmf, free_driving
-from harness.episode.control import draw_from
+from harness.episode.critical_moment import draw_from
 from harness.importance import functions, likelihood
 from harness.maneuvers import acceleration
 from harness.state import State

@@ -3,14 +3,14 @@ import pytest
 
 from harness.errors import CampaignError
 from harness.outcomes import AV, BV, CRASH, LV
-from harness.sumo import driven_world
+from harness.sumo import sumo_av_world
 from harness.sumo.av_type import DEFAULTS, recyclable
-from harness.sumo.driven_world import DrivenWorld, FreshWorld
+from harness.sumo.sumo_av_world import FreshWorld, SumoAvWorld
 from tests.sumo_av.running import ROOT, bits, run, run_idm, run_in, sumo_av
 
 
 def driven(av, ranges, *, cells=4):
-    world = DrivenWorld(cells, av.sumo)
+    world = SumoAvWorld(cells, av.sumo)
     try:
         return run_in(world, av, ranges)
     finally:
@@ -49,7 +49,7 @@ def test_other_models_do_not_and_get_a_seeded_simulation_per_episode(attributes)
 
 
 def test_random_numbers_differ_between_episodes_and_campaigns():
-    seeds = {driven_world.sumo_seed(seed, episode) for seed in (1, 2) for episode in range(50)}
+    seeds = {sumo_av_world.sumo_seed(seed, episode) for seed in (1, 2) for episode in range(50)}
     assert len(seeds) == 100
 
 
@@ -93,14 +93,14 @@ def test_collision_flag_and_formula_agree_for_an_av_that_keeps_a_gap_but_hardly_
 def test_the_speed_mode_of_a_released_av_does_not_matter_as_nothing_is_commanded(monkeypatch):
     av = sumo_av(carFollowModel="Krauss")
     (default,) = driven(av, [(0, 16)])
-    monkeypatch.setattr(driven_world, "SUMO_DECIDES", driven_world.OBEY)
+    monkeypatch.setattr(sumo_av_world, "SUMO_DECIDES", sumo_av_world.OBEY)
     (obeying,) = driven(av, [(0, 16)])
     assert [bits(default, row) for row in range(16)] == [bits(obeying, row) for row in range(16)]
 
 
 def test_python_and_shim_move_alike():
     av = sumo_av(carFollowModel="CACC")
-    world = DrivenWorld(4, av.sumo, shim=False)
+    world = SumoAvWorld(4, av.sumo, shim=False)
     try:
         (without,) = run_in(world, av, [(0, 12)])
     finally:
@@ -111,7 +111,7 @@ def test_python_and_shim_move_alike():
 
 def test_an_av_that_acts_from_the_start_changes_its_speed_before_the_cut_in():
     av = sumo_av(carFollowModel="IDM")
-    world = DrivenWorld(4, av.sumo, acts_before_cut_in=True)
+    world = SumoAvWorld(4, av.sumo, acts_before_cut_in=True)
     try:
         (shard,) = run_in(world, av, [(0, 12)])
     finally:
@@ -142,8 +142,8 @@ def test_wrong_attributes_are_named_with_what_sumo_says(attributes, where, words
 
 def test_a_world_can_be_opened_after_sumo_has_refused_a_type():
     with pytest.raises(CampaignError):
-        DrivenWorld(1, {"accel": -1.0})
-    DrivenWorld(1, {}).close()
+        SumoAvWorld(1, {"accel": -1.0})
+    SumoAvWorld(1, {}).close()
     FreshWorld({"carFollowModel": "EIDM"}, 1).close()
 
 
@@ -156,7 +156,7 @@ def test_documented_defaults_are_the_real_ones():
 
 @pytest.mark.parametrize(("overtakes", "speed_mps"), [(1.0, 40.0), (0.0, 26.0)])
 def test_by_default_the_av_looks_at_its_own_lane_alone(overtakes, speed_mps):
-    world = DrivenWorld(1, {"lcOvertakeRight": overtakes})
+    world = SumoAvWorld(1, {"lcOvertakeRight": overtakes})
     try:
         speeds = np.array([[20.0, 30.0, 30.0]])
         world.place(np.array([0]), np.array([[700.0, 640.0, 100.0]]), speeds)

@@ -29,7 +29,7 @@ RELEASE = -1.0
 """The speed that, commanded, gives a vehicle back to its model."""
 
 
-class DrivenWorld(SumoWorld):
+class SumoAvWorld(SumoWorld):
     """`SumoWorld` whose AVs are driven by SUMO after the cut-in.
 
     Parameters
@@ -117,7 +117,7 @@ class DrivenWorld(SumoWorld):
             self.x[k, AV], self.v[k, AV] = self._get_position(name), self._get_speed(name)
 
 
-class FreshWorld(DrivenWorld):
+class FreshWorld(SumoAvWorld):
     """One cell, and for every episode a simulation of its own, seeded with the campaign's seed and the episode.
 
     For types whose vehicles keep hidden state or draw random numbers: slower, and the same again in any order.

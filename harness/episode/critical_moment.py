@@ -10,7 +10,7 @@ from harness.environment.cut_in import acceptance, cut_in_hazard, opportunity
 from harness.environment.driving import acceleration_pmf, draw_acceleration, free_driving
 from harness.episode.cells import Bench
 from harness.importance.functions import challenges_nobody, propose_acceleration, propose_cut_in
-from harness.importance.likelihood import accumulate
+from harness.importance.likelihood import accumulate, forced_ratio
 from harness.maneuvers import CUT_IN, N_ACCELERATIONS, STAY
 from harness.outcomes import EPISODE_MIXTURE, FORCED, NDE, STEP_MIXTURE
 from harness.state import State
@@ -85,20 +85,6 @@ def update_ratios(k: int, cut: bool, p: float, hazard: float, critical: bool, be
         scratch.ratio[importance.first + j] = (q / p if cut else (1.0 - q) / (1.0 - p)) if critical else 1.0
         scratch.challenge[j] = scratch.challenge[j] if critical else 0.0
     return take_in(k, bench)
-
-
-@compiled_inline
-def forced_ratio(before: float, after: float, total: float, cut: bool) -> float:
-    """q/p of a step under the forced cut-in: P(the step | a cut-in will come)/P(the step).
-
-    ``before`` and ``after`` are the hazards accumulated until and including the step, ``total`` that of the path.
-    """
-    coming = -math.expm1(before - total)
-    if coming <= 0.0:  # nothing was left of the path's hazard: the ratio so far is 0 and stays it
-        return 1.0
-    if cut:
-        return 1.0 / coming
-    return -math.expm1(min(after - total, 0.0)) / coming
 
 
 @compiled_inline
