@@ -91,7 +91,8 @@ def test_gallery_prefers_traced_crashes_where_few_are_traced(run_folder, summary
         traces = pq.read_table(path)
         pq.write_table(traces.filter(np.asarray(traces.column("episode")) == tenth), path)
     rows = crash_gallery(read_run_folder(run_folder), summary)
-    assert [(row.crash.episode, row.reason) for row in rows if row.plot] == [(tenth, "impact no. 10")]
+    shown = [(row.crash.episode, row.reason.split(", ")[0]) for row in rows if row.plot]
+    assert shown == [(tenth, "impact no. 10")]
     assert any(row.plot is None for row in rows)
 
 

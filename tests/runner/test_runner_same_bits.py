@@ -73,8 +73,9 @@ n_writes, write = 0, Path.write_bytes
 
 def half_then_strike(path, content):
     global n_writes
-    n_writes += path.parent.name == "moments"
-    if n_writes == int(sys.argv[2]):
+    of_shard = path.parent.name == "moments"
+    n_writes += of_shard
+    if of_shard and n_writes == int(sys.argv[2]):
         write(path, content[: len(content) // 2])
         os.kill(os.getpid(), int(sys.argv[1]))
     return write(path, content)
