@@ -44,7 +44,7 @@ def require_coverage(drawn, seed: int, name: str, wrong: type) -> None:
 
 @pytest.mark.parametrize("name", METHODS)
 def test_intervals_cover_whatever_failed_tests_would_have_come_to(name):
-    n = 20 * N if name == "nde" else N
+    n = 5 * N if name == "nde" else N
     require_coverage(lambda rng: draw(CHAIN, METHODS[name], n, rng), 31, name, ACCUMULATORS[name])
 
 
