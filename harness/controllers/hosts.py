@@ -1,6 +1,6 @@
 """Hosts: what stands between the episode loop and a user's controller, and turns its faults into failed episodes.
 
-The episode loop knows a host as `harness.episode.loop.ControlledAV`.
+The episode loop calls `start`, `act` and `close`, and knows nothing else of a controller.
 """
 
 from __future__ import annotations
