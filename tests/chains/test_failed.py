@@ -1,6 +1,6 @@
 """What intervals are worth when a share of the crashes fails instead, by replication; counting these as safe must fail.
 
-Seeds are fixed. Each `binomtest` would reject a coverage of 0.90 with probability 1e-4; the mutant sibling, which takes a
+Seeds are fixed. Each `binomtest` would reject a coverage of 0.90 with probability 1e-4; the mutant, which takes a
 failed test for one without a crash, must miss at 1e-9.
 """
 
