@@ -251,7 +251,10 @@ CONTENDERS: dict[str, tuple[Callable[[], Contender], int]] = {
     "twin nde": (lambda: TwinAlone(campaign("nde")), 100_000),
     "twin recursive": (lambda: TwinAlone(campaign("recursive", **{"records.moments": "none"})), 40_000),
     "twin recorded": (
-        lambda: Recorded(campaign("nade", **{"world.cells": TWIN_CELLS}), lambda c: TwinWorld(c.world.cells)),
+        lambda: Recorded(
+            campaign("nade", **{"world.engine": "twin", "world.cells": TWIN_CELLS}),
+            lambda c: TwinWorld(c.world.cells),
+        ),
         40_000,
     ),
     "1 worker": (lambda: Workers(campaign("nade"), 1), 5_000),

@@ -54,6 +54,14 @@ def test_contenders_with_other_rows_stop_the_benchmark():
         require_equal_rows([Process("harness", b"1"), Process("traci", b"2")])
 
 
+def test_the_recorded_twin_takes_the_cells_of_the_twin():
+    recorded = CONTENDERS["twin recorded"][0]()
+    try:
+        assert recorded.run(0, 20).episodes == 20
+    finally:
+        recorded.close()
+
+
 def test_what_is_asked_for_names_contenders_that_exist():
     assert {name for wanted in RATIOS for name in (wanted.of, wanted.to)} | set(RATES) <= set(CONTENDERS)
 
