@@ -4,10 +4,9 @@ The assumption-free statement counts every shell, tested or empty. The condition
 only where the boundary surrogate, or a more careful one, crashes too: it needs far fewer tests, and one crash outside
 refutes it.
 
-The rate is Σ p_s c_s. Each crash share c_s has its own exact (Clopper-Pearson) limits; they are combined by the method
-of variance estimates recovery (MOVER; G. Y. Zou and A. Donner, Statistics in Medicine 27, 2008, 1693): the distance of
-each limit of the sum is the root of the summed squares of the terms' distances, and the error of the p_s. A stratum
-without a crash widens the upper limit only.
+The rate is Σ p_s c_s, c_s being the share of a stratum's tests that crash. Its limits are those of the likelihood
+ratio (`harness.estimators.likelihood_ratio`), with the error of the p_s in the same root. A stratum without a crash
+widens the upper limit only.
 
 Tests that failed count as no crash in the rate and in every lower limit, as crashes in every upper one: the limits are
 monotone in each stratum's crashes, so that [L(k), U(k + f)] holds whatever the f failed tests would have come to.
@@ -20,12 +19,13 @@ from dataclasses import asdict, dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import ndtri
+from scipy.special import ndtr
 
 from harness.arrays import FloatArray, IntArray
 from harness.estimators.block import Block
 from harness.estimators.estimate import Estimate, require_episodes
 from harness.estimators.intervals import clopper_pearson
+from harness.estimators.likelihood_ratio import Level, likelihood_limit
 from harness.strata import ShellDesign
 
 
@@ -71,10 +71,10 @@ def combined(
     tests: IntArray,
     moments: FloatArray,
     n_paths: int,
-    tail: float,
+    level: Level,
     failed: IntArray | int = 0,
 ) -> Limits:
-    """Rate Σ p_s c_s with limits that leave out ``tail`` at each end.
+    """Rate Σ p_s c_s with the two limits of an interval.
 
     Parameters
     ----------
@@ -84,18 +84,18 @@ def combined(
     moments, n_paths
         Of the pool, see `pool_variance`.
     """
-    if np.any(failed):
-        worst = combined(p, crashes + failed, tests, moments, n_paths, tail)
-        return combined(p, crashes, tests, moments, n_paths, tail)._replace(high=worst.high)
-    share = crashes / np.maximum(tests, 1)
-    low, high = clopper_pearson(crashes, tests, tail)
-    rate = float(p @ share)
-    z = -float(ndtri(tail))
-    pool = z * z * pool_variance(share, moments, rate, n_paths)
-    down = math.sqrt(((p * (share - low)) ** 2).sum() + pool)
-    up = math.sqrt(((p * (high - share)) ** 2).sum() + pool)
-    at_least = z * math.sqrt(pool_variance(low, moments, float(p @ low), n_paths))
-    return Limits(rate, max(rate - down, 0.0), min(rate + up, 1.0), math.sqrt(pool), at_least)
+
+    def limit(k: IntArray, side: float) -> tuple[float, float]:
+        share = k / np.maximum(tests, 1)
+        variance = pool_variance(share, moments, float(p @ share), n_paths)
+        return likelihood_limit(p, k, tests, level, side, variance), level.z * math.sqrt(variance)
+
+    low, from_pool = limit(crashes, -1.0)
+    high = limit(crashes + failed, 1.0)[0]
+    least, _ = clopper_pearson(crashes, tests, float(ndtr(-level.z)))
+    at_least = level.z * math.sqrt(pool_variance(least, moments, float(p @ least), n_paths))
+    rate = float(p @ (crashes / np.maximum(tests, 1)))
+    return Limits(rate, max(low, 0.0), min(high, float(p.sum())), from_pool, at_least)
 
 
 @dataclass(frozen=True)
@@ -195,8 +195,8 @@ class Shells:
         """Assumption-free estimate; the conditional one is among its details."""
         n = int(self.tests.sum())
         require_episodes(n)
-        design, tail = self._design, (1.0 - confidence) / 2.0
-        free, tests = self._limits(slice(None), tail), np.maximum(self.tests, 1)
+        design, level = self._design, Level.two_sided(confidence)
+        free, tests = self._limits(slice(None), level), np.maximum(self.tests, 1)
         share = self.crashes / tests
         y = design.p / tests  # contribution of one crash, up to the factor n
         squares = float((self.crashes * y * y).sum())
@@ -207,15 +207,15 @@ class Shells:
             std_error=math.sqrt(variance),
             ci_low=free.low,
             ci_high=free.high,
-            upper_bound=self._limits(slice(None), 1.0 - confidence).high,
+            upper_bound=self._limits(slice(None), Level.one_sided(confidence, n)).high,
             confidence=confidence,
             rhw=free.rhw,
             n_episodes=n,
             n_crashes=int(self.crashes.sum()),
             n_effective=free.rate**2 / squares if squares > 0.0 else 0.0,
             largest_weight_share=float(np.max(y[self.crashes > 0], initial=0.0)) / free.rate if free.rate > 0 else 0.0,
-            method="crashes within shells of known probability; Clopper-Pearson limits per shell, combined (MOVER); "
-            "upper bound: the same, one-sided",
+            method="crashes within shells of known probability; likelihood-ratio limits of their weighted sum; upper "
+            "bound: the same, one-sided",
             warnings=tuple(self._warnings()),
             details=asdict(
                 ShellDetails(
@@ -225,20 +225,21 @@ class Shells:
                     p_cut_in=design.p_cut_in,
                     p_impossible=design.p_impossible,
                     conditional=self._conditional(confidence),
-                    shells=self._shells(tail),
+                    shells=self._shells((1.0 - confidence) / 2.0),
                 )
             ),
         )
 
-    def _limits(self, strata: slice, tail: float) -> Limits:
+    def _limits(self, strata: slice, level: Level) -> Limits:
         design, crashes, tests, failed = self._design, self.crashes[strata], self.tests[strata], self.failed[strata]
-        return combined(design.p[strata], crashes, tests, design.moments[strata, strata], design.n_paths, tail, failed)
+        return combined(design.p[strata], crashes, tests, design.moments[strata, strata], design.n_paths, level, failed)
 
     def _conditional(self, confidence: float) -> Conditional:
         """The statement given that there are no crashes outside, and what is known about those."""
         p, within, outside = self._design.p, slice(0, self._design.n_inside), slice(self._design.n_inside, None)
-        inside = self._limits(within, (1.0 - confidence) / 2.0)
-        _, high = clopper_pearson(self.crashes[outside], self.tests[outside], 1.0 - confidence, self.failed[outside])
+        inside = self._limits(within, Level.two_sided(confidence))
+        tests, worst = self.tests[outside], self.crashes[outside] + self.failed[outside]
+        bound = likelihood_limit(p[outside], worst, tests, Level.one_sided(confidence, int(tests.sum())), 1.0)
         worst_share = (self.crashes + self.failed) / np.maximum(self.tests, 1)
         crashes_outside = int(self.crashes[outside].sum())
         return Conditional(
@@ -251,11 +252,11 @@ class Shells:
             n_crashes=int(self.crashes[within].sum()),
             n_failed=int(self.failed[within].sum()),
             crash_rate_if_failed_had_crashed=float(p[within] @ worst_share[within]),
-            n_episodes_outside=int(self.tests[outside].sum()),
+            n_episodes_outside=int(tests.sum()),
             n_crashes_outside=crashes_outside,
             n_failed_outside=int(self.failed[outside].sum()),
             refuted=crashes_outside > 0,
-            upper_bound_outside=float((p[outside] * high).sum()),
+            upper_bound_outside=bound,
         )
 
     def _shells(self, tail: float) -> tuple[Shell, ...]:

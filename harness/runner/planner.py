@@ -21,18 +21,19 @@ from harness.estimators import Shells, StopRule, accumulator
 from harness.estimators.block import Block
 from harness.estimators.estimate import BothWays, Estimate
 from harness.estimators.intervals import clopper_pearson
+from harness.estimators.likelihood_ratio import Level
 from harness.estimators.shells import combined
 from harness.pool.shells import Draw, PrescribedEpisodes
 from harness.runner.worker import ShardSpec
 from harness.strata import ShellDesign
 
-GROWTH = 1.25
+GROWTH = 1.1
 """Tests after a round over tests before it; also the distance of the looks at the result."""
 CONDITIONAL_RHW = 0.3
 """Relative half-width of the conditional statement at which testing turns to what lies outside."""
 CONFIDENCE = 0.9
 """Level at which widths are compared, whatever the campaign reports."""
-_TAIL = (1.0 - CONFIDENCE) / 2.0
+_TAIL, _LEVEL = (1.0 - CONFIDENCE) / 2.0, Level.two_sided(CONFIDENCE)
 MOST_FIRST_TESTS = 4
 """Testing turns to what lies outside after this many times the first tests, known or not."""
 SMALLEST_ROUND = 8
@@ -177,7 +178,7 @@ class Allocation:
         if self.conditional_only:
             return inside
         d, s = self.design, slice(0, self.design.n_inside)
-        inner = combined(d.p[s], crashes[s], tests[s], d.moments[s, s], d.n_paths, _TAIL, failed[s])
+        inner = combined(d.p[s], crashes[s], tests[s], d.moments[s, s], d.n_paths, _LEVEL, failed[s])
         known = inner.rhw <= CONDITIONAL_RHW
         exhausted = bool(np.all(tests[s] >= self.available[s]))
         started = bool(np.any(tests[d.n_inside :] > 0))
@@ -214,9 +215,9 @@ class Allocation:
 
 
 class RoundRule:
-    """Looks after each round, and is content with one pass: looks are 1.25 apart, not 1.1.
+    """Looks after each round, and is content with one pass.
 
-    That limits within shells are exact at a fixed number of tests says nothing about the number at which a rule stops;
+    That limits within shells hold at a fixed number of tests says nothing about the number at which a rule stops;
     that intervals cover there, and how far the rate is biased, is measured (docs/estimators.md).
 
     Parameters

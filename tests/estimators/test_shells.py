@@ -1,4 +1,4 @@
-"""Shells: exact limits per stratum, combined; counts that merge; statements that say what they rest on."""
+"""Shells: limits of the weighted sum; counts that merge; statements that say what they rest on."""
 
 import itertools
 import json
@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import binom
 
 from harness.estimators import Estimate, one_pass
-from harness.estimators.intervals import clopper_pearson
+from harness.estimators.likelihood_ratio import Level, likelihood_limit
 from harness.estimators.shells import combined, pool_variance
 from harness.estimators.statement import conditional_statement, statement
 
@@ -28,34 +28,27 @@ def shells_estimate(*rows: tuple[int, int, int, int], **settings) -> Estimate:
     return one_pass([replace(block, **settings)], ("shells",)).headline_estimate
 
 
-def test_one_stratum_has_the_clopper_pearson_interval():
-    one = np.array([0.25])
-    for crashes in (0, 1, 7, 20):
-        limits = combined(one, np.array([crashes]), np.array([20]), np.zeros((1, 1)), 1, 0.05)
-        low, high = clopper_pearson(crashes, 20, 0.05)
-        assert (limits.low, limits.high) == pytest.approx((0.25 * low, 0.25 * high), rel=1e-12, abs=1e-15)
+LEVEL = Level.two_sided(0.9)
 
 
-def test_limits_combine_as_written_down_by_hand():
-    crashes, tests = np.array([5, 0, 0]), np.array([10, 10, 100])
-    low, high = clopper_pearson(crashes, tests, 0.05)
-    limits = combined(P, crashes, tests, EXACT, 10**9, 0.05)
+def test_limits_without_an_error_of_the_pool_are_those_of_the_likelihood_ratio():
+    crashes, tests, failed = np.array([5, 0, 0]), np.array([10, 10, 100]), np.array([1, 0, 2])
+    limits = combined(P, crashes, tests, EXACT, 10**9, LEVEL, failed)
     assert limits.rate == pytest.approx(5e-5)
-    assert limits.low == pytest.approx(5e-5 - 1e-4 * (0.5 - low[0]))
-    up = np.sqrt((1e-4 * (high[0] - 0.5)) ** 2 + (3e-4 * high[1]) ** 2 + (2e-2 * high[2]) ** 2)
-    assert limits.high == pytest.approx(5e-5 + up)
+    assert limits.low == pytest.approx(likelihood_limit(P, crashes, tests, LEVEL, -1.0), rel=1e-6)
+    assert limits.high == pytest.approx(likelihood_limit(P, crashes + failed, tests, LEVEL, 1.0), rel=1e-6)
 
 
 def test_an_untested_stratum_may_hold_anything():
-    limits = combined(P, np.array([5, 5, 0]), np.array([10, 10, 0]), EXACT, 10**9, 0.05)
+    limits = combined(P, np.array([5, 5, 0]), np.array([10, 10, 0]), EXACT, 10**9, LEVEL)
     assert limits.high >= P[2]
 
 
 def test_the_error_of_the_pool_widens_the_interval():
     crashes, tests = np.array([5, 5, 5]), np.array([10, 10, 10])
     moments = np.diag(P * P) * 50.0
-    exact = combined(P, crashes, tests, EXACT, 10**9, 0.05)
-    rough = combined(P, crashes, tests, moments, 100, 0.05)
+    exact = combined(P, crashes, tests, EXACT, 10**9, LEVEL)
+    rough = combined(P, crashes, tests, moments, 100, LEVEL)
     assert rough.rate == exact.rate
     assert rough.high - rough.rate > 1.5 * (exact.high - exact.rate)
 
@@ -98,7 +91,9 @@ def test_failed_tests_outside_are_not_taken_for_safe_ones():
     conditional = estimate.details["conditional"]
     assert (conditional["n_failed"], conditional["n_failed_outside"]) == (2, 4)
     assert conditional["crash_rate_if_failed_had_crashed"] == pytest.approx(1e-4)
-    assert conditional["upper_bound_outside"] == pytest.approx(P[2] * clopper_pearson(4, 400, 0.1)[1])
+    assert conditional["upper_bound_outside"] == pytest.approx(
+        likelihood_limit(P[2:], np.array([4]), np.array([400]), Level.one_sided(0.9, 400), 1.0)
+    )
     text = conditional_statement(estimate)
     assert "2 FAILED: they count as no crash in the rate and as crashes in the upper limit. Had they all cras" in text
     assert "the rate would be 0.0001." in text
@@ -149,13 +144,13 @@ def test_others_are_refused():
     assert "testing.method shells" in one_pass([other], ("shells",)).estimates["shells"].reason
 
 
-def coverage(tests: np.ndarray, share: np.ndarray, tail: float = 0.05) -> float:
+def coverage(tests: np.ndarray, share: np.ndarray) -> float:
     """Exact probability that the interval covers, by summing over all outcomes of three strata."""
     truth, covered = float(P @ share), 0.0
     for crashes in itertools.product(*(range(n + 1) for n in tests)):
         chance = np.prod(binom.pmf(crashes, tests, share))
         if chance > 1e-9:
-            limits = combined(P, np.array(crashes), tests, EXACT, 10**9, tail)
+            limits = combined(P, np.array(crashes), tests, EXACT, 10**9, LEVEL)
             covered += chance * (limits.low <= truth * (1 + 1e-12) and truth <= limits.high * (1 + 1e-12))
     return float(covered)
 
@@ -172,6 +167,6 @@ def test_without_the_empty_stratum_it_does_not():
     without = P * [1.0, 1.0, 0.0]
     truth, covered = float(P @ share), 0.0
     for b in range(13):
-        limits = combined(without, np.array([12, b, 0]), tests, EXACT, 10**9, 0.05)
+        limits = combined(without, np.array([12, b, 0]), tests, EXACT, 10**9, LEVEL)
         covered += binom.pmf(b, 12, 0.3) * (limits.low <= truth <= limits.high)
     assert covered < 0.5
