@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 
 from harness.arrays import RecordArray
 from harness.campaign.loading import names_a_file
-from harness.campaign.models import FVDM, IDM, Constant, Reflexes
+from harness.campaign.models import FVDM, IDM, CarefulCompetent, Constant, FuzzySafety, NeedBased, Reflexes
 from harness.campaign.problems import read_model
 from harness.campaign.section import Section, SurrogateName, broken_rule
 from harness.errors import CampaignError
@@ -39,7 +39,28 @@ class LibraryConstant(Constant):
     reaction: Reflexes = Reflexes()
 
 
-LibraryDriver = Annotated[LibraryIDM | LibraryFVDM | LibraryConstant, Field(discriminator="model")]
+class LibraryCarefulCompetent(CarefulCompetent):
+    """A careful and competent human driver with its reflexes."""
+
+    reaction: Reflexes = Reflexes()
+
+
+class LibraryFuzzySafety(FuzzySafety):
+    """A driver by the fuzzy safety model with its reflexes."""
+
+    reaction: Reflexes = Reflexes()
+
+
+class LibraryNeedBased(NeedBased):
+    """A driver that brakes once it needs to, with its reflexes."""
+
+    reaction: Reflexes = Reflexes()
+
+
+LibraryDriver = Annotated[
+    LibraryIDM | LibraryFVDM | LibraryConstant | LibraryCarefulCompetent | LibraryFuzzySafety | LibraryNeedBased,
+    Field(discriminator="model"),
+]
 
 
 class Library(Section):

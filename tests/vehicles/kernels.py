@@ -6,7 +6,7 @@ import numpy as np
 
 from harness.campaign.models import IDMParameters
 from harness.compiled import compiled_threads
-from harness.vehicles import kinematics, models
+from harness.vehicles import kinematics, models, reaction
 
 
 @compiled_threads
@@ -25,18 +25,19 @@ def _motions(situations, out):
 
 @compiled_threads
 def _follow(driver, seed, episode, situations, out):
-    late = models.reaction_steps(driver[0], seed, episode)
-    a = 0.0
+    late = reaction.reaction_steps(driver[0], seed, episode)
+    memory = reaction.nothing_yet()
     for i in range(situations.shape[0]):
         if i > late:
-            a = models.reacting_acceleration(driver[0], a, situations[i, 0], situations[i, 1], situations[i, 2])
-        out[i] = a
+            v, v_lead, gap = situations[i]
+            memory = reaction.react(driver[0], memory, i - late - 1, v, v_lead, gap)
+        out[i] = memory.acceleration
 
 
 @compiled_threads
 def _late(driver, seed, first, out):
     for i in range(out.size):
-        out[i] = models.reaction_steps(driver[0], seed, first + i)
+        out[i] = reaction.reaction_steps(driver[0], seed, first + i)
 
 
 def accelerations(parameters, situations):
