@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import ndtr
 
-from harness.arrays import FloatArray, IntArray
+from harness.arrays import BoolArray, FloatArray, IntArray
 from harness.estimators.intervals import clopper_pearson
 from harness.estimators.likelihood_ratio import Level, likelihood_limit
 
@@ -59,11 +59,18 @@ class Tally(NamedTuple):
         counts = self.tests[strata], self.crashes[strata], self.failed[strata]
         return Tally(*counts, self.crash_mass[strata, strata], self.failed_mass[strata, strata])
 
-    def failed_as_crashes(self) -> Tally:
-        """The same tests, had all failed ones crashed."""
-        nothing = np.zeros_like(self.failed), np.zeros_like(self.failed_mass)
-        mass = self.crash_mass + self.failed_mass
-        return Tally(self.tests, self.crashes + self.failed, nothing[0], mass, nothing[1])
+    def joined(self, groups: FloatArray) -> Tally:
+        """That of groups of strata: ``groups``, shape (S, G), is 1 where a stratum belongs to one."""
+        tests, crashes, failed = (np.rint(each @ groups).astype(np.int64) for each in self[:3])
+        return Tally(tests, crashes, failed, groups.T @ self.crash_mass @ groups, groups.T @ self.failed_mass @ groups)
+
+    def failed_as_crashes(self, where: BoolArray | None = None) -> Tally:
+        """The same tests, had all failed ones crashed; with ``where``, shape (S,) bool, those of some strata alone."""
+        counted = np.ones(self.tests.size, np.bool_) if where is None else where
+        failed, mass = self.failed * counted, self.failed_mass * counted[:, None]
+        return Tally(
+            self.tests, self.crashes + failed, self.failed - failed, self.crash_mass + mass, self.failed_mass - mass
+        )
 
     @property
     def share(self) -> FloatArray:
@@ -97,12 +104,15 @@ def pool_variance(p: FloatArray, tally: Tally, n_paths: int, factor: FloatArray 
     factor : ndarray, shape (S,)
         By which crashes of each stratum are fewer than seen.
     """
-    scale = p / tally.at_least_one * factor
-    bound = scale[:, None] * tally.crash_mass
+    rate = float((p * factor) @ tally.share)
+    return max(mean_square(p, tally, factor) - rate * rate, 0.0) / n_paths
+
+
+def mean_square(p: FloatArray, tally: Tally, factor: FloatArray | float = 1.0) -> float:
+    """What the mean square of a path's probability of a crash is at most, as `pool_variance` estimates it."""
+    bound = (p / tally.at_least_one * factor)[:, None] * tally.crash_mass
     own = np.sqrt(np.diag(bound))
-    squares = float(np.minimum(np.minimum(bound, bound.T), np.outer(own, own)).sum())
-    rate = float(scale @ tally.crashes)
-    return max(squares - rate * rate, 0.0) / n_paths
+    return float(np.minimum(np.minimum(bound, bound.T), np.outer(own, own)).sum())
 
 
 def combined(p: FloatArray, tally: Tally, n_paths: int, level: Level) -> Limits:

@@ -14,11 +14,11 @@ from harness.controllers.loading import build_host, require_controller
 from harness.criticality.tables import Tables, build_tables, tables_cached
 from harness.environment.driving import Environment
 from harness.environment.initial_state import InitialStates
-from harness.episode.loop import MOMENT_LIMITS, EpisodeLoop, Keep, Policy
+from harness.episode.loop import MOMENT_LIMITS, NOBODY, EpisodeLoop, Keep, Policy
 from harness.episode.trajectory import empty_trajectory, mean_test_distance
 from harness.errors import RunFolderError
 from harness.importance.build import build_importance, needs_tables
-from harness.pool.shells import PrescribedEpisodes, require_boundary
+from harness.pool.shells import PrescribedEpisodes, checked_boundary
 from harness.pool.storage import campaign_pool, campaign_pool_key, pool_path
 from harness.progress import Progress, SilentProgress
 from harness.records.folder import SHELLS, read_json
@@ -85,8 +85,7 @@ def require_ready(campaign: Campaign) -> Resolved:
         require_private(campaign.av.traci)
     resolved = resolve(campaign, controller_sha256)
     if campaign.testing.method == "shells":
-        library = resolved.library
-        require_boundary(campaign.testing.shells.boundary or library.boundary, tuple(library.surrogates))
+        resolved.library.statement_settings(campaign.testing.shells)
     return resolved
 
 
@@ -115,7 +114,8 @@ def prepare(resolved: Resolved, progress: Progress | None = None) -> Prepared:
             if not pool_path(campaign_pool_key(resolved)).is_file():
                 compile_kernels(resolved)
             prescribed = PrescribedEpisodes(campaign, pooling.result())
-    policy = Policy(campaign.seed, environment, build_importance(campaign, tables), resolved.av)
+    boundary = NOBODY if prescribed is None else checked_boundary(resolved.library, prescribed.design)
+    policy = Policy(campaign.seed, environment, build_importance(campaign, tables), resolved.av, boundary)
     return Prepared(campaign, policy, InitialStates(environment.numbers), tables, prescribed)
 
 

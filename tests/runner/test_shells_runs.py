@@ -17,7 +17,7 @@ from harness.runner import compare_campaigns
 from harness.runner.campaign_run import episodes_on_disk
 from harness.runner.manifest import Manifest, Prefix
 from harness.runner.planner import GROWTH, Allocation, round_specs
-from harness.strata import ShellDesign
+from harness.strata import ShellDesign, Statement
 from tests.pool.conftest import SMALL_POOL
 from tests.runner.stored_runs import copy_of, manifest, shard_files, stored_table, unlike_columns
 
@@ -239,7 +239,7 @@ def test_comparing_is_refused(campaign, tmp_path):
 
 DESIGN = ShellDesign(
     pool="0" * 24, strata=("a", "b", "outside"), cell_stratum=(0, 1, 2), cell_p=np.array([1e-7, 2e-7, 3e-5]),
-    n_paths=10**9, n_inside=2, boundary="b", p_cut_in=4e-5, p_impossible=0.0,
+    n_paths=10**9, statements=(Statement("library", "b", "keeps to b", 2),), p_cut_in=4e-5, p_impossible=0.0,
 )  # fmt: skip
 
 
