@@ -49,8 +49,8 @@ class Tally(NamedTuple):
     """
 
     tests: IntArray
-    crashes: IntArray
-    failed: IntArray
+    crashes: IntArray | FloatArray
+    failed: IntArray | FloatArray
     crash_mass: FloatArray
     failed_mass: FloatArray
 
@@ -64,6 +64,12 @@ class Tally(NamedTuple):
         nothing = np.zeros_like(self.failed), np.zeros_like(self.failed_mass)
         mass = self.crash_mass + self.failed_mass
         return Tally(self.tests, self.crashes + self.failed, nothing[0], mass, nothing[1])
+
+    def scaled(self, tests: IntArray) -> Tally:
+        """What so many tests of each stratum are expected to come to."""
+        scale = tests / self.at_least_one
+        mass = self.crash_mass * scale[:, None], self.failed_mass * scale[:, None]
+        return Tally(tests, self.crashes * scale, self.failed * scale, *mass)
 
     @property
     def share(self) -> FloatArray:
