@@ -14,7 +14,7 @@ from scipy.special import ndtr
 
 from harness.arrays import FloatArray, IntArray
 from harness.estimators.intervals import clopper_pearson
-from harness.estimators.likelihood_ratio import Level, likelihood_limit
+from harness.estimators.likelihood_ratio import Counts, Level, likelihood_limit
 
 
 class Limits(NamedTuple):
@@ -49,8 +49,8 @@ class Tally(NamedTuple):
     """
 
     tests: IntArray
-    crashes: IntArray | FloatArray
-    failed: IntArray | FloatArray
+    crashes: Counts
+    failed: Counts
     crash_mass: FloatArray
     failed_mass: FloatArray
 

@@ -192,7 +192,7 @@ class Allocation:
         watched = slice(0, self.design.n_inside if self.conditional_only else p.size)
 
         def tests(factor: float) -> IntArray:
-            return np.minimum(np.ceil(factor * first.tests).astype(np.int64), available)
+            return np.asarray(np.minimum(np.ceil(factor * first.tests).astype(np.int64), available))
 
         def too_wide(factor: float) -> bool:
             expected = first.scaled(tests(factor)).part(watched)
