@@ -63,6 +63,11 @@ class ShellSettings(Section):
         description="what has to reach stop.rhw: assumption_free, library, or one of the statements, beyond whose "
         "boundary nothing is tested then",
     )
+    stopping: Literal["sequential", "two_phase"] = Field(
+        "sequential",
+        description="sequential: stop at the first interval that is narrow enough, which biases a rate that is only "
+        "roughly known; two_phase: first tests plan how many more there are, and these alone are reported",
+    )
     first_tests: Annotated[int, Field(ge=1, le=10_000), BeforeValidator(whole)] | None = Field(
         None, description="tests of each shell before any is preferred; by its probability"
     )

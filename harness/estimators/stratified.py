@@ -14,7 +14,7 @@ from scipy.special import ndtr
 
 from harness.arrays import BoolArray, FloatArray, IntArray
 from harness.estimators.intervals import clopper_pearson
-from harness.estimators.likelihood_ratio import Level, likelihood_limit
+from harness.estimators.likelihood_ratio import Counts, Level, likelihood_limit
 
 
 class Limits(NamedTuple):
@@ -49,8 +49,8 @@ class Tally(NamedTuple):
     """
 
     tests: IntArray
-    crashes: IntArray
-    failed: IntArray
+    crashes: Counts
+    failed: Counts
     crash_mass: FloatArray
     failed_mass: FloatArray
 
@@ -71,6 +71,12 @@ class Tally(NamedTuple):
         return Tally(
             self.tests, self.crashes + failed, self.failed - failed, self.crash_mass + mass, self.failed_mass - mass
         )
+
+    def scaled(self, tests: IntArray) -> Tally:
+        """What so many tests of each stratum are expected to come to."""
+        scale = tests / self.at_least_one
+        mass = self.crash_mass * scale[:, None], self.failed_mass * scale[:, None]
+        return Tally(tests, self.crashes * scale, self.failed * scale, *mass)
 
     @property
     def share(self) -> FloatArray:
