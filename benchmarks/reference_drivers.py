@@ -2,8 +2,8 @@
 
     python -m benchmarks.reference_drivers
 
-One line per driver: its crashes per test, and the share of the crash rate of three IDM vehicles, as careful as the default
-one, 0.6 s late and 1 s late, that falls on cut-ins on which it does not crash. Standard errors behind ±.
+One line per driver: its crashes per test, and the share of the crash rate of three IDM vehicles, the default one, and
+0.6 s and 1 s late, that falls on cut-ins on which it does not crash. Standard errors behind ±.
 """
 
 from __future__ import annotations
