@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
-from harness.campaign.section import Positive, Probability, Section, StepTime
+from harness.campaign.section import Positive, Probability, Section, StepTime, broken_rule
 
 MAX_CONFIGURED_SPEED_MPS = 60.0
 
@@ -113,7 +113,7 @@ class CarefulCompetentParameters(Reference):
         2.0, le=20.0, description="time to collision below which it brakes [JRC-FSM: CC_critical_ttc]"
     )
     coasting_mps2: float = Field(
-        0.4, ge=0.0, le=20.0, description="deceleration off the accelerator, until it brakes [JRC-FSM]"
+        0.4, ge=0.0, le=5.0, description="deceleration off the accelerator, until it brakes [JRC-FSM]"
     )
 
 
@@ -135,6 +135,17 @@ class FuzzySafetyParameters(Reference):
     safe_margin_m: Positive = Field(
         2.0, le=50.0, description="gap beyond the safe one that is felt as safe [JRC-FSM: FSM_margin_safe_dist]"
     )
+
+    @model_validator(mode="after")
+    def _hard_is_harder(self) -> Self:
+        if self.hard_braking_mps2 < self.comfortable_braking_mps2:
+            raise broken_rule(
+                "hard_braking_mps2",
+                found=f"{self.hard_braking_mps2:g}, below comfortable_braking_mps2 {self.comfortable_braking_mps2:g}",
+                expected="at least as much: it brakes the harder the greater the danger",
+                mend="Exchange them, or make them equal.",
+            )
+        return self
 
 
 class NeedBasedParameters(Section):

@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 
 from harness.arrays import RecordArray
 from harness.campaign.loading import names_a_file
-from harness.campaign.models import FVDM, IDM, CarefulCompetent, Constant, FuzzySafety, NeedBased, Reflexes
+from harness.campaign.models import FVDM, IDM, CarefulCompetent, Constant, FuzzySafety, NeedBased, Reference, Reflexes
 from harness.campaign.problems import read_model
 from harness.campaign.section import Section, SurrogateName, broken_rule
 from harness.campaign.testing import ShellSettings, StatementSettings, checked_statements
@@ -97,6 +97,15 @@ class Library(Section):
         """The surrogates and then the references as kernels read them, in the order of the file, shape (D + R,)."""
         models = [*self.surrogates.values(), *self.references.values()]
         return driver_records([model.parameters for model in models], [model.reaction for model in models])
+
+    @property
+    def delays_after_cut_in_s(self) -> dict[str, float]:
+        """How long after a dangerous cut-in each reference driver begins to brake (s), by name."""
+        return {
+            name: model.parameters.delay_after_cut_in_s + model.reaction.delay_s
+            for name, model in self.surrogates.items()
+            if isinstance(model.parameters, Reference)
+        }
 
     @property
     def envelope_mps2(self) -> float:

@@ -33,8 +33,8 @@ from harness.campaign.models import (
 from harness.compiled import compiled_inline
 
 IDM_KIND, FVDM_KIND, CONSTANT_KIND = 0, 1, 2
-CAREFUL_COMPETENT_KIND, FUZZY_SAFETY_KIND, NEED_BASED_KIND = 3, 4, 5
-"""Those that remember a danger come last."""
+CAREFUL_COMPETENT_KIND, FUZZY_SAFETY_KIND, NEED_BASED_KIND = -1, -2, -3
+"""Below zero: those that remember a danger."""
 SMALLEST_GAP_M = 0.1
 """Gap below which the models see this gap: they divide by it."""
 

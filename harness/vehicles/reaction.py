@@ -8,7 +8,7 @@ from harness.arrays import FloatArray, IntArray, Record, RecordArray
 from harness.compiled import compiled_inline, compiled_threads
 from harness.random_stream import AV_DRAWS, uniform
 from harness.vehicles.kinematics import STEP_S
-from harness.vehicles.models import CAREFUL_COMPETENT_KIND, CONSTANT_KIND, FUZZY_SAFETY_KIND, driver_acceleration
+from harness.vehicles.models import CAREFUL_COMPETENT_KIND, FUZZY_SAFETY_KIND, driver_acceleration
 from harness.vehicles.references import Memory, careful_competent, fuzzy_safety, need_based
 
 
@@ -33,7 +33,7 @@ def react(driver: Record, memory: Memory, step: int, speed: float, lead_speed: f
     ``step`` counts from 0, the first one in which it acts.
     """
     danger = memory.danger
-    if driver.kind <= CONSTANT_KIND:
+    if driver.kind >= 0:
         wanted = driver_acceleration(driver, speed, lead_speed, gap)
     elif driver.kind == CAREFUL_COMPETENT_KIND:
         wanted, danger = careful_competent(driver, memory, step, speed, lead_speed, gap)

@@ -48,7 +48,8 @@ def changing(part: float, before: float, after: float) -> float:
 def following(driver: Record, speed: float, lead_speed: float, gap: float) -> float:
     """Acceleration (m/s²) of the IDM by which a reference driver follows."""
     wanted = idm_acceleration(driver, speed, lead_speed, max(gap, SMALLEST_GAP_M))
-    return float(min(max(wanted, driver.following_min_acceleration_mps2), driver.max_acceleration_mps2))
+    hardest = max(driver.following_min_acceleration_mps2, driver.min_acceleration_mps2)
+    return float(min(max(wanted, hardest), driver.max_acceleration_mps2))
 
 
 @compiled_inline
@@ -78,11 +79,13 @@ def careful_competent(
         danger = math.inf
     elif danger == math.inf and gap < driver.critical_ttc_s * (speed - lead_speed):
         danger = first_perceived(driver, step)
-    idle = 0.0 if danger == math.inf else -driver.coasting_mps2
+    idle = 0.0 if danger == math.inf else max(-driver.coasting_mps2, driver.min_acceleration_mps2)
     follows = built_up(driver, memory, idle, following(driver, speed, lead_speed, gap))
-    brakes = built_up(driver, memory, idle, driver.min_acceleration_mps2)
     a = changing(part_after(step, -driver.used_up_steps, driver.reaction_steps), idle, follows)
-    return min(a, changing(part_after(step, danger, driver.reaction_steps), idle, brakes)), danger
+    if danger < math.inf:
+        brakes = built_up(driver, memory, idle, driver.min_acceleration_mps2)
+        a = min(a, changing(part_after(step, danger, driver.reaction_steps), idle, brakes))
+    return a, danger
 
 
 @compiled_inline
@@ -147,9 +150,9 @@ def fuzzy_safety(
     if wanted > 0.0 and danger == math.inf:
         danger = first_perceived(driver, step)
     follows = built_up(driver, memory, 0.0, following(driver, speed, lead_speed, gap))
-    brakes = built_up(driver, memory, 0.0, max(-wanted, driver.min_acceleration_mps2))
     a = changing(part_after(step, -driver.used_up_steps, driver.reaction_steps), 0.0, follows)
     if wanted > 0.0:
+        brakes = built_up(driver, memory, 0.0, max(-wanted, driver.min_acceleration_mps2))
         a = min(a, changing(part_after(step, danger, driver.reaction_steps), 0.0, brakes))
     return a, danger
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from harness.campaign.models import IDMParameters
 from harness.compiled import compiled_threads
-from harness.vehicles import kinematics, models, reaction
+from harness.vehicles import kinematics, models, reaction, references
 
 
 @compiled_threads
@@ -68,4 +68,41 @@ def steps_late(reflexes, n, *, seed=0, first=0):
     """Steps between cut-in and reaction in consecutive episodes (n,)."""
     out = np.empty(n, np.int64)
     _late(models.driver_records([IDMParameters()], [reflexes]), seed, first, out)
+    return out
+
+
+@compiled_threads
+def _approach(driver, v, v_lead, gaps, steps, out):
+    for k in range(gaps.size):
+        gap, speed, out[k] = gaps[k], v, gaps[k]
+        memory = reaction.nothing_yet()
+        for step in range(steps):
+            memory = reaction.react(driver[0], memory, step, speed, v_lead, gap)
+            after = kinematics.next_speed(speed, memory.acceleration)
+            gap += (v_lead - 0.5 * (speed + after)) * kinematics.STEP_S
+            speed = after
+            out[k] = min(out[k], gap)
+
+
+def smallest_gaps(parameters, v, v_lead, gaps, *, steps=150):
+    """Smallest gap (n,) within some steps behind a vehicle that keeps its speed, from the gaps (n,) after a cut-in."""
+    gaps = np.asarray(gaps, float)
+    out = np.empty(gaps.size)
+    _approach(models.driver_records([parameters]), v, v_lead, gaps, steps, out)
+    return out
+
+
+@compiled_threads
+def _fuzzy_metrics(driver, situations, out):
+    for i in range(situations.shape[0]):
+        v, v_lead, gap, a = situations[i]
+        out[i, 0] = references.proactive_metric(driver[0], v, v_lead, gap)
+        out[i, 1] = references.critical_metric(driver[0], v, v_lead, gap, a)
+
+
+def fuzzy_metrics(parameters, situations):
+    """PFS and CFS (n, 2) at speed, leader's speed, gap and acceleration: (n, 4)."""
+    situations = np.atleast_2d(np.asarray(situations, float))
+    out = np.empty((len(situations), 2))
+    _fuzzy_metrics(models.driver_records([parameters]), situations, out)
     return out
