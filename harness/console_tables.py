@@ -115,9 +115,9 @@ def print_pool(content: dict[str, Any]) -> None:
 def print_statements(content: dict[str, Any]) -> None:
     """Print the answer in a sentence, what else is stated under which assumption, and what all this is about."""
     click.echo(content["statement"])
-    for name, sentence in content["boundary_statements"].items():
+    for name, sentence in content.get("boundary_statements", {}).items():
         click.echo(f"Statement {name}: {sentence}")
-    for sentence in (*content["reference_statements"][1:], content["scope"]):
+    for sentence in (*content.get("reference_statements", [])[1:], content["scope"]):
         click.echo(sentence)
 
 

@@ -34,22 +34,21 @@ def build_pool(
     pilot = Enumerator(environment, library.drivers, names.index(library.envelope), settings.seed ^ _APART)
     progress.stage("pool: pilot", PILOT_PATHS)
     rates = pilot.run(0, PILOT_PATHS, progress).rates(len(names))
-    careful = _careful(rates, names.index(library.boundary), [names.index(name) for name in library.boundaries])
+    careful = _careful(rates, names.index(library.boundary))
     share = np.where(careful, 1.0, CARELESS_SHARE)
     aimed = pilot.aimed(rates, share)
     paths = _until_known(aimed, rates, careful, settings, progress)
     return _pool(paths, aimed, library, settings, key, environment_hash(environment))
 
 
-def _careful(rates: FloatArray, boundary: int, boundaries: list[int]) -> BoolArray:
+def _careful(rates: FloatArray, boundary: int) -> BoolArray:
     """Which columns (surrogates, and the cut-in) are to be known well, shape (D + 1,) bool.
 
-    Those that are no more careless than the widest boundary, and crash in the traffic that the library's own one
-    crashes in.
+    Those that are no more careless than the boundary, and crash in the traffic that it crashes in.
     """
     mean = rates.mean(0)
     relvar = rates.var(0) / np.maximum(mean, np.finfo(np.float64).tiny) ** 2
-    careful: BoolArray = (mean <= mean[boundaries].max()) & (relvar <= FAR_OFF * relvar[boundary])
+    careful: BoolArray = (mean <= mean[boundary]) & (relvar <= FAR_OFF * relvar[boundary])
     return careful
 
 

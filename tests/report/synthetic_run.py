@@ -157,7 +157,7 @@ def _episodes_table(episodes: Episodes, rows: np.ndarray, recipe: RunRecipe) -> 
         "failure": ["the world lost vehicle AV" if outcome == "failed" else None for outcome in c["outcome"]],
     }
     if recipe.method == "shells":
-        columns |= {"cell": c["component"], "cell_mass": [PATH_MASS] * len(rows)}
+        columns |= {"cell": c["component"], "cell_mass": [PATH_MASS] * len(rows), "ahead_step": None}
     n_cells = P.size if recipe.method == "shells" else 0
     return _table(columns, episodes_schema(n_importance, max(n_importance - 1, 0), n_cells))
 

@@ -129,8 +129,10 @@ def test_estimates_of_wrong_types_are_refused(stored):
                 read_run_folder(stored)
 
 
-SHELLS = {"pool": "k", "strata": ["a", "b"], "p": [0.1, 0.2], "moments": [[1, 2], [3, 4]], "n_paths": 3, "n_inside": 1,
-          "boundary": "a", "p_cut_in": 0.3, "p_impossible": 0.0, "available": [1, 2]}  # fmt: skip
+SHELLS = {"pool": "k", "strata": ["a", "b"], "cell_stratum": [0, 1], "cell_p": [0.1, 0.2], "cell_references": [0, 1],
+          "references": [{"name": "r", "described": "a driver", "delay_s": None}], "reference_rate": [0.1],
+          "reference_square": [0.2], "n_paths": 3, "p_cut_in": 0.3, "p_impossible": 0.0, "available": [1, 2],
+          "statements": [{"name": "s", "boundary": "a", "assumes": "b", "n_inside": 1, "checked": False}]}  # fmt: skip
 STOPS = {"a": {"campaign_hash": "x", "stop": {}, "n_episodes": 3, "stopped_by": "rhw"}}
 
 
@@ -138,8 +140,8 @@ STOPS = {"a": {"campaign_hash": "x", "stop": {}, "n_episodes": 3, "stopped_by": 
     ("model", "content", "wrong"),
     [
         *((StoredShells, SHELLS, {key: {}}) for key in SHELLS),
-        (StoredShells, SHELLS, {"p": [0.1]}),
-        (StoredShells, SHELLS, {"moments": [[1, 2]]}),
+        (StoredShells, SHELLS, {"cell_p": [0.1]}),
+        (StoredShells, SHELLS, {"statements": []}),
         *((StoredStops, STOPS, {"a": wrong}) for wrong in (1, [], {}, {**STOPS["a"], "n_episodes": "3"})),
     ],
 )
