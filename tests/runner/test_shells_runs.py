@@ -234,7 +234,7 @@ def test_a_run_of_an_earlier_version_is_told_so(shells_run, tmp_path):
     content = json.loads((folder / "shells.json").read_text())
     del content["statements"]
     (folder / "shells.json").write_text(json.dumps({**content, "n_inside": 6, "boundary": "brakes-2-late-1s"}))
-    with pytest.raises(RunFolderError, match="an earlier version.*Run the campaign again into a new folder"):
+    with pytest.raises(RunFolderError, match=r"an earlier version.*Run the campaign again into a new folder"):
         estimate(folder)
 
 
