@@ -145,9 +145,9 @@ class ShardRunner:
         prescribed = self._prepared.prescribed
         if prescribed is None:
             return self._loop.run(spec.first_episode, self._prepared.states(spec.first_episode, spec.n_episodes))
-        states, traffic, rows = prescribed.episodes(spec.draws)
+        states, traffic, cut_ins = prescribed.episodes(spec.draws)
         shard = self._loop.run(spec.first_episode, states, traffic)
-        shard.cut_ins = rows
+        shard.cut_ins = cut_ins
         return shard
 
     def _repeat(self, shard: Shard) -> Repeated:
