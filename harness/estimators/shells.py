@@ -106,6 +106,13 @@ class Shells:
         self.tally = empty_tally(0)
 
     @classmethod
+    def of(cls, design: ShellDesign, tally: Tally) -> Shells:
+        """From counts."""
+        shells = cls()
+        shells._design, shells.tally = design, tally
+        return shells
+
+    @classmethod
     def refusal(cls, block: Block) -> str | None:
         """Shells must have been drawn from, and their probabilities be known."""
         if block.shells is None or block.stratum is None:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import os
 import threading
 import time
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -23,13 +23,13 @@ from harness.progress import Progress, SilentProgress
 from harness.records.folder import SHELLS, TABLES, shard_files, shards_on_disk, sole_use, write_json, write_shard
 from harness.resolved import Resolved
 from harness.runner.manifest import SMALLEST_FAILED_SAMPLE, Manifest, Prefix, require_no_fewer, require_own_folder
-from harness.runner.planner import planner_of
+from harness.runner.planner import Planner, planner_of
 from harness.runner.prepare import distance_per_test_m, prepare, require_ready, require_same_pool
 from harness.runner.retrace import Retracing
 from harness.runner.shards import ShardPool, stored_shard
 from harness.runner.stored_estimates import estimate_run
 from harness.runner.table_accuracy import table_errors
-from harness.runner.worker import ShardDone
+from harness.runner.worker import ShardDone, ShardSpec
 from harness.stopped_by import StoppedBy, ending
 
 
@@ -96,16 +96,26 @@ def run_campaign(
         earlier = require_own_folder(out, resolved, resume=resume)
         if not shorten:
             require_no_fewer(out, earlier, resolved.campaign.stop.episodes)
-        run = _Run(resolved, out, earlier, workers or os.cpu_count() or 1, progress or SilentProgress(), began)
-        run.run_shards()
+        run = Run(resolved, out, earlier, workers or os.cpu_count() or 1, progress or SilentProgress(), began)
+        run.run_rounds()
         if not shorten:
             require_no_fewer(out, earlier, run.prefix.n_episodes)
             run.discard_uncounted()
         return run.finish()
 
 
-class _Run:
-    """A campaign on its way into a folder, in which nobody but this process writes."""
+class Run:
+    """A campaign on its way into a folder, in which nobody but this process writes.
+
+    Attributes
+    ----------
+    prefix : Prefix
+        What is finished.
+    prescribed : PrescribedEpisodes or None
+        Cut-ins to draw from, where they are prescribed.
+    planner : Planner
+        The campaign's own; another may take its place before the first round.
+    """
 
     def __init__(
         self, resolved: Resolved, out: Path, earlier: dict[str, Any], workers: int, progress: Progress, began: float
@@ -128,19 +138,29 @@ class _Run:
             write_json(out / SHELLS, prepared.prescribed.design.to_json())
         self._retracing = Retracing(resolved)
         self._stored = partial(stored_shard, out, prepared, self._retracing)
-        self._planner = planner_of(self._campaign, prepared.prescribed, held=earlier["n_episodes"])
+        self.prescribed = prepared.prescribed
+        self.planner: Planner = planner_of(self._campaign, prepared.prescribed, held=earlier["n_episodes"])
         self._workers = ShardPool(resolved, workers)
         self.prefix = Prefix()
 
-    def run_shards(self) -> None:
-        """Run shards until the stop rule is content; the manifest follows so that an interrupted run can be read."""
+    def run_rounds(self) -> None:
+        """Run rounds of shards until the stop rule is content."""
         self._progress.stage("episodes", self._campaign.stop.episodes, done=episodes_on_disk(self._out))
+        with self.under_way():
+            for specs in self.planner.rounds():
+                if self.run_round(specs):
+                    break
+
+    def run_round(self, specs: Iterator[ShardSpec]) -> bool:
+        """Run the shards of a round; True, at once, when the campaign is to stop."""
+        return any(self._is_enough(done) for done in self._workers.run(specs, self._stored))
+
+    @contextmanager
+    def under_way(self) -> Iterator[None]:
+        """Rounds are run within this: the manifest follows, so that an interrupted run can be read, and workers end."""
         threading.Thread(target=import_module, args=("harness.report",), daemon=True).start()
         try:
-            rounds = (self._workers.run(specs, self._stored) for specs in self._planner.rounds())
-            for done in chain.from_iterable(rounds):
-                if self._is_enough(done):
-                    break
+            yield
             self.prefix.require_few_failed(self._campaign)
         except BaseException:
             self._manifest.write(self.prefix, "interrupted")
@@ -155,7 +175,7 @@ class _Run:
             write_shard(self._out, done.spec.index, done.parquet)
         self.prefix.add(done, shard_files(self._out, done.spec.index))
         self.prefix.require_few_failed(self._campaign, at_least=SMALLEST_FAILED_SAMPLE)
-        enough = self._planner.add(done.block)
+        enough = self.planner.add(done.block)
         self._progress.advance(done.spec.n_episodes if done.parquet else 0)
         self._progress.status(**self._figures())
         self._manifest.follow(self.prefix)
@@ -167,9 +187,9 @@ class _Run:
         Only what a rule asks for is called ``rhw``: a bar reckons from it when the campaign will stop.
         """
         watched = "half_width" if self._campaign.stop.rhw is None else "rhw"
-        figures: dict[str, int | float] = {"crashes": self.prefix.n_crashes, watched: self._planner.rule.rhw}
+        figures: dict[str, int | float] = {"crashes": self.prefix.n_crashes, watched: self.planner.rule.rhw}
         weighted = SAMPLING[self._campaign.testing.method].forces
-        return figures | ({"heaviest": self._planner.rule.heaviest} if weighted else {})
+        return figures | ({"heaviest": self.planner.rule.heaviest} if weighted else {})
 
     def discard_uncounted(self) -> None:
         """Remove shards that an earlier, longer run has left beyond the stop."""
@@ -179,7 +199,7 @@ class _Run:
 
     def finish(self) -> RunResult:
         """Write manifest, estimates and report."""
-        stop, rule, n = self._campaign.stop, self._planner.rule, self.prefix.n_episodes
+        stop, rule, n = self._campaign.stop, self.planner.rule, self.prefix.n_episodes
         stopped_by = self._stopped_by()
         said = ending(stopped_by, n, rule.waited_for, precision_asked=stop.rhw is not None)
         retraced = self._retracing.summary(self.prefix.n_retraced)
@@ -195,7 +215,7 @@ class _Run:
         return RunResult(self._out, report, estimates, stopped_by, said, EXIT_BUDGET_SPENT if missed else EXIT_DONE)
 
     def _stopped_by(self) -> StoppedBy:
-        rule = self._planner.rule
+        rule = self.planner.rule
         if rule.reached:
             return "rhw"
         if rule.pool_error_above_target:  # whatever else is spent: more of it would not help

@@ -82,7 +82,7 @@ class ShellCampaign:
         design = drawn.design
         available = np.full(design.p.size, self.campaign.pool.cut_ins_per_shell, np.int64)
         planner = ShellPlanner(self.campaign, design, available)
-        inside, conditional = RoundRule(_conditional(self.campaign)), None
+        inside, conditional = RoundRule(conditional_campaign(self.campaign)), None
         estimate: Estimate | None = None
         enough = False
         while not enough and (added := planner.next_round()).any():
@@ -99,7 +99,8 @@ class ShellCampaign:
         yield conditional or _conditional_row(estimate, replication, reached=False)
 
 
-def _conditional(campaign: Campaign) -> Campaign:
+def conditional_campaign(campaign: Campaign) -> Campaign:
+    """The campaign with the conditional statement to be made precise."""
     shells = campaign.testing.shells.model_copy(update={"statement": "conditional"})
     return campaign.model_copy(update={"testing": campaign.testing.model_copy(update={"shells": shells})})
 
