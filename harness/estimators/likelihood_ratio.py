@@ -31,6 +31,8 @@ from scipy.special import ndtri
 from harness.arrays import FloatArray, IntArray
 from harness.compiled import compiled
 
+Counts = IntArray | FloatArray
+"""Of outcomes; where tests are planned, expected ones."""
 MARGIN = 0.395
 """Two-sided threshold for few crashes, ln(1/tail) less this: 2.60, 3.29 and 4.90 at 0.90, 0.95 and 0.99 (measured)."""
 FEW_TESTS = 9
@@ -77,7 +79,7 @@ class Level(NamedTuple):
 
 
 def likelihood_limit(
-    weights: FloatArray, crashes: IntArray, tests: IntArray, level: Level, side: float, variance: float = 0.0
+    weights: FloatArray, crashes: Counts, tests: IntArray, level: Level, side: float, variance: float = 0.0
 ) -> float:
     """One limit of Σ w_s θ_s, θ_s being the share of tests that crash.
 
@@ -93,7 +95,7 @@ def likelihood_limit(
     return contrast_limit(of_outcomes, np.column_stack([crashes, tests - crashes]), level, side, variance)
 
 
-def contrast_limit(weights: FloatArray, counts: IntArray, level: Level, side: float, variance: float = 0.0) -> float:
+def contrast_limit(weights: FloatArray, counts: Counts, level: Level, side: float, variance: float = 0.0) -> float:
     """One limit of Σ w_sj θ_sj, θ_sj being the share of a stratum's tests with an outcome.
 
     Parameters

@@ -40,7 +40,7 @@ class _Side:
     """One vehicle's run, which is told from outside what to test; also its `harness.runner.planner.Planner`."""
 
     def __init__(self, run: Run, side: int, pairs: PairedShells, rule: PairRule, shard_size: int) -> None:
-        self.run, self.rule = run, rule
+        self.run, self.rule, self.reported_from = run, rule, 0
         self._side, self._pairs, self._shard_size = side, pairs, shard_size
         self.run.planner = self
 
@@ -145,6 +145,13 @@ def _drive(planner: PairPlanner, pairs: PairedShells, both: list[_Side]) -> Pair
 
 def require_same_shells(sides: tuple[Resolved, Resolved]) -> None:
     """Refuse vehicles of which only one may crash where the envelope does not: their strata would differ."""
+    if sides[0].campaign.testing.shells.stopping != "sequential":
+        raise CampaignError(
+            "testing.shells.stopping",
+            found=sides[0].campaign.testing.shells.stopping,
+            expected="sequential: a comparison plans no second phase",
+            mend="Write --set testing.shells.stopping=sequential.",
+        )
     limits = [acceleration_limit(of_side.campaign.av) for of_side in sides]
     envelope = sides[0].library.envelope_mps2
     if (limits[0] > envelope) != (limits[1] > envelope):
