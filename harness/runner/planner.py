@@ -228,13 +228,13 @@ class Allocation:
         if self.conditional_only:
             return inside
         d, s = self.design, slice(0, self.design.n_inside)
-        inner = combined(d.p[s], tally.part(s), d.n_paths, _LEVEL)
-        known = inner.rhw <= CONDITIONAL_RHW
         exhausted = bool(np.all(tests[s] >= self.available[s]))
         started = bool(np.any(tests[d.n_inside :] > 0))
         # Without this end a vehicle that crashes rarely inside, and often outside, would not be tested outside at all.
         spent = bool(tests[s].sum() >= MOST_FIRST_TESTS * self.first_tests * d.n_inside)
-        return np.ones_like(inside) if known or exhausted or started or spent else inside
+        if exhausted or started or spent:
+            return np.ones_like(inside)
+        return inside | (combined(d.p[s], tally.part(s), d.n_paths, _LEVEL).rhw <= CONDITIONAL_RHW)
 
     def _spread(self, size: int, tally: Tally, active: BoolArray) -> IntArray:
         """Give portions, one after the other, to where each narrows the sum of squared half-widths most.
