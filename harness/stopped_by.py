@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Literal
 
-StoppedBy = Literal["rhw", "episodes", "pool", "pool_error"]
-"""The asked precision, the budget, the last cut-in that the pool holds of a shell that needs more, or the pool's own
-error, which alone is wider than the asked precision."""
+StoppedBy = Literal["rhw", "two_phase", "episodes", "pool", "pool_error"]
+"""The asked precision, the number of tests planned for it, the budget, the last cut-in that the pool holds of a shell
+that needs more, or the pool's own error, which alone is wider than the asked precision."""
 
 MENDS: dict[str, str] = {
     "episodes": "stop.episodes was spent; raise it and go on with --resume",
@@ -28,6 +28,8 @@ def ending(stopped_by: StoppedBy, n_episodes: int, waited_for: tuple[str, ...], 
         if not waited_for:
             return f"{after}: every condition was met at the first look."
         return f"{after}: the last condition to be met was {conditions}."
+    if stopped_by == "two_phase":
+        return f"{after}: as many as the first phase had planned, which are reported without it."
     if precision_asked:
         return f"{after} without {conditions}: {MENDS[stopped_by]}."
     if stopped_by == "episodes":

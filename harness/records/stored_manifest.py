@@ -87,6 +87,7 @@ class StoredManifest(Stored):
     ending: str | None = None
     retraced: Retraced | None = None
     repeated: Repeated | None = None
+    reported_from: Count | None = None
     table_errors: list[TableError] | None = None
 
 

@@ -44,7 +44,7 @@ class RunResult:
         The page ``report.html``.
     estimates : dict
         Content of ``estimates.json``.
-    stopped_by : {"rhw", "episodes", "pool", "pool_error"}
+    stopped_by : {"rhw", "two_phase", "episodes", "pool", "pool_error"}
         See `harness.stopped_by`.
     ending : str
         When it ended and which condition decided, in a sentence.
@@ -156,6 +156,7 @@ class _Run:
         self.prefix.add(done, shard_files(self._out, done.spec.index))
         self.prefix.require_few_failed(self._campaign, at_least=SMALLEST_FAILED_SAMPLE)
         enough = self._planner.add(done.block)
+        self.prefix.reported_from = self._planner.reported_from
         self._progress.advance(done.spec.n_episodes if done.parquet else 0)
         self._progress.status(**self._figures())
         self._manifest.follow(self.prefix)
@@ -182,6 +183,8 @@ class _Run:
         stop, rule, n = self._campaign.stop, self._planner.rule, self.prefix.n_episodes
         stopped_by = self._stopped_by()
         said = ending(stopped_by, n, rule.waited_for, precision_asked=stop.rhw is not None)
+        if stopped_by == "rhw" and self._planner.remark:
+            said += f" {self._planner.remark}"
         retraced = self._retracing.summary(self.prefix.n_retraced)
         self._manifest.write(self.prefix, "done", stopped_by=stopped_by, ending=said, retraced=retraced)
         self._progress.stage("estimates and report", None)
@@ -191,11 +194,13 @@ class _Run:
         from harness.report import write_report  # noqa: PLC0415
 
         report = write_report(self._out)
-        missed = stop.rhw is not None and not rule.reached
+        missed = stop.rhw is not None and not rule.reached and stopped_by != "two_phase"
         return RunResult(self._out, report, estimates, stopped_by, said, EXIT_BUDGET_SPENT if missed else EXIT_DONE)
 
     def _stopped_by(self) -> StoppedBy:
         rule = self._planner.rule
+        if self.prefix.reported_from and self.prefix.n_episodes < self._campaign.stop.episodes:
+            return "two_phase"
         if rule.reached:
             return "rhw"
         if rule.pool_error_above_target:  # whatever else is spent: more of it would not help
