@@ -40,7 +40,7 @@ class _Side:
     """One vehicle's run, which is told from outside what to test; also its `harness.runner.planner.Planner`."""
 
     def __init__(self, run: Run, side: int, pairs: PairedShells, rule: PairRule, shard_size: int) -> None:
-        self.run, self.rule, self.reported_from = run, rule, 0
+        self.run, self.rule, self.reported_from, self.remark = run, rule, 0, ""
         self._side, self._pairs, self._shard_size = side, pairs, shard_size
         self.run.planner = self
 

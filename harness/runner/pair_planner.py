@@ -113,7 +113,7 @@ class PairPlanner:
         added = self._allocation.next_round(
             _differing(pairs),
             self._budget - int(tests.sum()),
-            inner_rhw=pairs.inside().rhw(self._level) if tests.any() else math.inf,
+            inner_rhw=partial(pairs.inside().rhw, self._level),
             spread=partial(self._spread, pairs),
         )
         self.rule.of_first_tests = bool(np.any(tests[added > 0] < self._first_tests))

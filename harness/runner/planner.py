@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from typing import Protocol
 
@@ -44,6 +45,12 @@ USED_UP_SHARE = 0.95
 """Share of the squared widths that must lie in exhausted strata for the allocation to end."""
 MOST_SHARDS_PER_ROUND = 16
 SMALLEST_SHARD = 64
+WIDEST_RHW = 0.5
+"""Precision from which on stopping at the first interval biases the rate noticeably."""
+TOO_WIDE = (
+    f"A relative half-width above {WIDEST_RHW:g} is reached by chance: stopping at the first such interval makes rates "
+    "too high on the mean. Ask for a smaller stop.rhw, or for testing.shells.stopping: two_phase."
+)
 FIRST_PHASE = 1.7
 """Precision of the first of two phases over that of the second (measured: docs/estimators.md)."""
 POOL_SHARE = 0.5
@@ -56,7 +63,7 @@ class FixedPlanner:
     def __init__(self, campaign: Campaign) -> None:
         self._campaign = campaign
         stop, method, size = campaign.stop, campaign.testing.method, campaign.run.shard_size
-        self.reported_from = 0
+        self.reported_from, self.remark = 0, ""
         self.rule = StopRule(stop, method, size, min_crashes=campaign.min_crashes)
         self._sums = accumulator(self.rule.estimator)
         self._n_episodes = 0
@@ -83,13 +90,15 @@ class ShellPlanner:
     number does not depend on their results.
 
     ``available``, shape (S,), are the most tests of each stratum, ``held`` see `RoundRule`; ``estimate`` is that at the
-    end of the last round.
+    end of the last round, ``reported_from`` the first test of the second phase, ``remark`` what to say of stopping.
     """
 
     def __init__(self, campaign: Campaign, design: ShellDesign, available: IntArray, held: int = 0) -> None:
         shells = campaign.testing.shells
         self._plans = shells.stopping == "two_phase" and campaign.stop.rhw is not None
         self.rule = RoundRule(campaign, held, FIRST_PHASE if self._plans else 1.0)
+        wide = campaign.stop.rhw is not None and campaign.stop.rhw > WIDEST_RHW and not self._plans
+        self.remark = TOO_WIDE if wide else ""
         self.estimate: Estimate | None = None
         self.reported_from = 0
         self._campaign = campaign
@@ -168,6 +177,11 @@ class Planner(Protocol):
         """First test of those that the answer is from; 0 where all are."""
         ...
 
+    @property
+    def remark(self) -> str:
+        """What the ending is to say besides; mostly nothing."""
+        ...
+
     def rounds(self) -> Iterator[Iterator[ShardSpec]]:
         """Shards of each round; the next round is asked for when all of the last one have been added."""
         ...
@@ -202,7 +216,7 @@ class Allocation:
         tally: Tally,
         budget: int,
         *,
-        inner_rhw: float | None = None,
+        inner_rhw: Callable[[], float] | None = None,
         spread: Callable[[int, IntArray], IntArray] | None = None,
     ) -> IntArray:
         """Tests to add per stratum, at most ``budget``; all 0 when no stratum or no budget is left.
@@ -213,15 +227,15 @@ class Allocation:
         ----------
         tally : Tally
         budget : int
-        inner_rhw : float, optional
-            Relative half-width of the conditional statement; by default that of a crash rate.
+        inner_rhw : callable, optional
+            Gives the relative half-width of the conditional statement; by default that of a crash rate.
         spread : callable, optional
             Gives so many tests to strata with so much room (S,) each; by default to where a crash rate is narrowed.
         """
         tests = tally.tests
         if self._used_up(tally):
             return np.zeros_like(tests)
-        begun = self._begun(tests, self._inner_rhw(tally) if inner_rhw is None else inner_rhw)
+        begun = self._begun(tests, inner_rhw or partial(self._inner_rhw, tally))
         active = begun & (tests < self.available)
         wanted = np.where(active, np.maximum(self.first_tests - tests, 0), 0)
         if not wanted.any() and active.any():
@@ -260,22 +274,23 @@ class Allocation:
         squares = np.where(relevant, (self.design.p * (high - low)) ** 2, 0.0)
         return bool(squares[tests >= self.available].sum() >= USED_UP_SHARE * squares.sum())
 
-    def _inner_rhw(self, tally: Tally) -> float:
-        d, s = self.design, slice(0, self.design.n_inside)
-        return combined(d.p[s], tally.part(s), d.n_paths, _LEVEL).rhw
-
-    def _begun(self, tests: IntArray, inner_rhw: float) -> BoolArray:
+    def _begun(self, tests: IntArray, inner_rhw: Callable[[], float]) -> BoolArray:
         """Strata that it is time to test: those inside, and from some point on all."""
         n_inside = self.design.n_inside
         inside = np.arange(tests.size) < n_inside
         if self.conditional_only:
             return inside
-        known = inner_rhw <= CONDITIONAL_RHW
         exhausted = bool(np.all(tests[:n_inside] >= self.available[:n_inside]))
         started = bool(np.any(tests[n_inside:] > 0))
         # Without this end a vehicle that crashes rarely inside, and often outside, would not be tested outside at all.
         spent = bool(tests[:n_inside].sum() >= MOST_FIRST_TESTS * self.first_tests * n_inside)
-        return np.ones_like(inside) if known or exhausted or started or spent else inside
+        if exhausted or started or spent:
+            return np.ones_like(inside)
+        return inside | (inner_rhw() <= CONDITIONAL_RHW)
+
+    def _inner_rhw(self, tally: Tally) -> float:
+        d, s = self.design, slice(0, self.design.n_inside)
+        return combined(d.p[s], tally.part(s), d.n_paths, _LEVEL).rhw
 
     def _spread(self, size: int, tally: Tally, most: IntArray) -> IntArray:
         """Give portions, one after the other, to where each narrows the sum of squared half-widths most.

@@ -30,12 +30,14 @@ FREE, CONDITIONAL = "shells", "shells, conditional"
 class DrawnPool:
     """A pool, and what a vehicle does on its paths.
 
-    ``mass`` and ``crash_mass`` (n, S) are each path's probability of a cut-in of each stratum, and of a crash in it.
+    ``mass`` and ``crash_mass`` (n, S) are each path's probability of a cut-in of each stratum, and of a crash in it;
+    ``failing`` is the share of crashes that end as failed tests.
     """
 
     design: ShellDesign
     mass: FloatArray
     crash_mass: FloatArray
+    failing: float = 0.0
 
     @cached_property
     def share(self) -> FloatArray:
@@ -119,14 +121,15 @@ def _block(drawn: DrawnPool, added: IntArray, first: int, rng: np.random.Generat
     stratum, crashes = np.repeat(np.arange(added.size), added), rng.binomial(added, drawn.share)
     n = stratum.size
     rank = np.arange(n) - np.repeat(np.cumsum(added) - added, added)
-    none, crash = np.zeros(n, np.bool_), rank < crashes[stratum]
+    none, bad = np.zeros(n, np.bool_), rank < crashes[stratum]
+    failed = bad & (rank < rng.binomial(crashes, drawn.failing)[stratum]) if drawn.failing else none
     mass = np.zeros((n, added.size))
-    mass[crash] = np.concatenate([drawn.crashed_paths(s, k, rng) for s, k in enumerate(crashes.tolist())])
+    mass[bad] = np.concatenate([drawn.crashed_paths(s, k, rng) for s, k in enumerate(crashes.tolist())])
     return Block(
         first_episode=first,
         method="shells",
-        crash=crash,
-        failed=none,
+        crash=bad & ~failed,
+        failed=failed,
         cut_in=~none,
         bv_lv_contact=none,
         log_weight=np.zeros(n),

@@ -13,6 +13,7 @@ from harness.errors import CampaignError
 from harness.pool.cut_ins import CutIns, Pool, shells_of
 from harness.pool.library import Library
 from harness.pool.shells import acceleration_limit, design_shells, shells_in_strata
+from harness.studies.experiment import Adversary
 from harness.studies.shell_campaign import DrawnPool
 from harness.studies.super_population import Mixed, SuperPopulation
 
@@ -32,6 +33,8 @@ class OvertakingShells:
         The vehicle's equals.
     limit_mps2 : float
         Hardest acceleration of the vehicle.
+    failing : float
+        Share of its crashes that end as failed tests.
     shells, crashing : ndarray, shape (n, D + 1)
         Probability of each shell by path of the super-population, and the part on which the vehicle crashes.
     """
@@ -41,6 +44,12 @@ class OvertakingShells:
     limit_mps2: float
     shells: FloatArray
     crashing: FloatArray
+    failing: float = 0.0
+
+    @property
+    def crash_rate(self) -> float:
+        """That of the super-population."""
+        return float(self.crashing.sum() / len(self.crashing))
 
     @property
     def crashes_outside(self) -> float:
@@ -63,7 +72,19 @@ class OvertakingShells:
         def by_stratum(by_shell: FloatArray) -> FloatArray:
             return np.column_stack([by_shell[:, group].sum(1) for group in groups])
 
-        return [DrawnPool(design, by_stratum(drawn), by_stratum(part[rows])) for part in parts]
+        return [DrawnPool(design, by_stratum(drawn), by_stratum(part[rows]), self.failing) for part in parts]
+
+    def as_adversary(self, made: Adversary) -> OvertakingShells:
+        """The same vehicle with other crashes; see `harness.studies.experiment.Adversary`."""
+        inside, crashing = self.template.boundary + 1, self.crashing.copy()
+        if made.crashes != "everywhere":
+            weight = crashing[:, :inside].sum(1)
+            order = np.argsort(-weight if made.crashes == "on_heaviest_paths" else weight, kind="stable")
+            kept = np.cumsum(weight[order]) <= made.share * weight.sum()
+            crashing[order[~kept]] = 0.0
+        tested = slice(inside, -1)  # the last shell is for cut-ins on which nobody crashes
+        crashing[:, tested] = np.maximum(crashing[:, tested], made.hole * self.shells[:, tested])
+        return replace(self, crashing=crashing, failing=made.failing)
 
 
 @dataclass(frozen=True, eq=False)
