@@ -88,7 +88,7 @@ class ShellCampaign:
         estimate: Estimate | None = None
         enough = False
         while not enough and (added := planner.next_round()).any():
-            enough = planner.add(_block(drawn, added, int(planner.tally.tests.sum()), rng))
+            enough = planner.add(campaign_block(drawn, added, int(planner.tally.tests.sum()), rng))
             estimate = planner.estimate
             if estimate is not None and conditional is None:
                 inside.observe(estimate)
@@ -116,7 +116,7 @@ def _wrong(drawn: DrawnPool, fault: Fault | None) -> DrawnPool:
     return replace(drawn, design=replace(drawn.design, cell_p=drawn.design.cell_p * factor))
 
 
-def _block(drawn: DrawnPool, added: IntArray, first: int, rng: np.random.Generator) -> Block:
+def campaign_block(drawn: DrawnPool, added: IntArray, first: int, rng: np.random.Generator) -> Block:
     """What the records of a round become: within a stratum the crashes come first, which no estimator can see."""
     stratum, crashes = np.repeat(np.arange(added.size), added), rng.binomial(added, drawn.share)
     n = stratum.size
