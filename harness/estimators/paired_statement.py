@@ -10,7 +10,8 @@ from harness.estimators.difference import (
     failed_pairs_statement,
     rates_statement,
 )
-from harness.estimators.paired_shells import Contrast, Interval, PairedEstimate, Verdict
+from harness.estimators.paired_shells import Contrast, PairedEstimate
+from harness.estimators.pairs import Interval, Verdict
 
 
 def paired_statement(found: PairedEstimate, name_a: str, name_b: str) -> str:

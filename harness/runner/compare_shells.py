@@ -19,8 +19,9 @@ import numpy as np
 from harness.arrays import IntArray
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED, CampaignError
 from harness.estimators.block import Block
-from harness.estimators.paired_shells import PairCounts, PairedEstimate, PairedShells, Verdict, paired_estimate
+from harness.estimators.paired_shells import PairedEstimate, paired_estimate
 from harness.estimators.paired_statement import conditional_paired_statement, margin_statement, paired_statement
+from harness.estimators.pairs import PairCounts, PairedShells, Verdict
 from harness.pool.shells import Draw, PrescribedEpisodes, acceleration_limit
 from harness.progress import Progress, SilentProgress
 from harness.records.folder import sole_use

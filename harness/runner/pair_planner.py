@@ -14,7 +14,7 @@ import numpy as np
 from harness.arrays import IntArray
 from harness.campaign.models import Campaign
 from harness.estimators.likelihood_ratio import Level
-from harness.estimators.paired_shells import PairCounts, Verdict
+from harness.estimators.pairs import PairCounts, Verdict
 from harness.estimators.stratified import Tally
 from harness.runner.planner import CONFIDENCE, POOL_SHARE, Allocation
 from harness.strata import ShellDesign

@@ -15,7 +15,7 @@ import numpy as np
 from harness.arrays import IntArray
 from harness.campaign.models import Campaign
 from harness.estimators.likelihood_ratio import Level
-from harness.estimators.paired_shells import CRASH, NO_CRASH, PairCounts, no_pairs
+from harness.estimators.pairs import CRASH, NO_CRASH, PairCounts, no_pairs
 from harness.runner.pair_planner import PairPlanner, PairRule
 from harness.studies.judgement import Row
 from harness.studies.shell_campaign import DrawnPool, conditional_campaign

@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 
 from harness.estimators.likelihood_ratio import Level
-from harness.estimators.paired_shells import (
+from harness.estimators.paired_shells import paired_estimate
+from harness.estimators.paired_statement import conditional_paired_statement, margin_statement, paired_statement
+from harness.estimators.pairs import (
     A_CRASHES,
     B_CRASHES,
     CRASH,
@@ -19,9 +21,7 @@ from harness.estimators.paired_shells import (
     PairCounts,
     PairedShells,
     no_pairs,
-    paired_estimate,
 )
-from harness.estimators.paired_statement import conditional_paired_statement, margin_statement, paired_statement
 from harness.strata import ShellDesign
 from tests.estimators.small_blocks import SHELLS, in_shells
 
