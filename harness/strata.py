@@ -14,6 +14,8 @@ from harness.arrays import FloatArray
 
 OUTSIDE = "outside"
 """Name of the stratum of everything beyond the boundary."""
+FAILED_SHADOWS = "failed shadow runs"
+"""Name of a stratum that cannot be tested: cut-ins on paths on which the vehicle failed before one could come."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -282,7 +282,7 @@ class Shells:
         if empty := ", ".join(name for name, n in zip(design.strata, self.tests, strict=True) if n == 0):
             found.append(f"no test in {empty}: the interval allows for any share of crashes there")
         kept = zip(design.strata, self.tests, design.available, strict=False)
-        if used_up := ", ".join(name for name, n, available in kept if n >= available):
+        if used_up := ", ".join(name for name, n, available in kept if n >= available > 0):
             found.append(
                 f"all cut-ins that the pool has kept of {used_up} were tested: for more precision raise "
                 "pool.cut_ins_per_shell, and run into a new folder"

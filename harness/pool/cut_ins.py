@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from harness.arrays import BoolArray, FloatArray, Int8Array, IntArray, RecordArray
+from harness.arrays import BoolArray, FloatArray, Int8Array, IntArray, RecordArray, UInt64Array
 from harness.environment.driving import Environment
+from harness.pool.aimed_paths import PILOT_PATHS
 from harness.pool.library import Library
 
 FAR_OFF = 10.0
@@ -25,7 +26,8 @@ class CutIns:
     Within a shell all have the same probability. ``path``, ``step``, ``shell`` (n,): which path of the pool, cut-in
     step, and shell; ``state`` (n,): initial states. ``lv``, ``bv`` (n, draws): maneuver indices as an episode records
     them, 31 marking the cut-in; ``n_lv``, ``n_bv`` (n,): how many of them are used. ``crashes`` (n, D): which
-    surrogates crash, in the pool's order.
+    surrogates crash, in the pool's order. ``motion`` (n,) are hashes of what the AV did through the step of the cut-in,
+    in the pool of a vehicle that acts before it; else empty.
     """
 
     path: IntArray
@@ -37,6 +39,13 @@ class CutIns:
     n_lv: IntArray
     n_bv: IntArray
     crashes: BoolArray
+    motion: UInt64Array = field(default_factory=lambda: np.zeros(0, np.uint64))
+
+    @property
+    def row(self) -> IntArray:
+        """Which row of the pool's paths each is of, shape (n,): in the pool of a vehicle its shadow run."""
+        rows: IntArray = self.path - PILOT_PATHS
+        return rows
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +68,8 @@ class Pool:
         Probability of each shell; the last is a cut-in on which no surrogate crashes.
     shell_moments : ndarray, shape (D + 1, D + 1)
         Mean product of a path's probabilities in two shells.
+    p_unknown : float
+        Probability of cut-ins about which nothing is known, at most: of shadow runs that failed.
     """
 
     key: str
@@ -73,6 +84,7 @@ class Pool:
     shell_p: FloatArray
     shell_moments: FloatArray
     cut_ins: CutIns
+    p_unknown: float = 0.0
 
     @property
     def boundary(self) -> int:

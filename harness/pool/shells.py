@@ -16,7 +16,7 @@ from harness.campaign.models import AutomatedVehicle, BuiltInParameters, Campaig
 from harness.episode.cells import PrescribedTraffic
 from harness.errors import CampaignError
 from harness.pool.cut_ins import Pool
-from harness.strata import OUTSIDE, ShellDesign
+from harness.strata import FAILED_SHADOWS, OUTSIDE, ShellDesign
 
 
 def acceleration_limit(av: AutomatedVehicle) -> float:
@@ -64,11 +64,15 @@ def design_shells(pool: Pool, *, boundary: str | None = None, limit_mps2: float)
     for row, group in enumerate(groups):
         joined[row, group] = 1.0
     n_inside = sum(group[-1] <= pool.names.index(name) for group in groups)
+    names = (*(pool.names[group[0]] for group in groups[:n_inside]), *([OUTSIDE] * (len(groups) - n_inside)))
+    p, moments = joined @ pool.shell_p, joined @ pool.shell_moments @ joined.T
+    if pool.p_unknown > 0.0:  # a stratum without a test may crash as often as it happens
+        names, p, moments = (*names, FAILED_SHADOWS), np.append(p, pool.p_unknown), np.pad(moments, (0, 1))
     return ShellDesign(
         pool=pool.key,
-        strata=(*(pool.names[group[0]] for group in groups[:n_inside]), *([OUTSIDE] * (len(groups) - n_inside))),
-        p=joined @ pool.shell_p,
-        moments=joined @ pool.shell_moments @ joined.T,
+        strata=names,
+        p=p,
+        moments=moments,
         n_paths=pool.n_paths,
         n_inside=n_inside,
         boundary=name,
@@ -104,6 +108,7 @@ class PrescribedEpisodes:
         groups = shells_in_strata(pool, pool.names.index(design.boundary), limit)
         self._cut_ins = pool.cut_ins
         self._order = [_order(pool, group, campaign.seed, stratum) for stratum, group in enumerate(groups)]
+        self._order += [np.zeros(0, np.int64)] * (len(design.strata) - len(groups))
         self.design = replace(design, available=tuple(order.size for order in self._order))
 
     @property
@@ -128,12 +133,15 @@ class PrescribedEpisodes:
     def of_rows(self, rows: IntArray, stratum: IntArray) -> tuple[RecordArray, PrescribedTraffic]:
         """Initial states (n,) and traffic of given cut-ins of the pool (n,), tested for given strata (n,)."""
         c = self._cut_ins
+        acts = c.motion.size > 0
         traffic = PrescribedTraffic(
             lv=np.ascontiguousarray(c.lv[rows]),
             bv=np.ascontiguousarray(c.bv[rows]),
             cut_step=c.step[rows],
             stratum=stratum.astype(np.int64),
             log_weight=np.log(self.design.p[stratum]),
+            told=c.row[rows] if acts else np.zeros(0, np.int64),
+            motion=c.motion[rows] if acts else c.motion,
         )
         return c.state[rows], traffic
 

@@ -139,7 +139,7 @@ def _of_host(host: ControllerHost, campaign: Campaign) -> float:
     seen = [_observation(cells, k) for k in range(STEPS_ACTED)]
 
     def begin(episodes: IntArray) -> None:
-        _require_success(host.start(cells, episodes))
+        _require_success(host.start(cells, episodes, episodes))
 
     def step(k: int) -> None:
         _require_success(host.act(seen[k])[1])

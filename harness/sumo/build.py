@@ -25,7 +25,7 @@ def build_sumo_world(
     """
     cells = n_cells or campaign.world.cells
     av = campaign.av
-    early = av.before_cut_in == "controller"
+    early = av.acts_before_cut_in
     if av.traci is not None:
         from harness.sumo.traci_world import TraciWorld  # noqa: PLC0415 - few campaigns need it
 
