@@ -30,7 +30,7 @@ from harness.records.schemas import episodes_schema, moments_schema, traces_sche
 FOLDER = Path(__file__).parent
 _PART = re.compile(r"(<!-- generated: (\S+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
-SCHEMAS = {"episodes": episodes_schema(4, 3), "moments": moments_schema(3), "traces": traces_schema()}
+SCHEMAS = {"episodes": episodes_schema(4, 3, 2), "moments": moments_schema(3), "traces": traces_schema()}
 RESULTS = {
     "level_1": ("nde_1", "forced_1", "step_recursive_1", "episode_recursive_1"),
     "level_1e4": (

@@ -33,6 +33,7 @@ KERNEL_SOURCES = (
     "vehicles/*.py",
     "controllers/protocol.py",
     "criticality/*.py",
+    "estimators/likelihood_ratio.py",
     "importance/*.py",
     "episode/*.py",
     "pool/enumeration.py",

@@ -5,7 +5,8 @@ The pool makes both; estimators and the planner of a campaign use them, and need
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ OUTSIDE = "outside"
 """Name of the stratum of everything beyond the boundary."""
 FAILED_SHADOWS = "failed shadow runs"
 """Name of a stratum that cannot be tested: cut-ins on paths on which the vehicle failed before one could come."""
+_ARRAYS = ("cell_p", "reference_rate", "reference_square")
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,10 +30,14 @@ class ShellDesign:
         Key of the pool, and its number of paths.
     strata : tuple of str
         The surrogate that is the first to crash in each; the last is everything outside.
-    p : ndarray, shape (S,)
-        Probability per test that a cut-in of the stratum happens.
-    moments : ndarray, shape (S, S)
-        Mean product of a pool path's probabilities in two strata.
+    cell_stratum, cell_references : tuple of int, length C
+        Cells divide strata by what the reference drivers do: of each its stratum, and one bit per reference that
+        crashes.
+    cell_p : ndarray, shape (C,)
+        Probability per test that a cut-in of the cell happens.
+    references : tuple of str, length R
+    reference_rate, reference_square : ndarray, shape (R,)
+        Crash rate of each reference in the pool, and the mean square of a path's probability that it crashes.
     n_inside, boundary : int, str
         Strata up to the boundary, which is the most careless surrogate inside.
     p_cut_in, p_impossible : float
@@ -43,26 +49,40 @@ class ShellDesign:
 
     pool: str
     strata: tuple[str, ...]
-    p: FloatArray
-    moments: FloatArray
+    cell_stratum: tuple[int, ...]
+    cell_p: FloatArray
     n_paths: int
     n_inside: int
     boundary: str
     p_cut_in: float
     p_impossible: float
+    cell_references: tuple[int, ...] = ()
+    references: tuple[str, ...] = ()
+    reference_rate: FloatArray = field(default_factory=lambda: np.zeros(0))
+    reference_square: FloatArray = field(default_factory=lambda: np.zeros(0))
     available: tuple[int, ...] = ()
+
+    @cached_property
+    def p(self) -> FloatArray:
+        """Probability per test that a cut-in of each stratum happens, shape (S,)."""
+        return np.asarray(np.bincount(self.cell_stratum, self.cell_p, minlength=len(self.strata)), np.float64)
+
+    @cached_property
+    def joined(self) -> FloatArray:
+        """1 where a cell belongs to a stratum, shape (C, S)."""
+        joined: FloatArray = np.eye(len(self.strata))[list(self.cell_stratum)]
+        return joined
 
     def to_json(self) -> dict[str, Any]:
         """Plain content for a file."""
-        lists = {name: np.array(getattr(self, name)).tolist() for name in ("strata", "p", "moments", "available")}
-        return asdict(self) | lists
+        return {name: np.asarray(value).tolist() for name, value in asdict(self).items()}
 
     @classmethod
     def from_json(cls, content: dict[str, Any]) -> ShellDesign:
         """Back from `to_json`."""
-        arrays = {name: np.array(content[name], dtype=np.float64) for name in ("p", "moments")}
-        tuples = {name: tuple(content[name]) for name in ("strata", "available")}
-        return cls(**(content | arrays | tuples))
+        arrays = {name: np.array(content[name], dtype=np.float64) for name in _ARRAYS}
+        plain: dict[str, Any] = {name: tuple(x) if isinstance(x, list) else x for name, x in content.items()}
+        return cls(**(plain | arrays))
 
 
 @dataclass(frozen=True, eq=False)

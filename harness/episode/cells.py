@@ -203,6 +203,18 @@ class PrescribedTraffic(NamedTuple):
     motion: UInt64Array
 
 
+class PrescribedCutIns(NamedTuple):
+    """Which cut-ins of a pool tests prescribe, and what the error of the pool is told by.
+
+    ``row`` (n,) is the row in the pool, ``cell`` (n,) the cell of the campaign's design, ``cell_mass`` (n, C) the
+    path's probability of a cut-in of each cell.
+    """
+
+    row: IntArray
+    cell: IntArray
+    cell_mass: FloatArray
+
+
 def drawn_traffic() -> PrescribedTraffic:
     """For episodes that draw their own traffic."""
     none, no_index = np.zeros((0, 1), np.int8), np.zeros(0, np.int64)

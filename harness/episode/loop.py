@@ -14,6 +14,7 @@ from harness.environment.driving import Environment
 from harness.episode.begin import refill
 from harness.episode.cells import (
     Bench,
+    PrescribedCutIns,
     PrescribedTraffic,
     Results,
     drawn_traffic,
@@ -74,7 +75,7 @@ class Keep(NamedTuple):
 class Shard:
     """Everything that a range of episodes left behind, row by row; ``states`` (n,) are where they began.
 
-    ``cut_ins`` (n,) are the rows of the pool that were prescribed, if any were.
+    ``cut_ins`` are those of the pool that were prescribed, if any were.
     ``traces`` maps an episode's row to its (steps + 1, 3 vehicles, 3: x, v, a) motion, ``failures`` to the cause.
     """
 
@@ -85,7 +86,7 @@ class Shard:
     traffic: PrescribedTraffic = field(default_factory=drawn_traffic)
     traces: dict[int, FloatArray] = field(default_factory=dict)
     failures: dict[int, str] = field(default_factory=dict)
-    cut_ins: IntArray | None = None
+    cut_ins: PrescribedCutIns | None = None
 
 
 def hash_of_index(seed: int, episodes: IntArray) -> FloatArray:

@@ -45,8 +45,9 @@ class Block:
         Bound on Y = 1{crash}·weight that the design guarantees for every episode, seen or not; None if there is none.
     log_p_cut_in : (n,) float64 or None
         log P(cut-in | path), where the method draws the path ahead. Bounds Y of that episode alone.
-    stratum, shells : (n,) int, ShellDesign, or None
-        Stratum of each test, where they are drawn from shells, and what is known of the strata.
+    stratum, cell, cell_mass, shells : (n,) int, (n,) int, (n, C) float64, ShellDesign, or None
+        Where tests are drawn from shells: stratum and cell of each, its path's probability of a cut-in of each cell,
+        and what is known of the strata.
     surrogates_crash, known_rates : (n, D) bool, KnownRates, or None
         Which surrogates of a pool would have crashed on the same traffic, and their crash rates; only where asked for.
     """
@@ -65,18 +66,30 @@ class Block:
     weight_cap: float | None = None
     log_p_cut_in: FloatArray | None = None
     stratum: IntArray | None = None
+    cell: IntArray | None = None
+    cell_mass: FloatArray | None = None
     shells: ShellDesign | None = None
     surrogates_crash: BoolArray | None = None
     known_rates: KnownRates | None = None
 
     def __post_init__(self) -> None:
         n = len(self.crash)
-        columns = ("failed", "cut_in", "bv_lv_contact", "log_weight", "n_control_steps", "log_p_cut_in", "stratum")
+        columns = (
+            "failed",
+            "cut_in",
+            "bv_lv_contact",
+            "log_weight",
+            "n_control_steps",
+            "log_p_cut_in",
+            "stratum",
+            "cell",
+        )
         expected = {
             **dict.fromkeys(columns, (n,)),
             "log_q": (n, len(self.alpha)),
             "first_ratios": (n, MAX_CONTROL_STEPS, None),
             "surrogates_crash": (n, None),
+            "cell_mass": (n, None),
         }
         for name, shape in expected.items():
             array = getattr(self, name)

@@ -16,7 +16,7 @@ from harness.records.folder import MEND_SHARD
 from harness.strata import ShellDesign
 
 EPISODE_COLUMNS = ("episode", "outcome", "cut_in_step", "n_control_steps", "log_weight", "log_p_cut_in", "log_q")
-SHELL_COLUMNS = ("component",)
+SHELL_COLUMNS = ("component", "cell", "cell_mass")
 MOMENT_COLUMNS = ("episode", "q_sampled", "q")
 
 
@@ -71,6 +71,8 @@ def block_from_tables(
         weight_cap=1.0 if method == "nde" else None,
         log_p_cut_in=_log_p_cut_in(episodes, failed),
         stratum=None if shells is None else _integers(episodes, "component"),
+        cell=None if shells is None else _integers(episodes, "cell"),
+        cell_mass=None if shells is None else _nested(episodes, "cell_mass", len(shells.cell_stratum)),
         shells=shells,
     )
 

@@ -117,16 +117,22 @@ def pool_of(
     key: str,
     environment: str,
 ) -> Pool:
-    """Sort the cut-ins of paths into shells, by surrogates in this order, and keep a sample of each."""
-    n_surrogates = len(library.surrogates)
+    """Sort the cut-ins of paths into shells, by surrogates in this order, and cells; keep a sample of each shell."""
+    n_surrogates, n_references = len(library.surrogates), len(library.references)
     rates, mass = paths.rates(n_surrogates), paths.mass
     n = len(rates)
     ordered = rates[:, order]
-    shell = shells_of(paths.crashes, order)
-    by_path = np.column_stack([np.where(shell == s, mass, 0.0).sum(1) for s in range(n_surrogates + 1)])
-    path, step, kept_shell = _keep(mass, shell, n_surrogates + 1, settings)
+    shell, references = shells_of(paths.crashes, order), paths.crashes >> n_surrogates
+    kinds, by_path, cell = _cells(mass, (shell.astype(np.int64) << n_references) | references)
+    cell_references = kinds & ((1 << n_references) - 1)
+    by_reference = by_path @ ((cell_references[:, None] >> np.arange(n_references)) & 1)
+    path, step = _keep(mass, shell, n_surrogates + 1, settings)
     pairs = enumerator.pairs(paths.index[path], step, paths.state[path])
-    crashes = ((paths.crashes[path, step][:, None] >> order[None, :]) & 1).astype(np.bool_)
+    asked = np.concatenate([order, n_surrogates + np.arange(n_references)])
+    crashes = ((paths.crashes[path, step][:, None] >> asked[None, :]) & 1).astype(np.bool_)
+    sample = CutIns(
+        PILOT_PATHS + path, step, cell[path, step], paths.state[path], *pairs, crashes, by_path[path].astype(np.float32)
+    )
     return Pool(
         key=key,
         environment=environment,
@@ -137,18 +143,31 @@ def pool_of(
         p_cut_in_se=float(rates[:, -1].std() / np.sqrt(n)),
         mu=ordered.mean(0),
         mu_covariance=np.atleast_2d(np.cov(ordered.T, bias=True)) / n,
-        shell_p=by_path.mean(0),
-        shell_moments=by_path.T @ by_path / n,
-        cut_ins=CutIns(PILOT_PATHS + path, step, kept_shell, paths.state[path], *pairs, crashes),
+        cell_shell=kinds >> n_references,
+        cell_references=cell_references,
+        cell_p=by_path.mean(0),
+        reference_rate=by_reference.mean(0),
+        reference_square=(by_reference * by_reference).mean(0),
+        cut_ins=sample,
     )
 
 
-def _keep(
-    mass: FloatArray, shell: Int8Array, n_shells: int, settings: PoolSettings
-) -> tuple[IntArray, IntArray, IntArray]:
+def _cells(mass: FloatArray, kind: IntArray) -> tuple[IntArray, FloatArray, IntArray]:
+    """Cells of cut-ins with ``mass`` (n, steps) of some ``kind`` (n, steps).
+
+    Returns the kind of each cell (C,), the mass of each path in it (n, C), and the cell of each cut-in (n, steps).
+    """
+    kinds = np.unique(kind[mass > 0.0])
+    cell = np.minimum(np.searchsorted(kinds, kind), kinds.size - 1)  # without mass it may be of no kind
+    flat = np.arange(len(mass))[:, None] * kinds.size + cell
+    by_path: FloatArray = np.bincount(flat.ravel(), mass.ravel(), minlength=len(mass) * kinds.size).astype(np.float64)
+    return kinds, by_path.reshape(len(mass), kinds.size), cell
+
+
+def _keep(mass: FloatArray, shell: Int8Array, n_shells: int, settings: PoolSettings) -> tuple[IntArray, IntArray]:
     """Systematic sample of cut-ins of every shell, with probability proportional to mass.
 
-    Path and step (row and column in ``mass``) and shell, each (n,), sorted by shell and path.
+    Path and step (row and column in ``mass``), each (n,), sorted by shell and path.
     """
     kept = []
     for s in range(n_shells):
@@ -159,6 +178,6 @@ def _keep(
         offset = uniforms(settings.seed, s, 1, DIAGNOSTIC, KEEP_DRAW + 1)[0, KEEP_DRAW]
         wanted = (offset + np.arange(settings.cut_ins_per_shell)) * (cumulative[-1] / settings.cut_ins_per_shell)
         chosen = places[np.minimum(np.searchsorted(cumulative, wanted, side="right"), places.size - 1)]
-        kept.append((chosen // mass.shape[1], chosen % mass.shape[1], np.full(chosen.size, s, np.int64)))
-    path, step, of_shell = (np.concatenate(column) for column in zip(*kept, strict=True))
-    return path, step, of_shell
+        kept.append((chosen // mass.shape[1], chosen % mass.shape[1]))
+    path, step = (np.concatenate(column) for column in zip(*kept, strict=True))
+    return path, step

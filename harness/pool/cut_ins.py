@@ -5,11 +5,12 @@ from __future__ import annotations
 import hashlib
 import json
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from harness.arrays import BoolArray, FloatArray, Int8Array, IntArray, RecordArray, UInt64Array
+from harness.arrays import BoolArray, Float32Array, FloatArray, Int8Array, IntArray, RecordArray, UInt64Array
 from harness.environment.driving import Environment
 from harness.pool.aimed_paths import PILOT_PATHS
 from harness.pool.library import Library
@@ -23,22 +24,24 @@ own, which few paths meet: paths aimed there would be lost for all others."""
 class CutIns:
     """A weighted sample of cut-ins, each with the paths of LV and BV before and after it.
 
-    Within a shell all have the same probability. ``path``, ``step``, ``shell`` (n,): which path of the pool, cut-in
-    step, and shell; ``state`` (n,): initial states. ``lv``, ``bv`` (n, draws): maneuver indices as an episode records
-    them, 31 marking the cut-in; ``n_lv``, ``n_bv`` (n,): how many of them are used. ``crashes`` (n, D): which
-    surrogates crash, in the pool's order. ``motion`` (n,) are hashes of what the AV did through the step of the cut-in,
+    Within a shell all have the same probability. ``path``, ``step``, ``cell`` (n,): which path of the pool, cut-in
+    step, and cell; ``state`` (n,): initial states. ``lv``, ``bv`` (n, draws): maneuver indices as an episode records
+    them, 31 marking the cut-in; ``n_lv``, ``n_bv`` (n,): how many of them are used. ``crashes`` (n, D + R): which
+    surrogates crash, in the pool's order, and which references. ``path_mass`` (n, C) float32: the path's probability of
+    a cut-in of each cell. ``motion`` (n,) are hashes of what the AV did through the step of the cut-in,
     in the pool of a vehicle that acts before it; else empty.
     """
 
     path: IntArray
     step: IntArray
-    shell: IntArray
+    cell: IntArray
     state: RecordArray
     lv: Int8Array
     bv: Int8Array
     n_lv: IntArray
     n_bv: IntArray
     crashes: BoolArray
+    path_mass: Float32Array
     motion: UInt64Array = field(default_factory=lambda: np.zeros(0, np.uint64))
 
     @property
@@ -64,10 +67,12 @@ class Pool:
         Probability that BV cuts in in a test, and its standard error.
     mu, mu_covariance : ndarray, shapes (D,) and (D, D)
         Crash rates of the surrogates, per test, and the covariance of their errors.
-    shell_p : ndarray, shape (D + 1,)
-        Probability of each shell; the last is a cut-in on which no surrogate crashes.
-    shell_moments : ndarray, shape (D + 1, D + 1)
-        Mean product of a path's probabilities in two shells.
+    cell_shell, cell_references : ndarray of int64, shape (C,)
+        Cells divide shells by which references crash: the shell of each, and one bit per reference.
+    cell_p : ndarray, shape (C,)
+        Probability of each cell.
+    reference_rate, reference_square : ndarray, shape (R,)
+        Crash rates of the references, and mean squares of a path's probability that they crash.
     p_unknown : float
         Probability of cut-ins about which nothing is known, at most: of shadow runs that failed.
     """
@@ -81,10 +86,29 @@ class Pool:
     p_cut_in_se: float
     mu: FloatArray
     mu_covariance: FloatArray
-    shell_p: FloatArray
-    shell_moments: FloatArray
+    cell_shell: IntArray
+    cell_references: IntArray
+    cell_p: FloatArray
+    reference_rate: FloatArray
+    reference_square: FloatArray
     cut_ins: CutIns
     p_unknown: float = 0.0
+
+    @cached_property
+    def shell_p(self) -> FloatArray:
+        """Probability of each shell, shape (D + 1,); the last is a cut-in on which no surrogate crashes."""
+        return np.asarray(np.bincount(self.cell_shell, self.cell_p, minlength=len(self.names) + 1), np.float64)
+
+    @cached_property
+    def shell(self) -> IntArray:
+        """Shell of each kept cut-in, shape (n,)."""
+        found: IntArray = self.cell_shell[self.cut_ins.cell]
+        return found
+
+    @property
+    def _reference_error(self) -> FloatArray:
+        """Standard errors of the references' crash rates, shape (R,)."""
+        return np.sqrt(np.maximum(self.reference_square - self.reference_rate**2, 0.0) / self.n_paths)
 
     @property
     def boundary(self) -> int:
@@ -105,6 +129,12 @@ class Pool:
             "envelope": self.library.envelope,
             "surrogates": [dict(zip(keys, row, strict=True)) for row in zip(*columns, strict=True)],
             "no_surrogate_crashes": p[-1],
+            "references": [
+                {"name": name, "crash_rate": rate, "std_error": error}
+                for name, rate, error in zip(
+                    self.library.references, self.reference_rate.tolist(), self._reference_error.tolist(), strict=True
+                )
+            ],
         }
 
 

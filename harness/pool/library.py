@@ -59,11 +59,14 @@ class Library(Section):
         description="a driver at constant full throttle: it crashes wherever any vehicle within its acceleration does"
     )
     surrogates: dict[SurrogateName, LibraryDriver] = Field(description="drivers by name")
+    references: dict[SurrogateName, LibraryDriver] = Field(
+        default_factory=dict, description="drivers that the vehicle is compared with; no shell is made of them"
+    )
 
     @property
     def drivers(self) -> RecordArray:
-        """The surrogates as kernels read them, in the order of the file, shape (D,)."""
-        models = self.surrogates.values()
+        """The surrogates and then the references as kernels read them, in the order of the file, shape (D + R,)."""
+        models = [*self.surrogates.values(), *self.references.values()]
         return driver_records([model.parameters for model in models], [model.reaction for model in models])
 
     @property
@@ -103,10 +106,10 @@ class Library(Section):
 
     @model_validator(mode="after")
     def _few_enough(self) -> Self:
-        if len(self.surrogates) > MOST_SURROGATES:
+        if (n := len(self.surrogates) + len(self.references)) > MOST_SURROGATES:
             raise broken_rule(
                 "surrogates",
-                found=f"{len(self.surrogates)} of them",
+                found=f"{n} of them, with the references",
                 expected=f"at most {MOST_SURROGATES}",
                 mend="Every shell costs tests: keep those that differ in crash rate by a quarter or more.",
             )
@@ -123,7 +126,7 @@ class Library(Section):
                 mend="Write {model: constant, parameters: {acceleration_mps2: 2.0}}.",
             )
         most = envelope.parameters.acceleration_mps2
-        for name, model in self.surrogates.items():
+        for name, model in (self.surrogates | self.references).items():
             fastest = model.parameters.max_acceleration_mps2
             if fastest > most:
                 raise broken_rule(

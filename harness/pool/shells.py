@@ -13,7 +13,7 @@ import numpy as np
 
 from harness.arrays import IntArray, RecordArray
 from harness.campaign.models import AutomatedVehicle, BuiltInParameters, Campaign
-from harness.episode.cells import PrescribedTraffic
+from harness.episode.cells import PrescribedCutIns, PrescribedTraffic
 from harness.errors import CampaignError
 from harness.pool.cut_ins import Pool
 from harness.strata import FAILED_SHADOWS, OUTSIDE, ShellDesign
@@ -60,25 +60,53 @@ def design_shells(pool: Pool, *, boundary: str | None = None, limit_mps2: float)
     name = boundary or pool.library.boundary
     require_boundary(name, pool.names)
     groups = shells_in_strata(pool, pool.names.index(name), limit_mps2)
-    joined = np.zeros((len(groups), pool.shell_p.size))
-    for row, group in enumerate(groups):
-        joined[row, group] = 1.0
+    cells = cells_in_strata(pool, groups)
+    first = np.unique(cells, return_index=True)[1][-(cells.max() + 1) :]
     n_inside = sum(group[-1] <= pool.names.index(name) for group in groups)
-    names = (*(pool.names[group[0]] for group in groups[:n_inside]), *([OUTSIDE] * (len(groups) - n_inside)))
-    p, moments = joined @ pool.shell_p, joined @ pool.shell_moments @ joined.T
-    if pool.p_unknown > 0.0:  # a stratum without a test may crash as often as it happens
-        names, p, moments = (*names, FAILED_SHADOWS), np.append(p, pool.p_unknown), np.pad(moments, (0, 1))
-    return ShellDesign(
+    p = np.asarray(np.bincount(cells[cells >= 0], pool.cell_p[cells >= 0]), np.float64)
+    design = ShellDesign(
         pool=pool.key,
-        strata=names,
-        p=p,
-        moments=moments,
+        strata=(*(pool.names[group[0]] for group in groups[:n_inside]), *([OUTSIDE] * (len(groups) - n_inside))),
+        cell_stratum=tuple(_stratum_of_shell(pool, groups)[pool.cell_shell[first]].tolist()),
+        cell_p=p,
+        cell_references=tuple(pool.cell_references[first].tolist()),
+        references=tuple(pool.library.references),
+        reference_rate=pool.reference_rate,
+        reference_square=pool.reference_square,
         n_paths=pool.n_paths,
         n_inside=n_inside,
         boundary=name,
         p_cut_in=pool.p_cut_in,
-        p_impossible=pool.p_cut_in - float((joined @ pool.shell_p).sum()),
+        p_impossible=pool.p_cut_in - float(p.sum()),
     )
+    return design if pool.p_unknown == 0.0 else _with_failed_shadows(design, pool.p_unknown)
+
+
+def _with_failed_shadows(design: ShellDesign, p: float) -> ShellDesign:
+    """One more stratum, of probability ``p`` at most: as it has no test, it may crash as often as it happens."""
+    return replace(
+        design,
+        strata=(*design.strata, FAILED_SHADOWS),
+        cell_stratum=(*design.cell_stratum, len(design.strata)),
+        cell_p=np.append(design.cell_p, p),
+        cell_references=(*design.cell_references, 0),
+    )
+
+
+def _stratum_of_shell(pool: Pool, groups: list[list[int]]) -> IntArray:
+    """Stratum that each shell of the pool belongs to, -1 for none, shape (D + 1,)."""
+    stratum = np.full(pool.shell_p.size, -1, np.int64)
+    for place, group in enumerate(groups):
+        stratum[group] = place
+    return stratum
+
+
+def cells_in_strata(pool: Pool, groups: list[list[int]]) -> IntArray:
+    """Cell of a campaign that each cell of the pool belongs to, by stratum and references; -1 for none, shape (C,)."""
+    stratum = _stratum_of_shell(pool, groups)[pool.cell_shell]
+    kind = np.where(stratum < 0, -1, (stratum << len(pool.library.references)) | pool.cell_references)
+    kinds = np.unique(kind[kind >= 0])
+    return np.where(kind < 0, -1, np.searchsorted(kinds, kind))
 
 
 @dataclass(frozen=True)
@@ -107,6 +135,7 @@ class PrescribedEpisodes:
         design = design_shells(pool, boundary=campaign.testing.shells.boundary, limit_mps2=limit)
         groups = shells_in_strata(pool, pool.names.index(design.boundary), limit)
         self._cut_ins = pool.cut_ins
+        self._cells = cells_in_strata(pool, groups)
         self._order = [_order(pool, group, campaign.seed, stratum) for stratum, group in enumerate(groups)]
         self._order += [np.zeros(0, np.int64)] * (len(design.strata) - len(groups))
         self.design = replace(design, available=tuple(order.size for order in self._order))
@@ -125,10 +154,16 @@ class PrescribedEpisodes:
         rows = [self._order[draw.stratum][draw.first : draw.first + draw.n] for draw in draws]
         return np.concatenate(rows), np.repeat([draw.stratum for draw in draws], [draw.n for draw in draws])
 
-    def episodes(self, draws: tuple[Draw, ...]) -> tuple[RecordArray, PrescribedTraffic, IntArray]:
-        """Initial states (n,), traffic, and rows of the pool's cut-ins (n,)."""
+    def episodes(self, draws: tuple[Draw, ...]) -> tuple[RecordArray, PrescribedTraffic, PrescribedCutIns]:
+        """Initial states (n,), traffic, and which cut-ins they are."""
         rows, stratum = self.rows(draws)
-        return (*self.of_rows(rows, stratum), rows)
+        return (*self.of_rows(rows, stratum), self.cut_ins(rows))
+
+    def cut_ins(self, rows: IntArray) -> PrescribedCutIns:
+        """What records say of given cut-ins of the pool (n,)."""
+        joined = np.eye(len(self.design.cell_stratum) + 1)[self._cells, :-1]  # the last row is for what is not tested
+        mass = self._cut_ins.path_mass[rows] @ joined
+        return PrescribedCutIns(rows, self._cells[self._cut_ins.cell[rows]], mass)
 
     def of_rows(self, rows: IntArray, stratum: IntArray) -> tuple[RecordArray, PrescribedTraffic]:
         """Initial states (n,) and traffic of given cut-ins of the pool (n,), tested for given strata (n,)."""
@@ -149,7 +184,7 @@ class PrescribedEpisodes:
 def _order(pool: Pool, group: list[int], seed: int, stratum: int) -> IntArray:
     """Rows of the pool's cut-ins in the order in which a stratum, made of a group of shells, takes them."""
     rng = np.random.Generator(np.random.Philox(key=np.array([seed, stratum], np.uint64)))
-    rows = [rng.permutation(np.flatnonzero(pool.cut_ins.shell == s)) for s in group]
+    rows = [rng.permutation(np.flatnonzero(pool.shell == s)) for s in group]
     if len(rows) == 1:
         return rows[0]
     p = pool.shell_p[group]

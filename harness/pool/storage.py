@@ -25,7 +25,7 @@ from harness.records.folder import require_place, write_atomically
 from harness.resolved import Resolved
 from harness.state import STATE_COLUMNS, states_from
 
-_FORMAT = 3
+_FORMAT = 4
 """Raise it when the meaning of a pool changes."""
 _MADE_BY = ("aimed_paths.py", "build.py", "cut_ins.py")
 """Code that decides what is in a pool, beside the kernels."""
@@ -138,16 +138,21 @@ def _digest(table: pa.Table, facts: bytes) -> str:
 
 def _table(pool: Pool) -> pa.Table:
     c = pool.cut_ins
-    probability = pool.shell_p / np.maximum(np.bincount(c.shell, minlength=pool.shell_p.size), 1)
+    probability = pool.shell_p / np.maximum(np.bincount(pool.shell, minlength=pool.shell_p.size), 1)
     columns: dict[str, tuple[pa.Array, str]] = {
         "path": (pa.array(c.path), "index of the path in the pool"),
         **{name: (pa.array(np.ascontiguousarray(c.state[name])), "initial state") for name in STATE_COLUMNS},
         "cut_in_step": (pa.array(c.step.astype(np.int16)), "step (0.1 s) in which BV cuts in"),
-        "probability": (pa.array(probability[c.shell]), "P under the NDE that it stands for"),
-        "shell": (pa.array(c.shell.astype(np.int8)), "first surrogate that crashes; the last shell: none does"),
+        "probability": (pa.array(probability[pool.shell]), "P under the NDE that it stands for"),
+        "shell": (pa.array(pool.shell.astype(np.int8)), "first surrogate that crashes; the last shell: none does"),
+        "cell": (pa.array(c.cell.astype(np.int16)), "shell and references that crash, as the metadata lists cells"),
         "crashes": (
             pa.FixedSizeListArray.from_arrays(pa.array(c.crashes.ravel()), c.crashes.shape[1]),
-            "which surrogates crash, in the order of the metadata's names",
+            "which surrogates crash, in the order of the metadata's names, and which references",
+        ),
+        "path_mass": (
+            pa.FixedSizeListArray.from_arrays(pa.array(c.path_mass.ravel()), c.path_mass.shape[1]),
+            "P of a cut-in of each cell on the same path, times naturalistic over proposal density of the path",
         ),
         "lv_maneuvers": (_lists(c.lv, c.n_lv), "LV's draws, one per hold period"),
         "bv_maneuvers": (_lists(c.bv, c.n_bv), "BV's draws; 31 marks the cut-in"),
@@ -160,7 +165,7 @@ def _table(pool: Pool) -> pa.Table:
 
 
 def _facts(pool: Pool) -> dict[str, Any]:
-    known = {name: value for name, value in vars(pool).items() if name not in ("library", "cut_ins")}
+    known = {each.name: getattr(pool, each.name) for each in fields(pool) if each.name not in ("library", "cut_ins")}
     plain = {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in known.items()}
     return {"format": _FORMAT, "library": pool.library.model_dump(), **plain}
 
@@ -184,17 +189,21 @@ def _pool(table: pa.Table, facts: dict[str, Any]) -> Pool:
     width = int(np.asarray(bv_column.combine_chunks().value_lengths()).max(initial=0))
     lv, n_lv = _padded(table.column("lv_maneuvers"), width)
     bv, n_bv = _padded(bv_column, width)
-    crashes = table.column("crashes").combine_chunks().flatten().to_numpy(zero_copy_only=False)
+    crashes, mass = (
+        table.column(name).combine_chunks().flatten().to_numpy(zero_copy_only=False)
+        for name in ("crashes", "path_mass")
+    )
     cut_ins = CutIns(
         path=np.asarray(table.column("path")),
         step=np.asarray(table.column("cut_in_step")).astype(np.int64),
-        shell=np.asarray(table.column("shell")).astype(np.int64),
+        cell=np.asarray(table.column("cell")).astype(np.int64),
         state=states_from(np.asarray(table.column(name)) for name in STATE_COLUMNS),
         lv=lv,
         bv=bv,
         n_lv=n_lv,
         n_bv=n_bv,
-        crashes=np.asarray(crashes).reshape(-1, len(facts["names"])),
+        crashes=np.asarray(crashes).reshape(table.num_rows, -1),
+        path_mass=np.asarray(mass).reshape(table.num_rows, -1),
     )
     known: dict[str, Any] = {
         name: np.array(value) if isinstance(value, list) else value for name, value in facts.items()

@@ -58,9 +58,13 @@ def _outcome_type() -> pa.DataType:
     return pa.dictionary(pa.int8(), pa.string())
 
 
-def episodes_schema(n_importance: int, n_surrogates: int) -> pa.Schema:
-    """Schema of the ``episodes`` table for given numbers of importance functions and surrogates."""
+def episodes_schema(n_importance: int, n_surrogates: int, n_cells: int = 0) -> pa.Schema:
+    """Schema of the ``episodes`` table for given numbers of importance functions, surrogates, and cells of shells."""
     f8 = pa.float64()
+    of_shells = [
+        _field("cell", pa.int16(), "1", "cell of shells.json: shell, and which references crash (method shells alone)"),
+        _field("cell_mass", _per(n_cells), "1", "P of a cut-in of each cell on the same path (method shells alone)"),
+    ]
     return pa.schema(
         [
             _field("episode", pa.int64(), "1", "index of the episode in the campaign"),
@@ -88,6 +92,7 @@ def episodes_schema(n_importance: int, n_surrogates: int) -> pa.Schema:
             _field(
                 "pool_cut_in", pa.int64(), "1", "row of the pool's cut-in (method shells), else null", nullable=True
             ),
+            *(of_shells if n_cells else ()),
             _field("failure", pa.string(), "", "cause, for failed episodes", nullable=True),
         ]
     )

@@ -104,8 +104,12 @@ class StoredShells(Stored):
     model_config = ConfigDict(extra="forbid")
     pool: str
     strata: list[str]
-    p: list[float]
-    moments: list[list[float]]
+    cell_stratum: list[Count]
+    cell_p: list[float]
+    cell_references: list[Count]
+    references: list[str]
+    reference_rate: list[float]
+    reference_square: list[float]
     n_paths: Count
     n_inside: Count
     boundary: str
@@ -115,9 +119,13 @@ class StoredShells(Stored):
 
     @model_validator(mode="after")
     def _of_one_size(self) -> Self:
-        n = len(self.strata)
-        if [len(self.p), len(self.moments), *map(len, self.moments)] != [n] * (n + 2):
-            raise ValueError("p and moments need a row for each of the strata")
+        n, r = len(self.cell_stratum), len(self.references)
+        if [len(self.cell_p), len(self.cell_references)] != [n, n] or set(self.cell_stratum) != set(
+            range(len(self.strata))
+        ):
+            raise ValueError("cells need a stratum, a probability and references each, and strata a cell")
+        if [len(self.reference_rate), len(self.reference_square)] != [r, r]:
+            raise ValueError("references need a rate and a mean square each")
         return self
 
 

@@ -59,7 +59,9 @@ def _names(codes: Int8Array, names: tuple[str, ...]) -> pa.Array:
 def episodes_table(shard: Shard, seed: int) -> pa.Table:
     """One row per episode, in index order."""
     e, n = shard.results.episode, shard.results.episode.size
-    schema = episodes_schema(shard.results.log_q.shape[1], shard.results.martingale.shape[1])
+    prescribed = shard.cut_ins
+    n_cells = 0 if prescribed is None else prescribed.cell_mass.shape[1]
+    schema = episodes_schema(shard.results.log_q.shape[1], shard.results.martingale.shape[1], n_cells)
     never = e["cut_in_step"] < 0
     columns = {
         "episode": pa.array(shard.first_episode + np.arange(n)),
@@ -75,7 +77,11 @@ def episodes_table(shard: Shard, seed: int) -> pa.Table:
         "bv_maneuvers": _prefixes(shard.results.bv_path, e["n_bv"].astype(np.int64)),
         "failure": pa.array([shard.failures.get(row) for row in range(n)], pa.string()),
     }
-    columns["pool_cut_in"] = pa.nulls(n, pa.int64()) if shard.cut_ins is None else pa.array(shard.cut_ins)
+    if prescribed is None:
+        columns["pool_cut_in"] = pa.nulls(n, pa.int64())
+    else:
+        columns["pool_cut_in"], columns["cell"] = pa.array(prescribed.row), pa.array(prescribed.cell.astype(np.int16))
+        columns["cell_mass"] = _rows(prescribed.cell_mass)
     for name in ("n_steps", "n_control_steps", "component"):
         columns[name] = pa.array(e[name])
     for name in ("cut_in_r2_m", "cut_in_r2dot_mps", "crash_time_s", "impact_speed_mps", "min_ttc_s", "log_p_cut_in"):

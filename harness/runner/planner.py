@@ -21,18 +21,19 @@ from harness.estimators import Shells, StopRule, accumulator
 from harness.estimators.block import Block
 from harness.estimators.estimate import BothWays, Estimate
 from harness.estimators.intervals import clopper_pearson
-from harness.estimators.shells import combined
+from harness.estimators.likelihood_ratio import Level
+from harness.estimators.stratified import Tally, combined, empty_tally
 from harness.pool.shells import Draw, PrescribedEpisodes
 from harness.runner.worker import ShardSpec
 from harness.strata import ShellDesign
 
-GROWTH = 1.25
+GROWTH = 1.1
 """Tests after a round over tests before it; also the distance of the looks at the result."""
 CONDITIONAL_RHW = 0.3
 """Relative half-width of the conditional statement at which testing turns to what lies outside."""
 CONFIDENCE = 0.9
 """Level at which widths are compared, whatever the campaign reports."""
-_TAIL = (1.0 - CONFIDENCE) / 2.0
+_TAIL, _LEVEL = (1.0 - CONFIDENCE) / 2.0, Level.two_sided(CONFIDENCE)
 MOST_FIRST_TESTS = 4
 """Testing turns to what lies outside after this many times the first tests, known or not."""
 SMALLEST_ROUND = 8
@@ -83,30 +84,29 @@ class ShellPlanner:
         self.estimate: Estimate | None = None
         self._campaign = campaign
         self._allocation = Allocation(design, shells.first_tests, available, shells.statement == "conditional")
-        self._none = np.zeros(design.p.size, np.int64)
+        self._none = empty_tally(design.p.size)
         self._seen = Shells()
         self._sums = BothWays(self._seen)
         self._n_episodes = self._look = 0
 
     @property
-    def tests(self) -> IntArray:
-        """Tests of each stratum so far, shape (S,)."""
-        return self._seen.tests if self._n_episodes else self._none
+    def tally(self) -> Tally:
+        """What the tests of each stratum have come to so far."""
+        return self._seen.tally if self._n_episodes else self._none
 
     def rounds(self) -> Iterator[Iterator[ShardSpec]]:
         """Shards of each round; the next round is asked for when all of the last one have been added."""
         n_shards = 0
         while (added := self.next_round()).any():
-            specs = round_specs(self.tests, added, n_shards, self._n_episodes, self._campaign.run.shard_size)
+            specs = round_specs(self.tally.tests, added, n_shards, self._n_episodes, self._campaign.run.shard_size)
             n_shards += len(specs)
             yield iter(specs)
 
     def next_round(self) -> IntArray:
         """Tests to add per stratum, shape (S,); all 0 when no stratum or no budget is left."""
-        crashes, failed = (self._seen.crashes, self._seen.failed) if self._n_episodes else (self._none, self._none)
-        budget = self._campaign.stop.episodes - self._n_episodes
-        added = self._allocation.next_round(self.tests, crashes, failed, budget)
-        self.rule.of_first_tests = bool(np.any(self.tests[added > 0] < self._campaign.testing.shells.first_tests))
+        tally = self.tally
+        added = self._allocation.next_round(tally, self._campaign.stop.episodes - self._n_episodes)
+        self.rule.of_first_tests = bool(np.any(tally.tests[added > 0] < self._campaign.testing.shells.first_tests))
         self._look = self._n_episodes + int(added.sum())
         return added
 
@@ -143,41 +143,40 @@ class Allocation:
     available: IntArray
     conditional_only: bool
 
-    def next_round(self, tests: IntArray, crashes: IntArray, failed: IntArray, budget: int) -> IntArray:
+    def next_round(self, tally: Tally, budget: int) -> IntArray:
         """Tests to add per stratum, at most ``budget``; all 0 when no stratum or no budget is left.
 
-        Parameters
-        ----------
-        tests, crashes, failed : ndarray, shape (S,)
-            So far. Failed tests widen the limits that are to be narrowed: they may have been crashes.
+        Failed tests widen the limits that are to be narrowed: they may have been crashes.
         """
-        if self._used_up(tests, crashes, failed):
+        tests = tally.tests
+        if self._used_up(tally):
             return np.zeros_like(tests)
-        begun = self._begun(tests, crashes, failed)
+        begun = self._begun(tally)
         active = begun & (tests < self.available)
         wanted = np.where(active, np.maximum(self.first_tests - tests, 0), 0)
         if not wanted.any() and active.any():
             size = max(SMALLEST_ROUND, int(np.ceil(tests[begun].sum() * (GROWTH - 1.0))))
-            wanted = self._spread(min(size, budget), tests, crashes, failed, active)
+            wanted = self._spread(min(size, budget), tally, active)
         # The budget cuts a round from the last stratum on.
         allowed = np.minimum(np.cumsum(np.minimum(wanted, self.available - tests)), max(budget, 0))
         added: IntArray = np.diff(allowed, prepend=0)
         return added
 
-    def _used_up(self, tests: IntArray, crashes: IntArray, failed: IntArray) -> bool:
+    def _used_up(self, tally: Tally) -> bool:
         """Whether nearly all that is left to know lies in strata without further cut-ins."""
-        low, high = clopper_pearson(crashes, tests, _TAIL, failed)
+        tests, (low, high) = tally.tests, clopper_pearson(tally.crashes, tally.tests, _TAIL, tally.failed)
         relevant = np.arange(tests.size) < (self.design.n_inside if self.conditional_only else tests.size)
         squares = np.where(relevant, (self.design.p * (high - low)) ** 2, 0.0)
         return bool(squares[tests >= self.available].sum() >= USED_UP_SHARE * squares.sum())
 
-    def _begun(self, tests: IntArray, crashes: IntArray, failed: IntArray) -> BoolArray:
+    def _begun(self, tally: Tally) -> BoolArray:
         """Strata that it is time to test: those inside, and from some point on all."""
+        tests = tally.tests
         inside = np.arange(tests.size) < self.design.n_inside
         if self.conditional_only:
             return inside
         d, s = self.design, slice(0, self.design.n_inside)
-        inner = combined(d.p[s], crashes[s], tests[s], d.moments[s, s], d.n_paths, _TAIL, failed[s])
+        inner = combined(d.p[s], tally.part(s), d.n_paths, _LEVEL)
         known = inner.rhw <= CONDITIONAL_RHW
         exhausted = bool(np.all(tests[s] >= self.available[s]))
         started = bool(np.any(tests[d.n_inside :] > 0))
@@ -185,11 +184,12 @@ class Allocation:
         spent = bool(tests[s].sum() >= MOST_FIRST_TESTS * self.first_tests * d.n_inside)
         return np.ones_like(inside) if known or exhausted or started or spent else inside
 
-    def _spread(self, size: int, tests: IntArray, crashes: IntArray, failed: IntArray, active: BoolArray) -> IntArray:
+    def _spread(self, size: int, tally: Tally, active: BoolArray) -> IntArray:
         """Give portions, one after the other, to where each narrows the sum of squared half-widths most.
 
         A squared half-width shrinks as 1/n, or as 1/n² where shares are all 0 or 1.
         """
+        tests, crashes, failed = tally.tests, tally.crashes, tally.failed
         low, high = clopper_pearson(crashes, tests, _TAIL, failed)
         squares = ((self.design.p * (high - low) / 2.0) ** 2).tolist()
         powers = np.where((crashes + failed == 0) | (crashes == tests), 2, 1).tolist()
@@ -214,9 +214,9 @@ class Allocation:
 
 
 class RoundRule:
-    """Looks after each round, and is content with one pass: looks are 1.25 apart, not 1.1.
+    """Looks after each round, and is content with one pass.
 
-    That limits within shells are exact at a fixed number of tests says nothing about the number at which a rule stops;
+    That limits within shells hold at a fixed number of tests says nothing about the number at which a rule stops;
     that intervals cover there, and how far the rate is biased, is measured (docs/estimators.md).
 
     Parameters

@@ -126,7 +126,7 @@ def _replay(
         else:
             row, stratum = (np.asarray(stored[name]).astype(np.int64) for name in ("pool_cut_in", "component"))
             shard = loop.run(episode, *prepared.prescribed.of_rows(row, stratum))
-            shard.cut_ins = row
+            shard.cut_ins = prepared.prescribed.cut_ins(row)
     finally:
         world.close()
     tables = shard_tables(shard, resolved.campaign.seed, keep_traces=True)

@@ -170,9 +170,9 @@ class ShardRunner:
         prescribed, first = self._prepared.prescribed, spec.first_episode
         if prescribed is None:
             return run_drawn(self._loop, self._prepared, first, spec.n_episodes)
-        states, traffic, rows = prescribed.episodes(spec.draws)
+        states, traffic, cut_ins = prescribed.episodes(spec.draws)
         shard = self._loop.run(first, states, traffic)
-        shard.cut_ins = rows
+        shard.cut_ins = cut_ins
         return shard
 
     def _repeat(self, shard: Shard) -> Repeated:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -25,11 +26,40 @@ from harness.studies.judgement import Row, estimate_row
 FREE, CONDITIONAL = "shells", "shells, conditional"
 
 
+@dataclass(frozen=True, eq=False)
+class DrawnPool:
+    """A pool, and what a vehicle does on its paths.
+
+    ``mass`` and ``crash_mass`` (n, S) are each path's probability of a cut-in of each stratum, and of a crash in it.
+    """
+
+    design: ShellDesign
+    mass: FloatArray
+    crash_mass: FloatArray
+
+    @cached_property
+    def share(self) -> FloatArray:
+        """Share of crashes in each stratum, shape (S,)."""
+        p, crash_p = self.mass.sum(0), self.crash_mass.sum(0)
+        share = np.divide(crash_p, p, out=np.zeros_like(p), where=p > 0.0)
+        return np.asarray(np.clip(share, 0.0, 1.0))  # rounding may leave the unit interval
+
+    @cached_property
+    def _cumulative(self) -> FloatArray:
+        return np.cumsum(self.crash_mass, axis=0)
+
+    def crashed_paths(self, stratum: int, n: int, rng: np.random.Generator) -> FloatArray:
+        """Mass (n, S) of the paths of n crashed tests of a stratum."""
+        cumulative = self._cumulative[:, stratum]
+        paths: FloatArray = self.mass[np.searchsorted(cumulative, rng.random(n) * cumulative[-1], side="right")]
+        return paths
+
+
 class ShellSource(Protocol):
     """Where the pools of replications come from."""
 
-    def draw(self, rng: np.random.Generator) -> tuple[ShellDesign, FloatArray]:
-        """A new pool: its strata, and the vehicle's share of crashes (S,) in each."""
+    def draw(self, rng: np.random.Generator) -> DrawnPool:
+        """A new pool."""
         ...
 
 
@@ -48,16 +78,15 @@ class ShellCampaign:
 
     def _replicate(self, replication: int) -> Iterator[Row]:
         rng = np.random.default_rng([self.seed, replication])
-        design, share = self.source.draw(rng)
-        design = _wrong(design, self.fault)
+        drawn = _wrong(self.source.draw(rng), self.fault)
+        design = drawn.design
         available = np.full(design.p.size, self.campaign.pool.cut_ins_per_shell, np.int64)
         planner = ShellPlanner(self.campaign, design, available)
         inside, conditional = RoundRule(_conditional(self.campaign)), None
         estimate: Estimate | None = None
         enough = False
         while not enough and (added := planner.next_round()).any():
-            n = int(planner.tests.sum())
-            enough = planner.add(_block(design, added, rng.binomial(added, share), n))
+            enough = planner.add(_block(drawn, added, int(planner.tally.tests.sum()), rng))
             estimate = planner.estimate
             if estimate is not None and conditional is None:
                 inside.observe(estimate)
@@ -75,24 +104,27 @@ def _conditional(campaign: Campaign) -> Campaign:
     return campaign.model_copy(update={"testing": campaign.testing.model_copy(update={"shells": shells})})
 
 
-def _wrong(design: ShellDesign, fault: Fault | None) -> ShellDesign:
+def _wrong(drawn: DrawnPool, fault: Fault | None) -> DrawnPool:
+    """The pool with probabilities that are not those of its paths."""
     if fault is None:
-        return design
-    factor = np.ones(design.p.size)
+        return drawn
+    factor = np.ones(drawn.design.cell_p.size)
     factor[fault.shell] = fault.factor
-    return replace(design, p=design.p * factor, moments=design.moments * np.outer(factor, factor))
+    return replace(drawn, design=replace(drawn.design, cell_p=drawn.design.cell_p * factor))
 
 
-def _block(design: ShellDesign, added: IntArray, crashes: IntArray, first: int) -> Block:
+def _block(drawn: DrawnPool, added: IntArray, first: int, rng: np.random.Generator) -> Block:
     """What the records of a round become: within a stratum the crashes come first, which no estimator can see."""
-    stratum = np.repeat(np.arange(added.size), added)
+    stratum, crashes = np.repeat(np.arange(added.size), added), rng.binomial(added, drawn.share)
     n = stratum.size
     rank = np.arange(n) - np.repeat(np.cumsum(added) - added, added)
-    none = np.zeros(n, np.bool_)
+    none, crash = np.zeros(n, np.bool_), rank < crashes[stratum]
+    mass = np.zeros((n, added.size))
+    mass[crash] = np.concatenate([drawn.crashed_paths(s, k, rng) for s, k in enumerate(crashes.tolist())])
     return Block(
         first_episode=first,
         method="shells",
-        crash=rank < crashes[stratum],
+        crash=crash,
         failed=none,
         cut_in=~none,
         bv_lv_contact=none,
@@ -101,7 +133,9 @@ def _block(design: ShellDesign, added: IntArray, crashes: IntArray, first: int) 
         alpha=np.zeros(0),
         n_control_steps=np.zeros(n, np.int64),
         stratum=stratum,
-        shells=design,
+        cell=stratum,
+        cell_mass=mass,
+        shells=drawn.design,
     )
 
 

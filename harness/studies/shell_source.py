@@ -12,7 +12,7 @@ from harness.errors import CampaignError
 from harness.pool.cut_ins import CutIns, Pool, shells_of
 from harness.pool.library import Library
 from harness.pool.shells import acceleration_limit, design_shells, shells_in_strata
-from harness.strata import ShellDesign
+from harness.studies.shell_campaign import DrawnPool
 from harness.studies.super_population import Mixed, SuperPopulation
 
 EQUAL_RATE = 0.02
@@ -47,21 +47,18 @@ class OvertakingShells:
         by_shell = self.crashing.sum(0)
         return float(by_shell[self.template.boundary + 1 :].sum() / by_shell.sum())
 
-    def draw(self, rng: np.random.Generator) -> tuple[ShellDesign, FloatArray]:
-        """A new pool: its strata, and the vehicle's share of crashes (S,) in each."""
+    def draw(self, rng: np.random.Generator) -> DrawnPool:
+        """A new pool."""
         rows = rng.integers(0, len(self.shells), self.template.n_paths)
         drawn = self.shells[rows]
-        pool = replace(
-            self.template,
-            shell_p=drawn.mean(0),
-            shell_moments=drawn.T @ drawn / len(rows),
-            p_cut_in=float(drawn.sum(1).mean()),
-        )
+        pool = replace(self.template, cell_p=drawn.mean(0), p_cut_in=float(drawn.sum(1).mean()))
         design = design_shells(pool, limit_mps2=self.limit_mps2)
-        crash_p = self.crashing[rows].mean(0)
         groups = shells_in_strata(pool, pool.boundary, self.limit_mps2)
-        share = np.array([crash_p[group].sum() / pool.shell_p[group].sum() for group in groups])
-        return design, np.clip(share, 0.0, 1.0)
+        mass, crash_mass = (
+            np.column_stack([by_shell[:, group].sum(1) for group in groups])
+            for by_shell in (drawn, self.crashing[rows])
+        )
+        return DrawnPool(design, mass, crash_mass)
 
 
 def equals(library: Library, population: SuperPopulation, crashing: FloatArray) -> set[str]:
@@ -149,17 +146,21 @@ def _template(library: Library, names: tuple[str, ...], shells: FloatArray, n_pa
         p_cut_in_se=0.0,
         mu=np.zeros(d),
         mu_covariance=np.zeros((d, d)),
-        shell_p=shells.mean(0),
-        shell_moments=shells.T @ shells / len(shells),
+        cell_shell=np.arange(d + 1),
+        cell_references=np.zeros(d + 1, np.int64),
+        cell_p=shells.mean(0),
+        reference_rate=np.zeros(0),
+        reference_square=np.zeros(0),
         cut_ins=CutIns(
             path=none,
             step=none,
-            shell=none,
+            cell=none,
             state=np.zeros((0, 5)),
             lv=no_draws,
             bv=no_draws,
             n_lv=none,
             n_bv=none,
             crashes=np.zeros((0, d), np.bool_),
+            path_mass=np.zeros((0, d + 1), np.float32),
         ),
     )

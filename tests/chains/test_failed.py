@@ -51,8 +51,7 @@ def test_intervals_cover_whatever_failed_tests_would_have_come_to(name):
 def shells_block(rng: np.random.Generator) -> Block:
     """Fixed numbers of tests in the shells of a pool that is exactly known."""
     source = ChainShells(CHAIN, 20)
-    design, _ = source.draw(rng)
-    design = replace(design, p=source.shell_p, moments=np.outer(source.shell_p, source.shell_p))
+    design = replace(source.draw(rng).design, cell_p=source.shell_p, n_paths=10**12)
     stratum = np.repeat(np.arange(len(design.p)), 300)
     share = source.crash_p / source.shell_p
     n = len(stratum)
@@ -70,6 +69,8 @@ def shells_block(rng: np.random.Generator) -> Block:
         alpha=np.zeros(0),
         n_control_steps=np.ones(n, np.int64),
         stratum=stratum,
+        cell=stratum,
+        cell_mass=np.tile(source.shell_p, (n, 1)),
         shells=design,
     )
 

@@ -12,8 +12,9 @@ from harness.strata import ShellDesign
 
 State = TypeVar("State")
 SHELLS = ShellDesign(
-    pool="0" * 24, strata=("careful", "careless", "outside"), p=np.array([1e-4, 3e-4, 2e-2]), moments=np.zeros((3, 3)),
-    n_paths=10**9, n_inside=2, boundary="careless", p_cut_in=0.03, p_impossible=0.0096,
+    pool="0" * 24, strata=("careful", "careless", "outside"), cell_stratum=(0, 1, 2), cell_references=(0, 0, 0),
+    cell_p=np.array([1e-4, 3e-4, 2e-2]), n_paths=10**9, n_inside=2, boundary="careless",
+    p_cut_in=0.03, p_impossible=0.0096,
 )  # fmt: skip
 """Shells of a pool that is known exactly."""
 
@@ -45,7 +46,8 @@ def block(
 def in_shells(strata: list[int], crash: list[bool], failed: list[bool] | None = None, first: int = 0) -> Block:
     """Tests drawn from `SHELLS`."""
     n = len(strata)
-    design = {"stratum": np.array(strata, np.int64), "shells": SHELLS}
+    stratum = np.array(strata, np.int64)
+    design = {"stratum": stratum, "cell": stratum, "cell_mass": np.tile(SHELLS.p, (n, 1)), "shells": SHELLS}
     none = {"log_q": np.zeros((n, 0)), "alpha": np.zeros(0)}
     log_weight = np.log(SHELLS.p)[strata]
     some = block(crash, log_weight, failed=failed, method="shells", first_episode=first, **design, **none)

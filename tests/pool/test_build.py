@@ -48,12 +48,12 @@ def test_kept_cut_ins_stand_for_their_shell(pool):
     """Crash shares among the kept reproduce the crash rates: 1,500 of each shell, four standard errors."""
     c = pool.cut_ins
     for s in range(pool.shell_p.size - 1):
-        assert c.crashes[c.shell == s, s].all()
-        assert not c.crashes[c.shell == s, :s].any()
-    assert not c.crashes[c.shell == len(pool.names)].any()
-    kept = np.bincount(c.shell)
+        assert c.crashes[pool.shell == s, s].all()
+        assert not c.crashes[pool.shell == s, :s].any()
+    assert not c.crashes[pool.shell == len(pool.names)].any()
+    kept = np.bincount(pool.shell)
     for k in range(len(pool.names)):
-        share = np.array([c.crashes[c.shell == s, k].mean() for s in range(kept.size)])
+        share = np.array([c.crashes[pool.shell == s, k].mean() for s in range(kept.size)])
         error = np.sqrt((pool.shell_p**2 * share * (1.0 - share) / kept).sum())
         assert abs(pool.shell_p @ share - pool.mu[k]) <= 4.0 * error + 1e-12 * pool.mu[k]
 
@@ -76,7 +76,7 @@ def test_the_same_settings_give_the_same_bits(campaign, pool, tmp_path, monkeypa
     again = campaign_pool(resolve(campaign))
     for field in dataclasses.fields(pool.cut_ins):
         assert np.array_equal(getattr(pool.cut_ins, field.name), getattr(again.cut_ins, field.name))
-    for name in ("mu", "mu_covariance", "shell_p", "shell_moments"):
+    for name in ("mu", "mu_covariance", "cell_p", "cell_shell", "cell_references"):
         assert np.array_equal(getattr(pool, name), getattr(again, name))
 
 
@@ -157,7 +157,7 @@ def test_a_place_that_cannot_keep_a_pool_is_refused_before_it_is_built(campaign,
 
 def test_draws_are_a_permutation_within_a_shell_and_follow_probabilities_outside(campaign, pool):
     prescribed = PrescribedEpisodes(campaign, pool)
-    within, outermost = np.flatnonzero(pool.cut_ins.shell == 0), prescribed.design.n_inside
+    within, outermost = np.flatnonzero(pool.shell == 0), prescribed.design.n_inside
     assert prescribed.available[0] == within.size
     rows, stratum = prescribed.rows((Draw(0, 0, within.size), Draw(outermost, 0, 500)))
     assert sorted(rows[: within.size]) == within.tolist()
@@ -165,7 +165,7 @@ def test_draws_are_a_permutation_within_a_shell_and_follow_probabilities_outside
     outside = rows[within.size :]
     assert len(set(outside.tolist())) == 500
     beyond = pool.shell_p[pool.boundary + 1 : -1]
-    share, p = (pool.cut_ins.shell[outside] == pool.boundary + 1).mean(), beyond[0] / beyond.sum()
+    share, p = (pool.shell[outside] == pool.boundary + 1).mean(), beyond[0] / beyond.sum()
     assert abs(share - p) < 4.0 * np.sqrt(p * (1.0 - p) / 500)  # misses with probability 6e-5
     with pytest.raises(IndexError):
         prescribed.rows((Draw(0, within.size, 1),))

@@ -60,7 +60,8 @@ def test_a_prescribed_episode_ends_as_the_pool_says(campaign, pool, environment,
     """LV's and BV's paths, the cut-in and the surrogate's answer, driven by the episode loop instead of the pool."""
     prescribed = PrescribedEpisodes(campaign, pool)
     shells = [Draw(s, 0, 60) for s in range(prescribed.design.p.size)]
-    states, traffic, rows = prescribed.episodes(tuple(shells))
+    states, traffic, cut_ins = prescribed.episodes(tuple(shells))
+    rows = cut_ins.row
     driver = LIBRARY.drivers[NAMES.index(surrogate)][None]
     policy = Policy(1, environment, build_importance(campaign, None), driver)
     shard = EpisodeLoop(TwinWorld(16), policy, Keep(0, "none", 0.0)).run(0, states, traffic)

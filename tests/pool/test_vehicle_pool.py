@@ -98,7 +98,7 @@ def test_a_vehicle_that_is_a_surrogate_from_the_cut_in_on_crashes_where_that_one
     brakes = "av.parameters={min_acceleration_mps2: -3.0}"
     loop = prepare(resolve(acting("Speeds", brakes))).loop(TwinWorld(64))
     rows = np.unique(np.linspace(0, len(pool.cut_ins.path) - 1, 1500).astype(np.int64))
-    rows = rows[pool.cut_ins.shell[rows] < pool.shell_p.size - 1]
+    rows = rows[pool.shell[rows] < pool.shell_p.size - 1]
     shard = loop.run(10**6, *ready.prescribed.of_rows(rows, np.zeros(rows.size, np.int64)))
     assert shard.failures == {}
     crashed = shard.results.episode["outcome"] == CRASH

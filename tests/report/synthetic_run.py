@@ -27,8 +27,11 @@ LARGEST_P_CUT_IN = 1e-6
 """Made up: it bounds the weights by 1e-5, which none of these tests exceeds, so that there is a half-width to show."""
 P = np.array([4e-8, 9e-8, 3e-5])
 """Probabilities that are far apart: sums that ignore how often a shell was tested come out wrong by orders."""
+PATH_MASS = 3.0 * P
+"""Of a crashed test's path: some paths have more mass than others."""
 DESIGN = ShellDesign(
-    pool="c0ffee" * 4, strata=("brakes-hard", "brakes-late", "outside"), p=P, moments=np.diag(P * P) * 3.0,
+    pool="c0ffee" * 4, strata=("brakes-hard", "brakes-late", "outside"), cell_stratum=(0, 1, 2), cell_p=P,
+    cell_references=(0, 0, 0),
     n_paths=4_000, n_inside=2, boundary="brakes-late", p_cut_in=3.3e-5, p_impossible=2.87e-6,
 )  # fmt: skip
 
@@ -152,7 +155,10 @@ def _episodes_table(episodes: Episodes, rows: np.ndarray, recipe: RunRecipe) -> 
         ],
         "failure": ["the world lost vehicle AV" if outcome == "failed" else None for outcome in c["outcome"]],
     }
-    return _table(columns, episodes_schema(n_importance, max(n_importance - 1, 0)))
+    if recipe.method == "shells":
+        columns |= {"cell": c["component"], "cell_mass": [PATH_MASS] * len(rows)}
+    n_cells = P.size if recipe.method == "shells" else 0
+    return _table(columns, episodes_schema(n_importance, max(n_importance - 1, 0), n_cells))
 
 
 def _drawn(maneuvers: np.ndarray, n_steps: int, cut_in_step: int) -> list[int]:

@@ -8,10 +8,10 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from report_page import edit, page_of
-from synthetic_run import DESIGN, RECIPES, P
+from synthetic_run import DESIGN, PATH_MASS, RECIPES, P
 
 from harness.errors import RunFolderError
-from harness.estimators.shells import combined, pool_variance
+from harness.estimators.stratified import Tally, pool_variance
 from harness.outcomes import OUTCOMES
 from harness.report import write_report
 from harness.report.answer_plot import answer_plot
@@ -131,8 +131,8 @@ def test_shares_of_uncertainty_add_up_and_the_rest_is_the_pool(runs):
     found = runs["shells_refuted"].shells
     shells = found.shells
     tests, crashes = (np.array([getattr(s, name) for s in shells]) for name in ("n_episodes", "n_crashes"))
-    limits = combined(P, crashes, tests, DESIGN.moments, DESIGN.n_paths, 0.05)
-    variance = pool_variance(crashes / tests, DESIGN.moments, limits.rate, DESIGN.n_paths)
+    tally = Tally(tests, crashes, 0 * crashes, np.outer(crashes, PATH_MASS), np.zeros((3, 3)))
+    variance = pool_variance(P, tally, DESIGN.n_paths)
     assert found.pool_half_width == pytest.approx(1.6448536 * variance**0.5, rel=1e-6)
     widths = [*(s.half_width for s in shells), found.pool_half_width]
     assert sum(map(found.share_of_uncertainty, widths)) == pytest.approx(1.0)

@@ -12,6 +12,7 @@ import pytest
 
 from harness import estimate, replay
 from harness.errors import CampaignError, RunFolderError
+from harness.estimators.stratified import Tally
 from harness.runner import compare_campaigns
 from harness.runner.campaign_run import episodes_on_disk
 from harness.runner.manifest import Manifest, Prefix
@@ -110,12 +111,13 @@ def test_a_pool_that_is_too_rough_ends_the_run(campaign, run_here, tmp_path):
 
 def test_a_smaller_precision_that_the_pool_cannot_give_costs_no_test(campaign, run_here, tmp_path):
     """The run has gone beyond the look at which it would have given up on the smaller one."""
-    often = ("av={model: constant, parameters: {acceleration_mps2: -1.0}}", "world.engine=twin", "stop.episodes=100000")
+    often = ("av={model: constant, parameters: {acceleration_mps2: -1.0}}", "world.engine=twin")
+    many = ("stop.episodes=100000", "pool.cut_ins_per_shell=5000")
     out = tmp_path / "run"
-    held = run_here(campaign(*SHELLS, *often, "stop.rhw=0.1"), out)
-    fresh = run_here(campaign(*SHELLS, *often, "stop.rhw=0.05"), tmp_path / "fresh")
+    held = run_here(campaign(*SHELLS, *often, *many, "stop.rhw=0.15"), out)
+    fresh = run_here(campaign(*SHELLS, *often, *many, "stop.rhw=0.05"), tmp_path / "fresh")
     assert fresh.estimates["n_episodes"] < held.estimates["n_episodes"]
-    result = run_here(campaign(*SHELLS, *often, "stop.rhw=0.05"), out, resume=True)
+    result = run_here(campaign(*SHELLS, *often, *many, "stop.rhw=0.05"), out, resume=True)
     assert result.stopped_by == "pool_error"
     assert result.estimates["n_episodes"] == held.estimates["n_episodes"]
 
@@ -231,43 +233,50 @@ def test_comparing_is_refused(campaign, tmp_path):
 
 
 DESIGN = ShellDesign(
-    pool="0" * 24, strata=("a", "b", "outside"), p=np.array([1e-7, 2e-7, 3e-5]), moments=np.zeros((3, 3)),
+    pool="0" * 24, strata=("a", "b", "outside"), cell_stratum=(0, 1, 2), cell_p=np.array([1e-7, 2e-7, 3e-5]),
     n_paths=10**9, n_inside=2, boundary="b", p_cut_in=4e-5, p_impossible=0.0,
 )  # fmt: skip
+
+
+def tally(tests, crashes, failed):
+    """Counts of tests of a pool that is known exactly."""
+    return Tally(tests, crashes, failed, np.outer(crashes, DESIGN.p), np.outer(failed, DESIGN.p))
+
+
 MANY, NONE = np.full(3, 10_000), np.zeros(3, int)
 
 
 def test_what_lies_inside_is_tested_first():
     rule = Allocation(DESIGN, 12, MANY, conditional_only=False)
-    assert rule.next_round(NONE, NONE, NONE, 10**6).tolist() == [12, 12, 0]
-    assert rule.next_round(np.array([12, 12, 0]), np.array([6, 0, 0]), NONE, 10**6)[2] == 0
-    assert rule.next_round(np.array([400, 400, 0]), np.array([200, 0, 0]), NONE, 10**6).tolist() == [0, 0, 12]
-    hopeless = rule.next_round(np.array([48, 48, 0]), NONE, NONE, 10**6)
+    assert rule.next_round(tally(NONE, NONE, NONE), 10**6).tolist() == [12, 12, 0]
+    assert rule.next_round(tally(np.array([12, 12, 0]), np.array([6, 0, 0]), NONE), 10**6)[2] == 0
+    assert rule.next_round(tally(np.array([400, 400, 0]), np.array([200, 0, 0]), NONE), 10**6).tolist() == [0, 0, 12]
+    hopeless = rule.next_round(tally(np.array([48, 48, 0]), NONE, NONE), 10**6)
     assert hopeless.tolist() == [0, 0, 12]
 
 
 def test_rounds_grow_to_where_the_interval_is_widest():
     rule = Allocation(DESIGN, 12, MANY, conditional_only=False)
     tests = np.array([400, 400, 800])
-    added = rule.next_round(tests, np.array([200, 10, 0]), NONE, 10**6)
+    added = rule.next_round(tally(tests, np.array([200, 10, 0]), NONE), 10**6)
     assert added.sum() == np.ceil((GROWTH - 1.0) * tests.sum())
     assert added[2] > 0.9 * added.sum()
-    assert rule.next_round(tests, np.array([200, 10, 0]), NONE, 7).sum() == 7
-    assert rule.next_round(tests, np.array([200, 10, 0]), NONE, 0).sum() == 0
+    assert rule.next_round(tally(tests, np.array([200, 10, 0]), NONE), 7).sum() == 7
+    assert rule.next_round(tally(tests, np.array([200, 10, 0]), NONE), 0).sum() == 0
     full = Allocation(DESIGN, 12, tests, conditional_only=False)
-    assert full.next_round(tests, np.array([200, 10, 0]), NONE, 100).sum() == 0
+    assert full.next_round(tally(tests, np.array([200, 10, 0]), NONE), 100).sum() == 0
 
 
 def test_failed_tests_draw_further_tests_to_their_shell():
     rule = Allocation(DESIGN, 12, MANY, conditional_only=True)
     tests, crashes = np.array([400, 400, 0]), np.array([200, 0, 0])
-    without = rule.next_round(tests, crashes, NONE, 10**6)
-    with_failed = rule.next_round(tests, crashes, np.array([0, 40, 0]), 10**6)
+    without = rule.next_round(tally(tests, crashes, NONE), 10**6)
+    with_failed = rule.next_round(tally(tests, crashes, np.array([0, 40, 0])), 10**6)
     assert with_failed[1] > without[1]
     undecided = Allocation(DESIGN, 12, MANY, conditional_only=False)
     few, all_of_a = np.array([40, 40, 0]), np.array([40, 0, 0])
-    assert undecided.next_round(few, all_of_a, NONE, 10**6)[2] == 12
-    assert undecided.next_round(few, all_of_a, np.array([0, 20, 0]), 10**6)[2] == 0
+    assert undecided.next_round(tally(few, all_of_a, NONE), 10**6)[2] == 12
+    assert undecided.next_round(tally(few, all_of_a, np.array([0, 20, 0])), 10**6)[2] == 0
 
 
 def test_first_tests_that_are_enough_are_what_decided(campaign, run_here, tmp_path):

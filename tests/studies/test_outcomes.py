@@ -56,8 +56,8 @@ def test_shells_add_up(chain):
 def test_drawn_pools_scatter_around_the_exact_probabilities(chain):
     source = ChainShells(chain, 512)
     drawn = [source.draw(np.random.default_rng([1, k])) for k in range(200)]
-    p = np.array([design.p for design, _ in drawn])
-    crash = np.array([design.p * share for design, share in drawn])
+    p = np.array([each.design.p for each in drawn])
+    crash = np.array([each.design.p * each.share for each in drawn])
     for found, exact in ((p, source.shell_p), (crash, source.crash_p)):
         error = found.std(axis=0) / np.sqrt(len(found))
         assert np.all(np.abs(found.mean(axis=0) - exact) <= 4.5 * error + 1e-18)

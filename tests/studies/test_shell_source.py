@@ -98,10 +98,10 @@ def test_drawn_pools_scatter_around_the_population(drivers, population):
     assert source.shells.sum() == pytest.approx(population.cut_in.sum(), rel=1e-12)
     assert source.crashing.sum() == pytest.approx(drivers.vehicles["own"].crash_mass(population).sum(), rel=1e-12)
     drawn = [source.draw(np.random.default_rng([1, k])) for k in range(300)]
-    rates = np.array([design.p @ share for design, share in drawn])
+    rates = np.array([each.design.p @ each.share for each in drawn])
     exact = source.crashing.sum() / population.cut_in.size
     assert abs(rates.mean() - exact) < 4.0 * rates.std() / np.sqrt(len(rates))
-    assert all(design.strata[-1] == "outside" and design.boundary == LIBRARY.boundary for design, _ in drawn)
+    assert all((each.design.strata[-1], each.design.boundary) == ("outside", LIBRARY.boundary) for each in drawn)
 
 
 def test_a_vehicle_that_accelerates_harder_has_no_envelope(drivers):
@@ -117,9 +117,14 @@ def test_real_pools_have_the_shells_of_drawn_ones(drivers):
     source = overtaking_shells(LIBRARY, population, AVS["own"], drivers.vehicles["own"], paths)
     real = build_pool(ENVIRONMENT, LIBRARY, PoolSettings(relative_error=0.01, seed=7), "real")
     assert real.names == source.template.names
+    kept = [real.cut_ins.path_mass[real.shell == s, s].mean(dtype=float) for s in range(real.shell_p.size)]
+    squares = (
+        (source.shells**2).mean(0),
+        real.shell_p * kept,
+    )  # a kept cut-in is a draw in proportion to its path's mass
     errors = [
-        np.sqrt(np.maximum(np.diag(pool.shell_moments) - pool.shell_p**2, 0.0) / n)
-        for pool, n in ((source.template, paths), (real, real.n_paths))
+        np.sqrt(np.maximum(square - pool.shell_p**2, 0.0) / n)
+        for square, pool, n in zip(squares, (source.template, real), (paths, real.n_paths), strict=True)
     ]
     assert np.all(np.abs(real.shell_p - source.template.shell_p) < 4.5 * np.hypot(*errors))
     ratio = errors[1] * np.sqrt(real.n_paths) / (errors[0] * np.sqrt(paths))

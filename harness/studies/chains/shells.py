@@ -15,6 +15,7 @@ from harness.pool.cut_ins import shells_of
 from harness.strata import OUTSIDE, ShellDesign
 from harness.studies.chains.chain import Chain
 from harness.studies.chains.sampler import approach_paths
+from harness.studies.shell_campaign import DrawnPool
 
 
 class ChainShells:
@@ -49,29 +50,28 @@ class ChainShells:
             state = (state * (1.0 - chain.hazard)) @ chain.approach
         return total
 
-    def draw(self, rng: np.random.Generator) -> tuple[ShellDesign, FloatArray]:
-        """A new pool: its strata, and the vehicle's share of crashes (S,) in each."""
+    def draw(self, rng: np.random.Generator) -> DrawnPool:
+        """A new pool."""
         chain, names = self._chain, self._names
         path = approach_paths(chain, self._pool_paths, rng)
         hazard = chain.hazard[path]
         cut = hazard * np.cumprod(np.column_stack([np.ones(len(path)), 1.0 - hazard[:, :-1]]), axis=1)
         t = np.arange(chain.horizon)
         mass = np.einsum("nt,nts->ns", cut, self._shell[t, path])
-        crash = np.einsum("nt,nts->s", cut, self._crash[t, path]) / len(path)
+        crash_mass = np.einsum("nt,nts->ns", cut, self._crash[t, path])
         p = mass.mean(0)
         design = ShellDesign(
             pool="drawn",
             strata=names,
-            p=p,
-            moments=mass.T @ mass / len(path),
+            cell_stratum=tuple(range(p.size)),
+            cell_p=p,
             n_paths=len(path),
             n_inside=chain.n_surrogates,
             boundary=names[-2],
             p_cut_in=float(p.sum()),
             p_impossible=0.0,
         )
-        share = np.divide(crash, p, out=np.zeros_like(p), where=p > 0.0)
-        return design, np.clip(share, 0.0, 1.0)  # rounding may leave the unit interval
+        return DrawnPool(design, mass, crash_mass)
 
 
 def joint_outcomes(chain: Chain) -> FloatArray:

@@ -1,0 +1,120 @@
+"""Rates of strata of known probability added up: limits by the likelihood ratio, with the error of the probabilities.
+
+Tests that failed count as no crash in the rate and in every lower limit, as crashes in every upper one: the limits are
+monotone in each stratum's crashes, so that [L(k), U(k + f)] holds whatever the f failed tests would have come to.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import ndtr
+
+from harness.arrays import FloatArray, IntArray
+from harness.estimators.intervals import clopper_pearson
+from harness.estimators.likelihood_ratio import Level, likelihood_limit
+
+
+class Limits(NamedTuple):
+    """A rate with a lower and an upper limit, and the half-width that the error of the p_s would leave for itself.
+
+    ``from_pool`` takes the shares as they were seen, ``from_pool_at_least`` their lower limits: one crash in a rarely
+    tested stratum, where paths are few, can make the former large for a while.
+    """
+
+    rate: float
+    low: float
+    high: float
+    from_pool: float
+    from_pool_at_least: float
+
+    @property
+    def rhw(self) -> float:
+        """Half of the interval's length over the rate; infinite at rate 0."""
+        return (self.high - self.low) / 2.0 / self.rate if self.rate > 0.0 else math.inf
+
+    def from_pool_relative(self) -> dict[str, float]:
+        """The pool's part of `rhw`, and what of it more tests of the same pool will not take away; 0 at rate 0."""
+        rate = self.rate if self.rate > 0.0 else math.inf
+        return {"rhw_from_pool": self.from_pool / rate, "rhw_from_pool_at_least": self.from_pool_at_least / rate}
+
+
+class Tally(NamedTuple):
+    """What tests of strata have come to.
+
+    ``tests``, ``crashes``, ``failed`` (S,). ``crash_mass``, ``failed_mass`` (S, S): over the crashed or failed tests of
+    each stratum, the sum of their paths' probability of a cut-in of every stratum.
+    """
+
+    tests: IntArray
+    crashes: IntArray
+    failed: IntArray
+    crash_mass: FloatArray
+    failed_mass: FloatArray
+
+    def part(self, strata: slice) -> Tally:
+        """That of some strata."""
+        counts = self.tests[strata], self.crashes[strata], self.failed[strata]
+        return Tally(*counts, self.crash_mass[strata, strata], self.failed_mass[strata, strata])
+
+    def failed_as_crashes(self) -> Tally:
+        """The same tests, had all failed ones crashed."""
+        nothing = np.zeros_like(self.failed), np.zeros_like(self.failed_mass)
+        mass = self.crash_mass + self.failed_mass
+        return Tally(self.tests, self.crashes + self.failed, nothing[0], mass, nothing[1])
+
+    @property
+    def share(self) -> FloatArray:
+        """Share of tests that crashed, shape (S,)."""
+        return np.asarray(self.crashes / self.at_least_one)
+
+    @property
+    def at_least_one(self) -> IntArray:
+        """Number of tests, 1 where there is none, shape (S,)."""
+        return np.maximum(self.tests, 1)
+
+
+def empty_tally(n_strata: int) -> Tally:
+    """That of no tests."""
+    none, no_mass = np.zeros((3, n_strata), np.int64), np.zeros((2, n_strata, n_strata))
+    return Tally(*none, *no_mass)
+
+
+def pool_variance(p: FloatArray, tally: Tally, n_paths: int, factor: FloatArray | float = 1.0) -> float:
+    """Variance of Σ p_s c_s that comes from the pool's finite number of paths, wherever the vehicle crashes.
+
+    It is (Σ E[x_s x_t] - μ²)/n, x_s being a path's probability of a crash in stratum s. A crashed test of s is a draw
+    in proportion to x_s, so that B_st, p_s/n_s times the sum of the paths' whole probabilities m_t in t over these
+    tests, estimates E[x_s m_t], which E[x_s x_t] does not exceed; so it is at most the least of B_st, B_ts and, with
+    Cauchy and Schwarz, √(B_ss B_tt). A stratum in which no crash was seen adds nothing.
+
+    Parameters
+    ----------
+    p : ndarray, shape (S,)
+        Probabilities of the strata.
+    factor : ndarray, shape (S,)
+        By which crashes of each stratum are fewer than seen.
+    """
+    scale = p / tally.at_least_one * factor
+    bound = scale[:, None] * tally.crash_mass
+    own = np.sqrt(np.diag(bound))
+    squares = float(np.minimum(np.minimum(bound, bound.T), np.outer(own, own)).sum())
+    rate = float(scale @ tally.crashes)
+    return max(squares - rate * rate, 0.0) / n_paths
+
+
+def combined(p: FloatArray, tally: Tally, n_paths: int, level: Level) -> Limits:
+    """Rate Σ p_s c_s with the two limits of an interval; ``p`` (S,) are known from ``n_paths`` paths of a pool."""
+
+    def limit(found: Tally, side: float) -> tuple[float, float]:
+        variance = pool_variance(p, found, n_paths)
+        return likelihood_limit(p, found.crashes, found.tests, level, side, variance), level.z * math.sqrt(variance)
+
+    low, from_pool = limit(tally, -1.0)
+    high = limit(tally.failed_as_crashes(), 1.0)[0]
+    least = clopper_pearson(tally.crashes, tally.tests, float(ndtr(-level.z)))[0]
+    least = np.divide(least, tally.share, out=np.zeros_like(least), where=tally.crashes > 0)
+    at_least = level.z * math.sqrt(pool_variance(p, tally, n_paths, least))
+    return Limits(float(p @ tally.share), max(low, 0.0), min(high, float(p.sum())), from_pool, at_least)
