@@ -1,6 +1,6 @@
 """What stopping costs shells when the vehicle has a rare hole: bias and coverage of campaigns on the default pool.
 
-    python -m benchmarks.shells_rare_hole [REPLICATIONS]
+    python -m benchmarks.shells_rare_hole [REPLICATIONS] [testing.shells.stopping=two_phase ...]
 
 The vehicle crashes as the default IDM does inside the boundary, and in a small share of the cut-ins outside. Shell
 probabilities are those of the pool and taken as exact; allocation, rounds, stop rule and estimator are those of a
@@ -15,18 +15,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from benchmarks.contenders import SCENARIOS
-from harness.arrays import FloatArray
 from harness.campaign.loading import load_campaign
 from harness.pool.shells import design_shells
 from harness.pool.storage import campaign_pool
 from harness.resolved import resolve
-from harness.strata import ShellDesign
-from harness.studies.shell_campaign import FREE, ShellCampaign
+from harness.studies.shell_campaign import FREE, DrawnPool, ShellCampaign
 
-IDM = np.array([1.0, 1.0, 0.362, 0.0, 0.0, 0.0])
+IDM = {"brakes-8": 1.0, "brakes-5": 1.0, "brakes-3": 0.362}
 """Crash shares of the default IDM inside: in the run of docs/limits.md 1,086 of 3,000 tests crashed in brakes-3."""
 HOLES = (0.0, 0.001, 0.003, 0.01)
-ASKED = ((0.3, 0.9), (0.3, 0.95), (0.3, 0.99))
+ASKED = ((0.3, 0.9), (0.3, 0.95), (0.3, 0.99), (2.0, 0.9))
 """RHW and confidence."""
 SEED = 20_240
 
@@ -35,17 +33,16 @@ SEED = 20_240
 class Fixed:
     """A source of campaigns on one pool, without error of its own."""
 
-    design: ShellDesign
-    share: FloatArray
+    pool: DrawnPool
 
-    def draw(self, _: np.random.Generator) -> tuple[ShellDesign, FloatArray]:
+    def draw(self, _: np.random.Generator) -> DrawnPool:
         """The same each time."""
-        return self.design, self.share
+        return self.pool
 
 
-def main(replications: int) -> None:
+def main(replications: int, overrides: list[str]) -> None:
     """Print the table."""
-    settings = ["stop.min_crashes=null", "testing.shells.first_tests=12", "stop.episodes=1e6"]
+    settings = ["stop.min_crashes=null", "testing.shells.first_tests=12", "stop.episodes=1e6", *overrides]
     pool = campaign_pool(resolve(load_campaign(SCENARIOS / "smoke.yaml", settings)))
     design = replace(design_shells(pool, limit_mps2=2.0), n_paths=10**12)
     print("| crashes outside | asked RHW | confidence | median tests | bias | covers |")
@@ -55,9 +52,10 @@ def main(replications: int) -> None:
             SCENARIOS / "smoke.yaml", [*settings, f"stop.rhw={rhw}", f"stop.confidence={confidence}"]
         )
         for hole in HOLES:
-            share = np.r_[IDM, hole]
-            truth = float(design.p @ share)
-            source = ShellCampaign(campaign, Fixed(design, share), SEED)
+            share = np.array([IDM.get(name, 0.0) for name in design.strata])
+            share[-1] = hole
+            truth, one_path = float(design.p @ share), design.p[None]
+            source = ShellCampaign(campaign, Fixed(DrawnPool(design, one_path, one_path * share)), SEED)
             rows = [row for row in source.run(range(replications)) if row.result == FREE]
             rate = np.array([row.crash_rate for row in rows])
             error = rate.std(ddof=1) / truth / np.sqrt(replications)
@@ -68,4 +66,4 @@ def main(replications: int) -> None:
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else 2_000)
+    main(int(sys.argv[1]) if len(sys.argv) > 1 else 2_000, sys.argv[2:])

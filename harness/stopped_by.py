@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from typing import Literal
 
-StoppedBy = Literal["rhw", "episodes", "pool", "pool_error"]
-"""The asked precision, the budget, the last cut-in that the pool holds of a shell that needs more, or the pool's own
-error, which alone is wider than the asked precision."""
+StoppedBy = Literal["rhw", "two_phase", "episodes", "pool", "pool_error"]
+"""The asked precision, the number of tests planned for it, the budget, the last cut-in that the pool holds of a shell
+that needs more, or the pool's own error, which alone is wider than the asked precision."""
 
 MENDS: dict[str, str] = {
     "episodes": "stop.episodes was spent; raise it and go on with --resume",
     "pool": "all cut-ins that the pool keeps of a shell were tested; raise pool.cut_ins_per_shell and use a new folder",
-    "pool_error": "the pool's own error alone is wider; lower pool.relative_error and use a new folder",
+    "pool_error": "the pool's own error alone is wider; lower pool.relative_error (of a vehicle that acts before the cut-in: "
+    "raise pool.shadow_paths) and use a new folder",
 }
 """Why a campaign ended before its precision, and the mend."""
 
@@ -28,6 +29,8 @@ def ending(stopped_by: StoppedBy, n_episodes: int, waited_for: tuple[str, ...], 
         if not waited_for:
             return f"{after}: every condition was met at the first look."
         return f"{after}: the last condition to be met was {conditions}."
+    if stopped_by == "two_phase":
+        return f"{after}: as many as the first phase had planned, which are reported without it."
     if precision_asked:
         return f"{after} without {conditions}: {MENDS[stopped_by]}."
     if stopped_by == "episodes":

@@ -218,7 +218,9 @@ class Campaign(Section):
         Cells, workers, stop rule, trace policy and names are left out, so that a campaign can be continued to a
         smaller RHW or with other resources.
         """
+        planned = self.testing.method == "shells" and self.testing.shells.stopping == "two_phase"
         content = {
+            **({"rhw": self.stop.rhw} if planned else {}),  # it decides where the second phase begins
             "seed": self.seed,
             "environment": self.environment.model_dump(exclude={"parameters"}),
             "environment_parameters": environment_parameters,

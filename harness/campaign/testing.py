@@ -37,6 +37,11 @@ class ShellSettings(Section):
     statement: Literal["assumption_free", "conditional"] = Field(
         "assumption_free", description="what has to reach stop.rhw; conditional tests only within the boundary"
     )
+    stopping: Literal["sequential", "two_phase"] = Field(
+        "sequential",
+        description="sequential: stop at the first interval that is narrow enough, which biases a rate that is only "
+        "roughly known; two_phase: first tests plan how many more there are, and these alone are reported",
+    )
     first_tests: Whole = Field(12, ge=1, le=10_000, description="tests of each shell before any is preferred")
 
 

@@ -1,21 +1,26 @@
-"""Limits of Σ w_s θ_s from counts within strata, by the likelihood ratio.
+"""Limits of Σ w_sj θ_sj from counts of outcomes within strata, by the likelihood ratio.
 
-An interval holds every value of the sum that some shares θ explain well enough: those for which the least
+Each test of stratum s has one of several outcomes j: crash or not; of a pair of tests, which of the two crashed. An
+interval holds every value of the weighted sum that some shares θ explain well enough: those for which the least
 T(θ) = Σ n_s KL(c_s ‖ θ_s) is at most a threshold λ, c_s being the shares seen. Along one Lagrange multiplier ν,
 
-    a = ν w_s/n_s,  D² = (1 - a)² + 4 a c_s,  θ_s = 2c_s/(1 - a + D),  1 - θ_s = 2(1 - c_s)/(1 + a + D),
+    θ_sj = c_sj/(η_s - ν w_sj/n_s),  with the root η_s of Σ_j θ_sj = 1,
 
-T grows with |ν| and the sum with ν, so that each limit is one root. Weights may be negative (differences). Limits
-of each stratum combined by their squares hold 90 %, but not 95 and 99 % where several strata with few crashes decide.
+T grows with |ν| and the sum with ν, so that each limit is one root. No η_s is below the largest ν w_sj/n_s: where it
+would be, it stays there, and an outcome that was never seen takes what is left. Two outcomes of weights w and 0 are a
+binomial stratum. Weights may be negative (differences). Limits of each stratum combined by their squares hold 90 %, but
+not 95 and 99 % where several strata with few crashes decide.
 
 The threshold that holds whatever the counts is wider than needed where crashes are many. There χ²'s takes its place,
-by the effective number of crashes m = v²/Σ w⁴θ(1-θ)/n³ with v = Σ w²θ(1-θ)/n. All thresholds are measured, not derived:
-worst coverage over adversarial strata, docs/estimators.md.
+by the effective number of crashes m = v²/f, with v = ΣΣ θ_i θ_j (w_i - w_j)²/n over strata and pairs of outcomes, which
+is the sum's variance, and f = ΣΣ θ_i θ_j (w_i - w_j)⁴/n³. All thresholds are measured, not derived: worst coverage over
+adversarial strata, docs/estimators.md.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -26,12 +31,16 @@ from scipy.special import ndtri
 from harness.arrays import FloatArray, IntArray
 from harness.compiled import compiled
 
+Counts = IntArray | FloatArray
+"""Of outcomes; where tests are planned, expected ones."""
 MARGIN = 0.395
 """Two-sided threshold for few crashes, ln(1/tail) less this: 2.60, 3.29 and 4.90 at 0.90, 0.95 and 0.99 (measured)."""
 FEW_TESTS = 9
 """Below so many tests in all, the one-sided threshold is ln(2/tail) instead of ln(1/tail) (measured)."""
 _GRID = 64
 _MOST_DOUBLINGS = 80
+_MOST_STEPS = 200
+_MOST_OCTAVES = 7
 
 
 class Level(NamedTuple):
@@ -70,30 +79,49 @@ class Level(NamedTuple):
 
 
 def likelihood_limit(
-    weights: FloatArray, crashes: IntArray, tests: IntArray, level: Level, side: float, variance: float = 0.0
+    weights: FloatArray, crashes: Counts, tests: IntArray, level: Level, side: float, variance: float = 0.0
 ) -> float:
-    """One limit of Σ w_s θ_s.
+    """One limit of Σ w_s θ_s, θ_s being the share of tests that crash.
 
     Parameters
     ----------
     weights : ndarray, shape (S,)
         Known factors, negative ones for what is subtracted; 0 or more tests each.
     crashes, tests : ndarray of int64, shape (S,)
+    level, side, variance
+        See `contrast_limit`.
+    """
+    of_outcomes = np.column_stack([weights, np.zeros(weights.size)])
+    return contrast_limit(of_outcomes, np.column_stack([crashes, tests - crashes]), level, side, variance)
+
+
+def contrast_limit(weights: FloatArray, counts: Counts, level: Level, side: float, variance: float = 0.0) -> float:
+    """One limit of Σ w_sj θ_sj, θ_sj being the share of a stratum's tests with an outcome.
+
+    Parameters
+    ----------
+    weights : ndarray, shape (S, J)
+        Known factors of all outcomes; 0 for one that does not count.
+    counts : ndarray of int64, shape (S, J)
+        How often each was seen; a stratum without a test may have any shares.
     level : Level
     side : float
         +1 for the upper limit, -1 for the lower one.
     variance : float
         Of a further error, normal and independent of the tests, of the sum itself (the pool's).
     """
-    n = tests.astype(np.float64)
-    share = crashes / np.maximum(n, 1.0)
+    n = counts.sum(1).astype(np.float64)
     tested = n > 0.0
-    if not tested.any():
-        return float(np.maximum(side * weights, 0.0).sum()) * side
+    share = counts / np.maximum(n, 1.0)[:, None]
+    steepest = float(np.max(np.ptp(weights[tested], axis=1) / n[tested], initial=0.0))
+    if steepest == 0.0:
+        return side * float((side * np.where(tested[:, None], weights * share, weights)).max(1).sum())
+
+    room = np.empty(weights.shape[1])
 
     def at(nu: float, threshold: float) -> tuple[float, float, float]:
         kappa = level.z**2 / (2.0 * threshold)
-        return _profile(side * nu, weights, n, share, variance * kappa)
+        return _profile(side * nu, weights, n, share, variance * kappa, room)
 
     def excess(nu: float) -> float:
         return at(nu, level.threshold)[1] - level.threshold
@@ -102,7 +130,7 @@ def likelihood_limit(
         threshold = level.at(at(nu, level.threshold)[2])
         return at(nu, threshold)[1] - threshold
 
-    high = 1.0 / float(np.max(np.abs(weights[tested]) / n[tested]))
+    high = 1.0 / steepest
     for _ in range(_MOST_DOUBLINGS):
         if excess(high) > 0.0:
             break
@@ -117,32 +145,124 @@ def likelihood_limit(
     return at(outer, level.at(at(outer, level.threshold)[2]))[0]
 
 
+def ratio_limits(
+    above: FloatArray,
+    below: FloatArray,
+    counts: IntArray,
+    level: Level,
+    variance: Callable[[float], float] = lambda _: 0.0,
+) -> tuple[float, float]:
+    """Limits of x = Σ a_sj θ_sj / Σ b_sj θ_sj: the ratios x for which Σ (a - x b)θ may be 0.
+
+    Both limits of that contrast fall as x grows, so that the set is an interval: from 0 where the sum above may be
+    nothing, to infinity where the one below may.
+
+    Parameters
+    ----------
+    above, below : ndarray, shape (S, J)
+        Factors of the outcomes in both sums, none negative.
+    counts : ndarray of int64, shape (S, J)
+    level : Level
+    variance : callable
+        Of the further error of the contrast at a ratio, see `contrast_limit`.
+    """
+
+    def lower(x: float) -> float:
+        return contrast_limit(above - x * below, counts, level, -1.0, variance(x))
+
+    def upper(x: float) -> float:
+        return contrast_limit(above - x * below, counts, level, 1.0, variance(x))
+
+    return _crossing(lower, end=0.0), _crossing(upper, end=math.inf)
+
+
+def _crossing(falling: Callable[[float], float], end: float) -> float:
+    """Positive argument at which a function falls through 0; ``end``, 0 or infinity, where it does not before that."""
+    outwards = 1.0 if end else -1.0
+
+    def at(log_x: float) -> float:
+        return outwards * falling(math.exp(log_x))
+
+    inner = outer = 0.0
+    for step in range(_MOST_OCTAVES):
+        if at(outer) < 0.0:
+            break
+        inner, outer = outer, outer + outwards * 2.0**step
+    else:
+        return end
+    for step in range(_MOST_OCTAVES):
+        if at(inner) >= 0.0:
+            break
+        inner, outer = inner - outwards * 2.0**step, inner
+    else:
+        return 0.0 if end else math.inf  # beyond the other end
+    return math.exp(float(brentq(at, inner, outer, xtol=1e-10)))
+
+
 @compiled
 def _profile(
-    nu: float, weights: FloatArray, tests: FloatArray, share: FloatArray, variance: float
+    nu: float, weights: FloatArray, tests: FloatArray, share: FloatArray, variance: float, theta: FloatArray
 ) -> tuple[float, float, float]:
-    """Sum, T and effective number of crashes at a multiplier; a stratum without a test is at its end at no cost."""
+    """Sum, T and effective number of crashes at a multiplier; a stratum without a test is at its end at no cost.
+
+    ``theta``, shape (J,), is room for the shares of one stratum.
+    """
     total = variance * nu
     cost = 0.5 * variance * nu * nu
     spread = fourth = 0.0
-    for s in range(weights.size):
-        w, n, c = weights[s], tests[s], share[s]
+    n_outcomes = weights.shape[1]
+    for s in range(weights.shape[0]):
+        best = 0
+        for j in range(1, n_outcomes):
+            if nu * weights[s, j] > nu * weights[s, best]:
+                best = j
+        n = tests[s]
         if n == 0.0:
-            total += w if nu * w > 0.0 else 0.0
+            total += weights[s, best]
             continue
-        a = nu * w / n
-        # Each root is a sum of what is not negative, and each quotient has a numerator that does not cancel.
-        root = math.sqrt((1.0 - a) ** 2 + 4.0 * a * c if a > 0.0 else (1.0 + a) ** 2 - 4.0 * a * (1.0 - c))
-        # A root of 0 belongs to a stratum whose tests all went one way, at its kink: 0/0 there, and 0 in the limit.
-        below, above = 1.0 - a + root, 1.0 + a + root
-        crash = (a - 1.0 + root) / (2.0 * a) if a > 1.0 else 2.0 * c / below if below > 0.0 else 0.0
-        miss = (a + 1.0 - root) / (2.0 * a) if a < -1.0 else 2.0 * (1.0 - c) / above if above > 0.0 else 0.0
-        if c > 0.0:
-            cost += n * c * math.log(c / crash)
-        if c < 1.0:
-            cost += n * (1.0 - c) * math.log((1.0 - c) / miss)
-        total += w * crash
-        term = w * w * crash * miss / n
-        spread += term
-        fourth += term * (w / n) ** 2
+        slope = nu / n
+        excess = _excess(slope, weights[s, best], weights[s], share[s])
+        left = 1.0
+        for j in range(n_outcomes):
+            theta[j] = 0.0
+            if share[s, j] > 0.0:
+                apart = excess + slope * (weights[s, best] - weights[s, j])
+                theta[j] = share[s, j] / apart
+                left -= theta[j]
+                cost += n * share[s, j] * math.log(apart)
+        if excess == 0.0:
+            theta[best] = max(left, 0.0)
+        for j in range(n_outcomes):
+            total += weights[s, j] * theta[j]
+            for i in range(j):
+                square = ((weights[s, j] - weights[s, i]) / n) ** 2
+                term = theta[i] * theta[j] * square * n
+                spread += term
+                fourth += term * square
     return total, cost, spread * spread / fourth if fourth > 0.0 else 0.0
+
+
+@compiled
+def _excess(slope: float, best: float, weights: FloatArray, share: FloatArray) -> float:
+    """How far η of a stratum lies above its lowest value: root of Σ c_j/(x + slope·(best - w_j)) = 1, or 0.
+
+    The sum falls and is convex in x: from a point where it is above 1 Newton's steps come up to the root and never go
+    beyond it. At the largest c_j less what is added to x one term alone is 1.
+    """
+    x = 0.0
+    for j in range(weights.size):
+        x = max(x, share[j] - slope * (best - weights[j]))
+    for _ in range(_MOST_STEPS):
+        miss, fall = -1.0, 0.0
+        for j in range(weights.size):
+            if share[j] > 0.0:
+                apart = x + slope * (best - weights[j])
+                miss += share[j] / apart
+                fall += share[j] / (apart * apart)
+        if miss <= 0.0:
+            break
+        before = x
+        x += miss / fall
+        if x == before:
+            break
+    return x

@@ -14,7 +14,7 @@ from scipy.special import ndtr
 
 from harness.arrays import FloatArray, IntArray
 from harness.estimators.intervals import clopper_pearson
-from harness.estimators.likelihood_ratio import Level, likelihood_limit
+from harness.estimators.likelihood_ratio import Counts, Level, likelihood_limit
 
 
 class Limits(NamedTuple):
@@ -49,8 +49,8 @@ class Tally(NamedTuple):
     """
 
     tests: IntArray
-    crashes: IntArray
-    failed: IntArray
+    crashes: Counts
+    failed: Counts
     crash_mass: FloatArray
     failed_mass: FloatArray
 
@@ -64,6 +64,12 @@ class Tally(NamedTuple):
         nothing = np.zeros_like(self.failed), np.zeros_like(self.failed_mass)
         mass = self.crash_mass + self.failed_mass
         return Tally(self.tests, self.crashes + self.failed, nothing[0], mass, nothing[1])
+
+    def scaled(self, tests: IntArray) -> Tally:
+        """What so many tests of each stratum are expected to come to."""
+        scale = tests / self.at_least_one
+        mass = self.crash_mass * scale[:, None], self.failed_mass * scale[:, None]
+        return Tally(tests, self.crashes * scale, self.failed * scale, *mass)
 
     @property
     def share(self) -> FloatArray:

@@ -78,6 +78,7 @@ def design_shells(pool: Pool, *, boundary: str | None = None, limit_mps2: float)
         boundary=name,
         p_cut_in=pool.p_cut_in,
         p_impossible=pool.p_cut_in - float(p.sum()),
+        shadow_runs=pool.cut_ins.motion.size > 0,
     )
     return design if pool.p_unknown == 0.0 else _with_failed_shadows(design, pool.p_unknown)
 

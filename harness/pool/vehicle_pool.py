@@ -38,6 +38,12 @@ class ShadowRuns:
     x_m: FloatArray
     v_mps: FloatArray
 
+    def mean_distance_m(self, weight: FloatArray) -> float:
+        """Mean distance that the vehicle drives where nobody cuts in; paths have the ``weight`` (n,)."""
+        whole, rows = ~self.failed, np.arange(len(self.n_steps))
+        distance = self.x_m[rows, self.n_steps] - self.x_m[:, 0]
+        return float((weight * distance)[whole].sum() / weight[whole].sum())
+
     def digest(self) -> str:
         """Hash of what is on record."""
         digest = hashlib.sha256(self.n_steps.tobytes() + self.failed.tobytes())

@@ -95,6 +95,7 @@ class StoredManifest(Stored):
     retraced: Retraced | None = None
     repeated: Repeated | None = None
     shadow_runs: StoredShadows | None = None
+    reported_from: Count | None = None
     table_errors: list[TableError] | None = None
 
 
@@ -116,6 +117,7 @@ class StoredShells(Stored):
     p_cut_in: float
     p_impossible: float
     available: list[Count]
+    shadow_runs: bool = False
 
     @model_validator(mode="after")
     def _of_one_size(self) -> Self:

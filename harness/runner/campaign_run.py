@@ -63,7 +63,7 @@ class RunResult:
         The page ``report.html``.
     estimates : dict
         Content of ``estimates.json``.
-    stopped_by : {"rhw", "episodes", "pool", "pool_error"}
+    stopped_by : {"rhw", "two_phase", "episodes", "pool", "pool_error"}
         See `harness.stopped_by`.
     ending : str
         When it ended and which condition decided, in a sentence.
@@ -185,7 +185,9 @@ class _Run:
             self._manifest.note(shadow_runs={"n_runs": sum(map(len, tables)), "n_failed": causes.total()})
             self._manifest.follow(self.prefix)
         require_few_failed(causes, n, self._campaign.run.max_failed_share)
-        return as_recorded(tables, environment)
+        runs = as_recorded(tables, environment)
+        self._manifest.note(distance_per_test_m=runs.mean_distance_m(paths.weight))
+        return runs
 
     def _run_shards(self) -> None:
         """Run shards until the stop rule is content; the manifest follows."""
@@ -204,6 +206,7 @@ class _Run:
         self.prefix.add(done, shard_files(self._out, done.spec.index))
         self.prefix.require_few_failed(self._campaign, at_least=SMALLEST_FAILED_SAMPLE)
         enough = self._planner.add(done.block)
+        self.prefix.reported_from = self._planner.reported_from
         self._progress.advance(done.spec.n_episodes if done.parquet else 0)
         self._progress.status(**self._figures())
         self._manifest.follow(self.prefix)
@@ -239,11 +242,13 @@ class _Run:
         from harness.report import write_report  # noqa: PLC0415
 
         report = write_report(self._out)
-        missed = stop.rhw is not None and not rule.reached
+        missed = stop.rhw is not None and not rule.reached and stopped_by != "two_phase"
         return RunResult(self._out, report, estimates, stopped_by, said, EXIT_BUDGET_SPENT if missed else EXIT_DONE)
 
     def _stopped_by(self) -> StoppedBy:
         rule = self._planner.rule
+        if self.prefix.reported_from and self.prefix.n_episodes < self._campaign.stop.episodes:
+            return "two_phase"
         if rule.reached:
             return "rhw"
         if rule.pool_error_above_target:  # whatever else is spent: more of it would not help

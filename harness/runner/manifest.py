@@ -104,7 +104,7 @@ class Prefix:
 
     def __init__(self) -> None:
         self.shards: list[dict[str, Any]] = []
-        self.n_episodes = self.n_crashes = self.n_failed = self.n_retraced = 0
+        self.n_episodes = self.n_crashes = self.n_failed = self.n_retraced = self.reported_from = 0
         self.repeated: Repeated | None = None
         self._causes: Counter[str] = Counter()
 
@@ -226,6 +226,7 @@ class Manifest:
                 "repeated": None if repeated is None else repeated.to_json(),
                 "wall_time_s": round(self._written - self._began, 3),
                 "n_episodes": prefix.n_episodes,
+                "reported_from": prefix.reported_from if prefix.reported_from < prefix.n_episodes else 0,
                 "shards": prefix.shards,
             },
         )

@@ -9,6 +9,7 @@ statement is roughly known, some hundred tests; then all are.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
@@ -42,6 +43,8 @@ USED_UP_SHARE = 0.95
 """Share of the squared widths that must lie in exhausted strata for the allocation to end."""
 MOST_SHARDS_PER_ROUND = 16
 SMALLEST_SHARD = 64
+FIRST_PHASE = 1.7
+"""Precision of the first of two phases over that of the second (measured: docs/estimators.md)."""
 POOL_SHARE = 0.5
 """Share of the squared width from the pool's own error above which more tests hardly narrow an interval."""
 
@@ -52,6 +55,7 @@ class FixedPlanner:
     def __init__(self, campaign: Campaign) -> None:
         self._campaign = campaign
         stop, method, size = campaign.stop, campaign.testing.method, campaign.run.shard_size
+        self.reported_from = 0
         self.rule = StopRule(stop, method, size, min_crashes=campaign.min_crashes)
         self._sums = accumulator(self.rule.estimator)
         self._n_episodes = 0
@@ -74,17 +78,27 @@ class FixedPlanner:
 class ShellPlanner:
     """Fed with finished tests in order; says what is tested next, and when it is enough.
 
+    In two phases the tests up to a wider precision only plan the number of the others, which alone are reported: that
+    number does not depend on their results.
+
     ``available``, shape (S,), are the most tests of each stratum, ``held`` see `RoundRule`; ``estimate`` is that at the
     end of the last round.
     """
 
     def __init__(self, campaign: Campaign, design: ShellDesign, available: IntArray, held: int = 0) -> None:
         shells = campaign.testing.shells
-        self.rule = RoundRule(campaign, held)
+        self._plans = shells.stopping == "two_phase" and campaign.stop.rhw is not None
+        self.rule = RoundRule(campaign, held, FIRST_PHASE if self._plans else 1.0)
         self.estimate: Estimate | None = None
+        self.reported_from = 0
         self._campaign = campaign
+        self._available = available
         self._allocation = Allocation(design, shells.first_tests, available, shells.statement == "conditional")
-        self._none = empty_tally(design.p.size)
+        self._drawn = np.zeros(design.p.size, np.int64)
+        self._planned: IntArray | None = None
+        self._begin_phase()
+
+    def _begin_phase(self) -> None:
         self._seen = Shells()
         self._sums = BothWays(self._seen)
         self._n_episodes = self._look = 0
@@ -92,20 +106,22 @@ class ShellPlanner:
     @property
     def tally(self) -> Tally:
         """What the tests of each stratum have come to so far."""
-        return self._seen.tally if self._n_episodes else self._none
+        return self._seen.tally if self._n_episodes else empty_tally(self._drawn.size)
 
     def rounds(self) -> Iterator[Iterator[ShardSpec]]:
         """Shards of each round; the next round is asked for when all of the last one have been added."""
         n_shards = 0
         while (added := self.next_round()).any():
-            specs = round_specs(self.tally.tests, added, n_shards, self._n_episodes, self._campaign.run.shard_size)
+            first = self.reported_from + self._n_episodes
+            specs = round_specs(self._drawn, added, n_shards, first, self._campaign.run.shard_size)
+            self._drawn = self._drawn + added
             n_shards += len(specs)
             yield iter(specs)
 
     def next_round(self) -> IntArray:
         """Tests to add per stratum, shape (S,); all 0 when no stratum or no budget is left."""
-        tally = self.tally
-        added = self._allocation.next_round(tally, self._campaign.stop.episodes - self._n_episodes)
+        tally, budget = self.tally, self._campaign.stop.episodes - self.reported_from - self._n_episodes
+        added = self._allocation.next_round(tally, budget) if self._planned is None else self._planned - tally.tests
         self.rule.of_first_tests = bool(np.any(tally.tests[added > 0] < self._campaign.testing.shells.first_tests))
         self._look = self._n_episodes + int(added.sum())
         return added
@@ -117,7 +133,15 @@ class ShellPlanner:
         if self._n_episodes != self._look:
             return False
         self.estimate = self._sums.result(self._campaign.stop.confidence)
-        return self.rule.observe(self.estimate)
+        enough = self.rule.observe(self.estimate)
+        if not (enough and self._plans and self.rule.reached and self._planned is None):
+            return enough or self._planned is not None
+        budget = self._campaign.stop.episodes - self._n_episodes
+        left = self._available - self._drawn
+        self._planned = self._allocation.second_phase(self.tally, left, budget, self._campaign.stop.rhw or math.inf)
+        self.rule, self.reported_from = RoundRule(self._campaign), self._n_episodes
+        self._begin_phase()
+        return False
 
 
 Planner = FixedPlanner | ShellPlanner
@@ -157,10 +181,30 @@ class Allocation:
         if not wanted.any() and active.any():
             size = max(SMALLEST_ROUND, int(np.ceil(tests[begun].sum() * (GROWTH - 1.0))))
             wanted = self._spread(min(size, budget), tally, active)
-        # The budget cuts a round from the last stratum on.
-        allowed = np.minimum(np.cumsum(np.minimum(wanted, self.available - tests)), max(budget, 0))
-        added: IntArray = np.diff(allowed, prepend=0)
-        return added
+        return _cut(np.minimum(wanted, self.available - tests), budget)
+
+    def second_phase(self, first: Tally, available: IntArray, budget: int, rhw: float) -> IntArray:
+        """Tests per stratum, in proportion to a first phase's, of which an interval as narrow as ``rhw`` is expected.
+
+        No more than ``available``, shape (S,), and together at most ``budget``.
+        """
+        p, n_paths = self.design.p, self.design.n_paths
+        watched = slice(0, self.design.n_inside if self.conditional_only else p.size)
+
+        def tests(factor: float) -> IntArray:
+            return np.asarray(np.minimum(np.ceil(factor * first.tests).astype(np.int64), available))
+
+        def too_wide(factor: float) -> bool:
+            expected = first.scaled(tests(factor)).part(watched)
+            return combined(p[watched], expected, n_paths, _LEVEL).rhw > rhw
+
+        low, high = 0.0, 1.0
+        while too_wide(high) and tests(high).sum() < budget and np.any(tests(2.0 * high) > tests(high)):
+            low, high = high, 2.0 * high
+        while tests(high).sum() - tests(low).sum() > first.tests.size:
+            middle = (low + high) / 2.0
+            low, high = (middle, high) if too_wide(middle) and tests(middle).sum() < budget else (low, middle)
+        return _cut(tests(high), budget)
 
     def _used_up(self, tally: Tally) -> bool:
         """Whether nearly all that is left to know lies in strata without further cut-ins."""
@@ -224,6 +268,8 @@ class RoundRule:
     campaign : Campaign
     held : int
         Tests that the run folder holds: before them nothing is given up, whatever precision is asked for now.
+    factor : float
+        By which the precision is wider than the one that the campaign asks for.
 
     Attributes
     ----------
@@ -233,9 +279,9 @@ class RoundRule:
         See `StopRule`.
     """
 
-    def __init__(self, campaign: Campaign, held: int = 0) -> None:
+    def __init__(self, campaign: Campaign, held: int = 0, factor: float = 1.0) -> None:
         self._held = held
-        self._target = campaign.stop.rhw
+        self._target = None if campaign.stop.rhw is None else factor * campaign.stop.rhw
         self._min_crashes = campaign.min_crashes
         self._first_tests = campaign.testing.shells.first_tests
         self._conditional = campaign.testing.shells.statement == "conditional"
@@ -266,6 +312,12 @@ class RoundRule:
         self.pool_error_above_target = watched["rhw_from_pool_at_least"] > self._target
         hopeless = self.pool_error_above_target and watched["rhw_from_pool"] ** 2 >= POOL_SHARE * self.rhw**2
         return self.reached or (hopeless and estimate.n_episodes >= self._held)
+
+
+def _cut(wanted: IntArray, budget: int) -> IntArray:
+    """Tests per stratum, cut from the last stratum on to a budget."""
+    added: IntArray = np.diff(np.minimum(np.cumsum(wanted), max(budget, 0)), prepend=0)
+    return added
 
 
 def round_specs(tests: IntArray, added: IntArray, index: int, first_episode: int, shard_size: int) -> list[ShardSpec]:

@@ -89,7 +89,7 @@ def estimate_run(
 def stored_blocks(
     folder: Path, *, moments: bool, surrogates: SurrogateReplay | None = None, n_asked: int = 0
 ) -> Iterator[Block]:
-    """Blocks of the tests that count, in index order; a gap or too few of them is an error.
+    """Blocks of the tests that are reported, in index order; a gap or too few of them is an error.
 
     Parameters
     ----------
@@ -106,7 +106,8 @@ def stored_blocks(
         If the folder is not a run, or its records are damaged or incomplete.
     """
     campaign = load_campaign(folder / "campaign.yaml", check_files=False)
-    n_counted = int(read_manifest(folder)["n_episodes"])
+    manifest = read_manifest(folder)
+    n_counted, reported_from = int(manifest["n_episodes"]), int(manifest.get("reported_from") or 0)
     if n_counted == 0:
         raise no_episodes(folder)
     method, alpha = campaign.testing.method, mixture_weights(campaign)
@@ -120,9 +121,10 @@ def stored_blocks(
             block = replace(block, surrogates_crash=surrogates.crashes(episodes), known_rates=surrogates.known)
         if block.first_episode != n:
             raise _incomplete(folder, f"a shard that begins at episode {block.first_episode}", f"episode {n}")
-        counted = block.take(slice(0, n_counted - n))
-        n += len(counted)
-        yield counted
+        counted = block.take(slice(max(reported_from - n, 0), n_counted - n))
+        n = counted.first_episode + len(counted)
+        if len(counted):
+            yield counted
         if n == n_counted:
             return
     raise _incomplete(folder, f"{n} episodes on record", f"{n_counted} (manifest.json)")

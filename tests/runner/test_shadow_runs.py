@@ -125,6 +125,18 @@ def test_shadow_runs_that_fail_count_against_the_vehicle(campaign, run_here, tmp
     assert any("no test in failed shadow runs" in warning for warning in shells["warnings"])
 
 
+def test_crashes_on_a_handful_of_paths_give_no_interval(campaign, run_here, tmp_path):
+    """A vehicle that gives way crashes on few paths: the run ends, and says that it knows too little of it."""
+    lonely = campaign(*SHELLS, SHADOWS, TWIN, f"av={of('Yields')}", "stop.rhw=0.3", "stop.episodes=20000")
+    result = run_here(lonely, tmp_path / "run")
+    shells = result.estimates["estimates"]["shells"]
+    assert (result.exit_code, result.stopped_by) == (4, "pool_error")
+    assert (shells["ci_low"], shells["ci_high"], shells["rhw"]) == (0.0, 1.0, None)
+    assert "no interval: nearly all crashes lie on some" in result.estimates["statement"]
+    assert "raise pool.shadow_paths" in result.estimates["statement"]
+    assert "nothing more can be said" in result.estimates["conditional_statement"]
+
+
 def test_forced_cut_ins_of_a_vehicle_that_holds_are_those_of_one_that_holds(campaign, run_here, tmp_path):
     """The same paths, weights and ends, with and without a shadow run before each test."""
     plain = run_here(campaign(*FORCED, TWIN, "av={controller: 'tests.controllers.early:HoldsThenIdm'}"), tmp_path / "a")

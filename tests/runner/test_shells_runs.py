@@ -299,3 +299,30 @@ def test_a_round_is_divided_into_shards_without_gap():
         for draw in spec.draws:
             taken[draw.stratum] += range(draw.first, draw.first + draw.n)
     assert taken == {0: list(range(12, 82)), 2: list(range(100, 400))}
+
+
+def test_two_phases_report_the_second_alone(campaign, run_here, tmp_path):
+    """The first ends at 1.7 times the precision; the second is planned from it, and its number does not depend on it."""
+    planned = campaign(*SHELLS, "world.engine=twin", "testing.shells.stopping=two_phase")
+    found = run_here(planned, tmp_path / "run")
+    stored = manifest(tmp_path / "run")
+    first, estimates = stored["reported_from"], found.estimates
+    assert (found.exit_code, found.stopped_by) == (0, "two_phase")
+    assert estimates["n_episodes"] == stored["n_episodes"] - first > first > 0
+    assert estimates["estimates"]["shells"]["rhw"] == pytest.approx(0.5, rel=0.25)
+    tests = stored_table(tmp_path / "run", "episodes").slice(first)
+    assert estimates["n_crashes"] == tests.column("outcome").to_pylist().count("crash")
+    assert not set(tests.column("pool_cut_in").to_pylist()) & set(
+        stored_table(tmp_path / "run", "episodes").slice(0, first).column("pool_cut_in").to_pylist()
+    )
+    first_alone = run_here(campaign(*SHELLS, "world.engine=twin", "stop.rhw=0.85"), tmp_path / "first")
+    assert first_alone.estimates["n_episodes"] == first
+    assert estimate(tmp_path / "run")["estimates"] == estimates["estimates"]
+
+
+def test_two_phases_cannot_be_continued_to_another_precision(campaign, run_here, tmp_path):
+    """Where the second begins would be another place."""
+    planned = (*SHELLS, "world.engine=twin", "testing.shells.stopping=two_phase", "stop.rhw=1.0")
+    run_here(campaign(*planned), tmp_path / "run")
+    with pytest.raises(RunFolderError, match="another campaign"):
+        run_here(campaign(*planned, "stop.rhw=0.8"), tmp_path / "run", resume=True)

@@ -1,0 +1,213 @@
+"""Limits of contrasts of several outcomes: against the definition, identities, and coverage by exact enumeration."""
+
+from __future__ import annotations
+
+import math
+from itertools import product
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import brentq, minimize
+from scipy.special import gammaln, xlogy
+
+from harness.estimators.likelihood_ratio import Level, contrast_limit, likelihood_limit, ratio_limits
+
+MANY = 1e6
+"""A quantile so large that the threshold for few crashes always holds."""
+STRATA = st.lists(
+    st.tuples(st.floats(0.01, 100.0), *[st.integers(0, 30)] * 4), min_size=1, max_size=4, unique_by=lambda t: t[0]
+)
+"""Probability, and counts of the outcomes both, only A, only B, neither."""
+DIFFERENCE = np.array([0.0, 1.0, -1.0, 0.0])
+
+
+def both(weights, counts, level, variance=0.0):
+    return tuple(contrast_limit(np.array(weights, float), np.array(counts), level, side, variance) for side in (-1, 1))
+
+
+def closed_form(weights, crashes, tests, threshold, side):
+    """Limit of binomial strata by the two roots of a quadratic, without cancellation only in the middle."""
+    c = crashes / tests
+
+    def at(nu):
+        a = nu * weights / tests
+        root = np.sqrt((1 - a) ** 2 + 4 * a * c)
+        theta = np.where(a <= 1, 2 * c / (1 - a + root), (a - 1 + root) / (2 * np.where(a > 1, a, 1)))
+        cost = xlogy(c, c) - xlogy(c, theta) + xlogy(1 - c, 1 - c) - xlogy(1 - c, 1 - theta)
+        return weights @ theta, (tests * cost).sum() - threshold
+
+    nu = brentq(lambda nu: at(nu)[1], 0.0, side * 1e4, xtol=1e-14, rtol=1e-15)
+    return at(nu)[0]
+
+
+def test_two_outcomes_are_a_binomial_stratum_to_nine_digits():
+    rng = np.random.default_rng(3)
+    for _ in range(50):
+        tests = rng.integers(3, 400, 4)
+        crashes, weights = rng.integers(1, tests), rng.uniform(0.1, 3.0, 4) * [1, -1, 1, 1]
+        for side in (-1.0, 1.0):
+            expected = closed_form(weights, crashes, tests, 2.6, side)
+            assert likelihood_limit(weights, crashes, tests, Level(2.6, MANY), side) == pytest.approx(
+                expected, rel=1e-9, abs=1e-9
+            )
+
+
+def test_outcomes_of_equal_weight_are_one_outcome():
+    split = both([[1.0, 1.0, 0.0], [2.0, 0.0, 0.0]], [[3, 4, 13], [1, 20, 9]], Level.two_sided(0.9))
+    joined = both([[1.0, 0.0], [2.0, 0.0]], [[7, 13], [1, 29]], Level.two_sided(0.9))
+    assert split == pytest.approx(joined, rel=1e-12)
+
+
+@pytest.mark.parametrize("counts", [[(3, 8, 2, 27), (0, 1, 0, 89)], [(0, 4, 0, 16), (5, 0, 0, 35)]])
+def test_the_limit_is_the_largest_sum_that_shares_within_the_threshold_give(counts):
+    k, w, level = np.array(counts), np.array([[1.0], [0.3]]) * [0.2, 1.0, -1.5, 0.0], Level(2.6, MANY)
+    n = k.sum(1, keepdims=True)
+
+    def shares(x):
+        return np.exp(x.reshape(k.shape)) / np.exp(x.reshape(k.shape)).sum(1, keepdims=True)
+
+    def room(x):
+        return level.threshold - (xlogy(k, k / n) - xlogy(k, shares(x))).sum()
+
+    for side in (-1.0, 1.0):
+        found = minimize(
+            lambda x, s=side: -s * (w * shares(x)).sum(),
+            np.log(k + 0.3).ravel(),
+            constraints={"type": "ineq", "fun": room},
+            method="SLSQP",
+            options={"maxiter": 2000, "ftol": 1e-12},
+        )
+        assert contrast_limit(w, k, level, side) == pytest.approx(-side * found.fun, rel=1e-3)
+
+
+@given(STRATA, st.sampled_from([0.9, 0.95, 0.99]), st.floats(0.0, 0.1))
+@settings(deadline=None)
+def test_identities(strata, confidence, relative):
+    p, *columns = (np.array(column) for column in zip(*strata, strict=True))
+    counts, weights = np.column_stack(columns), p[:, None] * DIFFERENCE
+    level, variance, slack = Level.two_sided(confidence), relative * float(p @ p), 1e-9 * float(p.sum())
+    low, high = both(weights, counts, level, variance)
+    shares = counts / np.maximum(counts.sum(1, keepdims=True), 1)
+    assert low - slack <= (weights * shares).sum() <= high + slack
+    assert both(-weights, counts, level, variance) == pytest.approx((-high, -low), rel=1e-6, abs=slack)
+    order = [2, 0, 3, 1]
+    assert both(weights[:, order], counts[:, order], level, variance) == pytest.approx((low, high), rel=1e-6, abs=slack)
+    if counts[0, 3]:  # one pair more in which only A crashes
+        more = counts + np.outer(np.eye(len(p), dtype=int)[0], [0, 1, 0, -1])
+        assert np.all(np.array(both(weights, more, level, variance)) >= np.array((low, high)) - slack)
+
+
+def test_a_stratum_without_a_test_may_have_any_outcome():
+    assert both([[1.0, -2.0, 0.0]], [[0, 0, 0]], Level.two_sided(0.9)) == (-2.0, 1.0)
+    tested = both([[1.0, -2.0, 0.0]], [[5, 1, 90]], Level.two_sided(0.9))
+    more = both([[1.0, -2.0, 0.0], [0.5, -0.25, 0.0]], [[5, 1, 90], [0, 0, 0]], Level.two_sided(0.9))
+    assert more == pytest.approx((tested[0] - 0.25, tested[1] + 0.5))
+
+
+RATES = np.array([1.0, 1.0, 0.0, 0.0]), np.array([1.0, 0.0, 1.0, 0.0])
+"""A crashes; B crashes."""
+
+
+def ratio(p, counts, level):
+    a, b = (np.array(p)[:, None] * of for of in RATES)
+    return ratio_limits(a, b, np.array(counts), level)
+
+
+@given(STRATA)
+@settings(deadline=None, max_examples=40)
+def test_ratios_are_where_the_contrast_may_be_0_and_turn_over_with_the_vehicles(strata):
+    p, *columns = (np.array(column) for column in zip(*strata, strict=True))
+    counts, level = np.column_stack(columns), Level.two_sided(0.9)
+    low, high = ratio(p, counts, level)
+    assert low <= high
+    for x in (0.1, 0.5, 1.0, 3.0):
+        a, b = (p[:, None] * of for of in RATES)
+        lower, upper = both(a - x * b, counts, level)
+        if not min(abs(math.log(x / end)) if 0.0 < end < math.inf else 1.0 for end in (low, high)) < 1e-6:
+            assert (low <= x <= high) == (lower <= 0.0 <= upper)
+    swapped = ratio(p, counts[:, [0, 2, 1, 3]], level)
+    inverse = tuple(1.0 / end if end > 0.0 else math.inf for end in (high, low))
+    assert swapped == pytest.approx(inverse, rel=1e-6)
+
+
+def test_a_ratio_is_open_where_a_vehicle_has_not_crashed():
+    assert ratio([1.0], [[0, 9, 0, 91]], Level.two_sided(0.9))[1] == math.inf
+    assert ratio([1.0], [[0, 0, 9, 91]], Level.two_sided(0.9))[0] == 0.0
+    assert ratio([1.0], [[0, 0, 0, 100]], Level.two_sided(0.9)) == (0.0, math.inf)
+    low, high = ratio([1.0], [[50, 0, 0, 0]], Level.two_sided(0.9))
+    assert low < 1.0 < high
+
+
+def coverage(share, tests, weights, limits):
+    """Exact, over all counts of (only A, only B, the rest) that are likely enough to matter, one list per stratum."""
+    per_stratum = []
+    for (a, b), n in zip(share, tests, strict=True):
+        i, j = (x.ravel() for x in np.meshgrid(np.arange(n + 1), np.arange(n + 1), indexing="ij"))
+        i, j = i[i + j <= n], j[i + j <= n]
+        log_p = gammaln(n + 1) - gammaln(i + 1) - gammaln(j + 1) - gammaln(n - i - j + 1)
+        chance = np.exp(log_p + xlogy(i, a) + xlogy(j, b) + xlogy(n - i - j, 1 - a - b))
+        likely = chance > 1e-6
+        per_stratum.append(list(zip(chance[likely], i[likely], j[likely], (n - i - j)[likely], strict=True)))
+    truth = float(sum(w * (a - b) for w, (a, b) in zip(weights, share, strict=True)))
+    covered = 0.0
+    for drawn in product(*per_stratum):
+        chance = math.prod(one[0] for one in drawn)
+        if chance > 1e-8:
+            low, high = limits([one[1:] for one in drawn], weights)
+            covered += chance * (low - 1e-9 <= truth <= high + 1e-9)
+    return covered
+
+
+def paired(confidence):
+    def limits(counts, p):
+        return both(np.array(p)[:, None] * [1.0, -1.0, 0.0], counts, Level.two_sided(confidence))
+
+    return limits
+
+
+def independent(confidence):
+    """Each vehicle's crashes as if from tests of its own: what pairs must not be taken for."""
+
+    def limits(counts, p):
+        k, w = np.array(counts), np.array([*p, *(-x for x in p)])
+        crashes, tests = np.concatenate([k[:, 0], k[:, 1]]), np.tile(k.sum(1), 2)
+        return tuple(likelihood_limit(w, crashes, tests, Level.two_sided(confidence), side) for side in (-1.0, 1.0))
+
+    return limits
+
+
+@pytest.mark.parametrize("confidence", [0.9, 0.95, 0.99])
+@pytest.mark.parametrize(
+    ("share", "tests", "p"),
+    [
+        (((0.45, 0.45),), (25,), (1.0,)),
+        (((0.03, 0.03),), (50,), (1.0,)),
+        (((0.12, 0.0),), (25,), (1.0,)),
+        (((0.0, 0.2),), (12,), (1.0,)),
+        (((0.5, 0.4), (0.02, 0.0)), (8, 60), (1.0, 6.0)),
+        (((0.05, 0.0), (0.0, 0.1)), (30, 15), (1.0, 1.0)),
+    ],
+)
+def test_limits_of_a_difference_cover(confidence, share, tests, p):
+    assert coverage(share, tests, p, paired(confidence)) >= confidence
+
+
+def test_pairs_taken_for_independent_tests_do_not_cover():
+    assert coverage([(0.47, 0.47)], (60,), (1.0,), paired(0.95)) >= 0.95
+    assert coverage([(0.47, 0.47)], (60,), (1.0,), independent(0.95)) < 0.92
+
+
+@pytest.mark.parametrize("confidence", [0.9, 0.95, 0.99])
+def test_limits_of_a_ratio_cover(confidence):
+    """Of vehicles that crash together in 40 %, A alone in 25 %, B alone in 5 %: 1.44."""
+    share, n, covered = np.array([0.4, 0.25, 0.05, 0.3]), 16, 0.0
+    for k in product(range(n + 1), repeat=3):
+        if sum(k) <= n:
+            counts = np.array([*k, n - sum(k)])
+            chance = math.exp(gammaln(n + 1) - gammaln(counts + 1).sum() + xlogy(counts, share).sum())
+            if chance > 1e-5:
+                low, high = ratio([1.0], [counts], Level.two_sided(confidence))
+                covered += chance * (low <= 0.65 / 0.45 <= high)
+    assert covered >= confidence - 1e-3  # what was left out
