@@ -97,6 +97,16 @@ class Yields(idm_batch.IDM):
         return np.where(np.isinf(seen.gap_m) & (gap <= 0.0), 0.0, super().step_batch(ahead))
 
 
+class YieldsMostly(HoldsThenIdm):
+    """Gives way to BV while that is still beside it, but for one index in forty that it is told."""
+
+    def before(self, seen):
+        gap = seen.bv.position_m - 5.0 - seen.position_m
+        if self.index % 40 == 3 or gap <= 0.0:
+            return 0.0
+        return idm_acceleration(seen.speed_mps, seen.bv.speed_mps, gap, self._min)
+
+
 class FreshNoise(Speeds):
     """Noise of its own instead of the stream's."""
 

@@ -126,8 +126,8 @@ def test_shadow_runs_that_fail_count_against_the_vehicle(campaign, run_here, tmp
 
 
 def test_crashes_on_a_handful_of_paths_give_no_interval(campaign, run_here, tmp_path):
-    """A vehicle that gives way crashes on few paths: the run ends, and says that it knows too little of it."""
-    lonely = campaign(*SHELLS, SHADOWS, TWIN, f"av={of('Yields')}", "stop.rhw=0.3", "stop.episodes=20000")
+    """A vehicle that gives way, but on three paths of 120: the run ends, and says that it knows too little."""
+    lonely = campaign(*SHELLS, SHADOWS, TWIN, f"av={of('YieldsMostly')}", "stop.rhw=0.3", "stop.episodes=20000")
     result = run_here(lonely, tmp_path / "run")
     shells = result.estimates["estimates"]["shells"]
     assert (result.exit_code, result.stopped_by) == (4, "pool_error")
