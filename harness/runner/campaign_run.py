@@ -233,6 +233,8 @@ class _Run:
         stop, rule, n = self._campaign.stop, self._planner.rule, self.prefix.n_episodes
         stopped_by = self._stopped_by()
         said = ending(stopped_by, n, rule.waited_for, precision_asked=stop.rhw is not None)
+        if stopped_by == "rhw" and self._planner.remark:
+            said += f" {self._planner.remark}"
         retraced = self._retracing.summary(self.prefix.n_retraced)
         self._manifest.write(self.prefix, "done", stopped_by=stopped_by, ending=said, retraced=retraced)
         self._progress.stage("estimates and report", None)

@@ -43,6 +43,12 @@ USED_UP_SHARE = 0.95
 """Share of the squared widths that must lie in exhausted strata for the allocation to end."""
 MOST_SHARDS_PER_ROUND = 16
 SMALLEST_SHARD = 64
+WIDEST_RHW = 0.5
+"""Precision from which on stopping at the first interval biases the rate noticeably."""
+TOO_WIDE = (
+    f"A relative half-width above {WIDEST_RHW:g} is reached by chance: stopping at the first such interval makes rates "
+    "too high on the mean. Ask for a smaller stop.rhw, or for testing.shells.stopping: two_phase."
+)
 FIRST_PHASE = 1.7
 """Precision of the first of two phases over that of the second (measured: docs/estimators.md)."""
 POOL_SHARE = 0.5
@@ -55,7 +61,7 @@ class FixedPlanner:
     def __init__(self, campaign: Campaign) -> None:
         self._campaign = campaign
         stop, method, size = campaign.stop, campaign.testing.method, campaign.run.shard_size
-        self.reported_from = 0
+        self.reported_from, self.remark = 0, ""
         self.rule = StopRule(stop, method, size, min_crashes=campaign.min_crashes)
         self._sums = accumulator(self.rule.estimator)
         self._n_episodes = 0
@@ -82,13 +88,15 @@ class ShellPlanner:
     number does not depend on their results.
 
     ``available``, shape (S,), are the most tests of each stratum, ``held`` see `RoundRule`; ``estimate`` is that at the
-    end of the last round.
+    end of the last round, ``reported_from`` the first test of the second phase, ``remark`` what to say of stopping.
     """
 
     def __init__(self, campaign: Campaign, design: ShellDesign, available: IntArray, held: int = 0) -> None:
         shells = campaign.testing.shells
         self._plans = shells.stopping == "two_phase" and campaign.stop.rhw is not None
         self.rule = RoundRule(campaign, held, FIRST_PHASE if self._plans else 1.0)
+        wide = campaign.stop.rhw is not None and campaign.stop.rhw > WIDEST_RHW and not self._plans
+        self.remark = TOO_WIDE if wide else ""
         self.estimate: Estimate | None = None
         self.reported_from = 0
         self._campaign = campaign
@@ -220,13 +228,13 @@ class Allocation:
         if self.conditional_only:
             return inside
         d, s = self.design, slice(0, self.design.n_inside)
-        inner = combined(d.p[s], tally.part(s), d.n_paths, _LEVEL)
-        known = inner.rhw <= CONDITIONAL_RHW
         exhausted = bool(np.all(tests[s] >= self.available[s]))
         started = bool(np.any(tests[d.n_inside :] > 0))
         # Without this end a vehicle that crashes rarely inside, and often outside, would not be tested outside at all.
         spent = bool(tests[s].sum() >= MOST_FIRST_TESTS * self.first_tests * d.n_inside)
-        return np.ones_like(inside) if known or exhausted or started or spent else inside
+        if exhausted or started or spent:
+            return np.ones_like(inside)
+        return inside | (combined(d.p[s], tally.part(s), d.n_paths, _LEVEL).rhw <= CONDITIONAL_RHW)
 
     def _spread(self, size: int, tally: Tally, active: BoolArray) -> IntArray:
         """Give portions, one after the other, to where each narrows the sum of squared half-widths most.

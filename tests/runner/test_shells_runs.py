@@ -302,7 +302,7 @@ def test_a_round_is_divided_into_shards_without_gap():
 
 
 def test_two_phases_report_the_second_alone(campaign, run_here, tmp_path):
-    """The first ends at 1.7 times the precision; the second is planned from it, and its number does not depend on it."""
+    """The first ends at 1.7 times the precision; the number of the second is planned from it."""
     planned = campaign(*SHELLS, "world.engine=twin", "testing.shells.stopping=two_phase")
     found = run_here(planned, tmp_path / "run")
     stored = manifest(tmp_path / "run")
@@ -326,3 +326,9 @@ def test_two_phases_cannot_be_continued_to_another_precision(campaign, run_here,
     run_here(campaign(*planned), tmp_path / "run")
     with pytest.raises(RunFolderError, match="another campaign"):
         run_here(campaign(*planned, "stop.rhw=0.8"), tmp_path / "run", resume=True)
+
+
+def test_a_run_that_stops_at_a_wide_interval_says_what_that_does(campaign, run_here, tmp_path):
+    wide = run_here(campaign(*SHELLS, "world.engine=twin", "stop.rhw=0.6"), tmp_path / "wide")
+    assert wide.ending.endswith("Ask for a smaller stop.rhw, or for testing.shells.stopping: two_phase.")
+    assert "two_phase" not in run_here(campaign(*SHELLS, "world.engine=twin"), tmp_path / "narrow").ending
