@@ -82,7 +82,7 @@ def conditional_statement(estimate: Estimate) -> str | None:
             f"This vehicle crashed {found['n_crashes_outside']:,} times where the surrogate {boundary} does not crash: "
             f"nothing can be said under the assumption that it crashes only where {boundary} does."
         )
-    if math.isinf(found["rhw"] or 0.0) and found["n_crashes"]:
+    if math.isinf(found["rhw_from_pool"]):
         return "Under an assumption about where it crashes nothing more can be said: its crashes lie on too few paths."
     text = (
         f"If this vehicle crashes only where the surrogate {boundary} or a more careful one crashes, its crash rate is "

@@ -32,6 +32,6 @@ def build_sumo_world(
         return TraciWorld(cells, av.traci, av.limits.step_time_s, acts_before_cut_in=early)
     if av.sumo is None:
         return SumoWorld(cells, gui=gui, options=options)
-    if recyclable(av.sumo):
-        return SumoAvWorld(cells, av.sumo, acts_before_cut_in=early, gui=gui, options=options)
+    if recyclable(av.sumo) and not early:  # one that is released at the start remembers the last episode's cut-in
+        return SumoAvWorld(cells, av.sumo, gui=gui, options=options)
     return FreshWorld(av.sumo, campaign.seed, acts_before_cut_in=early, gui=gui, options=options)

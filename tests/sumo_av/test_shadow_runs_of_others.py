@@ -9,6 +9,7 @@ from harness.campaign.loading import load_campaign
 from harness.resolved import resolve
 from harness.runner.prepare import build_world, prepare
 from harness.runner.shadow_runs import as_recorded, run_shadows, shadow_specs
+from harness.sumo.sumo_av_world import FreshWorld, SumoAvWorld
 from tests.controllers.test_same_bits import ROOT, fmu_av
 from tests.pool.conftest import MIXTURE_FILE, SMALL_POOL
 from tests.sumo_av.running import EXAMPLE, program
@@ -31,12 +32,19 @@ def fmu(tmp_path_factory):
     )
 
 
-def driven(av: str, engine: str = "sumo"):
-    """Causes of failure of the shadow runs, and of tests on their paths; the motion of both (AV speeds)."""
+def acting(av: str, engine: str):
     changes = [f"av={av}", "testing.method=shells", f"world.engine={engine}", "world.cells=8", *SMALL_POOL]
-    campaign = load_campaign(MIXTURE_FILE, [*changes, "pool.shadow_paths=120"])
+    return load_campaign(MIXTURE_FILE, [*changes, "pool.shadow_paths=120"])
+
+
+def driven(av: str, engine: str = "sumo"):
+    campaign = acting(av, engine)
+    return driven_in(build_world(campaign), campaign)
+
+
+def driven_in(world, campaign):
+    """Causes of failure of the shadow runs, what tests on their paths left, and the motion of the former."""
     ready = prepare(resolve(campaign))
-    world = build_world(campaign)
     loop, environment = ready.loop(world), ready.policy.environment
     try:
         specs = list(shadow_specs(len(ready.shadow_paths)))
@@ -67,6 +75,16 @@ def test_it_does_in_tests_what_it_did_in_its_shadow_runs(av):
     moved = np.abs(runs.v_mps[np.arange(120), runs.n_steps] - runs.v_mps[:, 0]) > 0.1
     assert moved.mean() > 0.2, "it never acted"
     assert np.all(shard.results.episode["cut_in_step"] >= 0)
+
+
+def test_models_that_are_recycled_otherwise_remember_the_last_cut_in():
+    """Why they get a simulation per episode when they act from the start: in one, tests are not the same again."""
+    campaign = acting("{sumo: {carFollowModel: Krauss}" + EARLY, "sumo")
+    world = build_world(campaign)
+    assert isinstance(world, FreshWorld)
+    world.close()
+    _, shard, _ = driven_in(SumoAvWorld(8, campaign.av.sumo, acts_before_cut_in=True), campaign)
+    assert len(shard.failures) > 5
 
 
 def test_a_program_of_its_own_process():
