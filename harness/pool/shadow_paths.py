@@ -34,7 +34,11 @@ from harness.resolved import Resolved
 from harness.state import STATE_COLUMNS, states_from
 
 CANDIDATES = 32_768
-"""Paths of an AV that holds its speed to choose from: they cost milliseconds, and halve the shadow runs (measured)."""
+"""Paths of an AV that holds its speed to choose from: they cost milliseconds each, and save two of three shadow runs.
+
+Their own error (standard error 0.4 % of the careful surrogates' rates, against 2 % of 500 shadow runs; measured in the
+default traffic) is in no interval.
+"""
 EVENLY = 0.1
 """Share of the choice that does not look at surrogates: no path counts for more than ten times its even weight."""
 CHOICE_DRAW = 2

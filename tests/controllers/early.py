@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 
 import numpy as np
 
@@ -121,4 +122,13 @@ class Breaks(HoldsThenIdm):
     def before(self, seen):
         if self.index % 50 == 7 and seen.time_s > 2.0:
             raise RuntimeError("sensor lost")
+        return 0.3
+
+
+class Exits(HoldsThenIdm):
+    """Ends its process in the second second of the index 61 that it is told."""
+
+    def before(self, seen):
+        if self.index == 61 and seen.time_s > 1.0:
+            os._exit(9)
         return 0.3

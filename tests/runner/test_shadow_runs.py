@@ -178,3 +178,14 @@ def test_shadow_runs_that_are_gone_or_damaged_are_named(early_run, campaign, run
     with pytest.raises(RunFolderError, match="shadow runs of 2 of 3 files"):
         replay(folder, 5)
     assert estimate(folder)["n_episodes"] == early_run.estimates["n_episodes"]  # needs no path
+
+
+def test_a_vehicle_that_ends_its_process_in_a_shadow_run_fails_there(campaign, run, tmp_path):
+    """Nothing else is lost, and the tests under the same numbers are run."""
+    exits = campaign(*SHELLS, SHADOWS, TWIN, f"av={of('Exits')}", "run.max_failed_share=0.05", "stop.rhw=9")
+    folder = run(exits, tmp_path / "run", workers=1).folder
+    rows = [row for path in files_of(folder) for row in pq.read_table(path).to_pylist()]
+    assert [row["shadow"] for row in rows if row["outcome"] == "failed"] == [61]
+    assert "exit code 9" in rows[61]["failure"]
+    assert manifest(folder)["shadow_runs"] == {"n_runs": 120, "n_failed": 1}
+    assert stored_table(folder, "episodes").column("outcome").to_pylist()[61] != "failed"
