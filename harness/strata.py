@@ -15,6 +15,8 @@ from harness.arrays import FloatArray
 
 OUTSIDE = "outside"
 """Name of the stratum of everything beyond the boundary."""
+FAILED_SHADOWS = "failed shadow runs"
+"""Name of a stratum that cannot be tested: cut-ins on paths on which the vehicle failed before one could come."""
 _ARRAYS = ("cell_p", "reference_rate", "reference_square")
 
 
@@ -43,6 +45,8 @@ class ShellDesign:
         and which is not tested.
     available : tuple of int, length S
         Cut-ins that the pool has kept of each; empty if that is no limit.
+    shadow_runs : bool
+        Whether the pool's paths are the few that the vehicle has walked itself.
     """
 
     pool: str
@@ -59,6 +63,7 @@ class ShellDesign:
     reference_rate: FloatArray = field(default_factory=lambda: np.zeros(0))
     reference_square: FloatArray = field(default_factory=lambda: np.zeros(0))
     available: tuple[int, ...] = ()
+    shadow_runs: bool = False
 
     @cached_property
     def p(self) -> FloatArray:

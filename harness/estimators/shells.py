@@ -18,6 +18,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from harness.estimators.block import Block
+from harness.estimators.crash_paths import FEWEST_PATHS, CrashPaths
 from harness.estimators.estimate import Estimate, require_episodes
 from harness.estimators.intervals import clopper_pearson
 from harness.estimators.likelihood_ratio import Level, likelihood_limit
@@ -104,6 +105,7 @@ class Shells:
 
     def __init__(self) -> None:
         self.tally = empty_tally(0)
+        self._paths = CrashPaths()
 
     @classmethod
     def of(cls, design: ShellDesign, tally: Tally) -> Shells:
@@ -134,6 +136,9 @@ class Shells:
         ):
             np.add.at(counts, block.stratum[rows], 1)
             np.add.at(sums, block.stratum[rows], mass[rows])
+        if block.shells.shadow_runs:
+            crashed = block.crash
+            self._paths.add(block.cell_mass[crashed], block.stratum[crashed], block.shells.p.size)
 
     def result(self, confidence: float) -> Estimate:
         """Assumption-free estimate; the conditional one is among its details."""
@@ -157,7 +162,8 @@ class Shells:
             largest_weight_share=float(np.max(y[tally.crashes > 0], initial=0.0)) / free.rate if free.rate > 0 else 0.0,
             method="crashes within shells of known probability; likelihood-ratio limits of their weighted sum; upper "
             "bound: the same, one-sided",
-            warnings=tuple(self._warnings()),
+            warnings=(*self._cautions(), *self._warnings()),
+            cautions=tuple(self._cautions()),
             details=asdict(
                 ShellDetails(
                     boundary=design.boundary,
@@ -172,8 +178,26 @@ class Shells:
         )
 
     def _limits(self, tally: Tally, level: Level) -> Limits:
-        """Of the first strata, those of a tally."""
-        return combined(self._design.p[: tally.tests.size], tally, self._design.n_paths, level)
+        """Of the first strata, those of a tally; anything is possible where crashes lie on too few paths."""
+        p = self._design.p[: tally.tests.size]
+        if self._n_paths(tally) < FEWEST_PATHS:
+            return Limits(float(p @ tally.share), 0.0, 1.0, math.inf, math.inf)
+        return combined(p, tally, self._design.n_paths, level)
+
+    def _n_paths(self, tally: Tally) -> float:
+        """Number of paths that the crashes in the first strata, those of a tally, lie on, in effect."""
+        weight = np.zeros_like(self._design.p)
+        weight[: tally.tests.size] = self._design.p[: tally.tests.size] / tally.at_least_one
+        return self._paths.number(weight)
+
+    def _cautions(self) -> list[str]:
+        if (n := self._n_paths(self.tally)) >= FEWEST_PATHS:
+            return []
+        return [
+            f"no interval: nearly all crashes lie on some {max(n, 1.0):.0f} of the {self._design.n_paths:,} paths that "
+            f"the vehicle was driven along, and {FEWEST_PATHS:.0f} are needed; raise pool.shadow_paths, and run into a "
+            "new folder"
+        ]
 
     def _conditional(self, confidence: float) -> Conditional:
         """The statement given that there are no crashes outside, and what is known about those."""
@@ -224,7 +248,7 @@ class Shells:
         if empty := ", ".join(name for name, n in zip(design.strata, self.tally.tests, strict=True) if n == 0):
             found.append(f"no test in {empty}: the interval allows for any share of crashes there")
         kept = zip(design.strata, self.tally.tests, design.available, strict=False)
-        if used_up := ", ".join(name for name, n, available in kept if n >= available):
+        if used_up := ", ".join(name for name, n, available in kept if n >= available > 0):
             found.append(
                 f"all cut-ins that the pool has kept of {used_up} were tested: for more precision raise "
                 "pool.cut_ins_per_shell, and run into a new folder"

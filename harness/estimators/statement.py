@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -81,6 +82,8 @@ def conditional_statement(estimate: Estimate) -> str | None:
             f"This vehicle crashed {found['n_crashes_outside']:,} times where the surrogate {boundary} does not crash: "
             f"nothing can be said under the assumption that it crashes only where {boundary} does."
         )
+    if math.isinf(found["rhw_from_pool"]):
+        return "Under an assumption about where it crashes nothing more can be said: its crashes lie on too few paths."
     text = (
         f"If this vehicle crashes only where the surrogate {boundary} or a more careful one crashes, its crash rate is "
         f"{found['crash_rate']:.3g} per test ({level} interval {found['ci_low']:.3g} to {found['ci_high']:.3g}), "

@@ -16,7 +16,7 @@ from harness.campaign.models import AutomatedVehicle, BuiltInParameters, Campaig
 from harness.episode.cells import PrescribedCutIns, PrescribedTraffic
 from harness.errors import CampaignError
 from harness.pool.cut_ins import Pool
-from harness.strata import OUTSIDE, ShellDesign
+from harness.strata import FAILED_SHADOWS, OUTSIDE, ShellDesign
 
 
 def acceleration_limit(av: AutomatedVehicle) -> float:
@@ -64,7 +64,7 @@ def design_shells(pool: Pool, *, boundary: str | None = None, limit_mps2: float)
     first = np.unique(cells, return_index=True)[1][-(cells.max() + 1) :]
     n_inside = sum(group[-1] <= pool.names.index(name) for group in groups)
     p = np.asarray(np.bincount(cells[cells >= 0], pool.cell_p[cells >= 0]), np.float64)
-    return ShellDesign(
+    design = ShellDesign(
         pool=pool.key,
         strata=(*(pool.names[group[0]] for group in groups[:n_inside]), *([OUTSIDE] * (len(groups) - n_inside))),
         cell_stratum=tuple(_stratum_of_shell(pool, groups)[pool.cell_shell[first]].tolist()),
@@ -78,6 +78,19 @@ def design_shells(pool: Pool, *, boundary: str | None = None, limit_mps2: float)
         boundary=name,
         p_cut_in=pool.p_cut_in,
         p_impossible=pool.p_cut_in - float(p.sum()),
+        shadow_runs=pool.cut_ins.motion.size > 0,
+    )
+    return design if pool.p_unknown == 0.0 else _with_failed_shadows(design, pool.p_unknown)
+
+
+def _with_failed_shadows(design: ShellDesign, p: float) -> ShellDesign:
+    """One more stratum, of probability ``p`` at most: as it has no test, it may crash as often as it happens."""
+    return replace(
+        design,
+        strata=(*design.strata, FAILED_SHADOWS),
+        cell_stratum=(*design.cell_stratum, len(design.strata)),
+        cell_p=np.append(design.cell_p, p),
+        cell_references=(*design.cell_references, 0),
     )
 
 
@@ -125,6 +138,7 @@ class PrescribedEpisodes:
         self._cut_ins = pool.cut_ins
         self._cells = cells_in_strata(pool, groups)
         self._order = [_order(pool, group, campaign.seed, stratum) for stratum, group in enumerate(groups)]
+        self._order += [np.zeros(0, np.int64)] * (len(design.strata) - len(groups))
         self.design = replace(design, available=tuple(order.size for order in self._order))
 
     @property
@@ -155,12 +169,15 @@ class PrescribedEpisodes:
     def of_rows(self, rows: IntArray, stratum: IntArray) -> tuple[RecordArray, PrescribedTraffic]:
         """Initial states (n,) and traffic of given cut-ins of the pool (n,), tested for given strata (n,)."""
         c = self._cut_ins
+        acts = c.motion.size > 0
         traffic = PrescribedTraffic(
             lv=np.ascontiguousarray(c.lv[rows]),
             bv=np.ascontiguousarray(c.bv[rows]),
             cut_step=c.step[rows],
             stratum=stratum.astype(np.int64),
             log_weight=np.log(self.design.p[stratum]),
+            told=c.row[rows] if acts else np.zeros(0, np.int64),
+            motion=c.motion[rows] if acts else c.motion,
         )
         return c.state[rows], traffic
 

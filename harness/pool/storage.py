@@ -41,7 +41,7 @@ def pool_key(environment: Environment, library: Library, settings: PoolSettings)
         environment_hash(environment),
         {name: model.model_dump() for name, model in library.surrogates.items()},
         [library.boundary, library.envelope],
-        settings.model_dump(exclude={"library"}),
+        settings.model_dump(exclude={"library", "shadow_paths"}),
     ]
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:24]
 

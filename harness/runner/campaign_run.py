@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import threading
 import time
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -19,13 +20,32 @@ import pyarrow.parquet as pq
 from harness.campaign.models import Campaign
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE
 from harness.methods import SAMPLING
+from harness.pool.shadow_paths import ShadowPaths
+from harness.pool.shells import PrescribedEpisodes
+from harness.pool.vehicle_pool import ShadowRuns
 from harness.progress import Progress, SilentProgress
-from harness.records.folder import SHELLS, TABLES, shard_files, shards_on_disk, sole_use, write_json, write_shard
+from harness.records.folder import (
+    SHELLS,
+    TABLES,
+    shard_files,
+    shards_on_disk,
+    sole_use,
+    write_bytes,
+    write_json,
+    write_shard,
+)
 from harness.resolved import Resolved
 from harness.runner.manifest import SMALLEST_FAILED_SAMPLE, Manifest, Prefix, require_no_fewer, require_own_folder
 from harness.runner.planner import Planner, planner_of
-from harness.runner.prepare import distance_per_test_m, prepare, require_ready, require_same_pool
+from harness.runner.prepare import Prepared, distance_per_test_m, prepare, require_ready, require_same_pool
 from harness.runner.retrace import Retracing
+from harness.runner.shadow_runs import (
+    as_recorded,
+    require_few_failed,
+    shadow_file,
+    shadow_specs,
+    stored_shadows,
+)
 from harness.runner.shards import ShardPool, stored_shard
 from harness.runner.stored_estimates import estimate_run
 from harness.runner.table_accuracy import table_errors
@@ -97,7 +117,7 @@ def run_campaign(
         if not shorten:
             require_no_fewer(out, earlier, resolved.campaign.stop.episodes)
         run = Run(resolved, out, earlier, workers or os.cpu_count() or 1, progress or SilentProgress(), began)
-        run.run_rounds()
+        run.run_all()
         if not shorten:
             require_no_fewer(out, earlier, run.prefix.n_episodes)
             run.discard_uncounted()
@@ -133,20 +153,21 @@ class Run:
             distance_per_test_m=distance_per_test_m(resolved.environment),
             table_errors=table_errors(resolved, prepared.tables),
         )
-        if prepared.prescribed is not None:
-            require_same_pool(out, prepared)
-            write_json(out / SHELLS, prepared.prescribed.design.to_json())
+        self._held = earlier["n_episodes"]
         self._retracing = Retracing(resolved)
-        self._stored = partial(stored_shard, out, prepared, self._retracing)
-        self.prescribed = prepared.prescribed
-        self.planner: Planner = planner_of(self._campaign, prepared.prescribed, held=earlier["n_episodes"])
-        self._workers = ShardPool(resolved, workers)
+        self.prescribed: PrescribedEpisodes | None = None
+        self._prepared = prepared
+        if prepared.shadow_paths is None:
+            self._plan(prepared)
+        self._workers = ShardPool(resolved, out, workers)
         self.prefix = Prefix()
 
-    def run_rounds(self) -> None:
-        """Run rounds of shards until the stop rule is content."""
-        self._progress.stage("episodes", self._campaign.stop.episodes, done=episodes_on_disk(self._out))
+    def run_all(self) -> None:
+        """Run shadow runs, if there are any to make, and then rounds of shards until the stop rule is content."""
         with self.under_way():
+            if (paths := self._prepared.shadow_paths) is not None:
+                self._plan(self._prepared.after(self._run_shadows(paths)))
+            self._progress.stage("episodes", self._campaign.stop.episodes, done=episodes_on_disk(self._out))
             for specs in self.planner.rounds():
                 if self.run_round(specs):
                     break
@@ -167,6 +188,33 @@ class Run:
             raise
         finally:
             self._workers.close()
+
+    def _plan(self, prepared: Prepared) -> None:
+        """Begin to test what has been prepared."""
+        if prepared.prescribed is not None:
+            require_same_pool(self._out, prepared)
+            write_json(self._out / SHELLS, prepared.prescribed.design.to_json())
+        self._stored = partial(stored_shard, self._out, prepared, self._retracing)
+        self.prescribed = prepared.prescribed
+        self.planner: Planner = planner_of(self._campaign, prepared.prescribed, held=self._held)
+
+    def _run_shadows(self, paths: ShadowPaths) -> ShadowRuns:
+        """Drive the vehicle along all paths without a cut-in, but for what an earlier run has done of it."""
+        environment, n = self._resolved.environment, len(paths)
+        self._progress.stage("shadow runs", n)
+        tables, causes = [], Counter[str]()
+        for done in self._workers.run(shadow_specs(n), partial(stored_shadows, self._out, paths)):
+            if done.parquet:
+                write_bytes(shadow_file(self._out, done.spec), done.parquet)
+            tables.append(done.table)
+            causes += done.failures
+            self._progress.advance(done.spec.n_episodes)
+            self._manifest.note(shadow_runs={"n_runs": sum(map(len, tables)), "n_failed": causes.total()})
+            self._manifest.follow(self.prefix)
+        require_few_failed(causes, n, self._campaign.run.max_failed_share)
+        runs = as_recorded(tables, environment)
+        self._manifest.note(distance_per_test_m=runs.mean_distance_m(paths.weight))
+        return runs
 
     def _is_enough(self, done: ShardDone) -> bool:
         """Take the next shard; True when the campaign is to stop."""

@@ -153,6 +153,13 @@ def require_same_shells(sides: tuple[Resolved, Resolved]) -> None:
             expected="sequential: a comparison plans no second phase",
             mend="Write --set testing.shells.stopping=sequential.",
         )
+    if any(of_side.campaign.av.before_cut_in == "controller" for of_side in sides):
+        raise CampaignError(
+            "av.before_cut_in",
+            found="controller",
+            expected="two vehicles that hold their speed until the cut-in: each that acts before has cut-ins of its own",
+            mend="Write --set testing.method=forced, or compare the intervals of two runs.",
+        )
     limits = [acceleration_limit(of_side.campaign.av) for of_side in sides]
     envelope = sides[0].library.envelope_mps2
     if (limits[0] > envelope) != (limits[1] > envelope):

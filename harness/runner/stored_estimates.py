@@ -180,7 +180,7 @@ def _refusal(campaign: Campaign, columns: set[str]) -> str | None:
     """Why no surrogate can take the place of the AV in these records; None if one can."""
     if campaign.testing.method == "shells":
         return "needs weighted tests: those drawn from shells have used the surrogates' outcomes already"
-    if campaign.av.before_cut_in == "controller":
+    if campaign.av.acts_before_cut_in:
         return (
             "needs an AV that keeps its speed until the cut-in (av.before_cut_in: hold_speed): this one acted before "
             "it, and where it was when BV cut in depends on that"

@@ -197,11 +197,6 @@ def test_rows_say_which_cut_in_they_were(shells_run):
     assert weights.size == strata
 
 
-def test_a_vehicle_that_acts_before_the_cut_in_is_refused(campaign):
-    with pytest.raises(CampaignError, match="hold_speed"):
-        campaign(*SHELLS, "av.before_cut_in=controller")
-
-
 def test_an_unknown_boundary_is_refused(campaign, run_here, tmp_path):
     with pytest.raises(CampaignError, match="a surrogate of the library"):
         run_here(campaign(*SHELLS, "testing.shells.boundary=brakes-4"), tmp_path / "run")
