@@ -157,7 +157,7 @@ def require_same_shells(sides: tuple[Resolved, Resolved]) -> None:
         raise CampaignError(
             "av.before_cut_in",
             found="controller",
-            expected="two vehicles that hold their speed until the cut-in: each that acts before has cut-ins of its own",
+            expected="vehicles that hold their speed until the cut-in: each that acts before has its own cut-ins",
             mend="Write --set testing.method=forced, or compare the intervals of two runs.",
         )
     limits = [acceleration_limit(of_side.campaign.av) for of_side in sides]

@@ -129,7 +129,8 @@ def test_estimates_of_wrong_types_are_refused(stored):
                 read_run_folder(stored)
 
 
-SHELLS = {"pool": "k", "strata": ["a", "b"], "p": [0.1, 0.2], "moments": [[1, 2], [3, 4]], "n_paths": 3, "n_inside": 1,
+SHELLS = {"pool": "k", "strata": ["a", "b"], "cell_stratum": [0, 1], "cell_p": [0.1, 0.2], "cell_references": [0, 1],
+          "references": ["r"], "reference_rate": [0.1], "reference_square": [0.1], "n_paths": 3, "n_inside": 1,
           "boundary": "a", "p_cut_in": 0.3, "p_impossible": 0.0, "available": [1, 2]}  # fmt: skip
 STOPS = {"a": {"campaign_hash": "x", "stop": {}, "n_episodes": 3, "stopped_by": "rhw"}}
 
@@ -138,8 +139,9 @@ STOPS = {"a": {"campaign_hash": "x", "stop": {}, "n_episodes": 3, "stopped_by": 
     ("model", "content", "wrong"),
     [
         *((StoredShells, SHELLS, {key: {}}) for key in SHELLS),
-        (StoredShells, SHELLS, {"p": [0.1]}),
-        (StoredShells, SHELLS, {"moments": [[1, 2]]}),
+        (StoredShells, SHELLS, {"cell_p": [0.1]}),
+        (StoredShells, SHELLS, {"cell_stratum": [0, 0]}),
+        (StoredShells, SHELLS, {"reference_rate": []}),
         *((StoredStops, STOPS, {"a": wrong}) for wrong in (1, [], {}, {**STOPS["a"], "n_episodes": "3"})),
     ],
 )
