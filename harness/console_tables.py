@@ -108,6 +108,8 @@ def print_pool(content: dict[str, Any]) -> None:
     _print_table(f"Pool {content['pool']}: {content['n_paths']:,} paths", headings, rows, texts=("surrogate",))
     error = content["p_cut_in_std_error"] / content["p_cut_in"]
     click.echo(f"BV cuts in in {content['p_cut_in']:.3e} of all tests (standard error {error:.2%}).")
+    for name, delay_s in content["delays_after_cut_in_s"].items():
+        click.echo(f"{name} begins to brake {delay_s:.2f} s after a dangerous cut-in: it has seen BV come over.")
 
 
 def print_statements(content: dict[str, Any]) -> None:

@@ -375,6 +375,7 @@ POOL = {
     "surrogates": [{"name": "a", "crash_rate": 1e-6, "std_error": 1e-8, "shell_probability": 1e-6}],
     "boundary": "a",
     "envelope": "b",
+    "delays_after_cut_in_s": {"a": 0.469},
     "no_surrogate_crashes": 1e-5,
     "p_cut_in": 1e-5,
     "p_cut_in_std_error": 1e-8,
@@ -386,7 +387,9 @@ def test_pool_prints_what_it_wrote(calls, capsys, tmp_path):
     calls["stand_in"]("harness.pool.storage.write_pool", None)
     file = tmp_path / "pool.parquet"
     assert main(["pool", SMOKE, "--out", str(file)]) == 0
-    assert capsys.readouterr().out.splitlines()[-1] == str(file)
+    *_, delay, last = capsys.readouterr().out.splitlines()
+    assert delay == "a begins to brake 0.47 s after a dangerous cut-in: it has seen BV come over."
+    assert last == str(file)
     assert calls["harness.pool.storage.write_pool"][0][0] == file
     assert main(["pool", SMOKE, "--out", str(file), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["file"] == str(file)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
-from harness.campaign.section import Positive, Probability, Section, StepTime
+from harness.campaign.section import Positive, Probability, Section, StepTime, broken_rule
 
 MAX_CONFIGURED_SPEED_MPS = 60.0
 
@@ -53,6 +53,128 @@ class ConstantParameters(Section):
         return self.acceleration_mps2
 
 
+class Reference(Section):
+    """What the reference drivers of UN Regulation No. 157 share: when they react, and how they follow.
+
+    The regulation's cut-in takes time: BV moves sideways, and the driver has seen and evaluated the risk when their
+    sides are still ``evaluated_at_m`` apart. Ours is a step, after which they overlap. So by the cut-in the driver has
+    used up ``evaluated_at_m / lateral_speed_mps`` of its delay.
+    """
+
+    reaction_time_s: float = Field(
+        0.75, ge=0.0, le=5.0, description="from the evaluated risk to the brakes [JRC-FSM: CC_rt, FSM_rt]"
+    )
+    lateral_speed_mps: Positive = Field(
+        1.8, le=10.0, description="at which BV is taken to have come over [JRC-FSM: 0.72 m in 0.4 s]"
+    )
+    evaluated_at_m: float = Field(
+        0.505,
+        ge=0.0,
+        le=5.0,
+        description="distance of their sides when the risk has been evaluated: 1.6 of two vehicles of 1.9 in lanes of "
+        "3.5, less 0.375 of wandering, less 0.72 in which it is evaluated [JRC-FSM: CC_calc_dist_to_react]",
+    )
+    min_acceleration_mps2: float = Field(
+        -7.59294, ge=-20.0, le=0.0, description="hardest braking, 0.774 g [JRC-FSM: CC_max_deceleration]"
+    )
+    braking_jerk_mps3: Positive = Field(
+        12.65, le=1000.0, description="how fast it comes to brake harder, 0.774 g in 0.6 s [JRC-FSM: CC_min_jerk]"
+    )
+    acceleration_mps2: Positive = Field(2.0, le=20.0, description="alpha of the IDM by which it follows [cutin]")
+    comfortable_deceleration_mps2: Positive = Field(3.0, le=20.0, description="b of that IDM [cutin]")
+    time_headway_s: float = Field(1.0, ge=0.0, le=10.0, description="T of that IDM [cutin]")
+    minimum_gap_m: float = Field(2.0, ge=0.0, le=50.0, description="s0 of that IDM [cutin]")
+    desired_speed_mps: Positive = Field(40.0, le=MAX_CONFIGURED_SPEED_MPS, description="v0 of that IDM [assumed]")
+    following_min_acceleration_mps2: float = Field(
+        -4.0, ge=-20.0, le=0.0, description="hardest braking of that IDM [assumed]"
+    )
+    max_acceleration_mps2: Positive = Field(2.0, le=20.0, description="upper clip of that IDM [paper]")
+
+    @property
+    def reaction_steps(self) -> float:
+        """Its reaction time, in steps."""
+        return 10.0 * self.reaction_time_s
+
+    @property
+    def used_up_steps(self) -> float:
+        """How much of its reaction time has passed by the cut-in, if that is the danger; in steps."""
+        return 10.0 * self.evaluated_at_m / self.lateral_speed_mps
+
+    @property
+    def delay_after_cut_in_s(self) -> float:
+        """How long after the cut-in it begins to brake (s); not before it, however slowly BV comes over."""
+        return max(0.0, self.reaction_steps - self.used_up_steps) / 10.0
+
+
+class CarefulCompetentParameters(Reference):
+    """The careful and competent human driver of UN Regulation No. 157."""
+
+    critical_ttc_s: Positive = Field(
+        2.0, le=20.0, description="time to collision below which it brakes [JRC-FSM: CC_critical_ttc]"
+    )
+    coasting_mps2: float = Field(
+        0.4, ge=0.0, le=5.0, description="deceleration off the accelerator, until it brakes [JRC-FSM]"
+    )
+
+
+class FuzzySafetyParameters(Reference):
+    """The fuzzy safety model of the Joint Research Centre, a performance model of UN Regulation No. 157."""
+
+    comfortable_braking_mps2: Positive = Field(
+        4.0, le=20.0, description="b_min: braking in anticipation, and the least in danger [JRC-FSM: FSM_br_min]"
+    )
+    hard_braking_mps2: Positive = Field(
+        6.0, le=20.0, description="b_max: braking in the greatest danger [JRC-FSM: FSM_br_max]"
+    )
+    leader_braking_mps2: Positive = Field(
+        7.0, le=20.0, description="how hard the vehicle ahead may brake [JRC-FSM: FSM_bl]"
+    )
+    standstill_gap_m: float = Field(
+        2.0, ge=0.0, le=50.0, description="part of the gap that anticipation does not count [JRC-FSM: FSM_margin_dist]"
+    )
+    safe_margin_m: Positive = Field(
+        2.0, le=50.0, description="gap beyond the safe one that is felt as safe [JRC-FSM: FSM_margin_safe_dist]"
+    )
+
+    @model_validator(mode="after")
+    def _hard_is_harder(self) -> Self:
+        if self.hard_braking_mps2 < self.comfortable_braking_mps2:
+            raise broken_rule(
+                "hard_braking_mps2",
+                found=f"{self.hard_braking_mps2:g}, below comfortable_braking_mps2 {self.comfortable_braking_mps2:g}",
+                expected="at least as much: it brakes the harder the greater the danger",
+                mend="Exchange them, or make them equal.",
+            )
+        return self
+
+
+class NeedBasedParameters(Section):
+    """A vehicle that accelerates until it needs to brake, and then brakes at one rate, a delay later."""
+
+    acceleration_mps2: Positive = Field(1.0, le=20.0, description="until it needs to brake [assumed]")
+    deceleration_mps2: Positive = Field(3.0, le=20.0, description="from the delay after the need on [assumed]")
+    reaction_time_s: float = Field(0.5, ge=0.0, le=10.0, description="between the need and the brakes [assumed]")
+    needed_mps2: Positive = Field(
+        1.0, le=20.0, description="it needs to brake where no less than this prevents a collision [assumed]"
+    )
+    standstill_gap_m: float = Field(2.0, ge=0.0, le=50.0, description="gap that is to remain [assumed]")
+
+    @property
+    def reaction_steps(self) -> float:
+        """Its reaction time, in steps."""
+        return 10.0 * self.reaction_time_s
+
+    @property
+    def min_acceleration_mps2(self) -> float:
+        """Its braking (m/s²)."""
+        return -self.deceleration_mps2
+
+    @property
+    def max_acceleration_mps2(self) -> float:
+        """Its acceleration (m/s²)."""
+        return self.acceleration_mps2
+
+
 class IDM(Section):
     """A vehicle that follows the intelligent driver model."""
 
@@ -74,12 +196,43 @@ class Constant(Section):
     parameters: ConstantParameters = ConstantParameters()
 
 
+class CarefulCompetent(Section):
+    """A vehicle driven as by the careful and competent human of UN Regulation No. 157."""
+
+    model: Literal["r157-cc"]
+    parameters: CarefulCompetentParameters = CarefulCompetentParameters()
+
+
+class FuzzySafety(Section):
+    """A vehicle driven by the fuzzy safety model of UN Regulation No. 157."""
+
+    model: Literal["r157-fsm"]
+    parameters: FuzzySafetyParameters = FuzzySafetyParameters()
+
+
+class NeedBased(Section):
+    """A vehicle that brakes at one rate, a delay after it needs to."""
+
+    model: Literal["need-based"]
+    parameters: NeedBasedParameters = NeedBasedParameters()
+
+
 DriverModel = Annotated[IDM | FVDM, Field(discriminator="model")]
-BuiltInParameters = IDMParameters | FVDMParameters | ConstantParameters
+BuiltInParameters = (
+    IDMParameters
+    | FVDMParameters
+    | ConstantParameters
+    | CarefulCompetentParameters
+    | FuzzySafetyParameters
+    | NeedBasedParameters
+)
 PARAMETERS: dict[str, type[BuiltInParameters]] = {
     "idm": IDMParameters,
     "fvdm": FVDMParameters,
     "constant": ConstantParameters,
+    "r157-cc": CarefulCompetentParameters,
+    "r157-fsm": FuzzySafetyParameters,
+    "need-based": NeedBasedParameters,
 }
 
 

@@ -45,24 +45,29 @@ def _tell_sources_apart(av: Schema) -> None:
     named = [{"required": [name]} for name in AV_SOURCES]
     about = {"description": av["properties"]["parameters"]["description"]}
     av["properties"]["parameters"] = {"type": "object", **about}
-    av |= {
-        "oneOf": [*named, {"not": {"anyOf": named}}],
-        "if": {"required": ["model"], "properties": {"model": {"const": "fvdm"}}},
-        "then": {"properties": {"parameters": {"$ref": "#/$defs/FVDMParameters", **about}}},
-        "else": {
-            "if": {"required": ["model"], "properties": {"model": {"const": "constant"}}},
-            "then": {"properties": {"parameters": {"$ref": "#/$defs/ConstantParameters", **about}}},
-            "else": {
-                "if": {"required": ["controller"]},
-                "then": {"properties": {"parameters": {"type": "object", **about}}},
-                "else": {
-                    "if": {"anyOf": [{"required": [name]} for name in ("sumo", "traci", "fmu")]},
-                    "then": {"properties": {"parameters": {"type": "object", "maxProperties": 0, **about}}},
-                    "else": {"properties": {"parameters": {"$ref": "#/$defs/IDMParameters", **about}}},
-                },
-            },
-        },
-    }
+    av |= {"oneOf": [*named, {"not": {"anyOf": named}}], **_by_source(about)}
+
+
+def _by_source(about: Schema) -> Schema:
+    """What ``parameters`` are, as a chain of if, then and else: of a model, of a controller, none, else the IDM's."""
+    elsewhere = {"anyOf": [{"required": [name]} for name in ("sumo", "traci", "fmu")]}
+    cases: list[tuple[Schema, Schema]] = [
+        *(
+            ({"required": ["model"], "properties": {"model": {"const": model}}}, _parameters_of(model))
+            for model in PARAMETERS
+            if model != "idm"
+        ),
+        ({"required": ["controller"]}, {"type": "object"}),
+        (elsewhere, {"type": "object", "maxProperties": 0}),
+    ]
+    chain: Schema = {"properties": {"parameters": {**_parameters_of("idm"), **about}}}
+    for test, parameters in reversed(cases):
+        chain = {"if": test, "then": {"properties": {"parameters": {**parameters, **about}}}, "else": chain}
+    return chain
+
+
+def _parameters_of(model: str) -> Schema:
+    return {"$ref": f"#/$defs/{PARAMETERS[model].__name__}"}
 
 
 def schema_text() -> str:

@@ -79,7 +79,7 @@ AV_SOURCES = ("model", "controller", "sumo", "traci", "fmu")
 class AutomatedVehicle(Section):
     """The automated vehicle under test: one of model, controller, sumo, traci and fmu."""
 
-    model: Literal["idm", "fvdm", "constant"] | None = Field(
+    model: Literal["idm", "fvdm", "constant", "r157-cc", "r157-fsm", "need-based"] | None = Field(
         None, description="built-in driver model; idm when nothing is named"
     )
     controller: str | None = Field(

@@ -45,7 +45,7 @@ def begin_cell(k: int, row: int, bench: Bench) -> None:
     cell.lv_maneuver = cell.bv_maneuver = cell.n_lv = cell.n_bv = cell.n_bv_free = cell.n_path = cell.n_control = 0
     cell.clock = cell.hazard = cell.log_sampled = 0.0
     cell.hazard_total = cell.log_p_cut_in = math.nan
-    cell.min_ttc = math.inf
+    cell.min_ttc = cell.danger = math.inf
     cell.cut_r2 = cell.cut_r2dot = math.nan
     cell.av_start = bench.x[k, AV]
     cells.acceleration[k, AV] = 0.0

@@ -49,6 +49,7 @@ CELL_DTYPE = np.dtype(
         ("cut_r2", _f8),
         ("cut_r2dot", _f8),
         ("av_start", _f8),
+        ("danger", _f8),  # what a built-in AV remembers beside its acceleration
     ]
 )
 

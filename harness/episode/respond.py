@@ -13,7 +13,8 @@ from harness.controllers.protocol import BatchObservation
 from harness.episode.cells import Bench
 from harness.outcomes import AV, BV, LV
 from harness.vehicles.kinematics import STEP_S, gap, next_speed
-from harness.vehicles.models import reacting_acceleration, reaction_steps
+from harness.vehicles.reaction import react, reaction_steps
+from harness.vehicles.references import Memory
 
 
 @compiled
@@ -24,10 +25,11 @@ def respond(bench: Bench) -> None:
         cell = cells.cell[k]
         if cell.row < 0 or cell.cut_step < 0:
             continue
-        if cell.step - cell.cut_step > reaction_steps(driver[0], bench.seed, cell.episode):
-            cells.acceleration[k, AV] = reacting_acceleration(
-                driver[0], cells.acceleration[k, AV], v[k, AV], v[k, BV], gap(x[k, BV], x[k, AV])
-            )
+        step = cell.step - cell.cut_step - reaction_steps(driver[0], bench.seed, cell.episode) - 1
+        if step >= 0:
+            memory = Memory(cells.acceleration[k, AV], cell.danger)
+            memory = react(driver[0], memory, step, v[k, AV], v[k, BV], gap(x[k, BV], x[k, AV]))
+            cells.acceleration[k, AV], cell.danger = memory.acceleration, memory.danger
 
 
 @compiled

@@ -20,7 +20,7 @@ from harness.outcomes import AV, BV, BV_LV_CONTACT, LV, PASSED, RUNNING
 from harness.random_stream import BV_DRAWS, BV_FREE_DRAWS, LV_DRAWS, uniform
 from harness.state import State
 from harness.vehicles.kinematics import CONTACT_M, VEHICLE_LENGTH_M, gap, next_position, next_speed
-from harness.vehicles.models import reacting_acceleration
+from harness.vehicles.reaction import nothing_yet, react
 
 AV_START_M = 100.0
 NO_CRASH = -1
@@ -216,11 +216,12 @@ def follow(driver: Record, late: int, cut: int, until: int, path: Trajectory) ->
     x, v = path.x_av[cut + 1], path.v_av[cut + 1]
     if gap(path.x_after[cut + 1], x) < CONTACT_M:
         return cut + 1, v
-    a = 0.0
+    memory = nothing_yet()
     for step in range(cut + 1, until):
         if step - cut > late:
-            a = reacting_acceleration(driver, a, v, path.v_after[step], gap(path.x_after[step], x))
-        v_after = next_speed(v, a)
+            ahead = gap(path.x_after[step], x)
+            memory = react(driver, memory, step - cut - late - 1, v, path.v_after[step], ahead)
+        v_after = next_speed(v, memory.acceleration)
         x = next_position(x, v, v_after)
         v = v_after
         if gap(path.x_after[step + 1], x) < CONTACT_M:

@@ -108,6 +108,13 @@ class Shells:
         self._paths = CrashPaths()
 
     @classmethod
+    def of(cls, design: ShellDesign, tally: Tally) -> Shells:
+        """From counts."""
+        shells = cls()
+        shells._design, shells.tally = design, tally
+        return shells
+
+    @classmethod
     def refusal(cls, block: Block) -> str | None:
         """Shells must have been drawn from, and their probabilities be known."""
         if block.shells is None or block.stratum is None:

@@ -127,6 +127,7 @@ class Pool:
             "p_cut_in_std_error": self.p_cut_in_se,
             "boundary": self.library.boundary,
             "envelope": self.library.envelope,
+            "delays_after_cut_in_s": self.library.delays_after_cut_in_s,
             "surrogates": [dict(zip(keys, row, strict=True)) for row in zip(*columns, strict=True)],
             "no_surrogate_crashes": p[-1],
             "references": [

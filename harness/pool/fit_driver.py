@@ -21,7 +21,8 @@ from harness.arrays import FloatArray
 from harness.campaign.models import IDMParameters, Reflexes
 from harness.pool.library import LibraryIDM
 from harness.pool.observed import Observed
-from harness.vehicles.models import driver_records, expected_accelerations
+from harness.vehicles.models import driver_records
+from harness.vehicles.reaction import expected_accelerations
 
 MOST_DELAY_STEPS = 20
 ROUGH_EVALUATIONS, LAST_EVALUATIONS = 6, 60

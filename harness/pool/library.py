@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 
 from harness.arrays import RecordArray
 from harness.campaign.loading import names_a_file
-from harness.campaign.models import FVDM, IDM, Constant, Reflexes
+from harness.campaign.models import FVDM, IDM, CarefulCompetent, Constant, FuzzySafety, NeedBased, Reference, Reflexes
 from harness.campaign.problems import read_model
 from harness.campaign.section import Section, SurrogateName, broken_rule
 from harness.errors import CampaignError
@@ -39,7 +39,28 @@ class LibraryConstant(Constant):
     reaction: Reflexes = Reflexes()
 
 
-LibraryDriver = Annotated[LibraryIDM | LibraryFVDM | LibraryConstant, Field(discriminator="model")]
+class LibraryCarefulCompetent(CarefulCompetent):
+    """A careful and competent human driver with its reflexes."""
+
+    reaction: Reflexes = Reflexes()
+
+
+class LibraryFuzzySafety(FuzzySafety):
+    """A driver by the fuzzy safety model with its reflexes."""
+
+    reaction: Reflexes = Reflexes()
+
+
+class LibraryNeedBased(NeedBased):
+    """A driver that brakes once it needs to, with its reflexes."""
+
+    reaction: Reflexes = Reflexes()
+
+
+LibraryDriver = Annotated[
+    LibraryIDM | LibraryFVDM | LibraryConstant | LibraryCarefulCompetent | LibraryFuzzySafety | LibraryNeedBased,
+    Field(discriminator="model"),
+]
 
 
 class Library(Section):
@@ -68,6 +89,15 @@ class Library(Section):
         """The surrogates and then the references as kernels read them, in the order of the file, shape (D + R,)."""
         models = [*self.surrogates.values(), *self.references.values()]
         return driver_records([model.parameters for model in models], [model.reaction for model in models])
+
+    @property
+    def delays_after_cut_in_s(self) -> dict[str, float]:
+        """How long after a dangerous cut-in each reference driver begins to brake (s), by name."""
+        return {
+            name: model.parameters.delay_after_cut_in_s + model.reaction.delay_s
+            for name, model in self.surrogates.items()
+            if isinstance(model.parameters, Reference)
+        }
 
     @property
     def envelope_mps2(self) -> float:

@@ -16,7 +16,7 @@ from harness.environment.driving import Environment
 from harness.episode.trajectory import NO_CRASH, Trajectory, end_in, follow, leave, state_in, walk, who_crashes
 from harness.maneuvers import CUT_IN
 from harness.outcomes import BV_LV_CONTACT, CRASH, FAILED, PASSED, RUNNING, TIMEOUT
-from harness.vehicles.models import reaction_steps
+from harness.vehicles.reaction import reaction_steps
 
 
 class StoredPaths(NamedTuple):

@@ -6,11 +6,11 @@ import os
 import threading
 import time
 from collections import Counter
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +35,7 @@ from harness.records.folder import (
 )
 from harness.resolved import Resolved
 from harness.runner.manifest import SMALLEST_FAILED_SAMPLE, Manifest, Prefix, require_no_fewer, require_own_folder
-from harness.runner.planner import planner_of
+from harness.runner.planner import Planner, planner_of
 from harness.runner.prepare import Prepared, distance_per_test_m, prepare, require_ready, require_same_pool
 from harness.runner.retrace import Retracing
 from harness.runner.shadow_runs import (
@@ -48,7 +48,7 @@ from harness.runner.shadow_runs import (
 from harness.runner.shards import ShardPool, stored_shard
 from harness.runner.stored_estimates import estimate_run
 from harness.runner.table_accuracy import table_errors
-from harness.runner.worker import ShardDone
+from harness.runner.worker import ShardDone, ShardSpec
 from harness.stopped_by import StoppedBy, ending
 
 
@@ -115,16 +115,26 @@ def run_campaign(
         earlier = require_own_folder(out, resolved, resume=resume)
         if not shorten:
             require_no_fewer(out, earlier, resolved.campaign.stop.episodes)
-        run = _Run(resolved, out, earlier, workers or os.cpu_count() or 1, progress or SilentProgress(), began)
-        run.run_all()
+        run = Run(resolved, out, earlier, workers or os.cpu_count() or 1, progress or SilentProgress(), began)
+        run.run_rounds()
         if not shorten:
             require_no_fewer(out, earlier, run.prefix.n_episodes)
             run.discard_uncounted()
         return run.finish()
 
 
-class _Run:
-    """A campaign on its way into a folder, in which nobody but this process writes."""
+class Run:
+    """A campaign on its way into a folder, in which nobody but this process writes.
+
+    Attributes
+    ----------
+    prefix : Prefix
+        What is finished.
+    prescribed : PrescribedEpisodes or None
+        Cut-ins to draw from, where they are prescribed.
+    planner : Planner
+        The campaign's own; another may take its place before the first round.
+    """
 
     def __init__(
         self, resolved: Resolved, out: Path, earlier: dict[str, Any], workers: int, progress: Progress, began: float
@@ -150,13 +160,27 @@ class _Run:
         self._workers = ShardPool(resolved, out, workers)
         self.prefix = Prefix()
 
-    def run_all(self) -> None:
-        """Run shadow runs, if there are any to make, and then the tests; an interrupted run can be read."""
-        threading.Thread(target=import_module, args=("harness.report",), daemon=True).start()
-        try:
+    def run_rounds(self) -> None:
+        """Run rounds of shards until the stop rule is content, after the shadow runs if there are any to make."""
+        with self.under_way():
             if (paths := self._prepared.shadow_paths) is not None:
                 self._plan(self._prepared.after(self._run_shadows(paths)))
-            self._run_shards()
+            self._progress.stage("episodes", self._campaign.stop.episodes, done=episodes_on_disk(self._out))
+            for specs in self.planner.rounds():
+                if self.run_round(specs):
+                    break
+
+    def run_round(self, specs: Iterator[ShardSpec]) -> bool:
+        """Run the shards of a round; True, at once, when the campaign is to stop."""
+        return any(self._is_enough(done) for done in self._workers.run(specs, self._stored))
+
+    @contextmanager
+    def under_way(self) -> Iterator[None]:
+        """Rounds are run within this: the manifest follows, so that an interrupted run can be read, and workers end."""
+        threading.Thread(target=import_module, args=("harness.report",), daemon=True).start()
+        try:
+            yield
+            self.prefix.require_few_failed(self._campaign)
         except BaseException:
             self._manifest.write(self.prefix, "interrupted")
             raise
@@ -169,7 +193,8 @@ class _Run:
             require_same_pool(self._out, prepared)
             write_json(self._out / SHELLS, prepared.prescribed.design.to_json())
         self._stored = partial(stored_shard, self._out, prepared, self._retracing)
-        self._planner = planner_of(self._campaign, prepared.prescribed, held=self._held)
+        self.prescribed = prepared.prescribed
+        self.planner: Planner = planner_of(self._campaign, prepared.prescribed, held=self._held)
 
     def _run_shadows(self, paths: ShadowPaths) -> ShadowRuns:
         """Drive the vehicle along all paths without a cut-in, but for what an earlier run has done of it."""
@@ -189,15 +214,6 @@ class _Run:
         self._manifest.note(distance_per_test_m=runs.mean_distance_m(paths.weight))
         return runs
 
-    def _run_shards(self) -> None:
-        """Run shards until the stop rule is content; the manifest follows."""
-        self._progress.stage("episodes", self._campaign.stop.episodes, done=episodes_on_disk(self._out))
-        rounds = (self._workers.run(specs, self._stored) for specs in self._planner.rounds())
-        for done in chain.from_iterable(rounds):
-            if self._is_enough(done):
-                break
-        self.prefix.require_few_failed(self._campaign)
-
     def _is_enough(self, done: ShardDone) -> bool:
         """Take the next shard; True when the campaign is to stop."""
         if done.parquet:
@@ -205,8 +221,8 @@ class _Run:
             write_shard(self._out, done.spec.index, done.parquet)
         self.prefix.add(done, shard_files(self._out, done.spec.index))
         self.prefix.require_few_failed(self._campaign, at_least=SMALLEST_FAILED_SAMPLE)
-        enough = self._planner.add(done.block)
-        self.prefix.reported_from = self._planner.reported_from
+        enough = self.planner.add(done.block)
+        self.prefix.reported_from = self.planner.reported_from
         self._progress.advance(done.spec.n_episodes if done.parquet else 0)
         self._progress.status(**self._figures())
         self._manifest.follow(self.prefix)
@@ -218,9 +234,9 @@ class _Run:
         Only what a rule asks for is called ``rhw``: a bar reckons from it when the campaign will stop.
         """
         watched = "half_width" if self._campaign.stop.rhw is None else "rhw"
-        figures: dict[str, int | float] = {"crashes": self.prefix.n_crashes, watched: self._planner.rule.rhw}
+        figures: dict[str, int | float] = {"crashes": self.prefix.n_crashes, watched: self.planner.rule.rhw}
         weighted = SAMPLING[self._campaign.testing.method].forces
-        return figures | ({"heaviest": self._planner.rule.heaviest} if weighted else {})
+        return figures | ({"heaviest": self.planner.rule.heaviest} if weighted else {})
 
     def discard_uncounted(self) -> None:
         """Remove shards that an earlier, longer run has left beyond the stop."""
@@ -230,11 +246,11 @@ class _Run:
 
     def finish(self) -> RunResult:
         """Write manifest, estimates and report."""
-        stop, rule, n = self._campaign.stop, self._planner.rule, self.prefix.n_episodes
+        stop, rule, n = self._campaign.stop, self.planner.rule, self.prefix.n_episodes
         stopped_by = self._stopped_by()
         said = ending(stopped_by, n, rule.waited_for, precision_asked=stop.rhw is not None)
-        if stopped_by == "rhw" and self._planner.remark:
-            said += f" {self._planner.remark}"
+        if stopped_by == "rhw" and self.planner.remark:
+            said += f" {self.planner.remark}"
         retraced = self._retracing.summary(self.prefix.n_retraced)
         self._manifest.write(self.prefix, "done", stopped_by=stopped_by, ending=said, retraced=retraced)
         self._progress.stage("estimates and report", None)
@@ -248,7 +264,7 @@ class _Run:
         return RunResult(self._out, report, estimates, stopped_by, said, EXIT_BUDGET_SPENT if missed else EXIT_DONE)
 
     def _stopped_by(self) -> StoppedBy:
-        rule = self._planner.rule
+        rule = self.planner.rule
         if self.prefix.reported_from and self.prefix.n_episodes < self._campaign.stop.episodes:
             return "two_phase"
         if rule.reached:

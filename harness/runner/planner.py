@@ -10,9 +10,11 @@ statement is roughly known, some hundred tests; then all are.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
+from typing import Protocol
 
 import numpy as np
 
@@ -152,7 +154,41 @@ class ShellPlanner:
         return False
 
 
-Planner = FixedPlanner | ShellPlanner
+class Rule(Protocol):
+    """What a run says about why it ended; see `StopRule` and `RoundRule`."""
+
+    reached: bool
+    pool_error_above_target: bool
+    rhw: float
+    heaviest: float
+    waited_for: tuple[str, ...]
+
+
+class Planner(Protocol):
+    """Says what is tested next, in rounds."""
+
+    @property
+    def rule(self) -> Rule:
+        """Why it stops."""
+        ...
+
+    @property
+    def reported_from(self) -> int:
+        """First test of those that the answer is from; 0 where all are."""
+        ...
+
+    @property
+    def remark(self) -> str:
+        """What the ending is to say besides; mostly nothing."""
+        ...
+
+    def rounds(self) -> Iterator[Iterator[ShardSpec]]:
+        """Shards of each round; the next round is asked for when all of the last one have been added."""
+        ...
+
+    def add(self, block: Block) -> bool:
+        """Add the tests of the next shard; True when the campaign is to stop."""
+        ...
 
 
 def planner_of(campaign: Campaign, prescribed: PrescribedEpisodes | None, held: int) -> Planner:
@@ -175,20 +211,37 @@ class Allocation:
     available: IntArray
     conditional_only: bool
 
-    def next_round(self, tally: Tally, budget: int) -> IntArray:
+    def next_round(
+        self,
+        tally: Tally,
+        budget: int,
+        *,
+        inner_rhw: Callable[[], float] | None = None,
+        spread: Callable[[int, IntArray], IntArray] | None = None,
+    ) -> IntArray:
         """Tests to add per stratum, at most ``budget``; all 0 when no stratum or no budget is left.
 
         Failed tests widen the limits that are to be narrowed: they may have been crashes.
+
+        Parameters
+        ----------
+        tally : Tally
+        budget : int
+        inner_rhw : callable, optional
+            Gives the relative half-width of the conditional statement; by default that of a crash rate.
+        spread : callable, optional
+            Gives so many tests to strata with so much room (S,) each; by default to where a crash rate is narrowed.
         """
         tests = tally.tests
         if self._used_up(tally):
             return np.zeros_like(tests)
-        begun = self._begun(tally)
+        begun = self._begun(tests, inner_rhw or partial(self._inner_rhw, tally))
         active = begun & (tests < self.available)
         wanted = np.where(active, np.maximum(self.first_tests - tests, 0), 0)
         if not wanted.any() and active.any():
             size = max(SMALLEST_ROUND, int(np.ceil(tests[begun].sum() * (GROWTH - 1.0))))
-            wanted = self._spread(min(size, budget), tally, active)
+            room = np.where(active, self.available - tests, 0)
+            wanted = self._spread(min(size, budget), tally, room) if spread is None else spread(min(size, budget), room)
         return _cut(np.minimum(wanted, self.available - tests), budget)
 
     def second_phase(self, first: Tally, available: IntArray, budget: int, rhw: float) -> IntArray:
@@ -221,22 +274,25 @@ class Allocation:
         squares = np.where(relevant, (self.design.p * (high - low)) ** 2, 0.0)
         return bool(squares[tests >= self.available].sum() >= USED_UP_SHARE * squares.sum())
 
-    def _begun(self, tally: Tally) -> BoolArray:
+    def _begun(self, tests: IntArray, inner_rhw: Callable[[], float]) -> BoolArray:
         """Strata that it is time to test: those inside, and from some point on all."""
-        tests = tally.tests
-        inside = np.arange(tests.size) < self.design.n_inside
+        n_inside = self.design.n_inside
+        inside = np.arange(tests.size) < n_inside
         if self.conditional_only:
             return inside
-        d, s = self.design, slice(0, self.design.n_inside)
-        exhausted = bool(np.all(tests[s] >= self.available[s]))
-        started = bool(np.any(tests[d.n_inside :] > 0))
+        exhausted = bool(np.all(tests[:n_inside] >= self.available[:n_inside]))
+        started = bool(np.any(tests[n_inside:] > 0))
         # Without this end a vehicle that crashes rarely inside, and often outside, would not be tested outside at all.
-        spent = bool(tests[s].sum() >= MOST_FIRST_TESTS * self.first_tests * d.n_inside)
+        spent = bool(tests[:n_inside].sum() >= MOST_FIRST_TESTS * self.first_tests * n_inside)
         if exhausted or started or spent:
             return np.ones_like(inside)
-        return inside | (combined(d.p[s], tally.part(s), d.n_paths, _LEVEL).rhw <= CONDITIONAL_RHW)
+        return inside | (inner_rhw() <= CONDITIONAL_RHW)
 
-    def _spread(self, size: int, tally: Tally, active: BoolArray) -> IntArray:
+    def _inner_rhw(self, tally: Tally) -> float:
+        d, s = self.design, slice(0, self.design.n_inside)
+        return combined(d.p[s], tally.part(s), d.n_paths, _LEVEL).rhw
+
+    def _spread(self, size: int, tally: Tally, most: IntArray) -> IntArray:
         """Give portions, one after the other, to where each narrows the sum of squared half-widths most.
 
         A squared half-width shrinks as 1/n, or as 1/n² where shares are all 0 or 1.
@@ -245,7 +301,7 @@ class Allocation:
         low, high = clopper_pearson(crashes, tests, _TAIL, failed)
         squares = ((self.design.p * (high - low) / 2.0) ** 2).tolist()
         powers = np.where((crashes + failed == 0) | (crashes == tests), 2, 1).tolist()
-        so_far, room = tests.tolist(), np.where(active, self.available - tests, 0).tolist()
+        so_far, room = tests.tolist(), most.tolist()
         given = [0] * tests.size
 
         def gain(s: int) -> float:

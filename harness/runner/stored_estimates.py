@@ -89,7 +89,7 @@ def estimate_run(
 def stored_blocks(
     folder: Path, *, moments: bool, surrogates: SurrogateReplay | None = None, n_asked: int = 0
 ) -> Iterator[Block]:
-    """Blocks of the tests that are reported, in index order; a gap or too few of them is an error.
+    """Blocks of the tests that are reported, in index order from 0; a gap or too few of them is an error.
 
     Parameters
     ----------
@@ -124,7 +124,7 @@ def stored_blocks(
         counted = block.take(slice(max(reported_from - n, 0), n_counted - n))
         n = counted.first_episode + len(counted)
         if len(counted):
-            yield counted
+            yield replace(counted, first_episode=counted.first_episode - reported_from)
         if n == n_counted:
             return
     raise _incomplete(folder, f"{n} episodes on record", f"{n_counted} (manifest.json)")

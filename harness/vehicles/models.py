@@ -1,7 +1,8 @@
-"""Longitudinal driver models that AVs and surrogates share, and how a driver lags behind its model.
+"""Longitudinal driver models that AVs and surrogates share: as kernels read them, and those without a memory.
 
-The models are IDM, FVDM, and one that does not look ahead. A driver may react late, change its acceleration slowly, or
-not look: it keeps its speed until it reacts to the cut-in; then its model decides, as fast as its jerk limit allows.
+These are IDM, FVDM, and one that does not look ahead. `references` has those that remember a danger, and `reaction` how
+a driver lags behind its model: it may react late, change its acceleration slowly, or not look. It keeps its speed until
+it reacts to the cut-in; then its model decides, as fast as its jerk limit allows.
 
 Only + − × ÷ √ and explicit products are used (and ``math.tanh``, inside compiled code alone), so that every caller gets
 the same bits.
@@ -14,29 +15,36 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from harness.arrays import FloatArray, IntArray, Record, RecordArray
+from harness.arrays import Record, RecordArray
 from harness.campaign.models import (
     FVDM,
     IDM,
     AutomatedVehicle,
     BuiltInParameters,
+    CarefulCompetentParameters,
     ConstantParameters,
+    FuzzySafetyParameters,
     FVDMParameters,
     IDMParameters,
+    NeedBasedParameters,
     Reaction,
     Reflexes,
 )
-from harness.compiled import compiled_inline, compiled_threads
-from harness.random_stream import AV_DRAWS, uniform
-from harness.vehicles.kinematics import STEP_S
+from harness.compiled import compiled_inline
 
 IDM_KIND, FVDM_KIND, CONSTANT_KIND = 0, 1, 2
+CAREFUL_COMPETENT_KIND, FUZZY_SAFETY_KIND, NEED_BASED_KIND = -1, -2, -3
+"""Below zero: those that remember a danger."""
 SMALLEST_GAP_M = 0.1
 """Gap below which the models see this gap: they divide by it."""
 
 _COMMON = ("min_acceleration_mps2", "max_acceleration_mps2")
 _IDM = ("acceleration_mps2", "comfortable_deceleration_mps2", "time_headway_s", "minimum_gap_m", "desired_speed_mps")
 _FVDM = ("kappa_per_s", "lambda_per_s", "max_speed_mps", "v1", "v2", "c1_per_m", "c2")
+_REFERENCE = ("used_up_steps", "braking_jerk_mps3", "following_min_acceleration_mps2")
+_CAREFUL_COMPETENT = ("critical_ttc_s", "coasting_mps2")
+_FUZZY_SAFETY = ("comfortable_braking_mps2", "hard_braking_mps2", "leader_braking_mps2", "safe_margin_m")
+_NEED_BASED = ("reaction_steps", "needed_mps2", "standstill_gap_m")
 _REACTION = ("max_jerk_mps3", "inattention_probability")
 _STEPS = ("delay_steps", "inattention_steps")
 MODEL_FIELDS = ("kind", *_COMMON, *_IDM, *_FVDM)
@@ -44,17 +52,25 @@ MODEL_FIELDS = ("kind", *_COMMON, *_IDM, *_FVDM)
 DRIVER_DTYPE = np.dtype(
     [(name, np.int64) for name in ("kind", *_STEPS)]
     + [(name, np.float64) for name in (*_COMMON, *_IDM, *_FVDM, *_REACTION)]
+    + [(name, np.float64) for name in (*_REFERENCE, *_CAREFUL_COMPETENT, *_FUZZY_SAFETY, *_NEED_BASED)]
 )
 
 
 def driver_records(drivers: Sequence[BuiltInParameters], reactions: Sequence[Reflexes] | None = None) -> RecordArray:
     """Parameters of driver models as kernels read them, shape (number of drivers,); by default all react at once."""
-    kinds = {IDMParameters: IDM_KIND, FVDMParameters: FVDM_KIND, ConstantParameters: CONSTANT_KIND}
+    kinds: dict[type[BuiltInParameters], int] = {
+        IDMParameters: IDM_KIND,
+        FVDMParameters: FVDM_KIND,
+        ConstantParameters: CONSTANT_KIND,
+        CarefulCompetentParameters: CAREFUL_COMPETENT_KIND,
+        FuzzySafetyParameters: FUZZY_SAFETY_KIND,
+        NeedBasedParameters: NEED_BASED_KIND,
+    }
     records = np.zeros(len(drivers), dtype=DRIVER_DTYPE)
     for record, driver, reaction in zip(records, drivers, reactions or [Reflexes()] * len(drivers), strict=True):
         record["kind"] = kinds[type(driver)]
-        for name, value in driver.model_dump().items():
-            record[name] = value
+        for name in DRIVER_DTYPE.names or ():
+            record[name] = getattr(driver, name, record[name])
         record["max_jerk_mps3"] = math.inf if reaction.max_jerk_mps3 is None else reaction.max_jerk_mps3
         record["delay_steps"] = round(reaction.delay_s * 10.0)
         if isinstance(reaction, Reaction):
@@ -116,49 +132,3 @@ def driver_acceleration(driver: Record, speed: float, lead_speed: float, gap: fl
     else:
         a = fvdm_acceleration(driver, speed, lead_speed, fvdm_shape(driver, seen))
     return float(min(max(a, driver.min_acceleration_mps2), driver.max_acceleration_mps2))
-
-
-@compiled_inline
-def reaction_steps(driver: Record, seed: int, episode: int) -> int:
-    """Steps that pass after the cut-in before the driver reacts, its inattention in this episode included."""
-    if driver.inattention_probability > 0.0 and uniform(seed, episode, AV_DRAWS, 0) < driver.inattention_probability:
-        return int(driver.delay_steps + driver.inattention_steps)
-    return int(driver.delay_steps)
-
-
-@compiled_inline
-def reacting_acceleration(driver: Record, previous: float, speed: float, lead_speed: float, gap: float) -> float:
-    """Acceleration (m/s²) of a driver that has reacted; ``previous`` is that of the step before, 0 until then."""
-    wanted = driver_acceleration(driver, speed, lead_speed, gap)
-    change = driver.max_jerk_mps3 * STEP_S
-    return float(min(max(wanted, previous - change), previous + change))
-
-
-@compiled_threads
-def expected_accelerations(
-    driver: RecordArray, begin: IntArray, speed: FloatArray, lead_speed: FloatArray, gap: FloatArray, out: FloatArray
-) -> None:
-    """Accelerations of a driver that sees what was seen, but remembers its own acceleration.
-
-    Starting from the observed acceleration of the step before, a driver that hardly changes it would seem to explain
-    any vehicle.
-
-    Parameters
-    ----------
-    driver : structured ndarray, shape (1,)
-        Without inattention.
-    begin : ndarray, shape (m + 1,)
-        Where each cut-in's steps begin, the cut-in step first; and the end.
-    speed, lead_speed : ndarray, shape (n,)
-        Of the vehicle, and of the one that cut in (m/s).
-    gap : ndarray, shape (n,)
-        Bumper to bumper (m).
-    out : ndarray, shape (n,)
-        Receives accelerations (m/s²).
-    """
-    for e in range(begin.size - 1):
-        a = 0.0
-        for i in range(begin[e], begin[e + 1]):
-            if i - begin[e] > driver[0].delay_steps:
-                a = reacting_acceleration(driver[0], a, speed[i], lead_speed[i], gap[i])
-            out[i] = a

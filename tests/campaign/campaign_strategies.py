@@ -6,12 +6,13 @@ from typing import Any
 
 from hypothesis import strategies as st
 
+from harness.campaign.drivers import PARAMETERS
 from harness.campaign.schema import campaign_schema
 from harness.campaign.testing import MOST_SUMO_CELLS
 from harness.campaign.vehicle import AV_SOURCES
 
 SCHEMA = campaign_schema()
-BUILT_IN = {"idm": "IDM", "fvdm": "FVDM", "constant": "Constant"}
+BUILT_IN = {name: section.__name__ for name, section in PARAMETERS.items()}
 _NAMES = st.from_regex(r"[A-Za-z0-9][A-Za-z0-9_-]{0,11}", fullmatch=True)
 _PLAIN = st.recursive(
     st.none()
@@ -56,12 +57,20 @@ def _in_steps(reaction: dict[str, Any]) -> dict[str, Any]:
     return {key: round(value, 1) if key.endswith("delay_s") else value for key, value in reaction.items()}
 
 
+def _harder(parameters: dict[str, Any]) -> dict[str, Any]:
+    """Hard braking is no softer than comfortable braking, 4 m/s² when left out."""
+    if "comfortable_braking_mps2" in parameters or "hard_braking_mps2" in parameters:
+        comfortable = parameters.get("comfortable_braking_mps2", 4.0)
+        parameters["hard_braking_mps2"] = max(parameters.get("hard_braking_mps2", 0.0), comfortable)
+    return parameters
+
+
 def _parts(
     node: dict[str, Any], required: dict[str, st.SearchStrategy[Any]], driver: str
 ) -> st.SearchStrategy[dict[str, Any]]:
     optional = {name: values(node["properties"][name]) for name in ("before_cut_in", "limits")}
     if driver in BUILT_IN:
-        optional["parameters"] = values({"$ref": f"#/$defs/{BUILT_IN[driver]}Parameters"})
+        optional["parameters"] = values({"$ref": f"#/$defs/{BUILT_IN[driver]}"}).map(_harder)
         optional["reaction"] = values({"$ref": "#/$defs/Reaction"}).map(_in_steps)
     if driver == "controller":
         optional["parameters"] = st.dictionaries(_NAMES, _PLAIN, max_size=3) | values(

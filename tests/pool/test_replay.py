@@ -22,11 +22,12 @@ from harness.importance.build import mixture_weights
 from harness.outcomes import CRASH
 from harness.pool.cut_ins import Pool
 from harness.pool.storage import campaign_pool
-from harness.pool.surrogate_replay import SurrogateReplay
+from harness.pool.surrogate_replay import SurrogateReplay, drivers_crash
 from harness.records.tables import episodes_table
 from harness.resolved import resolve
 from harness.runner.prepare import prepare
 from harness.twin import TwinWorld
+from harness.vehicles.models import driver_records
 from tests.chains.seed import SEED
 
 SMALL = PoolSettings(relative_error=0.03, cut_ins_per_shell=600)
@@ -74,6 +75,19 @@ def test_a_surrogate_that_is_the_av_crashes_where_the_av_did(forced):
     assert block.crash.sum() > 30
     np.testing.assert_array_equal(own, block.crash)
     assert not np.array_equal(block.surrogates_crash[:, pool.names.index("brakes-3")], block.crash)
+
+
+@pytest.mark.parametrize("model", ["r157-cc", "r157-fsm", "need-based"])
+def test_a_driver_that_remembers_is_the_same_as_av_and_as_surrogate(model):
+    one = campaign("forced", av=AutomatedVehicle(model=model))
+    _, table = drive(one, 4_000)
+    crash = np.array(table.column("outcome").cast(pa.string()).to_pylist()) == "crash"
+    environment = resolve(one).environment
+    records = driver_records([AutomatedVehicle(model=name).parameters for name in (model, "idm")])
+    own, idm = drivers_crash(table, one.seed, environment, records, -1).T
+    assert crash.sum() > 10
+    np.testing.assert_array_equal(own, crash)
+    assert not np.array_equal(idm, crash)
 
 
 @pytest.mark.parametrize("hold_s", [1.0, 0.1])

@@ -13,7 +13,6 @@ import pytest
 from harness import estimate, replay
 from harness.errors import CampaignError, RunFolderError
 from harness.estimators.stratified import Tally
-from harness.runner import compare_campaigns
 from harness.runner.campaign_run import episodes_on_disk
 from harness.runner.manifest import Manifest, Prefix
 from harness.runner.planner import GROWTH, Allocation, round_specs
@@ -225,11 +224,6 @@ def test_another_pool_is_refused(shells_run, campaign, run_here, tmp_path):
         replay(folder, 3)
     with pytest.raises(RunFolderError, match="cut-ins of pool ffff"):
         run_here(campaign(*SHELLS, "world.cells=8"), folder, resume=True)
-
-
-def test_comparing_is_refused(campaign, tmp_path):
-    with pytest.raises(CampaignError, match=r"testing\.method=forced"):
-        compare_campaigns(campaign(*SHELLS), campaign(*SHELLS), tmp_path / "out")
 
 
 DESIGN = ShellDesign(

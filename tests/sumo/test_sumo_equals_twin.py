@@ -33,6 +33,10 @@ AVS = {
     "accelerates": "{model: constant, parameters: {acceleration_mps2: 1.3}}",
     "all_at_once": "{model: fvdm, parameters: {min_acceleration_mps2: -6}, reaction: {delay_s: 0.3, max_jerk_mps3: 7.7,"
     " inattention_probability: 0.3, inattention_delay_s: 0.9}}",
+    "careful_competent": "{model: r157-cc}",
+    "fuzzy_safety": "{model: r157-fsm, parameters: {lateral_speed_mps: 1}, reaction: {inattention_probability: 0.5,"
+    " inattention_delay_s: 0.9}}",
+    "need_based": "{model: need-based, reaction: {max_jerk_mps3: 12}}",
 }
 MIXTURE = "mixture"
 EPISODES = 150

@@ -6,7 +6,7 @@ import numpy as np
 
 from harness.campaign.models import IDMParameters
 from harness.compiled import compiled_threads
-from harness.vehicles import kinematics, models
+from harness.vehicles import kinematics, models, reaction, references
 
 
 @compiled_threads
@@ -25,18 +25,19 @@ def _motions(situations, out):
 
 @compiled_threads
 def _follow(driver, seed, episode, situations, out):
-    late = models.reaction_steps(driver[0], seed, episode)
-    a = 0.0
+    late = reaction.reaction_steps(driver[0], seed, episode)
+    memory = reaction.nothing_yet()
     for i in range(situations.shape[0]):
         if i > late:
-            a = models.reacting_acceleration(driver[0], a, situations[i, 0], situations[i, 1], situations[i, 2])
-        out[i] = a
+            v, v_lead, gap = situations[i]
+            memory = reaction.react(driver[0], memory, i - late - 1, v, v_lead, gap)
+        out[i] = memory.acceleration
 
 
 @compiled_threads
 def _late(driver, seed, first, out):
     for i in range(out.size):
-        out[i] = models.reaction_steps(driver[0], seed, first + i)
+        out[i] = reaction.reaction_steps(driver[0], seed, first + i)
 
 
 def accelerations(parameters, situations):
@@ -67,4 +68,41 @@ def steps_late(reflexes, n, *, seed=0, first=0):
     """Steps between cut-in and reaction in consecutive episodes (n,)."""
     out = np.empty(n, np.int64)
     _late(models.driver_records([IDMParameters()], [reflexes]), seed, first, out)
+    return out
+
+
+@compiled_threads
+def _approach(driver, v, v_lead, gaps, steps, out):
+    for k in range(gaps.size):
+        gap, speed, out[k] = gaps[k], v, gaps[k]
+        memory = reaction.nothing_yet()
+        for step in range(steps):
+            memory = reaction.react(driver[0], memory, step, speed, v_lead, gap)
+            after = kinematics.next_speed(speed, memory.acceleration)
+            gap += (v_lead - 0.5 * (speed + after)) * kinematics.STEP_S
+            speed = after
+            out[k] = min(out[k], gap)
+
+
+def smallest_gaps(parameters, v, v_lead, gaps, *, steps=150):
+    """Smallest gap (n,) within some steps behind a vehicle that keeps its speed, from the gaps (n,) after a cut-in."""
+    gaps = np.asarray(gaps, float)
+    out = np.empty(gaps.size)
+    _approach(models.driver_records([parameters]), v, v_lead, gaps, steps, out)
+    return out
+
+
+@compiled_threads
+def _fuzzy_metrics(driver, situations, out):
+    for i in range(situations.shape[0]):
+        v, v_lead, gap, a = situations[i]
+        out[i, 0] = references.proactive_metric(driver[0], v, v_lead, gap)
+        out[i, 1] = references.critical_metric(driver[0], v, v_lead, gap, a)
+
+
+def fuzzy_metrics(parameters, situations):
+    """PFS and CFS (n, 2) at speed, leader's speed, gap and acceleration: (n, 4)."""
+    situations = np.atleast_2d(np.asarray(situations, float))
+    out = np.empty((len(situations), 2))
+    _fuzzy_metrics(models.driver_records([parameters]), situations, out)
     return out

@@ -6,31 +6,47 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import binomtest
 
-from harness.campaign.models import ConstantParameters, FVDMParameters, IDMParameters, Reaction, Reflexes
+from harness.campaign.models import (
+    CarefulCompetentParameters,
+    ConstantParameters,
+    FuzzySafetyParameters,
+    FVDMParameters,
+    IDMParameters,
+    NeedBasedParameters,
+    Reaction,
+    Reflexes,
+)
 from tests.chains.seed import SEED
 from tests.vehicles.kernels import accelerations, follow, steps_late
 
 speeds = st.floats(0.0, 60.0)
 situation = st.tuples(speeds, speeds, st.floats(-5.0, 200.0))
 drives = st.lists(situation, min_size=1, max_size=60)
+braking = st.floats(-20.0, 0.0)
 drivers = st.one_of(
     st.builds(IDMParameters, min_acceleration_mps2=st.floats(-20.0, 0.0), time_headway_s=st.floats(0.0, 3.0)),
     st.builds(FVDMParameters, min_acceleration_mps2=st.floats(-20.0, 0.0)),
     st.builds(ConstantParameters, acceleration_mps2=st.floats(-5.0, 2.0)),
 )
+with_memory = st.one_of(
+    st.builds(CarefulCompetentParameters, lateral_speed_mps=st.floats(0.3, 3.0), min_acceleration_mps2=braking),
+    st.builds(FuzzySafetyParameters, lateral_speed_mps=st.floats(0.3, 3.0), min_acceleration_mps2=braking),
+    st.builds(NeedBasedParameters, deceleration_mps2=st.floats(0.5, 9.0), reaction_time_s=st.floats(0.0, 2.0)),
+)
+any_driver = drivers | with_memory
 delays = st.integers(0, 100).map(lambda steps: steps / 10.0)
 jerks = st.none() | st.floats(0.1, 1000.0)
 FALSE_ALARM = 1e-6
 """Probability that the test of a share fails although the share is right."""
 
 
-@given(drivers, delays, jerks, drives)
+@given(any_driver, delays, jerks, drives)
 def test_until_the_delay_is_over_the_acceleration_is_zero(driver, delay_s, jerk, drive):
     found = follow(driver, Reflexes(delay_s=delay_s, max_jerk_mps3=jerk), drive)
     assert (found[: round(delay_s * 10.0) + 1] == 0.0).all()
 
 
-@given(drivers, delays, st.floats(0.1, 1000.0), drives)
+@given(any_driver, delays, st.floats(0.1, 1000.0), drives)
 def test_the_jerk_limit_is_never_exceeded(driver, delay_s, jerk, drive):
     found = follow(driver, Reflexes(delay_s=delay_s, max_jerk_mps3=jerk), drive)
     change = np.abs(np.diff(found, prepend=0.0))
@@ -55,7 +71,7 @@ def test_within_the_jerk_limit_a_driver_is_its_model_and_beyond_it_moves_toward_
     assert (np.sign(found - before)[beyond] == np.sign(wanted - before)[beyond]).all()
 
 
-@given(drivers, delays, jerks, drives)
+@given(any_driver, delays, jerks, drives)
 def test_the_limits_of_the_model_hold(driver, delay_s, jerk, drive):
     found = follow(driver, Reflexes(delay_s=delay_s, max_jerk_mps3=jerk), drive)
     assert found.min() >= min(driver.min_acceleration_mps2, 0.0)

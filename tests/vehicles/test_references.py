@@ -1,0 +1,276 @@
+"""Drivers that remember a danger: by hand, against plain step-wise definitions, and against published outcomes."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from harness.campaign.models import (
+    CarefulCompetentParameters,
+    FuzzySafetyParameters,
+    IDMParameters,
+    NeedBasedParameters,
+    Reflexes,
+)
+from tests.vehicles.kernels import accelerations, follow, fuzzy_metrics, smallest_gaps
+
+speeds = st.floats(0.0, 60.0)
+gaps = st.floats(-5.0, 200.0)
+drives = st.lists(st.tuples(speeds, speeds, gaps), min_size=2, max_size=80)
+HALF_A_SECOND = {"evaluated_at_m": 0.45}
+"""At 1.8 m/s a quarter of a second has passed by the cut-in: they react 0.5 s after it."""
+ALONE = {"following_min_acceleration_mps2": -0.0, "max_acceleration_mps2": 1e-9}
+"""Without the braking and speeding up of the IDM."""
+JERK = 12.65 * 0.1
+CAP = 0.774 * 9.81
+
+
+def driven(parameters, *phases):
+    """Accelerations from the first step after the cut-in on, in phases of (steps, (speed, leader's speed, gap))."""
+    situations = [phases[0][1]] + [situation for steps, situation in phases for _ in range(steps)]
+    return follow(parameters, Reflexes(), situations)[1:]
+
+
+# -- the delay after the cut-in --
+
+
+@pytest.mark.parametrize(
+    ("settings", "delay_s"),
+    [
+        ({}, 0.75 - 0.505 / 1.8),  # 0.47
+        ({"lateral_speed_mps": 1.0}, 0.245),
+        ({"evaluated_at_m": 0.0}, 0.75),
+        ({"evaluated_at_m": 1.6}, 0.0),  # it would brake before they overlap: it holds its speed until then
+    ],
+)
+def test_the_delay_after_the_cut_in_is_stated(settings, delay_s):
+    for section in (CarefulCompetentParameters, FuzzySafetyParameters):
+        assert section(**settings).delay_after_cut_in_s == pytest.approx(delay_s, abs=1e-12)
+
+
+@pytest.mark.parametrize("section", [CarefulCompetentParameters, FuzzySafetyParameters])
+@given(st.floats(0.2, 5.0))
+def test_the_delay_stated_is_the_one_kept(section, lateral_speed):
+    driver = section(lateral_speed_mps=lateral_speed)
+    found = driven(driver, (20, (30.0, 20.0, 5.0)))
+    idle = -0.4 if section is CarefulCompetentParameters else 0.0
+    whole, part = divmod(10.0 * driver.delay_after_cut_in_s, 1.0)
+    assert found[: int(whole)] == pytest.approx(idle)
+    assert found[int(whole)] == pytest.approx(idle - (1.0 - part) * JERK)
+    assert found[int(whole) + 1] == pytest.approx(found[int(whole)] - JERK)
+
+
+# -- careful and competent: 30 m/s behind 20, 15 m ahead: time to collision 1.5 s --
+
+
+def test_it_coasts_and_brakes_harder_by_the_jerk_to_the_cap():
+    found = driven(CarefulCompetentParameters(**HALF_A_SECOND), (14, (30.0, 20.0, 15.0)))
+    assert found[:5] == pytest.approx([-0.4] * 5)
+    assert found[5:] == pytest.approx([-min(0.4 + JERK * k, CAP) for k in range(1, 10)], abs=1e-12)
+    assert pytest.approx(7.59, abs=0.005) == CAP
+    assert found[-1] == -7.59294
+
+
+def test_in_the_step_in_which_the_delay_ends_it_brakes_for_the_rest_of_it():
+    found = driven(CarefulCompetentParameters(), (7, (30.0, 20.0, 15.0)))
+    part = 5.0 - 10.0 * (0.75 - 0.505 / 1.8)  # 0.31 of the fifth step
+    assert found[:4] == pytest.approx([-0.4] * 4)
+    assert found[4:] == pytest.approx([-0.4 - JERK * (part + k) for k in range(3)])
+
+
+def test_it_goes_on_until_it_is_no_faster_than_the_vehicle_ahead():
+    driver = CarefulCompetentParameters(**HALF_A_SECOND)
+    far = (30.0, 20.0, 150.0)  # time to collision 15 s, which alone is no danger
+    found = driven(driver, (14, (30.0, 20.0, 15.0)), (9, far), (1, (20.0, 20.0, 44.0)), (3, far))
+    assert (found[14:23] == -7.59294).all()
+    assert found[23] == pytest.approx(1.375)  # as the IDM: 2 [1 - 1/16 - (22/44)^2]
+    assert found[24:] == pytest.approx(accelerations(IDMParameters(), far)[0])
+
+
+def test_a_danger_that_comes_later_takes_the_whole_reaction_time():
+    driver = CarefulCompetentParameters(**HALF_A_SECOND, **ALONE)
+    found = driven(driver, (10, (30.0, 20.0, 20.0)), (10, (30.0, 20.0, 19.9)))
+    assert found[:10] == pytest.approx(0.0, abs=1e-6)
+    assert found[10:17] == pytest.approx([-0.4] * 7)
+    assert found[17:] == pytest.approx([-0.4 - JERK * k for k in (0.5, 1.5, 2.5)])
+
+
+def test_without_a_danger_it_follows_once_it_has_seen_the_cut_in():
+    found = driven(CarefulCompetentParameters(**HALF_A_SECOND), (7, (20.0, 20.0, 44.0)))
+    assert found == pytest.approx([0.0] * 5 + [1.375] * 2)
+
+
+# -- fuzzy safety model --
+
+
+@pytest.mark.parametrize(
+    ("situation", "pfs", "cfs"),
+    [
+        # PFS: safe 22.5 + 900/8 - 400/14 + 2 = 108.43, unsafe 22.5 + 900/12 - 400/14 = 68.93, of the gap less 2
+        ((30.0, 20.0, 2.0 + 108.5, 0.0), 0.0, 0.0),
+        ((30.0, 20.0, 2.0 + 108.43 - 39.5 / 4.0, 0.0), 0.25, 0.0),
+        ((30.0, 20.0, 2.0 + 68.9, 0.0), 1.0, 0.0),
+        # CFS: safe 7.5 + 100/8 = 20, unsafe 7.5 + 100/12 = 15.83
+        ((30.0, 20.0, 20.0, 0.0), 1.0, 0.0),
+        ((30.0, 20.0, (20.0 + 15.0 + 5.0 / 6.0) / 2.0, 0.0), 1.0, 0.5),
+        ((30.0, 20.0, 15.8, 0.0), 1.0, 1.0),
+        # while it brakes with 2: (10 - 0.75) 0.75 = 6.9375, 8.5^2/8 = 9.03125, 8.5^2/12 = 6.02083
+        ((30.0, 20.0, 15.96875, -2.0), 1.0, 0.0),
+        ((30.0, 20.0, (15.96875 + 12.95833) / 2.0, -2.0), 1.0, 0.5),
+        # with 6 it counts on no more than 4: (10 - 1.5) 0.75 = 6.375, 7^2/12 = 4.08333, 7^2/8 = 6.125
+        ((30.0, 20.0, 6.375 + (6.125 + 4.08333) / 2.0, -6.0), 1.0, 0.5),
+        # in 0.75 s it will be slower than the vehicle ahead: 1^2/(2 2) = 0.25 m are enough
+        ((21.0, 20.0, 0.2, -2.0), 1.0, 1.0),
+        ((21.0, 20.0, 0.3, -2.0), 1.0, 0.0),
+        # 2^2/(2 6) = 0.333
+        ((22.0, 20.0, 0.33, -6.0), 1.0, 1.0),
+        ((22.0, 20.0, 0.34, -6.0), 1.0, 0.0),
+        ((20.0, 20.0, 0.1, 0.0), 1.0, 0.0),  # not closing in
+    ],
+)
+def test_the_metrics_by_hand(situation, pfs, cfs):
+    assert fuzzy_metrics(FuzzySafetyParameters(), situation)[0] == pytest.approx([pfs, cfs], abs=1e-3)
+
+
+@given(speeds, speeds, st.tuples(gaps, gaps), st.floats(-8.0, 2.0))
+def test_less_room_is_never_safer(v, v_lead, pair, a):
+    near, far = sorted(pair)
+    closer, wider = fuzzy_metrics(FuzzySafetyParameters(), [(v, v_lead, near, a), (v, v_lead, far, a)])
+    assert (closer >= wider).all()
+    assert ((wider >= 0.0) & (closer <= 1.0)).all()
+
+
+@given(st.tuples(speeds, speeds), st.tuples(speeds, speeds), gaps, st.floats(-8.0, 2.0))
+def test_going_faster_is_never_safer_nor_a_slower_vehicle_ahead(own, leads, gap, a):
+    (slow, fast), (slow_lead, fast_lead) = sorted(own), sorted(leads)
+    careful, careless, calm = fuzzy_metrics(
+        FuzzySafetyParameters(), [(slow, slow_lead, gap, a), (fast, slow_lead, gap, a), (slow, fast_lead, gap, a)]
+    )
+    assert (careless >= careful - 1e-9).all()
+    assert (calm <= careful + 1e-9).all()
+
+
+def test_it_brakes_between_the_comfortable_and_the_hard_rate():
+    driver = FuzzySafetyParameters(**HALF_A_SECOND, **ALONE)
+    for gap, wanted in ((12.0, 6.0), (80.0, 4.0 * (108.4286 - 78.0) / 39.5)):
+        found = driven(driver, (16, (30.0, 20.0, gap)))
+        assert (found[:5] == 0.0).all()
+        assert found[5] == pytest.approx(-min(JERK, wanted), abs=1e-3)
+        assert found.min() >= -wanted - 1e-3
+        assert gap == 12.0 or found[-1] == pytest.approx(-wanted, abs=1e-3)
+    assert driven(driver, (30, (30.0, 20.0, 112.0))) == pytest.approx(0.0, abs=1e-6)
+
+
+# -- need-based --
+
+
+def test_it_speeds_up_until_it_needs_to_brake_and_brakes_a_delay_later():
+    driver = NeedBasedParameters()
+    # 10^2/(2 1) + 2 = 52 m: from there on 1 m/s^2 is needed
+    found = driven(driver, (3, (30.0, 20.0, 52.1)), (9, (30.0, 20.0, 51.9)), (4, (30.0, 20.0, 99.0)))
+    assert found.tolist() == [1.0] * 8 + [-3.0] * 8
+    again = driven(driver, (9, (30.0, 20.0, 51.9)), (1, (20.0, 20.0, 1.0)), (9, (30.0, 20.0, 51.9)))
+    assert again.tolist() == [1.0] * 5 + [-3.0] * 4 + [1.0] * 6 + [-3.0] * 4
+    assert driven(driver, (9, (20.0, 20.1, 0.5))).tolist() == [1.0] * 9  # the vehicle ahead gets away
+
+
+def test_its_delay_need_not_be_whole_steps():
+    found = driven(NeedBasedParameters(reaction_time_s=0.32), (5, (30.0, 20.0, 40.0)))
+    assert found == pytest.approx([1.0, 1.0, 1.0, 0.2 * 1.0 - 0.8 * 3.0, -3.0])
+
+
+# -- against a plain definition, step by step, for delays of whole steps --
+
+
+def idm(p, v, v_lead, gap):
+    return accelerations(IDMParameters(min_acceleration_mps2=p.following_min_acceleration_mps2), (v, v_lead, gap))[0]
+
+
+def careful_competent(p, drive, left):
+    """The reaction time counts down while there is a danger; ``left`` steps of it are left at the cut-in."""
+    a, waits, out = 0.0, None, []
+    for step, (v, v_lead, gap) in enumerate(drive):
+        if v <= v_lead:
+            waits = None
+        elif waits is None and gap < 2.0 * (v - v_lead):
+            waits = left if step == 0 else 8
+        foot_off = 0.0 if waits is None else -0.4
+        wanted = foot_off if step < left else idm(p, v, v_lead, gap)
+        if waits is not None:
+            wanted = min(wanted, -CAP if waits == 0 else -0.4)
+            waits = max(waits - 1, 0)
+        a = max(wanted, min(a, foot_off) - JERK)
+        out.append(a)
+    return out
+
+
+def fuzzy(p, drive, left):
+    a, waits, out = 0.0, None, []
+    for step, (v, v_lead, gap) in enumerate(drive):
+        pfs, cfs = fuzzy_metrics(p, (v, v_lead, gap, a))[0]
+        asked = 4.0 + 2.0 * cfs if cfs > 0.0 else 4.0 * pfs
+        if asked > 0.0 and waits is None:
+            waits = left if step == 0 else 8
+        wanted = 0.0 if step < left else idm(p, v, v_lead, gap)
+        if asked > 0.0:
+            wanted = min(wanted, -asked if waits <= 0 else 0.0)
+        waits = waits if waits is None else waits - 1
+        a = max(wanted, min(a, 0.0) - JERK)
+        out.append(a)
+    return out
+
+
+@pytest.mark.parametrize(
+    ("section", "plain"), [(CarefulCompetentParameters, careful_competent), (FuzzySafetyParameters, fuzzy)]
+)
+@given(drives, st.integers(0, 8))
+def test_with_a_delay_of_whole_steps_it_is_the_plain_definition(section, plain, drive, left):
+    driver = section(reaction_time_s=0.8, lateral_speed_mps=1.0, evaluated_at_m=0.8 - left / 10.0)
+    expected = plain(driver, drive, left)
+    assert follow(driver, Reflexes(), [drive[0], *drive])[1:] == pytest.approx(expected, abs=1e-9)
+
+
+# -- against the authors' own code --
+
+PUBLISHED = {
+    # Smallest gap (m) at the overlap without a crash, bisected with the cut-in of JRC-FSM (commit 01b05c2) at 100
+    # steps a second, for speeds (km/h) of the vehicle and of the one that cuts in; 120: none up to there.
+    ("cc", 0.0, 1.8): {(50, 20): 12.42, (60, 40): 7.15, (90, 40): 25.90, (110, 70): 18.63, (130, 70): 120.0},
+    ("cc", 0.505, 1.8): {(50, 20): 10.08, (60, 40): 5.62, (90, 40): 22.03, (110, 70): 15.53, (130, 70): 120.0},
+    ("fsm", 1.6, 2.2): {(50, 20): 8.20, (60, 40): 4.28, (90, 40): 19.92, (110, 70): 13.48, (130, 70): 27.66},
+    ("fsm", 1.6, 3.2): {(50, 20): 10.08, (60, 40): 5.57, (90, 40): 23.09, (110, 70): 16.00, (130, 70): 31.58},
+}
+LATEST_S = 0.08
+"""Half a step of 0.1 s, by which brakes of whole steps are ahead of brakes that are applied steadily, and the published
+code's steps of its delays, 0.03 s."""
+
+
+def smallest_safe_gap(kind, evaluated_at, lateral_speed, v, v_lead, **more):
+    section = CarefulCompetentParameters if kind == "cc" else FuzzySafetyParameters
+    driver = section(evaluated_at_m=evaluated_at, lateral_speed_mps=lateral_speed, **more, **ALONE)
+    tried = np.arange(0.0, 120.0, 0.01)
+    unsafe = np.flatnonzero(smallest_gaps(driver, v, v_lead, tried) < 0.0)
+    return tried[unsafe[-1]] if unsafe[-1] + 1 < tried.size else 120.0
+
+
+def agrees(published, **more):
+    found = []
+    for (kind, evaluated_at, lateral_speed), gaps_of in published.items():
+        for (v, v_lead), gap in gaps_of.items():
+            own = smallest_safe_gap(kind, evaluated_at, lateral_speed, v / 3.6, v_lead / 3.6, **more)
+            found.append((gap - own) / ((v - v_lead) / 3.6))
+    return all(-0.01 <= late_s <= LATEST_S for late_s in found)
+
+
+def test_outcomes_of_cut_ins_are_those_of_the_published_code():
+    assert agrees(PUBLISHED)
+    assert not agrees(PUBLISHED, reaction_time_s=0.85)  # the test has teeth
+    assert not agrees(PUBLISHED, reaction_time_s=0.65)
+    assert not agrees(PUBLISHED, braking_jerk_mps3=20.0)
+
+
+def test_a_vehicle_that_waits_for_two_seconds_cannot_stop_from_60_kmh_faster():
+    """16.7 m/s of closing speed take more than the 33 m of a time to collision of 2 s, however early the cut-in."""
+    driver = CarefulCompetentParameters(**ALONE)
+    assert smallest_gaps(driver, 130 / 3.6, 70 / 3.6, [110.0])[0] < 0.0
+    assert smallest_gaps(CarefulCompetentParameters(), 130 / 3.6, 70 / 3.6, [110.0])[0] > 0.0  # but it follows, too
