@@ -116,17 +116,10 @@ def compare_shells(
 
 
 def _same_cut_ins(runs: list[Run]) -> PrescribedEpisodes:
-    """Cut-ins of both, which must come from one pool."""
+    """Cut-ins of both: one environment and one library make one pool."""
     a, b = (run.prescribed for run in runs)
     if a is None or b is None:
         raise ValueError("the campaigns do not draw from shells")
-    if a.design.pool != b.design.pool:
-        raise CampaignError(
-            "av",
-            found=f"vehicles with pools of their own ({a.design.pool} and {b.design.pool})",
-            expected="one pool for both: pairs need the same cut-ins",
-            mend="Write --set testing.method=forced.",
-        )
     return a
 
 
@@ -145,7 +138,14 @@ def _drive(planner: PairPlanner, pairs: PairedShells, both: list[_Side]) -> Pair
 
 
 def require_same_shells(sides: tuple[Resolved, Resolved]) -> None:
-    """Refuse vehicles of which only one may crash where the envelope does not: their strata would differ."""
+    """Refuse vehicles that would not have the same cut-ins, or not the same strata of them."""
+    if any(of_side.campaign.has_shadow_runs for of_side in sides):
+        raise CampaignError(
+            "av.before_cut_in",
+            found="controller: a vehicle that acts before the cut-in has cut-ins of its own",
+            expected="hold_speed in A and B: pairs need the same cut-ins",
+            mend="Write --set testing.method=forced, which drives each vehicle along the paths of the tests first.",
+        )
     if sides[0].campaign.testing.shells.stopping != "sequential":
         raise CampaignError(
             "testing.shells.stopping",
