@@ -25,12 +25,17 @@ from pydantic.fields import FieldInfo
 
 from harness.campaign.models import Campaign, EnvironmentSettings
 from harness.environment.loading import load_parameters
-from harness.records.schemas import episodes_schema, moments_schema, traces_schema
+from harness.records.schemas import episodes_schema, moments_schema, shadow_schema, traces_schema
 
 FOLDER = Path(__file__).parent
 _PART = re.compile(r"(<!-- generated: (\S+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
-SCHEMAS = {"episodes": episodes_schema(4, 3, 2), "moments": moments_schema(3), "traces": traces_schema()}
+SCHEMAS = {
+    "episodes": episodes_schema(4, 3, 2),
+    "moments": moments_schema(3),
+    "traces": traces_schema(),
+    "shadow": shadow_schema(),
+}
 RESULTS = {
     "level_1": ("nde_1", "forced_1", "step_recursive_1", "episode_recursive_1"),
     "level_1e4": (

@@ -73,12 +73,20 @@ def av_check(campaign: Campaign, n_episodes: int = 48) -> AvCheck:
 
 
 def compare(
-    a: Campaign, b: Campaign, out: str | Path, *, workers: int | None = None, progress: Progress | None = None
+    a: Campaign,
+    b: Campaign,
+    out: str | Path,
+    *,
+    stored: str | Path | None = None,
+    margin: float | None = None,
+    workers: int | None = None,
+    progress: Progress | None = None,
 ) -> Comparison:
     """Compare the AVs of two campaigns on common random numbers (see `harness.runner.compare_campaigns`)."""
     from harness.runner import compare_campaigns  # noqa: PLC0415
 
-    return compare_campaigns(a, b, Path(out), workers=workers, progress=progress)
+    run_of_a = None if stored is None else Path(stored)
+    return compare_campaigns(a, b, Path(out), workers=workers, progress=progress, stored=run_of_a, margin=margin)
 
 
 def estimate(

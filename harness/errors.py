@@ -16,6 +16,7 @@ EXIT_DONE = 0
 EXIT_BAD_INPUT = 2
 EXIT_TOO_MANY_FAILED = 3
 EXIT_BUDGET_SPENT = 4
+EXIT_REFUTED = 5
 
 LONGEST_PART = 400
 """Characters of a part of a message: five lines of a terminal. What a user typed may be as long as they like."""

@@ -25,8 +25,10 @@ class Sampling:
         Whether it mixes importance functions of the surrogates, and so needs some, and their challenge tables.
     forces : bool
         Whether forced cut-ins are among what it draws from.
-    draws_ahead : bool
-        Whether LV's and BV's path is drawn before the episode, for which the AV must hold its speed until the cut-in.
+    holds_speed : bool
+        Whether the AV must hold its speed until the cut-in, because what is drawn before the episode depends on it.
+    shadows : bool
+        Whether an AV that does not is driven along each path without a cut-in first.
     bounded : bool
         Whether something bounds the weights; else no precision can be promised.
     """
@@ -34,7 +36,8 @@ class Sampling:
     estimators: tuple[EstimatorName, ...]
     mixes: bool = False
     forces: bool = False
-    draws_ahead: bool = False
+    holds_speed: bool = False
+    shadows: bool = False
     bounded: bool = True
 
     @property
@@ -45,8 +48,8 @@ class Sampling:
 
 SAMPLING: dict[Method, Sampling] = {
     "nde": Sampling(("nde", "nade")),
-    "forced": Sampling(("nade",), forces=True, draws_ahead=True),
+    "forced": Sampling(("nade",), forces=True, shadows=True),
     "step_mixture": Sampling(("nade", "scv"), mixes=True, bounded=False),
-    "episode_mixture": Sampling(("mixture_cv", "nade"), mixes=True, forces=True, draws_ahead=True),
-    "shells": Sampling(("shells",), draws_ahead=True),
+    "episode_mixture": Sampling(("mixture_cv", "nade"), mixes=True, forces=True, holds_speed=True),
+    "shells": Sampling(("shells",), shadows=True),
 }

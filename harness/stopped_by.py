@@ -11,7 +11,8 @@ that needs more, or the pool's own error, which alone is wider than the asked pr
 MENDS: dict[str, str] = {
     "episodes": "stop.episodes was spent; raise it and go on with --resume",
     "pool": "all cut-ins that the pool keeps of a shell were tested; raise pool.cut_ins_per_shell and use a new folder",
-    "pool_error": "the pool's own error alone is wider; lower pool.relative_error and use a new folder",
+    "pool_error": "the pool's own error alone is wider; lower pool.relative_error (or raise pool.shadow_paths, of a "
+    "vehicle that acts before the cut-in) and use a new folder",
 }
 """Why a campaign ended before its precision, and the mend."""
 

@@ -60,8 +60,8 @@ BOTH = ("stop.rhw (0.1)", "stop.min_crashes (50)")
         (
             "pool_error",
             BOTH[:1],
-            " without stop.rhw (0.1): the pool's own error alone is wider; lower pool.relative_error and use a new "
-            "folder.",
+            " without stop.rhw (0.1): the pool's own error alone is wider; lower pool.relative_error (or raise "
+            "pool.shadow_paths, of a vehicle that acts before the cut-in) and use a new folder.",
         ),
         ("pool", None, f": {POOL_SPENT}."),
     ],

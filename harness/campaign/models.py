@@ -112,18 +112,19 @@ class Campaign(Section):
     @model_validator(mode="after")
     def _paths_need_an_av_that_holds_its_speed(self) -> Self:
         method = self.testing.method
-        if self.av.before_cut_in == "controller" and SAMPLING[method].draws_ahead:
+        if self.av.acts_before_cut_in and SAMPLING[method].holds_speed:
             raise broken_rule(
                 "av.before_cut_in",
                 found=f"controller, with testing.method {method}",
                 expected="hold_speed: the method draws LV's and BV's path ahead, which needs to know the AV's",
-                mend="Choose hold_speed, or testing.method step_mixture or nde.",
+                mend="Choose hold_speed, or testing.method shells (or forced), which drives the AV along its paths "
+                "first.",
             )
         return self
 
     @model_validator(mode="after")
     def _built_in_models_wait_for_the_cut_in(self) -> Self:
-        if self.av.before_cut_in == "controller" and self.av.model is not None:
+        if self.av.acts_before_cut_in and self.av.model is not None:
             raise broken_rule(
                 "av.before_cut_in",
                 found=f"controller, with the built-in model {self.av.model}",
@@ -202,6 +203,17 @@ class Campaign(Section):
         return self
 
     @property
+    def has_shadow_runs(self) -> bool:
+        """Whether the AV is first driven along its paths without a cut-in."""
+        return self.av.acts_before_cut_in and SAMPLING[self.testing.method].shadows
+
+    def _pool_content(self) -> dict[str, object] | None:
+        """What of the pool's settings changes an episode's bits."""
+        if self.testing.method != "shells":
+            return None
+        return self.pool.model_dump(exclude=set() if self.av.acts_before_cut_in else {"shadow_paths"})
+
+    @property
     def min_crashes(self) -> int:
         """Sampled crashes needed before RHW may stop the campaign; limits within shells are exact, without a floor."""
         if self.stop.min_crashes is not None:
@@ -229,7 +241,7 @@ class Campaign(Section):
             "av": self.av.identity(),
             "surrogates": [(name, model.model_dump()) for name, model in self.surrogates.items()],
             "testing": self.testing.model_dump(),
-            "pool": self.pool.model_dump() if self.testing.method == "shells" else None,
+            "pool": self._pool_content(),
             "engine": self.world.engine,
             "moments": self.records.moments,
             "shard_size": self.run.shard_size,

@@ -159,6 +159,13 @@ class PoolSettings(Section):
     cut_ins_per_shell: Whole = Field(
         25_000, ge=100, le=1_000_000, description="cut-ins kept of each shell: the most tests that it can give"
     )
+    shadow_paths: Whole = Field(
+        500,
+        ge=50,
+        le=100_000,
+        description="paths that a vehicle which acts before the cut-in (av.before_cut_in: controller) is driven along "
+        "without one, to know where it is",
+    )
     seed: Whole = Field(1, ge=0, lt=2**63, description="every random number of the pool follows from it")
 
 

@@ -111,6 +111,11 @@ class AutomatedVehicle(Section):
         return next(name for name in AV_SOURCES if getattr(self, name) is not None)
 
     @property
+    def acts_before_cut_in(self) -> bool:
+        """Whether its controller acts from the start of a test."""
+        return self.before_cut_in == "controller"
+
+    @property
     def reproducible(self) -> bool:
         """Whether an episode runs again bit for bit: the harness cannot promise it for a program outside of it."""
         return self.traci is None

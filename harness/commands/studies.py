@@ -79,16 +79,33 @@ def pool(campaign_file: Path, *, out: Path | None, overrides: Sequence[str], as_
         heading="Columns:",
     )
     + "\n\n"
-    + examples("harness validate scenarios/validate/shells_panel.yaml --out runs/shells_panel"),
+    + examples(
+        "harness validate scenarios/validate/shells_panel.yaml --out runs/shells_panel",
+        "harness validate scenarios/validate/shells_panel.yaml --out runs/at_99 --set campaign.stop.confidence=0.99",
+    ),
 )
 @click.argument("experiment_file", metavar="EXPERIMENT", type=CAMPAIGN)
 @click.option("--out", "folder", type=FOLDER, required=True, help="Folder of the results; made if it is not there.")
 @click.option("--replications", type=click.IntRange(min=2), help="Instead of the experiment's own number.")
+@click.option(
+    "--set",
+    "overrides",
+    multiple=True,
+    metavar="KEY=VALUE",
+    help="Instead of what the file says, e.g. campaign.stop.confidence=0.99; may be repeated.",
+)
 @click.option("--workers", type=click.IntRange(min=1), help="Processes. Default: one per core.")
 @quiet_option
 @json_option
 def validate(
-    experiment_file: Path, folder: Path, *, replications: int | None, workers: int | None, quiet: bool, as_json: bool
+    experiment_file: Path,
+    folder: Path,
+    *,
+    replications: int | None,
+    overrides: Sequence[str],
+    workers: int | None,
+    quiet: bool,
+    as_json: bool,
 ) -> None:
     """Repeat the campaign of EXPERIMENT for each of its vehicles or chains, and judge its intervals by that.
 
@@ -97,7 +114,7 @@ def validate(
     """
     from harness.studies.experiment import load_experiment  # noqa: PLC0415 - keeps --help fast
 
-    experiment = load_experiment(experiment_file)
+    experiment = load_experiment(experiment_file, overrides)
     if replications is not None:
         experiment = experiment.model_copy(update={"replications": replications})
     from harness.progress import terminal_progress  # noqa: PLC0415 - keeps --help fast

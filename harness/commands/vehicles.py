@@ -65,12 +65,12 @@ def av_check(
 @click.command(
     short_help="Two AVs on common random numbers: the interval of the difference.",
     epilog=examples(
-        "harness compare A.yaml B.yaml --out runs/a_b",
-        "harness compare scenarios/overtaking_forced.yaml --against av.model=fvdm --out runs/idm_fvdm",
-        "harness compare scenarios/overtaking_forced.yaml --av idm --against-av late-600ms --out runs/late",
+        "harness compare old.yaml new.yaml --out runs/old_new",
+        "harness compare runs/old new.yaml --margin 0.1 --out runs/old_new       # is the new one 10 % worse?",
+        "harness compare scenarios/smoke.yaml --av idm --against-av late-600ms --out runs/late",
     ),
 )
-@click.argument("file_a", metavar="A", type=CAMPAIGN)
+@click.argument("source_a", metavar="A", type=CAMPAIGN)
 @click.argument("file_b", metavar="[B]", type=CAMPAIGN, required=False)
 @click.option("--out", "folder", type=FOLDER, required=True, help="Folder; run folders a and b are made in it.")
 @click.option(
@@ -82,6 +82,12 @@ def av_check(
 @click.option(
     "--against-av", metavar="[PANEL.yaml:]NAME", help="Vehicle that B has instead; with it B may be left out."
 )
+@click.option(
+    "--margin",
+    type=click.FloatRange(min=0.0),
+    metavar="R",
+    help="Under shells: run until it is known whether B's crash rate is at most 1 + R times A's.",
+)
 @workers_option
 @quiet_option
 @av_option
@@ -90,39 +96,52 @@ def av_check(
 @click.pass_context
 def compare(
     ctx: click.Context,
-    file_a: Path,
+    source_a: Path,
     file_b: Path | None,
     folder: Path,
     *,
     against: Sequence[str],
     against_av: str | None,
+    margin: float | None,
     workers: int | None,
     quiet: bool,
     av: str | None,
     overrides: Sequence[str],
     as_json: bool,
 ) -> None:
-    """Run campaigns A and B, which differ in their AV only, on the same random numbers, and print the difference.
+    """Drive the AVs of campaigns A and B, which differ in nothing else, in the same traffic; print the difference.
 
-    Both run to their own stop rule, then the shorter one as far as the longer. Finished parts of an earlier call with
-    the same folder are used again. The folder receives the run folders a and b, and compare.json.
+    Under testing.method shells both meet the same cut-ins, round by round, until the half-width of the difference is
+    stop.rhw of the larger rate, or --margin is decided. Under the other methods both run to their own stop rule, then
+    the shorter one as far as the longer; forced is the one to choose there.
 
-    testing.method forced is the one to choose: there both AVs meet the very same cut-ins.
+    A may be a run folder: its tests are copied and not driven again. Finished parts of an earlier call with the same
+    --out are used again, too. The folder receives the run folders a and b, and compare.json.
+
+    Exit code 5 says that B is worse than A by more than --margin; 4 that the budget was spent before it was known.
     """
     if file_b is None and not against and against_av is None:
         raise click.UsageError("Name a second campaign, or say with --against or --against-av what is different in B.")
+    stored = source_a if source_a.is_dir() else None
+    file_a = source_a if stored is None else stored / "campaign.yaml"
     a, b = loaded(file_a, overrides, av), loaded(file_b or file_a, [*overrides, *against], against_av or av)
+    if stored is not None:  # how far it was run before says nothing about now
+        a = a.model_copy(update={"stop": b.stop})
     from harness.progress import terminal_progress  # noqa: PLC0415 - keeps --help fast
     from harness.runner import compare_campaigns  # noqa: PLC0415 - slow to import: only once the campaigns are right
 
     label_b = ", ".join([b.name, *filter(None, [against_av]), *against]) if file_b is None else b.name
+    labels = a.name, label_b
     bar = None if quiet else terminal_progress(a.stop.rhw, a.min_crashes)
     with bar or nullcontext():
-        found = compare_campaigns(a, b, folder, workers=workers, progress=bar, labels=(a.name, label_b))
+        found = compare_campaigns(
+            a, b, folder, workers=workers, progress=bar, labels=labels, stored=stored, margin=margin
+        )
     if as_json:
         print_json(found.content)
     else:
-        click.echo(found.content["statement"])
+        for sentence in found.content.get("statements", [found.content["statement"]]):
+            click.echo(sentence)
         for remark in found.difference.warnings:
             click.echo(f"note: {remark}")
         click.echo(str(folder / "compare.json"))

@@ -74,18 +74,20 @@ class VehicleHost:
         self.acts_before_cut_in = acts_before_cut_in
         self._make = make
         self._controllers: list[VehicleController | None] = [None] * n_cells
+        self._episodes = [-1] * n_cells
         self._seed = seed
         self._guard = Guard(limits, black_box)
         self._doomed = {} if doomed is None else doomed
 
-    def start(self, cells: IntArray, episodes: IntArray) -> Failures:
-        """Begin episodes; returns those that failed at once."""
+    def start(self, cells: IntArray, episodes: IntArray, told: IntArray) -> Failures:
+        """Begin episodes, each under the index that its controller is ``told``; returns those that failed at once."""
         failures = {}
         with self._guard.time_limit:
-            for k, episode in zip(cells.tolist(), episodes.tolist(), strict=True):
+            for k, episode, index in zip(cells.tolist(), episodes.tolist(), told.tolist(), strict=True):
+                self._episodes[k] = episode
                 wrong = self._known_death(episode, START)
                 if wrong is None:
-                    start = EpisodeStart(episode, STEP_S, episode_random(self._seed, episode))
+                    start = EpisodeStart(index, STEP_S, episode_random(self._seed, index))
                     _, wrong = self._guard.call(OF_EPISODE, self._start, k, start, episode=episode)
                 if wrong is not None:
                     failures[k] = f"start: {wrong}"
@@ -104,8 +106,8 @@ class VehicleHost:
         rows = zip(*(column.tolist() for column in observation), strict=True)
         call, check = self._guard.call, self._guard.wrong_answer
         with self._guard.time_limit:
-            for i, (k, episode, *seen) in enumerate(rows):
-                controller = self._controllers[k]
+            for i, (k, _, *seen) in enumerate(rows):
+                controller, episode = self._controllers[k], self._episodes[k]
                 if controller is None:
                     continue  # its episode has failed in this turn's start
                 step = round(seen[0] / STEP_S)
@@ -161,10 +163,10 @@ class BatchHost:
         self._limits = limits
         self._guard = Guard(limits, black_box)
 
-    def start(self, cells: IntArray, episodes: IntArray) -> Failures:
+    def start(self, cells: IntArray, episodes: IntArray, told: IntArray) -> Failures:  # noqa: ARG002 - see there
         """As `VehicleHost.start`."""
-        random = EpisodeRandom(self._seed, episodes.tolist())
-        given = read_only(cells.copy()), read_only(episodes.copy())
+        random = EpisodeRandom(self._seed, told.tolist())
+        given = read_only(cells.copy()), read_only(told.copy())
         with self._guard.time_limit:
             _, wrong = self._guard.call(START_BATCH, lambda: self._controller.start_batch(*given, random))
         return {} if wrong is None else dict.fromkeys(cells.tolist(), f"start_batch: {wrong}")

@@ -86,7 +86,7 @@ def build_host(
     CampaignError
         The controller cannot be found or made, or is of neither kind.
     """
-    acts_early = av.before_cut_in == "controller"
+    acts_early = av.acts_before_cut_in
     make: Callable[[], Any]
     if av.source == "controller":
         make = _maker(av)

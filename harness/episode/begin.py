@@ -40,6 +40,8 @@ def begin_cell(k: int, row: int, bench: Bench) -> None:
     seed, episode = bench.seed, bench.first_episode + row
     cell = cells.cell[k]
     cell.row, cell.episode, cell.step, cell.cut_step, cell.component = row, episode, 0, -1, -1
+    cell.told = bench.traffic.told[row] if bench.traffic.told.size > 0 else episode
+    cell.motion = 0
     cell.lv_maneuver = cell.bv_maneuver = cell.n_lv = cell.n_bv = cell.n_bv_free = cell.n_path = cell.n_control = 0
     cell.clock = cell.hazard = cell.log_sampled = 0.0
     cell.hazard_total = cell.log_p_cut_in = math.nan
@@ -51,7 +53,10 @@ def begin_cell(k: int, row: int, bench: Bench) -> None:
     cells.log_ratio[k, :] = 0.0
     cells.martingale[k, :] = 0.0
     if method == SHELLS:
-        cell.component, cell.log_sampled = bench.traffic.stratum[row], -bench.traffic.log_weight[row]
+        log_weight = bench.traffic.log_weight[row]
+        cell.component, cell.log_sampled = bench.traffic.stratum[row], -log_weight
+        if bench.importance.first == 1:  # a forced cut-in whose path has been walked by the AV itself
+            cell.log_p_cut_in, cells.log_ratio[k, 0] = log_weight, -log_weight
         return
     forced = method == FORCED
     if method == EPISODE_MIXTURE:

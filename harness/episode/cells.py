@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from harness.arrays import FloatArray, Int8Array, IntArray, RecordArray
+from harness.arrays import FloatArray, Int8Array, IntArray, RecordArray, UInt64Array
 from harness.compiled import compiled_inline
 from harness.controllers.protocol import BatchObservation
 from harness.environment.driving import Environment
@@ -27,6 +27,8 @@ CELL_DTYPE = np.dtype(
     [
         ("row", _i8),  # row of the shard, -1: idle
         ("episode", _i8),  # index in the campaign
+        ("told", _i8),  # index that the AV is told, and that its random stream follows from
+        ("motion", np.uint64),  # hash of the AV's motion, through the step of the cut-in
         ("step", _i8),  # t, in steps
         ("cut_step", _i8),  # -1 before the cut-in
         ("component", _i8),  # importance function drawn for the episode, -1 without an episode mixture
@@ -193,7 +195,10 @@ class PrescribedTraffic(NamedTuple):
     """Episodes whose traffic is prescribed: what LV and BV do in each row of a shard; no rows if it is drawn.
 
     ``lv``, ``bv`` (rows, draws) int8 are maneuver indices as an episode records them, 31 in ``bv`` being the cut-in in
-    step ``cut_step`` (rows,). ``stratum`` (rows,) is the shell and ``log_weight`` (rows,) its log probability.
+    step ``cut_step`` (rows,), which is -1 for a run without a cut-in. ``stratum`` (rows,) is the shell and
+    ``log_weight`` (rows,) its log probability.
+    ``told`` (rows,) are the indices that AVs are told, ``motion`` (rows,) hashes of what they must have done when the
+    step of the cut-in is over: those of their shadow runs. Both are empty where an AV keeps its speed until then.
     """
 
     lv: Int8Array
@@ -201,6 +206,8 @@ class PrescribedTraffic(NamedTuple):
     cut_step: IntArray
     stratum: IntArray
     log_weight: FloatArray
+    told: IntArray
+    motion: UInt64Array
 
 
 class PrescribedCutIns(NamedTuple):
@@ -217,8 +224,8 @@ class PrescribedCutIns(NamedTuple):
 
 def drawn_traffic() -> PrescribedTraffic:
     """For episodes that draw their own traffic."""
-    none = np.zeros((0, 1), np.int8)
-    return PrescribedTraffic(none, none, np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0))
+    none, no_index = np.zeros((0, 1), np.int8), np.zeros(0, np.int64)
+    return PrescribedTraffic(none, none, no_index, no_index, np.zeros(0), no_index, np.zeros(0, np.uint64))
 
 
 class Scratch(NamedTuple):

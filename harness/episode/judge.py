@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from harness.arrays import BoolArray, FloatArray, Int8Array, IntArray
 from harness.compiled import compiled, compiled_inline
 from harness.episode.beside import note_if_ahead
 from harness.episode.cells import Bench, state_of
+from harness.episode.motion import mixed
 from harness.importance.likelihood import log_weight
 from harness.outcomes import (
     AV,
@@ -47,6 +50,8 @@ def judge(bench: Bench, contact: BoolArray) -> int:
         outcome = outcome_of(k, state, bench)
         if contact[k] != (outcome in (CRASH, BV_LV_CONTACT)):
             return -1 - k
+        if bench.traffic.motion.size > 0 and strays(k, outcome, bench):
+            outcome = FAILED
         if outcome != RUNNING:
             end_episode(k, outcome, ended, bench)
             ended += 1
@@ -69,6 +74,19 @@ def outcome_of(k: int, state: State, bench: Bench) -> int:
     if cell.step >= bench.environment.numbers.max_steps:
         return TIMEOUT
     return RUNNING
+
+
+@compiled_inline
+def strays(k: int, outcome: int, bench: Bench) -> bool:
+    """Whether the AV has done something else than in its shadow run: what follows would count with a wrong weight."""
+    cell, traffic = bench.cells.cell[k], bench.traffic
+    if 0 <= cell.cut_step < cell.step - 1:
+        return False
+    x, v = bench.x.view(np.uint64), bench.v.view(np.uint64)
+    cell.motion = mixed(mixed(cell.motion, x[k, AV]), v[k, AV])
+    if cell.cut_step >= 0:
+        return bool(cell.motion != traffic.motion[cell.row])
+    return outcome != RUNNING  # before the cut-in that its shadow run has come to
 
 
 @compiled

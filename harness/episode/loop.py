@@ -37,6 +37,11 @@ from harness.world import AVLostError, DrivingWorld, World
 
 NOBODY = driver_records([])
 MOMENT_LIMITS = {"all": 32767, "first_9": 9, "none": 0}
+STRAYED = (
+    "the vehicle did something else than in its shadow run, given the same traffic and the same random stream: it "
+    "draws random numbers of its own, remembers earlier episodes, or depends on time"
+)
+"""Cause of a test that failed because its weight would have been wrong."""
 CONTROL_STEPS = 16
 """Of an episode, for which a shard has room at first; more is made where they are more."""
 
@@ -151,9 +156,9 @@ class EpisodeLoop:
             if recorded > shard.results.moment.size - self._world.n_cells:
                 bench = self._with_more_room(shard)
 
-    def beside(self, world: World) -> EpisodeLoop:
-        """Another loop with the same AV, policy and records, in a world of no more cells."""
-        return EpisodeLoop(world, self._policy, self._keep, self._av)
+    def beside(self, world: World | None = None, keep: Keep | None = None) -> EpisodeLoop:
+        """Another loop with the same AV and policy, in a world of no more cells, or with other records."""
+        return EpisodeLoop(world or self._world, self._policy, keep or self._keep, self._av)
 
     def close(self) -> None:
         """Release what the AV's controllers hold; the loop runs no more."""
@@ -210,7 +215,8 @@ class EpisodeLoop:
         cells, failures = self._cells, dict[int, str]()
         if placed:
             refilled = cells.placed[:placed]
-            failures.update(self._av.start(refilled, cells.cell["episode"][refilled]))
+            begun = cells.cell[refilled]
+            failures.update(self._av.start(refilled, begun["episode"], begun["told"]))
         if n := observe(bench):
             acting = self._observation.cell[:n]
             cells.acceleration[acting, AV], failed = self._av.act(first(self._observation, n))
@@ -224,7 +230,7 @@ class EpisodeLoop:
             if placed:
                 refilled = cells.placed[:placed]
                 if self._driving is not None:
-                    self._driving.announce(refilled, cells.cell["episode"][refilled])
+                    self._driving.announce(refilled, cells.cell["told"][refilled])
                 world.place(refilled, world.x, world.v)
             contact = world.step(cells.speed, cells.cut_in)
         except AVLostError as lost:
@@ -234,6 +240,7 @@ class EpisodeLoop:
             raise _disagreement(cells.cell[-1 - ended], bool(contact[-1 - ended]))
         if ended:
             self._keep_traces(ended, shard)
+            shard.failures.update((row, STRAYED) for _, row in self._ended(ended) if _has_failed(shard, row))
         return ended
 
     def _lose(self, cause: str, bench: Bench, shard: Shard) -> int:
@@ -267,6 +274,10 @@ class EpisodeLoop:
                 trace = shard.traces[row] = self._cells.trace[k, : int(episode["n_steps"]) + 1].copy()
                 if self._driving is not None:  # nobody commanded what the AV did: its speeds say it
                     trace[:-1, AV, 2] = np.diff(trace[:, AV, 1]) / STEP_S
+
+
+def _has_failed(shard: Shard, row: int) -> bool:
+    return int(shard.results.episode["outcome"][row]) == FAILED
 
 
 def _disagreement(cell: np.void, contact: bool) -> WorldDisagreementError:

@@ -42,7 +42,7 @@ def observe(bench: Bench) -> int:
         followed = 0 <= cell.cut_step < cell.step
         if cell.row < 0 or not (followed or bench.acts_before_cut_in):
             continue
-        out.cell[n], out.episode[n], out.time_s[n] = k, cell.episode, cell.step * STEP_S
+        out.cell[n], out.episode[n], out.time_s[n] = k, cell.told, cell.step * STEP_S
         out.position_m[n], out.speed_mps[n] = x[k, AV], v[k, AV]
         out.acceleration_mps2[n] = cells.acceleration[k, AV]
         out.gap_m[n] = gap(x[k, BV], x[k, AV]) if followed else math.inf

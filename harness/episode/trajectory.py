@@ -1,8 +1,8 @@
 """What happens around a cut-in, walked without a world: LV and BV before it, BV after it, and who runs into BV.
 
-Nobody's motion before the cut-in depends on the AV, which keeps its speed; nor does BV's after it. So a trajectory can
-be walked before the episode is run, or after it, with the same draws and the same arithmetic, and with any driver
-behind BV.
+Neither LV's nor BV's motion depends on the AV, before the cut-in or after it; only the hazard of the cut-in does. So a
+trajectory can be walked before the episode is run, or after it, with the same draws and the same arithmetic, and with
+any driver behind BV: beside an AV that keeps its speed until the cut-in, or one whose motion has been recorded.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ class Trajectory(NamedTuple):
     """Room for one; positions in m, speeds in m/s.
 
     ``x``, ``v`` (3,) are the initial placement. ``lv``, ``bv`` (draws,) are maneuver indices before the cut-in,
-    ``x_lv``, ``x_bv``, ``x_av``, ``v_lv``, ``v_bv`` (steps + 1,) the motion without it, and ``hazard`` (steps,) that of
-    cutting in.
+    ``x_lv``, ``x_bv``, ``x_av``, ``v_lv``, ``v_bv``, ``v_av`` (steps + 1,) the motion without it, and ``hazard``
+    (steps,) that of cutting in.
     ``free`` (draws,) are BV's maneuvers after the cut-in, ``x_after``, ``v_after`` (steps + 1,) its motion.
     """
 
@@ -44,6 +44,7 @@ class Trajectory(NamedTuple):
     x_av: FloatArray
     v_lv: FloatArray
     v_bv: FloatArray
+    v_av: FloatArray
     hazard: FloatArray
     free: Int8Array
     x_after: FloatArray
@@ -84,7 +85,7 @@ def place(state: State, x: FloatArray, v: FloatArray) -> None:
 def state_in(step: int, path: Trajectory) -> State:
     """State before the maneuvers of a step that has been walked."""
     x, v = path.x_bv[step], path.v_bv[step]
-    return State(v, gap(path.x_lv[step], x), path.v_lv[step] - v, gap(x, path.x_av[step]), v - path.v[AV])
+    return State(v, gap(path.x_lv[step], x), path.v_lv[step] - v, gap(x, path.x_av[step]), v - path.v_av[step])
 
 
 @compiled_inline
@@ -98,33 +99,70 @@ def end_in(step: int, path: Trajectory) -> int:
 
 
 @compiled_inline
+def set_out(state: State, path: Trajectory) -> None:
+    """LV and BV before the first step."""
+    place(state, path.x, path.v)
+    path.x_lv[0], path.x_bv[0] = path.x[LV], path.x[BV]
+    path.v_lv[0], path.v_bv[0] = path.v[LV], path.v[BV]
+
+
+@compiled_inline
+def take_step(step: int, seed: int, episode: int, known: int, environment: Environment, path: Trajectory) -> None:
+    """LV and BV move on; their first ``known`` maneuvers stand in ``path``, those after them are drawn."""
+    m = step // environment.numbers.hold_steps
+    v_lv, v_bv = path.v_lv[step], path.v_bv[step]
+    if step % environment.numbers.hold_steps == 0 and m >= known:
+        u = uniform(seed, episode, LV_DRAWS, m)
+        path.lv[m] = draw_acceleration(u, free_driving(v_lv, environment), environment)
+        u = uniform(seed, episode, BV_DRAWS, m)
+        path.bv[m] = draw_acceleration(u, car_following(state_in(step, path), environment), environment)
+    after_lv, after_bv = next_speed(v_lv, acceleration(path.lv[m])), next_speed(v_bv, acceleration(path.bv[m]))
+    path.x_lv[step + 1] = next_position(path.x_lv[step], v_lv, after_lv)
+    path.x_bv[step + 1] = next_position(path.x_bv[step], v_bv, after_bv)
+    path.v_lv[step + 1], path.v_bv[step + 1] = after_lv, after_bv
+
+
+@compiled_inline
 def walk(
     state: State, seed: int, episode: int, known: int, until: int, environment: Environment, path: Trajectory
 ) -> int:
     """Walk from an initial state to a step, or to the end that an episode without cut-in finds; returns the step.
 
-    The first ``known`` maneuvers of LV and BV stand in ``path``; what comes after them is drawn, and written there.
+    The AV keeps its speed. The first ``known`` maneuvers of LV and BV stand in ``path``; what comes after them is
+    drawn, and written there.
     """
-    hold_steps = environment.numbers.hold_steps
-    place(state, path.x, path.v)
-    path.x_lv[0], path.x_bv[0], path.x_av[0] = path.x[LV], path.x[BV], path.x[AV]
-    path.v_lv[0], path.v_bv[0] = path.v[LV], path.v[BV]
+    set_out(state, path)
+    path.x_av[0], path.v_av[0] = path.x[AV], path.v[AV]
     for step in range(until):
         if end_in(step, path) != RUNNING:
             return step
-        m = step // hold_steps
-        v_lv, v_bv = path.v_lv[step], path.v_bv[step]
-        if step % hold_steps == 0 and m >= known:
-            u = uniform(seed, episode, LV_DRAWS, m)
-            path.lv[m] = draw_acceleration(u, free_driving(v_lv, environment), environment)
-            u = uniform(seed, episode, BV_DRAWS, m)
-            path.bv[m] = draw_acceleration(u, car_following(state_in(step, path), environment), environment)
-        after_lv, after_bv = next_speed(v_lv, acceleration(path.lv[m])), next_speed(v_bv, acceleration(path.bv[m]))
-        path.x_lv[step + 1] = next_position(path.x_lv[step], v_lv, after_lv)
-        path.x_bv[step + 1] = next_position(path.x_bv[step], v_bv, after_bv)
+        take_step(step, seed, episode, known, environment, path)
         path.x_av[step + 1] = next_position(path.x_av[step], path.v[AV], path.v[AV])
-        path.v_lv[step + 1], path.v_bv[step + 1] = after_lv, after_bv
+        path.v_av[step + 1] = path.v[AV]
     return until
+
+
+@compiled_inline
+def walk_traffic(state: State, seed: int, episode: int, until: int, environment: Environment, path: Trajectory) -> int:
+    """LV and BV alone, to a step or to where they touch; returns the step. ``path`` says where the AV is."""
+    set_out(state, path)
+    for step in range(until):
+        if step > 0 and gap(path.x_lv[step], path.x_bv[step]) < CONTACT_M:
+            return step
+        take_step(step, seed, episode, 0, environment, path)
+    return until
+
+
+@compiled_inline
+def weigh_cut_ins(steps: int, environment: Environment, path: Trajectory) -> float:
+    """Write the cut-in hazard of each step that has been walked; returns their sum."""
+    total = 0.0
+    for step in range(steps):
+        state = state_in(step, path)
+        accepted = acceptance(state.r2_m, state.r2dot_mps, environment)
+        path.hazard[step] = cut_in_hazard(opportunity(state, environment), accepted, environment)
+        total += path.hazard[step]
+    return total
 
 
 @compiled_inline
@@ -133,13 +171,7 @@ def walk_without_cut_in(
 ) -> tuple[int, float]:
     """Walk to the end, writing the cut-in hazard of each step; returns the number of steps, and the sum of hazards."""
     steps = walk(state, seed, episode, 0, environment.numbers.max_steps, environment, path)
-    total = 0.0
-    for step in range(steps):
-        state = state_in(step, path)
-        accepted = acceptance(state.r2_m, state.r2dot_mps, environment)
-        path.hazard[step] = cut_in_hazard(opportunity(state, environment), accepted, environment)
-        total += path.hazard[step]
-    return steps, total
+    return steps, weigh_cut_ins(steps, environment, path)
 
 
 @compiled_inline
@@ -179,11 +211,13 @@ def leave(
 def follow(driver: Record, late: int, cut: int, until: int, path: Trajectory) -> tuple[int, float]:
     """Step after which a driver has run into BV, or `NO_CRASH`, and its speed (m/s) at the end.
 
-    It reacts ``late`` steps after its first chance.
+    It takes over from the AV after the step of the cut-in, and reacts ``late`` steps after its first chance.
     """
-    x, v = path.x_av[cut], path.v[AV]
+    x, v = path.x_av[cut + 1], path.v_av[cut + 1]
+    if gap(path.x_after[cut + 1], x) < CONTACT_M:
+        return cut + 1, v
     memory = nothing_yet()
-    for step in range(cut, until):
+    for step in range(cut + 1, until):
         if step - cut > late:
             ahead = gap(path.x_after[step], x)
             memory = react(driver, memory, step - cut - late - 1, v, path.v_after[step], ahead)

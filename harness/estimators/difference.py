@@ -201,23 +201,33 @@ class _Pairs:
 
 def difference_statement(found: Difference, name_a: str, name_b: str) -> str:
     """The answer in one sentence, and what pairing was worth in a second."""
-    level = f"{found.confidence:.0%} interval"
-    rates = (
-        f"A ({name_a}) crashes {found.a.crash_rate:.3g} times per test "
-        f"({found.a.ci_low:.3g} to {found.a.ci_high:.3g}), "
-        f"B ({name_b}) {found.b.crash_rate:.3g} times ({found.b.ci_low:.3g} to {found.b.ci_high:.3g})"
+    differs = found.n_differing > 0
+    return (
+        f"{rates_statement(found.a, found.b, name_a, name_b)}: "
+        f"{apart_statement(found.difference, found.ci_low, found.ci_high, found.confidence, differs=differs)}"
+        f"{_ratio(found)}, from {found.n_pairs:,} pairs of tests{_saved(found)}."
+        f"{failed_pairs_statement(found.a, found.b)}"
     )
-    verdict = "the difference is not distinguishable from 0"
-    if found.n_differing and found.ci_low > 0.0:
-        verdict = "A crashes more often"
-    elif found.n_differing and found.ci_high < 0.0:
-        verdict = "A crashes less often"
-    cautions = [f"{name}: {text}" for name, of in (("A", found.a), ("B", found.b)) for text in of.cautions]
+
+
+def rates_statement(a: Estimate, b: Estimate, name_a: str, name_b: str) -> str:
+    """Both rates with their intervals, after what may be wrong about them."""
+    cautions = [f"{name}: {text}" for name, of in (("A", a), ("B", b)) for text in of.cautions]
     return warned(
         cautions,
-        f"{rates}: {verdict}, A - B = {found.difference:.3g} ({level} {found.ci_low:.3g} to {found.ci_high:.3g})"
-        f"{_ratio(found)}, from {found.n_pairs:,} pairs of tests{_saved(found)}.{_failed(found)}",
+        f"A ({name_a}) crashes {a.crash_rate:.3g} times per test ({a.ci_low:.3g} to {a.ci_high:.3g}), "
+        f"B ({name_b}) {b.crash_rate:.3g} times ({b.ci_low:.3g} to {b.ci_high:.3g})",
     )
+
+
+def apart_statement(difference: float, low: float, high: float, confidence: float, *, differs: bool) -> str:
+    """Which of them crashes more often, and by how much."""
+    verdict = "the difference is not distinguishable from 0"
+    if differs and low > 0.0:
+        verdict = "A crashes more often"
+    elif differs and high < 0.0:
+        verdict = "A crashes less often"
+    return f"{verdict}, A - B = {difference:.3g} ({confidence:.0%} interval {low:.3g} to {high:.3g})"
 
 
 def _ratio(found: Difference) -> str:
@@ -235,11 +245,12 @@ def _saved(found: Difference) -> str:
     return f"; independent runs would need {'as many' if times == '1' else f'{times} times as many'}"
 
 
-def _failed(found: Difference) -> str:
-    a, b = found.a.details["n_failed"], found.b.details["n_failed"]
-    if not a and not b:
+def failed_pairs_statement(a: Estimate, b: Estimate) -> str:
+    """How failed tests count; nothing where none has failed."""
+    of_a, of_b = a.details["n_failed"], b.details["n_failed"]
+    if not of_a and not of_b:
         return ""
     return (
-        f" Of these tests A FAILED in {a:,} and B in {b:,}: each limit counts them as crashes or as none, whichever "
-        "takes it farther."
+        f" Of these tests A FAILED in {of_a:,} and B in {of_b:,}: each limit counts them as crashes or as none, "
+        "whichever takes it farther."
     )

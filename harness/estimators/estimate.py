@@ -130,13 +130,17 @@ class BothWays:
     Parameters
     ----------
     seen : Accumulator
-        Empty; takes failed tests as no crash.
+        Takes failed tests as no crash; empty, unless the others are given.
+    worst : Accumulator, optional
+        The same tests with failed ones as crashes.
+    n_failed : int
+        How many of them have failed.
     """
 
-    def __init__(self, seen: Accumulator) -> None:
+    def __init__(self, seen: Accumulator, worst: Accumulator | None = None, n_failed: int = 0) -> None:
         self.seen = seen
-        self._worst: Accumulator | None = None  # until a test fails it would be the same
-        self._n_failed = 0
+        self._worst = worst  # until a test fails it would be the same
+        self._n_failed = n_failed
 
     def add(self, block: Block) -> None:
         """Add the episodes of one block."""

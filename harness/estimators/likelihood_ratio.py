@@ -110,12 +110,34 @@ def contrast_limit(weights: FloatArray, counts: Counts, level: Level, side: floa
     variance : float
         Of a further error, normal and independent of the tests, of the sum itself (the pool's).
     """
+    return _limit(weights, counts, level, side, variance)[0]
+
+
+def contrast_gains(weights: FloatArray, counts: FloatArray, level: Level, side: float) -> FloatArray:
+    """How much one more test of each stratum moves a limit inwards, shape (S,); infinite where there is none yet.
+
+    With the shares as they are it is KL(c_s ‖ θ_s)/ν, by the envelope theorem. Parameters as in `contrast_limit`.
+    """
+    n = counts.sum(1)
+    _, nu = _limit(weights, counts, level, side)
+    gains, room = np.full(n.size, math.inf), np.empty(weights.shape[1])
+    for s in np.flatnonzero(n > 0.0).tolist():
+        rows = slice(s, s + 1)
+        cost = _profile(side * nu, weights[rows], n[rows], counts[rows] / n[s], 0.0, room)[1] if nu else 0.0
+        gains[s] = cost / (n[s] * nu) if nu else 0.0
+    return gains
+
+
+def _limit(
+    weights: FloatArray, counts: IntArray | FloatArray, level: Level, side: float, variance: float = 0.0
+) -> tuple[float, float]:
+    """A limit and its multiplier, 0 where no test says anything."""
     n = counts.sum(1).astype(np.float64)
     tested = n > 0.0
     share = counts / np.maximum(n, 1.0)[:, None]
     steepest = float(np.max(np.ptp(weights[tested], axis=1) / n[tested], initial=0.0))
     if steepest == 0.0:
-        return side * float((side * np.where(tested[:, None], weights * share, weights)).max(1).sum())
+        return side * float((side * np.where(tested[:, None], weights * share, weights)).max(1).sum()), 0.0
 
     room = np.empty(weights.shape[1])
 
@@ -136,13 +158,13 @@ def contrast_limit(weights: FloatArray, counts: Counts, level: Level, side: floa
             break
         high *= 2.0
     else:
-        return at(high, level.threshold)[0]  # all shares are at their end: nothing is left to be refused
+        return at(high, level.threshold)[0], high  # all shares are at their end: nothing is left to be refused
     outer = float(brentq(excess, 0.0, high, xtol=1e-12 * high, rtol=1e-12))
     if refused(outer) > 0.0:  # with many crashes: the outermost accepted multiplier, searched from outside
         grid = pairwise(np.linspace(outer, 0.0, _GRID).tolist())
         outer, inner = next(pair for pair in grid if refused(pair[1]) <= 0.0)  # at 0 nothing is refused
         outer = float(brentq(refused, inner, outer, xtol=1e-12 * high, rtol=1e-12))
-    return at(outer, level.at(at(outer, level.threshold)[2]))[0]
+    return at(outer, level.at(at(outer, level.threshold)[2]))[0], outer
 
 
 def ratio_limits(

@@ -60,7 +60,7 @@ def one_pass(
     Parameters
     ----------
     blocks : iterable of Block
-        Contiguous and in index order.
+        Contiguous and in index order, from episode 0.
     names : collection of str
         Estimators asked for.
     confidence : float
@@ -74,12 +74,10 @@ def one_pass(
     own: EstimatorName | None = None
     states: dict[EstimatorName, BothWays] = {}
     refusals: dict[EstimatorName, str | None] = {}
-    diagnostics, convergence, n, begin = Diagnostics(), list[dict[str, Any]](), 0, 0
+    diagnostics, convergence, n = Diagnostics(), list[dict[str, Any]](), 0
     for block in blocks:
-        if own is None:
-            begin = block.first_episode
-        if block.first_episode != begin + n:
-            raise ValueError(f"expected a block from episode {begin + n} on, got one from {block.first_episode}")
+        if block.first_episode != n:
+            raise ValueError(f"expected a block from episode {n} on, got one from {block.first_episode}")
         if own is None:
             own = SAMPLING[block.method].headline
             refusals = {name: ACCUMULATORS[name].refusal(block) for name in (own, *names)}

@@ -20,6 +20,7 @@ import numpy as np
 
 from harness.arrays import BoolArray
 from harness.estimators.block import Block
+from harness.estimators.crash_paths import FEWEST_PATHS, CrashPaths
 from harness.estimators.estimate import Estimate, require_episodes
 from harness.estimators.intervals import clopper_pearson
 from harness.estimators.likelihood_ratio import Level, likelihood_limit
@@ -117,6 +118,7 @@ class Shells:
 
     def __init__(self) -> None:
         self._cells = empty_tally(0)
+        self._paths = CrashPaths()
         self._crashed: dict[int, list[int]] = {}  # stratum → its first few tests that crashed
         self._n_checked = self._n_ahead = 0
         self._ahead_in: list[int] = []
@@ -125,6 +127,13 @@ class Shells:
     def tally(self) -> Tally:
         """Counts by stratum; of no strata before the first block."""
         return self._cells.joined(self._design.joined) if self._cells.tests.size else self._cells
+
+    @classmethod
+    def of(cls, design: ShellDesign, tally: Tally) -> Shells:
+        """From counts by stratum, which say nothing about reference drivers."""
+        shells = cls()
+        shells._design, shells._cells = design.without_references(), tally
+        return shells
 
     @classmethod
     def refusal(cls, block: Block) -> str | None:
@@ -148,6 +157,9 @@ class Shells:
         ):
             np.add.at(counts, block.cell[rows], 1)
             np.add.at(sums, block.cell[rows], block.cell_mass[rows])
+        if block.shells.shadow_runs:
+            crashed = block.crash
+            self._paths.add(block.cell_mass[crashed], block.stratum[crashed], block.shells.p.size)
         for s in np.unique(block.stratum[block.crash]).tolist():
             _name(self._crashed.setdefault(s, []), block, block.crash & (block.stratum == s))
         if block.ahead is not None:
@@ -177,7 +189,8 @@ class Shells:
             largest_weight_share=float(np.max(y[tally.crashes > 0], initial=0.0)) / free.rate if free.rate > 0 else 0.0,
             method="crashes within shells of known probability; likelihood-ratio limits of their weighted sum; upper "
             "bound: the same, one-sided",
-            warnings=tuple(self._warnings(tally)),
+            warnings=(*self._cautions(tally), *self._warnings(tally)),
+            cautions=tuple(self._cautions(tally)),
             details=asdict(
                 ShellDetails(
                     pool=design.pool,
@@ -192,8 +205,26 @@ class Shells:
         )
 
     def _limits(self, tally: Tally, level: Level) -> Limits:
-        """Of the first strata, those of a tally."""
-        return combined(self._design.p[: tally.tests.size], tally, self._design.n_paths, level)
+        """Of the first strata, those of a tally; anything is possible where crashes lie on too few paths."""
+        p = self._design.p[: tally.tests.size]
+        if self._n_paths(tally) < FEWEST_PATHS:
+            return Limits(float(p @ tally.share), 0.0, 1.0, math.inf, math.inf)
+        return combined(p, tally, self._design.n_paths, level)
+
+    def _n_paths(self, tally: Tally) -> float:
+        """Number of paths that the crashes in the first strata, those of a tally, lie on, in effect."""
+        weight = np.zeros_like(self._design.p)
+        weight[: tally.tests.size] = self._design.p[: tally.tests.size] / tally.at_least_one
+        return self._paths.number(weight)
+
+    def _cautions(self, tally: Tally) -> list[str]:
+        if (n := self._n_paths(tally)) >= FEWEST_PATHS:
+            return []
+        return [
+            f"no interval: nearly all crashes lie on some {max(n, 1.0):.0f} of the {self._design.n_paths:,} paths that "
+            f"the vehicle was driven along, and {FEWEST_PATHS:.0f} are needed; raise pool.shadow_paths, and run into a "
+            "new folder"
+        ]
 
     def _within(self, given: Statement, tally: Tally, confidence: float) -> Within:
         design, n = self._design, given.n_inside
@@ -252,7 +283,7 @@ class Shells:
         if empty := ", ".join(name for name, n in zip(design.strata, tally.tests, strict=True) if n == 0):
             found.append(f"no test in {empty}: the interval allows for any share of crashes there")
         kept = zip(design.strata, tally.tests, design.available, strict=False)
-        if used_up := ", ".join(name for name, n, available in kept if n >= available):
+        if used_up := ", ".join(name for name, n, available in kept if n >= available > 0):
             found.append(
                 f"all cut-ins that the pool has kept of {used_up} were tested: for more precision raise "
                 "pool.cut_ins_per_shell, and run into a new folder"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -120,6 +121,8 @@ def _within(found: Mapping[str, Any], n_shells: int, level: str) -> str:
             f"{found['n_crashes_outside']:,} of {found['n_episodes_outside']:,} tests beyond {found['boundary']}, "
             f"first in {_replayed(found['refuted_by'])}."
         )
+    if math.isinf(found["rhw_from_pool"]):
+        return "Under an assumption about where it crashes nothing more can be said: its crashes lie on too few paths."
     text = (
         f"If this vehicle {found['assumes']}, its crash rate is {found['crash_rate']:.3g} per test ({level} interval "
         f"{found['ci_low']:.3g} to {found['ci_high']:.3g}), estimated from {found['n_episodes']:,} tests "

@@ -98,10 +98,7 @@ def empty_tally(n_strata: int) -> Tally:
 def pool_variance(p: FloatArray, tally: Tally, n_paths: int, factor: FloatArray | float = 1.0) -> float:
     """Variance of Σ p_s c_s that comes from the pool's finite number of paths, wherever the vehicle crashes.
 
-    It is (Σ E[x_s x_t] - μ²)/n, x_s being a path's probability of a crash in stratum s. A crashed test of s is a draw
-    in proportion to x_s, so that B_st, p_s/n_s times the sum of the paths' whole probabilities m_t in t over these
-    tests, estimates E[x_s m_t], which E[x_s x_t] does not exceed; so it is at most the least of B_st, B_ts and, with
-    Cauchy and Schwarz, √(B_ss B_tt). A stratum in which no crash was seen adds nothing.
+    It is (Σ E[x_s x_t] - μ²)/n, see `mean_square`. A stratum in which no crash was seen adds nothing.
 
     Parameters
     ----------
@@ -110,13 +107,19 @@ def pool_variance(p: FloatArray, tally: Tally, n_paths: int, factor: FloatArray 
     factor : ndarray, shape (S,)
         By which crashes of each stratum are fewer than seen.
     """
-    rate = float((p * factor) @ tally.share)
-    return max(mean_square(p, tally, factor) - rate * rate, 0.0) / n_paths
+    scale = p / tally.at_least_one * factor
+    rate = float(scale @ tally.crashes)
+    return max(mean_square(scale, tally.crash_mass) - rate * rate, 0.0) / n_paths
 
 
-def mean_square(p: FloatArray, tally: Tally, factor: FloatArray | float = 1.0) -> float:
-    """What the mean square of a path's probability of a crash is at most, as `pool_variance` estimates it."""
-    bound = (p / tally.at_least_one * factor)[:, None] * tally.crash_mass
+def mean_square(scale: FloatArray, crash_mass: FloatArray) -> float:
+    """Bound of Σ E[x_s x_t], x_s being a path's probability of a crash in stratum s.
+
+    A crashed test of s is a draw in proportion to x_s, so that B_st, p_s/n_s (``scale``, shape (S,)) times the sum of
+    the paths' whole probabilities m_t in t over these tests (``crash_mass``, shape (S, S)), estimates E[x_s m_t], which
+    E[x_s x_t] does not exceed; so it is at most the least of B_st, B_ts and, with Cauchy and Schwarz, √(B_ss B_tt).
+    """
+    bound = scale[:, None] * crash_mass
     own = np.sqrt(np.diag(bound))
     return float(np.minimum(np.minimum(bound, bound.T), np.outer(own, own)).sum())
 

@@ -17,7 +17,7 @@ from harness.arrays import FloatArray, Int8Array, IntArray, RecordArray
 from harness.environment.driving import Environment
 from harness.environment.initial_state import InitialStates
 from harness.episode.trajectory import empty_trajectory
-from harness.pool.enumeration import STRIDE, enumerate_cut_ins, write_pairs
+from harness.pool.enumeration import FREE_DRAWS_PER_CUT_IN, STRIDE, enumerate_cut_ins, write_pairs
 from harness.progress import Progress
 from harness.random_stream import DIAGNOSTIC, INITIAL, uniforms
 from harness.state import STATE_COLUMNS
@@ -94,11 +94,14 @@ def contributions(rates: FloatArray, share: FloatArray | float = 1.0) -> FloatAr
 class EnumeratedPaths:
     """Initial states (n,) of some paths, and their cut-ins.
 
-    ``mass`` (n, steps) is the probability of the cut-ins that one in this step stands for, times the naturalistic over
-    the proposal's density of the path; ``crashes`` (n, steps) has one bit per surrogate, as the library orders them.
+    ``index`` (n,) are their numbers, ``weight`` (n,) the naturalistic over the proposal's density. ``mass`` (n, steps)
+    is the probability of the cut-ins that one in this step stands for, times the weight; ``crashes`` (n, steps) has one
+    bit per surrogate, as the library orders them.
     """
 
+    index: IntArray
     state: RecordArray
+    weight: FloatArray
     mass: FloatArray
     crashes: IntArray
 
@@ -163,7 +166,7 @@ class Enumerator:
         path = empty_trajectory(self._environment)
         where = self._environment, self._drivers, self._envelope
         enumerate_cut_ins(self._seed, first, state, *where, self._stride, offset, path, probability, crashes)
-        return EnumeratedPaths(state, probability * weight[:, None], crashes)
+        return EnumeratedPaths(first + np.arange(n), state, weight, probability * weight[:, None], crashes)
 
     def pairs(
         self, path: IntArray, step: IntArray, state: RecordArray
@@ -173,5 +176,5 @@ class Enumerator:
         n, draws = len(path), room.lv.size
         lv, bv = np.zeros((n, draws), np.int8), np.zeros((n, draws), np.int8)
         n_lv, n_bv = np.zeros(n, np.int64), np.zeros(n, np.int64)
-        write_pairs(self._seed, path, step, state, self._environment, room, lv, bv, n_lv, n_bv)
+        write_pairs(self._seed, path, step, state, FREE_DRAWS_PER_CUT_IN, self._environment, room, lv, bv, n_lv, n_bv)
         return lv, bv, n_lv, n_bv

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from harness.arrays import BoolArray, FloatArray, Int8Array, IntArray
@@ -19,7 +21,7 @@ CARELESS_SHARE = 0.2
 """How much the surrogates beyond the boundary count in aiming, and those far off: less has to be known there."""
 CARELESS_ERROR = 4.0
 """Their relative error may be this many times the target."""
-_APART = 0x706F6F6C
+POOL_SEED = 0x706F6F6C
 """Keeps a pool's random numbers apart from those of a campaign with the same seed."""
 KEEP_DRAW = 1
 """Draw of a shell within the diagnostic stream."""
@@ -30,15 +32,40 @@ def build_pool(
 ) -> Pool:
     """Build a pool in the twin, which will carry the content hash ``key``."""
     progress = progress or SilentProgress()
+    aim = take_aim(environment, library, settings, progress)
+    paths = _until_known(aim.enumerator, aim.pilot, aim.careful, settings, progress)
+    order = careful_first(paths.rates(len(library.surrogates)))
+    return pool_of(paths, aim.enumerator, order, library, settings, key, environment_hash(environment))
+
+
+@dataclass(frozen=True, eq=False)
+class Aim:
+    """Paths aimed at crashes, what the pilot run said (n, D + 1), and which of its columns are to be known well."""
+
+    enumerator: Enumerator
+    pilot: FloatArray
+    careful: BoolArray
+
+    @property
+    def share(self) -> FloatArray:
+        """How much each column counts in aiming, shape (D + 1,)."""
+        return np.where(self.careful, 1.0, CARELESS_SHARE)
+
+
+def take_aim(environment: Environment, library: Library, settings: PoolSettings, progress: Progress) -> Aim:
+    """Find out by a pilot run of naturalistic paths where surrogates crash."""
     names = list(library.surrogates)
-    pilot = Enumerator(environment, library.drivers, names.index(library.envelope), settings.seed ^ _APART)
+    pilot = Enumerator(environment, library.drivers, names.index(library.envelope), settings.seed ^ POOL_SEED)
     progress.stage("pool: pilot", PILOT_PATHS)
     rates = pilot.run(0, PILOT_PATHS, progress).rates(len(names))
-    careful = _careful(rates, names.index(library.boundary))
-    share = np.where(careful, 1.0, CARELESS_SHARE)
-    aimed = pilot.aimed(rates, share)
-    paths = _until_known(aimed, rates, careful, settings, progress)
-    return _pool(paths, aimed, library, settings, key, environment_hash(environment))
+    aim = Aim(pilot, rates, _careful(rates, names.index(library.boundary)))
+    return Aim(pilot.aimed(rates, aim.share), rates, aim.careful)
+
+
+def careful_first(rates: FloatArray) -> IntArray:
+    """Surrogates from careful to careless by the rates (n, D + 1) of paths, as places in the library, shape (D,)."""
+    order: IntArray = np.argsort(rates[:, :-1].mean(0), kind="stable")
+    return order
 
 
 def _careful(rates: FloatArray, boundary: int) -> BoolArray:
@@ -81,27 +108,31 @@ def _paths_needed(pilot: FloatArray, wanted: FloatArray) -> int:
     return min(MOST_PATHS, -(-int(needed) // ROUND_PATHS) * ROUND_PATHS)
 
 
-def _pool(
-    paths: EnumeratedPaths, enumerator: Enumerator, library: Library, settings: PoolSettings, key: str, environment: str
+def pool_of(
+    paths: EnumeratedPaths,
+    enumerator: Enumerator,
+    order: IntArray,
+    library: Library,
+    settings: PoolSettings,
+    key: str,
+    environment: str,
 ) -> Pool:
-    """Order the surrogates, sort the cut-ins into shells and cells, and keep a sample of each shell."""
+    """Sort the cut-ins of paths into shells, by surrogates in this order, and cells; keep a sample of each shell."""
     n_surrogates, n_references = len(library.surrogates), len(library.references)
     rates, mass = paths.rates(n_surrogates), paths.mass
     n = len(rates)
-    order = np.argsort(rates[:, :n_surrogates].mean(0), kind="stable")
     ordered = rates[:, order]
     shell, references = shells_of(paths.crashes, order), paths.crashes >> n_surrogates
     kinds, by_path, cell = _cells(mass, (shell.astype(np.int64) << n_references) | references)
     cell_references = kinds & ((1 << n_references) - 1)
     by_reference = by_path @ ((cell_references[:, None] >> np.arange(n_references)) & 1)
     path, step = _keep(mass, shell, n_surrogates + 1, settings)
-    index, state = PILOT_PATHS + path, paths.state[path]
+    pairs = enumerator.pairs(paths.index[path], step, paths.state[path])
     asked = np.concatenate([order, n_surrogates + np.arange(n_references)])
     crashes = ((paths.crashes[path, step][:, None] >> asked[None, :]) & 1).astype(np.bool_)
     sample = CutIns(
-        index, step, cell[path, step], state, *enumerator.pairs(index, step, state), crashes,
-        by_path[path].astype(np.float32),
-    )  # fmt: skip
+        PILOT_PATHS + path, step, cell[path, step], paths.state[path], *pairs, crashes, by_path[path].astype(np.float32)
+    )
     return Pool(
         key=key,
         environment=environment,

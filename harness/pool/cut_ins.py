@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from harness.arrays import BoolArray, Float32Array, FloatArray, Int8Array, IntArray, RecordArray
+from harness.arrays import BoolArray, Float32Array, FloatArray, Int8Array, IntArray, RecordArray, UInt64Array
 from harness.environment.driving import Environment
+from harness.pool.aimed_paths import PILOT_PATHS
 from harness.pool.library import Library
 
 FAR_OFF = 10.0
@@ -27,7 +28,8 @@ class CutIns:
     step, and cell; ``state`` (n,): initial states. ``lv``, ``bv`` (n, draws): maneuver indices as an episode records
     them, 31 marking the cut-in; ``n_lv``, ``n_bv`` (n,): how many of them are used. ``crashes`` (n, D + R): which
     surrogates crash, in the pool's order, and which references. ``path_mass`` (n, C) float32: the path's probability of
-    a cut-in of each cell.
+    a cut-in of each cell. ``motion`` (n,) are hashes of what the AV did through the step of the cut-in,
+    in the pool of a vehicle that acts before it; else empty.
     """
 
     path: IntArray
@@ -40,6 +42,13 @@ class CutIns:
     n_bv: IntArray
     crashes: BoolArray
     path_mass: Float32Array
+    motion: UInt64Array = field(default_factory=lambda: np.zeros(0, np.uint64))
+
+    @property
+    def row(self) -> IntArray:
+        """Which row of the pool's paths each is of, shape (n,): in the pool of a vehicle its shadow run."""
+        rows: IntArray = self.path - PILOT_PATHS
+        return rows
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +73,8 @@ class Pool:
         Probability of each cell.
     reference_rate, reference_square : ndarray, shape (R,)
         Crash rates of the references, and mean squares of a path's probability that they crash.
+    p_unknown : float
+        Probability of cut-ins about which nothing is known, at most: of shadow runs that failed.
     """
 
     key: str
@@ -81,6 +92,7 @@ class Pool:
     reference_rate: FloatArray
     reference_square: FloatArray
     cut_ins: CutIns
+    p_unknown: float = 0.0
 
     @cached_property
     def shell_p(self) -> FloatArray:

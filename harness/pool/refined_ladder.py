@@ -114,7 +114,7 @@ def refine_ladder(folder: Path, out: Path) -> RefinedLadder:
     """
     _require_new(out)
     campaign = load_campaign(folder / "campaign.yaml")
-    if campaign.av.before_cut_in == "controller":
+    if campaign.av.acts_before_cut_in:
         raise CampaignError(
             "av.before_cut_in",
             found="controller",

@@ -18,7 +18,7 @@ from harness.campaign.testing import ShellSettings, StatementSettings
 from harness.episode.cells import PrescribedCutIns, PrescribedTraffic
 from harness.pool.cut_ins import Pool
 from harness.pool.library import Library, LibraryDriver
-from harness.strata import OUTSIDE, Reference, ShellDesign, Statement
+from harness.strata import FAILED_SHADOWS, OUTSIDE, Reference, ShellDesign, Statement
 from harness.vehicles.models import driver_records
 
 _REFERENCES = {
@@ -69,7 +69,7 @@ def design_shells(pool: Pool, *, shells: ShellSettings | None = None, limit_mps2
     first = np.unique(cells, return_index=True)[1][-(cells.max() + 1) :]
     n_inside = statements[-1].n_inside
     p = np.asarray(np.bincount(cells[cells >= 0], pool.cell_p[cells >= 0]), np.float64)
-    return ShellDesign(
+    design = ShellDesign(
         pool=pool.key,
         strata=(*(pool.names[group[0]] for group in groups[:n_inside]), *([OUTSIDE] * (len(groups) - n_inside))),
         cell_stratum=tuple(_stratum_of_shell(pool, groups)[pool.cell_shell[first]].tolist()),
@@ -82,6 +82,19 @@ def design_shells(pool: Pool, *, shells: ShellSettings | None = None, limit_mps2
         statements=statements,
         p_cut_in=pool.p_cut_in,
         p_impossible=pool.p_cut_in - float(p.sum()),
+        shadow_runs=pool.cut_ins.motion.size > 0,
+    )
+    return design if pool.p_unknown == 0.0 else _with_failed_shadows(design, pool.p_unknown)
+
+
+def _with_failed_shadows(design: ShellDesign, p: float) -> ShellDesign:
+    """One more stratum, of probability ``p`` at most: as it has no test, it may crash as often as it happens."""
+    return replace(
+        design,
+        strata=(*design.strata, FAILED_SHADOWS),
+        cell_stratum=(*design.cell_stratum, len(design.strata)),
+        cell_p=np.append(design.cell_p, p),
+        cell_references=(*design.cell_references, 0),
     )
 
 
@@ -162,6 +175,7 @@ class PrescribedEpisodes:
         self._cut_ins = pool.cut_ins
         self._cells = cells_in_strata(pool, groups)
         self._order = [_order(pool, group, campaign.seed, stratum) for stratum, group in enumerate(groups)]
+        self._order += [np.zeros(0, np.int64)] * (len(design.strata) - len(groups))
         self.design = replace(design, available=tuple(order.size for order in self._order))
 
     @property
@@ -192,12 +206,15 @@ class PrescribedEpisodes:
     def of_rows(self, rows: IntArray, stratum: IntArray) -> tuple[RecordArray, PrescribedTraffic]:
         """Initial states (n,) and traffic of given cut-ins of the pool (n,), tested for given strata (n,)."""
         c = self._cut_ins
+        acts = c.motion.size > 0
         traffic = PrescribedTraffic(
             lv=np.ascontiguousarray(c.lv[rows]),
             bv=np.ascontiguousarray(c.bv[rows]),
             cut_step=c.step[rows],
             stratum=stratum.astype(np.int64),
             log_weight=np.log(self.design.p[stratum]),
+            told=c.row[rows] if acts else np.zeros(0, np.int64),
+            motion=c.motion[rows] if acts else c.motion,
         )
         return c.state[rows], traffic
 

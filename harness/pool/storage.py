@@ -42,7 +42,7 @@ def pool_key(environment: Environment, library: Library, settings: PoolSettings)
         {name: model.model_dump() for name, model in library.surrogates.items()},
         [(name, model.model_dump()) for name, model in library.references.items()],
         [sorted(library.boundaries), library.boundary, library.envelope],
-        settings.model_dump(exclude={"library"}),
+        settings.model_dump(exclude={"library", "shadow_paths"}),
     ]
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:24]
 

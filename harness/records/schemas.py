@@ -1,7 +1,8 @@
-"""Arrow schemas of the three tables that a run leaves, with units in the field metadata.
+"""Arrow schemas of the tables that a run leaves, with units in the field metadata.
 
 ``episodes``: one row per episode, failed ones included. ``moments``: one row per control step. ``traces``: one row
-per step and vehicle. Importance functions are in the order of `importance_names`: for the episode mixture the
+per step and vehicle. ``shadow``: one row per path that a vehicle which acts before the cut-in was driven along without
+one. Importance functions are in the order of `importance_names`: for the episode mixture the
 defensive ``forced`` cut-in first, then the surrogates; for the others the surrogates alone.
 """
 
@@ -25,6 +26,7 @@ __all__ = [
     "VEHICLES",
     "episodes_schema",
     "moments_schema",
+    "shadow_schema",
     "traces_schema",
 ]
 
@@ -132,5 +134,25 @@ def traces_schema() -> pa.Schema:
             _field("x_m", f8, "m", "position of the front bumper along the road"),
             _field("v_mps", f8, "m/s", "speed"),
             _field("a_mps2", f8, "m/s2", "acceleration commanded for the next step", nullable=True),
+        ]
+    )
+
+
+def shadow_schema() -> pa.Schema:
+    """Schema of the ``shadow`` table: one row per shadow run."""
+    f8 = pa.float64()
+    return pa.schema(
+        [
+            _field("shadow", pa.int64(), "1", "index of the run; tests on its path tell it to the vehicle"),
+            _field("path", pa.int64(), "1", "number of the path among those of the pool; may occur more than once"),
+            _field("weight", f8, "1", "naturalistic density of the path over that of the draw"),
+            *_state_fields("initial "),
+            _field("outcome", _outcome_type(), "", "passed, timeout, bv_lv_contact or failed"),
+            _field("n_steps", pa.int16(), "0.1 s", "steps simulated until the run ended"),
+            _field("lv_maneuvers", pa.list_(pa.int8()), "1", "LV's draws, in order"),
+            _field("bv_maneuvers", pa.list_(pa.int8()), "1", "BV's draws, in order"),
+            _field("av_position_m", pa.list_(f8), "m", "front bumper of the AV, initially and after each step"),
+            _field("av_speed_mps", pa.list_(f8), "m/s", "speed of the AV, initially and after each step"),
+            _field("failure", pa.string(), "", "cause, for failed runs", nullable=True),
         ]
     )

@@ -65,6 +65,13 @@ class Repeated(Stored):
     differing: list[Count]
 
 
+class StoredShadows(Stored):
+    """Shadow runs of a vehicle that acts before the cut-in."""
+
+    n_runs: Count
+    n_failed: Count
+
+
 class StoredManifest(Stored):
     """The manifest of a run."""
 
@@ -87,6 +94,7 @@ class StoredManifest(Stored):
     ending: str | None = None
     retraced: Retraced | None = None
     repeated: Repeated | None = None
+    shadow_runs: StoredShadows | None = None
     reported_from: Count | None = None
     table_errors: list[TableError] | None = None
 
@@ -128,6 +136,7 @@ class StoredShells(Stored):
     p_cut_in: float
     p_impossible: float
     available: list[Count]
+    shadow_runs: bool = False
 
     @model_validator(mode="after")
     def _of_one_size(self) -> Self:

@@ -7,10 +7,10 @@ from typing import NamedTuple
 import numpy as np
 import pyarrow as pa
 
-from harness.arrays import FloatArray, Int8Array
+from harness.arrays import FloatArray, Int8Array, IntArray
 from harness.episode.loop import Shard
-from harness.outcomes import OUTCOMES, VEHICLES
-from harness.records.schemas import episodes_schema, moments_schema, traces_schema
+from harness.outcomes import AV, OUTCOMES, VEHICLES
+from harness.records.schemas import episodes_schema, moments_schema, shadow_schema, traces_schema
 from harness.state import STATE_COLUMNS
 
 
@@ -134,3 +134,23 @@ def _trace_columns(shard: Shard, row: int) -> dict[str, np.ndarray]:
         "v_mps": flat[:, 1],
         "a_mps2": flat[:, 2],
     }
+
+
+def shadow_table(shard: Shard, path: IntArray, weight: FloatArray) -> pa.Table:
+    """One row per shadow run of a shard that has kept all motion; ``path``, ``weight`` (n,) as in the schema."""
+    e, n = shard.results.episode, shard.results.episode.size
+    columns = {
+        "shadow": pa.array(shard.first_episode + np.arange(n)),
+        "path": pa.array(path),
+        "weight": pa.array(weight),
+        **{name: pa.array(np.ascontiguousarray(shard.states[name])) for name in STATE_COLUMNS},
+        "outcome": _names(e["outcome"], OUTCOMES),
+        "n_steps": pa.array(e["n_steps"]),
+        "lv_maneuvers": _prefixes(shard.results.lv_path, e["n_lv"].astype(np.int64)),
+        "bv_maneuvers": _prefixes(shard.results.bv_path, e["n_bv"].astype(np.int64)),
+        "av_position_m": pa.array([shard.traces[row][:, AV, 0] for row in range(n)], pa.list_(pa.float64())),
+        "av_speed_mps": pa.array([shard.traces[row][:, AV, 1] for row in range(n)], pa.list_(pa.float64())),
+        "failure": pa.array([shard.failures.get(row) for row in range(n)], pa.string()),
+    }
+    schema = shadow_schema()
+    return pa.table([columns[name] for name in schema.names], schema=schema)

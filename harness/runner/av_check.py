@@ -144,7 +144,7 @@ def check_av(campaign: Campaign, n_episodes: int = EPISODES, *, black_box: Path 
         failures=dict(Counter(first.failures.values())),
         differing=tuple(i for i in range(n_episodes) if bits_of(first, i) != again[i]),
         limits_mps2=limits,
-        behaviour=_behaviour(first, limits, early=tested.av.before_cut_in == "controller"),
+        behaviour=_behaviour(first, limits, early=tested.av.acts_before_cut_in),
         speed=Speed(1e6 * elapsed_s / steps, n_episodes / elapsed_s, 1e6 * idm_s / idm_steps, n_episodes / idm_s),
     )
 

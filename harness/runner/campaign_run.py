@@ -5,11 +5,12 @@ from __future__ import annotations
 import os
 import threading
 import time
-from contextlib import suppress
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -19,17 +20,36 @@ import pyarrow.parquet as pq
 from harness.campaign.models import Campaign
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE
 from harness.methods import SAMPLING
+from harness.pool.shadow_paths import ShadowPaths
+from harness.pool.shells import PrescribedEpisodes
+from harness.pool.vehicle_pool import ShadowRuns
 from harness.progress import Progress, SilentProgress
-from harness.records.folder import SHELLS, TABLES, shard_files, shards_on_disk, sole_use, write_json, write_shard
+from harness.records.folder import (
+    SHELLS,
+    TABLES,
+    shard_files,
+    shards_on_disk,
+    sole_use,
+    write_bytes,
+    write_json,
+    write_shard,
+)
 from harness.resolved import Resolved
 from harness.runner.manifest import SMALLEST_FAILED_SAMPLE, Manifest, Prefix, require_no_fewer, require_own_folder
-from harness.runner.planner import planner_of
-from harness.runner.prepare import distance_per_test_m, prepare, require_ready, require_same_pool
+from harness.runner.planner import Planner, planner_of
+from harness.runner.prepare import Prepared, distance_per_test_m, prepare, require_ready, require_same_pool
 from harness.runner.retrace import Retracing
+from harness.runner.shadow_runs import (
+    as_recorded,
+    require_few_failed,
+    shadow_file,
+    shadow_specs,
+    stored_shadows,
+)
 from harness.runner.shards import ShardPool, stored_shard
 from harness.runner.stored_estimates import estimate_run
 from harness.runner.table_accuracy import table_errors
-from harness.runner.worker import ShardDone
+from harness.runner.worker import ShardDone, ShardSpec
 from harness.stopped_by import StoppedBy, ending
 
 
@@ -96,16 +116,26 @@ def run_campaign(
         earlier = require_own_folder(out, resolved, resume=resume)
         if not shorten:
             require_no_fewer(out, earlier, resolved.campaign.stop.episodes)
-        run = _Run(resolved, out, earlier, workers or os.cpu_count() or 1, progress or SilentProgress(), began)
-        run.run_shards()
+        run = Run(resolved, out, earlier, workers or os.cpu_count() or 1, progress or SilentProgress(), began)
+        run.run_all()
         if not shorten:
             require_no_fewer(out, earlier, run.prefix.n_episodes)
             run.discard_uncounted()
         return run.finish()
 
 
-class _Run:
-    """A campaign on its way into a folder, in which nobody but this process writes."""
+class Run:
+    """A campaign on its way into a folder, in which nobody but this process writes.
+
+    Attributes
+    ----------
+    prefix : Prefix
+        What is finished.
+    prescribed : PrescribedEpisodes or None
+        Cut-ins to draw from, where they are prescribed.
+    planner : Planner
+        The campaign's own; another may take its place before the first round.
+    """
 
     def __init__(
         self, resolved: Resolved, out: Path, earlier: dict[str, Any], workers: int, progress: Progress, began: float
@@ -123,30 +153,68 @@ class _Run:
             distance_per_test_m=distance_per_test_m(resolved.environment),
             table_errors=table_errors(resolved, prepared.tables),
         )
-        if prepared.prescribed is not None:
-            require_same_pool(out, prepared)
-            write_json(out / SHELLS, prepared.prescribed.design.to_json())
+        self._held = earlier["n_episodes"]
         self._retracing = Retracing(resolved)
-        self._stored = partial(stored_shard, out, prepared, self._retracing)
-        self._planner = planner_of(self._campaign, prepared.prescribed, held=earlier["n_episodes"])
-        self._workers = ShardPool(resolved, workers)
+        self.prescribed: PrescribedEpisodes | None = None
+        self._prepared = prepared
+        if prepared.shadow_paths is None:
+            self._plan(prepared)
+        self._workers = ShardPool(resolved, out, workers)
         self.prefix = Prefix()
 
-    def run_shards(self) -> None:
-        """Run shards until the stop rule is content; the manifest follows so that an interrupted run can be read."""
-        self._progress.stage("episodes", self._campaign.stop.episodes, done=episodes_on_disk(self._out))
+    def run_all(self) -> None:
+        """Run shadow runs, if there are any to make, and then rounds of shards until the stop rule is content."""
+        with self.under_way():
+            if (paths := self._prepared.shadow_paths) is not None:
+                self._plan(self._prepared.after(self._run_shadows(paths)))
+            self._progress.stage("episodes", self._campaign.stop.episodes, done=episodes_on_disk(self._out))
+            for specs in self.planner.rounds():
+                if self.run_round(specs):
+                    break
+
+    def run_round(self, specs: Iterator[ShardSpec]) -> bool:
+        """Run the shards of a round; True, at once, when the campaign is to stop."""
+        return any(self._is_enough(done) for done in self._workers.run(specs, self._stored))
+
+    @contextmanager
+    def under_way(self) -> Iterator[None]:
+        """Rounds are run within this: the manifest follows, so that an interrupted run can be read, and workers end."""
         threading.Thread(target=import_module, args=("harness.report",), daemon=True).start()
         try:
-            rounds = (self._workers.run(specs, self._stored) for specs in self._planner.rounds())
-            for done in chain.from_iterable(rounds):
-                if self._is_enough(done):
-                    break
+            yield
             self.prefix.require_few_failed(self._campaign)
         except BaseException:
             self._manifest.write(self.prefix, "interrupted")
             raise
         finally:
             self._workers.close()
+
+    def _plan(self, prepared: Prepared) -> None:
+        """Begin to test what has been prepared."""
+        if prepared.prescribed is not None:
+            require_same_pool(self._out, prepared)
+            write_json(self._out / SHELLS, prepared.prescribed.design.to_json())
+        self._stored = partial(stored_shard, self._out, prepared, self._retracing)
+        self.prescribed = prepared.prescribed
+        self.planner: Planner = planner_of(self._campaign, prepared.prescribed, held=self._held)
+
+    def _run_shadows(self, paths: ShadowPaths) -> ShadowRuns:
+        """Drive the vehicle along all paths without a cut-in, but for what an earlier run has done of it."""
+        environment, n = self._resolved.environment, len(paths)
+        self._progress.stage("shadow runs", n)
+        tables, causes = [], Counter[str]()
+        for done in self._workers.run(shadow_specs(n), partial(stored_shadows, self._out, paths)):
+            if done.parquet:
+                write_bytes(shadow_file(self._out, done.spec), done.parquet)
+            tables.append(done.table)
+            causes += done.failures
+            self._progress.advance(done.spec.n_episodes)
+            self._manifest.note(shadow_runs={"n_runs": sum(map(len, tables)), "n_failed": causes.total()})
+            self._manifest.follow(self.prefix)
+        require_few_failed(causes, n, self._campaign.run.max_failed_share)
+        runs = as_recorded(tables, environment)
+        self._manifest.note(distance_per_test_m=runs.mean_distance_m(paths.weight))
+        return runs
 
     def _is_enough(self, done: ShardDone) -> bool:
         """Take the next shard; True when the campaign is to stop."""
@@ -155,8 +223,8 @@ class _Run:
             write_shard(self._out, done.spec.index, done.parquet)
         self.prefix.add(done, shard_files(self._out, done.spec.index))
         self.prefix.require_few_failed(self._campaign, at_least=SMALLEST_FAILED_SAMPLE)
-        enough = self._planner.add(done.block)
-        self.prefix.reported_from = self._planner.reported_from
+        enough = self.planner.add(done.block)
+        self.prefix.reported_from = self.planner.reported_from
         self._progress.advance(done.spec.n_episodes if done.parquet else 0)
         self._progress.status(**self._figures())
         self._manifest.follow(self.prefix)
@@ -168,9 +236,9 @@ class _Run:
         Only what a rule asks for is called ``rhw``: a bar reckons from it when the campaign will stop.
         """
         watched = "half_width" if self._campaign.stop.rhw is None else "rhw"
-        figures: dict[str, int | float] = {"crashes": self.prefix.n_crashes, watched: self._planner.rule.rhw}
+        figures: dict[str, int | float] = {"crashes": self.prefix.n_crashes, watched: self.planner.rule.rhw}
         weighted = SAMPLING[self._campaign.testing.method].forces
-        return figures | ({"heaviest": self._planner.rule.heaviest} if weighted else {})
+        return figures | ({"heaviest": self.planner.rule.heaviest} if weighted else {})
 
     def discard_uncounted(self) -> None:
         """Remove shards that an earlier, longer run has left beyond the stop."""
@@ -180,9 +248,11 @@ class _Run:
 
     def finish(self) -> RunResult:
         """Write manifest, estimates and report."""
-        stop, rule, n = self._campaign.stop, self._planner.rule, self.prefix.n_episodes
+        stop, rule, n = self._campaign.stop, self.planner.rule, self.prefix.n_episodes
         stopped_by = self._stopped_by()
         said = ending(stopped_by, n, rule.waited_for, precision_asked=stop.rhw is not None)
+        if stopped_by == "rhw" and self.planner.remark:
+            said += f" {self.planner.remark}"
         retraced = self._retracing.summary(self.prefix.n_retraced)
         self._manifest.write(self.prefix, "done", stopped_by=stopped_by, ending=said, retraced=retraced)
         self._progress.stage("estimates and report", None)
@@ -196,7 +266,7 @@ class _Run:
         return RunResult(self._out, report, estimates, stopped_by, said, EXIT_BUDGET_SPENT if missed else EXIT_DONE)
 
     def _stopped_by(self) -> StoppedBy:
-        rule = self._planner.rule
+        rule = self.planner.rule
         if self.prefix.reported_from and self.prefix.n_episodes < self._campaign.stop.episodes:
             return "two_phase"
         if rule.reached:

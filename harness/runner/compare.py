@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import shutil
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Literal
 
 from harness.campaign.models import Campaign
@@ -12,13 +14,15 @@ from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, CampaignError, RunFolde
 from harness.estimators.block import Block
 from harness.estimators.difference import Difference, difference_statement, paired_difference
 from harness.estimators.from_records import EPISODE_COLUMNS, block_from_tables
+from harness.estimators.paired_shells import PairedEstimate
 from harness.importance.build import mixture_weights
 from harness.progress import Progress
-from harness.records.folder import MANIFEST, read_json, read_manifest, require_schema, write_json
+from harness.records.folder import MANIFEST, read_json, read_manifest, require_place, require_schema, write_json
 from harness.records.reader import read_shards
 from harness.records.stored_manifest import StoredStops
 from harness.resolved import Resolved
 from harness.runner.campaign_run import RunResult, run_campaign
+from harness.runner.compare_shells import PAIRING, compare_shells, exit_code, shells_content
 from harness.runner.manifest import require_own_folder
 from harness.runner.prepare import require_ready
 from harness.state import STATE_COLUMNS
@@ -37,15 +41,17 @@ class Comparison:
     ----------
     folder : Path
         Holds the run folders ``a`` and ``b``, and ``compare.json``.
-    difference : Difference
+    difference : Difference or PairedEstimate
+        The latter under shells.
     content : dict
         Content of ``compare.json``.
     exit_code : int
-        0, or 4 when either campaign spent its budget before the asked precision.
+        0; 4 when the budget was spent before the asked precision, or with the margin open; 5 when B is worse than A by
+        more than the margin.
     """
 
     folder: Path
-    difference: Difference
+    difference: Difference | PairedEstimate
     content: dict[str, Any]
     exit_code: int
 
@@ -58,11 +64,14 @@ def compare_campaigns(
     workers: int | None = None,
     progress: Progress | None = None,
     labels: tuple[str, str] | None = None,
+    stored: Path | None = None,
+    margin: float | None = None,
 ) -> Comparison:
     """Run two campaigns that differ in the AV over the same episodes, and estimate the difference.
 
-    Each runs to its own stop rule; then the shorter one is continued to the length of the longer. What an earlier call
-    has finished in ``out`` is used again.
+    Each runs to its own stop rule; then the shorter one is continued to the length of the longer. Under shells there is
+    one rule, of the difference (`harness.runner.compare_shells`). What an earlier call has finished in ``out`` is used
+    again.
 
     Parameters
     ----------
@@ -74,6 +83,10 @@ def compare_campaigns(
         See `harness.runner.run_campaign`.
     labels : (str, str), optional
         Names for the answer; the campaigns' own by default.
+    stored : Path, optional
+        Run folder of A, whose tests are not driven again; it is copied to ``out/a``.
+    margin : float, optional
+        Under shells, decide whether B's rate is at most 1 + margin times A's.
 
     Raises
     ------
@@ -83,9 +96,29 @@ def compare_campaigns(
         ``out`` holds other runs.
     """
     require_comparable(a, b)
+    if margin is not None and a.testing.method != "shells":
+        mend = "Write --set testing.method=shells, or read the ratio's interval."
+        raise CampaignError("--margin", found=f"method {a.testing.method}", expected="shells", mend=mend)
     sides: dict[Side, Resolved] = {"a": require_ready(a), "b": require_ready(b)}
+    if stored is not None:
+        _take_over(stored, out / "a", sides["a"])
     for side, of_side in sides.items():  # both, before either is touched
         require_own_folder(out / side, of_side, resume=True)
+    names = labels or (a.name, b.name)
+    if a.testing.method == "shells":
+        both, folders = (sides["a"], sides["b"]), (out / "a", out / "b")
+        pairs, rule = compare_shells(both, folders, margin=margin, workers=workers, progress=progress)
+        content = _content(sides, names, shells_content(pairs, rule, margin, names))
+        write_json(out / "compare.json", content)
+        return Comparison(out, pairs, content, exit_code(rule, precision_asked=a.stop.rhw is not None))
+    return _compare_weighted(sides, out, names, workers=workers, progress=progress)
+
+
+def _compare_weighted(
+    sides: dict[Side, Resolved], out: Path, names: tuple[str, str], *, workers: int | None, progress: Progress | None
+) -> Comparison:
+    """Each to its own stop rule, then both to the same length."""
+    a, b = (sides[side].campaign for side in SIDES)
     stops = _Stops(out, sides)
 
     def run(side: Side, of_side: Resolved) -> RunResult:
@@ -100,7 +133,9 @@ def compare_campaigns(
         if not _is_done(out / side, n):
             run(side, _exactly(of_side, n))
     found = paired_difference(_pairs(a, b, out), a.stop.confidence)
-    content = _content(sides, stops, found, labels or (a.name, b.name))
+    own = {side: {"own_stop": stops.of(side)} for side in SIDES}
+    answer = {**found.to_json(), "statement": difference_statement(found, *names)}
+    content = _content(sides, names, answer, own)
     write_json(out / "compare.json", content)
     missed = a.stop.rhw is not None and any(stops.of(side)["stopped_by"] != "rhw" for side in SIDES)
     return Comparison(out, found, content, EXIT_BUDGET_SPENT if missed else EXIT_DONE)
@@ -114,13 +149,6 @@ def require_comparable(a: Campaign, b: Campaign) -> None:
     CampaignError
         Names every key that differs, with both values.
     """
-    if a.testing.method == "shells":
-        raise CampaignError(
-            "testing.method",
-            found="shells, which test each AV where its own crashes are",
-            expected="a method under which both AVs meet the same cut-ins",
-            mend="Write --set testing.method=forced: the same cut-ins for both, and no assumption about either.",
-        )
     keys = set(MAY_DIFFER)
     apart = list(_differing("", a.model_dump(exclude=keys), b.model_dump(exclude=keys)))
     if not apart:
@@ -205,11 +233,14 @@ def _pairs(a: Campaign, b: Campaign, out: Path) -> Iterator[tuple[Block, Block]]
 
 
 def _content(
-    of_sides: dict[Side, Resolved], stops: _Stops, found: Difference, labels: tuple[str, str]
+    of_sides: dict[Side, Resolved],
+    labels: tuple[str, str],
+    answer: dict[str, Any],
+    facts: Mapping[Side, dict[str, Any]] | None = None,
 ) -> dict[str, Any]:
     campaign = of_sides["a"].campaign
     sides = {
-        side: {"label": label, "campaign_hash": of_sides[side].content_hash, "own_stop": stops.of(side)}
+        side: {"label": label, "campaign_hash": of_sides[side].content_hash, **(facts or {}).get(side, {})}
         for side, label in zip(SIDES, labels, strict=True)
     }
     return {
@@ -218,12 +249,40 @@ def _content(
         "seed": campaign.seed,
         "pairing": _pairing(campaign),
         "campaigns": sides,
-        **found.to_json(),
-        "statement": difference_statement(found, *labels),
+        **answer,
     }
 
 
+def _take_over(stored: Path, folder: Path, resolved: Resolved) -> None:
+    """Copy a stored run to where A is to be run, unless an earlier call has done so.
+
+    Raises
+    ------
+    RunFolderError
+        It is no run of this campaign.
+    """
+    if folder.exists() and any(folder.iterdir()):
+        return
+    manifest = read_manifest(stored)
+    if manifest["campaign_hash"] != resolved.content_hash:
+        raise RunFolderError(
+            str(stored),
+            found=f"a run of campaign {manifest['campaign_hash']}",
+            expected=f"one of A as it is to be compared ({resolved.content_hash})",
+            mend="Leave out --set and --av where they change more than the stop rule, or name A's campaign file.",
+        )
+    require_place(folder.parent)
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with TemporaryDirectory(dir=folder.parent, prefix=".", suffix=".part") as unfinished:
+        copy = shutil.copytree(stored, Path(unfinished) / "a")
+        if folder.exists():
+            folder.rmdir()
+        copy.replace(folder)
+
+
 def _pairing(campaign: Campaign) -> str:
+    if campaign.testing.method == "shells":
+        return PAIRING
     shared = "episode i of A is paired with episode i of B: same initial state and same random streams"
     if campaign.testing.method == "forced":
         return f"{shared}; under forced also the same paths, cut-ins and weights"

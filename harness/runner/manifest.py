@@ -188,6 +188,10 @@ class Manifest:
         self._earlier = {**self._earlier, **cut, "n_episodes": n_kept, "shards": kept}
         write_json(self._folder / MANIFEST, self._earlier)
 
+    def note(self, **facts: Any) -> None:
+        """More keys, from the next time on that it is written."""
+        self._content.update(facts)
+
     def follow(self, prefix: Prefix) -> None:
         """Write it every few seconds, so that a run which goes on can be read."""
         if time.monotonic() - self._written > INTERVAL_S:

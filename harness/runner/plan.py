@@ -18,6 +18,7 @@ from harness.controllers.loading import build_host
 from harness.controllers.protocol import BatchObservation
 from harness.criticality.tables import tables_cached
 from harness.importance.build import needs_tables
+from harness.pool.shadow_paths import shadow_paths_file
 from harness.pool.storage import cached_pool
 from harness.resolved import Resolved
 from harness.runner.prepare import build_world, require_ready
@@ -92,6 +93,9 @@ def _rounded(value: float) -> float:
 
 def _tables(resolved: Resolved) -> str:
     campaign = resolved.campaign
+    if campaign.testing.method == "shells" and campaign.has_shadow_runs:
+        known = "cached" if shadow_paths_file(resolved).is_file() else f"to choose ({POOL_S} on two cores)"
+        return f"paths of {campaign.pool.shadow_paths:,} shadow runs: {known}"
     if campaign.testing.method == "shells":
         return "pool of cut-ins: " + ("cached" if cached_pool(resolved) else f"to build ({POOL_S} on two cores)")
     if not needs_tables(campaign):
@@ -139,7 +143,7 @@ def _of_host(host: ControllerHost, campaign: Campaign) -> float:
     seen = [_observation(cells, k) for k in range(STEPS_ACTED)]
 
     def begin(episodes: IntArray) -> None:
-        _require_success(host.start(cells, episodes))
+        _require_success(host.start(cells, episodes, episodes))
 
     def step(k: int) -> None:
         _require_success(host.act(seen[k])[1])

@@ -10,9 +10,11 @@ stated about them is roughly known, some ten tests; then those inside the next o
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
+from typing import Protocol
 
 import numpy as np
 
@@ -47,6 +49,12 @@ USED_UP_SHARE = 0.95
 """Share of the squared widths that must lie in exhausted strata for the allocation to end."""
 MOST_SHARDS_PER_ROUND = 16
 SMALLEST_SHARD = 64
+WIDEST_RHW = 0.5
+"""Precision from which on stopping at the first interval biases the rate noticeably."""
+TOO_WIDE = (
+    f"A relative half-width above {WIDEST_RHW:g} is reached by chance: stopping at the first such interval makes rates "
+    "too high on the mean. Ask for a smaller stop.rhw, or for testing.shells.stopping: two_phase."
+)
 FIRST_PHASE = 1.7
 """Precision of the first of two phases over that of the second (measured: docs/estimators.md)."""
 POOL_SHARE = 0.5
@@ -59,7 +67,7 @@ class FixedPlanner:
     def __init__(self, campaign: Campaign) -> None:
         self._campaign = campaign
         stop, method, size = campaign.stop, campaign.testing.method, campaign.run.shard_size
-        self.reported_from = 0
+        self.reported_from, self.remark = 0, ""
         self.rule = StopRule(stop, method, size, min_crashes=campaign.min_crashes)
         self._sums = accumulator(self.rule.estimator)
         self._n_episodes = 0
@@ -86,13 +94,15 @@ class ShellPlanner:
     number does not depend on their results.
 
     ``available``, shape (S,), are the most tests of each stratum, ``held`` see `RoundRule`; ``estimate`` is that at the
-    end of the last round.
+    end of the last round, ``reported_from`` the first test of the second phase, ``remark`` what to say of stopping.
     """
 
     def __init__(self, campaign: Campaign, design: ShellDesign, available: IntArray, held: int = 0) -> None:
         shells = campaign.testing.shells
         self._plans = shells.stopping == "two_phase" and campaign.stop.rhw is not None
         self.rule = RoundRule(campaign, held, FIRST_PHASE if self._plans else 1.0)
+        wide = campaign.stop.rhw is not None and campaign.stop.rhw > WIDEST_RHW and not self._plans
+        self.remark = TOO_WIDE if wide else ""
         self.estimate: Estimate | None = None
         self.reported_from = 0
         self._campaign = campaign
@@ -149,7 +159,41 @@ class ShellPlanner:
         return False
 
 
-Planner = FixedPlanner | ShellPlanner
+class Rule(Protocol):
+    """What a run says about why it ended; see `StopRule` and `RoundRule`."""
+
+    reached: bool
+    pool_error_above_target: bool
+    rhw: float
+    heaviest: float
+    waited_for: tuple[str, ...]
+
+
+class Planner(Protocol):
+    """Says what is tested next, in rounds."""
+
+    @property
+    def rule(self) -> Rule:
+        """Why it stops."""
+        ...
+
+    @property
+    def reported_from(self) -> int:
+        """First test of those that the answer is from; 0 where all are."""
+        ...
+
+    @property
+    def remark(self) -> str:
+        """What the ending is to say besides; mostly nothing."""
+        ...
+
+    def rounds(self) -> Iterator[Iterator[ShardSpec]]:
+        """Shards of each round; the next round is asked for when all of the last one have been added."""
+        ...
+
+    def add(self, block: Block) -> bool:
+        """Add the tests of the next shard; True when the campaign is to stop."""
+        ...
 
 
 def planner_of(campaign: Campaign, prescribed: PrescribedEpisodes | None, held: int) -> Planner:
@@ -192,20 +236,37 @@ class Allocation:
         inside = {each.name: each.n_inside for each in self.design.statements}
         return inside.get(self.statement, self.design.p.size)
 
-    def next_round(self, tally: Tally, budget: int) -> IntArray:
+    def next_round(
+        self,
+        tally: Tally,
+        budget: int,
+        *,
+        inner_rhw: Callable[[int], float] | None = None,
+        spread: Callable[[int, IntArray], IntArray] | None = None,
+    ) -> IntArray:
         """Tests to add per stratum, at most ``budget``; all 0 when no stratum or no budget is left.
 
         Failed tests widen the limits that are to be narrowed: they may have been crashes.
+
+        Parameters
+        ----------
+        tally : Tally
+        budget : int
+        inner_rhw : callable, optional
+            Gives the relative half-width within the first so many strata; by default that of a crash rate.
+        spread : callable, optional
+            Gives so many tests to strata with so much room (S,) each; by default to where a crash rate is narrowed.
         """
         tests = tally.tests
         if self._used_up(tally):
             return np.zeros_like(tests)
-        begun = self._begun(tally)
+        begun = self._begun(tests, inner_rhw or partial(self._inner_rhw, tally))
         active = begun & (tests < self.available)
         wanted = np.where(active, np.maximum(self.first_tests - tests, 0), 0)
         if not wanted.any() and active.any():
             size = max(SMALLEST_ROUND, int(np.ceil(tests[begun].sum() * (GROWTH - 1.0))))
-            wanted = self._spread(min(size, budget), tally, active)
+            room = np.where(active, self.available - tests, 0)
+            wanted = self._spread(min(size, budget), tally, room) if spread is None else spread(min(size, budget), room)
         return _cut(np.minimum(wanted, self.available - tests), budget)
 
     def second_phase(self, first: Tally, available: IntArray, budget: int, rhw: float) -> IntArray:
@@ -238,24 +299,26 @@ class Allocation:
         squares = np.where(relevant, (self.design.p * (high - low)) ** 2, 0.0)
         return bool(squares[tests >= self.available].sum() >= USED_UP_SHARE * squares.sum())
 
-    def _begun(self, tally: Tally) -> BoolArray:
+    def _begun(self, tests: IntArray, inner_rhw: Callable[[int], float]) -> BoolArray:
         """Strata that it is time to test: those inside the narrowest boundary that leaves much open."""
         boundaries = (each.n_inside for each in self.design.statements if each.n_inside < self.n_asked)
-        n = next((n for n in boundaries if not self._enough_inside(n, tally)), self.n_asked)
-        begun: BoolArray = np.arange(tally.tests.size) < n
+        n = next((n for n in boundaries if not self._enough_inside(n, tests, inner_rhw)), self.n_asked)
+        begun: BoolArray = np.arange(tests.size) < n
         return begun
 
-    def _enough_inside(self, n: int, tally: Tally) -> bool:
+    def _enough_inside(self, n: int, tests: IntArray, inner_rhw: Callable[[int], float]) -> bool:
         """Whether it is time to test more than the first ``n`` strata."""
-        tests, s = tally.tests, slice(0, n)
-        if np.any(tests[n:] > 0) or np.all(tests[s] >= self.available[s]):
-            return True
+        exhausted = bool(np.all(tests[:n] >= self.available[:n]))
+        started = bool(np.any(tests[n:] > 0))
         # Without this end a vehicle that crashes rarely inside, and often outside, would not be tested outside at all.
-        if tests[s].sum() >= MOST_INNER_TESTS * self.first_tests[s].sum():
-            return True
-        return combined(self.design.p[s], tally.part(s), self.design.n_paths, _LEVEL).rhw <= INNER_RHW
+        spent = bool(tests[:n].sum() >= MOST_INNER_TESTS * self.first_tests[:n].sum())
+        return exhausted or started or spent or inner_rhw(n) <= INNER_RHW
 
-    def _spread(self, size: int, tally: Tally, active: BoolArray) -> IntArray:
+    def _inner_rhw(self, tally: Tally, n: int) -> float:
+        d, s = self.design, slice(0, n)
+        return combined(d.p[s], tally.part(s), d.n_paths, _LEVEL).rhw
+
+    def _spread(self, size: int, tally: Tally, most: IntArray) -> IntArray:
         """Give portions, one after the other, to where each narrows the sum of squared half-widths most.
 
         A squared half-width shrinks as 1/n, or as 1/n² where shares are all 0 or 1.
@@ -264,7 +327,7 @@ class Allocation:
         low, high = clopper_pearson(crashes, tests, _TAIL, failed)
         squares = ((self.design.p * (high - low) / 2.0) ** 2).tolist()
         powers = np.where((crashes + failed == 0) | (crashes == tests), 2, 1).tolist()
-        so_far, room = tests.tolist(), np.where(active, self.available - tests, 0).tolist()
+        so_far, room = tests.tolist(), most.tolist()
         given = [0] * tests.size
 
         def gain(s: int) -> float:

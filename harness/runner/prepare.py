@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from harness.arrays import RecordArray
@@ -18,8 +18,11 @@ from harness.episode.loop import MOMENT_LIMITS, NOBODY, EpisodeLoop, Keep, Polic
 from harness.episode.trajectory import empty_trajectory, mean_test_distance
 from harness.errors import RunFolderError
 from harness.importance.build import build_importance, needs_tables
+from harness.outcomes import SHELLS as PRESCRIBED
+from harness.pool.shadow_paths import ShadowPaths, campaign_shadow_paths, shadow_paths_file
 from harness.pool.shells import PrescribedEpisodes, checked_boundary
 from harness.pool.storage import campaign_pool, campaign_pool_key, pool_path
+from harness.pool.vehicle_pool import ShadowRuns, vehicle_pool
 from harness.progress import Progress, SilentProgress
 from harness.records.folder import SHELLS, read_json
 from harness.resolved import Resolved, resolve
@@ -35,13 +38,35 @@ DISTANCE_PATHS = 20_000
 
 @dataclass(frozen=True)
 class Prepared:
-    """A campaign ready to run."""
+    """A campaign ready to run.
 
-    campaign: Campaign
+    A vehicle that acts before the cut-in is to walk the ``shadow_paths`` first; its tests are prescribed after that.
+    """
+
+    resolved: Resolved
     policy: Policy
     initial_states: InitialStates
     tables: Tables | None
     prescribed: PrescribedEpisodes | None = None
+    shadow_paths: ShadowPaths | None = None
+
+    @property
+    def campaign(self) -> Campaign:
+        """The campaign itself."""
+        return self.resolved.campaign
+
+    def after(self, runs: ShadowRuns) -> Prepared:
+        """The same, after the shadow runs, with the tests that follow from them.
+
+        Raises
+        ------
+        HarnessError
+            Nothing on these paths can be tested.
+        """
+        if self.shadow_paths is None:
+            raise ValueError("this campaign has no shadow runs")
+        pool = vehicle_pool(self.resolved, self.shadow_paths, runs)
+        return replace(self, prescribed=PrescribedEpisodes(self.campaign, pool))
 
     def states(self, first_episode: int, n_episodes: int) -> RecordArray:
         """Initial states of consecutive episodes, shape (n_episodes,)."""
@@ -101,6 +126,7 @@ def prepare(resolved: Resolved, progress: Progress | None = None) -> Prepared:
     campaign, environment = resolved.campaign, resolved.environment
     tables: Tables | None = None
     prescribed: PrescribedEpisodes | None = None
+    shadow_paths: ShadowPaths | None = None
     with ThreadPoolExecutor(1) as thread:
         if needs_tables(campaign):
             drivers, challenge = resolved.surrogates, campaign.testing.challenge
@@ -109,14 +135,22 @@ def prepare(resolved: Resolved, progress: Progress | None = None) -> Prepared:
             if not tables_cached(environment, drivers, challenge):
                 compile_kernels(resolved)
             tables = building.result()
-        if campaign.testing.method == "shells":
+        if campaign.testing.method == "shells" and campaign.has_shadow_runs:
+            choosing = thread.submit(campaign_shadow_paths, resolved, progress)
+            if not shadow_paths_file(resolved).is_file():
+                compile_kernels(resolved)
+            shadow_paths = choosing.result()
+        elif campaign.testing.method == "shells":
             pooling = thread.submit(campaign_pool, resolved, progress)
             if not pool_path(campaign_pool_key(resolved)).is_file():
                 compile_kernels(resolved)
             prescribed = PrescribedEpisodes(campaign, pooling.result())
+    importance = build_importance(campaign, tables)
+    if campaign.has_shadow_runs:  # what happens then is prescribed, cut-in included
+        importance = importance._replace(method=PRESCRIBED)
     boundary = NOBODY if prescribed is None else checked_boundary(resolved.library, prescribed.design)
-    policy = Policy(campaign.seed, environment, build_importance(campaign, tables), resolved.av, boundary)
-    return Prepared(campaign, policy, InitialStates(environment.numbers), tables, prescribed)
+    policy = Policy(campaign.seed, environment, importance, resolved.av, boundary)
+    return Prepared(resolved, policy, InitialStates(environment.numbers), tables, prescribed, shadow_paths)
 
 
 def require_same_pool(folder: Path, prepared: Prepared) -> None:

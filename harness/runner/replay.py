@@ -21,6 +21,8 @@ from harness.records.tables import shard_tables
 from harness.resolved import Resolved, resolve
 from harness.runner.manifest import cpu_name, versions
 from harness.runner.prepare import build_world, prepare, require_same_pool, require_world
+from harness.runner.shadow_runs import read_shadows
+from harness.runner.worker import run_drawn
 from harness.sumo.system_libraries import require_libraries
 from harness.world import World
 
@@ -113,12 +115,14 @@ def _replay(
 ) -> dict[str, pa.Table]:
     """Row and trace of the episode, run again."""
     prepared = prepare(resolved)
+    if prepared.shadow_paths is not None:
+        prepared = prepared.after(read_shadows(folder, prepared.shadow_paths, resolved.environment))
     require_same_pool(folder, prepared)
     world = _world(resolved.campaign, gui=gui, fcd=fcd)
     try:
         loop = prepared.loop(world, traces="all", black_box=black_box)
         if prepared.prescribed is None:
-            shard = loop.run(episode, prepared.states(episode, 1))
+            shard = run_drawn(loop, prepared, episode, 1)
         else:
             row, stratum = (np.asarray(stored[name]).astype(np.int64) for name in ("pool_cut_in", "component"))
             shard = loop.run(episode, *prepared.prescribed.of_rows(row, stratum))

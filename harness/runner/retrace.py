@@ -30,7 +30,7 @@ class Retracing:
         self._reason: str | None = None
         if campaign.world.engine == "twin":
             self._reason = "the episodes were simulated in the twin itself"
-        elif campaign.av.before_cut_in == "controller":
+        elif campaign.av.acts_before_cut_in:
             self._reason = "the AV acted before the cut-in, and nothing on record says how"
         self._seed, self._environment = campaign.seed, resolved.environment
         self._driver = resolved.av

@@ -12,6 +12,7 @@ from itertools import count, islice
 from multiprocessing.connection import wait
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import TypeVar
 
 import numpy as np
 from scipy.special import bdtrc
@@ -25,7 +26,7 @@ from harness.records.tables import ShardTables
 from harness.resolved import Resolved
 from harness.runner.prepare import Prepared
 from harness.runner.retrace import Retracing
-from harness.runner.worker import ShardDone, ShardSpec, finished, serve
+from harness.runner.worker import Done, ShardDone, ShardSpec, Spec, finished, serve
 from harness.spawning import spawn_context
 
 ATTEMPTS = 3
@@ -38,6 +39,10 @@ SENT_FROM_OUTSIDE = (-signal.SIGKILL, -signal.SIGTERM)
 CLOSING_S = 10.0
 """Time that a worker gets to release its controllers once all is done."""
 CLOSING_LOOK_S = 0.05
+
+
+_Spec = TypeVar("_Spec", bound=Spec)
+_Done = TypeVar("_Done", bound=Done)
 
 
 class WorkerLostError(HarnessError):
@@ -75,14 +80,14 @@ def stored_shard(folder: Path, prepared: Prepared, retracing: Retracing, spec: S
 class WorkerProcess:
     """A process that runs one shard after another, at the end of a pipe of its own."""
 
-    def __init__(self, resolved: Resolved, black_box: Path) -> None:
+    def __init__(self, resolved: Resolved, folder: Path, black_box: Path) -> None:
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
         self._black_box = black_box
         self.connection, theirs = spawn_context().Pipe()
-        self._process = start_process(serve, theirs, resolved, black_box)
+        self._process = start_process(serve, theirs, resolved, folder, black_box)
         theirs.close()  # or its death would not end the pipe
 
-    def give(self, spec: ShardSpec, doomed: Mapping[int, Death]) -> bool:
+    def give(self, spec: Spec, doomed: Mapping[int, Death]) -> bool:
         """Give it a shard to run, with the episodes known to end a process; False if it is dead."""
         try:
             self.connection.send((spec, dict(doomed)))
@@ -90,7 +95,7 @@ class WorkerProcess:
             return False
         return True
 
-    def answer(self) -> ShardDone | None:
+    def answer(self) -> Done | None:
         """The finished shard, or None if the process has died on it.
 
         Raises
@@ -146,8 +151,8 @@ def first_to_answer(workers: Sequence[WorkerProcess]) -> WorkerProcess:
 class _Job:
     """A shard that is wanted, with its result once there is one."""
 
-    spec: ShardSpec
-    done: ShardDone | None
+    spec: Spec
+    done: Done | None
     deaths: int = 0
     suspected: Call | None = None
     doomed: dict[int, Death] = field(default_factory=dict)
@@ -160,8 +165,8 @@ class ShardPool:
     process could keep, and no queue that Ctrl-C could leave half filled.
     """
 
-    def __init__(self, resolved: Resolved, workers: int) -> None:
-        self._resolved, self._campaign = resolved, resolved.campaign
+    def __init__(self, resolved: Resolved, folder: Path, workers: int) -> None:
+        self._resolved, self._campaign, self._folder = resolved, resolved.campaign, folder
         self._n_workers = workers
         self._black_boxes = TemporaryDirectory(prefix="harness-workers-")
         self._numbers = count()
@@ -179,7 +184,7 @@ class ShardPool:
         self._idle, self._busy = [], {}
         self._black_boxes.cleanup()
 
-    def run(self, specs: Iterator[ShardSpec], stored: Callable[[ShardSpec], ShardDone | None]) -> Iterator[ShardDone]:
+    def run(self, specs: Iterator[_Spec], stored: Callable[[_Spec], _Done | None]) -> Iterator[_Done]:
         """Finished shards in index order; those that ``stored`` knows are not run again.
 
         Two shards per worker are under way or wait for their turn to be handed back: little is lost at the stop.
@@ -214,7 +219,7 @@ class ShardPool:
                 worker.kill()  # it died while it was idle
 
     def _new_worker(self) -> WorkerProcess:
-        return WorkerProcess(self._resolved, Path(self._black_boxes.name) / str(next(self._numbers)))
+        return WorkerProcess(self._resolved, self._folder, Path(self._black_boxes.name) / str(next(self._numbers)))
 
     def _collect(self, waiting: deque[_Job]) -> None:
         """Wait for one worker to finish its shard, or to die on it."""

@@ -89,7 +89,7 @@ def estimate_run(
 def stored_blocks(
     folder: Path, *, moments: bool, surrogates: SurrogateReplay | None = None, n_asked: int = 0
 ) -> Iterator[Block]:
-    """Blocks of the tests that are reported, in index order; a gap or too few of them is an error.
+    """Blocks of the tests that are reported, in index order from 0; a gap or too few of them is an error.
 
     Parameters
     ----------
@@ -124,7 +124,7 @@ def stored_blocks(
         counted = block.take(slice(max(reported_from - n, 0), n_counted - n))
         n = counted.first_episode + len(counted)
         if len(counted):
-            yield counted
+            yield replace(counted, first_episode=counted.first_episode - reported_from)
         if n == n_counted:
             return
     raise _incomplete(folder, f"{n} episodes on record", f"{n_counted} (manifest.json)")
@@ -188,7 +188,7 @@ def _refusal(campaign: Campaign, columns: set[str]) -> str | None:
     """Why no surrogate can take the place of the AV in these records; None if one can."""
     if campaign.testing.method == "shells":
         return "needs weighted tests: those drawn from shells have used the surrogates' outcomes already"
-    if campaign.av.before_cut_in == "controller":
+    if campaign.av.acts_before_cut_in:
         return (
             "needs an AV that keeps its speed until the cut-in (av.before_cut_in: hold_speed): this one acted before "
             "it, and where it was when BV cut in depends on that"

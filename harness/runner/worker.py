@@ -28,12 +28,14 @@ from harness.estimators.block import Block
 from harness.estimators.from_records import block_from_tables
 from harness.importance.build import mixture_weights
 from harness.outcomes import FAILED
+from harness.pool.shadow_paths import ShadowPaths
 from harness.pool.shells import Draw, PrescribedEpisodes
 from harness.records.folder import encoded
 from harness.records.tables import ShardTables, shard_tables
 from harness.resolved import Resolved
-from harness.runner.prepare import build_world, prepare
+from harness.runner.prepare import Prepared, build_world, prepare
 from harness.runner.retrace import Retracing
+from harness.runner.shadow_runs import ShadowDone, ShadowSpec, forced_traffic, read_shadows, run_shadows
 from harness.twin import TwinWorld
 
 REPEATED = b"harness.repeated"
@@ -86,8 +88,16 @@ class ShardDone:
     parquet: dict[str, bytes] = field(default_factory=dict)
 
 
-def serve(connection: Connection, resolved: Resolved, black_box: Path) -> None:
-    """Prepare with the first shard, run shards until the parent is gone or has no more."""
+Done = ShardDone | ShadowDone
+"""What a worker hands back."""
+Spec = ShardSpec | ShadowSpec
+
+
+def serve(connection: Connection, resolved: Resolved, folder: Path, black_box: Path) -> None:
+    """Prepare with the first shard, run shards until the parent is gone or has no more.
+
+    In the run's ``folder`` stand the shadow runs that tests follow from, once there are some.
+    """
     runner: ShardRunner | None = None
     while True:
         try:
@@ -95,8 +105,8 @@ def serve(connection: Connection, resolved: Resolved, black_box: Path) -> None:
         except (EOFError, OSError):
             break
         try:
-            runner = runner or ShardRunner(resolved, black_box)
-            answer: ShardDone | Exception = runner.run(spec, doomed)
+            runner = runner or ShardRunner(resolved, folder, black_box)
+            answer: Done | Exception = runner.run(spec, doomed)
         except Exception as error:  # noqa: BLE001 - whatever goes wrong here is the parent's to judge
             answer = fit_to_travel(error)
         try:
@@ -113,8 +123,9 @@ class ShardRunner:
     The file ``black_box`` tells that process in which call of a controller this one died.
     """
 
-    def __init__(self, resolved: Resolved, black_box: Path | None = None) -> None:
+    def __init__(self, resolved: Resolved, folder: Path, black_box: Path | None = None) -> None:
         self._doomed: dict[int, Death] = {}
+        self._folder = folder
         self._prepared = prepare(resolved)
         self._retracing = Retracing(resolved)
         world = build_world(resolved.campaign)
@@ -124,7 +135,7 @@ class ShardRunner:
         """Release the AV's controllers."""
         self._loop.close()
 
-    def run(self, spec: ShardSpec, doomed: Mapping[int, Death] | None = None) -> ShardDone:
+    def run(self, spec: Spec, doomed: Mapping[int, Death] | None = None) -> Done:
         """Run a shard; episodes in ``doomed`` fail before the call that ended a process.
 
         Raises
@@ -132,7 +143,21 @@ class ShardRunner:
         WorldDisagreementError
             The twin retraces an episode differently.
         """
+        self._doomed.clear()  # a shadow run may have the number of a test
         self._doomed.update(doomed or {})
+        if isinstance(spec, ShadowSpec):
+            return run_shadows(self._loop, self._paths(), self._prepared.policy.environment, spec)
+        return self._tests(spec)
+
+    def _paths(self) -> ShadowPaths:
+        if (paths := self._prepared.shadow_paths) is None:
+            raise ValueError("this campaign has no shadow runs")
+        return paths
+
+    def _tests(self, spec: ShardSpec) -> ShardDone:
+        if self._prepared.shadow_paths is not None and self._prepared.prescribed is None:
+            runs = read_shadows(self._folder, self._paths(), self._prepared.policy.environment)
+            self._prepared = self._prepared.after(runs)
         campaign, prescribed = self._prepared.campaign, self._prepared.prescribed
         shard = self._run(spec)
         keep_traces = campaign.records.traces != "none" or campaign.records.trace_share > 0.0
@@ -142,11 +167,11 @@ class ShardRunner:
         return finished(spec, tables, campaign, prescribed, self._retracing, encoded(tables))
 
     def _run(self, spec: ShardSpec) -> Shard:
-        prescribed = self._prepared.prescribed
+        prescribed, first = self._prepared.prescribed, spec.first_episode
         if prescribed is None:
-            return self._loop.run(spec.first_episode, self._prepared.states(spec.first_episode, spec.n_episodes))
+            return run_drawn(self._loop, self._prepared, first, spec.n_episodes)
         states, traffic, cut_ins = prescribed.episodes(spec.draws)
-        shard = self._loop.run(spec.first_episode, states, traffic)
+        shard = self._loop.run(first, states, traffic)
         shard.cut_ins = cut_ins
         return shard
 
@@ -155,7 +180,7 @@ class ShardRunner:
         campaign = self._prepared.campaign
         # The twin does one episode at little cost; an AV that SUMO moves has to be moved by SUMO again.
         alone = self._loop if campaign.av.sumo is not None else self._loop.beside(TwinWorld(1))
-        rows = _rows_to_repeat(shard, campaign.seed, acts_early=campaign.av.before_cut_in == "controller")
+        rows = _rows_to_repeat(shard, campaign.seed, acts_early=campaign.av.acts_before_cut_in)
         differing = []
         for row in rows:
             traffic = PrescribedTraffic._make(column[row : row + 1] for column in shard.traffic)
@@ -163,6 +188,14 @@ class ShardRunner:
             if bits_of(shard, row) != bits_of(again, 0):
                 differing.append(shard.first_episode + row)
         return Repeated(len(rows), tuple(sorted(differing)))
+
+
+def run_drawn(loop: EpisodeLoop, prepared: Prepared, first: int, n: int) -> Shard:
+    """Run consecutive episodes that follow from their index alone."""
+    states, policy = prepared.states(first, n), prepared.policy
+    if not prepared.campaign.has_shadow_runs:
+        return loop.run(first, states)
+    return loop.run(first, states, forced_traffic(loop, policy.seed, first, states, policy.environment))
 
 
 def finished(

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
 from harness.campaign.models import AutomatedVehicle, BuiltInParameters, Campaign
-from harness.campaign.problems import read_model
+from harness.campaign.overrides import Places, apply_overrides, parse_override
+from harness.campaign.problems import validated
 from harness.campaign.section import NAME_PATTERN, Section, Whole, broken_rule
+from harness.campaign.yaml_text import read_yaml
 from harness.errors import CampaignError
 from harness.methods import SAMPLING, EstimatorName
 from harness.studies.chains.named import CHAINS
@@ -32,6 +35,24 @@ class Fault(Section):
     factor: float = Field(gt=0.0, description="wrong probability over the right one")
 
 
+class Adversary(Section):
+    """A vehicle made to look for a weak place of the intervals: another one's crashes, some of them elsewhere or gone.
+
+    Its truth is that of the super-population which pools are drawn from: what is rare there is rare for both.
+    """
+
+    of: AvName = Field(description="vehicle of avs whose crashes it has")
+    crashes: Literal["everywhere", "on_heaviest_paths", "on_lightest_paths"] = Field(
+        "everywhere",
+        description="which of its crashes inside the boundary it has: those on the paths that weigh most, or least",
+    )
+    share: float = Field(0.1, gt=0.0, le=1.0, description="share of its crash rate that these paths hold")
+    hole: float = Field(
+        0.0, ge=0.0, le=1.0, description="share of cut-ins outside the boundary on which it crashes besides"
+    )
+    failing: float = Field(0.0, ge=0.0, lt=1.0, description="share of its crashes that end as failed tests instead")
+
+
 class Experiment(Section):
     """A replication experiment, as one YAML file describes it."""
 
@@ -43,6 +64,9 @@ class Experiment(Section):
     replications: Whole = Field(2000, ge=2, le=1_000_000, description="independent repetitions for each vehicle")
     campaign: Campaign = Field(description="what is repeated; its own av is replaced, stop.rhw null means a fixed n")
     avs: dict[AvName, AutomatedVehicle] = Field(default_factory=dict, description="vehicles, overtaking in the twin")
+    adversaries: dict[AvName, Adversary] = Field(
+        default_factory=dict, description="made of some of avs; testing.method shells alone"
+    )
     chains: list[str] = Field(default_factory=list, description="exact Markov chains, instead of avs")
     estimators: list[EstimatorName] = Field(
         default_factory=list, description="whose results are judged; the method's own when left out"
@@ -88,6 +112,25 @@ class Experiment(Section):
         return self
 
     @model_validator(mode="after")
+    def _adversaries_are_made_of_vehicles(self) -> Self:
+        if self.adversaries and self.campaign.testing.method != "shells":
+            raise broken_rule(
+                "adversaries",
+                found=f"adversaries for {self.campaign.testing.method}",
+                expected="method shells: their crashes are drawn within shells",
+                mend="Delete them.",
+            )
+        for name, adversary in self.adversaries.items():
+            if adversary.of not in self.avs:
+                raise broken_rule(
+                    f"adversaries.{name}.of",
+                    found=f"'{adversary.of}'",
+                    expected=f"one of avs: {', '.join(self.avs)}",
+                    mend="Name one of them.",
+                )
+        return self
+
+    @model_validator(mode="after")
     def _has_a_twin(self) -> Self:
         if self.campaign.world.engine != "twin":
             raise broken_rule(
@@ -129,15 +172,17 @@ class Experiment(Section):
         return self
 
 
-def load_experiment(path: Path) -> Experiment:
-    """Read an experiment.
+def load_experiment(path: Path, overrides: Sequence[str] = ()) -> Experiment:
+    """Read an experiment, with ``section.key=value`` laid over what the file says.
 
     Raises
     ------
     CampaignError
         The file cannot be read or says something wrong; the error names every place.
     """
-    experiment = read_model(path, Experiment)
+    data, lines = read_yaml(path)
+    changes = [parse_override(text) for text in overrides]
+    experiment = validated(apply_overrides(data, changes), Experiment, str(path), Places(lines, changes))
     campaign = experiment.campaign
     library = campaign.pool.library
     if "/" not in library and not library.endswith((".yaml", ".yml")):

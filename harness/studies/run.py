@@ -25,8 +25,8 @@ from harness.studies.experiment import Experiment
 from harness.studies.judgement import Judgement, Row, Subject, corrected, judge
 from harness.studies.results import write_results
 from harness.studies.shell_campaign import ShellCampaign, result_of
-from harness.studies.shell_source import overtaking_shells
-from harness.studies.super_population import Drivers, enumerate_paths, truths
+from harness.studies.shell_source import OvertakingShells, overtaking_shells
+from harness.studies.super_population import Drivers, Truth, enumerate_paths, truths
 from harness.studies.weighted_campaign import ChainEpisodes, TwinEpisodes, WeightedCampaign
 
 TASKS_PER_SUBJECT = 8
@@ -107,10 +107,19 @@ def _vehicles(experiment: Experiment, progress: Progress) -> Iterator[tuple[Subj
             yield Subject(name, truth.crash_rate, truth.std_error), repeated
         else:
             source = overtaking_shells(library, pools, av, drivers.vehicles[name], size.pool_paths)
-            outside = {result_of(name): share for name, share in source.crashes_outside.items()}
-            facts = outside, source.left_out, source.template.library.boundary
             repeated = ShellCampaign(tested, source, own_seed, experiment.fault)
-            yield Subject(name, truth.crash_rate, truth.std_error, *facts), repeated
+            yield _subject(name, source, truth), repeated
+            for made_name, made in experiment.adversaries.items():
+                if made.of == name:
+                    adversary = source.as_adversary(made)
+                    repeated = ShellCampaign(tested, adversary, own_seed, experiment.fault)
+                    yield _subject(made_name, adversary, Truth(adversary.crash_rate, 0.0)), repeated
+
+
+def _subject(name: str, source: OvertakingShells, truth: Truth) -> Subject:
+    outside = {result_of(each): share for each, share in source.crashes_outside.items()}
+    facts = outside, source.left_out, source.template.library.boundary
+    return Subject(name, truth.crash_rate, truth.std_error, *facts)
 
 
 @contextmanager

@@ -35,12 +35,14 @@ def result_of(statement: str) -> str:
 class DrawnPool:
     """A pool, and what a vehicle does on its paths.
 
-    ``mass`` and ``crash_mass`` (n, S) are each path's probability of a cut-in of each stratum, and of a crash in it.
+    ``mass`` and ``crash_mass`` (n, S) are each path's probability of a cut-in of each stratum, and of a crash in it;
+    ``failing`` is the share of crashes that end as failed tests.
     """
 
     design: ShellDesign
     mass: FloatArray
     crash_mass: FloatArray
+    failing: float = 0.0
 
     @cached_property
     def share(self) -> FloatArray:
@@ -87,12 +89,12 @@ class ShellCampaign:
         design = drawn.design
         available = np.full(design.p.size, self.campaign.pool.cut_ins_per_shell, np.int64)
         planner = ShellPlanner(self.campaign, design, available)
-        rules = {each.name: RoundRule(_asking(self.campaign, each.name)) for each in design.statements}
+        rules = {each.name: RoundRule(asking(self.campaign, each.name)) for each in design.statements}
         known: dict[str, Row] = {}
         estimate: Estimate | None = None
         enough = False
         while not enough and (added := planner.next_round()).any():
-            enough = planner.add(_block(drawn, added, int(planner.tally.tests.sum()), rng))
+            enough = planner.add(campaign_block(drawn, added, int(planner.tally.tests.sum()), rng))
             estimate = planner.estimate
             if estimate is not None:
                 known |= dict(_newly_known(estimate, replication, {k: v for k, v in rules.items() if k not in known}))
@@ -112,7 +114,7 @@ def _newly_known(estimate: Estimate, replication: int, rules: dict[str, RoundRul
             yield name, _statement_row(estimate, name, replication, reached=True)
 
 
-def _asking(campaign: Campaign, statement: str) -> Campaign:
+def asking(campaign: Campaign, statement: str) -> Campaign:
     """The campaign, were it to end with a statement."""
     shells = campaign.testing.shells.model_copy(update={"statement": statement})
     return campaign.model_copy(update={"testing": campaign.testing.model_copy(update={"shells": shells})})
@@ -127,19 +129,20 @@ def _wrong(drawn: DrawnPool, fault: Fault | None) -> DrawnPool:
     return replace(drawn, design=replace(drawn.design, cell_p=drawn.design.cell_p * factor))
 
 
-def _block(drawn: DrawnPool, added: IntArray, first: int, rng: np.random.Generator) -> Block:
+def campaign_block(drawn: DrawnPool, added: IntArray, first: int, rng: np.random.Generator) -> Block:
     """What the records of a round become: within a stratum the crashes come first, which no estimator can see."""
     stratum, crashes = np.repeat(np.arange(added.size), added), rng.binomial(added, drawn.share)
     n = stratum.size
     rank = np.arange(n) - np.repeat(np.cumsum(added) - added, added)
-    none, crash = np.zeros(n, np.bool_), rank < crashes[stratum]
+    none, bad = np.zeros(n, np.bool_), rank < crashes[stratum]
+    failed = bad & (rank < rng.binomial(crashes, drawn.failing)[stratum]) if drawn.failing else none
     mass = np.zeros((n, added.size))
-    mass[crash] = np.concatenate([drawn.crashed_paths(s, k, rng) for s, k in enumerate(crashes.tolist())])
+    mass[bad] = np.concatenate([drawn.crashed_paths(s, k, rng) for s, k in enumerate(crashes.tolist())])
     return Block(
         first_episode=first,
         method="shells",
-        crash=crash,
-        failed=none,
+        crash=bad & ~failed,
+        failed=failed,
         cut_in=~none,
         bv_lv_contact=none,
         log_weight=np.zeros(n),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,6 +14,7 @@ from harness.errors import CampaignError
 from harness.pool.cut_ins import CutIns, Pool, shells_of
 from harness.pool.library import Library
 from harness.pool.shells import acceleration_limit, design_shells, outermost, shells_in_strata
+from harness.studies.experiment import Adversary
 from harness.studies.shell_campaign import DrawnPool
 from harness.studies.super_population import Mixed, SuperPopulation
 
@@ -32,6 +34,8 @@ class OvertakingShells:
         The vehicle's equals.
     limit_mps2 : float
         Hardest acceleration of the vehicle.
+    failing : float
+        Share of its crashes that end as failed tests.
     shells, crashing : ndarray, shape (n, D + 1)
         Probability of each shell by path of the super-population, and the part on which the vehicle crashes.
     """
@@ -41,6 +45,12 @@ class OvertakingShells:
     limit_mps2: float
     shells: FloatArray
     crashing: FloatArray
+    failing: float = 0.0
+
+    @property
+    def crash_rate(self) -> float:
+        """That of the super-population."""
+        return float(self.crashing.sum() / len(self.crashing))
 
     @property
     def crashes_outside(self) -> dict[str, float]:
@@ -54,16 +64,57 @@ class OvertakingShells:
 
     def draw(self, rng: np.random.Generator) -> DrawnPool:
         """A new pool."""
+        return self.draw_parts(rng, self.crashing[None])[0]
+
+    def draw_parts(self, rng: np.random.Generator, parts: FloatArray) -> list[DrawnPool]:
+        """A new pool, with each of some parts of the shells, shape (K, n, D + 1), in the crashes' place."""
         rows = rng.integers(0, len(self.shells), self.template.n_paths)
         drawn = self.shells[rows]
         pool = replace(self.template, cell_p=drawn.mean(0), p_cut_in=float(drawn.sum(1).mean()))
         design = design_shells(pool, limit_mps2=self.limit_mps2)
         groups = shells_in_strata(pool, outermost(pool, ShellSettings()), self.limit_mps2)
-        mass, crash_mass = (
-            np.column_stack([by_shell[:, group].sum(1) for group in groups])
-            for by_shell in (drawn, self.crashing[rows])
-        )
-        return DrawnPool(design, mass, crash_mass)
+
+        def by_stratum(by_shell: FloatArray) -> FloatArray:
+            return np.column_stack([by_shell[:, group].sum(1) for group in groups])
+
+        return [DrawnPool(design, by_stratum(drawn), by_stratum(part[rows]), self.failing) for part in parts]
+
+    def as_adversary(self, made: Adversary) -> OvertakingShells:
+        """The same vehicle with other crashes; see `harness.studies.experiment.Adversary`."""
+        inside, crashing = self.template.boundary + 1, self.crashing.copy()
+        if made.crashes != "everywhere":
+            weight = crashing[:, :inside].sum(1)
+            order = np.argsort(-weight if made.crashes == "on_heaviest_paths" else weight, kind="stable")
+            kept = np.cumsum(weight[order]) <= made.share * weight.sum()
+            crashing[order[~kept]] = 0.0
+        tested = slice(inside, -1)  # the last shell is for cut-ins on which nobody crashes
+        crashing[:, tested] = np.maximum(crashing[:, tested], made.hole * self.shells[:, tested])
+        return replace(self, crashing=crashing, failing=made.failing)
+
+
+@dataclass(frozen=True, eq=False)
+class OvertakingPairs:
+    """Pools of two vehicles; see `harness.studies.paired_campaign.PairSource`.
+
+    Attributes
+    ----------
+    pools : OvertakingShells
+    outcomes : ndarray, shape (3, n, D + 1)
+        Part of the shells on which both crash, only A, only B.
+    """
+
+    pools: OvertakingShells
+    outcomes: FloatArray
+
+    @property
+    def crashes_outside(self) -> float:
+        """Share of the cut-ins on which either vehicle crashes that lies beyond the boundary."""
+        by_shell = self.outcomes.sum((0, 1))
+        return float(by_shell[self.pools.template.boundary + 1 :].sum() / by_shell.sum())
+
+    def draw(self, rng: np.random.Generator) -> list[DrawnPool]:
+        """A new pool: where both crash, only A, only B."""
+        return self.pools.draw_parts(rng, self.outcomes)
 
 
 def equals(library: Library, population: SuperPopulation, crashing: FloatArray) -> set[str]:
@@ -115,11 +166,30 @@ def overtaking_shells(
     library: Library, population: SuperPopulation, av: AutomatedVehicle, vehicle: Mixed, pool_paths: int
 ) -> OvertakingShells:
     """Source of a vehicle's pools; the library's drivers are the first of the population's."""
+    crashing = vehicle.crash_mass(population)
+    pools, by_shell = _pools(library, population, [crashing], acceleration_limit(av), pool_paths)
+    return replace(pools, crashing=by_shell(crashing))
+
+
+def overtaking_pairs(
+    library: Library, population: SuperPopulation, limit_mps2: float, vehicles: tuple[Mixed, Mixed], pool_paths: int
+) -> OvertakingPairs:
+    """Source of the pools of two vehicles, of which each does on a cut-in what it does whatever the other one does."""
+    a, b = (vehicle.crash_mass(population) for vehicle in vehicles)
+    pools, by_shell = _pools(library, population, [a, b], limit_mps2, pool_paths)
+    both = np.divide(a * b, population.mass, out=np.zeros_like(a), where=population.mass > 0.0)
+    return OvertakingPairs(pools, np.stack([by_shell(mass) for mass in (both, a - both, b - both)]))
+
+
+def _pools(
+    library: Library, population: SuperPopulation, crashing: list[FloatArray], limit_mps2: float, pool_paths: int
+) -> tuple[OvertakingShells, Callable[[FloatArray], FloatArray]]:
+    """Pools without the vehicles' equals, and what divides a mass of cut-ins (m,) by path and shell (n, D + 1)."""
     bit = {name: driver for driver, name in enumerate(library.surrogates)}
     rate = {name: float(population.mass[population.crashes(driver)].sum()) for name, driver in bit.items()}
     careful_first = tuple(sorted(bit, key=rate.__getitem__))
-    crashing = vehicle.crash_mass(population)
-    reduced = leave_out(library, equals(library, population, crashing), careful_first)
+    alike = set().union(*(equals(library, population, of_vehicle) for of_vehicle in crashing))
+    reduced = leave_out(library, alike, careful_first)
     names = tuple(name for name in careful_first if name in reduced.surrogates)
     shell = shells_of(population.bits, np.array([bit[name] for name in names]))
 
@@ -128,13 +198,9 @@ def overtaking_shells(
 
     shells = by_shell(population.mass)
     shells[:, -1] = np.maximum(population.cut_in - shells[:, :-1].sum(1), 0.0)
-    return OvertakingShells(
-        template=_template(reduced, names, shells, pool_paths),
-        left_out=tuple(name for name in careful_first if name not in reduced.surrogates),
-        limit_mps2=acceleration_limit(av),
-        shells=shells,
-        crashing=by_shell(crashing),
-    )
+    left_out = tuple(name for name in careful_first if name not in reduced.surrogates)
+    template = _template(reduced, names, shells, pool_paths)
+    return OvertakingShells(template, left_out, limit_mps2, shells, np.zeros_like(shells)), by_shell
 
 
 def _template(library: Library, names: tuple[str, ...], shells: FloatArray, n_paths: int) -> Pool:

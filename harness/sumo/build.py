@@ -25,13 +25,13 @@ def build_sumo_world(
     """
     cells = n_cells or campaign.world.cells
     av = campaign.av
-    early = av.before_cut_in == "controller"
+    early = av.acts_before_cut_in
     if av.traci is not None:
         from harness.sumo.traci_world import TraciWorld  # noqa: PLC0415 - few campaigns need it
 
         return TraciWorld(cells, av.traci, av.limits.step_time_s, acts_before_cut_in=early)
     if av.sumo is None:
         return SumoWorld(cells, gui=gui, options=options)
-    if recyclable(av.sumo):
-        return SumoAvWorld(cells, av.sumo, acts_before_cut_in=early, gui=gui, options=options)
+    if recyclable(av.sumo) and not early:  # one that is released at the start remembers the last episode's cut-in
+        return SumoAvWorld(cells, av.sumo, gui=gui, options=options)
     return FreshWorld(av.sumo, campaign.seed, acts_before_cut_in=early, gui=gui, options=options)

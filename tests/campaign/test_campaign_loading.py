@@ -81,7 +81,7 @@ def load(tmp_path):
         ("av:\n  fmu: {file: a.fmu, output: a}", "av.fmu.inputs", 3, "Add 'inputs: …'"),
         ("av:\n  fmu: {file: a.fmu, output: a, inputs: {v: 1}}", "av.fmu.inputs.v", 3, "text"),
         ("av:\n  limits: {step_time_s: 0}", "av.limits.step_time_s", 3, "above 0"),
-        ("av:\n  before_cut_in: controller", "av.before_cut_in", 3, "step_mixture or nde"),
+        ("av:\n  before_cut_in: controller", "av.before_cut_in", 3, "shells (or forced)"),
         ("stop:\n  rhw: 1\n  rhw: 2", "stop.rhw", 4, "first written on line 3"),
         ("world: {cells: 257}", "world.cells", 2, "at most 256"),
         ("testing: {method: step_mixture}\nstop:\n  rhw: 0.3", "stop.rhw", 4, "a fixed number of tests"),

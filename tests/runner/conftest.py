@@ -40,8 +40,8 @@ def run() -> Callable[..., RunResult]:
 class WorkerInThisProcess:
     """Stands in for `WorkerProcess` where the tests are not about processes: spares starting one."""
 
-    def __init__(self, resolved: Resolved, black_box: Path) -> None:
-        self._runner = ShardRunner(resolved)
+    def __init__(self, resolved: Resolved, folder: Path, black_box: Path) -> None:
+        self._runner = ShardRunner(resolved, folder)
 
     def give(self, spec: ShardSpec, doomed: Mapping[int, Death]) -> bool:
         self._done = self._runner.run(spec, doomed)

@@ -126,7 +126,7 @@ def serve(campaign, tmp_path, monkeypatch):
                 events.append("closed")
 
         monkeypatch.setattr(worker, "ShardRunner", Runner)
-        worker.serve(pipe, campaign(), tmp_path / "black-box")
+        worker.serve(pipe, campaign(), tmp_path, tmp_path / "black-box")
         return events
 
     return served

@@ -24,7 +24,7 @@ def run_shards(connection, folder: Path) -> None:
     from harness.resolved import resolve
     from harness.runner.worker import ShardRunner, ShardSpec
 
-    runner = ShardRunner(resolve(load_campaign(MIXTURE_FILE)))
+    runner = ShardRunner(resolve(load_campaign(MIXTURE_FILE)), folder)
     for index in range(EPISODES // SHARD):
         runner.run(ShardSpec(index, index * SHARD, SHARD))
         for path in folder.rglob("*.parquet"):

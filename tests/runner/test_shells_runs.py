@@ -14,7 +14,6 @@ import pytest
 from harness import estimate, replay
 from harness.errors import CampaignError, RunFolderError
 from harness.estimators.stratified import Tally
-from harness.runner import compare_campaigns
 from harness.runner.campaign_run import episodes_on_disk
 from harness.runner.manifest import Manifest, Prefix
 from harness.runner.planner import GROWTH, Allocation, first_tests, round_specs
@@ -211,11 +210,6 @@ def test_rows_say_which_cut_in_they_were(shells_run):
     assert weights.size == strata
 
 
-def test_a_vehicle_that_acts_before_the_cut_in_is_refused(campaign):
-    with pytest.raises(CampaignError, match="hold_speed"):
-        campaign(*SHELLS, "av.before_cut_in=controller")
-
-
 def test_an_unknown_boundary_is_refused(campaign, run_here, tmp_path):
     with pytest.raises(CampaignError, match="a surrogate of the library"):
         run_here(campaign(*SHELLS, "testing.shells.boundary=brakes-4"), tmp_path / "run")
@@ -252,11 +246,6 @@ def test_another_pool_is_refused(shells_run, campaign, run_here, tmp_path):
         replay(folder, 3)
     with pytest.raises(RunFolderError, match="cut-ins of pool ffff"):
         run_here(campaign(*SHELLS, "world.cells=8"), folder, resume=True)
-
-
-def test_comparing_is_refused(campaign, tmp_path):
-    with pytest.raises(CampaignError, match=r"testing\.method=forced"):
-        compare_campaigns(campaign(*SHELLS), campaign(*SHELLS), tmp_path / "out")
 
 
 DESIGN = ShellDesign(
@@ -377,3 +366,9 @@ def test_two_phases_cannot_be_continued_to_another_precision(campaign, run_here,
     run_here(campaign(*planned), tmp_path / "run")
     with pytest.raises(RunFolderError, match="another campaign"):
         run_here(campaign(*planned, "stop.rhw=0.8"), tmp_path / "run", resume=True)
+
+
+def test_a_run_that_stops_at_a_wide_interval_says_what_that_does(campaign, run_here, tmp_path):
+    wide = run_here(campaign(*SHELLS, "world.engine=twin", "stop.rhw=0.6"), tmp_path / "wide")
+    assert wide.ending.endswith("Ask for a smaller stop.rhw, or for testing.shells.stopping: two_phase.")
+    assert "two_phase" not in run_here(campaign(*SHELLS, "world.engine=twin"), tmp_path / "narrow").ending

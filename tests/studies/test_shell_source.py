@@ -11,6 +11,8 @@ from harness.errors import CampaignError
 from harness.pool.build import build_pool
 from harness.pool.library import load_library
 from harness.progress import SilentProgress
+from harness.studies.experiment import Adversary
+from harness.studies.shell_campaign import campaign_block
 from harness.studies.shell_source import equals, leave_out, overtaking_shells
 from harness.studies.super_population import NO_ENVELOPE, Drivers, Truth, combined, enumerate_paths, truths
 
@@ -129,3 +131,39 @@ def test_real_pools_have_the_shells_of_drawn_ones(drivers):
     assert np.all(np.abs(real.shell_p - source.template.shell_p) < 4.5 * np.hypot(*errors))
     ratio = errors[1] * np.sqrt(real.n_paths) / (errors[0] * np.sqrt(paths))
     assert np.all((ratio[:5] > 0.6) & (ratio[:5] < 1.6))  # inside; outside the aims differ
+
+
+def adversary_of(drivers, population, **made):
+    source = overtaking_shells(LIBRARY, population, AVS["own"], drivers.vehicles["own"], 256)
+    return source, source.as_adversary(Adversary(of="own", **made))
+
+
+def test_an_adversary_on_the_heaviest_paths_has_a_share_of_the_crashes_on_few_of_them(drivers, population):
+    source, heavy = adversary_of(drivers, population, crashes="on_heaviest_paths", share=0.3)
+    light = source.as_adversary(Adversary(of="own", crashes="on_lightest_paths", share=0.3))
+    inside = source.template.boundary + 1
+    for made in (heavy, light):
+        assert 0.2 < made.crashing[:, :inside].sum() / source.crashing[:, :inside].sum() <= 0.3
+    used = [int((made.crashing[:, :inside].sum(1) > 0.0).sum()) for made in (heavy, light)]
+    assert used[0] < 0.2 * used[1]
+
+
+def test_an_adversary_with_a_hole_crashes_outside_in_that_share(drivers, population):
+    source, made = adversary_of(drivers, population, hole=0.01)
+    outside = slice(source.template.boundary + 1, -1)
+    assert np.all(made.crashing[:, outside] >= 0.01 * source.shells[:, outside])
+    assert made.crash_rate == pytest.approx(
+        source.crash_rate + 0.01 * source.shells[:, outside].sum(1).mean(), rel=0.05
+    )
+    assert made.crashes_outside > source.crashes_outside
+
+
+def test_failed_crashes_are_counted_as_failed(drivers, population):
+    _, made = adversary_of(drivers, population, failing=0.5)
+    rng = np.random.default_rng(8)
+    drawn = made.draw(rng)
+    block = campaign_block(drawn, np.full(drawn.design.p.size, 400), 0, rng)
+    assert not np.any(block.crash & block.failed)
+    bad = block.crash | block.failed
+    assert block.failed[bad].mean() == pytest.approx(0.5, abs=4.5 * 0.5 / np.sqrt(bad.sum()))
+    assert np.all(block.cell_mass[bad].sum(1) > 0.0)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from harness.environment.loading import load_environment
-from harness.episode.cells import PrescribedTraffic
+from harness.episode.cells import PrescribedTraffic, drawn_traffic
 from harness.episode.loop import EpisodeLoop, Keep, Policy, Shard
 from harness.episode.trajectory import empty_trajectory
 from harness.importance.build import build_importance
@@ -40,7 +40,8 @@ def cut_in_at_once() -> PrescribedTraffic:
     n = len(STATES)
     lv, bv = np.full((n, 22), KEEP_SPEED, np.int8), np.full((n, 22), KEEP_SPEED, np.int8)
     bv[:, 1] = CUT_IN
-    return PrescribedTraffic(lv, bv, np.zeros(n, np.int64), np.zeros(n, np.int64), np.zeros(n))
+    zeros = np.zeros(n, np.int64)
+    return drawn_traffic()._replace(lv=lv, bv=bv, cut_step=zeros, stratum=zeros, log_weight=np.zeros(n))
 
 
 def run(world, smoke) -> Shard:

@@ -1,0 +1,150 @@
+"""What pairs of tests of two vehicles say: rates, difference and ratio, without an assumption and given the library."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from harness.estimators.estimate import BothWays, Estimate, finite_json
+from harness.estimators.likelihood_ratio import Level
+from harness.estimators.pairs import Interval, PairCounts
+from harness.estimators.shells import Shells
+
+
+@dataclass(frozen=True)
+class Contrast:
+    """What lies between A and B; rates are crashes per test.
+
+    Attributes
+    ----------
+    difference, ci_low, ci_high : float
+        A - B.
+    rhw : float
+        Half-width of that interval over the larger of the two rates.
+    rhw_from_pool : float
+        What the pool's own error alone would leave of it.
+    ratio, ratio_low, ratio_high : float
+        A/B.
+    only_a, only_b : Interval
+        Rate of cut-ins on which only A, or only B crashes.
+    n_pairs, n_differing : int
+    """
+
+    difference: float
+    ci_low: float
+    ci_high: float
+    rhw: float
+    rhw_from_pool: float
+    ratio: float
+    ratio_low: float
+    ratio_high: float
+    only_a: Interval
+    only_b: Interval
+    n_pairs: int
+    n_differing: int
+
+    @classmethod
+    def of(cls, pairs: PairCounts, level: Level) -> Contrast:
+        """Of the strata that ``pairs`` holds."""
+        difference, ratio = pairs.difference(level), pairs.ratio(level)
+        return cls(
+            *difference,
+            pairs.rhw(level),
+            pairs.rhw_from_pool(level),
+            *ratio,
+            pairs.only_a(level),
+            pairs.only_b(level),
+            int(pairs.tests.sum()),
+            pairs.n_differing,
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain content."""
+        of_one = {"only_a": self.only_a._asdict(), "only_b": self.only_b._asdict()}
+        return finite_json(asdict(self) | of_one)
+
+
+@dataclass(frozen=True)
+class PairedEstimate:
+    """Two vehicles compared.
+
+    Attributes
+    ----------
+    a, b : Estimate
+        Crash rate of each, from the tests of the pairs.
+    free, conditional : Contrast
+        Over all strata, and over those inside: if neither vehicle crashes beyond the boundary.
+    refuted : bool
+        Whether one of them has crashed there.
+    pairs : PairCounts
+    """
+
+    a: Estimate
+    b: Estimate
+    free: Contrast
+    conditional: Contrast
+    refuted: bool
+    pairs: PairCounts
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What is to be known of the tests of either vehicle."""
+        return tuple(f"{name}: {text}" for name, of in (("A", self.a), ("B", self.b)) for text in of.warnings)
+
+    def to_json(self) -> dict[str, Any]:
+        """Content of ``compare.json``, as far as it comes from counts."""
+        return {
+            "a": self.a.to_json(),
+            "b": self.b.to_json(),
+            **self.free.to_json(),
+            "confidence": self.a.confidence,
+            "conditional": {
+                **self.conditional.to_json(),
+                "boundary": self.pairs.design.library.boundary,
+                "n_pairs_outside": self.free.n_pairs - self.conditional.n_pairs,
+                "refuted": self.refuted,
+            },
+            "shells": _shells(self.pairs),
+            "warnings": list(self.warnings),
+        }
+
+
+def paired_estimate(pairs: PairCounts, confidence: float) -> PairedEstimate:
+    """Everything that pairs of tests say, at one level of confidence.
+
+    Raises
+    ------
+    ValueError
+        There is no pair.
+    """
+    level, n_inside = Level.two_sided(confidence), pairs.design.library.n_inside
+    return PairedEstimate(
+        a=_own(pairs, 0, confidence),
+        b=_own(pairs, 1, confidence),
+        free=Contrast.of(pairs, level),
+        conditional=Contrast.of(pairs.inside(), level),
+        refuted=any(pairs.tally(side).crashes[n_inside:].any() for side in (0, 1)),
+        pairs=pairs,
+    )
+
+
+def _own(pairs: PairCounts, side: int, confidence: float) -> Estimate:
+    tally = pairs.tally(side)
+    worst = Shells.of(pairs.design, tally.failed_as_crashes())
+    return BothWays(Shells.of(pairs.design, tally), worst, int(tally.failed.sum())).result(confidence)
+
+
+def _shells(pairs: PairCounts) -> list[dict[str, Any]]:
+    design, columns = pairs.design, ("n_both", "n_only_a", "n_only_b", "n_neither")
+    failed = pairs.tally(0).failed + pairs.tally(1).failed
+    return [
+        {
+            "shell": design.strata[s],
+            "inside": s < design.library.n_inside,
+            "p": float(design.p[s]),
+            "n_pairs": int(pairs.tests[s]),
+            **dict(zip(columns, row.tolist(), strict=True)),
+            "n_failed_tests": int(failed[s]),
+        }
+        for s, row in enumerate(pairs.outcomes())
+    ]

@@ -1,0 +1,242 @@
+"""Pairs of tests of two vehicles on the same cut-ins, drawn within shells: counts, and limits of what they say.
+
+Each cut-in is driven by A and by B. A pair of tests has one of four outcomes: both crash, only A, only B, neither. The
+rates, their difference and their ratio are weighted sums of the shares of these outcomes, and their limits those of
+the likelihood ratio (`harness.estimators.likelihood_ratio`). Cut-ins on which both do the same say nothing against
+either, so that a difference takes far fewer tests than two rates.
+
+What a failed test would have come to is not known. Each limit takes A's failed tests for crashes and B's for none, or
+the other way round, whichever takes it farther.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from harness.arrays import BoolArray, FloatArray, IntArray
+from harness.estimators.block import Block
+from harness.estimators.likelihood_ratio import Level, contrast_gains, contrast_limit, ratio_limits
+from harness.estimators.stratified import Tally, mean_square
+from harness.strata import ShellDesign
+
+NO_CRASH, CRASH, FAILED = range(3)
+"""How a test of a pair ended."""
+N_ENDS = 3
+A_CRASHES, B_CRASHES = np.array([1.0, 1.0, 0.0, 0.0]), np.array([1.0, 0.0, 1.0, 0.0])
+"""Of the outcomes: both crash, only A, only B, neither."""
+ONLY_A, ONLY_B = np.array([0.0, 1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0, 0.0])
+
+
+def _kinds(failed_a: bool, failed_b: bool) -> tuple[BoolArray, ...]:
+    """Of the four outcomes, which ends of A and B belong to each, shape (3, 3)."""
+    a, b = np.meshgrid([False, True, failed_a], [False, True, failed_b], indexing="ij")
+    return a & b, a & ~b, ~a & b, ~a & ~b
+
+
+Verdict = Literal["proven", "refuted", "open"]
+
+
+class Interval(NamedTuple):
+    """A number with its interval."""
+
+    value: float
+    ci_low: float
+    ci_high: float
+
+    @property
+    def half_width(self) -> float:
+        """Half of the interval's length."""
+        return (self.ci_high - self.ci_low) / 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class PairCounts:
+    """Pairs of tests of some strata.
+
+    Attributes
+    ----------
+    design : ShellDesign
+    ends : ndarray of int64, shape (S, 3, 3)
+        How often A ended in one way (second axis) and B in another (third): no crash, crash, failed.
+    mass : ndarray, shape (S, 3, 3, S)
+        Over the same pairs, the sum of their paths' probability of a cut-in of every stratum.
+    """
+
+    design: ShellDesign
+    ends: IntArray
+    mass: FloatArray
+
+    @property
+    def p(self) -> FloatArray:
+        """Probabilities of the strata, which are the first of the design's, shape (S,)."""
+        return self.design.p[: len(self.ends)]
+
+    @property
+    def tests(self) -> IntArray:
+        """Pairs of each stratum, shape (S,)."""
+        return np.asarray(self.ends.sum((1, 2)))
+
+    def inside(self, n: int | None = None) -> PairCounts:
+        """Only the first ``n`` strata, by default those within the boundary of the statement `library`."""
+        within = slice(0, self.design.library.n_inside if n is None else n)
+        return PairCounts(self.design, self.ends[within], self.mass[within, :, :, within])
+
+    def outcomes(self, *, failed_a: bool = False, failed_b: bool = False) -> IntArray:
+        """How often both crash, only A, only B, neither, shape (S, 4), with failed tests as crashes or as none."""
+        return np.stack([self.ends[:, kind].sum(1) for kind in _kinds(failed_a, failed_b)], axis=1)
+
+    def tally(self, side: int) -> Tally:
+        """Tests of A (0) or B (1) by themselves."""
+        ends, mass = self.ends.sum(2 - side), self.mass.sum(2 - side)
+        return Tally(self.tests, ends[:, CRASH], ends[:, FAILED], mass[:, CRASH], mass[:, FAILED])
+
+    @property
+    def n_differing(self) -> int:
+        """Pairs of which one vehicle is known to have crashed, and the other not to have."""
+        return int(self.ends[:, CRASH, NO_CRASH].sum() + self.ends[:, NO_CRASH, CRASH].sum())
+
+    @property
+    def any_failed(self) -> bool:
+        """Whether a test has failed."""
+        return bool(self.ends[:, FAILED].any() or self.ends[:, :, FAILED].any())
+
+    def rate(self, weights: FloatArray) -> float:
+        """Weighted sum over outcomes (4,) and strata, as seen."""
+        return float((self.p / np.maximum(self.tests, 1)) @ (self.outcomes() @ weights))
+
+    @property
+    def larger_rate(self) -> float:
+        """That of the vehicle that has crashed more often; infinite where neither has."""
+        return max(self.rate(A_CRASHES), self.rate(B_CRASHES)) or math.inf
+
+    def pool_variance(self, weights: FloatArray, *, failed_a: bool = False, failed_b: bool = False) -> float:
+        """Variance of a weighted sum that comes from the pool's finite number of paths.
+
+        The mean square of a path's part in it is at most that of its outcomes of positive weight and that of those of
+        negative weight together, as the product of the two only lowers it.
+        """
+        scale, square, rate = self.p / np.maximum(self.tests, 1), 0.0, 0.0
+        kinds = _kinds(failed_a, failed_b)
+        for sign in (1.0, -1.0):
+            part = np.maximum(sign * weights, 0.0)
+            mass = sum(w * self.mass[:, kind].sum(1) for w, kind in zip(part, kinds, strict=True))
+            square += float(part.max()) * mean_square(scale, np.asarray(mass))
+            rate += sign * float(scale @ (self.outcomes(failed_a=failed_a, failed_b=failed_b) @ part))
+        return max(square - rate**2, 0.0) / self.design.n_paths
+
+    def limit(self, weights: FloatArray, level: Level, side: float) -> float:
+        """One limit of a weighted sum that does not fall where A crashes more often or B less."""
+        worst = {"failed_a": side > 0.0, "failed_b": side < 0.0}
+        variance = self.pool_variance(weights, **worst)
+        return contrast_limit(self.p[:, None] * weights, self.outcomes(**worst), level, side, variance)
+
+    def interval(self, weights: FloatArray, level: Level) -> Interval:
+        """The sum with both limits; see `limit`."""
+        low, high = (self.limit(weights, level, side) for side in (-1.0, 1.0))
+        return Interval(self.rate(weights), low, high)
+
+    def difference(self, level: Level) -> Interval:
+        """A - B in crashes per test."""
+        return self.interval(A_CRASHES - B_CRASHES, level)
+
+    def only_a(self, level: Level) -> Interval:
+        """Rate of cut-ins on which A crashes and B does not."""
+        return self._of_one(self.interval(ONLY_A, level))
+
+    def only_b(self, level: Level) -> Interval:
+        """Rate of cut-ins on which B crashes and A does not."""
+        low, high = (-self.limit(-ONLY_B, level, side) for side in (1.0, -1.0))
+        return self._of_one(Interval(self.rate(ONLY_B), low, high))
+
+    def _of_one(self, found: Interval) -> Interval:
+        return Interval(found.value, max(found.ci_low, 0.0) + 0.0, min(found.ci_high, float(self.p.sum())))
+
+    def ratio(self, level: Level) -> Interval:
+        """A over B; NaN where B has no crash, and open upwards where it may have none."""
+        a, b, p = self.rate(A_CRASHES), self.rate(B_CRASHES), self.p[:, None]
+
+        def limits(side: float) -> tuple[float, float]:
+            worst = {"failed_a": side > 0.0, "failed_b": side < 0.0}
+
+            def variance(ratio: float) -> float:
+                return self.pool_variance(A_CRASHES - ratio * B_CRASHES, **worst)
+
+            return ratio_limits(p * A_CRASHES, p * B_CRASHES, self.outcomes(**worst), level, variance)
+
+        low, high = limits(-1.0)
+        return Interval(a / b if b > 0.0 else math.nan, low, limits(1.0)[1] if self.any_failed else high)
+
+    def rhw(self, level: Level) -> float:
+        """Half-width of the difference over the larger of the two rates; infinite where neither has crashed."""
+        return self.difference(level).half_width / self.larger_rate if self.n_crashes else math.inf
+
+    def rhw_from_pool(self, level: Level) -> float:
+        """What the pool's own error alone would leave of `rhw`."""
+        return level.z * math.sqrt(self.pool_variance(A_CRASHES - B_CRASHES)) / self.larger_rate
+
+    @property
+    def n_crashes(self) -> int:
+        """Crashes of both vehicles."""
+        return int(self.ends[:, CRASH].sum() + self.ends[:, :, CRASH].sum())
+
+    def gains(self, given: IntArray, level: Level) -> FloatArray:
+        """How much one more pair of each stratum narrows the difference's interval, after some given ones, (S,)."""
+        weights, grown = self.p[:, None] * (A_CRASHES - B_CRASHES), (1.0 + given / np.maximum(self.tests, 1))[:, None]
+        return sum(
+            (
+                contrast_gains(weights, grown * self.outcomes(failed_a=side > 0.0, failed_b=side < 0.0), level, side)
+                for side in (-1.0, 1.0)
+            ),
+            start=np.zeros(len(given)),
+        )
+
+    def verdict(self, margin: float, level: Level) -> Verdict:
+        """Whether B's rate is at most 1 + margin times A's: proven, refuted, or open."""
+        excess = (1.0 + margin) * A_CRASHES - B_CRASHES
+        if self.limit(excess, level, -1.0) >= 0.0:
+            return "proven"
+        return "refuted" if self.limit(excess, level, 1.0) < 0.0 else "open"
+
+
+class PairedShells:
+    """Tests of A and B as they come; the i-th of a stratum with A and the i-th with B are the same cut-in."""
+
+    def __init__(self, design: ShellDesign) -> None:
+        n = len(design.strata)
+        self._design = design
+        self._ends = [[np.zeros(0, np.int64)] * n, [np.zeros(0, np.int64)] * n]
+        self._mass = [np.zeros((0, n))] * n  # of A's tests; B's paths are the same
+
+    def add(self, side: int, block: Block) -> None:
+        """Tests of A (0) or of B (1), in the order of their draws."""
+        if block.stratum is None or block.cell_mass is None:
+            raise ValueError("the block has no shells")
+        ends = np.where(block.failed, FAILED, np.where(block.crash, CRASH, NO_CRASH))
+        for s in np.unique(block.stratum).tolist():
+            rows = block.stratum == s
+            self._ends[side][s] = np.concatenate([self._ends[side][s], ends[rows]])
+            if side == 0:
+                self._mass[s] = np.concatenate([self._mass[s], block.cell_mass[rows] @ self._design.joined])
+
+    def tests(self, side: int) -> IntArray:
+        """Tests of A or B by stratum, shape (S,)."""
+        return np.array([ends.size for ends in self._ends[side]], np.int64)
+
+    def first(self, n_pairs: IntArray) -> PairCounts:
+        """The first pairs of each stratum, of which both tests must be there."""
+        counted = no_pairs(self._design)
+        for s, n in enumerate(n_pairs.tolist()):
+            a, b = (of_side[s][:n] for of_side in self._ends)
+            np.add.at(counted.ends[s], (a, b), 1)
+            np.add.at(counted.mass[s], (a, b), self._mass[s][:n])
+        return counted
+
+
+def no_pairs(design: ShellDesign) -> PairCounts:
+    """That of no tests."""
+    n = len(design.strata)
+    return PairCounts(design, np.zeros((n, N_ENDS, N_ENDS), np.int64), np.zeros((n, N_ENDS, N_ENDS, n)))

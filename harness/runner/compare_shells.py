@@ -1,0 +1,214 @@
+"""Compare two AVs on the same cut-ins drawn from shells: both are driven round by round, to where they differ.
+
+The i-th cut-in of a stratum is the same for both, as it follows from the campaign's seed and the pool. What either
+folder holds already, from an earlier call or because it is the copy of a stored run, is not driven again.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from harness.arrays import IntArray
+from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED, CampaignError
+from harness.estimators.block import Block
+from harness.estimators.paired_shells import PairedEstimate, paired_estimate
+from harness.estimators.paired_statement import conditional_paired_statement, margin_statement, paired_statement
+from harness.estimators.pairs import PairCounts, PairedShells, Verdict
+from harness.pool.shells import Draw, PrescribedEpisodes, acceleration_limit
+from harness.progress import Progress, SilentProgress
+from harness.records.folder import sole_use
+from harness.records.reader import read_shards
+from harness.resolved import Resolved
+from harness.runner.campaign_run import Run
+from harness.runner.manifest import require_own_folder
+from harness.runner.pair_planner import LOOKS, PairPlanner, PairRule
+from harness.runner.planner import round_specs
+from harness.runner.worker import ShardSpec
+
+PAIRING = "the i-th cut-in that A meets of a shell is the i-th that B meets: same initial state, paths and cut-in"
+EXIT_OF: Mapping[Verdict, int] = {"proven": EXIT_DONE, "refuted": EXIT_REFUTED, "open": EXIT_BUDGET_SPENT}
+
+
+class _Side:
+    """One vehicle's run, which is told from outside what to test; also its `harness.runner.planner.Planner`."""
+
+    def __init__(self, run: Run, side: int, pairs: PairedShells, rule: PairRule, shard_size: int) -> None:
+        self.run, self.rule, self.reported_from, self.remark = run, rule, 0, ""
+        self._side, self._pairs, self._shard_size = side, pairs, shard_size
+        self.run.planner = self
+
+    def rounds(self) -> Iterator[Iterator[ShardSpec]]:
+        """None of its own."""
+        return iter(())
+
+    def add(self, block: Block) -> bool:
+        """Hand on the tests of a shard."""
+        self._pairs.add(self._side, block)
+        return False
+
+    def drive(self, n_pairs: IntArray) -> None:
+        """Test what is missing of the first cut-ins of each stratum."""
+        held, prefix = self._pairs.tests(self._side), self.run.prefix
+        missing = np.maximum(n_pairs - held, 0)
+        if missing.any():
+            self.run.run_round(
+                iter(round_specs(held, missing, len(prefix.shards), prefix.n_episodes, self._shard_size))
+            )
+
+
+def compare_shells(
+    sides: tuple[Resolved, Resolved],
+    folders: tuple[Path, Path],
+    *,
+    margin: float | None = None,
+    workers: int | None = None,
+    progress: Progress | None = None,
+) -> tuple[PairedEstimate, PairRule]:
+    """Drive both vehicles on the same cut-ins until the difference, or the margin, is known well enough.
+
+    Parameters
+    ----------
+    sides, folders : pair
+        Campaigns that differ in the vehicle only, and their run folders.
+    margin : float, optional
+        Stop when it is known whether B's rate is at most 1 + margin times A's, instead of at ``stop.rhw``.
+    workers, progress
+        See `harness.runner.run_campaign`.
+
+    Raises
+    ------
+    CampaignError
+        The vehicles do not have the same shells.
+    """
+    require_same_shells(sides)
+    began, progress = time.monotonic(), progress or SilentProgress()
+    campaign = sides[0].campaign
+    with ExitStack() as locks:
+        runs, held = [], []
+        for resolved, folder in zip(sides, folders, strict=True):
+            locks.enter_context(sole_use(folder))
+            earlier = require_own_folder(folder, resolved, resume=True)
+            held.append(list(_held_specs(folder, earlier)))
+            runs.append(Run(resolved, folder, earlier, workers or os.cpu_count() or 1, progress, began))
+        prescribed = _same_cut_ins(runs)
+        planner = PairPlanner(campaign, prescribed.design, prescribed.available, margin)
+        pairs = PairedShells(prescribed.design)
+        both = [_Side(run, side, pairs, planner.rule, campaign.run.shard_size) for side, run in enumerate(runs)]
+        progress.stage("tests of A and B", 2 * campaign.stop.episodes)
+        with ExitStack() as working:
+            for run in runs:
+                working.enter_context(run.under_way())
+            for run, specs in zip(runs, held, strict=True):
+                run.run_round(iter(specs))
+            counts = _drive(planner, pairs, both)
+        for run in runs:
+            run.discard_uncounted()
+            run.finish()
+    return paired_estimate(counts, campaign.stop.confidence), planner.rule
+
+
+def _same_cut_ins(runs: list[Run]) -> PrescribedEpisodes:
+    """Cut-ins of both: one environment and one library make one pool."""
+    a, b = (run.prescribed for run in runs)
+    if a is None or b is None:
+        raise ValueError("the campaigns do not draw from shells")
+    return a
+
+
+def _drive(planner: PairPlanner, pairs: PairedShells, both: list[_Side]) -> PairCounts:
+    """Rounds of pairs until the rule is content; the pairs that it has seen."""
+    n_pairs = np.zeros_like(pairs.tests(0))
+    counts = pairs.first(n_pairs)
+    while (added := planner.next_round(counts)).any():
+        n_pairs = n_pairs + added
+        for side in both:
+            side.drive(n_pairs)
+        counts = pairs.first(n_pairs)
+        if planner.rule.observe(counts):
+            break
+    return counts
+
+
+def require_same_shells(sides: tuple[Resolved, Resolved]) -> None:
+    """Refuse vehicles that would not have the same cut-ins, or not the same strata of them."""
+    if any(of_side.campaign.has_shadow_runs for of_side in sides):
+        raise CampaignError(
+            "av.before_cut_in",
+            found="controller: a vehicle that acts before the cut-in has cut-ins of its own",
+            expected="hold_speed in A and B: pairs need the same cut-ins",
+            mend="Write --set testing.method=forced, which drives each vehicle along the paths of the tests first.",
+        )
+    if sides[0].campaign.testing.shells.stopping != "sequential":
+        raise CampaignError(
+            "testing.shells.stopping",
+            found=sides[0].campaign.testing.shells.stopping,
+            expected="sequential: a comparison plans no second phase",
+            mend="Write --set testing.shells.stopping=sequential.",
+        )
+    if any(of_side.campaign.av.before_cut_in == "controller" for of_side in sides):
+        raise CampaignError(
+            "av.before_cut_in",
+            found="controller",
+            expected="vehicles that hold their speed until the cut-in: each that acts before has its own cut-ins",
+            mend="Write --set testing.method=forced, or compare the intervals of two runs.",
+        )
+    limits = [acceleration_limit(of_side.campaign.av) for of_side in sides]
+    envelope = sides[0].library.envelope_mps2
+    if (limits[0] > envelope) != (limits[1] > envelope):
+        raise CampaignError(
+            "av",
+            found=f"a hardest acceleration of {limits[0]:g} m/s² in A and {limits[1]:g} m/s² in B",
+            expected=f"both up to {envelope:g} m/s², the envelope of the surrogate library, or both above",
+            mend=f"Limit both (av.limits.max_acceleration_mps2: {envelope:g}), or neither.",
+        )
+
+
+def _held_specs(folder: Path, earlier: Mapping[str, Any]) -> Iterator[ShardSpec]:
+    """Shards that a folder holds, as they were asked for."""
+    if not earlier["shards"]:
+        return
+    taken: dict[int, int] = {}
+    tables = read_shards(folder, episode_columns=["component"], moment_columns=[])
+    for shard, (episodes, _) in zip(earlier["shards"], tables, strict=True):
+        stratum = episodes.column("component").to_numpy()
+        edges = [0, *(np.flatnonzero(np.diff(stratum)) + 1).tolist(), stratum.size]
+        draws = []
+        for first, end in pairwise(edges):
+            s, n = int(stratum[first]), end - first
+            draws.append(Draw(s, taken.get(s, 0), n))
+            taken[s] = taken.get(s, 0) + n
+        yield ShardSpec(shard["index"], shard["first_episode"], shard["n_episodes"], tuple(draws))
+
+
+def shells_content(
+    found: PairedEstimate, rule: PairRule, margin: float | None, labels: tuple[str, str]
+) -> dict[str, Any]:
+    """What ``compare.json`` says under shells."""
+    level = 1.0 - (1.0 - found.a.confidence) / LOOKS
+    free, given = paired_statement(found, *labels), conditional_paired_statement(found)
+    statements = [given, free] if rule.conditional else [free, given]
+    decided = None
+    if margin is not None and rule.verdict is not None:
+        decided = {
+            "margin": margin,
+            "verdict": rule.verdict,
+            "confidence": level,
+            "given_the_library": rule.conditional,
+        }
+        statements.insert(0, margin_statement(rule.verdict, margin, level, conditional=rule.conditional))
+    return {**found.to_json(), "margin": decided, "statement": statements[0], "statements": statements}
+
+
+def exit_code(rule: PairRule, *, precision_asked: bool) -> int:
+    """5 where B is worse by more than the margin; 4 where the budget was spent before anything was known."""
+    if rule.verdict is not None:
+        return EXIT_OF[rule.verdict]
+    return EXIT_BUDGET_SPENT if precision_asked and not rule.reached else EXIT_DONE

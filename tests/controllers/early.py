@@ -1,0 +1,134 @@
+"""Controllers that act before the cut-in, or could; each brakes, or is the IDM, after it."""
+
+from __future__ import annotations
+
+import math
+import os
+
+import numpy as np
+
+from examples import idm_batch
+from examples.idm import idm_acceleration
+from harness.controllers.traci_style import TraciStyleController
+
+
+class HoldsThenIdm:
+    """Keeps its speed until the cut-in, as a vehicle that is only asked from then on would."""
+
+    def __init__(self, min_acceleration_mps2: float = -4.0) -> None:
+        self._min = min_acceleration_mps2
+
+    def start(self, episode):
+        self.random, self.index = episode.random, episode.episode
+
+    def step(self, seen):
+        if math.isinf(seen.gap_m):
+            return self.before(seen)
+        return idm_acceleration(seen.speed_mps, seen.lead_speed_mps, seen.gap_m, self._min)
+
+    def before(self, seen):
+        return 0.0
+
+    def close(self): ...
+
+
+class HoldsBatch(idm_batch.IDM):
+    """The same over arrays."""
+
+    def step_batch(self, seen):
+        return np.where(np.isinf(seen.gap_m), 0.0, super().step_batch(seen))
+
+
+class Speeds(HoldsThenIdm):
+    """Drives freely to 1.2 times its first speed, with noise from the stream that it is given."""
+
+    def __init__(self, min_acceleration_mps2: float = -4.0, noise_mps2: float = 0.0) -> None:
+        super().__init__(min_acceleration_mps2)
+        self._noise = noise_mps2
+
+    def start(self, episode):
+        super().start(episode)
+        self._wanted = None
+
+    def before(self, seen):
+        self._wanted = self._wanted or 1.2 * seen.speed_mps
+        noise = self._noise * self.random.uniform(-1.0, 1.0) if self._noise else 0.0
+        return (0.8 if seen.speed_mps < self._wanted else 0.0) + noise
+
+
+class SpeedsBatch(idm_batch.IDM):
+    """`Speeds` without noise over arrays."""
+
+    def start_batch(self, cells, episodes, random):
+        self.wanted = getattr(self, "wanted", np.zeros(4096))
+        self.wanted[cells] = np.nan
+
+    def step_batch(self, seen):
+        wanted = self.wanted[seen.cell]
+        self.wanted[seen.cell] = wanted = np.where(np.isnan(wanted), 1.2 * seen.speed_mps, wanted)
+        free = np.where(seen.speed_mps < wanted, 0.8, 0.0)
+        return np.where(np.isinf(seen.gap_m), free, super().step_batch(seen))
+
+
+class SpeedsTraci(TraciStyleController):
+    """A script that speeds up until someone is ahead, and then is the IDM."""
+
+    def on_step(self, traci, veh_id, time):
+        leader, speed = traci.vehicle.getLeader(veh_id), traci.vehicle.getSpeed(veh_id)
+        a = 0.5
+        if leader is not None:
+            a = idm_acceleration(speed, traci.vehicle.getSpeed(leader[0]), leader[1])
+        traci.vehicle.setAcceleration(veh_id, a, traci.simulation.getDeltaT())
+
+
+class Beside(idm_batch.IDM):
+    """Speeds up by 1.5 m/s² from 20 m behind BV's bumper on, to get past it."""
+
+    def step_batch(self, seen):
+        gap = seen.bv_position_m - 5.0 - seen.position_m
+        return np.where(np.isinf(seen.gap_m), np.where(gap < 20.0, 1.5, 0.0), super().step_batch(seen))
+
+
+class Yields(idm_batch.IDM):
+    """Follows BV as the IDM does while it is still on the other lane."""
+
+    def step_batch(self, seen):
+        gap = seen.bv_position_m - 5.0 - seen.position_m
+        ahead = seen._replace(gap_m=np.maximum(gap, 0.1), lead_speed_mps=seen.bv_speed_mps)
+        return np.where(np.isinf(seen.gap_m) & (gap <= 0.0), 0.0, super().step_batch(ahead))
+
+
+class YieldsMostly(HoldsThenIdm):
+    """Gives way to BV while that is still beside it, but for one index in forty that it is told."""
+
+    def before(self, seen):
+        gap = seen.bv.position_m - 5.0 - seen.position_m
+        if self.index % 40 == 3 or gap <= 0.0:
+            return 0.0
+        return idm_acceleration(seen.speed_mps, seen.bv.speed_mps, gap, self._min)
+
+
+class FreshNoise(Speeds):
+    """Noise of its own instead of the stream's."""
+
+    def start(self, episode):
+        super().start(episode)
+        self.random = np.random.default_rng()
+
+
+class Breaks(HoldsThenIdm):
+    """Raises two seconds into every fiftieth index that it is told."""
+
+    def before(self, seen):
+        if self.index % 50 == 7 and seen.time_s > 2.0:
+            raise RuntimeError("sensor lost")
+        return 0.3
+
+
+class Exits(HoldsThenIdm):
+    """Ends its process in the second second of the index 61 that it is told."""
+
+    def before(self, seen):
+        if self.index == 61 and seen.time_s > 1.0:
+            os._exit(9)
+        return 0.3

@@ -1,0 +1,165 @@
+"""Pairs within shells: their counts, limits both ways of failed tests, what the pool's error adds, and the verdict."""
+
+from __future__ import annotations
+
+import json
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from harness.estimators.likelihood_ratio import Level
+from harness.estimators.paired_shells import paired_estimate
+from harness.estimators.paired_statement import conditional_paired_statement, margin_statement, paired_statement
+from harness.estimators.pairs import (
+    A_CRASHES,
+    B_CRASHES,
+    CRASH,
+    FAILED,
+    NO_CRASH,
+    PairCounts,
+    PairedShells,
+    no_pairs,
+)
+from harness.strata import ShellDesign, Statement
+from tests.estimators.small_blocks import SHELLS, in_shells
+
+LEVEL = Level.two_sided(0.9)
+DESIGN = ShellDesign(
+    pool="0" * 24, strata=("a", "b", "outside"), cell_stratum=(0, 1, 2), cell_p=np.array([1e-7, 2e-7, 3e-5]),
+    n_paths=10**9, statements=(Statement("library", "b", "keeps to b", 2),), p_cut_in=4e-5, p_impossible=0.0,
+)  # fmt: skip
+
+
+def pairs_of(*strata, mass=0.0):
+    """Counts of both, only A, only B, neither for each stratum; ``mass`` of every path in its own stratum."""
+    pairs = no_pairs(DESIGN)
+    for s, counts in enumerate(strata):
+        for (a, b), n in zip(((1, 1), (1, 0), (0, 1), (0, 0)), counts, strict=True):
+            pairs.ends[s, a, b] += n
+            pairs.mass[s, a, b, s] += n * mass
+    return pairs
+
+
+PAIRS = pairs_of((30, 10, 2, 8), (0, 5, 0, 45), (0, 0, 0, 4000))
+
+
+def test_rates_are_those_of_each_and_their_difference():
+    found = paired_estimate(PAIRS, 0.9)
+    assert found.a.crash_rate == pytest.approx(1e-7 * 0.8 + 2e-7 * 0.1)
+    assert found.b.crash_rate == pytest.approx(1e-7 * 0.64)
+    assert found.free.difference == pytest.approx(found.a.crash_rate - found.b.crash_rate)
+    assert found.free.only_a.value - found.free.only_b.value == pytest.approx(found.free.difference)
+    assert found.free.ratio == pytest.approx(found.a.crash_rate / found.b.crash_rate)
+    assert (found.free.n_pairs, found.free.n_differing, found.conditional.n_pairs) == (4100, 17, 100)
+
+
+def test_intervals_hold_what_was_seen_and_the_conditional_one_is_within():
+    found = paired_estimate(PAIRS, 0.9)
+    free, inside = found.free, found.conditional
+    assert free.ci_low < inside.ci_low < free.difference < inside.ci_high < free.ci_high
+    assert free.ratio_low < inside.ratio_low < free.ratio < inside.ratio_high < free.ratio_high
+    assert 0.0 < free.only_a.ci_low < free.only_a.value < free.only_a.ci_high
+    # What was not seen outside, in 4,000 tests, may be 2.6 of 4,000 on either side.
+    assert free.ci_high - inside.ci_high < 3e-5 * 2.6 / 4000
+
+
+def test_pairing_is_worth_more_where_both_crash_alike():
+    alike, apart = (pairs_of(counts, (0, 0, 0, 2000)) for counts in ((49, 1, 0, 50), (24, 26, 25, 25)))
+    assert alike.inside().difference(LEVEL).half_width < 0.35 * apart.inside().difference(LEVEL).half_width
+
+
+def test_vehicles_changed_over_change_signs():
+    swapped = PairCounts(DESIGN, PAIRS.ends.transpose(0, 2, 1), PAIRS.mass.transpose(0, 2, 1, 3))
+    there, back = PAIRS.difference(LEVEL), swapped.difference(LEVEL)
+    assert (-back.ci_high, -back.ci_low) == pytest.approx((there.ci_low, there.ci_high))
+    assert swapped.only_b(LEVEL) == pytest.approx(PAIRS.only_a(LEVEL))
+
+
+def test_failed_tests_widen_both_ways():
+    """A fails 3 times where B does not crash, B twice where A does."""
+    failed = pairs_of((30, 8, 2, 5), (0, 5, 0, 45), (0, 0, 0, 4000))
+    failed.ends[0, FAILED, NO_CRASH] = 3
+    failed.ends[0, CRASH, FAILED] = 2
+    worst_a = pairs_of((30, 13, 2, 5), (0, 5, 0, 45), (0, 0, 0, 4000))
+    worst_b = pairs_of((32, 8, 2, 8), (0, 5, 0, 45), (0, 0, 0, 4000))
+    found = failed.difference(LEVEL)
+    assert found.ci_high == pytest.approx(worst_a.difference(LEVEL).ci_high)
+    assert found.ci_low == pytest.approx(worst_b.difference(LEVEL).ci_low)
+    ratio = failed.ratio(LEVEL)
+    assert ratio.ci_high == pytest.approx(worst_a.ratio(LEVEL).ci_high)
+    assert ratio.ci_low == pytest.approx(worst_b.ratio(LEVEL).ci_low)
+    estimate = paired_estimate(failed, 0.9)
+    assert (estimate.a.details["n_failed"], estimate.b.details["n_failed"]) == (3, 2)
+    assert "A FAILED in 3 and B in 2" in paired_statement(estimate, "x", "y")
+    assert estimate.to_json()["shells"][0]["n_failed_tests"] == 5
+
+
+def test_the_pool_adds_the_error_of_pairs_that_differ():
+    """One stratum, every path of mass m in it: the variance of p·c has E[x²] = p c m, and cuts-ins of both cancel."""
+    mass, n_paths = 4e-4, 10**9
+    only = pairs_of((0, 40, 0, 60), mass=mass)
+    expected = (1e-7 * 0.4 * mass - (1e-7 * 0.4) ** 2) / n_paths
+    assert only.pool_variance(A_CRASHES - B_CRASHES) == pytest.approx(expected)
+    both = pairs_of((40, 0, 0, 60), mass=mass)
+    assert both.pool_variance(A_CRASHES - B_CRASHES) == 0.0
+    assert both.pool_variance(A_CRASHES) == pytest.approx(expected)
+    each = pairs_of((0, 40, 40, 20), mass=mass)
+    assert each.pool_variance(A_CRASHES - B_CRASHES) == pytest.approx(2 * 1e-7 * 0.4 * mass / n_paths, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("inside", "n_outside", "verdict"),
+    [((50, 0, 0, 50), 60_000, "proven"), ((50, 0, 20, 30), 60_000, "refuted"), ((50, 0, 0, 50), 300, "open")],
+)
+def test_a_margin_is_proven_or_refuted_or_open(inside, n_outside, verdict):
+    pairs = pairs_of(inside, (0, 0, 0, 1000), (0, 0, 0, n_outside))
+    assert pairs.verdict(0.1, LEVEL) == verdict
+
+
+def test_a_margin_is_where_the_ratio_ends():
+    low, high = PAIRS.ratio(LEVEL)[1:]
+    for factor, verdict in ((1.001, "proven"), (0.999, "open")):
+        assert PAIRS.verdict(factor / low - 1.0, LEVEL) == verdict
+    assert PAIRS.verdict(1.001 / high - 1.0, LEVEL) == "open"
+    swapped = PairCounts(DESIGN, PAIRS.ends.transpose(0, 2, 1), PAIRS.mass.transpose(0, 2, 1, 3))
+    assert swapped.inside().verdict(0.1, LEVEL) == "refuted"
+
+
+def test_a_crash_of_either_outside_refutes_the_assumption():
+    found = paired_estimate(pairs_of((30, 10, 2, 8), (0, 5, 0, 45), (0, 0, 1, 3999)), 0.9)
+    assert found.refuted
+    assert "B has 1 times crashed where the surrogate b does not" in conditional_paired_statement(found)
+    assert "In 4,000 pairs of tests outside neither crashed" in conditional_paired_statement(
+        paired_estimate(PAIRS, 0.9)
+    )
+
+
+def test_equal_vehicles_are_not_told_apart_and_json_has_no_infinity():
+    found = paired_estimate(pairs_of((0, 0, 0, 50), (0, 0, 0, 50), (0, 0, 0, 400)), 0.9)
+    assert found.free.ci_low < 0.0 < found.free.ci_high
+    assert math.isnan(found.free.ratio)
+    assert found.free.ratio_high == math.inf
+    content = json.loads(json.dumps(found.to_json(), allow_nan=False))
+    assert content["ratio_high"] is None
+    assert content["only_a"]["ci_low"] == 0.0
+    assert "not distinguishable from 0" in paired_statement(found, "x", "y")
+    assert margin_statement("refuted", 0.1, 0.983, conditional=False).startswith("B IS WORSE")
+
+
+def test_the_ith_test_of_a_stratum_belongs_to_the_ith_of_the_other_whatever_the_shards():
+    rng = np.random.default_rng(4)
+    stratum = np.sort(rng.integers(0, 3, 40))
+    a, b = rng.random((2, 40)) < 0.5
+    pairs = PairedShells(SHELLS)
+    for side, crash, edges in ((0, a, (0, 7, 40)), (1, b, (0, 20, 33, 40))):
+        for first, end in pairwise(edges):
+            pairs.add(side, in_shells(stratum[first:end].tolist(), crash[first:end].tolist(), first=first))
+    n = np.minimum(pairs.tests(0), 9)
+    counted = pairs.first(n)
+    for s in range(3):
+        first = np.flatnonzero(stratum == s)[:9]
+        assert counted.ends[s, CRASH, NO_CRASH] == np.count_nonzero(a[first] & ~b[first])
+        assert counted.ends[s, CRASH, CRASH] == np.count_nonzero(a[first] & b[first])
+    assert counted.tests.tolist() == n.tolist()

@@ -1,0 +1,162 @@
+"""The pool of a vehicle that acts before the cut-in: its own hazard, and surrogates that take over from it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from harness.campaign.loading import load_campaign
+from harness.environment.cut_in import acceptance, cut_in_hazard, opportunity
+from harness.episode.motion import motion_hashes
+from harness.errors import HarnessError
+from harness.outcomes import AV, BV, CRASH, LV
+from harness.pool.aimed_paths import Enumerator
+from harness.pool.shadow_paths import CANDIDATES, EVENLY, ShadowPaths, chances
+from harness.pool.vehicle_pool import ShadowRuns, recorded_cut_ins, vehicle_pool
+from harness.progress import SilentProgress
+from harness.resolved import resolve
+from harness.runner.prepare import prepare
+from harness.runner.shadow_runs import as_recorded, run_shadows, shadow_specs, without_cut_in
+from harness.state import State
+from harness.twin import TwinWorld
+from tests.pool.conftest import MIXTURE_FILE, SMALL_POOL
+
+N = 256
+ACTING = "{{controller: 'tests.controllers.early:{}', before_cut_in: controller, limits: {{max_acceleration_mps2: 2}}}}"
+
+
+def acting(name: str, *more: str):
+    av = ACTING.format(name)
+    overrides = ["testing.method=shells", f"av={av}", "world.engine=twin", "pool.shadow_paths=120", *SMALL_POOL]
+    return load_campaign(MIXTURE_FILE, [*overrides, *more])
+
+
+def prepared_after(campaign):
+    """The campaign after its shadow runs, its loop, and what the runs left."""
+    ready = prepare(resolve(campaign))
+    loop = ready.loop(TwinWorld(32))
+    environment = ready.policy.environment
+    specs = shadow_specs(len(ready.shadow_paths))
+    runs = as_recorded([run_shadows(loop, ready.shadow_paths, environment, spec).table for spec in specs], environment)
+    return ready.after(runs), loop, runs
+
+
+@pytest.fixture(scope="module")
+def speeds():
+    return prepared_after(acting("Speeds"))
+
+
+def test_a_vehicle_that_holds_its_speed_has_the_cut_ins_of_one_that_holds(environment, campaign):
+    """Every bit: same hazards, same probabilities, same crashes, on naturalistic paths."""
+    library = resolve(campaign).library
+    envelope = list(library.surrogates).index(library.envelope)
+    enumerator = Enumerator(environment, library.drivers, envelope, 5, stride=1)
+    held = enumerator.run(0, N, SilentProgress())
+    steps = np.arange(int(environment.numbers["max_steps"]) + 1)
+    v = np.repeat((held.state["v_bv_mps"] - held.state["r2dot_mps"])[:, None], steps.size, 1)
+    x = np.full(v.shape, 100.0)
+    for step in steps[1:]:
+        x[:, step] = x[:, step - 1] + v[:, step] * 0.1
+    runs = ShadowRuns(np.full(N, steps[-1]), np.zeros(N, np.bool_), x, v)
+    where = 5, held.index, held.state, environment, library.drivers, envelope
+    probability, crashes, unknown = recorded_cut_ins(runs, *where)
+    asked = held.mass > 0.0
+    assert asked.sum() > 10_000
+    np.testing.assert_array_equal(probability[asked], held.mass[asked])
+    np.testing.assert_array_equal(crashes[asked], held.crashes[asked])
+    assert probability[~asked].sum() < 1e-6 * probability.sum()  # BV that falls back behind the AV's front again
+    assert np.all(unknown == 0.0)
+
+
+def test_probabilities_are_those_of_the_states_that_were_driven(speeds):
+    """Against the hazard at the states of a trace, worked out one by one."""
+    ready, loop, runs = speeds
+    paths, environment = ready.shadow_paths, ready.policy.environment
+    rows = slice(0, 10)
+    shard = without_cut_in(loop, paths.seed, 0, paths.index[rows], paths.state[rows], environment)
+    nobody = np.zeros(0, ready.resolved.library.drivers.dtype), -1
+    some = ShadowRuns(runs.n_steps[rows], runs.failed[rows], runs.x_m[rows], runs.v_mps[rows])
+    given = paths.seed, paths.index[rows], paths.state[rows], environment, *nobody
+    probability, _, _ = recorded_cut_ins(some, *given)
+    for row in range(10):
+        trace, stays = shard.traces[row], 1.0
+        for step in range(len(trace) - 1):
+            (lv, bv, av), (v_lv, v_bv, v_av) = trace[step, :, 0], trace[step, :, 1]
+            state = State(v_bv, lv - 5.0 - bv, v_lv - v_bv, bv - 5.0 - av, v_bv - v_av)
+            wish = opportunity(state, environment)
+            cut = -np.expm1(-cut_in_hazard(wish, acceptance(state.r2_m, state.r2dot_mps, environment), environment))
+            assert probability[row, step] == pytest.approx(stays * cut, rel=1e-9)
+            stays *= 1.0 - cut
+        assert np.all(probability[row, len(trace) - 1 :] == 0.0)
+    assert (LV, BV, AV) == (0, 1, 2)
+
+
+def test_a_vehicle_that_is_a_surrogate_from_the_cut_in_on_crashes_where_that_one_does(speeds):
+    """The loop drives what the pool has worked out: script, motion and hash agree, and every outcome."""
+    ready, _, _ = speeds
+    pool = vehicle_pool(ready.resolved, ready.shadow_paths, speeds[2])
+    brakes = "av.parameters={min_acceleration_mps2: -3.0}"
+    loop = prepare(resolve(acting("Speeds", brakes))).loop(TwinWorld(64))
+    rows = np.unique(np.linspace(0, len(pool.cut_ins.path) - 1, 1500).astype(np.int64))
+    rows = rows[pool.shell[rows] < pool.shell_p.size - 1]
+    shard = loop.run(10**6, *ready.prescribed.of_rows(rows, np.zeros(rows.size, np.int64)))
+    assert shard.failures == {}
+    crashed = shard.results.episode["outcome"] == CRASH
+    expected = pool.cut_ins.crashes[rows, pool.names.index("brakes-3")]
+    assert 300 < expected.sum() < rows.size - 300
+    np.testing.assert_array_equal(crashed, expected)
+
+
+def test_another_motion_is_noticed(speeds):
+    """The sibling that must fail: another vehicle on the same scripts."""
+    ready, _, _ = speeds
+    loop = prepare(resolve(acting("HoldsThenIdm"))).loop(TwinWorld(64))
+    rows = np.arange(0, len(ready.prescribed.of_rows(np.arange(50), np.zeros(50, np.int64))[0]))
+    shard = loop.run(0, *ready.prescribed.of_rows(rows, np.zeros(rows.size, np.int64)))
+    assert len(shard.failures) == rows.size
+    assert set(shard.failures.values()) == {shard.failures[0]}
+    assert "something else than in its shadow run" in shard.failures[0]
+
+
+def test_weights_of_the_chosen_paths_keep_every_mean():
+    """Sum over candidates of chance times weight is the candidates' mean, whatever is averaged; no weight above 10."""
+    rng = np.random.default_rng(1)
+    rates = rng.exponential(size=(4000, 3)) * (rng.random((4000, 1)) < 0.01)
+    chance = chances(rates, np.ones(3))
+    weight = 1.0 / (len(rates) * chance)
+    assert chance.sum() == pytest.approx(1.0, abs=1e-12)
+    np.testing.assert_allclose((chance * weight) @ rates, rates.mean(0), rtol=1e-12)
+    assert weight.max() <= 1.0 / EVENLY + 1e-9
+    assert CANDIDATES % 1024 == 0
+    np.testing.assert_allclose(chances(np.zeros((10, 2)), np.ones(2)), 0.1)
+
+
+def test_shells_of_a_holder_on_few_chosen_paths_are_those_of_the_large_pool(campaign, pool):
+    """Each within four standard errors (false alarm for 9 numbers below 1e-3), which are 13 % at most, mostly 3 %."""
+    ready, _, runs = prepared_after(acting("HoldsBatch", "pool.shadow_paths=1000"))
+    own = vehicle_pool(ready.resolved, ready.shadow_paths, runs)
+    order = [own.names.index(name) for name in pool.names]
+    error = np.sqrt(np.diag(own.mu_covariance)[order] + np.diag(pool.mu_covariance))
+    assert np.all(error < 0.13 * pool.mu)
+    assert np.median(error / pool.mu) < 0.05
+    assert np.all(np.abs(own.mu[order] - pool.mu) < 4.0 * error)
+    assert abs(own.p_cut_in - pool.p_cut_in) < 4.0 * np.hypot(own.p_cut_in_se, pool.p_cut_in_se)
+
+
+def test_hashes_tell_motions_apart_from_the_first_step_that_differs_on():
+    x, v = np.linspace(100.0, 500.0, 201)[None, :].repeat(3, 0), np.full((3, 201), 30.0)
+    x[1, 77] = np.nextafter(x[1, 77], 1e9)
+    v[2, 200] = -0.0
+    hashes = motion_hashes(x, v)
+    assert hashes.shape == (3, 200)
+    assert np.all((hashes[0] == hashes[1]) == (np.arange(200) < 76))
+    assert np.all((hashes[0] == hashes[2]) == (np.arange(200) < 199))
+    assert np.unique(hashes[0]).size == 200
+
+
+def test_a_vehicle_that_never_moves_is_refused(speeds):
+    ready, _, runs = speeds
+    paths: ShadowPaths = ready.shadow_paths
+    parked = ShadowRuns(np.zeros_like(runs.n_steps), np.ones_like(runs.failed), runs.x_m, runs.v_mps)
+    with pytest.raises(HarnessError, match="no cut-in on 120 paths"):
+        vehicle_pool(ready.resolved, paths, parked)

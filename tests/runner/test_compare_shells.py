@@ -1,0 +1,177 @@
+"""Two AVs on the same cut-ins of shells: pairs, what is not driven again, a margin, and what is refused."""
+
+from __future__ import annotations
+
+import json
+from collections import defaultdict
+from pathlib import Path
+
+import pytest
+
+from harness.cli import main
+from harness.errors import CampaignError, RunFolderError
+from harness.records.reader import read_shards
+from harness.runner import compare_campaigns, shards
+from harness.runner.campaign_run import Run
+from harness.runner.worker import ShardRunner
+from tests.pool.conftest import SMALL_POOL
+from tests.runner.conftest import MIXTURE_FILE, WorkerInThisProcess
+from tests.runner.stored_runs import manifest
+
+SHELLS = (
+    *("testing.method=shells", "testing.shells.statement=library", "stop.rhw=0.15", "stop.episodes=3000"),
+    *("stop.min_crashes=null", "world.engine=twin", *SMALL_POOL),
+)
+HARDER = "av.parameters.min_acceleration_mps2=-8"
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _here():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(shards, "WorkerProcess", WorkerInThisProcess)
+        patch.setattr(shards, "first_to_answer", lambda workers: workers[0])
+        patch.setattr("harness.report.write_report", lambda folder: folder / "report.html")
+        yield
+
+
+@pytest.fixture(scope="module")
+def campaigns(campaign):
+    return campaign(*SHELLS), campaign(*SHELLS, HARDER)
+
+
+@pytest.fixture(scope="module")
+def done(campaigns, tmp_path_factory):
+    return compare_campaigns(*campaigns, tmp_path_factory.mktemp("pairs") / "out", workers=1)
+
+
+@pytest.fixture
+def driven(monkeypatch):
+    """Episodes that were driven, not read."""
+    n, run = [], ShardRunner.run
+
+    def counted(self, spec, doomed=None):
+        n.append(spec.n_episodes)
+        return run(self, spec, doomed)
+
+    monkeypatch.setattr(ShardRunner, "run", counted)
+    return n
+
+
+def by_stratum(folder):
+    """Cut-in, initial range and outcome of each test, in order, by stratum."""
+    found = defaultdict(list)
+    columns = ["component", "pool_cut_in", "r2_m", "outcome"]
+    for episodes, _ in read_shards(folder, episode_columns=columns, moment_columns=[]):
+        for row in episodes.to_pylist():
+            found[row["component"]].append((row["pool_cut_in"], row["r2_m"], row["outcome"]))
+    return found
+
+
+def test_both_meet_the_same_cut_ins_and_the_difference_is_that_of_the_records(done):
+    a, b = (by_stratum(done.folder / side) for side in "ab")
+    shells, difference = done.content["shells"], 0.0
+    for s, shell in enumerate(shells):
+        assert [row[:2] for row in a[s]] == [row[:2] for row in b[s]]
+        assert len(a[s]) == shell["n_pairs"]
+        ends = [(x[2] == "crash", y[2] == "crash") for x, y in zip(a[s], b[s], strict=True)]
+        assert [ends.count(kind) for kind in ((True, True), (True, False), (False, True), (False, False))] == [
+            shell[key] for key in ("n_both", "n_only_a", "n_only_b", "n_neither")
+        ]
+        difference += shell["p"] * (shell["n_only_a"] - shell["n_only_b"]) / max(shell["n_pairs"], 1)
+    assert done.content["conditional"]["difference"] == pytest.approx(difference)
+    assert done.content["conditional"]["rhw"] <= 0.15
+    assert done.exit_code == 0
+    assert json.loads((done.folder / "compare.json").read_text()) == done.content
+
+
+def test_braking_harder_prevents_crashes_and_causes_none(done):
+    inside = done.content["conditional"]
+    assert inside["ci_low"] > 0.0
+    assert inside["only_b"]["value"] == 0.0
+    assert inside["ratio_low"] < 1.35e-7 / 7.5e-8 < inside["ratio_high"]
+
+
+def test_each_side_is_a_run_that_says_where_it_ended(done):
+    for side in "ab":
+        content = manifest(done.folder / side)
+        assert content["status"] == "done"
+        assert "of the difference" in content["ending"]
+        assert content["n_episodes"] == done.content["n_pairs"]
+        estimates = json.loads((done.folder / side / "estimates.json").read_text())["estimates"]["shells"]
+        assert estimates["crash_rate"] == pytest.approx(done.content[side]["crash_rate"])
+        assert estimates["ci_high"] == pytest.approx(done.content[side]["ci_high"])
+
+
+def test_what_is_finished_is_not_driven_again(done, campaigns, driven):
+    assert compare_campaigns(*campaigns, done.folder, workers=1).content == done.content
+    assert driven == []
+
+
+def test_a_stored_run_of_a_is_taken_over(done, campaigns, run_here, campaign, tmp_path, driven):
+    run_here(campaign(*SHELLS, "stop.rhw=0.9"), tmp_path / "stored")
+    before = sum(driven)
+    again = compare_campaigns(*campaigns, tmp_path / "out", workers=1, stored=tmp_path / "stored")
+    assert again.content == done.content
+    assert sum(driven) - before < 2 * done.content["n_pairs"]
+    assert sum(driven) == manifest(tmp_path / "out" / "a")["n_episodes"] + done.content["n_pairs"]
+
+
+def test_an_interrupted_comparison_goes_on(done, campaigns, tmp_path, monkeypatch, driven):
+    run_round, calls = Run.run_round, []
+
+    def interrupted(self, specs):
+        calls.append(1)
+        if len(calls) == 8:
+            raise KeyboardInterrupt
+        return run_round(self, specs)
+
+    monkeypatch.setattr(Run, "run_round", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        compare_campaigns(*campaigns, tmp_path, workers=1)
+    assert manifest(tmp_path / "a")["status"] == manifest(tmp_path / "b")["status"] == "interrupted"
+    assert compare_campaigns(*campaigns, tmp_path, workers=1).content == done.content
+    assert sum(driven) == 2 * done.content["n_pairs"]
+
+
+@pytest.mark.parametrize(("swapped", "verdict", "exit_code"), [(False, "proven", 0), (True, "refuted", 5)])
+def test_a_margin_is_decided(campaigns, done, tmp_path, swapped, verdict, exit_code):
+    a, b = reversed(campaigns) if swapped else campaigns
+    found = compare_campaigns(a, b, tmp_path, workers=1, margin=0.1)
+    assert (found.content["margin"]["verdict"], found.exit_code) == (verdict, exit_code)
+    assert found.content["margin"]["confidence"] > 0.98
+    assert "10 %" in found.content["statement"] or "0.1 times" in found.content["statement"]
+    assert "--margin (0.1)" in manifest(tmp_path / "a")["ending"]
+
+
+def test_a_margin_that_the_budget_leaves_open(campaign, tmp_path):
+    few = campaign(*SHELLS, "stop.episodes=60"), campaign(*SHELLS, "stop.episodes=60", "name=same")
+    found = compare_campaigns(*few, tmp_path, workers=1, margin=0.01)
+    assert (found.content["margin"]["verdict"], found.exit_code) == ("open", 4)
+    assert found.content["n_pairs"] == 60
+    assert found.content["ci_low"] <= 0.0 <= found.content["ci_high"]
+
+
+def test_refusals(campaigns, campaign, tmp_path, done):
+    forced = campaign("testing.method=forced"), campaign("testing.method=forced", HARDER)
+    with pytest.raises(CampaignError, match="--margin"):
+        compare_campaigns(*forced, tmp_path / "out", margin=0.1)
+    faster = campaign(*SHELLS, "av.parameters.max_acceleration_mps2=5")
+    with pytest.raises(CampaignError, match="hardest acceleration"):
+        compare_campaigns(campaigns[0], faster, tmp_path / "out")
+    early = campaign(*SHELLS, "av={controller: 'tests.controllers.early:Speeds', before_cut_in: controller}")
+    with pytest.raises(CampaignError, match="cut-ins of its own"):
+        compare_campaigns(early, early, tmp_path / "out")
+    with pytest.raises(RunFolderError, match="a run of campaign"):
+        compare_campaigns(*campaigns, tmp_path / "out", stored=done.folder / "b")
+    assert not (tmp_path / "out" / "a").exists()
+
+
+def test_the_command_line_takes_a_run_folder(done, tmp_path, capsys):
+    copy = Path(done.folder) / "a"
+    call = ["compare", str(copy), "--against", HARDER, "--out", str(tmp_path / "out"), "--workers", "1"]
+    assert main([*call, "--set", "stop.rhw=0.15"]) == 0
+    out = capsys.readouterr().out
+    assert out.startswith("If A and B crash only where the surrogate")
+    again = json.loads((tmp_path / "out" / "compare.json").read_text())
+    assert again["shells"] == done.content["shells"]
+    assert main(["compare", str(MIXTURE_FILE), str(MIXTURE_FILE), "--out", str(tmp_path / "x"), "--margin", "0.1"]) == 2

@@ -1,0 +1,191 @@
+"""Vehicles that act before the cut-in: shadow runs, tests that follow from them, and motion that is not the same."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from harness import estimate, replay
+from harness.errors import RunFolderError, TooManyFailedError
+from harness.records.schemas import shadow_schema
+from tests.pool.conftest import SMALL_POOL
+from tests.pool.test_vehicle_pool import ACTING
+from tests.runner.stored_runs import copy_of, manifest, shard_files, stored_table, unlike_columns
+
+SHELLS = ("testing.method=shells", "stop.rhw=0.5", "stop.episodes=3000", "stop.min_crashes=null", *SMALL_POOL)
+SHADOWS, TWIN = "pool.shadow_paths=120", "world.engine=twin"
+FORCED = ("testing.method=forced", "stop.episodes=600", "run.shard_size=100")
+
+
+def of(name: str, *more: str) -> str:
+    return ACTING.format(name)[:-1] + "".join(f", {text}" for text in more) + "}"
+
+
+def files_of(folder):
+    return sorted((folder / "shadow").glob("*.parquet"))
+
+
+@pytest.fixture(scope="module")
+def early_run(campaign, run, tmp_path_factory):
+    """One worker, eight cells, in SUMO. Never written to."""
+    out = tmp_path_factory.mktemp("early") / "run"
+    return run(campaign(*SHELLS, SHADOWS, f"av={of('Speeds')}", "world.cells=8"), out, workers=1)
+
+
+def test_it_reaches_the_precision_and_keeps_the_shadow_runs(early_run):
+    assert (early_run.exit_code, early_run.stopped_by) == (0, "rhw")
+    folder = early_run.folder
+    assert manifest(folder)["shadow_runs"] == {"n_runs": 120, "n_failed": 0}
+    tables = [pq.read_table(path) for path in files_of(folder)]
+    assert [table.num_rows for table in tables] == [50, 50, 20]
+    assert all(table.schema.equals(shadow_schema()) for table in tables)
+    rows = [row for table in tables for row in table.to_pylist()]
+    assert [row["shadow"] for row in rows] == list(range(120))
+    assert {row["outcome"] for row in rows} <= {"passed", "timeout", "bv_lv_contact"}
+    assert all(len(row["av_position_m"]) == len(row["av_speed_mps"]) == row["n_steps"] + 1 for row in rows)
+    assert any(row["av_speed_mps"][-1] > row["av_speed_mps"][0] + 2.0 for row in rows)
+    episodes = stored_table(folder, "episodes")
+    assert episodes.column("failure").null_count == episodes.num_rows
+    assert json.loads((folder / "shells.json").read_text())["n_paths"] == 120
+
+
+def test_the_twin_gives_the_same_bits_for_two_workers_and_other_cells(early_run, campaign, run, tmp_path):
+    twin = run(campaign(*SHELLS, SHADOWS, f"av={of('Speeds')}", TWIN, "world.cells=64"), tmp_path / "run", workers=2)
+    assert _unlike(early_run.folder, twin.folder) == []
+
+
+def _unlike(one, other) -> list[str]:
+    """Columns of the episodes that differ; the pool's key names the engine, so that files of JSON differ."""
+    names = [name for name in unlike_columns(one, other) if not name.endswith(".json")]
+    same = [a.read_bytes() == b.read_bytes() for a, b in zip(files_of(one), files_of(other), strict=True)]
+    return names + ["shadow"] * (not all(same))
+
+
+def test_an_array_controller_gives_the_same_bits(early_run, campaign, run_here, tmp_path):
+    batch = run_here(campaign(*SHELLS, SHADOWS, f"av={of('SpeedsBatch')}", TWIN), tmp_path / "run")
+    assert _unlike(early_run.folder, batch.folder) == []
+
+
+def test_a_test_is_replayed_bit_for_bit(early_run):
+    again = replay(early_run.folder, 5)
+    assert again.bit_equal
+    assert again.row["pool_cut_in"] is not None
+
+
+def test_a_run_that_was_interrupted_goes_on_where_it_was(early_run, campaign, run_here, tmp_path, monkeypatch):
+    """Ended in the middle of the shadow runs, and again among the tests: the end is that of a run in one go."""
+    asked = campaign(*SHELLS, SHADOWS, f"av={of('Speeds')}", TWIN)
+    whole = run_here(asked, tmp_path / "whole")
+    out = copy_of(whole.folder, tmp_path / "run")
+    for table in ("episodes", "traces"):
+        shutil.rmtree(out / table)
+    files_of(out)[1].unlink()
+    kept = {path.name: path.stat().st_mtime_ns for path in files_of(out)}
+    (out / "manifest.json").write_text(
+        json.dumps({**manifest(out), "n_episodes": 0, "shards": [], "status": "interrupted"})
+    )
+    run_here(asked, out, resume=True)
+    assert unlike_columns(whole.folder, out) == []
+    assert {path.name: path.stat().st_mtime_ns for path in files_of(out) if path.name in kept} == kept
+    shard_files(out)[-1].unlink()
+    run_here(asked, out, resume=True)
+    assert unlike_columns(whole.folder, out) == []
+
+
+def test_a_vehicle_with_noise_of_its_own_is_refused_and_one_with_the_given_noise_is_not(campaign, run_here, tmp_path):
+    noisy = "parameters: {noise_mps2: 0.2}"
+    fresh = campaign(*SHELLS, SHADOWS, TWIN, f"av={of('FreshNoise', noisy)}")
+    with pytest.raises(TooManyFailedError, match="something else than in its shadow run"):
+        run_here(fresh, tmp_path / "fresh")
+    episodes = stored_table(tmp_path / "fresh", "episodes")
+    assert set(episodes.column("outcome").to_pylist()) == {"failed"}
+    seeded = run_here(campaign(*SHELLS, SHADOWS, TWIN, f"av={of('Speeds', noisy)}"), tmp_path / "seeded")
+    assert manifest(seeded.folder)["repeated"]["differing"] == []
+    assert stored_table(seeded.folder, "episodes").column("failure").drop_null().to_pylist() == []
+
+
+def test_shadow_runs_that_fail_count_against_the_vehicle(campaign, run_here, tmp_path):
+    """Three in 120 fail: refused at one per cent; with five they are a part of the upper limit that no test takes."""
+    breaks = (*SHELLS, SHADOWS, TWIN, f"av={of('Breaks')}")
+    with pytest.raises(TooManyFailedError, match="3 of 120 shadow runs failed, 3 of them with: step: RuntimeError"):
+        run_here(campaign(*breaks), tmp_path / "run")
+    assert manifest(tmp_path / "run")["status"] == "interrupted"
+    loose = campaign(*breaks, "run.max_failed_share=0.05", "stop.rhw=9")
+    result = run_here(loose, tmp_path / "run", resume=True)
+    shells = result.estimates["estimates"]["shells"]
+    lost = shells["details"]["shells"][-1]
+    assert (lost["shell"], lost["n_episodes"], lost["inside"]) == ("failed shadow runs", 0, False)
+    assert lost["p"] > 1e-9
+    assert shells["ci_high"] > shells["crash_rate"] + lost["p"]
+    assert shells["details"]["statements"][-1]["upper_bound_outside"] > lost["p"]
+    assert any("no test in failed shadow runs" in warning for warning in shells["warnings"])
+
+
+def test_crashes_on_a_handful_of_paths_give_no_interval(campaign, run_here, tmp_path):
+    """A vehicle that gives way, but on three paths of 120: the run ends, and says that it knows too little."""
+    lonely = campaign(*SHELLS, SHADOWS, TWIN, f"av={of('YieldsMostly')}", "stop.rhw=0.3", "stop.episodes=20000")
+    result = run_here(lonely, tmp_path / "run")
+    shells = result.estimates["estimates"]["shells"]
+    assert (result.exit_code, result.stopped_by) == (4, "pool_error")
+    assert (shells["ci_low"], shells["ci_high"], shells["rhw"]) == (0.0, 1.0, None)
+    assert "no interval: nearly all crashes lie on some" in result.estimates["statement"]
+    assert "raise pool.shadow_paths" in result.estimates["statement"]
+    assert "nothing more can be said" in result.estimates["boundary_statements"]["library"]
+
+
+def test_forced_cut_ins_of_a_vehicle_that_holds_are_those_of_one_that_holds(campaign, run_here, tmp_path):
+    """The same paths, weights and ends, with and without a shadow run before each test."""
+    plain = run_here(campaign(*FORCED, TWIN, "av={controller: 'tests.controllers.early:HoldsThenIdm'}"), tmp_path / "a")
+    walked = run_here(campaign(*FORCED, TWIN, f"av={of('HoldsThenIdm')}"), tmp_path / "b")
+    a, b = (stored_table(result.folder, "episodes") for result in (plain, walked))
+    for name in ("outcome", "cut_in_step", "n_steps", "crash_time_s", "impact_speed_mps", "cut_in_r2_m"):
+        assert a.column(name).to_pylist() == b.column(name).to_pylist(), name
+    for name in ("log_weight", "log_p_cut_in"):
+        np.testing.assert_allclose(a.column(name).to_numpy(), b.column(name).to_numpy(), rtol=1e-9)
+    one, other = (result.estimates["estimates"]["nade"] for result in (plain, walked))
+    assert one["crash_rate"] == pytest.approx(other["crash_rate"], rel=1e-9)
+    assert one["n_crashes"] > 0
+
+
+def test_forced_tests_are_replayed_and_follow_from_their_index(campaign, run_here, tmp_path):
+    out = tmp_path / "run"
+    run_here(campaign(*FORCED, TWIN, f"av={of('Speeds', 'parameters: {noise_mps2: 0.2}')}"), out)
+    assert replay(out, 123).bit_equal
+    with pytest.raises(TooManyFailedError, match="something else than in its shadow run"):
+        run_here(campaign(*FORCED, TWIN, f"av={of('FreshNoise', 'parameters: {noise_mps2: 0.2}')}"), tmp_path / "fresh")
+
+
+def test_a_forced_test_fails_where_its_shadow_run_did(campaign, run_here, tmp_path):
+    """A row, with the weight of the cut-in that it may have hidden, and counted as a crash in the upper limit."""
+    loose = campaign(*FORCED, TWIN, "run.max_failed_share=0.05", f"av={of('Breaks')}")
+    result = run_here(loose, tmp_path / "run")
+    rows = [row for row in stored_table(result.folder, "episodes").to_pylist() if row["outcome"] == "failed"]
+    assert rows
+    assert all(row["episode"] % 50 == 7 and "sensor lost" in row["failure"] for row in rows)
+    assert all(np.isfinite(row["log_weight"]) and row["log_weight"] < 0.0 for row in rows)
+
+
+def test_shadow_runs_that_are_gone_or_damaged_are_named(early_run, campaign, run_here, tmp_path):
+    folder = copy_of(early_run.folder, tmp_path / "run")
+    files_of(folder)[0].write_bytes(b"PAR1")
+    with pytest.raises(RunFolderError, match=r"shard-000000\.parquet.*Delete this file"):
+        replay(folder, 5)
+    files_of(folder)[0].unlink()
+    with pytest.raises(RunFolderError, match="shadow runs of 2 of 3 files"):
+        replay(folder, 5)
+    assert estimate(folder)["n_episodes"] == early_run.estimates["n_episodes"]  # needs no path
+
+
+def test_a_vehicle_that_ends_its_process_in_a_shadow_run_fails_there(campaign, run, tmp_path):
+    """Nothing else is lost, and the tests under the same numbers are run."""
+    exits = campaign(*SHELLS, SHADOWS, TWIN, f"av={of('Exits')}", "run.max_failed_share=0.05", "stop.rhw=9")
+    folder = run(exits, tmp_path / "run", workers=1).folder
+    rows = [row for path in files_of(folder) for row in pq.read_table(path).to_pylist()]
+    assert [row["shadow"] for row in rows if row["outcome"] == "failed"] == [61]
+    assert "exit code 9" in rows[61]["failure"]
+    assert manifest(folder)["shadow_runs"] == {"n_runs": 120, "n_failed": 1}
+    assert stored_table(folder, "episodes").column("outcome").to_pylist()[61] != "failed"

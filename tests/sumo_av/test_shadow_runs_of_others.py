@@ -1,0 +1,105 @@
+"""Vehicles that SUMO, a program or an FMU drives from the start: shadow runs, and tests that find the same motion."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from harness.campaign.loading import load_campaign
+from harness.resolved import resolve
+from harness.runner.prepare import build_world, prepare
+from harness.runner.shadow_runs import as_recorded, run_shadows, shadow_specs
+from harness.sumo.sumo_av_world import FreshWorld, SumoAvWorld
+from tests.controllers.test_same_bits import ROOT, fmu_av
+from tests.pool.conftest import MIXTURE_FILE, SMALL_POOL
+from tests.sumo_av.running import EXAMPLE, program
+
+SHOWN = 60
+EARLY = ", before_cut_in: controller}"
+
+
+@pytest.fixture(autouse=True)
+def _in_the_checkout(monkeypatch):
+    monkeypatch.chdir(ROOT)
+
+
+@pytest.fixture(scope="module")
+def fmu(tmp_path_factory):
+    builder = pytest.importorskip("pythonfmu.builder", reason="pythonfmu builds the FMU")
+    folder = tmp_path_factory.mktemp("fmu")
+    return builder.FmuBuilder.build_FMU(
+        ROOT / "examples/idm_fmu.py", dest=folder, project_files=[ROOT / "examples/idm.py"]
+    )
+
+
+def acting(av: str, engine: str):
+    changes = [f"av={av}", "testing.method=shells", f"world.engine={engine}", "world.cells=8", *SMALL_POOL]
+    return load_campaign(MIXTURE_FILE, [*changes, "pool.shadow_paths=120"])
+
+
+def driven(av: str, engine: str = "sumo"):
+    campaign = acting(av, engine)
+    return driven_in(build_world(campaign), campaign)
+
+
+def driven_in(world, campaign):
+    """Causes of failure of the shadow runs, what tests on their paths left, and the motion of the former."""
+    ready = prepare(resolve(campaign))
+    loop, environment = ready.loop(world), ready.policy.environment
+    try:
+        specs = list(shadow_specs(len(ready.shadow_paths)))
+        done = [run_shadows(loop, ready.shadow_paths, environment, spec) for spec in specs]
+        runs = as_recorded([part.table for part in done], environment)
+        after = ready.after(runs)
+        rows = np.linspace(0, after.prescribed.available.sum() - 1, SHOWN).astype(np.int64)
+        shard = loop.run(1000, *after.prescribed.of_rows(rows, np.zeros(SHOWN, np.int64)))
+    finally:
+        loop.close()
+        world.close()
+    return sum((part.failures for part in done), start=done[0].failures), shard, runs
+
+
+@pytest.mark.parametrize(
+    "av",
+    [
+        "{sumo: {carFollowModel: ACC}" + EARLY,
+        "{sumo: {carFollowModel: Krauss, sigma: 0.5}" + EARLY,
+        "{controller: 'tests.controllers.early:SpeedsTraci'" + EARLY,
+    ],
+    ids=["SUMO's ACC", "SUMO's Krauss with seeded noise", "TraCI style"],
+)
+def test_it_does_in_tests_what_it_did_in_its_shadow_runs(av):
+    failures, shard, runs = driven(av)
+    assert not failures
+    assert shard.failures == {}
+    moved = np.abs(runs.v_mps[np.arange(120), runs.n_steps] - runs.v_mps[:, 0]) > 0.1
+    assert moved.mean() > 0.2, "it never acted"
+    assert np.all(shard.results.episode["cut_in_step"] >= 0)
+
+
+def test_models_that_are_recycled_otherwise_remember_the_last_cut_in():
+    """Why they get a simulation per episode when they act from the start: in one, tests are not the same again."""
+    campaign = acting("{sumo: {carFollowModel: Krauss}" + EARLY, "sumo")
+    world = build_world(campaign)
+    assert isinstance(world, FreshWorld)
+    world.close()
+    _, shard, _ = driven_in(SumoAvWorld(8, campaign.av.sumo, acts_before_cut_in=True), campaign)
+    assert len(shard.failures) > 5
+
+
+def test_a_program_of_its_own_process():
+    av = program(EXAMPLE).traci.command
+    failures, shard, _ = driven(f"{{traci: {{command: {av!r}}}" + EARLY)
+    assert not failures
+    assert shard.failures == {}
+
+
+def test_an_fmu_in_both_worlds(fmu):
+    av = fmu_av(fmu, EARLY[:-1])
+    failures, shard, runs = driven(av)
+    other, in_twin, runs_in_twin = driven(av, "twin")
+    assert not failures
+    assert not other
+    assert shard.failures == in_twin.failures == {}
+    assert runs.digest() == runs_in_twin.digest()
+    assert shard.results.episode.tobytes() == in_twin.results.episode.tobytes()
