@@ -97,9 +97,9 @@ def verdict(found: Within) -> str:
         return "refuted by these tests"
     if found.n_ahead:
         return "no longer justified: this vehicle does not keep to it"
-    if not found.n_episodes_outside:
-        return "not put to the test"
-    return "kept to in every test" if found.n_checked else "no crash seen outside"
+    if found.n_checked:
+        return "kept to in every test"
+    return "no crash seen outside" if found.n_episodes_outside else "not put to the test"
 
 
 def outcome_rows(summary: RunSummary) -> list[tuple[str, float, float, float]]:
