@@ -113,17 +113,19 @@ def print_pool(content: dict[str, Any]) -> None:
 
 
 def print_statements(content: dict[str, Any]) -> None:
-    """Print the answer in a sentence, what holds under the conditional assumption, and what all this is about."""
-    for sentence in (content["statement"], content.get("conditional_statement"), content["scope"]):
-        if sentence:
-            click.echo(sentence)
+    """Print the answer in a sentence, what else is stated under which assumption, and what all this is about."""
+    click.echo(content["statement"])
+    for name, sentence in content.get("boundary_statements", {}).items():
+        click.echo(f"Statement {name}: {sentence}")
+    for sentence in (*content.get("reference_statements", [])[1:], content["scope"]):
+        click.echo(sentence)
 
 
 def _print_shells(shells: list[dict[str, Any]]) -> None:
     headings = ("first to crash", "probability", "tests", "crashes", "contribution to the crash rate")
     rows = [
         (
-            shell["shell"] + ("" if shell["inside"] else " (beyond the boundary)"),
+            shell["shell"] + ("" if shell["inside"] else " (beyond every boundary)"),
             f"{shell['p']:.3e}",
             f"{shell['n_episodes']:,}",
             f"{shell['n_crashes']:,}",

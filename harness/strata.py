@@ -17,7 +17,44 @@ OUTSIDE = "outside"
 """Name of the stratum of everything beyond the boundary."""
 FAILED_SHADOWS = "failed shadow runs"
 """Name of a stratum that cannot be tested: cut-ins on paths on which the vehicle failed before one could come."""
+ASSUMPTION_FREE, LIBRARY_STATEMENT = "assumption_free", "library"
+"""Names of the statement that has no boundary, and of the one whose boundary is the library's own."""
 _ARRAYS = ("cell_p", "reference_rate", "reference_square")
+
+
+@dataclass(frozen=True)
+class Statement:
+    """What is said about vehicles that crash only inside a boundary.
+
+    Attributes
+    ----------
+    name, boundary : str
+        Its name, and the most careless surrogate inside.
+    assumes : str
+        What it assumes, as the end of a sentence that begins with "If this vehicle".
+    n_inside : int
+        Strata up to the boundary.
+    checked : bool
+        Whether each test shows that the assumption holds in it: that the vehicle is never ahead of the boundary.
+    """
+
+    name: str
+    boundary: str
+    assumes: str
+    n_inside: int
+    checked: bool = False
+
+
+@dataclass(frozen=True)
+class Reference:
+    """A driver that the vehicle is compared with: its name, the driver in plain words, and when it acts.
+
+    ``delay_s`` is the time (s) after the cut-in at which it begins to brake, None if it has no delay of its own.
+    """
+
+    name: str
+    described: str
+    delay_s: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,11 +72,11 @@ class ShellDesign:
         crashes.
     cell_p : ndarray, shape (C,)
         Probability per test that a cut-in of the cell happens.
-    references : tuple of str, length R
+    references : tuple of Reference, length R
     reference_rate, reference_square : ndarray, shape (R,)
         Crash rate of each reference in the pool, and the mean square of a path's probability that it crashes.
-    n_inside, boundary : int, str
-        Strata up to the boundary, which is the most careless surrogate inside.
+    statements : tuple of Statement
+        From the narrowest boundary to the widest; strata up to the widest are shells.
     p_cut_in, p_impossible : float
         Probability of a cut-in, and the part of it on which no vehicle within the envelope's acceleration can crash,
         and which is not tested.
@@ -54,12 +91,11 @@ class ShellDesign:
     cell_stratum: tuple[int, ...]
     cell_p: FloatArray
     n_paths: int
-    n_inside: int
-    boundary: str
+    statements: tuple[Statement, ...]
     p_cut_in: float
     p_impossible: float
     cell_references: tuple[int, ...] = ()
-    references: tuple[str, ...] = ()
+    references: tuple[Reference, ...] = ()
     reference_rate: FloatArray = field(default_factory=lambda: np.zeros(0))
     reference_square: FloatArray = field(default_factory=lambda: np.zeros(0))
     available: tuple[int, ...] = ()
@@ -70,6 +106,21 @@ class ShellDesign:
         """Probability per test that a cut-in of each stratum happens, shape (S,)."""
         return np.asarray(np.bincount(self.cell_stratum, self.cell_p, minlength=len(self.strata)), np.float64)
 
+    @property
+    def n_inside(self) -> int:
+        """Strata up to the widest boundary."""
+        return self.statements[-1].n_inside
+
+    @property
+    def boundary(self) -> str:
+        """The widest boundary."""
+        return self.statements[-1].boundary
+
+    @property
+    def checked(self) -> Statement | None:
+        """The statement whose assumption is checked in each test, if there is one."""
+        return next((each for each in self.statements if each.checked), None)
+
     @cached_property
     def joined(self) -> FloatArray:
         """1 where a cell belongs to a stratum, shape (C, S)."""
@@ -78,14 +129,18 @@ class ShellDesign:
 
     def to_json(self) -> dict[str, Any]:
         """Plain content for a file."""
-        return {name: np.asarray(value).tolist() for name, value in asdict(self).items()}
+        return {name: x.tolist() if isinstance(x, np.ndarray) else x for name, x in asdict(self).items()}
 
     @classmethod
     def from_json(cls, content: dict[str, Any]) -> ShellDesign:
         """Back from `to_json`."""
         arrays = {name: np.array(content[name], dtype=np.float64) for name in _ARRAYS}
         plain: dict[str, Any] = {name: tuple(x) if isinstance(x, list) else x for name, x in content.items()}
-        return cls(**(plain | arrays))
+        records = {
+            "statements": tuple(Statement(**each) for each in content["statements"]),
+            "references": tuple(Reference(**each) for each in content["references"]),
+        }
+        return cls(**(plain | arrays | records))
 
 
 @dataclass(frozen=True, eq=False)

@@ -46,11 +46,12 @@ def test_the_rate_is_within_two_standard_errors_of_the_reference(estimates):
     assert abs(found["crash_rate"] - REFERENCE["crash_rate"]) < 2.0 * combined
 
 
-def test_both_statements_are_made(estimates):
-    assert "If this vehicle crashes only where the surrogate brakes-2-late-1s" in estimates["conditional_statement"]
-    conditional = estimates["estimates"]["shells"]["details"]["conditional"]
-    assert conditional["rhw"] < 0.03
-    assert not conditional["refuted"]
+def test_all_statements_are_made(estimates):
+    assert "as often as a careful and competent driver (r157-cc) would" in estimates["statement"]
+    assert "If this vehicle brakes as hard as it takes, up to 3 m/s²" in estimates["boundary_statements"]["need-based"]
+    for found in estimates["estimates"]["shells"]["details"]["statements"]:
+        assert found["rhw"] < 0.03
+        assert not found["refuted"]
 
 
 def test_dropping_the_probabilities_of_shells_misses_the_reference(folder, estimates):

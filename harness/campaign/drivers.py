@@ -149,11 +149,13 @@ class FuzzySafetyParameters(Reference):
 
 
 class NeedBasedParameters(Section):
-    """A vehicle that accelerates until it needs to brake, and then brakes at one rate, a delay later."""
+    """A vehicle that accelerates until it needs to brake, and a delay later brakes with what it needs."""
 
     acceleration_mps2: Positive = Field(1.0, le=20.0, description="until it needs to brake [assumed]")
-    deceleration_mps2: Positive = Field(3.0, le=20.0, description="from the delay after the need on [assumed]")
-    reaction_time_s: float = Field(0.5, ge=0.0, le=10.0, description="between the need and the brakes [assumed]")
+    deceleration_mps2: Positive = Field(
+        3.0, le=20.0, description="hardest braking, from the delay after the first need on [assumed]"
+    )
+    reaction_time_s: float = Field(0.5, ge=0.0, le=10.0, description="between the first need and the brakes [assumed]")
     needed_mps2: Positive = Field(
         1.0, le=20.0, description="it needs to brake where no less than this prevents a collision [assumed]"
     )
@@ -211,7 +213,7 @@ class FuzzySafety(Section):
 
 
 class NeedBased(Section):
-    """A vehicle that brakes at one rate, a delay after it needs to."""
+    """A vehicle that brakes with what it needs, a delay after it first needs to."""
 
     model: Literal["need-based"]
     parameters: NeedBasedParameters = NeedBasedParameters()

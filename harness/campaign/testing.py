@@ -7,8 +7,19 @@ from typing import Annotated, Literal
 
 from pydantic import BeforeValidator, Field, field_validator
 
-from harness.campaign.section import Positive, Probability, Section, StepTime, SurrogateName, Whole, broken_rule, whole
+from harness.campaign.section import (
+    Positive,
+    Probability,
+    Section,
+    StepTime,
+    SurrogateName,
+    Whole,
+    broken_rule,
+    listed,
+    whole,
+)
 from harness.methods import EstimatorName, Method
+from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT
 
 MOST_SUMO_CELLS = 256
 """Roads of the largest committed network."""
@@ -28,21 +39,74 @@ class EnvironmentSettings(Section):
     )
 
 
+class StatementSettings(Section):
+    """A statement about vehicles that crash only inside a boundary."""
+
+    boundary: SurrogateName = Field(description="the most careless surrogate inside")
+    assumes: str = Field("", description='what it assumes, as the end of a sentence that begins with "If this vehicle"')
+    checked: bool = Field(
+        False, description="whether each test has to show that the vehicle is never ahead of that surrogate"
+    )
+
+
 class ShellSettings(Section):
-    """How tests are spread over the shells of the pool."""
+    """How tests are spread over the shells of the pool, and what is said about vehicles that keep to some of them."""
 
     boundary: SurrogateName | None = Field(
-        None, description="surrogate within which the conditional statement assumes all crashes; the library's own"
+        None, description="surrogate within which the statement library assumes all crashes; the library's own"
     )
-    statement: Literal["assumption_free", "conditional"] = Field(
-        "assumption_free", description="what has to reach stop.rhw; conditional tests only within the boundary"
+    statements: dict[SurrogateName, StatementSettings] | None = Field(
+        None, description="further statements by name, in place of the library's"
+    )
+    statement: str = Field(
+        ASSUMPTION_FREE,
+        description="what has to reach stop.rhw: assumption_free, library, or one of the statements, beyond whose "
+        "boundary nothing is tested then",
     )
     stopping: Literal["sequential", "two_phase"] = Field(
         "sequential",
         description="sequential: stop at the first interval that is narrow enough, which biases a rate that is only "
         "roughly known; two_phase: first tests plan how many more there are, and these alone are reported",
     )
-    first_tests: Whole = Field(12, ge=1, le=10_000, description="tests of each shell before any is preferred")
+    first_tests: Annotated[int, Field(ge=1, le=10_000), BeforeValidator(whole)] | None = Field(
+        None, description="tests of each shell before any is preferred; by its probability"
+    )
+
+    @field_validator("statement")
+    @classmethod
+    def _is_not_called_conditional(cls, statement: str) -> str:
+        if statement == "conditional":
+            raise broken_rule(
+                "",
+                found="conditional, of which there are several now",
+                expected=f"{ASSUMPTION_FREE}, or the name of a statement",
+                mend=f"The former one is called {LIBRARY_STATEMENT}.",
+            )
+        return statement
+
+    @field_validator("statements")
+    @classmethod
+    def _can_be_told_apart(cls, found: dict[str, StatementSettings] | None) -> dict[str, StatementSettings] | None:
+        return None if found is None else checked_statements(found)
+
+
+def checked_statements(statements: dict[str, StatementSettings]) -> dict[str, StatementSettings]:
+    """The statements, if they can stand beside the library's own one, and in one test."""
+    if taken := {ASSUMPTION_FREE, LIBRARY_STATEMENT} & set(statements):
+        raise broken_rule(
+            "",
+            found=f"a statement named {min(taken)}",
+            expected=f"another name: {ASSUMPTION_FREE} and {LIBRARY_STATEMENT} are there always",
+            mend="Rename it; the boundary of the statement library is the key boundary.",
+        )
+    if len(checked := [name for name, each in statements.items() if each.checked]) > 1:
+        raise broken_rule(
+            "",
+            found=f"{len(checked)} statements that are checked in each test: {listed(checked)}",
+            expected="one at most",
+            mend="Leave checked out of the others: a crash beyond their boundary refutes them.",
+        )
+    return statements
 
 
 class Testing(Section):
@@ -84,7 +148,7 @@ class Testing(Section):
 class PoolSettings(Section):
     """The pool of cut-ins that shells, surrogate replay and the alarm on SUMO use; built once, in the twin."""
 
-    library: str = Field("ladder-1", description="name of a shipped surrogate library, or a path to your own")
+    library: str = Field("ladder-2", description="name of a shipped surrogate library, or a path to your own")
     relative_error: float = Field(
         0.005,
         ge=0.001,

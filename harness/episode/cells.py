@@ -50,6 +50,11 @@ CELL_DTYPE = np.dtype(
         ("cut_r2dot", _f8),
         ("av_start", _f8),
         ("danger", _f8),  # what a built-in AV remembers beside its acceleration
+        ("beside_x", _f8),  # of the boundary beside the AV: position, speed, and what it remembers
+        ("beside_v", _f8),
+        ("beside_acceleration", _f8),
+        ("beside_danger", _f8),
+        ("ahead_step", _i8),  # first step after which the AV was ahead of it, -1: never
     ]
 )
 
@@ -70,6 +75,7 @@ EPISODE_DTYPE = np.dtype(
         ("log_p_cut_in", _f8),
         ("n_lv", np.int16),
         ("n_bv", np.int16),
+        ("ahead_step", np.int16),
     ]
 )
 
@@ -256,7 +262,8 @@ class Bench(NamedTuple):
     ``first_episode`` is the campaign index of row 0, ``states`` (rows,) are initial states. ``x``, ``v`` (K, 3) are the
     world's positions (m) and speeds (m/s) of LV, BV, AV. ``driver`` is (1,) for a built-in AV, else (0,). ``passed_m``
     is the R2 at which the AV has passed. ``observation`` is what a controller outside of the kernels sees, and
-    ``acts_before_cut_in`` whether it acts from the start; else from the step after the cut-in.
+    ``acts_before_cut_in`` whether it acts from the start; else from the step after the cut-in. ``boundary`` is (1,)
+    where the AV is compared with a driver beside it, else (0,).
     """
 
     seed: int
@@ -275,6 +282,7 @@ class Bench(NamedTuple):
     keep_traces: bool
     observation: BatchObservation
     acts_before_cut_in: bool
+    boundary: RecordArray
 
 
 @compiled_inline

@@ -8,6 +8,7 @@ import numpy as np
 
 from harness.arrays import BoolArray, FloatArray, Int8Array, IntArray
 from harness.compiled import compiled, compiled_inline
+from harness.episode.beside import note_if_ahead
 from harness.episode.cells import Bench, state_of
 from harness.episode.motion import mixed
 from harness.importance.likelihood import log_weight
@@ -44,6 +45,8 @@ def judge(bench: Bench, contact: BoolArray) -> int:
         state = state_of(k, bench)
         if cell.cut_step >= 0 and state.r2dot_mps < 0.0 and state.r2_m >= 0.0:
             cell.min_ttc = min(cell.min_ttc, state.r2_m / -state.r2dot_mps)
+        if bench.boundary.size > 0:
+            note_if_ahead(k, bench)
         outcome = outcome_of(k, state, bench)
         if contact[k] != (outcome in (CRASH, BV_LV_CONTACT)):
             return -1 - k
@@ -109,6 +112,7 @@ def end_episode(k: int, outcome: int, n: int, bench: Bench) -> None:
     row.log_weight = log_weight(method, alpha, cells.log_ratio[k], cell.log_sampled, cell.log_p_cut_in)
     row.log_p_cut_in = cell.log_p_cut_in
     row.n_lv, row.n_bv = cell.n_lv, cell.n_path
+    row.ahead_step = cell.ahead_step
     copy_row(cells.log_ratio[k], results.log_q[cell.row])
     copy_row(cells.martingale[k], results.martingale[cell.row])
     copy_row(cells.lv_path[k], results.lv_path[cell.row])

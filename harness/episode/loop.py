@@ -12,6 +12,7 @@ from harness.arrays import BoolArray, FloatArray, IntArray, RecordArray
 from harness.controllers.hosts import ControllerHost
 from harness.environment.driving import Environment
 from harness.episode.begin import refill
+from harness.episode.beside import drive_beside
 from harness.episode.cells import (
     Bench,
     PrescribedCutIns,
@@ -31,8 +32,10 @@ from harness.importance.functions import Importance
 from harness.outcomes import AV, CRASH, FAILED
 from harness.unboxed import unboxed
 from harness.vehicles.kinematics import STEP_S
+from harness.vehicles.models import driver_records
 from harness.world import AVLostError, DrivingWorld, World
 
+NOBODY = driver_records([])
 MOMENT_LIMITS = {"all": 32767, "first_9": 9, "none": 0}
 STRAYED = (
     "the vehicle did something else than in its shadow run, given the same traffic and the same random stream: it "
@@ -44,12 +47,13 @@ CONTROL_STEPS = 16
 
 
 class Policy(NamedTuple):
-    """What decides the motion of LV, BV and AV."""
+    """What decides the motion of LV, BV and AV; ``boundary`` is (1,) if the AV is compared with a driver, else (0,)."""
 
     seed: int
     environment: Environment
     importance: Importance
     driver: RecordArray
+    boundary: RecordArray = NOBODY
 
 
 class Keep(NamedTuple):
@@ -145,6 +149,8 @@ class EpisodeLoop:
             if ended == states.size:
                 return shard
             command(bench)
+            if self._policy.boundary.size:
+                drive_beside(bench)
             ended += self._step_and_judge(bench, shard, placed)
             given += placed
             if recorded > shard.results.moment.size - self._world.n_cells:
@@ -191,6 +197,7 @@ class EpisodeLoop:
                 keep_traces=self._keep.any_trace,
                 observation=self._observation,
                 acts_before_cut_in=early,
+                boundary=policy.boundary,
             )
         )
 

@@ -48,6 +48,8 @@ class Block:
     stratum, cell, cell_mass, shells : (n,) int, (n,) int, (n, C) float64, ShellDesign, or None
         Where tests are drawn from shells: stratum and cell of each, its path's probability of a cut-in of each cell,
         and what is known of the strata.
+    ahead : (n,) bool or None
+        Whether the vehicle was ever ahead of the boundary that a statement checks; None where none is.
     surrogates_crash, known_rates : (n, D) bool, KnownRates, or None
         Which surrogates of a pool would have crashed on the same traffic, and their crash rates; only where asked for.
     """
@@ -69,6 +71,7 @@ class Block:
     cell: IntArray | None = None
     cell_mass: FloatArray | None = None
     shells: ShellDesign | None = None
+    ahead: BoolArray | None = None
     surrogates_crash: BoolArray | None = None
     known_rates: KnownRates | None = None
 
@@ -83,6 +86,7 @@ class Block:
             "log_p_cut_in",
             "stratum",
             "cell",
+            "ahead",
         )
         expected = {
             **dict.fromkeys(columns, (n,)),

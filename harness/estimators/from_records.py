@@ -16,7 +16,7 @@ from harness.records.folder import MEND_SHARD
 from harness.strata import ShellDesign
 
 EPISODE_COLUMNS = ("episode", "outcome", "cut_in_step", "n_control_steps", "log_weight", "log_p_cut_in", "log_q")
-SHELL_COLUMNS = ("component", "cell", "cell_mass")
+SHELL_COLUMNS = ("component", "cell", "cell_mass", "ahead_step")
 MOMENT_COLUMNS = ("episode", "q_sampled", "q")
 
 
@@ -74,6 +74,7 @@ def block_from_tables(
         cell=None if shells is None else _integers(episodes, "cell"),
         cell_mass=None if shells is None else _nested(episodes, "cell_mass", len(shells.cell_stratum)),
         shells=shells,
+        ahead=None if shells is None or shells.checked is None else _known(episodes, "ahead_step"),
     )
 
 

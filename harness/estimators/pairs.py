@@ -80,10 +80,14 @@ class PairCounts:
         """Pairs of each stratum, shape (S,)."""
         return np.asarray(self.ends.sum((1, 2)))
 
-    def inside(self) -> PairCounts:
-        """Only what lies within the boundary."""
-        within = slice(0, self.design.n_inside)
+    def part(self, n: int) -> PairCounts:
+        """Only the first ``n`` strata."""
+        within = slice(0, n)
         return PairCounts(self.design, self.ends[within], self.mass[within, :, :, within])
+
+    def inside(self) -> PairCounts:
+        """Only what lies within the boundary of the first statement, the narrowest."""
+        return self.part(self.design.statements[0].n_inside)
 
     def outcomes(self, *, failed_a: bool = False, failed_b: bool = False) -> IntArray:
         """How often both crash, only A, only B, neither, shape (S, 4), with failed tests as crashes or as none."""

@@ -85,7 +85,8 @@ def estimate_blocks(
             "convergence": done.convergence,
             "statement": statements[done.headline],
             "statements": statements,
-            "conditional_statement": say.conditional_statement(best),
+            "reference_statements": say.reference_statements(best),
+            "boundary_statements": say.boundary_statements(best),
             "scope": say.SCOPE,
             "ending": facts.ending,
         }
@@ -101,7 +102,7 @@ def _statements(
     """What each estimator says, what it must be warned of first; of one without a value, why."""
     first = [*alarm, *say.repeated_cautions(facts.repeated)]
     return {
-        name: say.warned(first, say.statement(found, facts.lane_change_level, distance_km))
+        name: say.warned(first, say.answer(found, facts.lane_change_level, distance_km))
         + say.failed_statement(found.details)
         + say.repeated_statement(facts.repeated)
         if isinstance(found, Estimate)

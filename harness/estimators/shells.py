@@ -1,8 +1,9 @@
-"""`shells`: crashes counted within shells of known probability p_s, and the two statements that they allow.
+"""`shells`: crashes counted within shells of known probability p_s, and the statements that they allow.
 
-The assumption-free statement counts every shell, tested or empty. The conditional one holds for vehicles that crash
-only where the boundary surrogate, or a more careful one, crashes too: it needs far fewer tests, and one crash outside
-refutes it.
+The assumption-free statement counts every shell, tested or empty. Each of the others holds for vehicles that crash
+only where its boundary surrogate, or a more careful one, crashes too: it needs far fewer tests, and one crash outside
+refutes it. Where a boundary is checked in each test, one in which the vehicle was ahead of it takes away the reason to
+believe in the statement.
 
 The rate is Σ p_s c_s, c_s being the share of a stratum's tests that crash. Its limits are those of the likelihood
 ratio (`harness.estimators.likelihood_ratio`), with the error of the p_s in the same root. A stratum without a crash
@@ -13,17 +14,22 @@ Failed tests count against the vehicle (`harness.estimators.stratified`).
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
+from harness.arrays import BoolArray
 from harness.estimators.block import Block
 from harness.estimators.crash_paths import FEWEST_PATHS, CrashPaths
 from harness.estimators.estimate import Estimate, require_episodes
 from harness.estimators.intervals import clopper_pearson
 from harness.estimators.likelihood_ratio import Level, likelihood_limit
+from harness.estimators.reference import Comparison, compared
 from harness.estimators.stratified import Limits, Tally, combined, empty_tally, pool_variance
-from harness.strata import ShellDesign
+from harness.strata import ShellDesign, Statement
+
+MOST_NAMED = 10
+"""Tests that are named of those that refute a statement, or show that its reason fails."""
 
 
 @dataclass(frozen=True)
@@ -58,9 +64,17 @@ class Shell:
 
 
 @dataclass(frozen=True)
-class Conditional:
-    """The rate given that there are no crashes outside the boundary, and what is known about those."""
+class Within:
+    """A statement: the rate given that there are no crashes outside its boundary, and what is known about those.
 
+    ``refuted_by`` are the first few tests (episodes) that crashed outside, and ``ahead_in`` those in which the vehicle
+    was ahead of the boundary, of the ``n_checked`` that were asked; ``n_ahead`` is their number.
+    """
+
+    name: str
+    boundary: str
+    assumes: str
+    n_shells: int
     crash_rate: float
     ci_low: float
     ci_high: float
@@ -75,44 +89,55 @@ class Conditional:
     n_crashes_outside: int
     n_failed_outside: int
     refuted: bool
+    refuted_by: tuple[int, ...]
     upper_bound_outside: float
+    checked: bool
+    n_checked: int
+    n_ahead: int
+    ahead_in: tuple[int, ...]
 
 
 @dataclass(frozen=True)
 class ShellDetails:
     """``details`` of the estimate: shells from careful to careless, and the pool that they come from."""
 
-    boundary: str
     pool: str
     rhw_from_pool: float
     rhw_from_pool_at_least: float
     p_cut_in: float
     p_impossible: float
-    conditional: Conditional
+    references: tuple[Comparison, ...]
+    statements: tuple[Within, ...]
     shells: tuple[Shell, ...]
 
 
 class Shells:
-    """Tests of a shells campaign, counted within strata.
-
-    Attributes
-    ----------
-    tally : Tally
-        Of no strata before the first block.
-    """
+    """Tests of a shells campaign, counted within the cells of strata."""
 
     _design: ShellDesign  # of the first block
 
     def __init__(self) -> None:
-        self.tally = empty_tally(0)
+        self._cells = empty_tally(0)
         self._paths = CrashPaths()
+        self._crashed: dict[int, list[int]] = {}  # stratum → its first few tests that crashed
+        self._n_checked = self._n_ahead = 0
+        self._ahead_in: list[int] = []
 
     @classmethod
     def of(cls, design: ShellDesign, tally: Tally) -> Shells:
-        """From counts."""
+        """From counts by stratum, of which nothing is known by reference drivers."""
         shells = cls()
-        shells._design, shells.tally = design, tally
+        strata = tuple(range(design.p.size))
+        shells._design = replace(
+            design, cell_stratum=strata, cell_p=design.p, cell_references=(0,) * len(strata), references=()
+        )
+        shells._cells = tally
         return shells
+
+    @property
+    def tally(self) -> Tally:
+        """Counts by stratum; of no strata before the first block."""
+        return self._cells.joined(self._design.joined) if self._cells.tests.size else self._cells
 
     @classmethod
     def refusal(cls, block: Block) -> str | None:
@@ -123,25 +148,31 @@ class Shells:
 
     def add(self, block: Block) -> None:
         """Count one block."""
-        if block.shells is None or block.stratum is None or block.cell_mass is None:
+        if block.shells is None or block.stratum is None or block.cell is None or block.cell_mass is None:
             raise ValueError("the block has no shells")
-        if not self.tally.tests.size:
+        if not self._cells.tests.size:
             self._design = block.shells
-            self.tally = empty_tally(block.shells.p.size)
-        tally, mass = self.tally, block.cell_mass @ block.shells.joined
-        np.add.at(tally.tests, block.stratum, 1)
+            self._cells = empty_tally(block.shells.cell_p.size)
+        tally = self._cells
+        np.add.at(tally.tests, block.cell, 1)
         for rows, counts, sums in (
             (block.crash, tally.crashes, tally.crash_mass),
             (block.failed, tally.failed, tally.failed_mass),
         ):
-            np.add.at(counts, block.stratum[rows], 1)
-            np.add.at(sums, block.stratum[rows], mass[rows])
+            np.add.at(counts, block.cell[rows], 1)
+            np.add.at(sums, block.cell[rows], block.cell_mass[rows])
         if block.shells.shadow_runs:
-            crashed = block.crash
-            self._paths.add(block.cell_mass[crashed], block.stratum[crashed], block.shells.p.size)
+            crashed, mass = block.crash, block.cell_mass @ block.shells.joined
+            self._paths.add(mass[crashed], block.stratum[crashed], block.shells.p.size)
+        for s in np.unique(block.stratum[block.crash]).tolist():
+            _name(self._crashed.setdefault(s, []), block, block.crash & (block.stratum == s))
+        if block.ahead is not None:
+            self._n_checked += len(block)
+            self._n_ahead += int(block.ahead.sum())
+            _name(self._ahead_in, block, block.ahead)
 
     def result(self, confidence: float) -> Estimate:
-        """Assumption-free estimate; the conditional one is among its details."""
+        """Assumption-free estimate; the other statements are among its details."""
         tally, design = self.tally, self._design
         n = int(tally.tests.sum())
         require_episodes(n)
@@ -162,17 +193,17 @@ class Shells:
             largest_weight_share=float(np.max(y[tally.crashes > 0], initial=0.0)) / free.rate if free.rate > 0 else 0.0,
             method="crashes within shells of known probability; likelihood-ratio limits of their weighted sum; upper "
             "bound: the same, one-sided",
-            warnings=(*self._cautions(), *self._warnings()),
+            warnings=(*self._cautions(), *self._warnings(tally)),
             cautions=tuple(self._cautions()),
             details=asdict(
                 ShellDetails(
-                    boundary=design.boundary,
                     pool=design.pool,
                     **free.from_pool_relative(),
                     p_cut_in=design.p_cut_in,
                     p_impossible=design.p_impossible,
-                    conditional=self._conditional(confidence),
-                    shells=self._shells((1.0 - confidence) / 2.0),
+                    references=compared(design, self._cells, Level.two_sided(confidence)),
+                    statements=tuple(self._within(each, tally, confidence) for each in design.statements),
+                    shells=self._shells(tally, (1.0 - confidence) / 2.0),
                 )
             ),
         )
@@ -199,15 +230,18 @@ class Shells:
             "new folder"
         ]
 
-    def _conditional(self, confidence: float) -> Conditional:
-        """The statement given that there are no crashes outside, and what is known about those."""
-        design, inside = self._design, self.tally.part(slice(0, self._design.n_inside))
-        outside = self.tally.part(slice(design.n_inside, None)).failed_as_crashes()
+    def _within(self, given: Statement, tally: Tally, confidence: float) -> Within:
+        design, n = self._design, given.n_inside
+        inside, outside = tally.part(slice(0, n)), tally.part(slice(n, None)).failed_as_crashes()
         limits, n_outside = self._limits(inside, Level.two_sided(confidence)), int(outside.tests.sum())
-        p_outside, level = design.p[design.n_inside :], Level.one_sided(confidence, n_outside)
-        n_failed_outside = int(self.tally.failed[design.n_inside :].sum())
+        level, n_failed_outside = Level.one_sided(confidence, n_outside), int(tally.failed[n:].sum())
         n_crashes_outside = int(outside.crashes.sum()) - n_failed_outside
-        return Conditional(
+        crashed = [episode for s, episodes in self._crashed.items() if s >= n for episode in episodes]
+        return Within(
+            name=given.name,
+            boundary=given.boundary,
+            assumes=given.assumes,
+            n_shells=n,
             crash_rate=limits.rate,
             ci_low=limits.low,
             ci_high=limits.high,
@@ -216,16 +250,21 @@ class Shells:
             n_episodes=int(inside.tests.sum()),
             n_crashes=int(inside.crashes.sum()),
             n_failed=int(inside.failed.sum()),
-            crash_rate_if_failed_had_crashed=float(design.p[: design.n_inside] @ inside.failed_as_crashes().share),
+            crash_rate_if_failed_had_crashed=float(design.p[:n] @ inside.failed_as_crashes().share),
             n_episodes_outside=n_outside,
             n_crashes_outside=n_crashes_outside,
             n_failed_outside=n_failed_outside,
             refuted=n_crashes_outside > 0,
-            upper_bound_outside=likelihood_limit(p_outside, outside.crashes, outside.tests, level, 1.0),
+            refuted_by=tuple(sorted(crashed)[:MOST_NAMED]),
+            upper_bound_outside=likelihood_limit(design.p[n:], outside.crashes, outside.tests, level, 1.0),
+            checked=given.checked,
+            n_checked=self._n_checked if given.checked else 0,
+            n_ahead=self._n_ahead if given.checked else 0,
+            ahead_in=tuple(self._ahead_in) if given.checked else (),
         )
 
-    def _shells(self, tail: float) -> tuple[Shell, ...]:
-        p, tally = self._design.p, self.tally
+    def _shells(self, tally: Tally, tail: float) -> tuple[Shell, ...]:
+        p = self._design.p
         low, high = clopper_pearson(tally.crashes, tally.tests, tail, tally.failed)
         return tuple(
             Shell(
@@ -243,19 +282,30 @@ class Shells:
             for s, name in enumerate(self._design.strata)
         )
 
-    def _warnings(self) -> list[str]:
+    def _warnings(self, tally: Tally) -> list[str]:
         design, found = self._design, []
-        if empty := ", ".join(name for name, n in zip(design.strata, self.tally.tests, strict=True) if n == 0):
+        if empty := ", ".join(name for name, n in zip(design.strata, tally.tests, strict=True) if n == 0):
             found.append(f"no test in {empty}: the interval allows for any share of crashes there")
-        kept = zip(design.strata, self.tally.tests, design.available, strict=False)
+        kept = zip(design.strata, tally.tests, design.available, strict=False)
         if used_up := ", ".join(name for name, n, available in kept if n >= available > 0):
             found.append(
                 f"all cut-ins that the pool has kept of {used_up} were tested: for more precision raise "
                 "pool.cut_ins_per_shell, and run into a new folder"
             )
-        if crashes := int(self.tally.crashes[design.n_inside :].sum()):
+        outside = {each: int(tally.crashes[each.n_inside :].sum()) for each in design.statements}
+        found += [
+            f"{crashes:,} crashes beyond {each.boundary}: the statement {each.name} does not hold for this vehicle"
+            for each, crashes in outside.items()
+            if crashes
+        ]
+        if design.checked is not None and self._n_ahead:
             found.append(
-                f"{crashes} crashes where {design.boundary} does not crash: the conditional statement does not hold "
-                "for this vehicle"
+                f"the vehicle was ahead of {design.checked.boundary} in {self._n_ahead:,} of {self._n_checked:,} "
+                f"tests: nothing but the lack of a crash outside speaks for the statement {design.checked.name}"
             )
         return found
+
+
+def _name(episodes: list[int], block: Block, rows: BoolArray) -> None:
+    """Note the first few of some tests of a block."""
+    episodes += (block.first_episode + np.flatnonzero(rows)[: MOST_NAMED - len(episodes)]).tolist()

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from harness.estimators.estimate import WIDEST_RHW, Estimate
 
 _PER_KM = 1e6
+REPLAY = "harness replay FOLDER"
+"""Command that replays a test, without its number; FOLDER stands for the run's."""
 SCOPE = "The interval is about sampling error in this environment, not about how well the environment matches the road."
 
 
@@ -71,35 +73,93 @@ def failed_statement(found: Mapping[str, Any]) -> str:
     )
 
 
-def conditional_statement(estimate: Estimate) -> str | None:
-    """What holds if the vehicle crashes only where the boundary surrogate does; None unless drawn from shells."""
-    found = estimate.details.get("conditional")
-    if found is None:
-        return None
-    boundary, level = estimate.details["boundary"], f"{estimate.confidence:.0%}"
+def reference_statements(estimate: Estimate) -> list[str]:
+    """How the vehicle compares with each reference driver, a sentence each; none unless drawn from shells."""
+    return [_beside(found, estimate.confidence) for found in estimate.details.get("references", ()) if _known(found)]
+
+
+def _known(found: Mapping[str, Any]) -> bool:
+    return bool(found["crash_rate"] > 0.0)
+
+
+def _beside(found: Mapping[str, Any], confidence: float) -> str:
+    who, level = f"{found['described']} ({found['reference']})", f"{confidence:.0%}"
+    if found["ratio"] == 0.0:
+        return (
+            f"In the same traffic this vehicle crashes less than {found['ratio_high']:.3g} times as often as {who} "
+            f"would (upper end of the {level} interval): no crash was sampled."
+        )
+    low, high = found["preventable_low"], found["preventable_high"]
+    return (
+        f"This vehicle crashes {found['ratio']:.2f} times as often as {who} would in the same traffic ({level} "
+        f"interval {found['ratio_low']:.2f} to {found['ratio_high']:.2f}); {_percent(found['preventable'])} of its "
+        f"crashes such a driver would have avoided ({_percent(low)} to {_percent(high)})."
+    )
+
+
+def _percent(share: float) -> str:
+    """A share to two figures at least: whether it is 0.1 or 0 % may matter."""
+    return f"{100.0 * share:.2g} %" if share < 0.1 else f"{100.0 * share:.0f} %"
+
+
+def answer(estimate: Estimate, lane_change_level: float, distance_per_test_km: float | None) -> str:
+    """The `statement`, led by the comparison with the first reference driver where there is one."""
+    told = statement(estimate, lane_change_level, distance_per_test_km)
+    return " ".join([*reference_statements(estimate)[:1], told])
+
+
+def boundary_statements(estimate: Estimate) -> dict[str, str]:
+    """What holds for vehicles that crash only within a boundary, by statement; none unless drawn from shells."""
+    details, level = estimate.details, f"{estimate.confidence:.0%}"
+    return {found["name"]: _within(found, len(details["shells"]), level) for found in details.get("statements", ())}
+
+
+def _within(found: Mapping[str, Any], n_shells: int, level: str) -> str:
     if found["refuted"]:
         return (
-            f"This vehicle crashed {found['n_crashes_outside']:,} times where the surrogate {boundary} does not crash: "
-            f"nothing can be said under the assumption that it crashes only where {boundary} does."
+            f"REFUTED: it is not so that this vehicle {found['assumes']}. It crashed in "
+            f"{found['n_crashes_outside']:,} of {found['n_episodes_outside']:,} tests beyond {found['boundary']}, "
+            f"first in {_replayed(found['refuted_by'])}."
         )
     if math.isinf(found["rhw_from_pool"]):
         return "Under an assumption about where it crashes nothing more can be said: its crashes lie on too few paths."
     text = (
-        f"If this vehicle crashes only where the surrogate {boundary} or a more careful one crashes, its crash rate is "
-        f"{found['crash_rate']:.3g} per test ({level} interval {found['ci_low']:.3g} to {found['ci_high']:.3g}), "
-        f"estimated from {found['n_episodes']:,} tests ({found['n_crashes']:,} sampled crashes)."
-        f"{failed_statement(found)}"
+        f"If this vehicle {found['assumes']}, its crash rate is {found['crash_rate']:.3g} per test ({level} interval "
+        f"{found['ci_low']:.3g} to {found['ci_high']:.3g}), estimated from {found['n_episodes']:,} tests "
+        f"({found['n_crashes']:,} sampled crashes).{failed_statement(found)}"
     )
-    if all(shell["inside"] for shell in estimate.details["shells"]):
-        return f"{text} Nothing lies outside."
+    return f"{text} {_outside(found, n_shells, level)}{_ahead(found)}"
+
+
+def _outside(found: Mapping[str, Any], n_shells: int, level: str) -> str:
+    if found["n_shells"] == n_shells:
+        return "Nothing lies outside."
     if not found["n_episodes_outside"]:
-        return f"{text} Nothing was tested outside: whether the assumption holds is not known."
+        return "Nothing was tested outside: whether the assumption holds is not known."
     failed = found["n_failed_outside"]
     counted = f", but {failed:,} of them FAILED and are counted as crashes here" if failed else ""
     return (
-        f"{text} There was no crash in {found['n_episodes_outside']:,} tests outside{counted}: with {level} confidence "
+        f"There was no crash in {found['n_episodes_outside']:,} tests outside{counted}: with {level} confidence "
         f"fewer than {found['upper_bound_outside']:.3g} crashes per test lie there."
     )
+
+
+def _ahead(found: Mapping[str, Any]) -> str:
+    """What each test says about the assumption, where it was asked."""
+    if not found["n_checked"]:
+        return ""
+    if not found["n_ahead"]:
+        return f" In none of {found['n_checked']:,} tests was it ahead of such a vehicle: each keeps to the assumption."
+    return (
+        f" In {found['n_ahead']:,} of {found['n_checked']:,} tests it was AHEAD of such a vehicle, first in "
+        f"{_replayed(found['ahead_in'])}: it does not do what is assumed, and nothing but the lack of crashes outside "
+        "speaks for the statement."
+    )
+
+
+def _replayed(episodes: Sequence[int]) -> str:
+    """The first of some tests, and how to see it."""
+    return f"episode {episodes[0]} (`{REPLAY} {episodes[0]}`)"
 
 
 def repeated_statement(repeated: Mapping[str, Any] | None) -> str:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import ndtr
 
-from harness.arrays import FloatArray, IntArray
+from harness.arrays import BoolArray, FloatArray, IntArray
 from harness.estimators.intervals import clopper_pearson
 from harness.estimators.likelihood_ratio import Counts, Level, likelihood_limit
 
@@ -59,11 +59,18 @@ class Tally(NamedTuple):
         counts = self.tests[strata], self.crashes[strata], self.failed[strata]
         return Tally(*counts, self.crash_mass[strata, strata], self.failed_mass[strata, strata])
 
-    def failed_as_crashes(self) -> Tally:
-        """The same tests, had all failed ones crashed."""
-        nothing = np.zeros_like(self.failed), np.zeros_like(self.failed_mass)
-        mass = self.crash_mass + self.failed_mass
-        return Tally(self.tests, self.crashes + self.failed, nothing[0], mass, nothing[1])
+    def joined(self, groups: FloatArray) -> Tally:
+        """That of groups of strata: ``groups``, shape (S, G), is 1 where a stratum belongs to one."""
+        tests, crashes, failed = (np.rint(each @ groups).astype(np.int64) for each in self[:3])
+        return Tally(tests, crashes, failed, groups.T @ self.crash_mass @ groups, groups.T @ self.failed_mass @ groups)
+
+    def failed_as_crashes(self, where: BoolArray | None = None) -> Tally:
+        """The same tests, had all failed ones crashed; with ``where``, shape (S,) bool, those of some strata alone."""
+        counted = np.ones(self.tests.size, np.bool_) if where is None else where
+        failed, mass = self.failed * counted, self.failed_mass * counted[:, None]
+        return Tally(
+            self.tests, self.crashes + failed, self.failed - failed, self.crash_mass + mass, self.failed_mass - mass
+        )
 
     def scaled(self, tests: IntArray) -> Tally:
         """What so many tests of each stratum are expected to come to."""

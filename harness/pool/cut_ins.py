@@ -112,7 +112,7 @@ class Pool:
 
     @property
     def boundary(self) -> int:
-        """Index of the outermost shell that the conditional statement keeps."""
+        """Index of the outermost shell that the statement library keeps."""
         return self.names.index(self.library.boundary)
 
     def to_json(self) -> dict[str, Any]:

@@ -13,7 +13,9 @@ from harness.campaign.loading import names_a_file
 from harness.campaign.models import FVDM, IDM, CarefulCompetent, Constant, FuzzySafety, NeedBased, Reference, Reflexes
 from harness.campaign.problems import read_model
 from harness.campaign.section import Section, SurrogateName, broken_rule
+from harness.campaign.testing import ShellSettings, StatementSettings, checked_statements
 from harness.errors import CampaignError
+from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT
 from harness.vehicles.models import driver_records
 
 SHIPPED_FOLDER = Path(__file__).parent
@@ -74,7 +76,13 @@ class Library(Section):
     description: str = ""
     boundary: SurrogateName = Field(
         description="the most careless driver that the vehicle under test is assumed to be more careful than, "
-        "in the conditional statement"
+        "in the statement library"
+    )
+    assumes: str = Field(
+        "", description='what that statement assumes, as the end of a sentence that begins with "If this vehicle"'
+    )
+    statements: dict[SurrogateName, StatementSettings] = Field(
+        default_factory=dict, description="further statements by name"
     )
     envelope: SurrogateName = Field(
         description="a driver at constant full throttle: it crashes wherever any vehicle within its acceleration does"
@@ -107,15 +115,52 @@ class Library(Section):
             raise TypeError(type(envelope).__name__)
         return envelope.parameters.acceleration_mps2
 
+    @property
+    def boundaries(self) -> tuple[str, ...]:
+        """The most careless drivers inside, of all statements."""
+        return self.boundary, *(statement.boundary for statement in self.statements.values())
+
     def without(self, names: set[str]) -> Library:
-        """The library with some surrogates left out, never its boundary or envelope."""
+        """The library with some surrogates left out, and statements with them; never its boundary or envelope."""
         kept = {name: model for name, model in self.surrogates.items() if name not in names}
-        return Library.model_validate({**dict(self), "surrogates": kept})
+        statements = {name: each for name, each in self.statements.items() if each.boundary not in names}
+        return Library.model_validate({**dict(self), "surrogates": kept, "statements": statements})
+
+    def statement_settings(self, shells: ShellSettings) -> dict[str, StatementSettings]:
+        """The statements of a campaign, its own or the library's, by name.
+
+        Raises
+        ------
+        CampaignError
+            A boundary is no surrogate that reacts, or the statement that is asked for is none of them.
+        """
+        own = shells.boundary or self.boundary
+        assumes = self.assumes if own == self.boundary else ""
+        found = {LIBRARY_STATEMENT: StatementSettings(boundary=own, assumes=assumes)}
+        found |= self.statements if shells.statements is None else shells.statements
+        allowed = [name for name in self.surrogates if name != self.envelope]
+        for name, each in found.items():
+            if each.boundary not in allowed:
+                where = "boundary" if name == LIBRARY_STATEMENT else f"statements.{name}.boundary"
+                raise CampaignError(
+                    f"testing.shells.{where}",
+                    found=f"'{each.boundary}'",
+                    expected=f"a surrogate of the library other than its envelope: {', '.join(allowed)}",
+                    mend=f"Name one of them, or leave {where.split('.', maxsplit=1)[0]} out for the library's own.",
+                )
+        if shells.statement not in (ASSUMPTION_FREE, *found):
+            raise CampaignError(
+                "testing.shells.statement",
+                found=f"'{shells.statement}'",
+                expected=f"one of {ASSUMPTION_FREE}, {', '.join(found)}",
+                mend="Name one of them, or add it to testing.shells.statements.",
+            )
+        return found
 
     @model_validator(mode="after")
     def _names_are_known(self) -> Self:
-        for key in ("boundary", "envelope"):
-            name = getattr(self, key)
+        places = {f"statements.{name}.boundary": each.boundary for name, each in self.statements.items()}
+        for key, name in {"boundary": self.boundary, "envelope": self.envelope, **places}.items():
             if name not in self.surrogates:
                 close = difflib.get_close_matches(name, self.surrogates, n=1)
                 raise broken_rule(
@@ -124,14 +169,21 @@ class Library(Section):
                     expected=f"one of the surrogates: {', '.join(self.surrogates)}",
                     mend=f"Did you mean '{close[0]}'?" if close else "Add it to surrogates, or name another.",
                 )
-        if self.boundary == self.envelope:
+        for key, name in {"boundary": self.boundary, **places}.items():
+            if name != self.envelope:
+                continue
             raise broken_rule(
-                "boundary",
-                found=f"'{self.boundary}', which is the envelope",
+                key,
+                found=f"'{name}', which is the envelope",
                 expected="a driver that reacts: the envelope crashes nearly always, and assuming less than it says "
                 "nothing",
                 mend="Name the most careless driver that the vehicle can be expected to outdo.",
             )
+        return self
+
+    @model_validator(mode="after")
+    def _statements_can_be_told_apart(self) -> Self:
+        checked_statements(self.statements)
         return self
 
     @model_validator(mode="after")

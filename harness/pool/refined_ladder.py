@@ -139,11 +139,14 @@ def _refined(
     drivers: list[LibraryDriver] = [fitted.driver, careless, library.surrogates[library.boundary]]
     replayed = replay_drivers(folder, campaign, drivers).apart_from(to_fit.episode)
     prediction, of_careless, of_boundary = (predict(replayed, driver) for driver in range(3))
-    # The conditional statement is about vehicles inside the boundary: it must not lie within the AV's own neighbour.
+    # The statement library is about vehicles inside its boundary: it must not lie within the AV's own neighbour.
     beyond = of_careless.crash_rate_driver > of_boundary.crash_rate_driver
     surrogates = {**library.surrogates, names[0]: fitted.driver, names[1]: careless}
     boundary = names[1] if beyond else library.boundary
-    refined = Library.model_validate({**dict(library), "surrogates": surrogates, "boundary": boundary})
+    assumes = library.assumes if boundary == library.boundary else ""
+    refined = Library.model_validate(
+        {**dict(library), "surrogates": surrogates, "boundary": boundary, "assumes": assumes}
+    )
     agreed = agreement(fitted.driver, to_check)
     return RefinedLadder(refined, *names, fitted, *agreed, to_check.episode.size, prediction)
 
@@ -204,15 +207,23 @@ def _text(refined: RefinedLadder, folder: Path) -> str:
         f"{refined.careless} brakes {100.0 * (1.0 - CARELESS_BRAKING):.0f} % less and "
         f"{CARELESS_DELAY_STEPS / 10.0:g} s later.",
     ]
-    drivers = [f"  {name}: {_line(model.model_dump(exclude_unset=True))}" for name, model in library.surrogates.items()]
     head = [
         f"format: {library.format}",
         f"version: {library.version}",
         f"description: {_line(library.description)}",
         f"boundary: {library.boundary}",
+        f"assumes: {_line(library.assumes)}",
+        f"statements: {_line({name: each.model_dump() for name, each in library.statements.items()})}",
         f"envelope: {library.envelope}",
     ]
-    return "\n".join([*(f"# {line}".rstrip() for line in comment), "", *head, "surrogates:", *drivers, ""])
+    drivers = ["surrogates:", *_drivers(library.surrogates), "references:", *_drivers(library.references)]
+    if not library.references:
+        drivers[-1] += " {}"
+    return "\n".join([*(f"# {line}".rstrip() for line in comment), "", *head, *drivers, ""])
+
+
+def _drivers(drivers: dict[str, LibraryDriver]) -> list[str]:
+    return [f"  {name}: {_line(model.model_dump(exclude_unset=True))}" for name, model in drivers.items()]
 
 
 def _line(value: Any) -> str:

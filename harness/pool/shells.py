@@ -13,10 +13,19 @@ import numpy as np
 
 from harness.arrays import IntArray, RecordArray
 from harness.campaign.models import AutomatedVehicle, BuiltInParameters, Campaign
+from harness.campaign.models import Reference as ReferenceParameters
+from harness.campaign.testing import ShellSettings, StatementSettings
 from harness.episode.cells import PrescribedCutIns, PrescribedTraffic
-from harness.errors import CampaignError
 from harness.pool.cut_ins import Pool
-from harness.strata import FAILED_SHADOWS, OUTSIDE, ShellDesign
+from harness.pool.library import Library, LibraryDriver
+from harness.strata import FAILED_SHADOWS, OUTSIDE, Reference, ShellDesign, Statement
+from harness.vehicles.models import driver_records
+
+_REFERENCES = {
+    "r157-cc": "a careful and competent driver",
+    "r157-fsm": "a driver by the fuzzy safety model",
+}
+"""Drivers of UN Regulation No. 157 in plain words."""
 
 
 def acceleration_limit(av: AutomatedVehicle) -> float:
@@ -26,17 +35,6 @@ def acceleration_limit(av: AutomatedVehicle) -> float:
     if av.controller is not None or av.fmu is not None:
         return av.limits.max_acceleration_mps2
     return float("inf")
-
-
-def require_boundary(name: str, surrogates: tuple[str, ...]) -> None:
-    """Refuse a boundary that is none of the surrogates, with a CampaignError."""
-    if name not in surrogates:
-        raise CampaignError(
-            "testing.shells.boundary",
-            found=f"'{name}'",
-            expected=f"a surrogate of the library: {', '.join(surrogates)}",
-            mend="Name one of them, or leave boundary out for the library's own.",
-        )
 
 
 def shells_in_strata(pool: Pool, boundary: int, limit_mps2: float) -> list[list[int]]:
@@ -51,18 +49,25 @@ def shells_in_strata(pool: Pool, boundary: int, limit_mps2: float) -> list[list[
     return [*inside, outside] if outside else inside
 
 
-def design_shells(pool: Pool, *, boundary: str | None = None, limit_mps2: float) -> ShellDesign:
+def outermost(pool: Pool, shells: ShellSettings) -> int:
+    """Index of the shell up to which a campaign's strata are shells: the widest boundary of its statements."""
+    return max(pool.names.index(each.boundary) for each in pool.library.statement_settings(shells).values())
+
+
+def design_shells(pool: Pool, *, shells: ShellSettings | None = None, limit_mps2: float) -> ShellDesign:
     """Strata of a campaign; see `acceleration_limit`.
 
-    ``boundary`` is the surrogate up to which strata are inside, the library's by default; CampaignError if the pool
-    knows no such surrogate.
+    Raises
+    ------
+    CampaignError
+        The library knows no such boundary or statement.
     """
-    name = boundary or pool.library.boundary
-    require_boundary(name, pool.names)
-    groups = shells_in_strata(pool, pool.names.index(name), limit_mps2)
+    shells = shells or ShellSettings()
+    groups = shells_in_strata(pool, outermost(pool, shells), limit_mps2)
+    statements = _statements(pool, shells, groups)
     cells = cells_in_strata(pool, groups)
     first = np.unique(cells, return_index=True)[1][-(cells.max() + 1) :]
-    n_inside = sum(group[-1] <= pool.names.index(name) for group in groups)
+    n_inside = statements[-1].n_inside
     p = np.asarray(np.bincount(cells[cells >= 0], pool.cell_p[cells >= 0]), np.float64)
     design = ShellDesign(
         pool=pool.key,
@@ -70,12 +75,11 @@ def design_shells(pool: Pool, *, boundary: str | None = None, limit_mps2: float)
         cell_stratum=tuple(_stratum_of_shell(pool, groups)[pool.cell_shell[first]].tolist()),
         cell_p=p,
         cell_references=tuple(pool.cell_references[first].tolist()),
-        references=tuple(pool.library.references),
+        references=tuple(_reference(*each) for each in pool.library.references.items()),
         reference_rate=pool.reference_rate,
         reference_square=pool.reference_square,
         n_paths=pool.n_paths,
-        n_inside=n_inside,
-        boundary=name,
+        statements=statements,
         p_cut_in=pool.p_cut_in,
         p_impossible=pool.p_cut_in - float(p.sum()),
         shadow_runs=pool.cut_ins.motion.size > 0,
@@ -92,6 +96,39 @@ def _with_failed_shadows(design: ShellDesign, p: float) -> ShellDesign:
         cell_p=np.append(design.cell_p, p),
         cell_references=(*design.cell_references, 0),
     )
+
+
+def _statements(pool: Pool, shells: ShellSettings, groups: list[list[int]]) -> tuple[Statement, ...]:
+    """The statements of a campaign, the narrowest boundary first."""
+
+    def place(each: StatementSettings) -> int:
+        return pool.names.index(each.boundary)
+
+    def inside(each: StatementSettings) -> int:
+        return sum(group[-1] <= place(each) for group in groups)
+
+    found = sorted(pool.library.statement_settings(shells).items(), key=lambda each: place(each[1]))
+    return tuple(
+        Statement(name, each.boundary, each.assumes or _keeps_to(each.boundary), inside(each), each.checked)
+        for name, each in found
+    )
+
+
+def _keeps_to(boundary: str) -> str:
+    return f"crashes only where the surrogate {boundary} or a more careful one crashes"
+
+
+def _reference(name: str, driver: LibraryDriver) -> Reference:
+    described, delay = _REFERENCES.get(driver.model, "the driver"), None
+    if isinstance(driver.parameters, ReferenceParameters):
+        delay = driver.parameters.delay_after_cut_in_s + driver.reaction.delay_s
+    return Reference(name, described, delay)
+
+
+def checked_boundary(library: Library, design: ShellDesign) -> RecordArray:
+    """The driver that a vehicle is compared with in each test, shape (1,); (0,) if no statement is checked."""
+    model = None if design.checked is None else library.surrogates[design.checked.boundary]
+    return driver_records([]) if model is None else driver_records([model.parameters], [model.reaction])
 
 
 def _stratum_of_shell(pool: Pool, groups: list[list[int]]) -> IntArray:
@@ -133,8 +170,8 @@ class PrescribedEpisodes:
 
     def __init__(self, campaign: Campaign, pool: Pool) -> None:
         limit = acceleration_limit(campaign.av)
-        design = design_shells(pool, boundary=campaign.testing.shells.boundary, limit_mps2=limit)
-        groups = shells_in_strata(pool, pool.names.index(design.boundary), limit)
+        design = design_shells(pool, shells=campaign.testing.shells, limit_mps2=limit)
+        groups = shells_in_strata(pool, outermost(pool, campaign.testing.shells), limit)
         self._cut_ins = pool.cut_ins
         self._cells = cells_in_strata(pool, groups)
         self._order = [_order(pool, group, campaign.seed, stratum) for stratum, group in enumerate(groups)]

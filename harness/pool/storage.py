@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +40,8 @@ def pool_key(environment: Environment, library: Library, settings: PoolSettings)
         *(hashlib.sha256((Path(__file__).parent / name).read_bytes()).hexdigest() for name in _MADE_BY),
         environment_hash(environment),
         {name: model.model_dump() for name, model in library.surrogates.items()},
-        [library.boundary, library.envelope],
+        [(name, model.model_dump()) for name, model in library.references.items()],
+        [sorted(library.boundaries), library.boundary, library.envelope],
         settings.model_dump(exclude={"library", "shadow_paths"}),
     ]
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:24]
@@ -65,7 +66,7 @@ def campaign_pool(resolved: Resolved, progress: Progress | None = None) -> Pool:
         The pool could not be kept.
     """
     key = campaign_pool_key(resolved)
-    if (cached := _cached(key)) is not None:
+    if (cached := cached_pool(resolved)) is not None:
         return cached
     require_place(pool_path(key).parent, mend="Change its permissions, or name another place in HARNESS_CACHE_DIR.")
     pool = build_pool(resolved.environment, resolved.library, resolved.campaign.pool, key, progress)
@@ -75,7 +76,9 @@ def campaign_pool(resolved: Resolved, progress: Progress | None = None) -> Pool:
 
 def cached_pool(resolved: Resolved) -> Pool | None:
     """The pool of a campaign if it has been built on this machine, else None."""
-    return _cached(campaign_pool_key(resolved))
+    cached = _cached(campaign_pool_key(resolved))
+    # The key does not hold the words of statements: they are those of today.
+    return None if cached is None else replace(cached, library=resolved.library)
 
 
 def _cached(key: str) -> Pool | None:

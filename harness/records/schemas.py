@@ -63,6 +63,13 @@ def episodes_schema(n_importance: int, n_surrogates: int, n_cells: int = 0) -> p
     f8 = pa.float64()
     of_shells = [
         _field("cell", pa.int16(), "1", "cell of shells.json: shell, and which references crash (method shells alone)"),
+        _field(
+            "ahead_step",
+            pa.int16(),
+            "0.1 s",
+            "step after which the AV was first ahead of the boundary that is checked, null: never, or not asked",
+            nullable=True,
+        ),
         _field("cell_mass", _per(n_cells), "1", "P of a cut-in of each cell on the same path (method shells alone)"),
     ]
     return pa.schema(

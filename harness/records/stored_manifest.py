@@ -99,6 +99,26 @@ class StoredManifest(Stored):
     table_errors: list[TableError] | None = None
 
 
+class StoredStatement(Stored):
+    """A statement of ``shells.json``."""
+
+    model_config = ConfigDict(extra="forbid")
+    name: str
+    boundary: str
+    assumes: str
+    n_inside: Count
+    checked: bool
+
+
+class StoredReference(Stored):
+    """A reference driver of ``shells.json``."""
+
+    model_config = ConfigDict(extra="forbid")
+    name: str
+    described: str
+    delay_s: float | None
+
+
 class StoredShells(Stored):
     """``shells.json``: the strata of a shells campaign, see `harness.strata.ShellDesign`."""
 
@@ -108,12 +128,11 @@ class StoredShells(Stored):
     cell_stratum: list[Count]
     cell_p: list[float]
     cell_references: list[Count]
-    references: list[str]
+    references: list[StoredReference]
     reference_rate: list[float]
     reference_square: list[float]
     n_paths: Count
-    n_inside: Count
-    boundary: str
+    statements: list[StoredStatement] = Field(min_length=1)
     p_cut_in: float
     p_impossible: float
     available: list[Count]

@@ -82,6 +82,7 @@ def episodes_table(shard: Shard, seed: int) -> pa.Table:
     else:
         columns["pool_cut_in"], columns["cell"] = pa.array(prescribed.row), pa.array(prescribed.cell.astype(np.int16))
         columns["cell_mass"] = _rows(prescribed.cell_mass)
+        columns["ahead_step"] = pa.array(e["ahead_step"], mask=e["ahead_step"] < 0)
     for name in ("n_steps", "n_control_steps", "component"):
         columns[name] = pa.array(e[name])
     for name in ("cut_in_r2_m", "cut_in_r2dot_mps", "crash_time_s", "impact_speed_mps", "min_ttc_s", "log_p_cut_in"):

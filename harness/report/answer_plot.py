@@ -28,12 +28,13 @@ class Interval(NamedTuple):
 def answer_plot(estimates: StoredEstimates, shells: ShownShells | None) -> Plot | None:
     """Draw the intervals of all estimators that have one, the headline first; None when there is none.
 
-    Of a shells run also that of the conditional statement, unless its tests have refuted it.
+    Of a shells run also those of the statements about a boundary, unless its tests have refuted them.
     """
     shown = _intervals(estimates)
-    if shells is not None and not shells.conditional.refuted:
-        inside = shells.conditional
-        shown.append(Interval("if none outside", inside.crash_rate, inside.ci_low, inside.ci_high, is_headline=False))
+    for each in () if shells is None else shells.statements:
+        if not each.refuted:
+            name = f"given {each.name}"
+            shown.append(Interval(name, each.crash_rate, each.ci_low, each.ci_high, is_headline=False))
     if not shown:
         return None
     figure = new_figure(FULL_WIDTH_IN, 1.15 + 0.34 * len(shown))
@@ -141,7 +142,7 @@ def _caption(estimates: StoredEstimates, shown: list[Interval], on_log: bool, *,
     if len(shown) == 1:
         return text
     if of_shells:
-        return text + " The other one holds if there are no crashes outside the boundary."
+        return text + " The others hold for vehicles that keep to what the statement assumes."
     return text + (
         " Estimators that use the same tests are not independent: agreement among them is expected, not evidence."
     )

@@ -28,20 +28,20 @@ _WEIGHTED = (
     "many late jumps mean that the interval cannot be trusted yet."
 )
 _SHELLS = (
-    "Tests come in rounds, first inside the boundary. A shell without tests counts as free of crashes in the estimate "
-    "(line) and as anything in the interval (band), which is why the band begins wide and one-sided, and why the line "
-    "may jump when a shell is first tested. Right, RHW falls faster than the dotted line while what remains is to see "
-    "no crash outside, and along it where crashes must be counted."
+    "Tests come in rounds, first inside the narrowest boundary. A shell without tests counts as free of crashes in "
+    "the estimate (line) and as anything in the interval (band), which is why the band begins wide and one-sided, and "
+    "why the line may jump when a shell is first tested. Right, RHW falls faster than the dotted line while what "
+    "remains is to see no crash outside, and along it where crashes must be counted."
 )
 _RHW = "Relative half-width (RHW)"
 
 
 def convergence_plot(
-    estimates: StoredEstimates, target_rhw: float | None, *, of_conditional: bool = False
+    estimates: StoredEstimates, target_rhw: float | None, *, of_statement: str | None = None
 ) -> Plot | None:
     """Rate with its band, and RHW with its target, against tests; None without convergence records.
 
-    ``of_conditional``: the target is one for the conditional statement of a shells run, which convergence does not
+    ``of_statement``: the target is one for a statement of a shells run about a boundary, which convergence does not
     record.
     """
     curve = _curve(estimates.convergence or [])
@@ -55,7 +55,7 @@ def convergence_plot(
     for axes in (rate_axes, rhw_axes):
         _label_tests(axes, curve)
     _draw_rate(rate_axes, curve, confidence, level)
-    _draw_rhw(rhw_axes, curve, None if of_conditional else target_rhw)
+    _draw_rhw(rhw_axes, curve, None if of_statement else target_rhw)
     alt = (
         f"Left: crash rate against number of tests with its {confidence} band, ending at "
         f"{number(curve['crash_rate'][-1])} after {count(curve['n'][-1])} tests. Right: relative half-width against "
@@ -64,8 +64,8 @@ def convergence_plot(
     caption = _WEIGHTED if estimates.headline != "shells" else _SHELLS
     if target_rhw is None:
         caption += " No RHW was asked for."
-    elif of_conditional:
-        caption += " The RHW that was asked for is that of the conditional statement; drawn is the assumption-free one."
+    elif of_statement:
+        caption += f" The RHW that was asked for is that of the statement {of_statement}, not of the rate drawn here."
     return Plot("convergence", figure, alt, caption)
 
 

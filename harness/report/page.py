@@ -25,7 +25,7 @@ from harness.report.plot_style import RC, Plot, inline_svg, png, svg
 from harness.report.run_folder import RunFolder, read_run_folder, typed_folder
 from harness.report.shells_plot import shells_plot
 from harness.report.summary import RunSummary, summarise
-from harness.report.tables import RateUnit, details, diagnostics, outcome_rows, run_notes, setting_sections
+from harness.report.tables import RateUnit, details, diagnostics, outcome_rows, run_notes, setting_sections, verdict
 from harness.report.telling_bands import RELABELINGS, SIGNIFICANT
 
 PLOT_NAMES = re.compile(
@@ -49,6 +49,7 @@ FILTERS: dict[str, Callable[..., str]] = {
         number_format.signed_percent,
         number_format.size,
         number_format.value,
+        verdict,
     )
 }
 
@@ -129,7 +130,7 @@ def _plots(run: RunFolder, summary: RunSummary, contrast: Contrast, gallery: lis
     drawn_by = [weight_plot(summary), strata_plot(summary)] if run.shells is None else [shells_plot(run.shells)]
     plots = [
         answer_plot(run.estimates, run.shells),
-        convergence_plot(run.estimates, run.campaign.stop.rhw, of_conditional=run.asked_of_conditional),
+        convergence_plot(run.estimates, run.campaign.stop.rhw, of_statement=run.asked_statement),
         *drawn_by,
         contrast_plot(contrast),
         cut_in_plot(summary),

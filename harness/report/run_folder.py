@@ -18,10 +18,11 @@ from harness.arrays import FloatArray
 from harness.campaign.loading import load_campaign
 from harness.campaign.models import Campaign
 from harness.errors import CampaignError, RunFolderError
-from harness.estimators.shells import ShellDetails
+from harness.estimators.shells import ShellDetails, Within
 from harness.records.folder import MANIFEST, NO_RUN, read_json, read_manifest, require_schema
 from harness.records.reader import read_shards
 from harness.records.stored_manifest import Count, Stored, StoredManifest
+from harness.strata import ASSUMPTION_FREE
 
 
 class ShownManifest(StoredManifest):
@@ -71,7 +72,8 @@ class StoredEstimates(Stored):
     headline: str
     estimates: dict[str, StoredEstimate]
     statement: str
-    conditional_statement: str | None = None
+    reference_statements: list[str] = []
+    boundary_statements: dict[str, str] = {}
     n_episodes: int | None = None
     distance_per_test_km: float | None = None
     diagnostics: dict[str, Any] | None = None
@@ -85,9 +87,24 @@ class ShownShells(ShellDetails):
     rate: float
 
     @property
+    def widest(self) -> Within:
+        """The statement with the widest boundary."""
+        return self.statements[-1]
+
+    @property
+    def boundary(self) -> str:
+        """The widest boundary."""
+        return self.widest.boundary
+
+    @property
     def n_inside(self) -> int:
-        """Number of shells within the boundary, which come first."""
-        return sum(shell.inside for shell in self.shells)
+        """Number of shells within the widest boundary, which come first."""
+        return self.widest.n_shells
+
+    def narrowest(self, place: int) -> str:
+        """Which boundary a shell is inside of, the narrowest one."""
+        names = (f"inside {each.name}" for each in self.statements if place < each.n_shells)
+        return next(names, "outside")
 
     @property
     def has_outside(self) -> bool:
@@ -126,10 +143,11 @@ class RunFolder:
         return self.estimates.estimates[self.estimates.headline]
 
     @property
-    def asked_of_conditional(self) -> bool:
-        """Whether it is the conditional statement of a shells run that should reach ``stop.rhw``."""
+    def asked_statement(self) -> str | None:
+        """The statement about a boundary that should reach ``stop.rhw``; None for the assumption-free one."""
         testing = self.campaign.testing
-        return testing.method == "shells" and testing.shells.statement == "conditional"
+        asked = testing.shells.statement if testing.method == "shells" else ASSUMPTION_FREE
+        return None if asked == ASSUMPTION_FREE else asked
 
     def episodes(self, *columns: str) -> Iterator[pa.RecordBatch]:
         """Columns of the tests that count, shard by shard in index order.

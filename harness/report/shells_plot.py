@@ -70,14 +70,16 @@ def _draw_width(axes: Axes, row: int, half_width: float, widest: float, found: S
 
 
 def _draw_boundary(panels: tuple[Axes, Axes], found: ShownShells) -> None:
-    """Lines between inside and outside, and between the shells and the pool."""
-    boundary = found.n_inside - 0.5
+    """Lines at the boundary of each statement, and between the shells and the pool."""
     for axes in panels:
-        if found.has_outside:
-            axes.axhline(boundary, color=MUTED, linewidth=1.0, linestyle=(0, (4, 3)))
         axes.axhline(len(found.shells) - 0.5, color=MUTED, linewidth=0.6)
-    if found.has_outside:
-        text, place = f"outside {found.boundary} ↓", ("axes fraction", "data")
+    for each in found.statements:
+        if each.n_shells == len(found.shells):
+            continue
+        boundary = each.n_shells - 0.5
+        for axes in panels:
+            axes.axhline(boundary, color=MUTED, linewidth=1.0, linestyle=(0, (4, 3)))
+        text, place = f"outside {each.boundary} ({each.name}) ↓", ("axes fraction", "data")
         note(panels[0], text, (1.0, boundary), (-2, 2), xycoords=place, ha="right", color=MUTED, fontsize=8)
 
 
@@ -95,8 +97,12 @@ def _colours(found: ShownShells, limit: float) -> str:
     if not found.has_outside or not seen:
         return ""
     if seen == {True, False}:
-        return "; blue inside the boundary, orange outside"
-    return "; all that can be seen (blue) lies inside the boundary" if True in seen else "; all lies outside (orange)"
+        return "; blue inside the widest boundary, orange outside"
+    return (
+        "; all that can be seen (blue) lies inside the widest boundary"
+        if True in seen
+        else "; all lies outside (orange)"
+    )
 
 
 def _source(found: ShownShells) -> str:

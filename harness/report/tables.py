@@ -9,7 +9,7 @@ from pydantic import BaseModel
 
 from harness.campaign.dumping import written_out
 from harness.campaign.models import Campaign
-from harness.estimators.shells import ShellDetails
+from harness.estimators.shells import ShellDetails, Within
 from harness.outcomes import OUTCOMES
 from harness.report.number_format import (
     MISSING,
@@ -75,8 +75,8 @@ def run_notes(run: RunFolder, summary: RunSummary) -> list[str]:
             "harness estimate DIR --write."
         )
     target, rhw = run.campaign.stop.rhw, run.headline.rhw
-    if run.asked_of_conditional and run.shells is not None:
-        rhw = run.shells.conditional.rhw
+    if run.asked_statement and run.shells is not None:
+        rhw = next(each.rhw for each in run.shells.statements if each.name == run.asked_statement)
     if target is not None and (rhw is None or rhw > target):
         reached = "it is not known" if rhw is None else f"it is {half_width(rhw)}"
         mend = MENDS.get(run.manifest.get("stopped_by") or "")
@@ -89,6 +89,17 @@ def run_notes(run: RunFolder, summary: RunSummary) -> list[str]:
             "listed under Outcomes; a crash rate over the others is biased if failing and crashing go together."
         )
     return notes
+
+
+def verdict(found: Within) -> str:
+    """What the tests say about the assumption of a statement."""
+    if found.refuted:
+        return "refuted by these tests"
+    if found.n_ahead:
+        return "no longer justified: this vehicle does not keep to it"
+    if not found.n_episodes_outside:
+        return "not put to the test"
+    return "kept to in every test" if found.n_checked else "no crash seen outside"
 
 
 def outcome_rows(summary: RunSummary) -> list[tuple[str, float, float, float]]:

@@ -16,8 +16,8 @@ from harness.campaign.models import Campaign
 from harness.estimators.likelihood_ratio import Level
 from harness.estimators.pairs import PairCounts, Verdict
 from harness.estimators.stratified import Tally
-from harness.runner.planner import CONFIDENCE, POOL_SHARE, Allocation
-from harness.strata import ShellDesign
+from harness.runner.planner import CONFIDENCE, POOL_SHARE, Allocation, first_tests
+from harness.strata import ASSUMPTION_FREE, ShellDesign
 
 LOOKS = 6
 """A margin is decided at a level that leaves out so many times less than the campaign's, as it is looked at after each
@@ -46,10 +46,10 @@ class PairRule:
 
     def __init__(self, campaign: Campaign, margin: float | None) -> None:
         self._target, self._margin = campaign.stop.rhw, margin
-        self._min_crashes, self._first_tests = campaign.min_crashes, campaign.testing.shells.first_tests
+        self._min_crashes = campaign.min_crashes
         self._level = Level.two_sided(campaign.stop.confidence)
         self._decision = decision_level(campaign.stop.confidence)
-        self.conditional = campaign.testing.shells.statement == "conditional"
+        self.conditional = campaign.testing.shells.statement != ASSUMPTION_FREE
         self.reached = self.pool_error_above_target = self.of_first_tests = False
         self.rhw, self.heaviest = math.inf, 0.0
         self.waited_for: tuple[str, ...] = ()
@@ -66,7 +66,7 @@ class PairRule:
         met = {
             f"stop.rhw ({self._target:g}, of the difference)": self.rhw <= self._target,
             f"stop.min_crashes ({self._min_crashes:,})": pairs.n_crashes >= self._min_crashes,
-            f"testing.shells.first_tests ({self._first_tests:,} of each shell)": not self.of_first_tests,
+            "the first tests of each shell (testing.shells.first_tests)": not self.of_first_tests,
         }
         missing = tuple(condition for condition, is_met in met.items() if not is_met)
         self.waited_for = missing or self.waited_for
@@ -103,8 +103,8 @@ class PairPlanner:
     def __init__(self, campaign: Campaign, design: ShellDesign, available: IntArray, margin: float | None) -> None:
         shells = campaign.testing.shells
         self.rule = PairRule(campaign, margin)
-        self._budget, self._first_tests = campaign.stop.episodes, shells.first_tests
-        self._allocation = Allocation(design, shells.first_tests, available, shells.statement == "conditional")
+        self._budget, self._first_tests = campaign.stop.episodes, first_tests(design, shells.first_tests)
+        self._allocation = Allocation(design, self._first_tests, available, shells.statement)
         self._level = Level.two_sided(CONFIDENCE)
 
     def next_round(self, pairs: PairCounts) -> IntArray:
@@ -113,10 +113,10 @@ class PairPlanner:
         added = self._allocation.next_round(
             _differing(pairs),
             self._budget - int(tests.sum()),
-            inner_rhw=partial(pairs.inside().rhw, self._level),
+            inner_rhw=lambda n: pairs.part(n).rhw(self._level),
             spread=partial(self._spread, pairs),
         )
-        self.rule.of_first_tests = bool(np.any(tests[added > 0] < self._first_tests))
+        self.rule.of_first_tests = bool(np.any((tests < self._first_tests)[added > 0]))
         return added
 
     def _spread(self, pairs: PairCounts, size: int, room: IntArray) -> IntArray:

@@ -3,8 +3,8 @@
 Most methods know all their tests beforehand. Shells decide from each round what the next one tests, so that a round is
 run to its end before the next begins, whatever the number of workers; the result is looked at between rounds. Rounds
 grow geometrically, to where they narrow the interval most. That depends on counts alone, not on the stop rule or on
-time: a run can be continued to a smaller RHW. First the strata inside the boundary are tested until the conditional
-statement is roughly known, some hundred tests; then all are.
+time: a run can be continued to a smaller RHW. First the strata inside the narrowest boundary are tested until what is
+stated about them is roughly known, some ten tests; then those inside the next one, and at last all.
 """
 
 from __future__ import annotations
@@ -28,16 +28,20 @@ from harness.estimators.likelihood_ratio import Level
 from harness.estimators.stratified import Tally, combined, empty_tally
 from harness.pool.shells import Draw, PrescribedEpisodes
 from harness.runner.worker import ShardSpec
-from harness.strata import ShellDesign
+from harness.strata import ASSUMPTION_FREE, ShellDesign
 
 GROWTH = 1.1
 """Tests after a round over tests before it; also the distance of the looks at the result."""
-CONDITIONAL_RHW = 0.3
-"""Relative half-width of the conditional statement at which testing turns to what lies outside."""
+INNER_RHW = 0.3
+"""Relative half-width of a statement at which testing turns to what lies outside its boundary."""
 CONFIDENCE = 0.9
 """Level at which widths are compared, whatever the campaign reports."""
 _TAIL, _LEVEL = (1.0 - CONFIDENCE) / 2.0, Level.two_sided(CONFIDENCE)
-MOST_FIRST_TESTS = 4
+FIRST_TESTS = 36
+"""First tests of all strata within the narrowest boundary together, each its share of the probability there."""
+LEAST_FIRST_TESTS, MOST_FIRST_TESTS = 3, 12
+"""Of one stratum."""
+MOST_INNER_TESTS = 8
 """Testing turns to what lies outside after this many times the first tests, known or not."""
 SMALLEST_ROUND = 8
 SHARES_PER_ROUND = 32
@@ -103,7 +107,8 @@ class ShellPlanner:
         self.reported_from = 0
         self._campaign = campaign
         self._available = available
-        self._allocation = Allocation(design, shells.first_tests, available, shells.statement == "conditional")
+        self._first_tests = first_tests(design, shells.first_tests)
+        self._allocation = Allocation(design, self._first_tests, available, shells.statement)
         self._drawn = np.zeros(design.p.size, np.int64)
         self._planned: IntArray | None = None
         self._begin_phase()
@@ -132,7 +137,7 @@ class ShellPlanner:
         """Tests to add per stratum, shape (S,); all 0 when no stratum or no budget is left."""
         tally, budget = self.tally, self._campaign.stop.episodes - self.reported_from - self._n_episodes
         added = self._allocation.next_round(tally, budget) if self._planned is None else self._planned - tally.tests
-        self.rule.of_first_tests = bool(np.any(tally.tests[added > 0] < self._campaign.testing.shells.first_tests))
+        self.rule.of_first_tests = bool(np.any((tally.tests < self._first_tests)[added > 0]))
         self._look = self._n_episodes + int(added.sum())
         return added
 
@@ -198,25 +203,45 @@ def planner_of(campaign: Campaign, prescribed: PrescribedEpisodes | None, held: 
     return ShellPlanner(campaign, prescribed.design, prescribed.available, held)
 
 
+def first_tests(design: ShellDesign, asked: int | None = None) -> IntArray:
+    """Tests that each stratum gets before anything is decided about it, shape (S,); ``asked`` is a number for all.
+
+    A stratum without a crash leaves about p_s/n_s open, and of several the largest counts. So tests go in proportion
+    to the probability, which leaves the same open in each; further ones come where crashes are seen.
+    """
+    if asked is not None:
+        return np.full(design.p.size, asked, np.int64)
+    within = design.p[: design.statements[0].n_inside].sum()
+    share = np.ceil(FIRST_TESTS * design.p / within) if within > 0.0 else np.full(design.p.size, np.inf)
+    found: IntArray = np.clip(share, LEAST_FIRST_TESTS, MOST_FIRST_TESTS).astype(np.int64)
+    return found
+
+
 @dataclass(frozen=True)
 class Allocation:
     """How many tests each shell gets next.
 
     A stratum gets ``first_tests`` before anything is decided about it, and at most those ``available``, shape (S,).
-    With ``conditional_only`` what lies outside is never tested.
+    With a ``statement`` of the design what lies outside its boundary is never tested.
     """
 
     design: ShellDesign
-    first_tests: int
+    first_tests: IntArray
     available: IntArray
-    conditional_only: bool
+    statement: str = ASSUMPTION_FREE
+
+    @property
+    def n_asked(self) -> int:
+        """Strata that may be tested, which come first."""
+        inside = {each.name: each.n_inside for each in self.design.statements}
+        return inside.get(self.statement, self.design.p.size)
 
     def next_round(
         self,
         tally: Tally,
         budget: int,
         *,
-        inner_rhw: Callable[[], float] | None = None,
+        inner_rhw: Callable[[int], float] | None = None,
         spread: Callable[[int, IntArray], IntArray] | None = None,
     ) -> IntArray:
         """Tests to add per stratum, at most ``budget``; all 0 when no stratum or no budget is left.
@@ -228,14 +253,14 @@ class Allocation:
         tally : Tally
         budget : int
         inner_rhw : callable, optional
-            Gives the relative half-width of the conditional statement; by default that of a crash rate.
+            Gives the relative half-width from so many first strata; by default that of a crash rate.
         spread : callable, optional
             Gives so many tests to strata with so much room (S,) each; by default to where a crash rate is narrowed.
         """
         tests = tally.tests
         if self._used_up(tally):
             return np.zeros_like(tests)
-        begun = self._begun(tests, inner_rhw or partial(self._inner_rhw, tally))
+        begun = self._begun(tally, inner_rhw or partial(self._inner_rhw, tally))
         active = begun & (tests < self.available)
         wanted = np.where(active, np.maximum(self.first_tests - tests, 0), 0)
         if not wanted.any() and active.any():
@@ -250,7 +275,7 @@ class Allocation:
         No more than ``available``, shape (S,), and together at most ``budget``.
         """
         p, n_paths = self.design.p, self.design.n_paths
-        watched = slice(0, self.design.n_inside if self.conditional_only else p.size)
+        watched = slice(0, self.n_asked)
 
         def tests(factor: float) -> IntArray:
             return np.asarray(np.minimum(np.ceil(factor * first.tests).astype(np.int64), available))
@@ -270,27 +295,29 @@ class Allocation:
     def _used_up(self, tally: Tally) -> bool:
         """Whether nearly all that is left to know lies in strata without further cut-ins."""
         tests, (low, high) = tally.tests, clopper_pearson(tally.crashes, tally.tests, _TAIL, tally.failed)
-        relevant = np.arange(tests.size) < (self.design.n_inside if self.conditional_only else tests.size)
+        relevant = np.arange(tests.size) < self.n_asked
         squares = np.where(relevant, (self.design.p * (high - low)) ** 2, 0.0)
         return bool(squares[tests >= self.available].sum() >= USED_UP_SHARE * squares.sum())
 
-    def _begun(self, tests: IntArray, inner_rhw: Callable[[], float]) -> BoolArray:
-        """Strata that it is time to test: those inside, and from some point on all."""
-        n_inside = self.design.n_inside
-        inside = np.arange(tests.size) < n_inside
-        if self.conditional_only:
-            return inside
-        exhausted = bool(np.all(tests[:n_inside] >= self.available[:n_inside]))
-        started = bool(np.any(tests[n_inside:] > 0))
-        # Without this end a vehicle that crashes rarely inside, and often outside, would not be tested outside at all.
-        spent = bool(tests[:n_inside].sum() >= MOST_FIRST_TESTS * self.first_tests * n_inside)
-        if exhausted or started or spent:
-            return np.ones_like(inside)
-        return inside | (inner_rhw() <= CONDITIONAL_RHW)
+    def _begun(self, tally: Tally, inner_rhw: Callable[[int], float]) -> BoolArray:
+        """Strata that it is time to test: those inside the narrowest boundary that leaves much open."""
+        boundaries = (each.n_inside for each in self.design.statements if each.n_inside < self.n_asked)
+        n = next((n for n in boundaries if not self._enough_inside(n, tally.tests, inner_rhw)), self.n_asked)
+        begun: BoolArray = np.arange(tally.tests.size) < n
+        return begun
 
-    def _inner_rhw(self, tally: Tally) -> float:
-        d, s = self.design, slice(0, self.design.n_inside)
-        return combined(d.p[s], tally.part(s), d.n_paths, _LEVEL).rhw
+    def _enough_inside(self, n: int, tests: IntArray, inner_rhw: Callable[[int], float]) -> bool:
+        """Whether it is time to test more than the first ``n`` strata."""
+        s = slice(0, n)
+        if np.any(tests[n:] > 0) or np.all(tests[s] >= self.available[s]):
+            return True
+        # Without this end a vehicle that crashes rarely inside, and often outside, would not be tested outside at all.
+        if tests[s].sum() >= MOST_INNER_TESTS * self.first_tests[s].sum():
+            return True
+        return inner_rhw(n) <= INNER_RHW
+
+    def _inner_rhw(self, tally: Tally, n: int) -> float:
+        return combined(self.design.p[:n], tally.part(slice(0, n)), self.design.n_paths, _LEVEL).rhw
 
     def _spread(self, size: int, tally: Tally, most: IntArray) -> IntArray:
         """Give portions, one after the other, to where each narrows the sum of squared half-widths most.
@@ -347,8 +374,7 @@ class RoundRule:
         self._held = held
         self._target = None if campaign.stop.rhw is None else factor * campaign.stop.rhw
         self._min_crashes = campaign.min_crashes
-        self._first_tests = campaign.testing.shells.first_tests
-        self._conditional = campaign.testing.shells.statement == "conditional"
+        self._statement = campaign.testing.shells.statement
         self.reached = self.pool_error_above_target = False
         self.rhw = float("inf")
         self.heaviest = 0.0  # limits within shells allow for every crash that has not been seen
@@ -357,7 +383,9 @@ class RoundRule:
 
     def observe(self, estimate: Estimate) -> bool:
         """Whether to stop at the end of a round, with this estimate from all tests so far."""
-        watched = estimate.details["conditional"] if self._conditional else {"rhw": estimate.rhw, **estimate.details}
+        watched = {"rhw": estimate.rhw, **estimate.details}
+        if self._statement != ASSUMPTION_FREE:
+            watched = next(each for each in estimate.details["statements"] if each["name"] == self._statement)
         self.rhw = watched["rhw"]
         if self._target is None:
             return False
@@ -369,7 +397,7 @@ class RoundRule:
         if missing:
             self.waited_for = missing
         elif self.of_first_tests:
-            self.waited_for = (f"testing.shells.first_tests ({self._first_tests:,} of each shell)",)
+            self.waited_for = ("the first tests of each shell (testing.shells.first_tests)",)
         if estimate.n_crashes < self._min_crashes:
             return False
         self.reached = not missing

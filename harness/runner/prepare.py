@@ -14,13 +14,13 @@ from harness.controllers.loading import build_host, require_controller
 from harness.criticality.tables import Tables, build_tables, tables_cached
 from harness.environment.driving import Environment
 from harness.environment.initial_state import InitialStates
-from harness.episode.loop import MOMENT_LIMITS, EpisodeLoop, Keep, Policy
+from harness.episode.loop import MOMENT_LIMITS, NOBODY, EpisodeLoop, Keep, Policy
 from harness.episode.trajectory import empty_trajectory, mean_test_distance
 from harness.errors import RunFolderError
 from harness.importance.build import build_importance, needs_tables
 from harness.outcomes import SHELLS as PRESCRIBED
 from harness.pool.shadow_paths import ShadowPaths, campaign_shadow_paths, shadow_paths_file
-from harness.pool.shells import PrescribedEpisodes, require_boundary
+from harness.pool.shells import PrescribedEpisodes, checked_boundary
 from harness.pool.storage import campaign_pool, campaign_pool_key, pool_path
 from harness.pool.vehicle_pool import ShadowRuns, vehicle_pool
 from harness.progress import Progress, SilentProgress
@@ -66,7 +66,9 @@ class Prepared:
         if self.shadow_paths is None:
             raise ValueError("this campaign has no shadow runs")
         pool = vehicle_pool(self.resolved, self.shadow_paths, runs)
-        return replace(self, prescribed=PrescribedEpisodes(self.campaign, pool))
+        prescribed = PrescribedEpisodes(self.campaign, pool)
+        policy = self.policy._replace(boundary=checked_boundary(self.resolved.library, prescribed.design))
+        return replace(self, prescribed=prescribed, policy=policy)
 
     def states(self, first_episode: int, n_episodes: int) -> RecordArray:
         """Initial states of consecutive episodes, shape (n_episodes,)."""
@@ -110,8 +112,7 @@ def require_ready(campaign: Campaign) -> Resolved:
         require_private(campaign.av.traci)
     resolved = resolve(campaign, controller_sha256)
     if campaign.testing.method == "shells":
-        library = resolved.library
-        require_boundary(campaign.testing.shells.boundary or library.boundary, tuple(library.surrogates))
+        resolved.library.statement_settings(campaign.testing.shells)
     return resolved
 
 
@@ -149,7 +150,8 @@ def prepare(resolved: Resolved, progress: Progress | None = None) -> Prepared:
     importance = build_importance(campaign, tables)
     if campaign.has_shadow_runs:  # what happens then is prescribed, cut-in included
         importance = importance._replace(method=PRESCRIBED)
-    policy = Policy(campaign.seed, environment, importance, resolved.av)
+    boundary = NOBODY if prescribed is None else checked_boundary(resolved.library, prescribed.design)
+    policy = Policy(campaign.seed, environment, importance, resolved.av, boundary)
     return Prepared(resolved, policy, InitialStates(environment.numbers), tables, prescribed, shadow_paths)
 
 

@@ -136,9 +136,17 @@ def read_shells(folder: Path) -> ShellDesign:
     Raises
     ------
     RunFolderError
-        The file is missing or damaged.
+        The file is missing, damaged, or of a version that knew neither statements nor reference drivers.
     """
     content = read_json(folder / SHELLS, mend=_FINISH)
+    if "n_inside" in content and "statements" not in content:
+        version = read_manifest(folder).get("versions", {}).get("harness", "that made it")
+        raise RunFolderError(
+            str(folder / SHELLS),
+            found="shells of an earlier version, without statements and reference drivers",
+            expected="a run of this version: its tests say what those rest on",
+            mend=f"Run the campaign again into a new folder, or estimate this one with version {version}.",
+        )
     require_schema(content, StoredShells, folder / SHELLS, mend=_FINISH)
     return ShellDesign.from_json(content)
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,7 @@ from harness.estimators.intervals import clopper_pearson
 COVERAGE_CONFIDENCE = 0.95
 SIGNIFICANCE = 0.05
 NEGLIGIBLE_OUTSIDE = 1e-3
-"""Largest share of a vehicle's crashes beyond the boundary with which it still meets the conditional assumption."""
+"""Largest share of a vehicle's crashes beyond the boundary with which it still meets the assumption of a statement."""
 WANTED_RHW = 0.3
 
 
@@ -64,8 +64,8 @@ class Subject:
     ----------
     crash_rate, std_error : float
         The truth, and how well it is known.
-    crashes_outside : float
-        Share of its crash rate beyond the boundary; 0 where there is none.
+    crashes_outside : dict
+        For each result that assumes a boundary, the share of its crash rate beyond it.
     left_out : tuple of str
         Surrogates that are its equals.
     boundary : str or None
@@ -75,14 +75,13 @@ class Subject:
     name: str
     crash_rate: float
     std_error: float = 0.0
-    crashes_outside: float = 0.0
+    crashes_outside: dict[str, float] = field(default_factory=dict)
     left_out: tuple[str, ...] = ()
     boundary: str | None = None
 
-    @property
-    def meets_assumption(self) -> bool:
-        """Whether the conditional statement holds for it."""
-        return self.crashes_outside < NEGLIGIBLE_OUTSIDE
+    def meets_assumption_of(self, result: str) -> bool:
+        """Whether what a result assumes holds for it."""
+        return self.crashes_outside.get(result, 0.0) < NEGLIGIBLE_OUTSIDE
 
 
 @dataclass(frozen=True)
@@ -92,7 +91,7 @@ class Judgement:
     Attributes
     ----------
     assumption_met : bool
-        False only for the conditional statement of a vehicle that crashes outside; its coverage is then not judged.
+        False for a statement about vehicles that do not crash outside, and one that does; coverage is then not judged.
     bias, bias_std_error : float
         Of the mean estimate, relative to the truth.
     true_relvar, claimed_relvar : float
@@ -141,9 +140,7 @@ class Judgement:
         return content
 
 
-def judge(
-    subject: Subject, result: str, rows: Sequence[Row], confidence: float, *, conditional: bool = False
-) -> Judgement:
+def judge(subject: Subject, result: str, rows: Sequence[Row], confidence: float) -> Judgement:
     """Judge one method on one vehicle; `corrected` then fills in the corrected p-values.
 
     Parameters
@@ -152,15 +149,13 @@ def judge(
         Of this vehicle and result.
     confidence : float
         Nominal coverage.
-    conditional : bool
-        Whether the statement holds only for vehicles that meet the assumption.
     """
     columns = {field.name: np.array([getattr(row, field.name) for row in rows]) for field in fields(Row)}
     rates, tests, reached = columns["crash_rate"], columns["n_tests"], columns["reached"]
     truth, n = subject.crash_rate, len(rows)
     covered = int(np.count_nonzero((columns["ci_low"] <= truth) & (truth <= columns["ci_high"])))
     low, high = map(float, clopper_pearson(covered, n, (1.0 - COVERAGE_CONFIDENCE) / 2.0))
-    met = subject.meets_assumption or not conditional
+    met = subject.meets_assumption_of(result)
     tests_5, median, tests_95 = (float(q) for q in np.quantile(tests, [0.05, 0.5, 0.95]))
     relvar = float(np.mean((rates / truth - 1.0) ** 2))
     fixed = not reached.any() and bool(np.all(tests == tests[0]))

@@ -17,8 +17,9 @@ from harness.campaign.models import Campaign
 from harness.estimators.likelihood_ratio import Level
 from harness.estimators.pairs import CRASH, NO_CRASH, PairCounts, no_pairs
 from harness.runner.pair_planner import PairPlanner, PairRule
+from harness.strata import LIBRARY_STATEMENT
 from harness.studies.judgement import Row
-from harness.studies.shell_campaign import DrawnPool, conditional_campaign
+from harness.studies.shell_campaign import DrawnPool, asking
 
 _CRASHING = ((CRASH, CRASH), (CRASH, NO_CRASH), (NO_CRASH, CRASH))
 """How A and B end: both crash, only A, only B."""
@@ -47,7 +48,7 @@ class PairedCampaign:
         return [row for replication in replications for row in self._rows(replication)]
 
     def _rows(self, replication: int) -> Iterator[Row]:
-        inside = PairRule(conditional_campaign(self.campaign), None)
+        inside = PairRule(asking(self.campaign, LIBRARY_STATEMENT), None)
         early: PairCounts | None = None
         for pairs, rule in self.rounds(replication):
             reached = rule.reached
@@ -75,7 +76,7 @@ class PairedCampaign:
     def _row(self, result: str, replication: int, pairs: PairCounts, *, reached: bool) -> Row:
         level = Level.two_sided(self.campaign.stop.confidence)
         found = pairs.difference(level)
-        outside = pairs.ends[pairs.design.n_inside :]
+        outside = pairs.ends[pairs.design.statements[0].n_inside :]
         return Row(
             result,
             replication,

@@ -41,7 +41,7 @@ def write_results(
             "confidence": confidence,
             "truth": TRUTH_OF_CHAINS if experiment.chains else TRUTH_OF_VEHICLES,
             "largest_relative_error_of_truth": max(one.std_error / one.crash_rate for one, _ in found),
-            "subjects": [asdict(one) | {"meets_assumption": one.meets_assumption} for one, _ in found],
+            "subjects": [asdict(one) for one, _ in found],
             "judgements": [one.to_json() for one in judgements],
         },
     )

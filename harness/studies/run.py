@@ -18,12 +18,13 @@ from harness.pool.library import load_library
 from harness.progress import Progress, SilentProgress
 from harness.records.folder import require_place
 from harness.spawning import spawn_context
+from harness.strata import LIBRARY_STATEMENT
 from harness.studies.chains.named import CHAINS
 from harness.studies.chains.shells import ChainShells
 from harness.studies.experiment import Experiment
 from harness.studies.judgement import Judgement, Row, Subject, corrected, judge
 from harness.studies.results import write_results
-from harness.studies.shell_campaign import CONDITIONAL, ShellCampaign
+from harness.studies.shell_campaign import ShellCampaign, result_of
 from harness.studies.shell_source import OvertakingShells, overtaking_shells
 from harness.studies.super_population import Drivers, Truth, enumerate_paths, truths
 from harness.studies.weighted_campaign import ChainEpisodes, TwinEpisodes, WeightedCampaign
@@ -73,7 +74,7 @@ def _judge(experiment: Experiment, subject: Subject, rows: list[Row]) -> Iterato
     for result in dict.fromkeys(row.result for row in rows):
         of_result = [row for row in rows if row.result == result]
         confidence = experiment.campaign.stop.confidence
-        yield judge(subject, result, of_result, confidence, conditional=result == CONDITIONAL)
+        yield judge(subject, result, of_result, confidence)
 
 
 def _chains(experiment: Experiment) -> Iterator[tuple[Subject, Repeated]]:
@@ -82,7 +83,9 @@ def _chains(experiment: Experiment) -> Iterator[tuple[Subject, Repeated]]:
         chain, seed = CHAINS[name], experiment.seed_of(place)
         if method == "shells":
             source = ChainShells(chain, experiment.super_population.pool_paths)
-            subject = Subject(name, chain.crash_rate, crashes_outside=source.crashes_outside)
+            subject = Subject(
+                name, chain.crash_rate, crashes_outside={result_of(LIBRARY_STATEMENT): source.crashes_outside}
+            )
             yield subject, ShellCampaign(campaign, source, seed, experiment.fault)
         else:
             episodes = ChainEpisodes(chain, method, seed)
@@ -114,7 +117,8 @@ def _vehicles(experiment: Experiment, progress: Progress) -> Iterator[tuple[Subj
 
 
 def _subject(name: str, source: OvertakingShells, truth: Truth) -> Subject:
-    facts = source.crashes_outside, source.left_out, source.template.library.boundary
+    outside = {result_of(statement): share for statement, share in source.crashes_outside.items()}
+    facts = outside, source.left_out, source.template.library.boundary
     return Subject(name, truth.crash_rate, truth.std_error, *facts)
 
 

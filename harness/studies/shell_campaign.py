@@ -23,7 +23,12 @@ from harness.strata import ShellDesign
 from harness.studies.experiment import Fault
 from harness.studies.judgement import Row, estimate_row
 
-FREE, CONDITIONAL = "shells", "shells, conditional"
+FREE = "shells"
+
+
+def result_of(statement: str) -> str:
+    """Name of a statement's rows among results."""
+    return f"{FREE}, {statement}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,26 +89,34 @@ class ShellCampaign:
         design = drawn.design
         available = np.full(design.p.size, self.campaign.pool.cut_ins_per_shell, np.int64)
         planner = ShellPlanner(self.campaign, design, available)
-        inside, conditional = RoundRule(conditional_campaign(self.campaign)), None
+        rules = {each.name: RoundRule(asking(self.campaign, each.name)) for each in design.statements}
+        known: dict[str, Row] = {}
         estimate: Estimate | None = None
         enough = False
         while not enough and (added := planner.next_round()).any():
             enough = planner.add(campaign_block(drawn, added, int(planner.tally.tests.sum()), rng))
             estimate = planner.estimate
-            if estimate is not None and conditional is None:
-                inside.observe(estimate)
-                if inside.reached:
-                    conditional = _conditional_row(estimate, replication, reached=True)
+            if estimate is not None:
+                known |= dict(_newly_known(estimate, replication, {k: v for k, v in rules.items() if k not in known}))
         if estimate is None:
             raise ValueError("the campaign has no tests")
-        outside = int(estimate.details["conditional"]["n_crashes_outside"])
+        outside = int(estimate.details["statements"][0]["n_crashes_outside"])
         yield estimate_row(FREE, replication, estimate, reached=planner.rule.reached, outside=outside)
-        yield conditional or _conditional_row(estimate, replication, reached=False)
+        for name in rules:
+            yield known.get(name) or _statement_row(estimate, name, replication, reached=False)
 
 
-def conditional_campaign(campaign: Campaign) -> Campaign:
-    """The campaign with the conditional statement to be made precise."""
-    shells = campaign.testing.shells.model_copy(update={"statement": "conditional"})
+def _newly_known(estimate: Estimate, replication: int, rules: dict[str, RoundRule]) -> Iterator[tuple[str, Row]]:
+    """Rows of statements that have just become precise enough."""
+    for name, rule in rules.items():
+        rule.observe(estimate)
+        if rule.reached:
+            yield name, _statement_row(estimate, name, replication, reached=True)
+
+
+def asking(campaign: Campaign, statement: str) -> Campaign:
+    """The campaign, were it to end with a statement."""
+    shells = campaign.testing.shells.model_copy(update={"statement": statement})
     return campaign.model_copy(update={"testing": campaign.testing.model_copy(update={"shells": shells})})
 
 
@@ -143,15 +156,15 @@ def campaign_block(drawn: DrawnPool, added: IntArray, first: int, rng: np.random
     )
 
 
-def _conditional_row(estimate: Estimate, replication: int, *, reached: bool) -> Row:
-    found = estimate.details["conditional"]
-    shells = [shell for shell in estimate.details["shells"] if shell["inside"] and shell["n_episodes"]]
+def _statement_row(estimate: Estimate, name: str, replication: int, *, reached: bool) -> Row:
+    found = next(each for each in estimate.details["statements"] if each["name"] == name)
+    shells = [shell for shell in estimate.details["shells"][: found["n_shells"]] if shell["n_episodes"]]
     variance = sum(
         shell["p"] ** 2 * shell["crash_share"] * (1.0 - shell["crash_share"]) / shell["n_episodes"] for shell in shells
     )
     reported = {name: found[name] for name in ("n_crashes", "crash_rate", "ci_low", "ci_high", "n_crashes_outside")}
     return Row(
-        CONDITIONAL,
+        result_of(name),
         replication,
         n_tests=found["n_episodes"],
         std_error=float(np.sqrt(variance)),

@@ -9,10 +9,11 @@ import numpy as np
 
 from harness.arrays import FloatArray, IntArray
 from harness.campaign.models import AutomatedVehicle
+from harness.campaign.testing import ShellSettings
 from harness.errors import CampaignError
 from harness.pool.cut_ins import CutIns, Pool, shells_of
 from harness.pool.library import Library
-from harness.pool.shells import acceleration_limit, design_shells, shells_in_strata
+from harness.pool.shells import acceleration_limit, design_shells, outermost, shells_in_strata
 from harness.studies.experiment import Adversary
 from harness.studies.shell_campaign import DrawnPool
 from harness.studies.super_population import Mixed, SuperPopulation
@@ -52,10 +53,14 @@ class OvertakingShells:
         return float(self.crashing.sum() / len(self.crashing))
 
     @property
-    def crashes_outside(self) -> float:
-        """Share of the vehicle's crash rate that lies beyond the boundary."""
-        by_shell = self.crashing.sum(0)
-        return float(by_shell[self.template.boundary + 1 :].sum() / by_shell.sum())
+    def crashes_outside(self) -> dict[str, float]:
+        """Share of the vehicle's crash rate that lies beyond the boundary of each statement."""
+        by_shell, names = self.crashing.sum(0), self.template.names
+        inside = {
+            name: np.isin(np.arange(by_shell.size), range(names.index(each.boundary) + 1))
+            for name, each in self.template.library.statement_settings(ShellSettings()).items()
+        }
+        return {name: float(by_shell[~within].sum() / by_shell.sum()) for name, within in inside.items()}
 
     def draw(self, rng: np.random.Generator) -> DrawnPool:
         """A new pool."""
@@ -67,7 +72,7 @@ class OvertakingShells:
         drawn = self.shells[rows]
         pool = replace(self.template, cell_p=drawn.mean(0), p_cut_in=float(drawn.sum(1).mean()))
         design = design_shells(pool, limit_mps2=self.limit_mps2)
-        groups = shells_in_strata(pool, pool.boundary, self.limit_mps2)
+        groups = shells_in_strata(pool, outermost(pool, ShellSettings()), self.limit_mps2)
 
         def by_stratum(by_shell: FloatArray) -> FloatArray:
             return np.column_stack([by_shell[:, group].sum(1) for group in groups])
@@ -76,7 +81,7 @@ class OvertakingShells:
 
     def as_adversary(self, made: Adversary) -> OvertakingShells:
         """The same vehicle with other crashes; see `harness.studies.experiment.Adversary`."""
-        inside, crashing = self.template.boundary + 1, self.crashing.copy()
+        inside, crashing = outermost(self.template, ShellSettings()) + 1, self.crashing.copy()
         if made.crashes != "everywhere":
             weight = crashing[:, :inside].sum(1)
             order = np.argsort(-weight if made.crashes == "on_heaviest_paths" else weight, kind="stable")
@@ -205,7 +210,7 @@ def _template(library: Library, names: tuple[str, ...], shells: FloatArray, n_pa
     return Pool(
         key="drawn",
         environment="drawn",
-        library=library,
+        library=library.model_copy(update={"references": {}}),
         names=names,
         n_paths=n_paths,
         p_cut_in=float(shells.sum(1).mean()),

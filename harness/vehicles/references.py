@@ -164,12 +164,16 @@ def need_based(
     """Acceleration (m/s²) of a vehicle that brakes when it needs to, and the step since when it has.
 
     It needs to brake where the deceleration that prevents a collision, dv²/(2 (gap − standstill gap)), is no less than
-    a threshold, and does so until it is no faster than the vehicle ahead.
+    a threshold; then it brakes with that, as hard as it can at most. It waits once: whoever has braked watches the
+    vehicle ahead.
     """
     danger, closing = memory.danger, speed - lead_speed
-    if closing <= 0.0:
-        danger = math.inf
-    elif danger == math.inf and closing * closing >= 2.0 * driver.needed_mps2 * (gap - driver.standstill_gap_m):
+    room = 2.0 * (gap - driver.standstill_gap_m)
+    needs = closing > 0.0 and closing * closing >= driver.needed_mps2 * room
+    if danger == math.inf and needs:
         danger = float(step)
-    braking = part_after(step, danger, driver.reaction_steps)
-    return changing(braking, driver.acceleration_mps2, driver.min_acceleration_mps2), danger
+    if not needs:
+        return driver.acceleration_mps2, danger
+    hardest = driver.min_acceleration_mps2
+    wanted = hardest if room <= 0.0 else max(-(closing * closing) / room, hardest)
+    return changing(part_after(step, danger, driver.reaction_steps), driver.acceleration_mps2, wanted), danger

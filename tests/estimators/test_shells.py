@@ -10,8 +10,9 @@ from scipy.stats import binom
 
 from harness.estimators import Estimate, one_pass
 from harness.estimators.likelihood_ratio import Level, likelihood_limit
-from harness.estimators.statement import conditional_statement, statement
+from harness.estimators.statement import boundary_statements, statement
 from harness.estimators.stratified import Tally, combined, pool_variance
+from harness.strata import Statement
 
 from .small_blocks import SHELLS, in_shells
 
@@ -32,6 +33,12 @@ def shells_estimate(*rows: tuple[int, int, int, int], **settings) -> Estimate:
     end = np.concatenate([np.repeat(["crash", "failed", "passed"], counts) for _, *counts in rows])
     block = in_shells(strata, end == "crash", end == "failed")
     return one_pass([replace(block, **settings)], ("shells",)).headline_estimate
+
+
+def within(estimate: Estimate) -> dict:
+    """Details of the only statement."""
+    (found,) = estimate.details["statements"]
+    return found
 
 
 LEVEL = Level.two_sided(0.9)
@@ -117,21 +124,21 @@ def test_crash_shares_and_moments_alone_would_be_too_small_for_the_heaviest_path
 
 
 def test_what_lies_outside_nothing_is_said_to_be_nothing():
-    all_inside = replace(SHELLS, n_inside=3, boundary="outermost")
+    all_inside = replace(SHELLS, statements=(Statement("library", "outermost", "keeps to outermost", 3),))
     estimate = shells_estimate((0, 9, 0, 0), (1, 0, 0, 9), (2, 0, 0, 9), shells=all_inside)
-    assert conditional_statement(estimate).endswith("Nothing lies outside.")
-    assert estimate.details["conditional"]["rhw"] == estimate.rhw
+    assert boundary_statements(estimate)["library"].endswith("Nothing lies outside.")
+    assert within(estimate)["rhw"] == estimate.rhw
 
 
 def test_failed_tests_outside_are_not_taken_for_safe_ones():
     estimate = shells_estimate((0, 8, 2, 0), (2, 0, 4, 396))
-    conditional = estimate.details["conditional"]
+    conditional = within(estimate)
     assert (conditional["n_failed"], conditional["n_failed_outside"]) == (2, 4)
     assert conditional["crash_rate_if_failed_had_crashed"] == pytest.approx(1e-4)
     assert conditional["upper_bound_outside"] == pytest.approx(
         likelihood_limit(P[2:], np.array([4]), np.array([400]), Level.one_sided(0.9, 400), 1.0)
     )
-    text = conditional_statement(estimate)
+    text = boundary_statements(estimate)["library"]
     assert "2 FAILED: they count as no crash in the rate and as crashes in the upper limit. Had they all cras" in text
     assert "the rate would be 0.0001." in text
     assert "no crash in 400 tests outside, but 4 of them FAILED and are counted as crashes here: with" in text
@@ -144,13 +151,13 @@ def test_two_statements():
     estimate = found["shells"]
     assert isinstance(estimate, Estimate)
     assert estimate.crash_rate == pytest.approx(0.8e-4 + 0.15 * 3e-4)
-    conditional = estimate.details["conditional"]
+    conditional = within(estimate)
     assert conditional["crash_rate"] == pytest.approx(estimate.crash_rate)
     assert conditional["ci_high"] < estimate.ci_high
     assert conditional["n_episodes"] == 30
     assert conditional["upper_bound_outside"] == pytest.approx(2e-2 * -np.expm1(np.log(0.1) / 400))
     assert not conditional["refuted"]
-    text = conditional_statement(estimate)
+    text = boundary_statements(estimate)["library"]
     assert "careless" in text
     assert "There was no crash in 400 tests outside" in text
     assert sum(shell["contribution"] for shell in estimate.details["shells"]) == pytest.approx(estimate.crash_rate)
@@ -171,9 +178,43 @@ def test_a_half_width_far_wider_than_the_rate_is_no_number():
 
 def test_a_crash_outside_refutes_the_assumption():
     estimate = shells_estimate((0, 1, 0, 0), (1, 0, 0, 1), (2, 1, 0, 1))
-    assert estimate.details["conditional"]["refuted"]
-    assert "crashed 1 times where the surrogate careless does not crash" in conditional_statement(estimate)
+    assert within(estimate)["refuted"]
+    assert within(estimate)["refuted_by"] == (2,)
+    text = boundary_statements(estimate)["library"]
+    assert text.startswith("REFUTED: it is not so that this vehicle keeps to careless.")
+    assert "in 1 of 2 tests beyond careless, first in episode 2 (`harness replay FOLDER 2`)" in text
     assert any("does not hold" in warning for warning in estimate.warnings)
+
+
+TWO = (Statement("library", "careful", "keeps to careful", 1), Statement("need", "careless", "brakes", 2, checked=True))
+
+
+def test_each_statement_has_its_own_inside_and_its_own_refutation():
+    """One set of tests: a crash beyond the narrow boundary alone leaves the wide statement as it is."""
+    design = replace(SHELLS, statements=TWO)
+    estimate = shells_estimate((0, 8, 0, 2), (1, 3, 0, 17), (2, 0, 0, 400), shells=design, ahead=np.zeros(430, bool))
+    library, need = estimate.details["statements"]
+    assert (library["n_episodes"], library["n_episodes_outside"], library["refuted"]) == (10, 420, True)
+    assert library["refuted_by"] == (10, 11, 12)
+    assert (need["n_episodes"], need["n_episodes_outside"], need["refuted"]) == (30, 400, False)
+    assert library["crash_rate"] == pytest.approx(0.8e-4)
+    assert need["crash_rate"] == pytest.approx(estimate.crash_rate)
+    alone = combined(P[:2], tally((8, 3, 0), (10, 20, 400)).part(slice(0, 2)), SHELLS.n_paths, LEVEL)
+    assert (need["ci_low"], need["ci_high"]) == pytest.approx((alone.low, alone.high), rel=1e-9)
+    assert "In none of 430 tests was it ahead" in boundary_statements(estimate)["need"]
+    assert "ahead" not in boundary_statements(estimate)["library"]
+
+
+def test_one_test_ahead_of_the_boundary_takes_away_the_reason():
+    ahead = np.zeros(430, bool)
+    ahead[[7, 250]] = True
+    counts = (0, 8, 0, 2), (1, 3, 0, 17), (2, 0, 0, 400)
+    estimate = shells_estimate(*counts, shells=replace(SHELLS, statements=TWO), ahead=ahead)
+    need = estimate.details["statements"][1]
+    assert (need["n_checked"], need["n_ahead"], need["ahead_in"], need["refuted"]) == (430, 2, (7, 250), False)
+    text = boundary_statements(estimate)["need"]
+    assert "In 2 of 430 tests it was AHEAD of such a vehicle, first in episode 7 (`harness replay FOLDER 7`)" in text
+    assert any("was ahead of careless in 2 of 430 tests" in warning for warning in estimate.warnings)
 
 
 def test_others_are_refused():

@@ -20,7 +20,7 @@ from harness.maneuvers import CUT_IN, STAY
 from harness.outcomes import VEHICLES
 from harness.records.schemas import episodes_schema, moments_schema, traces_schema
 from harness.runner.stored_estimates import stored_blocks
-from harness.strata import ShellDesign
+from harness.strata import ShellDesign, Statement
 
 HASH = "0123456789abcdef"
 LARGEST_P_CUT_IN = 1e-6
@@ -32,7 +32,8 @@ PATH_MASS = 3.0 * P
 DESIGN = ShellDesign(
     pool="c0ffee" * 4, strata=("brakes-hard", "brakes-late", "outside"), cell_stratum=(0, 1, 2), cell_p=P,
     cell_references=(0, 0, 0),
-    n_paths=4_000, n_inside=2, boundary="brakes-late", p_cut_in=3.3e-5, p_impossible=2.87e-6,
+    n_paths=4_000, statements=(Statement("library", "brakes-late", "keeps to brakes-late", 2),),
+    p_cut_in=3.3e-5, p_impossible=2.87e-6,
 )  # fmt: skip
 
 
@@ -64,7 +65,7 @@ RECIPES = {
     "shells_refuted": RunRecipe(method="shells", moments=False, outside="crashes"),
     "shells_no_crashes": RunRecipe(method="shells", moments=False, crashes=False, traces="none"),
     "shells_inside_only": RunRecipe(
-        method="shells", moments=False, traces="none", outside="untested", statement="conditional"
+        method="shells", moments=False, traces="none", outside="untested", statement="library"
     ),
 }
 
@@ -156,7 +157,7 @@ def _episodes_table(episodes: Episodes, rows: np.ndarray, recipe: RunRecipe) -> 
         "failure": ["the world lost vehicle AV" if outcome == "failed" else None for outcome in c["outcome"]],
     }
     if recipe.method == "shells":
-        columns |= {"cell": c["component"], "cell_mass": [PATH_MASS] * len(rows)}
+        columns |= {"cell": c["component"], "cell_mass": [PATH_MASS] * len(rows), "ahead_step": None}
     n_cells = P.size if recipe.method == "shells" else 0
     return _table(columns, episodes_schema(n_importance, max(n_importance - 1, 0), n_cells))
 

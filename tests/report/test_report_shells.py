@@ -15,7 +15,7 @@ from harness.estimators.stratified import Tally, pool_variance
 from harness.outcomes import OUTCOMES
 from harness.report import write_report
 from harness.report.answer_plot import answer_plot
-from harness.report.run_folder import read_run_folder
+from harness.report.run_folder import read_run_folder, typed_folder
 from harness.report.shells_plot import POOL, shells_plot
 from harness.report.summary import RunSummary, summarise
 from harness.report.tables import run_notes
@@ -25,15 +25,17 @@ SHELLS = [name for name, recipe in RECIPES.items() if recipe.method == "shells"]
 
 @pytest.mark.parametrize("name", SHELLS)
 def test_both_statements_lead_the_page_and_every_shell_is_named(runs, name):
-    text, estimates = page_of(runs[name].path).words, runs[name].estimates
+    page, estimates = page_of(runs[name].path), runs[name].estimates
+    text, (told,) = page.words, estimates.boundary_statements.values()
+    told = told.replace("FOLDER", typed_folder(runs[name].path))
     places = [
         text.index(part)
-        for part in ("Assumption-free", estimates.statement, "Conditional on the library",
-                     estimates.conditional_statement, "sampling error in this environment")
+        for part in ("Assumption-free", estimates.statement, "Statement library", told,
+                     "sampling error in this environment")
     ]  # fmt: skip
     assert places == sorted(places)
     for shell in DESIGN.strata:
-        assert f"{shell} {'outside' if shell == 'outside' else 'inside'}" in text
+        assert f"{shell} {'outside' if shell == 'outside' else 'inside library'}" in text
     assert DESIGN.pool in text
     assert "2.87 × 10⁻⁶: not even full throttle" in text
     assert "3.30 × 10⁻⁵" in text
@@ -56,23 +58,24 @@ def test_a_refuted_assumption_is_said_so_and_its_interval_is_gone(runs):
     run = runs["shells_refuted"]
     text, found = page_of(run.path).words, run.shells
     outside = found.shells[-1]
-    assert found.conditional.refuted
-    assert "Conditional on the library: refuted by these tests" in text
+    assert found.widest.refuted
+    assert "Statement library: refuted by these tests" in text
+    assert f"by episode {found.widest.refuted_by[0]}," in text
     assert f"crashed in {outside.n_crashes:,} of {outside.n_episodes:,} tests there" in text
-    assert "Conditional half-width" not in text
+    assert "Of statement library" not in text
     assert rows_of_answer(run) == ["shells"]
 
 
 def test_a_safe_outside_gives_its_bound_and_the_conditional_interval(runs):
     text = page_of(runs["shells"].path).words
     assert "refuted by these tests" not in text
-    assert "None of" in text.split("Outside the boundary")[1]
-    assert rows_of_answer(runs["shells"]) == ["shells", "if none outside"]
+    assert "None of" in text.split("Outside every boundary")[1]
+    assert rows_of_answer(runs["shells"]) == ["shells", "given library"]
 
 
 def test_an_outside_without_tests_is_said_and_runs_out_of_the_plot(runs):
     run = runs["shells_inside_only"]
-    assert "Conditional on the library: not put to the test" in page_of(run.path).words
+    assert "Statement library: not put to the test" in page_of(run.path).words
     rates, widths = shells_plot(run.shells).figure.axes
     assert [text.get_text() for text in rates.texts if "not tested" in text.get_text()] == [
         "not tested: up to 3.00 × 10⁻⁵"
@@ -85,11 +88,11 @@ def test_the_half_width_that_was_asked_for_is_that_of_the_statement_it_was_asked
     """Inside alone the assumption-free half-width stays wide: only the conditional one may be held against the run."""
     run = runs["shells_inside_only"]
     assert run.headline.rhw > 10.0
-    rhw = run.shells.conditional.rhw
+    rhw = run.shells.widest.rhw
     notes = run_notes(run, summarise(run))
     assert any("not reached" in note for note in notes) == (rhw > 0.1)
     assert not any("it is 1" in note for note in notes)
-    assert "Conditional half-width (asked: 0.1)" in page_of(run.path).words
+    assert "Of statement library (asked: 0.1)" in page_of(run.path).words
 
 
 @pytest.fixture(scope="module", params=["shells", "shells_refuted"])

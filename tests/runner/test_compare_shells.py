@@ -19,7 +19,7 @@ from tests.runner.conftest import MIXTURE_FILE, WorkerInThisProcess
 from tests.runner.stored_runs import manifest
 
 SHELLS = (
-    *("testing.method=shells", "testing.shells.statement=conditional", "stop.rhw=0.15", "stop.episodes=3000"),
+    *("testing.method=shells", "testing.shells.statement=library", "stop.rhw=0.15", "stop.episodes=3000"),
     *("stop.min_crashes=null", "world.engine=twin", *SMALL_POOL),
 )
 HARDER = "av.parameters.min_acceleration_mps2=-8"

@@ -121,7 +121,7 @@ def test_shadow_runs_that_fail_count_against_the_vehicle(campaign, run_here, tmp
     assert (lost["shell"], lost["n_episodes"], lost["inside"]) == ("failed shadow runs", 0, False)
     assert lost["p"] > 1e-9
     assert shells["ci_high"] > shells["crash_rate"] + lost["p"]
-    assert shells["details"]["conditional"]["upper_bound_outside"] > lost["p"]
+    assert shells["details"]["statements"][0]["upper_bound_outside"] > lost["p"]
     assert any("no test in failed shadow runs" in warning for warning in shells["warnings"])
 
 
@@ -134,7 +134,7 @@ def test_crashes_on_a_handful_of_paths_give_no_interval(campaign, run_here, tmp_
     assert (shells["ci_low"], shells["ci_high"], shells["rhw"]) == (0.0, 1.0, None)
     assert "no interval: nearly all crashes lie on some" in result.estimates["statement"]
     assert "raise pool.shadow_paths" in result.estimates["statement"]
-    assert "nothing more can be said" in result.estimates["conditional_statement"]
+    assert "nothing more can be said" in result.estimates["boundary_statements"]["library"]
 
 
 def test_forced_cut_ins_of_a_vehicle_that_holds_are_those_of_one_that_holds(campaign, run_here, tmp_path):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +16,8 @@ from harness.errors import CampaignError, RunFolderError
 from harness.estimators.stratified import Tally
 from harness.runner.campaign_run import episodes_on_disk
 from harness.runner.manifest import Manifest, Prefix
-from harness.runner.planner import GROWTH, Allocation, round_specs
-from harness.strata import ShellDesign
+from harness.runner.planner import GROWTH, Allocation, first_tests, round_specs
+from harness.strata import ShellDesign, Statement
 from tests.pool.conftest import SMALL_POOL
 from tests.runner.stored_runs import copy_of, manifest, shard_files, stored_table, unlike_columns
 
@@ -38,8 +39,11 @@ def test_it_reaches_the_precision_and_says_both_things(shells_run):
     assert estimate["rhw"] <= 0.5
     assert pytest.approx(estimate["crash_rate"], rel=0.5) == 1.352e-7
     assert estimate["ci_low"] < 1.352e-7 < estimate["ci_high"]
-    assert "If this vehicle crashes only where" in content["conditional_statement"]
-    assert not estimate["details"]["conditional"]["refuted"]
+    assert content["statement"].startswith("This vehicle crashes ")
+    assert "as often as a careful and competent driver (r157-cc) would in the same traffic" in content["statement"]
+    assert list(content["boundary_statements"]) == ["library", "need-based"]
+    assert "brakes as hard as it takes, up to 3 m/s²" in content["boundary_statements"]["need-based"]
+    assert not any(each["refuted"] for each in estimate["details"]["statements"])
 
 
 def test_the_twin_gives_the_same_bits(shells_run, campaign, run_here, tmp_path):
@@ -74,8 +78,8 @@ def test_what_a_campaign_names_is_read_once(campaign, run_here, tmp_path, monkey
 
     monkeypatch.setattr(io, "open", noted)  # what pathlib opens files by
     run_here(campaign(*SHELLS, "world.engine=twin", "stop.episodes=150"), tmp_path / "run")
-    named = Counter(name for name in opened if name in ("ndd-overtaking-1.yaml", "ladder-1.yaml"))
-    assert named == {"ndd-overtaking-1.yaml": 1, "ladder-1.yaml": 1}
+    named = Counter(name for name in opened if name in ("ndd-overtaking-1.yaml", "ladder-2.yaml"))
+    assert named == {"ndd-overtaking-1.yaml": 1, "ladder-2.yaml": 1}
 
 
 def test_a_budget_that_is_spent_is_exit_code_4(campaign, run_here, tmp_path):
@@ -170,21 +174,30 @@ def test_the_bar_begins_where_the_run_was(shells_run):
     assert episodes_on_disk(shells_run.folder) == shells_run.estimates["n_episodes"]
 
 
-def test_the_conditional_statement_alone_stays_inside(campaign, run_here, tmp_path):
-    conditional = ("testing.shells.statement=conditional", "stop.rhw=0.3", "world.engine=twin")
+@pytest.mark.parametrize(("asked", "place"), [("library", 0), ("need-based", 1)])
+def test_a_statement_alone_stays_inside(asked, place, campaign, run_here, tmp_path):
+    conditional = (f"testing.shells.statement={asked}", "stop.rhw=0.3", "world.engine=twin")
     result = run_here(campaign(*SHELLS, *conditional), tmp_path / "run")
-    details = result.estimates["estimates"]["shells"]["details"]
+    found = result.estimates["estimates"]["shells"]["details"]["statements"][place]
     assert result.exit_code == 0
-    assert details["conditional"]["rhw"] <= 0.3
-    assert details["conditional"]["n_episodes_outside"] == 0
-    assert "Nothing was tested outside" in result.estimates["conditional_statement"]
-    assert any("no test in outside" in warning for warning in result.estimates["estimates"]["shells"]["warnings"])
+    assert found["name"] == asked
+    assert found["rhw"] <= 0.3
+    assert found["n_episodes_outside"] == 0
+    assert "Nothing was tested outside" in result.estimates["boundary_statements"][asked]
+    assert any(
+        "outside: the interval allows for any share" in warning
+        for warning in result.estimates["estimates"]["shells"]["warnings"]
+    )
 
 
 def test_a_careless_vehicle_is_found_out(campaign, run_here, tmp_path):
     careless = ("world.engine=twin", "av.model=constant", "av.parameters={acceleration_mps2: 0.0}")
     result = run_here(campaign(*SHELLS, *careless), tmp_path / "run")
-    assert "crashed" in result.estimates["conditional_statement"]
+    refuted = result.estimates["boundary_statements"]["need-based"]
+    assert refuted.startswith("REFUTED: it is not so that this vehicle brakes as hard as it takes, up to 3 m/s²")
+    first = result.estimates["estimates"]["shells"]["details"]["statements"][1]["refuted_by"][0]
+    assert f"`harness replay FOLDER {first}`" in refuted
+    assert replay(tmp_path / "run", first).row["outcome"] == "crash"
     assert result.estimates["estimates"]["shells"]["crash_rate"] == pytest.approx(2.4e-5, rel=0.5)
 
 
@@ -210,6 +223,15 @@ def test_a_run_without_its_shells_is_named(shells_run, tmp_path):
         estimate(folder)
 
 
+def test_a_run_of_an_earlier_version_is_told_so(shells_run, tmp_path):
+    folder = copy_of(shells_run.folder, tmp_path / "run")
+    content = json.loads((folder / "shells.json").read_text())
+    del content["statements"]
+    (folder / "shells.json").write_text(json.dumps({**content, "n_inside": 6, "boundary": "brakes-2-late-1s"}))
+    with pytest.raises(RunFolderError, match=r"an earlier version.*Run the campaign again into a new folder"):
+        estimate(folder)
+
+
 def test_an_episode_is_replayed_bit_for_bit(shells_run):
     again = replay(shells_run.folder, 3)
     assert again.bit_equal
@@ -228,7 +250,7 @@ def test_another_pool_is_refused(shells_run, campaign, run_here, tmp_path):
 
 DESIGN = ShellDesign(
     pool="0" * 24, strata=("a", "b", "outside"), cell_stratum=(0, 1, 2), cell_p=np.array([1e-7, 2e-7, 3e-5]),
-    n_paths=10**9, n_inside=2, boundary="b", p_cut_in=4e-5, p_impossible=0.0,
+    n_paths=10**9, statements=(Statement("library", "b", "keeps to b", 2),), p_cut_in=4e-5, p_impossible=0.0,
 )  # fmt: skip
 
 
@@ -237,46 +259,70 @@ def tally(tests, crashes, failed):
     return Tally(tests, crashes, failed, np.outer(crashes, DESIGN.p), np.outer(failed, DESIGN.p))
 
 
-MANY, NONE = np.full(3, 10_000), np.zeros(3, int)
+MANY, NONE, TWELVE = np.full(3, 10_000), np.zeros(3, int), np.full(3, 12)
+
+
+def test_first_tests_go_in_proportion_to_the_probability():
+    """Within limits: at least a few, and no more beyond the narrowest boundary than a start."""
+    p = np.array([1e-9, 1e-7, 2e-7, 5e-7, 3e-5])
+    statements = Statement("library", "c", "keeps to c", 3), Statement("need", "d", "brakes", 4)
+    strata = ("a", "b", "c", "d", "outside")
+    design = replace(DESIGN, strata=strata, cell_stratum=tuple(range(5)), cell_p=p, statements=statements)
+    assert first_tests(design).tolist() == [3, 12, 12, 12, 12]
+    many = replace(design, cell_p=p * [1, 1, 0.5, 1, 1], statements=statements[1:])
+    assert first_tests(many).tolist() == [3, 6, 6, 12, 12]
+    assert first_tests(design, 40).tolist() == [40] * 5
+
+
+def test_each_boundary_is_passed_when_what_lies_within_is_known():
+    statements = Statement("narrow", "a", "keeps to a", 1), Statement("wide", "b", "keeps to b", 2)
+    rule = Allocation(replace(DESIGN, statements=statements), TWELVE, MANY)
+    assert rule.next_round(tally(NONE, NONE, NONE), 10**6).tolist() == [12, 0, 0]
+    assert rule.next_round(tally(np.array([12, 0, 0]), np.array([12, 0, 0]), NONE), 10**6).tolist() == [0, 12, 0]
+    tests, crashes = np.array([400, 400, 0]), np.array([400, 200, 0])
+    assert rule.next_round(tally(tests, crashes, NONE), 10**6).tolist() == [0, 0, 12]
+    inside = Allocation(rule.design, TWELVE, MANY, "wide")
+    assert inside.next_round(tally(tests, crashes, NONE), 10**6)[2] == 0
 
 
 def test_what_lies_inside_is_tested_first():
-    rule = Allocation(DESIGN, 12, MANY, conditional_only=False)
+    rule = Allocation(DESIGN, TWELVE, MANY)
     assert rule.next_round(tally(NONE, NONE, NONE), 10**6).tolist() == [12, 12, 0]
     assert rule.next_round(tally(np.array([12, 12, 0]), np.array([6, 0, 0]), NONE), 10**6)[2] == 0
     assert rule.next_round(tally(np.array([400, 400, 0]), np.array([200, 0, 0]), NONE), 10**6).tolist() == [0, 0, 12]
-    hopeless = rule.next_round(tally(np.array([48, 48, 0]), NONE, NONE), 10**6)
+    hopeless = rule.next_round(tally(np.array([96, 96, 0]), NONE, NONE), 10**6)
     assert hopeless.tolist() == [0, 0, 12]
 
 
 def test_rounds_grow_to_where_the_interval_is_widest():
-    rule = Allocation(DESIGN, 12, MANY, conditional_only=False)
+    rule = Allocation(DESIGN, TWELVE, MANY)
     tests = np.array([400, 400, 800])
     added = rule.next_round(tally(tests, np.array([200, 10, 0]), NONE), 10**6)
     assert added.sum() == np.ceil((GROWTH - 1.0) * tests.sum())
     assert added[2] > 0.9 * added.sum()
     assert rule.next_round(tally(tests, np.array([200, 10, 0]), NONE), 7).sum() == 7
     assert rule.next_round(tally(tests, np.array([200, 10, 0]), NONE), 0).sum() == 0
-    full = Allocation(DESIGN, 12, tests, conditional_only=False)
+    full = Allocation(DESIGN, TWELVE, tests)
     assert full.next_round(tally(tests, np.array([200, 10, 0]), NONE), 100).sum() == 0
 
 
 def test_failed_tests_draw_further_tests_to_their_shell():
-    rule = Allocation(DESIGN, 12, MANY, conditional_only=True)
+    rule = Allocation(DESIGN, TWELVE, MANY, "library")
     tests, crashes = np.array([400, 400, 0]), np.array([200, 0, 0])
     without = rule.next_round(tally(tests, crashes, NONE), 10**6)
     with_failed = rule.next_round(tally(tests, crashes, np.array([0, 40, 0])), 10**6)
     assert with_failed[1] > without[1]
-    undecided = Allocation(DESIGN, 12, MANY, conditional_only=False)
+    undecided = Allocation(DESIGN, TWELVE, MANY)
     few, all_of_a = np.array([40, 40, 0]), np.array([40, 0, 0])
     assert undecided.next_round(tally(few, all_of_a, NONE), 10**6)[2] == 12
     assert undecided.next_round(tally(few, all_of_a, np.array([0, 20, 0])), 10**6)[2] == 0
 
 
 def test_first_tests_that_are_enough_are_what_decided(campaign, run_here, tmp_path):
-    many = ("testing.shells.statement=conditional", "testing.shells.first_tests=100")
+    many = ("testing.shells.statement=library", "testing.shells.first_tests=100")
     found = run_here(campaign(*SHELLS, "world.engine=twin", *many), tmp_path)
-    assert found.ending.endswith(": the last condition to be met was testing.shells.first_tests (100 of each shell).")
+    last = "the first tests of each shell (testing.shells.first_tests)"
+    assert found.ending.endswith(f": the last condition to be met was {last}.")
     assert manifest(tmp_path)["ending"] == found.estimates["ending"] == found.ending
 
 
@@ -296,7 +342,7 @@ def test_a_round_is_divided_into_shards_without_gap():
 
 
 def test_two_phases_report_the_second_alone(campaign, run_here, tmp_path):
-    """The first ends at 1.7 times the precision; the number of the second is planned from it."""
+    """The first ends at 1.7 times the precision; the second is planned from it, whatever its own results are."""
     planned = campaign(*SHELLS, "world.engine=twin", "testing.shells.stopping=two_phase")
     found = run_here(planned, tmp_path / "run")
     stored = manifest(tmp_path / "run")

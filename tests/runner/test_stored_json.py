@@ -130,8 +130,9 @@ def test_estimates_of_wrong_types_are_refused(stored):
 
 
 SHELLS = {"pool": "k", "strata": ["a", "b"], "cell_stratum": [0, 1], "cell_p": [0.1, 0.2], "cell_references": [0, 1],
-          "references": ["r"], "reference_rate": [0.1], "reference_square": [0.1], "n_paths": 3, "n_inside": 1,
-          "boundary": "a", "p_cut_in": 0.3, "p_impossible": 0.0, "available": [1, 2]}  # fmt: skip
+          "references": [{"name": "r", "described": "a driver", "delay_s": None}], "reference_rate": [0.1],
+          "reference_square": [0.2], "n_paths": 3, "p_cut_in": 0.3, "p_impossible": 0.0, "available": [1, 2],
+          "statements": [{"name": "s", "boundary": "a", "assumes": "b", "n_inside": 1, "checked": False}]}  # fmt: skip
 STOPS = {"a": {"campaign_hash": "x", "stop": {}, "n_episodes": 3, "stopped_by": "rhw"}}
 
 
@@ -142,6 +143,7 @@ STOPS = {"a": {"campaign_hash": "x", "stop": {}, "n_episodes": 3, "stopped_by": 
         (StoredShells, SHELLS, {"cell_p": [0.1]}),
         (StoredShells, SHELLS, {"cell_stratum": [0, 0]}),
         (StoredShells, SHELLS, {"reference_rate": []}),
+        (StoredShells, SHELLS, {"statements": []}),
         *((StoredStops, STOPS, {"a": wrong}) for wrong in (1, [], {}, {**STOPS["a"], "n_episodes": "3"})),
     ],
 )

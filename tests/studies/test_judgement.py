@@ -42,12 +42,12 @@ def test_too_narrow_intervals_are_noticed_and_too_wide_ones_are_not_blamed():
 
 def test_a_conditional_statement_is_not_judged_where_it_does_not_hold():
     of = rows([0.5] * 10, 0.1, outside=1)
-    found = judge(Subject("a", 1.0, crashes_outside=0.4), "x", of, 0.9, conditional=True)
+    found = judge(Subject("a", 1.0, crashes_outside={"x": 0.4}), "x", of, 0.9)
     (found,) = corrected([found])
     assert found.p_value is None
     assert not found.too_low
     assert found.alarm == 1.0
-    held = judge(Subject("a", 1.0, crashes_outside=1e-4), "x", of, 0.9, conditional=True)
+    held = judge(Subject("a", 1.0, crashes_outside={"x": 1e-4}), "x", of, 0.9)
     assert held.p_value < 1e-6
 
 

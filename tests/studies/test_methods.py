@@ -17,7 +17,7 @@ from harness.studies.chains.shells import ChainShells
 from harness.studies.experiment import Experiment, Fault, load_experiment
 from harness.studies.judgement import Judgement, Row, Subject, corrected, judge
 from harness.studies.run import validate
-from harness.studies.shell_campaign import CONDITIONAL, FREE, ShellCampaign
+from harness.studies.shell_campaign import FREE, ShellCampaign
 from harness.studies.weighted_campaign import ChainEpisodes, WeightedCampaign
 
 from .regression_stopping import RegressionStopping
@@ -88,6 +88,8 @@ def test_stopping_on_regression_residuals_is_caught():
 
 
 COMMITTED = ["chains_shells", "chains_forced"]
+CONDITIONAL = "shells, conditional"
+"""What the statement library was called when these experiments were run."""
 
 
 @pytest.mark.parametrize("name", COMMITTED)

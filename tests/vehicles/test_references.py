@@ -167,15 +167,25 @@ def test_it_brakes_between_the_comfortable_and_the_hard_rate():
 def test_it_speeds_up_until_it_needs_to_brake_and_brakes_a_delay_later():
     driver = NeedBasedParameters()
     # 10^2/(2 1) + 2 = 52 m: from there on 1 m/s^2 is needed
-    found = driven(driver, (3, (30.0, 20.0, 52.1)), (9, (30.0, 20.0, 51.9)), (4, (30.0, 20.0, 99.0)))
-    assert found.tolist() == [1.0] * 8 + [-3.0] * 8
-    again = driven(driver, (9, (30.0, 20.0, 51.9)), (1, (20.0, 20.0, 1.0)), (9, (30.0, 20.0, 51.9)))
-    assert again.tolist() == [1.0] * 5 + [-3.0] * 4 + [1.0] * 6 + [-3.0] * 4
+    found = driven(driver, (3, (30.0, 20.0, 52.1)), (9, (30.0, 20.0, 42.0)), (4, (30.0, 20.0, 52.1)))
+    assert found.tolist() == [1.0] * 8 + [-1.25] * 4 + [1.0] * 4
     assert driven(driver, (9, (20.0, 20.1, 0.5))).tolist() == [1.0] * 9  # the vehicle ahead gets away
 
 
+def test_it_brakes_with_what_it_needs_as_hard_as_it_can_at_most():
+    found = driven(
+        NeedBasedParameters(reaction_time_s=0.0), *((1, (30.0, 20.0, gap)) for gap in (52.0, 27.0, 18.0, 1.0))
+    )
+    assert found == pytest.approx([-1.0, -2.0, -3.0, -3.0])
+
+
+def test_it_waits_once():
+    again = driven(NeedBasedParameters(), (9, (30.0, 20.0, 10.0)), (1, (20.0, 20.0, 1.0)), (9, (30.0, 20.0, 10.0)))
+    assert again.tolist() == [1.0] * 5 + [-3.0] * 4 + [1.0] + [-3.0] * 9
+
+
 def test_its_delay_need_not_be_whole_steps():
-    found = driven(NeedBasedParameters(reaction_time_s=0.32), (5, (30.0, 20.0, 40.0)))
+    found = driven(NeedBasedParameters(reaction_time_s=0.32), (5, (30.0, 20.0, 18.0)))
     assert found == pytest.approx([1.0, 1.0, 1.0, 0.2 * 1.0 - 0.8 * 3.0, -3.0])
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from harness.arrays import FloatArray, IntArray
 from harness.pool.cut_ins import shells_of
-from harness.strata import OUTSIDE, ShellDesign
+from harness.strata import LIBRARY_STATEMENT, OUTSIDE, ShellDesign, Statement
 from harness.studies.chains.chain import Chain
 from harness.studies.chains.sampler import approach_paths
 from harness.studies.shell_campaign import DrawnPool
@@ -66,8 +66,7 @@ class ChainShells:
             cell_stratum=tuple(range(p.size)),
             cell_p=p,
             n_paths=len(path),
-            n_inside=chain.n_surrogates,
-            boundary=names[-2],
+            statements=(Statement(LIBRARY_STATEMENT, names[-2], "crashes only inside", chain.n_surrogates),),
             p_cut_in=float(p.sum()),
             p_impossible=0.0,
         )

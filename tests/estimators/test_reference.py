@@ -1,0 +1,184 @@
+"""Beside a reference driver: against the definition, identities, and coverage by enumeration and by replication."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+from scipy.special import xlogy
+from scipy.stats import binom, binomtest
+
+from harness.estimators.likelihood_ratio import Level, likelihood_limit
+from harness.estimators.reference import compared, preventable_share, rate_ratio_limits
+from harness.estimators.stratified import Tally, empty_tally
+from harness.strata import Reference, ShellDesign, Statement
+
+LEVEL = Level.two_sided(0.9)
+FEW = Level(2.6, 1e6)
+"""The threshold for few crashes always holds."""
+EXACT = 10**12
+"""Paths of a pool that is known exactly."""
+P = np.array([1e-7, 3e-7, 2e-6])
+
+
+def tally(crashes, tests, failed=None, mass=None) -> Tally:
+    """Counts; all paths have the same mass unless it is given."""
+    k, n = np.array(crashes), np.array(tests)
+    f = np.zeros_like(k) if failed is None else np.array(failed)
+    mass = P[: k.size] if mass is None else mass
+    return Tally(n, k, f, np.outer(k, mass), np.outer(f, mass))
+
+
+def test_the_ratio_to_a_known_rate_is_the_rate_over_it():
+    found = tally((5, 9, 0), (10, 20, 300))
+    low, high = (likelihood_limit(P, found.crashes, found.tests, LEVEL, side) for side in (-1.0, 1.0))
+    ratio = rate_ratio_limits(P, found, np.zeros(3), (2e-7, 4e-14), EXACT, LEVEL)
+    assert ratio == pytest.approx((low / 2e-7, high / 2e-7), rel=1e-6)
+
+
+def test_without_a_crash_the_ratio_may_be_nothing():
+    found = tally((0, 0, 0), (10, 20, 300))
+    low, high = rate_ratio_limits(P, found, np.zeros(3), (2e-7, 4e-14), EXACT, LEVEL)
+    assert low == 0.0
+    assert high == pytest.approx(likelihood_limit(P, found.crashes, found.tests, LEVEL, 1.0) / 2e-7, rel=1e-6)
+
+
+def test_the_reference_itself_is_as_often_as_itself_whatever_the_pool():
+    """It crashes on all cut-ins of its cells: the error of the pool cancels where both crash on the same paths."""
+    mass = np.random.default_rng(1).exponential(P[:1], 4_000)
+    crashed = mass[np.random.default_rng(2).choice(4_000, 1_000_000, p=mass / mass.sum())]
+    found = Tally(*(np.array([x]) for x in (1_000_000, 1_000_000, 0)), crashed.sum()[None, None], np.zeros((1, 1)))
+    p, square = mass.mean(), (mass**2).mean()
+    alone = rate_ratio_limits(np.array([p]), found, np.zeros(1), (p, p * p), 4_000, LEVEL)
+    beside = rate_ratio_limits(np.array([p]), found, np.array([crashed.sum()]), (p, square), 4_000, LEVEL)
+    assert alone[1] - alone[0] > 0.04
+    assert beside == pytest.approx((1.0, 1.0), abs=2e-3)
+
+
+def least_cost(p, k, n, prevented, y):
+    """Σ n KL at the shares nearest to those seen that have this share of crashes in the prevented cells."""
+    weights, c = p * (prevented - y) / p.max(), k / n
+
+    def shares(nu):
+        a = nu * weights / n
+        root = np.sqrt((1 - a) ** 2 + 4 * a * c)
+        return np.where(a <= 1, 2 * c / (1 - a + root), (a - 1 + root) / (2 * np.where(a > 1, a, 1)))
+
+    nu = brentq(lambda nu: weights @ shares(nu), -1e5, 1e5, xtol=1e-14, rtol=1e-15, maxiter=1000)
+    s = shares(nu)
+    return (n * (xlogy(c, c) - xlogy(c, s) + xlogy(1 - c, 1 - c) - xlogy(1 - c, 1 - s))).sum()
+
+
+@pytest.mark.parametrize(("k", "n"), [((6, 9, 3), (40, 30, 200)), ((1, 20, 5), (25, 30, 400))])
+def test_the_preventable_shares_are_those_that_some_crash_shares_explain(k, n):
+    k, n, prevented = np.array(k), np.array(n), np.array([True, False, True])
+    share, low, high = preventable_share(P, tally(k, n, mass=np.zeros(3)), prevented, EXACT, FEW)
+    both = P * k / n
+    assert share == pytest.approx(both[prevented].sum() / both.sum())
+    assert low < share < high
+    for limit in (low, high):
+        assert least_cost(P, k, n, prevented, limit) == pytest.approx(FEW.threshold, rel=1e-5)
+
+
+def test_a_share_stays_a_share():
+    prevented = np.array([True, False, True])
+    assert preventable_share(P, tally((0, 0, 0), (10, 10, 10)), prevented, EXACT, LEVEL)[1:] == (0.0, 1.0)
+    share, low, high = preventable_share(P, tally((9, 0, 9), (10, 50, 10)), prevented, EXACT, LEVEL)
+    assert (share, high) == (1.0, 1.0)
+    assert 0.5 < low < 1.0
+    share, low, high = preventable_share(P, tally((0, 45, 0), (90, 50, 900)), prevented, EXACT, LEVEL)
+    assert (share, low) == (0.0, 0.0)
+    assert high < 0.05
+
+
+def test_failed_tests_count_as_whatever_is_worse():
+    prevented = np.array([True, False])
+    plain = preventable_share(P[:2], tally((8, 9), (20, 30)), prevented, EXACT, LEVEL)
+    failed = preventable_share(P[:2], tally((8, 9), (20, 30), (3, 4)), prevented, EXACT, LEVEL)
+    assert failed[0] == plain[0]
+    for crashes in product(range(8, 12), range(9, 14)):
+        _, low, high = preventable_share(P[:2], tally(crashes, (20, 30)), prevented, EXACT, LEVEL)
+        assert failed[1] <= low + 1e-9
+        assert high <= failed[2] + 1e-9
+    assert failed[1] < plain[1]
+    assert plain[2] < failed[2]
+
+
+def enumerated_coverage(tests, share, prevented, level) -> float:
+    """Exact probability that the interval holds the true preventable share."""
+    true = P * share
+    truth, covered = true[prevented].sum() / true.sum(), 0.0
+    for crashes in product(*(range(n + 1) for n in tests)):
+        chance = float(np.prod(binom.pmf(crashes, tests, share)))
+        if chance > 1e-7:
+            _, low, high = preventable_share(P, tally(crashes, tests), prevented, EXACT, level)
+            covered += chance * (low - 1e-9 <= truth <= high + 1e-9)
+    return covered
+
+
+@pytest.mark.parametrize("share", [(0.9, 0.4, 0.0), (0.3, 0.1, 0.01), (0.02, 0.9, 0.05)])
+def test_the_preventable_share_is_held_often_enough_whatever_the_counts(share):
+    """Known answers: coverage summed over outcomes, nominal 0.90; and too narrow a level does not hold it."""
+    where = np.array([8, 9, 14]), np.array(share), np.array([True, False, True])
+    assert enumerated_coverage(*where, LEVEL) >= 0.90
+    assert enumerated_coverage(*where, Level(0.3, 0.5)) < 0.85
+
+
+N_PATHS, REPLICATIONS = 300, 1_000
+CELLS = ShellDesign(
+    pool="0" * 24, strata=("a", "b", "outside"), cell_stratum=(0, 0, 1, 1, 2), cell_references=(1, 0, 1, 0, 0),
+    cell_p=np.zeros(5), n_paths=N_PATHS, statements=(Statement("library", "b", "keeps to b", 2),), p_cut_in=1.0,
+    p_impossible=0.0, references=(Reference("r", "a driver"),),
+)  # fmt: skip
+
+
+def replicated(seed: int, *, pool_error: bool) -> tuple[float, float]:
+    """Share of pools, each drawn anew, whose campaign holds the ratio, and the preventable share."""
+    rng = np.random.default_rng(seed)
+    population = rng.exponential(size=(20_000, 1)) * rng.exponential(size=(20_000, 5)) * [4.0, 2.0, 3.0, 3.0, 40.0]
+    on = rng.random((20_000, 1)) < np.array([0.9, 0.5, 0.4, 0.3, 0.002])  # it crashes on whole paths
+    true, crashes_too = (population * on).mean(0), np.array([True, False, True, False, False])
+    reference = population @ crashes_too
+    truths = true.sum() / reference.mean(), true[~crashes_too].sum() / true.sum()
+    tests, held = np.array([400, 400, 600]), np.zeros(2)
+    for _ in range(REPLICATIONS):
+        rows = rng.integers(0, len(population), N_PATHS)
+        mass, crash_on, of_reference = population[rows], on[rows], reference[rows]
+        cells = empty_tally(5)
+        for stratum, n in enumerate(tests):
+            within = mass * (np.array(CELLS.cell_stratum) == stratum)
+            drawn = np.searchsorted(np.cumsum(within), rng.random(n) * within.sum(), side="right")
+            path, cell = np.divmod(np.minimum(drawn, within.size - 1), 5)
+            crashed = crash_on[path, cell]
+            np.add.at(cells.tests, cell, 1)
+            np.add.at(cells.crashes, cell[crashed], 1)
+            np.add.at(cells.crash_mass, cell[crashed], mass[path[crashed]])
+        design = replace(
+            CELLS,
+            cell_p=mass.mean(0),
+            n_paths=N_PATHS if pool_error else EXACT,
+            reference_rate=np.array([of_reference.mean()]),
+            reference_square=np.array([(of_reference**2).mean()]),
+        )
+        (found,) = compared(design, cells, LEVEL)
+        limits = (found.ratio_low, found.ratio_high), (found.preventable_low, found.preventable_high)
+        held += [low <= truth <= high for truth, (low, high) in zip(truths, limits, strict=True)]
+    ratio, preventable = (held / REPLICATIONS).tolist()
+    return ratio, preventable
+
+
+@pytest.mark.slow
+def test_both_are_held_often_enough_over_pools_drawn_anew():
+    """Nominal 0.90; with a coverage of 0.90 a test fails with a probability of 0.001."""
+    for held in replicated(11, pool_error=True):
+        assert binomtest(round(held * REPLICATIONS), REPLICATIONS, 0.9, alternative="less").pvalue > 0.001
+
+
+@pytest.mark.slow
+def test_without_the_error_of_the_pool_they_are_not():
+    """The sibling that must fail."""
+    for held in replicated(11, pool_error=False):
+        assert binomtest(round(held * REPLICATIONS), REPLICATIONS, 0.9, alternative="less").pvalue < 1e-3
