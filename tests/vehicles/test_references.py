@@ -173,10 +173,8 @@ def test_it_speeds_up_until_it_needs_to_brake_and_brakes_a_delay_later():
 
 
 def test_it_brakes_with_what_it_needs_as_hard_as_it_can_at_most():
-    found = driven(
-        NeedBasedParameters(reaction_time_s=0.0), *((1, (30.0, 20.0, gap)) for gap in (52.0, 27.0, 18.0, 1.0))
-    )
-    assert found == pytest.approx([-1.0, -2.0, -3.0, -3.0])
+    drive = [(1, (30.0, 20.0, gap)) for gap in (52.0, 27.0, 18.0, 1.0)]
+    assert driven(NeedBasedParameters(reaction_time_s=0.0), *drive) == pytest.approx([-1.0, -2.0, -3.0, -3.0])
 
 
 def test_it_waits_once():
