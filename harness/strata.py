@@ -5,7 +5,7 @@ The pool makes both; estimators and the planner of a campaign use them, and need
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -15,10 +15,10 @@ from harness.arrays import FloatArray
 
 OUTSIDE = "outside"
 """Name of the stratum of everything beyond the boundary."""
-FAILED_SHADOWS = "failed shadow runs"
-"""Name of a stratum that cannot be tested: cut-ins on paths on which the vehicle failed before one could come."""
 ASSUMPTION_FREE, LIBRARY_STATEMENT = "assumption_free", "library"
 """Names of the statement that has no boundary, and of the one whose boundary is the library's own."""
+FAILED_SHADOWS = "failed shadow runs"
+"""Name of a stratum that cannot be tested: cut-ins on paths on which the vehicle failed before one could come."""
 _ARRAYS = ("cell_p", "reference_rate", "reference_square")
 
 
@@ -115,6 +115,17 @@ class ShellDesign:
     def boundary(self) -> str:
         """The widest boundary."""
         return self.statements[-1].boundary
+
+    @property
+    def library(self) -> Statement:
+        """The statement whose boundary is the library's own; the narrowest one if there is none of that name."""
+        return next((each for each in self.statements if each.name == LIBRARY_STATEMENT), self.statements[0])
+
+    def without_references(self) -> ShellDesign:
+        """The same strata, each one cell."""
+        n, none = len(self.strata), np.zeros(0)
+        one_each = replace(self, cell_stratum=tuple(range(n)), cell_references=(0,) * n, cell_p=self.p)
+        return replace(one_each, references=(), reference_rate=none, reference_square=none)
 
     @property
     def checked(self) -> Statement | None:

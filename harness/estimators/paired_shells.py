@@ -100,7 +100,7 @@ class PairedEstimate:
             "confidence": self.a.confidence,
             "conditional": {
                 **self.conditional.to_json(),
-                "boundary": self.pairs.design.statements[0].boundary,
+                "boundary": self.pairs.design.library.boundary,
                 "n_pairs_outside": self.free.n_pairs - self.conditional.n_pairs,
                 "refuted": self.refuted,
             },
@@ -117,7 +117,7 @@ def paired_estimate(pairs: PairCounts, confidence: float) -> PairedEstimate:
     ValueError
         There is no pair.
     """
-    level, n_inside = Level.two_sided(confidence), pairs.design.statements[0].n_inside
+    level, n_inside = Level.two_sided(confidence), pairs.design.library.n_inside
     return PairedEstimate(
         a=_own(pairs, 0, confidence),
         b=_own(pairs, 1, confidence),
@@ -140,7 +140,7 @@ def _shells(pairs: PairCounts) -> list[dict[str, Any]]:
     return [
         {
             "shell": design.strata[s],
-            "inside": s < design.statements[0].n_inside,
+            "inside": s < design.library.n_inside,
             "p": float(design.p[s]),
             "n_pairs": int(pairs.tests[s]),
             **dict(zip(columns, row.tolist(), strict=True)),

@@ -27,7 +27,7 @@ def paired_statement(found: PairedEstimate, name_a: str, name_b: str) -> str:
 
 def conditional_paired_statement(found: PairedEstimate) -> str:
     """If both crash only where the boundary surrogate or a more careful one does."""
-    boundary, inside = found.pairs.design.statements[0].boundary, found.conditional
+    boundary, inside = found.pairs.design.library.boundary, found.conditional
     if found.refuted:
         who = " and ".join(_crashed_outside(found))
         return (
@@ -70,5 +70,5 @@ def _alone(found: Interval) -> str:
 
 def _crashed_outside(found: PairedEstimate) -> Iterator[str]:
     for side, name in enumerate("AB"):
-        if n := int(found.pairs.tally(side).crashes[found.pairs.design.statements[0].n_inside :].sum()):
+        if n := int(found.pairs.tally(side).crashes[found.pairs.design.library.n_inside :].sum()):
             yield f"{name} has {n:,} times"

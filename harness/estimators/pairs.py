@@ -80,9 +80,9 @@ class PairCounts:
         """Pairs of each stratum, shape (S,)."""
         return np.asarray(self.ends.sum((1, 2)))
 
-    def part(self, n: int) -> PairCounts:
-        """Only the first ``n`` strata."""
-        within = slice(0, n)
+    def inside(self, n: int | None = None) -> PairCounts:
+        """Only the first ``n`` strata, by default those within the boundary of the statement `library`."""
+        within = slice(0, self.design.library.n_inside if n is None else n)
         return PairCounts(self.design, self.ends[within], self.mass[within, :, :, within])
 
     def inside(self) -> PairCounts:

@@ -137,7 +137,7 @@ def preventable_share(
 
 def _share_limits(p: FloatArray, cells: Tally, prevented: BoolArray, n_paths: int, level: Level) -> tuple[float, float]:
     scale = p / cells.at_least_one
-    first, second = (mean_square(scale * of, cells.crash_mass) for of in (prevented, ~prevented))
+    first, second = (mean_square(scale * part, cells.crash_mass) for part in (prevented, ~prevented))
     rates = p * cells.share
     of_prevented, of_others = float(rates[prevented].sum()), float(rates[~prevented].sum())
 

@@ -140,6 +140,13 @@ class Shells:
         return self._cells.joined(self._design.joined) if self._cells.tests.size else self._cells
 
     @classmethod
+    def of(cls, design: ShellDesign, tally: Tally) -> Shells:
+        """From counts by stratum, which say nothing about reference drivers."""
+        shells = cls()
+        shells._design, shells._cells = design.without_references(), tally
+        return shells
+
+    @classmethod
     def refusal(cls, block: Block) -> str | None:
         """Shells must have been drawn from, and their probabilities be known."""
         if block.shells is None or block.stratum is None:
@@ -162,8 +169,8 @@ class Shells:
             np.add.at(counts, block.cell[rows], 1)
             np.add.at(sums, block.cell[rows], block.cell_mass[rows])
         if block.shells.shadow_runs:
-            crashed, mass = block.crash, block.cell_mass @ block.shells.joined
-            self._paths.add(mass[crashed], block.stratum[crashed], block.shells.p.size)
+            crashed = block.crash
+            self._paths.add(block.cell_mass[crashed], block.stratum[crashed], block.shells.p.size)
         for s in np.unique(block.stratum[block.crash]).tolist():
             _name(self._crashed.setdefault(s, []), block, block.crash & (block.stratum == s))
         if block.ahead is not None:
@@ -193,8 +200,8 @@ class Shells:
             largest_weight_share=float(np.max(y[tally.crashes > 0], initial=0.0)) / free.rate if free.rate > 0 else 0.0,
             method="crashes within shells of known probability; likelihood-ratio limits of their weighted sum; upper "
             "bound: the same, one-sided",
-            warnings=(*self._cautions(), *self._warnings(tally)),
-            cautions=tuple(self._cautions()),
+            warnings=(*self._cautions(tally), *self._warnings(tally)),
+            cautions=tuple(self._cautions(tally)),
             details=asdict(
                 ShellDetails(
                     pool=design.pool,
@@ -221,8 +228,8 @@ class Shells:
         weight[: tally.tests.size] = self._design.p[: tally.tests.size] / tally.at_least_one
         return self._paths.number(weight)
 
-    def _cautions(self) -> list[str]:
-        if (n := self._n_paths(self.tally)) >= FEWEST_PATHS:
+    def _cautions(self, tally: Tally) -> list[str]:
+        if (n := self._n_paths(tally)) >= FEWEST_PATHS:
             return []
         return [
             f"no interval: nearly all crashes lie on some {max(n, 1.0):.0f} of the {self._design.n_paths:,} paths that "

@@ -16,8 +16,7 @@ from harness.campaign.models import Campaign
 from harness.estimators.likelihood_ratio import Level
 from harness.estimators.pairs import PairCounts, Verdict
 from harness.estimators.stratified import Tally
-from harness.runner.allocation import CONFIDENCE, Allocation, first_tests
-from harness.runner.planner import POOL_SHARE
+from harness.runner.planner import CONFIDENCE, POOL_SHARE, Allocation, first_tests
 from harness.strata import ASSUMPTION_FREE, ShellDesign
 
 LOOKS = 6
@@ -50,7 +49,8 @@ class PairRule:
         self._min_crashes = campaign.min_crashes
         self._level = Level.two_sided(campaign.stop.confidence)
         self._decision = decision_level(campaign.stop.confidence)
-        self.conditional = campaign.testing.shells.statement != ASSUMPTION_FREE
+        self._statement = campaign.testing.shells.statement
+        self.conditional = self._statement != ASSUMPTION_FREE
         self.reached = self.pool_error_above_target = self.of_first_tests = False
         self.rhw, self.heaviest = math.inf, 0.0
         self.waited_for: tuple[str, ...] = ()
@@ -58,7 +58,8 @@ class PairRule:
 
     def observe(self, pairs: PairCounts) -> bool:
         """Whether to stop at the end of a round."""
-        watched = pairs.inside() if self.conditional else pairs
+        inside = {each.name: each.n_inside for each in pairs.design.statements}
+        watched = pairs.inside(inside[self._statement]) if self.conditional else pairs
         self.rhw = watched.rhw(self._level)
         if self._margin is not None:
             return self._decide(watched, self._margin)
@@ -114,7 +115,7 @@ class PairPlanner:
         added = self._allocation.next_round(
             _differing(pairs),
             self._budget - int(tests.sum()),
-            inner_rhw=lambda n: pairs.part(n).rhw(self._level),
+            inner_rhw=lambda n: pairs.inside(n).rhw(self._level),
             spread=partial(self._spread, pairs),
         )
         self.rule.of_first_tests = bool(np.any((tests < self._first_tests)[added > 0]))

@@ -76,7 +76,7 @@ class PairedCampaign:
     def _row(self, result: str, replication: int, pairs: PairCounts, *, reached: bool) -> Row:
         level = Level.two_sided(self.campaign.stop.confidence)
         found = pairs.difference(level)
-        outside = pairs.ends[pairs.design.statements[0].n_inside :]
+        outside = pairs.ends[pairs.design.library.n_inside :]
         return Row(
             result,
             replication,

@@ -117,7 +117,7 @@ def _vehicles(experiment: Experiment, progress: Progress) -> Iterator[tuple[Subj
 
 
 def _subject(name: str, source: OvertakingShells, truth: Truth) -> Subject:
-    outside = {result_of(statement): share for statement, share in source.crashes_outside.items()}
+    outside = {result_of(each): share for each, share in source.crashes_outside.items()}
     facts = outside, source.left_out, source.template.library.boundary
     return Subject(name, truth.crash_rate, truth.std_error, *facts)
 

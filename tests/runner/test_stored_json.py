@@ -141,9 +141,9 @@ STOPS = {"a": {"campaign_hash": "x", "stop": {}, "n_episodes": 3, "stopped_by": 
     [
         *((StoredShells, SHELLS, {key: {}}) for key in SHELLS),
         (StoredShells, SHELLS, {"cell_p": [0.1]}),
+        (StoredShells, SHELLS, {"statements": []}),
         (StoredShells, SHELLS, {"cell_stratum": [0, 0]}),
         (StoredShells, SHELLS, {"reference_rate": []}),
-        (StoredShells, SHELLS, {"statements": []}),
         *((StoredStops, STOPS, {"a": wrong}) for wrong in (1, [], {}, {**STOPS["a"], "n_episodes": "3"})),
     ],
 )
