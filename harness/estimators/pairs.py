@@ -85,10 +85,6 @@ class PairCounts:
         within = slice(0, self.design.library.n_inside if n is None else n)
         return PairCounts(self.design, self.ends[within], self.mass[within, :, :, within])
 
-    def inside(self) -> PairCounts:
-        """Only what lies within the boundary of the first statement, the narrowest."""
-        return self.part(self.design.statements[0].n_inside)
-
     def outcomes(self, *, failed_a: bool = False, failed_b: bool = False) -> IntArray:
         """How often both crash, only A, only B, neither, shape (S, 4), with failed tests as crashes or as none."""
         return np.stack([self.ends[:, kind].sum(1) for kind in _kinds(failed_a, failed_b)], axis=1)

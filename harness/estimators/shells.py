@@ -14,7 +14,7 @@ Failed tests count against the vehicle (`harness.estimators.stratified`).
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 
 import numpy as np
 
@@ -122,17 +122,6 @@ class Shells:
         self._crashed: dict[int, list[int]] = {}  # stratum → its first few tests that crashed
         self._n_checked = self._n_ahead = 0
         self._ahead_in: list[int] = []
-
-    @classmethod
-    def of(cls, design: ShellDesign, tally: Tally) -> Shells:
-        """From counts by stratum, of which nothing is known by reference drivers."""
-        shells = cls()
-        strata = tuple(range(design.p.size))
-        shells._design = replace(
-            design, cell_stratum=strata, cell_p=design.p, cell_references=(0,) * len(strata), references=()
-        )
-        shells._cells = tally
-        return shells
 
     @property
     def tally(self) -> Tally:

@@ -32,7 +32,6 @@ from harness.runner.manifest import require_own_folder
 from harness.runner.pair_planner import LOOKS, PairPlanner, PairRule
 from harness.runner.planner import round_specs
 from harness.runner.worker import ShardSpec
-from harness.strata import ASSUMPTION_FREE
 
 PAIRING = "the i-th cut-in that A meets of a shell is the i-th that B meets: same initial state, paths and cut-in"
 EXIT_OF: Mapping[Verdict, int] = {"proven": EXIT_DONE, "refuted": EXIT_REFUTED, "open": EXIT_BUDGET_SPENT}
@@ -99,7 +98,7 @@ def compare_shells(
             earlier = require_own_folder(folder, resolved, resume=True)
             held.append(list(_held_specs(folder, earlier)))
             runs.append(Run(resolved, folder, earlier, workers or os.cpu_count() or 1, progress, began))
-        prescribed = _same_cut_ins(runs, campaign.testing.shells.statement)
+        prescribed = _same_cut_ins(runs)
         planner = PairPlanner(campaign, prescribed.design, prescribed.available, margin)
         pairs = PairedShells(prescribed.design)
         both = [_Side(run, side, pairs, planner.rule, campaign.run.shard_size) for side, run in enumerate(runs)]
@@ -116,18 +115,11 @@ def compare_shells(
     return paired_estimate(counts, campaign.stop.confidence), planner.rule
 
 
-def _same_cut_ins(runs: list[Run], asked: str) -> PrescribedEpisodes:
+def _same_cut_ins(runs: list[Run]) -> PrescribedEpisodes:
     """Cut-ins of both: one environment and one library make one pool."""
     a, b = (run.prescribed for run in runs)
     if a is None or b is None:
         raise ValueError("the campaigns do not draw from shells")
-    if asked not in (ASSUMPTION_FREE, first := a.design.statements[0].name):
-        raise CampaignError(
-            "testing.shells.statement",
-            found=asked,
-            expected=f"{ASSUMPTION_FREE} or {first}, the narrowest: a comparison has these two",
-            mend="Choose one of them.",
-        )
     return a
 
 
