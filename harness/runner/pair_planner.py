@@ -16,7 +16,8 @@ from harness.campaign.models import Campaign
 from harness.estimators.likelihood_ratio import Level
 from harness.estimators.pairs import PairCounts, Verdict
 from harness.estimators.stratified import Tally
-from harness.runner.planner import CONFIDENCE, POOL_SHARE, Allocation, first_tests
+from harness.runner.allocation import CONFIDENCE, Allocation, first_tests
+from harness.runner.planner import POOL_SHARE
 from harness.strata import ASSUMPTION_FREE, ShellDesign
 
 LOOKS = 6

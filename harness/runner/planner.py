@@ -10,43 +10,23 @@ stated about them is roughly known, some ten tests; then those inside the next o
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from functools import partial
+from collections.abc import Iterator
 from itertools import pairwise
 from typing import Protocol
 
 import numpy as np
 
-from harness.arrays import BoolArray, IntArray
+from harness.arrays import IntArray
 from harness.campaign.models import Campaign
 from harness.estimators import Shells, StopRule, accumulator
 from harness.estimators.block import Block
 from harness.estimators.estimate import BothWays, Estimate
-from harness.estimators.intervals import clopper_pearson
-from harness.estimators.likelihood_ratio import Level
-from harness.estimators.stratified import Tally, combined, empty_tally
+from harness.estimators.stratified import Tally, empty_tally
 from harness.pool.shells import Draw, PrescribedEpisodes
+from harness.runner.allocation import Allocation, first_tests
 from harness.runner.worker import ShardSpec
 from harness.strata import ASSUMPTION_FREE, ShellDesign
 
-GROWTH = 1.1
-"""Tests after a round over tests before it; also the distance of the looks at the result."""
-INNER_RHW = 0.3
-"""Relative half-width of a statement at which testing turns to what lies outside its boundary."""
-CONFIDENCE = 0.9
-"""Level at which widths are compared, whatever the campaign reports."""
-_TAIL, _LEVEL = (1.0 - CONFIDENCE) / 2.0, Level.two_sided(CONFIDENCE)
-FIRST_TESTS = 36
-"""First tests of all strata within the narrowest boundary together, each its share of the probability there."""
-LEAST_FIRST_TESTS, MOST_FIRST_TESTS = 3, 12
-"""Of one stratum."""
-MOST_INNER_TESTS = 8
-"""Testing turns to what lies outside after this many times the first tests, known or not."""
-SMALLEST_ROUND = 8
-SHARES_PER_ROUND = 32
-USED_UP_SHARE = 0.95
-"""Share of the squared widths that must lie in exhausted strata for the allocation to end."""
 MOST_SHARDS_PER_ROUND = 16
 SMALLEST_SHARD = 64
 WIDEST_RHW = 0.5
@@ -203,150 +183,6 @@ def planner_of(campaign: Campaign, prescribed: PrescribedEpisodes | None, held: 
     return ShellPlanner(campaign, prescribed.design, prescribed.available, held)
 
 
-def first_tests(design: ShellDesign, asked: int | None = None) -> IntArray:
-    """Tests that each stratum gets before anything is decided about it, shape (S,); ``asked`` is a number for all.
-
-    A stratum without a crash leaves about p_s/n_s open, and of several the largest counts. So tests go in proportion
-    to the probability, which leaves the same open in each; further ones come where crashes are seen.
-    """
-    if asked is not None:
-        return np.full(design.p.size, asked, np.int64)
-    within = design.p[: design.statements[0].n_inside].sum()
-    share = np.ceil(FIRST_TESTS * design.p / within) if within > 0.0 else np.full(design.p.size, np.inf)
-    found: IntArray = np.clip(share, LEAST_FIRST_TESTS, MOST_FIRST_TESTS).astype(np.int64)
-    return found
-
-
-@dataclass(frozen=True)
-class Allocation:
-    """How many tests each shell gets next.
-
-    A stratum gets ``first_tests`` before anything is decided about it, and at most those ``available``, shape (S,).
-    With a ``statement`` of the design what lies outside its boundary is never tested.
-    """
-
-    design: ShellDesign
-    first_tests: IntArray
-    available: IntArray
-    statement: str = ASSUMPTION_FREE
-
-    @property
-    def n_asked(self) -> int:
-        """Strata that may be tested, which come first."""
-        inside = {each.name: each.n_inside for each in self.design.statements}
-        return inside.get(self.statement, self.design.p.size)
-
-    def next_round(
-        self,
-        tally: Tally,
-        budget: int,
-        *,
-        inner_rhw: Callable[[int], float] | None = None,
-        spread: Callable[[int, IntArray], IntArray] | None = None,
-    ) -> IntArray:
-        """Tests to add per stratum, at most ``budget``; all 0 when no stratum or no budget is left.
-
-        Failed tests widen the limits that are to be narrowed: they may have been crashes.
-
-        Parameters
-        ----------
-        tally : Tally
-        budget : int
-        inner_rhw : callable, optional
-            Gives the relative half-width within the first so many strata; by default that of a crash rate.
-        spread : callable, optional
-            Gives so many tests to strata with so much room (S,) each; by default to where a crash rate is narrowed.
-        """
-        tests = tally.tests
-        if self._used_up(tally):
-            return np.zeros_like(tests)
-        begun = self._begun(tests, inner_rhw or partial(self._inner_rhw, tally))
-        active = begun & (tests < self.available)
-        wanted = np.where(active, np.maximum(self.first_tests - tests, 0), 0)
-        if not wanted.any() and active.any():
-            size = max(SMALLEST_ROUND, int(np.ceil(tests[begun].sum() * (GROWTH - 1.0))))
-            room = np.where(active, self.available - tests, 0)
-            wanted = self._spread(min(size, budget), tally, room) if spread is None else spread(min(size, budget), room)
-        return _cut(np.minimum(wanted, self.available - tests), budget)
-
-    def second_phase(self, first: Tally, available: IntArray, budget: int, rhw: float) -> IntArray:
-        """Tests per stratum, in proportion to a first phase's, of which an interval as narrow as ``rhw`` is expected.
-
-        No more than ``available``, shape (S,), and together at most ``budget``.
-        """
-        p, n_paths = self.design.p, self.design.n_paths
-        watched = slice(0, self.n_asked)
-
-        def tests(factor: float) -> IntArray:
-            return np.asarray(np.minimum(np.ceil(factor * first.tests).astype(np.int64), available))
-
-        def too_wide(factor: float) -> bool:
-            expected = first.scaled(tests(factor)).part(watched)
-            return combined(p[watched], expected, n_paths, _LEVEL).rhw > rhw
-
-        low, high = 0.0, 1.0
-        while too_wide(high) and tests(high).sum() < budget and np.any(tests(2.0 * high) > tests(high)):
-            low, high = high, 2.0 * high
-        while tests(high).sum() - tests(low).sum() > first.tests.size:
-            middle = (low + high) / 2.0
-            low, high = (middle, high) if too_wide(middle) and tests(middle).sum() < budget else (low, middle)
-        return _cut(tests(high), budget)
-
-    def _used_up(self, tally: Tally) -> bool:
-        """Whether nearly all that is left to know lies in strata without further cut-ins."""
-        tests, (low, high) = tally.tests, clopper_pearson(tally.crashes, tally.tests, _TAIL, tally.failed)
-        relevant = np.arange(tests.size) < self.n_asked
-        squares = np.where(relevant, (self.design.p * (high - low)) ** 2, 0.0)
-        return bool(squares[tests >= self.available].sum() >= USED_UP_SHARE * squares.sum())
-
-    def _begun(self, tests: IntArray, inner_rhw: Callable[[int], float]) -> BoolArray:
-        """Strata that it is time to test: those inside the narrowest boundary that leaves much open."""
-        boundaries = (each.n_inside for each in self.design.statements if each.n_inside < self.n_asked)
-        n = next((n for n in boundaries if not self._enough_inside(n, tests, inner_rhw)), self.n_asked)
-        begun: BoolArray = np.arange(tests.size) < n
-        return begun
-
-    def _enough_inside(self, n: int, tests: IntArray, inner_rhw: Callable[[int], float]) -> bool:
-        """Whether it is time to test more than the first ``n`` strata."""
-        exhausted = bool(np.all(tests[:n] >= self.available[:n]))
-        started = bool(np.any(tests[n:] > 0))
-        # Without this end a vehicle that crashes rarely inside, and often outside, would not be tested outside at all.
-        spent = bool(tests[:n].sum() >= MOST_INNER_TESTS * self.first_tests[:n].sum())
-        return exhausted or started or spent or inner_rhw(n) <= INNER_RHW
-
-    def _inner_rhw(self, tally: Tally, n: int) -> float:
-        d, s = self.design, slice(0, n)
-        return combined(d.p[s], tally.part(s), d.n_paths, _LEVEL).rhw
-
-    def _spread(self, size: int, tally: Tally, most: IntArray) -> IntArray:
-        """Give portions, one after the other, to where each narrows the sum of squared half-widths most.
-
-        A squared half-width shrinks as 1/n, or as 1/n² where shares are all 0 or 1.
-        """
-        tests, crashes, failed = tally.tests, tally.crashes, tally.failed
-        low, high = clopper_pearson(crashes, tests, _TAIL, failed)
-        squares = ((self.design.p * (high - low) / 2.0) ** 2).tolist()
-        powers = np.where((crashes + failed == 0) | (crashes == tests), 2, 1).tolist()
-        so_far, room = tests.tolist(), most.tolist()
-        given = [0] * tests.size
-
-        def gain(s: int) -> float:
-            """Fall of the squared half-width per further test of a stratum."""
-            if given[s] >= room[s]:
-                return -1.0
-            n = max(so_far[s] + given[s], 1)
-            return float(squares[s] * (max(so_far[s], 1) / n) ** powers[s] * powers[s] / n)
-
-        gains, left, portion = [gain(s) for s in range(tests.size)], size, max(1, size // SHARES_PER_ROUND)
-        while left > 0 and max(gains) >= 0.0:
-            best = gains.index(max(gains))
-            more = min(portion, left, room[best] - given[best])
-            given[best] += more
-            left -= more
-            gains[best] = gain(best)
-        return np.array(given, np.int64)
-
-
 class RoundRule:
     """Looks after each round, and is content with one pass.
 
@@ -403,12 +239,6 @@ class RoundRule:
         self.pool_error_above_target = watched["rhw_from_pool_at_least"] > self._target
         hopeless = self.pool_error_above_target and watched["rhw_from_pool"] ** 2 >= POOL_SHARE * self.rhw**2
         return self.reached or (hopeless and estimate.n_episodes >= self._held)
-
-
-def _cut(wanted: IntArray, budget: int) -> IntArray:
-    """Tests per stratum, cut from the last stratum on to a budget."""
-    added: IntArray = np.diff(np.minimum(np.cumsum(wanted), max(budget, 0)), prepend=0)
-    return added
 
 
 def round_specs(tests: IntArray, added: IntArray, index: int, first_episode: int, shard_size: int) -> list[ShardSpec]:

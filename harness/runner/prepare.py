@@ -66,7 +66,9 @@ class Prepared:
         if self.shadow_paths is None:
             raise ValueError("this campaign has no shadow runs")
         pool = vehicle_pool(self.resolved, self.shadow_paths, runs)
-        return replace(self, prescribed=PrescribedEpisodes(self.campaign, pool))
+        prescribed = PrescribedEpisodes(self.campaign, pool)
+        policy = self.policy._replace(boundary=checked_boundary(self.resolved.library, prescribed.design))
+        return replace(self, prescribed=prescribed, policy=policy)
 
     def states(self, first_episode: int, n_episodes: int) -> RecordArray:
         """Initial states of consecutive episodes, shape (n_episodes,)."""

@@ -81,7 +81,7 @@ class OvertakingShells:
 
     def as_adversary(self, made: Adversary) -> OvertakingShells:
         """The same vehicle with other crashes; see `harness.studies.experiment.Adversary`."""
-        inside, crashing = self.template.boundary + 1, self.crashing.copy()
+        inside, crashing = outermost(self.template, ShellSettings()) + 1, self.crashing.copy()
         if made.crashes != "everywhere":
             weight = crashing[:, :inside].sum(1)
             order = np.argsort(-weight if made.crashes == "on_heaviest_paths" else weight, kind="stable")

@@ -14,9 +14,10 @@ import pytest
 from harness import estimate, replay
 from harness.errors import CampaignError, RunFolderError
 from harness.estimators.stratified import Tally
+from harness.runner.allocation import GROWTH, Allocation, first_tests
 from harness.runner.campaign_run import episodes_on_disk
 from harness.runner.manifest import Manifest, Prefix
-from harness.runner.planner import GROWTH, Allocation, first_tests, round_specs
+from harness.runner.planner import round_specs
 from harness.strata import ShellDesign, Statement
 from tests.pool.conftest import SMALL_POOL
 from tests.runner.stored_runs import copy_of, manifest, shard_files, stored_table, unlike_columns
