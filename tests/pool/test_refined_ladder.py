@@ -112,7 +112,7 @@ def test_white_noise_is_reported_as_not_predicted(run, tmp_path):
 
 def test_the_library_is_the_runs_with_two_drivers_more(late, ladder):
     refined, out = ladder
-    library, before = load_library(str(out)), load_library("ladder-1")
+    library, before = load_library(str(out)), load_library("ladder-2")
     assert library == refined.library
     assert library.surrogates.keys() - before.surrogates.keys() == {"fitted", "fitted-careless"}
     assert all(library.surrogates[name] == model for name, model in before.surrogates.items())

@@ -139,7 +139,7 @@ def test_too_few_crashes_are_judged_by_an_inequality(forced):
     """A hundred times the rate cannot be missed in a few hundred tests, normal or not."""
     one, table, pool = forced
     for factor, raised in ((1.0, False), (1_000.0, True)):
-        found = alarmed(one, table.slice(0, 300), replace(pool, mu=pool.mu * [factor, *[1] * 7]))
+        found = alarmed(one, table.slice(0, 300), replace(pool, mu=pool.mu * [factor, *[1] * (pool.mu.size - 1)]))
         assert found["surrogates"][0]["z"] is None
         assert found["raised"] == raised
 
