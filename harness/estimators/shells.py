@@ -172,6 +172,7 @@ class Shells:
         tally, design = self.tally, self._design
         n = int(tally.tests.sum())
         require_episodes(n)
+        cautions = tuple(self._cautions(tally))
         free, share, y = self._limits(tally, Level.two_sided(confidence)), tally.share, design.p / tally.at_least_one
         squares = float((tally.crashes * y * y).sum())
         variance = float((design.p * y * share * (1.0 - share)).sum()) + pool_variance(design.p, tally, design.n_paths)
@@ -189,15 +190,15 @@ class Shells:
             largest_weight_share=float(np.max(y[tally.crashes > 0], initial=0.0)) / free.rate if free.rate > 0 else 0.0,
             method="crashes within shells of known probability; likelihood-ratio limits of their weighted sum; upper "
             "bound: the same, one-sided",
-            warnings=(*self._cautions(tally), *self._warnings(tally)),
-            cautions=tuple(self._cautions(tally)),
+            warnings=(*cautions, *self._warnings(tally)),
+            cautions=cautions,
             details=asdict(
                 ShellDetails(
                     pool=design.pool,
                     **free.from_pool_relative(),
                     p_cut_in=design.p_cut_in,
                     p_impossible=design.p_impossible,
-                    references=compared(design, self._cells, Level.two_sided(confidence)),
+                    references=() if cautions else compared(design, self._cells, Level.two_sided(confidence)),
                     statements=tuple(self._within(each, tally, confidence) for each in design.statements),
                     shells=self._shells(tally, (1.0 - confidence) / 2.0),
                 )

@@ -32,6 +32,7 @@ from harness.runner.manifest import require_own_folder
 from harness.runner.pair_planner import LOOKS, PairPlanner, PairRule
 from harness.runner.planner import round_specs
 from harness.runner.worker import ShardSpec
+from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT
 
 PAIRING = "the i-th cut-in that A meets of a shell is the i-th that B meets: same initial state, paths and cut-in"
 EXIT_OF: Mapping[Verdict, int] = {"proven": EXIT_DONE, "refuted": EXIT_REFUTED, "open": EXIT_BUDGET_SPENT}
@@ -152,6 +153,13 @@ def require_same_shells(sides: tuple[Resolved, Resolved]) -> None:
             found=sides[0].campaign.testing.shells.stopping,
             expected="sequential: a comparison plans no second phase",
             mend="Write --set testing.shells.stopping=sequential.",
+        )
+    if (asked := sides[0].campaign.testing.shells.statement) not in (ASSUMPTION_FREE, LIBRARY_STATEMENT):
+        raise CampaignError(
+            "testing.shells.statement",
+            found=asked,
+            expected=f"{ASSUMPTION_FREE} or {LIBRARY_STATEMENT}: a comparison has these two",
+            mend="Choose one of them.",
         )
     if any(of_side.campaign.av.before_cut_in == "controller" for of_side in sides):
         raise CampaignError(

@@ -148,7 +148,11 @@ def test_too_many_failures_of_a_short_campaign_are_no_answer_either(bad, tmp_pat
         (f"av={_other('RaisesInClose', '{pth: x}')}", "av.parameters", "pth"),
         ("testing={method: shells, shells: {boundary: foo}}", "testing.shells.boundary", "foo"),
         ("testing={method: shells, shells: {statement: foo}}", "testing.shells.statement", "foo"),
-        ("testing={method: shells, shells: {statements: {a: {boundary: foo}}}}", "testing.shells.statements.a.boundary", "foo"),
+        (
+            "testing={method: shells, shells: {statements: {a: {boundary: foo}}}}",
+            "testing.shells.statements.a.boundary",
+            "foo",
+        ),
     ],
 )
 def test_check_refuses_what_run_refuses(change, where, words, tmp_path, capsys):

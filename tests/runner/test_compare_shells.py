@@ -158,6 +158,9 @@ def test_refusals(campaigns, campaign, tmp_path, done):
     faster = campaign(*SHELLS, "av.parameters.max_acceleration_mps2=5")
     with pytest.raises(CampaignError, match="hardest acceleration"):
         compare_campaigns(campaigns[0], faster, tmp_path / "out")
+    needed = campaign(*SHELLS, "testing.shells.statement=need-based")
+    with pytest.raises(CampaignError, match="assumption_free or library"):
+        compare_campaigns(needed, needed, tmp_path / "out")
     early = campaign(*SHELLS, "av={controller: 'tests.controllers.early:Speeds', before_cut_in: controller}")
     with pytest.raises(CampaignError, match="cut-ins of its own"):
         compare_campaigns(early, early, tmp_path / "out")

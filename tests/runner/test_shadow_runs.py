@@ -134,6 +134,7 @@ def test_crashes_on_a_handful_of_paths_give_no_interval(campaign, run_here, tmp_
     assert (shells["ci_low"], shells["ci_high"], shells["rhw"]) == (0.0, 1.0, None)
     assert "no interval: nearly all crashes lie on some" in result.estimates["statement"]
     assert "raise pool.shadow_paths" in result.estimates["statement"]
+    assert shells["details"]["references"] == []
     assert "nothing more can be said" in result.estimates["boundary_statements"]["library"]
 
 
