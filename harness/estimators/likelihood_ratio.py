@@ -129,7 +129,7 @@ def contrast_gains(weights: FloatArray, counts: FloatArray, level: Level, side: 
 
 
 def _limit(
-    weights: FloatArray, counts: IntArray | FloatArray, level: Level, side: float, variance: float = 0.0
+    weights: FloatArray, counts: Counts, level: Level, side: float, variance: float = 0.0
 ) -> tuple[float, float]:
     """A limit and its multiplier, 0 where no test says anything."""
     n = counts.sum(1).astype(np.float64)

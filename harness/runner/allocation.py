@@ -99,12 +99,12 @@ class Allocation:
             wanted = self._spread(min(size, budget), tally, room) if spread is None else spread(min(size, budget), room)
         return _cut(np.minimum(wanted, self.available - tests), budget)
 
-    def second_phase(self, first: Tally, available: IntArray, budget: int, rhw: float) -> IntArray:
+    def second_phase(self, first: Tally, available: IntArray, budget: int, rhw: float, confidence: float) -> IntArray:
         """Tests per stratum, in proportion to a first phase's, of which an interval as narrow as ``rhw`` is expected.
 
         No more than ``available``, shape (S,), and together at most ``budget``.
         """
-        p, n_paths = self.design.p, self.design.n_paths
+        p, n_paths, level = self.design.p, self.design.n_paths, Level.two_sided(confidence)
         watched = slice(0, self.n_asked)
 
         def tests(factor: float) -> IntArray:
@@ -112,7 +112,7 @@ class Allocation:
 
         def too_wide(factor: float) -> bool:
             expected = first.scaled(tests(factor)).part(watched)
-            return combined(p[watched], expected, n_paths, _LEVEL).rhw > rhw
+            return combined(p[watched], expected, n_paths, level).rhw > rhw
 
         low, high = 0.0, 1.0
         while too_wide(high) and tests(high).sum() < budget and np.any(tests(2.0 * high) > tests(high)):

@@ -132,8 +132,9 @@ class ShellPlanner:
         if not (enough and self._plans and self.rule.reached and self._planned is None):
             return enough or self._planned is not None
         budget = self._campaign.stop.episodes - self._n_episodes
-        left = self._available - self._drawn
-        self._planned = self._allocation.second_phase(self.tally, left, budget, self._campaign.stop.rhw or math.inf)
+        stop, left = self._campaign.stop, self._available - self._drawn
+        rhw = stop.rhw or math.inf
+        self._planned = self._allocation.second_phase(self.tally, left, budget, rhw, stop.confidence)
         self.rule, self.reported_from = RoundRule(self._campaign), self._n_episodes
         self._begin_phase()
         return False

@@ -13,7 +13,8 @@ import pytest
 
 from harness import estimate, replay
 from harness.errors import CampaignError, RunFolderError
-from harness.estimators.stratified import Tally
+from harness.estimators.likelihood_ratio import Level
+from harness.estimators.stratified import Tally, combined
 from harness.runner.allocation import GROWTH, Allocation, first_tests
 from harness.runner.campaign_run import episodes_on_disk
 from harness.runner.manifest import Manifest, Prefix
@@ -373,3 +374,15 @@ def test_a_run_that_stops_at_a_wide_interval_says_what_that_does(campaign, run_h
     wide = run_here(campaign(*SHELLS, "world.engine=twin", "stop.rhw=0.6"), tmp_path / "wide")
     assert wide.ending.endswith("Ask for a smaller stop.rhw, or for testing.shells.stopping: two_phase.")
     assert "two_phase" not in run_here(campaign(*SHELLS, "world.engine=twin"), tmp_path / "narrow").ending
+
+
+def test_a_second_phase_is_planned_at_the_campaigns_own_level():
+    """The plan's expected interval is as narrow as asked, and by no more than a few tests: at 0.99 it takes more."""
+    p, tests, crashes = DESIGN.p, np.array([400, 400, 800]), np.array([200, 40, 0])
+    first = tally(tests, crashes, NONE)
+    rule = Allocation(DESIGN, TWELVE, MANY)
+    planned = {level: rule.second_phase(first, MANY, 10**6, 0.3, level) for level in (0.9, 0.99)}
+    for level, n in planned.items():
+        expected = combined(p, first.scaled(n), DESIGN.n_paths, Level.two_sided(level)).rhw
+        assert 0.28 < expected <= 0.3
+    assert planned[0.99].sum() > 1.5 * planned[0.9].sum()
