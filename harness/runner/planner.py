@@ -29,10 +29,10 @@ from harness.strata import ASSUMPTION_FREE, ShellDesign
 
 MOST_SHARDS_PER_ROUND = 16
 SMALLEST_SHARD = 64
-WIDEST_RHW = 0.5
+BIASED_RHW = 0.5
 """Precision from which on stopping at the first interval biases the rate noticeably."""
 TOO_WIDE = (
-    f"A relative half-width above {WIDEST_RHW:g} is reached by chance: stopping at the first such interval makes rates "
+    f"A relative half-width above {BIASED_RHW:g} is reached by chance: stopping at the first such interval makes rates "
     "too high on the mean. Ask for a smaller stop.rhw, or for testing.shells.stopping: two_phase."
 )
 FIRST_PHASE = 1.7
@@ -81,7 +81,7 @@ class ShellPlanner:
         shells = campaign.testing.shells
         self._plans = shells.stopping == "two_phase" and campaign.stop.rhw is not None
         self.rule = RoundRule(campaign, held, FIRST_PHASE if self._plans else 1.0)
-        wide = campaign.stop.rhw is not None and campaign.stop.rhw > WIDEST_RHW and not self._plans
+        wide = campaign.stop.rhw is not None and campaign.stop.rhw > BIASED_RHW and not self._plans
         self.remark = TOO_WIDE if wide else ""
         self.estimate: Estimate | None = None
         self.reported_from = 0

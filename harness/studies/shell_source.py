@@ -64,10 +64,6 @@ class OvertakingShells:
 
     def draw(self, rng: np.random.Generator) -> DrawnPool:
         """A new pool."""
-        return self.draw_parts(rng, self.crashing[None])[0]
-
-    def draw_parts(self, rng: np.random.Generator, parts: FloatArray) -> list[DrawnPool]:
-        """A new pool, with each of some parts of the shells, shape (K, n, D + 1), in the crashes' place."""
         rows = rng.integers(0, len(self.shells), self.template.n_paths)
         drawn = self.shells[rows]
         pool = replace(self.template, cell_p=drawn.mean(0), p_cut_in=float(drawn.sum(1).mean()))
@@ -77,7 +73,7 @@ class OvertakingShells:
         def by_stratum(by_shell: FloatArray) -> FloatArray:
             return np.column_stack([by_shell[:, group].sum(1) for group in groups])
 
-        return [DrawnPool(design, by_stratum(drawn), by_stratum(part[rows]), self.failing) for part in parts]
+        return DrawnPool(design, by_stratum(drawn), by_stratum(self.crashing[rows]), self.failing)
 
     def as_adversary(self, made: Adversary) -> OvertakingShells:
         """The same vehicle with other crashes; see `harness.studies.experiment.Adversary`."""
@@ -90,31 +86,6 @@ class OvertakingShells:
         tested = slice(inside, -1)  # the last shell is for cut-ins on which nobody crashes
         crashing[:, tested] = np.maximum(crashing[:, tested], made.hole * self.shells[:, tested])
         return replace(self, crashing=crashing, failing=made.failing)
-
-
-@dataclass(frozen=True, eq=False)
-class OvertakingPairs:
-    """Pools of two vehicles; see `harness.studies.paired_campaign.PairSource`.
-
-    Attributes
-    ----------
-    pools : OvertakingShells
-    outcomes : ndarray, shape (3, n, D + 1)
-        Part of the shells on which both crash, only A, only B.
-    """
-
-    pools: OvertakingShells
-    outcomes: FloatArray
-
-    @property
-    def crashes_outside(self) -> float:
-        """Share of the cut-ins on which either vehicle crashes that lies beyond the boundary."""
-        by_shell = self.outcomes.sum((0, 1))
-        return float(by_shell[self.pools.template.boundary + 1 :].sum() / by_shell.sum())
-
-    def draw(self, rng: np.random.Generator) -> list[DrawnPool]:
-        """A new pool: where both crash, only A, only B."""
-        return self.pools.draw_parts(rng, self.outcomes)
 
 
 def equals(library: Library, population: SuperPopulation, crashing: FloatArray) -> set[str]:
@@ -169,16 +140,6 @@ def overtaking_shells(
     crashing = vehicle.crash_mass(population)
     pools, by_shell = _pools(library, population, [crashing], acceleration_limit(av), pool_paths)
     return replace(pools, crashing=by_shell(crashing))
-
-
-def overtaking_pairs(
-    library: Library, population: SuperPopulation, limit_mps2: float, vehicles: tuple[Mixed, Mixed], pool_paths: int
-) -> OvertakingPairs:
-    """Source of the pools of two vehicles, of which each does on a cut-in what it does whatever the other one does."""
-    a, b = (vehicle.crash_mass(population) for vehicle in vehicles)
-    pools, by_shell = _pools(library, population, [a, b], limit_mps2, pool_paths)
-    both = np.divide(a * b, population.mass, out=np.zeros_like(a), where=population.mass > 0.0)
-    return OvertakingPairs(pools, np.stack([by_shell(mass) for mass in (both, a - both, b - both)]))
 
 
 def _pools(
