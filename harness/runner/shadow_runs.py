@@ -197,7 +197,7 @@ def _forced(
     loop: EpisodeLoop, seed: int, first: int, state: RecordArray, environment: Environment
 ) -> PrescribedTraffic:
     n, index = len(state), first + np.arange(len(state))
-    runs = _recorded(without_cut_in(loop, seed, first, index, state, environment), environment)
+    runs = recorded(without_cut_in(loop, seed, first, index, state, environment), environment)
     nobody = np.zeros(0, DRIVER_DTYPE), -1
     probability, _, unknown = recorded_cut_ins(runs, seed, index, state, environment, *nobody)
     cumulative = np.cumsum(probability, axis=1)
@@ -223,7 +223,7 @@ def _with_cut_in(
     return lv, bv
 
 
-def _recorded(shard: Shard, environment: Environment) -> ShadowRuns:
+def recorded(shard: Shard, environment: Environment) -> ShadowRuns:
     """Shadow runs as they come from the loop."""
     episode, width = shard.results.episode, int(environment.numbers["max_steps"]) + 1
     x, v = np.zeros((2, episode.size, width))
