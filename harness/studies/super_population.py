@@ -20,7 +20,7 @@ import pyarrow.parquet as pq
 
 from harness.arrays import BoolArray, FloatArray, IntArray, RecordArray
 from harness.campaign.models import AutomatedVehicle, BuiltInParameters, Reflexes
-from harness.compiled import cache_root, source_hash
+from harness.compiled import WORLD_SOURCES, cache_root, source_hash
 from harness.environment.driving import Environment
 from harness.errors import CampaignError
 from harness.pool.aimed_paths import PILOT_PATHS, Enumerator
@@ -175,7 +175,7 @@ def _compressed(aimed: Enumerator, n_paths: int, progress: Progress) -> SuperPop
 
 def _key(environment: Environment, drivers: RecordArray, envelope: int, seed: int, n_paths: int) -> str:
     numbers = {name: environment.numbers[name].item() for name in environment.numbers.dtype.names or ()}
-    content = [_FORMAT, source_hash(), numbers, drivers.tolist(), envelope, seed, n_paths]
+    content = [_FORMAT, source_hash(WORLD_SOURCES), numbers, drivers.tolist(), envelope, seed, n_paths]
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:24]
 
 
