@@ -118,6 +118,7 @@ class Shells:
 
     def __init__(self) -> None:
         self._cells = empty_tally(0)
+        self._tally: Tally | None = None  # of the cells, once it is asked for
         self._paths = CrashPaths()
         self._crashed: dict[int, list[int]] = {}  # stratum → its first few tests that crashed
         self._n_checked = self._n_ahead = 0
@@ -126,7 +127,9 @@ class Shells:
     @property
     def tally(self) -> Tally:
         """Counts by stratum; of no strata before the first block."""
-        return self._cells.joined(self._design.joined) if self._cells.tests.size else self._cells
+        if self._tally is None:
+            self._tally = self._cells.joined(self._design.joined) if self._cells.tests.size else self._cells
+        return self._tally
 
     @classmethod
     def of(cls, design: ShellDesign, tally: Tally) -> Shells:
@@ -149,7 +152,7 @@ class Shells:
         if not self._cells.tests.size:
             self._design = block.shells
             self._cells = empty_tally(block.shells.cell_p.size)
-        tally = self._cells
+        tally, self._tally = self._cells, None
         np.add.at(tally.tests, block.cell, 1)
         for rows, counts, sums in (
             (block.crash, tally.crashes, tally.crash_mass),
@@ -204,6 +207,11 @@ class Shells:
                 )
             ),
         )
+
+    def limits_of(self, statement: str, confidence: float) -> Limits:
+        """Rate and interval of a statement, or of all strata."""
+        inside = {each.name: each.n_inside for each in self._design.statements}
+        return self._limits(self.tally.part(slice(0, inside.get(statement))), Level.two_sided(confidence))
 
     def _limits(self, tally: Tally, level: Level) -> Limits:
         """Of the first strata, those of a tally; anything is possible where crashes lie on too few paths."""

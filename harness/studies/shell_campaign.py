@@ -103,15 +103,13 @@ class ShellCampaign:
         planner = ShellPlanner(self.campaign, design, available)
         rules = {each.name: RoundRule(asking(self.campaign, each.name)) for each in design.statements}
         known: dict[str, Row] = {}
-        estimate: Estimate | None = None
         enough = False
         while not enough and (added := planner.next_round()).any():
             enough = planner.add(campaign_block(drawn, added, int(planner.tally.tests.sum()), rng))
-            estimate = planner.estimate
-            if estimate is not None:
-                known |= dict(_newly_known(estimate, replication, {k: v for k, v in rules.items() if k not in known}))
-        if estimate is None:
-            raise ValueError("the campaign has no tests")
+            for name, rule in rules.items():
+                if name not in known and planner.seen.tally.tests.size and rule.observe(planner.seen) and rule.reached:
+                    known[name] = _statement_row(self._estimate(planner), name, replication, reached=True)
+        estimate = self._estimate(planner)
         outside = int(estimate.details["statements"][0]["n_crashes_outside"])
         yield estimate_row(FREE, replication, estimate, reached=planner.rule.reached, outside=outside)
         for name in rules:
@@ -119,13 +117,8 @@ class ShellCampaign:
         for reference in design.references:
             yield from _reference_rows(estimate, reference.name, replication, reached=planner.rule.reached)
 
-
-def _newly_known(estimate: Estimate, replication: int, rules: dict[str, RoundRule]) -> Iterator[tuple[str, Row]]:
-    """Rows of statements that have just become precise enough."""
-    for name, rule in rules.items():
-        rule.observe(estimate)
-        if rule.reached:
-            yield name, _statement_row(estimate, name, replication, reached=True)
+    def _estimate(self, planner: ShellPlanner) -> Estimate:
+        return planner.seen.result(self.campaign.stop.confidence)
 
 
 def asking(campaign: Campaign, statement: str) -> Campaign:

@@ -20,7 +20,7 @@ import pyarrow.parquet as pq
 
 from harness.arrays import BoolArray, FloatArray, IntArray, RecordArray
 from harness.campaign.models import AutomatedVehicle, BuiltInParameters, Reflexes
-from harness.compiled import cache_root, source_hash
+from harness.compiled import WORLD_SOURCES, cache_root, source_hash
 from harness.environment.driving import Environment
 from harness.errors import CampaignError
 from harness.pool.aimed_paths import PILOT_PATHS, Enumerator
@@ -202,7 +202,7 @@ def joined(parts: Sequence[SuperPopulation]) -> SuperPopulation:
 def population_key(environment: Environment, *content_of: object) -> str:
     """Hash of all that a population depends on: plain content, an environment, and code."""
     numbers = {name: environment.numbers[name].item() for name in environment.numbers.dtype.names or ()}
-    content = [_FORMAT, source_hash(), numbers, *content_of]
+    content = [_FORMAT, source_hash(WORLD_SOURCES), numbers, *content_of]
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:24]
 
 

@@ -16,6 +16,7 @@ import numpy as np
 
 from harness.arrays import BoolArray, IntArray
 from harness.campaign.models import Campaign
+from harness.compiled import source_hash
 from harness.controllers.loading import build_host, require_controller
 from harness.episode.cells import PrescribedTraffic
 from harness.episode.loop import EpisodeLoop, Keep, Policy
@@ -44,12 +45,14 @@ def vehicle_bit(resolved: Resolved) -> int:
     return int(resolved.library.drivers.size)
 
 
+_SOURCES = ("studies/walked_population.py", "pool/shadow_paths.py", "pool/vehicle_pool.py", "controllers/hosts.py")
+"""Files beside those of the world that decide what a vehicle meets, and is told."""
 Choose = Callable[[int, int], ShadowPaths]
 """Chooses paths from a seed, so many of them; all vehicles of an experiment walk the same."""
 
 
 def chooser(campaign: Campaign, progress: Progress, candidates: int = CANDIDATES) -> Choose:
-    """Paths for vehicles in the traffic of a campaign, each time the same, out of so many or as many as are asked for."""
+    """Chooses paths in the traffic of a campaign, out of so many, or of as many as are asked for."""
     resolved = resolve(campaign)
 
     @cache
@@ -71,9 +74,9 @@ def walk_paths(
     HarnessError
         The vehicle failed, or did something else in a test than in its shadow run.
     """
-    sha256 = require_controller(campaign)
+    code = require_controller(campaign), source_hash(_SOURCES)
     resolved = resolve(campaign)
-    asked = resolved.library.drivers.tolist(), campaign.av.identity(), sha256, campaign.seed, seed, n_paths
+    asked = resolved.library.drivers.tolist(), campaign.av.identity(), *code, campaign.seed, seed, n_paths
 
     def walked() -> SuperPopulation:
         paths = choose(seed, n_paths)
