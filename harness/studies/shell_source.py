@@ -180,9 +180,9 @@ class Division:
         two do so independently.
         """
         mass = self._population.mass
-        both = np.divide(a * b, mass, out=np.zeros_like(mass), where=mass > 0.0)
-        masses = (self.by_cell(both), self.by_cell(a - both), self.by_cell(b - both))
-        return OvertakingPairs(self.cells, masses)
+        both = a * np.divide(b, mass, out=np.zeros_like(mass), where=mass > 0.0)
+        only_a, only_b = (np.maximum(one - both, 0.0) for one in (a, b))
+        return OvertakingPairs(self.cells, (self.by_cell(both), self.by_cell(only_a), self.by_cell(only_b)))
 
     def as_adversary(self, made: Adversary, crashing: FloatArray) -> FloatArray:
         """The mass of crashes (m,) of an adversary made of a vehicle; see `harness.studies.experiment.Adversary`."""

@@ -174,3 +174,44 @@ def test_failed_crashes_are_counted_as_failed(drivers, population):
     bad = block.crash | block.failed
     assert block.failed[bad].mean() == pytest.approx(0.5, abs=4.5 * 0.5 / np.sqrt(bad.sum()))
     assert np.all(block.cell_mass[bad].sum(1) > 0.0)
+
+
+def test_cells_divide_strata_by_what_references_do():
+    """Pools with references: rates, moments and cells of the design are those of the drawn paths, test by test."""
+    library = load_library("ladder-2")
+    drivers = Drivers.of(library, {"own": AVS["own"]})
+    population = enumerated(drivers)
+    crashing = drivers.vehicles["own"].crash_mass(population)
+    source = Division(library, population, [crashing], 512, limit_mps2=2.0).of_vehicle(crashing)
+    drawn = source.draw(np.random.default_rng(4))
+    design = drawn.design
+    np.testing.assert_allclose(drawn.mass.mean(0), design.cell_p, rtol=1e-12)
+    crash_too = (np.array(design.cell_references) & 1).astype(bool)
+    of_reference = drawn.mass[:, crash_too].sum(1)
+    assert design.reference_rate[0] == pytest.approx(of_reference.mean(), rel=1e-9)
+    assert design.reference_square[0] == pytest.approx((of_reference**2).mean(), rel=1e-9)
+    rng, added = np.random.default_rng(5), np.full(design.p.size, 20_000)
+    block = campaign_block(drawn, added, 0, rng)
+    np.testing.assert_array_equal(np.bincount(block.stratum), added)
+    tests, crashes = (np.bincount(block.cell[rows], minlength=crash_too.size) for rows in (..., block.crash))
+    expected = 20_000 * design.cell_p / design.p[list(design.cell_stratum)]
+    assert np.all(np.abs(tests - expected) < 5.0 * np.sqrt(expected + 1.0))
+    mass = drawn.mass.sum(0)
+    share = np.divide(drawn.crash_mass.sum(0), mass, out=np.zeros_like(mass), where=mass > 0.0)
+    assert np.all(np.abs(crashes - tests * share) < 5.0 * np.sqrt(tests * share * (1.0 - share) + 1.0))
+
+
+def test_pairs_are_divided_into_both_only_a_and_only_b(drivers, population):
+    a, b = (drivers.vehicles[name].crash_mass(population) for name in ("own", "equal"))
+    division = Division(LIBRARY, population, [a, b], 256, limit_mps2=2.0)
+    both, only_a, only_b = division.of_pair(a, b).crashing
+    np.testing.assert_allclose(both + only_a, division.by_cell(a), atol=1e-22)
+    np.testing.assert_allclose(both + only_b, division.by_cell(b), atol=1e-22)
+    assert only_b.sum() > 0.05 * b.sum()  # brakes less hard
+    assert only_a.sum() == pytest.approx(0.0, abs=1e-20)
+    same = division.of_pair(a, a).crashing
+    assert (same[1].sum(), same[2].sum()) == (0.0, 0.0)
+    pools = division.of_pair(a, b).draw(np.random.default_rng(2))
+    assert [pool.design is pools[0].design for pool in pools] == [True] * 3
+    mass = sum(pool.crash_mass for pool in pools)
+    assert np.all(mass <= pools[0].mass * (1.0 + 1e-9))
