@@ -84,7 +84,7 @@ def pool(campaign_file: Path, *, out: Path | None, overrides: Sequence[str], as_
     + examples(
         "harness validate scenarios/validate/shells_panel.yaml --out runs/shells_panel",
         "harness validate scenarios/validate/shells_panel.yaml --out runs/at_99 --set campaign.stop.confidence=0.99",
-        "harness validate scenarios/validate/shells_acting.yaml --out runs/shells_acting   # vehicles that walk paths first",
+        "harness validate scenarios/validate/shells_acting.yaml --out runs/shells_acting   # vehicles walk paths first",
         "harness validate scenarios/validate/shells_pairs.yaml --out runs/shells_pairs     # what compare would find",
     ),
 )

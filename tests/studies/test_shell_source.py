@@ -158,7 +158,7 @@ def test_an_adversary_on_the_heaviest_paths_has_a_share_of_the_crashes_on_few_of
 def test_an_adversary_with_a_hole_crashes_outside_in_that_share(drivers, population):
     source, made = adversary_of(drivers, population, hole=0.01)
     outside, mass = slice(source.cells.template.boundary + 1, -1), source.cells.mass
-    assert np.all(made.crashing[:, outside] >= 0.01 * mass[:, outside])
+    assert np.all(made.crashing[:, outside] >= (0.01 - 1e-12) * mass[:, outside])
     assert made.crash_rate == pytest.approx(source.crash_rate + 0.01 * mass[:, outside].sum(1).mean(), rel=0.05)
     before = source.cells.crashes_outside(source.crashing)
     after = made.cells.crashes_outside(made.crashing)
