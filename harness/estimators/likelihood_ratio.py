@@ -36,6 +36,8 @@ MARGIN = 0.395
 """Two-sided threshold for few crashes, ln(1/tail) less this: 2.60, 3.29 and 4.90 at 0.90, 0.95 and 0.99 (measured)."""
 FEW_TESTS = 9
 """Below so many tests in all, the one-sided threshold is ln(2/tail) instead of ln(1/tail) (measured)."""
+PORTIONS = 6
+"""Of further tests."""
 _GRID = 64
 _MOST_DOUBLINGS = 80
 _MOST_STEPS = 200
@@ -104,15 +106,27 @@ def contrast_limit(weights: FloatArray, counts: Counts, level: Level, side: floa
     return float(_outermost(_Seen.of(weights, counts, side, variance), level)[0])
 
 
-def contrast_gains(weights: FloatArray, counts: FloatArray, level: Level, side: float) -> FloatArray:
-    """How much one more test of each stratum moves a limit inwards, shape (S,); infinite where there is none yet.
+def spread(weights: FloatArray, lower: Counts, upper: Counts, level: Level, size: int, most: IntArray) -> IntArray:
+    """Divide further tests among strata, shape (S,), so that they narrow the interval of Σ w_sj θ_sj most.
 
-    With the shares as they are it is KL(c_s ‖ θ_s)/ν, by the envelope theorem. Parameters as in `contrast_limit`.
+    Portions are given one after the other. With the shares as they are one more test of a stratum moves a limit by
+    KL(c_s ‖ θ_s)/ν, by the envelope theorem; a stratum without a test comes first.
+
+    Parameters
+    ----------
+    weights : ndarray, shape (S, J)
+    lower, upper : ndarray, shape (S, J)
+        Counts of outcomes that either limit is from: they differ by what failed tests may have been.
+    level : Level
+    size : int
+        How many tests.
+    most : ndarray of int64, shape (S,)
+        How many there are of each stratum.
     """
-    seen = _Seen.of(weights, counts, side)
-    gains = np.full(seen.tests.size, math.inf)
-    _set_gains(gains, seen, _outermost(seen, level)[1])
-    return gains
+    given = np.zeros_like(most)
+    below, above = _Seen.of(weights, lower, -1.0), _Seen.of(weights, upper, 1.0)
+    _give(below, above, level, min(size, int(most.sum())), -(-size // PORTIONS), most, given)
+    return given
 
 
 def ratio_limits(
@@ -219,13 +233,33 @@ def _outermost(seen: _Seen, level: Level) -> tuple[float, float]:
 
 
 @compiled
-def _set_gains(gains: FloatArray, seen: _Seen, nu: float) -> None:
-    """See `contrast_gains`; only those of strata with tests are set."""
-    for s in range(seen.tests.size):
-        if seen.tests[s] > 0.0:
-            part = slice(s, s + 1)
-            found = _profile(seen.side * nu, seen.weights[part], seen.tests[part], seen.share[part], 0.0, seen.room)
-            gains[s] = found[1] / (seen.tests[s] * nu) if nu > 0.0 else 0.0
+def _give(below: _Seen, above: _Seen, level: Level, size: int, portion: int, most: IntArray, given: IntArray) -> None:
+    """See `spread`; ``given`` and the numbers of tests, whose shares stay, grow."""
+    while size > 0:
+        nu_below, nu_above = _outermost(below, level)[1], _outermost(above, level)[1]
+        best, largest = 0, -1.0
+        for s in range(most.size):
+            if given[s] < most[s]:
+                gain = _gain(below, s, nu_below) + _gain(above, s, nu_above)
+                if gain > largest:
+                    best, largest = s, gain
+        more = min(portion, size, most[best] - given[best])
+        given[best] += more
+        below.tests[best] += more
+        above.tests[best] += more
+        size -= more
+
+
+@compiled
+def _gain(seen: _Seen, s: int, nu: float) -> float:
+    """By how much one more test of a stratum moves the limit that has a multiplier."""
+    if seen.tests[s] == 0.0:
+        return math.inf
+    if nu == 0.0:
+        return 0.0
+    part = slice(s, s + 1)
+    _, cost, _ = _profile(seen.side * nu, seen.weights[part], seen.tests[part], seen.share[part], 0.0, seen.room)
+    return float(cost / (seen.tests[s] * nu))
 
 
 @compiled

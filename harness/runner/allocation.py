@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 
-from harness.arrays import BoolArray, FloatArray, IntArray
+from harness.arrays import BoolArray, IntArray
 from harness.estimators.intervals import clopper_pearson
-from harness.estimators.likelihood_ratio import Level, contrast_gains
+from harness.estimators.likelihood_ratio import Level, spread
 from harness.estimators.stratified import Tally, combined
 from harness.strata import ASSUMPTION_FREE, ShellDesign
 
@@ -29,8 +28,6 @@ LEAST_FIRST_TESTS, MOST_FIRST_TESTS = 3, 12
 MOST_INNER_TESTS = 8
 """Testing turns to what lies outside after this many times the first tests, known or not."""
 SMALLEST_ROUND = 8
-PORTIONS = 6
-"""Of a round, each given to where it narrows the interval most."""
 USED_UP_SHARE = 0.95
 """Share of the squared widths that must lie in exhausted strata for the allocation to end."""
 
@@ -74,7 +71,7 @@ class Allocation:
         budget: int,
         *,
         inner_rhw: Callable[[int], float] | None = None,
-        gains: Callable[[IntArray], FloatArray] | None = None,
+        given_by: Callable[[int, IntArray], IntArray] | None = None,
     ) -> IntArray:
         """Tests to add per stratum, at most ``budget``; all 0 when no stratum or no budget is left.
 
@@ -86,9 +83,8 @@ class Allocation:
         budget : int
         inner_rhw : callable, optional
             Gives the relative half-width from so many first strata; by default that of a crash rate.
-        gains : callable, optional
-            Says by how much one more test of each stratum narrows an interval after some that are given (S,) each; by
-            default that of a crash rate.
+        given_by : callable, optional
+            Gives so many tests to strata with so much room (S,) each; by default to where a crash rate is narrowed.
         """
         tests = tally.tests
         if self._used_up(tally):
@@ -99,7 +95,7 @@ class Allocation:
         if not wanted.any() and active.any():
             size = max(SMALLEST_ROUND, int(np.ceil(tests[begun].sum() * (GROWTH - 1.0))))
             room = np.where(active, self.available - tests, 0)
-            wanted = _spread(min(size, budget), room, gains or partial(self._gains, tally))
+            wanted = (given_by or partial(self._spread, tally))(min(size, budget), room)
         return _cut(np.minimum(wanted, self.available - tests), budget)
 
     def second_phase(self, first: Tally, available: IntArray, budget: int, rhw: float, confidence: float) -> IntArray:
@@ -152,21 +148,13 @@ class Allocation:
     def _inner_rhw(self, tally: Tally, n: int) -> float:
         return combined(self.design.p[:n], tally.part(slice(0, n)), self.design.n_paths, _LEVEL).rhw
 
-    def _gains(self, tally: Tally, given: IntArray) -> FloatArray:
+    def _spread(self, tally: Tally, size: int, most: IntArray) -> IntArray:
         weights = np.column_stack([self.design.p, np.zeros_like(self.design.p)])
-        grown, total = (1.0 + given / tally.at_least_one)[:, None], np.zeros(given.size)
-        for side, crashes in ((-1.0, tally.crashes), (1.0, tally.crashes + tally.failed)):
-            total += contrast_gains(weights, grown * np.column_stack([crashes, tally.tests - crashes]), _LEVEL, side)
-        return total
-
-
-def _spread(size: int, room: IntArray, gains: Callable[[IntArray], FloatArray]) -> IntArray:
-    """Give portions, one after the other, to where a test narrows the interval most."""
-    given, portion = np.zeros_like(room), -(-size // PORTIONS)
-    while (left := min(size, int(room.sum())) - int(given.sum())) > 0:
-        best = int(np.where(given < room, gains(given), -math.inf).argmax())
-        given[best] += min(portion, left, int(room[best] - given[best]))
-    return given
+        lower, upper = (
+            np.column_stack([crashes, tally.tests - crashes])
+            for crashes in (tally.crashes, tally.crashes + tally.failed)
+        )
+        return spread(weights, lower, upper, _LEVEL, size, most)
 
 
 def _cut(wanted: IntArray, budget: int) -> IntArray:

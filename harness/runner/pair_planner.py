@@ -7,6 +7,7 @@ where the likelihood ratio says that one more narrows the interval of the differ
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import numpy as np
 
@@ -114,7 +115,7 @@ class PairPlanner:
             _differing(pairs),
             self._budget - int(tests.sum()),
             inner_rhw=lambda n: pairs.inside(n).rhw(self._level),
-            gains=lambda given: pairs.gains(given, self._level),
+            given_by=partial(pairs.spread, self._level),
         )
         self.rule.of_first_tests = bool(np.any((tests < self._first_tests)[added > 0]))
         return added
