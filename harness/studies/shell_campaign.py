@@ -20,6 +20,7 @@ from harness.campaign.models import Campaign
 from harness.estimators.block import Block
 from harness.estimators.estimate import Estimate
 from harness.estimators.likelihood_ratio import Level
+from harness.estimators.shells import Shells
 from harness.runner.planner import RoundRule, ShellPlanner
 from harness.strata import ShellDesign
 from harness.studies.experiment import Fault
@@ -60,12 +61,14 @@ class DrawnPool:
 
     def tests_of_cells(self, added: IntArray, rng: np.random.Generator) -> IntArray:
         """How many of so many tests of each stratum (S,) are of each cell, shape (C,)."""
-        within = (self.design.joined * self.mass.sum(0)[:, None]).T
-        if within.shape[0] == within.shape[1]:
-            return added
-        total = np.maximum(within.sum(1, keepdims=True), np.finfo(np.float64).tiny)
-        found: IntArray = rng.multinomial(added, within / total).sum(0)
+        found: IntArray = added if added.size == self.mass.shape[1] else rng.multinomial(added, self._cells).sum(0)
         return found
+
+    @cached_property
+    def _cells(self) -> FloatArray:
+        """Probability of each cell given the stratum, shape (S, C)."""
+        within = (self.design.joined * self.mass.sum(0)[:, None]).T
+        return np.asarray(within / np.maximum(within.sum(1, keepdims=True), np.finfo(np.float64).tiny))
 
     def crashed_paths(self, cell: int, n: int, rng: np.random.Generator) -> FloatArray:
         """Mass (n, C) of the paths of n crashed tests of a cell."""
@@ -108,17 +111,30 @@ class ShellCampaign:
             enough = planner.add(campaign_block(drawn, added, int(planner.tally.tests.sum()), rng))
             for name, rule in rules.items():
                 if name not in known and planner.seen.tally.tests.size and rule.observe(planner.seen) and rule.reached:
-                    known[name] = _statement_row(self._estimate(planner), name, replication, reached=True)
-        estimate = self._estimate(planner)
+                    known[name] = self._statement_row(planner.seen, name, replication, reached=True)
+        estimate = planner.seen.result(self.campaign.stop.confidence)
         outside = int(estimate.details["statements"][0]["n_crashes_outside"])
         yield estimate_row(FREE, replication, estimate, reached=planner.rule.reached, outside=outside)
         for name in rules:
-            yield known.get(name) or _statement_row(estimate, name, replication, reached=False)
+            yield known.get(name) or self._statement_row(planner.seen, name, replication, reached=False)
         for reference in design.references:
             yield from _reference_rows(estimate, reference.name, replication, reached=planner.rule.reached)
 
-    def _estimate(self, planner: ShellPlanner) -> Estimate:
-        return planner.seen.result(self.campaign.stop.confidence)
+    def _statement_row(self, seen: Shells, name: str, replication: int, *, reached: bool) -> Row:
+        found = seen.within(name, self.campaign.stop.confidence)
+        return Row(
+            result_of(name),
+            replication,
+            n_tests=found.n_episodes,
+            n_crashes=found.n_crashes,
+            crash_rate=found.crash_rate,
+            std_error=seen.std_error(found.n_shells),
+            ci_low=found.ci_low,
+            ci_high=found.ci_high,
+            reached=reached,
+            n_crashes_outside=found.n_crashes_outside,
+            refused=math.isinf(found.rhw_from_pool),
+        )
 
 
 def asking(campaign: Campaign, statement: str) -> Campaign:
@@ -144,7 +160,8 @@ def campaign_block(drawn: DrawnPool, added: IntArray, first: int, rng: np.random
     none, bad = np.zeros(n, np.bool_), rank < crashes[cell]
     failed = bad & (rank < rng.binomial(crashes, drawn.failing)[cell]) if drawn.failing else none
     mass = np.zeros((n, tests.size))
-    mass[bad] = np.concatenate([drawn.crashed_paths(s, k, rng) for s, k in enumerate(crashes.tolist())])
+    for c in np.flatnonzero(crashes).tolist():
+        mass[bad & (cell == c)] = drawn.crashed_paths(c, int(crashes[c]), rng)
     return Block(
         first_episode=first,
         method="shells",
@@ -160,24 +177,6 @@ def campaign_block(drawn: DrawnPool, added: IntArray, first: int, rng: np.random
         cell=cell,
         cell_mass=mass,
         shells=drawn.design,
-    )
-
-
-def _statement_row(estimate: Estimate, name: str, replication: int, *, reached: bool) -> Row:
-    found = next(each for each in estimate.details["statements"] if each["name"] == name)
-    shells = [shell for shell in estimate.details["shells"][: found["n_shells"]] if shell["n_episodes"]]
-    variance = sum(
-        shell["p"] ** 2 * shell["crash_share"] * (1.0 - shell["crash_share"]) / shell["n_episodes"] for shell in shells
-    )
-    reported = {name: found[name] for name in ("n_crashes", "crash_rate", "ci_low", "ci_high", "n_crashes_outside")}
-    return Row(
-        result_of(name),
-        replication,
-        n_tests=found["n_episodes"],
-        std_error=float(np.sqrt(variance)),
-        reached=reached,
-        refused=bool(np.isinf(found["rhw_from_pool"])),
-        **reported,
     )
 
 
