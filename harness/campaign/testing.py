@@ -37,6 +37,13 @@ class EnvironmentSettings(Section):
     acceleration_hold_s: StepTime = Field(
         1.0, ge=0.1, le=2.0, description="how long a drawn acceleration is held, in whole 0.1 s steps; 1.0 or 0.1"
     )
+    cut_in_lead_s: StepTime | None = Field(
+        None,
+        ge=0.0,
+        le=10.0,
+        description="how long before overlap every cut-in shows itself, in place of the lateral motion that the "
+        "parameters describe",
+    )
 
 
 class StatementSettings(Section):

@@ -55,7 +55,9 @@ class Aim:
 def take_aim(environment: Environment, library: Library, settings: PoolSettings, progress: Progress) -> Aim:
     """Find out by a pilot run of naturalistic paths where surrogates crash."""
     names = list(library.surrogates)
-    pilot = Enumerator(environment, library.drivers, names.index(library.envelope), settings.seed ^ POOL_SEED)
+    pilot = Enumerator(
+        environment, library.drivers_in(environment), names.index(library.envelope), settings.seed ^ POOL_SEED
+    )
     progress.stage("pool: pilot", PILOT_PATHS)
     rates = pilot.run(0, PILOT_PATHS, progress).rates(len(names))
     aim = Aim(pilot, rates, _careful(rates, names.index(library.boundary)))
@@ -131,7 +133,14 @@ def pool_of(
     asked = np.concatenate([order, n_surrogates + np.arange(n_references)])
     crashes = ((paths.crashes[path, step][:, None] >> asked[None, :]) & 1).astype(np.bool_)
     sample = CutIns(
-        PILOT_PATHS + path, step, cell[path, step], paths.state[path], *pairs, crashes, by_path[path].astype(np.float32)
+        PILOT_PATHS + path,
+        step,
+        cell[path, step],
+        paths.state[path],
+        *pairs,
+        crashes,
+        by_path[path].astype(np.float32),
+        lead=enumerator.leads(paths.index[path], step),
     )
     return Pool(
         key=key,

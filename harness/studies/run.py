@@ -95,7 +95,7 @@ def _chains(experiment: Experiment) -> Iterator[tuple[Subject, Repeated]]:
 def _vehicles(experiment: Experiment, progress: Progress) -> Iterator[tuple[Subject, Repeated]]:
     campaign, size, seed = experiment.campaign, experiment.super_population, experiment.seed
     environment, library = load_environment(campaign.environment), load_library(campaign.pool.library)
-    drivers, pools = Drivers.of(library, experiment.avs), None
+    drivers, pools = Drivers.of(library, experiment.avs, see_onset=environment.lateral.present), None
     if campaign.testing.method == "shells":
         pools = enumerate_paths(environment, drivers, seed, size.paths, progress)
     known = truths(environment, drivers, seed + 1, size.reference_paths, progress)

@@ -24,6 +24,7 @@ from harness.compiled import cache_root, source_hash
 from harness.environment.driving import Environment
 from harness.errors import CampaignError
 from harness.pool.aimed_paths import PILOT_PATHS, Enumerator
+from harness.pool.cut_ins import environment_hash
 from harness.pool.library import Library
 from harness.pool.shells import acceleration_limit
 from harness.progress import Progress
@@ -101,8 +102,10 @@ class Drivers:
     vehicles: dict[str, Mixed]
 
     @classmethod
-    def of(cls, library: Library, avs: Mapping[str, AutomatedVehicle]) -> Drivers:
+    def of(cls, library: Library, avs: Mapping[str, AutomatedVehicle], *, see_onset: bool = False) -> Drivers:
         """The library's, in the order of its file, and then those of vehicles with built-in models.
+
+        ``see_onset`` as in `harness.vehicles.models.driver_records`.
 
         The envelope is the library's, unless a vehicle accelerates harder.
         """
@@ -124,7 +127,7 @@ class Drivers:
             )
         enclosed = all(acceleration_limit(av) <= library.envelope_mps2 for av in avs.values())
         envelope = list(library.surrogates).index(library.envelope) if enclosed else NO_ENVELOPE
-        return cls(driver_records(parameters, reactions), envelope, vehicles)
+        return cls(driver_records(parameters, reactions, see_onset=see_onset), envelope, vehicles)
 
     def only(self, names: set[str]) -> Drivers:
         """The envelope and the drivers of some vehicles."""
@@ -174,8 +177,7 @@ def _compressed(aimed: Enumerator, n_paths: int, progress: Progress) -> SuperPop
 
 
 def _key(environment: Environment, drivers: RecordArray, envelope: int, seed: int, n_paths: int) -> str:
-    numbers = {name: environment.numbers[name].item() for name in environment.numbers.dtype.names or ()}
-    content = [_FORMAT, source_hash(), numbers, drivers.tolist(), envelope, seed, n_paths]
+    content = [_FORMAT, source_hash(), environment_hash(environment), drivers.tolist(), envelope, seed, n_paths]
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:24]
 
 
