@@ -76,7 +76,8 @@ def _careful(rates: FloatArray, boundary: int) -> BoolArray:
     Those that are no more careless than the boundary, and crash in the traffic that it crashes in.
     """
     mean = rates.mean(0)
-    relvar = rates.var(0) / np.maximum(mean, np.finfo(np.float64).tiny) ** 2
+    seen = mean > 0.0  # one that no path has met yet is met by few
+    relvar = np.where(seen, rates.var(0) / np.where(seen, mean, 1.0) ** 2, np.inf)
     careful: BoolArray = (mean <= mean[boundary]) & (relvar <= FAR_OFF * relvar[boundary])
     return careful
 

@@ -7,11 +7,12 @@ import json
 import numpy as np
 import pytest
 
-from harness import check_av, estimate, replay
+from harness import estimate, replay
 from harness.errors import CampaignError
 from harness.pool.refined_ladder import refine_ladder
 from harness.report import write_report
 from harness.runner import plan_campaign
+from harness.runner.av_check import check_av
 from tests.pool.conftest import SMALL_POOL
 from tests.pool.test_vehicle_pool import ACTING
 from tests.runner.stored_runs import manifest, stored_table, unlike_columns
