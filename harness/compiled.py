@@ -20,7 +20,7 @@ import platformdirs
 _Function = TypeVar("_Function", bound=Callable[..., object])
 
 
-KERNEL_SOURCES = (
+WORLD_SOURCES = (
     "arrays.py",
     "compiled.py",
     "maneuvers.py",
@@ -33,21 +33,22 @@ KERNEL_SOURCES = (
     "vehicles/*.py",
     "controllers/protocol.py",
     "criticality/*.py",
-    "estimators/likelihood_ratio.py",
     "importance/*.py",
     "episode/*.py",
     "pool/enumeration.py",
     "pool/replay.py",
     "twin.py",
 )
+"""All files that decide what happens in a test; pools and tables are made again when one changes."""
+KERNEL_SOURCES = (*WORLD_SOURCES, "estimators/likelihood_ratio.py")
 """All files that compiled code may come from, or take constants from (a test holds this against the imports)."""
 
 
-def source_hash() -> str:
-    """Hash of all sources that end in machine code (16 hex digits)."""
+def source_hash(patterns: tuple[str, ...] = KERNEL_SOURCES) -> str:
+    """Hash of sources (16 hex digits)."""
     digest = hashlib.sha256()
     root = Path(__file__).parent
-    for path in sorted(path for pattern in KERNEL_SOURCES for path in root.glob(pattern)):
+    for path in sorted(path for pattern in patterns for path in root.glob(pattern)):
         digest.update(path.relative_to(root).as_posix().encode())
         digest.update(path.read_bytes())
     return digest.hexdigest()[:16]

@@ -68,20 +68,24 @@ def pool(campaign_file: Path, *, out: Path | None, overrides: Sequence[str], as_
 @click.command(
     short_help="Repeat a campaign thousands of times: what are its intervals worth?",
     epilog=examples(
-        "truth        the crash rate that all replications should find",
-        "bias         mean of the estimates relative to the truth, ± its standard error",
+        "truth        crash rate that all replications should find, or ratio, share or difference",
+        "bias         mean of the estimates relative to the truth, ± its standard error; of a difference",
+        "             relative to the larger of the two rates, of a share in percentage points",
         "relvar true  mean squared error of the estimates, over the square of the truth",
         "claimed      the same, as the campaigns themselves estimate it",
         "coverage     share of the intervals that hold the truth, with its 95 % interval",
         "p (Holm)     of so low a coverage if the intervals were right, for as many lines",
         "tests        that a campaign needed: median, 5 % and 95 % quantile",
         "alarm        share of replications with a crash outside the library's boundary",
+        "refused      share without an interval, as crashes lie on too few paths; counted as covered",
         heading="Columns:",
     )
     + "\n\n"
     + examples(
         "harness validate scenarios/validate/shells_panel.yaml --out runs/shells_panel",
         "harness validate scenarios/validate/shells_panel.yaml --out runs/at_99 --set campaign.stop.confidence=0.99",
+        "harness validate scenarios/validate/shells_acting.yaml --out runs/shells_acting   # vehicles walk paths first",
+        "harness validate scenarios/validate/shells_pairs.yaml --out runs/shells_pairs     # what compare would find",
     ),
 )
 @click.argument("experiment_file", metavar="EXPERIMENT", type=CAMPAIGN)
@@ -107,7 +111,11 @@ def validate(
     quiet: bool,
     as_json: bool,
 ) -> None:
-    """Repeat the campaign of EXPERIMENT for each of its vehicles or chains, and judge its intervals by that.
+    """Repeat the campaign of EXPERIMENT for each of its vehicles, pairs or chains, and judge its intervals by that.
+
+    Vehicles may be built-in models or, under shells, controllers that act before the cut-in: these walk all paths that
+    pools are drawn from once, which takes minutes and is kept. Under shells the ratio to each reference driver of the
+    library, and the share of crashes that it would have avoided, are judged as well.
 
     Printed is a line per vehicle and result, with the columns below. The folder receives results.json,
     replications.parquet (one row each) and coverage.png.

@@ -36,7 +36,10 @@ def episode_random(seed: int, episode: int) -> np.random.Generator:
 
 
 class EpisodeRandom(Sequence[np.random.Generator]):
-    """`episode_random` of several episodes, made when they are asked for: most controllers want none."""
+    """`episode_random` of several episodes, made when they are asked for: most controllers want none.
+
+    Each place has a generator of its own: tests of one shadow run, which are told the same index, may begin together.
+    """
 
     def __init__(self, seed: int, episodes: list[int]) -> None:
         self._seed, self._episodes = seed, episodes
@@ -48,10 +51,10 @@ class EpisodeRandom(Sequence[np.random.Generator]):
     def __getitem__(self, i: Any) -> Any:
         if isinstance(i, slice):
             return [self[j] for j in range(len(self))[i]]
-        episode = self._episodes[i]
-        if episode not in self._made:
-            self._made[episode] = episode_random(self._seed, episode)
-        return self._made[episode]
+        place = range(len(self))[i]
+        if place not in self._made:
+            self._made[place] = episode_random(self._seed, self._episodes[place])
+        return self._made[place]
 
 
 class VehicleHost:

@@ -21,7 +21,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -37,6 +36,8 @@ MARGIN = 0.395
 """Two-sided threshold for few crashes, ln(1/tail) less this: 2.60, 3.29 and 4.90 at 0.90, 0.95 and 0.99 (measured)."""
 FEW_TESTS = 9
 """Below so many tests in all, the one-sided threshold is ln(2/tail) instead of ln(1/tail) (measured)."""
+PORTIONS = 6
+"""Of further tests."""
 _GRID = 64
 _MOST_DOUBLINGS = 80
 _MOST_STEPS = 200
@@ -68,14 +69,6 @@ class Level(NamedTuple):
         """For an upper bound from n tests in all."""
         tail = 1.0 - confidence
         return cls(math.log((2.0 if n < FEW_TESTS else 1.0) / tail), -float(ndtri(tail)))
-
-    def at(self, crashes: float) -> float:
-        """Threshold at an effective number of crashes: λ up to 1.25 λ, χ² with a margin from 2 λ on, linear between."""
-        few = self.threshold
-        if crashes <= 1.25 * few:
-            return few
-        many = min(few, self.z**2 / 2.0 * (1.0 + 2.0 / math.sqrt(max(crashes, 2.0 * few))))
-        return few + (many - few) * min((crashes / few - 1.25) / 0.75, 1.0)
 
 
 def likelihood_limit(
@@ -110,61 +103,30 @@ def contrast_limit(weights: FloatArray, counts: Counts, level: Level, side: floa
     variance : float
         Of a further error, normal and independent of the tests, of the sum itself (the pool's).
     """
-    return _limit(weights, counts, level, side, variance)[0]
+    return float(_outermost(_Seen.of(weights, counts, side, variance), level)[0])
 
 
-def contrast_gains(weights: FloatArray, counts: FloatArray, level: Level, side: float) -> FloatArray:
-    """How much one more test of each stratum moves a limit inwards, shape (S,); infinite where there is none yet.
+def spread(weights: FloatArray, lower: Counts, upper: Counts, level: Level, size: int, most: IntArray) -> IntArray:
+    """Divide further tests among strata, shape (S,), so that they narrow the interval of Σ w_sj θ_sj most.
 
-    With the shares as they are it is KL(c_s ‖ θ_s)/ν, by the envelope theorem. Parameters as in `contrast_limit`.
+    Portions are given one after the other. With the shares as they are one more test of a stratum moves a limit by
+    KL(c_s ‖ θ_s)/ν, by the envelope theorem; a stratum without a test comes first.
+
+    Parameters
+    ----------
+    weights : ndarray, shape (S, J)
+    lower, upper : ndarray, shape (S, J)
+        Counts of outcomes that either limit is from: they differ by what failed tests may have been.
+    level : Level
+    size : int
+        How many tests.
+    most : ndarray of int64, shape (S,)
+        How many there are of each stratum.
     """
-    n = counts.sum(1)
-    _, nu = _limit(weights, counts, level, side)
-    gains, room = np.full(n.size, math.inf), np.empty(weights.shape[1])
-    for s in np.flatnonzero(n > 0.0).tolist():
-        rows = slice(s, s + 1)
-        cost = _profile(side * nu, weights[rows], n[rows], counts[rows] / n[s], 0.0, room)[1] if nu else 0.0
-        gains[s] = cost / (n[s] * nu) if nu else 0.0
-    return gains
-
-
-def _limit(
-    weights: FloatArray, counts: Counts, level: Level, side: float, variance: float = 0.0
-) -> tuple[float, float]:
-    """A limit and its multiplier, 0 where no test says anything."""
-    n = counts.sum(1).astype(np.float64)
-    tested = n > 0.0
-    share = counts / np.maximum(n, 1.0)[:, None]
-    steepest = float(np.max(np.ptp(weights[tested], axis=1) / n[tested], initial=0.0))
-    if steepest == 0.0:
-        return side * float((side * np.where(tested[:, None], weights * share, weights)).max(1).sum()), 0.0
-
-    room = np.empty(weights.shape[1])
-
-    def at(nu: float, threshold: float) -> tuple[float, float, float]:
-        kappa = level.z**2 / (2.0 * threshold)
-        return _profile(side * nu, weights, n, share, variance * kappa, room)
-
-    def excess(nu: float) -> float:
-        return at(nu, level.threshold)[1] - level.threshold
-
-    def refused(nu: float) -> float:
-        threshold = level.at(at(nu, level.threshold)[2])
-        return at(nu, threshold)[1] - threshold
-
-    high = 1.0 / steepest
-    for _ in range(_MOST_DOUBLINGS):
-        if excess(high) > 0.0:
-            break
-        high *= 2.0
-    else:
-        return at(high, level.threshold)[0], high  # all shares are at their end: nothing is left to be refused
-    outer = float(brentq(excess, 0.0, high, xtol=1e-12 * high, rtol=1e-12))
-    if refused(outer) > 0.0:  # with many crashes: the outermost accepted multiplier, searched from outside
-        grid = pairwise(np.linspace(outer, 0.0, _GRID).tolist())
-        outer, inner = next(pair for pair in grid if refused(pair[1]) <= 0.0)  # at 0 nothing is refused
-        outer = float(brentq(refused, inner, outer, xtol=1e-12 * high, rtol=1e-12))
-    return at(outer, level.at(at(outer, level.threshold)[2]))[0], outer
+    given = np.zeros_like(most)
+    below, above = _Seen.of(weights, lower, -1.0), _Seen.of(weights, upper, 1.0)
+    _give(below, above, level, min(size, int(most.sum())), -(-size // PORTIONS), most, given)
+    return given
 
 
 def ratio_limits(
@@ -219,6 +181,134 @@ def _crossing(falling: Callable[[float], float], end: float) -> float:
     else:
         return 0.0 if end else math.inf  # beyond the other end
     return math.exp(float(brentq(at, inner, outer, xtol=1e-10)))
+
+
+class _Seen(NamedTuple):
+    """What limits are asked of: ``weights``, ``share`` (S, J), ``tests`` (S,); ``room`` (J,) is for `_profile`."""
+
+    weights: FloatArray
+    tests: FloatArray
+    share: FloatArray
+    side: float
+    variance: float
+    room: FloatArray
+
+    @classmethod
+    def of(cls, weights: FloatArray, counts: Counts, side: float, variance: float = 0.0) -> _Seen:
+        """From counts of outcomes, shape (S, J)."""
+        tests = counts.sum(1).astype(np.float64)
+        share = counts / np.maximum(tests, 1.0)[:, None]
+        return cls(np.ascontiguousarray(weights), tests, share, side, variance, np.empty(weights.shape[1]))
+
+
+@compiled
+def _outermost(seen: _Seen, level: Level) -> tuple[float, float]:
+    """A limit and its multiplier, 0 where no test says anything."""
+    steepest = total = 0.0
+    for s in range(seen.tests.size):
+        low, high = math.inf, -math.inf
+        for j in range(seen.room.size):
+            low, high = min(low, seen.weights[s, j]), max(high, seen.weights[s, j])
+        total += high if seen.side > 0.0 else low
+        if seen.tests[s] > 0.0:
+            steepest = max(steepest, (high - low) / seen.tests[s])
+    if steepest == 0.0:
+        return total, 0.0
+    high = 1.0 / steepest
+    for _ in range(_MOST_DOUBLINGS):
+        if _refusal(seen, level, high, False) > 0.0:
+            break
+        high *= 2.0
+    else:
+        return _at(seen, level, high, level.threshold)[0], high  # shares are at their end: nothing is refused
+    outer = _root(seen, level, 0.0, high, False)
+    if _refusal(seen, level, outer, True) > 0.0:
+        step = outer / (_GRID - 1)  # with many crashes: the outermost accepted multiplier, searched from outside
+        k = _GRID - 2
+        while _refusal(seen, level, k * step, True) > 0.0:  # at 0 nothing is refused
+            k -= 1
+        outer = _root(seen, level, k * step, (k + 1) * step, True)
+    threshold = _threshold(level, _at(seen, level, outer, level.threshold)[2])
+    return _at(seen, level, outer, threshold)[0], outer
+
+
+@compiled
+def _give(below: _Seen, above: _Seen, level: Level, size: int, portion: int, most: IntArray, given: IntArray) -> None:
+    """See `spread`; ``given`` and the numbers of tests, whose shares stay, grow."""
+    while size > 0:
+        nu_below, nu_above = _outermost(below, level)[1], _outermost(above, level)[1]
+        best, largest = 0, -1.0
+        for s in range(most.size):
+            if given[s] < most[s]:
+                gain = _gain(below, s, nu_below) + _gain(above, s, nu_above)
+                if gain > largest:
+                    best, largest = s, gain
+        more = min(portion, size, most[best] - given[best])
+        given[best] += more
+        below.tests[best] += more
+        above.tests[best] += more
+        size -= more
+
+
+@compiled
+def _gain(seen: _Seen, s: int, nu: float) -> float:
+    """By how much one more test of a stratum moves the limit that has a multiplier."""
+    if seen.tests[s] == 0.0:
+        return math.inf
+    if nu == 0.0:
+        return 0.0
+    part = slice(s, s + 1)
+    _, cost, _ = _profile(seen.side * nu, seen.weights[part], seen.tests[part], seen.share[part], 0.0, seen.room)
+    return float(cost / (seen.tests[s] * nu))
+
+
+@compiled
+def _root(seen: _Seen, level: Level, low: float, high: float, by_crashes: bool) -> float:
+    """Where a multiplier begins to be refused: regula falsi, an end that stays counting half (Illinois)."""
+    at_low, at_high = _refusal(seen, level, low, by_crashes), _refusal(seen, level, high, by_crashes)
+    end = 1e-13 * high
+    kept = 0
+    for _ in range(_MOST_STEPS):
+        middle = (low * at_high - high * at_low) / (at_high - at_low)
+        found = _refusal(seen, level, middle, by_crashes)
+        if found > 0.0:
+            high, at_high = middle, found
+            at_low *= 0.5 if kept == -1 else 1.0
+            kept = -1
+        else:
+            low, at_low = middle, found
+            at_high *= 0.5 if kept == 1 else 1.0
+            kept = 1
+        if found == 0.0 or high - low <= end:
+            break
+    return low
+
+
+@compiled
+def _refusal(seen: _Seen, level: Level, nu: float, by_crashes: bool) -> float:
+    """By how much T at a multiplier is above the threshold, that for few crashes or that for their effective number."""
+    _, cost, crashes = _at(seen, level, nu, level.threshold)
+    if not by_crashes:
+        return cost - level.threshold
+    threshold = _threshold(level, crashes)
+    return _at(seen, level, nu, threshold)[1] - threshold
+
+
+@compiled
+def _threshold(level: Level, crashes: float) -> float:
+    """Threshold at an effective number of crashes: λ up to 1.25 λ, χ² with a margin from 2 λ on, linear between."""
+    few = level.threshold
+    if crashes <= 1.25 * few:
+        return few
+    many = min(few, level.z**2 / 2.0 * (1.0 + 2.0 / math.sqrt(max(crashes, 2.0 * few))))
+    return few + (many - few) * min((crashes / few - 1.25) / 0.75, 1.0)
+
+
+@compiled
+def _at(seen: _Seen, level: Level, nu: float, threshold: float) -> tuple[float, float, float]:
+    """See `_profile`; the further error's variance is that which its own interval at the threshold would have."""
+    variance = seen.variance * level.z**2 / (2.0 * threshold)
+    return _profile(seen.side * nu, seen.weights, seen.tests, seen.share, variance, seen.room)
 
 
 @compiled

@@ -19,7 +19,7 @@ import numpy as np
 
 from harness.arrays import BoolArray, FloatArray, IntArray
 from harness.estimators.block import Block
-from harness.estimators.likelihood_ratio import Level, contrast_gains, contrast_limit, ratio_limits
+from harness.estimators.likelihood_ratio import Level, contrast_limit, ratio_limits, spread
 from harness.estimators.stratified import Tally, mean_square
 from harness.strata import ShellDesign
 
@@ -183,16 +183,11 @@ class PairCounts:
         """Crashes of both vehicles."""
         return int(self.ends[:, CRASH].sum() + self.ends[:, :, CRASH].sum())
 
-    def gains(self, given: IntArray, level: Level) -> FloatArray:
-        """How much one more pair of each stratum narrows the difference's interval, after some given ones, (S,)."""
-        weights, grown = self.p[:, None] * (A_CRASHES - B_CRASHES), (1.0 + given / np.maximum(self.tests, 1))[:, None]
-        return sum(
-            (
-                contrast_gains(weights, grown * self.outcomes(failed_a=side > 0.0, failed_b=side < 0.0), level, side)
-                for side in (-1.0, 1.0)
-            ),
-            start=np.zeros(len(given)),
-        )
+    def spread(self, level: Level, size: int, most: IntArray) -> IntArray:
+        """Divide further pairs among strata, (S,), at most so many each, to where they narrow the difference most."""
+        weights = self.p[:, None] * (A_CRASHES - B_CRASHES)
+        lower, upper = self.outcomes(failed_a=False, failed_b=True), self.outcomes(failed_a=True, failed_b=False)
+        return spread(weights, lower, upper, level, size, most)
 
     def verdict(self, margin: float, level: Level) -> Verdict:
         """Whether B's rate is at most 1 + margin times A's: proven, refuted, or open."""

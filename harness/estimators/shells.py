@@ -26,7 +26,7 @@ from harness.estimators.intervals import clopper_pearson
 from harness.estimators.likelihood_ratio import Level, likelihood_limit
 from harness.estimators.reference import Comparison, compared
 from harness.estimators.stratified import Limits, Tally, combined, empty_tally, pool_variance
-from harness.strata import ShellDesign, Statement
+from harness.strata import ShellDesign
 
 MOST_NAMED = 10
 """Tests that are named of those that refute a statement, or show that its reason fails."""
@@ -118,6 +118,7 @@ class Shells:
 
     def __init__(self) -> None:
         self._cells = empty_tally(0)
+        self._tally: Tally | None = None  # of the cells, once it is asked for
         self._paths = CrashPaths()
         self._crashed: dict[int, list[int]] = {}  # stratum → its first few tests that crashed
         self._n_checked = self._n_ahead = 0
@@ -126,7 +127,9 @@ class Shells:
     @property
     def tally(self) -> Tally:
         """Counts by stratum; of no strata before the first block."""
-        return self._cells.joined(self._design.joined) if self._cells.tests.size else self._cells
+        if self._tally is None:
+            self._tally = self._cells.joined(self._design.joined) if self._cells.tests.size else self._cells
+        return self._tally
 
     @classmethod
     def of(cls, design: ShellDesign, tally: Tally) -> Shells:
@@ -149,7 +152,7 @@ class Shells:
         if not self._cells.tests.size:
             self._design = block.shells
             self._cells = empty_tally(block.shells.cell_p.size)
-        tally = self._cells
+        tally, self._tally = self._cells, None
         np.add.at(tally.tests, block.cell, 1)
         for rows, counts, sums in (
             (block.crash, tally.crashes, tally.crash_mass),
@@ -173,12 +176,11 @@ class Shells:
         n = int(tally.tests.sum())
         require_episodes(n)
         cautions = tuple(self._cautions(tally))
-        free, share, y = self._limits(tally, Level.two_sided(confidence)), tally.share, design.p / tally.at_least_one
+        free, y = self._limits(tally, Level.two_sided(confidence)), design.p / tally.at_least_one
         squares = float((tally.crashes * y * y).sum())
-        variance = float((design.p * y * share * (1.0 - share)).sum()) + pool_variance(design.p, tally, design.n_paths)
         return Estimate(
             crash_rate=free.rate,
-            std_error=math.sqrt(variance),
+            std_error=self.std_error(),
             ci_low=free.low,
             ci_high=free.high,
             upper_bound=self._limits(tally, Level.one_sided(confidence, n)).high,
@@ -199,11 +201,22 @@ class Shells:
                     p_cut_in=design.p_cut_in,
                     p_impossible=design.p_impossible,
                     references=() if cautions else compared(design, self._cells, Level.two_sided(confidence)),
-                    statements=tuple(self._within(each, tally, confidence) for each in design.statements),
+                    statements=tuple(self.within(each.name, confidence) for each in design.statements),
                     shells=self._shells(tally, (1.0 - confidence) / 2.0),
                 )
             ),
         )
+
+    def std_error(self, n_strata: int | None = None) -> float:
+        """Of the rate of the first strata, all by default, with the pool's own error."""
+        tally, p = self.tally.part(slice(0, n_strata)), self._design.p[:n_strata]
+        of_tests = p * p * tally.share * (1.0 - tally.share) / tally.at_least_one
+        return math.sqrt(float(of_tests.sum()) + pool_variance(p, tally, self._design.n_paths))
+
+    def limits_of(self, statement: str, confidence: float) -> Limits:
+        """Rate and interval of a statement, or of all strata."""
+        inside = {each.name: each.n_inside for each in self._design.statements}
+        return self._limits(self.tally.part(slice(0, inside.get(statement))), Level.two_sided(confidence))
 
     def _limits(self, tally: Tally, level: Level) -> Limits:
         """Of the first strata, those of a tally; anything is possible where crashes lie on too few paths."""
@@ -227,8 +240,11 @@ class Shells:
             "new folder"
         ]
 
-    def _within(self, given: Statement, tally: Tally, confidence: float) -> Within:
-        design, n = self._design, given.n_inside
+    def within(self, statement: str, confidence: float) -> Within:
+        """One of the design's statements."""
+        design, tally = self._design, self.tally
+        given = next(each for each in design.statements if each.name == statement)
+        n = given.n_inside
         inside, outside = tally.part(slice(0, n)), tally.part(slice(n, None)).failed_as_crashes()
         limits, n_outside = self._limits(inside, Level.two_sided(confidence)), int(outside.tests.sum())
         level, n_failed_outside = Level.one_sided(confidence, n_outside), int(tally.failed[n:].sum())

@@ -66,6 +66,8 @@ class Tally(NamedTuple):
 
     def failed_as_crashes(self, where: BoolArray | None = None) -> Tally:
         """The same tests, had all failed ones crashed; with ``where``, shape (S,) bool, those of some strata alone."""
+        if not self.failed.any():
+            return self
         counted = np.ones(self.tests.size, np.bool_) if where is None else where
         failed, mass = self.failed * counted, self.failed_mass * counted[:, None]
         return Tally(
@@ -120,20 +122,17 @@ def mean_square(scale: FloatArray, crash_mass: FloatArray) -> float:
     E[x_s x_t] does not exceed; so it is at most the least of B_st, B_ts and, with Cauchy and Schwarz, √(B_ss B_tt).
     """
     bound = scale[:, None] * crash_mass
-    own = np.sqrt(np.diag(bound))
-    return float(np.minimum(np.minimum(bound, bound.T), np.outer(own, own)).sum())
+    own = np.sqrt(bound.diagonal())
+    return float(np.minimum(np.minimum(bound, bound.T), own[:, None] * own).sum())
 
 
 def combined(p: FloatArray, tally: Tally, n_paths: int, level: Level) -> Limits:
     """Rate Σ p_s c_s with the two limits of an interval; ``p`` (S,) are known from ``n_paths`` paths of a pool."""
-
-    def limit(found: Tally, side: float) -> tuple[float, float]:
-        variance = pool_variance(p, found, n_paths)
-        return likelihood_limit(p, found.crashes, found.tests, level, side, variance), level.z * math.sqrt(variance)
-
-    low, from_pool = limit(tally, -1.0)
-    high = limit(tally.failed_as_crashes(), 1.0)[0]
+    worst, variance = tally.failed_as_crashes(), pool_variance(p, tally, n_paths)
+    variance_of_worst = variance if worst is tally else pool_variance(p, worst, n_paths)
+    low = likelihood_limit(p, tally.crashes, tally.tests, level, -1.0, variance)
+    high = likelihood_limit(p, worst.crashes, worst.tests, level, 1.0, variance_of_worst)
     least = clopper_pearson(tally.crashes, tally.tests, float(ndtr(-level.z)))[0]
     least = np.divide(least, tally.share, out=np.zeros_like(least), where=tally.crashes > 0)
-    at_least = level.z * math.sqrt(pool_variance(p, tally, n_paths, least))
+    from_pool, at_least = level.z * math.sqrt(variance), level.z * math.sqrt(pool_variance(p, tally, n_paths, least))
     return Limits(float(p @ tally.share), max(low, 0.0), min(high, float(p.sum())), from_pool, at_least)

@@ -20,6 +20,11 @@ FAR_OFF = 10.0
 own, which few paths meet: paths aimed there would be lost for all others."""
 
 
+def onset_steps(step: IntArray, lead: IntArray) -> IntArray:
+    """Steps of the onset of cut-ins in given steps (n,); ``lead`` (n,) is empty where they are the same."""
+    return np.maximum(step - lead, 0) if lead.size else step
+
+
 @dataclass(frozen=True, eq=False)
 class CutIns:
     """A weighted sample of cut-ins, each with the paths of LV and BV before and after it.
@@ -49,7 +54,7 @@ class CutIns:
     @property
     def onset(self) -> IntArray:
         """Step of the onset of each, shape (n,)."""
-        return np.maximum(self.step - self.lead, 0) if self.lead.size else self.step
+        return onset_steps(self.step, self.lead)
 
     @property
     def row(self) -> IntArray:

@@ -114,12 +114,14 @@ def enumerate_recorded(
     environment: Environment,
     drivers: RecordArray,
     envelope: int,
+    stride: int,
+    offset: IntArray,
     path: Trajectory,
     probability: FloatArray,
     unknown: FloatArray,
     crashes: IntArray,
 ) -> None:
-    """Every cut-in of chosen paths, ``indices`` and ``states`` (n,), beside an AV whose motion has been recorded.
+    """Cut-ins of chosen paths, ``indices`` and ``states`` (n,), beside an AV whose motion has been recorded.
 
     Parameters
     ----------
@@ -127,8 +129,8 @@ def enumerate_recorded(
         Steps that are on record; less than the path has where the AV failed.
     x_av, v_av : ndarray, shape (n, steps + 1)
         The AV's positions (m) and speeds (m/s).
-    probability, crashes : ndarray, shape (n, steps)
-        As for `enumerate_cut_ins`, with stride 1. Drivers take over from the AV after the step of the cut-in.
+    stride, offset, probability, crashes
+        As for `enumerate_cut_ins`. Drivers take over from the AV after the step of the cut-in.
     unknown : ndarray, shape (n,)
         Receives the most that the probability of a cut-in after the recorded steps can be, wherever the AV may be then:
         every wish to change lanes is carried out. It means something where the AV has failed.
@@ -144,8 +146,8 @@ def enumerate_recorded(
         weigh_cut_ins(steps, environment, path)
         hazard = 0.0
         for cut in range(steps):
-            if path.hazard[cut] > 0.0:
-                probability[i, cut] = math.exp(-hazard) * -math.expm1(-path.hazard[cut])
+            if path.hazard[cut] > 0.0 and cut % stride == offset[i]:
+                probability[i, cut] = stride * (math.exp(-hazard) * -math.expm1(-path.hazard[cut]))
                 if drivers.size > 0:
                     crashes[i, cut] = who_crashes_after(cut, seed, indices[i], drivers, envelope, environment, path)
             hazard += path.hazard[cut]

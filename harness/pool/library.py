@@ -105,6 +105,11 @@ class Library(Section):
         return library_records([*self.surrogates.values(), *self.references.values()], environment)
 
     @property
+    def n_drivers(self) -> int:
+        """Number of surrogates and references."""
+        return len(self.surrogates) + len(self.references)
+
+    @property
     def delays_after_cut_in_s(self) -> dict[str, float]:
         """How long after a dangerous cut-in each reference driver begins to brake (s), by name."""
         return {
@@ -194,7 +199,7 @@ class Library(Section):
 
     @model_validator(mode="after")
     def _few_enough(self) -> Self:
-        if (n := len(self.surrogates) + len(self.references)) > MOST_SURROGATES:
+        if (n := self.n_drivers) > MOST_SURROGATES:
             raise broken_rule(
                 "surrogates",
                 found=f"{n} of them, with the references",

@@ -88,22 +88,27 @@ def traffic_without_cut_in(
 
 
 def choose_paths(
-    environment: Environment, library: Library, settings: PoolSettings, key: str, progress: Progress | None = None
+    environment: Environment,
+    library: Library,
+    settings: PoolSettings,
+    key: str,
+    progress: Progress | None = None,
+    candidates: int = CANDIDATES,
 ) -> ShadowPaths:
-    """Walk the candidates, and draw ``settings.shadow_paths`` of them."""
+    """Walk so many candidates, and draw ``settings.shadow_paths`` of them."""
     progress = progress or SilentProgress()
     aim = take_aim(environment, library, settings, progress)
-    progress.stage("paths for shadow runs", CANDIDATES)
+    progress.stage("paths for shadow runs", candidates)
     n_surrogates = len(library.surrogates)
-    rounds = range(PILOT_PATHS, PILOT_PATHS + CANDIDATES, ROUND_PATHS)
+    rounds = range(PILOT_PATHS, PILOT_PATHS + candidates, ROUND_PATHS)
     parts = (aim.enumerator.run(first, ROUND_PATHS, progress) for first in rounds)
     columns = [(part.index, part.state, part.weight, part.rates(n_surrogates)) for part in parts]
     index, state, weight, rates = (np.concatenate(column) for column in zip(*columns, strict=True))
     probability = chances(rates, aim.share)
     u = uniforms(settings.seed ^ POOL_SEED, 0, settings.shadow_paths, DIAGNOSTIC, CHOICE_DRAW + 1)[:, CHOICE_DRAW]
     cumulative = np.cumsum(probability)
-    chosen = np.minimum(np.searchsorted(cumulative, u * cumulative[-1], side="right"), CANDIDATES - 1)
-    weights = weight[chosen] / (CANDIDATES * probability[chosen])
+    chosen = np.minimum(np.searchsorted(cumulative, u * cumulative[-1], side="right"), candidates - 1)
+    weights = weight[chosen] / (candidates * probability[chosen])
     seed, order = settings.seed ^ POOL_SEED, careful_first(rates)
     return ShadowPaths(key, seed, order, index[chosen], state[chosen], weights)
 

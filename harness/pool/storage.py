@@ -14,7 +14,7 @@ import pyarrow.parquet as pq
 
 from harness.arrays import IntArray
 from harness.campaign.models import PoolSettings
-from harness.compiled import cache_root, source_hash
+from harness.compiled import WORLD_SOURCES, cache_root, source_hash
 from harness.environment.driving import Environment
 from harness.errors import RunFolderError
 from harness.pool.build import build_pool
@@ -36,7 +36,7 @@ def pool_key(environment: Environment, library: Library, settings: PoolSettings)
     """Hash of all that a pool depends on: environment, level of lane changing, library, settings, and code."""
     content = [
         _FORMAT,
-        source_hash(),
+        source_hash(WORLD_SOURCES),
         *(hashlib.sha256((Path(__file__).parent / name).read_bytes()).hexdigest() for name in _MADE_BY),
         environment_hash(environment),
         {name: model.model_dump() for name, model in library.surrogates.items()},

@@ -20,7 +20,7 @@ from harness.errors import HarnessError
 from harness.pool.aimed_paths import EnumeratedPaths, Enumerator
 from harness.pool.build import pool_of
 from harness.pool.cut_ins import Pool, environment_hash
-from harness.pool.enumeration import enumerate_recorded
+from harness.pool.enumeration import STRIDE, enumerate_recorded
 from harness.pool.shadow_paths import ShadowPaths
 from harness.resolved import Resolved
 
@@ -61,14 +61,19 @@ def recorded_cut_ins(
     environment: Environment,
     drivers: RecordArray,
     envelope: int,
+    offset: IntArray | None = None,
 ) -> tuple[FloatArray, IntArray, FloatArray]:
-    """Probability of a cut-in in each step (n, steps) and who crashes then; and the most that failures hide (n,)."""
+    """Probability of a cut-in in each step (n, steps) and who crashes then; and the most that failures hide (n,).
+
+    With an ``offset`` (n,) only every `STRIDE`-th step is asked, from that one on; see `enumerate_cut_ins`.
+    """
     shape = len(index), int(environment.numbers["max_steps"])
     probability, crashes, unknown = np.zeros(shape), np.zeros(shape, np.int64), np.zeros(len(index))
     room = empty_trajectory(environment)
     motion = runs.n_steps, runs.x_m, runs.v_mps
+    asked = (1, np.zeros(len(index), np.int64)) if offset is None else (STRIDE, offset)
     where = environment, drivers, envelope
-    enumerate_recorded(seed, index, state, *motion, *where, room, probability, unknown, crashes)
+    enumerate_recorded(seed, index, state, *motion, *where, *asked, room, probability, unknown, crashes)
     return probability, crashes, np.where(runs.failed, unknown, 0.0)
 
 

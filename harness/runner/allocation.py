@@ -10,7 +10,7 @@ import numpy as np
 
 from harness.arrays import BoolArray, IntArray
 from harness.estimators.intervals import clopper_pearson
-from harness.estimators.likelihood_ratio import Level
+from harness.estimators.likelihood_ratio import Level, spread
 from harness.estimators.stratified import Tally, combined
 from harness.strata import ASSUMPTION_FREE, ShellDesign
 
@@ -28,7 +28,6 @@ LEAST_FIRST_TESTS, MOST_FIRST_TESTS = 3, 12
 MOST_INNER_TESTS = 8
 """Testing turns to what lies outside after this many times the first tests, known or not."""
 SMALLEST_ROUND = 8
-SHARES_PER_ROUND = 32
 USED_UP_SHARE = 0.95
 """Share of the squared widths that must lie in exhausted strata for the allocation to end."""
 
@@ -72,7 +71,7 @@ class Allocation:
         budget: int,
         *,
         inner_rhw: Callable[[int], float] | None = None,
-        spread: Callable[[int, IntArray], IntArray] | None = None,
+        given_by: Callable[[int, IntArray], IntArray] | None = None,
     ) -> IntArray:
         """Tests to add per stratum, at most ``budget``; all 0 when no stratum or no budget is left.
 
@@ -84,7 +83,7 @@ class Allocation:
         budget : int
         inner_rhw : callable, optional
             Gives the relative half-width from so many first strata; by default that of a crash rate.
-        spread : callable, optional
+        given_by : callable, optional
             Gives so many tests to strata with so much room (S,) each; by default to where a crash rate is narrowed.
         """
         tests = tally.tests
@@ -96,7 +95,7 @@ class Allocation:
         if not wanted.any() and active.any():
             size = max(SMALLEST_ROUND, int(np.ceil(tests[begun].sum() * (GROWTH - 1.0))))
             room = np.where(active, self.available - tests, 0)
-            wanted = self._spread(min(size, budget), tally, room) if spread is None else spread(min(size, budget), room)
+            wanted = (given_by or partial(self._spread, tally))(min(size, budget), room)
         return _cut(np.minimum(wanted, self.available - tests), budget)
 
     def second_phase(self, first: Tally, available: IntArray, budget: int, rhw: float, confidence: float) -> IntArray:
@@ -149,33 +148,13 @@ class Allocation:
     def _inner_rhw(self, tally: Tally, n: int) -> float:
         return combined(self.design.p[:n], tally.part(slice(0, n)), self.design.n_paths, _LEVEL).rhw
 
-    def _spread(self, size: int, tally: Tally, most: IntArray) -> IntArray:
-        """Give portions, one after the other, to where each narrows the sum of squared half-widths most.
-
-        A squared half-width shrinks as 1/n, or as 1/n² where shares are all 0 or 1.
-        """
-        tests, crashes, failed = tally.tests, tally.crashes, tally.failed
-        low, high = clopper_pearson(crashes, tests, _TAIL, failed)
-        squares = ((self.design.p * (high - low) / 2.0) ** 2).tolist()
-        powers = np.where((crashes + failed == 0) | (crashes == tests), 2, 1).tolist()
-        so_far, room = tests.tolist(), most.tolist()
-        given = [0] * tests.size
-
-        def gain(s: int) -> float:
-            """Fall of the squared half-width per further test of a stratum."""
-            if given[s] >= room[s]:
-                return -1.0
-            n = max(so_far[s] + given[s], 1)
-            return float(squares[s] * (max(so_far[s], 1) / n) ** powers[s] * powers[s] / n)
-
-        gains, left, portion = [gain(s) for s in range(tests.size)], size, max(1, size // SHARES_PER_ROUND)
-        while left > 0 and max(gains) >= 0.0:
-            best = gains.index(max(gains))
-            more = min(portion, left, room[best] - given[best])
-            given[best] += more
-            left -= more
-            gains[best] = gain(best)
-        return np.array(given, np.int64)
+    def _spread(self, tally: Tally, size: int, most: IntArray) -> IntArray:
+        weights = np.column_stack([self.design.p, np.zeros_like(self.design.p)])
+        lower, upper = (
+            np.column_stack([crashes, tally.tests - crashes])
+            for crashes in (tally.crashes, tally.crashes + tally.failed)
+        )
+        return spread(weights, lower, upper, _LEVEL, size, most)
 
 
 def _cut(wanted: IntArray, budget: int) -> IntArray:

@@ -23,8 +23,6 @@ from harness.strata import ASSUMPTION_FREE, ShellDesign
 LOOKS = 6
 """A margin is decided at a level that leaves out so many times less than the campaign's, as it is looked at after each
 round. Measured where B's rate is 1 + margin times A's, by looks from 40 to 3,000 pairs: docs/compare.md."""
-PORTIONS = 12
-"""Of a round, each given to where it narrows the interval most."""
 
 
 def decision_level(confidence: float) -> Level:
@@ -117,19 +115,10 @@ class PairPlanner:
             _differing(pairs),
             self._budget - int(tests.sum()),
             inner_rhw=lambda n: pairs.inside(n).rhw(self._level),
-            spread=partial(self._spread, pairs),
+            given_by=partial(pairs.spread, self._level),
         )
         self.rule.of_first_tests = bool(np.any((tests < self._first_tests)[added > 0]))
         return added
-
-    def _spread(self, pairs: PairCounts, size: int, room: IntArray) -> IntArray:
-        """Give portions, one after the other, to where a pair narrows the interval of the difference most."""
-        given, portion = np.zeros_like(room), -(-size // PORTIONS)
-        while (left := min(size, int(room.sum())) - int(given.sum())) > 0:
-            gains = np.where(given < room, pairs.gains(given, self._level), -math.inf)
-            best = int(gains.argmax())
-            given[best] += min(portion, left, int(room[best] - given[best]))
-        return given
 
 
 def _differing(pairs: PairCounts) -> Tally:

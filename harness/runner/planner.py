@@ -20,12 +20,11 @@ from harness.arrays import IntArray
 from harness.campaign.models import Campaign
 from harness.estimators import Shells, StopRule, accumulator
 from harness.estimators.block import Block
-from harness.estimators.estimate import BothWays, Estimate
 from harness.estimators.stratified import Tally, empty_tally
 from harness.pool.shells import Draw, PrescribedEpisodes
 from harness.runner.allocation import Allocation, first_tests
 from harness.runner.worker import ShardSpec
-from harness.strata import ASSUMPTION_FREE, ShellDesign
+from harness.strata import ShellDesign
 
 MOST_SHARDS_PER_ROUND = 16
 SMALLEST_SHARD = 64
@@ -73,8 +72,8 @@ class ShellPlanner:
     In two phases the tests up to a wider precision only plan the number of the others, which alone are reported: that
     number does not depend on their results.
 
-    ``available``, shape (S,), are the most tests of each stratum, ``held`` see `RoundRule`; ``estimate`` is that at the
-    end of the last round, ``reported_from`` the first test of the second phase, ``remark`` what to say of stopping.
+    ``available``, shape (S,), are the most tests of each stratum, ``held`` see `RoundRule`; ``seen`` are the tests of
+    this phase, ``reported_from`` the first test of the second one, ``remark`` what to say of stopping.
     """
 
     def __init__(self, campaign: Campaign, design: ShellDesign, available: IntArray, held: int = 0) -> None:
@@ -83,7 +82,6 @@ class ShellPlanner:
         self.rule = RoundRule(campaign, held, FIRST_PHASE if self._plans else 1.0)
         wide = campaign.stop.rhw is not None and campaign.stop.rhw > BIASED_RHW and not self._plans
         self.remark = TOO_WIDE if wide else ""
-        self.estimate: Estimate | None = None
         self.reported_from = 0
         self._campaign = campaign
         self._available = available
@@ -94,14 +92,13 @@ class ShellPlanner:
         self._begin_phase()
 
     def _begin_phase(self) -> None:
-        self._seen = Shells()
-        self._sums = BothWays(self._seen)
+        self.seen = Shells()
         self._n_episodes = self._look = 0
 
     @property
     def tally(self) -> Tally:
         """What the tests of each stratum have come to so far."""
-        return self._seen.tally if self._n_episodes else empty_tally(self._drawn.size)
+        return self.seen.tally if self._n_episodes else empty_tally(self._drawn.size)
 
     def rounds(self) -> Iterator[Iterator[ShardSpec]]:
         """Shards of each round; the next round is asked for when all of the last one have been added."""
@@ -123,12 +120,11 @@ class ShellPlanner:
 
     def add(self, block: Block) -> bool:
         """Add the tests of the next shard; True when the campaign is to stop."""
-        self._sums.add(block)
+        self.seen.add(block)
         self._n_episodes += len(block)
         if self._n_episodes != self._look:
             return False
-        self.estimate = self._sums.result(self._campaign.stop.confidence)
-        enough = self.rule.observe(self.estimate)
+        enough = self.rule.observe(self.seen)
         if not (enough and self._plans and self.rule.reached and self._planned is None):
             return enough or self._planned is not None
         budget = self._campaign.stop.episodes - self._n_episodes
@@ -209,7 +205,7 @@ class RoundRule:
     def __init__(self, campaign: Campaign, held: int = 0, factor: float = 1.0) -> None:
         self._held = held
         self._target = None if campaign.stop.rhw is None else factor * campaign.stop.rhw
-        self._min_crashes = campaign.min_crashes
+        self._min_crashes, self._confidence = campaign.min_crashes, campaign.stop.confidence
         self._statement = campaign.testing.shells.statement
         self.reached = self.pool_error_above_target = False
         self.rhw = float("inf")
@@ -217,29 +213,27 @@ class RoundRule:
         self.of_first_tests = False
         self.waited_for: tuple[str, ...] = ()
 
-    def observe(self, estimate: Estimate) -> bool:
-        """Whether to stop at the end of a round, with this estimate from all tests so far."""
-        watched = {"rhw": estimate.rhw, **estimate.details}
-        if self._statement != ASSUMPTION_FREE:
-            watched = next(each for each in estimate.details["statements"] if each["name"] == self._statement)
-        self.rhw = watched["rhw"]
+    def observe(self, seen: Shells) -> bool:
+        """Whether to stop at the end of a round, with all tests so far."""
+        watched, n_crashes = seen.limits_of(self._statement, self._confidence), int(seen.tally.crashes.sum())
+        self.rhw, from_pool = watched.rhw, watched.from_pool_relative()
         if self._target is None:
             return False
         met = {
             f"stop.rhw ({self._target:g})": self.rhw <= self._target,
-            f"stop.min_crashes ({self._min_crashes:,})": estimate.n_crashes >= self._min_crashes,
+            f"stop.min_crashes ({self._min_crashes:,})": n_crashes >= self._min_crashes,
         }
         missing = tuple(condition for condition, is_met in met.items() if not is_met)
         if missing:
             self.waited_for = missing
         elif self.of_first_tests:
             self.waited_for = ("the first tests of each shell (testing.shells.first_tests)",)
-        if estimate.n_crashes < self._min_crashes:
+        if n_crashes < self._min_crashes:
             return False
         self.reached = not missing
-        self.pool_error_above_target = watched["rhw_from_pool_at_least"] > self._target
-        hopeless = self.pool_error_above_target and watched["rhw_from_pool"] ** 2 >= POOL_SHARE * self.rhw**2
-        return self.reached or (hopeless and estimate.n_episodes >= self._held)
+        self.pool_error_above_target = from_pool["rhw_from_pool_at_least"] > self._target
+        hopeless = self.pool_error_above_target and from_pool["rhw_from_pool"] ** 2 >= POOL_SHARE * self.rhw**2
+        return self.reached or (hopeless and seen.tally.tests.sum() >= self._held)
 
 
 def round_specs(tests: IntArray, added: IntArray, index: int, first_episode: int, shard_size: int) -> list[ShardSpec]:

@@ -25,6 +25,7 @@ from harness.episode.motion import motion_hashes
 from harness.episode.trajectory import empty_trajectory
 from harness.errors import RunFolderError, TooManyFailedError
 from harness.outcomes import AV, FAILED
+from harness.pool.cut_ins import onset_steps
 from harness.pool.enumeration import draw_leads, write_pairs
 from harness.pool.shadow_paths import ShadowPaths, traffic_without_cut_in
 from harness.pool.vehicle_pool import ShadowRuns, recorded_cut_ins
@@ -197,7 +198,7 @@ def _forced(
     loop: EpisodeLoop, seed: int, first: int, state: RecordArray, environment: Environment
 ) -> PrescribedTraffic:
     n, index = len(state), first + np.arange(len(state))
-    runs = _recorded(without_cut_in(loop, seed, first, index, state, environment), environment)
+    runs = recorded(without_cut_in(loop, seed, first, index, state, environment), environment)
     nobody = np.zeros(0, DRIVER_DTYPE), -1
     probability, _, unknown = recorded_cut_ins(runs, seed, index, state, environment, *nobody)
     cumulative = np.cumsum(probability, axis=1)
@@ -210,8 +211,7 @@ def _forced(
     lead = np.zeros(n if environment.lateral.present else 0, np.int64)
     if lead.size:
         draw_leads(seed, index, step, environment.lateral, lead)
-    onset = np.maximum(step - lead, 0) if lead.size else step
-    motion = motion_hashes(runs.x_m, runs.v_mps)[np.arange(n), onset]
+    motion = motion_hashes(runs.x_m, runs.v_mps)[np.arange(n), onset_steps(step, lead)]
     step[runs.failed] = -1
     return PrescribedTraffic(lv, bv, step, np.full(n, -1), np.log(p_cut_in + unknown), index, motion, lead)
 
@@ -227,7 +227,7 @@ def _with_cut_in(
     return lv, bv
 
 
-def _recorded(shard: Shard, environment: Environment) -> ShadowRuns:
+def recorded(shard: Shard, environment: Environment) -> ShadowRuns:
     """Shadow runs as they come from the loop."""
     episode, width = shard.results.episode, int(environment.numbers["max_steps"]) + 1
     x, v = np.zeros((2, episode.size, width))

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from harness.arrays import FloatArray
-from harness.compiled import cache_root, source_hash
+from harness.compiled import WORLD_SOURCES, cache_root, source_hash
 from harness.criticality.tables import Tables, tables_hash
 from harness.environment.initial_state import InitialStates
 from harness.episode.loop import MOMENT_LIMITS, EpisodeLoop, Keep, Policy, Shard
@@ -44,7 +44,8 @@ def table_errors(resolved: Resolved, tables: Tables | None) -> list[dict[str, An
         return []
     of_tables = tables_hash(environment, resolved.surrogates, "recursive")
     level = float(environment.numbers["level"])
-    key = hashlib.sha256(json.dumps([of_tables, list(campaign.surrogates), level, source_hash()]).encode()).hexdigest()
+    content = [of_tables, list(campaign.surrogates), level, source_hash(WORLD_SOURCES)]
+    key = hashlib.sha256(json.dumps(content).encode()).hexdigest()
     path = cache_root() / "tables" / f"accuracy-{key[:24]}.json"
     if path.exists():
         found: list[dict[str, Any]] = json.loads(path.read_text(encoding="utf-8"))

@@ -21,7 +21,10 @@ AvName = Annotated[str, Field(pattern=NAME_PATTERN)]
 
 
 class SuperPopulation(Section):
-    """Paths enumerated once, that pools of all replications are drawn from; and others for the truth."""
+    """Paths enumerated once, that pools of all replications are drawn from; and others for the truth.
+
+    A vehicle that acts before the cut-in walks all of these itself, and its pools have ``pool.shadow_paths``.
+    """
 
     paths: Whole = Field(65_536, ge=1024, le=1 << 22, description="paths that pools are drawn from, with replacement")
     reference_paths: Whole = Field(65_536, ge=1024, le=1 << 22, description="independent paths that the truth is from")
@@ -53,6 +56,13 @@ class Adversary(Section):
     failing: float = Field(0.0, ge=0.0, lt=1.0, description="share of its crashes that end as failed tests instead")
 
 
+class Pair(Section):
+    """Two vehicles, compared on the same cut-ins."""
+
+    a: AvName = Field(description="one of avs or adversaries")
+    b: AvName = Field(description="another, or the same")
+
+
 class Experiment(Section):
     """A replication experiment, as one YAML file describes it."""
 
@@ -63,9 +73,17 @@ class Experiment(Section):
     seed: Whole = Field(1, ge=0, lt=2**31)
     replications: Whole = Field(2000, ge=2, le=1_000_000, description="independent repetitions for each vehicle")
     campaign: Campaign = Field(description="what is repeated; its own av is replaced, stop.rhw null means a fixed n")
-    avs: dict[AvName, AutomatedVehicle] = Field(default_factory=dict, description="vehicles, overtaking in the twin")
+    avs: dict[AvName, AutomatedVehicle] = Field(
+        default_factory=dict,
+        description="vehicles, overtaking in the twin: built-in models, and for testing.method shells controllers with "
+        "before_cut_in controller",
+    )
     adversaries: dict[AvName, Adversary] = Field(
         default_factory=dict, description="made of some of avs; testing.method shells alone"
+    )
+    pairs: dict[AvName, Pair] = Field(
+        default_factory=dict,
+        description="comparisons to repeat instead of campaigns of single vehicles; testing.method shells alone",
     )
     chains: list[str] = Field(default_factory=list, description="exact Markov chains, instead of avs")
     estimators: list[EstimatorName] = Field(
@@ -82,6 +100,16 @@ class Experiment(Section):
     def subject(self, name: str) -> Campaign:
         """The campaign with one of the vehicles."""
         return self.campaign.model_copy(update={"av": self.avs[name]})
+
+    @property
+    def acting(self) -> dict[str, AutomatedVehicle]:
+        """Vehicles that act before the cut-in."""
+        return {name: av for name, av in self.avs.items() if av.acts_before_cut_in}
+
+    @property
+    def holding(self) -> dict[str, AutomatedVehicle]:
+        """Vehicles that keep their speed until the cut-in."""
+        return {name: av for name, av in self.avs.items() if not av.acts_before_cut_in}
 
     def seed_of(self, place: int) -> int:
         """Seed of a subject's own, by its place in the file."""
@@ -128,6 +156,31 @@ class Experiment(Section):
                     expected=f"one of avs: {', '.join(self.avs)}",
                     mend="Name one of them.",
                 )
+            if name in self.avs:
+                raise broken_rule(
+                    f"adversaries.{name}", found="a name that avs has, too", expected="another", mend="Rename it."
+                )
+        return self
+
+    @model_validator(mode="after")
+    def _pairs_are_of_vehicles_that_hold_their_speed(self) -> Self:
+        if self.pairs and self.campaign.testing.method != "shells":
+            raise broken_rule(
+                "pairs",
+                found=f"pairs for {self.campaign.testing.method}",
+                expected="method shells: it compares on drawn cut-ins",
+                mend="Delete them.",
+            )
+        known = [*self.holding, *(name for name, made in self.adversaries.items() if made.of in self.holding)]
+        for name, pair in self.pairs.items():
+            for side in ("a", "b"):
+                if (asked := getattr(pair, side)) not in known:
+                    raise broken_rule(
+                        f"pairs.{name}.{side}",
+                        found=f"'{asked}'",
+                        expected=f"a vehicle that holds its speed before the cut-in: {', '.join(known)}",
+                        mend="Name one of them; `harness compare` takes no others under shells.",
+                    )
         return self
 
     @model_validator(mode="after")
@@ -140,18 +193,20 @@ class Experiment(Section):
                 mend="Leave the key out.",
             )
         for name, av in self.avs.items():
-            if not isinstance(av.parameters, BuiltInParameters):
+            built_in, acts = isinstance(av.parameters, BuiltInParameters), av.acts_before_cut_in
+            if not (built_in or (av.source in ("controller", "fmu") and acts)):
                 raise broken_rule(
                     f"avs.{name}",
-                    found=f"an AV that av.{av.source} drives",
-                    expected="a built-in model (idm, fvdm, constant): replications run in the twin, which has no other",
+                    found=f"an AV that av.{av.source} drives" + ("" if acts else " from the cut-in on"),
+                    expected="a built-in model (idm, fvdm, constant), or a controller with before_cut_in controller: "
+                    "replications run in the twin",
                     mend="Leave it out here, and test it in SUMO with `harness run`.",
                 )
-            if av.before_cut_in != "hold_speed":
+            if acts and (built_in or self.campaign.testing.method != "shells"):
                 raise broken_rule(
                     f"avs.{name}.before_cut_in",
                     found=av.before_cut_in,
-                    expected="hold_speed: paths before the cut-in are drawn ahead",
+                    expected="hold_speed, but for a controller with testing.method shells, which walks paths first",
                     mend="Leave the key out.",
                 )
         return self

@@ -14,8 +14,10 @@ from typing import Any
 import numpy as np
 from scipy.stats import binomtest, norm
 
+from harness.arrays import FloatArray
 from harness.estimators.estimate import Estimate, finite_json
 from harness.estimators.intervals import clopper_pearson
+from harness.studies.truths import Known
 
 COVERAGE_CONFIDENCE = 0.95
 SIGNIFICANCE = 0.05
@@ -31,11 +33,15 @@ class Row:
     Attributes
     ----------
     result : str
-        Estimator, or one of the two statements of shells.
+        Estimator, a statement of shells, a comparison with a reference driver, or the difference of two vehicles.
+    crash_rate : float
+        What is judged: a crash rate, or the ratio, share or difference that the result names; NaN if there is none.
     reached : bool
         Whether the asked precision was reached; False when none was asked.
     n_crashes_outside : int
         Crashes beyond the boundary; 0 where there are no shells.
+    refused : bool
+        Whether no interval was made, because crashes lie on too few paths: it is as wide as can be.
     """
 
     result: str
@@ -48,12 +54,14 @@ class Row:
     ci_high: float
     reached: bool
     n_crashes_outside: int = 0
+    refused: bool = False
 
 
 def estimate_row(result: str, replication: int, found: Estimate, *, reached: bool, outside: int = 0) -> Row:
     """Row of an estimate with one interval."""
     numbers = found.crash_rate, found.std_error, found.ci_low, found.ci_high
-    return Row(result, replication, found.n_episodes, found.n_crashes, *numbers, reached, outside)
+    counts = found.n_episodes, found.n_crashes
+    return Row(result, replication, *counts, *numbers, reached, outside, refused=bool(found.cautions))
 
 
 @dataclass(frozen=True)
@@ -62,8 +70,10 @@ class Subject:
 
     Attributes
     ----------
-    crash_rate, std_error : float
-        The truth, and how well it is known.
+    crash_rate : Known
+        The truth for all results that estimate it.
+    others : dict of Known
+        The truth for results that estimate something else.
     crashes_outside : dict
         For each result that assumes a boundary, the share of its crash rate beyond it.
     left_out : tuple of str
@@ -73,11 +83,25 @@ class Subject:
     """
 
     name: str
-    crash_rate: float
-    std_error: float = 0.0
+    crash_rate: Known
+    others: dict[str, Known] = field(default_factory=dict)
     crashes_outside: dict[str, float] = field(default_factory=dict)
     left_out: tuple[str, ...] = ()
     boundary: str | None = None
+
+    @classmethod
+    def exact(cls, name: str, crash_rate: float, **more: Any) -> Subject:
+        """One whose crash rate is known without error."""
+        return cls(name, Known(crash_rate, 0.0, crash_rate), **more)
+
+    def truth(self, result: str) -> Known:
+        """What a result estimates."""
+        return self.others.get(result, self.crash_rate)
+
+    @property
+    def relative_error(self) -> float:
+        """The largest one of what is known about it, each over its scale."""
+        return max(known.relative_error for known in (self.crash_rate, *self.others.values()))
 
     def meets_assumption_of(self, result: str) -> bool:
         """Whether what a result assumes holds for it."""
@@ -90,12 +114,14 @@ class Judgement:
 
     Attributes
     ----------
+    truth, scale : float
+        What it should have found, and what deviations are relative to: see `harness.studies.truths.Known`.
     assumption_met : bool
         False for a statement about vehicles that do not crash outside, and one that does; coverage is then not judged.
     bias, bias_std_error : float
-        Of the mean estimate, relative to the truth.
+        Of the mean estimate, relative to the scale, as is all that follows.
     true_relvar, claimed_relvar : float
-        Variance over the squared truth: of the estimates around the truth, and the mean that they claim.
+        Variance over the squared scale: of the estimates around the truth, and the mean that they claim.
     coverage, coverage_low, coverage_high : float
         Share of intervals that hold the truth, with its own exact 95 % interval.
     p_value, p_value_holm : float or None
@@ -105,12 +131,16 @@ class Judgement:
         Tests for RHW 0.3 by the true variance at this number of tests; None if the number was not fixed.
     reached, alarm : float
         Share of replications that reached the precision asked for, and in which a crash was seen outside.
+    refused : float
+        Share of replications without an interval, which count as covered. Where they have no value either, nothing else
+        takes notice of them.
     """
 
     subject: str
     result: str
     replications: int
     truth: float
+    scale: float
     assumption_met: bool
     bias: float
     bias_std_error: float
@@ -128,6 +158,7 @@ class Judgement:
     tests_for_wanted_rhw: float | None
     reached: float
     alarm: float
+    refused: float
 
     @property
     def too_low(self) -> bool:
@@ -151,13 +182,16 @@ def judge(subject: Subject, result: str, rows: Sequence[Row], confidence: float)
         Nominal coverage.
     """
     columns = {field.name: np.array([getattr(row, field.name) for row in rows]) for field in fields(Row)}
-    rates, tests, reached = columns["crash_rate"], columns["n_tests"], columns["reached"]
-    truth, n = subject.crash_rate, len(rows)
+    tests, reached = columns["n_tests"], columns["reached"]
+    known, n = subject.truth(result), len(rows)
+    truth, scale = known.value, known.scale
+    said = np.isfinite(columns["crash_rate"])
+    errors, claimed = (columns["crash_rate"][said] - truth) / scale, columns["std_error"][said] / scale
     covered = int(np.count_nonzero((columns["ci_low"] <= truth) & (truth <= columns["ci_high"])))
     low, high = map(float, clopper_pearson(covered, n, (1.0 - COVERAGE_CONFIDENCE) / 2.0))
     met = subject.meets_assumption_of(result)
     tests_5, median, tests_95 = (float(q) for q in np.quantile(tests, [0.05, 0.5, 0.95]))
-    relvar = float(np.mean((rates / truth - 1.0) ** 2))
+    relvar = _mean(errors**2)
     fixed = not reached.any() and bool(np.all(tests == tests[0]))
     z = float(norm.isf((1.0 - confidence) / 2.0))
     return Judgement(
@@ -165,11 +199,12 @@ def judge(subject: Subject, result: str, rows: Sequence[Row], confidence: float)
         result=result,
         replications=n,
         truth=truth,
+        scale=scale,
         assumption_met=met,
-        bias=float(rates.mean()) / truth - 1.0,
-        bias_std_error=float(rates.std(ddof=1)) / math.sqrt(n) / truth,
+        bias=_mean(errors),
+        bias_std_error=float(errors.std(ddof=1)) / math.sqrt(errors.size) if errors.size > 1 else math.nan,
         true_relvar=relvar,
-        claimed_relvar=float(np.mean(columns["std_error"] ** 2)) / truth**2,
+        claimed_relvar=_mean(claimed**2),
         covered=covered,
         coverage=covered / n,
         coverage_low=low,
@@ -182,7 +217,13 @@ def judge(subject: Subject, result: str, rows: Sequence[Row], confidence: float)
         tests_for_wanted_rhw=(z / WANTED_RHW) ** 2 * (relvar * median) if fixed else None,
         reached=float(reached.mean()),
         alarm=float(np.mean(columns["n_crashes_outside"] > 0)),
+        refused=float(columns["refused"].mean()),
     )
+
+
+def _mean(values: FloatArray) -> float:
+    """Mean of some numbers, NaN of none."""
+    return float(values.mean()) if values.size else math.nan
 
 
 def corrected(judgements: Sequence[Judgement]) -> list[Judgement]:

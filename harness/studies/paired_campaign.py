@@ -18,19 +18,20 @@ from harness.estimators.likelihood_ratio import Level
 from harness.estimators.pairs import CRASH, NO_CRASH, PairCounts, no_pairs
 from harness.runner.pair_planner import PairPlanner, PairRule
 from harness.strata import LIBRARY_STATEMENT
+from harness.studies.experiment import Fault
 from harness.studies.judgement import Row
-from harness.studies.shell_campaign import DrawnPool, asking
+from harness.studies.shell_campaign import DrawnPool, asking, with_fault
+from harness.studies.truths import CONDITIONAL_DIFFERENCE, DIFFERENCE
 
 _CRASHING = ((CRASH, CRASH), (CRASH, NO_CRASH), (NO_CRASH, CRASH))
 """How A and B end: both crash, only A, only B."""
-DIFFERENCE, CONDITIONAL_DIFFERENCE = "difference", "difference, conditional"
 
 
 class PairSource(Protocol):
     """Where the pools of replications come from."""
 
     def draw(self, rng: np.random.Generator) -> list[DrawnPool]:
-        """A new pool: where both crash, only A, only B."""
+        """A new pool without references: where both crash, only A, only B."""
         ...
 
 
@@ -42,6 +43,7 @@ class PairedCampaign:
     source: PairSource
     seed: int
     margin: float | None = None
+    fault: Fault | None = None
 
     def run(self, replications: range) -> list[Row]:
         """Rows of both statements for each replication."""
@@ -61,7 +63,7 @@ class PairedCampaign:
     def rounds(self, replication: int) -> Iterator[tuple[PairCounts, PairRule]]:
         """All pairs so far after each round of one comparison, until its rule is content."""
         rng = np.random.default_rng([self.seed, replication])
-        drawn = self.source.draw(rng)
+        drawn = [with_fault(pool, self.fault) for pool in self.source.draw(rng)]
         design = drawn[0].design
         available = np.full(design.p.size, self.campaign.pool.cut_ins_per_shell, np.int64)
         planner = PairPlanner(self.campaign, design, available, self.margin)

@@ -40,7 +40,7 @@ def write_results(
             "experiment": experiment.model_dump(mode="json"),
             "confidence": confidence,
             "truth": TRUTH_OF_CHAINS if experiment.chains else TRUTH_OF_VEHICLES,
-            "largest_relative_error_of_truth": max(one.std_error / one.crash_rate for one, _ in found),
+            "largest_relative_error_of_truth": max(one.relative_error for one, _ in found),
             "subjects": [asdict(one) for one, _ in found],
             "judgements": [one.to_json() for one in judgements],
         },
@@ -90,4 +90,5 @@ def _cells(one: Judgement) -> dict[str, str]:
         "p (Holm)": p + (" TOO LOW" if one.too_low else ""),
         "tests median [5, 95 %]": f"{one.tests_median:,.0f} [{one.tests_5:,.0f}, {one.tests_95:,.0f}]",
         "alarm": f"{one.alarm:.1%}",
+        "refused": f"{one.refused:.1%}",
     }

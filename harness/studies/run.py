@@ -12,27 +12,16 @@ from multiprocessing import parent_process
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 
-from harness.environment.loading import load_environment
 from harness.interruption import leave_signals_to_parent
-from harness.pool.library import load_library
 from harness.progress import Progress, SilentProgress
 from harness.records.folder import require_place
 from harness.spawning import spawn_context
-from harness.strata import LIBRARY_STATEMENT
-from harness.studies.chains.named import CHAINS
-from harness.studies.chains.shells import ChainShells
 from harness.studies.experiment import Experiment
 from harness.studies.judgement import Judgement, Row, Subject, corrected, judge
 from harness.studies.results import write_results
-from harness.studies.shell_campaign import ShellCampaign, result_of
-from harness.studies.shell_source import OvertakingShells, overtaking_shells
-from harness.studies.super_population import Drivers, Truth, enumerate_paths, truths
-from harness.studies.weighted_campaign import ChainEpisodes, TwinEpisodes, WeightedCampaign
+from harness.studies.subjects import Repeated, subjects
 
 TASKS_PER_SUBJECT = 8
-
-Repeated = ShellCampaign | WeightedCampaign
-"""A campaign that can be repeated, in any process."""
 
 
 @dataclass(frozen=True)
@@ -60,9 +49,9 @@ def validate(
     """
     progress = progress or SilentProgress()
     require_place(folder)
-    tested = list(_chains(experiment) if experiment.chains else _vehicles(experiment, progress))
-    progress.stage("replications", len(tested) * experiment.replications)
     with worker_processes(workers) as executor:
+        tested = list(subjects(experiment, executor, progress))
+        progress.stage("replications", len(tested) * experiment.replications)
         rows = [_replicate(repeated, experiment.replications, executor, progress) for _, repeated in tested]
     found = [(subject, of_subject) for (subject, _), of_subject in zip(tested, rows, strict=True)]
     judgements = corrected([one for subject, of_subject in found for one in _judge(experiment, subject, of_subject)])
@@ -75,51 +64,6 @@ def _judge(experiment: Experiment, subject: Subject, rows: list[Row]) -> Iterato
         of_result = [row for row in rows if row.result == result]
         confidence = experiment.campaign.stop.confidence
         yield judge(subject, result, of_result, confidence)
-
-
-def _chains(experiment: Experiment) -> Iterator[tuple[Subject, Repeated]]:
-    campaign, method = experiment.campaign, experiment.campaign.testing.method
-    for place, name in enumerate(experiment.chains):
-        chain, seed = CHAINS[name], experiment.seed_of(place)
-        if method == "shells":
-            source = ChainShells(chain, experiment.super_population.pool_paths)
-            subject = Subject(
-                name, chain.crash_rate, crashes_outside={result_of(LIBRARY_STATEMENT): source.crashes_outside}
-            )
-            yield subject, ShellCampaign(campaign, source, seed, experiment.fault)
-        else:
-            episodes = ChainEpisodes(chain, method, seed)
-            yield Subject(name, chain.crash_rate), WeightedCampaign(campaign, episodes, experiment.results)
-
-
-def _vehicles(experiment: Experiment, progress: Progress) -> Iterator[tuple[Subject, Repeated]]:
-    campaign, size, seed = experiment.campaign, experiment.super_population, experiment.seed
-    environment, library = load_environment(campaign.environment), load_library(campaign.pool.library)
-    drivers, pools = Drivers.of(library, experiment.avs, see_onset=environment.lateral.present), None
-    if campaign.testing.method == "shells":
-        pools = enumerate_paths(environment, drivers, seed, size.paths, progress)
-    known = truths(environment, drivers, seed + 1, size.reference_paths, progress)
-    for place, (name, av) in enumerate(experiment.avs.items()):
-        tested, own_seed, truth = experiment.subject(name), experiment.seed_of(place), known[name]
-        if pools is None:
-            episodes = TwinEpisodes(tested, own_seed, experiment.results)
-            repeated: Repeated = WeightedCampaign(tested, episodes, experiment.results)
-            yield Subject(name, truth.crash_rate, truth.std_error), repeated
-        else:
-            source = overtaking_shells(library, pools, av, drivers.vehicles[name], size.pool_paths)
-            repeated = ShellCampaign(tested, source, own_seed, experiment.fault)
-            yield _subject(name, source, truth), repeated
-            for made_name, made in experiment.adversaries.items():
-                if made.of == name:
-                    adversary = source.as_adversary(made)
-                    repeated = ShellCampaign(tested, adversary, own_seed, experiment.fault)
-                    yield _subject(made_name, adversary, Truth(adversary.crash_rate, 0.0)), repeated
-
-
-def _subject(name: str, source: OvertakingShells, truth: Truth) -> Subject:
-    outside = {result_of(each): share for each, share in source.crashes_outside.items()}
-    facts = outside, source.left_out, source.template.library.boundary
-    return Subject(name, truth.crash_rate, truth.std_error, *facts)
 
 
 @contextmanager

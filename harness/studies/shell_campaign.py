@@ -1,12 +1,13 @@
 """One shells campaign on a drawn pool: allocation, rounds, stop rule and estimator are those of a real campaign.
 
-Given the pool, the tests of a stratum are independent draws, so that the world is replaced by one binomial number per
-stratum and round. A real campaign draws from a systematic sample of the pool's cut-ins without replacement, which
-scatters no more than that.
+Given the pool, the tests of a stratum are independent draws, so that the world is replaced by a few random numbers per
+stratum and round: how many tests fall into each of its cells, and how many of those crash. A real campaign draws from a
+systematic sample of the pool's cut-ins without replacement, which scatters no more than that.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -18,10 +19,13 @@ from harness.arrays import FloatArray, IntArray
 from harness.campaign.models import Campaign
 from harness.estimators.block import Block
 from harness.estimators.estimate import Estimate
+from harness.estimators.likelihood_ratio import Level
+from harness.estimators.shells import Shells
 from harness.runner.planner import RoundRule, ShellPlanner
 from harness.strata import ShellDesign
 from harness.studies.experiment import Fault
 from harness.studies.judgement import Row, estimate_row
+from harness.studies.truths import preventable_by, ratio_to
 
 FREE = "shells"
 
@@ -35,8 +39,8 @@ def result_of(statement: str) -> str:
 class DrawnPool:
     """A pool, and what a vehicle does on its paths.
 
-    ``mass`` and ``crash_mass`` (n, S) are each path's probability of a cut-in of each stratum, and of a crash in it;
-    ``failing`` is the share of crashes that end as failed tests.
+    ``mass`` and ``crash_mass`` (n, C) are each path's probability of a cut-in of each cell of the design, and of a
+    crash in it; ``failing`` is the share of crashes that end as failed tests.
     """
 
     design: ShellDesign
@@ -46,7 +50,7 @@ class DrawnPool:
 
     @cached_property
     def share(self) -> FloatArray:
-        """Share of crashes in each stratum, shape (S,)."""
+        """Share of crashes in each cell, shape (C,)."""
         p, crash_p = self.mass.sum(0), self.crash_mass.sum(0)
         share = np.divide(crash_p, p, out=np.zeros_like(p), where=p > 0.0)
         return np.asarray(np.clip(share, 0.0, 1.0))  # rounding may leave the unit interval
@@ -55,9 +59,20 @@ class DrawnPool:
     def _cumulative(self) -> FloatArray:
         return np.cumsum(self.crash_mass, axis=0)
 
-    def crashed_paths(self, stratum: int, n: int, rng: np.random.Generator) -> FloatArray:
-        """Mass (n, S) of the paths of n crashed tests of a stratum."""
-        cumulative = self._cumulative[:, stratum]
+    def tests_of_cells(self, added: IntArray, rng: np.random.Generator) -> IntArray:
+        """How many of so many tests of each stratum (S,) are of each cell, shape (C,)."""
+        found: IntArray = added if added.size == self.mass.shape[1] else rng.multinomial(added, self._cells).sum(0)
+        return found
+
+    @cached_property
+    def _cells(self) -> FloatArray:
+        """Probability of each cell given the stratum, shape (S, C)."""
+        within = (self.design.joined * self.mass.sum(0)[:, None]).T
+        return np.asarray(within / np.maximum(within.sum(1, keepdims=True), np.finfo(np.float64).tiny))
+
+    def crashed_paths(self, cell: int, n: int, rng: np.random.Generator) -> FloatArray:
+        """Mass (n, C) of the paths of n crashed tests of a cell."""
+        cumulative = self._cumulative[:, cell]
         paths: FloatArray = self.mass[np.searchsorted(cumulative, rng.random(n) * cumulative[-1], side="right")]
         return paths
 
@@ -80,38 +95,46 @@ class ShellCampaign:
     fault: Fault | None = None
 
     def run(self, replications: range) -> list[Row]:
-        """Rows of both statements for each replication."""
+        """Rows of all statements for each replication, and of the comparisons with reference drivers."""
         return [row for replication in replications for row in self._replicate(replication)]
 
     def _replicate(self, replication: int) -> Iterator[Row]:
         rng = np.random.default_rng([self.seed, replication])
-        drawn = _wrong(self.source.draw(rng), self.fault)
+        drawn = with_fault(self.source.draw(rng), self.fault)
         design = drawn.design
         available = np.full(design.p.size, self.campaign.pool.cut_ins_per_shell, np.int64)
         planner = ShellPlanner(self.campaign, design, available)
         rules = {each.name: RoundRule(asking(self.campaign, each.name)) for each in design.statements}
         known: dict[str, Row] = {}
-        estimate: Estimate | None = None
         enough = False
         while not enough and (added := planner.next_round()).any():
             enough = planner.add(campaign_block(drawn, added, int(planner.tally.tests.sum()), rng))
-            estimate = planner.estimate
-            if estimate is not None:
-                known |= dict(_newly_known(estimate, replication, {k: v for k, v in rules.items() if k not in known}))
-        if estimate is None:
-            raise ValueError("the campaign has no tests")
+            for name, rule in rules.items():
+                if name not in known and planner.seen.tally.tests.size and rule.observe(planner.seen) and rule.reached:
+                    known[name] = self._statement_row(planner.seen, name, replication, reached=True)
+        estimate = planner.seen.result(self.campaign.stop.confidence)
         outside = int(estimate.details["statements"][0]["n_crashes_outside"])
         yield estimate_row(FREE, replication, estimate, reached=planner.rule.reached, outside=outside)
         for name in rules:
-            yield known.get(name) or _statement_row(estimate, name, replication, reached=False)
+            yield known.get(name) or self._statement_row(planner.seen, name, replication, reached=False)
+        for reference in design.references:
+            yield from _reference_rows(estimate, reference.name, replication, reached=planner.rule.reached)
 
-
-def _newly_known(estimate: Estimate, replication: int, rules: dict[str, RoundRule]) -> Iterator[tuple[str, Row]]:
-    """Rows of statements that have just become precise enough."""
-    for name, rule in rules.items():
-        rule.observe(estimate)
-        if rule.reached:
-            yield name, _statement_row(estimate, name, replication, reached=True)
+    def _statement_row(self, seen: Shells, name: str, replication: int, *, reached: bool) -> Row:
+        found = seen.within(name, self.campaign.stop.confidence)
+        return Row(
+            result_of(name),
+            replication,
+            n_tests=found.n_episodes,
+            n_crashes=found.n_crashes,
+            crash_rate=found.crash_rate,
+            std_error=seen.std_error(found.n_shells),
+            ci_low=found.ci_low,
+            ci_high=found.ci_high,
+            reached=reached,
+            n_crashes_outside=found.n_crashes_outside,
+            refused=math.isinf(found.rhw_from_pool),
+        )
 
 
 def asking(campaign: Campaign, statement: str) -> Campaign:
@@ -120,24 +143,25 @@ def asking(campaign: Campaign, statement: str) -> Campaign:
     return campaign.model_copy(update={"testing": campaign.testing.model_copy(update={"shells": shells})})
 
 
-def _wrong(drawn: DrawnPool, fault: Fault | None) -> DrawnPool:
+def with_fault(drawn: DrawnPool, fault: Fault | None) -> DrawnPool:
     """The pool with probabilities that are not those of its paths."""
     if fault is None:
         return drawn
-    factor = np.ones(drawn.design.cell_p.size)
-    factor[fault.shell] = fault.factor
+    factor = np.where(np.array(drawn.design.cell_stratum) == fault.shell, fault.factor, 1.0)
     return replace(drawn, design=replace(drawn.design, cell_p=drawn.design.cell_p * factor))
 
 
 def campaign_block(drawn: DrawnPool, added: IntArray, first: int, rng: np.random.Generator) -> Block:
-    """What the records of a round become: within a stratum the crashes come first, which no estimator can see."""
-    stratum, crashes = np.repeat(np.arange(added.size), added), rng.binomial(added, drawn.share)
-    n = stratum.size
-    rank = np.arange(n) - np.repeat(np.cumsum(added) - added, added)
-    none, bad = np.zeros(n, np.bool_), rank < crashes[stratum]
-    failed = bad & (rank < rng.binomial(crashes, drawn.failing)[stratum]) if drawn.failing else none
-    mass = np.zeros((n, added.size))
-    mass[bad] = np.concatenate([drawn.crashed_paths(s, k, rng) for s, k in enumerate(crashes.tolist())])
+    """What the records of a round become: within a cell the crashes come first, which no estimator can see."""
+    tests = drawn.tests_of_cells(added, rng)
+    cell, crashes = np.repeat(np.arange(tests.size), tests), rng.binomial(tests, drawn.share)
+    n = cell.size
+    rank = np.arange(n) - np.repeat(np.cumsum(tests) - tests, tests)
+    none, bad = np.zeros(n, np.bool_), rank < crashes[cell]
+    failed = bad & (rank < rng.binomial(crashes, drawn.failing)[cell]) if drawn.failing else none
+    mass = np.zeros((n, tests.size))
+    for c in np.flatnonzero(crashes).tolist():
+        mass[bad & (cell == c)] = drawn.crashed_paths(c, int(crashes[c]), rng)
     return Block(
         first_episode=first,
         method="shells",
@@ -149,25 +173,31 @@ def campaign_block(drawn: DrawnPool, added: IntArray, first: int, rng: np.random
         log_q=np.zeros((n, 0)),
         alpha=np.zeros(0),
         n_control_steps=np.zeros(n, np.int64),
-        stratum=stratum,
-        cell=stratum,
+        stratum=np.array(drawn.design.cell_stratum)[cell],
+        cell=cell,
         cell_mass=mass,
         shells=drawn.design,
     )
 
 
-def _statement_row(estimate: Estimate, name: str, replication: int, *, reached: bool) -> Row:
-    found = next(each for each in estimate.details["statements"] if each["name"] == name)
-    shells = [shell for shell in estimate.details["shells"][: found["n_shells"]] if shell["n_episodes"]]
-    variance = sum(
-        shell["p"] ** 2 * shell["crash_share"] * (1.0 - shell["crash_share"]) / shell["n_episodes"] for shell in shells
-    )
-    reported = {name: found[name] for name in ("n_crashes", "crash_rate", "ci_low", "ci_high", "n_crashes_outside")}
-    return Row(
-        result_of(name),
-        replication,
-        n_tests=found["n_episodes"],
-        std_error=float(np.sqrt(variance)),
-        reached=reached,
-        **reported,
-    )
+def _reference_rows(estimate: Estimate, reference: str, replication: int, *, reached: bool) -> Iterator[Row]:
+    """Ratio to a reference driver, and the share of crashes that it would have avoided; open where nothing is said."""
+    found = next((each for each in estimate.details["references"] if each["reference"] == reference), None)
+    z = Level.two_sided(estimate.confidence).z
+    for name, key, widest in (
+        (ratio_to(reference), "ratio", (math.nan, 0.0, math.inf)),
+        (preventable_by(reference), "preventable", (math.nan, 0.0, 1.0)),
+    ):
+        value, low, high = widest if found is None else (found[key], found[f"{key}_low"], found[f"{key}_high"])
+        yield Row(
+            name,
+            replication,
+            n_tests=estimate.n_episodes,
+            n_crashes=estimate.n_crashes,
+            crash_rate=value,
+            std_error=(high - low) / 2.0 / z,
+            ci_low=low,
+            ci_high=high,
+            reached=reached,
+            refused=found is None,
+        )

@@ -2,48 +2,94 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from harness.arrays import FloatArray, IntArray
-from harness.campaign.models import AutomatedVehicle
+from harness.arrays import BoolArray, FloatArray, IntArray
 from harness.campaign.testing import ShellSettings
 from harness.errors import CampaignError
 from harness.pool.cut_ins import CutIns, Pool, shells_of
 from harness.pool.library import Library
-from harness.pool.shells import acceleration_limit, design_shells, outermost, shells_in_strata
+from harness.pool.shells import cells_in_strata, design_shells, outermost, shells_in_strata
+from harness.strata import ShellDesign
 from harness.studies.experiment import Adversary
 from harness.studies.shell_campaign import DrawnPool
-from harness.studies.super_population import Mixed, SuperPopulation
+from harness.studies.super_population import SuperPopulation, reference_drivers
 
 EQUAL_RATE = 0.02
 """A surrogate whose crash rate is this close to the vehicle's counts as its equal."""
 
 
 @dataclass(frozen=True, eq=False)
-class OvertakingShells:
-    """Pools of one vehicle, with its equals left out of the library; see `harness.studies.shell_campaign.ShellSource`.
+class DrawnCells:
+    """Cells of a super-population's paths, of which pools are drawn.
 
     Attributes
     ----------
     template : Pool
-        Pool without cut-ins, whose probabilities each draw replaces.
+        Pool without cut-ins, whose probabilities each draw replaces; ``n_paths`` is that of a pool.
     left_out : tuple of str
-        The vehicle's equals.
+        Surrogates that are equals of a vehicle.
     limit_mps2 : float
-        Hardest acceleration of the vehicle.
-    failing : float
-        Share of its crashes that end as failed tests.
-    shells, crashing : ndarray, shape (n, D + 1)
-        Probability of each shell by path of the super-population, and the part on which the vehicle crashes.
+        Hardest acceleration of the vehicles.
+    mass : ndarray, shape (n, C)
+        Probability of a cut-in of each cell, by path of the super-population.
     """
 
     template: Pool
     left_out: tuple[str, ...]
     limit_mps2: float
-    shells: FloatArray
+    mass: FloatArray
+
+    def draw(self, rng: np.random.Generator, masses: Sequence[FloatArray]) -> tuple[ShellDesign, list[FloatArray]]:
+        """The design of a new pool, and for ``masses`` (n, C) what they are on its paths, by the design's cells."""
+        rows = rng.integers(0, len(self.mass), self.template.n_paths)
+        drawn = self.mass[rows]
+        by_reference = drawn @ self._crash_of_references
+        pool = replace(
+            self.template,
+            cell_p=drawn.mean(0),
+            p_cut_in=float(drawn.sum(1).mean()),
+            reference_rate=by_reference.mean(0),
+            reference_square=(by_reference * by_reference).mean(0),
+        )
+        design = design_shells(pool, limit_mps2=self.limit_mps2)
+        groups = shells_in_strata(pool, outermost(pool, ShellSettings()), self.limit_mps2)
+        cells = cells_in_strata(pool, groups)
+        tested = np.flatnonzero(cells >= 0)
+        joined = np.zeros((tested.size, design.cell_p.size))
+        joined[np.arange(tested.size), cells[tested]] = 1.0
+        found = [of[rows][:, tested] @ joined if of is not self.mass else drawn[:, tested] @ joined for of in masses]
+        return design, found
+
+    @property
+    def _crash_of_references(self) -> FloatArray:
+        """1 where a reference crashes on a cell's cut-ins, shape (C, R)."""
+        references = np.arange(len(self.template.library.references))
+        return np.asarray((self.template.cell_references[:, None] >> references) & 1, np.float64)
+
+    def crashes_outside(self, crashing: FloatArray) -> dict[str, float]:
+        """Share of a crash mass by cell (n, C) that lies beyond the boundary of each statement; 0 of no crash."""
+        by_cell, names = crashing.sum(0), self.template.names
+        total = by_cell.sum() or 1.0
+        places = {
+            name: names.index(each.boundary)
+            for name, each in self.template.library.statement_settings(ShellSettings()).items()
+        }
+        return {name: float(by_cell[self.template.cell_shell > place].sum() / total) for name, place in places.items()}
+
+
+@dataclass(frozen=True, eq=False)
+class OvertakingShells:
+    """Pools of one vehicle; see `harness.studies.shell_campaign.ShellSource`.
+
+    ``crashing`` (n, C) is the part of ``cells.mass`` on which the vehicle crashes, ``failing`` the share of its crashes
+    that end as failed tests.
+    """
+
+    cells: DrawnCells
     crashing: FloatArray
     failing: float = 0.0
 
@@ -52,40 +98,105 @@ class OvertakingShells:
         """That of the super-population."""
         return float(self.crashing.sum() / len(self.crashing))
 
-    @property
-    def crashes_outside(self) -> dict[str, float]:
-        """Share of the vehicle's crash rate that lies beyond the boundary of each statement."""
-        by_shell, names = self.crashing.sum(0), self.template.names
-        inside = {
-            name: np.isin(np.arange(by_shell.size), range(names.index(each.boundary) + 1))
-            for name, each in self.template.library.statement_settings(ShellSettings()).items()
-        }
-        return {name: float(by_shell[~within].sum() / by_shell.sum()) for name, within in inside.items()}
-
     def draw(self, rng: np.random.Generator) -> DrawnPool:
         """A new pool."""
-        rows = rng.integers(0, len(self.shells), self.template.n_paths)
-        drawn = self.shells[rows]
-        pool = replace(self.template, cell_p=drawn.mean(0), p_cut_in=float(drawn.sum(1).mean()))
-        design = design_shells(pool, limit_mps2=self.limit_mps2)
-        groups = shells_in_strata(pool, outermost(pool, ShellSettings()), self.limit_mps2)
+        design, (mass, crashing) = self.cells.draw(rng, [self.cells.mass, self.crashing])
+        return DrawnPool(design, mass, crashing, self.failing)
 
-        def by_stratum(by_shell: FloatArray) -> FloatArray:
-            return np.column_stack([by_shell[:, group].sum(1) for group in groups])
 
-        return DrawnPool(design, by_stratum(drawn), by_stratum(self.crashing[rows]), self.failing)
+@dataclass(frozen=True, eq=False)
+class OvertakingPairs:
+    """Pools of two vehicles; see `harness.studies.paired_campaign.PairSource`.
 
-    def as_adversary(self, made: Adversary) -> OvertakingShells:
-        """The same vehicle with other crashes; see `harness.studies.experiment.Adversary`."""
-        inside, crashing = outermost(self.template, ShellSettings()) + 1, self.crashing.copy()
+    ``crashing`` are the masses (n, C) of cut-ins on which both crash, only A, and only B.
+    """
+
+    cells: DrawnCells
+    crashing: tuple[FloatArray, FloatArray, FloatArray]
+
+    def draw(self, rng: np.random.Generator) -> list[DrawnPool]:
+        """A new pool: where both crash, only A, only B."""
+        design, (mass, *crashing) = self.cells.draw(rng, [self.cells.mass, *self.crashing])
+        return [DrawnPool(design, mass, each) for each in crashing]
+
+
+class Division:
+    """Cut-ins of a super-population, divided by a library without the equals of some vehicles.
+
+    Attributes
+    ----------
+    cells : DrawnCells
+    """
+
+    def __init__(
+        self,
+        library: Library,
+        population: SuperPopulation,
+        crashing: Sequence[FloatArray],
+        pool_paths: int,
+        *,
+        limit_mps2: float,
+        shadow_runs: bool = False,
+    ) -> None:
+        """Leave out the equals of vehicles that crash on these masses of cut-ins, (m,) each."""
+        bit = {name: driver for driver, name in enumerate(library.surrogates)}
+        rate = {name: float(population.mass[population.crashes(driver)].sum()) for name, driver in bit.items()}
+        careful_first = tuple(sorted(bit, key=rate.__getitem__))
+        alike = set().union(*(equals(library, population, of_vehicle) for of_vehicle in crashing))
+        reduced = leave_out(library, alike, careful_first)
+        names = tuple(name for name in careful_first if name in reduced.surrogates)
+        self._population = population
+        self._shell = shells_of(population.bits, np.array([bit[name] for name in names])).astype(np.int64)
+        references = list(reference_drivers(library).values())
+        crash_too = sum(
+            (population.crashes(driver).astype(np.int64) << r for r, driver in enumerate(references)),
+            start=np.zeros(population.bits.size, np.int64),
+        )
+        nobody = len(names) << len(references)
+        kind = np.append((self._shell << len(references)) | crash_too, nobody)
+        kinds, cell = np.unique(kind, return_inverse=True)
+        self._cell, self._n_cells = cell[:-1], kinds.size
+        mass = self.by_cell(population.mass)
+        mass[:, cell[-1]] += np.maximum(population.cut_in - mass.sum(1), 0.0)
+        divided = kinds >> len(references), kinds & ((1 << len(references)) - 1)
+        template = _template(reduced, names, divided, mass, pool_paths, shadow_runs=shadow_runs)
+        left_out = tuple(name for name in careful_first if name not in reduced.surrogates)
+        self.cells = DrawnCells(template, left_out, limit_mps2, mass)
+
+    def by_cell(self, mass: FloatArray) -> FloatArray:
+        """A mass of cut-ins (m,) by path and cell, (n, C)."""
+        place = self._population.path * self._n_cells + self._cell
+        summed = np.bincount(place, mass, minlength=self._population.n_paths * self._n_cells)
+        return np.asarray(summed, np.float64).reshape(-1, self._n_cells)
+
+    def of_vehicle(self, crashing: FloatArray, failing: float = 0.0) -> OvertakingShells:
+        """Pools of a vehicle that crashes on this mass of cut-ins (m,)."""
+        return OvertakingShells(self.cells, self.by_cell(crashing), failing)
+
+    def of_pair(self, a: FloatArray, b: FloatArray) -> OvertakingPairs:
+        """Pools of two vehicles that crash on these masses of cut-ins (m,).
+
+        Where either crashes on a share of a cut-in's episodes, by inattention or by what an adversary is made of, the
+        two do so independently.
+        """
+        mass = self._population.mass
+        both = a * np.divide(b, mass, out=np.zeros_like(mass), where=mass > 0.0)
+        only_a, only_b = (np.maximum(one - both, 0.0) for one in (a, b))
+        return OvertakingPairs(self.cells, (self.by_cell(both), self.by_cell(only_a), self.by_cell(only_b)))
+
+    def as_adversary(self, made: Adversary, crashing: FloatArray) -> FloatArray:
+        """The mass of crashes (m,) of an adversary made of a vehicle; see `harness.studies.experiment.Adversary`."""
+        boundary, population = outermost(self.cells.template, ShellSettings()), self._population
+        inside: BoolArray = self._shell <= boundary
         if made.crashes != "everywhere":
-            weight = crashing[:, :inside].sum(1)
+            weight = population.by_path(crashing * inside)
             order = np.argsort(-weight if made.crashes == "on_heaviest_paths" else weight, kind="stable")
-            kept = np.cumsum(weight[order]) <= made.share * weight.sum()
-            crashing[order[~kept]] = 0.0
-        tested = slice(inside, -1)  # the last shell is for cut-ins on which nobody crashes
-        crashing[:, tested] = np.maximum(crashing[:, tested], made.hole * self.shells[:, tested])
-        return replace(self, crashing=crashing, failing=made.failing)
+            kept = np.zeros(weight.size, np.bool_)
+            kept[order] = np.cumsum(weight[order]) <= made.share * weight.sum()
+            crashing = crashing * kept[population.path]
+        # Cut-ins on which nobody crashes are no part of a hole either: they are not tested.
+        tested = ~inside & (self._shell < len(self.cells.template.names))
+        return np.where(tested, np.maximum(crashing, made.hole * population.mass), crashing)
 
 
 def equals(library: Library, population: SuperPopulation, crashing: FloatArray) -> set[str]:
@@ -133,56 +244,34 @@ def leave_out(library: Library, names: set[str], careful_first: tuple[str, ...])
     return library.without(names)
 
 
-def overtaking_shells(
-    library: Library, population: SuperPopulation, av: AutomatedVehicle, vehicle: Mixed, pool_paths: int
-) -> OvertakingShells:
-    """Source of a vehicle's pools; the library's drivers are the first of the population's."""
-    crashing = vehicle.crash_mass(population)
-    pools, by_shell = _pools(library, population, [crashing], acceleration_limit(av), pool_paths)
-    return replace(pools, crashing=by_shell(crashing))
-
-
-def _pools(
-    library: Library, population: SuperPopulation, crashing: list[FloatArray], limit_mps2: float, pool_paths: int
-) -> tuple[OvertakingShells, Callable[[FloatArray], FloatArray]]:
-    """Pools without the vehicles' equals, and what divides a mass of cut-ins (m,) by path and shell (n, D + 1)."""
-    bit = {name: driver for driver, name in enumerate(library.surrogates)}
-    rate = {name: float(population.mass[population.crashes(driver)].sum()) for name, driver in bit.items()}
-    careful_first = tuple(sorted(bit, key=rate.__getitem__))
-    alike = set().union(*(equals(library, population, of_vehicle) for of_vehicle in crashing))
-    reduced = leave_out(library, alike, careful_first)
-    names = tuple(name for name in careful_first if name in reduced.surrogates)
-    shell = shells_of(population.bits, np.array([bit[name] for name in names]))
-
-    def by_shell(mass: FloatArray) -> FloatArray:
-        return np.column_stack([population.by_path(mass * (shell == s)) for s in range(len(names) + 1)])
-
-    shells = by_shell(population.mass)
-    shells[:, -1] = np.maximum(population.cut_in - shells[:, :-1].sum(1), 0.0)
-    left_out = tuple(name for name in careful_first if name not in reduced.surrogates)
-    template = _template(reduced, names, shells, pool_paths)
-    return OvertakingShells(template, left_out, limit_mps2, shells, np.zeros_like(shells)), by_shell
-
-
-def _template(library: Library, names: tuple[str, ...], shells: FloatArray, n_paths: int) -> Pool:
-    d = len(names)
+def _template(
+    library: Library,
+    names: tuple[str, ...],
+    kind: tuple[IntArray, IntArray],
+    mass: FloatArray,
+    n_paths: int,
+    *,
+    shadow_runs: bool,
+) -> Pool:
+    """Pool without cut-ins; ``kind`` are shell and references of each cell, ``mass`` is (n, C)."""
+    d, r = len(names), len(library.references)
     none: IntArray = np.zeros(0, np.int64)
     no_draws = np.zeros((0, 0), np.int8)
     return Pool(
         key="drawn",
         environment="drawn",
-        library=library.model_copy(update={"references": {}}),
+        library=library,
         names=names,
         n_paths=n_paths,
-        p_cut_in=float(shells.sum(1).mean()),
+        p_cut_in=float(mass.sum(1).mean()),
         p_cut_in_se=0.0,
         mu=np.zeros(d),
         mu_covariance=np.zeros((d, d)),
-        cell_shell=np.arange(d + 1),
-        cell_references=np.zeros(d + 1, np.int64),
-        cell_p=shells.mean(0),
-        reference_rate=np.zeros(0),
-        reference_square=np.zeros(0),
+        cell_shell=kind[0],
+        cell_references=kind[1],
+        cell_p=mass.mean(0),
+        reference_rate=np.zeros(r),
+        reference_square=np.zeros(r),
         cut_ins=CutIns(
             path=none,
             step=none,
@@ -192,7 +281,8 @@ def _template(library: Library, names: tuple[str, ...], shells: FloatArray, n_pa
             bv=no_draws,
             n_lv=none,
             n_bv=none,
-            crashes=np.zeros((0, d), np.bool_),
-            path_mass=np.zeros((0, d + 1), np.float32),
+            crashes=np.zeros((0, d + r), np.bool_),
+            path_mass=np.zeros((0, kind[0].size), np.float32),
+            motion=np.zeros(int(shadow_runs), np.uint64),
         ),
     )

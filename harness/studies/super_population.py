@@ -1,15 +1,15 @@
 """A large population of enumerated paths: every cut-in, its probability, which drivers crash on it; and so the truth.
 
 Enumerating a pool takes seconds, thousands of pools hours. So many paths are enumerated once, and the pools of the
-replications are drawn from them with replacement, path by path, as real pools are drawn from all paths. The true crash
-rates are from other paths, that no pool of the experiment has.
+replications are drawn from them with replacement, path by path, as real pools are drawn from all paths. The truth is
+from other paths (`harness.studies.truths`), that no pool of the experiment has.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
@@ -20,7 +20,7 @@ import pyarrow.parquet as pq
 
 from harness.arrays import BoolArray, FloatArray, IntArray, RecordArray
 from harness.campaign.models import AutomatedVehicle, BuiltInParameters, Reflexes
-from harness.compiled import cache_root, source_hash
+from harness.compiled import WORLD_SOURCES, cache_root, source_hash
 from harness.environment.driving import Environment
 from harness.errors import CampaignError
 from harness.pool.aimed_paths import PILOT_PATHS, Enumerator
@@ -34,9 +34,6 @@ from harness.vehicles.models import driver_records
 MOST_DRIVERS = 62
 NO_ENVELOPE = -1
 CHUNK_PATHS = 2048
-LARGEST_ERROR = 0.005
-"""Relative standard error that a truth should have at most."""
-MORE_PATHS = 2
 _FORMAT = 1
 _COLUMNS = ("path", "mass", "bits")
 
@@ -59,6 +56,11 @@ class SuperPopulation:
     path: IntArray
     mass: FloatArray
     bits: IntArray
+
+    @property
+    def n_paths(self) -> int:
+        """Number of paths."""
+        return self.cut_in.size
 
     def crashes(self, driver: int) -> BoolArray:
         """On which cut-ins a driver crashes, shape (m,)."""
@@ -95,21 +97,24 @@ class Drivers:
         The driver that crashes wherever another one does; -1 if there is none.
     vehicles : dict of Mixed
         By name.
+    references : dict of int
+        The library's reference drivers by name.
     """
 
     records: RecordArray
     envelope: int
     vehicles: dict[str, Mixed]
+    references: dict[str, int]
 
     @classmethod
     def of(cls, library: Library, avs: Mapping[str, AutomatedVehicle], *, see_onset: bool = False) -> Drivers:
-        """The library's, in the order of its file, and then those of vehicles with built-in models.
+        """The library's, references last, in the order of its file, and then vehicles with built-in models.
 
-        ``see_onset`` as in `harness.vehicles.models.driver_records`.
+        ``see_onset`` is that of `harness.vehicles.models.driver_records`.
 
         The envelope is the library's, unless a vehicle accelerates harder.
         """
-        models = list(library.surrogates.values())
+        models = [*library.surrogates.values(), *library.references.values()]
         parameters: list[BuiltInParameters] = [model.parameters for model in models]
         reactions: list[Reflexes] = [model.reaction for model in models]
         vehicles = {}
@@ -127,15 +132,23 @@ class Drivers:
             )
         enclosed = all(acceleration_limit(av) <= library.envelope_mps2 for av in avs.values())
         envelope = list(library.surrogates).index(library.envelope) if enclosed else NO_ENVELOPE
-        return cls(driver_records(parameters, reactions, see_onset=see_onset), envelope, vehicles)
+        records = driver_records(parameters, reactions, see_onset=see_onset)
+        return cls(records, envelope, vehicles, reference_drivers(library))
 
     def only(self, names: set[str]) -> Drivers:
-        """The envelope and the drivers of some vehicles."""
+        """The envelope, the references and the drivers of some vehicles."""
         vehicles = {name: one for name, one in self.vehicles.items() if name in names}
         enclosed = self.envelope != NO_ENVELOPE
-        kept = [self.envelope] * enclosed + [d for one in vehicles.values() for d in one.drivers]
+        kept = [self.envelope] * enclosed + [*self.references.values()]
+        kept += [d for one in vehicles.values() for d in one.drivers]
         renumbered = {name: Mixed(tuple(map(kept.index, one.drivers)), one.shares) for name, one in vehicles.items()}
-        return Drivers(self.records[kept], 0 if enclosed else NO_ENVELOPE, renumbered)
+        references = {name: kept.index(driver) for name, driver in self.references.items()}
+        return Drivers(self.records[kept], 0 if enclosed else NO_ENVELOPE, renumbered, references)
+
+
+def reference_drivers(library: Library) -> dict[str, int]:
+    """The library's reference drivers by name, as places among all its drivers."""
+    return {name: len(library.surrogates) + r for r, name in enumerate(library.references)}
 
 
 def _reactions(av: AutomatedVehicle) -> list[tuple[Reflexes, float]]:
@@ -153,14 +166,22 @@ def enumerate_paths(
 ) -> SuperPopulation:
     """Enumerate paths that are aimed at the drivers' crashes, or read them from the cache."""
     asked = environment, drivers.records, drivers.envelope, seed
-    file = cache_root() / "super_populations" / f"{_key(*asked, n_paths)}.parquet"
+
+    def enumerated() -> SuperPopulation:
+        pilot = Enumerator(*asked)
+        progress.stage(f"super-population of seed {seed}", n_paths + PILOT_PATHS)
+        rates = pilot.run(0, PILOT_PATHS, progress).rates(drivers.records.size)
+        return _compressed(pilot.aimed(rates), n_paths, progress)
+
+    return cached(population_key(environment, drivers.records.tolist(), *asked[2:], n_paths), enumerated)
+
+
+def cached(key: str, make: Callable[[], SuperPopulation]) -> SuperPopulation:
+    """A population of a key, read from the cache or made and kept there."""
+    file = cache_root() / "super_populations" / f"{key}.parquet"
     if file.is_file():
         return _read(file)
-    pilot = Enumerator(*asked)
-    progress.stage(f"super-population of seed {seed}", n_paths + PILOT_PATHS)
-    rates = pilot.run(0, PILOT_PATHS, progress).rates(drivers.records.size)
-    aimed = pilot.aimed(rates)
-    population = _compressed(aimed, n_paths, progress)
+    population = make()
     _write(file, population)
     return population
 
@@ -172,12 +193,19 @@ def _compressed(aimed: Enumerator, n_paths: int, progress: Progress) -> SuperPop
         paths = aimed.run(PILOT_PATHS + first, min(CHUNK_PATHS, n_paths - first), progress)
         mass, bits = paths.mass, paths.crashes
         row, step = np.nonzero((bits != 0) & (mass > 0.0))
-        parts.append((mass.sum(1), first + row.astype(np.int64), mass[row, step], bits[row, step]))
-    return SuperPopulation(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+        parts.append(SuperPopulation(mass.sum(1), first + row.astype(np.int64), mass[row, step], bits[row, step]))
+    return joined(parts)
 
 
-def _key(environment: Environment, drivers: RecordArray, envelope: int, seed: int, n_paths: int) -> str:
-    content = [_FORMAT, source_hash(), environment_hash(environment), drivers.tolist(), envelope, seed, n_paths]
+def joined(parts: Sequence[SuperPopulation]) -> SuperPopulation:
+    """All in one; each part knows the numbers that its paths have in the whole."""
+    columns = ("cut_in", *_COLUMNS)
+    return SuperPopulation(*(np.concatenate([getattr(part, name) for part in parts]) for name in columns))
+
+
+def population_key(environment: Environment, *content_of: object) -> str:
+    """Hash of all that a population depends on: plain content, an environment, and code."""
+    content = [_FORMAT, source_hash(WORLD_SOURCES), environment_hash(environment), *content_of]
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:24]
 
 
@@ -191,46 +219,3 @@ def _read(file: Path) -> SuperPopulation:
     table = pq.read_table(file, partitioning=None)
     cut_in = np.frombuffer(table.schema.metadata[b"cut_in"], np.float64)
     return SuperPopulation(cut_in, *(np.asarray(table.column(name)) for name in _COLUMNS))
-
-
-@dataclass(frozen=True)
-class Truth:
-    """A crash rate and its standard error."""
-
-    crash_rate: float
-    std_error: float
-
-    @property
-    def relative_error(self) -> float:
-        """Standard error over the rate; infinite at rate 0."""
-        return self.std_error / self.crash_rate if self.crash_rate > 0.0 else float("inf")
-
-
-def truths(environment: Environment, drivers: Drivers, seed: int, n_paths: int, progress: Progress) -> dict[str, Truth]:
-    """Crash rates of all vehicles.
-
-    Paths are aimed at all drivers together. Vehicles that this leaves too imprecise, mostly those that crash in quite
-    other places than the rest, are enumerated again with twice the paths, aimed at them alone.
-    """
-    found = _rates(drivers, enumerate_paths(environment, drivers, seed, n_paths, progress))
-    imprecise = {name for name, truth in found.items() if truth.relative_error > LARGEST_ERROR}
-    if not imprecise:
-        return found
-    again = drivers.only(imprecise)
-    aimed = enumerate_paths(environment, again, seed + 1, MORE_PATHS * n_paths, progress)
-    return found | {name: combined(found[name], better) for name, better in _rates(again, aimed).items()}
-
-
-def combined(a: Truth, b: Truth) -> Truth:
-    """Mean of two independent truths, weighted by their inverse variances."""
-    weights = a.std_error**-2, b.std_error**-2
-    total = sum(weights)
-    return Truth((weights[0] * a.crash_rate + weights[1] * b.crash_rate) / total, total**-0.5)
-
-
-def _rates(drivers: Drivers, population: SuperPopulation) -> dict[str, Truth]:
-    found = {}
-    for name, vehicle in drivers.vehicles.items():
-        by_path = population.by_path(vehicle.crash_mass(population))
-        found[name] = Truth(float(by_path.mean()), float(by_path.std() / np.sqrt(by_path.size)))
-    return found

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from harness.campaign.loading import load_campaign
+from harness.controllers.hosts import EpisodeRandom
 from harness.errors import CampaignError
 from harness.outcomes import PASSED
 from harness.resolved import resolve
@@ -62,3 +63,13 @@ def test_a_controller_acts_from_the_first_step(method, monkeypatch):
 def test_a_method_that_draws_the_path_ahead_refuses_it():
     with pytest.raises(CampaignError, match=r"draws LV's and BV's path ahead.*shells \(or forced\)"):
         load("episode_mixture")
+
+
+def test_tests_of_one_shadow_run_that_begin_together_have_streams_of_their_own():
+    """Both are told the same index: the second was given the rest of the first one's numbers, and its test failed."""
+    random = EpisodeRandom(7, [3, 5, 3])
+    first, other, second = (stream.uniform(size=4) for stream in random)
+    np.testing.assert_array_equal(first, second)
+    assert not np.any(first == other)
+    assert random[0] is random[-3]
+    assert [stream is random[i] for i, stream in zip((1, 2), random[1:], strict=True)] == [True, True]

@@ -93,18 +93,17 @@ def test_stored_forced_tests_can_be_asked_what_surrogates_would_have_done(campai
     assert rates["p_value_jointly"] > 1e-3  # seed fixed; fails once in a thousand
 
 
-def test_a_vehicle_that_acts_before_the_onset_has_a_pool_of_its_own(campaign, run_here, tmp_path):
-    """Shells and forced: in a test it must do what it did in its shadow run, through the step of the onset."""
-    asked = (*SHELLS, "world.engine=twin", "pool.shadow_paths=120", f"av={ACTING.format('Speeds')}")
-    shells = run_here(campaign(*asked), tmp_path / "shells")
-    episodes = stored_table(shells.folder, "episodes")
-    assert episodes.column("failure").null_count == episodes.num_rows > 500
-    assert set(episodes.column("lead_steps").to_pylist()) == {5}
-    forced = run_here(campaign(*asked, "testing.method=forced", "stop.episodes=240"), tmp_path / "forced")
+def test_a_vehicle_that_acts_before_the_onset_is_tested_after_shadow_runs(campaign, run_here, tmp_path):
+    """With forced cut-ins: in a test it must do what it did in its shadow run, through the step of the onset."""
+    asked = ("testing.method=forced", "world.engine=twin", LEAD, "stop.rhw=null", "stop.episodes=240")
+    speeds = f"av={ACTING.format('Speeds')}"
+    forced, again = (
+        run_here(campaign(*asked, speeds, f"world.cells={cells}"), tmp_path / str(cells)) for cells in (64, 5)
+    )
     rows = stored_table(forced.folder, "episodes")
-    assert rows.column("failure").null_count == rows.num_rows
-    again = run_here(campaign(*asked, "world.cells=5"), tmp_path / "again")
-    assert [name for name in unlike_columns(shells.folder, again.folder) if not name.endswith(".json")] == []
+    assert rows.column("failure").null_count == rows.num_rows == 240
+    assert set(rows.column("lead_steps").to_pylist()) == {5}
+    assert unlike_columns(forced.folder, again.folder) == []
 
 
 def test_av_check_looks_at_a_vehicle_from_the_onset_on_and_refuses_one_that_acts_before(campaign):

@@ -310,7 +310,7 @@ def test_rounds_grow_to_where_the_interval_is_widest():
 
 def test_failed_tests_draw_further_tests_to_their_shell():
     rule = Allocation(DESIGN, TWELVE, MANY, "library")
-    tests, crashes = np.array([400, 400, 0]), np.array([200, 0, 0])
+    tests, crashes = np.array([400, 400, 0]), np.array([20, 0, 0])
     without = rule.next_round(tally(tests, crashes, NONE), 10**6)
     with_failed = rule.next_round(tally(tests, crashes, np.array([0, 40, 0])), 10**6)
     assert with_failed[1] > without[1]

@@ -33,7 +33,20 @@ def test_shipped_experiments_are_right(file):
     ("text", "where", "found"),
     [
         ("avs: {acc: {sumo: {carFollowModel: ACC}}}\n" + SHELLS, "avs.acc", "an AV that av.sumo drives"),
-        ("avs: {mine: {controller: 'a.b:C'}}\n" + SHELLS, "avs.mine", "av.controller"),
+        ("avs: {mine: {controller: 'a.b:C'}}\n" + SHELLS, "avs.mine", "av.controller drives from the cut-in on"),
+        (
+            "avs: {mine: {controller: 'a.b:C', before_cut_in: controller}}\ncampaign: {testing: {method: forced}}\n",
+            "avs.mine.before_cut_in",
+            "controller",
+        ),
+        ("avs: {a: {}}\npairs: {p: {a: a, b: nobody}}\n" + SHELLS, "pairs.p.b", "nobody"),
+        (
+            "avs: {a: {}, c: {controller: 'a.b:C', before_cut_in: controller}}\npairs: {p: {a: a, b: c}}\n" + SHELLS,
+            "pairs.p.b",
+            "'c'",
+        ),
+        ("avs: {a: {}}\npairs: {p: {a: a, b: a}}\ncampaign: {testing: {method: nde}}\n", "pairs", "nde"),
+        ("avs: {a: {}}\nadversaries: {a: {of: a}}\n" + SHELLS, "adversaries.a", "a name that avs has"),
         ("avs: {a: {before_cut_in: controller}}\n" + SHELLS, "avs.a.before_cut_in", "controller"),
         (SHELLS, "avs", "neither"),
         ("avs: {a: {}}\nchains: [rare]\n" + SHELLS, "avs", "both"),

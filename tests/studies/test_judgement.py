@@ -21,7 +21,7 @@ def test_holm_as_in_a_worked_example():
 def test_normal_estimates_are_judged_right():
     rng = np.random.default_rng(1)
     rates = rng.normal(1.0, 0.1, 4000)
-    found = judge(Subject("a", 1.0), "x", rows(rates, 0.16449), 0.9)
+    found = judge(Subject.exact("a", 1.0), "x", rows(rates, 0.16449), 0.9)
     assert abs(found.bias) < 4.0 * found.bias_std_error
     assert found.true_relvar == pytest.approx(0.01, rel=0.1)
     assert found.claimed_relvar == pytest.approx(0.01, rel=1e-9)
@@ -32,7 +32,9 @@ def test_normal_estimates_are_judged_right():
 
 def test_too_narrow_intervals_are_noticed_and_too_wide_ones_are_not_blamed():
     rates = np.random.default_rng(1).normal(1.0, 0.1, 1000)
-    narrow, wide = (judge(Subject(n, 1.0), "x", rows(rates, h), 0.9) for n, h in (("narrow", 0.13), ("wide", 0.3)))
+    narrow, wide = (
+        judge(Subject.exact(n, 1.0), "x", rows(rates, h), 0.9) for n, h in (("narrow", 0.13), ("wide", 0.3))
+    )
     narrow, wide = corrected([narrow, wide])
     assert narrow.too_low
     assert not wide.too_low
@@ -42,17 +44,17 @@ def test_too_narrow_intervals_are_noticed_and_too_wide_ones_are_not_blamed():
 
 def test_a_conditional_statement_is_not_judged_where_it_does_not_hold():
     of = rows([0.5] * 10, 0.1, outside=1)
-    found = judge(Subject("a", 1.0, crashes_outside={"x": 0.4}), "x", of, 0.9)
+    found = judge(Subject.exact("a", 1.0, crashes_outside={"x": 0.4}), "x", of, 0.9)
     (found,) = corrected([found])
     assert found.p_value is None
     assert not found.too_low
     assert found.alarm == 1.0
-    held = judge(Subject("a", 1.0, crashes_outside={"x": 1e-4}), "x", of, 0.9)
+    held = judge(Subject.exact("a", 1.0, crashes_outside={"x": 1e-4}), "x", of, 0.9)
     assert held.p_value < 1e-6
 
 
 def test_the_number_of_tests_is_described_by_its_quantiles():
     of = [Row("x", k, k, 1, 1.0, 0.1, 0.9, 1.1, True) for k in range(1, 102)]
-    found = judge(Subject("a", 1.0), "x", of, 0.9)
+    found = judge(Subject.exact("a", 1.0), "x", of, 0.9)
     assert (found.tests_5, found.tests_median, found.tests_95) == (6.0, 51.0, 96.0)
     assert found.tests_for_wanted_rhw is None

@@ -37,7 +37,7 @@ def judged(runs: dict[str, list[Row]], result: str) -> list[Judgement]:
     found = []
     for name, rows in runs.items():
         of_result = [row for row in rows if row.result == result]
-        found.append(judge(Subject(name, CHAINS[name].crash_rate), result, of_result, CONFIDENCE))
+        found.append(judge(Subject.exact(name, CHAINS[name].crash_rate), result, of_result, CONFIDENCE))
     return corrected(found)
 
 

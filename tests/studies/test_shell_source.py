@@ -10,11 +10,13 @@ from harness.environment.loading import load_environment
 from harness.errors import CampaignError
 from harness.pool.build import build_pool
 from harness.pool.library import load_library
+from harness.pool.shells import acceleration_limit
 from harness.progress import SilentProgress
 from harness.studies.experiment import Adversary
 from harness.studies.shell_campaign import campaign_block
-from harness.studies.shell_source import equals, leave_out, overtaking_shells
-from harness.studies.super_population import NO_ENVELOPE, Drivers, Truth, combined, enumerate_paths, truths
+from harness.studies.shell_source import Division, equals, leave_out
+from harness.studies.super_population import NO_ENVELOPE, Drivers, enumerate_paths
+from harness.studies.truths import RATE, Truths
 
 PATHS = 1024
 ENVIRONMENT = load_environment(EnvironmentSettings())
@@ -50,17 +52,19 @@ def population(drivers):
     return enumerated(drivers)
 
 
-def test_two_truths_are_weighted_by_their_precision():
-    one = combined(Truth(1.0, 0.1), Truth(2.0, 0.2))
-    assert one.crash_rate == pytest.approx(1.2)
-    assert one.std_error == pytest.approx(0.1 * 0.8**0.5)
+def shells_of(drivers, population, name="own", paths=256):
+    """Cut-ins without the equals of a vehicle, and its pools."""
+    crashing = drivers.vehicles[name].crash_mass(population)
+    division = Division(LIBRARY, population, [crashing], paths, limit_mps2=acceleration_limit(AVS[name]))
+    return division, division.of_vehicle(crashing)
 
 
 def test_imprecise_truths_are_enumerated_again_and_agree():
-    found = truths(ENVIRONMENT, drivers_of("own", "wild"), 3, PATHS, SilentProgress())
-    assert found["own"].crash_rate == pytest.approx(1.343e-7, abs=4.0 * found["own"].std_error)
-    assert found["own"].relative_error < 0.02  # once would leave some 2 %
-    assert found["wild"].crash_rate == pytest.approx(2.43e-5, abs=4.0 * found["wild"].std_error)
+    truths = Truths.of(ENVIRONMENT, drivers_of("own", "wild"), 3, PATHS, SilentProgress())
+    own, wild = (truths.vehicle(name)[RATE] for name in ("own", "wild"))
+    assert own.value == pytest.approx(1.343e-7, abs=4.0 * own.std_error)
+    assert own.relative_error < 0.02  # once would leave some 2 %
+    assert wild.value == pytest.approx(2.43e-5, abs=4.0 * wild.std_error)
 
 
 def test_the_cache_gives_the_same_back(drivers, population):
@@ -78,9 +82,9 @@ def test_an_inattentive_vehicle_is_two_drivers_mixed(drivers, population):
 def test_equals_are_found_and_left_out(drivers, population):
     vehicle = drivers.vehicles["equal"].crash_mass(population)
     assert equals(LIBRARY, population, vehicle) == {"brakes-3"}
-    source = overtaking_shells(LIBRARY, population, AVS["equal"], drivers.vehicles["equal"], 256)
-    assert source.left_out == ("brakes-3",)
-    assert "brakes-3" not in source.template.names
+    _, source = shells_of(drivers, population, "equal")
+    assert source.cells.left_out == ("brakes-3",)
+    assert "brakes-3" not in source.cells.template.names
     assert equals(LIBRARY, population, drivers.vehicles["own"].crash_mass(population)) == set()
 
 
@@ -96,8 +100,8 @@ def test_the_envelope_stays_and_another_surrogate_becomes_the_boundary():
 
 
 def test_drawn_pools_scatter_around_the_population(drivers, population):
-    source = overtaking_shells(LIBRARY, population, AVS["own"], drivers.vehicles["own"], 256)
-    assert source.shells.sum() == pytest.approx(population.cut_in.sum(), rel=1e-12)
+    _, source = shells_of(drivers, population)
+    assert source.cells.mass.sum() == pytest.approx(population.cut_in.sum(), rel=1e-12)
     assert source.crashing.sum() == pytest.approx(drivers.vehicles["own"].crash_mass(population).sum(), rel=1e-12)
     drawn = [source.draw(np.random.default_rng([1, k])) for k in range(300)]
     rates = np.array([each.design.p @ each.share for each in drawn])
@@ -116,32 +120,35 @@ def test_real_pools_have_the_shells_of_drawn_ones(drivers):
     """A pool as a campaign builds it, from other paths: shell probabilities and their errors agree."""
     paths = 16_384
     population = enumerated(drivers, paths)
-    source = overtaking_shells(LIBRARY, population, AVS["own"], drivers.vehicles["own"], paths)
+    _, source = shells_of(drivers, population, paths=paths)
     real = build_pool(ENVIRONMENT, LIBRARY, PoolSettings(relative_error=0.01, seed=7), "real")
-    assert real.names == source.template.names
+    template = source.cells.template
+    assert real.names == template.names
     kept = [real.cut_ins.path_mass[real.shell == s, s].mean(dtype=float) for s in range(real.shell_p.size)]
     squares = (
-        (source.shells**2).mean(0),
+        (source.cells.mass**2).mean(0),
         real.shell_p * kept,
     )  # a kept cut-in is a draw in proportion to its path's mass
     errors = [
         np.sqrt(np.maximum(square - pool.shell_p**2, 0.0) / n)
-        for square, pool, n in zip(squares, (source.template, real), (paths, real.n_paths), strict=True)
+        for square, pool, n in zip(squares, (template, real), (paths, real.n_paths), strict=True)
     ]
-    assert np.all(np.abs(real.shell_p - source.template.shell_p) < 4.5 * np.hypot(*errors))
+    assert np.all(np.abs(real.shell_p - template.shell_p) < 4.5 * np.hypot(*errors))
     ratio = errors[1] * np.sqrt(real.n_paths) / (errors[0] * np.sqrt(paths))
     assert np.all((ratio[:5] > 0.6) & (ratio[:5] < 1.6))  # inside; outside the aims differ
 
 
 def adversary_of(drivers, population, **made):
-    source = overtaking_shells(LIBRARY, population, AVS["own"], drivers.vehicles["own"], 256)
-    return source, source.as_adversary(Adversary(of="own", **made))
+    division, source = shells_of(drivers, population)
+    adversary = Adversary(of="own", **made)
+    crashing = drivers.vehicles["own"].crash_mass(population)
+    return source, division.of_vehicle(division.as_adversary(adversary, crashing), adversary.failing)
 
 
 def test_an_adversary_on_the_heaviest_paths_has_a_share_of_the_crashes_on_few_of_them(drivers, population):
     source, heavy = adversary_of(drivers, population, crashes="on_heaviest_paths", share=0.3)
-    light = source.as_adversary(Adversary(of="own", crashes="on_lightest_paths", share=0.3))
-    inside = source.template.boundary + 1
+    _, light = adversary_of(drivers, population, crashes="on_lightest_paths", share=0.3)
+    inside = source.cells.template.boundary + 1
     for made in (heavy, light):
         assert 0.2 < made.crashing[:, :inside].sum() / source.crashing[:, :inside].sum() <= 0.3
     used = [int((made.crashing[:, :inside].sum(1) > 0.0).sum()) for made in (heavy, light)]
@@ -150,12 +157,12 @@ def test_an_adversary_on_the_heaviest_paths_has_a_share_of_the_crashes_on_few_of
 
 def test_an_adversary_with_a_hole_crashes_outside_in_that_share(drivers, population):
     source, made = adversary_of(drivers, population, hole=0.01)
-    outside = slice(source.template.boundary + 1, -1)
-    assert np.all(made.crashing[:, outside] >= 0.01 * source.shells[:, outside])
-    assert made.crash_rate == pytest.approx(
-        source.crash_rate + 0.01 * source.shells[:, outside].sum(1).mean(), rel=0.05
-    )
-    assert all(made.crashes_outside[name] > share for name, share in source.crashes_outside.items())
+    outside, mass = slice(source.cells.template.boundary + 1, -1), source.cells.mass
+    assert np.all(made.crashing[:, outside] >= (0.01 - 1e-12) * mass[:, outside])
+    assert made.crash_rate == pytest.approx(source.crash_rate + 0.01 * mass[:, outside].sum(1).mean(), rel=0.05)
+    before = source.cells.crashes_outside(source.crashing)
+    after = made.cells.crashes_outside(made.crashing)
+    assert all(after[name] > share for name, share in before.items())
 
 
 def test_failed_crashes_are_counted_as_failed(drivers, population):
@@ -167,3 +174,44 @@ def test_failed_crashes_are_counted_as_failed(drivers, population):
     bad = block.crash | block.failed
     assert block.failed[bad].mean() == pytest.approx(0.5, abs=4.5 * 0.5 / np.sqrt(bad.sum()))
     assert np.all(block.cell_mass[bad].sum(1) > 0.0)
+
+
+def test_cells_divide_strata_by_what_references_do():
+    """Pools with references: rates, moments and cells of the design are those of the drawn paths, test by test."""
+    library = load_library("ladder-2")
+    drivers = Drivers.of(library, {"own": AVS["own"]})
+    population = enumerated(drivers)
+    crashing = drivers.vehicles["own"].crash_mass(population)
+    source = Division(library, population, [crashing], 512, limit_mps2=2.0).of_vehicle(crashing)
+    drawn = source.draw(np.random.default_rng(4))
+    design = drawn.design
+    np.testing.assert_allclose(drawn.mass.mean(0), design.cell_p, rtol=1e-12)
+    crash_too = (np.array(design.cell_references) & 1).astype(bool)
+    of_reference = drawn.mass[:, crash_too].sum(1)
+    assert design.reference_rate[0] == pytest.approx(of_reference.mean(), rel=1e-9)
+    assert design.reference_square[0] == pytest.approx((of_reference**2).mean(), rel=1e-9)
+    rng, added = np.random.default_rng(5), np.full(design.p.size, 20_000)
+    block = campaign_block(drawn, added, 0, rng)
+    np.testing.assert_array_equal(np.bincount(block.stratum), added)
+    tests, crashes = (np.bincount(block.cell[rows], minlength=crash_too.size) for rows in (..., block.crash))
+    expected = 20_000 * design.cell_p / design.p[list(design.cell_stratum)]
+    assert np.all(np.abs(tests - expected) < 5.0 * np.sqrt(expected + 1.0))
+    mass = drawn.mass.sum(0)
+    share = np.divide(drawn.crash_mass.sum(0), mass, out=np.zeros_like(mass), where=mass > 0.0)
+    assert np.all(np.abs(crashes - tests * share) < 5.0 * np.sqrt(tests * share * (1.0 - share) + 1.0))
+
+
+def test_pairs_are_divided_into_both_only_a_and_only_b(drivers, population):
+    a, b = (drivers.vehicles[name].crash_mass(population) for name in ("own", "equal"))
+    division = Division(LIBRARY, population, [a, b], 256, limit_mps2=2.0)
+    both, only_a, only_b = division.of_pair(a, b).crashing
+    np.testing.assert_allclose(both + only_a, division.by_cell(a), atol=1e-22)
+    np.testing.assert_allclose(both + only_b, division.by_cell(b), atol=1e-22)
+    assert only_b.sum() > 0.05 * b.sum()  # brakes less hard
+    assert only_a.sum() == pytest.approx(0.0, abs=1e-20)
+    same = division.of_pair(a, a).crashing
+    assert (same[1].sum(), same[2].sum()) == (0.0, 0.0)
+    pools = division.of_pair(a, b).draw(np.random.default_rng(2))
+    assert [pool.design is pools[0].design for pool in pools] == [True] * 3
+    mass = sum(pool.crash_mass for pool in pools)
+    assert np.all(mass <= pools[0].mass * (1.0 + 1e-9))

@@ -1,0 +1,91 @@
+"""Vehicles that act before the cut-in: `av: {controller: "examples.acting:Speeds", before_cut_in: controller}`.
+
+After the cut-in all are the intelligent driver model of `examples.idm_batch`.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from examples.idm_batch import IDM
+
+_LENGTH_M = 5.0
+_LONGEST_STEPS = 400
+
+
+class Holds(IDM):
+    """Keeps its speed, as a vehicle that is only asked from the cut-in on."""
+
+    def step_batch(self, seen: Any) -> Any:
+        """Accelerations (m/s²)."""
+        return np.where(np.isinf(seen.gap_m), self.before(seen), super().step_batch(seen))
+
+    def before(self, seen: Any) -> Any:
+        """What it does until the cut-in (m/s²)."""
+        return np.zeros(seen.cell.size)
+
+
+class Speeds(Holds):
+    """Drives freely to so many times its first speed."""
+
+    def __init__(self, times: float = 1.2, acceleration_mps2: float = 0.8) -> None:
+        self._times, self._acceleration = times, acceleration_mps2
+        self._wanted = np.zeros(0)
+
+    def start_batch(self, cells: Any, episodes: Any, random: Any) -> None:
+        """Nobody knows yet how fast each begins."""
+        self._wanted = _with_room(self._wanted, cells)
+        self._wanted[cells] = np.nan
+
+    def before(self, seen: Any) -> Any:
+        """What it does until the cut-in (m/s²)."""
+        wanted = self._wanted[seen.cell]
+        self._wanted[seen.cell] = wanted = np.where(np.isnan(wanted), self._times * seen.speed_mps, wanted)
+        return np.where(seen.speed_mps < wanted, self._acceleration, 0.0)
+
+
+class Beside(Holds):
+    """Speeds up once BV's rear bumper is near, to get past it."""
+
+    def __init__(self, from_m: float = 20.0, acceleration_mps2: float = 1.5) -> None:
+        self._from, self._acceleration = from_m, acceleration_mps2
+
+    def before(self, seen: Any) -> Any:
+        """What it does until the cut-in (m/s²)."""
+        return np.where(seen.bv_position_m - _LENGTH_M - seen.position_m < self._from, self._acceleration, 0.0)
+
+
+class Noisy(Holds):
+    """Holds its speed with noise, drawn from the stream that it is given."""
+
+    def __init__(self, noise_mps2: float = 0.5) -> None:
+        self._noise = noise_mps2
+        self._drawn = np.zeros((0, _LONGEST_STEPS))
+
+    def start_batch(self, cells: Any, episodes: Any, random: Any) -> None:
+        """Draw the noise of whole episodes at once."""
+        self._drawn = _with_room(self._drawn, cells)
+        for cell, stream in zip(cells, random, strict=True):
+            self._drawn[cell] = stream.uniform(-self._noise, self._noise, _LONGEST_STEPS)
+
+    def before(self, seen: Any) -> Any:
+        """What it does until the cut-in (m/s²)."""
+        return self._drawn[seen.cell, np.rint(seen.time_s / 0.1).astype(np.int64)]
+
+
+class PartlyYields(Holds):
+    """Brakes gently while BV's rear bumper is a little ahead, to make room for it."""
+
+    def __init__(self, within_m: float = 15.0, deceleration_mps2: float = 0.5) -> None:
+        self._within, self._deceleration = within_m, deceleration_mps2
+
+    def before(self, seen: Any) -> Any:
+        """What it does until the cut-in (m/s²)."""
+        gap = seen.bv_position_m - _LENGTH_M - seen.position_m
+        return np.where((gap > 0.0) & (gap < self._within), -self._deceleration, 0.0)
+
+
+def _with_room(values: Any, cells: Any) -> Any:
+    """The array, with rows for cells of these numbers."""
+    missing = int(np.max(cells, initial=-1)) + 1 - len(values)
+    return values if missing <= 0 else np.concatenate([values, np.zeros((missing, *values.shape[1:]))])
