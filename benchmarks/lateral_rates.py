@@ -54,7 +54,7 @@ def plot(found: dict[str, tuple[np.ndarray, np.ndarray]], names: list[str], file
 
     figure = Figure(figsize=(6.4, 3.2), layout="constrained")
     axes = figure.subplots()
-    styles = {"one step": ("#1f5fa8", "o", -0.09), "log-normal": ("#c03a2b", "s", 0.09)}
+    styles = {"one step": ("#1f5fa8", "o", -0.1), "log-normal": ("#c03a2b", "s", 0.1)}
     labels = {"one step": "cut-ins of one step", "log-normal": "cut-ins that take time (log-normal)"}
     for name, (colour, marker, shift) in styles.items():
         mean, covariance = found[name]
@@ -63,12 +63,13 @@ def plot(found: dict[str, tuple[np.ndarray, np.ndarray]], names: list[str], file
             label = labels[name] if place == 0 else None
             style = {"color": colour, "marker": marker, "markersize": 7, "capsize": 3, "linestyle": "none"}
             axes.errorbar(value, place + shift, xerr=1.645 * error, label=label, **style)
-            axes.annotate(f"{value:.2g}", (value, place + shift), (0, 7), textcoords="offset points", ha="center")
+            where = {"xytext": (0, 7 if shift < 0.0 else -17), "textcoords": "offset points", "ha": "center"}
+            axes.annotate(f"{value:.2g}", (value, place + shift), **where)
     axes.axvline(1.0, color="#444444", linewidth=0.9, linestyle=(0, (4, 3)))
     axes.set_xscale("log")
     axes.set_yticks(range(len(COMPARED)), list(COMPARED.values()))
     axes.set_ylim(len(COMPARED) - 0.4, -0.6)
-    axes.set_xlabel("crash rate over that of the competent driver (r157-cc, follows by an IDM of 3 m/s²)")
+    axes.set_xlabel("crash rate over that of the competent driver")
     axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, frameon=False)
     figure.savefig(file, dpi=120)
 
