@@ -22,7 +22,7 @@ from harness.studies.walked_population import chooser, walk_paths
 LIBRARY = load_library("ladder-2")
 PATHS = 1024
 FEW = 60
-VEHICLE = int(LIBRARY.drivers.size)
+VEHICLE = LIBRARY.n_drivers
 
 
 def campaign(controller: str, **parameters) -> Campaign:
