@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 from pydantic import BeforeValidator, Field, field_validator
 
 from harness.campaign.section import (
+    LeadTime,
     Positive,
     Probability,
     Section,
@@ -37,10 +38,8 @@ class EnvironmentSettings(Section):
     acceleration_hold_s: StepTime = Field(
         1.0, ge=0.1, le=2.0, description="how long a drawn acceleration is held, in whole 0.1 s steps; 1.0 or 0.1"
     )
-    cut_in_lead_s: StepTime | None = Field(
+    cut_in_lead_s: LeadTime | None = Field(
         None,
-        ge=0.0,
-        le=10.0,
         description="how long before overlap every cut-in shows itself, in place of the lateral motion that the "
         "parameters describe",
     )
