@@ -28,7 +28,7 @@ def main() -> None:
     environment, library = load_environment(campaign.environment), load_library(campaign.pool.library)
     names = list(library.surrogates)
     before = names[: names.index(library.boundary) + 1]
-    asked, envelope = (environment, library.drivers), names.index(library.envelope)
+    asked, envelope = (environment, library.drivers_in(environment)), names.index(library.envelope)
     pilot = Enumerator(*asked, envelope, SEED)
     pilot_rates = pilot.run(0, PILOT_PATHS, SilentProgress()).rates(len(names))[:, : len(before)]
     print("stride  ms/path  cost  " + "  ".join(before))

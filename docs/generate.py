@@ -31,9 +31,9 @@ FOLDER = Path(__file__).parent
 _PART = re.compile(r"(<!-- generated: (\S+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 SCHEMAS = {
-    "episodes": episodes_schema(4, 3, 2),
+    "episodes": episodes_schema(4, 3, 2, takes_time=True),
     "moments": moments_schema(3),
-    "traces": traces_schema(),
+    "traces": traces_schema(takes_time=True),
     "shadow": shadow_schema(),
 }
 RESULTS = {
@@ -155,13 +155,15 @@ def columns_table(schema: pa.Schema) -> str:
 
 def environment_table() -> str:
     """Numbers of the shipped environment, by section and source."""
-    parameters = load_parameters(EnvironmentSettings())
+    parameters = load_parameters(EnvironmentSettings(parameters="ndd-overtaking-1-lateral"))
     rows = []
     for section, numbers in parameters:
         if not isinstance(numbers, BaseModel):
             continue
         by_source: dict[str, list[str]] = {}
         for name, number in numbers:
+            if number is None:
+                continue
             by_source.setdefault(number.source, []).append(f"`{name}` {number.value:g}")
         rows += [(f"`{section}`", f"[{source}]", ", ".join(found)) for source, found in by_source.items()]
     return _table(("section", "source", "numbers"), rows)

@@ -9,6 +9,8 @@ from harness.arrays import RecordArray
 from harness.campaign.models import Campaign
 from harness.environment.driving import Environment
 from harness.environment.loading import load_environment, load_parameters
+from harness.errors import CampaignError
+from harness.methods import SAMPLING
 from harness.pool.library import Library, load_library
 from harness.vehicles.models import av_records, surrogate_records
 
@@ -48,6 +50,32 @@ class Resolved:
         return load_library(self.campaign.pool.library)
 
 
+def require_lead_is_drawn(campaign: Campaign) -> None:
+    """Refuse what does not know how long a cut-in shows itself before BV overlaps.
+
+    Raises
+    ------
+    CampaignError
+        The method's tables are for cut-ins of one step, or nobody could draw the lead.
+    """
+    method, acts = campaign.testing.method, campaign.av.acts_before_cut_in
+    if SAMPLING[method].mixes:
+        raise CampaignError(
+            "testing.method",
+            found=f"{method}, where cut-ins take time (`lateral` of the environment)",
+            expected="shells, forced or nde: the tables of criticality are for cut-ins of one step, and would aim at "
+            "those that an attentive vehicle avoids",
+            mend="Choose shells, or an environment without that section.",
+        )
+    if acts and not SAMPLING[method].shadows:
+        raise CampaignError(
+            "av.before_cut_in",
+            found=f"controller, with testing.method {method}, where cut-ins take time (`lateral` of the environment)",
+            expected="a method that drives the AV along its paths first: only then the onset is known in time",
+            mend="Choose testing.method shells or forced, or hold_speed.",
+        )
+
+
 def resolve(campaign: Campaign, controller_sha256: str | None = None) -> Resolved:
     """Read what a campaign names.
 
@@ -57,10 +85,13 @@ def resolve(campaign: Campaign, controller_sha256: str | None = None) -> Resolve
         The environment's parameter file is missing or wrong.
     """
     parameters = load_parameters(campaign.environment)
+    environment = load_environment(campaign.environment, parameters)
+    if environment.lateral.present:
+        require_lead_is_drawn(campaign)
     return Resolved(
         campaign,
-        load_environment(campaign.environment, parameters),
-        av_records(campaign.av),
+        environment,
+        av_records(campaign.av, see_onset=environment.lateral.present),
         surrogate_records(campaign.surrogates),
         campaign.content_hash(parameters.content_hash()),
         controller_sha256,

@@ -49,7 +49,8 @@ class Statement:
 class Reference:
     """A driver that the vehicle is compared with: its name, the driver in plain words, and when it acts.
 
-    ``delay_s`` is the time (s) after the cut-in at which it begins to brake, None if it has no delay of its own.
+    ``delay_s`` is the time (s) after the cut-in at which it begins to brake, None if it has no delay of its own, or if
+    cut-ins take time, and it sees them come.
     """
 
     name: str

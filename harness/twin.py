@@ -7,7 +7,7 @@ import numpy as np
 from harness.arrays import BoolArray, FloatArray, Int8Array, IntArray
 from harness.compiled import compiled
 from harness.outcomes import AV, BV, LV
-from harness.vehicles.kinematics import CONTACT_M, gap, next_position
+from harness.vehicles.kinematics import CONTACT_M, gap, next_position, overlaps
 
 
 @compiled
@@ -29,7 +29,7 @@ def contacts(x: FloatArray, on_right: Int8Array, cut_in: Int8Array, out: BoolArr
     for k in range(x.shape[0]):
         out[k] = False
         if on_right[k]:
-            out[k] = gap(x[k, BV], x[k, AV]) < CONTACT_M
+            out[k] = overlaps(x[k, BV], x[k, AV])
         if cut_in[k] or not on_right[k]:
             out[k] = out[k] or gap(x[k, LV], x[k, BV]) < CONTACT_M
 

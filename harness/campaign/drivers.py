@@ -9,6 +9,8 @@ from pydantic import Field, model_validator
 from harness.campaign.section import Positive, Probability, Section, StepTime, broken_rule
 
 MAX_CONFIGURED_SPEED_MPS = 60.0
+PERCEIVES_LATERAL_M = 0.375
+RISK_EVALUATION_S = 0.4
 
 
 class IDMParameters(Section):
@@ -57,8 +59,9 @@ class Reference(Section):
     """What the reference drivers of UN Regulation No. 157 share: when they react, and how they follow.
 
     The regulation's cut-in takes time: BV moves sideways, and the driver has seen and evaluated the risk when their
-    sides are still ``evaluated_at_m`` apart. Ours is a step, after which they overlap. So by the cut-in the driver has
-    used up ``evaluated_at_m / lateral_speed_mps`` of its delay.
+    sides are still ``evaluated_at_m`` apart. Where ours is a step, after which they overlap, the driver has used up
+    ``evaluated_at_m / lateral_speed_mps`` of its delay by then. Where cut-ins take time it sees them, evaluates them
+    for ``risk_evaluation_s``, and nothing stands in for that.
     """
 
     reaction_time_s: float = Field(
@@ -73,6 +76,12 @@ class Reference(Section):
         le=5.0,
         description="distance of their sides when the risk has been evaluated: 1.6 of two vehicles of 1.9 in lanes of "
         "3.5, less 0.375 of wandering, less 0.72 in which it is evaluated [JRC-FSM: CC_calc_dist_to_react]",
+    )
+    risk_evaluation_s: StepTime = Field(
+        RISK_EVALUATION_S,
+        ge=0.0,
+        le=5.0,
+        description="how long it evaluates what it has perceived, where cut-ins take time [JRC-FSM: 0.4 s]",
     )
     min_acceleration_mps2: float = Field(
         -7.59294, ge=-20.0, le=0.0, description="hardest braking, 0.774 g [JRC-FSM: CC_max_deceleration]"
@@ -94,6 +103,11 @@ class Reference(Section):
     def reaction_steps(self) -> float:
         """Its reaction time, in steps."""
         return 10.0 * self.reaction_time_s
+
+    @property
+    def evaluation_steps(self) -> int:
+        """How long it evaluates what it has perceived, in steps."""
+        return round(10.0 * self.risk_evaluation_s)
 
     @property
     def used_up_steps(self) -> float:
@@ -246,6 +260,13 @@ class Reflexes(Section):
     )
     max_jerk_mps3: Annotated[float, Field(ge=0.1, le=1000.0)] | None = Field(
         None, description="fastest change of its acceleration; unlimited when left out [assumed]"
+    )
+    perceives_lateral_m: float = Field(
+        PERCEIVES_LATERAL_M,
+        ge=0.0,
+        le=10.0,
+        description="how far a vehicle has to have come over before the driver sees that it cuts in: 0 acts from the "
+        "onset, the way to overlap or more only from there; where cut-ins take time [JRC-FSM: 0.375 of wandering]",
     )
 
 

@@ -213,6 +213,13 @@ class Campaign(Section):
             return None
         return self.pool.model_dump(exclude=set() if self.av.acts_before_cut_in else {"shadow_paths"})
 
+    def _environment_content(self) -> dict[str, object]:
+        """What the environment's settings say beside its parameters; no lead of their own, nothing of it."""
+        content = self.environment.model_dump(exclude={"parameters"})
+        if self.environment.cut_in_lead_s is None:
+            del content["cut_in_lead_s"]
+        return content
+
     @property
     def min_crashes(self) -> int:
         """Sampled crashes needed before RHW may stop the campaign; limits within shells are exact, without a floor."""
@@ -236,7 +243,7 @@ class Campaign(Section):
         content = {
             **({"rhw": self.stop.rhw} if planned else {}),  # it decides where the second phase begins
             "seed": self.seed,
-            "environment": self.environment.model_dump(exclude={"parameters"}),
+            "environment": self._environment_content(),
             "environment_parameters": environment_parameters,
             "av": self.av.identity(),
             "surrogates": [(name, model.model_dump()) for name, model in self.surrogates.items()],

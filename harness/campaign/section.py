@@ -61,6 +61,8 @@ def _whole_steps(seconds: float) -> float:
 
 
 StepTime = Annotated[float, AfterValidator(_whole_steps)]
+LeadTime = Annotated[float, Field(ge=0.0, le=10.0), AfterValidator(_whole_steps)]
+"""Between the onset of a lane change and overlap."""
 
 
 def listed(names: Iterable[str]) -> str:

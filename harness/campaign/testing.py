@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 from pydantic import BeforeValidator, Field, field_validator
 
 from harness.campaign.section import (
+    LeadTime,
     Positive,
     Probability,
     Section,
@@ -36,6 +37,11 @@ class EnvironmentSettings(Section):
     )
     acceleration_hold_s: StepTime = Field(
         1.0, ge=0.1, le=2.0, description="how long a drawn acceleration is held, in whole 0.1 s steps; 1.0 or 0.1"
+    )
+    cut_in_lead_s: LeadTime | None = Field(
+        None,
+        description="how long before overlap every cut-in shows itself, in place of the lateral motion that the "
+        "parameters describe",
     )
 
 

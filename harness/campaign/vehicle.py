@@ -11,7 +11,14 @@ from typing import Any, Literal, Self
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 from pydantic_core import PydanticKnownError
 
-from harness.campaign.drivers import PARAMETERS, BuiltInParameters, IDMParameters, Reaction
+from harness.campaign.drivers import (
+    PARAMETERS,
+    PERCEIVES_LATERAL_M,
+    RISK_EVALUATION_S,
+    BuiltInParameters,
+    IDMParameters,
+    Reaction,
+)
 from harness.campaign.section import Positive, Section, Whole, broken_rule, listed
 
 CONTROLLER_PATTERN = r"^([A-Za-z_][A-Za-z0-9_.]*:[A-Za-z_][A-Za-z0-9_]*|[A-Za-z0-9][A-Za-z0-9_.-]*)$"
@@ -73,6 +80,10 @@ class FmuController(Section):
     start_values: dict[str, float] = Field(default_factory=dict, description="values set before initialisation")
 
 
+_LATER = (
+    ("reaction", "perceives_lateral_m", PERCEIVES_LATERAL_M),
+    ("parameters", "risk_evaluation_s", RISK_EVALUATION_S),
+)
 AV_SOURCES = ("model", "controller", "sumo", "traci", "fmu")
 
 
@@ -123,6 +134,10 @@ class AutomatedVehicle(Section):
     def identity(self) -> dict[str, Any]:
         """What the AV is, for the campaign's hash: an FMU counts by its content, wherever it lies."""
         content = self.model_dump()
+        # What has come with cut-ins that take time changes no test of before; a controller's parameters are its own.
+        for section, key, usual in _LATER if self.model is not None else _LATER[:1]:
+            if content[section].get(key) == usual:
+                del content[section][key]
         if self.fmu is not None and (file := Path(self.fmu.file)).is_file():
             content["fmu"]["file"] = hashlib.sha256(file.read_bytes()).hexdigest()
         if self.traci is not None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -16,6 +16,10 @@ from harness.methods import ESTIMATORS
 
 if TYPE_CHECKING:
     from harness.methods import EstimatorName
+
+
+LATERAL = ("lead_steps", "onset_step", "onset_r2_m", "onset_ttc_s", "overlap_ttc_s", "contact")
+"""What a replay tells of a cut-in that takes time."""
 
 
 @click.command(
@@ -99,6 +103,8 @@ def report(folder: Path) -> None:
 def replay(folder: Path, episode: int, *, out: Path | None, fcd: Path | None, gui: bool, as_json: bool) -> None:
     """Simulate episode number EPISODE of the run in DIR again, bit for bit.
 
+    Where cut-ins take time, it is said when BV began to come over; the trace holds how far it had.
+
     Where the run has stored the episode's trace, the replay is compared with it; a difference ends with exit code 3.
     """
     from harness.runner import replay_episode  # noqa: PLC0415 - keeps --help fast
@@ -108,10 +114,13 @@ def replay(folder: Path, episode: int, *, out: Path | None, fcd: Path | None, gu
     if out is not None:
         write_trace(result.trace, out)
     if as_json:
-        print_json({"episode": episode, "outcome": result.outcome, "bit_equal": result.bit_equal, "files": files})
+        said = {"episode": episode, "outcome": result.outcome, "bit_equal": result.bit_equal, "files": files}
+        print_json({**said, **{name: result.row[name] for name in LATERAL if name in result.row}})
     else:
         compared = {None: "no stored trace to compare with", True: "bit for bit as stored", False: "NOT as stored"}
         click.echo(f"episode {episode}: {result.outcome}; {compared[result.bit_equal]}")
+        if result.row.get("onset_step") is not None and result.row["cut_in_step"] is not None:
+            click.echo(_onset(result.row))
         for file in files:
             click.echo(file)
     if result.bit_equal is False:
@@ -121,3 +130,13 @@ def replay(folder: Path, episode: int, *, out: Path | None, fcd: Path | None, gu
             expected="the same bits",
             mend=str(result.suspects),
         )
+
+
+def _onset(row: dict[str, Any]) -> str:
+    """When BV began to come over, and overlapped, in a sentence."""
+    onset_s, overlap_s = 0.1 * (row["onset_step"] + 1), 0.1 * (row["cut_in_step"] + 1)
+    contact = "" if row["contact"] is None else f"; {row['contact']} contact"
+    return (
+        f"BV comes over from {onset_s:.1f} s on, {row['onset_r2_m']:.1f} m ahead of the AV, and overlaps at "
+        f"{overlap_s:.1f} s{contact}"
+    )

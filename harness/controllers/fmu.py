@@ -35,6 +35,9 @@ OBSERVATIONS: dict[str, Callable[[Observation], float]] = {
     "bv_lane": lambda seen: float(seen.bv.lane),
     "lv_position_m": lambda seen: seen.lv.position_m,
     "lv_speed_mps": lambda seen: seen.lv.speed_mps,
+    "bv_lateral_m": lambda seen: seen.bv_lateral_m,
+    "bv_lateral_speed_mps": lambda seen: seen.bv_lateral_speed_mps,
+    "bv_overlaps": lambda seen: float(seen.bv_overlaps),
 }
 """What an FMU's inputs can be connected to."""
 

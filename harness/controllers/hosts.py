@@ -143,8 +143,9 @@ class VehicleHost:
 
 def _step(controller: VehicleController, seen: list[Any]) -> Any:
     """Answer to a row of a `BatchObservation`, without cell and episode."""
-    *row, bv_position_m, bv_speed_mps, bv_lane, lv_position_m, lv_speed_mps = seen
+    *row, bv_position_m, bv_speed_mps, bv_lane, lv_position_m, lv_speed_mps, lateral_m, lateral_mps, overlaps = seen
     row += [Neighbour(bv_position_m, bv_speed_mps, bv_lane), Neighbour(lv_position_m, lv_speed_mps, 1)]
+    row += [lateral_m, lateral_mps, bool(overlaps)]
     return controller.step(Observation(*row))
 
 

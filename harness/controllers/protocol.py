@@ -56,6 +56,13 @@ class Observation:
         Bumper-to-bumper gap to, and speed of, the vehicle ahead on the AV's lane; infinite and NaN without one.
     bv, lv : Neighbour
         Background and leading vehicle.
+    bv_lateral_m : float
+        How far BV has come over from its lane, from 0 to the way to overlap (1.7 m), where it is counted no further.
+        Where cut-ins are one step there is nothing between.
+    bv_lateral_speed_mps : float
+        How fast it comes over; 0 before the onset, and from the overlap on.
+    bv_overlaps : bool
+        Whether it is on the AV's lane. Until then the gap is infinite: one that sees only its own lane sees nobody.
     """
 
     time_s: float
@@ -66,13 +73,16 @@ class Observation:
     lead_speed_mps: float
     bv: Neighbour
     lv: Neighbour
+    bv_lateral_m: float = 0.0
+    bv_lateral_speed_mps: float = 0.0
+    bv_overlaps: bool = False
 
 
 class BatchObservation(NamedTuple):
     """What a batch controller sees before a step: one entry per AV that is to act, all arrays of shape (n,).
 
     ``cell`` numbers the AV (0 … K − 1) and ``episode`` its episode; the other fields are those of `Observation`, with
-    positions and speeds of BV and LV.
+    positions and speeds of BV and LV; ``bv_overlaps`` is 0 or 1.
     """
 
     cell: IntArray
@@ -88,6 +98,9 @@ class BatchObservation(NamedTuple):
     bv_lane: IntArray
     lv_position_m: FloatArray
     lv_speed_mps: FloatArray
+    bv_lateral_m: FloatArray
+    bv_lateral_speed_mps: FloatArray
+    bv_overlaps: IntArray
 
 
 @runtime_checkable

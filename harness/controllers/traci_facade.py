@@ -46,6 +46,8 @@ class VehicleDomain(Domain):
         self._position: dict[str, float] = {}
         self._acceleration: dict[str, float] = {}
         self._lane = {"LV": 1, "BV": 1, VEH_ID: 0}
+        self._lateral_m = {"LV": 0.0, "BV": 0.0, VEH_ID: 0.0}
+        self._lateral_mps = dict(self._lateral_m)
 
     def see(self, now: Observation) -> None:
         """Take in what is there before a step."""
@@ -54,6 +56,9 @@ class VehicleDomain(Domain):
         self._speed = {"LV": lv.speed_mps, "BV": bv.speed_mps, VEH_ID: now.speed_mps}
         self._position = {"LV": lv.position_m, "BV": bv.position_m, VEH_ID: now.position_m}
         self._lane["BV"] = bv.lane
+        # SUMO counts to the left; once BV overlaps it counts as a vehicle of the right lane, in its middle.
+        self._lateral_m["BV"] = 0.0 if now.bv_overlaps else -now.bv_lateral_m
+        self._lateral_mps["BV"] = -now.bv_lateral_speed_mps
         self._acceleration = {VEH_ID: now.acceleration_mps2, "LV": 0.0, "BV": 0.0}
         if before:
             self._acceleration["LV"] = (lv.speed_mps - before["LV"]) / STEP_S
@@ -87,8 +92,17 @@ class VehicleDomain(Domain):
         return float(self._of(self._acceleration, vehID))
 
     def getPosition(self, vehID: str) -> tuple[float, float]:
-        """Front bumper (m) along, and lane centre across, the cell's own road."""
-        return self._of(self._position, vehID), LANE_CENTRES_M[self._lane[vehID]]
+        """Front bumper (m) along, and the vehicle's middle across, the cell's own road."""
+        along = self._of(self._position, vehID)
+        return along, LANE_CENTRES_M[self._lane[vehID]] + self._lateral_m[vehID]
+
+    def getLateralLanePosition(self, vehID: str) -> float:
+        """How far (m) to the left of the middle of its lane; a BV that comes over is on the right of it."""
+        return float(self._of(self._lateral_m, vehID))
+
+    def getLateralSpeed(self, vehID: str) -> float:
+        """Speed (m/s) to the left."""
+        return float(self._of(self._lateral_mps, vehID))
 
     def getLanePosition(self, vehID: str) -> float:
         """Front bumper along the lane (m)."""

@@ -17,6 +17,7 @@ from scipy import special
 
 from harness.arrays import FloatArray, Record
 from harness.compiled import compiled_inline
+from harness.environment.lateral import LateralMotion
 from harness.maneuvers import ACCELERATIONS_MPS2, N_ACCELERATIONS, acceleration, upper_edge
 from harness.state import State
 
@@ -30,12 +31,14 @@ class Environment(NamedTuple):
     """All that kernels need of the environment.
 
     ``numbers`` is the parameter record; ``noise_t`` (2, 4097, 2) are the tables of Student's t for free driving and car
-    following; ``brake_cumulative`` (31,) is the cumulative distribution of braking in free driving.
+    following; ``brake_cumulative`` (31,) is the cumulative distribution of braking in free driving; ``lateral`` says
+    how long cut-ins show themselves.
     """
 
     numbers: Record
     noise_t: FloatArray
     brake_cumulative: FloatArray
+    lateral: LateralMotion
 
 
 class AccelerationLaw(NamedTuple):
@@ -52,7 +55,7 @@ class AccelerationLaw(NamedTuple):
     brake_share: float
 
 
-def build_environment(numbers: Record) -> Environment:
+def build_environment(numbers: Record, lateral: LateralMotion) -> Environment:
     """Tables of an environment from its parameter record."""
     braking = np.where(
         numbers["free_driving__brake_max_mps2"] + 1e-9 >= ACCELERATIONS_MPS2,
@@ -62,7 +65,7 @@ def build_environment(numbers: Record) -> Environment:
     cumulative = np.cumsum(braking) / braking.sum()
     cumulative[-1] = 1.0
     noise_t = np.stack([t_table(float(numbers[name])) for name in ("free_driving__df", "car_following__df")])
-    return Environment(numbers, noise_t, cumulative)
+    return Environment(numbers, noise_t, cumulative, lateral)
 
 
 def t_table(df: float) -> FloatArray:

@@ -21,6 +21,7 @@ from harness.compiled import compiled_threads
 from harness.environment.cut_in import acceptance, opportunity
 from harness.environment.driving import Environment, acceleration_pmf, build_environment, car_following, free_driving
 from harness.environment.initial_state import InitialStates
+from harness.environment.lateral import constant_lead
 from harness.environment.parameters import SHIPPED_FOLDER, EnvironmentParameters, parameter_record
 from harness.errors import CampaignError
 from harness.maneuvers import N_ACCELERATIONS
@@ -61,9 +62,13 @@ def load_parameters(settings: EnvironmentSettings) -> EnvironmentParameters:
 
 def load_environment(settings: EnvironmentSettings, parameters: EnvironmentParameters | None = None) -> Environment:
     """The environment of a campaign, with its tables; ``parameters`` are read unless they are given."""
-    level, hold_s = settings.lane_change_level, settings.acceleration_hold_s
+    level, hold_s, lead_s = settings.lane_change_level, settings.acceleration_hold_s, settings.cut_in_lead_s
     given = parameters or load_parameters(settings)
-    return build_environment(parameter_record(given, lane_change_level=level, hold_s=hold_s))
+    numbers = parameter_record(given, lane_change_level=level, hold_s=hold_s)
+    if lead_s is None:
+        return build_environment(numbers, given.lateral_motion())
+    distance_m = given.lateral_motion().distance_m
+    return build_environment(numbers, constant_lead(lead_s, distance_m))
 
 
 def require_sound_laws(environment: Environment, file: str) -> None:

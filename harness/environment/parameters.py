@@ -13,12 +13,17 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, model_validator
 from harness.arrays import Record
 from harness.campaign.drivers import MAX_CONFIGURED_SPEED_MPS
 from harness.campaign.section import broken_rule
+from harness.environment.lateral import LateralMotion, constant_lead, in_one_step, log_normal_speed
 from harness.maneuvers import ACCELERATIONS_MPS2
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
 
 SHIPPED_FOLDER = Path(__file__).parent
 FIXED = {"step_s": STEP_S, "vehicle_length_m": VEHICLE_LENGTH_M}
 """What the compiled motion and SUMO's network are made for: no file can change it, but campaigns' hashes contain it."""
+
+
+LONGEST_LEAD_S = 10.0
+_SPEED = ("speed_median_mps", "speed_log_sd", "longest_lead_s")
 
 
 class _Frozen(BaseModel):
@@ -29,7 +34,7 @@ class Number(_Frozen):
     """A value and where it comes from (the tags are explained in the shipped file)."""
 
     value: float
-    source: Literal["paper", "itsc", "ndd", "cutin", "openacc", "assumed", "fitted", "user"]
+    source: Literal["paper", "itsc", "ndd", "cutin", "openacc", "assumed", "fitted", "derived", "measured", "user"]
     note: str = ""
 
 
@@ -215,6 +220,35 @@ class CutIn(_Frozen):
     max_probability_1s: Annotated[Number, _within(1e-6, 0.5)]
 
 
+class Lateral(_Frozen):
+    """How long cut-ins show themselves before BV overlaps: a constant lead, or a log-normal lateral speed."""
+
+    distance_m: Annotated[Number, _within(0.1, 5.0)]
+    lead_s: Annotated[Number, _within(0.0, LONGEST_LEAD_S), AfterValidator(_whole_steps)] | None = None
+    speed_median_mps: Annotated[Number, _within(0.05, 20.0)] | None = None
+    speed_log_sd: Annotated[Number, _within(0.01, 3.0)] | None = None
+    longest_lead_s: Annotated[Number, _within(0.1, LONGEST_LEAD_S), AfterValidator(_whole_steps)] | None = None
+
+    @model_validator(mode="after")
+    def _one_of_both(self) -> Self:
+        named = tuple(name for name in ("lead_s", *_SPEED) if getattr(self, name) is not None)
+        if named not in (("lead_s",), _SPEED):
+            raise broken_rule(
+                "",
+                found=", ".join(named) or "neither",
+                expected=f"lead_s alone, or {', '.join(_SPEED)}",
+                mend="A lead is constant, or follows from a lateral speed and is cut off at the longest.",
+            )
+        return self
+
+    def motion(self) -> LateralMotion:
+        """As kernels read it."""
+        if self.lead_s is not None:
+            return constant_lead(self.lead_s.value, self.distance_m.value)
+        median, log_sd, longest = (getattr(self, name).value for name in _SPEED)
+        return log_normal_speed(self.distance_m.value, median, log_sd, longest)
+
+
 class EnvironmentParameters(_Frozen):
     """All numbers of the environment."""
 
@@ -227,6 +261,7 @@ class EnvironmentParameters(_Frozen):
     car_following: CarFollowing
     guard: Guard
     cut_in: CutIn
+    lateral: Lateral | None = None
 
     @model_validator(mode="after")
     def _av_has_a_speed(self) -> Self:
@@ -249,8 +284,13 @@ class EnvironmentParameters(_Frozen):
             for section, numbers in self.model_dump().items()
             if isinstance(numbers, dict)
             for name, number in numbers.items()
+            if number is not None
         }
         return {**{f"scenario__{name}": value for name, value in FIXED.items()}, **given}
+
+    def lateral_motion(self) -> LateralMotion:
+        """How long cut-ins show themselves."""
+        return in_one_step() if self.lateral is None else self.lateral.motion()
 
     def content_hash(self) -> str:
         """Hash of the numbers alone: a corrected note does not change a campaign."""
@@ -259,7 +299,8 @@ class EnvironmentParameters(_Frozen):
 
 def parameter_record(parameters: EnvironmentParameters, *, lane_change_level: float, hold_s: float) -> Record:
     """The numbers as kernels read them: ``section__name``, lane-changing ``level``, ``hold_steps``, ``max_steps``."""
-    numbers = {**parameters.values(), "level": lane_change_level}
+    read = {name: value for name, value in parameters.values().items() if not name.startswith("lateral__")}
+    numbers = {**read, "level": lane_change_level}
     steps = {
         "hold_steps": round(hold_s / STEP_S),
         "max_steps": round(numbers["scenario__duration_s"] / STEP_S),

@@ -6,8 +6,11 @@ import math
 
 from harness.arrays import FloatArray
 from harness.compiled import compiled, compiled_inline
+from harness.environment.lateral import draw_lead, onset_of
 from harness.episode.cells import Bench
-from harness.episode.trajectory import place, walk_without_cut_in
+from harness.episode.critical_moment import record_moment, update_ratios
+from harness.episode.trajectory import place, state_in, walk_without_cut_in
+from harness.maneuvers import CUT_IN as CUT_IN_MANEUVER
 from harness.outcomes import AV, EPISODE_MIXTURE, FORCED, SHELLS
 from harness.random_stream import CUT_IN, uniform
 
@@ -40,13 +43,14 @@ def begin_cell(k: int, row: int, bench: Bench) -> None:
     seed, episode = bench.seed, bench.first_episode + row
     cell = cells.cell[k]
     cell.row, cell.episode, cell.step, cell.cut_step, cell.component = row, episode, 0, -1, -1
+    cell.planned, cell.lead, cell.onset_step = -1, 0, -1
     cell.told = bench.traffic.told[row] if bench.traffic.told.size > 0 else episode
     cell.motion = 0
     cell.lv_maneuver = cell.bv_maneuver = cell.n_lv = cell.n_bv = cell.n_bv_free = cell.n_path = cell.n_control = 0
     cell.clock = cell.hazard = cell.log_sampled = 0.0
     cell.hazard_total = cell.log_p_cut_in = math.nan
     cell.min_ttc = cell.danger = math.inf
-    cell.cut_r2 = cell.cut_r2dot = math.nan
+    cell.cut_r2 = cell.cut_r2dot = cell.onset_r2 = cell.onset_r2dot = math.nan
     cell.av_start = bench.x[k, AV]
     cell.ahead_step = -1
     cells.acceleration[k, AV] = 0.0
@@ -57,21 +61,59 @@ def begin_cell(k: int, row: int, bench: Bench) -> None:
         cell.component, cell.log_sampled = bench.traffic.stratum[row], -log_weight
         if bench.importance.first == 1:  # a forced cut-in whose path has been walked by the AV itself
             cell.log_p_cut_in, cells.log_ratio[k, 0] = log_weight, -log_weight
+        if bench.traffic.lead.size > 0 and bench.traffic.cut_step[row] >= 0:
+            plan_cut_in(k, bench.traffic.cut_step[row], bench.traffic.lead[row], bench)
         return
     forced = method == FORCED
     if method == EPISODE_MIXTURE:
         cell.component = draw_component(uniform(seed, episode, CUT_IN, COMPONENT_DRAW), bench.importance.alpha)
         forced = cell.component == 0
     u = uniform(seed, episode, CUT_IN, CUT_IN_DRAW)
-    if method in (FORCED, EPISODE_MIXTURE):
-        environment, path = bench.environment, bench.scratch.path
-        _, cell.hazard_total = walk_without_cut_in(bench.states[row], seed, episode, environment, path)
-        p_cut_in = -math.expm1(-cell.hazard_total)
-        cell.log_p_cut_in = math.log(p_cut_in)
-        if forced:
-            cell.target = min(-math.log1p(-u * p_cut_in), cell.hazard_total)
-            return
     cell.target = -math.log1p(-u)
+    environment, path, takes_time = bench.environment, bench.scratch.path, bench.environment.lateral.cumulative.size > 0
+    if method in (FORCED, EPISODE_MIXTURE) or takes_time:
+        steps, hazard_total = walk_without_cut_in(bench.states[row], seed, episode, environment, path)
+        if method in (FORCED, EPISODE_MIXTURE):
+            cell.hazard_total = hazard_total
+            p_cut_in = -math.expm1(-cell.hazard_total)
+            cell.log_p_cut_in = math.log(p_cut_in)
+            if forced:
+                cell.target = min(-math.log1p(-u * p_cut_in), cell.hazard_total)
+        if takes_time:
+            look_for_cut_in(k, steps, bench)
+
+
+@compiled_inline
+def look_for_cut_in(k: int, steps: int, bench: Bench) -> None:
+    """Plan the cut-in that the cell's clock leads to on a path that has been walked, if there is one."""
+    cell, hazard = bench.cells.cell[k], bench.scratch.path.hazard
+    for step in range(steps):
+        cell.clock += hazard[step]
+        cut = cell.clock >= cell.target
+        if bench.importance.method == FORCED:
+            follow_ratios(k, step, cut, hazard[step], bench)
+        if cut:
+            lead = draw_lead(step, bench.seed, cell.episode, bench.environment.lateral)
+            plan_cut_in(k, step, lead, bench)
+            return
+
+
+@compiled_inline
+def follow_ratios(k: int, step: int, cut: bool, hazard: float, bench: Bench) -> None:
+    """What `harness.episode.critical_moment` does in each step with forced cut-ins that come as they are drawn."""
+    p = -math.expm1(-hazard)
+    sampled = update_ratios(k, cut, p, hazard, False, bench)
+    bench.cells.cell[k].hazard += hazard
+    if cut:
+        bench.cells.cell[k].n_control += 1
+        record_moment(k, step, state_in(step, bench.scratch.path), CUT_IN_MANEUVER, p, p * sampled, bench)
+
+
+@compiled_inline
+def plan_cut_in(k: int, cut: int, lead: int, bench: Bench) -> None:
+    """BV will cut in in a step, and show it some steps earlier."""
+    cell = bench.cells.cell[k]
+    cell.planned, cell.lead, cell.onset_step = cut, lead, onset_of(cut, lead)
 
 
 @compiled_inline

@@ -31,6 +31,9 @@ CELL_DTYPE = np.dtype(
         ("motion", np.uint64),  # hash of the AV's motion, through the step of the cut-in
         ("step", _i8),  # t, in steps
         ("cut_step", _i8),  # -1 before the cut-in
+        ("planned", _i8),  # step in which BV will cut in, where cut-ins take time; -1: it will not
+        ("lead", _i8),  # steps from the onset of its lateral motion to overlap
+        ("onset_step", _i8),  # from the step after it on the AV may act; -1: nobody knows of an onset yet
         ("component", _i8),  # importance function drawn for the episode, -1 without an episode mixture
         ("lv_maneuver", _i8),
         ("bv_maneuver", _i8),
@@ -48,6 +51,8 @@ CELL_DTYPE = np.dtype(
         ("min_ttc", _f8),
         ("cut_r2", _f8),
         ("cut_r2dot", _f8),
+        ("onset_r2", _f8),
+        ("onset_r2dot", _f8),
         ("av_start", _f8),
         ("danger", _f8),  # what a built-in AV remembers beside its acceleration
         ("beside_x", _f8),  # of the boundary beside the AV: position, speed, and what it remembers
@@ -65,6 +70,10 @@ EPISODE_DTYPE = np.dtype(
         ("cut_in_step", np.int16),
         ("cut_in_r2_m", _f8),
         ("cut_in_r2dot_mps", _f8),
+        ("lead_steps", np.int16),
+        ("onset_step", np.int16),
+        ("onset_r2_m", _f8),
+        ("onset_r2dot_mps", _f8),
         ("crash_time_s", _f8),
         ("impact_speed_mps", _f8),
         ("min_ttc_s", _f8),
@@ -198,7 +207,8 @@ class PrescribedTraffic(NamedTuple):
     step ``cut_step`` (rows,), which is -1 for a run without a cut-in. ``stratum`` (rows,) is the shell and
     ``log_weight`` (rows,) its log probability.
     ``told`` (rows,) are the indices that AVs are told, ``motion`` (rows,) hashes of what they must have done when the
-    step of the cut-in is over: those of their shadow runs. Both are empty where an AV keeps its speed until then.
+    step of the onset is over: those of their shadow runs. Both are empty where an AV keeps its speed until then.
+    ``lead`` (rows,) is how many steps before its cut-in BV begins to move sideways; empty where cut-ins are one step.
     """
 
     lv: Int8Array
@@ -208,6 +218,7 @@ class PrescribedTraffic(NamedTuple):
     log_weight: FloatArray
     told: IntArray
     motion: UInt64Array
+    lead: IntArray
 
 
 class PrescribedCutIns(NamedTuple):
@@ -225,7 +236,7 @@ class PrescribedCutIns(NamedTuple):
 def drawn_traffic() -> PrescribedTraffic:
     """For episodes that draw their own traffic."""
     none, no_index = np.zeros((0, 1), np.int8), np.zeros(0, np.int64)
-    return PrescribedTraffic(none, none, no_index, no_index, np.zeros(0), no_index, np.zeros(0, np.uint64))
+    return PrescribedTraffic(none, none, no_index, no_index, np.zeros(0), no_index, np.zeros(0, np.uint64), no_index)
 
 
 class Scratch(NamedTuple):

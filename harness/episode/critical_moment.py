@@ -42,7 +42,7 @@ def choose_lane(k: int, state: State, bench: Bench) -> None:
         exposure = p if cut else 1.0 - p
         for j in range(importance.n_surrogates):
             scratch.q[j] = scratch.q[j] if cut else 1.0 - scratch.q[j]
-        record_moment(k, state, CUT_IN if cut else STAY, exposure, exposure * sampled, bench)
+        record_moment(k, cell.step, state, CUT_IN if cut else STAY, exposure, exposure * sampled, bench)
 
 
 @compiled_inline
@@ -50,6 +50,8 @@ def begin_cut_in(k: int, state: State, bench: Bench) -> None:
     """BV moves to the right lane in this step."""
     cell = bench.cells.cell[k]
     cell.cut_step = cell.step
+    if cell.onset_step < 0:
+        cell.planned, cell.onset_step = cell.step, cell.step
     cell.cut_r2, cell.cut_r2dot = state.r2_m, state.r2dot_mps
     bench.cells.cut_in[k] = 1
     bench.cells.bv_path[k, cell.n_path] = CUT_IN
@@ -109,7 +111,7 @@ def controlled_draw(k: int, u: float, state: State, bench: Bench) -> int:
         scratch.ratio[importance.first + j] = q[j, maneuver] / p[maneuver]
     sampled = take_in(k, bench)
     cell.n_control += 1
-    record_moment(k, state, maneuver, p[maneuver], p[maneuver] * sampled, bench)
+    record_moment(k, cell.step, state, maneuver, p[maneuver], p[maneuver] * sampled, bench)
     return maneuver
 
 
@@ -154,7 +156,7 @@ def take_in(k: int, bench: Bench) -> float:
 
 
 @compiled_inline
-def record_moment(k: int, state: State, maneuver: int, p: float, q_sampled: float, bench: Bench) -> None:
+def record_moment(k: int, step: int, state: State, maneuver: int, p: float, q_sampled: float, bench: Bench) -> None:
     """Keep a control step, if the campaign keeps that many of an episode."""
     results, scratch = bench.results, bench.scratch
     cell = bench.cells.cell[k]
@@ -162,7 +164,7 @@ def record_moment(k: int, state: State, maneuver: int, p: float, q_sampled: floa
         return
     i = results.moment_count[0]
     moment = results.moment[i]
-    moment.row, moment.step, moment.maneuver = cell.row, cell.step, maneuver
+    moment.row, moment.step, moment.maneuver = cell.row, step, maneuver
     moment.v_bv_mps, moment.r1_m, moment.r1dot_mps = state.v_bv_mps, state.r1_m, state.r1dot_mps
     moment.r2_m, moment.r2dot_mps = state.r2_m, state.r2dot_mps
     moment.p, moment.q_sampled = p, q_sampled

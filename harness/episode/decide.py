@@ -43,7 +43,10 @@ def draw_maneuvers(k: int, state: State, bench: Bench) -> None:
     if cell.cut_step < 0:
         if redraw:
             redraw_following(k, state, bench)
-        choose_lane(k, state, bench)
+        if bench.environment.lateral.cumulative.size > 0:
+            follow_plan(k, state, bench)
+        else:
+            choose_lane(k, state, bench)
     elif (cell.step - cell.cut_step - 1) % hold_steps == 0:
         redraw_free(k, state, bench)
 
@@ -91,9 +94,27 @@ def repeat_traffic(k: int, state: State, bench: Bench) -> None:
     since = cell.step - cell.cut_step - 1
     if (cell.cut_step < 0 and redraw) or (cell.cut_step >= 0 and since % hold_steps == 0):
         take_bv(k, traffic.bv[cell.row, cell.n_path], bench)
+    if bench.traffic.lead.size > 0:
+        note_onset(k, state, bench)
     if cell.step == traffic.cut_step[cell.row]:
         begin_cut_in(k, state, bench)
         cell.n_control += 1
+
+
+@compiled_inline
+def follow_plan(k: int, state: State, bench: Bench) -> None:
+    """Cut in when it has been decided, before anybody could see it."""
+    note_onset(k, state, bench)
+    if bench.cells.cell[k].step == bench.cells.cell[k].planned:
+        begin_cut_in(k, state, bench)
+
+
+@compiled_inline
+def note_onset(k: int, state: State, bench: Bench) -> None:
+    """Keep the state in which BV begins to move sideways."""
+    cell = bench.cells.cell[k]
+    if cell.step == cell.onset_step:
+        cell.onset_r2, cell.onset_r2dot = state.r2_m, state.r2dot_mps
 
 
 @compiled_inline

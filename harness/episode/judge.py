@@ -23,7 +23,7 @@ from harness.outcomes import (
     TIMEOUT,
 )
 from harness.state import State
-from harness.vehicles.kinematics import CONTACT_M, STEP_S
+from harness.vehicles.kinematics import CONTACT_M, STEP_S, overlaps
 
 PASSED_M, PASSED_UNDER_CONTROL_M = 0.0, -10.0
 """R2 at which the AV has passed BV: at once if it holds its speed, with a margin if its controller acts."""
@@ -66,10 +66,10 @@ def outcome_of(k: int, state: State, bench: Bench) -> int:
         if cell.step == cell.cut_step + 1 and state.r1_m < CONTACT_M:
             return BV_LV_CONTACT  # it touched LV before it had left the lane
         if state.r2_m < CONTACT_M:
-            return CRASH
+            return CRASH if overlaps(bench.x[k, BV], bench.x[k, AV]) else PASSED
     elif state.r1_m < CONTACT_M:
         return BV_LV_CONTACT
-    elif state.r2_m <= bench.passed_m:
+    elif state.r2_m <= bench.passed_m and not (0 <= cell.onset_step < cell.step):
         return PASSED
     if cell.step >= bench.environment.numbers.max_steps:
         return TIMEOUT
@@ -80,13 +80,13 @@ def outcome_of(k: int, state: State, bench: Bench) -> int:
 def strays(k: int, outcome: int, bench: Bench) -> bool:
     """Whether the AV has done something else than in its shadow run: what follows would count with a wrong weight."""
     cell, traffic = bench.cells.cell[k], bench.traffic
-    if 0 <= cell.cut_step < cell.step - 1:
+    if 0 <= cell.onset_step < cell.step - 1:
         return False
     x, v = bench.x.view(np.uint64), bench.v.view(np.uint64)
     cell.motion = mixed(mixed(cell.motion, x[k, AV]), v[k, AV])
-    if cell.cut_step >= 0:
+    if 0 <= cell.onset_step < cell.step:
         return bool(cell.motion != traffic.motion[cell.row])
-    return outcome != RUNNING  # before the cut-in that its shadow run has come to
+    return outcome != RUNNING  # before the onset that its shadow run has come to
 
 
 @compiled
@@ -104,6 +104,8 @@ def end_episode(k: int, outcome: int, n: int, bench: Bench) -> None:
     row = results.episode[cell.row]
     row.outcome, row.n_steps, row.cut_in_step = outcome, cell.step, cell.cut_step
     row.cut_in_r2_m, row.cut_in_r2dot_mps, row.min_ttc_s = cell.cut_r2, cell.cut_r2dot, cell.min_ttc
+    row.lead_steps, row.onset_step = cell.lead, cell.onset_step
+    row.onset_r2_m, row.onset_r2dot_mps = cell.onset_r2, cell.onset_r2dot
     row.crash_time_s = cell.step * STEP_S if outcome == CRASH else math.nan
     row.impact_speed_mps = v[k, AV] - v[k, BV] if outcome == CRASH else math.nan
     row.av_distance_m = bench.x[k, AV] - cell.av_start

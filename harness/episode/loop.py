@@ -11,6 +11,7 @@ import numpy as np
 from harness.arrays import BoolArray, FloatArray, IntArray, RecordArray
 from harness.controllers.hosts import ControllerHost
 from harness.environment.driving import Environment
+from harness.environment.lateral import LateralMotion, in_one_step
 from harness.episode.begin import refill
 from harness.episode.beside import drive_beside
 from harness.episode.cells import (
@@ -80,6 +81,7 @@ class Shard:
     """Everything that a range of episodes left behind, row by row; ``states`` (n,) are where they began.
 
     ``cut_ins`` are those of the pool that were prescribed, if any were.
+    ``lateral`` says how cut-ins show themselves before BV overlaps.
     ``traces`` maps an episode's row to its (steps + 1, 3 vehicles, 3: x, v, a) motion, ``failures`` to the cause.
     """
 
@@ -91,6 +93,7 @@ class Shard:
     traces: dict[int, FloatArray] = field(default_factory=dict)
     failures: dict[int, str] = field(default_factory=dict)
     cut_ins: PrescribedCutIns | None = None
+    lateral: LateralMotion = field(default_factory=in_one_step)
 
 
 def hash_of_index(seed: int, episodes: IntArray) -> FloatArray:
@@ -173,7 +176,7 @@ class EpisodeLoop:
             states.size, policy.environment, policy.importance, moment_limit=keep.moments, capacity=room
         )
         traced = traced_by_index(policy.seed, first_episode + np.arange(states.size), keep.trace_share)
-        return Shard(first_episode, states, results, traced, traffic)
+        return Shard(first_episode, states, results, traced, traffic, lateral=policy.environment.lateral)
 
     def _bench(self, shard: Shard) -> Bench:
         """All that kernels need for a shard, in the form that they need it in."""

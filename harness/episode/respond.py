@@ -10,6 +10,7 @@ import numpy as np
 from harness.arrays import FloatArray, IntArray, read_only
 from harness.compiled import compiled
 from harness.controllers.protocol import BatchObservation
+from harness.environment.lateral import lateral_position, perceived_in
 from harness.episode.cells import Bench
 from harness.outcomes import AV, BV, LV
 from harness.vehicles.kinematics import STEP_S, gap, next_speed
@@ -19,15 +20,17 @@ from harness.vehicles.references import Memory
 
 @compiled
 def respond(bench: Bench) -> None:
-    """Acceleration of a built-in AV wherever it has been cut in on; it acts from the step after the cut-in at most."""
+    """Acceleration of a built-in AV wherever it is cut in on; it acts from the step after the onset at most."""
     x, v, cells, driver = bench.x, bench.v, bench.cells, bench.driver
+    perceives_m, distance_m = driver[0].perceives_lateral_m, bench.environment.lateral.distance_m
     for k in range(cells.cell.size):
         cell = cells.cell[k]
-        if cell.row < 0 or cell.cut_step < 0:
+        if cell.row < 0 or cell.onset_step < 0 or cell.step <= cell.onset_step:
             continue
-        step = cell.step - cell.cut_step - reaction_steps(driver[0], bench.seed, cell.episode) - 1
+        first, earlier = perceived_in(perceives_m, cell.planned, cell.lead, distance_m)
+        step = cell.step - first - reaction_steps(driver[0], bench.seed, cell.episode)
         if step >= 0:
-            memory = Memory(cells.acceleration[k, AV], cell.danger)
+            memory = Memory(cells.acceleration[k, AV], cell.danger, driver[0].used_up_steps + earlier)
             memory = react(driver[0], memory, step, v[k, AV], v[k, BV], gap(x[k, BV], x[k, AV]))
             cells.acceleration[k, AV], cell.danger = memory.acceleration, memory.danger
 
@@ -36,11 +39,12 @@ def respond(bench: Bench) -> None:
 def observe(bench: Bench) -> int:
     """Write what the AVs that are to act see to ``bench.observation``; returns their number."""
     x, v, cells, out = bench.x, bench.v, bench.cells, bench.observation
+    distance_m = bench.environment.lateral.distance_m
     n = 0
     for k in range(cells.cell.size):
         cell = cells.cell[k]
-        followed = 0 <= cell.cut_step < cell.step
-        if cell.row < 0 or not (followed or bench.acts_before_cut_in):
+        followed, comes = 0 <= cell.cut_step < cell.step, 0 <= cell.onset_step < cell.step
+        if cell.row < 0 or not (comes or bench.acts_before_cut_in):
             continue
         out.cell[n], out.episode[n], out.time_s[n] = k, cell.told, cell.step * STEP_S
         out.position_m[n], out.speed_mps[n] = x[k, AV], v[k, AV]
@@ -50,13 +54,16 @@ def observe(bench: Bench) -> int:
         out.bv_position_m[n], out.bv_speed_mps[n] = x[k, BV], v[k, BV]
         out.bv_lane[n] = 0 if followed else 1
         out.lv_position_m[n], out.lv_speed_mps[n] = x[k, LV], v[k, LV]
+        out.bv_lateral_m[n] = lateral_position(cell.step, cell.planned, cell.lead, distance_m) if comes else 0.0
+        out.bv_lateral_speed_mps[n] = distance_m / (cell.lead * STEP_S) if comes and not followed else 0.0
+        out.bv_overlaps[n] = 1 if followed else 0
         n += 1
     return n
 
 
 def empty_observation(n_cells: int) -> BatchObservation:
     """Room for the observations of K cells: rows of one array of whole numbers and of one of floats."""
-    return _rows(np.zeros((3, n_cells), np.int64), np.zeros((10, n_cells)))
+    return _rows(np.zeros((4, n_cells), np.int64), np.zeros((12, n_cells)))
 
 
 def first(observation: BatchObservation, n: int) -> BatchObservation:
@@ -67,8 +74,8 @@ def first(observation: BatchObservation, n: int) -> BatchObservation:
 
 
 def _rows(whole: IntArray, real: FloatArray) -> BatchObservation:
-    cell, episode, bv_lane = whole
-    return BatchObservation._make([cell, episode, *real[:8], bv_lane, *real[8:]])
+    cell, episode, bv_lane, bv_overlaps = whole
+    return BatchObservation._make([cell, episode, *real[:8], bv_lane, *real[8:], bv_overlaps])
 
 
 @compiled

@@ -15,15 +15,17 @@ from harness.arrays import FloatArray, Int8Array, Record, RecordArray
 from harness.compiled import compiled_inline, compiled_threads
 from harness.environment.cut_in import acceptance, cut_in_hazard, opportunity
 from harness.environment.driving import Environment, car_following, draw_acceleration, free_driving
+from harness.environment.lateral import LateralMotion, onset_of, perceived_in
 from harness.maneuvers import acceleration
 from harness.outcomes import AV, BV, BV_LV_CONTACT, LV, PASSED, RUNNING
 from harness.random_stream import BV_DRAWS, BV_FREE_DRAWS, LV_DRAWS, uniform
 from harness.state import State
-from harness.vehicles.kinematics import CONTACT_M, VEHICLE_LENGTH_M, gap, next_position, next_speed
+from harness.vehicles.kinematics import CONTACT_M, VEHICLE_LENGTH_M, gap, next_position, next_speed, overlaps
+from harness.vehicles.models import NEED_BASED_KIND
 from harness.vehicles.reaction import nothing_yet, react
 
 AV_START_M = 100.0
-NO_CRASH = -1
+NO_CRASH, WAS_AHEAD = -1, -2
 
 
 class Trajectory(NamedTuple):
@@ -208,47 +210,72 @@ def leave(
 
 
 @compiled_inline
-def follow(driver: Record, late: int, cut: int, until: int, path: Trajectory) -> tuple[int, float]:
-    """Step after which a driver has run into BV, or `NO_CRASH`, and its speed (m/s) at the end.
+def follow(
+    driver: Record, first: int, used_up: float, cut: int, onset: int, until: int, encloses: bool, path: Trajectory
+) -> tuple[int, float]:
+    """Step after which a driver has run into BV, `NO_CRASH` or `WAS_AHEAD`, and its speed (m/s) at the end.
 
-    It takes over from the AV after the step of the cut-in, and reacts ``late`` steps after its first chance.
+    It takes over from the AV after the step of the onset, and reacts from step ``first`` on; ``used_up`` steps of its
+    delay have passed by then. One that is to enclose others also counts as having run into BV where it has passed it
+    before the overlap: a slower one may not have.
     """
-    x, v = path.x_av[cut + 1], path.v_av[cut + 1]
-    if gap(path.x_after[cut + 1], x) < CONTACT_M:
+    x, v = path.x_av[onset + 1], path.v_av[onset + 1]
+    if onset == cut and gap(path.x_after[cut + 1], x) < CONTACT_M:
         return cut + 1, v
-    memory = nothing_yet()
-    for step in range(cut + 1, until):
-        if step - cut > late:
-            ahead = gap(path.x_after[step], x)
-            memory = react(driver, memory, step - cut - late - 1, v, path.v_after[step], ahead)
+    memory = nothing_yet(used_up)
+    for step in range(onset + 1, until):
+        if step >= first:
+            x_bv, v_bv = path.x_after[step], path.v_after[step]
+            if step <= cut:
+                x_bv, v_bv = path.x_bv[step], path.v_bv[step]
+            memory = react(driver, memory, step - first, v, v_bv, gap(x_bv, x))
         v_after = next_speed(v, memory.acceleration)
         x = next_position(x, v, v_after)
         v = v_after
-        if gap(path.x_after[step + 1], x) < CONTACT_M:
-            return step + 1, v
+        if step >= cut and gap(path.x_after[step + 1], x) < CONTACT_M:
+            return step + 1 if encloses or overlaps(path.x_after[step + 1], x) else WAS_AHEAD, v
     return NO_CRASH, v
 
 
 @compiled_inline
-def crashes(driver: Record, cut: int, until: int, path: Trajectory) -> bool:
-    """Whether an attentive driver runs into BV."""
-    return follow(driver, driver.delay_steps, cut, until, path)[0] != NO_CRASH
+def crashes(
+    driver: Record, cut: int, lead: int, until: int, encloses: bool, lateral: LateralMotion, path: Trajectory
+) -> bool:
+    """Whether an attentive driver runs into BV; one that encloses others acts from the onset."""
+    perceives_m = 0.0 if encloses else driver.perceives_lateral_m
+    first, earlier = perceived_in(perceives_m, cut, lead, lateral.distance_m)
+    first, used_up = first + driver.delay_steps, driver.used_up_steps + earlier
+    return follow(driver, first, used_up, cut, onset_of(cut, lead), until, encloses, path)[0] >= 0
 
 
 @compiled_inline
-def who_crashes(drivers: RecordArray, envelope: int, cut: int, until: int, path: Trajectory) -> int:
-    """One bit for each driver that runs into BV.
+def who_crashes(
+    drivers: RecordArray,
+    envelope: int,
+    cut: int,
+    lead: int,
+    until: int,
+    lateral: LateralMotion,
+    path: Trajectory,
+) -> int:
+    """One bit for each driver that runs into BV, which shows ``lead`` steps before its cut-in that it will come over.
 
     ``envelope`` is the driver that crashes wherever another one does: where it does not, nobody else is asked; -1 for
     none.
     """
-    if envelope >= 0 and not crashes(drivers[envelope], cut, until, path):
+    if envelope >= 0 and not crashes(drivers[envelope], cut, lead, until, True, lateral, path):
         return 0
     found = 0
     for d in range(drivers.size):
-        if d == envelope or crashes(drivers[d], cut, until, path):
+        if d == envelope or crashes(drivers[d], cut, lead, until, is_boundary(drivers[d]), lateral, path):
             found |= 1 << d
     return found
+
+
+@compiled_inline
+def is_boundary(driver: Record) -> bool:
+    """Whether a driver is one that vehicles are said never to be ahead of."""
+    return bool(driver.kind == NEED_BASED_KIND)
 
 
 @compiled_threads

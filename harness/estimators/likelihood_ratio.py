@@ -109,8 +109,8 @@ def contrast_limit(weights: FloatArray, counts: Counts, level: Level, side: floa
 def spread(weights: FloatArray, lower: Counts, upper: Counts, level: Level, size: int, most: IntArray) -> IntArray:
     """Divide further tests among strata, shape (S,), so that they narrow the interval of Σ w_sj θ_sj most.
 
-    Portions are given one after the other. With the shares as they are one more test of a stratum moves a limit by
-    KL(c_s ‖ θ_s)/ν, by the envelope theorem; a stratum without a test comes first.
+    Portions are given one after the other. With shares and threshold as they are one more test of a stratum moves
+    a limit by KL(c_s ‖ θ_s)/ν, by the envelope theorem; a stratum without a test comes first.
 
     Parameters
     ----------

@@ -17,7 +17,7 @@ from harness.arrays import FloatArray, Int8Array, IntArray, RecordArray
 from harness.environment.driving import Environment
 from harness.environment.initial_state import InitialStates
 from harness.episode.trajectory import empty_trajectory
-from harness.pool.enumeration import FREE_DRAWS_PER_CUT_IN, STRIDE, enumerate_cut_ins, write_pairs
+from harness.pool.enumeration import FREE_DRAWS_PER_CUT_IN, STRIDE, draw_leads, enumerate_cut_ins, write_pairs
 from harness.progress import Progress
 from harness.random_stream import DIAGNOSTIC, INITIAL, uniforms
 from harness.state import STATE_COLUMNS
@@ -167,6 +167,14 @@ class Enumerator:
         where = self._environment, self._drivers, self._envelope
         enumerate_cut_ins(self._seed, first, state, *where, self._stride, offset, path, probability, crashes)
         return EnumeratedPaths(first + np.arange(n), state, weight, probability * weight[:, None], crashes)
+
+    def leads(self, path: IntArray, step: IntArray) -> IntArray:
+        """Leads (steps) of chosen (path, cut-in step) pairs, shape (n,); (0,) where cut-ins are one step."""
+        lateral = self._environment.lateral
+        found = np.zeros(len(path) if lateral.present else 0, np.int64)
+        if lateral.present:
+            draw_leads(self._seed, path, step, lateral, found)
+        return found
 
     def pairs(
         self, path: IntArray, step: IntArray, state: RecordArray

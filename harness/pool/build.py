@@ -55,7 +55,9 @@ class Aim:
 def take_aim(environment: Environment, library: Library, settings: PoolSettings, progress: Progress) -> Aim:
     """Find out by a pilot run of naturalistic paths where surrogates crash."""
     names = list(library.surrogates)
-    pilot = Enumerator(environment, library.drivers, names.index(library.envelope), settings.seed ^ POOL_SEED)
+    pilot = Enumerator(
+        environment, library.drivers_in(environment), names.index(library.envelope), settings.seed ^ POOL_SEED
+    )
     progress.stage("pool: pilot", PILOT_PATHS)
     rates = pilot.run(0, PILOT_PATHS, progress).rates(len(names))
     aim = Aim(pilot, rates, _careful(rates, names.index(library.boundary)))
@@ -74,7 +76,8 @@ def _careful(rates: FloatArray, boundary: int) -> BoolArray:
     Those that are no more careless than the boundary, and crash in the traffic that it crashes in.
     """
     mean = rates.mean(0)
-    relvar = rates.var(0) / np.maximum(mean, np.finfo(np.float64).tiny) ** 2
+    seen = mean > 0.0  # one that no path has met yet is met by few
+    relvar = np.where(seen, rates.var(0) / np.where(seen, mean, 1.0) ** 2, np.inf)
     careful: BoolArray = (mean <= mean[boundary]) & (relvar <= FAR_OFF * relvar[boundary])
     return careful
 
@@ -131,7 +134,14 @@ def pool_of(
     asked = np.concatenate([order, n_surrogates + np.arange(n_references)])
     crashes = ((paths.crashes[path, step][:, None] >> asked[None, :]) & 1).astype(np.bool_)
     sample = CutIns(
-        PILOT_PATHS + path, step, cell[path, step], paths.state[path], *pairs, crashes, by_path[path].astype(np.float32)
+        PILOT_PATHS + path,
+        step,
+        cell[path, step],
+        paths.state[path],
+        *pairs,
+        crashes,
+        by_path[path].astype(np.float32),
+        lead=enumerator.leads(paths.index[path], step),
     )
     return Pool(
         key=key,

@@ -20,6 +20,11 @@ FAR_OFF = 10.0
 own, which few paths meet: paths aimed there would be lost for all others."""
 
 
+def onset_steps(step: IntArray, lead: IntArray) -> IntArray:
+    """Steps of the onset of cut-ins in given steps (n,); ``lead`` (n,) is empty where they are the same."""
+    return np.maximum(step - lead, 0) if lead.size else step
+
+
 @dataclass(frozen=True, eq=False)
 class CutIns:
     """A weighted sample of cut-ins, each with the paths of LV and BV before and after it.
@@ -29,7 +34,8 @@ class CutIns:
     them, 31 marking the cut-in; ``n_lv``, ``n_bv`` (n,): how many of them are used. ``crashes`` (n, D + R): which
     surrogates crash, in the pool's order, and which references. ``path_mass`` (n, C) float32: the path's probability of
     a cut-in of each cell. ``motion`` (n,) are hashes of what the AV did through the step of the cut-in,
-    in the pool of a vehicle that acts before it; else empty.
+    in the pool of a vehicle that acts before it, or of its onset; else empty. ``lead`` (n,) is how many steps earlier
+    that is; empty where cut-ins are one step.
     """
 
     path: IntArray
@@ -43,6 +49,12 @@ class CutIns:
     crashes: BoolArray
     path_mass: Float32Array
     motion: UInt64Array = field(default_factory=lambda: np.zeros(0, np.uint64))
+    lead: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
+
+    @property
+    def onset(self) -> IntArray:
+        """Step of the onset of each, shape (n,)."""
+        return onset_steps(self.step, self.lead)
 
     @property
     def row(self) -> IntArray:
@@ -127,7 +139,7 @@ class Pool:
             "p_cut_in_std_error": self.p_cut_in_se,
             "boundary": self.library.boundary,
             "envelope": self.library.envelope,
-            "delays_after_cut_in_s": self.library.delays_after_cut_in_s,
+            "delays_after_cut_in_s": {} if self.cut_ins.lead.size else self.library.delays_after_cut_in_s,
             "surrogates": [dict(zip(keys, row, strict=True)) for row in zip(*columns, strict=True)],
             "no_surrogate_crashes": p[-1],
             "references": [
@@ -142,6 +154,8 @@ class Pool:
 def environment_hash(environment: Environment) -> str:
     """Hash of all numbers of an environment, level of lane changing and hold time included."""
     numbers = {name: environment.numbers[name].item() for name in environment.numbers.dtype.names or ()}
+    if (lateral := environment.lateral).present:
+        numbers["lateral"] = [lateral.distance_m, lateral.cumulative.tolist()]
     return hashlib.sha256(json.dumps(numbers, sort_keys=True).encode()).hexdigest()[:24]
 
 

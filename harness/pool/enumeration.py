@@ -18,6 +18,7 @@ from harness.arrays import FloatArray, Int8Array, IntArray, RecordArray
 from harness.compiled import compiled_inline, compiled_threads
 from harness.environment.cut_in import cut_in_hazard, opportunity
 from harness.environment.driving import Environment, draw_acceleration, free_driving
+from harness.environment.lateral import LateralMotion, draw_lead
 from harness.episode.trajectory import (
     Trajectory,
     leave,
@@ -82,6 +83,13 @@ def enumerate_cut_ins(
             crashes[i, cut] = who_crashes_after(cut, seed, first + i, drivers, envelope, environment, path)
 
 
+@compiled_threads
+def draw_leads(seed: int, indices: IntArray, cuts: IntArray, lateral: LateralMotion, leads: IntArray) -> None:
+    """Leads (steps) of chosen (path, cut-in step) pairs, (n,) each."""
+    for i in range(indices.size):
+        leads[i] = draw_lead(cuts[i], seed, indices[i], lateral)
+
+
 @compiled_inline
 def who_crashes_after(
     cut: int, seed: int, index: int, drivers: RecordArray, envelope: int, environment: Environment, path: Trajectory
@@ -91,7 +99,8 @@ def who_crashes_after(
     leave(cut, max_steps, seed, index, cut * FREE_DRAWS_PER_CUT_IN, 0, environment, path)
     if gap(path.x_lv[cut + 1], path.x_after[cut + 1]) < CONTACT_M:
         return 0  # the episode ends as bv_lv_contact
-    return who_crashes(drivers, envelope, cut, max_steps, path)
+    lead = draw_lead(cut, seed, index, environment.lateral)
+    return who_crashes(drivers, envelope, cut, lead, max_steps, environment.lateral, path)
 
 
 @compiled_threads

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
@@ -14,6 +15,7 @@ from harness.campaign.models import FVDM, IDM, CarefulCompetent, Constant, Fuzzy
 from harness.campaign.problems import read_model
 from harness.campaign.section import Section, SurrogateName, broken_rule
 from harness.campaign.testing import ShellSettings, StatementSettings, checked_statements
+from harness.environment.driving import Environment
 from harness.errors import CampaignError
 from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT
 from harness.vehicles.models import driver_records
@@ -65,6 +67,12 @@ LibraryDriver = Annotated[
 ]
 
 
+def library_records(models: Sequence[LibraryDriver], environment: Environment) -> RecordArray:
+    """Drivers of a library as kernels read them in an environment, shape (D,)."""
+    parameters, reactions = [model.parameters for model in models], [model.reaction for model in models]
+    return driver_records(parameters, reactions, see_onset=environment.lateral.present)
+
+
 class Library(Section):
     """Surrogates that shells are made of.
 
@@ -92,11 +100,14 @@ class Library(Section):
         default_factory=dict, description="drivers that the vehicle is compared with; no shell is made of them"
     )
 
-    @property
-    def drivers(self) -> RecordArray:
+    def drivers_in(self, environment: Environment) -> RecordArray:
         """The surrogates and then the references as kernels read them, in the order of the file, shape (D + R,)."""
-        models = [*self.surrogates.values(), *self.references.values()]
-        return driver_records([model.parameters for model in models], [model.reaction for model in models])
+        return library_records([*self.surrogates.values(), *self.references.values()], environment)
+
+    @property
+    def n_drivers(self) -> int:
+        """Number of surrogates and references."""
+        return len(self.surrogates) + len(self.references)
 
     @property
     def delays_after_cut_in_s(self) -> dict[str, float]:
@@ -188,7 +199,7 @@ class Library(Section):
 
     @model_validator(mode="after")
     def _few_enough(self) -> Self:
-        if (n := len(self.surrogates) + len(self.references)) > MOST_SURROGATES:
+        if (n := self.n_drivers) > MOST_SURROGATES:
             raise broken_rule(
                 "surrogates",
                 found=f"{n} of them, with the references",

@@ -12,10 +12,9 @@ import pyarrow as pa
 from harness.arrays import BoolArray, FloatArray, IntArray
 from harness.campaign.models import Campaign
 from harness.environment.loading import load_environment
-from harness.pool.library import LibraryDriver
+from harness.pool.library import LibraryDriver, library_records
 from harness.pool.surrogate_replay import PATH_COLUMNS, drivers_crash
 from harness.records.folder import read_manifest, read_table
-from harness.vehicles.models import driver_records
 
 _COLUMNS = [*PATH_COLUMNS, "outcome", "component", "log_weight"]
 
@@ -91,7 +90,7 @@ def replay_drivers(folder: Path, campaign: Campaign, drivers: Sequence[LibraryDr
         Records are missing or damaged.
     """
     environment = load_environment(campaign.environment)
-    records = driver_records([model.parameters for model in drivers], [model.reaction for model in drivers])
+    records = library_records(drivers, environment)
     parts = []
     for shard in read_manifest(folder)["shards"]:
         table = read_table(folder / shard["files"]["episodes"], _COLUMNS)

@@ -17,6 +17,7 @@ import numpy as np
 from harness.campaign.dumping import yaml_text
 from harness.campaign.loading import load_campaign
 from harness.campaign.models import Campaign, Reflexes
+from harness.environment.loading import load_environment
 from harness.errors import CampaignError, RunFolderError
 from harness.pool.fit_driver import MOST_DELAY_STEPS, FittedDriver, agreement, fit_driver
 from harness.pool.library import Library, LibraryDriver, LibraryIDM, load_library
@@ -108,7 +109,7 @@ def refine_ladder(folder: Path, out: Path) -> RefinedLadder:
     Raises
     ------
     CampaignError
-        The AV acts before the cut-in, or the library's file is gone.
+        The AV acts before the cut-in, cut-ins take time, or the library's file is gone.
     RunFolderError
         The run's traces depend on the outcome or hold too few cut-ins, or ``out`` is there already.
     """
@@ -120,6 +121,14 @@ def refine_ladder(folder: Path, out: Path) -> RefinedLadder:
             found="controller",
             expected="hold_speed: a fitted driver keeps its speed until the cut-in, as all surrogates do",
             mend="Run the campaign with --set av.before_cut_in=hold_speed.",
+        )
+    if load_environment(campaign.environment).lateral.present:
+        raise CampaignError(
+            "environment",
+            found="cut-ins that take time (`lateral` of the environment)",
+            expected="cut-ins of one step: when the vehicle began to see BV come over is not fitted",
+            mend="Fit the driver to a run with environment.parameters=ndd-overtaking-1, and set perceives_lateral_m in "
+            "the file that is written.",
         )
     library = load_library(campaign.pool.library)
     observed = read_observed(folder, campaign)

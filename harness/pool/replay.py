@@ -13,7 +13,18 @@ from typing import NamedTuple
 from harness.arrays import FloatArray, Int8Array, IntArray, RecordArray
 from harness.compiled import compiled_inline, compiled_threads
 from harness.environment.driving import Environment
-from harness.episode.trajectory import NO_CRASH, Trajectory, end_in, follow, leave, state_in, walk, who_crashes
+from harness.environment.lateral import onset_of, perceived_in
+from harness.episode.trajectory import (
+    NO_CRASH,
+    WAS_AHEAD,
+    Trajectory,
+    end_in,
+    follow,
+    leave,
+    state_in,
+    walk,
+    who_crashes,
+)
 from harness.maneuvers import CUT_IN
 from harness.outcomes import BV_LV_CONTACT, CRASH, FAILED, PASSED, RUNNING, TIMEOUT
 from harness.vehicles.reaction import reaction_steps
@@ -24,7 +35,8 @@ class StoredPaths(NamedTuple):
 
     ``state`` (n,) are initial states; ``n_steps``, ``cut_step`` (n,) steps simulated and that of the cut-in, -1
     without one. ``lv``, ``bv`` are the maneuver indices of all episodes one after another, those of row i at
-    ``begin[i] … begin[i + 1] - 1``; 31 in ``bv`` marks the cut-in.
+    ``begin[i] … begin[i + 1] - 1``; 31 in ``bv`` marks the cut-in. ``lead`` (n,) is how many steps before its cut-in BV
+    begins to move sideways.
     """
 
     seed: int
@@ -36,19 +48,21 @@ class StoredPaths(NamedTuple):
     lv_begin: IntArray
     bv: Int8Array
     bv_begin: IntArray
+    lead: IntArray
 
 
 class Retraced(NamedTuple):
     """What the twin says of stored episodes, one array entry (n,) each.
 
-    ``outcome``: how the episode ends, `RUNNING` where only the AV knows. ``n_steps``: when. ``cut_r2``, ``cut_r2dot``:
-    R2 (m) and R2dot (m/s) at the cut-in, NaN without one. ``impact``: v_AV - v_BV (m/s) at a crash, else NaN.
+    ``outcome``: how the episode ends, `RUNNING` where only the AV knows. ``n_steps``: when. ``onset_r2``,
+    ``onset_r2dot``: R2 (m) and R2dot (m/s) at the cut-in, or at its onset where that comes before, NaN without one.
+    ``impact``: v_AV - v_BV (m/s) at a crash, else NaN.
     """
 
     outcome: IntArray
     n_steps: IntArray
-    cut_r2: FloatArray
-    cut_r2dot: FloatArray
+    onset_r2: FloatArray
+    onset_r2dot: FloatArray
     impact: FloatArray
 
 
@@ -102,14 +116,16 @@ def retrace_episode(
     """Fill row ``i`` of ``twin``."""
     max_steps = environment.numbers.max_steps
     cut, end = stored.cut_step[i], min(stored.n_steps[i], max_steps)
-    twin.cut_r2[i] = twin.cut_r2dot[i] = twin.impact[i] = float("nan")
+    lead = stored.lead[i]
+    onset = onset_of(cut, lead)
+    twin.onset_r2[i] = twin.onset_r2dot[i] = twin.impact[i] = float("nan")
     if cut < 0 or cut >= end:
         twin.outcome[i], twin.n_steps[i] = approach(i, end, stored, environment, path)
     else:
         twin.outcome[i], twin.n_steps[i] = approach_cut_in(i, stored, environment, path)
     if 0 <= cut <= twin.n_steps[i]:
-        state = state_in(cut, path)
-        twin.cut_r2[i], twin.cut_r2dot[i] = state.r2_m, state.r2dot_mps
+        state = state_in(onset, path)
+        twin.onset_r2[i], twin.onset_r2dot[i] = state.r2_m, state.r2dot_mps
     if twin.outcome[i] != RUNNING:
         return
     if cut < 0:
@@ -122,8 +138,12 @@ def retrace_episode(
         return
     if driver.size > 0:
         late = reaction_steps(driver[0], stored.seed, stored.first + i)
-        crash, speed = follow(driver[0], late, cut, end, path)
-        if crash != NO_CRASH:
+        first, earlier = perceived_in(driver[0].perceives_lateral_m, cut, lead, environment.lateral.distance_m)
+        used_up = driver[0].used_up_steps + earlier
+        crash, speed = follow(driver[0], first + late, used_up, cut, onset, end, False, path)
+        if crash == WAS_AHEAD:
+            twin.outcome[i], twin.n_steps[i] = PASSED, cut + 1
+        elif crash != NO_CRASH:
             twin.outcome[i], twin.n_steps[i] = CRASH, crash
             twin.impact[i] = speed - path.v_after[crash]
         elif end == max_steps:
@@ -169,5 +189,5 @@ def replay_surrogates(
             continue
         if decided != RUNNING or not leave_stored(i, max_steps, stored, environment, path):
             return i
-        crashes[i] = who_crashes(drivers, envelope, cut, max_steps, path)
+        crashes[i] = who_crashes(drivers, envelope, cut, stored.lead[i], max_steps, environment.lateral, path)
     return -1

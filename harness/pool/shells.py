@@ -15,11 +15,11 @@ from harness.arrays import IntArray, RecordArray
 from harness.campaign.models import AutomatedVehicle, BuiltInParameters, Campaign
 from harness.campaign.models import Reference as ReferenceParameters
 from harness.campaign.testing import ShellSettings, StatementSettings
+from harness.environment.driving import Environment
 from harness.episode.cells import PrescribedCutIns, PrescribedTraffic
 from harness.pool.cut_ins import Pool
-from harness.pool.library import Library, LibraryDriver
+from harness.pool.library import Library, LibraryDriver, library_records
 from harness.strata import FAILED_SHADOWS, OUTSIDE, Reference, ShellDesign, Statement
-from harness.vehicles.models import driver_records
 
 _REFERENCES = {
     "r157-cc": "a careful and competent driver",
@@ -75,7 +75,9 @@ def design_shells(pool: Pool, *, shells: ShellSettings | None = None, limit_mps2
         cell_stratum=tuple(_stratum_of_shell(pool, groups)[pool.cell_shell[first]].tolist()),
         cell_p=p,
         cell_references=tuple(pool.cell_references[first].tolist()),
-        references=tuple(_reference(*each) for each in pool.library.references.items()),
+        references=tuple(
+            _reference(*each, takes_time=pool.cut_ins.lead.size > 0) for each in pool.library.references.items()
+        ),
         reference_rate=pool.reference_rate,
         reference_square=pool.reference_square,
         n_paths=pool.n_paths,
@@ -118,17 +120,17 @@ def _keeps_to(boundary: str) -> str:
     return f"crashes only where the surrogate {boundary} or a more careful one crashes"
 
 
-def _reference(name: str, driver: LibraryDriver) -> Reference:
+def _reference(name: str, driver: LibraryDriver, *, takes_time: bool) -> Reference:
     described, delay = _REFERENCES.get(driver.model, "the driver"), None
-    if isinstance(driver.parameters, ReferenceParameters):
+    if isinstance(driver.parameters, ReferenceParameters) and not takes_time:
         delay = driver.parameters.delay_after_cut_in_s + driver.reaction.delay_s
     return Reference(name, described, delay)
 
 
-def checked_boundary(library: Library, design: ShellDesign) -> RecordArray:
+def checked_boundary(library: Library, design: ShellDesign, environment: Environment) -> RecordArray:
     """The driver that a vehicle is compared with in each test, shape (1,); (0,) if no statement is checked."""
-    model = None if design.checked is None else library.surrogates[design.checked.boundary]
-    return driver_records([]) if model is None else driver_records([model.parameters], [model.reaction])
+    models = [] if design.checked is None else [library.surrogates[design.checked.boundary]]
+    return library_records(models, environment)
 
 
 def _stratum_of_shell(pool: Pool, groups: list[list[int]]) -> IntArray:
@@ -215,6 +217,7 @@ class PrescribedEpisodes:
             log_weight=np.log(self.design.p[stratum]),
             told=c.row[rows] if acts else np.zeros(0, np.int64),
             motion=c.motion[rows] if acts else c.motion,
+            lead=c.lead[rows] if c.lead.size else c.lead,
         )
         return c.state[rows], traffic
 

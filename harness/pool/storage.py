@@ -160,6 +160,8 @@ def _table(pool: Pool) -> pa.Table:
         "lv_maneuvers": (_lists(c.lv, c.n_lv), "LV's draws, one per hold period"),
         "bv_maneuvers": (_lists(c.bv, c.n_bv), "BV's draws; 31 marks the cut-in"),
     }
+    if c.lead.size:
+        columns["lead_steps"] = pa.array(c.lead.astype(np.int16)), "steps from the onset of lateral motion to overlap"
     schema = pa.schema(
         [pa.field(name, array.type, nullable=False, metadata={"doc": doc}) for name, (array, doc) in columns.items()]
     )
@@ -207,6 +209,9 @@ def _pool(table: pa.Table, facts: dict[str, Any]) -> Pool:
         n_bv=n_bv,
         crashes=np.asarray(crashes).reshape(table.num_rows, -1),
         path_mass=np.asarray(mass).reshape(table.num_rows, -1),
+        lead=np.asarray(table.column("lead_steps")).astype(np.int64)
+        if "lead_steps" in table.column_names
+        else np.zeros(0, np.int64),
     )
     known: dict[str, Any] = {
         name: np.array(value) if isinstance(value, list) else value for name, value in facts.items()

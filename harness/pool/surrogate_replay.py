@@ -21,6 +21,8 @@ from harness.strata import KnownRates
 
 PATH_COLUMNS = ("episode", *STATE_COLUMNS, "n_steps", "cut_in_step", "lv_maneuvers", "bv_maneuvers")
 """What of the episodes table determines LV's and BV's motion."""
+LEAD = "lead_steps"
+"""And since when BV shows what it will do, where cut-ins take time."""
 _PART = 512
 """Episodes that a thread replays at a time."""
 
@@ -36,14 +38,20 @@ class SurrogateReplay:
     Attributes
     ----------
     known : KnownRates
+    columns : tuple of str
+        What of the episodes table it needs.
     """
 
     def __init__(self, resolved: Resolved, pool: Pool) -> None:
         self._environment, self._seed = resolved.environment, resolved.campaign.seed
         _require_same_environment(self._environment, pool)
         self.known = KnownRates(pool.key, pool.names, pool.mu, pool.mu_covariance)
+        self.columns = (*PATH_COLUMNS, *((LEAD,) if self._environment.lateral.present else ()))
         names = list(pool.library.surrogates)
-        self._drivers, self._envelope = pool.library.drivers, names.index(pool.library.envelope)
+        self._drivers, self._envelope = (
+            pool.library.drivers_in(resolved.environment),
+            names.index(pool.library.envelope),
+        )
         self._order = [names.index(name) for name in pool.names]
 
     def crashes(self, episodes: pa.Table) -> BoolArray:
@@ -107,6 +115,7 @@ def _rows_of(stored: StoredPaths, begin: int, end: int) -> StoredPaths:
         cut_step=stored.cut_step[rows],
         lv_begin=stored.lv_begin[edges],
         bv_begin=stored.bv_begin[edges],
+        lead=stored.lead[rows],
     )
 
 
@@ -120,7 +129,15 @@ def stored_paths(episodes: pa.Table, seed: int) -> StoredPaths:
         np.asarray(episodes.column("cut_in_step").fill_null(-1)).astype(np.int64),
         *_lists(episodes.column("lv_maneuvers")),
         *_lists(episodes.column("bv_maneuvers")),
+        _leads(episodes),
     )
+
+
+def _leads(episodes: pa.Table) -> IntArray:
+    """Leads (steps) of the cut-ins, shape (n,); zero where those were one step."""
+    if LEAD not in episodes.column_names:
+        return np.zeros(episodes.num_rows, np.int64)
+    return np.asarray(episodes.column(LEAD).fill_null(0)).astype(np.int64)
 
 
 def _lists(column: pa.ChunkedArray) -> tuple[Int8Array, IntArray]:

@@ -87,16 +87,17 @@ def vehicle_pool(resolved: Resolved, paths: ShadowPaths, runs: ShadowRuns) -> Po
     """
     environment, library = resolved.environment, resolved.library
     envelope = list(library.surrogates).index(library.envelope)
-    given = paths.seed, paths.index, paths.state, environment, library.drivers, envelope
+    drivers = library.drivers_in(environment)
+    given = paths.seed, paths.index, paths.state, environment, drivers, envelope
     probability, crashes, unknown = recorded_cut_ins(runs, *given)
     if not crashes.any():
         raise _no_crash(len(paths), int(runs.failed.sum()))
     enumerated = EnumeratedPaths(paths.index, paths.state, paths.weight, probability * paths.weight[:, None], crashes)
-    enumerator = Enumerator(environment, library.drivers, envelope, paths.seed)
+    enumerator = Enumerator(environment, drivers, envelope, paths.seed)
     key, settings = vehicle_pool_key(resolved, paths, runs), resolved.campaign.pool
     pool = pool_of(enumerated, enumerator, paths.order, library, settings, key, environment_hash(environment))
     hashes = motion_hashes(runs.x_m, runs.v_mps)
-    cut_ins = replace(pool.cut_ins, motion=hashes[pool.cut_ins.row, pool.cut_ins.step])
+    cut_ins = replace(pool.cut_ins, motion=hashes[pool.cut_ins.row, pool.cut_ins.onset])
     return replace(pool, cut_ins=cut_ins, p_unknown=float((unknown * paths.weight).mean()))
 
 

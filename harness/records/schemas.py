@@ -58,8 +58,11 @@ def _outcome_type() -> pa.DataType:
     return pa.dictionary(pa.int8(), pa.string())
 
 
-def episodes_schema(n_importance: int, n_surrogates: int, n_cells: int = 0) -> pa.Schema:
-    """Schema of the ``episodes`` table for given numbers of importance functions, surrogates, and cells of shells."""
+def episodes_schema(n_importance: int, n_surrogates: int, n_cells: int = 0, *, takes_time: bool = False) -> pa.Schema:
+    """Schema of the ``episodes`` table for given numbers of importance functions, surrogates, and cells of shells.
+
+    Cut-ins that take time have columns of their own.
+    """
     f8 = pa.float64()
     of_shells = [
         _field("cell", pa.int16(), "1", "cell of shells.json: shell, and which references crash (method shells alone)"),
@@ -100,9 +103,28 @@ def episodes_schema(n_importance: int, n_surrogates: int, n_cells: int = 0) -> p
                 "pool_cut_in", pa.int64(), "1", "row of the pool's cut-in (method shells), else null", nullable=True
             ),
             *(of_shells if n_cells else ()),
+            *(_lateral_fields() if takes_time else ()),
             _field("failure", pa.string(), "", "cause, for failed episodes", nullable=True),
         ]
     )
+
+
+def _lateral_fields() -> list[pa.Field]:
+    f8 = pa.float64()
+    about = "where cut-ins take time alone"
+    return [
+        _field(
+            "lead_steps", pa.int16(), "0.1 s", f"from the onset of lateral motion to overlap ({about})", nullable=True
+        ),
+        _field("onset_step", pa.int16(), "0.1 s", "step at whose end BV began to move sideways", nullable=True),
+        _field("onset_r2_m", f8, "m", "R2 at the onset", nullable=True),
+        _field("onset_r2dot_mps", f8, "m/s", "R2dot at the onset", nullable=True),
+        _field("onset_ttc_s", f8, "s", "R2/-R2dot at the onset, null where the AV does not close in", nullable=True),
+        _field(
+            "overlap_ttc_s", f8, "s", "the same at the cut-in decision, the last state before overlap", nullable=True
+        ),
+        _field("contact", pa.string(), "", "of a crash: side, in the first state of overlap, or rear", nullable=True),
+    ]
 
 
 def moments_schema(n_surrogates: int) -> pa.Schema:
@@ -122,9 +144,10 @@ def moments_schema(n_surrogates: int) -> pa.Schema:
     )
 
 
-def traces_schema() -> pa.Schema:
-    """Schema of the ``traces`` table: one row per step and vehicle."""
+def traces_schema(*, takes_time: bool = False) -> pa.Schema:
+    """Schema of the ``traces`` table: one row per step and vehicle, with how far BV has come over."""
     f8 = pa.float64()
+    lateral = _field("lateral_m", f8, "m", "how far it has come over to the right lane (where cut-ins take time alone)")
     return pa.schema(
         [
             _field("episode", pa.int64(), "1", "index of the episode"),
@@ -134,6 +157,7 @@ def traces_schema() -> pa.Schema:
             _field("x_m", f8, "m", "position of the front bumper along the road"),
             _field("v_mps", f8, "m/s", "speed"),
             _field("a_mps2", f8, "m/s2", "acceleration commanded for the next step", nullable=True),
+            *([lateral] if takes_time else ()),
         ]
     )
 

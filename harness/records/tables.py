@@ -7,9 +7,9 @@ from typing import NamedTuple
 import numpy as np
 import pyarrow as pa
 
-from harness.arrays import FloatArray, Int8Array, IntArray
+from harness.arrays import FloatArray, Int8Array, IntArray, RecordArray
 from harness.episode.loop import Shard
-from harness.outcomes import AV, OUTCOMES, VEHICLES
+from harness.outcomes import AV, BV, CRASH, OUTCOMES, VEHICLES
 from harness.records.schemas import episodes_schema, moments_schema, shadow_schema, traces_schema
 from harness.state import STATE_COLUMNS
 
@@ -61,7 +61,8 @@ def episodes_table(shard: Shard, seed: int) -> pa.Table:
     e, n = shard.results.episode, shard.results.episode.size
     prescribed = shard.cut_ins
     n_cells = 0 if prescribed is None else prescribed.cell_mass.shape[1]
-    schema = episodes_schema(shard.results.log_q.shape[1], shard.results.martingale.shape[1], n_cells)
+    of_all = shard.results.log_q.shape[1], shard.results.martingale.shape[1], n_cells
+    schema = episodes_schema(*of_all, takes_time=shard.lateral.present)
     never = e["cut_in_step"] < 0
     columns = {
         "episode": pa.array(shard.first_episode + np.arange(n)),
@@ -87,7 +88,29 @@ def episodes_table(shard: Shard, seed: int) -> pa.Table:
         columns[name] = pa.array(e[name])
     for name in ("cut_in_r2_m", "cut_in_r2dot_mps", "crash_time_s", "impact_speed_mps", "min_ttc_s", "log_p_cut_in"):
         columns[name] = _nullable(e[name])
+    if shard.lateral.present:
+        columns |= _lateral_columns(e)
     return pa.table([columns[name] for name in schema.names], schema=schema)
+
+
+def _lateral_columns(e: RecordArray) -> dict[str, pa.Array]:
+    """When BV showed what it would do, and what that was like."""
+    none = e["onset_step"] < 0
+    side = np.where(e["n_steps"] == e["cut_in_step"] + 1, "side", "rear")
+    return {
+        **{name: pa.array(e[name], mask=none) for name in ("lead_steps", "onset_step")},
+        **{name: _nullable(e[name]) for name in ("onset_r2_m", "onset_r2dot_mps")},
+        "onset_ttc_s": _nullable(_time_to_collision(e["onset_r2_m"], e["onset_r2dot_mps"])),
+        "overlap_ttc_s": _nullable(_time_to_collision(e["cut_in_r2_m"], e["cut_in_r2dot_mps"])),
+        "contact": pa.array(side, pa.string(), mask=e["outcome"] != CRASH),
+    }
+
+
+def _time_to_collision(r2_m: FloatArray, r2dot_mps: FloatArray) -> FloatArray:
+    """NaN where nobody closes in, or has passed."""
+    closing = (r2dot_mps < 0.0) & (r2_m >= 0.0)
+    found: FloatArray = np.divide(r2_m, -r2dot_mps, out=np.full(r2_m.shape, np.nan), where=closing)
+    return found
 
 
 def moments_table(shard: Shard) -> pa.Table:
@@ -106,7 +129,7 @@ def moments_table(shard: Shard) -> pa.Table:
 
 def traces_table(shard: Shard) -> pa.Table:
     """One row per step and vehicle of the traced episodes."""
-    schema = traces_schema()
+    schema = traces_schema(takes_time=shard.lateral.present)
     if not shard.traces:
         return schema.empty_table()
     parts = [_trace_columns(shard, row) for row in sorted(shard.traces)]
@@ -133,7 +156,20 @@ def _trace_columns(shard: Shard, row: int) -> dict[str, np.ndarray]:
         "x_m": flat[:, 0],
         "v_mps": flat[:, 1],
         "a_mps2": flat[:, 2],
+        "lateral_m": np.where(vehicle == BV, _came_over(shard, row, step), 0.0),
     }
+
+
+def _came_over(shard: Shard, row: int, state: np.ndarray) -> FloatArray:
+    """How far (m) BV has come over in states (n,) of an episode."""
+    episode, distance_m = shard.results.episode[row], shard.lateral.distance_m
+    lead, onset, cut = (int(episode[name]) for name in ("lead_steps", "onset_step", "cut_in_step"))
+    if onset < 0:
+        return np.zeros(state.shape)
+    if lead == 0:
+        return np.where(state > onset, distance_m, 0.0)
+    begins = cut - lead if cut >= 0 else onset  # it may have begun before the test
+    return distance_m * np.clip((state - begins - 1) / lead, 0.0, 1.0)
 
 
 def shadow_table(shard: Shard, path: IntArray, weight: FloatArray) -> pa.Table:

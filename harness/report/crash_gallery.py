@@ -15,7 +15,7 @@ from matplotlib.axes import Axes
 
 from harness.arrays import FloatArray
 from harness.outcomes import VEHICLES
-from harness.records.reader import read_traces
+from harness.records.reader import read_traces, stored_columns
 from harness.report.number_format import decimal, number
 from harness.report.plot_style import HALF_WIDTH_IN, INK, VEHICLE_COLOURS, Plot, new_figure, note
 from harness.report.run_folder import RunFolder, typed_folder
@@ -56,7 +56,8 @@ def crash_gallery(run: RunFolder, summary: RunSummary) -> list[GalleryRow]:
     elif not summary.all_weights_one:
         rankings.append((summary.heaviest.crashes, "weight"))
     episodes = {crash.episode for ranked, _ in rankings for crash in ranked}
-    traces = read_traces(run.path, episodes, ["episode", "step", "vehicle", "lane", "x_m", "v_mps"])
+    lateral = ["lateral_m"] if "lead_steps" in stored_columns(run.path) else []
+    traces = read_traces(run.path, episodes, ["episode", "step", "vehicle", "lane", "x_m", "v_mps", *lateral])
     traced = set() if traces is None else set(traces.column("episode").unique().to_pylist())
     reasons: dict[Crash, list[str]] = {}
     for ranked, reason in rankings:
@@ -94,12 +95,27 @@ def _diagram(run: RunFolder, summary: RunSummary, crash: Crash, traces: pa.Table
 
 @dataclass(frozen=True)
 class Track:
-    """One vehicle's motion; all of shape (n_steps,): time in s, front bumper in m, speed in m/s, lane (0 right)."""
+    """One vehicle's motion; all of shape (n_steps,): time in s, front bumper in m, speed in m/s, lane (0 right).
+
+    ``lateral_m`` is how far it has come over, None where cut-ins are one step.
+    """
 
     time_s: FloatArray
     x_m: FloatArray
     v_mps: FloatArray
     lane: FloatArray
+    lateral_m: FloatArray | None = None
+
+    @property
+    def came_over_m(self) -> FloatArray:
+        """How far it has come over: not at all where that is not known."""
+        return np.zeros(self.time_s.shape) if self.lateral_m is None else self.lateral_m
+
+    @property
+    def onset_s(self) -> float | None:
+        """When it begins to move sideways; None if it does not, or that takes no time."""
+        moved = self.came_over_m > 0.0
+        return float(self.time_s[max(int(np.argmax(moved)) - 1, 0)]) if moved.any() else None
 
     def front_m(self, time_s: float, frame_mps: float) -> float:
         """Front bumper in the moving frame at one time."""
@@ -116,7 +132,8 @@ def _tracks(traces: pa.Table, episode: int) -> dict[str, Track]:
     tracks = {}
     for vehicle in VEHICLES:
         part = rows.filter(pc.equal(rows.column("vehicle").cast(pa.string()), vehicle)).sort_by("step")
-        columns = [part.column(name).to_numpy().astype(np.float64) for name in ("step", "x_m", "v_mps", "lane")]
+        names = ["step", "x_m", "v_mps", "lane", *(name for name in part.column_names if name == "lateral_m")]
+        columns = [part.column(name).to_numpy().astype(np.float64) for name in names]
         tracks[vehicle] = Track(STEP_S * columns[0], *columns[1:])
     return tracks
 
@@ -126,18 +143,22 @@ def time_space_plot(crash: Crash, tracks: dict[str, Track], *, worth: str) -> Pl
 
     ``worth`` ends the caption: what the crash means for the estimate.
     """
-    figure = new_figure(HALF_WIDTH_IN, 4.7)
-    position, speed = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
+    onset_s = tracks["BV"].onset_s
+    figure = new_figure(HALF_WIDTH_IN, 4.7 if onset_s is None else 5.7)
+    position, speed, *lateral = figure.subplots(
+        2 if onset_s is None else 3, 1, sharex=True, height_ratios=(3, 2) if onset_s is None else (3, 2, 1)
+    )
     frame_mps = float(tracks["BV"].v_mps[0])
     for vehicle, track in tracks.items():
         _draw_positions(position, vehicle, track, frame_mps)
         speed.plot(track.time_s, track.v_mps, color=VEHICLE_COLOURS[vehicle])
-    for axes in (position, speed):
+    for axes in (position, speed, *lateral):
         axes.axvline(crash.cut_in_time_s, color=INK, linewidth=0.9, linestyle=(0, (4, 3)))
     place = ("data", "axes fraction")
     note(position, "cut-in", (crash.cut_in_time_s, 0.0), (-4, 5), xycoords=place, ha="right", color=INK, fontsize=8)
     _mark_crash(position, speed, crash.crash_time_s, tracks, frame_mps)
     _label(position, speed, crash, tracks, frame_mps)
+    came = "" if onset_s is None else _draw_lateral(speed, lateral[0], tracks["BV"], onset_s, crash)
     alt = (
         f"Time-space diagram of episode {crash.episode}: BV cuts in at {decimal(crash.cut_in_time_s)} s, "
         f"{decimal(crash.cut_in_r2_m)} m before the AV; the AV hits it at {decimal(crash.crash_time_s)} s with "
@@ -145,9 +166,23 @@ def time_space_plot(crash: Crash, tracks: dict[str, Track], *, worth: str) -> Pl
     )
     caption = (
         f"R2 = {decimal(crash.cut_in_r2_m)} m and R2dot = {decimal(crash.cut_in_r2dot_mps)} m/s at the cut-in, crash "
-        f"{decimal(crash.crash_time_s - crash.cut_in_time_s)} s later; {worth}."
+        f"{decimal(crash.crash_time_s - crash.cut_in_time_s)} s later; {came}{worth}."
     )
     return Plot(f"crash-{crash.episode:09d}", figure, alt, caption)
+
+
+def _draw_lateral(above: Axes, axes: Axes, bv: Track, onset_s: float, crash: Crash) -> str:
+    """How far BV has come over, from the onset on; returns what the caption says of it."""
+    axes.plot(bv.time_s, bv.came_over_m, color=VEHICLE_COLOURS["BV"])
+    for panel in above.figure.axes:
+        panel.axvline(onset_s, color=INK, linewidth=0.9, linestyle=(0, (1, 2)))
+    place = ("data", "axes fraction")
+    note(axes, "onset", (onset_s, 1.0), (-4, -10), xycoords=place, ha="right", color=INK, fontsize=8)
+    axes.set_ylabel("BV over, m")
+    axes.set_xlabel(above.get_xlabel())
+    above.set_xlabel("")
+    axes.set_xlim(min(axes.get_xlim()[0], onset_s - 0.5), axes.get_xlim()[1])
+    return f"BV came over for {decimal(crash.cut_in_time_s + STEP_S - onset_s)} s before; "
 
 
 def _draw_positions(axes: Axes, vehicle: str, track: Track, frame_mps: float) -> None:

@@ -21,6 +21,7 @@ from harness.report.crash_gallery import GalleryRow, crash_gallery
 from harness.report.cut_in_conditions import CONDITIONS
 from harness.report.cut_in_plot import cut_in_plot
 from harness.report.histogram_plots import crash_time_plot, impact_speed_plot, strata_plot, weight_plot
+from harness.report.lateral import lateral_facts
 from harness.report.plot_style import RC, Plot, inline_svg, png, svg
 from harness.report.run_folder import RunFolder, read_run_folder, typed_folder
 from harness.report.shells_plot import shells_plot
@@ -108,6 +109,7 @@ def write_report(folder: Path) -> Path:
         gallery=gallery,
         figures=figures,
         conditions=CONDITIONS,
+        lateral=lateral_facts(run),
         relabelings=RELABELINGS,
         significant=SIGNIFICANT,
         estimators=sorted(run.estimates.estimates.items(), key=lambda item: item[0] != run.estimates.headline),

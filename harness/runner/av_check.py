@@ -15,8 +15,9 @@ import numpy as np
 from harness.arrays import FloatArray
 from harness.campaign.models import AutomatedVehicle, Campaign
 from harness.controllers.apart import has_foreign_code, run_apart
+from harness.environment.loading import load_environment
 from harness.episode.loop import EpisodeLoop, Shard
-from harness.errors import EXIT_DONE, EXIT_TOO_MANY_FAILED
+from harness.errors import EXIT_DONE, EXIT_TOO_MANY_FAILED, CampaignError
 from harness.estimators.estimate import finite_json
 from harness.outcomes import AV, CRASH, FAILED
 from harness.resolved import resolve
@@ -38,8 +39,8 @@ AT_LIMIT_MPS2 = 1e-9
 class Behaviour:
     """What the AV did in all steps in which it acted, and after the cut-ins.
 
-    ``reaction_s`` is the median time from the cut-in to the first braking beyond 0.1 m/s², over the episodes that
-    braked at all; their share is ``braking_share``.
+    ``reaction_s`` is the median time from the onset of the cut-in to the first braking beyond 0.1 m/s², over the
+    episodes that braked at all; their share is ``braking_share``.
     """
 
     mean_acceleration_mps2: float
@@ -129,6 +130,7 @@ def check_av(campaign: Campaign, n_episodes: int = EPISODES, *, black_box: Path 
     """
     tested = _as_checked(campaign)
     require_world(tested)
+    _require_immediate(tested)
     prepared = prepare(resolve(tested))
     first, elapsed_s, steps = _timed_run(prepared, n_episodes, black_box)
     again = _run_in_another_order(prepared, n_episodes, black_box)
@@ -147,6 +149,18 @@ def check_av(campaign: Campaign, n_episodes: int = EPISODES, *, black_box: Path 
         behaviour=_behaviour(first, limits, early=tested.av.acts_before_cut_in),
         speed=Speed(1e6 * elapsed_s / steps, n_episodes / elapsed_s, 1e6 * idm_s / idm_steps, n_episodes / idm_s),
     )
+
+
+def _require_immediate(tested: Campaign) -> None:
+    """Refuse a vehicle that acts before the cut-in where those take time: nobody knows the onset of one it leads to."""
+    if tested.av.acts_before_cut_in and load_environment(tested.environment).lateral.present:
+        raise CampaignError(
+            "av.before_cut_in",
+            found="controller, where cut-ins take time (`lateral` of the environment)",
+            expected="hold_speed, or cut-ins of one step: a look at a vehicle makes no shadow runs, without which the "
+            "onset is not known in time",
+            mend="Add --set av.before_cut_in=hold_speed, or --set environment.parameters=ndd-overtaking-1.",
+        )
 
 
 def check_av_apart(campaign: Campaign, n_episodes: int = EPISODES) -> AvCheck:
@@ -217,14 +231,14 @@ def _behaviour(shard: Shard, limits: tuple[float, float], *, early: bool) -> Beh
     episode = shard.results.episode
     acted, reactions = [], []
     for row, trace in sorted(shard.traces.items()):
-        cut = int(episode["cut_in_step"][row])
+        cut, onset = int(episode["cut_in_step"][row]), int(episode["onset_step"][row])
         if episode["outcome"][row] == FAILED:
             continue
         commanded = trace[:-1, AV, 2]  # the last row commands nothing
         if early or cut >= 0:
-            acted.append(commanded[0 if early else cut + 1 :])
+            acted.append(commanded[0 if early else onset + 1 :])
         if cut >= 0:
-            reactions.append(_reaction_s(commanded[cut + 1 :]))
+            reactions.append(_reaction_s(commanded[onset + 1 :]))
     a = np.concatenate([*acted, np.empty(0)])
     reaction = np.array(reactions)
     braked = np.isfinite(reaction)
@@ -243,6 +257,6 @@ def _behaviour(shard: Shard, limits: tuple[float, float], *, early: bool) -> Beh
 
 
 def _reaction_s(a: FloatArray) -> float:
-    """Time (s) from the cut-in to the step that brakes; infinite if none does."""
+    """Time (s) from the onset of the cut-in to the step that brakes; infinite if none does."""
     braking = np.flatnonzero(a < BRAKING_MPS2)
     return float(braking[0]) * STEP_S if braking.size else np.inf

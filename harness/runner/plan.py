@@ -17,11 +17,13 @@ from harness.controllers.hosts import BatchHost, ControllerHost
 from harness.controllers.loading import build_host
 from harness.controllers.protocol import BatchObservation
 from harness.criticality.tables import tables_cached
+from harness.environment.lateral import DISTANCE_M as OVERLAP_M
 from harness.importance.build import needs_tables
 from harness.pool.shadow_paths import shadow_paths_file
 from harness.pool.storage import cached_pool
 from harness.resolved import Resolved
 from harness.runner.prepare import build_world, require_ready
+from harness.runner.reach import reach_of_statements
 from harness.sumo.shim import shim_library
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
 from harness.world import AVLostError, DrivingWorld, World
@@ -56,7 +58,8 @@ def plan_campaign(campaign: Campaign) -> dict[str, Any]:
     -------
     dict
         ``episodes``, ``episodes_per_second_estimate`` (all cores), ``seconds_estimate``, ``tables`` (in words) and
-        ``disk_mb``; of an AV that is not built in ``av_ms_per_test``, measured, or in words why there is none.
+        ``disk_mb``; of an AV that is not built in ``av_ms_per_test``, measured, or in words why there is none. Where
+        cut-ins take time, ``within_reach_of_`` each statement: which rates it can tell, in words.
 
     Raises
     ------
@@ -83,7 +86,18 @@ def plan_campaign(campaign: Campaign) -> dict[str, Any]:
         "tables": _tables(resolved),
         "disk_mb": round(episodes * (KB_PER_EPISODE + KB_PER_MOMENT * moments) / 1000.0, 1),
         **of_av,
+        **_reach(resolved),
     }
+
+
+def _reach(resolved: Resolved) -> dict[str, str]:
+    """Which rates statements can tell, where cut-ins take time and those of attentive vehicles are tiny."""
+    campaign = resolved.campaign
+    if not resolved.environment.lateral.present or campaign.testing.method != "shells" or campaign.has_shadow_runs:
+        return {}
+    if (pool := cached_pool(resolved)) is None:
+        return {"within_reach": "known once the pool is built (harness pool)"}
+    return {f"within_reach_of_{name}": said for name, said in reach_of_statements(campaign, pool).items()}
 
 
 def _rounded(value: float) -> float:
@@ -196,7 +210,8 @@ def _observation(cells: IntArray, k: int) -> BatchObservation:
     gap = max(bv - VEHICLE_LENGTH_M - av, 1.0)
     real = [k * STEP_S, av, v_av, 0.0, gap, v_bv, bv, v_bv, lv, v_lv]
     columns = [np.full(cells.size, value) for value in real]
-    return BatchObservation._make([cells, cells, *columns[:8], np.zeros_like(cells), *columns[8:]])
+    overlaps = np.full(cells.size, OVERLAP_M), np.zeros(cells.size), np.ones_like(cells)
+    return BatchObservation._make([cells, cells, *columns[:8], np.zeros_like(cells), *columns[8:], *overlaps])
 
 
 def _require_success(failures: dict[int, str]) -> None:

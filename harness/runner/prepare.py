@@ -67,7 +67,9 @@ class Prepared:
             raise ValueError("this campaign has no shadow runs")
         pool = vehicle_pool(self.resolved, self.shadow_paths, runs)
         prescribed = PrescribedEpisodes(self.campaign, pool)
-        policy = self.policy._replace(boundary=checked_boundary(self.resolved.library, prescribed.design))
+        policy = self.policy._replace(
+            boundary=checked_boundary(self.resolved.library, prescribed.design, self.resolved.environment)
+        )
         return replace(self, prescribed=prescribed, policy=policy)
 
     def states(self, first_episode: int, n_episodes: int) -> RecordArray:
@@ -150,7 +152,7 @@ def prepare(resolved: Resolved, progress: Progress | None = None) -> Prepared:
     importance = build_importance(campaign, tables)
     if campaign.has_shadow_runs:  # what happens then is prescribed, cut-in included
         importance = importance._replace(method=PRESCRIBED)
-    boundary = NOBODY if prescribed is None else checked_boundary(resolved.library, prescribed.design)
+    boundary = NOBODY if prescribed is None else checked_boundary(resolved.library, prescribed.design, environment)
     policy = Policy(campaign.seed, environment, importance, resolved.av, boundary)
     return Prepared(resolved, policy, InitialStates(environment.numbers), tables, prescribed, shadow_paths)
 

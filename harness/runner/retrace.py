@@ -33,6 +33,8 @@ class Retracing:
         elif campaign.av.acts_before_cut_in:
             self._reason = "the AV acted before the cut-in, and nothing on record says how"
         self._seed, self._environment = campaign.seed, resolved.environment
+        # After an onset the AV may act: where it is then, nothing on record says of one that is not built in.
+        self._at_cut_in = _AT_ONSET if resolved.environment.lateral.present else _AT_CUT_IN
         self._driver = resolved.av
         self._room = empty_trajectory(resolved.environment)
 
@@ -50,7 +52,7 @@ class Retracing:
         n = int(episodes.num_rows)
         twin = Retraced(np.zeros(n, np.int64), np.zeros(n, np.int64), np.zeros(n), np.zeros(n), np.zeros(n))
         retrace(stored, self._environment, self._driver, self._room, twin)
-        differing = _differences(episodes, stored, twin, self._driver.size > 0)
+        differing = _differences(episodes, stored, twin, self._at_cut_in, self._driver.size > 0)
         for column, (wrong, in_sumo, in_twin) in differing.items():
             if wrong.any():
                 row = int(np.argmax(wrong))
@@ -66,32 +68,34 @@ class Retracing:
         """What manifest and estimates say: ``n`` episodes retraced, or why none could be."""
         if self._reason is not None:
             return {"reason": self._reason}
-        compared = ["cut_in_r2_m", "cut_in_r2dot_mps", "outcome without a cut-in", "n_steps"]
+        compared = [*self._at_cut_in, "outcome without a cut-in", "n_steps"]
         if self._driver.size > 0:
             compared += ["outcome", "crash_time_s", "impact_speed_mps"]
         return {"n_episodes": n, "n_equal": n, "compared": compared}
 
 
+_AT_CUT_IN, _AT_ONSET = ("cut_in_r2_m", "cut_in_r2dot_mps"), ("onset_r2_m", "onset_r2dot_mps")
 _Difference = tuple[BoolArray, np.ndarray, np.ndarray]
 """Which rows differ, what is stored, and what the twin says."""
 
 
-def _differences(episodes: pa.Table, stored: StoredPaths, twin: Retraced, built_in: bool) -> dict[str, _Difference]:
+def _differences(
+    episodes: pa.Table, stored: StoredPaths, twin: Retraced, at_cut_in: tuple[str, str], built_in: bool
+) -> dict[str, _Difference]:
     """Per column what is to be equal."""
     outcome = _outcomes(episodes)
-    r2, r2dot, impact, time = (
-        _floats(episodes, name) for name in ("cut_in_r2_m", "cut_in_r2dot_mps", "impact_speed_mps", "crash_time_s")
-    )
+    r2, r2dot, impact, time = (_floats(episodes, name) for name in (*at_cut_in, "impact_speed_mps", "crash_time_s"))
     unknown = (outcome == FAILED) | ((stored.cut_step >= 0) & (not built_in))
     expected = np.where(unknown, np.where(twin.outcome == RUNNING, outcome, twin.outcome), twin.outcome)
     crash = (outcome == CRASH) & built_in
+    before = (outcome == FAILED) & (stored.cut_step < 0)  # it may have failed between the onset and the cut-in
     at = np.where(outcome == CRASH, stored.n_steps * STEP_S, np.nan)
     names = np.array([*OUTCOMES, "neither crash nor end"])
     maneuvers = (twin.outcome == FAILED, names[outcome], np.full(len(outcome), "maneuvers that lead there"))
     return {
         "lv_maneuvers, bv_maneuvers": maneuvers,
-        "cut_in_r2_m": (_unlike(r2, twin.cut_r2), r2, twin.cut_r2),
-        "cut_in_r2dot_mps": (_unlike(r2dot, twin.cut_r2dot), r2dot, twin.cut_r2dot),
+        at_cut_in[0]: (_unlike(r2, twin.onset_r2) & ~before, r2, twin.onset_r2),
+        at_cut_in[1]: (_unlike(r2dot, twin.onset_r2dot) & ~before, r2dot, twin.onset_r2dot),
         "outcome": (outcome != expected, names[outcome], names[expected]),
         "n_steps": (stored.n_steps != twin.n_steps, stored.n_steps, twin.n_steps),
         "crash_time_s": (_unlike(time, at), time, at),

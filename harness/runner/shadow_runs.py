@@ -25,7 +25,8 @@ from harness.episode.motion import motion_hashes
 from harness.episode.trajectory import empty_trajectory
 from harness.errors import RunFolderError, TooManyFailedError
 from harness.outcomes import AV, FAILED
-from harness.pool.enumeration import write_pairs
+from harness.pool.cut_ins import onset_steps
+from harness.pool.enumeration import draw_leads, write_pairs
 from harness.pool.shadow_paths import ShadowPaths, traffic_without_cut_in
 from harness.pool.vehicle_pool import ShadowRuns, recorded_cut_ins
 from harness.random_stream import CUT_IN, uniforms
@@ -207,9 +208,12 @@ def _forced(
     lv, bv = traffic_without_cut_in(seed, index, state, environment)
     went = np.flatnonzero(~runs.failed)
     lv[went], bv[went] = _with_cut_in(seed, index[went], step[went], state[went], environment)
-    motion = motion_hashes(runs.x_m, runs.v_mps)[np.arange(n), step]
+    lead = np.zeros(n if environment.lateral.present else 0, np.int64)
+    if lead.size:
+        draw_leads(seed, index, step, environment.lateral, lead)
+    motion = motion_hashes(runs.x_m, runs.v_mps)[np.arange(n), onset_steps(step, lead)]
     step[runs.failed] = -1
-    return PrescribedTraffic(lv, bv, step, np.full(n, -1), np.log(p_cut_in + unknown), index, motion)
+    return PrescribedTraffic(lv, bv, step, np.full(n, -1), np.log(p_cut_in + unknown), index, motion, lead)
 
 
 def _with_cut_in(

@@ -112,7 +112,7 @@ def stored_blocks(
         raise no_episodes(folder)
     method, alpha = campaign.testing.method, mixture_weights(campaign)
     shells = read_shells(folder) if method == "shells" else None
-    columns = [*EPISODE_COLUMNS, *(SHELL_COLUMNS if shells else ()), *(PATH_COLUMNS if surrogates else ())]
+    columns = [*EPISODE_COLUMNS, *(SHELL_COLUMNS if shells else ()), *(surrogates.columns if surrogates else ())]
     ratios = list(MOMENT_COLUMNS) if moments and method == "step_mixture" else []
     n = 0
     for episodes, steps in read_shards(folder, episode_columns=list(dict.fromkeys(columns)), moment_columns=ratios):

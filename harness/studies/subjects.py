@@ -84,7 +84,7 @@ class _Held:
     def of(cls, experiment: Experiment, progress: Progress) -> _Held:
         campaign, size, seed = experiment.campaign, experiment.super_population, experiment.seed
         environment, library = load_environment(campaign.environment), load_library(campaign.pool.library)
-        drivers, pools = Drivers.of(library, experiment.holding), None
+        drivers, pools = Drivers.of(library, experiment.holding, see_onset=environment.lateral.present), None
         if campaign.testing.method == "shells":
             pools = enumerate_paths(environment, drivers, seed, size.paths, progress)
         together: dict[str, set[str]] = {}
@@ -158,7 +158,7 @@ def _acting(experiment: Experiment, name: str, choose: Choose, executor: Executo
     """A vehicle that acts before the cut-in, on paths of its own."""
     campaign, size, place = experiment.subject(name), experiment.super_population, list(experiment.avs).index(name)
     library = load_library(campaign.pool.library)
-    vehicle = Mixed((library.drivers.size,), (1.0,))
+    vehicle = Mixed((library.n_drivers,), (1.0,))
     truth = walk_paths(campaign, choose, experiment.seed + 1, size.reference_paths, executor, progress)
     pools = walk_paths(campaign, choose, experiment.seed, size.paths, executor, progress)
     known = of_vehicle(truth, vehicle.crash_mass(truth), reference_drivers(library))

@@ -24,6 +24,7 @@ from harness.compiled import WORLD_SOURCES, cache_root, source_hash
 from harness.environment.driving import Environment
 from harness.errors import CampaignError
 from harness.pool.aimed_paths import PILOT_PATHS, Enumerator
+from harness.pool.cut_ins import environment_hash
 from harness.pool.library import Library
 from harness.pool.shells import acceleration_limit
 from harness.progress import Progress
@@ -106,8 +107,10 @@ class Drivers:
     references: dict[str, int]
 
     @classmethod
-    def of(cls, library: Library, avs: Mapping[str, AutomatedVehicle]) -> Drivers:
+    def of(cls, library: Library, avs: Mapping[str, AutomatedVehicle], *, see_onset: bool = False) -> Drivers:
         """The library's, references last, in the order of its file, and then vehicles with built-in models.
+
+        ``see_onset`` is that of `harness.vehicles.models.driver_records`.
 
         The envelope is the library's, unless a vehicle accelerates harder.
         """
@@ -129,7 +132,8 @@ class Drivers:
             )
         enclosed = all(acceleration_limit(av) <= library.envelope_mps2 for av in avs.values())
         envelope = list(library.surrogates).index(library.envelope) if enclosed else NO_ENVELOPE
-        return cls(driver_records(parameters, reactions), envelope, vehicles, reference_drivers(library))
+        records = driver_records(parameters, reactions, see_onset=see_onset)
+        return cls(records, envelope, vehicles, reference_drivers(library))
 
     def only(self, names: set[str]) -> Drivers:
         """The envelope, the references and the drivers of some vehicles."""
@@ -201,8 +205,7 @@ def joined(parts: Sequence[SuperPopulation]) -> SuperPopulation:
 
 def population_key(environment: Environment, *content_of: object) -> str:
     """Hash of all that a population depends on: plain content, an environment, and code."""
-    numbers = {name: environment.numbers[name].item() for name in environment.numbers.dtype.names or ()}
-    content = [_FORMAT, source_hash(WORLD_SOURCES), numbers, *content_of]
+    content = [_FORMAT, source_hash(WORLD_SOURCES), environment_hash(environment), *content_of]
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:24]
 
 

@@ -26,6 +26,7 @@ from harness.importance.build import build_importance
 from harness.outcomes import CRASH
 from harness.outcomes import SHELLS as PRESCRIBED
 from harness.pool.aimed_paths import Enumerator
+from harness.pool.cut_ins import onset_steps
 from harness.pool.enumeration import STRIDE
 from harness.pool.shadow_paths import CANDIDATES, ShadowPaths, choose_paths
 from harness.pool.vehicle_pool import ShadowRuns, recorded_cut_ins
@@ -42,7 +43,7 @@ CHUNK_PATHS = 1024
 
 def vehicle_bit(resolved: Resolved) -> int:
     """Which bit of a cut-in says whether the vehicle itself crashes: the one after the library's drivers."""
-    return int(resolved.library.drivers.size)
+    return resolved.library.n_drivers
 
 
 _SOURCES = ("studies/walked_population.py", "pool/shadow_paths.py", "pool/vehicle_pool.py", "controllers/hosts.py")
@@ -76,7 +77,8 @@ def walk_paths(
     """
     code = require_controller(campaign), source_hash(_SOURCES)
     resolved = resolve(campaign)
-    asked = resolved.library.drivers.tolist(), campaign.av.identity(), *code, campaign.seed, seed, n_paths
+    drivers = resolved.library.drivers_in(resolved.environment).tolist()
+    asked = drivers, campaign.av.identity(), *code, campaign.seed, seed, n_paths
 
     def walked() -> SuperPopulation:
         paths = choose(seed, n_paths)
@@ -108,7 +110,7 @@ def _walk(campaign_json: str, first: int, paths: ShadowPaths) -> SuperPopulation
     _require_none_failed(resolved, int(runs.failed.sum()), len(paths), "shadow runs")
     envelope = list(library.surrogates).index(library.envelope)
     offset = np.random.default_rng([paths.seed, first]).integers(0, STRIDE, len(paths))
-    where = environment, library.drivers, envelope
+    where = environment, library.drivers_in(environment), envelope
     probability, bits, _ = recorded_cut_ins(runs, paths.seed, paths.index, paths.state, *where, offset)
     mass = probability * paths.weight[:, None]
     row, step = np.nonzero(mass > 0.0)
@@ -139,11 +141,13 @@ def _crashes(
 ) -> BoolArray:
     """Drive the vehicle on cut-ins of paths in given rows and steps (n,): whether it crashed on each."""
     environment, library = resolved.environment, resolved.library
-    enumerator = Enumerator(environment, library.drivers, list(library.surrogates).index(library.envelope), paths.seed)
-    motion = motion_hashes(runs.x_m, runs.v_mps)[row, step]
+    drivers, envelope = library.drivers_in(environment), list(library.surrogates).index(library.envelope)
+    enumerator = Enumerator(environment, drivers, envelope, paths.seed)
+    lead = enumerator.leads(paths.index[row], step)
+    motion = motion_hashes(runs.x_m, runs.v_mps)[row, onset_steps(step, lead)]
     lv, bv, _, _ = enumerator.pairs(paths.index[row], step, paths.state[row])
     nowhere, weightless = np.full(row.size, -1), np.zeros(row.size)
-    traffic = PrescribedTraffic(lv, bv, step, nowhere, weightless, first + row, motion)
+    traffic = PrescribedTraffic(lv, bv, step, nowhere, weightless, first + row, motion, lead)
     outcome = loop.run(0, paths.state[row], traffic)
     _require_none_failed(resolved, len(outcome.failures), row.size, "tests")
     return np.asarray(outcome.results.episode["outcome"] == CRASH)

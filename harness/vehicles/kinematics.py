@@ -34,3 +34,9 @@ def next_position(position: float, speed: float, speed_after: float) -> float:
 def gap(leader_position: float, follower_position: float) -> float:
     """Bumper-to-bumper gap (m) between front-bumper positions."""
     return leader_position - VEHICLE_LENGTH_M - follower_position
+
+
+@compiled_inline
+def overlaps(one_position: float, other_position: float) -> bool:
+    """Whether two vehicles of one lane touch, whoever is ahead."""
+    return gap(one_position, other_position) < CONTACT_M and gap(other_position, one_position) < CONTACT_M

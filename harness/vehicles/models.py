@@ -28,6 +28,7 @@ from harness.campaign.models import (
     IDMParameters,
     NeedBasedParameters,
     Reaction,
+    Reference,
     Reflexes,
 )
 from harness.compiled import compiled_inline
@@ -45,7 +46,7 @@ _REFERENCE = ("used_up_steps", "braking_jerk_mps3", "following_min_acceleration_
 _CAREFUL_COMPETENT = ("critical_ttc_s", "coasting_mps2")
 _FUZZY_SAFETY = ("comfortable_braking_mps2", "hard_braking_mps2", "leader_braking_mps2", "safe_margin_m")
 _NEED_BASED = ("reaction_steps", "needed_mps2", "standstill_gap_m")
-_REACTION = ("max_jerk_mps3", "inattention_probability")
+_REACTION = ("max_jerk_mps3", "inattention_probability", "perceives_lateral_m")
 _STEPS = ("delay_steps", "inattention_steps")
 MODEL_FIELDS = ("kind", *_COMMON, *_IDM, *_FVDM)
 """What decides a driver's acceleration once it has reacted; the other fields say how it lags behind."""
@@ -56,8 +57,14 @@ DRIVER_DTYPE = np.dtype(
 )
 
 
-def driver_records(drivers: Sequence[BuiltInParameters], reactions: Sequence[Reflexes] | None = None) -> RecordArray:
-    """Parameters of driver models as kernels read them, shape (number of drivers,); by default all react at once."""
+def driver_records(
+    drivers: Sequence[BuiltInParameters], reactions: Sequence[Reflexes] | None = None, *, see_onset: bool = False
+) -> RecordArray:
+    """Parameters of driver models as kernels read them, shape (number of drivers,); by default all react at once.
+
+    ``see_onset`` says that cut-ins take time: reference drivers then perceive and evaluate them, and none of their
+    delay has been used up before.
+    """
     kinds: dict[type[BuiltInParameters], int] = {
         IDMParameters: IDM_KIND,
         FVDMParameters: FVDM_KIND,
@@ -72,17 +79,21 @@ def driver_records(drivers: Sequence[BuiltInParameters], reactions: Sequence[Ref
         for name in DRIVER_DTYPE.names or ():
             record[name] = getattr(driver, name, record[name])
         record["max_jerk_mps3"] = math.inf if reaction.max_jerk_mps3 is None else reaction.max_jerk_mps3
+        record["perceives_lateral_m"] = reaction.perceives_lateral_m
         record["delay_steps"] = round(reaction.delay_s * 10.0)
+        if see_onset and isinstance(driver, Reference):
+            record["used_up_steps"] = 0.0
+            record["delay_steps"] += driver.evaluation_steps
         if isinstance(reaction, Reaction):
             record["inattention_probability"] = reaction.inattention_probability
             record["inattention_steps"] = round(reaction.inattention_delay_s * 10.0)
     return records
 
 
-def av_records(av: AutomatedVehicle) -> RecordArray:
+def av_records(av: AutomatedVehicle, *, see_onset: bool = False) -> RecordArray:
     """Parameters of a built-in AV, shape (1,); of an AV that something else drives, shape (0,)."""
     if isinstance(av.parameters, BuiltInParameters):
-        return driver_records([av.parameters], [av.reaction])
+        return driver_records([av.parameters], [av.reaction], see_onset=see_onset)
     return driver_records([])
 
 

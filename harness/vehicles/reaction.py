@@ -21,9 +21,9 @@ def reaction_steps(driver: Record, seed: int, episode: int) -> int:
 
 
 @compiled_inline
-def nothing_yet() -> Memory:
+def nothing_yet(used_up: float) -> Memory:
     """What a driver remembers before it acts: it has kept its speed, and seen no danger."""
-    return Memory(0.0, math.inf)
+    return Memory(0.0, math.inf, used_up)
 
 
 @compiled_inline
@@ -42,7 +42,7 @@ def react(driver: Record, memory: Memory, step: int, speed: float, lead_speed: f
     else:
         wanted, danger = need_based(driver, memory, step, speed, lead_speed, gap)
     change = driver.max_jerk_mps3 * STEP_S
-    return Memory(min(max(wanted, memory.acceleration - change), memory.acceleration + change), danger)
+    return Memory(min(max(wanted, memory.acceleration - change), memory.acceleration + change), danger, memory.used_up)
 
 
 @compiled_threads
@@ -68,7 +68,7 @@ def expected_accelerations(
         Receives accelerations (m/s²).
     """
     for e in range(begin.size - 1):
-        memory = nothing_yet()
+        memory = nothing_yet(driver[0].used_up_steps)
         for i in range(begin[e], begin[e + 1]):
             step = i - begin[e] - driver[0].delay_steps - 1
             if step >= 0:

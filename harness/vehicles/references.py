@@ -26,10 +26,12 @@ class Memory(NamedTuple):
 
     ``acceleration`` (m/s²) is that of the step before, ``danger`` the step, counted from the first in which it could
     act, in which the danger was perceived that it reacts to: infinite for none, negative for one seen before.
+    ``used_up`` (steps) is how long before that step it has perceived that BV comes over.
     """
 
     acceleration: float
     danger: float
+    used_up: float
 
 
 @compiled_inline
@@ -60,9 +62,9 @@ def built_up(driver: Record, memory: Memory, idle: float, wanted: float) -> floa
 
 
 @compiled_inline
-def first_perceived(driver: Record, step: int) -> float:
+def first_perceived(memory: Memory, step: int) -> float:
     """When a danger was perceived that is there in a step: in the first, while BV was still coming over."""
-    return -driver.used_up_steps if step == 0 else float(step)
+    return -memory.used_up if step == 0 else float(step)
 
 
 @compiled_inline
@@ -78,10 +80,10 @@ def careful_competent(
     if speed <= lead_speed:
         danger = math.inf
     elif danger == math.inf and gap < driver.critical_ttc_s * (speed - lead_speed):
-        danger = first_perceived(driver, step)
+        danger = first_perceived(memory, step)
     idle = 0.0 if danger == math.inf else max(-driver.coasting_mps2, driver.min_acceleration_mps2)
     follows = built_up(driver, memory, idle, following(driver, speed, lead_speed, gap))
-    a = changing(part_after(step, -driver.used_up_steps, driver.reaction_steps), idle, follows)
+    a = changing(part_after(step, -memory.used_up, driver.reaction_steps), idle, follows)
     if danger < math.inf:
         brakes = built_up(driver, memory, idle, driver.min_acceleration_mps2)
         a = min(a, changing(part_after(step, danger, driver.reaction_steps), idle, brakes))
@@ -148,9 +150,9 @@ def fuzzy_safety(
     danger = memory.danger
     wanted = fuzzy_braking(driver, memory, speed, lead_speed, gap)
     if wanted > 0.0 and danger == math.inf:
-        danger = first_perceived(driver, step)
+        danger = first_perceived(memory, step)
     follows = built_up(driver, memory, 0.0, following(driver, speed, lead_speed, gap))
-    a = changing(part_after(step, -driver.used_up_steps, driver.reaction_steps), 0.0, follows)
+    a = changing(part_after(step, -memory.used_up, driver.reaction_steps), 0.0, follows)
     if wanted > 0.0:
         brakes = built_up(driver, memory, 0.0, max(-wanted, driver.min_acceleration_mps2))
         a = min(a, changing(part_after(step, danger, driver.reaction_steps), 0.0, brakes))

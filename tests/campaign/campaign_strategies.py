@@ -58,10 +58,12 @@ def _in_steps(reaction: dict[str, Any]) -> dict[str, Any]:
 
 
 def _harder(parameters: dict[str, Any]) -> dict[str, Any]:
-    """Hard braking is no softer than comfortable braking, 4 m/s² when left out."""
+    """Hard braking is no softer than comfortable braking, 4 m/s² when left out; times are whole steps."""
     if "comfortable_braking_mps2" in parameters or "hard_braking_mps2" in parameters:
         comfortable = parameters.get("comfortable_braking_mps2", 4.0)
         parameters["hard_braking_mps2"] = max(parameters.get("hard_braking_mps2", 0.0), comfortable)
+    if "risk_evaluation_s" in parameters:
+        parameters["risk_evaluation_s"] = round(parameters["risk_evaluation_s"], 1)
     return parameters
 
 
@@ -112,8 +114,9 @@ def _obey_rules(data: dict[str, Any]) -> dict[str, Any]:
         traci["command"] = shlex.join(
             ["x", traci["command"].replace("{", "").replace("}", "")]
         )  # words, nothing to fill in
-    if "acceleration_hold_s" in environment:
-        environment["acceleration_hold_s"] = round(environment["acceleration_hold_s"], 1)
+    for name in ("acceleration_hold_s", "cut_in_lead_s"):
+        if environment.get(name) is not None:
+            environment[name] = round(environment[name], 1)
     if testing.get("alpha") is not None:
         names = list(data.get("surrogates", ("SM-I", "SM-II", "SM-III")))
         testing["alpha"] = dict.fromkeys(names[:-1], 0.25) | {names[-1]: 1 - 0.25 * (len(names) - 1)}

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.optimize import brentq, minimize
 from scipy.special import gammaln, xlogy
 
-from harness.estimators.likelihood_ratio import Level, contrast_limit, likelihood_limit, ratio_limits
+from harness.estimators.likelihood_ratio import Level, contrast_limit, likelihood_limit, ratio_limits, spread
 
 MANY = 1e6
 """A quantile so large that the threshold for few crashes always holds."""
@@ -211,3 +211,36 @@ def test_limits_of_a_ratio_cover(confidence):
                 low, high = ratio([1.0], [counts], Level.two_sided(confidence))
                 covered += chance * (low <= 0.65 / 0.45 <= high)
     assert covered >= confidence - 1e-3  # what was left out
+
+
+LEVEL = Level(Level.two_sided(0.9).threshold, MANY)
+
+
+def test_further_tests_go_where_one_more_narrows_the_interval_most():
+    """Against the interval itself, with a little more of each stratum; nowhere but where there is room."""
+    rng = np.random.default_rng(5)
+    decided = 0
+    for _ in range(200):
+        weights = 10.0 ** rng.uniform(-2.0, 0.0, (4, 1)) * np.array([1.0, 0.0])
+        tests = rng.integers(5, 400, 4)
+        crashes = rng.binomial(tests, rng.beta(0.3, 1.0, 4))
+        counts = np.column_stack([crashes, tests - crashes])
+
+        def width(s, counts=counts, weights=weights, tests=tests):
+            grown = counts * np.where(np.arange(4) == s, 1.0 + 1e-3 / tests, 1.0)[:, None]
+            return sum(side * contrast_limit(weights, grown, LEVEL, side) for side in (-1.0, 1.0))
+
+        narrowed = np.array([width(None) - width(s) for s in range(4)])
+        best, second = np.argsort(-narrowed)[:2]
+        if narrowed[best] > 1.1 * max(narrowed[second], 1e-9):
+            decided += 1
+            room = np.full(4, 10)
+            np.testing.assert_array_equal(spread(weights, counts, counts, LEVEL, 1, room), np.arange(4) == best)
+            assert spread(weights, counts, counts, LEVEL, 100, np.where(np.arange(4) == best, 0, room))[best] == 0
+    assert decided > 100
+
+
+def test_strata_without_a_test_come_first_and_all_that_there_is_is_given():
+    weights, counts = np.array([[1.0, 0.0], [1e-9, 0.0]]), np.array([[3, 7], [0, 0]])
+    np.testing.assert_array_equal(spread(weights, counts, counts, LEVEL, 1, np.array([5, 5])), [0, 1])
+    np.testing.assert_array_equal(spread(weights, counts, counts, LEVEL, 100, np.array([5, 7])), [5, 7])

@@ -32,7 +32,7 @@ def enumerated(environment, n: int, envelope: int = ENVELOPE, stride: int = 1, o
     steps = int(environment.numbers["max_steps"])
     states, offsets = InitialStates(environment.numbers).draw(SEED, 0, n), np.full(n, offset)
     probability, crashes = np.zeros((n, steps)), np.zeros((n, steps), np.int64)
-    asked = environment, LIBRARY.drivers, envelope, stride, offsets
+    asked = environment, LIBRARY.drivers_in(environment), envelope, stride, offsets
     enumerate_cut_ins(SEED, 0, states, *asked, empty_trajectory(environment), probability, crashes)
     return probability, crashes
 
@@ -62,7 +62,7 @@ def test_a_prescribed_episode_ends_as_the_pool_says(campaign, pool, environment,
     shells = [Draw(s, 0, 60) for s in range(prescribed.design.p.size)]
     states, traffic, cut_ins = prescribed.episodes(tuple(shells))
     rows = cut_ins.row
-    driver = LIBRARY.drivers[NAMES.index(surrogate)][None]
+    driver = LIBRARY.drivers_in(environment)[NAMES.index(surrogate)][None]
     policy = Policy(1, environment, build_importance(campaign, None), driver)
     shard = EpisodeLoop(TwinWorld(16), policy, Keep(0, "none", 0.0)).run(0, states, traffic)
     episode = shard.results.episode
@@ -89,7 +89,7 @@ def test_a_stride_asks_the_same_cut_ins_and_each_stands_for_as_many(environment)
 
 
 def test_blocks_use_every_offset_about_equally(environment):
-    paths = Enumerator(environment, LIBRARY.drivers, ENVELOPE, 5).run(0, 2048, SilentProgress())
+    paths = Enumerator(environment, LIBRARY.drivers_in(environment), ENVELOPE, 5).run(0, 2048, SilentProgress())
     asked = paths.mass > 0.0
     offsets = [np.flatnonzero(row) % STRIDE for row in asked if row.any()]
     assert all(np.unique(found).size == 1 for found in offsets)
@@ -98,7 +98,7 @@ def test_blocks_use_every_offset_about_equally(environment):
 
 
 def test_the_number_of_cores_changes_no_bit(environment, monkeypatch):
-    enumerator = Enumerator(environment, LIBRARY.drivers, ENVELOPE, PoolSettings().seed)
+    enumerator = Enumerator(environment, LIBRARY.drivers_in(environment), ENVELOPE, PoolSettings().seed)
     many = enumerator.run(0, 512, SilentProgress())
     monkeypatch.setattr("os.cpu_count", lambda: 1)
     one = enumerator.run(0, 512, SilentProgress())

@@ -50,7 +50,7 @@ def test_a_vehicle_that_holds_its_speed_has_the_cut_ins_of_one_that_holds(enviro
     """Every bit: same hazards, same probabilities, same crashes, on naturalistic paths."""
     library = resolve(campaign).library
     envelope = list(library.surrogates).index(library.envelope)
-    enumerator = Enumerator(environment, library.drivers, envelope, 5, stride=1)
+    enumerator = Enumerator(environment, library.drivers_in(environment), envelope, 5, stride=1)
     held = enumerator.run(0, N, SilentProgress())
     steps = np.arange(int(environment.numbers["max_steps"]) + 1)
     v = np.repeat((held.state["v_bv_mps"] - held.state["r2dot_mps"])[:, None], steps.size, 1)
@@ -58,7 +58,7 @@ def test_a_vehicle_that_holds_its_speed_has_the_cut_ins_of_one_that_holds(enviro
     for step in steps[1:]:
         x[:, step] = x[:, step - 1] + v[:, step] * 0.1
     runs = ShadowRuns(np.full(N, steps[-1]), np.zeros(N, np.bool_), x, v)
-    where = 5, held.index, held.state, environment, library.drivers, envelope
+    where = 5, held.index, held.state, environment, library.drivers_in(environment), envelope
     probability, crashes, unknown = recorded_cut_ins(runs, *where)
     asked = held.mass > 0.0
     assert asked.sum() > 10_000
@@ -74,7 +74,7 @@ def test_probabilities_are_those_of_the_states_that_were_driven(speeds):
     paths, environment = ready.shadow_paths, ready.policy.environment
     rows = slice(0, 10)
     shard = without_cut_in(loop, paths.seed, 0, paths.index[rows], paths.state[rows], environment)
-    nobody = np.zeros(0, ready.resolved.library.drivers.dtype), -1
+    nobody = np.zeros(0, ready.resolved.library.drivers_in(environment).dtype), -1
     some = ShadowRuns(runs.n_steps[rows], runs.failed[rows], runs.x_m[rows], runs.v_mps[rows])
     given = paths.seed, paths.index[rows], paths.state[rows], environment, *nobody
     probability, _, _ = recorded_cut_ins(some, *given)

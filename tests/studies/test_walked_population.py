@@ -22,7 +22,7 @@ from harness.studies.walked_population import chooser, walk_paths
 LIBRARY = load_library("ladder-2")
 PATHS = 1024
 FEW = 60
-VEHICLE = int(LIBRARY.drivers.size)
+VEHICLE = LIBRARY.n_drivers
 
 
 def campaign(controller: str, **parameters) -> Campaign:
@@ -102,7 +102,7 @@ def test_redrawn_pools_cover_and_wrong_ones_are_found(speeds):
     assert drawn.design.n_paths == len(drawn.mass) == 200
     for name in (FREE, ratio_to("r157-cc"), preventable_by("r157-cc")):
         assert right[name].p_value > 0.01
-        assert right[name].refused == 0.0
+        assert right[name].refused <= 0.15  # 200 paths, of which 40 are to count
     heaviest = int(np.argmax(np.bincount(drawn.design.cell_stratum, drawn.crash_mass.sum(0))))
     _, wrong = repeated(speeds, crashing, Fault(shell=heaviest, factor=3.0))
     assert wrong[FREE].p_value < 1e-6

@@ -21,6 +21,7 @@ from harness.runner.retrace import Retracing
 from harness.state import STATE_DTYPE
 from harness.twin import TwinWorld
 from harness.vehicles.models import av_records
+from tests.episode.test_lateral import BESIDE, NEVER, beside, policy_of
 
 KEEP_SPEED, BRAKE = 20, 0
 STATES = np.array(
@@ -65,7 +66,7 @@ def test_contact_in_the_step_of_the_cut_in_is_retraced_and_no_surrogate_crashes(
     assert Retracing(resolve(campaign)).check(episodes) == len(STATES)
     crashes = np.full(len(STATES), -1, np.int64)
     stored, room = stored_paths(episodes, campaign.seed), empty_trajectory(environment)
-    assert replay_surrogates(stored, environment, library.drivers, -1, room, crashes) == -1
+    assert replay_surrogates(stored, environment, library.drivers_in(environment), -1, room, crashes) == -1
     everybody = 2 ** len(library.surrogates) - 1
     assert crashes.tolist()[::2] == [0, everybody]
     assert crashes[3] == 0
@@ -78,3 +79,15 @@ def test_sumo_agrees_also_with_cells_that_stay_empty(smoke, open_world, n_cells,
     assert twin.results.episode.tobytes() == sumo.results.episode.tobytes()
     for row, trace in twin.traces.items():
         assert np.array_equal(trace, sumo.traces[row], equal_nan=True)
+
+
+def test_sumo_flags_vehicles_beside_each_other_by_the_rule_of_the_first_overlap(open_world):
+    """Around -0.001 and -9.999 m: the loop stops where SUMO's own flag says something else than the positions."""
+    states, traffic = beside(0, 0, [r2_m for r2_m, _ in BESIDE])
+    episode = {}
+    for name, world in (("twin", TwinWorld(4)), ("sumo", open_world(4))):
+        loop = EpisodeLoop(world, policy_of(NEVER, 0.0), Keep(0, "none", 0.0))
+        episode[name] = loop.run(0, states, traffic).results.episode
+    assert episode["sumo"].tobytes() == episode["twin"].tobytes()
+    for row, (_, outcome) in zip(episode["sumo"], BESIDE, strict=True):
+        assert (row["n_steps"] > 1) if outcome is None else (row["outcome"], row["n_steps"]) == (outcome, 1)

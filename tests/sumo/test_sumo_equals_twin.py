@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from harness.episode.loop import Shard
-from harness.outcomes import AV, BV, BV_LV_CONTACT, CRASH, LV
+from harness.outcomes import AV, BV, BV_LV_CONTACT, CRASH, LV, PASSED
 from harness.state import STATE_DTYPE
 from harness.twin import TwinWorld
 from tests.episode.twin_runs import TWO
@@ -38,6 +38,15 @@ AVS = {
     " inattention_delay_s: 0.9}}",
     "need_based": "{model: need-based, reaction: {max_jerk_mps3: 12}}",
 }
+LATERAL = {
+    "seen": ("environment.parameters=ndd-overtaking-1-lateral", "av={model: idm}"),
+    "seen_by_a_reference": ("environment.parameters=ndd-overtaking-1-lateral", "av={model: r157-cc}"),
+    "overtaken": (
+        "environment.cut_in_lead_s=4",
+        "av={model: constant, parameters: {acceleration_mps2: 5}, reaction: {perceives_lateral_m: 0}}",
+    ),
+}
+"""Cut-ins that take time; before some that take long the AV has passed BV."""
 MIXTURE = "mixture"
 EPISODES = 150
 """Of each driver."""
@@ -81,6 +90,7 @@ def jobs(smoke) -> dict[str, Job]:
     # Fewer episodes than cells: the other cells stay parked, where nothing may be compared with where they are not.
     small = (Job(smoke(forced), 5, 64), Job(smoke(forced), 5, 64, shim=False), Job(late, 60, 16))
     of_avs = {name: Job(smoke(forced, f"av={av}"), EPISODES, 32) for name, av in AVS.items()}
+    of_avs |= {name: Job(smoke(forced, *of), 2 * EPISODES, 32) for name, of in LATERAL.items()}
     return {**dict(zip((*METHODS, *SMALL), (*of_methods, *small), strict=True)), **of_avs}
 
 
@@ -95,7 +105,7 @@ def twins(jobs) -> dict[str, Shard]:
     return {name: run_episodes(job, TwinWorld(48)) for name, job in jobs.items()}
 
 
-@pytest.mark.parametrize("name", [*METHODS, *SMALL, *AVS])
+@pytest.mark.parametrize("name", [*METHODS, *SMALL, *AVS, *LATERAL])
 def test_sumo_and_twin_agree_in_every_bit(name, recordings, twins):
     assert differences(motions_seen(recordings[name]), motions_computed(twins[name])) == {}
     assert np.array_equal(recordings[name]["outcome"], twins[name].results.episode["outcome"])
@@ -113,6 +123,15 @@ def test_the_episodes_compared_are_many_and_of_every_kind(jobs, twins):
     assert vanilla.size >= 200
     assert (vanilla["outcome"] == CRASH).sum() >= 50
     assert ((vanilla["cut_in_step"] >= 0) & (vanilla["outcome"] != CRASH)).sum() >= 50
+
+
+def test_among_cut_ins_that_take_time_are_side_contacts_and_vehicles_that_have_passed(twins):
+    episode = twins["overtaken"].results.episode
+    at_overlap = episode["n_steps"] == episode["cut_in_step"] + 1
+    assert ((episode["outcome"] == PASSED) & at_overlap).sum() >= 5
+    assert ((episode["outcome"] == CRASH) & at_overlap).sum() >= 5
+    seen = twins["seen"].results.episode
+    assert np.unique(seen["lead_steps"]).size >= 20
 
 
 def test_vehicles_that_brake_to_a_standstill_and_drive_off_are_among_them(twins):

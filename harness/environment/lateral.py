@@ -1,0 +1,104 @@
+"""How long BV's lane change shows itself before BV overlaps the AV: the lead of a cut-in.
+
+The hazard is the rate of *crossings*, predicted by the driver who cuts in: R2 and time to collision are taken at the
+crossing, beside an AV that goes on as it did. The *onset* of lateral motion is the lead earlier; from then on the AV
+may act. The decision precedes the onset: BV does not abort.
+
+The lead is the distance from first lateral motion to overlap over the lateral speed, which is log-normal or gives a
+constant lead; it is rounded to whole steps. States are counted as everywhere: BV begins to move at the end of step
+``onset``, overlaps at the end of step ``cut = onset + lead``, and is at ``distance · (s - onset - 1) / lead`` in state
+s between them. A lead of zero is the cut-in of one step.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from scipy import special
+
+from harness.arrays import FloatArray
+from harness.compiled import compiled_inline
+from harness.random_stream import LATERAL, uniform
+from harness.vehicles.kinematics import STEP_S
+
+DISTANCE_M = 1.7
+"""Lane of 3.6 m less a car of 1.9 m [derived]."""
+_ROUNDING = 1e-9
+
+
+class LateralMotion(NamedTuple):
+    """``distance_m`` from first lateral motion to overlap, and P(lead ≤ k steps), ``cumulative`` (k + 1,).
+
+    ``cumulative`` is empty where cut-ins are one step.
+    """
+
+    distance_m: float
+    cumulative: FloatArray
+
+    @property
+    def present(self) -> bool:
+        """Whether cut-ins take time here, if only none."""
+        return self.cumulative.size > 0
+
+
+def in_one_step() -> LateralMotion:
+    """The paper's cut-in."""
+    return LateralMotion(DISTANCE_M, np.zeros(0))
+
+
+def constant_lead(lead_s: float, distance_m: float = DISTANCE_M) -> LateralMotion:
+    """Every cut-in shows itself this long before overlap."""
+    cumulative = np.zeros(round(lead_s / STEP_S) + 1)
+    cumulative[-1] = 1.0
+    return LateralMotion(distance_m, cumulative)
+
+
+def log_normal_speed(distance_m: float, median_mps: float, log_sd: float, longest_s: float) -> LateralMotion:
+    """Leads of a log-normal lateral speed; longer ones count as the longest."""
+    upto_s = STEP_S * (np.arange(round(longest_s / STEP_S) + 1) + 0.5)
+    cumulative = special.ndtr((np.log(median_mps) - np.log(distance_m / upto_s)) / log_sd)
+    cumulative[-1] = 1.0
+    return LateralMotion(distance_m, cumulative)
+
+
+@compiled_inline
+def draw_lead(cut: int, seed: int, episode: int, lateral: LateralMotion) -> int:
+    """Lead (steps) of the cut-in that overlaps after a step."""
+    last = lateral.cumulative.size - 1
+    if last <= 0:
+        return 0
+    u = uniform(seed, episode, LATERAL, cut)
+    lead = 0
+    while lead < last and lateral.cumulative[lead] <= u:
+        lead += 1
+    return lead
+
+
+@compiled_inline
+def onset_of(cut: int, lead: int) -> int:
+    """Step at whose end BV begins to move sideways: at the earliest the first of the test."""
+    return max(cut - lead, 0)
+
+
+@compiled_inline
+def lateral_position(state: int, cut: int, lead: int, distance_m: float) -> float:
+    """How far (m) BV has come over in a state between onset and overlap."""
+    if state > cut or lead == 0:
+        return distance_m
+    return distance_m * (state + lead - cut - 1) / lead
+
+
+@compiled_inline
+def perceived_in(perceives_m: float, cut: int, lead: int, distance_m: float) -> tuple[int, float]:
+    """First step in which somebody may act who perceives a lateral motion of so many metres; the overlap anyone.
+
+    And by how much of a step it was perceived before that: drivers whose delays need not be whole steps count it.
+    """
+    until = float(lead)
+    if lead > 0 and perceives_m < distance_m:
+        until = perceives_m * lead / distance_m
+    perceived = max(cut - lead + until, float(onset_of(cut, lead)))
+    first = math.ceil(perceived - _ROUNDING)
+    return first + 1, max(first - perceived, 0.0)

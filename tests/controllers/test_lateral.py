@@ -1,0 +1,136 @@
+"""What controllers see of a BV that comes over, in every form that they may have."""
+
+from __future__ import annotations
+
+import importlib
+import math
+
+import numpy as np
+import pytest
+
+from examples.idm import idm_acceleration
+from harness.campaign.loading import load_campaign
+from harness.controllers.protocol import Neighbour, Observation
+from harness.controllers.traci_facade import Traci
+from harness.controllers.traci_style import TraciStyleController
+from harness.resolved import resolve
+from harness.runner.prepare import prepare
+from harness.twin import TwinWorld
+
+N = 400
+LATERAL = "environment.parameters=ndd-overtaking-1-lateral"
+FORCED = ("testing.method=forced", "world.engine=twin")
+SEEN: list[Observation] = []
+"""What `Notes` has seen: of this module as the campaign imports it, which is another one than pytest's."""
+
+
+def drive(*overrides: str):
+    ready = prepare(resolve(load_campaign("scenarios/smoke.yaml", [*FORCED, *overrides])))
+    loop = ready.loop(TwinWorld(32))
+    shard = loop.run(0, ready.states(0, N))
+    loop.close()
+    assert shard.failures == {}
+    return shard.results.episode
+
+
+class Notes:
+    """Keeps its speed and writes down what it sees."""
+
+    def start(self, episode): ...
+
+    def step(self, seen):
+        SEEN.append(seen)
+        return 0.0
+
+    def close(self): ...
+
+
+class YieldsBatch:
+    """`examples.sees_lateral` over arrays."""
+
+    def start_batch(self, cells, episodes, random): ...
+
+    def step_batch(self, seen):
+        comes = (seen.bv_lateral_speed_mps > 0.0) & (seen.bv_lateral_m >= 0.375 - 1e-9)
+        gap = seen.bv_position_m - 5.0 - seen.position_m
+        of = zip(seen.speed_mps.tolist(), seen.bv_speed_mps.tolist(), gap.tolist(), strict=True)
+        follows = np.array([idm_acceleration(*each) for each in of])
+        return np.where(comes | (seen.bv_overlaps == 1), follows, 0.0)
+
+    def close(self): ...
+
+
+class YieldsScript(TraciStyleController):
+    """The same as a TraCI script, which knows lanes and positions in them."""
+
+    def on_step(self, traci, veh_id, time):
+        vehicle = traci.vehicle
+        over = -vehicle.getLateralLanePosition("BV")
+        comes = vehicle.getLateralSpeed("BV") < 0.0 and over >= 0.375 - 1e-9
+        if not comes and vehicle.getLaneIndex("BV") == 1:
+            return
+        gap = vehicle.getLanePosition("BV") - vehicle.getLength("BV") - vehicle.getLanePosition(veh_id)
+        a = idm_acceleration(vehicle.getSpeed(veh_id), vehicle.getSpeed("BV"), gap)
+        vehicle.setAcceleration(veh_id, a, 0.1)
+
+
+@pytest.fixture(scope="module")
+def built_in():
+    return drive(LATERAL)
+
+
+@pytest.mark.parametrize(
+    "controller",
+    [
+        "examples.sees_lateral:Yields",
+        "tests.controllers.test_lateral:YieldsBatch",
+        "tests.controllers.test_lateral:YieldsScript",
+    ],
+)
+def test_a_controller_that_sees_it_is_the_built_in_model_to_the_last_bit(built_in, controller):
+    found = drive(LATERAL, f"av={{controller: '{controller}'}}")
+    assert found.tobytes() == built_in.tobytes()
+
+
+def test_one_that_waits_for_the_overlap_is_another_vehicle(built_in):
+    """The sibling that must fail; it is the built-in model that is blind until then."""
+    waits = drive(LATERAL, "av={controller: 'examples.sees_lateral:Yields', parameters: {perceives_m: 2.0}}")
+    assert waits.tobytes() != built_in.tobytes()
+    blind = drive(LATERAL, "av.reaction.perceives_lateral_m=2.0")
+    assert waits.tobytes() == blind.tobytes()
+
+
+@pytest.mark.parametrize("lead_s", [0.0, 1.0])
+def test_what_is_seen_of_a_lead(lead_s):
+    SEEN = importlib.import_module("tests.controllers.test_lateral").SEEN  # noqa: N806 - the other one
+    SEEN.clear()
+    drive(
+        f"environment.cut_in_lead_s={lead_s}",
+        "av={controller: 'tests.controllers.test_lateral:Notes'}",
+        "world.cells=1",
+    )
+    starts = [0, *(i for i in range(1, len(SEEN)) if SEEN[i].time_s <= SEEN[i - 1].time_s)]
+    assert len(SEEN) > 10_000
+    assert all(seen.bv_overlaps == (seen.bv.lane == 0) == math.isfinite(seen.gap_m) for seen in SEEN)
+    assert all((seen.bv_lateral_m == 1.7) and (seen.bv_lateral_speed_mps == 0.0) for seen in SEEN if seen.bv_overlaps)
+    if lead_s == 0.0:
+        assert all(seen.bv_overlaps for seen in SEEN)
+        return
+    coming = [seen for seen in SEEN if not seen.bv_overlaps]
+    assert {seen.bv_lateral_speed_mps for seen in coming} == {1.7}
+    assert len(starts) > 1
+
+
+def test_a_script_sees_it_on_the_right_of_its_lane_until_it_is_on_the_other():
+    traci = Traci()
+    lv = Neighbour(400.0, 30.0, 1)
+    traci.see(Observation(1.0, 100.0, 30.0, 0.0, math.inf, math.nan, Neighbour(140.0, 28.0, 1), lv, 0.5, 0.7, False))
+    vehicle = traci.vehicle
+    assert (vehicle.getLateralLanePosition("BV"), vehicle.getLateralSpeed("BV")) == (-0.5, -0.7)
+    assert vehicle.getPosition("BV") == (140.0, pytest.approx(1.1))
+    assert vehicle.getLaneIndex("BV") == 1
+    assert (vehicle.getLateralLanePosition("AV"), vehicle.getLateralSpeed("LV")) == (0.0, 0.0)
+    assert vehicle.getLeader("AV") is None
+    traci.see(Observation(1.1, 103.0, 30.0, 0.0, 35.0, 28.0, Neighbour(143.0, 28.0, 0), lv, 1.7, 0.0, True))
+    assert (vehicle.getLateralLanePosition("BV"), vehicle.getPosition("BV")) == (0.0, (143.0, -1.6))
+    assert vehicle.getLeader("AV")[0] == "BV"

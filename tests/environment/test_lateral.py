@@ -1,0 +1,158 @@
+"""How long cut-ins show themselves: leads by known answers, files by their rules, hashes that stay where nothing is."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import yaml
+
+from harness.campaign.loading import load_campaign
+from harness.campaign.models import EnvironmentSettings
+from harness.campaign.problems import read_model
+from harness.environment.lateral import constant_lead, in_one_step, lateral_position, log_normal_speed, perceived_in
+from harness.environment.loading import load_environment, load_parameters, parameter_file
+from harness.environment.parameters import EnvironmentParameters
+from harness.errors import CampaignError
+from harness.pool.cut_ins import environment_hash
+from harness.pool.enumeration import draw_leads
+from harness.resolved import resolve
+
+PAPER, LATERAL = "ndd-overtaking-1", "ndd-overtaking-1-lateral"
+
+
+def leads(lateral, n=20_000, seed=1):
+    out = np.zeros(n, np.int64)
+    draw_leads(seed, np.arange(n), np.full(n, 57), lateral, out)
+    return out
+
+
+@pytest.mark.parametrize("lead_s", [0.0, 0.1, 0.5, 2.0])
+def test_a_constant_lead_is_always_that(lead_s):
+    assert set(leads(constant_lead(lead_s), 500).tolist()) == {round(10 * lead_s)}
+
+
+def test_without_the_section_nothing_shows_itself():
+    assert not in_one_step().present
+    assert set(leads(in_one_step(), 500).tolist()) == {0}
+
+
+def test_leads_of_a_log_normal_speed_have_its_quantiles():
+    """1.7 m at a median of 0.69 m/s: half of the leads are below 2.46 s; a speed of 1.39 m/s is two deviations up."""
+    lateral = log_normal_speed(1.7, 0.69, 0.35, 4.0)
+    assert lateral.cumulative.size == 41
+    assert lateral.cumulative[24] == pytest.approx(0.5, abs=0.01)  # up to 2.45 s
+    two = 1.7 / (0.69 * math.exp(2 * 0.35))
+    assert np.interp(two, 0.1 * (np.arange(41) + 0.5), lateral.cumulative) == pytest.approx(0.0228, abs=0.002)
+    found = leads(lateral)
+    assert (found == 40).mean() == pytest.approx(1.0 - lateral.cumulative[39], abs=0.01)
+    # Kolmogorov's bound: a right sampler fails once in a thousand seeds.
+    share = np.array([(found <= k).mean() for k in range(41)])
+    assert np.abs(share - lateral.cumulative).max() < 1.95 / math.sqrt(found.size)
+    assert np.abs(share - log_normal_speed(1.7, 0.69, 0.5, 4.0).cumulative).max() > 1.95 / math.sqrt(found.size)
+
+
+def test_leads_depend_on_path_and_cut_in_step_alone():
+    lateral, out = log_normal_speed(1.7, 0.69, 0.35, 4.0), np.zeros(2, np.int64)
+    draw_leads(3, np.array([5, 5]), np.array([80, 80]), lateral, out)
+    assert out[0] == out[1]
+    many = np.zeros(200, np.int64)
+    draw_leads(3, np.full(200, 5), np.arange(200), lateral, many)
+    assert np.unique(many).size > 10
+
+
+@pytest.mark.parametrize(
+    ("perceives_m", "lead", "expected"),
+    [(0.0, 10, 91), (0.375, 10, 94), (0.375, 15, 90), (0.85, 10, 96), (1.7, 10, 101), (9.0, 10, 101), (0.375, 0, 101)],
+)
+def test_who_perceives_so_much_may_act_from_that_step(perceives_m, lead, expected):
+    """BV cuts in in step 100. 0.375 of 1.7 m take 2.2 of 10 steps, and 3.3 of 15: the next whole one counts."""
+    first, earlier = perceived_in(perceives_m, 100, lead, 1.7)
+    assert first == expected
+    reached = lateral_position(first, 100, lead, 1.7)
+    assert reached >= min(perceives_m, 1.7) - 1e-9
+    assert lead == 0 or first == 91 or lateral_position(first - 1, 100, lead, 1.7) < perceives_m
+    assert earlier == pytest.approx((reached - min(perceives_m, 1.7)) * lead / 1.7, abs=1e-8)
+
+
+def test_an_onset_before_the_test_is_seen_in_its_first_step_with_what_has_come_over_by_then():
+    assert perceived_in(0.0, 4, 20, 1.7) == (1, 0.0)
+    assert perceived_in(0.375, 4, 20, 1.7) == (1, 0.0)  # 1.275 m have come over
+    assert perceived_in(1.5, 4, 20, 1.7)[0] == 3
+
+
+def test_the_shipped_environment_is_the_papers_with_a_section_more():
+    paper, lateral = (read_model(parameter_file(name), EnvironmentParameters) for name in (PAPER, LATERAL))
+    assert lateral.model_copy(update={"lateral": None}) == paper
+    assert {name for name in lateral.values() if name not in paper.values()} == {
+        f"lateral__{name}" for name in ("distance_m", "speed_median_mps", "speed_log_sd", "longest_lead_s")
+    }
+    numbers = [load_environment(EnvironmentSettings(parameters=name)).numbers for name in (PAPER, LATERAL)]
+    assert numbers[0].dtype == numbers[1].dtype  # kernels are compiled once for both
+    assert numbers[0] == numbers[1]
+
+
+def test_what_says_nothing_of_leads_has_the_hashes_of_before():
+    """Written down before cut-ins could take time."""
+    smoke = load_campaign("scenarios/smoke.yaml")
+    assert load_parameters(smoke.environment).content_hash() == "838b5235175d4be5"
+    assert environment_hash(load_environment(smoke.environment)) == "e5b943592be3f1b7d3db2db8"
+    assert resolve(smoke).content_hash == "e96a008c5e8b50b4"
+    reference = load_campaign("scenarios/smoke.yaml", ["av={model: r157-cc}"])
+    assert resolve(reference).content_hash == "8e61b44d997bf0d0"
+
+
+@pytest.mark.parametrize(
+    "override",
+    ["environment.parameters=ndd-overtaking-1-lateral", "environment.cut_in_lead_s=0", "environment.cut_in_lead_s=0.5"],
+)
+def test_what_says_something_has_others(override):
+    smoke, other = load_campaign("scenarios/smoke.yaml"), load_campaign("scenarios/smoke.yaml", [override])
+    assert resolve(other).content_hash != resolve(smoke).content_hash
+    assert environment_hash(load_environment(other.environment)) != environment_hash(
+        load_environment(smoke.environment)
+    )
+
+
+@pytest.mark.parametrize(
+    ("section", "found"),
+    [
+        ({"distance_m": 1.7}, "neither"),
+        ({"distance_m": 1.7, "lead_s": 1.0, "speed_median_mps": 0.7}, "lead_s, speed_median_mps"),
+        ({"distance_m": 1.7, "speed_median_mps": 0.7, "speed_log_sd": 0.3}, "speed_median_mps, speed_log_sd"),
+        ({"distance_m": 1.7, "lead_s": 0.55}, "0.55"),
+        ({"distance_m": 0.0, "lead_s": 0.5}, "0"),
+    ],
+)
+def test_a_section_that_says_too_little_or_too_much_is_refused(section, found, tmp_path):
+    content = yaml.safe_load(parameter_file(PAPER).read_text(encoding="utf-8"))
+    content["lateral"] = {name: {"value": value, "source": "user"} for name, value in section.items()}
+    file = tmp_path / "mine.yaml"
+    file.write_text(yaml.safe_dump(content), encoding="utf-8")
+    with pytest.raises(CampaignError) as error:
+        load_parameters(EnvironmentSettings(parameters=str(file)))
+    assert "lateral" in error.value.where
+    assert found in error.value.found
+
+
+def test_a_lead_in_the_campaign_replaces_that_of_the_file():
+    settings = EnvironmentSettings(parameters=LATERAL, cut_in_lead_s=0.7)
+    lateral = load_environment(settings).lateral
+    assert set(leads(lateral, 100).tolist()) == {7}
+    assert lateral.distance_m == 1.7
+
+
+@pytest.mark.parametrize(
+    ("overrides", "where"),
+    [
+        (("testing.method=step_mixture", "stop.rhw=null"), "testing.method"),
+        (("testing.method=episode_mixture",), "testing.method"),
+        (("testing.method=nde", "av={controller: 'examples.idm:IDM', before_cut_in: controller}"), "av.before_cut_in"),
+    ],
+)
+def test_methods_that_cannot_know_of_an_onset_refuse_it(overrides, where):
+    campaign = load_campaign("scenarios/smoke.yaml", ["environment.cut_in_lead_s=0.5", *overrides])
+    with pytest.raises(CampaignError, match="cut-ins take time") as error:
+        resolve(campaign)
+    assert error.value.where == where
