@@ -119,7 +119,7 @@ def test_a_smaller_precision_that_the_pool_cannot_give_costs_no_test(campaign, r
     often = ("av={model: constant, parameters: {acceleration_mps2: -1.0}}", "world.engine=twin")
     many = ("stop.episodes=100000", "pool.cut_ins_per_shell=5000")
     out = tmp_path / "run"
-    held = run_here(campaign(*SHELLS, *often, *many, "stop.rhw=0.15"), out)
+    held = run_here(campaign(*SHELLS, *often, *many, "stop.rhw=0.14"), out)
     fresh = run_here(campaign(*SHELLS, *often, *many, "stop.rhw=0.05"), tmp_path / "fresh")
     assert fresh.estimates["n_episodes"] < held.estimates["n_episodes"]
     result = run_here(campaign(*SHELLS, *often, *many, "stop.rhw=0.05"), out, resume=True)
