@@ -260,9 +260,23 @@ def _command(name: str) -> str:
 
 
 def validated_table(name: str) -> str:
-    """Table of a replication experiment, with its command."""
+    """Tables of a replication experiment, rates and what else it judged, with its command."""
     head = ("vehicle or chain", "statement", "true rate", "bias", "coverage", "p (Holm)", "tests", "5–95 %", "alarm")
-    return _table(head, [_validated_cells(one) for one in _result(name)["judgements"]]) + f"\n{_command(name)}\n"
+    judgements = _result(name)["judgements"]
+    rates = _table(head, [_validated_cells(one) for one in judgements if _is_rate(one)])
+    others: dict[str, dict[str, str]] = {}
+    for one in judgements:
+        if not _is_rate(one):
+            cell = f"{one['truth']:.3g}, {one['bias']:+.1%}, {one['coverage']:.3f}"
+            others.setdefault(one["subject"], {})[one["result"]] = cell
+    compared = [(subject, *cells.values()) for subject, cells in others.items()]
+    names = next(iter(others.values()), {})
+    beside = f"\nTruth, bias and coverage:\n\n{_table(('vehicle', *names), compared)}" if others else ""
+    return f"{rates}{beside}\n{_command(name)}\n"
+
+
+def _is_rate(one: dict[str, Any]) -> bool:
+    return not one["result"].startswith(("ratio to ", "preventable by "))
 
 
 def _validated_cells(one: dict[str, Any]) -> tuple[str, ...]:
@@ -287,7 +301,7 @@ def methods_table() -> str:
         (words, *_method_cells(one))
         for name, words in METHODS.items()
         for one in _result(name)["judgements"]
-        if one["subject"] == "idm"
+        if one["subject"] == "idm" and _is_rate(one)
     ]
     commands = [f"- {words}: {_command(name)}" for name, words in METHODS.items()]
     return _table((*head, "tests for RHW 0.3", "as claimed"), rows) + "\n" + "\n".join(commands) + "\n"
