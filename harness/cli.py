@@ -1,8 +1,6 @@
 """The command ``harness``.
 
-Results go to stdout or to files, progress and complaints to stderr. Exit codes: 0 done; 2 the campaign or the call is
-wrong; 3 too many episodes failed or the world disagreed; 4 budget spent before the asked precision; 130, 143 or 129
-interrupted by Ctrl-C, SIGTERM or SIGHUP.
+Results go to stdout or to files, progress and complaints to stderr. `cli` lists the exit codes.
 What does the work is imported inside each command, so that ``--help`` answers at once.
 """
 
@@ -40,7 +38,8 @@ def cli() -> None:
 
     Exit codes: 0 done; 2 the campaign or the call is wrong, or the records do not allow what was asked for; 3 too many
     episodes failed, or SUMO disagreed with the formula; 4 the budget or the pool was spent before the asked precision;
-    130 interrupted by Ctrl-C, 143 by SIGTERM, 129 by SIGHUP: all three keep what is finished.
+    5 the vehicle is worse than the other by more than --margin; 130 interrupted by Ctrl-C, 143 by SIGTERM, 129 by
+    SIGHUP: all three keep what is finished.
     """
 
 

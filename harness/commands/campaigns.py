@@ -88,7 +88,8 @@ def run(
     interrupted and resumed. The run folder holds the resolved campaign, all records (Parquet), estimates.json and
     report.html.
 
-    Exit code 4 says that stop.episodes was spent before stop.rhw was reached; the results are there all the same.
+    Exit code 4 says that stop.episodes or the pool was spent before stop.rhw was reached; the results are there all the
+    same.
     """
     campaign = loaded(campaign_file, overrides, av)
     from harness.progress import terminal_progress  # noqa: PLC0415 - keeps --help fast
