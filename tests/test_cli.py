@@ -73,6 +73,7 @@ class Replay:
     bit_equal: bool | None
     outcome: str = "crash"
     suspects: str = "The controller's source file has been changed since the run."
+    row: dict[str, object] = field(default_factory=dict)
     trace: pa.Table = field(
         default_factory=lambda: pa.table(
             {"step": pa.array([0, 1], pa.int16()), "vehicle": pa.array(["LV", "BV"]).dictionary_encode()}
@@ -412,6 +413,14 @@ def test_replay_that_differs_is_an_error(calls, capsys, tmp_path):
     calls["stand_in"]("harness.runner.replay_episode", Replay(bit_equal=None))
     assert main(["replay", str(tmp_path), "17"]) == 0
     assert "no stored trace" in capsys.readouterr().out
+
+
+def test_replay_says_when_a_cut_in_that_takes_time_began(calls, tmp_path, capsys):
+    row = {"onset_step": 41, "cut_in_step": 53, "onset_r2_m": 7.25, "contact": "side"}
+    calls["stand_in"]("harness.runner.replay_episode", Replay(bit_equal=True, row=row))
+    assert main(["replay", str(tmp_path), "17"]) == 0
+    sentence = "BV comes over from 4.2 s on, 7.2 m ahead of the AV, and overlaps at 5.4 s; side contact"
+    assert sentence in capsys.readouterr().out
 
 
 def test_schema_prints_what_is_committed():
