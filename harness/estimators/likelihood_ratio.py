@@ -37,7 +37,7 @@ MARGIN = 0.395
 FEW_TESTS = 9
 """Below so many tests in all, the one-sided threshold is ln(2/tail) instead of ln(1/tail) (measured)."""
 PORTIONS = 6
-"""Of further tests."""
+"""Of further tests; with 4 or 12 campaigns take as many within 1 % (measured: IDM, brakes-8)."""
 _GRID = 64
 _MOST_DOUBLINGS = 80
 _MOST_STEPS = 200
@@ -264,7 +264,10 @@ def _gain(seen: _Seen, s: int, nu: float) -> float:
 
 @compiled
 def _root(seen: _Seen, level: Level, low: float, high: float, by_crashes: bool) -> float:
-    """Where a multiplier begins to be refused: regula falsi, an end that stays counting half (Illinois)."""
+    """Where a multiplier begins to be refused: regula falsi, an end that stays counting half (Illinois).
+
+    Compiled code cannot call scipy's roots, and this is a planner's hot loop.
+    """
     at_low, at_high = _refusal(seen, level, low, by_crashes), _refusal(seen, level, high, by_crashes)
     end = 1e-13 * high
     kept = 0

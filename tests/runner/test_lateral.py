@@ -127,5 +127,5 @@ def test_check_says_what_is_within_reach(lateral_run, campaign):
     smallest = {name: float(text.split("some ")[1].split(" per test")[0]) for name, text in said.items()}
     assert smallest["within_reach_of_library"] < smallest["within_reach_of_assumption_free"] / 10.0
     shells = json.loads((lateral_run.folder / "shells.json").read_text(encoding="utf-8"))
-    free = 1.3 * np.log(10.0) * sum(shells["cell_p"]) / (2.0 * 0.5 * 4000)
+    free = 1.6 * np.log(10.0) * sum(shells["cell_p"]) / (2.0 * 0.5 * 4000)
     assert smallest["within_reach_of_assumption_free"] == pytest.approx(free, rel=0.05)
