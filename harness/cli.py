@@ -15,7 +15,7 @@ import click
 from harness.commands.campaigns import check, run, schema, setup
 from harness.commands.options import examples
 from harness.commands.stored import estimate, replay, report
-from harness.commands.studies import pool, rnot, validate
+from harness.commands.studies import pool, rnot, study, validate
 from harness.commands.vehicles import av_check, compare, ladder
 from harness.console import show_error, show_interrupted, system_error, usage_error
 from harness.errors import EXIT_DONE, HarnessError, shortened
@@ -43,7 +43,8 @@ def cli() -> None:
     """
 
 
-for command in (check, av_check, run, compare, pool, ladder, estimate, rnot, report, replay, validate, schema, setup):
+_TESTING = check, av_check, run, compare, pool, ladder, estimate, rnot, report, replay
+for command in (*_TESTING, validate, study, schema, setup):
     cli.add_command(command)
 
 

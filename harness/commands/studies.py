@@ -220,3 +220,42 @@ def rnot(
         print_json(content)
     else:
         print_required_tests(content)
+
+
+@click.command(
+    short_help="Reproduce a paper's case study, and answer its claims.",
+    epilog=examples(
+        "harness study scenarios/case_study/study.yaml --out runs/quick --quick   # minutes: tiny, to see it work",
+        "harness study scenarios/case_study/study.yaml --out runs/case_study     # under an hour on two cores",
+    ),
+)
+@click.argument("study_file", metavar="STUDY", type=CAMPAIGN)
+@click.option("--out", "folder", type=FOLDER, required=True, help="Folder of the results; made if it is not there.")
+@click.option("--quick", is_flag=True, help="The sizes of the file's own section quick, too small for conclusions.")
+@click.option("--workers", type=click.IntRange(min=1), help="Processes. Default: one per core.")
+@quiet_option
+@json_option
+def study(study_file: Path, folder: Path, *, quick: bool, workers: int | None, quiet: bool, as_json: bool) -> None:
+    """Make the steps of STUDY that are not in the folder yet, and the page that puts them beside the paper's numbers.
+
+    Each step has a folder of its own under steps/, named after all that it depends on: a second run makes nothing
+    again, a killed one goes on, and a change in the file makes only what it concerns. The folder receives
+    case_study.md, claims.json (the verdicts) and plots/.
+    """
+    from harness.studies.case_study.study_file import load_study  # noqa: PLC0415 - keeps --help fast
+
+    asked = load_study(study_file, quick=quick)
+    from harness.progress import terminal_progress  # noqa: PLC0415 - keeps --help fast
+    from harness.studies.case_study.steps import run_study  # noqa: PLC0415 - slow to import: once the file is right
+
+    def told(name: str, seconds: float | None) -> None:
+        if not (as_json or quiet):
+            click.echo(f"{name}: " + ("there already" if seconds is None else f"{seconds:.1f} s"))
+
+    bar = None if quiet else terminal_progress(None, 0)
+    with bar or nullcontext():
+        done = run_study(asked, folder, workers=workers, progress=bar, told=told)
+    if as_json:
+        print_json({"page": str(done.page), "claims": done.claims, "seconds": done.seconds})
+        return
+    click.echo(str(done.page))

@@ -75,8 +75,7 @@ class Scv:
         """Algorithm 1's estimate and its published variance."""
         n = self.sums.n
         require_episodes(n)
-        levels = sorted(self._strata)
-        fits = side_by_side(lambda level: self._strata[level].fit(), levels, worthwhile=n >= CHUNK_ROWS)
+        levels, fits = zip(*self.fits(), strict=True)
         rate = math.fsum(fit.n * fit.intercept for fit in fits) / n
         within = math.fsum(fit.residual_squares for fit in fits)
         between = math.fsum(fit.n * (fit.intercept - rate) ** 2 for fit in fits)
@@ -102,15 +101,22 @@ class Scv:
             },
         )
 
+    def fits(self) -> list[tuple[int, StratumFit]]:
+        """Every number of control steps with its regression."""
+        levels = sorted(self._strata)
+        fits = side_by_side(lambda level: self._strata[level].fit(), levels, worthwhile=self.sums.n >= CHUNK_ROWS)
+        return list(zip(levels, fits, strict=True))
+
 
 class StratumFit(NamedTuple):
-    """Regression of Y_l on H_l: episodes, columns, rank of the centred columns, η_l, and Σ(Z - η_l)²."""
+    """Regression of Y_l on H_l: episodes, columns, rank of the centred columns, η_l, Σ(Z - η_l)² and Σ(Y - η_l)²."""
 
     n: int
     n_columns: int
     rank: int
     intercept: float
     residual_squares: float
+    total_squares: float
 
 
 class Stratum:
@@ -180,6 +186,7 @@ class Stratum:
         last = factor.shape[1] - 1
         centred, target = factor[1:last, 1:last], factor[1:last, last]
         residual_squares = float(factor[last, last] ** 2) if len(factor) > last else 0.0
+        total_squares = residual_squares + float(np.sum(target**2))
         rank = 0
         if centred.size:
             left, singular, _ = np.linalg.svd(centred, full_matrices=False)
@@ -187,7 +194,7 @@ class Stratum:
             kept = singular > max(self._n, last - 1) * np.finfo(np.float64).eps * largest
             rank = int(np.count_nonzero(kept))
             residual_squares += float(np.sum((left[:, ~kept].T @ target) ** 2))
-        return StratumFit(self._n, last - 1, rank, intercept, residual_squares)
+        return StratumFit(self._n, last - 1, rank, intercept, residual_squares, total_squares)
 
 
 def steps_used(n_control_steps: int, n_surrogates: int) -> int:

@@ -157,14 +157,14 @@ def plain_rhw(
         _, places = _crash_places(procedure.seed, shuffle, n_tests, len(y))
         order = np.argsort(places)
         n_placed = np.searchsorted(places[order], grid)
-        total, below = _total_and_half_width(y[order], n_placed, grid, z)
-        most, above = (total, below) if y is worst else _total_and_half_width(worst[order], n_placed, grid, z)
+        total, below = total_and_half_width(y[order], n_placed, grid, z)
+        most, above = (total, below) if y is worst else total_and_half_width(worst[order], n_placed, grid, z)
         rhw[shuffle] = ((most - total) + above + below) / 2.0 / total
         done()
     return rhw
 
 
-def _total_and_half_width(y: FloatArray, k: IntArray, n: IntArray, z: float) -> tuple[FloatArray, FloatArray]:
+def total_and_half_width(y: FloatArray, k: IntArray, n: IntArray, z: float) -> tuple[FloatArray, FloatArray]:
     """ΣY of the first ``k`` values among ``n`` tests, and z times its standard error; infinite if nothing is known."""
     total, squares = (np.concatenate([[0.0], np.cumsum(power)])[k] for power in (y, y * y))
     with np.errstate(divide="ignore", invalid="ignore"):

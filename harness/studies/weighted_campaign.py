@@ -64,7 +64,7 @@ class TwinEpisodes:
 
     def block(self, first: int, n: int) -> Block:
         """See `EpisodeSource`."""
-        prepared, loop = _prepared(self._campaign.model_dump_json())
+        prepared, loop = prepared_twin(self._campaign.model_dump_json())
         tables = shard_tables(loop.run(first, prepared.states(first, n)), self._campaign.seed, keep_traces=False)
         return block_from_tables(
             tables.episodes,
@@ -75,7 +75,8 @@ class TwinEpisodes:
 
 
 @cache
-def _prepared(campaign_json: str) -> tuple[Prepared, EpisodeLoop]:
+def prepared_twin(campaign_json: str) -> tuple[Prepared, EpisodeLoop]:
+    """A campaign in the twin; prepared when a process asks for it first, and once only."""
     prepared = prepare(resolve(Campaign.model_validate_json(campaign_json)))
     return prepared, prepared.loop(TwinWorld(CELLS))
 

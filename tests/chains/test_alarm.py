@@ -9,9 +9,9 @@ import numpy as np
 from harness.estimators.alarm import Alarm
 from harness.estimators.block import Block
 from harness.strata import KnownRates
+from harness.studies.chains.single_choice import SingleChoice
 
 from .seed import SEED
-from .single_choice import SingleChoice
 
 REPLICATIONS = 400
 N = 2_000

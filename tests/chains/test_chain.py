@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.stats import binomtest
 
+from harness.studies.chains.enumeration import enumerate_episodes
 from harness.studies.chains.named import frequent_decisive, overtaking, panel, rare_decisive
 from harness.studies.chains.sampler import draw
 
-from .enumeration import enumerate_episodes
 from .seed import SEED
 
 

@@ -16,9 +16,9 @@ from harness.estimators.nade import Nade
 from harness.estimators.scv import Scv
 from harness.studies.chains.named import frequent_decisive, rare_decisive
 from harness.studies.chains.sampler import draw
+from harness.studies.chains.single_choice import with_optimal_function
 
 from .coverage import replicate
-from .single_choice import with_optimal_function
 
 REPLICATIONS = 400
 N = 2_000

@@ -17,9 +17,9 @@ from harness.estimators.block import Block
 from harness.estimators.difference import Difference, difference_statement, paired_difference
 from harness.studies.chains.named import overtaking
 from harness.studies.chains.sampler import draw
+from harness.studies.chains.single_choice import with_optimal_function
 
 from .seed import SEED
-from .single_choice import with_optimal_function
 
 REPLICATIONS = 400
 N = 2_000

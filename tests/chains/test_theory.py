@@ -7,11 +7,11 @@ import pytest
 
 from harness.estimators.mixture_cv import MixtureCv
 from harness.estimators.scv import Scv
+from harness.studies.chains.enumeration import enumerate_episodes
 from harness.studies.chains.named import overtaking, rare_decisive
+from harness.studies.chains.single_choice import with_optimal_function
 
-from .enumeration import enumerate_episodes
 from .seed import SEED
-from .single_choice import with_optimal_function
 
 SMALL = [
     overtaking("right and wrong", skill=0.6, surrogates=[0.6, 0.2], level=0.05, horizon=4),

@@ -22,6 +22,7 @@ class SingleChoice:
 
     @property
     def crash_rate(self) -> float:
+        """μ."""
         return float(self.p @ self.crash)
 
     def draw(self, method: Method, n: int, rng: np.random.Generator) -> Block:

@@ -1,4 +1,4 @@
-"""All episodes of a small chain with their exact probabilities, and exact moments under the episode mixture."""
+"""All episodes of a small chain with their exact probabilities under p, and their ratios under either mixture."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from harness.arrays import BoolArray, FloatArray
+from harness.arrays import BoolArray, FloatArray, IntArray
 from harness.studies.chains.chain import Chain
 from harness.studies.chains.sampler import mixture_weights
 
@@ -76,3 +76,63 @@ def _after(chain: Chain, t: int, p: float, ratios: FloatArray, d: int) -> Iterat
         for following in np.flatnonzero(chain.response[d, a]):
             weight = p * exposure * chain.response[d, a, following]
             yield from _after(chain, t + 1, weight, ratios * q / exposure, int(following))
+
+
+@dataclass(frozen=True, eq=False)
+class StepEpisodes:
+    """Every episode under the step mixture with equal weights.
+
+    Probability under p (k,), q_j/p of each control step (k, T, J), 1 beyond the last one, how many there are (k,), and
+    whether it crashes (k,).
+    """
+
+    p: FloatArray
+    ratios: FloatArray
+    n_control_steps: IntArray
+    crash: BoolArray
+
+    @property
+    def mixture(self) -> FloatArray:
+        """q_alpha/p."""
+        return np.asarray(self.ratios.mean(axis=2).prod(axis=1))
+
+
+def enumerate_step_mixture(chain: Chain) -> StepEpisodes:
+    """Episodes of the chain, with the ratios of every control step."""
+    rows = [row for path, p in _paths(chain) for row in _controlled(chain, path, p)]
+    p, controlled, crash = zip(*rows, strict=True)
+    ratios = np.ones((len(p), max(map(len, controlled)), chain.n_surrogates))
+    for row, steps in enumerate(controlled):
+        for t, step in enumerate(steps):
+            ratios[row, t] = step
+    return StepEpisodes(np.array(p), ratios, np.array([len(steps) for steps in controlled]), np.array(crash))
+
+
+_Controlled = tuple[float, list[FloatArray], bool]
+
+
+def _controlled(chain: Chain, path: list[int], p: float) -> Iterator[_Controlled]:
+    """As `_episodes`, step by step."""
+    before: list[FloatArray] = []
+    for t, g in enumerate(path):
+        hazard, q = float(chain.hazard[g]), chain.proposals.cut[:, t, g]
+        critical = bool(chain.proposals.critical_before[t, g])
+        if hazard > 0.0:
+            here = [*before, q / hazard] if critical else before
+            for d in np.flatnonzero(chain.entry[g]):
+                yield from _controlled_after(chain, t + 1, p * hazard * float(chain.entry[g, d]), here, int(d))
+        p *= 1.0 - hazard
+        before = [*before, (1.0 - q) / (1.0 - hazard)] if critical else before
+    yield p, before, False
+
+
+def _controlled_after(chain: Chain, t: int, p: float, before: list[FloatArray], d: int) -> Iterator[_Controlled]:
+    if t == chain.horizon or d >= chain.crashed - 1:
+        yield p, before, d == chain.crashed
+        return
+    critical = bool(chain.proposals.critical_after[t, d])
+    for a, exposure in enumerate(chain.exposure[d]):
+        here = [*before, chain.proposals.maneuver[:, t, d, a] / exposure] if critical else before
+        for following in np.flatnonzero(chain.response[d, a]):
+            weight = p * float(exposure) * float(chain.response[d, a, following])
+            yield from _controlled_after(chain, t + 1, weight, here, int(following))

@@ -1,0 +1,302 @@
+"""The study as a user runs it: made once, resumed, refused where it is wrong, and every number of its page traced."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from harness.cli import main
+from harness.progress import Progress
+from harness.report.number_format import number
+from harness.studies.case_study import tested
+from harness.studies.case_study.context import Made
+from harness.studies.case_study.figures import exactly, figure, verdict
+from harness.studies.case_study.page import asked, count, shown
+from harness.studies.case_study.steps import run_study, step_keys
+from harness.studies.case_study.study_file import load_study
+
+SCENARIOS = Path(__file__).parents[2] / "scenarios"
+SHIPPED = SCENARIOS / "case_study" / "study.yaml"
+STUDY = f"""
+format: case-study
+version: 1
+name: small
+title: Small
+steps:
+  nde:
+    kind: twin_tests
+    campaign: {SCENARIOS}/overtaking_nde.yaml
+    set: [environment.lane_change_level=1e4]
+    tests: 6_000
+  nade:
+    kind: run
+    campaign: {SCENARIOS}/overtaking_nade.yaml
+    set: [environment.lane_change_level=1e4, testing.epsilon=0.9, world.engine=twin, records.traces=none,
+          stop.episodes=1_200, run.shard_size=500]
+  curves: {{kind: convergence, of: [nde, nade], reference: nade}}
+  adjusted: {{kind: control_variates, of: nade, sizes: [700, 1_200, 5_000]}}
+  required:
+    {{kind: required_tests, of: [nde, nade], shuffles: 4, scv: nade, scv_tests: 600, scv_shuffles: 2, scv_ratio: 4.0}}
+  theorems: {{kind: theorems, draws: 3, tests: 200}}
+quick:
+  nde: {{tests: 2_000}}
+picture: {{NDE: required.nde, NADE: nade.tests_for_rhw}}
+claims:
+  - {{says: "a | bound", where: V-B, paper: 1, ours: theorems.variance_over_bound, at_most: true}}
+  - {{says: wrong, where: nowhere, paper: 123.0, ours: theorems.best_over_plain, why: it was made up}}
+"""
+
+
+class Interrupting(Progress):
+    """Ends the work after some advances within a stage, as Ctrl-C would."""
+
+    def __init__(self, stage: str, after: int) -> None:
+        self._asked, self._left, self._stage = stage, after, ""
+
+    def stage(self, name: str, total: int | None, *, done: int = 0) -> None:
+        self._stage = name
+
+    def advance(self, n: int) -> None:
+        self._left -= self._stage.startswith(self._asked)
+        if self._left == 0:
+            raise KeyboardInterrupt
+
+
+def written(folder: Path) -> dict[str, tuple[int, bytes]]:
+    files = (path for path in sorted(folder.rglob("*")) if path.is_file())
+    return {str(path.relative_to(folder)): (path.stat().st_mtime_ns, path.read_bytes()) for path in files}
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory):
+    file = tmp_path_factory.mktemp("study") / "study.yaml"
+    file.write_text(STUDY)
+    folder = file.parent / "out"
+    assert main(["study", str(file), "--out", str(folder), "--workers", "1"]) == 0
+    return file, folder
+
+
+@pytest.fixture(scope="module")
+def made(study):
+    file, folder = study
+    keys = step_keys(load_study(file))
+    return {
+        name: Made(place := folder / "steps" / f"{name}-{key}", json.loads((place / "result.json").read_text()))
+        for name, key in keys.items()
+    }
+
+
+def test_a_second_run_changes_nothing(study, capsys):
+    file, folder = study
+    before = written(folder)
+    assert main(["study", str(file), "--out", str(folder), "--workers", "2"]) == 0
+    assert written(folder) == before
+    assert capsys.readouterr().out.count("there already") == 6
+
+
+def test_a_change_makes_only_what_depends_on_it(study):
+    file, _ = study
+    other = file.with_name("other.yaml")
+    other.write_text(STUDY.replace("stop.episodes=1_200", "stop.episodes=1_300"))
+    keys, changed = step_keys(load_study(file)), step_keys(load_study(other))
+    assert {name for name in keys if keys[name] != changed[name]} == {"nade", "curves", "adjusted", "required"}
+    quick = step_keys(load_study(file, quick=True))
+    assert {name for name in keys if keys[name] != quick[name]} == {"nde", "curves", "required"}
+
+
+def test_a_killed_step_goes_on_from_its_parts(tmp_path, monkeypatch, made):
+    monkeypatch.setattr(tested, "PART", 2_000)
+    file = tmp_path / "study.yaml"
+    file.write_text(STUDY.partition("  nade:")[0])
+    asked_for, folder = load_study(file), tmp_path / "out"
+    with pytest.raises(KeyboardInterrupt):
+        run_study(asked_for, folder, workers=1, progress=Interrupting("nde", 2))
+    (step,) = (folder / "steps").iterdir()
+    assert not (step / "result.json").exists()
+    parts = {path.name: path.stat().st_mtime_ns for path in (step / "parts").glob("*.parquet")}
+    assert sorted(parts) == ["000000000000.parquet", "000000002000.parquet"]
+    seen: list[tuple[int, int]] = []
+    really = tested.crashes_in_twin
+    monkeypatch.setattr(tested, "crashes_in_twin", lambda campaign, part: seen.append(part) or really(campaign, part))
+    monkeypatch.setattr(tested, "worker_processes", lambda workers: Here())
+    run_study(asked_for, folder, workers=1)
+    assert [first for first, _ in seen] == [
+        first for first in (0, 2_000, 4_000) if f"{first:012d}.parquet" not in parts
+    ]
+    assert pq.read_table(step / "crashes.parquet").equals(pq.read_table(made["nde"].folder / "crashes.parquet"))
+    assert not (step / "parts").exists()
+
+
+class Here:
+    """An executor in this process."""
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *error):
+        return None
+
+    map = staticmethod(map)
+
+
+def test_a_killed_run_goes_on_from_its_shards(tmp_path, study, made):
+    file = tmp_path / "study.yaml"
+    nade = STUDY[STUDY.index("  nade:") : STUDY.index("  curves:")]
+    file.write_text(STUDY[: STUDY.index("  nde:")] + nade)
+    asked_for, folder = load_study(file), tmp_path / "out"
+    with pytest.raises(KeyboardInterrupt):
+        run_study(asked_for, folder, workers=1, progress=Interrupting("episodes", 2))
+    (step,) = (folder / "steps").iterdir()
+    shards = {path: path.stat().st_mtime_ns for path in step.rglob("episodes/*.parquet")}
+    assert shards
+    run_study(asked_for, folder, workers=1)
+    assert {path: path.stat().st_mtime_ns for path in shards} == shards
+    assert (step / "crashes.parquet").read_bytes() == (made["nade"].folder / "crashes.parquet").read_bytes()
+
+
+def numbers_of(content) -> set[str]:
+    """Every number of a result, in all the forms that the page may write it in."""
+    if isinstance(content, dict):
+        own = {shown(content)} if set(content) == {"value", "low", "high"} else set()
+        return own.union(*map(numbers_of, content.values()))
+    if isinstance(content, list):
+        return set().union(*map(numbers_of, content))
+    if isinstance(content, int | float) and not isinstance(content, bool):
+        return {count(content), number(content), number(content, 4), number(content, 6)}
+    return set()
+
+
+def test_every_number_of_the_page_is_one_of_a_result_or_of_the_paper(study, made):
+    file, folder = study
+    known = {"–"}.union(*(numbers_of(each.result) for each in made.values()))
+    asked_for = load_study(file)
+    known |= {count(claim.paper) for claim in asked_for.claims} | {str(claim.within) for claim in asked_for.claims}
+    lines = (folder / "case_study.md").read_text().splitlines()
+    cells = [cell.strip(" *") for line in lines if line.startswith("|") for cell in re.split(r"(?<!\\)\|", line)]
+    with_digits = [cell for cell in cells if re.search(r"\d", cell)]
+    assert len(with_digits) > 60
+    titles = re.compile(r"n|RHW 0\.3 .*|.*Theorem 2.*|Var.*|.*V-B.*")
+    assert [cell for cell in with_digits if cell not in known and not titles.fullmatch(cell)] == []
+
+
+def test_claims_say_where_they_are_from_and_are_judged(study, made):
+    _, folder = study
+    right, wrong = json.loads((folder / "claims.json").read_text())
+    assert right["found"] == made["theorems"].result["figures"]["variance_over_bound"]
+    assert (right["verdict"], right["why"]) == ("reproduced", "")
+    assert (wrong["verdict"], wrong["why"]) == ("not reproduced", "it was made up")
+    page = (folder / "case_study.md").read_text()
+    assert r"a \| bound" in page
+    assert "wrong: it was made up" in page
+    assert (folder / "plots" / "tests.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_steps_agree_with_the_run_that_they_keep(made):
+    nade = made["nade"]
+    estimates = json.loads((nade.folder / "run" / "estimates.json").read_text())["estimates"]["nade"]
+    assert nade.result["figures"]["crash_rate"]["value"] == pytest.approx(estimates["crash_rate"], rel=1e-12)
+    assert nade.result["figures"]["crashes"]["value"] == estimates["n_crashes"]
+    rows = made["adjusted"].result["sizes"]
+    assert [row["n"] for row in rows] == [700, 1_200]
+    assert made["adjusted"].result["left_out"] == [5_000]
+    assert rows[-1]["nade_rate"] == pytest.approx(estimates["crash_rate"], rel=1e-12)
+    assert all(row["difference"] < 1e-12 and row["claimed_gain"] >= 1.0 for row in rows)
+    assert sum(row["n"] for row in made["adjusted"].result["strata"]) == 1_200
+    curves = pq.read_table(made["curves"].folder / "curves.parquet").to_pandas()
+    last = curves[curves["step"] == "nade"].iloc[-1]
+    assert last["n"] == 1_200
+    assert last["crash_rate"] == pytest.approx(estimates["crash_rate"], rel=1e-12)
+    assert last["half_width"] == pytest.approx(1.6448536 * estimates["std_error"], rel=1e-6)
+
+
+def test_the_theorems_hold_on_exact_chains(made):
+    figures = made["theorems"].result["figures"]
+    assert figures["largest_bias"]["value"] < 1e-10
+    assert figures["variance_over_bound"]["value"] <= 1.0
+    assert figures["best_over_plain"]["value"] <= 1.0 + 1e-9
+    assert figures["largest_error_known"]["value"] < 1e-9
+    assert figures["claimed_error_estimated"]["value"] < 1e-9
+    assert figures["scatter_estimated"]["value"] > 0.01
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        (("tests: 6_000", "tests: 0"), "steps.nde.tests"),
+        (("tests: 6_000", "test: 6_000"), "'test'"),
+        (("kind: theorems", "kind: theorem"), "steps.theorems.kind"),
+        (("reference: nade", "reference: nobody"), "steps.curves.reference"),
+        (("of: nade, sizes", "of: nde, sizes"), "steps.adjusted.of"),
+        (("sizes: [700, 1_200", "sizes: [1_200, 700"), "steps.adjusted.sizes"),
+        (("{tests: 2_000}", "{tests: many}"), "quick: steps.nde.tests"),
+        (("quick:\n  nde", "quick:\n  nothing"), "quick.nothing"),
+        (("ours: theorems.var", "ours: theory.var"), "claims"),
+        (("NDE: required.nde", "NDE: nobody.nde"), "picture.NDE"),
+        (("overtaking_nde.yaml", "overtaking_nowhere.yaml"), "steps.nde.campaign"),
+        (("lane_change_level=1e4]", "lane_change_levels=1e4]"), "lane_change_levels"),
+        (("version: 1", "version: 2"), "version"),
+    ],
+)
+def test_a_wrong_file_is_refused_before_anything_is_made(tmp_path, capsys, wrong, said):
+    assert wrong[0] in STUDY
+    file = tmp_path / "study.yaml"
+    file.write_text(STUDY.replace(*wrong))
+    assert main(["study", str(file), "--out", str(tmp_path / "out")]) == 2
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_figure_that_is_not_there_is_named_with_those_that_are(made):
+    with pytest.raises(Exception, match=r"largest_bias") as error:
+        asked("theorems.smallest_bias", made)
+    assert error.value.exit_code == 2
+
+
+def test_the_shipped_study_is_right_and_its_claims_ask_for_what_there_is():
+    for quick in (False, True):
+        study = load_study(SHIPPED, quick=quick)
+        assert set(step_keys(study)) == set(study.steps)
+    assert len(study.claims) >= 15
+
+
+@pytest.mark.parametrize(
+    ("found", "expected"),
+    [
+        (figure(10.0, 6.0, 19.0), "reproduced"),
+        (figure(10.0, 4.0, 19.0), "cannot be told"),
+        (figure(30.0, 21.0, 40.0), "not reproduced"),
+        (figure(30.0, 21.0), "not reproduced"),
+        (figure(10.0, 6.0), "cannot be told"),
+        (figure(10.0), "cannot be told"),
+        (figure(None), "cannot be told"),
+        (figure(None, 21.0), "not reproduced"),
+        (exactly(20.0), "reproduced"),
+        (exactly(20.1), "not reproduced"),
+    ],
+)
+def test_a_verdict_is_of_the_whole_interval(found, expected):
+    assert verdict(10.0, found, within=2.0, tolerance=None, at_most=False) == expected
+
+
+def test_a_verdict_beside_zero_and_below_a_limit():
+    assert verdict(0.0, exactly(-1e-12), within=2.0, tolerance=1e-9, at_most=False) == "reproduced"
+    assert verdict(0.0, exactly(0.1), within=2.0, tolerance=1e-9, at_most=False) == "not reproduced"
+    assert verdict(1.0, exactly(0.01), within=2.0, tolerance=None, at_most=True) == "reproduced"
+    assert verdict(1.0, exactly(1.01), within=2.0, tolerance=None, at_most=True) == "not reproduced"
+
+
+def test_relative_variance_of_known_weights():
+    """Every tenth test crashes with weight 1 or 3 in turn: ΣY = 2 n/10, ΣY² = 5 n/10."""
+    n = 4_000
+    episode = np.arange(0, n, 10)
+    weight = np.where(episode % 20 == 0, 1.0, 3.0)
+    tests = tested.Tests(n, episode, weight, np.ones_like(episode), np.zeros(len(episode), bool))
+    found = tested.relative_variance(tests)
+    assert found["value"] == pytest.approx(0.5 / 0.2**2 - 1.0, rel=1e-12)
+    assert found["low"] == pytest.approx(found["value"], rel=1e-9)
+    assert tested.crash_rate(tests, 0.9)["value"] == pytest.approx(0.2)

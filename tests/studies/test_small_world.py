@@ -1,0 +1,91 @@
+"""The smaller case: backward induction against all paths and against drawn tests; identities; a wrong sibling fails."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from harness.campaign.models import AutomatedVehicle
+from harness.estimators.nade import Nade
+from harness.studies.case_study.small_world import AV_MPS, HOLD, Proposal, _crashes, small_world
+from harness.vehicles.models import av_records
+from tests.chains.seed import SEED
+
+
+@pytest.fixture(scope="module")
+def world():
+    return small_world(1e4)
+
+
+def test_backward_induction_is_the_sum_over_all_paths(world):
+    """Forwards: the probability to reach each situation, times that of a cut-in there which ends in a crash."""
+    reach, total = world.levels[0].share, 0.0
+    for t, level in enumerate(world.levels):
+        if t:
+            reach = (reach * (1.0 - world.levels[t - 1].p))[level.parent] * level.share
+        total += float(reach @ (level.p * level.crash))
+    assert total == pytest.approx(world.crash_rate, rel=1e-12)
+
+
+def test_situations_that_follow_are_certain_or_spread_by_a_distribution(world):
+    for t, level in enumerate(world.levels[1:], 1):
+        total = np.bincount(level.parent, level.share)[np.unique(level.parent)]
+        np.testing.assert_allclose(total, 1.0, rtol=1e-12)
+        assert (level.share == 1.0).all() or t % HOLD == 0
+    assert world.levels[0].share.sum() == pytest.approx(1.0, rel=1e-12)
+
+
+def test_more_nodes_change_nothing(world):
+    assert small_world(1e4, nodes=12).crash_rate == pytest.approx(world.crash_rate, rel=1e-8)
+
+
+def test_without_control_the_relative_variance_is_that_of_a_share(world):
+    plain = [Proposal(np.repeat(level.p[:, None], 3, 1), np.zeros(len(level.p), bool)) for level in world.levels]
+    assert world.relvar(plain) == pytest.approx(1.0 / world.crash_rate - 1.0, rel=1e-12)
+    assert world.draw(plain, 100, np.random.default_rng(1)).log_weight == pytest.approx(0.0, abs=1e-12)
+
+
+@pytest.mark.parametrize(("recursive", "epsilon"), [(True, 0.1), (False, 0.9)])
+def test_drawn_tests_meet_rate_and_variance(world, recursive, epsilon):
+    """Within four standard errors; forgetting the weights, the sibling, is seen."""
+    proposals = world.proposals(epsilon, recursive=recursive)
+    block = world.draw(proposals, 60_000, np.random.default_rng(SEED))
+    state = Nade()
+    state.add(block)
+    found = state.result(0.9)
+    assert abs(found.crash_rate - world.crash_rate) < 4.0 * found.std_error
+    relvar = len(block) * (found.std_error / world.crash_rate) ** 2
+    assert relvar == pytest.approx(world.relvar(proposals), rel=0.2)
+    weights = block.weights()
+    assert abs(weights.mean() - 1.0) < 4.0 * weights.std() / np.sqrt(len(block))
+    assert abs(block.crash.mean() - world.crash_rate) > 4.0 * found.std_error
+
+
+def test_ratios_on_record_multiply_to_the_weight_of_each_function(world):
+    """Up to nine control steps: Π q_j/q_alpha is what log_q and log_weight say of q_j and p."""
+    block = world.draw(world.proposals(0.5, recursive=True), 3_000, np.random.default_rng(SEED))
+    short = block.n_control_steps <= 9
+    assert short.any()
+    products = block.first_ratios.prod(axis=1)[short]
+    controlled = np.exp(block.log_q + block.log_weight[:, None])[short]
+    np.testing.assert_allclose(products, controlled, rtol=1e-9)
+
+
+def test_who_crashes_is_what_a_plain_roll_out_says():
+    """Default vehicle, IDM limited to -4 m/s², behind a BV that keeps 8 m/s."""
+    gaps = np.array([0.5, 2.0, 3.0, 3.5, 4.0, 4.9])
+    found = _crashes([av_records(AutomatedVehicle())], np.full(6, 8.0), gaps, 80)[:, 0]
+    expected = []
+    for gap in gaps:
+        speed, r2 = AV_MPS, gap
+        for _ in range(80):
+            desired = 2.0 + max(0.0, speed + speed * (speed - 8.0) / (2.0 * np.sqrt(6.0)))
+            a = np.clip(2.0 * (1.0 - (speed / 40.0) ** 4 - (desired / max(r2, 0.1)) ** 2), -4.0, 2.0)
+            after = max(speed + 0.1 * a, 0.0)
+            r2 += 0.1 * (8.0 - 0.5 * (speed + after))
+            speed = after
+            if r2 < -0.001:
+                break
+        expected.append(float(r2 < -0.001))
+    assert found.tolist() == expected
+    assert 0.0 < np.mean(expected) < 1.0
