@@ -83,7 +83,7 @@ def convergence_plot(name: str, of: list[str], made: Made, rhw: float, confidenc
     top = 0.0
     for place, (label, (n, rate, half)) in enumerate(zip(of, curves, strict=True)):
         colour, axes = _COLOURS[place], left if place == 0 else left.twiny()
-        axes.fill_between(n, rate - half, rate + half, color=colour, alpha=0.16, linewidth=0)
+        axes.fill_between(n, np.maximum(rate - half, 0.0), rate + half, color=colour, alpha=0.16, linewidth=0)
         axes.plot(n, rate, color=colour, label=label)
         axes.set_xlim(0.0, n[-1])
         axes.set_xlabel(f"tests, {label}{scaled(axes.xaxis, n[-1])}", color=colour)
@@ -129,9 +129,10 @@ def strata_plot(name: str, strata: list[dict[str, Any]]) -> Plot | None:
         left.plot(steps, [max(row[key], 0.8) for row in shown], "o-", color=colour, label=label, markersize=4)
     for key, label, colour in (("sd_before", "NADE", BLUE), ("sd_after", "SCV", VERMILLION)):
         right.plot(steps, [row[key] or np.nan for row in shown], "o-", color=colour, label=label, markersize=4)
-    for axes, title in ((left, "Strata"), (right, "Standard deviation of a weighted result")):
+    for axes, title in ((left, "Strata"), (right, "Standard deviation of Y and Z")):
         if any(row["sd_before"] for row in shown) or axes is left:
             axes.set_yscale("log")
+            decades(axes.yaxis, *axes.get_ylim())
         axes.set_xlabel("control steps")
         axes.set_title(title)
         axes.legend()
@@ -157,15 +158,16 @@ def theorems_plot(name: str, result: dict[str, Any]) -> Plot:
     ):
         left.plot([], [], marker, color=colour, label=label)
     left.set_xscale("log")
+    decades(left.xaxis, *left.get_xlim())
     left.set_yticks(range(len(chains)), [chain["chain"] for chain in chains])
     left.set_ylim(len(chains) - 0.5, -0.5 - 0.6)
-    left.set_title("Theorem 2: variance per test, over μ²")
+    left.set_title("Theorem 2: variance over μ²")
     left.legend(ncols=3, fontsize=7.5, loc="upper left")
     draws = np.asarray(result["draws"]["estimated"]) - 1.0
     right.hist(draws, bins=30, color=VERMILLION, alpha=0.7, label="estimated means")
     right.axvline(0.0, color=GREEN, label="known means: all of them")
     right.set_xlabel("error relative to μ; claimed: 0")
-    right.set_title("Theorem 3: estimates where it promises no variance")
+    right.set_title("Theorem 3: repeated estimates")
     right.legend(fontsize=7.5)
     caption = (
         "Left: exact variances of NADE and with the best control parameters, below Theorem 2's bound. Right: repeated "

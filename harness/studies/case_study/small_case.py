@@ -12,7 +12,7 @@ from harness.estimators.estimate import Estimate
 from harness.estimators.nade import Nade
 from harness.estimators.scv import Scv
 from harness.studies.case_study.context import Context
-from harness.studies.case_study.figures import exactly, figure, tests_for, z_of
+from harness.studies.case_study.figures import exactly, figure, quantiles, tests_for, z_of
 from harness.studies.case_study.small_world import Proposal, SmallWorld, small_world
 from harness.studies.case_study.study_file import SmallCase
 from harness.studies.case_study.tested import write_table
@@ -35,10 +35,8 @@ def answer_small_case(step: SmallCase, context: Context) -> dict[str, Any]:
         "nde": exactly(nde),
         "nade": exactly(published["nade_exact"]),
         "nade_gain": exactly(nde / published["nade_exact"]),
-        "scv_claimed": figure(published["scv_claimed"]),
-        "fewest_claimed": figure(
-            min((row["scv_claimed"] for row in rows if row["scv_claimed"] is not None), default=None)
-        ),
+        "scv_claimed": figure(published["scv_claimed"], *published["scv_claims"]),
+        "fewest_claimed": _fewest(rows),
         "fewest_exact": exactly(min(row["nade_exact"] for row in rows)),
         "scv_gain_true": figure(published["gain_true"]),
     }
@@ -71,6 +69,7 @@ def _row(
         "rate_over_truth": nade / world.crash_rate,
         "difference": abs(scv / nade - 1.0) if nade > 0.0 else None,
         **{key: None if x is None else tests_for(x, step.rhw, context.confidence) for key, x in tests.items()},
+        "scv_claims": _range([_claimed(each["scv"]) for each in many], step.rhw, context.confidence),
         **{f"{name}_covers": _coverage(world, [each[name] for each in many]) for name in once},
         "gain_true": true["nade"] / true["scv"] if true["scv"] > 0.0 else None,
     }
@@ -90,6 +89,19 @@ def _both(
 def _claimed(found: Estimate) -> float | None:
     """Relative variance per test that an estimate claims."""
     return found.n_episodes * (found.std_error / found.crash_rate) ** 2 if found.crash_rate > 0.0 else None
+
+
+def _range(relvar: Sequence[float | None], rhw: float, confidence: float) -> list[float] | list[None]:
+    """Tests that single campaigns claim, from and to."""
+    known = [tests_for(each, rhw, confidence) for each in relvar if each is not None]
+    return list(quantiles(np.array(known), confidence)) if known else [None, None]
+
+
+def _fewest(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """The setting in which SCV claims to need fewest tests."""
+    known = [row for row in rows if row["scv_claimed"] is not None]
+    least = min(known, key=lambda row: float(row["scv_claimed"]), default=None)
+    return figure(None) if least is None else figure(least["scv_claimed"], *least["scv_claims"])
 
 
 def _relative_square(world: SmallWorld, found: Sequence[Estimate]) -> float:
