@@ -42,6 +42,14 @@ steps:
   adjusted: {{kind: control_variates, of: nade, sizes: [700, 1_200, 5_000]}}
   required:
     {{kind: required_tests, of: [nde, nade], shuffles: 4, scv: nade, scv_tests: 600, scv_shuffles: 2, scv_ratio: 4.0}}
+  variants:
+    kind: variants
+    title: Variants
+    campaign: {SCENARIOS}/overtaking_nade.yaml
+    set: [environment.lane_change_level=1e4, testing.epsilon=0.9]
+    tests: 600
+    avs: [alpha-0.5]
+    settings: {{same: [], recursive: [testing.epsilon=0.1, testing.challenge=recursive, testing.method=episode_mixture]}}
   theorems: {{kind: theorems, draws: 3, tests: 200}}
 quick:
   nde: {{tests: 2_000}}
@@ -96,7 +104,7 @@ def test_a_second_run_changes_nothing(study, capsys):
     before = written(folder)
     assert main(["study", str(file), "--out", str(folder), "--workers", "2"]) == 0
     assert written(folder) == before
-    assert capsys.readouterr().out.count("there already") == 6
+    assert capsys.readouterr().out.count("there already") == 7
 
 
 def test_a_change_makes_only_what_depends_on_it(study):
@@ -180,7 +188,7 @@ def test_every_number_of_the_page_is_one_of_a_result_or_of_the_paper(study, made
     cells = [cell.strip(" *") for line in lines if line.startswith("|") for cell in re.split(r"(?<!\\)\|", line)]
     with_digits = [cell for cell in cells if re.search(r"\d", cell)]
     assert len(with_digits) > 60
-    titles = re.compile(r"n|RHW 0\.3 .*|.*Theorem 2.*|Var.*|.*V-B.*")
+    titles = re.compile(r"n|RHW 0\.3 .*|.*Theorem 2.*|Var.*|alpha-.*|.*V-B.*")
     assert [cell for cell in with_digits if cell not in known and not titles.fullmatch(cell)] == []
 
 
@@ -214,6 +222,18 @@ def test_steps_agree_with_the_run_that_they_keep(made):
     assert last["half_width"] == pytest.approx(1.6448536 * estimates["std_error"], rel=1e-6)
 
 
+def test_variants_are_tested_on_the_same_traffic(made):
+    by_alpha, same, recursive = made["variants"].result["variants"]
+    assert by_alpha["n_crashes"] == same["n_crashes"] > 0  # alpha moves nothing: its braking is at the limit
+    assert by_alpha["crash_rate"] == same["crash_rate"]
+    assert same["tests_nade"] / same["tests_scv"] == pytest.approx(same["gain_claimed"], rel=1e-9)
+    assert same["difference"] < 1e-12
+    assert (recursive["tests_scv"], recursive["gain_claimed"]) == (None, None)
+    assert recursive["tests_nade"] < same["tests_nade"]
+    figures = made["variants"].result["figures"]
+    assert figures["mean"] == exactly((by_alpha["gain_claimed"] + same["gain_claimed"]) / 2)
+
+
 def test_the_theorems_hold_on_exact_chains(made):
     figures = made["theorems"].result["figures"]
     assert figures["largest_bias"]["value"] < 1e-10
@@ -239,6 +259,7 @@ def test_the_theorems_hold_on_exact_chains(made):
         (("NDE: required.nde", "NDE: nobody.nde"), "picture.NDE"),
         (("overtaking_nde.yaml", "overtaking_nowhere.yaml"), "steps.nde.campaign"),
         (("lane_change_level=1e4]", "lane_change_levels=1e4]"), "lane_change_levels"),
+        (("avs: [alpha-0.5]", "avs: [alpha-0.6]"), "alpha-0.6"),
         (("version: 1", "version: 2"), "version"),
     ],
 )

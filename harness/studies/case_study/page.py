@@ -79,7 +79,7 @@ def _answered(claim: dict[str, Any], made: Mapping[str, Made]) -> dict[str, Any]
     """A claim with our number and the verdict; the reason of a difference only where there is one."""
     found = asked(claim["ours"], made)
     answer = verdict(claim["paper"], found, **{key: claim[key] for key in ("within", "tolerance", "at_most")})
-    return {**claim, "found": found, "verdict": answer, "why": "" if answer == "reproduced" else claim["why"]}
+    return {**claim, "found": found, "verdict": answer, "why": claim["why"] if answer == "not reproduced" else ""}
 
 
 def shown(found: dict[str, Any]) -> str:
@@ -91,6 +91,8 @@ def shown(found: dict[str, Any]) -> str:
         return number_format.number(value)
     if low == high:
         return count(value) if float(value).is_integer() else number_format.number(value)
+    if value == 0.0:
+        return f"0 (to {number_format.number(high)})"
     if high is None:
         return f"at least {number_format.number(low)}"
     return number_format.with_interval(value, 0.0 if low is None else low, high)

@@ -27,7 +27,8 @@ def replicate(step: Replications, context: Context) -> dict[str, Any]:
     n = experiment.campaign.stop.episodes
     for one in done.judgements:
         per_relvar = tests_for(n, context.rhw, context.confidence)
-        figures[f"{one.result}_true"] = _scattered(one.true_relvar * per_relvar, one.replications)
+        missed = one.bias + 2.0 * one.bias_std_error < 0.0
+        figures[f"{one.result}_true"] = _scattered(one.true_relvar * per_relvar, one.replications, missed=missed)
         figures[f"{one.result}_claimed"] = _claimed(rows[rows["result"] == one.result], per_relvar, context.confidence)
         figures[f"{one.result}_covers"] = figure(one.coverage, one.coverage_low, one.coverage_high)
         figures[f"{one.result}_over_truth"] = figure(
@@ -55,8 +56,14 @@ def _claimed(rows: pd.DataFrame, per_relvar: float, confidence: float) -> dict[s
     return figure(float(np.median(relvar)), *quantiles(relvar, confidence))
 
 
-def _scattered(value: float, replications: int) -> dict[str, Any]:
-    """A variance from so many replications, with two standard errors as if errors were normal."""
+def _scattered(value: float, replications: int, *, missed: bool) -> dict[str, Any]:
+    """Tests by the spread of replications, with two standard errors as if errors were normal.
+
+    Where their mean is below the truth, what has not occurred in any of them is missing from the spread, too: it is a
+    lower limit.
+    """
+    if missed:
+        return figure(None, value)
     error = value * np.sqrt(2.0 / replications)
     return figure(value, max(value - 2.0 * error, 0.0), value + 2.0 * error)
 

@@ -33,6 +33,7 @@ from harness.studies.case_study.small_case import answer_small_case
 from harness.studies.case_study.study_file import Step, Study, inputs_of
 from harness.studies.case_study.tested import keep_run, test_in_twin
 from harness.studies.case_study.theorems import check_theorems
+from harness.studies.case_study.variants import test_variants, variants_of
 from harness.studies.experiment import load_experiment
 
 RESULT = "result.json"
@@ -43,6 +44,7 @@ _MAKERS: dict[str, Callable[[Any, Context], dict[str, Any]]] = {
     "control_variates": compare_control_variates,
     "required_tests": count_required_tests,
     "replications": replicate,
+    "variants": test_variants,
     "theorems": check_theorems,
     "small_case": answer_small_case,
 }
@@ -124,6 +126,9 @@ def _content(step: Step) -> Any:
     if step.kind in ("twin_tests", "run"):
         campaign = load_campaign(step.campaign, step.set)
         return campaign.model_dump(mode="json", exclude={"run"}), resolve(campaign).content_hash
+    if step.kind == "variants":
+        forms = variants_of(step).items()
+        return [(name, one.model_dump(mode="json", exclude={"run"}), resolve(one).content_hash) for name, one in forms]
     if step.kind == "replications":
         experiment = load_experiment(Path(step.experiment), step.set)
         parameters = load_parameters(experiment.campaign.environment).content_hash()

@@ -80,6 +80,26 @@ class Replications(Section):
     set: Overrides = _OVERRIDES
 
 
+class Variants(Section):
+    """One campaign with other vehicles, or with other settings, and what NADE and SCV claim of each."""
+
+    kind: Literal["variants"]
+    title: str
+    campaign: str = Field(description="campaign file, relative to the study's; of any method but shells")
+    set: Overrides = _OVERRIDES
+    tests: Whole = Field(ge=2, le=100_000_000, description="of each")
+    avs: list[str] = Field(default_factory=list, description="vehicles of the shipped panel")
+    settings: dict[Annotated[str, Field(pattern=r"^[^.|]+$")], Overrides] = Field(
+        default_factory=dict, description="values laid over the campaign's, by a name for the table"
+    )
+
+    @model_validator(mode="after")
+    def _has_any(self) -> Self:
+        if not (self.avs or self.settings):
+            raise broken_rule("avs", found="no variant", expected="some under avs or settings", mend="Name some.")
+        return self
+
+
 class Theorems(Section):
     """The paper's three theorems on small chains, by enumeration of all episodes."""
 
@@ -101,7 +121,7 @@ class SmallCase(Section):
 
 
 Step = Annotated[
-    TwinTests | Run | Convergence | ControlVariates | RequiredNumbers | Replications | Theorems | SmallCase,
+    TwinTests | Run | Variants | Convergence | ControlVariates | RequiredNumbers | Replications | Theorems | SmallCase,
     Field(discriminator="kind"),
 ]
 
@@ -112,7 +132,7 @@ class Claim(Section):
     says: str = Field(description="what the paper says, in a few words")
     where: str = Field(description="section, figure or table")
     paper: float
-    ours: str = Field(pattern=r"^\w+\.[\w.]+$", description="STEP.FIGURE that answers it")
+    ours: str = Field(pattern=r"^\w+\.[\w.-]+$", description="STEP.FIGURE that answers it")
     within: float = Field(2.0, gt=1.0, description="factor within which our number counts as the same")
     tolerance: Positive | None = Field(None, description="distance that counts as the same, instead of a factor")
     at_most: bool = Field(False, description="whether the paper's number is a limit that ours does not exceed")
@@ -213,7 +233,9 @@ def load_study(path: Path, *, quick: bool = False) -> Study:
         for key, value in values.items()
     ]
     small = validated(apply_overrides(data, changes), Study, str(path), Places(lines, changes))
-    study = small if quick else full
+    study = full
+    if quick:
+        study = small.model_copy(update={"title": f"{small.title} (quick: too few tests for conclusions)"})
     return study.model_copy(update={"steps": {name: _placed(step, path, name) for name, step in study.steps.items()}})
 
 
