@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Sequence
-from contextlib import nullcontext
 from pathlib import Path
 
 import click
@@ -92,14 +91,13 @@ def run(
     same.
     """
     campaign = loaded(campaign_file, overrides, av)
-    from harness.progress import terminal_progress  # noqa: PLC0415 - keeps --help fast
+    from harness.progress import shown_progress  # noqa: PLC0415 - keeps --help fast
     from harness.runner import run_campaign  # noqa: PLC0415 - slow to import: only once the campaign is right
 
-    bar = None if quiet else terminal_progress(campaign.stop.rhw, campaign.min_crashes)
-    with bar or nullcontext():
+    bar = shown_progress(campaign.stop.rhw, campaign.min_crashes, quiet=quiet)
+    with bar:
         result = run_campaign(campaign, folder, workers=workers, resume=resume, progress=bar)
-        if bar is not None:
-            bar.stage("report", total=None)
+        bar.stage("report", total=None)
         report_file = result.report
     if as_json:
         print_json(result.estimates)

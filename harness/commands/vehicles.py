@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import nullcontext
 from pathlib import Path
 
 import click
@@ -127,13 +126,13 @@ def compare(
     a, b = loaded(file_a, overrides, av), loaded(file_b or file_a, [*overrides, *against], against_av or av)
     if stored is not None:  # how far it was run before says nothing about now
         a = a.model_copy(update={"stop": b.stop})
-    from harness.progress import terminal_progress  # noqa: PLC0415 - keeps --help fast
+    from harness.progress import shown_progress  # noqa: PLC0415 - keeps --help fast
     from harness.runner import compare_campaigns  # noqa: PLC0415 - slow to import: only once the campaigns are right
 
     label_b = ", ".join([b.name, *filter(None, [against_av]), *against]) if file_b is None else b.name
     labels = a.name, label_b
-    bar = None if quiet else terminal_progress(a.stop.rhw, a.min_crashes)
-    with bar or nullcontext():
+    bar = shown_progress(a.stop.rhw, a.min_crashes, quiet=quiet)
+    with bar:
         found = compare_campaigns(
             a, b, folder, workers=workers, progress=bar, labels=labels, stored=stored, margin=margin
         )
