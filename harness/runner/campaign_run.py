@@ -171,7 +171,8 @@ class Run:
         with self.under_way():
             if (paths := self._prepared.shadow_paths) is not None:
                 self._plan(self._prepared.after(self._run_shadows(paths)))
-            self._progress.stage("episodes", self._campaign.stop.episodes, done=episodes_on_disk(self._out))
+            most = self._campaign.stop.episodes if self._campaign.accept is None else None  # nobody knows how many
+            self._progress.stage("episodes", most, done=episodes_on_disk(self._out))
             for specs in self.planner.rounds():
                 if self.run_round(specs):
                     break
