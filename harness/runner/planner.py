@@ -20,8 +20,8 @@ from harness.arrays import IntArray
 from harness.campaign.models import Campaign
 from harness.estimators import Shells, StopRule, accumulator
 from harness.estimators.block import Block
-from harness.estimators.decision import Decision, decision_confidence
-from harness.estimators.stratified import Tally, empty_tally
+from harness.estimators.decision import Decision
+from harness.estimators.stratified import Limits, Tally, empty_tally
 from harness.pool.shells import Draw, PrescribedEpisodes
 from harness.runner.allocation import Allocation, first_tests
 from harness.runner.worker import ShardSpec
@@ -224,7 +224,7 @@ class RoundRule:
         watched, n_crashes = seen.limits_of(self._statement, self._confidence), int(seen.tally.crashes.sum())
         self.rhw, from_pool = watched.rhw, watched.from_pool_relative()
         if self._accept is not None:
-            return self._decide(seen, self._accept.crash_rate_below)
+            return self._decide(watched, self._accept.crash_rate_below)
         if self._target is None:
             return False
         met = {
@@ -243,9 +243,9 @@ class RoundRule:
         hopeless = self.pool_error_above_target and from_pool["rhw_from_pool"] ** 2 >= POOL_SHARE * self.rhw**2
         return self.reached or (hopeless and seen.tally.tests.sum() >= self._held)
 
-    def _decide(self, seen: Shells, limit: float) -> bool:
-        _, low, high, *_ = seen.limits_of(self._statement, decision_confidence(self._confidence))
-        self.decision = Decision(limit, self._statement, 1.0 - (1.0 - self._confidence) / 2.0, low, high)
+    def _decide(self, watched: Limits, limit: float) -> bool:
+        one_sided = (1.0 + self._confidence) / 2.0
+        self.decision = Decision(limit, self._statement, one_sided, watched.low, watched.high)
         self.reached = self.decision.verdict != "undecided"
         self.waited_for = (f"accept.crash_rate_below ({limit:g})",)
         return self.reached
