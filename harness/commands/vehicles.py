@@ -15,6 +15,7 @@ from harness.commands.options import (
     av_option,
     examples,
     json_option,
+    junit_option,
     loaded,
     quiet_option,
     set_option,
@@ -88,6 +89,7 @@ def av_check(
     help="Under shells: run until it is known whether B's crash rate is at most 1 + R times A's.",
 )
 @workers_option
+@junit_option
 @quiet_option
 @av_option
 @set_option
@@ -103,6 +105,7 @@ def compare(
     against_av: str | None,
     margin: float | None,
     workers: int | None,
+    junit: Path | None,
     quiet: bool,
     av: str | None,
     overrides: Sequence[str],
@@ -136,6 +139,11 @@ def compare(
         found = compare_campaigns(
             a, b, folder, workers=workers, progress=bar, labels=labels, stored=stored, margin=margin
         )
+    if junit is not None:
+        from harness.report.junit import Case, outcome_of, write_junit  # noqa: PLC0415 - keeps --help fast
+
+        case = Case("difference", found.content["statement"], outcome_of(found.exit_code))
+        write_junit(junit, " and ".join(labels), [case], [folder / "compare.json"])
     if as_json:
         print_json(found.content)
     else:
