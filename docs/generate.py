@@ -275,6 +275,42 @@ def validated_table(name: str) -> str:
     return f"{rates}{beside}\n{_command(name)}\n"
 
 
+VARIED = {
+    "shells_adversaries": ("campaign.stop.confidence", ("0.9", "0.99")),
+}
+"""Replication experiments repeated with other values of one key, shown side by side; the first is the file's own."""
+
+
+def varied_files(name: str) -> list[str]:
+    """Names of the results of an experiment of `VARIED`."""
+    _, (_, *others) = VARIED[name]
+    return [name, *(f"{name}-{value}" for value in others)]
+
+
+def varied_table(name: str) -> str:
+    """Table of a replication experiment with several values of a key, with its commands."""
+    key, values = VARIED[name]
+    found = [
+        {(one["subject"], one["result"]): one for one in _result(file)["judgements"]} for file in varied_files(name)
+    ]
+    judged = [each for each, one in found[0].items() if _is_rate(one) and one["p_value_holm"] is not None]
+    rows = [(*each, *(_varied_cell(one[each]) for one in found)) for each in judged]
+    others = [min(one["coverage"] for one in of.values() if not _is_rate(one)) for of in found]
+    lowest = ", ".join(f"{coverage:.3f}" for coverage in others)
+    short = key.rpartition(".")[2]
+    return (
+        _table(("vehicle", "statement", *(f"{short} {value}" for value in values)), rows)
+        + "\nBias, coverage, median of tests. Lowest coverage of ratios to reference drivers and preventable shares: "
+        + f"{lowest}.\n\n"
+        + "\n".join([f"- {_command(name)}", *(f"- … `--set {key}={value}`" for value in values[1:])])
+        + "\n"
+    )
+
+
+def _varied_cell(one: dict[str, Any]) -> str:
+    return f"{one['bias']:+.1%}, {one['coverage']:.3f}, {one['tests_median']:,.0f}"
+
+
 def _is_rate(one: dict[str, Any]) -> bool:
     return not one["result"].startswith(("ratio to ", "preventable by "))
 
@@ -330,6 +366,7 @@ PARTS: dict[str, Callable[[], str]] = {
     **{f"columns-{name}": partial(columns_table, schema) for name, schema in SCHEMAS.items()},
     **{f"results-{name}": partial(results_table, results) for name, results in RESULTS.items()},
     **{f"validated-{name}": partial(validated_table, name) for name in VALIDATED},
+    **{f"varied-{name}": partial(varied_table, name) for name in VARIED},
 }
 """All generated parts by name."""
 

@@ -37,9 +37,9 @@ def cli() -> None:
     A campaign is a YAML file that says which traffic meets which vehicle and when it is enough.
 
     Exit codes: 0 done; 2 the campaign or the call is wrong, or the records do not allow what was asked for; 3 too many
-    episodes failed, or SUMO disagreed with the formula; 4 the budget or the pool was spent before the asked precision;
-    5 the vehicle is worse than the other by more than --margin; 130 interrupted by Ctrl-C, 143 by SIGTERM, 129 by
-    SIGHUP: all three keep what is finished.
+    episodes failed, or SUMO disagreed with the formula; 4 the budget or the pool was spent before the asked precision,
+    or before a decision; 5 the crash rate is above --accept, or the vehicle is worse than the other by more than
+    --margin; 130 interrupted by Ctrl-C, 143 by SIGTERM, 129 by SIGHUP: all three keep what is finished.
     """
 
 

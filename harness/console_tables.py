@@ -114,6 +114,8 @@ def print_pool(content: dict[str, Any]) -> None:
 
 def print_statements(content: dict[str, Any]) -> None:
     """Print the answer in a sentence, what else is stated under which assumption, and what all this is about."""
+    if decision := content.get("decision"):
+        click.echo(decision["sentence"])
     click.echo(content["statement"])
     for name, sentence in content.get("boundary_statements", {}).items():
         click.echo(f"Statement {name}: {sentence}")

@@ -1,9 +1,11 @@
-"""Progress of a campaign: what the runner reports, and how a terminal shows it."""
+"""Progress of a campaign: what the runner reports, and how a terminal or a log shows it."""
 
 from __future__ import annotations
 
 import math
 import sys
+import threading
+import time
 from types import TracebackType
 from typing import Self, TextIO
 
@@ -14,6 +16,8 @@ from rich.progress import Progress as Bars
 Figure = float | int | str
 
 _BAR_WIDTH = 12  # leaves room for all figures on a terminal of 80 columns
+LINE_INTERVAL_S = 30.0
+_CLOCK_S = 1e-6
 _RECKONED_WITH = ("rhw", "crashes", "heaviest")
 
 
@@ -58,11 +62,13 @@ def episodes_left(
     return max(math.ceil(min(needed, total)) - done, 0)
 
 
-class RichProgress(Progress):
-    """A bar on a terminal: share done, episodes per second, crashes so far, current RHW, time left.
+class ShownProgress(Progress):
+    """What is to be shown: work done, units per second, crashes so far, current RHW, time left.
+
+    Use as a context manager. This one itself shows nothing.
 
     The share is that of the work which is thought necessary: a campaign that stops on precision ends at 100 %, however
-    little of its budget it took. Use as a context manager.
+    little of its budget it took.
 
     Parameters
     ----------
@@ -75,18 +81,66 @@ class RichProgress(Progress):
     """
 
     def __init__(self, target_rhw: float | None = None, min_crashes: int = 0, stream: TextIO | None = None) -> None:
+        self._stream = stream or sys.stderr
+        self._target_rhw, self._min_crashes = target_rhw, min_crashes
+        self._name = ""
+        self._begin("", None, 0)
+
+    def _begin(self, name: str, budget: int | None, done: int) -> None:
+        self._name, self._budget, self._done_before, self._done = name, budget, done, done
+        self._began_s = time.monotonic()
+        self._figures: dict[str, Figure] = {}
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Show no more."""
+
+    def stage(self, name: str, total: int | None, *, done: int = 0) -> None:
+        """Begin a stage; the last one is shown no more."""
+        self._begin(name, total, done)
+
+    def advance(self, n: int) -> None:
+        """Count, and renew rate and time left."""
+        self._done += n
+
+    def status(self, **figures: Figure) -> None:
+        """Show figures, keeping those not named."""
+        self._figures = self._figures | figures  # a new one: a thread may be reading the old
+
+    def _left(self) -> int | None:
+        if self._budget is None:
+            return None
+        known = {name: float(figure) for name, figure in self._figures.items() if name in _RECKONED_WITH}
+        target, crashes = self._target_rhw, self._min_crashes
+        return episodes_left(self._done, self._budget, target_rhw=target, min_crashes=crashes, **known)
+
+    def _words(self) -> str:
+        """Rate, figures, and time left, of what this run itself has done: an earlier run's share took no time now."""
+        figures = [_worded(name, figure) for name, figure in self._figures.items()]
+        rate_per_s = (self._done - self._done_before) / max(time.monotonic() - self._began_s, _CLOCK_S)
+        if rate_per_s <= 0.0:
+            return " · ".join(figures)
+        rate, left = f"{rate_per_s:,.0f}/s" if rate_per_s >= 10 else f"{rate_per_s:.2g}/s", self._left()
+        return " · ".join([rate, *figures, *([] if left is None else [f"{_clock(left / rate_per_s)} left"])])
+
+
+class RichProgress(ShownProgress):
+    """A bar on a terminal."""
+
+    def __init__(self, target_rhw: float | None = None, min_crashes: int = 0, stream: TextIO | None = None) -> None:
+        super().__init__(target_rhw, min_crashes, stream)
         self._bars = Bars(
             TextColumn("{task.description}"),
             BarColumn(bar_width=_BAR_WIDTH),
             TaskProgressColumn(),
             TextColumn("{task.fields[figures]}"),
-            console=Console(file=stream or sys.stderr),
+            console=Console(file=self._stream),
         )
-        self._target_rhw, self._min_crashes = target_rhw, min_crashes
         self._task: TaskID | None = None
-        self._figures: dict[str, Figure] = {}
-        self._done_before = 0
-        self._budget: int | None = None
 
     def __enter__(self) -> Self:
         self._bars.start()
@@ -99,50 +153,73 @@ class RichProgress(Progress):
 
     def stage(self, name: str, total: int | None, *, done: int = 0) -> None:
         """Begin a bar; it takes the place of the last stage's, for there is one line on the terminal."""
+        super().stage(name, total, done=done)
         if self._task is not None:
             self._bars.update(self._task, visible=False)
-        self._figures, self._done_before, self._budget = {}, done, total
         self._task = self._bars.add_task(name, total=total, completed=done, figures="")
 
     def advance(self, n: int) -> None:
-        """Move the bar on, and renew rate and time left."""
-        if self._task is not None:
-            self._bars.advance(self._task, n)
-            self._show()
+        """Move the bar on."""
+        super().advance(n)
+        self._show()
 
     def status(self, **figures: Figure) -> None:
-        """Show figures beside the bar, keeping those not named."""
-        self._figures |= figures
+        """Show figures beside the bar."""
+        super().status(**figures)
         self._show()
 
     def _show(self) -> None:
         if self._task is not None:
-            figures = [_worded(name, figure) for name, figure in self._figures.items()]
-            n_left = self._left()
-            rate, left = self._pace(n_left)
-            total = None if n_left is None else int(self._bars.tasks[-1].completed) + n_left
-            self._bars.update(self._task, total=total, figures=" · ".join([*rate, *figures, *left]))
-
-    def _pace(self, n_left: int | None) -> tuple[list[str], list[str]]:
-        """Rate, and time left, of what this run itself has done: an earlier run's share took no time now."""
-        task = self._bars.tasks[-1]
-        if not task.elapsed or task.completed <= self._done_before:
-            return [], []
-        rate_per_s = (task.completed - self._done_before) / task.elapsed
-        rate = [f"{rate_per_s:,.0f}/s" if rate_per_s >= 10 else f"{rate_per_s:.2g}/s"]
-        return rate, [] if n_left is None else [f"{_clock(n_left / rate_per_s)} left"]
-
-    def _left(self) -> int | None:
-        if self._budget is None:
-            return None
-        known = {name: float(figure) for name, figure in self._figures.items() if name in _RECKONED_WITH}
-        done = int(self._bars.tasks[-1].completed)
-        return episodes_left(done, self._budget, target_rhw=self._target_rhw, min_crashes=self._min_crashes, **known)
+            left = self._left()
+            total = None if left is None else self._done + left
+            self._bars.update(self._task, completed=self._done, total=total, figures=self._words())
 
 
-def terminal_progress(target_rhw: float | None = None, min_crashes: int = 0) -> RichProgress | None:
-    """Give a bar when stderr is a terminal, else None: a log file is no place for one."""
-    return RichProgress(target_rhw, min_crashes) if sys.stderr.isatty() else None
+class LineProgress(ShownProgress):
+    """A line every half a minute, for logs; nothing of work that takes less.
+
+    ``interval_s`` is the time between lines.
+    """
+
+    def __init__(
+        self,
+        target_rhw: float | None = None,
+        min_crashes: int = 0,
+        stream: TextIO | None = None,
+        *,
+        interval_s: float = LINE_INTERVAL_S,
+    ) -> None:
+        super().__init__(target_rhw, min_crashes, stream)
+        self._interval_s = interval_s
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._print_lines, daemon=True)  # a shard may take longer than that
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._ended.set()
+        self._thread.join()
+
+    def _print_lines(self) -> None:
+        while not self._ended.wait(self._interval_s):
+            print(self.line(), file=self._stream, flush=True)
+
+    def line(self) -> str:
+        """What there is to say now, with the time of day."""
+        left = self._left()
+        of = "" if left is None else f" of {self._done + left:,}"
+        done = f" {self._done:,}{of}" if self._done else ""
+        return f"{time.strftime('%H:%M:%S')} {self._name}:{done} · {self._words()}".rstrip(" ·:")
+
+
+def shown_progress(target_rhw: float | None = None, min_crashes: int = 0, *, quiet: bool = False) -> ShownProgress:
+    """Give a bar when stderr is a terminal, else lines: a log file is no place for a bar. Nothing at all if quiet."""
+    kind = ShownProgress if quiet else RichProgress if sys.stderr.isatty() else LineProgress
+    return kind(target_rhw, min_crashes)
 
 
 def _worded(name: str, figure: Figure) -> str:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Literal
 
-StoppedBy = Literal["rhw", "two_phase", "episodes", "pool", "pool_error"]
-"""The asked precision, the number of tests planned for it, the budget, the last cut-in that the pool holds of a shell
-that needs more, or the pool's own error, which alone is wider than the asked precision."""
+StoppedBy = Literal["rhw", "accept", "two_phase", "episodes", "pool", "pool_error"]
+"""The asked precision, a decision about the limit, the number of tests planned for a precision, the budget, the last
+cut-in that the pool holds of a shell that needs more, or the pool's own error, which alone is wider than that."""
 
 MENDS: dict[str, str] = {
     "episodes": "stop.episodes was spent; raise it and go on with --resume",
@@ -25,7 +25,7 @@ def ending(stopped_by: StoppedBy, n_episodes: int, waited_for: tuple[str, ...], 
     """
     after = f"Stopped after {n_episodes:,} tests"
     conditions = " and ".join(waited_for)
-    if stopped_by == "rhw":
+    if stopped_by in ("rhw", "accept"):
         if not waited_for:
             return f"{after}: every condition was met at the first look."
         return f"{after}: the last condition to be met was {conditions}."

@@ -2,12 +2,13 @@
 
 import io
 import re
+import threading
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from harness.progress import RichProgress, SilentProgress, episodes_left, terminal_progress
+from harness.progress import LineProgress, RichProgress, ShownProgress, SilentProgress, episodes_left, shown_progress
 
 
 class Terminal(io.StringIO):
@@ -98,9 +99,47 @@ def test_figures_before_any_stage_are_no_error():
 
 def test_a_bar_only_on_a_terminal(monkeypatch):
     monkeypatch.setattr("sys.stderr", io.StringIO())
-    assert terminal_progress() is None
+    assert isinstance(shown_progress(), LineProgress)
+    assert type(shown_progress(quiet=True)) is ShownProgress
     monkeypatch.setattr("sys.stderr", Terminal())
-    assert isinstance(terminal_progress(), RichProgress)
+    assert isinstance(shown_progress(), RichProgress)
+
+
+class Log(io.StringIO):
+    """Tells when a line has come."""
+
+    def __init__(self):
+        super().__init__()
+        self.came = threading.Event()
+
+    def flush(self):
+        self.came.set()
+
+
+def test_a_log_gets_a_line_now_and_then_while_a_shard_is_under_way():
+    log = Log()
+    with LineProgress(0.05, 3_000, log, interval_s=1e-3) as lines:
+        lines.stage("episodes", total=400_000)
+        lines.advance(5_000)
+        lines.status(crashes=1_234, rhw=0.0812)
+        assert log.came.wait(60)
+    text = r"\d\d:\d\d:\d\d episodes: 5,000 of 13,187 · [\d,]+/s · crashes 1,234 · RHW 0.081 · 0:\d\d left"
+    assert re.fullmatch(text, lines.line())
+    assert re.match(r"\d\d:\d\d:\d\d ", log.getvalue())
+
+
+def test_a_log_gets_no_line_of_what_is_quickly_done():
+    log = Log()
+    with LineProgress(stream=log) as lines:
+        lines.stage("episodes", total=10)
+        lines.advance(10)
+    assert log.getvalue() == ""
+
+
+def test_a_stage_of_unknown_length_is_named():
+    lines = LineProgress()
+    lines.stage("estimates and report", None)
+    assert lines.line().endswith(" estimates and report")
 
 
 def test_silence(capsys):

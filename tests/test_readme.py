@@ -39,6 +39,9 @@ def _commands():
         for line in shown:
             if line.startswith("harness "):
                 yield pytest.param(line, id=f"{page.name}: {line[:60]}")
+    for workflow in sorted((ROOT / "examples/ci").glob("*.yml")):
+        for line in re.findall(r"^ *- run: (harness .*)$", workflow.read_text(encoding="utf-8"), re.MULTILINE):
+            yield pytest.param(line, id=f"{workflow.name}: {line[:60]}")
     for campaign in sorted((ROOT / "scenarios").glob("*.yaml")):
         text = campaign.read_text(encoding="utf-8").replace("\\\n#", " ")
         for line in re.findall(r"^# +(harness \S.*)$", text, re.MULTILINE):
@@ -89,7 +92,7 @@ def test_shown_command_lines_parse(line, tmp_path, monkeypatch):
     if ">" in words:
         words = words[: words.index(">")]
     for word in words:
-        if word == "DIR" or word.startswith("runs/"):
+        if word == "DIR" or (word.startswith("runs/") and not word.endswith(".xml")):
             (tmp_path / word).mkdir(parents=True, exist_ok=True)
     context = click.Context(cli, info_name="harness")
     name, command, rest = cli.resolve_command(context, words)
@@ -128,6 +131,7 @@ def test_generated_parts_are_current():
 
 def test_every_long_run_is_in_the_table():
     shown = {name for names in generate.RESULTS.values() for name in names}
+    shown |= {file for name in generate.VARIED for file in generate.varied_files(name)}
     shown |= {*generate.VALIDATED, *generate.METHODS, "limits"}
     assert {path.stem for path in (ROOT / "docs/validation").glob("*.json")} <= shown
 

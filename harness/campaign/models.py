@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from typing import Self
+from typing import Any, Self
 
 from pydantic import Field, model_validator
 
@@ -36,6 +36,7 @@ from harness.campaign.drivers import (
 from harness.campaign.section import NAME_PATTERN, Section, SurrogateName, Whole, broken_rule, listed
 from harness.campaign.testing import (
     MOST_SUMO_CELLS,
+    Accept,
     EnvironmentSettings,
     PoolSettings,
     Records,
@@ -50,6 +51,7 @@ from harness.methods import METHODS, SAMPLING
 __all__ = [
     "FVDM",
     "IDM",
+    "Accept",
     "AutomatedVehicle",
     "BuiltInParameters",
     "Campaign",
@@ -95,7 +97,48 @@ class Campaign(Section):
     world: World = World()
     records: Records = Records()
     stop: Stop = Stop()
+    accept: Accept | None = Field(None, description="stop at a decision instead of at a precision")
     run: Run = Run()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _what_decides_is_what_is_tested(cls, content: Any) -> Any:
+        """One place says which statement a run is about, and that its tests follow: ``testing.shells.statement``."""
+        if not isinstance(content, dict) or not isinstance(accept := content.get("accept"), dict):
+            return content
+        asked, testing = accept.get("statement"), content.get("testing") or {}
+        shells = testing.get("shells") or {} if isinstance(testing, dict) else None
+        if asked is None or not isinstance(shells, dict) or "statement" in shells:
+            return content
+        return {**content, "testing": {**testing, "shells": {**shells, "statement": asked}}}
+
+    @model_validator(mode="after")
+    def _limit_can_be_decided(self) -> Self:
+        if self.accept is None:
+            return self
+        asked, shells = self.accept.statement, self.testing.shells
+        if self.testing.method != "shells":
+            raise broken_rule(
+                "accept",
+                found=f"a limit, with testing.method {self.testing.method}",
+                expected="testing.method shells: how often decisions are wrong is known for its intervals alone",
+                mend="Choose shells, or delete the section and compare the interval with the limit yourself.",
+            )
+        if asked not in (None, shells.statement):
+            raise broken_rule(
+                "accept.statement",
+                found=f"{asked}, and {shells.statement} in testing.shells.statement",
+                expected="the same statement, or one of the two keys alone",
+                mend="Delete one of them.",
+            )
+        if shells.stopping != "sequential":
+            raise broken_rule(
+                "accept",
+                found=f"a limit, with testing.shells.stopping {shells.stopping}",
+                expected="sequential: a decision plans no second phase",
+                mend="Delete testing.shells.stopping.",
+            )
+        return self
 
     @model_validator(mode="after")
     def _alpha_matches_surrogates(self) -> Self:

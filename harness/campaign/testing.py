@@ -206,6 +206,15 @@ class Stop(Section):
     )
 
 
+class Accept(Section):
+    """A limit: a run of shells ends as soon as it is known on which side of it the crash rate lies."""
+
+    crash_rate_below: float = Field(gt=0.0, lt=1.0, description="crashes per test: accepted below it, rejected above")
+    statement: str | None = Field(
+        None, description="which statement decides, as testing.shells.statement, whose place it takes"
+    )
+
+
 class Run(Section):
     """How the work is spread; nothing here changes a result."""
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Sequence
-from contextlib import nullcontext
 from pathlib import Path
 
 import click
@@ -15,6 +14,7 @@ from harness.commands.options import (
     av_option,
     examples,
     json_option,
+    junit_option,
     loaded,
     quiet_option,
     set_option,
@@ -59,12 +59,20 @@ def check(campaign_file: Path, overrides: Sequence[str], av: str | None, *, as_j
         "harness run scenarios/smoke.yaml --out runs/smoke --resume --set stop.rhw=0.03",
         "harness run scenarios/smoke.yaml --out runs/hard --set av.parameters.min_acceleration_mps2=-8",
         "harness run scenarios/smoke.yaml --out runs/late --av late-600ms",
+        "harness run scenarios/smoke.yaml --out runs/gate --accept 3e-7 --junit gate.xml",
     ),
 )
 @click.argument("campaign_file", metavar="CAMPAIGN", type=CAMPAIGN)
 @click.option("--out", "folder", type=FOLDER, required=True, help="Run folder; made if it is not there.")
 @workers_option
 @click.option("--resume", is_flag=True, help="Go on with what the run folder already holds.")
+@click.option(
+    "--accept",
+    type=click.FloatRange(0.0, 1.0, min_open=True, max_open=True),
+    metavar="RATE",
+    help="Run until it is known whether the crash rate is below so many per test, instead of to stop.rhw.",
+)
+@junit_option
 @quiet_option
 @av_option
 @set_option
@@ -77,6 +85,8 @@ def run(
     *,
     workers: int | None,
     resume: bool,
+    accept: float | None,
+    junit: Path | None,
     quiet: bool,
     av: str | None,
     overrides: Sequence[str],
@@ -88,19 +98,24 @@ def run(
     interrupted and resumed. The run folder holds the resolved campaign, all records (Parquet), estimates.json and
     report.html.
 
-    Exit code 4 says that stop.episodes or the pool was spent before stop.rhw was reached; the results are there all the
-    same.
+    Exit code 4 says that stop.episodes or the pool was spent before stop.rhw was reached, or a limit decided; the
+    results are there all the same. With --accept 0 says accepted, 5 rejected.
     """
-    campaign = loaded(campaign_file, overrides, av)
-    from harness.progress import terminal_progress  # noqa: PLC0415 - keeps --help fast
+    limit = [] if accept is None else [f"accept.crash_rate_below={accept!r}"]
+    campaign = loaded(campaign_file, [*overrides, *limit], av)
+    from harness.progress import shown_progress  # noqa: PLC0415 - keeps --help fast
     from harness.runner import run_campaign  # noqa: PLC0415 - slow to import: only once the campaign is right
 
-    bar = None if quiet else terminal_progress(campaign.stop.rhw, campaign.min_crashes)
-    with bar or nullcontext():
+    bar = shown_progress(campaign.stop.rhw, campaign.min_crashes, quiet=quiet)
+    with bar:
         result = run_campaign(campaign, folder, workers=workers, resume=resume, progress=bar)
-        if bar is not None:
-            bar.stage("report", total=None)
+        bar.stage("report", total=None)
         report_file = result.report
+    if junit is not None:
+        from harness.report.junit import statement_cases, write_junit  # noqa: PLC0415 - keeps --help fast
+
+        asked = campaign.testing.shells.statement
+        write_junit(junit, campaign.name, statement_cases(result.estimates, asked, result.exit_code), [report_file])
     if as_json:
         print_json(result.estimates)
     else:

@@ -58,7 +58,13 @@ workers_option = click.option(
     "--workers", type=click.IntRange(min=1), help="Processes that simulate. Default: one per core."
 )
 quiet_option = click.option(
-    "--quiet", is_flag=True, help="No progress bar. There is none either when stderr is not a terminal."
+    "--quiet", is_flag=True, help="No progress: no bar on a terminal, no line every 30 s elsewhere."
+)
+junit_option = click.option(
+    "--junit",
+    type=FILE,
+    callback=written_file(".xml"),
+    help="Write the result as JUnit XML, too: a test case for each statement.",
 )
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON on stdout instead of text.")
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -49,11 +48,11 @@ def pool(campaign_file: Path, *, out: Path | None, overrides: Sequence[str], as_
     """
     campaign = loaded(campaign_file, overrides)
     from harness.pool.storage import campaign_pool, write_pool  # noqa: PLC0415 - slow to import
-    from harness.progress import terminal_progress  # noqa: PLC0415 - keeps --help fast
+    from harness.progress import shown_progress  # noqa: PLC0415 - keeps --help fast
     from harness.resolved import resolve  # noqa: PLC0415 - slow to import
 
-    bar = terminal_progress()
-    with bar or nullcontext():
+    bar = shown_progress()
+    with bar:
         found = campaign_pool(resolve(campaign), bar)
     if out is not None:
         write_pool(out, found)
@@ -125,12 +124,12 @@ def validate(
     experiment = load_experiment(experiment_file, overrides)
     if replications is not None:
         experiment = experiment.model_copy(update={"replications": replications})
-    from harness.progress import terminal_progress  # noqa: PLC0415 - keeps --help fast
+    from harness.progress import shown_progress  # noqa: PLC0415 - keeps --help fast
     from harness.studies.results import RESULTS, table_lines  # noqa: PLC0415
     from harness.studies.run import validate as repeat  # noqa: PLC0415 - slow to import: only once the file is right
 
-    bar = None if quiet else terminal_progress(None, 0)
-    with bar or nullcontext():
+    bar = shown_progress(quiet=quiet)
+    with bar:
         done = repeat(experiment, folder, workers=workers, progress=bar)
     if as_json:
         print_json([one.to_json() for one in done.judgements])
@@ -208,13 +207,13 @@ def rnot(
     'scv' is computed only when asked for. It solves its regressions anew at each look of each shuffle, which takes
     minutes: a larger --ratio and a smaller --total make it quicker. Its RHW rests on a variance that is too small.
     """
-    from harness.progress import terminal_progress  # noqa: PLC0415 - keeps --help fast
+    from harness.progress import shown_progress  # noqa: PLC0415 - keeps --help fast
     from harness.studies.required_tests import Procedure  # noqa: PLC0415 - keeps --help fast
     from harness.studies.run_required_tests import required_tests_of_runs  # noqa: PLC0415 - keeps --help fast
 
     procedure = Procedure(rhw, confidence, shuffles, seed, first, ratio, total)
-    bar = terminal_progress()
-    with bar or nullcontext():
+    bar = shown_progress()
+    with bar:
         content = required_tests_of_runs(folders, procedure, estimators=estimators, progress=bar)
     if as_json:
         print_json(content)

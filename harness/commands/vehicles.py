@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import nullcontext
 from pathlib import Path
 
 import click
@@ -16,6 +15,7 @@ from harness.commands.options import (
     av_option,
     examples,
     json_option,
+    junit_option,
     loaded,
     quiet_option,
     set_option,
@@ -89,6 +89,7 @@ def av_check(
     help="Under shells: run until it is known whether B's crash rate is at most 1 + R times A's.",
 )
 @workers_option
+@junit_option
 @quiet_option
 @av_option
 @set_option
@@ -104,6 +105,7 @@ def compare(
     against_av: str | None,
     margin: float | None,
     workers: int | None,
+    junit: Path | None,
     quiet: bool,
     av: str | None,
     overrides: Sequence[str],
@@ -127,16 +129,21 @@ def compare(
     a, b = loaded(file_a, overrides, av), loaded(file_b or file_a, [*overrides, *against], against_av or av)
     if stored is not None:  # how far it was run before says nothing about now
         a = a.model_copy(update={"stop": b.stop})
-    from harness.progress import terminal_progress  # noqa: PLC0415 - keeps --help fast
+    from harness.progress import shown_progress  # noqa: PLC0415 - keeps --help fast
     from harness.runner import compare_campaigns  # noqa: PLC0415 - slow to import: only once the campaigns are right
 
     label_b = ", ".join([b.name, *filter(None, [against_av]), *against]) if file_b is None else b.name
     labels = a.name, label_b
-    bar = None if quiet else terminal_progress(a.stop.rhw, a.min_crashes)
-    with bar or nullcontext():
+    bar = shown_progress(a.stop.rhw, a.min_crashes, quiet=quiet)
+    with bar:
         found = compare_campaigns(
             a, b, folder, workers=workers, progress=bar, labels=labels, stored=stored, margin=margin
         )
+    if junit is not None:
+        from harness.report.junit import Case, outcome_of, write_junit  # noqa: PLC0415 - keeps --help fast
+
+        case = Case("difference", found.content["statement"], outcome_of(found.exit_code))
+        write_junit(junit, " and ".join(labels), [case], [folder / "compare.json"])
     if as_json:
         print_json(found.content)
     else:

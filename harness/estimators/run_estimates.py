@@ -29,6 +29,8 @@ class CampaignFacts:
         What the run says about tests that it ran twice.
     ending : str or None
         When the run ended and which condition decided, in a sentence; None while it goes on.
+    decision : dict or None
+        What the run has found about the limit that it was asked about; `harness.estimators.decision.Decision`.
     no_surrogates : str
         Why surrogates were not asked about the tests, where they were not.
     """
@@ -42,6 +44,7 @@ class CampaignFacts:
     retraced: dict[str, Any] | None = None
     repeated: dict[str, Any] | None = None
     ending: str | None = None
+    decision: dict[str, Any] | None = None
     no_surrogates: str = "the blocks do not say what surrogates would have done"
 
 
@@ -89,6 +92,7 @@ def estimate_blocks(
             "boundary_statements": say.boundary_statements(best),
             "scope": say.SCOPE,
             "ending": facts.ending,
+            "decision": facts.decision,
         }
     )
 

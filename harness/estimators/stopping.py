@@ -20,6 +20,7 @@ from __future__ import annotations
 import math
 
 from harness.campaign.models import Stop
+from harness.estimators.decision import Decision
 from harness.estimators.estimate import Estimate
 from harness.methods import SAMPLING, EstimatorName, Method
 
@@ -74,6 +75,7 @@ class StopRule:
     """
 
     pool_error_above_target = False  # no pool is behind these estimates
+    decision: Decision | None = None  # limits are decided by the intervals of shells alone
 
     def __init__(
         self,

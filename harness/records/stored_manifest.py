@@ -92,6 +92,7 @@ class StoredManifest(Stored):
     wall_time_s: float | None = None
     distance_per_test_m: float | None = None
     ending: str | None = None
+    decision: dict[str, Any] | None = None
     retraced: Retraced | None = None
     repeated: Repeated | None = None
     shadow_runs: StoredShadows | None = None

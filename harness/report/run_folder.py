@@ -72,6 +72,7 @@ class StoredEstimates(Stored):
     headline: str
     estimates: dict[str, StoredEstimate]
     statement: str
+    decision: dict[str, Any] | None = None
     reference_statements: list[str] = []
     boundary_statements: dict[str, str] = {}
     n_episodes: int | None = None

@@ -98,7 +98,7 @@ def verdict(found: Within) -> str:
     if found.n_ahead:
         return "no longer justified: this vehicle does not keep to it"
     if found.n_checked:
-        return "kept to in every test"
+        return "kept to in every test" + ("" if found.n_episodes_outside else ", none of them outside")
     return "no crash seen outside" if found.n_episodes_outside else "not put to the test"
 
 

@@ -6,7 +6,7 @@ import os
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
@@ -18,7 +18,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from harness.campaign.models import Campaign
-from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE
+from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED
+from harness.estimators.decision import Verdict
 from harness.methods import SAMPLING
 from harness.pool.shadow_paths import ShadowPaths
 from harness.pool.shells import PrescribedEpisodes
@@ -52,6 +53,8 @@ from harness.runner.table_accuracy import table_errors
 from harness.runner.worker import ShardDone, ShardSpec
 from harness.stopped_by import StoppedBy, ending
 
+EXIT_OF: Mapping[Verdict, int] = {"accepted": EXIT_DONE, "rejected": EXIT_REFUTED, "undecided": EXIT_BUDGET_SPENT}
+
 
 @dataclass(frozen=True)
 class RunResult:
@@ -64,12 +67,13 @@ class RunResult:
         The page ``report.html``.
     estimates : dict
         Content of ``estimates.json``.
-    stopped_by : {"rhw", "two_phase", "episodes", "pool", "pool_error"}
+    stopped_by : {"rhw", "accept", "two_phase", "episodes", "pool", "pool_error"}
         See `harness.stopped_by`.
     ending : str
         When it ended and which condition decided, in a sentence.
     exit_code : int
-        0, or 4 when the budget or the pool was spent before the asked precision.
+        0, or 4 when the budget or the pool was spent before the asked precision or decision, or 5 where the crash rate
+        is above the limit that was to be kept.
     """
 
     folder: Path
@@ -167,7 +171,8 @@ class Run:
         with self.under_way():
             if (paths := self._prepared.shadow_paths) is not None:
                 self._plan(self._prepared.after(self._run_shadows(paths)))
-            self._progress.stage("episodes", self._campaign.stop.episodes, done=episodes_on_disk(self._out))
+            most = self._campaign.stop.episodes if self._campaign.accept is None else None  # nobody knows how many
+            self._progress.stage("episodes", most, done=episodes_on_disk(self._out))
             for specs in self.planner.rounds():
                 if self.run_round(specs):
                     break
@@ -250,10 +255,13 @@ class Run:
         """Write manifest, estimates and report."""
         stop, rule, n = self._campaign.stop, self.planner.rule, self.prefix.n_episodes
         stopped_by = self._stopped_by()
-        said = ending(stopped_by, n, rule.waited_for, precision_asked=stop.rhw is not None)
+        asked = stop.rhw is not None or rule.decision is not None
+        said = ending(stopped_by, n, rule.waited_for, precision_asked=asked)
         if stopped_by == "rhw" and self.planner.remark:
             said += f" {self.planner.remark}"
         retraced = self._retracing.summary(self.prefix.n_retraced)
+        if rule.decision is not None:
+            self._manifest.note(decision=rule.decision.to_json())
         self._manifest.write(self.prefix, "done", stopped_by=stopped_by, ending=said, retraced=retraced)
         self._progress.stage("estimates and report", None)
         estimates = estimate_run(self._out)
@@ -262,15 +270,21 @@ class Run:
         from harness.report import write_report  # noqa: PLC0415
 
         report = write_report(self._out)
-        missed = stop.rhw is not None and not rule.reached and stopped_by != "two_phase"
-        return RunResult(self._out, report, estimates, stopped_by, said, EXIT_BUDGET_SPENT if missed else EXIT_DONE)
+        return RunResult(self._out, report, estimates, stopped_by, said, self._exit_code(stopped_by))
+
+    def _exit_code(self, stopped_by: StoppedBy) -> int:
+        rule = self.planner.rule
+        if rule.decision is not None:
+            return EXIT_OF[rule.decision.verdict]
+        missed = self._campaign.stop.rhw is not None and not rule.reached and stopped_by != "two_phase"
+        return EXIT_BUDGET_SPENT if missed else EXIT_DONE
 
     def _stopped_by(self) -> StoppedBy:
         rule = self.planner.rule
         if self.prefix.reported_from and self.prefix.n_episodes < self._campaign.stop.episodes:
             return "two_phase"
         if rule.reached:
-            return "rhw"
+            return "rhw" if rule.decision is None else "accept"
         if rule.pool_error_above_target:  # whatever else is spent: more of it would not help
             return "pool_error"
         return "episodes" if self.prefix.n_episodes >= self._campaign.stop.episodes else "pool"

@@ -13,6 +13,7 @@ import numpy as np
 
 from harness.arrays import IntArray
 from harness.campaign.models import Campaign
+from harness.estimators.decision import Decision
 from harness.estimators.likelihood_ratio import Level
 from harness.estimators.pairs import PairCounts, Verdict
 from harness.estimators.stratified import Tally
@@ -42,6 +43,8 @@ class PairRule:
     of_first_tests, reached, rhw, heaviest, waited_for, pool_error_above_target
         See `harness.runner.planner.RoundRule`; ``rhw`` is that of the difference over the larger rate.
     """
+
+    decision: Decision | None = None  # it is a margin that comparisons decide
 
     def __init__(self, campaign: Campaign, margin: float | None) -> None:
         self._target, self._margin = campaign.stop.rhw, margin

@@ -20,7 +20,8 @@ from harness.arrays import IntArray
 from harness.campaign.models import Campaign
 from harness.estimators import Shells, StopRule, accumulator
 from harness.estimators.block import Block
-from harness.estimators.stratified import Tally, empty_tally
+from harness.estimators.decision import Decision
+from harness.estimators.stratified import Limits, Tally, empty_tally
 from harness.pool.shells import Draw, PrescribedEpisodes
 from harness.runner.allocation import Allocation, first_tests
 from harness.runner.worker import ShardSpec
@@ -140,6 +141,7 @@ class Rule(Protocol):
     """What a run says about why it ended; see `StopRule` and `RoundRule`."""
 
     reached: bool
+    decision: Decision | None
     pool_error_above_target: bool
     rhw: float
     heaviest: float
@@ -196,6 +198,9 @@ class RoundRule:
 
     Attributes
     ----------
+    decision : Decision or None
+        What is known about the limit that the campaign asks about, if it does; that, not a precision, is then waited
+        for.
     of_first_tests : bool
         Whether the round brings the tests that every shell gets before anything is decided about it.
     reached, rhw, heaviest, waited_for, pool_error_above_target
@@ -206,7 +211,8 @@ class RoundRule:
         self._held = held
         self._target = None if campaign.stop.rhw is None else factor * campaign.stop.rhw
         self._min_crashes, self._confidence = campaign.min_crashes, campaign.stop.confidence
-        self._statement = campaign.testing.shells.statement
+        self._statement, self._accept = campaign.testing.shells.statement, campaign.accept
+        self.decision: Decision | None = None
         self.reached = self.pool_error_above_target = False
         self.rhw = float("inf")
         self.heaviest = 0.0  # limits within shells allow for every crash that has not been seen
@@ -217,6 +223,8 @@ class RoundRule:
         """Whether to stop at the end of a round, with all tests so far."""
         watched, n_crashes = seen.limits_of(self._statement, self._confidence), int(seen.tally.crashes.sum())
         self.rhw, from_pool = watched.rhw, watched.from_pool_relative()
+        if self._accept is not None:
+            return self._decide(watched, self._accept.crash_rate_below)
         if self._target is None:
             return False
         met = {
@@ -234,6 +242,13 @@ class RoundRule:
         self.pool_error_above_target = from_pool["rhw_from_pool_at_least"] > self._target
         hopeless = self.pool_error_above_target and from_pool["rhw_from_pool"] ** 2 >= POOL_SHARE * self.rhw**2
         return self.reached or (hopeless and seen.tally.tests.sum() >= self._held)
+
+    def _decide(self, watched: Limits, limit: float) -> bool:
+        one_sided = (1.0 + self._confidence) / 2.0
+        self.decision = Decision(limit, self._statement, one_sided, watched.low, watched.high)
+        self.reached = self.decision.verdict != "undecided"
+        self.waited_for = (f"accept.crash_rate_below ({limit:g})",)
+        return self.reached
 
 
 def round_specs(tests: IntArray, added: IntArray, index: int, first_episode: int, shard_size: int) -> list[ShardSpec]:

@@ -75,6 +75,7 @@ def estimate_run(
         retraced=manifest.get("retraced"),
         repeated=manifest.get("repeated"),
         ending=manifest.get("ending"),
+        decision=manifest.get("decision"),
         no_surrogates=surrogates if isinstance(surrogates, str) else "",
     )
     blocks = stored_blocks(

@@ -11,7 +11,7 @@ from pydantic import Field, field_validator, model_validator
 from harness.campaign.models import AutomatedVehicle, BuiltInParameters, Campaign
 from harness.campaign.overrides import Places, apply_overrides, parse_override
 from harness.campaign.problems import validated
-from harness.campaign.section import NAME_PATTERN, Section, Whole, broken_rule
+from harness.campaign.section import NAME_PATTERN, Positive, Section, Whole, broken_rule
 from harness.campaign.yaml_text import read_yaml
 from harness.errors import CampaignError
 from harness.methods import SAMPLING, EstimatorName
@@ -89,6 +89,10 @@ class Experiment(Section):
     estimators: list[EstimatorName] = Field(
         default_factory=list, description="whose results are judged; the method's own when left out"
     )
+    limits: list[Positive] = Field(
+        default_factory=list,
+        description="judge decisions instead of intervals: limits of `accept`, as multiples of each one's crash rate",
+    )
     super_population: SuperPopulation = SuperPopulation()
     fault: Fault | None = None
 
@@ -96,6 +100,12 @@ class Experiment(Section):
     def results(self) -> tuple[EstimatorName, ...]:
         """Estimators to judge."""
         return tuple(self.estimators) or (SAMPLING[self.campaign.testing.method].headline,)
+
+    @property
+    def nominal(self) -> float:
+        """Share of intervals that are to hold the truth, or of decisions that are to be right."""
+        confidence = self.campaign.stop.confidence
+        return (1.0 + confidence) / 2.0 if self.limits else confidence
 
     def subject(self, name: str) -> Campaign:
         """The campaign with one of the vehicles."""
@@ -221,6 +231,13 @@ class Experiment(Section):
                 found=", ".join(sorted(wrong)),
                 expected=f"for testing.method {method}: {', '.join(sorted(judged))}",
                 mend="Change one of the two.",
+            )
+        if self.limits and (method != "shells" or self.pairs):
+            raise broken_rule(
+                "limits",
+                found="comparisons of two vehicles" if self.pairs else f"testing.method {method}",
+                expected="campaigns of single vehicles by testing.method shells, which alone decide",
+                mend="Delete the key.",
             )
         if self.fault is not None and method != "shells":
             raise broken_rule("fault", found=f"a wrong shell for {method}", expected="method shells", mend="Delete it.")

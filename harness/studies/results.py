@@ -28,7 +28,7 @@ def write_results(
 ) -> None:
     """Write all files of an experiment; ``found`` are the replications of each subject."""
     folder.mkdir(parents=True, exist_ok=True)
-    confidence = experiment.campaign.stop.confidence
+    confidence = experiment.nominal
     flat = [(subject.name, row) for subject, rows in found for row in rows]
     columns = {"subject": [name for name, _ in flat]}
     table = pa.table(columns | {field.name: [getattr(row, field.name) for _, row in flat] for field in fields(Row)})

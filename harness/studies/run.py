@@ -62,8 +62,7 @@ def validate(
 def _judge(experiment: Experiment, subject: Subject, rows: list[Row]) -> Iterator[Judgement]:
     for result in dict.fromkeys(row.result for row in rows):
         of_result = [row for row in rows if row.result == result]
-        confidence = experiment.campaign.stop.confidence
-        yield judge(subject, result, of_result, confidence)
+        yield judge(subject, result, of_result, experiment.nominal)
 
 
 @contextmanager

@@ -8,15 +8,15 @@ systematic sample of the pool's cut-ins without replacement, which scatters no m
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Protocol
 
 import numpy as np
 
 from harness.arrays import FloatArray, IntArray
-from harness.campaign.models import Campaign
+from harness.campaign.models import Accept, Campaign
 from harness.estimators.block import Block
 from harness.estimators.estimate import Estimate
 from harness.estimators.likelihood_ratio import Level
@@ -28,6 +28,11 @@ from harness.studies.judgement import Row, estimate_row
 from harness.studies.truths import preventable_by, ratio_to
 
 FREE = "shells"
+
+
+def limit_at(factor: float) -> str:
+    """Name of the decision about a limit, a multiple of the crash rate."""
+    return f"limit {factor:g} x rate"
 
 
 def result_of(statement: str) -> str:
@@ -87,23 +92,61 @@ class ShellSource(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class ShellCampaign:
-    """A shells campaign to replicate; its stop rule, statement and first tests are used."""
+    """A shells campaign to replicate; its stop rule, statement and first tests are used.
+
+    With ``limits``, by name, it is repeated until all of these are decided, as by ``accept``.
+    """
 
     campaign: Campaign
     source: ShellSource
     seed: int
     fault: Fault | None = None
+    limits: Mapping[str, float] = field(default_factory=dict)
 
     def run(self, replications: range) -> list[Row]:
-        """Rows of all statements for each replication, and of the comparisons with reference drivers."""
-        return [row for replication in replications for row in self._replicate(replication)]
+        """Rows of all statements for each replication, and of the comparisons with reference drivers; or of limits."""
+        rows = self._decide if self.limits else self._replicate
+        return [row for replication in replications for row in rows(replication)]
 
-    def _replicate(self, replication: int) -> Iterator[Row]:
+    def _begin(self, replication: int) -> tuple[np.random.Generator, DrawnPool, ShellPlanner]:
         rng = np.random.default_rng([self.seed, replication])
         drawn = with_fault(self.source.draw(rng), self.fault)
+        available = np.full(drawn.design.p.size, self.campaign.pool.cut_ins_per_shell, np.int64)
+        return rng, drawn, ShellPlanner(self.campaign, drawn.design, available)
+
+    def _decide(self, replication: int) -> Iterator[Row]:
+        """All limits from the same tests: what is tested next does not depend on any."""
+        rng, drawn, planner = self._begin(replication)
+        pending = {
+            name: RoundRule(self.campaign.model_copy(update={"accept": Accept(crash_rate_below=limit)}))
+            for name, limit in self.limits.items()
+        }
+        while pending and (added := planner.next_round()).any():
+            planner.add(campaign_block(drawn, added, int(planner.tally.tests.sum()), rng))
+            for name in [name for name, rule in pending.items() if rule.observe(planner.seen)]:
+                yield self._decision_row(planner.seen, name, replication, pending.pop(name))
+        for name, rule in pending.items():
+            yield self._decision_row(planner.seen, name, replication, rule)
+
+    def _decision_row(self, seen: Shells, name: str, replication: int, rule: RoundRule) -> Row:
+        """A decision is a one-sided interval: below the limit, or above."""
+        verdict = "undecided" if rule.decision is None else rule.decision.verdict
+        limit, tally = self.limits[name], seen.tally
+        return Row(
+            name,
+            replication,
+            n_tests=int(tally.tests.sum()),
+            n_crashes=int(tally.crashes.sum()),
+            crash_rate=seen.limits_of(self.campaign.testing.shells.statement, self.campaign.stop.confidence).rate,
+            std_error=seen.std_error(),
+            ci_low=limit if verdict == "rejected" else 0.0,
+            ci_high=limit if verdict == "accepted" else math.inf,
+            reached=verdict != "undecided",
+        )
+
+    def _replicate(self, replication: int) -> Iterator[Row]:
+        rng, drawn, planner = self._begin(replication)
         design = drawn.design
-        available = np.full(design.p.size, self.campaign.pool.cut_ins_per_shell, np.int64)
-        planner = ShellPlanner(self.campaign, design, available)
         rules = {each.name: RoundRule(asking(self.campaign, each.name)) for each in design.statements}
         known: dict[str, Row] = {}
         enough = False

@@ -7,6 +7,7 @@ from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 
 from harness.arrays import FloatArray
+from harness.campaign.models import Campaign
 from harness.environment.loading import load_environment
 from harness.pool.library import Library, load_library
 from harness.pool.shells import acceleration_limit
@@ -17,7 +18,7 @@ from harness.studies.chains.shells import ChainShells
 from harness.studies.experiment import Experiment
 from harness.studies.judgement import Subject
 from harness.studies.paired_campaign import PairedCampaign
-from harness.studies.shell_campaign import ShellCampaign, result_of
+from harness.studies.shell_campaign import ShellCampaign, ShellSource, limit_at, result_of
 from harness.studies.shell_source import Division, OvertakingShells
 from harness.studies.super_population import Drivers, Mixed, SuperPopulation, enumerate_paths, reference_drivers
 from harness.studies.truths import CONDITIONAL_DIFFERENCE, RATE, Known, Truths, of_pair, of_vehicle
@@ -51,15 +52,24 @@ def _chains(experiment: Experiment) -> Iterator[Tested]:
             source = ChainShells(chain, experiment.super_population.pool_paths)
             outside = {result_of(LIBRARY_STATEMENT): source.crashes_outside}
             subject = Subject.exact(name, chain.crash_rate, crashes_outside=outside)
-            yield subject, ShellCampaign(campaign, source, seed, experiment.fault)
+            yield subject, _repeated(experiment, campaign, source, seed, subject)
         else:
             episodes = ChainEpisodes(chain, method, seed)
             yield Subject.exact(name, chain.crash_rate), WeightedCampaign(campaign, episodes, experiment.results)
 
 
-def _subject(name: str, source: OvertakingShells, known: Mapping[str, Known]) -> Subject:
+def _repeated(
+    experiment: Experiment, campaign: Campaign, source: ShellSource, seed: int, subject: Subject
+) -> ShellCampaign:
+    limits = {limit_at(factor): factor * subject.crash_rate.value for factor in experiment.limits}
+    return ShellCampaign(campaign, source, seed, experiment.fault, limits)
+
+
+def _subject(experiment: Experiment, name: str, source: OvertakingShells, known: Mapping[str, Known]) -> Subject:
     """A vehicle by what is known about it, its crash rate among it."""
     outside = {result_of(each): share for each, share in source.cells.crashes_outside(source.crashing).items()}
+    asked = result_of(experiment.campaign.testing.shells.statement)
+    outside |= {limit_at(factor): outside.get(asked, 0.0) for factor in experiment.limits}
     others = {result: value for result, value in known.items() if result != RATE}
     facts = outside, source.cells.left_out, source.cells.template.library.boundary
     return Subject(name, known[RATE], others, *facts)
@@ -109,14 +119,15 @@ class _Held:
             crashing = self.drivers.vehicles[name].crash_mass(self.pools)
             division = self._division(crashing, limit_mps2=acceleration_limit(tested.av))
             source = division.of_vehicle(crashing)
-            yield _subject(name, source, known), ShellCampaign(tested, source, seed, experiment.fault)
+            subject = _subject(experiment, name, source, known)
+            yield subject, _repeated(experiment, tested, source, seed, subject)
             for made_name, made in experiment.adversaries.items():
                 if made.of == name:
                     of_adversary = division.as_adversary(made, crashing)
                     adversary = division.of_vehicle(of_adversary, made.failing)
                     exact = _exactly(of_vehicle(self.pools, of_adversary, self.drivers.references))
-                    repeated_adversary = ShellCampaign(tested, adversary, seed, experiment.fault)
-                    yield _subject(made_name, adversary, exact), repeated_adversary
+                    made_subject = _subject(experiment, made_name, adversary, exact)
+                    yield made_subject, _repeated(experiment, tested, adversary, seed, made_subject)
 
     def pairs(self) -> Iterator[Tested]:
         """Each comparison."""
@@ -166,4 +177,5 @@ def _acting(experiment: Experiment, name: str, choose: Choose, executor: Executo
     paths = campaign.pool.shadow_paths
     division = Division(library, pools, [crashing], paths, limit_mps2=limit, shadow_runs=True)
     source = division.of_vehicle(crashing)
-    return _subject(name, source, known), ShellCampaign(campaign, source, experiment.seed_of(place), experiment.fault)
+    subject = _subject(experiment, name, source, known)
+    return subject, _repeated(experiment, campaign, source, experiment.seed_of(place), subject)

@@ -154,7 +154,7 @@ def reference_drivers(library: Library) -> dict[str, int]:
 def _reactions(av: AutomatedVehicle) -> list[tuple[Reflexes, float]]:
     """The reflexes that a vehicle can have in an episode, and how probable each is."""
     own = av.reaction
-    reflexes = Reflexes(delay_s=own.delay_s, max_jerk_mps3=own.max_jerk_mps3)
+    reflexes = Reflexes(**own.model_dump(include=set(Reflexes.model_fields)))
     if own.inattention_probability == 0.0 or own.inattention_delay_s == 0.0:
         return [(reflexes, 1.0)]
     late = reflexes.model_copy(update={"delay_s": own.delay_s + own.inattention_delay_s})

@@ -74,6 +74,32 @@ class YieldsScript(TraciStyleController):
         vehicle.setAcceleration(veh_id, a, 0.1)
 
 
+YIELDS_FMU = '''
+from pythonfmu import Fmi2Causality, Fmi2Slave, Real
+
+try:
+    from examples.idm import idm_acceleration
+except ImportError:  # in the FMU the files are beside each other
+    from idm import idm_acceleration
+
+
+class YieldsFmu(Fmi2Slave):
+    """The same as an FMU."""
+
+    def __init__(self, **kwargs):
+        super().__init__(**kwargs)
+        for name in ("x", "v", "x_bv", "v_bv", "over", "moves", "overlaps", "a"):
+            setattr(self, name, 0.0)
+            self.register_variable(Real(name, causality=Fmi2Causality.output if name == "a" else Fmi2Causality.input))
+
+    def do_step(self, current_time, step_size):
+        comes = self.moves > 0.0 and self.over >= 0.375 - 1e-9
+        gap = self.x_bv - 5.0 - self.x
+        self.a = idm_acceleration(self.v, self.v_bv, gap) if comes or self.overlaps else 0.0
+        return True
+'''
+
+
 @pytest.fixture(scope="module")
 def built_in():
     return drive(LATERAL)
@@ -89,6 +115,16 @@ def built_in():
 )
 def test_a_controller_that_sees_it_is_the_built_in_model_to_the_last_bit(built_in, controller):
     found = drive(LATERAL, f"av={{controller: '{controller}'}}")
+    assert found.tobytes() == built_in.tobytes()
+
+
+def test_so_is_an_fmu_that_sees_it(built_in, tmp_path):
+    builder = pytest.importorskip("pythonfmu.builder", reason="pythonfmu builds the FMU")
+    (tmp_path / "yields.py").write_text(YIELDS_FMU)
+    fmu = builder.FmuBuilder.build_FMU(tmp_path / "yields.py", dest=tmp_path, project_files=["examples/idm.py"])
+    inputs = "position_m: x, speed_mps: v, bv_position_m: x_bv, bv_speed_mps: v_bv, bv_lateral_m: over"
+    inputs += ", bv_lateral_speed_mps: moves, bv_overlaps: overlaps"
+    found = drive(LATERAL, f"av={{fmu: {{file: '{fmu}', inputs: {{{inputs}}}, output: a}}}}", "world.cells=1")
     assert found.tobytes() == built_in.tobytes()
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -18,7 +19,7 @@ from harness.report.answer_plot import answer_plot
 from harness.report.run_folder import read_run_folder, typed_folder
 from harness.report.shells_plot import POOL, shells_plot
 from harness.report.summary import RunSummary, summarise
-from harness.report.tables import run_notes
+from harness.report.tables import run_notes, verdict
 
 SHELLS = [name for name, recipe in RECIPES.items() if recipe.method == "shells"]
 
@@ -82,6 +83,21 @@ def test_an_outside_without_tests_is_said_and_runs_out_of_the_plot(runs):
     ]
     assert rates.get_xlim()[1] < 1e-6
     assert widths.get_xlim()[1] < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"n_checked": 0, "n_episodes_outside": 0}, "not put to the test"),
+        ({"n_checked": 0, "n_episodes_outside": 5}, "no crash seen outside"),
+        ({"n_checked": 9, "n_episodes_outside": 5}, "kept to in every test"),
+        ({"n_checked": 9, "n_episodes_outside": 0}, "kept to in every test, none of them outside"),
+        ({"n_checked": 9, "n_ahead": 1}, "no longer justified: this vehicle does not keep to it"),
+        ({"n_checked": 9, "n_ahead": 1, "refuted": True}, "refuted by these tests"),
+    ],
+)
+def test_the_label_says_what_tests_have_shown(runs, changed, said):
+    assert verdict(replace(runs["shells"].shells.widest, **changed)) == said
 
 
 def test_the_half_width_that_was_asked_for_is_that_of_the_statement_it_was_asked_of(runs):

@@ -18,7 +18,7 @@ from harness.studies.chains.shells import ChainShells
 from harness.studies.experiment import Experiment, Fault, load_experiment
 from harness.studies.judgement import Judgement, Row, Subject, corrected, judge
 from harness.studies.run import validate
-from harness.studies.shell_campaign import FREE, ShellCampaign, result_of
+from harness.studies.shell_campaign import FREE, ShellCampaign, limit_at, result_of
 from harness.studies.truths import preventable_by, ratio_to
 from harness.studies.weighted_campaign import ChainEpisodes, WeightedCampaign
 
@@ -70,6 +70,31 @@ def test_a_corrupted_shell_probability_is_caught():
     assert one.too_low
     assert one.p_value_holm < 1e-6
     assert abs(one.bias) > max(LARGEST_BIAS, 8.0 * one.bias_std_error)
+
+
+def decisions(chain, fault: Fault | None = None) -> list[Judgement]:
+    """By chains that are told apart at 0.5, 0.8, 1.25 and 2 times their crash rate; nominal: 95 of 100 are right."""
+    limits = {limit_at(factor): factor * chain.crash_rate for factor in (0.5, 0.8, 1.25, 2.0)}
+    rows = ShellCampaign(campaign("shells", 4000), ChainShells(chain, 2048), 11, fault, limits).run(range(FEW))
+    subject = Subject.exact(chain.name, chain.crash_rate)
+    return corrected([judge(subject, name, [row for row in rows if row.result == name], 0.95) for name in limits])
+
+
+def test_limits_are_decided_rightly():
+    for chain in replayed():
+        assert not any(one.too_low for one in decisions(chain))
+
+
+def test_limits_that_are_far_from_the_rate_are_decided_early():
+    half, *_, twice = decisions(CHAINS["good surrogates"])
+    assert half.reached == twice.reached == 1.0
+    assert max(half.tests_95, twice.tests_95) < 4000
+
+
+def test_decisions_by_a_wrong_probability_are_caught():
+    """The sibling that must fail: shells count twice what they are worth, so that rates below a limit are rejected."""
+    found = decisions(CHAINS["good surrogates"], Fault(shell=0, factor=2.0))
+    assert min(one.p_value_holm for one in found) < 1e-6
 
 
 @pytest.mark.parametrize("chain", [frequent_decisive(), rare_decisive()], ids=lambda c: c.name)

@@ -17,6 +17,7 @@ from harness.studies.shell_campaign import campaign_block
 from harness.studies.shell_source import Division, equals, leave_out
 from harness.studies.super_population import NO_ENVELOPE, Drivers, enumerate_paths
 from harness.studies.truths import RATE, Truths
+from harness.vehicles.models import av_records
 
 PATHS = 1024
 ENVIRONMENT = load_environment(EnvironmentSettings())
@@ -77,6 +78,12 @@ def test_an_inattentive_vehicle_is_two_drivers_mixed(drivers, population):
     mixed, early, late = (drivers.vehicles[name].crash_mass(population) for name in ("late", "own", "attentive-late"))
     np.testing.assert_allclose(mixed, 0.75 * early + 0.25 * late, rtol=1e-12)
     assert late.sum() > 1.5 * early.sum()
+
+
+def test_a_vehicle_keeps_all_its_reflexes():
+    reaction = {"delay_s": 0.3, "max_jerk_mps3": 7.0, "perceives_lateral_m": 2.0}
+    av = AutomatedVehicle.model_validate({"model": "idm", "reaction": reaction})
+    assert Drivers.of(LIBRARY, {"late": av}).records[-1:].tobytes() == av_records(av).tobytes()
 
 
 def test_equals_are_found_and_left_out(drivers, population):
