@@ -244,15 +244,15 @@ def study(study_file: Path, folder: Path, *, quick: bool, workers: int | None, q
     from harness.studies.case_study.study_file import load_study  # noqa: PLC0415 - keeps --help fast
 
     asked = load_study(study_file, quick=quick)
-    from harness.progress import terminal_progress  # noqa: PLC0415 - keeps --help fast
+    from harness.progress import shown_progress  # noqa: PLC0415 - keeps --help fast
     from harness.studies.case_study.steps import run_study  # noqa: PLC0415 - slow to import: once the file is right
 
     def told(name: str, seconds: float | None) -> None:
         if not (as_json or quiet):
             click.echo(f"{name}: " + ("there already" if seconds is None else f"{seconds:.1f} s"))
 
-    bar = None if quiet else terminal_progress(None, 0)
-    with bar or nullcontext():
+    bar = shown_progress(quiet=quiet)
+    with bar:
         done = run_study(asked, folder, workers=workers, progress=bar, told=told)
     if as_json:
         print_json({"page": str(done.page), "claims": done.claims, "seconds": done.seconds})

@@ -49,7 +49,9 @@ steps:
     set: [environment.lane_change_level=1e4, testing.epsilon=0.9]
     tests: 600
     avs: [alpha-0.5]
-    settings: {{same: [], recursive: [testing.epsilon=0.1, testing.challenge=recursive, testing.method=episode_mixture]}}
+    settings:
+      same: []
+      recursive: [testing.epsilon=0.1, testing.challenge=recursive, testing.method=episode_mixture]
   theorems: {{kind: theorems, draws: 3, tests: 200}}
 quick:
   nde: {{tests: 2_000}}
