@@ -225,7 +225,7 @@ def rnot(
     short_help="Reproduce a paper's case study, and answer its claims.",
     epilog=examples(
         "harness study scenarios/case_study/study.yaml --out runs/quick --quick   # minutes: tiny, to see it work",
-        "harness study scenarios/case_study/study.yaml --out runs/case_study     # under an hour on two cores",
+        "harness study scenarios/case_study/study.yaml --out runs/case_study     # about an hour on two cores",
     ),
 )
 @click.argument("study_file", metavar="STUDY", type=CAMPAIGN)
