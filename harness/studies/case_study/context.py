@@ -39,3 +39,8 @@ class Context:
     made: Mapping[str, Made]
     workers: int | None
     progress: Progress
+
+    @property
+    def name(self) -> str:
+        """The step's, which its folder's begins with."""
+        return self.folder.name.rpartition("-")[0]

@@ -81,7 +81,7 @@ def test_in_twin(step: TwinTests, context: Context) -> dict[str, Any]:
     parts.mkdir(exist_ok=True)
     places = {first: parts / f"{first:012d}.parquet" for first in range(0, step.tests, PART)}
     missing = [(first, min(PART, step.tests - first)) for first, place in places.items() if not place.is_file()]
-    context.progress.stage(context.folder.name, step.tests, done=step.tests - sum(n for _, n in missing))
+    context.progress.stage(context.name, step.tests, done=step.tests - sum(n for _, n in missing))
     with worker_processes(context.workers) as executor:
         for (first, n), table in zip(missing, executor.map(partial(crashes_in_twin, file), missing), strict=True):
             write_table(places[first], table)

@@ -38,7 +38,7 @@ def test_variants(step: Variants, context: Context) -> dict[str, Any]:
     missing = [name for name, place in places.items() if not place.is_file()]
     for name in missing:
         prepare(resolve(campaigns[name]), context.progress)  # tables are built once, before the workers start
-    context.progress.stage(context.folder.name, len(campaigns), done=len(campaigns) - len(missing))
+    context.progress.stage(context.name, len(campaigns), done=len(campaigns) - len(missing))
     with worker_processes(context.workers) as executor:
         work = partial(claims_in_twin, step.tests, context.confidence)
         jobs = [campaigns[name].model_dump_json() for name in missing]
