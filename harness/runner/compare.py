@@ -99,6 +99,9 @@ def compare_campaigns(
     if margin is not None and a.testing.method != "shells":
         mend = "Write --set testing.method=shells, or read the ratio's interval."
         raise CampaignError("--margin", found=f"method {a.testing.method}", expected="shells", mend=mend)
+    if a.accept is not None or b.accept is not None:
+        mend = "Write --set accept=null, and --margin if something is to be decided."
+        raise CampaignError("accept", found="a limit of one crash rate", expected="none in a comparison", mend=mend)
     sides: dict[Side, Resolved] = {"a": require_ready(a), "b": require_ready(b)}
     if stored is not None:
         _take_over(stored, out / "a", sides["a"])

@@ -161,13 +161,6 @@ def require_same_shells(sides: tuple[Resolved, Resolved]) -> None:
             expected=f"{ASSUMPTION_FREE} or {LIBRARY_STATEMENT}: a comparison has these two",
             mend="Choose one of them.",
         )
-    if any(of_side.campaign.av.before_cut_in == "controller" for of_side in sides):
-        raise CampaignError(
-            "av.before_cut_in",
-            found="controller",
-            expected="vehicles that hold their speed until the cut-in: each that acts before has its own cut-ins",
-            mend="Write --set testing.method=forced, or compare the intervals of two runs.",
-        )
     limits = [acceleration_limit(of_side.campaign.av) for of_side in sides]
     envelope = sides[0].library.envelope_mps2
     if (limits[0] > envelope) != (limits[1] > envelope):

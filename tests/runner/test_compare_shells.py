@@ -161,6 +161,9 @@ def test_refusals(campaigns, campaign, tmp_path, done):
     needed = campaign(*SHELLS, "testing.shells.statement=need-based")
     with pytest.raises(CampaignError, match="assumption_free or library"):
         compare_campaigns(needed, needed, tmp_path / "out")
+    limited = campaign(*SHELLS, "accept.crash_rate_below=1e-7")
+    with pytest.raises(CampaignError, match="a limit of one crash rate"):
+        compare_campaigns(limited, limited, tmp_path / "out")
     early = campaign(*SHELLS, "av={controller: 'tests.controllers.early:Speeds', before_cut_in: controller}")
     with pytest.raises(CampaignError, match="cut-ins of its own"):
         compare_campaigns(early, early, tmp_path / "out")
