@@ -98,8 +98,8 @@ def run(
     interrupted and resumed. The run folder holds the resolved campaign, all records (Parquet), estimates.json and
     report.html.
 
-    Exit code 4 says that stop.episodes or the pool was spent before stop.rhw was reached, or a limit decided; the
-    results are there all the same. With --accept 0 says accepted, 5 rejected.
+    Exit code 4 says that stop.episodes or the pool was spent before stop.rhw was reached, or --accept decided; the
+    results are there all the same. With --accept 0 means accepted, 5 rejected.
     """
     limit = [] if accept is None else [f"accept.crash_rate_below={accept!r}"]
     campaign = loaded(campaign_file, [*overrides, *limit], av)

@@ -15,7 +15,7 @@ from harness.records.folder import write_bytes
 from harness.report import number_format
 from harness.report.plot_style import RC, png
 from harness.studies.case_study.context import Made
-from harness.studies.case_study.figures import verdict
+from harness.studies.case_study.figures import Verdict, verdict
 from harness.studies.case_study.plots import plots_of
 from harness.studies.case_study.study_file import Study
 
@@ -32,7 +32,7 @@ def write_page(study: Study, folder: Path, made: Mapping[str, Made]) -> tuple[Pa
     HarnessError
         A claim or the picture asks for a figure that its step does not have.
     """
-    claims = [_answered(claim.model_dump(), made) for claim in study.claims]
+    claims = [_answered(claim.model_dump(), made, conclusive=study.conclusive) for claim in study.claims]
     with matplotlib.style.context(["default", RC]):
         plots = plots_of(study, made, {label: asked(path, made) for label, path in study.picture.items()})
         for plot in plots.values():
@@ -75,10 +75,12 @@ def asked(path: str, made: Mapping[str, Made]) -> dict[str, Any]:
     return found
 
 
-def _answered(claim: dict[str, Any], made: Mapping[str, Made]) -> dict[str, Any]:
+def _answered(claim: dict[str, Any], made: Mapping[str, Made], *, conclusive: bool) -> dict[str, Any]:
     """A claim with our number and the verdict; the reason of a difference only where there is one."""
     found = asked(claim["ours"], made)
-    answer = verdict(claim["paper"], found, **{key: claim[key] for key in ("within", "tolerance", "at_most")})
+    answer: Verdict = "cannot be told"
+    if conclusive:
+        answer = verdict(claim["paper"], found, **{key: claim[key] for key in ("within", "tolerance", "at_most")})
     return {**claim, "found": found, "verdict": answer, "why": claim["why"] if answer == "not reproduced" else ""}
 
 

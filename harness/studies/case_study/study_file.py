@@ -153,6 +153,7 @@ class Study(Section):
         default_factory=dict, description="what --quick lays over steps, by step and key"
     )
     claims: list[Claim] = Field(default_factory=list)
+    conclusive: bool = Field(True, description="whether the sizes allow verdicts; those of --quick never do")
     picture: dict[str, str] = Field(
         default_factory=dict, description="label and STEP.FIGURE of each line of the last picture"
     )
@@ -235,7 +236,8 @@ def load_study(path: Path, *, quick: bool = False) -> Study:
     small = validated(apply_overrides(data, changes), Study, str(path), Places(lines, changes))
     study = full
     if quick:
-        study = small.model_copy(update={"title": f"{small.title} (quick: too few tests for conclusions)"})
+        title = f"{small.title} (quick: too few tests for conclusions)"
+        study = small.model_copy(update={"title": title, "conclusive": False})
     return study.model_copy(update={"steps": {name: _placed(step, path, name) for name, step in study.steps.items()}})
 
 
