@@ -19,6 +19,7 @@ from harness.campaign.loading import load_campaign
 from harness.cli import cli, main
 from harness.errors import EXIT_BAD_INPUT, RunFolderError, TooManyFailedError
 from harness.methods import EstimatorName
+from harness.progress import LineProgress
 
 SCENARIOS = Path(__file__).parents[1] / "scenarios"
 SMOKE = str(SCENARIOS / "smoke.yaml")
@@ -142,7 +143,8 @@ def test_run_prints_the_answer_and_where_more_is(calls, capsys, tmp_path):
     assert err == ""
     (campaign, to), options = calls["harness.runner.run_campaign"]
     assert (campaign.seed, to) == (7, folder)
-    assert options == {"workers": 2, "resume": True, "progress": None}
+    assert isinstance(options.pop("progress"), LineProgress)
+    assert options == {"workers": 2, "resume": True}
 
 
 def test_run_as_json_and_with_the_budget_spent(calls, capsys, tmp_path):

@@ -123,6 +123,11 @@ def _obey_rules(data: dict[str, Any]) -> dict[str, Any]:
     stop.pop("estimator", None)
     if testing.get("method") == "step_mixture":
         stop.pop("rhw", None)
+    shells = testing.get("shells", {})
+    if testing.get("method") != "shells" or shells.get("stopping") == "two_phase":
+        data.pop("accept", None)
+    if data.get("accept") and "statement" in shells:
+        data["accept"].pop("statement", None)
     av = data.get("av", {})
     if testing.get("method", "episode_mixture") in ("forced", "episode_mixture", "shells"):
         av.pop("before_cut_in", None)

@@ -22,7 +22,8 @@ SIZES = [600, 600, 300]
 KEYS = {
     "campaign", "campaign_hash", "lane_change_level", "confidence", "n_episodes", "n_crashes", "headline",
     "distance_per_test_km", "crash_rate_per_1e6_km", "estimates", "diagnostics", "convergence", "statement",
-    "statements", "reference_statements", "boundary_statements", "ending", "scope",
+    "statements", "reference_statements", "boundary_statements", "ending", "decision",
+    "scope",
 }  # fmt: skip
 
 
