@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
+from matplotlib.ticker import MaxNLocator
 
 from harness.records.folder import read_table
 from harness.report.plot_style import (
@@ -38,7 +39,7 @@ def plots_of(study: Study, made: Mapping[str, Made], picture: Mapping[str, dict[
     plots: list[Plot | None] = [tests_plot(picture, study.rhw)] if picture else []
     for name, step in study.steps.items():
         if isinstance(step, Convergence):
-            plots.append(convergence_plot(name, step.of, made[name], study.rhw, study.confidence))
+            plots.append(convergence_plot(name, step, made, study.rhw, study.confidence))
         elif step.kind == "control_variates":
             plots.append(strata_plot(name, made[name].result["strata"]))
         elif step.kind == "theorems":
@@ -74,13 +75,15 @@ def tests_plot(picture: Mapping[str, dict[str, Any]], rhw: float) -> Plot | None
     return Plot("tests", figure, "Number of tests by method, on a logarithmic axis. " + caption, caption)
 
 
-def convergence_plot(name: str, of: list[str], made: Made, rhw: float, confidence: float) -> Plot:
+def convergence_plot(name: str, step: Convergence, made: Mapping[str, Made], rhw: float, confidence: float) -> Plot:
     """Crash rate with its band, the first curve on the lower axis and the second on the upper; RHW of all."""
-    table = read_table(made.folder / CURVES)
+    of, table = step.of, read_table(made[name].folder / CURVES)
+    reference = made[step.reference].result["figures"]["crash_rate"]["value"] or 0.0
     figure = new_figure(FULL_WIDTH_IN, 3.6)
     left, right = figure.subplots(1, 2)
     curves = [_curve(table, each) for each in of]
-    top = 0.0
+    top = reference
+    left.axhline(reference, color=MUTED, linewidth=0.9, linestyle=(0, (4, 3)))
     for place, (label, (n, rate, half)) in enumerate(zip(of, curves, strict=True)):
         colour, axes = _COLOURS[place], left if place == 0 else left.twiny()
         axes.fill_between(n, np.maximum(rate - half, 0.0), rate + half, color=colour, alpha=0.16, linewidth=0)
@@ -104,7 +107,10 @@ def convergence_plot(name: str, of: list[str], made: Made, rhw: float, confidenc
     right.set_xlabel("tests")
     right.set_ylabel("relative half-width")
     right.legend()
-    caption = f"Left: crash rates with their {confidence:.0%} bands. Right: relative half-widths; dashed: {rhw:g}."
+    caption = (
+        f"Left: crash rates with their {confidence:.0%} bands; dashed: that of {step.reference}. Right: relative "
+        f"half-widths; dashed: {rhw:g}."
+    )
     return Plot(name, figure, f"Convergence of {', '.join(of)}. {caption}", caption)
 
 
@@ -134,6 +140,7 @@ def strata_plot(name: str, strata: list[dict[str, Any]]) -> Plot | None:
             axes.set_yscale("log")
             decades(axes.yaxis, *axes.get_ylim())
         axes.set_xlabel("control steps")
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         axes.set_title(title)
         axes.legend()
         only_horizontal_grid(axes)
