@@ -276,7 +276,7 @@ def validated_table(name: str) -> str:
 
 
 VARIED = {
-    "shells_adversaries": ("campaign.stop.confidence", ("0.9", "0.99")),
+    "shells_adversaries": ("campaign.stop.confidence", ("0.9", "0.95", "0.99")),
     "lateral": ("campaign.environment.cut_in_lead_s", ("log-normal", "0.5", "1.0")),
 }
 """Replication experiments repeated with other values of one key, shown side by side; the first is the file's own."""
