@@ -83,7 +83,6 @@ class ShownProgress(Progress):
     def __init__(self, target_rhw: float | None = None, min_crashes: int = 0, stream: TextIO | None = None) -> None:
         self._stream = stream or sys.stderr
         self._target_rhw, self._min_crashes = target_rhw, min_crashes
-        self._name = ""
         self._begin("", None, 0)
 
     def _begin(self, name: str, budget: int | None, done: int) -> None:
@@ -92,11 +91,18 @@ class ShownProgress(Progress):
         self._figures: dict[str, Figure] = {}
 
     def __enter__(self) -> Self:
+        self._open()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        self._close()
+
+    def _open(self) -> None:
+        """Begin to show."""
+
+    def _close(self) -> None:
         """Show no more."""
 
     def stage(self, name: str, total: int | None, *, done: int = 0) -> None:
@@ -142,13 +148,10 @@ class RichProgress(ShownProgress):
         )
         self._task: TaskID | None = None
 
-    def __enter__(self) -> Self:
+    def _open(self) -> None:
         self._bars.start()
-        return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def _close(self) -> None:
         self._bars.stop()
 
     def stage(self, name: str, total: int | None, *, done: int = 0) -> None:
@@ -194,13 +197,10 @@ class LineProgress(ShownProgress):
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._print_lines, daemon=True)  # a shard may take longer than that
 
-    def __enter__(self) -> Self:
+    def _open(self) -> None:
         self._thread.start()
-        return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def _close(self) -> None:
         self._ended.set()
         self._thread.join()
 

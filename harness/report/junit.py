@@ -10,6 +10,7 @@ from typing import Any, Literal
 
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE
 from harness.records.folder import write_text
+from harness.strata import ASSUMPTION_FREE
 
 Outcome = Literal["passed", "failure", "error", "skipped"]
 
@@ -34,9 +35,14 @@ def outcome_of(exit_code: int) -> Outcome:
 
 
 def statement_cases(content: dict[str, Any], asked: str, exit_code: int) -> list[Case]:
-    """Cases of ``estimates.json``: the statement that was asked about decides, the others are shown."""
+    """Cases of ``estimates.json``: the statement that was asked about decides, the others are shown.
+
+    Where there is no such statement, as under other methods than shells, the answer itself decides: a gate in which
+    nothing does would let everything pass.
+    """
     decision = content["decision"]
-    found = {"assumption_free": content["statement"], **content["boundary_statements"]}
+    found = {ASSUMPTION_FREE: content["statement"], **content["boundary_statements"]}
+    asked = asked if asked in found else ASSUMPTION_FREE
     ends = "" if decision is None else decision["sentence"] + " "
     return [
         Case(name, ends + sentence, outcome_of(exit_code)) if name == asked else Case(name, sentence, "skipped")

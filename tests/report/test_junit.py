@@ -34,6 +34,12 @@ def test_what_was_asked_decides_and_the_rest_is_shown(tmp_path, code, kind):
     assert f"[[ATTACHMENT|{report}]]" in asked.system_out
 
 
+def test_a_gate_never_passes_because_nothing_was_asked():
+    """A method without shells may still carry a statement's name in its settings."""
+    cases = statement_cases({**CONTENT, "decision": None, "boundary_statements": {}}, "library", 4)
+    assert [(case.name, case.outcome) for case in cases] == [("assumption_free", "error")]
+
+
 def test_a_comparison_is_one_case(tmp_path):
     write_junit(tmp_path / "c.xml", "a and b", [Case("difference", "B is worse.", outcome_of(5))], [])
     suite, cases = cases_of(tmp_path / "c.xml")
