@@ -129,7 +129,7 @@ def _add_key(figure: Figure, ramps: list[tuple[str, ...]]) -> None:
 
 def _caption(summary: RunSummary) -> str:
     per_test = number(summary.per_test(float(summary.cut_in.weight.sum())))
-    text = "Gap R2 and its rate R2dot (BV minus AV) when BV decides to cut in. "
+    text = "Gap R2 and its rate R2dot (BV minus AV) when BV cuts in. "
     if summary.all_weights_one:
         text += f"Tests are naturalistic driving itself; there are {per_test} cut-ins per test."
     else:
