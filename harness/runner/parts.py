@@ -110,7 +110,7 @@ def fixed_specs(campaign: Campaign, part: Part) -> list[ShardSpec]:
             "testing.method",
             found="shells, with --part",
             expected="nde, forced, step_mixture or episode_mixture: shells decide after each round what is tested next",
-            mend="Run the campaign on one machine (shells need few tests), or choose one of the other methods.",
+            mend="Run it on one machine with many --workers (shells need few tests), or choose another method.",
         )
     if stop.rhw is not None:
         raise CampaignError(
@@ -121,7 +121,7 @@ def fixed_specs(campaign: Campaign, part: Part) -> list[ShardSpec]:
         )
     n_shards = -(-stop.episodes // size)
     if n_shards < part.of:
-        mend = f"Take at most {n_shards} parts."
+        mend = f"Take at most {n_shards} part{'s' * (n_shards > 1)}."
         if stop.episodes >= part.of:
             mend += f" Or write --set run.shard_size={stop.episodes // part.of} for all of them."
         raise CampaignError(

@@ -111,6 +111,22 @@ def test_in_sumo_with_a_part_that_was_killed(sumo_run, campaign, part_here, merg
     assert unlike_columns(sumo_run, tmp_path / "merged") == []
 
 
+def test_a_vehicle_that_fails_now_and_then(campaign, run_here, part_here, merged, tmp_path):
+    """2 of 400 tests fail, which the whole may, but 2 of 160 in the second part; the first repeats some tests."""
+    vehicle = (
+        "av={controller: 'tests.controllers.misbehaving:Misbehaving', parameters: {bad: {'100': nan, '101': nan}}}"
+    )
+    of_vehicle = campaign(*TWIN, "testing.method=forced", vehicle)
+    whole = run_here(of_vehicle, tmp_path / "whole")
+    parts = [tmp_path / f"part{number}" for number in (1, 2, 3)]
+    done = [part_here(of_vehicle, number, 3, part) for number, part in enumerate(parts, 1)]
+    assert [part.n_failed for part in done] == [0, 2, 0]
+    result = merged(parts, tmp_path / "merged")
+    assert unlike_columns(whole.folder, result.folder) == []
+    assert without_what_is_the_machines(result.folder) == without_what_is_the_machines(whole.folder)
+    assert manifest(result.folder)["repeated"]["n_episodes"] > 0
+
+
 @given(st.integers(1, 500).flatmap(lambda of: st.tuples(st.just(of), st.integers(of, 5000))))
 def test_parts_tile_the_shards_evenly(sizes):
     of, n_shards = sizes
@@ -277,9 +293,9 @@ def test_a_part_is_not_refused_for_failures_that_chance_may_bring(campaign):
         ("testing.method=shells", "testing.method: found shells"),
         (
             "stop.episodes=239",
-            "run.shard_size: found 80: .* makes 3 in all, for 4 parts.* at most 3 parts. Or .* run.shard_size=59 ",
+            r"run\.shard_size: found 80, .* makes 3 in all, for 4 parts.* at most 3 parts\. Or .* run\.shard_size=59 ",
         ),
-        ("stop.episodes=3", "run.shard_size: found 80: .* makes 1 in all, for 4 parts.* at most 1 parts"),
+        ("stop.episodes=3", r"run\.shard_size: found 80, .* makes 1 in all, for 4 parts.* at most 1 part\.$"),
     ],
 )
 def test_campaigns_whose_tests_are_not_known_beforehand(override, said, campaign, tmp_path):
