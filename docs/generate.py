@@ -241,7 +241,7 @@ def limits_table() -> str:
     )
 
 
-VALIDATED = ("shells_panel", "shells_acting", "chains_shells", "chains_forced", "twin_forced_online")
+VALIDATED = ("shells_panel", "shells_acting", "shells_pairs", "chains_shells", "chains_forced", "twin_forced_online")
 """Replication experiments that are shown line by line."""
 METHODS = {
     "twin_nde": "no control, level 10,000",
@@ -276,6 +276,8 @@ def validated_table(name: str) -> str:
 
 
 VARIED = {
+    "shells_panel": ("campaign.stop.confidence", ("0.9", "0.95", "0.99")),
+    "shells_heaviest": ("campaign.stop.rhw", ("0.15", "0.05")),
     "shells_adversaries": ("campaign.stop.confidence", ("0.9", "0.95", "0.99")),
     "lateral": ("campaign.environment.cut_in_lead_s", ("log-normal", "0.5", "1.0")),
 }
