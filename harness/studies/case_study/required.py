@@ -79,7 +79,7 @@ def _plain(made: Made, procedure: Procedure, context: Context, *, first: int | N
     tests = read_tests(made)
     n = min(tests.n, first or tests.n)
     kept = tests.episode < n
-    context.progress.stage(f"shuffles of {made.folder.name}", procedure.n_shuffles)
+    context.progress.stage(f"shuffles of {made.folder.name.rpartition('-')[0]}", procedure.n_shuffles)
     rhw = plain_rhw(tests.weight[kept], n, procedure, lambda: context.progress.advance(1), tests.failed[kept])
     return _Found(required_tests(rhw, procedure.grid(n), procedure.rhw), n, settled(made))
 
