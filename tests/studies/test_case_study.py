@@ -65,7 +65,7 @@ steps:
     avs: [alpha-0.5]
     settings: {{same: []}}
     each_of:
-      - {{immediate: [], recursive: [testing.challenge=recursive]}}
+      - {{immediate: [], recursive: [testing.challenge=recursive, testing.epsilon=0.1]}}
       - {{step: [], episode: [testing.method=episode_mixture]}}
   theorems: {{kind: theorems, draws: 3, tests: 200}}
 quick:
@@ -282,9 +282,10 @@ def test_steps_agree_with_the_run_that_they_keep(made):
     rows = made["adjusted"].result["sizes"]
     assert [row["n"] for row in rows] == [700, 1_200]
     assert made["adjusted"].result["left_out"] == [5_000]
-    assert rows[-1]["nade_rate"] == pytest.approx(estimates["crash_rate"], rel=1e-12)
+    assert rows[-1]["nade_rate"]["value"] == pytest.approx(estimates["crash_rate"], rel=1e-12)
     assert all(row["difference"] < 1e-12 and row["claimed_gain"] >= 1.0 for row in rows)
     assert sum(row["n"] for row in made["adjusted"].result["strata"]) == 1_200
+    assert made["adjusted"].result["all"]["n"] == 1_200
     curves = pq.read_table(made["curves"].folder / "curves.parquet").to_pandas()
     last = curves[curves["step"] == "nade"].iloc[-1]
     assert last["n"] == 1_200
@@ -305,6 +306,35 @@ def test_variants_are_tested_on_the_same_traffic(made):
     assert recursive["nade_tests"] < same["nade_tests"]
     mean = made["variants"].result["figures"]["mean"]["value"]
     assert mean == pytest.approx((by_alpha["gain_claimed"]["value"] + gain["value"]) / 2)
+
+
+def test_variants_are_tested_with_shells_too(tmp_path):
+    """One run of shells beside plain simulation: two rates of the same vehicle on the same traffic."""
+    file = tmp_path / "study.yaml"
+    file.write_text(f"""
+format: case-study
+version: 1
+name: shells
+title: Shells
+steps:
+  table:
+    kind: variants
+    title: Table
+    campaign: {SCENARIOS}/overtaking_forced.yaml
+    set: [environment.lane_change_level=1e4]
+    tests: 4_000
+    avs: [alpha-0.5]
+    shells: {SCENARIOS}/smoke.yaml
+    shells_set: [environment.lane_change_level=1e4, stop.rhw=0.3, testing.shells.first_tests=null,
+                 pool.relative_error=0.03, pool.cut_ins_per_shell=1500]
+    reported: {{alpha-0.5: 11.52}}
+""")
+    done = run_study(load_study(file), tmp_path / "out", workers=1)
+    (row,) = json.loads(next((tmp_path / "out" / "steps").glob("*/result.json")).read_text())["variants"]
+    assert row["shells_rate"]["low"] < row["nade_rate"]["value"] < row["shells_rate"]["high"]
+    assert 100 < row["shells_tests"]["value"] < 20_000
+    assert f"{shown(row['shells_rate'])} | {shown(row['shells_tests'])} |" in done.page.read_text()
+    assert "| 11.52 |" in done.page.read_text()
 
 
 def test_the_theorems_hold_on_exact_chains(made):
