@@ -243,7 +243,7 @@ def limits_table() -> str:
     )
 
 
-VALIDATED = ("shells_panel", "chains_shells", "chains_forced", "twin_forced_online")
+VALIDATED = ("shells_panel", "shells_acting", "chains_shells", "chains_forced", "twin_forced_online")
 """Replication experiments that are shown line by line."""
 METHODS = {
     "twin_nde": "no control, level 10,000",

@@ -25,6 +25,14 @@ class Holds(IDM):
         return np.zeros(seen.cell.size)
 
 
+class DrivesFreely(Holds):
+    """Makes for the speed that the intelligent driver model wants, with nothing ahead of it."""
+
+    def before(self, seen: Any) -> Any:
+        """What it does until the cut-in (m/s²)."""
+        return 2.0 * (1.0 - (seen.speed_mps / 40.0) ** 4)
+
+
 class Speeds(Holds):
     """Drives freely to so many times its first speed."""
 

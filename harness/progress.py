@@ -17,6 +17,8 @@ Figure = float | int | str
 
 _BAR_WIDTH = 12  # leaves room for all figures on a terminal of 80 columns
 LINE_INTERVAL_S = 30.0
+END_SHOWN_FROM_S = 600.0
+_HALF_A_DAY_S = 43_200.0
 _CLOCK_S = 1e-6
 _RECKONED_WITH = ("rhw", "crashes", "heaviest")
 
@@ -130,8 +132,9 @@ class ShownProgress(Progress):
         rate_per_s = (self._done - self._done_before) / max(time.monotonic() - self._began_s, _CLOCK_S)
         if rate_per_s <= 0.0:
             return " · ".join(figures)
-        rate, left = f"{rate_per_s:,.0f}/s" if rate_per_s >= 10 else f"{rate_per_s:.2g}/s", self._left()
-        return " · ".join([rate, *figures, *([] if left is None else [f"{_clock(left / rate_per_s)} left"])])
+        left = self._left()
+        end = [] if left is None else [_end(left / rate_per_s)]
+        return " · ".join([_rate(rate_per_s), *figures, *end])
 
 
 class RichProgress(ShownProgress):
@@ -229,6 +232,21 @@ def _worded(name: str, figure: Figure) -> str:
     if figure == math.inf:
         return f"{label} unknown"
     return f"{label} {figure:.2g}" if isinstance(figure, float) else f"{label} {figure}"
+
+
+def _rate(per_s: float) -> str:
+    if per_s < 1.0:
+        return f"{1.0 / per_s:,.3g} s each"
+    return f"{per_s:,.0f}/s" if per_s >= 10.0 else f"{per_s:.2g}/s"
+
+
+def _end(left_s: float) -> str:
+    """The time left; of what takes long also the time of day, and of what takes very long the day."""
+    left = f"{_clock(left_s)} left"
+    if left_s < END_SHOWN_FROM_S:
+        return left
+    end = time.localtime(time.time() + left_s)
+    return f"{left}, until {time.strftime('%a %H:%M' if left_s > _HALF_A_DAY_S else '%H:%M', end)}"
 
 
 def _clock(seconds: float) -> str:

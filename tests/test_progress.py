@@ -3,6 +3,7 @@
 import io
 import re
 import threading
+import time
 
 import pytest
 from hypothesis import given
@@ -87,6 +88,22 @@ def test_work_of_an_earlier_run_does_not_count_as_speed():
         bar.status(crashes=3)
     assert "50%" in stream.getvalue()
     assert "/s" not in stream.getvalue()
+
+
+def test_slow_tests_show_the_time_of_each_and_the_expected_end(monkeypatch):
+    now_s = 100.0
+    monkeypatch.setattr("time.monotonic", lambda: now_s)
+    monkeypatch.setattr("time.time", lambda: 0.0)
+    monkeypatch.setattr("time.localtime", time.gmtime)
+    log = LineProgress(stream=Log())
+    log.stage("episodes", total=1_600)
+    now_s += 120.0
+    log.advance(30)
+    assert log.line().endswith("episodes: 30 of 1,600 · 4 s each · 1:44:40 left, until 01:44")
+    now_s += 4_890.0
+    assert log.line().endswith(" · 167 s each · 72:49:50 left, until Sun 00:49")
+    log.advance(1_400)
+    assert log.line().endswith(" · 3.5 s each · 9:56 left")
 
 
 def test_figures_before_any_stage_are_no_error():

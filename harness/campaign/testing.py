@@ -77,6 +77,12 @@ class ShellSettings(Section):
     first_tests: Annotated[int, Field(ge=1, le=10_000), BeforeValidator(whole)] | None = Field(
         None, description="tests of each shell before any is preferred; by its probability"
     )
+    smallest_round: Whole = Field(
+        1,
+        ge=1,
+        le=10_000,
+        description="tests of a round at least: as many as workers, where a test takes seconds",
+    )
 
     @field_validator("statement")
     @classmethod

@@ -54,13 +54,15 @@ class Allocation:
     """How many tests each shell gets next.
 
     A stratum gets ``first_tests`` before anything is decided about it, and at most those ``available``, shape (S,).
-    With a ``statement`` of the design what lies outside its boundary is never tested.
+    With a ``statement`` of the design what lies outside its boundary is never tested. A round has at least
+    ``smallest_round`` tests, where there are as many.
     """
 
     design: ShellDesign
     first_tests: IntArray
     available: IntArray
     statement: str = ASSUMPTION_FREE
+    smallest_round: int = 1
 
     @property
     def n_asked(self) -> int:
@@ -95,11 +97,19 @@ class Allocation:
         begun = self._begun(tally, inner_rhw or partial(self._inner_rhw, tally))
         active = begun & (tests < self.available)
         wanted = np.where(active, np.maximum(self.first_tests - tests, 0), 0)
-        if not wanted.any() and active.any():
-            size = max(SMALLEST_ROUND, int(np.ceil(tests[begun].sum() * (GROWTH - 1.0))))
+        if wanted.any():
+            wanted = wanted + self._fill(active, self.smallest_round - int(wanted.sum()))
+        elif active.any():
+            size = max(SMALLEST_ROUND, self.smallest_round, int(np.ceil(tests[begun].sum() * (GROWTH - 1.0))))
             room = np.where(active, self.available - tests, 0)
             wanted = (given_by or partial(self._spread, tally))(min(size, budget), room)
         return _cut(np.minimum(wanted, self.available - tests), budget)
+
+    def _fill(self, active: BoolArray, missing: int) -> IntArray:
+        """Further first tests by the probability of strata, while that is all that is known of them."""
+        p = np.where(active, self.design.p, 0.0)
+        filled: IntArray = np.ceil(max(missing, 0) * p / p.sum()).astype(np.int64) if p.any() else np.zeros(p.size, int)
+        return filled
 
     def second_phase(self, first: Tally, available: IntArray, budget: int, rhw: float, confidence: float) -> IntArray:
         """Tests per stratum, in proportion to a first phase's, of which an interval as narrow as ``rhw`` is expected.

@@ -108,7 +108,7 @@ class PairPlanner:
         shells = campaign.testing.shells
         self.rule = PairRule(campaign, margin)
         self._budget, self._first_tests = campaign.stop.episodes, first_tests(design, shells.first_tests)
-        self._allocation = Allocation(design, self._first_tests, available, shells.statement)
+        self._allocation = Allocation(design, self._first_tests, available, shells.statement, shells.smallest_round)
         self._level = Level.two_sided(CONFIDENCE)
 
     def next_round(self, pairs: PairCounts) -> IntArray:

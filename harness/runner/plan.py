@@ -40,6 +40,8 @@ KB_PER_MOMENT = 0.1
 MOMENTS_PER_EPISODE = {"all": 70, "first_9": 9, "none": 0}
 
 MEASURED_S = 1.0
+SLOW_TEST_S = 0.1
+"""Time of a test from which on handing tests out one by one costs less than workers that wait (docs/performance.md)."""
 MOST_AT_ONCE = 16
 """Controllers of one vehicle each that are asked between two looks at the clock."""
 STEPS, STEPS_WITH_CUT_IN = 89, 185
@@ -76,6 +78,7 @@ def plan_campaign(campaign: Campaign) -> dict[str, Any]:
         if isinstance(measured, float):
             moved_by_sumo = campaign.av.source in ("sumo", "traci")
             per_core = 1.0 / (measured + (0.0 if moved_by_sumo else 1.0 / per_core))
+            of_av |= _if_slow(measured, campaign)
     rate = _rounded(per_core * (os.cpu_count() or 1))
     moments = MOMENTS_PER_EPISODE[campaign.records.moments] if needs_tables(campaign) else 0
     episodes = campaign.stop.episodes
@@ -88,6 +91,17 @@ def plan_campaign(campaign: Campaign) -> dict[str, Any]:
         **of_av,
         **_reach(resolved),
     }
+
+
+def _if_slow(test_s: float, campaign: Campaign) -> dict[str, str]:
+    """How many workers are fed where a test takes long."""
+    task_s = test_s * campaign.run.shard_size
+    if test_s < SLOW_TEST_S or campaign.run.shard_size == 1:
+        return {}
+    said = f"with run.shard_size 1 a task is one test of {test_s:.2g} s, and now up to {task_s:,.0f} s"
+    if campaign.testing.method == "shells":
+        said += "; testing.shells.smallest_round feeds so many workers from the first round on"
+    return {"slow_av": said}
 
 
 def _reach(resolved: Resolved) -> dict[str, str]:

@@ -87,7 +87,7 @@ class ShellPlanner:
         self._campaign = campaign
         self._available = available
         self._first_tests = first_tests(design, shells.first_tests)
-        self._allocation = Allocation(design, self._first_tests, available, shells.statement)
+        self._allocation = Allocation(design, self._first_tests, available, shells.statement, shells.smallest_round)
         self._drawn = np.zeros(design.p.size, np.int64)
         self._planned: IntArray | None = None
         self._begin_phase()

@@ -13,7 +13,7 @@ from harness.cli import main
 from harness.controllers.loading import build_host
 from harness.errors import EXIT_BAD_INPUT, EXIT_DONE, EXIT_TOO_MANY_FAILED
 from harness.resolved import resolve
-from harness.runner import shards
+from harness.runner import plan_campaign, shards
 from harness.runner.prepare import prepare
 from harness.twin import TwinWorld
 from tests.controllers.misbehaving import ChangesItsParameters
@@ -255,3 +255,12 @@ def test_check_survives_a_controller_that_does_not(tmp_path, capsys):
     av = f"av={_other('EndsTheProcess', '{where: step}')}"
     assert main(["check", str(tmp_path / "c.yaml"), "--json", "--set", av]) == EXIT_DONE
     assert "in the call of step 0 of episode 0" in json.loads(capsys.readouterr().out)["plan"]["av_ms_per_test"]
+
+
+def test_check_says_how_a_slow_controller_keeps_many_workers_busy(tmp_path, monkeypatch):
+    monkeypatch.setattr("harness.runner.plan.seconds_per_test", lambda _: 12.0)
+    (tmp_path / "c.yaml").write_text(SMALL)
+    settings = [f"av={_other('Prints')}", "run.shard_size=100"]
+    plan = plan_campaign(load_campaign(tmp_path / "c.yaml", settings))
+    assert plan["slow_av"].startswith("with run.shard_size 1 a task is one test of 12 s, and now up to 1,200 s")
+    assert "slow_av" not in plan_campaign(load_campaign(tmp_path / "c.yaml", [settings[0], "run.shard_size=1"]))

@@ -308,6 +308,21 @@ def test_rounds_grow_to_where_the_interval_is_widest():
     assert full.next_round(tally(tests, np.array([200, 10, 0]), NONE), 100).sum() == 0
 
 
+def test_rounds_can_be_made_to_feed_many_workers():
+    """By probability while nothing else is known, then to where the interval is widest."""
+    rule = Allocation(DESIGN, TWELVE, MANY, smallest_round=64)
+    first = rule.next_round(tally(NONE, NONE, NONE), 10**6)
+    assert 64 <= first.sum() <= 66
+    assert first[2] == 0
+    inside = DESIGN.p[:2] / DESIGN.p[:2].sum()
+    assert (first[:2] - 12).tolist() == np.ceil(40 * inside).tolist()
+    assert rule.next_round(tally(NONE, NONE, NONE), 20).sum() == 20
+    later = rule.next_round(tally(np.array([40, 40, 40]), np.array([20, 1, 0]), NONE), 10**6)
+    assert later.sum() == 64
+    few = Allocation(DESIGN, TWELVE, np.full(3, 15), smallest_round=64)
+    assert few.next_round(tally(NONE, NONE, NONE), 10**6).tolist() == [15, 15, 0]
+
+
 def test_failed_tests_draw_further_tests_to_their_shell():
     rule = Allocation(DESIGN, TWELVE, MANY, "library")
     tests, crashes = np.array([400, 400, 0]), np.array([20, 0, 0])
