@@ -23,8 +23,7 @@ from harness.campaign.models import AutomatedVehicle, EnvironmentSettings
 from harness.criticality.grid import GridPoints
 from harness.criticality.immediate import roll_out
 from harness.environment.driving import Environment
-from harness.environment.loading import _evaluate as evaluate_laws
-from harness.environment.loading import load_environment
+from harness.environment.loading import evaluate_laws, load_environment
 from harness.estimators.block import MAX_CONTROL_STEPS, Block
 from harness.maneuvers import ACCELERATIONS_MPS2, N_ACCELERATIONS
 from harness.vehicles.kinematics import CONTACT_M, STEP_S
