@@ -384,14 +384,18 @@ def pages() -> Iterator[Path]:
     return (page for page in sorted(FOLDER.rglob("*.md")) if "<!-- generated:" in page.read_text(encoding="utf-8"))
 
 
+MADE_BY = (
+    "\n\nMade by `harness study scenarios/case_study/study.yaml --out runs/case_study` "
+    "([how](validation.md#the-papers-case-study)).\n\n"
+)
+
+
 def take_case_study(study: Path) -> None:
     """Copy the page of a study, whose plots then lie with the images, and whose links are those of a page here."""
     if not json.loads((study / "claims.json").read_text(encoding="utf-8"))["conclusive"]:
         raise SystemExit(f"{study} was made with --quick: its sizes are too small for a page")
-    page = (study / "case_study.md").read_text(encoding="utf-8")
-    page = page.replace("](plots/", "](images/case_study/").replace(
-        "(docs/scv-defect.md)", "([scv-defect.md](scv-defect.md))"
-    )
+    page = (study / "case_study.md").read_text(encoding="utf-8").replace("\n\n", MADE_BY, 1)
+    page = page.replace("](plots/", "](images/case_study/").replace("(docs/scv-defect.md)", "([why](scv-defect.md))")
     (FOLDER / "case_study.md").write_text(page, encoding="utf-8")
     images = FOLDER / "images" / "case_study"
     shutil.rmtree(images, ignore_errors=True)
