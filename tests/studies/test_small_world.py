@@ -114,6 +114,9 @@ def test_the_case_is_answered_and_goes_on_when_killed(world, tmp_path, monkeypat
     assert found["figures"]["nade"]["value"] == pytest.approx(exact, rel=1e-6)
     assert found["nearest"]["nade"]["challenge"] == "immediate"
     assert found["settings"][0]["difference"] < 1e-12
+    assert small_case._holds(56.0, 57.0)
+    assert not small_case._holds(82.7, 25_929.0)
+    assert not small_case._holds(None, 57.0)
 
 
 def test_ratios_on_record_multiply_to_the_weight_of_each_function(world):

@@ -19,6 +19,8 @@ from harness.studies.kept_parts import kept_parts, write_table
 from harness.studies.run import worker_processes
 
 _world = cache(small_world)
+TRUE_WITHIN = 2.0
+"""Factor between NADE's claim and the exact number up to which claims of a setting count, as in the page's verdicts."""
 
 
 class _Setting(NamedTuple):
@@ -77,16 +79,22 @@ def claims_of_setting(step: SmallCase, confidence: float, setting: _Setting) -> 
         "difference": once["difference"],
         "nade_exact": tests_for(world.relvar(proposals), step.rhw, confidence),
     }
+    holds = _holds(mean_of((each["nade_tests"] for each in many), confidence)["value"], row["nade_exact"])
     for name in ("nade", "scv"):
         said = mean_of((each[f"{name}_tests"] for each in many), confidence)
         square = np.mean([((each[f"{name}_rate"]["value"] or 0.0) / world.crash_rate - 1.0) ** 2 for each in many])
         row |= {
             f"{name}_claimed_once": once[f"{name}_tests"],
-            f"{name}_claimed": marked(said, settled=once["settled"]),
+            f"{name}_claimed": marked(said, settled=once["settled"] and holds),
             f"{name}_repeated": tests_for(n * float(square), step.rhw, confidence),
             f"{name}_covers": float(np.mean([_covers(each[f"{name}_rate"], world) for each in many])),
         }
     return pa.Table.from_pylist([row])
+
+
+def _holds(claimed: float | None, exact: float) -> bool:
+    """Whether NADE claims what is known to be true, about."""
+    return claimed is not None and exact / TRUE_WITHIN <= claimed <= exact * TRUE_WITHIN
 
 
 def _covers(rate: dict[str, Any], world: SmallWorld) -> bool:
