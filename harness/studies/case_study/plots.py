@@ -19,6 +19,7 @@ from harness.report.plot_style import (
     GREY,
     INK,
     MUTED,
+    PAPER,
     VERMILLION,
     Plot,
     decades,
@@ -204,7 +205,7 @@ def theorems_plot(name: str, result: dict[str, Any]) -> Plot:
     third.set_ylabel("repetitions")
     third.set_title("Theorem 3: zero variance")
     third.set_ylim(0.0, 1.45 * third.get_ylim()[1])
-    third.legend(fontsize=7.5, loc="upper left")
+    third.legend(fontsize=7.5, loc="upper left", frameon=True, framealpha=1.0, facecolor=PAPER, edgecolor=PAPER)
     caption = (
         "Left: exact means, of NADE and with two choices of control parameters. Middle: exact variances, below "
         "Theorem 2's bound. Right: repeated estimates in a world that meets Theorem 3's assumptions, with known "
