@@ -1,7 +1,8 @@
 """Write the generated parts of the documentation: settings, columns, results of long runs.
 
-    python docs/generate.py            rewrites them in place
-    python docs/generate.py --check    says which pages are out of date (exit code 1)
+    python docs/generate.py                                 rewrites them in place
+    python docs/generate.py --check                         says which pages are out of date (exit code 1)
+    python docs/generate.py --case-study runs/case_study    takes page and plots of a full `harness study`
 
 A generated part stands between ``<!-- generated: NAME -->`` and ``<!-- end -->``. Its source is the code (models of the
 campaign, Arrow schemas) or the committed results in ``docs/validation/``, so that it cannot drift from them.
@@ -13,6 +14,7 @@ import argparse
 import json
 import math
 import re
+import shutil
 import types
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -384,11 +386,33 @@ def pages() -> Iterator[Path]:
     return (page for page in sorted(FOLDER.rglob("*.md")) if "<!-- generated:" in page.read_text(encoding="utf-8"))
 
 
+MADE_BY = (
+    "\n\nMade by `harness study scenarios/case_study/study.yaml --out runs/case_study` "
+    "([how](validation.md#the-papers-case-study)).\n\n"
+)
+
+
+def take_case_study(study: Path) -> None:
+    """Copy the page of a study, whose plots then lie with the images, and whose links are those of a page here."""
+    if not json.loads((study / "claims.json").read_text(encoding="utf-8"))["conclusive"]:
+        raise SystemExit(f"{study} was made with --quick: its sizes are too small for a page")
+    page = (study / "case_study.md").read_text(encoding="utf-8").replace("\n\n", MADE_BY, 1)
+    page = page.replace("](plots/", "](images/case_study/").replace("(docs/scv-defect.md)", "([why](scv-defect.md))")
+    (FOLDER / "case_study.md").write_text(page, encoding="utf-8")
+    images = FOLDER / "images" / "case_study"
+    shutil.rmtree(images, ignore_errors=True)
+    shutil.copytree(study / "plots", images)
+
+
 def main() -> int:
     """Rewrite, or with ``--check`` only compare; returns the exit code."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--check", action="store_true")
-    check = parser.parse_args().check
+    parser.add_argument("--case-study", type=Path, metavar="FOLDER")
+    asked = parser.parse_args()
+    check: bool = asked.check
+    if asked.case_study is not None:
+        take_case_study(asked.case_study)
     stale = 0
     for page in pages():
         before = page.read_text(encoding="utf-8")

@@ -136,6 +136,25 @@ def test_every_long_run_is_in_the_table():
     assert {path.stem for path in (ROOT / "docs/validation").glob("*.json")} <= shown
 
 
+def test_a_full_study_becomes_a_page_of_the_docs_and_a_quick_one_is_refused(tmp_path, monkeypatch):
+    docs, study = tmp_path / "docs", tmp_path / "study"
+    monkeypatch.setattr(generate, "FOLDER", docs)
+    for folder in (docs, study / "plots"):
+        folder.mkdir(parents=True)
+    (study / "plots" / "tests.png").write_bytes(b"picture")
+    (study / "case_study.md").write_text("# Title\n\n![tests](plots/tests.png), defect (docs/scv-defect.md)\n\nend\n")
+    (study / "claims.json").write_text('{"conclusive": false}')
+    with pytest.raises(SystemExit, match="quick"):
+        generate.take_case_study(study)
+    assert list(docs.iterdir()) == []
+    (study / "claims.json").write_text('{"conclusive": true}')
+    generate.take_case_study(study)
+    page = (docs / "case_study.md").read_text()
+    assert page.count("Made by") == 1
+    assert (docs / re.search(r"!\[tests\]\(([^)]+)\)", page)[1]).read_bytes() == b"picture"
+    assert "([why](scv-defect.md))" in page
+
+
 def test_the_lock_pins_what_the_project_depends_on():
     import tomllib
 

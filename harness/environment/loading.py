@@ -88,7 +88,7 @@ def require_sound_laws(environment: Environment, file: str) -> None:
     approaches = np.array(list(product(AV_GAPS_M, RATES_MPS)))
     pmf, scale = np.empty((2, len(states), N_ACCELERATIONS)), np.empty((2, len(states)))
     chance, accepted = np.empty(len(states)), np.empty(len(approaches))
-    _evaluate(states, approaches, environment, pmf, scale, chance, accepted)
+    evaluate_laws(states, approaches, environment, pmf, scale, chance, accepted)
     for law, section in enumerate(("free_driving", "car_following")):
         where, total = f"{section} ({file})", pmf[law].sum(axis=1)
         limits = "a scale from {:g} to {:g} m/s²".format(*SCALES_MPS2)
@@ -154,7 +154,7 @@ def _require(sound: BoolArray, where: str, found: str, values: tuple[FloatArray,
 
 
 @compiled_threads
-def _evaluate(
+def evaluate_laws(
     states: FloatArray,
     approaches: FloatArray,
     environment: Environment,

@@ -179,15 +179,21 @@ def scv_rhw(tests: Block, procedure: Procedure, done: Callable[[], None] = lambd
 
     ``tests`` are all tests of a run in index order, with ``first_ratios``; ``done`` is called after each shuffle.
     """
-    grid = procedure.grid(len(tests))
-    rhw = np.empty((procedure.n_shuffles, len(grid)))
+    rhw = []
     for shuffle in range(procedure.n_shuffles):
-        order = shuffled(procedure.seed, shuffle, tests.crash | tests.failed)
-        state = BothWays(Scv())
-        for at, (start, stop) in enumerate(itertools.pairwise([0, *grid.tolist()])):
-            state.add(rows_of(tests, order[start:stop]))
-            rhw[shuffle, at] = state.result(procedure.confidence).rhw
+        rhw.append(scv_rhw_of(tests, procedure, shuffle))
         done()
+    return np.array(rhw)
+
+
+def scv_rhw_of(tests: Block, procedure: Procedure, shuffle: int) -> FloatArray:
+    """The same of one shuffle, shape (g,)."""
+    grid = procedure.grid(len(tests))
+    rhw, state = np.empty(len(grid)), BothWays(Scv())
+    order = shuffled(procedure.seed, shuffle, tests.crash | tests.failed)
+    for at, (start, stop) in enumerate(itertools.pairwise([0, *grid.tolist()])):
+        state.add(rows_of(tests, order[start:stop]))
+        rhw[at] = state.result(procedure.confidence).rhw
     return rhw
 
 

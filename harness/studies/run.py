@@ -7,10 +7,13 @@ import threading
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from functools import partial
 from multiprocessing import parent_process
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
+
+import pyarrow as pa
 
 from harness.interruption import leave_signals_to_parent
 from harness.progress import Progress, SilentProgress
@@ -18,6 +21,7 @@ from harness.records.folder import require_place
 from harness.spawning import spawn_context
 from harness.studies.experiment import Experiment
 from harness.studies.judgement import Judgement, Row, Subject, corrected, judge
+from harness.studies.kept_parts import kept_parts
 from harness.studies.results import write_results
 from harness.studies.subjects import Repeated, subjects
 
@@ -34,7 +38,12 @@ class ValidationResult:
 
 
 def validate(
-    experiment: Experiment, folder: Path, *, workers: int | None = None, progress: Progress | None = None
+    experiment: Experiment,
+    folder: Path,
+    *,
+    workers: int | None = None,
+    progress: Progress | None = None,
+    parts: Path | None = None,
 ) -> ValidationResult:
     """Repeat, judge, and write the results.
 
@@ -46,13 +55,19 @@ def validate(
     workers : int, optional
         Processes; one per core by default. They change no bit.
     progress : Progress, optional
+    parts : Path, optional
+        Where finished replications of this very experiment are kept, and taken from.
     """
     progress = progress or SilentProgress()
     require_place(folder)
     with worker_processes(workers) as executor:
         tested = list(subjects(experiment, executor, progress))
-        progress.stage("replications", len(tested) * experiment.replications)
-        rows = [_replicate(repeated, experiment.replications, executor, progress) for _, repeated in tested]
+        rows = [
+            _replicate(
+                subject.name, repeated, experiment.replications, executor, progress, parts and parts / str(place)
+            )
+            for place, (subject, repeated) in enumerate(tested)
+        ]
     found = [(subject, of_subject) for (subject, _), of_subject in zip(tested, rows, strict=True)]
     judgements = corrected([one for subject, of_subject in found for one in _judge(experiment, subject, of_subject)])
     write_results(folder, experiment, judgements, found)
@@ -94,11 +109,21 @@ def _end_after(ends: list[Connection | int]) -> None:
     os._exit(1)
 
 
-def _replicate(repeated: Repeated, n: int, executor: ProcessPoolExecutor, progress: Progress) -> list[Row]:
-    rows: list[Row] = []
+def _replicate(
+    name: str,
+    repeated: Repeated,
+    n: int,
+    executor: ProcessPoolExecutor,
+    progress: Progress,
+    parts: Path | None,
+) -> list[Row]:
     size = -(-n // TASKS_PER_SUBJECT)
-    parts = [range(first, min(first + size, n)) for first in range(0, n, size)]
-    for part, found in zip(parts, executor.map(repeated.run, parts), strict=True):
-        rows += found
-        progress.advance(len(part))
-    return rows
+    jobs = [range(first, min(first + size, n)) for first in range(0, n, size)]
+    stage = f"replications of {name}"
+    tables = kept_parts(parts, stage, jobs, partial(replications_of, repeated), progress, run=executor.map, size=len)
+    return [Row(**row) for table in tables for row in table.to_pylist()]
+
+
+def replications_of(repeated: Repeated, part: range) -> pa.Table:
+    """Rows of some replications."""
+    return pa.Table.from_pylist([asdict(row) for row in repeated.run(part)])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -13,12 +14,24 @@ import pytest
 from harness.cli import main
 from harness.progress import Progress
 from harness.report.number_format import number
-from harness.studies.case_study import tested
-from harness.studies.case_study.context import Made
-from harness.studies.case_study.figures import exactly, figure, verdict
+from harness.studies import run as studies_run
+from harness.studies.case_study import required, tested
+from harness.studies.case_study.claimed import Claims, weights_are_in
+from harness.studies.case_study.context import Context, Made
+from harness.studies.case_study.figures import (
+    exactly,
+    figure,
+    marked,
+    mean_of,
+    ratio_of_means,
+    ratio_of_variances,
+    verdict,
+)
 from harness.studies.case_study.page import asked, count, shown
+from harness.studies.case_study.replicated import replicate
 from harness.studies.case_study.steps import run_study, step_keys
-from harness.studies.case_study.study_file import load_study
+from harness.studies.case_study.study_file import Replications, load_study
+from harness.studies.required_tests import RequiredTests
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
 SHIPPED = SCENARIOS / "case_study" / "study.yaml"
@@ -47,15 +60,17 @@ steps:
     title: Variants
     campaign: {SCENARIOS}/overtaking_nade.yaml
     set: [environment.lane_change_level=1e4, testing.epsilon=0.9]
-    tests: 600
+    tests: 200
+    replications: 3
     avs: [alpha-0.5]
-    settings:
-      same: []
-      recursive: [testing.epsilon=0.1, testing.challenge=recursive, testing.method=episode_mixture]
+    settings: {{same: []}}
+    each_of:
+      - {{immediate: [], recursive: [testing.challenge=recursive, testing.epsilon=0.1]}}
+      - {{step: [], episode: [testing.method=episode_mixture]}}
   theorems: {{kind: theorems, draws: 3, tests: 200}}
 quick:
   nde: {{tests: 2_000}}
-picture: {{NDE: required.nde, NADE: nade.tests_for_rhw}}
+picture: {{NDE: {{ours: required.nde, paper: 1e5}}, NADE: {{ours: nade.tests_for_rhw}}}}
 claims:
   - {{says: "a | bound", where: V-B, paper: 1, ours: theorems.variance_over_bound, at_most: true}}
   - {{says: wrong, where: nowhere, paper: 123.0, ours: theorems.best_over_plain, why: it was made up}}
@@ -129,15 +144,13 @@ def test_a_killed_step_goes_on_from_its_parts(tmp_path, monkeypatch, made):
     (step,) = (folder / "steps").iterdir()
     assert not (step / "result.json").exists()
     parts = {path.name: path.stat().st_mtime_ns for path in (step / "parts").glob("*.parquet")}
-    assert sorted(parts) == ["000000000000.parquet", "000000002000.parquet"]
+    assert sorted(parts) == ["00000.parquet", "00001.parquet"]
     seen: list[tuple[int, int]] = []
     really = tested.crashes_in_twin
     monkeypatch.setattr(tested, "crashes_in_twin", lambda campaign, part: seen.append(part) or really(campaign, part))
     monkeypatch.setattr(tested, "worker_processes", lambda workers: Here())
     run_study(asked_for, folder, workers=1)
-    assert [first for first, _ in seen] == [
-        first for first in (0, 2_000, 4_000) if f"{first:012d}.parquet" not in parts
-    ]
+    assert [first for first, _ in seen] == [4_000]
     assert pq.read_table(step / "crashes.parquet").equals(pq.read_table(made["nde"].folder / "crashes.parquet"))
     assert not (step / "parts").exists()
 
@@ -169,10 +182,63 @@ def test_a_killed_run_goes_on_from_its_shards(tmp_path, study, made):
     assert (step / "crashes.parquet").read_bytes() == (made["nade"].folder / "crashes.parquet").read_bytes()
 
 
+def resumed(study, made, tmp_path, step, progress):
+    """The study with everything made but one step, which is interrupted; then its folder."""
+    file, folder = study
+    again = tmp_path / "out"
+    shutil.copytree(folder, again)
+    place = again / "steps" / made[step].folder.name
+    shutil.rmtree(place)
+    with pytest.raises(KeyboardInterrupt):
+        run_study(load_study(file), again, workers=1, progress=progress)
+    assert any((place / "parts").iterdir())
+    return load_study(file), again, place
+
+
+def test_a_killed_pass_over_the_control_variates_goes_on_from_its_last_size(study, made, tmp_path, monkeypatch):
+    asked_for, again, place = resumed(study, made, tmp_path, "adjusted", Interrupting("adjusted", 3))
+    seen, really = [], Claims.add
+    monkeypatch.setattr(Claims, "add", lambda self, block: seen.append(block.first_episode) or really(self, block))
+    run_study(asked_for, again, workers=1)
+    assert seen == [700, 1_000]
+    assert json.loads((place / "result.json").read_text()) == made["adjusted"].result
+    assert not (place / "parts").exists()
+
+
+def test_killed_shuffles_of_scv_go_on_from_the_last_one(study, made, tmp_path, monkeypatch):
+    asked_for, again, place = resumed(study, made, tmp_path, "required", Interrupting("scv", 1))
+    seen, really = [], required.scv_rhw_of
+    monkeypatch.setattr(required, "scv_rhw_of", lambda *args: seen.append(args[-1]) or really(*args))
+    run_study(asked_for, again, workers=1)
+    assert seen == [1]
+    assert json.loads((place / "result.json").read_text()) == made["required"].result
+
+
+def test_killed_replications_go_on_from_the_last_ones(tmp_path, monkeypatch):
+    text = "format: validation-experiment\nversion: 1\nname: x\nreplications: 4\nchains: [good surrogates]\n"
+    (tmp_path / "x.yaml").write_text(text + "campaign: {testing: {method: step_mixture}, stop: {episodes: 300}}\n")
+    step = Replications(kind="replications", experiment=str(tmp_path / "x.yaml"))
+    whole, killed = (tmp_path / name for name in ("whole", "killed"))
+    monkeypatch.setattr(studies_run, "worker_processes", lambda workers: Here())
+    seen, really = [], studies_run.replications_of
+    monkeypatch.setattr(studies_run, "replications_of", lambda *args: seen.append(args[1]) or really(*args))
+    results = []
+    for folder, progress in ((whole, Progress()), (killed, Interrupting("replications", 2)), (killed, Progress())):
+        folder.mkdir(exist_ok=True)
+        context = Context(folder, 0.3, 0.9, {}, 1, progress)
+        try:
+            results.append(replicate(step, context))
+        except KeyboardInterrupt:
+            assert seen[4:] == [range(1), range(1, 2)]
+            seen.clear()
+    assert seen == [range(2, 3), range(3, 4)]
+    assert results[0] == results[1]
+
+
 def numbers_of(content) -> set[str]:
     """Every number of a result, in all the forms that the page may write it in."""
     if isinstance(content, dict):
-        own = {shown(content)} if set(content) == {"value", "low", "high"} else set()
+        own = {shown(content)} if {"value", "low", "high"} <= set(content) else set()
         return own.union(*map(numbers_of, content.values()))
     if isinstance(content, list):
         return set().union(*map(numbers_of, content))
@@ -190,13 +256,15 @@ def test_every_number_of_the_page_is_one_of_a_result_or_of_the_paper(study, made
     cells = [cell.strip(" *") for line in lines if line.startswith("|") for cell in re.split(r"(?<!\\)\|", line)]
     with_digits = [cell for cell in cells if re.search(r"\d", cell)]
     assert len(with_digits) > 60
-    titles = re.compile(r"n|RHW 0\.3 .*|.*Theorem 2.*|Var.*|alpha-.*|.*V-B.*")
+    titles = re.compile(
+        r"n|RHW 0\.3 .*|.*Theorem 2.*|Var.*|alpha-.*|.*V-B.*|10 and more|.*half-width of its.*|weighted.*"
+    )
     assert [cell for cell in with_digits if cell not in known and not titles.fullmatch(cell)] == []
 
 
 def test_claims_say_where_they_are_from_and_are_judged(study, made):
     _, folder = study
-    right, wrong = json.loads((folder / "claims.json").read_text())
+    right, wrong = json.loads((folder / "claims.json").read_text())["claims"]
     assert right["found"] == made["theorems"].result["figures"]["variance_over_bound"]
     assert (right["verdict"], right["why"]) == ("reproduced", "")
     assert (wrong["verdict"], wrong["why"]) == ("not reproduced", "it was made up")
@@ -214,9 +282,10 @@ def test_steps_agree_with_the_run_that_they_keep(made):
     rows = made["adjusted"].result["sizes"]
     assert [row["n"] for row in rows] == [700, 1_200]
     assert made["adjusted"].result["left_out"] == [5_000]
-    assert rows[-1]["nade_rate"] == pytest.approx(estimates["crash_rate"], rel=1e-12)
-    assert all(row["difference"] < 1e-12 and row["claimed_gain"] >= 1.0 for row in rows)
+    assert rows[-1]["nade_rate"]["value"] == pytest.approx(estimates["crash_rate"], rel=1e-12)
+    assert all(row["difference"] < 1e-12 and row["gain_claimed"] >= 1.0 for row in rows)
     assert sum(row["n"] for row in made["adjusted"].result["strata"]) == 1_200
+    assert made["adjusted"].result["all"]["n"] == 1_200
     curves = pq.read_table(made["curves"].folder / "curves.parquet").to_pandas()
     last = curves[curves["step"] == "nade"].iloc[-1]
     assert last["n"] == 1_200
@@ -225,15 +294,48 @@ def test_steps_agree_with_the_run_that_they_keep(made):
 
 
 def test_variants_are_tested_on_the_same_traffic(made):
-    by_alpha, same, recursive = made["variants"].result["variants"]
+    by_alpha, same, *_, recursive = made["variants"].result["variants"]
     assert by_alpha["n_crashes"] == same["n_crashes"] > 0  # alpha moves nothing: its braking is at the limit
-    assert by_alpha["crash_rate"] == same["crash_rate"]
-    assert same["tests_nade"] / same["tests_scv"] == pytest.approx(same["gain_claimed"], rel=1e-9)
+    assert by_alpha["nade_rate"] == same["nade_rate"]
+    gain, scv = same["gain_claimed"], same["scv_tests"]
+    assert gain["low"] < gain["value"] < gain["high"]
+    assert 1.0 < gain["value"] == pytest.approx(same["nade_tests"] / scv["value"], rel=0.2)
+    assert same["gain_true"]["value"] == pytest.approx(1.0, abs=1e-9)
     assert same["difference"] < 1e-12
-    assert (recursive["tests_scv"], recursive["gain_claimed"]) == (None, None)
-    assert recursive["tests_nade"] < same["tests_nade"]
-    figures = made["variants"].result["figures"]
-    assert figures["mean"] == exactly((by_alpha["gain_claimed"] + same["gain_claimed"]) / 2)
+    assert (recursive["scv_tests"]["value"], recursive["gain_claimed"]["value"]) == (None, None)
+    assert recursive["nade_tests"] < same["nade_tests"]
+    gains = [row["gain_claimed"]["value"] for row in made["variants"].result["variants"]]
+    mean = made["variants"].result["figures"]["mean"]["value"]
+    assert mean == pytest.approx(np.mean([one for one in gains if one is not None]))
+
+
+def test_variants_are_tested_with_shells_too(tmp_path):
+    """One run of shells beside plain simulation: two rates of the same vehicle on the same traffic."""
+    file = tmp_path / "study.yaml"
+    file.write_text(f"""
+format: case-study
+version: 1
+name: shells
+title: Shells
+steps:
+  table:
+    kind: variants
+    title: Table
+    campaign: {SCENARIOS}/overtaking_forced.yaml
+    set: [environment.lane_change_level=1e4]
+    tests: 4_000
+    avs: [alpha-0.5]
+    shells: {SCENARIOS}/smoke.yaml
+    shells_set: [environment.lane_change_level=1e4, stop.rhw=0.3, testing.shells.first_tests=null,
+                 pool.relative_error=0.03, pool.cut_ins_per_shell=1500]
+    reported: {{alpha-0.5: 11.52}}
+""")
+    done = run_study(load_study(file), tmp_path / "out", workers=1)
+    (row,) = json.loads(next((tmp_path / "out" / "steps").glob("*/result.json")).read_text())["variants"]
+    assert row["shells_rate"]["low"] < row["nade_rate"]["value"] < row["shells_rate"]["high"]
+    assert 100 < row["shells_tests"]["value"] < 20_000
+    assert f"{shown(row['shells_rate'])} | {shown(row['shells_tests'])} |" in done.page.read_text()
+    assert "| 11.52 |" in done.page.read_text()
 
 
 def test_the_theorems_hold_on_exact_chains(made):
@@ -258,7 +360,7 @@ def test_the_theorems_hold_on_exact_chains(made):
         (("{tests: 2_000}", "{tests: many}"), "quick: steps.nde.tests"),
         (("quick:\n  nde", "quick:\n  nothing"), "quick.nothing"),
         (("ours: theorems.var", "ours: theory.var"), "claims"),
-        (("NDE: required.nde", "NDE: nobody.nde"), "picture.NDE"),
+        (("ours: required.nde", "ours: nobody.nde"), "picture.NDE"),
         (("overtaking_nde.yaml", "overtaking_nowhere.yaml"), "steps.nde.campaign"),
         (("lane_change_level=1e4]", "lane_change_levels=1e4]"), "lane_change_levels"),
         (("avs: [alpha-0.5]", "avs: [alpha-0.6]"), "alpha-0.6"),
@@ -300,6 +402,8 @@ def test_the_shipped_study_is_right_and_its_claims_ask_for_what_there_is():
         (figure(None, 21.0), "not reproduced"),
         (exactly(20.0), "reproduced"),
         (exactly(20.1), "not reproduced"),
+        (marked(exactly(20.1), settled=False), "cannot be told"),
+        (marked(exactly(10.0), settled=True), "reproduced"),
     ],
 )
 def test_a_verdict_is_of_the_whole_interval(found, expected):
@@ -311,6 +415,51 @@ def test_a_verdict_beside_zero_and_below_a_limit():
     assert verdict(0.0, exactly(0.1), within=2.0, tolerance=1e-9, at_most=False) == "not reproduced"
     assert verdict(1.0, exactly(0.01), within=2.0, tolerance=None, at_most=True) == "reproduced"
     assert verdict(1.0, exactly(1.01), within=2.0, tolerance=None, at_most=True) == "not reproduced"
+
+
+def test_means_of_repetitions_have_t_intervals():
+    """Of 1, 2, 3: 2 ± t(2, 95 %) / √3, where t is 2.920; of one alone there is none."""
+    found = mean_of([1.0, None, 2.0, 3.0], 0.9)
+    assert (found["value"], found["high"]) == (2.0, pytest.approx(2.0 + 2.919986 / np.sqrt(3.0), rel=1e-6))
+    assert mean_of([5.0], 0.9) == figure(5.0)
+    assert mean_of([None], 0.9) == figure(None)
+    assert mean_of([0.1, 9.0], 0.9)["low"] == 0.0
+
+
+def test_ratios_of_paired_repetitions():
+    assert ratio_of_means([2.0, 4.0], [1.0, 2.0], 0.9) == exactly(2.0)
+    found = ratio_of_means([2.0, 4.0, 6.0], [2.0, 2.0, 2.0], 0.9)
+    assert found["low"] < found["value"] == 2.0 < found["high"]
+    assert found["low"] * found["high"] == pytest.approx(4.0)
+    assert ratio_of_means([2.0], [1.0], 0.9) == figure(2.0)
+    assert ratio_of_means([np.nan], [1.0], 0.9) == figure(None)
+    rates = [1.0, 2.0, 4.0]
+    assert ratio_of_variances(rates, rates, 0.9) == exactly(1.0)
+    assert ratio_of_variances(rates, [1.0, 1.0, 1.0], 0.9) == figure(None)
+
+
+def test_shuffles_are_judged_by_their_mean_or_not_at_all():
+    """Ten shuffles from 8 to 12 have the mean 10 ± 1; one alone is no interval."""
+    n = np.array([8, 12] * 5)
+    none = np.zeros(10, bool)
+    found = required._Found(RequiredTests(n, none, none), 100, settled=True)
+    low, high = found.figure(0.9)["low"], found.figure(0.9)["high"]
+    assert 8.0 < low < 9.0
+    assert low + high == pytest.approx(20.0)
+    assert found.over(found, 0.9) == exactly(1.0)
+    one = required._Found(RequiredTests(n[:1], none[:1], none[:1]), 100, settled=True)
+    assert verdict(8.0, one.figure(0.9), within=2.0, tolerance=None, at_most=False) == "cannot be told"
+    unsettled = found._replace(settled=False)
+    assert verdict(10.0, found.over(unsettled, 0.9), within=99.0, tolerance=None, at_most=False) == "cannot be told"
+    limit = required._Found(RequiredTests(n, np.arange(10) > 8, none), 12, settled=True)
+    assert limit.figure(0.9)["high"] is None
+    assert limit.over(found, 0.9)["high"] is None
+
+
+def test_weights_that_have_not_come_in_leave_the_rate_open():
+    assert not weights_are_in("step_mixture", 0.03)
+    assert weights_are_in("step_mixture", 0.9)
+    assert weights_are_in("forced", 3e-5)  # their expectation is the probability of a cut-in
 
 
 def test_relative_variance_of_known_weights():

@@ -7,7 +7,11 @@ import pytest
 
 from harness.campaign.models import AutomatedVehicle
 from harness.estimators.nade import Nade
+from harness.progress import Progress
+from harness.studies.case_study import small_case
+from harness.studies.case_study.context import Context
 from harness.studies.case_study.small_world import AV_MPS, HOLD, Proposal, _crashes, small_world
+from harness.studies.case_study.study_file import SmallCase
 from harness.vehicles.models import av_records
 from tests.chains.seed import SEED
 
@@ -59,6 +63,60 @@ def test_drawn_tests_meet_rate_and_variance(world, recursive, epsilon):
     weights = block.weights()
     assert abs(weights.mean() - 1.0) < 4.0 * weights.std() / np.sqrt(len(block))
     assert abs(block.crash.mean() - world.crash_rate) > 4.0 * found.std_error
+
+
+def test_nothing_is_controlled_below_the_threshold(world):
+    """One above any criticality leaves plain simulation; in between, only situations above it are drawn otherwise."""
+    for proposal, level in zip(world.proposals(0.1, recursive=True, threshold=0.99), world.levels, strict=True):
+        assert not proposal.critical.any()
+        np.testing.assert_array_equal(proposal.q, np.repeat(level.p[:, None], 3, 1))
+    some = world.proposals(0.1, recursive=True, threshold=2e-3)
+    every = world.proposals(0.1, recursive=True)
+    assert 0 < sum(x.critical.sum() for x in some) < sum(x.critical.sum() for x in every)
+    for a, b in zip(some, every, strict=True):
+        np.testing.assert_array_equal(a.q[a.critical], b.q[a.critical])
+    assert world.relvar(some) > world.relvar(every)
+
+
+class Here:
+    """An executor in this process."""
+
+    map = staticmethod(map)
+    __enter__ = __exit__ = lambda self, *_: self if not _ else None
+
+
+class Interrupting(Progress):
+    """Ends the work after its first part, as Ctrl-C would."""
+
+    def advance(self, n: int) -> None:
+        raise KeyboardInterrupt
+
+
+def test_the_case_is_answered_and_goes_on_when_killed(world, tmp_path, monkeypatch):
+    monkeypatch.setattr(small_case, "_world", lambda level: world)
+    monkeypatch.setattr(small_case, "worker_processes", lambda workers: Here())
+    sizes = {"epsilons": [0.8], "thresholds": [0.0, 4.5e-4], "tests": 2_000, "draws": 3}
+    step = SmallCase(kind="small_case", lane_change_level=1e4, **sizes, reported={"nade": 385.0, "scv": 12.0})
+    contexts = [Context(tmp_path, 0.3, 0.9, {}, 1, progress) for progress in (Interrupting(), Progress())]
+    with pytest.raises(KeyboardInterrupt):
+        small_case.answer_small_case(step, contexts[0])
+    (part,) = (tmp_path / "parts").iterdir()
+    first = part.stat().st_mtime_ns
+    found = small_case.answer_small_case(step, contexts[1])
+    assert part.stat().st_mtime_ns == first
+    assert [(row["challenge"], row["threshold"]) for row in found["settings"]] == [
+        ("immediate", 0.0),
+        ("immediate", 4.5e-4),
+        ("recursive", 0.0),
+        ("recursive", 4.5e-4),
+    ]
+    exact = world.relvar(world.proposals(0.8, recursive=False)) * (1.6448536 / 0.1) ** 2
+    assert found["figures"]["nade"]["value"] == pytest.approx(exact, rel=1e-6)
+    assert found["nearest"]["nade"]["challenge"] == "immediate"
+    assert found["settings"][0]["difference"] < 1e-12
+    assert small_case._holds(56.0, 57.0)
+    assert not small_case._holds(82.7, 25_929.0)
+    assert not small_case._holds(None, 57.0)
 
 
 def test_ratios_on_record_multiply_to_the_weight_of_each_function(world):

@@ -2,49 +2,65 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import pickle
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 
 from harness.estimators.block import MAX_CONTROL_STEPS, Block
-from harness.estimators.estimate import BothWays, Estimate
-from harness.estimators.nade import Nade
-from harness.estimators.scv import Scv, StratumFit
+from harness.estimators.scv import StratumFit
+from harness.records.folder import write_bytes
 from harness.runner.stored_estimates import stored_blocks
+from harness.studies.case_study.claimed import Claims
 from harness.studies.case_study.context import Context
-from harness.studies.case_study.figures import exactly, figure, z_of
+from harness.studies.case_study.figures import exactly, figure, marked
 from harness.studies.case_study.study_file import ControlVariates
-from harness.studies.case_study.tested import write_table
+from harness.studies.case_study.tested import PARTS
+from harness.studies.kept_parts import write_table
 
 
 def compare_control_variates(step: ControlVariates, context: Context) -> dict[str, Any]:
-    """Both estimates at every size, in one pass; the strata after the last one."""
+    """Both estimates at every size, in one pass that goes on from the last size; the strata after the last one."""
     run = context.made[step.of]
     sizes = [size for size in step.sizes if size <= run.result["n"]]
-    nade, inner = BothWays(Nade()), Scv()
-    scv, rows, n = BothWays(inner), [], 0
-    context.progress.stage("control variates", sizes[-1] if sizes else 0)
+    begun = context.folder / PARTS / "state.pickle"
+    # Written by this very step: its folder is named after the code whose objects these are.
+    claims, rows = pickle.loads(begun.read_bytes()) if begun.is_file() else (Claims(), [])  # noqa: S301
+    done = rows[-1]["n"] if rows else 0
+    context.progress.stage(context.name, sizes[-1] if sizes else 0, done=done)
     for block in _cut_at(stored_blocks(run.folder / "run", moments=True), sizes):
-        nade.add(block)
-        scv.add(block)
-        n += len(block)
+        n = block.first_episode + len(block)
+        if n <= done:
+            continue
+        if block.first_episode >= max(sizes, default=0):
+            break
+        claims.add(block)
         context.progress.advance(len(block))
         if n in sizes:
-            rows.append(_row(n, nade.result(context.confidence), scv.result(context.confidence), context.confidence))
-        if sizes and n >= sizes[-1]:
-            break
-    strata = [_stratum(level, fit) for level, fit in inner.fits()]
+            rows.append(claims.row(context.rhw, context.confidence))
+            _keep(begun, (claims, rows))
+    fits = claims.scv.fits()
+    beyond = [fit for level, fit in fits if level > MAX_CONTROL_STEPS]
+    strata = [{"control_steps": level, **_together([fit])} for level, fit in fits]
     write_table(context.folder / "sizes.parquet", pa.Table.from_pylist(rows))
     write_table(context.folder / "strata.parquet", pa.Table.from_pylist(strata))
     return {
         "sizes": rows,
-        "left_out": [size for size in step.sizes if size > n],
+        "left_out": [size for size in step.sizes if size > run.result["n"]],
         "strata": strata,
-        "figures": _figures(rows, strata),
+        "beyond": _together(beyond),
+        "all": _together([fit for _, fit in fits]),
+        "figures": _figures(rows, fits),
     }
+
+
+def _keep(path: Path, state: Any) -> None:
+    path.parent.mkdir(exist_ok=True)
+    write_bytes(path, pickle.dumps(state))
 
 
 def _cut_at(blocks: Iterator[Block], sizes: list[int]) -> Iterator[Block]:
@@ -56,45 +72,33 @@ def _cut_at(blocks: Iterator[Block], sizes: list[int]) -> Iterator[Block]:
             yield block.take(slice(start, end))
 
 
-def _row(n: int, nade: Estimate, scv: Estimate, confidence: float) -> dict[str, Any]:
-    """What is claimed after n tests; half-widths are z times the standard error, as in the paper."""
-    rate, z = nade.crash_rate, z_of(confidence)
-    half = {"nade": z * nade.std_error, "scv": z * scv.std_error}
+def _together(fits: Sequence[StratumFit]) -> dict[str, Any]:
+    """One stratum, or several: their tests and results together, the most columns, the largest rank."""
+    n = sum(fit.n for fit in fits)
+    mean = sum(fit.n * fit.intercept for fit in fits) / max(n, 1)
+    between = sum(fit.n * (fit.intercept - mean) ** 2 for fit in fits)
+    spread = {
+        name: float(np.sqrt((sum(each) + between) / max(n, 1)))
+        for name, each in {
+            "sd_before": [fit.total_squares for fit in fits],
+            "sd_after": [fit.residual_squares for fit in fits],
+        }.items()
+    }
     return {
         "n": n,
-        "n_crashes": nade.n_crashes,
-        "nade_rate": rate,
-        "scv_rate": scv.crash_rate,
-        **{f"{name}_half_width": each for name, each in half.items()},
-        **{f"{name}_rhw": each / rate if rate > 0.0 else None for name, each in half.items()},
-        "claimed_gain": (nade.std_error / scv.std_error) ** 2 if scv.std_error > 0.0 else None,
-        "difference": abs(scv.crash_rate - rate) / rate if rate > 0.0 else None,
+        "columns": max((fit.n_columns for fit in fits), default=0),
+        "rank": max((fit.rank for fit in fits), default=0),
+        **spread,
     }
 
 
-def _stratum(level: int, fit: StratumFit) -> dict[str, Any]:
-    return {
-        "n_control_steps": level,
-        "n": fit.n,
-        "columns": fit.n_columns,
-        "rank": fit.rank,
-        "sd_before": float(np.sqrt(fit.total_squares / fit.n)),
-        "sd_after": float(np.sqrt(fit.residual_squares / fit.n)),
-    }
-
-
-def _figures(rows: list[dict[str, Any]], strata: list[dict[str, Any]]) -> dict[str, Any]:
+def _figures(rows: list[dict[str, Any]], fits: list[tuple[int, StratumFit]]) -> dict[str, Any]:
     if not rows:
         return {}
-    last, most = (
-        rows[-1],
-        max((row for row in strata if row["n_control_steps"] > 0), key=lambda row: row["n"], default=None),
-    )
-    few = [row["rank"] for row in strata if row["n_control_steps"] <= MAX_CONTROL_STEPS]
+    last, most = rows[-1], max(((fit.n, level) for level, fit in fits if level > 0), default=(0, None))[1]
+    gain = last["gain_claimed"]
     return {
-        **{f"{name}_rhw_{row['n']}": figure(row[f"{name}_rhw"]) for row in rows for name in ("nade", "scv")},
-        "claimed_gain": exactly(last["claimed_gain"]) if last["claimed_gain"] is not None else figure(None),
+        "claimed_gain": marked(figure(None) if gain is None else exactly(gain), settled=last["settled"]),
         "difference": figure(last["difference"]),
-        "most_frequent_stratum": figure(None) if most is None else exactly(most["n_control_steps"]),
-        "largest_rank": exactly(max(few, default=0)),
+        "most_frequent_stratum": figure(None) if most is None else exactly(most),
     }

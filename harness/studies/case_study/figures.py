@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Sequence
 from typing import Any, Literal
 
 import numpy as np
 from scipy.stats import norm
+from scipy.stats import t as student
 
-from harness.arrays import FloatArray
-
-Verdict = Literal["reproduced", "not reproduced", "cannot be told"]
+Verdict = Literal["reproduced", "not reproduced", "cannot be told", "ours to choose"]
 
 
 def figure(value: float | None, low: float | None = None, high: float | None = None) -> dict[str, Any]:
@@ -24,10 +24,55 @@ def exactly(value: float) -> dict[str, Any]:
     return figure(value, value, value)
 
 
+def marked(found: dict[str, Any], *, settled: bool) -> dict[str, Any]:
+    """The number, marked where it is of tests whose weights have not come in yet: it means nothing then."""
+    return found if settled else {**found, "settled": False}
+
+
+def is_settled(*found: dict[str, Any]) -> bool:
+    """Whether none of them is marked."""
+    return all(each.get("settled", True) for each in found)
+
+
+def mean_of(values: Iterable[float | None], confidence: float) -> dict[str, Any]:
+    """Mean of repetitions of something positive with its t interval; one of them alone has none."""
+    known = np.array([x for x in values if x is not None and math.isfinite(x)])
+    if len(known) < 2:
+        return figure(known[0] if len(known) else None)
+    half = student.isf((1.0 - confidence) / 2.0, len(known) - 1) * known.std(ddof=1) / math.sqrt(len(known))
+    return figure(known.mean(), max(known.mean() - half, 0.0), known.mean() + half)
+
+
+def ratio_of_means(above: Sequence[float], below: Sequence[float], confidence: float) -> dict[str, Any]:
+    """Ratio of the means of paired repetitions, with the t interval of its logarithm, to the first order."""
+    pairs = np.array([above, below], dtype=np.float64)
+    pairs = pairs[:, np.isfinite(pairs).all(axis=0)]
+    if not (pairs.size and np.all(means := pairs.mean(axis=1))):
+        return figure(None)
+    value, apart = means[0] / means[1], pairs[0] / means[0] - pairs[1] / means[1]
+    n = len(apart)
+    if n < 2:
+        return figure(value)
+    half = float(student.isf((1.0 - confidence) / 2.0, n - 1)) * apart.std(ddof=1) / math.sqrt(n)
+    return figure(value, value * math.exp(-half), value * math.exp(half))
+
+
+def ratio_of_variances(above: Sequence[float], below: Sequence[float], confidence: float) -> dict[str, Any]:
+    """Ratio of the variances of two estimates of the same tests; limits from leaving out one repetition at a time."""
+    pairs = np.array([above, below], dtype=np.float64)
+    n = pairs.shape[1]
+    if n < 3 or not np.all(pairs.var(axis=1)):
+        return figure(None)
+    left = np.array([np.divide(*np.delete(pairs, k, axis=1).var(axis=1)) for k in range(n)])
+    value = float(np.divide(*pairs.var(axis=1)))
+    half = student.isf((1.0 - confidence) / 2.0, n - 1) * left.std() * math.sqrt(n - 1)
+    return figure(value, max(value - half, 0.0), value + half)
+
+
 def verdict(paper: float, found: dict[str, Any], *, within: float, tolerance: float | None, at_most: bool) -> Verdict:
     """Whether the whole interval of our number agrees with the paper's, or all of it differs.
 
-    An interval that does neither leaves it open, as does a number that is not known.
+    An interval that does neither leaves it open, as does a number that is not known, or is marked as not settled.
 
     Parameters
     ----------
@@ -41,7 +86,7 @@ def verdict(paper: float, found: dict[str, Any], *, within: float, tolerance: fl
     at_most : bool
         Whether the paper's number is a limit that ours is not to exceed, whatever the factor.
     """
-    if found["value"] is None and found["low"] is None:
+    if not is_settled(found) or (found["value"] is None and found["low"] is None):
         return "cannot be told"
     low = -math.inf if found["low"] is None else found["low"]
     high = math.inf if found["high"] is None else found["high"]
@@ -64,10 +109,3 @@ def z_of(confidence: float) -> float:
 def tests_for(relvar: float, rhw: float, confidence: float) -> float:
     """Tests after which a mean of this relative variance per test has the relative half-width."""
     return relvar * (z_of(confidence) / rhw) ** 2
-
-
-def quantiles(values: FloatArray, confidence: float) -> tuple[float, float]:
-    """The range that holds this share of the values, as much beyond either end."""
-    beyond = (1.0 - confidence) / 2.0
-    low, high = np.quantile(values, [beyond, 1.0 - beyond])
-    return float(low), float(high)

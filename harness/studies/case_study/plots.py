@@ -10,6 +10,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from matplotlib.ticker import MaxNLocator
 
+from harness.estimators.block import MAX_CONTROL_STEPS
 from harness.records.folder import read_table
 from harness.report.plot_style import (
     BLUE,
@@ -18,6 +19,7 @@ from harness.report.plot_style import (
     GREY,
     INK,
     MUTED,
+    PAPER,
     VERMILLION,
     Plot,
     decades,
@@ -29,14 +31,15 @@ from harness.report.plot_style import (
 )
 from harness.studies.case_study.context import Made
 from harness.studies.case_study.convergence import CURVES
-from harness.studies.case_study.study_file import Convergence, Study
+from harness.studies.case_study.figures import is_settled
+from harness.studies.case_study.study_file import Convergence, Line, Study
 
 _COLOURS = (INK, BLUE, VERMILLION, GREEN)
 
 
-def plots_of(study: Study, made: Mapping[str, Made], picture: Mapping[str, dict[str, Any]]) -> dict[str, Plot]:
+def plots_of(study: Study, made: Mapping[str, Made], ours: Mapping[str, dict[str, Any]]) -> dict[str, Plot]:
     """All plots that the study's steps give, by name."""
-    plots: list[Plot | None] = [tests_plot(picture, study.rhw)] if picture else []
+    plots: list[Plot | None] = [tests_plot(study.picture, ours, study.rhw)] if ours else []
     for name, step in study.steps.items():
         if isinstance(step, Convergence):
             plots.append(convergence_plot(name, step, made, study.rhw, study.confidence))
@@ -47,31 +50,44 @@ def plots_of(study: Study, made: Mapping[str, Made], picture: Mapping[str, dict[
     return {plot.name: plot for plot in plots if plot is not None}
 
 
-def tests_plot(picture: Mapping[str, dict[str, Any]], rhw: float) -> Plot | None:
-    """Tests that each method asks for, on a logarithmic axis; an arrow where the number is a lower limit."""
-    known = {label: found for label, found in picture.items() if (found["value"] or found["low"] or 0.0) > 0.0}
-    if not known:
+def tests_plot(picture: Mapping[str, Line], ours: Mapping[str, dict[str, Any]], rhw: float) -> Plot | None:
+    """Tests that each method asks for, on a logarithmic axis, and what the paper reports; arrows for lower limits."""
+    if not any(found["value"] or found["low"] for found in ours.values()):
         return None
-    figure = new_figure(FULL_WIDTH_IN, 0.9 + 0.36 * len(picture))
+    figure = new_figure(FULL_WIDTH_IN, 1.1 + 0.36 * len(picture))
     axes = figure.subplots()
-    ends: list[float] = []
-    for place, (label, found) in enumerate(picture.items()):
-        if label not in known:
+    ends = [line.paper for line in picture.values() if line.paper is not None]
+    for place, (label, found) in enumerate(ours.items()):
+        if (paper := picture[label].paper) is not None:
+            axes.plot(paper, place, "D", markerfacecolor="none", color=VERMILLION, markersize=8)
+        if not (value := found["value"] or found["low"]):
             axes.text(0.02, place, "not reached", transform=axes.get_yaxis_transform(), va="center", color=MUTED)
             continue
-        value = found["value"] or found["low"]
         low, high = found["low"] or value, found["high"] or value
         axes.plot([low, high], [place, place], color=GREY, linewidth=3.0)
-        axes.plot(value, place, "o" if found["high"] is not None or found["low"] is None else ">", color=BLUE)
-        note(axes, tick_label(float(f"{value:.2g}")), (high, place), (8, -3), color=INK)
+        is_limit = found["high"] is None and found["low"] is not None
+        axes.plot(value, place, ">" if is_limit else "o", color=BLUE if is_settled(found) else GREY)
+        words = tick_label(float(f"{value:.2g}")) + ("" if is_settled(found) else " †")
+        beside = paper if paper is not None and high / 1.5 < paper < 6.0 * high else high
+        note(axes, words, (beside, place), (9, -3), color=INK)
         ends += [low, high]
     axes.set_xscale("log")
     axes.set_xlim(min(ends) / 3.0, max(ends) * 8.0)
     decades(axes.xaxis, *axes.get_xlim())
     axes.set_yticks(np.arange(len(picture)), list(picture))
     axes.set_ylim(len(picture) - 0.5, -0.5)
-    axes.set_title(f"Tests for a relative half-width of {rhw:g}")
-    caption = "Bars are intervals; an arrow is a lower limit."
+    axes.set_xlabel(f"tests until the relative half-width is {rhw:g}")
+    for label, marker, face, colour in (
+        ("here", "o", BLUE, BLUE),
+        ("here, not converged (†)", "o", GREY, GREY),
+        ("the paper", "D", "none", VERMILLION),
+    ):
+        axes.plot([], [], marker, markerfacecolor=face, color=colour, label=label)
+    axes.legend(ncols=3, loc="lower left", bbox_to_anchor=(0.0, 1.0), fontsize=8)
+    caption = (
+        "Filled: here, with intervals as bars, arrows for lower limits; all by one definition, tests made times the "
+        f"square of their relative half-width over {rhw:g}. Hollow: reported in the paper."
+    )
     return Plot("tests", figure, "Number of tests by method, on a logarithmic axis. " + caption, caption)
 
 
@@ -89,6 +105,7 @@ def convergence_plot(name: str, step: Convergence, made: Mapping[str, Made], rhw
         axes.fill_between(n, np.maximum(rate - half, 0.0), rate + half, color=colour, alpha=0.16, linewidth=0)
         axes.plot(n, rate, color=colour, label=label)
         axes.set_xlim(0.0, n[-1])
+        axes.xaxis.set_major_locator(MaxNLocator(4))
         axes.set_xlabel(f"tests, {label}{scaled(axes.xaxis, n[-1])}", color=colour)
         if place:
             axes.grid(visible=False)
@@ -96,7 +113,8 @@ def convergence_plot(name: str, step: Convergence, made: Mapping[str, Made], rhw
         late = np.isfinite(half) & (n > n[-1] / 10)
         top = max(top, float(np.max((rate + half)[late], initial=0.0)))
         known = (rate > 0.0) & np.isfinite(half)
-        right.plot(n[known], half[known] / rate[known], color=colour, label=label)
+        if known.any():
+            right.plot(n[known], half[known] / rate[known], color=colour, label=label)
     left.set_ylim(0.0, 1.1 * top or 1.0)
     left.set_ylabel(f"crash rate per test{scaled(left.yaxis, 1.1 * top or 1.0)}")
     right.set_xscale("log")
@@ -106,7 +124,8 @@ def convergence_plot(name: str, step: Convergence, made: Mapping[str, Made], rhw
     decades(right.yaxis, *right.get_ylim())
     right.set_xlabel("tests")
     right.set_ylabel("relative half-width")
-    right.legend()
+    if right.get_legend_handles_labels()[0]:
+        right.legend()
     caption = (
         f"Left: crash rates with their {confidence:.0%} bands; dashed: that of {step.reference}. Right: relative "
         f"half-widths; dashed: {rhw:g}."
@@ -121,28 +140,29 @@ def _curve(table: pa.Table, step: str) -> tuple[np.ndarray, ...]:
 
 def strata_plot(name: str, strata: list[dict[str, Any]]) -> Plot | None:
     """Tests, columns and rank by number of control steps, and the spread of results before and after adjustment."""
-    shown = [row for row in strata if 1 <= row["n_control_steps"] <= 20]
-    if not shown:
+    shown = [row for row in strata if row["control_steps"] >= 1]
+    last = max((row["control_steps"] for row in shown if row["sd_before"]), default=MAX_CONTROL_STEPS)
+    if not (shown := [row for row in shown if row["control_steps"] <= last]):
         return None
-    steps = [row["n_control_steps"] for row in shown]
+    steps = [row["control_steps"] for row in shown]
     figure = new_figure(FULL_WIDTH_IN, 3.2)
-    left, right = figure.subplots(1, 2)
+    left, right = figure.subplots(1, 2, sharex=True)
     for key, label, colour in (
         ("n", "tests", BLUE),
         ("columns", "control variates", VERMILLION),
         ("rank", "rank", GREEN),
     ):
-        left.plot(steps, [max(row[key], 0.8) for row in shown], "o-", color=colour, label=label, markersize=4)
-    for key, label, colour in (("sd_before", "NADE", BLUE), ("sd_after", "SCV", VERMILLION)):
-        right.plot(steps, [row[key] or np.nan for row in shown], "o-", color=colour, label=label, markersize=4)
-    for axes, title in ((left, "Strata"), (right, "Standard deviation of Y and Z")):
+        left.plot(steps, [max(row[key], 0.8) for row in shown], "o-", color=colour, label=label, markersize=3)
+    for key, label, colour in (("sd_before", "Y, NADE", BLUE), ("sd_after", "Z, SCV", VERMILLION)):
+        right.plot(steps, [row[key] or np.nan for row in shown], "o-", color=colour, label=label, markersize=3)
+    for axes, title in ((left, "number in a stratum"), (right, "standard deviation of results")):
         if any(row["sd_before"] for row in shown) or axes is left:
             axes.set_yscale("log")
             decades(axes.yaxis, *axes.get_ylim())
-        axes.set_xlabel("control steps")
+        axes.set_xlabel("control steps l; from 10 on columns are of the first 9")
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-        axes.set_title(title)
-        axes.legend()
+        axes.set_ylabel(title)
+        axes.legend(ncols=3, loc="lower left", bbox_to_anchor=(0.0, 1.0), fontsize=8)
         only_horizontal_grid(axes)
     caption = (
         "Left: tests, control variates and rank of the columns. Right: spread of Y (NADE) and of Z = Y − Hβ (SCV)."
@@ -151,33 +171,44 @@ def strata_plot(name: str, strata: list[dict[str, Any]]) -> Plot | None:
 
 
 def theorems_plot(name: str, result: dict[str, Any]) -> Plot:
-    """Variances under their bound on exact chains, and what known and estimated means give where it should be zero."""
-    figure = new_figure(FULL_WIDTH_IN, 3.0)
-    left, right = figure.subplots(1, 2)
+    """Means and variances on exact chains, and what known and estimated means give where it should be zero."""
+    figure = new_figure(FULL_WIDTH_IN, 3.3)
+    first, second, third = figure.subplots(1, 3)
     chains = result["chains"]
+    looks = {
+        "plain": ("NADE", "o", BLUE, 11),
+        "best": ("best β, known means", "o", GREEN, 7),
+        "any": ("another β", "o", GREY, 3),
+    }
     for place, chain in enumerate(chains):
+        for key, (_, marker, colour, size) in looks.items():
+            first.plot(chain["means"][key], place, marker, color=colour, markersize=size)
         for key, marker, colour in (("plain", "o", BLUE), ("best", "o", GREEN), ("bound", "|", INK)):
-            left.plot(chain[key], place, marker, color=colour, markersize=9 if marker == "|" else 5)
-    for label, colour, marker in (
-        ("NADE", BLUE, "o"),
-        ("best β, known means", GREEN, "o"),
-        ("bound", INK, "|"),
-    ):
-        left.plot([], [], marker, color=colour, label=label)
-    left.set_xscale("log")
-    decades(left.xaxis, *left.get_xlim())
-    left.set_yticks(range(len(chains)), [chain["chain"] for chain in chains])
-    left.set_ylim(len(chains) - 0.5, -0.5 - 0.6)
-    left.set_title("Theorem 2: variance over μ²")
-    left.legend(ncols=3, fontsize=7.5, loc="upper left")
-    draws = np.asarray(result["draws"]["estimated"]) - 1.0
-    right.hist(draws, bins=30, color=VERMILLION, alpha=0.7, label="estimated means")
-    right.axvline(0.0, color=GREEN, label="known means: all of them")
-    right.set_xlabel("error relative to μ; claimed: 0")
-    right.set_title("Theorem 3: repeated estimates")
-    right.legend(fontsize=7.5)
+            second.plot(chain[key], place, marker, color=colour, markersize=9 if marker == "|" else 5)
+    for label, marker, colour, size in (*looks.values(), ("bound", "|", INK, 9)):
+        first.plot([], [], marker, color=colour, label=label, markersize=size)
+    first.set_xlim(0.9, 1.1)
+    first.set_yticks(range(len(chains)), [chain["chain"] for chain in chains])
+    first.set_title("Theorem 1: unbiased")
+    first.set_xlabel("exact mean / crash rate μ")
+    second.set_xscale("log")
+    decades(second.xaxis, *second.get_xlim())
+    second.set_yticks(range(len(chains)), [])
+    second.set_title("Theorem 2: bounded")
+    second.set_xlabel("exact variance per test / μ²")
+    for axes in (first, second):
+        axes.set_ylim(len(chains) - 0.5, -0.5)
+    figure.legend(*first.get_legend_handles_labels(), ncols=4, fontsize=8, loc="outside lower left")
+    third.hist(np.asarray(result["draws"]["estimated"]) - 1.0, bins=30, color=VERMILLION, label="estimated means")
+    third.axvline(0.0, color=GREEN, label="known means: all of them")
+    third.set_xlabel("error of an estimate / μ; claimed: 0")
+    third.set_ylabel("repetitions")
+    third.set_title("Theorem 3: zero variance")
+    third.set_ylim(0.0, 1.45 * third.get_ylim()[1])
+    third.legend(fontsize=7.5, loc="upper left", frameon=True, framealpha=1.0, facecolor=PAPER, edgecolor=PAPER)
     caption = (
-        "Left: exact variances of NADE and with the best control parameters, below Theorem 2's bound. Right: repeated "
-        "estimates in a world that meets Theorem 3's assumptions."
+        "Left: exact means, of NADE and with two choices of control parameters. Middle: exact variances, below "
+        "Theorem 2's bound. Right: repeated estimates in a world that meets Theorem 3's assumptions, with known "
+        "means of the control variates and, as in Algorithm 1, with those of the same tests."
     )
     return Plot(name, figure, caption, caption)

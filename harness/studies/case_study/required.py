@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
 
-from harness.arrays import FloatArray
 from harness.estimators.block import Block
 from harness.runner.stored_estimates import stored_blocks
-from harness.studies.case_study.context import Context
-from harness.studies.case_study.figures import figure, quantiles
+from harness.studies.case_study.context import Context, Made
+from harness.studies.case_study.figures import figure, marked, mean_of, ratio_of_means
 from harness.studies.case_study.study_file import RequiredNumbers
-from harness.studies.case_study.tested import read_tests, write_table
+from harness.studies.case_study.tested import PARTS, read_tests, settled
+from harness.studies.kept_parts import kept_parts, write_table
 from harness.studies.required_tests import (
     Procedure,
     RequiredTests,
@@ -22,48 +22,81 @@ from harness.studies.required_tests import (
     joined,
     plain_rhw,
     required_tests,
-    scv_rhw,
+    scv_rhw_of,
 )
+
+
+class _Found(NamedTuple):
+    """RNoT of every shuffle of some tests, and whether their weights have come in."""
+
+    rnot: RequiredTests
+    tests: int
+    settled: bool
+
+    def figure(self, confidence: float) -> dict[str, Any]:
+        """Mean over shuffles with its interval; a lower limit where some needed more tests than there were."""
+        mean = mean_of(self.rnot.n.tolist(), confidence)
+        if self.rnot.is_lower_limit:
+            mean = figure(None if self.rnot.never_reached.all() else mean["value"], mean["low"] or mean["value"])
+        return marked(mean, settled=self.settled)
+
+    def over(self, other: _Found, confidence: float) -> dict[str, Any]:
+        """AAR of the other one: ratio of the means, open where one of them is a lower limit."""
+        found = ratio_of_means(self.rnot.n.tolist(), other.rnot.n.tolist(), confidence)
+        side = acceleration(self.rnot, other.rnot)[1]
+        if side == "at least":
+            found = figure(found["value"], found["low"] or found["value"])
+        elif side == "at most":
+            found = figure(found["value"], None, found["high"] or found["value"])
+        return marked(figure(None) if side == "unknown" else found, settled=self.settled and other.settled)
 
 
 def count_required_tests(step: RequiredNumbers, context: Context) -> dict[str, Any]:
     """RNoT of every step that is named, and of SCV beside NADE on the same shuffles of the same tests."""
-    found = {}
-    for name in step.of:
-        tests = read_tests(context.made[name])
-        procedure = Procedure(context.rhw, context.confidence, step.shuffles)
-        context.progress.stage(f"shuffles of {name}", step.shuffles)
-        rhw = plain_rhw(tests.weight, tests.n, procedure, lambda: context.progress.advance(1), tests.failed)
-        found[name] = required_tests(rhw, procedure.grid(tests.n), context.rhw)
-    pairs = {f"{step.of[0]}_over_{name}": (found[step.of[0]], found[name]) for name in step.of[1:]}
+    asked = context.rhw, context.confidence
+    found = {name: _plain(context.made[name], Procedure(*asked, step.shuffles), context) for name in step.of}
+    pairs = {f"{step.of[0]}_over_{name}": (step.of[0], name) for name in step.of[1:]}
     if step.scv is not None:
-        found |= (both := _with_scv(step, context))
-        pairs["nade_over_scv"] = both["nade_beside_scv"], both["scv"]
+        made, fewer = context.made[step.scv], Procedure(*asked, step.scv_shuffles, ratio=step.scv_ratio)
+        found["nade_beside_scv"] = _plain(made, fewer, context, first=step.scv_tests)
+        found["scv"] = _scv(made, fewer, context, first=step.scv_tests)
+        pairs["nade_over_scv"] = "nade_beside_scv", "scv"
     for name, each in found.items():
-        columns = {"shuffle": np.arange(len(each.n)), "tests": each.n, "never_reached": each.never_reached}
-        write_table(context.folder / f"{name}.parquet", pa.table(columns))
-    figures = {name: _figure(each, context.confidence) for name, each in found.items()}
-    ratios = {name: _ratio(*both, context.confidence) for name, both in pairs.items()}
+        columns = {"shuffle": np.arange(len(each.rnot.n)), "tests": each.rnot.n}
+        write_table(context.folder / f"{name}.parquet", pa.table({**columns, "never_reached": each.rnot.never_reached}))
+    figures = {name: each.figure(context.confidence) for name, each in found.items()}
+    ratios = {name: found[a].over(found[b], context.confidence) for name, (a, b) in pairs.items()}
     return {
-        "never_reached": {name: int(np.count_nonzero(each.never_reached)) for name, each in found.items()},
-        "shuffles": {name: len(each.n) for name, each in found.items()},
+        "never_reached": {name: int(np.count_nonzero(each.rnot.never_reached)) for name, each in found.items()},
+        "shuffles": {name: len(each.rnot.n) for name, each in found.items()},
+        "tests": {name: each.tests for name, each in found.items()},
         "figures": figures | ratios,
     }
 
 
-def _with_scv(step: RequiredNumbers, context: Context) -> dict[str, RequiredTests]:
-    run = context.made[str(step.scv)].folder / "run"
-    tests = joined(list(_first(stored_blocks(run, moments=True), step.scv_tests)))
-    procedure = Procedure(context.rhw, context.confidence, step.scv_shuffles, ratio=step.scv_ratio)
-    grid, counted = procedure.grid(len(tests)), tests.crash | tests.failed
-    context.progress.stage("shuffles of scv", step.scv_shuffles)
-    rhw: dict[str, FloatArray] = {
-        "nade_beside_scv": plain_rhw(
-            np.exp(tests.log_weight[counted]), len(tests), procedure, failed=tests.failed[counted]
-        ),
-        "scv": scv_rhw(tests, procedure, lambda: context.progress.advance(1)),
-    }
-    return {name: required_tests(each, grid, context.rhw) for name, each in rhw.items()}
+def _plain(made: Made, procedure: Procedure, context: Context, *, first: int | None = None) -> _Found:
+    """Of the mean of Y, on all tests of a step or its first ones."""
+    tests = read_tests(made)
+    n = min(tests.n, first or tests.n)
+    kept = tests.episode < n
+    context.progress.stage(f"shuffles of {made.folder.name.rpartition('-')[0]}", procedure.n_shuffles)
+    rhw = plain_rhw(tests.weight[kept], n, procedure, lambda: context.progress.advance(1), tests.failed[kept])
+    return _Found(required_tests(rhw, procedure.grid(n), procedure.rhw), n, settled(made))
+
+
+def _scv(made: Made, procedure: Procedure, context: Context, *, first: int) -> _Found:
+    """Of what SCV claims, a part for each shuffle; the tests are read only if any is missing."""
+    n, tests = min(made.result["n"], first), list[Block]()
+
+    def rhw_of(shuffle: int) -> pa.Table:
+        if not tests:
+            tests.append(joined(list(_first(stored_blocks(made.folder / "run", moments=True), n))))
+        return pa.table({"rhw": scv_rhw_of(tests[0], procedure, shuffle)})
+
+    parts = context.folder / PARTS, "scv"
+    tables = kept_parts(*parts, range(procedure.n_shuffles), rhw_of, context.progress)
+    rhw = np.array([table.column("rhw").to_numpy() for table in tables])
+    return _Found(required_tests(rhw, procedure.grid(n), procedure.rhw), n, settled(made))
 
 
 def _first(blocks: Iterator[Block], n: int) -> Iterator[Block]:
@@ -71,20 +104,3 @@ def _first(blocks: Iterator[Block], n: int) -> Iterator[Block]:
         yield block.take(slice(0, n - block.first_episode))
         if block.first_episode + len(block) >= n:
             return
-
-
-def _figure(found: RequiredTests, confidence: float) -> dict[str, Any]:
-    """Mean over shuffles and the range of single ones; no upper end where some needed more tests than there were."""
-    low, high = quantiles(found.n.astype(np.float64), confidence)
-    if found.is_lower_limit:
-        return figure(None if found.never_reached.all() else found.mean, low)
-    return figure(found.mean, low, high)
-
-
-def _ratio(above: RequiredTests, below: RequiredTests, confidence: float) -> dict[str, Any]:
-    """AAR: ratio of the means, and the range of ratios of single shuffles, open where a mean is a lower limit."""
-    value, side = acceleration(above, below)
-    low, high = quantiles(above.n / below.n, confidence)
-    if side == "unknown":
-        return figure(None)
-    return figure(value, None if side == "at most" else low, None if side == "at least" else high)

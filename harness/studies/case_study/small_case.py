@@ -2,113 +2,115 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from functools import cache, partial
+from itertools import product
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
 
-from harness.estimators.estimate import Estimate
-from harness.estimators.nade import Nade
-from harness.estimators.scv import Scv
+from harness.studies.case_study.claimed import Claims
 from harness.studies.case_study.context import Context
-from harness.studies.case_study.figures import exactly, figure, quantiles, tests_for, z_of
-from harness.studies.case_study.small_world import Proposal, SmallWorld, small_world
+from harness.studies.case_study.figures import exactly, figure, marked, mean_of, tests_for
+from harness.studies.case_study.small_world import SmallWorld, small_world
 from harness.studies.case_study.study_file import SmallCase
-from harness.studies.case_study.tested import write_table
+from harness.studies.case_study.tested import PARTS
+from harness.studies.kept_parts import kept_parts, write_table
+from harness.studies.run import worker_processes
+
+_world = cache(small_world)
+TRUE_WITHIN = 2.0
+"""Factor between NADE's claim and the exact number up to which claims of a setting count, as in the page's verdicts."""
+
+
+class _Setting(NamedTuple):
+    """Of the importance functions; ``place`` is among all, and seeds its tests."""
+
+    place: int
+    recursive: bool
+    threshold: float
+    epsilon: float
 
 
 def answer_small_case(step: SmallCase, context: Context) -> dict[str, Any]:
-    """Exact rate and variances, and what drawn tests claim, for every challenge and epsilon."""
-    world = small_world(step.lane_change_level)
-    settings = [(recursive, epsilon) for recursive in (False, True) for epsilon in step.epsilons]
-    context.progress.stage("small case", len(settings))
-    rows = []
-    for place, (recursive, epsilon) in enumerate(settings):
-        rows.append(_row(world, epsilon, step, context, place, recursive=recursive))
-        context.progress.advance(1)
+    """Exact rate and variances, and what drawn tests claim, for every challenge, threshold and epsilon."""
+    every = product((False, True), step.thresholds, step.epsilons)
+    settings = [_Setting(place, *setting) for place, setting in enumerate(every)]
+    make = partial(claims_of_setting, step, context.confidence)
+    with worker_processes(context.workers) as executor:
+        parts = context.folder / PARTS, context.name
+        tables = kept_parts(*parts, settings, make, context.progress, run=executor.map)
+    rows = [table.to_pylist()[0] for table in tables]
     write_table(context.folder / "settings.parquet", pa.Table.from_pylist(rows))
-    published = rows[0]
-    nde = tests_for(1.0 / world.crash_rate - 1.0, step.rhw, context.confidence)
-    figures = {
-        "crash_rate": exactly(world.crash_rate),
-        "nde": exactly(nde),
-        "nade": exactly(published["nade_exact"]),
-        "nade_gain": exactly(nde / published["nade_exact"]),
-        "scv_claimed": figure(published["scv_claimed"], *published["scv_claims"]),
-        "fewest_claimed": _fewest(rows),
-        "fewest_exact": exactly(min(row["nade_exact"] for row in rows)),
-        "scv_gain_true": figure(published["gain_true"]),
-    }
+    rate, published = _world(step.lane_change_level).crash_rate, rows[0]
+    nearest = {name: _nearest(name, wanted, rows) for name, wanted in step.reported.items()}
     return {
-        "crash_rate": world.crash_rate,
+        "crash_rate": rate,
         "rhw": step.rhw,
-        "steps": len(world.levels),
+        "steps": len(_world(step.lane_change_level).levels),
         "settings": rows,
-        "figures": figures,
+        "nearest": nearest,
+        "figures": {
+            "nde": exactly(tests_for(1.0 / rate - 1.0, step.rhw, context.confidence)),
+            "nade": exactly(published["nade_exact"]),
+            "scv_claimed": published["scv_claimed"],
+            **{f"nearest_{name}": row[name] for name, row in nearest.items()},
+        },
     }
 
 
-def _row(
-    world: SmallWorld, epsilon: float, step: SmallCase, context: Context, place: int, *, recursive: bool
-) -> dict[str, Any]:
+def claims_of_setting(step: SmallCase, confidence: float, setting: _Setting) -> pa.Table:
     """One setting: its exact variance, what NADE and SCV claim of the same tests, and what repeating both shows."""
-    proposals = world.proposals(epsilon, recursive=recursive)
-    once = _both(world, proposals, step.tests, context, [2, place])
-    many = [_both(world, proposals, step.tests_of_draw, context, [3, place, k]) for k in range(step.draws)]
-    true = {name: _relative_square(world, [each[name] for each in many]) * step.tests_of_draw for name in once}
-    tests = {
-        "nade_exact": world.relvar(proposals),
-        **{f"{name}_claimed": _claimed(found) for name, found in once.items()},
-        **{f"{name}_repeated": relvar for name, relvar in true.items()},
+    world, n = _world(step.lane_change_level), step.tests_of_draw
+    proposals = world.proposals(setting.epsilon, recursive=setting.recursive, threshold=setting.threshold)
+
+    def claims(tests: int, *seed: int) -> dict[str, Any]:
+        found = Claims()
+        found.add(world.draw(proposals, tests, np.random.default_rng(seed)))
+        return found.row(step.rhw, confidence)
+
+    once = claims(step.tests, 2, setting.place)
+    many = [claims(n, 3, setting.place, k) for k in range(step.draws)]
+    row: dict[str, Any] = {
+        "challenge": "recursive" if setting.recursive else "immediate",
+        "threshold": setting.threshold,
+        "epsilon": setting.epsilon,
+        "mean_weight": once["mean_weight"],
+        "difference": once["difference"],
+        "nade_exact": tests_for(world.relvar(proposals), step.rhw, confidence),
     }
-    nade, scv = once["nade"].crash_rate, once["scv"].crash_rate
-    return {
-        "challenge": "recursive" if recursive else "immediate",
-        "epsilon": epsilon,
-        "rate_over_truth": nade / world.crash_rate,
-        "difference": abs(scv / nade - 1.0) if nade > 0.0 else None,
-        **{key: None if x is None else tests_for(x, step.rhw, context.confidence) for key, x in tests.items()},
-        "scv_claims": _range([_claimed(each["scv"]) for each in many], step.rhw, context.confidence),
-        **{f"{name}_covers": _coverage(world, [each[name] for each in many]) for name in once},
-        "gain_true": true["nade"] / true["scv"] if true["scv"] > 0.0 else None,
-    }
+    holds = _holds(mean_of((each["nade_tests"] for each in many), confidence)["value"], row["nade_exact"])
+    for name in ("nade", "scv"):
+        said = mean_of((each[f"{name}_tests"] for each in many), confidence)
+        square = np.mean([((each[f"{name}_rate"]["value"] or 0.0) / world.crash_rate - 1.0) ** 2 for each in many])
+        row |= {
+            f"{name}_claimed_once": once[f"{name}_tests"],
+            f"{name}_claimed": marked(said, settled=once["settled"] and holds),
+            f"{name}_repeated": tests_for(n * float(square), step.rhw, confidence),
+            f"{name}_covers": float(np.mean([_covers(each[f"{name}_rate"], world) for each in many])),
+        }
+    return pa.Table.from_pylist([row])
 
 
-def _both(
-    world: SmallWorld, proposals: Sequence[Proposal], n: int, context: Context, seed: list[int]
-) -> dict[str, Estimate]:
-    """Both estimates of the same n tests."""
-    block, found = world.draw(proposals, n, np.random.default_rng(seed)), {}
-    for name, state in (("nade", Nade()), ("scv", Scv())):
-        state.add(block)
-        found[name] = state.result(context.confidence)
-    return found
+def _holds(claimed: float | None, exact: float) -> bool:
+    """Whether NADE claims what is known to be true, about."""
+    return claimed is not None and exact / TRUE_WITHIN <= claimed <= exact * TRUE_WITHIN
 
 
-def _claimed(found: Estimate) -> float | None:
-    """Relative variance per test that an estimate claims."""
-    return found.n_episodes * (found.std_error / found.crash_rate) ** 2 if found.crash_rate > 0.0 else None
+def _covers(rate: dict[str, Any], world: SmallWorld) -> bool:
+    """Whether a normal interval holds the truth; that of no crash holds nothing."""
+    return rate["value"] is not None and rate["low"] <= world.crash_rate <= rate["high"]
 
 
-def _range(relvar: Sequence[float | None], rhw: float, confidence: float) -> list[float] | list[None]:
-    """Tests that single campaigns claim, from and to."""
-    known = [tests_for(each, rhw, confidence) for each in relvar if each is not None]
-    return list(quantiles(np.array(known), confidence)) if known else [None, None]
+def _nearest(name: str, wanted: float, rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """The setting whose number is nearest to a reported one: NADE's exact one, or what SCV claims."""
 
+    def found(row: dict[str, Any]) -> dict[str, Any]:
+        claimed: dict[str, Any] = row["scv_claimed"]
+        return exactly(row["nade_exact"]) if name == "nade" else claimed
 
-def _fewest(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """The setting in which SCV claims to need fewest tests."""
-    known = [row for row in rows if row["scv_claimed"] is not None]
-    least = min(known, key=lambda row: float(row["scv_claimed"]), default=None)
-    return figure(None) if least is None else figure(least["scv_claimed"], *least["scv_claims"])
-
-
-def _relative_square(world: SmallWorld, found: Sequence[Estimate]) -> float:
-    """Mean square of the relative errors."""
-    return float(np.mean([(each.crash_rate / world.crash_rate - 1.0) ** 2 for each in found]))
-
-
-def _coverage(world: SmallWorld, found: Sequence[Estimate]) -> float:
-    """Share of the normal intervals that hold the truth."""
-    return float(np.mean([abs(x.crash_rate - world.crash_rate) <= z_of(x.confidence) * x.std_error for x in found]))
+    known = [row for row in rows if found(row)["value"] and found(row).get("settled", True) is not False]
+    row = min(known, key=lambda each: abs(np.log(found(each)["value"] / wanted)), default=None)
+    if row is None:
+        return {name: figure(None)}
+    return {name: found(row), **{key: row[key] for key in ("challenge", "threshold", "epsilon")}}

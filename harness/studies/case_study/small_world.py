@@ -23,8 +23,7 @@ from harness.campaign.models import AutomatedVehicle, EnvironmentSettings
 from harness.criticality.grid import GridPoints
 from harness.criticality.immediate import roll_out
 from harness.environment.driving import Environment
-from harness.environment.loading import _evaluate as evaluate_laws
-from harness.environment.loading import load_environment
+from harness.environment.loading import evaluate_laws, load_environment
 from harness.estimators.block import MAX_CONTROL_STEPS, Block
 from harness.maneuvers import ACCELERATIONS_MPS2, N_ACCELERATIONS
 from harness.vehicles.kinematics import CONTACT_M, STEP_S
@@ -85,21 +84,24 @@ class SmallWorld:
         """μ."""
         return float(self.levels[0].share @ self.value([level.crash for level in self.levels])[0])
 
-    def proposals(self, epsilon: float, *, recursive: bool) -> list[Proposal]:
-        """Importance functions; a later cut-in counts only for the recursive challenge."""
+    def proposals(self, epsilon: float, *, recursive: bool, threshold: float = 0.0) -> list[Proposal]:
+        """Importance functions; a later cut-in counts only for the recursive challenge.
+
+        A situation is critical where V_j of any surrogate is above the threshold; elsewhere all draw from p.
+        """
         n_surrogates = self.levels[0].surrogates.shape[1]
         found = [
             Proposal(np.repeat(level.p[:, None], n_surrogates, 1), np.zeros(len(level.p), bool))
             for level in self.levels
         ]
-        for j in range(n_surrogates):
-            values = self.value([level.surrogates[:, j] for level in self.levels])
-            for t, level in enumerate(self.levels):
-                now = level.p * level.surrogates[:, j]
-                v = values[t] if recursive else now
-                aimed = np.divide(now, v, out=level.p.copy(), where=v > 0.0)
-                found[t].q[:, j] = np.where(v > 0.0, epsilon * level.p + (1.0 - epsilon) * aimed, level.p)
-                found[t].critical[:] |= v > 0.0
+        of_surrogates = [self.value([level.surrogates[:, j] for level in self.levels]) for j in range(n_surrogates)]
+        for t, level in enumerate(self.levels):
+            now = level.p[:, None] * level.surrogates
+            v = np.stack([values[t] for values in of_surrogates], axis=1) if recursive else now
+            aimed = np.divide(now, v, out=found[t].q.copy(), where=v > 0.0)
+            found[t].critical[:] = np.any(v > threshold, axis=1)
+            controlled = found[t].critical[:, None] & (v > 0.0)
+            found[t].q[:] = np.where(controlled, epsilon * level.p[:, None] + (1.0 - epsilon) * aimed, found[t].q)
         return found
 
     def relvar(self, proposals: Sequence[Proposal]) -> float:

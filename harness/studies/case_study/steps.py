@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import inspect
 import json
+import shutil
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -30,13 +31,14 @@ from harness.studies.case_study.page import write_page
 from harness.studies.case_study.replicated import replicate
 from harness.studies.case_study.required import count_required_tests
 from harness.studies.case_study.small_case import answer_small_case
-from harness.studies.case_study.study_file import Step, Study, inputs_of
-from harness.studies.case_study.tested import keep_run, test_in_twin
+from harness.studies.case_study.study_file import FILES, Step, Study, inputs_of
+from harness.studies.case_study.tested import PARTS, keep_run, test_in_twin
 from harness.studies.case_study.theorems import check_theorems
 from harness.studies.case_study.variants import test_variants, variants_of
 from harness.studies.experiment import load_experiment
 
 RESULT = "result.json"
+_SHARED = (*(f"studies/case_study/{name}.py" for name in ("claimed", "figures", "small_world")), "studies/*.py")
 _MAKERS: dict[str, Callable[[Any, Context], dict[str, Any]]] = {
     "twin_tests": test_in_twin,
     "run": keep_run,
@@ -98,6 +100,7 @@ def run_study(
                 context = Context(place, study.rhw, study.confidence, made, workers, progress or SilentProgress())
                 write_json(place / RESULT, finite_json({"kind": step.kind, **_MAKERS[step.kind](step, context)}))
                 seconds[name] = time.monotonic() - began
+            shutil.rmtree(place / PARTS, ignore_errors=True)  # what they were kept for is there
             result = read_json(place / RESULT, mend="Delete the folder of this step; it is made again.")
             made[name] = Made(place, result)
             told(name, seconds[name])
@@ -110,8 +113,10 @@ def step_keys(study: Study) -> dict[str, str]:
     for name, step in study.steps.items():
         maker = Path(str(inspect.getsourcefile(_MAKERS[step.kind])))
         sources = WORLD_SOURCES if step.kind == "twin_tests" else (*WORLD_SOURCES, "estimators/*.py")
+        if step.kind not in ("twin_tests", "run"):  # whose records do not follow from any of these
+            sources = *sources, *_SHARED
         content = {
-            "step": step.model_dump(mode="json", exclude={"campaign", "experiment"}),
+            "step": step.model_dump(mode="json", exclude=set(FILES)),
             "file": _content(step),
             "reads": [(key, keys[wanted]) for key, wanted in inputs_of(step)],
             "asks": (study.rhw, study.confidence),
@@ -127,7 +132,7 @@ def _content(step: Step) -> Any:
         campaign = load_campaign(step.campaign, step.set)
         return campaign.model_dump(mode="json", exclude={"run"}), resolve(campaign).content_hash
     if step.kind == "variants":
-        forms = variants_of(step).items()
+        forms = [*variants_of(step).items(), *variants_of(step, shells=True).items()]
         return [(name, one.model_dump(mode="json", exclude={"run"}), resolve(one).content_hash) for name, one in forms]
     if step.kind == "replications":
         experiment = load_experiment(Path(step.experiment), step.set)

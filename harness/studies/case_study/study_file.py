@@ -81,22 +81,30 @@ class Replications(Section):
 
 
 class Variants(Section):
-    """One campaign with other vehicles, or with other settings, and what NADE and SCV claim of each."""
+    """One campaign with other vehicles or settings: what NADE and SCV claim of each, and shells beside it."""
 
     kind: Literal["variants"]
     title: str
     campaign: str = Field(description="campaign file, relative to the study's; of any method but shells")
     set: Overrides = _OVERRIDES
-    tests: Whole = Field(ge=2, le=100_000_000, description="of each")
+    tests: Whole = Field(ge=2, le=100_000_000, description="of each campaign")
+    replications: Whole = Field(1, ge=1, le=10_000, description="campaigns with each of them")
+    shells: str | None = Field(None, description="campaign of shells, which each is tested with, too")
+    shells_set: Overrides = _OVERRIDES
     avs: list[str] = Field(default_factory=list, description="vehicles of the shipped panel")
     settings: dict[Annotated[str, Field(pattern=r"^[^.|]+$")], Overrides] = Field(
         default_factory=dict, description="values laid over the campaign's, by a name for the table"
     )
+    each_of: list[dict[Annotated[str, Field(pattern=r"^[^.|]+$")], Overrides]] = Field(
+        default_factory=list, description="lists of such settings, of which every combination is another variant"
+    )
+    reported: dict[str, Positive] = Field(default_factory=dict, description="the paper's gains, by variant")
 
     @model_validator(mode="after")
     def _has_any(self) -> Self:
-        if not (self.avs or self.settings):
-            raise broken_rule("avs", found="no variant", expected="some under avs or settings", mend="Name some.")
+        if not (self.avs or self.settings or self.each_of):
+            found, expected = "no variant", "some under avs, settings or each_of"
+            raise broken_rule("avs", found=found, expected=expected, mend="Name some.")
         return self
 
 
@@ -116,8 +124,12 @@ class SmallCase(Section):
     rhw: Positive = Field(0.1, description="relative half-width that numbers of tests are for")
     tests: Whole = Field(100_000, ge=100, description="drawn tests for each setting")
     epsilons: list[Probability] = Field(default=[0.1], min_length=1)
+    thresholds: list[Probability] = Field(default=[0.0], min_length=1, description="of criticality")
     draws: Whole = Field(200, ge=2, le=100_000, description="campaigns that are repeated to see the true spread")
     tests_of_draw: Whole = Field(1_000, ge=10)
+    reported: dict[Literal["nade", "scv"], Positive] = Field(
+        default_factory=dict, description="numbers of tests that are looked for among the settings"
+    )
 
 
 Step = Annotated[
@@ -136,7 +148,15 @@ class Claim(Section):
     within: float = Field(2.0, gt=1.0, description="factor within which our number counts as the same")
     tolerance: Positive | None = Field(None, description="distance that counts as the same, instead of a factor")
     at_most: bool = Field(False, description="whether the paper's number is a limit that ours does not exceed")
-    why: str = Field("", description="why ours differs, as far as known; printed only if it does")
+    why: str = Field("", description="why ours differs, as far as known; printed unless it is reproduced")
+    ours_to_choose: bool = Field(False, description="whether a setting of ours decides it, so that nothing is judged")
+
+
+class Line(Section):
+    """A line of the last picture."""
+
+    ours: str = Field(pattern=r"^\w+\.[\w.-]+$", description="STEP.FIGURE")
+    paper: Positive | None = Field(None, description="what the paper reports")
 
 
 class Study(Section):
@@ -154,9 +174,7 @@ class Study(Section):
     )
     claims: list[Claim] = Field(default_factory=list)
     conclusive: bool = Field(True, description="whether the sizes allow verdicts; those of --quick never do")
-    picture: dict[str, str] = Field(
-        default_factory=dict, description="label and STEP.FIGURE of each line of the last picture"
-    )
+    picture: dict[str, Line] = Field(default_factory=dict, description="numbers of tests, by a label for each line")
 
     @model_validator(mode="after")
     def _names_steps_before(self) -> Self:
@@ -184,7 +202,7 @@ class Study(Section):
     @model_validator(mode="after")
     def _asks_steps_that_are_there(self) -> Self:
         asked = [(f"claims.{k}.ours", claim.ours) for k, claim in enumerate(self.claims)]
-        asked += [(f"picture.{label}", path) for label, path in self.picture.items()]
+        asked += [(f"picture.{label}.ours", line.ours) for label, line in self.picture.items()]
         asked += [(f"quick.{name}", f"{name}.") for name in self.quick]
         for key, path in asked:
             if (name := path.partition(".")[0]) not in self.steps:
@@ -193,6 +211,7 @@ class Study(Section):
         return self
 
 
+FILES = ("campaign", "experiment", "shells")
 _TESTED: tuple[type[Section], ...] = (TwinTests, Run)
 _SOURCES: dict[tuple[str, str], tuple[type[Section], ...]] = {
     ("of", "convergence"): _TESTED,
@@ -243,7 +262,7 @@ def load_study(path: Path, *, quick: bool = False) -> Study:
 
 def _placed(step: Step, path: Path, name: str) -> Step:
     """A step whose file is absolute, and there."""
-    for key in ("campaign", "experiment"):
+    for key in FILES:
         if (named := getattr(step, key, None)) is None:
             continue
         file = (path.parent / named).resolve()
@@ -251,7 +270,7 @@ def _placed(step: Step, path: Path, name: str) -> Step:
             raise CampaignError(
                 f"{path}: steps.{name}.{key}",
                 found=f"{named}, but there is no file {file}",
-                expected=f"a file with {'a campaign' if key == 'campaign' else 'an experiment'}",
+                expected=f"a file with {'an experiment' if key == 'experiment' else 'a campaign'}",
                 mend="Correct the path; it is relative to the folder of the study.",
             )
         step = step.model_copy(update={key: str(file)})

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from harness.arrays import BoolArray, FloatArray, IntArray
 from harness.campaign.loading import load_campaign
@@ -18,23 +16,27 @@ from harness.campaign.models import Campaign
 from harness.errors import HarnessError
 from harness.estimators.block import Block
 from harness.estimators.intervals import clopper_pearson
+from harness.methods import Method
 from harness.outcomes import CRASH, FAILED
-from harness.records.folder import read_table, write_atomically
+from harness.records.folder import read_table
 from harness.resolved import resolve
-from harness.runner.campaign_run import run_campaign
+from harness.runner.campaign_run import RunResult, run_campaign
 from harness.runner.prepare import prepare
 from harness.runner.stored_estimates import stored_blocks
+from harness.studies.case_study.claimed import weights_are_in
 from harness.studies.case_study.context import Context, Made
-from harness.studies.case_study.figures import exactly, figure, tests_for, z_of
+from harness.studies.case_study.figures import exactly, figure, is_settled, marked, tests_for, z_of
 from harness.studies.case_study.study_file import Run, TwinTests
+from harness.studies.kept_parts import kept_parts, write_table
 from harness.studies.run import worker_processes
 from harness.studies.weighted_campaign import prepared_twin
 
 PART, AT_ONCE = 500_000, 50_000
 """Tests of a file that a killed step goes on from, and of a call of the twin."""
 GROUPS = 20
-CRASHES = "crashes.parquet"
+CRASHES, PARTS = "crashes.parquet", "parts"
 _IN_THE_TWIN = ("world.engine=twin", "records.moments=none", "records.traces=none", "records.trace_share=0.0")
+_WEIGHT = b"sum_of_weights"
 _COLUMNS = ("episode", "weight", "n_control_steps", "failed")
 
 
@@ -77,34 +79,26 @@ def test_in_twin(step: TwinTests, context: Context) -> dict[str, Any]:
     """Test in worker processes, part by part; parts on disk are taken as they are."""
     campaign = campaign_of(step)
     prepare(resolve(campaign), context.progress)  # tables and kernels are built once, before the workers start
-    file, parts = campaign.model_dump_json(), context.folder / "parts"
-    parts.mkdir(exist_ok=True)
-    places = {first: parts / f"{first:012d}.parquet" for first in range(0, step.tests, PART)}
-    missing = [(first, min(PART, step.tests - first)) for first, place in places.items() if not place.is_file()]
-    context.progress.stage(context.name, step.tests, done=step.tests - sum(n for _, n in missing))
+    make = partial(crashes_in_twin, campaign.model_dump_json())
+    jobs = [(first, min(PART, step.tests - first)) for first in range(0, step.tests, PART)]
     with worker_processes(context.workers) as executor:
-        for (first, n), table in zip(missing, executor.map(partial(crashes_in_twin, file), missing), strict=True):
-            write_table(places[first], table)
-            context.progress.advance(n)
-    whole = pa.concat_tables([read_table(place) for place in places.values()])
-    result = _kept(context, step.tests, whole)
-    for place in places.values():
-        place.unlink()
-    parts.rmdir()
-    return result
+        parts = context.folder / PARTS, context.name
+        tables = kept_parts(*parts, jobs, make, context.progress, run=executor.map, size=lambda job: job[1])
+    return _kept(context, campaign.testing.method, step.tests, tables)
 
 
 def crashes_in_twin(campaign_json: str, part: tuple[int, int]) -> pa.Table:
     """Crashed and failed ones of the tests ``first … first + n - 1``."""
     prepared, loop = prepared_twin(campaign_json)
-    (first, n), tables = part, []
+    (first, n), tables, weight = part, [], 0.0
     for start in range(first, first + n, AT_ONCE):
         size = min(AT_ONCE, first + n - start)
         rows = loop.run(start, prepared.states(start, size)).results.episode
+        weight += float(np.exp(rows["log_weight"]).sum())
         at = np.flatnonzero((rows["outcome"] == CRASH) | (rows["outcome"] == FAILED))
         failed = rows["outcome"][at] == FAILED
         tables.append(_rows(start + at, rows["log_weight"][at], rows["n_control_steps"][at], failed))
-    return pa.concat_tables(tables)
+    return _with_weight(pa.concat_tables(tables), weight)
 
 
 def keep_run(step: Run, context: Context) -> dict[str, Any]:
@@ -113,21 +107,33 @@ def keep_run(step: Run, context: Context) -> dict[str, Any]:
     begun = (run / "manifest.json").is_file()
     done = run_campaign(campaign, run, workers=context.workers, resume=begun, progress=context.progress)
     if campaign.testing.method != "shells":
-        blocks = list(_crashes_of(stored_blocks(run, moments=False)))
-        n = int(done.estimates["n_episodes"])
-        return {"engine": campaign.world.engine, **_kept(context, n, pa.concat_tables(blocks))}
+        tables = [_crashes_of(block) for block in stored_blocks(run, moments=False)]
+        n, method = int(done.estimates["n_episodes"]), campaign.testing.method
+        return {"engine": campaign.world.engine, **_kept(context, method, n, tables)}
+    return {"engine": campaign.world.engine, "figures": figures_of_shells(done, context.rhw)}
+
+
+def figures_of_shells(done: RunResult, rhw: float) -> dict[str, Any]:
+    """What a run of shells says."""
     found = done.estimates["estimates"]["shells"]
-    rate = figure(found["crash_rate"], found["ci_low"], found["ci_high"])
-    figures = {"tests": exactly(found["n_episodes"]), "crashes": exactly(found["n_crashes"]), "crash_rate": rate}
-    reached = found["rhw"] is not None and found["rhw"] <= context.rhw
-    tests = exactly(found["n_episodes"]) if reached else figure(None)
-    return {"engine": campaign.world.engine, "figures": {**figures, "tests_for_rhw": tests}}
+    known = found["rhw"] is not None
+    return {
+        "tests": exactly(found["n_episodes"]),
+        "crashes": exactly(found["n_crashes"]),
+        "crash_rate": figure(found["crash_rate"], found["ci_low"], found["ci_high"]),
+        "tests_for_rhw": figure(found["n_episodes"] * (found["rhw"] / rhw) ** 2 if known else None),
+    }
 
 
-def _crashes_of(blocks: Iterator[Block]) -> Iterator[pa.Table]:
-    for block in blocks:
-        at = np.flatnonzero(block.crash | block.failed)
-        yield _rows(block.first_episode + at, block.log_weight[at], block.n_control_steps[at], block.failed[at])
+def _crashes_of(block: Block) -> pa.Table:
+    at = np.flatnonzero(block.crash | block.failed)
+    table = _rows(block.first_episode + at, block.log_weight[at], block.n_control_steps[at], block.failed[at])
+    return _with_weight(table, float(block.weights().sum()))
+
+
+def _with_weight(table: pa.Table, total: float) -> pa.Table:
+    """Rows of crashes, together with the sum of the weights of all tests."""
+    return table.replace_schema_metadata({_WEIGHT: repr(total)})
 
 
 def _rows(episode: IntArray, log_weight: FloatArray, n_control_steps: IntArray, failed: BoolArray) -> pa.Table:
@@ -136,23 +142,23 @@ def _rows(episode: IntArray, log_weight: FloatArray, n_control_steps: IntArray, 
     return pa.table(dict(zip(_COLUMNS, columns, strict=True)))
 
 
-def write_table(path: Path, table: pa.Table) -> None:
-    """Write a table of results."""
-    write_atomically(path, lambda file: pq.write_table(table, file, compression="zstd"))
-
-
-def _kept(context: Context, n: int, table: pa.Table) -> dict[str, Any]:
+def _kept(context: Context, method: Method, n: int, tables: list[pa.Table]) -> dict[str, Any]:
+    mean_weight = math.fsum(float(table.schema.metadata[_WEIGHT]) for table in tables) / n
+    table = pa.concat_tables(tables)
     write_table(context.folder / CRASHES, table)
-    tests = _tests(n, table)
+    tests, is_in = _tests(n, table), weights_are_in(method, mean_weight)
     relvar = relative_variance(tests)
     per_relvar = tests_for(1.0, context.rhw, context.confidence)
     figures = {
         "tests": exactly(n),
         "crashes": exactly(int(np.count_nonzero(~tests.failed))),
         "failed": exactly(int(np.count_nonzero(tests.failed))),
-        "crash_rate": crash_rate(tests, context.confidence),
-        "relvar": relvar,
-        "tests_for_rhw": figure(*(None if x is None else x * per_relvar for x in relvar.values())),
+        "crash_rate": marked(crash_rate(tests, context.confidence), settled=is_in),
+        "relvar": marked(relvar, settled=is_in),
+        "tests_for_rhw": marked(
+            figure(*(None if x is None else x * per_relvar for x in relvar.values())), settled=is_in
+        ),
+        "mean_weight": exactly(mean_weight),
     }
     return {"n": n, "figures": figures}
 
@@ -177,6 +183,11 @@ def read_tests(made: Made) -> Tests:
             mend="Name another step.",
         )
     return _tests(made.result["n"], read_table(made.folder / CRASHES))
+
+
+def settled(made: Made) -> bool:
+    """Whether the crash rate of a step means something."""
+    return is_settled(made.result["figures"]["crash_rate"])
 
 
 def crash_rate(tests: Tests, confidence: float) -> dict[str, Any]:

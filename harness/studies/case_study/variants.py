@@ -2,93 +2,90 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
+import math
 from functools import partial
+from itertools import product
 from typing import Any
 
 import pyarrow as pa
 
 from harness.campaign.loading import load_campaign
 from harness.campaign.models import Campaign
-from harness.estimators import accumulator
 from harness.methods import EstimatorName
-from harness.records.folder import write_json
 from harness.resolved import resolve
+from harness.runner.campaign_run import run_campaign
 from harness.runner.prepare import prepare
+from harness.studies.case_study.claimed import Claims
 from harness.studies.case_study.context import Context
-from harness.studies.case_study.figures import exactly, figure, tests_for, z_of
+from harness.studies.case_study.figures import marked, mean_of, ratio_of_means, ratio_of_variances
 from harness.studies.case_study.study_file import Variants
-from harness.studies.case_study.tested import AT_ONCE, write_table
+from harness.studies.case_study.tested import AT_ONCE, PARTS, figures_of_shells
+from harness.studies.kept_parts import kept_parts, write_table
 from harness.studies.run import worker_processes
-from harness.studies.weighted_campaign import TwinEpisodes
+from harness.studies.weighted_campaign import TwinEpisodes, prepared_twin
+
+_IN_THE_TWIN = ("world.engine=twin", "records.traces=none", "records.trace_share=0.0")
 
 
-def variants_of(step: Variants) -> dict[str, Campaign]:
-    """The campaign in each of its forms, in the twin, by name."""
-    always = [*step.set, "world.engine=twin", "records.traces=none", "records.trace_share=0.0"]
-    vehicles = {name: load_campaign(step.campaign, always, av=name) for name in step.avs}
-    return vehicles | {name: load_campaign(step.campaign, [*always, *more]) for name, more in step.settings.items()}
+def variants_of(step: Variants, *, shells: bool = False) -> dict[str, Campaign]:
+    """The campaign in each of its forms, in the twin, by name; or the one of shells for the same vehicles."""
+    file, always = (step.shells, step.shells_set) if shells else (step.campaign, step.set)
+    if file is None:
+        return {}
+    always = [*always, *_IN_THE_TWIN]
+    settings = dict(step.settings)
+    for chosen in product(*(options.items() for options in step.each_of)) if step.each_of else ():
+        settings[", ".join(name for name, _ in chosen)] = [value for _, values in chosen for value in values]
+    vehicles = {name: load_campaign(file, always, av=name) for name in step.avs}
+    return vehicles | {name: load_campaign(file, [*always, *more]) for name, more in settings.items()}
 
 
 def test_variants(step: Variants, context: Context) -> dict[str, Any]:
-    """Test each in the twin, one to a worker; rows on disk are taken as they are."""
+    """Test each in the twin, one to a worker, and each with shells, if asked for."""
     campaigns = variants_of(step)
-    places = {name: context.folder / f"variant-{k}.json" for k, name in enumerate(campaigns)}
-    missing = [name for name, place in places.items() if not place.is_file()]
-    for name in missing:
-        prepare(resolve(campaigns[name]), context.progress)  # tables are built once, before the workers start
-    context.progress.stage(context.name, len(campaigns), done=len(campaigns) - len(missing))
+    for campaign in campaigns.values():
+        prepare(resolve(campaign), context.progress)  # tables are built once, before the workers start
+    make = partial(claims_in_twin, step.tests, step.replications, context.rhw, context.confidence)
+    jobs = [campaign.model_dump_json() for campaign in campaigns.values()]
     with worker_processes(context.workers) as executor:
-        work = partial(claims_in_twin, step.tests, context.confidence)
-        jobs = [campaigns[name].model_dump_json() for name in missing]
-        for name, row in zip(missing, executor.map(work, jobs), strict=True):
-            write_json(places[name], _in_tests({"variant": name, **row}, context))
-            context.progress.advance(1)
-    rows = [json.loads(place.read_text(encoding="utf-8")) for place in places.values()]
+        parts = context.folder / PARTS, context.name
+        tables = kept_parts(*parts, jobs, make, context.progress, run=executor.map)
+    rows = [{"variant": name, **table.to_pylist()[0]} for name, table in zip(campaigns, tables, strict=True)]
+    for k, (row, campaign) in enumerate(zip(rows, variants_of(step, shells=True).values(), strict=False)):
+        folder = context.folder / f"shells-{k}"
+        begun = (folder / "manifest.json").is_file()
+        done = run_campaign(campaign, folder, workers=context.workers, resume=begun, progress=context.progress)
+        found = figures_of_shells(done, context.rhw)
+        row |= {"shells_rate": found["crash_rate"], "shells_tests": found["tests_for_rhw"]}
     write_table(context.folder / "variants.parquet", pa.Table.from_pylist(rows))
     gains = {row["variant"]: row["gain_claimed"] for row in rows}
-    known = [gain for gain in gains.values() if gain is not None]
-    figures = {name: figure(None) if gain is None else exactly(gain) for name, gain in gains.items()}
+    mean = mean_of((gain["value"] for gain in gains.values()), context.confidence)
     return {
         "variants": rows,
-        "figures": {**figures, "mean": exactly(sum(known) / len(known)) if known else figure(None)},
+        "figures": {**gains, "mean": marked(mean, settled=all(row["settled"] for row in rows))},
     }
 
 
-def claims_in_twin(n: int, confidence: float, campaign_json: str) -> dict[str, Any]:
-    """What NADE, and SCV where it is defined, say of the same n tests."""
+def claims_in_twin(n: int, replications: int, rhw: float, confidence: float, campaign_json: str) -> pa.Table:
+    """What NADE and SCV say of n tests each, in so many campaigns, and what these truly scatter by."""
     campaign = Campaign.model_validate_json(campaign_json)
-    names: tuple[EstimatorName, ...] = ("nade", "scv") if campaign.testing.method == "step_mixture" else ("nade",)
-    source, states = TwinEpisodes(campaign, campaign.seed, names), {name: accumulator(name) for name in names}
-    for first in range(0, n, AT_ONCE):
-        block = source.block(first, min(AT_ONCE, n - first))
-        for state in states.values():
-            state.add(block)
-    found = {name: state.result(confidence) for name, state in states.items()}
-    nade, scv = found["nade"], found.get("scv")
-    rate, half = nade.crash_rate, z_of(confidence) * nade.std_error
-    weighed = scv is not None and rate > 0.0 and scv.std_error > 0.0
-    return {
-        "n_crashes": nade.n_crashes,
-        "crash_rate": {"value": rate, "low": max(rate - half, 0.0), "high": rate + half},
-        "relvar_nade": _relvar(n, rate, nade.std_error),
-        "relvar_scv": None if scv is None else _relvar(n, rate, scv.std_error),
-        "gain_claimed": (nade.std_error / scv.std_error) ** 2 if scv is not None and weighed else None,
-        "difference": abs(scv.crash_rate / rate - 1.0) if scv is not None and weighed else None,
-        "largest_weight_share": nade.largest_weight_share,
+    asked: tuple[EstimatorName, ...] = ("nade", "scv") if campaign.testing.method == "step_mixture" else ("nade",)
+    source, whole, rows = TwinEpisodes(campaign, campaign.seed, asked), Claims(with_scv=False), []
+    for start in range(0, n * replications, n):
+        claims = Claims()
+        for first in range(start, start + n, AT_ONCE):
+            block = source.block(first, min(AT_ONCE, start + n - first))
+            whole.add(block)
+            claims.add(block)
+        rows.append(claims.row(rhw, confidence))
+    prepared_twin.cache_clear()  # or a worker would keep the tables of all variants
+    row = whole.row(rhw, confidence)
+    tests = {name: [each[f"{name}_tests"] or math.nan for each in rows] for name in ("nade", "scv")}
+    rates = {name: [each[f"{name}_rate"]["value"] or 0.0 for each in rows] for name in ("nade", "scv")}
+    row |= {
+        "scv_tests": mean_of(tests["scv"], confidence),
+        "gain_claimed": marked(ratio_of_means(tests["nade"], tests["scv"], confidence), settled=row["settled"]),
+        "gain_true": ratio_of_variances(rates["nade"], rates["scv"], confidence),
+        "difference": max((each["difference"] for each in rows if each["difference"] is not None), default=None),
     }
-
-
-def _relvar(n: int, rate: float, std_error: float) -> float | None:
-    return n * (std_error / rate) ** 2 if rate > 0.0 else None
-
-
-def _in_tests(row: Mapping[str, Any], context: Context) -> dict[str, Any]:
-    """A row with numbers of tests in the place of relative variances."""
-    relvar = {name: row[f"relvar_{name}"] for name in ("nade", "scv")}
-    tests = {
-        f"tests_{name}": None if x is None else tests_for(x, context.rhw, context.confidence)
-        for name, x in relvar.items()
-    }
-    return {key: value for key, value in row.items() if not key.startswith("relvar_")} | tests
+    return pa.Table.from_pylist([row])
