@@ -30,10 +30,10 @@ Fingerprint = tuple[int, int]
 """Size (bytes) and CRC-32 of a file: against damage, not against malice."""
 
 
-def fingerprint(path: Path) -> Fingerprint | None:
+def fingerprint(path: str | Path) -> Fingerprint | None:
     """Size and checksum of a file; None if it cannot be read."""
-    with suppress(OSError):
-        content = path.read_bytes()
+    with suppress(OSError), open(path, "rb", buffering=0) as file:  # noqa: PTH123 - a path takes as long as reading
+        content = file.read()
         return len(content), zlib.crc32(content)
     return None
 
@@ -73,7 +73,7 @@ class Gathered:
         shard = self._shards.get(index)
         if shard is None or (shard.first_episode, shard.n_episodes) != (first_episode, n_episodes):
             return None
-        same = all(fingerprint(self._folder / file) == shard.files.get(name) for name, file in files.items())
+        same = all(fingerprint(f"{self._folder}/{file}") == shard.files.get(name) for name, file in files.items())
         return shard if same else None
 
     def table(self, path: Path) -> pa.Table | None:

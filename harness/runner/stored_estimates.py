@@ -134,7 +134,7 @@ def stored_blocks(
         counted = block.take(slice(max(reported_from - n, 0), n_counted - n))
         n = counted.first_episode + len(counted)
         if len(counted):
-            yield replace(counted, first_episode=counted.first_episode - reported_from)
+            yield replace(counted, first_episode=counted.first_episode - reported_from) if reported_from else counted
         if n == n_counted:
             return
     raise _incomplete(folder, f"{n} episodes on record", f"{n_counted} (manifest.json)")
