@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from harness.pool.refined_ladder import RefinedLadder
     from harness.progress import Progress
     from harness.records.frames import StoredRun
-    from harness.runner import AvCheck, Comparison, ReplayResult, RunResult
+    from harness.runner import AvCheck, Comparison, PartResult, ReplayResult, RunResult
 
 __all__ = [
     "HarnessError",
@@ -35,9 +35,11 @@ __all__ = [
     "estimate",
     "ladder",
     "load_campaign",
+    "merge",
     "read",
     "replay",
     "run",
+    "run_part",
     "write_report",
 ]
 
@@ -63,6 +65,30 @@ def run(
     from harness.runner import run_campaign  # noqa: PLC0415
 
     return run_campaign(campaign, Path(out), workers=workers, resume=resume, progress=progress)
+
+
+def run_part(
+    campaign: Campaign,
+    number: int,
+    of: int,
+    out: str | Path,
+    *,
+    workers: int | None = None,
+    resume: bool = False,
+    progress: Progress | None = None,
+) -> PartResult:
+    """Run the ``number``-th, from 1 on, ``of`` so many parts of a campaign (see `harness.runner.run_part`)."""
+    from harness.part import Part  # noqa: PLC0415
+    from harness.runner import run_part  # noqa: PLC0415
+
+    return run_part(campaign, Part(number, of), Path(out), workers=workers, resume=resume, progress=progress)
+
+
+def merge(parts: Sequence[str | Path], out: str | Path) -> RunResult:
+    """Make one run of all its parts (see `harness.runner.merge_parts`)."""
+    from harness.runner import merge_parts  # noqa: PLC0415
+
+    return merge_parts([Path(part) for part in parts], Path(out))
 
 
 def av_check(campaign: Campaign, n_episodes: int = 48) -> AvCheck:

@@ -15,6 +15,8 @@ from harness.errors import HarnessError
 if TYPE_CHECKING:
     import pyarrow as pa
 
+    from harness.runner import PartResult
+
 
 def show_error(error: HarnessError) -> None:
     """Print an error on stderr: where it is, and what was found, expected and can be done, each on its line."""
@@ -91,6 +93,17 @@ def usage_error(error: click.UsageError, context: click.Context) -> HarnessError
 def print_json(content: Any) -> None:
     """Print strict JSON (no NaN) on stdout."""
     click.echo(json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False))
+
+
+def print_part(part: PartResult, *, as_json: bool) -> None:
+    """Print what a finished part of a run holds."""
+    if as_json:
+        print_json(
+            {**part.described, "n_crashes": part.n_crashes, "n_failed": part.n_failed, "folder": str(part.folder)}
+        )
+        return
+    click.echo(f"{part.kind}: {part.n_crashes:,} crashed, {part.n_failed:,} failed. `harness merge` takes all parts.")
+    click.echo(str(part.folder))
 
 
 def print_plan(plan: dict[str, Any]) -> None:

@@ -32,7 +32,18 @@ def result(tmp_path_factory):
 
 
 def test_all_that_is_promised_is_there():
-    commands = {"av_check", "compare", "run", "estimate", "ladder", "read", "replay", "write_report"}
+    commands = {
+        "av_check",
+        "compare",
+        "run",
+        "run_part",
+        "merge",
+        "estimate",
+        "ladder",
+        "read",
+        "replay",
+        "write_report",
+    }
     assert set(harness.__all__) == {"HarnessError", "load_campaign"} | commands
     for name in harness.__all__:
         assert inspect.getdoc(getattr(harness, name))

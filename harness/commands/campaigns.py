@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
@@ -16,12 +17,17 @@ from harness.commands.options import (
     json_option,
     junit_option,
     loaded,
+    part_option,
     quiet_option,
     set_option,
     workers_option,
 )
-from harness.console import print_json, print_plan
+from harness.console import print_json, print_part, print_plan
 from harness.console_tables import print_statements
+from harness.errors import HarnessError
+
+if TYPE_CHECKING:
+    from harness.part import Part
 
 
 @click.command(
@@ -60,10 +66,20 @@ def check(campaign_file: Path, overrides: Sequence[str], av: str | None, *, as_j
         "harness run scenarios/smoke.yaml --out runs/hard --set av.parameters.min_acceleration_mps2=-8",
         "harness run scenarios/smoke.yaml --out runs/late --av late-600ms",
         "harness run scenarios/smoke.yaml --out runs/gate --accept 3e-7 --junit gate.xml",
+        "harness run scenarios/overtaking_forced.yaml --set stop.rhw=null --part 3/64 --out runs/part3",
+    )
+    + "\n\n"
+    + examples(
+        "Slurm        --part $SLURM_ARRAY_TASK_ID/64             with --array=1-64",
+        "SGE, PBS     --part $SGE_TASK_ID/64, --part $PBS_ARRAY_INDEX/64",
+        "Kubernetes   --part $((JOB_COMPLETION_INDEX + 1))/64    of an Indexed job with 64 completions",
+        "AWS Batch    --part $((AWS_BATCH_JOB_ARRAY_INDEX + 1))/64",
+        heading="Job arrays:",
     ),
 )
 @click.argument("campaign_file", metavar="CAMPAIGN", type=CAMPAIGN)
 @click.option("--out", "folder", type=FOLDER, required=True, help="Run folder; made if it is not there.")
+@part_option
 @workers_option
 @click.option("--resume", is_flag=True, help="Go on with what the run folder already holds.")
 @click.option(
@@ -83,6 +99,7 @@ def run(
     campaign_file: Path,
     folder: Path,
     *,
+    part: Part | None,
     workers: int | None,
     resume: bool,
     accept: float | None,
@@ -100,6 +117,11 @@ def run(
 
     Exit code 4 says that stop.episodes or the pool was spent before stop.rhw was reached, or --accept decided; the
     results are there all the same. With --accept 0 means accepted, 5 rejected.
+
+    Job arrays: --part K/N runs the K-th of N equal slices of the very tests that a whole run makes; 'harness merge'
+    makes one run of all parts. The number of tests has to be fixed beforehand (stop.rhw: null; any method but shells).
+    K counts from 1, and N stays the same when only some parts are run again. With --resume a part goes on, or begins if
+    nothing is there. Give --workers: a scheduler may grant fewer cores than the machine has.
     """
     limit = [] if accept is None else [f"accept.crash_rate_below={accept!r}"]
     campaign = loaded(campaign_file, [*overrides, *limit], av)
@@ -107,6 +129,16 @@ def run(
     from harness.runner import run_campaign  # noqa: PLC0415 - slow to import: only once the campaign is right
 
     bar = shown_progress(campaign.stop.rhw, campaign.min_crashes, quiet=quiet)
+    if part is not None:
+        if junit is not None:
+            mend = "Leave out --junit."
+            raise HarnessError("--junit", found="--part", expected="a whole run: a part has no result", mend=mend)
+        from harness.runner import run_part  # noqa: PLC0415 - as above
+
+        with bar:
+            done = run_part(campaign, part, folder, workers=workers, resume=resume, progress=bar)
+        print_part(done, as_json=as_json)
+        return
     with bar:
         result = run_campaign(campaign, folder, workers=workers, resume=resume, progress=bar)
         bar.stage("report", total=None)

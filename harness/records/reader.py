@@ -90,7 +90,7 @@ def stored_columns(folder: Path, manifest: Mapping[str, Any] | None = None) -> s
         The first shard is missing or damaged.
     """
     shards = (manifest or read_manifest(folder))["shards"]
-    return set(_footer(folder / shards[0]["files"]["episodes"]).schema.to_arrow_schema().names) if shards else set()
+    return set(footer(folder / shards[0]["files"]["episodes"]).schema.to_arrow_schema().names) if shards else set()
 
 
 class TableSize(NamedTuple):
@@ -114,12 +114,19 @@ def table_sizes(folder: Path) -> list[TableSize]:
     sizes = []
     for table in TABLES:
         files = [folder / shard["files"][table] for shard in shards if shard["files"].get(table)]
-        n_rows = sum(_footer(file).num_rows for file in files)
+        n_rows = sum(footer(file).num_rows for file in files)
         sizes.append(TableSize(table, len(files), n_rows, sum(file.stat().st_size for file in files)))
     return sizes
 
 
-def _footer(path: Path) -> pq.FileMetaData:
+def footer(path: Path) -> pq.FileMetaData:
+    """What a Parquet file says of itself.
+
+    Raises
+    ------
+    RunFolderError
+        It is missing or damaged.
+    """
     try:
         return pq.read_metadata(path)
     except (OSError, pa.ArrowException) as error:

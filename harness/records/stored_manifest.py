@@ -6,6 +6,7 @@ error, but for the three without which nothing can be read.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Annotated, Any, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
@@ -72,6 +73,15 @@ class StoredShadows(Stored):
     n_failed: Count
 
 
+class StoredPart(Stored):
+    """Which part of a run a folder holds."""
+
+    number: Count
+    of: Count
+    first_episode: Count
+    n_episodes: Count
+
+
 class StoredManifest(Stored):
     """The manifest of a run."""
 
@@ -99,6 +109,32 @@ class StoredManifest(Stored):
     reported_from: Count | None = None
     table_errors: list[TableError] | None = None
     results: dict[str, list[Count] | None] | None = None
+    part: StoredPart | None = None
+
+
+class PartManifest(StoredManifest):
+    """A manifest of a part, with what bringing the parts together needs."""
+
+    part: StoredPart
+    created: str
+    engine: str
+    versions: dict[str, str]
+    cpu: str
+    workers: Count
+    status: str
+    wall_time_s: float
+
+
+WHOLE = "a whole run"
+
+
+def kind_of(manifest: Mapping[str, Any]) -> str:
+    """What a folder with this manifest holds: `WHOLE`, or which part of one."""
+    part = manifest.get("part")
+    if part is None:
+        return WHOLE
+    first, n = part["first_episode"], part["n_episodes"]
+    return f"part {part['number']} of {part['of']} (tests {first:,} to {first + n - 1:,})"
 
 
 class StoredStatement(Stored):

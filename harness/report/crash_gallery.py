@@ -18,7 +18,7 @@ from harness.outcomes import VEHICLES
 from harness.records.reader import read_traces, stored_columns
 from harness.report.number_format import decimal, number
 from harness.report.plot_style import HALF_WIDTH_IN, INK, VEHICLE_COLOURS, Plot, new_figure, note
-from harness.report.run_folder import RunFolder, typed_folder
+from harness.report.run_folder import RunFolder
 from harness.report.summary import Crash, RunSummary
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
 
@@ -71,7 +71,7 @@ def crash_gallery(run: RunFolder, summary: RunSummary) -> list[GalleryRow]:
             reason=", ".join(why),
             share_of_estimate=crash.weight / total if total > 0.0 else math.nan,
             component=component_name(run, crash.component),
-            command=f"harness replay {typed_folder(run.path)} {crash.episode}",
+            command=f"harness replay {run.typed} {crash.episode}",
             plot=_diagram(run, summary, crash, traces) if crash.episode in traced else None,
         )
         for crash, why in reasons.items()

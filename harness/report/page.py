@@ -63,7 +63,7 @@ class Figure(NamedTuple):
     caption: str
 
 
-def write_report(folder: Path) -> Path:
+def write_report(folder: Path, *, final: Path | None = None) -> Path:
     """Write ``report.html`` and ``plots/`` (PNG and SVG) into a run folder.
 
     The same folder gives the same bytes if it is reached from the working directory by the same relative path, by which
@@ -74,6 +74,8 @@ def write_report(folder: Path) -> Path:
     ----------
     folder : Path
         A finished run, as `harness run` leaves it.
+    final : Path, optional
+        Where it is going to be, which the commands on the page name.
 
     Returns
     -------
@@ -86,7 +88,7 @@ def write_report(folder: Path) -> Path:
         If the folder misses a file, or a file is damaged or belongs to another run.
     """
     folder = Path(folder)
-    run = read_run_folder(folder)
+    run = read_run_folder(folder, typed=typed_folder(final or folder))
     sizes = table_sizes(folder)
     summary, contrast = summarise(run), crash_contrast(run)
     with matplotlib.style.context(["default", RC]):
@@ -119,7 +121,7 @@ def write_report(folder: Path) -> Path:
         diagnostics=diagnostics(run),
         details=details(run),
         settings=setting_sections(run.campaign, reproducible=run.manifest.get("reproducible")),
-        folder=typed_folder(folder),
+        folder=run.typed,
         style=Markup(style),  # noqa: S704 - our own file
     )
     _write_plots(folder / "plots", files)

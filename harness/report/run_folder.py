@@ -125,13 +125,17 @@ class ShownShells(ShellDetails):
 
 @dataclass(frozen=True)
 class RunFolder:
-    """A finished run: its campaign, manifest and estimates; ``shells`` is None where tests were drawn otherwise."""
+    """A finished run: its campaign, manifest and estimates; ``shells`` is None where tests were drawn otherwise.
+
+    ``typed`` is how commands on the page name it.
+    """
 
     path: Path
     campaign: Campaign
     manifest: dict[str, Any]
     estimates: StoredEstimates
     shells: ShownShells | None
+    typed: str
 
     @property
     def n_episodes(self) -> int:
@@ -184,8 +188,8 @@ def typed_folder(folder: Path) -> str:
     return shlex.quote(folder.resolve().name)
 
 
-def read_run_folder(path: Path) -> RunFolder:
-    """Read campaign, manifest and estimates of a run.
+def read_run_folder(path: Path, *, typed: str | None = None) -> RunFolder:
+    """Read campaign, manifest and estimates of a run; ``typed`` see `RunFolder`.
 
     Raises
     ------
@@ -196,7 +200,8 @@ def read_run_folder(path: Path) -> RunFolder:
     require_schema(manifest, ShownManifest, path / MANIFEST, mend=NO_RUN)
     estimates = _read_estimates(path, manifest["campaign_hash"])
     shells = _shells(path, estimates.estimates[estimates.headline])
-    return RunFolder(path, _read_campaign(path / "campaign.yaml"), manifest, estimates, shells)
+    campaign = _read_campaign(path / "campaign.yaml")
+    return RunFolder(path, campaign, manifest, estimates, shells, typed or typed_folder(path))
 
 
 def _read_campaign(path: Path) -> Campaign:

@@ -37,7 +37,7 @@ from harness.records.gathered import MOST_EPISODES, MOST_SHARDS, gather
 from harness.resolved import Resolved
 from harness.runner.gathered_blocks import COLUMNS, GatheredBlocks
 from harness.runner.manifest import SMALLEST_FAILED_SAMPLE, Manifest, Prefix, require_no_fewer, require_own_folder
-from harness.runner.planner import Planner, planner_of
+from harness.runner.planner import PartPlanner, Planner, planner_of
 from harness.runner.prepare import Prepared, distance_per_test_m, prepare, require_ready, require_same_pool
 from harness.runner.retrace import Retracing
 from harness.runner.run_result import ESTIMATES, RunResult, earlier_result, exit_code, results_of
@@ -112,10 +112,21 @@ class Run:
         Cut-ins to draw from, where they are prescribed.
     planner : Planner
         The campaign's own; another may take its place before the first round.
+
+    Notes
+    -----
+    ``facts`` are keys of the manifest of what is only a part of a run.
     """
 
     def __init__(
-        self, resolved: Resolved, out: Path, earlier: dict[str, Any], workers: int, progress: Progress, began: float
+        self,
+        resolved: Resolved,
+        out: Path,
+        earlier: dict[str, Any],
+        workers: int,
+        progress: Progress,
+        began: float,
+        **facts: Any,
     ) -> None:
         self._resolved, self._campaign, self._out, self._progress = resolved, resolved.campaign, out, progress
         for left in out.rglob(".*.part"):  # of an earlier run that was killed
@@ -129,6 +140,7 @@ class Run:
             workers=workers,
             distance_per_test_m=distance_per_test_m(resolved.environment),
             table_errors=table_errors(resolved, prepared.tables),
+            **facts,
         )
         self._held, self._listed = earlier["n_episodes"], earlier["shards"]
         self._retracing = Retracing(resolved)
@@ -137,19 +149,23 @@ class Run:
         if prepared.shadow_paths is None:
             self._plan(prepared)
         self._workers = ShardPool(resolved, out, workers)
-        self.prefix = Prefix()
+        self.prefix = Prefix(of_part=bool(facts))
         self._ungathered: list[dict[str, Any]] = []
 
     def run_all(self) -> None:
         """Run shadow runs, if there are any to make, and then rounds of shards until the stop rule is content."""
         with self.under_way():
-            if (paths := self._prepared.shadow_paths) is not None:
-                self._plan(self._prepared.after(self._run_shadows(paths)))
-            most = self._campaign.stop.episodes if self._campaign.accept is None else None  # nobody knows how many
-            self._progress.stage("episodes", most, done=episodes_on_disk(self._out, self._listed))
+            # Until a decision nobody knows how many.
+            self.make_ready(self._campaign.stop.episodes if self._campaign.accept is None else None)
             for specs in self.planner.rounds():
                 if self.run_round(specs):
                     break
+
+    def make_ready(self, most: int | None) -> None:
+        """Run shadow runs, if there are any to make: rounds of ``most`` tests may begin (None: not known)."""
+        if (paths := self._prepared.shadow_paths) is not None:
+            self._plan(self._prepared.after(self._run_shadows(paths)))
+        self._progress.stage("episodes", most, done=episodes_on_disk(self._out, self._listed))
 
     def run_round(self, specs: Iterator[ShardSpec]) -> bool:
         """Run the shards of a round; True, at once, when the campaign is to stop."""
@@ -235,6 +251,8 @@ class Run:
 
         Only what a rule asks for is called ``rhw``: a bar reckons from it when the campaign will stop.
         """
+        if isinstance(self.planner, PartPlanner):
+            return {"crashes": self.prefix.n_crashes}
         watched = "half_width" if self._campaign.stop.rhw is None else "rhw"
         figures: dict[str, int | float] = {"crashes": self.prefix.n_crashes, watched: self.planner.rule.rhw}
         weighted = SAMPLING[self._campaign.testing.method].forces
@@ -245,6 +263,10 @@ class Run:
         counted = {self._out / file for shard in self.prefix.shards for file in shard["files"].values()}
         for path in {path for table in TABLES for path in shards_on_disk(self._out, table)} - counted:
             path.unlink()
+
+    def leave(self) -> None:
+        """Write the manifest of a finished part: it is estimated with the others."""
+        self._manifest.write(self.prefix, "done", retraced=self._retracing.summary(self.prefix.n_retraced))
 
     def finish(self) -> RunResult:
         """Write manifest, estimates and report."""

@@ -26,6 +26,7 @@ from harness.runner.compare_shells import PAIRING, compare_shells, exit_code, sh
 from harness.runner.manifest import require_own_folder
 from harness.runner.prepare import require_ready
 from harness.runner.run_result import RunResult
+from harness.runner.stored_estimates import require_whole
 from harness.state import STATE_COLUMNS
 
 Side = Literal["a", "b"]
@@ -267,7 +268,7 @@ def _take_over(stored: Path, folder: Path, resolved: Resolved) -> None:
     """
     if folder.exists() and any(folder.iterdir()):
         return
-    manifest = read_manifest(stored)
+    manifest = require_whole(stored)
     if manifest["campaign_hash"] != resolved.content_hash:
         raise RunFolderError(
             str(stored),

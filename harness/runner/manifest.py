@@ -10,12 +10,16 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from scipy.special import bdtrc
+
 from harness.campaign.dumping import dump_campaign
 from harness.campaign.models import Campaign
 from harness.errors import RunFolderError, TooManyFailedError
 from harness.records.folder import MANIFEST, read_manifest, require_place, write_json, write_text
 from harness.records.gathered import Fingerprint
+from harness.records.stored_manifest import WHOLE, kind_of
 from harness.resolved import Resolved
+from harness.runner.shards import SURELY_TOO_MANY
 from harness.runner.worker import Repeated, ShardDone, ShardSpec
 
 INTERVAL_S = 5.0
@@ -44,14 +48,15 @@ def cpu_name() -> str:
     return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.machine())
 
 
-def require_own_folder(folder: Path, resolved: Resolved, *, resume: bool) -> dict[str, Any]:
+def require_own_folder(folder: Path, resolved: Resolved, *, resume: bool, kind: str = WHOLE) -> dict[str, Any]:
     """Refuse a folder that holds something else; return the manifest of a run to be continued, or one without shards.
 
     Raises
     ------
     RunFolderError
         The folder cannot be written to, holds another campaign, this one without ``--resume`` or with another
-        controller (one file may not mix two versions of it), or files that are no run.
+        controller (one file may not mix two versions of it), not the ``kind`` of run that is asked for (`kind_of`), or
+        files that are no run.
     """
 
     def refusal(found: str, expected: str, mend: str) -> RunFolderError:
@@ -71,6 +76,9 @@ def require_own_folder(folder: Path, resolved: Resolved, *, resume: bool) -> dic
             f"a folder for this one ({resolved.content_hash})",
             "Choose another folder with --out, or run the campaign.yaml that it holds.",
         )
+    if (held := kind_of(manifest)) != kind:
+        mend = "Repeat --part and stop.episodes as they were when it was begun, or choose another folder with --out."
+        raise refusal(f"{held} of this campaign", kind, mend)
     if not resume:
         mend = "Continue it with --resume, or choose another folder with --out."
         raise refusal("this campaign, already begun", "a new or empty folder", mend)
@@ -103,7 +111,8 @@ def require_no_fewer(folder: Path, earlier: dict[str, Any], n_episodes: int) -> 
 class Prefix:
     """Finished shards in order, from the first on, as the manifest lists them, and what is counted over them."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, of_part: bool = False) -> None:
+        self._of_part = of_part
         self.shards: list[dict[str, Any]] = []
         self.n_episodes = self.n_crashes = self.n_failed = self.n_retraced = self.reported_from = 0
         self.repeated: Repeated | None = None
@@ -125,21 +134,36 @@ class Prefix:
     def require_few_failed(self, campaign: Campaign, *, at_least: int = 0) -> None:
         """Refuse an answer from tests of which too many failed, once there are ``at_least`` so many.
 
+        A part of a run is refused when its share is too large beyond all chance: the whole is judged by `merge`.
+
         Raises
         ------
         TooManyFailedError
             More episodes failed than the campaign allows.
         """
         most = campaign.run.max_failed_share
-        if self.n_episodes >= at_least and self.n_failed > most * self.n_episodes:
-            cause = "".join(f", {n} of them with: {why}" for why, n in self._causes.most_common(1))
-            raise TooManyFailedError(
-                "run.max_failed_share",
-                found=f"{self.n_failed} of {self.n_episodes} episodes failed{cause}",
-                expected=f"a share of at most {most:g}",
-                mend="Mend the AV (`harness av-check` looks at it in seconds), or raise the share to go on. All causes "
-                "are in the column 'failure' of the episodes table.",
-            )
+        by_chance = self._of_part and bdtrc(self.n_failed - 1, self.n_episodes, most) >= SURELY_TOO_MANY
+        if self.n_episodes >= at_least and not by_chance:
+            require_few_failed(self.n_failed, self.n_episodes, self._causes, most)
+
+
+def require_few_failed(n_failed: int, n_episodes: int, causes: Counter[str], most: float) -> None:
+    """Refuse an answer from tests of which more than the share ``most`` failed.
+
+    Raises
+    ------
+    TooManyFailedError
+        They did.
+    """
+    if n_failed > most * n_episodes:
+        cause = "".join(f", {n} of them with: {why}" for why, n in causes.most_common(1))
+        raise TooManyFailedError(
+            "run.max_failed_share",
+            found=f"{n_failed} of {n_episodes} episodes failed{cause}",
+            expected=f"a share of at most {most:g}",
+            mend="Mend the AV (`harness av-check` looks at it in seconds), or raise the share to go on. All causes "
+            "are in the column 'failure' of the episodes table.",
+        )
 
 
 class Manifest:
@@ -179,12 +203,13 @@ class Manifest:
         One of the same size whose file is missing is only made anew.
         """
         shards = self._earlier["shards"]
-        if spec.index >= len(shards):
+        place = spec.index - shards[0]["index"] if shards else 0  # a part begins at a later one
+        if place >= len(shards):
             return
-        shard = shards[spec.index]
+        shard = shards[place]
         if shard["n_episodes"] == spec.n_episodes and not (self._folder / shard["files"]["episodes"]).exists():
             return
-        kept = shards[: spec.index]
+        kept = shards[:place]
         cut = {"status": "interrupted", "stopped_by": None, "ending": None, "results": None}
         n_kept = sum(shard["n_episodes"] for shard in kept)
         self._earlier = {**self._earlier, **cut, "n_episodes": n_kept, "shards": kept}

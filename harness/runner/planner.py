@@ -10,7 +10,7 @@ stated about them is roughly known, some ten tests; then those inside the next o
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from typing import Protocol
 
@@ -54,9 +54,7 @@ class FixedPlanner:
 
     def rounds(self) -> Iterator[Iterator[ShardSpec]]:
         """See `ShellPlanner`."""
-        size, total = self._campaign.run.shard_size, self._campaign.stop.episodes
-        firsts = enumerate(range(0, total, size))
-        yield (ShardSpec(index, first, min(size, total - first)) for index, first in firsts)
+        yield known_specs(self._campaign)
 
     def add(self, block: Block) -> bool:
         """See `ShellPlanner`."""
@@ -65,6 +63,28 @@ class FixedPlanner:
         if not self.rule.due(self._n_episodes):
             return False
         return self.rule.observe(self._n_episodes, self._sums.result(self._campaign.stop.confidence))
+
+
+def known_specs(campaign: Campaign, begin: int = 0, end: int | None = None) -> Iterator[ShardSpec]:
+    """Shards of a campaign all of whose tests are known beforehand, or those from ``begin`` to before ``end``."""
+    size, total = campaign.run.shard_size, campaign.stop.episodes
+    return (ShardSpec(first // size, first, min(size, total - first)) for first in range(0, total, size)[begin:end])
+
+
+class PartPlanner:
+    """Some of a campaign's tests that are known beforehand: nobody looks at what they come to before all are there."""
+
+    def __init__(self, campaign: Campaign, specs: Sequence[ShardSpec]) -> None:
+        self.specs, self.reported_from, self.remark = specs, 0, ""
+        self.rule = StopRule(campaign.stop, campaign.testing.method, campaign.run.shard_size)
+
+    def rounds(self) -> Iterator[Iterator[ShardSpec]]:
+        """See `ShellPlanner`."""
+        yield iter(self.specs)
+
+    def add(self, block: Block) -> bool:  # noqa: ARG002 - nothing is decided
+        """See `ShellPlanner`."""
+        return False
 
 
 class ShellPlanner:

@@ -20,7 +20,7 @@ from harness.pool.storage import cached_pool, read_pool
 from harness.pool.surrogate_replay import PATH_COLUMNS, SurrogateReplay
 from harness.records.folder import SHELLS, no_episodes, read_json, read_manifest, require_schema
 from harness.records.reader import read_shard, stored_columns
-from harness.records.stored_manifest import StoredShells
+from harness.records.stored_manifest import WHOLE, StoredShells, kind_of
 from harness.resolved import resolve
 from harness.runner.gathered_blocks import GatheredBlocks
 from harness.strata import ShellDesign
@@ -62,7 +62,7 @@ def estimate_run(
         If the folder is not a run, its records are damaged or incomplete, or the pool is of another environment.
     """
     folder = Path(folder)
-    manifest = read_manifest(folder)
+    manifest = require_whole(folder)
     campaign = load_campaign(folder / "campaign.yaml", check_files=False)
     distance = manifest.get("distance_per_test_m")
     surrogates = surrogates_of(campaign, stored_columns(folder, manifest), pool)
@@ -108,7 +108,7 @@ def stored_blocks(
         If the folder is not a run, or its records are damaged or incomplete.
     """
     campaign = load_campaign(folder / "campaign.yaml", check_files=False)
-    manifest = read_manifest(folder)
+    manifest = require_whole(folder)
     n_counted, reported_from = int(manifest["n_episodes"]), int(manifest.get("reported_from") or 0)
     if n_counted == 0:
         raise no_episodes(folder)
@@ -145,6 +145,25 @@ def _gathered(gathered: GatheredBlocks, shard: Mapping[str, Any]) -> Block | Non
     files = {"episodes": shard["files"]["episodes"]}
     taken = gathered.take(shard["index"], shard["first_episode"], shard["n_episodes"], files)
     return None if taken is None else taken.block
+
+
+def require_whole(folder: Path) -> dict[str, Any]:
+    """Manifest of a run, and not of a part of one.
+
+    Raises
+    ------
+    RunFolderError
+        It is a part, or no run.
+    """
+    manifest = read_manifest(folder)
+    if (kind := kind_of(manifest)) != WHOLE:
+        raise RunFolderError(
+            str(folder),
+            found=kind,
+            expected=WHOLE,
+            mend="Bring all parts together with `harness merge PART... --out DIR`.",
+        )
+    return manifest
 
 
 def read_shells(folder: Path) -> ShellDesign:

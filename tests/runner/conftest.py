@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -60,14 +61,21 @@ class WorkerInThisProcess:
     def wait(self) -> None: ...
 
 
+@contextmanager
+def one_process() -> Iterator[None]:
+    """Where shards are run, it is here."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(shards, "WorkerProcess", WorkerInThisProcess)
+        patch.setattr(shards, "first_to_answer", lambda workers: workers[0])
+        yield
+
+
 @pytest.fixture(scope="session")
 def run_here(run) -> Callable[..., RunResult]:
     """`run` with one worker that is this process."""
 
     def run_in_this_process(campaign: Campaign, out: Path, **options) -> RunResult:
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(shards, "WorkerProcess", WorkerInThisProcess)
-            patch.setattr(shards, "first_to_answer", lambda workers: workers[0])
+        with one_process():
             return run(campaign, out, workers=1, **options)
 
     return run_in_this_process

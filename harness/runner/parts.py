@@ -1,0 +1,133 @@
+"""A part of a campaign whose tests are known beforehand: the very tests that a whole run would make, and no others.
+
+A job array runs each part by itself, on any machine; `harness.runner.merge` makes of all of them what one process
+would have left.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from harness.campaign.models import Campaign
+from harness.errors import CampaignError
+from harness.part import Part
+from harness.progress import Progress, SilentProgress
+from harness.records.folder import sole_use
+from harness.records.stored_manifest import kind_of
+from harness.runner.campaign_run import Run
+from harness.runner.manifest import require_own_folder
+from harness.runner.planner import PartPlanner, known_specs
+from harness.runner.prepare import require_ready
+from harness.runner.worker import ShardSpec
+
+
+@dataclass(frozen=True)
+class PartResult:
+    """What a finished part left.
+
+    Attributes
+    ----------
+    folder : Path
+    described : dict
+        Its number, of how many, its first test and how many it has.
+    n_crashes, n_failed : int
+        Of its tests; not yet an estimate.
+    """
+
+    folder: Path
+    described: dict[str, int]
+    n_crashes: int
+    n_failed: int
+
+    @property
+    def kind(self) -> str:
+        """Which part it is, in words."""
+        return kind_of({"part": self.described})
+
+
+def run_part(
+    campaign: Campaign,
+    part: Part,
+    out: Path,
+    *,
+    workers: int | None = None,
+    resume: bool = False,
+    progress: Progress | None = None,
+) -> PartResult:
+    """Run one part of a campaign into a folder.
+
+    Parameters
+    ----------
+    campaign : Campaign
+        With a fixed number of tests.
+    part : Part
+    out, workers, resume, progress
+        See `harness.runner.run_campaign`.
+
+    Raises
+    ------
+    HarnessError
+        The campaign decides while it runs what it tests or when it ends, or has fewer shards than parts; or as
+        `harness.runner.run_campaign`.
+    """
+    began = time.monotonic()
+    specs = fixed_specs(campaign, part)
+    resolved = require_ready(campaign)
+    with sole_use(out):
+        facts = {"part": _described(part, specs)}
+        earlier = require_own_folder(out, resolved, resume=resume, kind=kind_of(facts))
+        progress = progress or SilentProgress()
+        run = Run(resolved, out, earlier, workers or os.cpu_count() or 1, progress, began, **facts)
+        with run.under_way():
+            run.make_ready(facts["part"]["n_episodes"])
+            run.planner = PartPlanner(campaign, specs)
+            run.run_round(iter(specs))
+        run.discard_uncounted()
+        run.leave()
+        return PartResult(out, facts["part"], run.prefix.n_crashes, run.prefix.n_failed)
+
+
+def _described(part: Part, specs: list[ShardSpec]) -> dict[str, int]:
+    """As the manifest has it."""
+    n_episodes = sum(spec.n_episodes for spec in specs)
+    return {"number": part.number, "of": part.of, "first_episode": specs[0].first_episode, "n_episodes": n_episodes}
+
+
+def fixed_specs(campaign: Campaign, part: Part) -> list[ShardSpec]:
+    """Shards of a part of a campaign with a fixed number of tests.
+
+    Raises
+    ------
+    CampaignError
+        It has no fixed number, or fewer shards than parts.
+    """
+    stop, size = campaign.stop, campaign.run.shard_size
+    if campaign.testing.method == "shells":
+        raise CampaignError(
+            "testing.method",
+            found="shells, with --part",
+            expected="nde, forced, step_mixture or episode_mixture: shells decide after each round what is tested next",
+            mend="Run it on one machine with many --workers (shells need few tests), or choose another method.",
+        )
+    if stop.rhw is not None:
+        raise CampaignError(
+            "stop.rhw",
+            found=f"{stop.rhw:g}, with --part",
+            expected="null: no part knows when all together are precise enough",
+            mend=f"Write --set stop.rhw=null; all parts together make stop.episodes ({stop.episodes:,}) tests.",
+        )
+    n_shards = -(-stop.episodes // size)
+    if n_shards < part.of:
+        mend = f"Take at most {n_shards} part{'s' * (n_shards > 1)}."
+        if stop.episodes >= part.of:
+            mend += f" Or write --set run.shard_size={stop.episodes // part.of} for all of them."
+        raise CampaignError(
+            "run.shard_size",
+            found=f"{size:,}, of which stop.episodes ({stop.episodes:,}) makes {n_shards} in all, for {part.of} parts",
+            expected="a shard for each part, at least",
+            mend=mend,
+        )
+    return list(known_specs(campaign, *part.bounds(n_shards)))

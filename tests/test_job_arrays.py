@@ -1,0 +1,96 @@
+"""The example job scripts: what each task of an array calls, and that these calls make one run."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from pathlib import Path
+
+import pytest
+import yaml
+
+from harness.cli import main
+from tests.runner.conftest import one_process
+from tests.runner.stored_runs import manifest
+
+EXAMPLES = Path(__file__).parents[1] / "examples/cluster"
+SLURM, KUBERNETES = EXAMPLES / "slurm_parts.sh", EXAMPLES / "kubernetes_parts.yaml"
+N = 64
+CAMPAIGN = "name: array\nworld: {engine: twin}\ntesting: {method: forced}\nrecords: {moments: none}\n" + (
+    "stop: {episodes: 192, rhw: 0.2}\nrun: {shard_size: 3}\n"
+)
+"""Asks for a precision, as campaigns do: the scripts take it back."""
+
+
+@pytest.fixture
+def called(tmp_path, monkeypatch):
+    """Give the words of ``harness`` that a script calls, with the variables of its task."""
+    stub = tmp_path / "bin" / "harness"
+    stub.parent.mkdir()
+    stub.write_text('#!/bin/sh\nprintf "%s\\n" "$@"\n')
+    stub.chmod(0o755)
+    monkeypatch.chdir(tmp_path)
+    environment = {"PATH": f"{stub.parent}:{os.environ['PATH']}"}
+
+    def words(command: list[str], **variables: str) -> list[str]:
+        done = subprocess.run(
+            command, env={**environment, **variables}, capture_output=True, text=True, check=False, cwd=tmp_path
+        )
+        assert (done.returncode, done.stderr) == (0, "")
+        return done.stdout.splitlines()
+
+    return words
+
+
+def jobs() -> list[dict]:
+    return list(yaml.safe_load_all(KUBERNETES.read_text(encoding="utf-8")))
+
+
+def kubernetes_command(job: dict, root: Path) -> list[str]:
+    container = job["spec"]["template"]["spec"]["containers"][0]
+    return [*container["command"], *(text.replace("/runs/", f"{root}/") for text in container["args"])]
+
+
+def slurm_calls(called) -> list[list[str]]:
+    command = ["bash", str(SLURM), "campaign.yaml", "campaign", "--set", "world.cells=8"]
+    tasks = ({"SLURM_ARRAY_TASK_ID": str(task), "SLURM_CPUS_PER_TASK": "4"} for task in range(1, N + 1))
+    return [called(command, **task) for task in tasks]
+
+
+def kubernetes_calls(called) -> list[list[str]]:
+    command = kubernetes_command(jobs()[0], Path.cwd())
+    return [called(command, JOB_COMPLETION_INDEX=str(index)) for index in range(N)]
+
+
+@pytest.mark.parametrize("calls_of", [slurm_calls, kubernetes_calls])
+def test_the_calls_of_all_tasks_make_one_run(calls_of, called, tmp_path, monkeypatch, capsys):
+    calls = calls_of(called)
+    assert [words[words.index("--part") + 1] for words in calls] == [f"{k}/{N}" for k in range(1, N + 1)]
+    assert len({words[words.index("--out") + 1] for words in calls}) == N
+    assert all("--resume" in words and words[words.index("--workers") + 1] == "4" for words in calls)
+    (tmp_path / "campaign.yaml").write_text(CAMPAIGN)
+    with one_process():
+        for words in calls[-2:]:
+            assert main(words) == 0
+    last = next((tmp_path / "campaign.parts").glob("64"))
+    assert manifest(last)["part"] == {"number": N, "of": N, "first_episode": 189, "n_episodes": 3}
+    capsys.readouterr()
+    merge = called(kubernetes_command(jobs()[1], Path.cwd()))
+    assert merge[-2:] == ["--out", str(tmp_path / "campaign")]
+    assert main(merge) == 2
+    assert "missing: part 1-62 of 64" in capsys.readouterr().err
+
+
+def test_numbers_of_tasks_agree():
+    script = SLURM.read_text(encoding="utf-8")
+    assert f"#SBATCH --array=1-{N}\n" in script
+    parts, merging = jobs()
+    assert parts["spec"]["completions"] == N
+    assert parts["spec"]["completionMode"] == "Indexed"
+    assert merging["spec"]["suspend"] is True
+
+
+def test_slurm_says_what_is_missing(tmp_path):
+    done = subprocess.run(["bash", str(SLURM)], capture_output=True, text=True, check=False, cwd=tmp_path)
+    assert done.returncode != 0
+    assert "campaign file" in done.stderr
