@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import pickle
 import signal
+import threading
+import time
 import traceback
 from collections.abc import Callable
 from contextlib import suppress
@@ -34,17 +36,25 @@ class AvEndedProcessError(HarnessError):
 
 def start_process(target: Callable[..., None], *arguments: Any) -> BaseProcess:
     """Start a process that leaves stdout to the harness's results, and answers for all that it starts itself."""
-    child = spawn_context().Process(target=_begin, args=(target, *arguments), daemon=True)
+    child = spawn_context().Process(target=_begin, args=(os.getpid(), target, *arguments), daemon=True)
     child.start()
     return child
 
 
-def _begin(target: Callable[..., None], *arguments: Any) -> None:
+def _begin(parent: int, target: Callable[..., None], *arguments: Any) -> None:
     leave_signals_to_parent()
     os.setsid()
+    threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
     with suppress(OSError):  # stderr may be closed
         os.dup2(2, 1)
     target(*arguments)
+
+
+def _end_with(parent: int) -> None:
+    """End this process and all that it has started once its parent has been killed: a shard may take hours more."""
+    while os.getppid() == parent:
+        time.sleep(LOOK_S)
+    os.killpg(0, signal.SIGKILL)
 
 
 def end_process(child: BaseProcess) -> int | None:

@@ -7,6 +7,7 @@ controller's first step, and each step is ``doStep`` over 0.1 s between setting 
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import shutil
 import zipfile
@@ -20,7 +21,7 @@ from typing import Any
 from harness.campaign.models import FmuController
 from harness.compiled import cache_root
 from harness.controllers.protocol import EpisodeStart, Observation, VehicleController
-from harness.errors import CampaignError
+from harness.errors import CampaignError, writing
 from harness.vehicles.kinematics import STEP_S
 
 OBSERVATIONS: dict[str, Callable[[Observation], float]] = {
@@ -40,6 +41,8 @@ OBSERVATIONS: dict[str, Callable[[Observation], float]] = {
     "bv_overlaps": lambda seen: float(seen.bv_overlaps),
 }
 """What an FMU's inputs can be connected to."""
+_OF_THE_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EACCES, errno.EPERM, errno.EROFS)
+"""Errors that unpacking a sound FMU meets as well."""
 
 
 @dataclass(frozen=True)
@@ -69,6 +72,8 @@ def fmu_maker(fmu: FmuController) -> Callable[[], VehicleController]:
         folder = _unpacked(Path(fmu.file))
         description = fmpy.read_model_description(str(folder))
     except Exception as error:
+        if isinstance(error, OSError) and error.errno in _OF_THE_DISK:
+            raise  # it names the file or the cache: nothing is wrong with the FMU
         raise CampaignError(
             "av.fmu.file",
             found=f"{fmu.file}, which cannot be read ({' '.join(str(error).split())[:300]})",
@@ -106,10 +111,11 @@ def _unpacked(file: Path) -> Path:
     """Folder with the FMU's content, in the cache, by its hash: workers share it."""
     folder = cache_root() / "fmu" / hashlib.sha256(file.read_bytes()).hexdigest()[:16]
     if not folder.exists():
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        fresh = Path(mkdtemp(prefix=f"{folder.name}-", dir=folder.parent))
+        with writing(folder):
+            folder.parent.mkdir(parents=True, exist_ok=True)
+            fresh = Path(mkdtemp(prefix=f"{folder.name}-", dir=folder.parent))
         try:
-            with zipfile.ZipFile(file) as archive:
+            with zipfile.ZipFile(file) as archive, writing(folder):
                 archive.extractall(fresh)
             with suppress(OSError):  # another worker was faster
                 fresh.rename(folder)

@@ -7,8 +7,8 @@ tests), the twin and SUMO all end here, so that an estimator cannot tell them ap
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, replace
-from typing import Any
+from copy import copy
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -143,9 +143,14 @@ class Block:
         start, stop, step = rows.indices(len(self))
         if step != 1:
             raise ValueError("a block holds consecutive episodes: the slice must have step 1")
-        arrays = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "alpha"}
-        taken: dict[str, Any] = {k: array[start:stop] for k, array in arrays.items() if isinstance(array, np.ndarray)}
-        return replace(self, **taken, first_episode=self.first_episode + start)
+        if (start, stop) == (0, len(self)):
+            return self
+        taken = copy(self)  # not checked again: that takes longer than all the rest
+        for name, array in vars(self).items():
+            if isinstance(array, np.ndarray) and name != "alpha":
+                object.__setattr__(taken, name, array[start:stop])
+        object.__setattr__(taken, "first_episode", self.first_episode + start)
+        return taken
 
 
 def _fits(shape: tuple[int, ...], expected: tuple[int | None, ...]) -> bool:

@@ -100,8 +100,11 @@ def drivers_crash(
             )
         return bits
 
-    with ThreadPoolExecutor(os.cpu_count()) as threads:
-        bits = np.concatenate(list(threads.map(replayed, range(0, episodes.num_rows, _PART))))
+    if episodes.num_rows <= _PART:  # small shards may be many: threads would cost more than the work
+        bits = replayed(0)
+    else:
+        with ThreadPoolExecutor(os.cpu_count()) as threads:
+            bits = np.concatenate(list(threads.map(replayed, range(0, episodes.num_rows, _PART))))
     found: BoolArray = ((bits[:, None] >> np.arange(drivers.size)) & 1).astype(np.bool_)
     return found
 

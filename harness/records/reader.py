@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -37,19 +37,30 @@ def read_shards(
         A file is missing or damaged, or holds another number of episodes than the manifest says.
     """
     for shard in read_manifest(folder)["shards"]:
-        files = shard["files"]
-        episodes = read_table(folder / files["episodes"], episode_columns)
-        if episodes.num_rows != shard["n_episodes"]:
-            raise RunFolderError(
-                str(folder / files["episodes"]),
-                found=f"{episodes.num_rows} rows",
-                expected=f"{shard['n_episodes']} rows (manifest.json)",
-                mend=MEND_SHARD,
-            )
-        moments = None
-        if "moments" in files and moment_columns != []:
-            moments = read_table(folder / files["moments"], moment_columns)
-        yield episodes, moments
+        yield read_shard(folder, shard, episode_columns=episode_columns, moment_columns=moment_columns)
+
+
+def read_shard(
+    folder: Path,
+    shard: Mapping[str, Any],
+    *,
+    episode_columns: list[str] | None = None,
+    moment_columns: list[str] | None = None,
+) -> tuple[pa.Table, pa.Table | None]:
+    """Episodes and moments of one shard, as the manifest lists it; see `read_shards`."""
+    files = shard["files"]
+    episodes = read_table(folder / files["episodes"], episode_columns)
+    if episodes.num_rows != shard["n_episodes"]:
+        raise RunFolderError(
+            str(folder / files["episodes"]),
+            found=f"{episodes.num_rows} rows",
+            expected=f"{shard['n_episodes']} rows (manifest.json)",
+            mend=MEND_SHARD,
+        )
+    moments = None
+    if "moments" in files and moment_columns != []:
+        moments = read_table(folder / files["moments"], moment_columns)
+    return episodes, moments
 
 
 def read_traces(folder: Path, episodes: Collection[int], columns: list[str]) -> pa.Table | None:
@@ -70,15 +81,15 @@ def read_traces(folder: Path, episodes: Collection[int], columns: list[str]) -> 
     return pa.concat_tables(found).unify_dictionaries() if found else None
 
 
-def stored_columns(folder: Path) -> set[str]:
-    """Columns of the episodes table of a run; none if it has no shard.
+def stored_columns(folder: Path, manifest: Mapping[str, Any] | None = None) -> set[str]:
+    """Columns of the episodes table of a run; none if it has no shard. A ``manifest`` at hand spares reading it.
 
     Raises
     ------
     RunFolderError
         The first shard is missing or damaged.
     """
-    shards = read_manifest(folder)["shards"]
+    shards = (manifest or read_manifest(folder))["shards"]
     return set(footer(folder / shards[0]["files"]["episodes"]).schema.to_arrow_schema().names) if shards else set()
 
 

@@ -1,12 +1,13 @@
 """Run campaigns: shards over worker processes, stopping, resuming, replaying."""
 
 from harness.runner.av_check import AvCheck, check_av
-from harness.runner.campaign_run import RunResult, run_campaign
+from harness.runner.campaign_run import run_campaign
 from harness.runner.compare import Comparison, compare_campaigns
 from harness.runner.merge import merge_parts
 from harness.runner.parts import PartResult, run_part
 from harness.runner.plan import plan_campaign
 from harness.runner.replay import ReplayResult, replay_episode
+from harness.runner.run_result import RunResult
 from harness.runner.stored_estimates import estimate_run
 
 __all__ = [

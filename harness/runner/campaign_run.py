@@ -6,9 +6,8 @@ import os
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -18,8 +17,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from harness.campaign.models import Campaign
-from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED
-from harness.estimators.decision import Verdict
+from harness.errors import RunFolderError
 from harness.methods import SAMPLING
 from harness.pool.shadow_paths import ShadowPaths
 from harness.pool.shells import PrescribedEpisodes
@@ -35,11 +33,14 @@ from harness.records.folder import (
     write_json,
     write_shard,
 )
+from harness.records.gathered import MOST_EPISODES, MOST_SHARDS, gather
 from harness.resolved import Resolved
+from harness.runner.gathered_blocks import COLUMNS, GatheredBlocks
 from harness.runner.manifest import SMALLEST_FAILED_SAMPLE, Manifest, Prefix, require_no_fewer, require_own_folder
 from harness.runner.planner import PartPlanner, Planner, planner_of
 from harness.runner.prepare import Prepared, distance_per_test_m, prepare, require_ready, require_same_pool
 from harness.runner.retrace import Retracing
+from harness.runner.run_result import ESTIMATES, RunResult, earlier_result, exit_code, results_of
 from harness.runner.shadow_runs import (
     as_recorded,
     require_few_failed,
@@ -52,36 +53,6 @@ from harness.runner.stored_estimates import estimate_run
 from harness.runner.table_accuracy import table_errors
 from harness.runner.worker import ShardDone, ShardSpec
 from harness.stopped_by import StoppedBy, ending
-
-EXIT_OF: Mapping[Verdict, int] = {"accepted": EXIT_DONE, "rejected": EXIT_REFUTED, "undecided": EXIT_BUDGET_SPENT}
-
-
-@dataclass(frozen=True)
-class RunResult:
-    """What a finished campaign left.
-
-    Attributes
-    ----------
-    folder : Path
-    report : Path
-        The page ``report.html``.
-    estimates : dict
-        Content of ``estimates.json``.
-    stopped_by : {"rhw", "accept", "two_phase", "episodes", "pool", "pool_error"}
-        See `harness.stopped_by`.
-    ending : str
-        When it ended and which condition decided, in a sentence.
-    exit_code : int
-        0, or 4 when the budget or the pool was spent before the asked precision or decision, or 5 where the crash rate
-        is above the limit that was to be kept.
-    """
-
-    folder: Path
-    report: Path
-    estimates: dict[str, Any]
-    stopped_by: StoppedBy
-    ending: str
-    exit_code: int
 
 
 def run_campaign(
@@ -120,6 +91,8 @@ def run_campaign(
         earlier = require_own_folder(out, resolved, resume=resume)
         if not shorten:
             require_no_fewer(out, earlier, resolved.campaign.stop.episodes)
+        if (result := earlier_result(out, resolved, earlier)) is not None:
+            return result
         run = Run(resolved, out, earlier, workers or os.cpu_count() or 1, progress or SilentProgress(), began)
         run.run_all()
         if not shorten:
@@ -169,7 +142,7 @@ class Run:
             table_errors=table_errors(resolved, prepared.tables),
             **facts,
         )
-        self._held = earlier["n_episodes"]
+        self._held, self._listed = earlier["n_episodes"], earlier["shards"]
         self._retracing = Retracing(resolved)
         self.prescribed: PrescribedEpisodes | None = None
         self._prepared = prepared
@@ -177,6 +150,7 @@ class Run:
             self._plan(prepared)
         self._workers = ShardPool(resolved, out, workers)
         self.prefix = Prefix(of_part=bool(facts))
+        self._ungathered: list[dict[str, Any]] = []
 
     def run_all(self) -> None:
         """Run shadow runs, if there are any to make, and then rounds of shards until the stop rule is content."""
@@ -191,7 +165,7 @@ class Run:
         """Run shadow runs, if there are any to make: rounds of ``most`` tests may begin (None: not known)."""
         if (paths := self._prepared.shadow_paths) is not None:
             self._plan(self._prepared.after(self._run_shadows(paths)))
-        self._progress.stage("episodes", most, done=episodes_on_disk(self._out))
+        self._progress.stage("episodes", most, done=episodes_on_disk(self._out, self._listed))
 
     def run_round(self, specs: Iterator[ShardSpec]) -> bool:
         """Run the shards of a round; True, at once, when the campaign is to stop."""
@@ -209,14 +183,17 @@ class Run:
             raise
         finally:
             self._workers.close()
+            self._gather()
 
     def _plan(self, prepared: Prepared) -> None:
         """Begin to test what has been prepared."""
         if prepared.prescribed is not None:
             require_same_pool(self._out, prepared)
             write_json(self._out / SHELLS, prepared.prescribed.design.to_json())
-        self._stored = partial(stored_shard, self._out, prepared, self._retracing)
         self.prescribed = prepared.prescribed
+        self._gathers = self.prescribed is None and self._campaign.stop.estimator != "scv"  # which needs moments
+        gathered = GatheredBlocks(self._out, self._campaign, same_sources=True) if self._gathers else None
+        self._stored = partial(stored_shard, self._out, prepared, self._retracing, gathered)
         self.planner: Planner = planner_of(self._campaign, prepared.prescribed, held=self._held)
 
     def _run_shadows(self, paths: ShadowPaths) -> ShadowRuns:
@@ -243,6 +220,7 @@ class Run:
             self._manifest.forget_replaced(done.spec)
             write_shard(self._out, done.spec.index, done.parquet)
         self.prefix.add(done, shard_files(self._out, done.spec.index))
+        self._remember(done)
         self.prefix.require_few_failed(self._campaign, at_least=SMALLEST_FAILED_SAMPLE)
         enough = self.planner.add(done.block)
         self.prefix.reported_from = self.planner.reported_from
@@ -250,6 +228,23 @@ class Run:
         self._progress.status(**self._figures())
         self._manifest.follow(self.prefix)
         return enough
+
+    def _remember(self, done: ShardDone) -> None:
+        """Keep in mind what to gather: consecutive shards, a part's worth of them."""
+        if done.gathered or not self._gathers:
+            self._gather()
+            return
+        self._ungathered.append({**self.prefix.shards[-1], "n_retraced": done.n_retraced})
+        n_episodes = done.spec.first_episode + done.spec.n_episodes - self._ungathered[0]["first_episode"]
+        if len(self._ungathered) >= MOST_SHARDS or n_episodes >= MOST_EPISODES:
+            self._gather()
+
+    def _gather(self) -> None:
+        """Gather what is in mind. It is a copy: where none can be written, the run goes on."""
+        waiting, self._ungathered = self._ungathered, []
+        if waiting:
+            with suppress(OSError, RunFolderError, pa.ArrowException):
+                gather(self._out, waiting, COLUMNS)
 
     def _figures(self) -> dict[str, int | float]:
         """What a progress bar shows: crashes, and what the stop rule saw at its last look.
@@ -287,19 +282,15 @@ class Run:
         self._manifest.write(self.prefix, "done", stopped_by=stopped_by, ending=said, retraced=retraced)
         self._progress.stage("estimates and report", None)
         estimates = estimate_run(self._out)
-        write_json(self._out / "estimates.json", estimates)
+        write_json(self._out / ESTIMATES, estimates)
         # No worker loads matplotlib, and it has been loaded here while workers were busy.
         from harness.report import write_report  # noqa: PLC0415
 
         report = write_report(self._out)
-        return RunResult(self._out, report, estimates, stopped_by, said, self._exit_code(stopped_by))
-
-    def _exit_code(self, stopped_by: StoppedBy) -> int:
-        rule = self.planner.rule
-        if rule.decision is not None:
-            return EXIT_OF[rule.decision.verdict]
-        missed = self._campaign.stop.rhw is not None and not rule.reached and stopped_by != "two_phase"
-        return EXIT_BUDGET_SPENT if missed else EXIT_DONE
+        self._manifest.write_results(results_of(self._out))
+        verdict = None if rule.decision is None else rule.decision.verdict
+        code = exit_code(self._campaign, stopped_by, verdict)
+        return RunResult(self._out, report, estimates, stopped_by, said, code)
 
     def _stopped_by(self) -> StoppedBy:
         rule = self.planner.rule
@@ -312,10 +303,11 @@ class Run:
         return "episodes" if self.prefix.n_episodes >= self._campaign.stop.episodes else "pool"
 
 
-def episodes_on_disk(folder: Path) -> int:
-    """Episodes that an earlier run has finished, for the progress bar."""
+def episodes_on_disk(folder: Path, listed: Sequence[Mapping[str, Any]] = ()) -> int:
+    """Episodes that an earlier run has finished, for the progress bar; ``listed`` are shards of its manifest."""
+    known = {shard["files"]["episodes"]: int(shard["n_episodes"]) for shard in listed}
     n = 0
     for path in shards_on_disk(folder, "episodes"):
         with suppress(OSError, pa.ArrowException):  # a damaged file is refused when its turn comes
-            n += pq.read_metadata(path).num_rows
+            n += known.get(f"episodes/{path.name}") or pq.read_metadata(path).num_rows
     return n

@@ -21,10 +21,11 @@ from harness.records.folder import MANIFEST, read_json, read_manifest, require_p
 from harness.records.reader import read_shards
 from harness.records.stored_manifest import StoredStops
 from harness.resolved import Resolved
-from harness.runner.campaign_run import RunResult, run_campaign
+from harness.runner.campaign_run import run_campaign
 from harness.runner.compare_shells import PAIRING, compare_shells, exit_code, shells_content
 from harness.runner.manifest import require_own_folder
 from harness.runner.prepare import require_ready
+from harness.runner.run_result import RunResult
 from harness.runner.stored_estimates import require_whole
 from harness.state import STATE_COLUMNS
 

@@ -16,6 +16,7 @@ from harness.campaign.dumping import dump_campaign
 from harness.campaign.models import Campaign
 from harness.errors import RunFolderError, TooManyFailedError
 from harness.records.folder import MANIFEST, read_manifest, require_place, write_json, write_text
+from harness.records.gathered import Fingerprint
 from harness.records.stored_manifest import WHOLE, kind_of
 from harness.resolved import Resolved
 from harness.runner.shards import SURELY_TOO_MANY
@@ -193,6 +194,7 @@ class Manifest:
             **facts,
         }
         self._written = began
+        self._last: dict[str, Any] = {}
         self.write(Prefix(), "running")  # first: --resume knows a folder by its manifest
 
     def forget_replaced(self, spec: ShardSpec) -> None:
@@ -208,7 +210,7 @@ class Manifest:
         if shard["n_episodes"] == spec.n_episodes and not (self._folder / shard["files"]["episodes"]).exists():
             return
         kept = shards[:place]
-        cut = {"status": "interrupted", "stopped_by": None, "ending": None}
+        cut = {"status": "interrupted", "stopped_by": None, "ending": None, "results": None}
         n_kept = sum(shard["n_episodes"] for shard in kept)
         self._earlier = {**self._earlier, **cut, "n_episodes": n_kept, "shards": kept}
         write_json(self._folder / MANIFEST, self._earlier)
@@ -239,20 +241,23 @@ class Manifest:
         if status != "done" and prefix.n_episodes < self._earlier["n_episodes"]:
             return
         repeated = prefix.repeated
-        write_json(
-            self._folder / MANIFEST,
-            {
-                **self._content,
-                "status": status,
-                "stopped_by": stopped_by,
-                "ending": ending,
-                "retraced": retraced,
-                "reproducible": self._reproducible and not (repeated and repeated.differing),
-                "repeated": None if repeated is None else repeated.to_json(),
-                "wall_time_s": round(self._written - self._began, 3),
-                "n_episodes": prefix.n_episodes,
-                "reported_from": prefix.reported_from if prefix.reported_from < prefix.n_episodes else 0,
-                "shards": prefix.shards,
-            },
-        )
+        self._last = {
+            **self._content,
+            "status": status,
+            "stopped_by": stopped_by,
+            "ending": ending,
+            "retraced": retraced,
+            "reproducible": self._reproducible and not (repeated and repeated.differing),
+            "repeated": None if repeated is None else repeated.to_json(),
+            "wall_time_s": round(self._written - self._began, 3),
+            "n_episodes": prefix.n_episodes,
+            "reported_from": prefix.reported_from if prefix.reported_from < prefix.n_episodes else 0,
+            "results": None,
+            "shards": prefix.shards,
+        }
+        write_json(self._folder / MANIFEST, self._last)
         write_text(self._folder / "campaign.yaml", self._campaign)
+
+    def write_results(self, results: dict[str, Fingerprint | None]) -> None:
+        """Record what was made of the tests, as it was last written."""
+        write_json(self._folder / MANIFEST, {**self._last, "results": results})

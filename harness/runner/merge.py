@@ -28,8 +28,8 @@ from harness.records.folder import (
 )
 from harness.records.reader import footer
 from harness.records.stored_manifest import WHOLE, PartManifest, kind_of
-from harness.runner.campaign_run import RunResult
 from harness.runner.manifest import require_few_failed
+from harness.runner.run_result import RunResult
 from harness.runner.stored_estimates import estimate_run
 from harness.stopped_by import ending
 

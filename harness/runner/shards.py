@@ -24,9 +24,10 @@ from harness.errors import HarnessError, TooManyFailedError
 from harness.records.folder import read_table, shard_files
 from harness.records.tables import ShardTables
 from harness.resolved import Resolved
+from harness.runner.gathered_blocks import GatheredBlocks
 from harness.runner.prepare import Prepared
 from harness.runner.retrace import Retracing
-from harness.runner.worker import Done, ShardDone, ShardSpec, Spec, finished, serve
+from harness.runner.worker import Done, ShardDone, ShardSpec, Spec, finished, repeated_of, serve
 from harness.spawning import spawn_context
 
 ATTEMPTS = 3
@@ -51,8 +52,10 @@ class WorkerLostError(HarnessError):
     exit_code = 3
 
 
-def stored_shard(folder: Path, prepared: Prepared, retracing: Retracing, spec: ShardSpec) -> ShardDone | None:
-    """A shard that an earlier run has finished, or None; retraced again.
+def stored_shard(
+    folder: Path, prepared: Prepared, retracing: Retracing, gathered: GatheredBlocks | None, spec: ShardSpec
+) -> ShardDone | None:
+    """A shard that an earlier run has finished, or None; retraced again, unless it has been ``gathered`` after that.
 
     Raises
     ------
@@ -66,6 +69,9 @@ def stored_shard(folder: Path, prepared: Prepared, retracing: Retracing, spec: S
     needed = {"episodes"} | ({"moments"} if campaign.records.moments != "none" else set())
     if not needed <= files.keys():
         return None
+    if gathered is not None and (taken := gathered.take(spec.index, spec.first_episode, spec.n_episodes, files)):
+        repeated = repeated_of(taken.shard.metadata)
+        return ShardDone(spec, taken.block, taken.shard.n_retraced, taken.failures, repeated, gathered=True)
     tables = {name: read_table(folder / path) for name, path in files.items()}
     kept = ShardTables(tables["episodes"], tables.get("moments"), tables.get("traces"))
     if kept.episodes.num_rows != spec.n_episodes:

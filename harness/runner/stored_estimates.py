@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,9 +19,10 @@ from harness.methods import EstimatorName
 from harness.pool.storage import cached_pool, read_pool
 from harness.pool.surrogate_replay import PATH_COLUMNS, SurrogateReplay
 from harness.records.folder import SHELLS, no_episodes, read_json, read_manifest, require_schema
-from harness.records.reader import read_shards, stored_columns
+from harness.records.reader import read_shard, stored_columns
 from harness.records.stored_manifest import WHOLE, StoredShells, kind_of
 from harness.resolved import resolve
+from harness.runner.gathered_blocks import GatheredBlocks
 from harness.strata import ShellDesign
 
 MOST_UNASKED = 100_000
@@ -64,7 +65,7 @@ def estimate_run(
     manifest = require_whole(folder)
     campaign = load_campaign(folder / "campaign.yaml", check_files=False)
     distance = manifest.get("distance_per_test_m")
-    surrogates = surrogates_of(campaign, stored_columns(folder), pool)
+    surrogates = surrogates_of(campaign, stored_columns(folder, manifest), pool)
     facts = CampaignFacts(
         name=campaign.name,
         content_hash=str(manifest["campaign_hash"]),
@@ -113,22 +114,37 @@ def stored_blocks(
         raise no_episodes(folder)
     method, alpha = campaign.testing.method, mixture_weights(campaign)
     shells = read_shells(folder) if method == "shells" else None
-    columns = [*EPISODE_COLUMNS, *(SHELL_COLUMNS if shells else ()), *(surrogates.columns if surrogates else ())]
+    needed = [*EPISODE_COLUMNS, *(SHELL_COLUMNS if shells else ())]
     ratios = list(MOMENT_COLUMNS) if moments and method == "step_mixture" else []
+    gathered = None if ratios or shells else GatheredBlocks(folder, campaign)
     n = 0
-    for episodes, steps in read_shards(folder, episode_columns=list(dict.fromkeys(columns)), moment_columns=ratios):
-        block = block_from_tables(episodes, steps, method=method, alpha=alpha, shells=shells)
-        if surrogates is not None and n < n_asked:
-            block = replace(block, surrogates_crash=surrogates.crashes(episodes), known_rates=surrogates.known)
+    for shard in manifest["shards"]:
+        asked = surrogates is not None and n < n_asked
+        block = None if asked or gathered is None else _gathered(gathered, shard)
+        if block is None:
+            columns = [*needed, *(surrogates.columns if surrogates and asked else ())]
+            episodes, steps = read_shard(
+                folder, shard, episode_columns=list(dict.fromkeys(columns)), moment_columns=ratios
+            )
+            block = block_from_tables(episodes, steps, method=method, alpha=alpha, shells=shells)
+            if surrogates is not None and asked:
+                block = replace(block, surrogates_crash=surrogates.crashes(episodes), known_rates=surrogates.known)
         if block.first_episode != n:
             raise _incomplete(folder, f"a shard that begins at episode {block.first_episode}", f"episode {n}")
         counted = block.take(slice(max(reported_from - n, 0), n_counted - n))
         n = counted.first_episode + len(counted)
         if len(counted):
-            yield replace(counted, first_episode=counted.first_episode - reported_from)
+            yield replace(counted, first_episode=counted.first_episode - reported_from) if reported_from else counted
         if n == n_counted:
             return
     raise _incomplete(folder, f"{n} episodes on record", f"{n_counted} (manifest.json)")
+
+
+def _gathered(gathered: GatheredBlocks, shard: Mapping[str, Any]) -> Block | None:
+    """A shard whose episodes file is what it was when it was gathered."""
+    files = {"episodes": shard["files"]["episodes"]}
+    taken = gathered.take(shard["index"], shard["first_episode"], shard["n_episodes"], files)
+    return None if taken is None else taken.block
 
 
 def require_whole(folder: Path) -> dict[str, Any]:

@@ -77,7 +77,8 @@ class Repeated:
 class ShardDone:
     """A finished shard: what the stop rule needs of it, how many episodes the twin has retraced, causes of failures.
 
-    ``repeated`` is None where no test was run twice; ``parquet``, its tables as files, is empty where they are on disk.
+    ``repeated`` is None where no test was run twice; ``parquet``, its tables as files, is empty where they are on disk;
+    ``gathered`` says whether it comes from columns gathered of many shards.
     """
 
     spec: ShardSpec
@@ -86,6 +87,7 @@ class ShardDone:
     failures: Counter[str]
     repeated: Repeated | None
     parquet: dict[str, bytes] = field(default_factory=dict)
+    gathered: bool = False
 
 
 Done = ShardDone | ShadowDone
@@ -216,7 +218,7 @@ def finished(
         shells=None if prescribed is None else prescribed.design,
     )
     failures = Counter(tables.episodes.column("failure").drop_null().to_pylist())
-    return ShardDone(spec, block, n_retraced, failures, _repeated_of(tables.episodes), parquet)
+    return ShardDone(spec, block, n_retraced, failures, repeated_of(tables.episodes.schema.metadata), parquet)
 
 
 def _has_to_repeat(campaign: Campaign) -> bool:
@@ -246,9 +248,9 @@ def _with_repeated(episodes: pa.Table, repeated: Repeated) -> pa.Table:
     return episodes.replace_schema_metadata(metadata)
 
 
-def _repeated_of(episodes: pa.Table) -> Repeated | None:
-    """What `_with_repeated` has put into a table."""
-    found = (episodes.schema.metadata or {}).get(REPEATED)
+def repeated_of(metadata: Mapping[bytes, bytes] | None) -> Repeated | None:
+    """What `_with_repeated` has put into a table's metadata."""
+    found = (metadata or {}).get(REPEATED)
     if found is None:
         return None
     content = json.loads(found)

@@ -1,13 +1,17 @@
 """``av.fmu`` is checked against the FMU before anything runs; an instance per cell, a reset per episode."""
 
 import builtins
+import errno
+import os
 import re
 import zipfile
 
 import pytest
 
 from harness.campaign.loading import load_campaign
+from harness.console import system_error
 from harness.controllers import EpisodeStart, Neighbour, Observation
+from harness.controllers.fmu import fmu_maker
 from harness.controllers.loading import build_host, require_controller
 from harness.errors import CampaignError
 from harness.resolved import resolve
@@ -80,6 +84,19 @@ def test_a_file_that_is_no_fmu_is_refused(tmp_path):
         check(tmp_path / "no.fmu", tmp_path, "inputs: {speed_mps: x}, output: total")
 
 
+def test_a_full_cache_disk_is_not_the_fault_of_the_fmu(fmu, tmp_path, monkeypatch):
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    cache = tmp_path / "cache"
+    monkeypatch.setenv("HARNESS_CACHE_DIR", str(cache))
+    monkeypatch.setattr(zipfile.ZipFile, "extractall", full)
+    with pytest.raises(OSError, match="No space left") as raised:
+        fmu_maker(load(tmp_path, f"{{file: '{fmu}', inputs: {{speed_mps: x}}, output: total}}").av.fmu)
+    assert str(cache) in system_error(raised.value).where
+    assert list((cache / "fmu").iterdir()) == []
+
+
 @pytest.mark.parametrize(
     ("old", "new", "found"),
     [
@@ -126,8 +143,6 @@ def test_the_path_is_relative_to_the_campaign_and_the_content_counts(fmu, tmp_pa
 
 
 def test_instances_are_apart_and_an_episode_forgets_the_last(fmu, tmp_path):
-    from harness.controllers.fmu import fmu_maker
-
     make = fmu_maker(load(tmp_path, f"{{file: '{fmu}', inputs: {{speed_mps: x}}, output: total}}").av.fmu)
     first, second = make(), make()
 

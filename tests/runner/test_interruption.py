@@ -112,3 +112,33 @@ def test_a_worker_whose_parent_dies_while_it_starts_is_silent(tmp_path, deed):
     process = subprocess.Popen([sys.executable, str(script)], start_new_session=True, stderr=subprocess.PIPE, text=True)
     _, complaints = finished(process)
     assert complaints == ""
+
+
+ABANDONED = """
+import os, signal, subprocess, sys, time
+from harness.controllers.apart import start_process
+
+def work(note):
+    with open(note, "w") as file:
+        helper = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"])
+        print(os.getpid(), helper.pid, file=file)
+    os.rename(note, note + ".done")
+    time.sleep(600)
+
+if __name__ == "__main__":
+    start_process(work, sys.argv[1])
+    while not os.path.exists(sys.argv[1] + ".done"):
+        time.sleep(0.01)
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_a_busy_worker_does_not_outlive_a_killed_parent_nor_does_what_it_has_started(tmp_path):
+    script, note = tmp_path / "parent.py", tmp_path / "pids"
+    script.write_text(ABANDONED, encoding="utf-8")
+    process = subprocess.Popen([sys.executable, str(script), str(note)], stderr=subprocess.PIPE, text=True)
+    code, complaints = finished(process)  # the pipe ends only when nobody is left that holds it
+    assert (code, complaints) == (-signal.SIGKILL, "")
+    for pid in map(int, (tmp_path / "pids.done").read_text().split()):
+        state = Path(f"/proc/{pid}/stat")
+        assert not state.exists() or state.read_text().rsplit(")", 1)[1].split()[0] == "Z"

@@ -18,6 +18,7 @@ from harness import estimate, replay
 from harness.cli import main
 from harness.errors import CampaignError, HarnessError, RunFolderError, TooManyFailedError
 from harness.part import Part
+from harness.records.folder import TABLES
 from harness.runner import merge_parts, run_part
 from harness.runner.manifest import Prefix
 from harness.runner.merge import ranges
@@ -31,7 +32,7 @@ METHODS = {
     "forced": ("testing.method=forced", "av={model: fvdm}"),
     "published": ("testing.method=step_mixture", "testing.challenge=immediate", "stop.estimator=scv"),
 }
-OF_THE_MACHINE = {"created", "wall_time_s", "workers"}
+OF_THE_MACHINE = {"created", "wall_time_s", "workers", "results"}
 
 
 @pytest.fixture(scope="module")
@@ -91,8 +92,11 @@ def test_merged_parts_are_the_whole_run(method, campaign, run_here, part_here, m
     assert whole.estimates["n_crashes"] > 0
     assert unlike_columns(whole.folder, result.folder) == []
     assert without_what_is_the_machines(result.folder) == without_what_is_the_machines(whole.folder)
-    files = [path.relative_to(whole.folder) for path in sorted(whole.folder.rglob("*.parquet"))]
-    assert [path.relative_to(result.folder) for path in sorted(result.folder.rglob("*.parquet"))] == files
+    files, merged_files = (
+        [path.relative_to(folder) for table in TABLES for path in shard_files(folder, table)]
+        for folder in (whole.folder, result.folder)
+    )
+    assert merged_files == files
     assert all((whole.folder / file).read_bytes() == (result.folder / file).read_bytes() for file in files)
     assert (result.estimates, result.ending, result.exit_code) == (whole.estimates, whole.ending, whole.exit_code)
 

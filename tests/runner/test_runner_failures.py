@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import errno
+import io
+import itertools
 import multiprocessing
 import os
 import pickle
@@ -13,6 +15,7 @@ import pytest
 
 from harness.cli import main
 from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, WorldDisagreementError
+from harness.progress import LineProgress
 from harness.runner import campaign_run, shards, worker
 from harness.runner.shards import WorkerLostError
 from harness.runner.worker import ShardSpec
@@ -85,6 +88,21 @@ def test_a_disk_that_is_full_at_the_very_end(run_here, campaign, twin_run, tmp_p
     assert not (out / "estimates.json").exists()
     run_here(campaign(*TWIN), out, resume=True)
     assert unlike_columns(twin_run, out) == []
+
+
+def test_a_clock_that_jumps_back(run_here, campaign, twin_run, tmp_path, monkeypatch):
+    """An hour at every look, in both sessions of a run: nothing but the time of day in a line of progress knows it."""
+    hours, stream, out = itertools.count(start=500_000, step=-1), io.StringIO(), tmp_path / "run"
+    monkeypatch.setattr("time.time", lambda: 3600.0 * next(hours))
+    with LineProgress(stream=stream, interval_s=0.01) as progress:
+        run_here(campaign(*TWIN, "stop.episodes=240"), out, progress=progress)
+        run_here(campaign(*TWIN), out, resume=True, progress=progress)
+        progress.stage("episodes", 400, done=200)
+        progress.advance(100)
+        assert "300 of 400" in progress.line()
+    assert unlike_columns(twin_run, out) == []
+    assert 0.0 <= manifest(out)["wall_time_s"] < 600.0
+    assert " -" not in stream.getvalue()
 
 
 # -- the worker's side of the pipe --

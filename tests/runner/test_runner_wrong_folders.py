@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import json
 import sys
+from functools import partial
 from pathlib import Path
 
 import pytest
 
 from harness.cli import main
-from harness.records.folder import require_place, sole_use
+from harness.errors import RunFolderError
+from harness.records.folder import read_manifest, require_place, sole_use
+from harness.resolved import resolve
+from harness.runner.manifest import require_own_folder
 from tests.runner.conftest import MIXTURE_FILE, SMALL, TWIN
 from tests.runner.stored_runs import copy_of, manifest, shard_files, truncate, unlike_columns
 
@@ -219,6 +223,22 @@ def test_a_missing_or_damaged_manifest_or_campaign(name, content, stored, capsys
         assert "Errno" not in text
     if name == "manifest.json":
         assert "Give a folder that `harness run` has written" in text
+
+
+def test_a_manifest_cut_at_every_byte_is_named_and_nothing_is_touched(stored, campaign):
+    """Nothing of it is taken for the whole: neither read nor gone on with."""
+    path, resolved = stored / "manifest.json", resolve(campaign(*TWIN))
+    whole = path.read_bytes()
+    files = sorted(stored.rglob("*"))
+    for n in range(len(whole) - len(b"}\n") + 1):
+        path.write_bytes(whole[:n])
+        for read in (read_manifest, partial(require_own_folder, resolved=resolved, resume=True)):
+            with pytest.raises(RunFolderError) as raised:
+                read(stored)
+            assert raised.value.where == str(path)
+    path.write_bytes(whole.rstrip())
+    assert require_own_folder(stored, resolved, resume=True) == json.loads(whole)
+    assert sorted(stored.rglob("*")) == files
 
 
 def test_a_folder_that_is_not_there(tmp_path, capsys):
