@@ -20,7 +20,7 @@ from harness.methods import Method
 from harness.outcomes import CRASH, FAILED
 from harness.records.folder import read_table
 from harness.resolved import resolve
-from harness.runner.campaign_run import RunResult, run_campaign
+from harness.runner import RunResult, run_campaign
 from harness.runner.prepare import prepare
 from harness.runner.stored_estimates import stored_blocks
 from harness.studies.case_study.claimed import weights_are_in
