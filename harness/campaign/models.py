@@ -263,6 +263,13 @@ class Campaign(Section):
             del content["cut_in_lead_s"]
         return content
 
+    def _testing_content(self) -> dict[str, Any]:
+        """How it is tested; rounds as they come, nothing of them."""
+        content = self.testing.model_dump()
+        if self.testing.shells.smallest_round == 1:
+            del content["shells"]["smallest_round"]
+        return content
+
     @property
     def min_crashes(self) -> int:
         """Sampled crashes needed before RHW may stop the campaign; limits within shells are exact, without a floor."""
@@ -290,7 +297,7 @@ class Campaign(Section):
             "environment_parameters": environment_parameters,
             "av": self.av.identity(),
             "surrogates": [(name, model.model_dump()) for name, model in self.surrogates.items()],
-            "testing": self.testing.model_dump(),
+            "testing": self._testing_content(),
             "pool": self._pool_content(),
             "engine": self.world.engine,
             "moments": self.records.moments,
