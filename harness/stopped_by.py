@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from typing import Literal
 
-StoppedBy = Literal["rhw", "accept", "two_phase", "episodes", "pool", "pool_error"]
-"""The asked precision, a decision about the limit, the number of tests planned for a precision, the budget, the last
-cut-in that the pool holds of a shell that needs more, or the pool's own error, which alone is wider than that."""
+StoppedBy = Literal["rhw", "accept", "contradicted", "two_phase", "episodes", "pool", "pool_error"]
+"""The asked precision, a decision about the limit, a vehicle that does not do what the deciding statement assumes, the
+number of tests planned for a precision, the budget, the last cut-in that the pool holds of a shell that needs more, or
+the pool's own error, which alone is wider than that."""
 
 MENDS: dict[str, str] = {
     "episodes": "stop.episodes was spent; raise it and go on with --resume",
     "pool": "all cut-ins that the pool keeps of a shell were tested; raise pool.cut_ins_per_shell and use a new folder",
+    "contradicted": "the vehicle does not do what the statement assumes; ask for accept.statement: assumption_free and "
+    "use a new folder",
     "pool_error": "the pool's own error alone is wider; lower pool.relative_error (or raise pool.shadow_paths, of a "
     "vehicle that acts before the cut-in) and use a new folder",
 }

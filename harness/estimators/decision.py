@@ -28,6 +28,9 @@ class Decision:
         That the crash rate lies on the side which is said: an interval leaves out half as much there as at both sides.
     low, high : float
         The interval.
+    contradicted : bool
+        Whether a test has shown that the vehicle does not do what the statement assumes. Its upper limit then says
+        nothing, while what crashed, crashed.
     """
 
     crash_rate_below: float
@@ -35,19 +38,31 @@ class Decision:
     confidence: float
     low: float
     high: float
+    contradicted: bool = False
 
     @property
     def verdict(self) -> Verdict:
-        """On which side of the limit the interval lies."""
-        if self.high < self.crash_rate_below:
-            return "accepted"
-        return "rejected" if self.low > self.crash_rate_below else "undecided"
+        """On which side of the limit the interval lies, if that can be said."""
+        if self.low > self.crash_rate_below:
+            return "rejected"
+        return "accepted" if self.high < self.crash_rate_below and not self.contradicted else "undecided"
+
+    @property
+    def is_final(self) -> bool:
+        """Whether further tests would change nothing."""
+        return self.verdict != "undecided" or self.high < self.crash_rate_below
 
     @property
     def sentence(self) -> str:
         """The verdict in words."""
         given = "" if self.statement == ASSUMPTION_FREE else f", given statement {self.statement},"
         level, limit = f"{self.confidence:.3g}", f"{self.crash_rate_below:.3g}"
+        if self.contradicted and self.verdict == "undecided":
+            return (
+                f"UNDECIDED: whether the crash rate is below {limit} per test is not known: the vehicle does not do "
+                f"what statement {self.statement} assumes. Ask for accept.statement: {ASSUMPTION_FREE}, and use a new "
+                "folder."
+            )
         if self.verdict == "undecided":
             between = f"it may be {self.low:.3g} as well as {self.high:.3g}"
             return f"UNDECIDED: whether the crash rate{given} is below {limit} per test is not known; {between}."

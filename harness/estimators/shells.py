@@ -218,6 +218,14 @@ class Shells:
         inside = {each.name: each.n_inside for each in self._design.statements}
         return self._limits(self.tally.part(slice(0, inside.get(statement))), Level.two_sided(confidence))
 
+    def contradicts(self, statement: str) -> bool:
+        """Whether a test crashed beyond the boundary of a statement, or was ahead of it where that is checked."""
+        return any(
+            bool(self.tally.crashes[each.n_inside :].any()) or (each.checked and self._n_ahead > 0)
+            for each in self._design.statements
+            if each.name == statement
+        )
+
     def _limits(self, tally: Tally, level: Level) -> Limits:
         """Of the first strata, those of a tally; anything is possible where crashes lie on too few paths."""
         p = self._design.p[: tally.tests.size]

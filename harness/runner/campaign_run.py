@@ -298,6 +298,8 @@ class Run:
             return "two_phase"
         if rule.reached:
             return "rhw" if rule.decision is None else "accept"
+        if rule.decision is not None and rule.decision.is_final:
+            return "contradicted"
         if rule.pool_error_above_target:  # whatever else is spent: more of it would not help
             return "pool_error"
         return "episodes" if self.prefix.n_episodes >= self._campaign.stop.episodes else "pool"

@@ -244,7 +244,7 @@ class RoundRule:
         watched, n_crashes = seen.limits_of(self._statement, self._confidence), int(seen.tally.crashes.sum())
         self.rhw, from_pool = watched.rhw, watched.from_pool_relative()
         if self._accept is not None:
-            return self._decide(watched, self._accept.crash_rate_below)
+            return self._decide(watched, self._accept.crash_rate_below, contradicted=seen.contradicts(self._statement))
         if self._target is None:
             return False
         met = {
@@ -263,12 +263,12 @@ class RoundRule:
         hopeless = self.pool_error_above_target and from_pool["rhw_from_pool"] ** 2 >= POOL_SHARE * self.rhw**2
         return self.reached or (hopeless and seen.tally.tests.sum() >= self._held)
 
-    def _decide(self, watched: Limits, limit: float) -> bool:
+    def _decide(self, watched: Limits, limit: float, *, contradicted: bool) -> bool:
         one_sided = (1.0 + self._confidence) / 2.0
-        self.decision = Decision(limit, self._statement, one_sided, watched.low, watched.high)
+        self.decision = Decision(limit, self._statement, one_sided, watched.low, watched.high, contradicted)
         self.reached = self.decision.verdict != "undecided"
         self.waited_for = (f"accept.crash_rate_below ({limit:g})",)
-        return self.reached
+        return self.decision.is_final
 
 
 def round_specs(tests: IntArray, added: IntArray, index: int, first_episode: int, shard_size: int) -> list[ShardSpec]:

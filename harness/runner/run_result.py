@@ -33,7 +33,7 @@ class RunResult:
         The page ``report.html``.
     estimates : dict
         Content of ``estimates.json``.
-    stopped_by : {"rhw", "accept", "two_phase", "episodes", "pool", "pool_error"}
+    stopped_by : {"rhw", "accept", "contradicted", "two_phase", "episodes", "pool", "pool_error"}
         See `harness.stopped_by`.
     ending : str
         When it ended and which condition decided, in a sentence.

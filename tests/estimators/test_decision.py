@@ -42,3 +42,13 @@ def test_what_a_statement_decides_says_so():
     found = Decision(2e-7, "library", 0.95, 0.0, 1e-7)
     assert "the crash rate, given statement library, is below" in found.sentence
     assert found.to_json()["verdict"] == "accepted"
+
+
+@pytest.mark.parametrize(
+    ("interval", "verdict", "final"),
+    [((1e-8, 1e-7), "undecided", True), ((1e-7, 3e-7), "undecided", False), ((3e-7, 4e-7), "rejected", True)],
+)
+def test_a_statement_that_tests_contradict_accepts_nothing_and_still_rejects(interval, verdict, final):
+    found = Decision(2e-7, "need-based", 0.95, *interval, contradicted=True)
+    assert (found.verdict, found.is_final) == (verdict, final)
+    assert ("does not do what statement need-based assumes" in found.sentence) == (verdict == "undecided")

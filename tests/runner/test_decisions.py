@@ -33,6 +33,18 @@ def test_a_limit_ends_it_with_a_decision(campaign, run_here, tmp_path, changes, 
     assert n_outside == 0 or "library" not in changes[0]
 
 
+def test_nothing_is_accepted_given_what_the_vehicle_does_not_do(campaign, run_here, tmp_path):
+    """SM-II crashes 8.8e-6 times per test, mostly outside, and brakes later than the need-based driver."""
+    changes = (
+        "accept={crash_rate_below: 1e-6, statement: need-based}",
+        "av={model: fvdm, parameters: {min_acceleration_mps2: -1.0}}",
+    )
+    found = run_here(campaign(*SHELLS, "world.engine=twin", *changes), tmp_path / "run")
+    assert (found.exit_code, found.stopped_by) == (4, "contradicted")
+    assert found.estimates["decision"]["sentence"].startswith("UNDECIDED")
+    assert "ask for accept.statement: assumption_free" in found.ending
+
+
 @pytest.mark.parametrize(
     ("changes", "where"),
     [
