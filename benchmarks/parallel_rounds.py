@@ -33,8 +33,8 @@ WORKERS = (8, 64, 512)
 TEST_S = (0.01, 1.0, 20.0)
 ROUNDS = ((5_000, 1), (1, 1), (1, 64), (1, 128), (1, 512))
 """run.shard_size and testing.shells.smallest_round."""
-HANDLING_S = 0.003
-"""Of a shard, in the process that writes: measured, 1,000 shards of one test in the twin."""
+HANDLING_S = 0.0005
+"""CPU time of a shard in the process that writes: measured in the twin, 1,218 shards of one test against 33 of many."""
 SETTINGS = ("stop.min_crashes=null", "testing.shells.first_tests=null", "stop.rhw=0.3", "stop.episodes=1e5")
 
 
