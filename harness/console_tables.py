@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 if TYPE_CHECKING:
-    from harness.runner import AvCheck
+    from harness.runner import AvCheck, RunResult
 
 _WIDTH_OF_FILES = 140
 
@@ -121,6 +121,14 @@ def print_statements(content: dict[str, Any]) -> None:
         click.echo(f"Statement {name}: {sentence}")
     for sentence in (*content.get("reference_statements", [])[1:], content["scope"]):
         click.echo(sentence)
+
+
+def print_result(result: RunResult) -> None:
+    """Print what a run says, why it ended, and where all of it is."""
+    print_statements(result.estimates)
+    click.echo(result.ending)
+    click.echo(str(result.report))
+    click.echo(str(result.folder / "estimates.json"))
 
 
 def _print_shells(shells: list[dict[str, Any]]) -> None:

@@ -23,7 +23,7 @@ from harness.commands.options import (
     workers_option,
 )
 from harness.console import print_json, print_part, print_plan
-from harness.console_tables import print_statements
+from harness.console_tables import print_result
 from harness.errors import HarnessError
 
 if TYPE_CHECKING:
@@ -141,20 +141,15 @@ def run(
         return
     with bar:
         result = run_campaign(campaign, folder, workers=workers, resume=resume, progress=bar)
-        bar.stage("report", total=None)
-        report_file = result.report
     if junit is not None:
         from harness.report.junit import statement_cases, write_junit  # noqa: PLC0415 - keeps --help fast
 
         asked = campaign.testing.shells.statement
-        write_junit(junit, campaign.name, statement_cases(result.estimates, asked, result.exit_code), [report_file])
+        write_junit(junit, campaign.name, statement_cases(result.estimates, asked, result.exit_code), [result.report])
     if as_json:
         print_json(result.estimates)
     else:
-        print_statements(result.estimates)
-        click.echo(result.ending)
-        click.echo(str(report_file))
-        click.echo(str(result.folder / "estimates.json"))
+        print_result(result)
     ctx.exit(result.exit_code)
 
 

@@ -9,7 +9,7 @@ import click
 
 from harness.commands.options import FOLDER, RUN_FOLDER, examples, json_option, quiet_option
 from harness.console import print_json
-from harness.console_tables import print_statements
+from harness.console_tables import print_result
 
 
 @click.command(
@@ -38,8 +38,5 @@ def merge(parts: Sequence[Path], folder: Path, *, quiet: bool, as_json: bool) ->
         result = merge_parts(parts, folder, progress=bar)
     if as_json:
         print_json(result.estimates)
-        return
-    print_statements(result.estimates)
-    click.echo(result.ending)
-    click.echo(str(result.report))
-    click.echo(str(result.folder / "estimates.json"))
+    else:
+        print_result(result)
