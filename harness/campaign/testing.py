@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, field_validator
 
@@ -221,8 +221,29 @@ class Accept(Section):
     )
 
 
+class Resources(Section):
+    """What Ray sets aside for one worker."""
+
+    cpus: Positive = Field(1.0, description="cores; also a share of one")
+    gpus: float = Field(0.0, ge=0.0, description="GPUs; also a share of one")
+
+
+class RaySettings(Section):
+    """A Ray cluster, used where run.executor is ray."""
+
+    address: str | None = Field(
+        None, description="HOST:6379 or auto, as ray.init takes it; null: $RAY_ADDRESS, else a cluster of this machine"
+    )
+    resources: Resources = Resources()
+    runtime_env: dict[str, Any] = Field(
+        default_factory=dict, description="Ray's runtime_env: brings the controller's package to the machines"
+    )
+
+
 class Run(Section):
     """How the work is spread; nothing here changes a result."""
 
     shard_size: Whole = Field(5_000, ge=1, le=1_000_000, description="episodes per file and per task")
     max_failed_share: Probability = Field(0.01, description="stop with exit code 3 above this share of failures")
+    executor: Literal["local", "ray"] = Field("local", description="where workers run: on this machine, or a cluster")
+    ray: RaySettings = RaySettings()

@@ -14,6 +14,7 @@ from harness.commands.options import (
     FOLDER,
     av_option,
     examples,
+    executor_option,
     json_option,
     junit_option,
     loaded,
@@ -66,6 +67,7 @@ def check(campaign_file: Path, overrides: Sequence[str], av: str | None, *, as_j
         "harness run scenarios/smoke.yaml --out runs/hard --set av.parameters.min_acceleration_mps2=-8",
         "harness run scenarios/smoke.yaml --out runs/late --av late-600ms",
         "harness run scenarios/smoke.yaml --out runs/gate --accept 3e-7 --junit gate.xml",
+        "harness run scenarios/smoke.yaml --out runs/cluster --executor ray",
         "harness run scenarios/overtaking_forced.yaml --set stop.rhw=null --part 3/64 --out runs/part3",
     )
     + "\n\n"
@@ -81,6 +83,7 @@ def check(campaign_file: Path, overrides: Sequence[str], av: str | None, *, as_j
 @click.option("--out", "folder", type=FOLDER, required=True, help="Run folder; made if it is not there.")
 @part_option
 @workers_option
+@executor_option
 @click.option("--resume", is_flag=True, help="Go on with what the run folder already holds.")
 @click.option(
     "--accept",
@@ -101,6 +104,7 @@ def run(
     *,
     part: Part | None,
     workers: int | None,
+    executor: str | None,
     resume: bool,
     accept: float | None,
     junit: Path | None,
@@ -124,7 +128,8 @@ def run(
     nothing is there. Give --workers: a scheduler may grant fewer cores than the machine has.
     """
     limit = [] if accept is None else [f"accept.crash_rate_below={accept!r}"]
-    campaign = loaded(campaign_file, [*overrides, *limit], av)
+    where = [] if executor is None else [f"run.executor={executor}"]
+    campaign = loaded(campaign_file, [*overrides, *limit, *where], av)
     from harness.progress import shown_progress  # noqa: PLC0415 - keeps --help fast
     from harness.runner import run_campaign  # noqa: PLC0415 - slow to import: only once the campaign is right
 

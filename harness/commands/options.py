@@ -56,7 +56,14 @@ av_option = click.option(
     help="Test this vehicle of a panel instead of the campaign's; a bare NAME is one of the shipped panel.",
 )
 workers_option = click.option(
-    "--workers", type=click.IntRange(min=1), help="Processes that simulate. Default: one per core."
+    "--workers",
+    type=click.IntRange(min=1),
+    help="Processes that simulate. Default: one per core; with Ray, as many as the cluster has room for.",
+)
+executor_option = click.option(
+    "--executor",
+    type=click.Choice(["local", "ray"]),
+    help="Where they run: on this machine, or a Ray cluster ($RAY_ADDRESS, or run.ray.address of the campaign).",
 )
 quiet_option = click.option(
     "--quiet", is_flag=True, help="No progress: no bar on a terminal, no line every 30 s elsewhere."

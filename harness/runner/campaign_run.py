@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import threading
 import time
 from collections import Counter
@@ -36,7 +35,14 @@ from harness.records.folder import (
 from harness.records.gathered import MOST_EPISODES, MOST_SHARDS, gather
 from harness.resolved import Resolved
 from harness.runner.gathered_blocks import COLUMNS, GatheredBlocks
-from harness.runner.manifest import SMALLEST_FAILED_SAMPLE, Manifest, Prefix, require_no_fewer, require_own_folder
+from harness.runner.manifest import (
+    SMALLEST_FAILED_SAMPLE,
+    Manifest,
+    Prefix,
+    cpu_name,
+    require_no_fewer,
+    require_own_folder,
+)
 from harness.runner.planner import PartPlanner, Planner, planner_of
 from harness.runner.prepare import Prepared, distance_per_test_m, prepare, require_ready, require_same_pool
 from harness.runner.retrace import Retracing
@@ -48,7 +54,7 @@ from harness.runner.shadow_runs import (
     shadow_specs,
     stored_shadows,
 )
-from harness.runner.shards import ShardPool, stored_shard
+from harness.runner.shards import ShardPool, executor_of, stored_shard
 from harness.runner.stored_estimates import estimate_run
 from harness.runner.table_accuracy import table_errors
 from harness.runner.worker import ShardDone, ShardSpec
@@ -93,7 +99,7 @@ def run_campaign(
             require_no_fewer(out, earlier, resolved.campaign.stop.episodes)
         if (result := earlier_result(out, resolved, earlier)) is not None:
             return result
-        run = Run(resolved, out, earlier, workers or os.cpu_count() or 1, progress or SilentProgress(), began)
+        run = Run(resolved, out, earlier, workers, progress or SilentProgress(), began)
         run.run_all()
         if not shorten:
             require_no_fewer(out, earlier, run.prefix.n_episodes)
@@ -115,7 +121,7 @@ class Run:
 
     Notes
     -----
-    ``facts`` are keys of the manifest of what is only a part of a run.
+    ``n_runs`` are at work in turns; ``facts`` are keys of the manifest of what is only a part of a run.
     """
 
     def __init__(
@@ -123,21 +129,24 @@ class Run:
         resolved: Resolved,
         out: Path,
         earlier: dict[str, Any],
-        workers: int,
+        workers: int | None,
         progress: Progress,
         began: float,
+        *,
+        n_runs: int = 1,
         **facts: Any,
     ) -> None:
         self._resolved, self._campaign, self._out, self._progress = resolved, resolved.campaign, out, progress
         for left in out.rglob(".*.part"):  # of an earlier run that was killed
             left.unlink()
         prepared = prepare(resolved, progress)
+        self._executor = executor_of(resolved, out, workers, n_runs=n_runs)
         self._manifest = Manifest(
             out,
             resolved,
             earlier,
             began=began,
-            workers=workers,
+            workers=self._executor.n_workers,
             distance_per_test_m=distance_per_test_m(resolved.environment),
             table_errors=table_errors(resolved, prepared.tables),
             **facts,
@@ -148,7 +157,7 @@ class Run:
         self._prepared = prepared
         if prepared.shadow_paths is None:
             self._plan(prepared)
-        self._workers = ShardPool(resolved, out, workers)
+        self._workers = ShardPool(resolved.campaign, self._executor)
         self.prefix = Prefix(of_part=bool(facts))
         self._ungathered: list[dict[str, Any]] = []
 
@@ -264,8 +273,14 @@ class Run:
         for path in {path for table in TABLES for path in shards_on_disk(self._out, table)} - counted:
             path.unlink()
 
+    def _note_cpus(self) -> None:
+        """Name all processors that bits may have come from."""
+        if others := self._executor.cpus():
+            self._manifest.note(cpu=", ".join(sorted({cpu_name(), *others})))
+
     def leave(self) -> None:
         """Write the manifest of a finished part: it is estimated with the others."""
+        self._note_cpus()
         self._manifest.write(self.prefix, "done", retraced=self._retracing.summary(self.prefix.n_retraced))
 
     def finish(self) -> RunResult:
@@ -277,6 +292,7 @@ class Run:
         if stopped_by == "rhw" and self.planner.remark:
             said += f" {self.planner.remark}"
         retraced = self._retracing.summary(self.prefix.n_retraced)
+        self._note_cpus()
         if rule.decision is not None:
             self._manifest.note(decision=rule.decision.to_json())
         self._manifest.write(self.prefix, "done", stopped_by=stopped_by, ending=said, retraced=retraced)

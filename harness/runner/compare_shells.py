@@ -6,7 +6,6 @@ folder holds already, from an earlier call or because it is the copy of a stored
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
@@ -98,7 +97,7 @@ def compare_shells(
             locks.enter_context(sole_use(folder))
             earlier = require_own_folder(folder, resolved, resume=True)
             held.append(list(_held_specs(folder, earlier)))
-            runs.append(Run(resolved, folder, earlier, workers or os.cpu_count() or 1, progress, began))
+            runs.append(Run(resolved, folder, earlier, workers, progress, began, n_runs=2))
         prescribed = _same_cut_ins(runs)
         planner = PairPlanner(campaign, prescribed.design, prescribed.available, margin)
         pairs = PairedShells(prescribed.design)

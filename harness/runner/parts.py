@@ -6,7 +6,6 @@ would have left.
 
 from __future__ import annotations
 
-import os
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -80,7 +79,7 @@ def run_part(
         facts = {"part": _described(part, specs)}
         earlier = require_own_folder(out, resolved, resume=resume, kind=kind_of(facts))
         progress = progress or SilentProgress()
-        run = Run(resolved, out, earlier, workers or os.cpu_count() or 1, progress, began, **facts)
+        run = Run(resolved, out, earlier, workers, progress, began, part=facts["part"])
         with run.under_way():
             run.make_ready(facts["part"]["n_episodes"])
             run.planner = PartPlanner(campaign, specs)

@@ -11,7 +11,7 @@ from harness.arrays import RecordArray
 from harness.campaign.models import Campaign
 from harness.controllers.black_box import Death
 from harness.controllers.loading import build_host, require_controller
-from harness.criticality.tables import Tables, build_tables, tables_cached
+from harness.criticality.tables import Tables, build_tables, table_path, tables_cached
 from harness.environment.driving import Environment
 from harness.environment.initial_state import InitialStates
 from harness.episode.loop import MOMENT_LIMITS, NOBODY, EpisodeLoop, Keep, Policy
@@ -155,6 +155,16 @@ def prepare(resolved: Resolved, progress: Progress | None = None) -> Prepared:
     boundary = NOBODY if prescribed is None else checked_boundary(resolved.library, prescribed.design, environment)
     policy = Policy(campaign.seed, environment, importance, resolved.av, boundary)
     return Prepared(resolved, policy, InitialStates(environment.numbers), tables, prescribed, shadow_paths)
+
+
+def cached_files(resolved: Resolved) -> list[Path]:
+    """What `prepare` leaves in the cache, or has found there: with these another machine builds nothing."""
+    campaign = resolved.campaign
+    if needs_tables(campaign):
+        return [table_path(resolved.environment, resolved.surrogates, campaign.testing.challenge)]
+    if campaign.testing.method != "shells":
+        return []
+    return [shadow_paths_file(resolved) if campaign.has_shadow_runs else pool_path(campaign_pool_key(resolved))]
 
 
 def require_same_pool(folder: Path, prepared: Prepared) -> None:

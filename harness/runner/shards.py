@@ -1,34 +1,32 @@
-"""The shards of a campaign: taken over from an earlier run, or run by worker processes; handed back in order."""
+"""The shards of a campaign: taken over from an earlier run, or run by workers; handed back in order."""
 
 from __future__ import annotations
 
 import os
 import signal
-import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from itertools import count, islice
-from multiprocessing.connection import wait
+from itertools import islice
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from scipy.special import bdtrc
 
-from harness.controllers.apart import LOOK_S, end_process, start_process
-from harness.controllers.black_box import OF_EPISODE, Call, Death, last_call
+from harness.campaign.models import Campaign
+from harness.controllers.black_box import OF_EPISODE, Call, Death
 from harness.controllers.time_limit import death_cause
 from harness.errors import HarnessError, TooManyFailedError
 from harness.records.folder import read_table, shard_files
 from harness.records.tables import ShardTables
 from harness.resolved import Resolved
+from harness.runner.executor import AnyWorker, Ended, Executor
 from harness.runner.gathered_blocks import GatheredBlocks
+from harness.runner.local_executor import LocalExecutor
 from harness.runner.prepare import Prepared
 from harness.runner.retrace import Retracing
-from harness.runner.worker import Done, ShardDone, ShardSpec, Spec, finished, repeated_of, serve
-from harness.spawning import spawn_context
+from harness.runner.worker import Done, ShardDone, ShardSpec, Spec, finished, repeated_of
 
 ATTEMPTS = 3
 """A shard whose worker dies is given to another one, this many times in all."""
@@ -37,10 +35,6 @@ SURELY_TOO_MANY = 1e-4
 its third at the earliest, its seventh if it dies in all of 96 cells, some ten seconds into the run."""
 SENT_FROM_OUTSIDE = (-signal.SIGKILL, -signal.SIGTERM)
 """Ends that an operator or a shortage of memory brings: a controller is blamed only when its call is hit again."""
-CLOSING_S = 10.0
-"""Time that a worker gets to release its controllers once all is done."""
-CLOSING_LOOK_S = 0.05
-
 
 _Spec = TypeVar("_Spec", bound=Spec)
 _Done = TypeVar("_Done", bound=Done)
@@ -83,74 +77,19 @@ def stored_shard(
     return finished(spec, kept, campaign, prescribed, retracing, {})
 
 
-class WorkerProcess:
-    """A process that runs one shard after another, at the end of a pipe of its own."""
+def executor_of(resolved: Resolved, folder: Path, n_workers: int | None, *, n_runs: int = 1) -> Executor[Any]:
+    """Where a campaign's shards are run; ``n_runs`` campaigns share it and take turns.
 
-    def __init__(self, resolved: Resolved, folder: Path, black_box: Path) -> None:
-        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-        self._black_box = black_box
-        self.connection, theirs = spawn_context().Pipe()
-        self._process = start_process(serve, theirs, resolved, folder, black_box)
-        theirs.close()  # or its death would not end the pipe
+    Raises
+    ------
+    HarnessError
+        The package, the cluster or room in it is missing.
+    """
+    if resolved.campaign.run.executor == "local":
+        return LocalExecutor(resolved, folder, n_workers or os.cpu_count() or 1)
+    from harness.runner.ray_executor import RayExecutor  # noqa: PLC0415 - an extra
 
-    def give(self, spec: Spec, doomed: Mapping[int, Death]) -> bool:
-        """Give it a shard to run, with the episodes known to end a process; False if it is dead."""
-        try:
-            self.connection.send((spec, dict(doomed)))
-        except OSError:
-            return False
-        return True
-
-    def answer(self) -> Done | None:
-        """The finished shard, or None if the process has died on it.
-
-        Raises
-        ------
-        Exception
-            Whatever running the shard has raised.
-        """
-        try:
-            answer = self.connection.recv() if self.connection.poll() else None
-        except (EOFError, OSError):
-            return None
-        if isinstance(answer, BaseException):
-            raise answer
-        return answer
-
-    def kill(self) -> int | None:
-        """End it at once, whatever it does; returns its exit code."""
-        exit_code = end_process(self._process)
-        self.connection.close()
-        return exit_code
-
-    def is_alive(self) -> bool:
-        """Whether it runs."""
-        return self._process.is_alive()
-
-    def last_call(self) -> Call | None:
-        """The controller's call that it is in, or has died in."""
-        return last_call(self._black_box)
-
-    def dismiss(self) -> None:
-        """Tell an idle worker that nothing more comes: it releases its controllers."""
-        self.connection.close()
-
-    def wait(self) -> None:
-        """Give a dismissed worker a little time; then end it."""
-        until = time.monotonic() + CLOSING_S
-        while self.is_alive() and time.monotonic() < until:  # a copy of it may keep open what join() waits for
-            self._process.join(CLOSING_LOOK_S)
-        self.kill()
-
-
-def first_to_answer(workers: Sequence[WorkerProcess]) -> WorkerProcess:
-    """Wait until one of the workers has answered or died."""
-    while True:
-        dead = [worker for worker in workers if not worker.is_alive()]
-        ready = wait([worker.connection for worker in workers], 0.0 if dead else LOOK_S)
-        found = [worker for worker in workers if worker.connection in ready] or dead
-        if found:
-            return found[0]
+    return RayExecutor(resolved, folder, n_workers, n_runs=n_runs)
 
 
 @dataclass
@@ -164,20 +103,17 @@ class _Job:
     doomed: dict[int, Death] = field(default_factory=dict)
 
 
-class ShardPool:
-    """Worker processes that run shards; one that dies takes nothing but its unfinished shard along.
+class ShardPool(Generic[AnyWorker]):
+    """Workers that run shards; one that dies takes nothing but its unfinished shard along.
 
-    Everything happens in the caller's thread and each worker has a pipe of its own. So there is no lock that a killed
-    process could keep, and no queue that Ctrl-C could leave half filled.
+    Everything happens in the caller's thread, and no two workers share anything. So there is no lock that a killed one
+    could keep, and no queue that Ctrl-C could leave half filled.
     """
 
-    def __init__(self, resolved: Resolved, folder: Path, workers: int) -> None:
-        self._resolved, self._campaign, self._folder = resolved, resolved.campaign, folder
-        self._n_workers = workers
-        self._black_boxes = TemporaryDirectory(prefix="harness-workers-")
-        self._numbers = count()
-        self._idle: list[WorkerProcess] = []
-        self._busy: dict[WorkerProcess, _Job] = {}
+    def __init__(self, campaign: Campaign, executor: Executor[AnyWorker]) -> None:
+        self._campaign, self._executor = campaign, executor
+        self._idle: list[AnyWorker] = []
+        self._busy: dict[AnyWorker, _Job] = {}
 
     def close(self) -> None:
         """Stop all workers, finished or not; those that are idle may release their controllers first."""
@@ -188,12 +124,13 @@ class ShardPool:
         for worker in self._idle:
             worker.wait()
         self._idle, self._busy = [], {}
-        self._black_boxes.cleanup()
+        self._executor.close()
 
     def run(self, specs: Iterator[_Spec], stored: Callable[[_Spec], _Done | None]) -> Iterator[_Done]:
         """Finished shards in index order; those that ``stored`` knows are not run again.
 
-        Two shards per worker are under way or wait for their turn to be handed back: little is lost at the stop.
+        Two shards per worker are under way or wait for their turn to be handed back: little is lost at the stop, and
+        little is held in memory.
 
         Raises
         ------
@@ -203,7 +140,7 @@ class ShardPool:
         wanted: deque[_Job] = deque()
         waiting: deque[_Job] = deque()
         while True:
-            for spec in islice(specs, 2 * self._n_workers + 1 - len(wanted)):
+            for spec in islice(specs, 2 * self._executor.n_workers + 1 - len(wanted)):
                 wanted.append(_Job(spec, stored(spec)))
                 if wanted[-1].done is None:
                     waiting.append(wanted[-1])
@@ -217,44 +154,51 @@ class ShardPool:
 
     def _hand_out(self, waiting: deque[_Job]) -> None:
         """Give waiting shards to idle workers, of which there may be up to as many as were asked for."""
-        while waiting and len(self._busy) < self._n_workers:
-            worker = self._idle.pop() if self._idle else self._new_worker()
+        while waiting and len(self._busy) < self._executor.n_workers:
+            worker = self._idle.pop() if self._idle else self._executor.new_worker(len(self._busy))
+            if worker is None:
+                return
             if worker.give(waiting[0].spec, waiting[0].doomed):
                 self._busy[worker] = waiting.popleft()
             else:
                 worker.kill()  # it died while it was idle
 
-    def _new_worker(self) -> WorkerProcess:
-        return WorkerProcess(self._resolved, self._folder, Path(self._black_boxes.name) / str(next(self._numbers)))
-
     def _collect(self, waiting: deque[_Job]) -> None:
         """Wait for one worker to finish its shard, or to die on it."""
-        worker = first_to_answer(list(self._busy))
+        worker = self._executor.first_to_answer(list(self._busy))
+        if worker is None:
+            return
         job = self._busy[worker]
-        job.done = worker.answer()
+        answer = worker.answer()
         del self._busy[worker]
-        if job.done is not None:
+        if not isinstance(answer, Ended):
+            job.done = answer
             self._idle.append(worker)
             return
-        call = worker.last_call()
-        exit_code = worker.kill()
         waiting.appendleft(job)
+        self._judge(job, answer)
+
+    def _judge(self, job: _Job, ended: Ended) -> None:
+        """Say whose doing the death of a worker was: a test's that is run no more, or nobody's knows."""
+        call = ended.call
         first_time = call != job.suspected
         job.suspected = call
-        cause = death_cause(exit_code, self._campaign.av.limits.step_time_s)
-        own = call is not None and not (exit_code in SENT_FROM_OUTSIDE and first_time)  # the controller's own doing
+        cause = death_cause(ended.exit_code, self._campaign.av.limits.step_time_s)
+        own = call is not None and not (ended.exit_code in SENT_FROM_OUTSIDE and first_time)  # the controller's own
         if own and call is not None and call.kind == OF_EPISODE:
             job.doomed[call.episode] = Death(call.step, cause)
             self._require_few_deaths(job)
             return
         job.deaths += 1
         if job.deaths == ATTEMPTS:
-            raise self._lost(job, exit_code, f"{cause}, in {call}" if own else None)
+            raise self._lost(job, ended.exit_code, f"{cause}, in {call}" if own else None)
 
     def _lost(self, job: _Job, exit_code: int | None, blamed: str | None) -> WorkerLostError:
         """What to say of a shard that no worker survives; ``blamed`` is what the controller did, if it did."""
         found = f"{ATTEMPTS} worker processes that died, the last " + (
-            f"with exit code {exit_code}" if blamed is None else f"because {blamed}"
+            f"because {blamed}"
+            if blamed
+            else f"with {'its machine' if exit_code is None else f'exit code {exit_code}'}"
         )
         mend = "Look for a memory limit (fewer --workers), then continue with --resume."
         if blamed is not None:

@@ -1,0 +1,335 @@
+"""Workers on the machines of a Ray cluster (extra ``harness[ray]``).
+
+On each machine actors stand in for the run: an actor starts a worker process as a run does on its own machine, and
+learns as it does how a controller ended one. Shards come back as encoded Parquet, and are written by the run alone.
+Pools and tables lie once in each machine's part of the object store, and from there in its cache.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from harness.campaign.testing import RaySettings
+from harness.compiled import cache_root, source_hash
+from harness.controllers.apart import fit_to_travel
+from harness.controllers.black_box import Death
+from harness.controllers.loading import require_controller
+from harness.errors import CampaignError, HarnessError
+from harness.interruption import FROM_USER
+from harness.records.folder import write_bytes
+from harness.resolved import Resolved
+from harness.runner.executor import CLOSING_S, Ended
+from harness.runner.local_executor import LocalExecutor, WorkerProcess
+from harness.runner.manifest import cpu_name
+from harness.runner.prepare import cached_files
+from harness.runner.shadow_runs import SHADOW
+from harness.runner.worker import Done, ShardSpec, Spec
+
+try:
+    import ray
+    from ray.exceptions import RayError, RayTaskError, RuntimeEnvSetupError
+except ImportError as error:
+    raise CampaignError(
+        "run.executor",
+        found="ray, but no package ray",
+        expected="the extra for clusters",
+        mend="Install it here and on all machines of the cluster: pip install 'harness[ray]'.",
+    ) from error
+
+Files = Mapping[str, "ray.ObjectRef[Any]"]
+"""Content of files in the object store, by their names below some folder."""
+LOCAL = "local"
+"""Ray's word for a cluster of this machine alone, which ends with the run."""
+LOOK_S = 1.0
+PATIENCE_S = 30.0
+"""After this time without any worker the user is told what is waited for."""
+STARTS = 3
+"""As many workers in a row may be lost before they are ready."""
+
+
+class LostAtStartError(HarnessError):
+    """The cluster cannot bring up a worker."""
+
+    exit_code = 3
+
+
+@dataclass(frozen=True)
+class Machine:
+    """What must be equal on all machines, ``made_of``, and what is said of one."""
+
+    made_of: dict[str, str | None]
+    cpu: str
+
+    @classmethod
+    def this(cls, resolved: Resolved, controller_sha256: str | None) -> Machine:
+        """The one that this runs on."""
+        packages = ["harness", *(["libsumo"] if resolved.campaign.world.engine == "sumo" else [])]
+        made_of: dict[str, str | None] = {package: metadata.version(package) for package in packages}
+        made_of["sources of its kernels"] = source_hash()
+        made_of["source of the controller"] = controller_sha256
+        return cls(made_of, cpu_name())
+
+
+class OnMachine:
+    """What an actor is: it runs shards in a worker process beside it, and tells how that ended if it did."""
+
+    def __init__(self, resolved: Resolved) -> None:
+        self._resolved = resolved
+        self._folder = TemporaryDirectory(prefix="harness-shadow-runs-")
+        self._executor = LocalExecutor(resolved, Path(self._folder.name), n_workers=1)
+        self._worker: WorkerProcess | None = None
+
+    def begin(self, cached: Files) -> Machine | Exception:
+        """Fill the cache, and say what there is."""
+        try:
+            _place(cached, cache_root())
+            return Machine.this(self._resolved, require_controller(self._resolved.campaign))
+        except Exception as error:  # noqa: BLE001 - whatever goes wrong here is the run's to judge
+            return fit_to_travel(error)
+
+    def run(self, spec: Spec, doomed: Mapping[int, Death], shadows: Files) -> Done | Ended | Exception:
+        """Run a shard; tests may follow from the ``shadows``, files of the run folder."""
+        try:
+            _place(shadows, Path(self._folder.name))
+            worker = self._worker = self._worker or self._executor.new_worker(0)
+            worker.give(spec, doomed)  # if it is dead, it has no answer either
+            return self._executor.first_to_answer([worker]).answer()
+        except Exception as error:  # noqa: BLE001 - as above
+            return fit_to_travel(error)
+
+    def close(self) -> None:
+        """Let the worker release its controllers."""
+        if self._worker is not None:
+            self._worker.dismiss()
+            self._worker.wait()
+        self._executor.close()
+        self._folder.cleanup()
+
+
+def _place(files: Files, folder: Path) -> None:
+    for name, content in files.items():
+        if not (path := folder / name).exists():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_bytes(path, ray.get(content))
+
+
+class RayWorker:
+    """An actor, seen from the run; ``pending`` is what it is asked for."""
+
+    def __init__(self, actor: Any, pending: ray.ObjectRef[Any], executor: RayExecutor) -> None:
+        self._actor, self.pending, self._executor = actor, pending, executor
+
+    def give(self, spec: Spec, doomed: Mapping[int, Death]) -> bool:
+        """See `harness.runner.executor.Worker`: that it is dead shows in its answer."""
+        self.pending = self._actor.run.remote(spec, dict(doomed), self._executor.shadows(spec))
+        return True
+
+    def answer(self) -> Done | Ended:
+        """See `harness.runner.executor.Worker`."""
+        answer = self.result()
+        if answer is None:
+            answer = Ended(None, None)
+        if isinstance(answer, Ended):
+            self.kill()
+        return answer  # type: ignore[no-any-return]
+
+    def result(self) -> Any:
+        """What it was asked for; None if it is lost."""
+        try:
+            found = ray.get(self.pending)
+        except (RayTaskError, RuntimeEnvSetupError):
+            raise
+        except RayError:
+            return None
+        if isinstance(found, Exception):
+            raise found
+        return found
+
+    def kill(self) -> None:
+        """See `harness.runner.executor.Worker`; its process follows it at once."""
+        ray.kill(self._actor)
+
+    def dismiss(self) -> None:
+        """See `harness.runner.executor.Worker`."""
+        self.pending = self._actor.close.remote()
+
+    def wait(self) -> None:
+        """See `harness.runner.executor.Worker`."""
+        ray.wait([self.pending], timeout=2.0 * CLOSING_S)
+        self.kill()
+
+
+class RayExecutor:
+    """Starts an actor for each worker, as far as the cluster has room, and others for those that it loses.
+
+    ``n_runs`` such runs share the machines: their workers take turns.
+
+    Raises
+    ------
+    HarnessError
+        There is no such cluster, or it has no room for one worker.
+    """
+
+    def __init__(self, resolved: Resolved, folder: Path, n_workers: int | None, *, n_runs: int = 1) -> None:
+        self._resolved, self._folder = resolved, folder
+        self._settings = settings = resolved.campaign.run.ray
+        address = settings.address or os.environ.get("RAY_ADDRESS") or LOCAL
+        if is_ours := not ray.is_initialized():
+            _connect(address)
+        self._is_ours = is_ours
+        self.n_workers = n_workers or _room(settings)
+        self._here = Machine.this(resolved, resolved.controller_sha256)
+        self._there: set[str] = set()
+        self._starting: list[RayWorker] = []
+        self._ready: list[RayWorker] = []
+        self._lost_at_start = 0
+        self._told = False
+        self._since = time.monotonic()
+        self._shadows: Files | None = None
+        self._content = ray.put(resolved)
+        self._cached = {} if address == LOCAL else _stored(cached_files(resolved), cache_root())
+        self._actor_class = ray.remote(OnMachine).options(
+            num_cpus=settings.resources.cpus / n_runs,
+            num_gpus=settings.resources.gpus / n_runs,
+            runtime_env=settings.runtime_env or None,
+        )
+
+    def cpus(self) -> set[str]:
+        """See `harness.runner.executor.Executor`."""
+        return self._there
+
+    def shadows(self, spec: Spec) -> Files:
+        """Shadow runs that tests follow from: they have all been written before the first test."""
+        if not isinstance(spec, ShardSpec):
+            return {}
+        if self._shadows is None:
+            self._shadows = _stored(sorted((self._folder / SHADOW).glob("*.parquet")), self._folder)
+        return self._shadows
+
+    def new_worker(self, n_there: int) -> RayWorker | None:
+        """See `harness.runner.executor.Executor`."""
+        while n_there + len(self._ready) + len(self._starting) < self.n_workers:
+            actor = self._actor_class.remote(self._content)
+            self._starting.append(RayWorker(actor, actor.begin.remote(self._cached), self))
+        return self._ready.pop() if self._ready else None
+
+    def first_to_answer(self, busy: Sequence[RayWorker]) -> RayWorker | None:
+        """See `harness.runner.executor.Executor`."""
+        waited_for = {worker.pending: worker for worker in [*busy, *self._starting]}
+        while not (answered := ray.wait(list(waited_for), num_returns=1, timeout=LOOK_S)[0]):
+            if not busy:
+                self._tell_of_waiting()
+        worker = waited_for[answered[0]]
+        if worker not in self._starting:
+            return worker
+        self._starting.remove(worker)
+        self._admit(worker)
+        return None
+
+    def _admit(self, worker: RayWorker) -> None:
+        """Let a worker in that is ready, if it is one of ours."""
+        try:
+            machine: Machine | None = worker.result()
+        except RuntimeEnvSetupError as error:
+            raise CampaignError(
+                "run.ray.runtime_env",
+                found=f"an environment that the cluster cannot set up: {error}",
+                expected="what ray.init takes as runtime_env",
+                mend="Correct it; docs/cluster.md has an example.",
+            ) from error
+        if machine is None:
+            self._lost_at_start += 1
+            if self._lost_at_start == STARTS:
+                raise LostAtStartError(
+                    "run.executor",
+                    found=f"{STARTS} workers in a row that were lost while they began",
+                    expected="machines on which the harness starts",
+                    mend="Install the same harness on all of them, and look at Ray's logs there (/tmp/ray).",
+                )
+            return
+        for what, here in self._here.made_of.items():
+            if (there := machine.made_of.get(what)) != here:
+                raise HarnessError(
+                    "run.executor",
+                    found=f"a machine with {what} {there}",
+                    expected=f"{here}, as here: all must run the same code",
+                    mend="Install the same versions everywhere; bring a controller along in run.ray.runtime_env "
+                    "(working_dir), or install its package on all machines.",
+                )
+        self._lost_at_start = 0
+        self._there.add(machine.cpu)
+        self._ready.append(worker)
+
+    def _tell_of_waiting(self) -> None:
+        if not self._told and time.monotonic() - self._since > PATIENCE_S:
+            self._told = True
+            wanted = self._settings.resources
+            sys.stderr.write(  # nothing is wrong yet: machines may come
+                f"waiting for {wanted.cpus:g} CPUs and {wanted.gpus:g} GPUs of one machine; free are "
+                f"{_said(ray.available_resources())} of {_said(ray.cluster_resources())} in all\n"
+            )
+
+    def close(self) -> None:
+        """See `harness.runner.executor.Executor`."""
+        for worker in [*self._starting, *self._ready]:
+            worker.kill()
+        if self._is_ours:
+            ray.shutdown()
+
+
+def _connect(address: str) -> None:
+    """Begin to use a cluster; signals stay the harness's own."""
+    in_main_thread = threading.current_thread() is threading.main_thread()
+    before = {number: signal.getsignal(number) for number in FROM_USER} if in_main_thread else {}
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    ours: dict[str, Any] = {"include_dashboard": False} if address == LOCAL else {}
+    try:
+        ray.init(address=address, logging_level=logging.ERROR, **ours)
+    except (RayError, OSError, RuntimeError, ValueError) as error:
+        raise HarnessError(
+            "run.ray.address",
+            found=f"{address}: {error}",
+            expected="the address of a Ray cluster, whose machines run the same versions of Ray and Python",
+            mend="Start it with `ray start --head` and give its address, such as 10.0.0.1:6379, or none for a cluster "
+            "of this machine.",
+        ) from error
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _room(settings: RaySettings) -> int:
+    """How many workers the cluster has room for."""
+    have, want = ray.cluster_resources(), settings.resources
+    room = [have.get(name, 0.0) / n for name, n in (("CPU", want.cpus), ("GPU", want.gpus)) if n > 0.0]
+    n = int(min(room, default=float(os.cpu_count() or 1)))
+    if n == 0:
+        raise HarnessError(
+            "run.ray.resources",
+            found=f"a cluster of {_said(have)}",
+            expected=f"room for one worker: {want.cpus:g} CPUs and {want.gpus:g} GPUs on one machine",
+            mend="Ask for less, or give --workers if machines are to come later.",
+        )
+    return n
+
+
+def _said(resources: Mapping[str, float]) -> str:
+    return f"{resources.get('CPU', 0.0):g} CPUs and {resources.get('GPU', 0.0):g} GPUs"
+
+
+def _stored(paths: Sequence[Path], folder: Path) -> Files:
+    """Put files into the object store."""
+    return {str(path.relative_to(folder)): ray.put(np.fromfile(path, np.uint8)) for path in paths}
