@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from harness.campaign.models import Campaign
 from harness.campaign.overrides import Places, apply_overrides, parse_override
@@ -61,10 +62,25 @@ def load_campaign(
                 mend="Correct the path; it is relative to the folder of the campaign file.",
             )
         campaign = campaign.replaced(where, str(file))
+    campaign = campaign.replaced(("run", "ray", "runtime_env"), _with_absolute_paths(campaign, Path(path).parent))
     name = campaign.environment.parameters
     if check_files and not names_a_file(name) and name not in shipped_parameters():
         raise _unknown_parameters(name, place(("environment", "parameters")))
     return campaign
+
+
+def _with_absolute_paths(campaign: Campaign, folder: Path) -> dict[str, Any]:
+    """Ray's environment, in which folders of this machine are relative to the campaign's file; others are URIs."""
+
+    def absolute(value: Any) -> Any:
+        if isinstance(value, list):
+            return [absolute(each) for each in value]
+        return str((folder / Path(value).expanduser()).resolve()) if "://" not in str(value) else value
+
+    environment = campaign.run.ray.runtime_env
+    return {
+        key: absolute(value) if key in ("working_dir", "py_modules") else value for key, value in environment.items()
+    }
 
 
 def _named_files(campaign: Campaign) -> dict[tuple[str, ...], tuple[str, str]]:

@@ -41,6 +41,7 @@ from harness.runner.worker import Done, ShardSpec, Spec
 try:
     import ray
     from ray.exceptions import RayError, RayTaskError, RuntimeEnvSetupError
+    from ray.runtime_env import RuntimeEnv
 except ImportError as error:
     raise CampaignError(
         "run.executor",
@@ -104,11 +105,13 @@ class OnMachine:
         """Run a shard; tests may follow from the ``shadows``, files of the run folder."""
         try:
             _place(shadows, Path(self._folder.name))
-            worker = self._worker = self._worker or self._executor.new_worker(0)
+            worker = self._worker or self._executor.new_worker(0)
             worker.give(spec, doomed)  # if it is dead, it has no answer either
-            return self._executor.first_to_answer([worker]).answer()
+            answer = self._executor.first_to_answer([worker]).answer()
         except Exception as error:  # noqa: BLE001 - as above
             return fit_to_travel(error)
+        self._worker = None if isinstance(answer, Ended) else worker
+        return answer
 
     def close(self) -> None:
         """Let the worker release its controllers."""
@@ -140,11 +143,9 @@ class RayWorker:
     def answer(self) -> Done | Ended:
         """See `harness.runner.executor.Worker`."""
         answer = self.result()
-        if answer is None:
-            answer = Ended(None, None)
         if isinstance(answer, Ended):
-            self.kill()
-        return answer  # type: ignore[no-any-return]
+            self._executor.take_back(self)  # its actor lives, and will start another process
+        return answer or Ended(None, None)
 
     def result(self) -> Any:
         """What it was asked for; None if it is lost."""
@@ -187,8 +188,9 @@ class RayExecutor:
         self._resolved, self._folder = resolved, folder
         self._settings = settings = resolved.campaign.run.ray
         address = settings.address or os.environ.get("RAY_ADDRESS") or LOCAL
+        environment = _runtime_env(settings)
         if is_ours := not ray.is_initialized():
-            _connect(address)
+            _connect(address, environment)
         self._is_ours = is_ours
         self.n_workers = n_workers or _room(settings)
         self._here = Machine.this(resolved, resolved.controller_sha256)
@@ -204,7 +206,7 @@ class RayExecutor:
         self._actor_class = ray.remote(OnMachine).options(
             num_cpus=settings.resources.cpus / n_runs,
             num_gpus=settings.resources.gpus / n_runs,
-            runtime_env=settings.runtime_env or None,
+            runtime_env=None if is_ours else environment,  # of ours it is the whole job's
         )
 
     def cpus(self) -> set[str]:
@@ -239,17 +241,16 @@ class RayExecutor:
         self._admit(worker)
         return None
 
+    def take_back(self, worker: RayWorker) -> None:
+        """Keep a worker for another shard."""
+        self._ready.append(worker)
+
     def _admit(self, worker: RayWorker) -> None:
         """Let a worker in that is ready, if it is one of ours."""
         try:
             machine: Machine | None = worker.result()
         except RuntimeEnvSetupError as error:
-            raise CampaignError(
-                "run.ray.runtime_env",
-                found=f"an environment that the cluster cannot set up: {error}",
-                expected="what ray.init takes as runtime_env",
-                mend="Correct it; docs/cluster.md has an example.",
-            ) from error
+            raise _wrong_environment(error) from error
         if machine is None:
             self._lost_at_start += 1
             if self._lost_at_start == STARTS:
@@ -290,14 +291,30 @@ class RayExecutor:
             ray.shutdown()
 
 
-def _connect(address: str) -> None:
+def _runtime_env(settings: RaySettings) -> dict[str, Any] | None:
+    try:
+        return dict(RuntimeEnv(**settings.runtime_env)) or None
+    except (TypeError, ValueError) as error:
+        raise _wrong_environment(error) from error
+
+
+def _wrong_environment(error: Exception) -> CampaignError:
+    return CampaignError(
+        "run.ray.runtime_env",
+        found=f"an environment that Ray cannot set up: {error}",
+        expected="what ray.init takes as runtime_env",
+        mend="Correct it; docs/cluster.md has an example.",
+    )
+
+
+def _connect(address: str, environment: dict[str, Any] | None) -> None:
     """Begin to use a cluster; signals stay the harness's own."""
     in_main_thread = threading.current_thread() is threading.main_thread()
     before = {number: signal.getsignal(number) for number in FROM_USER} if in_main_thread else {}
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     ours: dict[str, Any] = {"include_dashboard": False} if address == LOCAL else {}
     try:
-        ray.init(address=address, logging_level=logging.ERROR, **ours)
+        ray.init(address=address, logging_level=logging.ERROR, runtime_env=environment, **ours)
     except (RayError, OSError, RuntimeError, ValueError) as error:
         raise HarnessError(
             "run.ray.address",

@@ -1,0 +1,137 @@
+"""Shards on a Ray cluster of this machine: the same records as by processes of the run's own, whatever is killed.
+
+Several machines, and cables that are pulled: `python -m benchmarks.ray_cluster`.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from benchmarks.kills import descendants
+from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, HarnessError
+from harness.runner.executor import Ended
+from tests.runner.conftest import TWIN
+from tests.runner.stored_runs import manifest, shard_files, unlike_columns
+from tests.runner.test_shadow_runs import FORCED, SHADOWS, SHELLS, of
+
+ray = pytest.importorskip("ray")
+from harness.runner import ray_executor  # noqa: E402 - not without the extra
+
+ROOT = Path(__file__).parents[2]
+ON_RAY = "run.executor=ray"
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _cluster():
+    """One for all tests of this file: runs use the cluster that their process is connected to."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", str(ROOT))
+        patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+        ray.init(address="local", num_cpus=2, include_dashboard=False, logging_level="ERROR", log_to_driver=False)
+        yield
+        ray.shutdown()
+
+
+def below(word: bytes) -> list[int]:
+    """Processes that this one has started, itself or by others, with a word in their command."""
+    return [pid for pid in descendants(os.getpid()) if word in Path(f"/proc/{pid}/cmdline").read_bytes()]
+
+
+def test_records_are_those_of_a_local_run(run, campaign, twin_run, tmp_path):
+    run(campaign(*TWIN, ON_RAY), tmp_path / "run")
+    assert unlike_columns(twin_run, tmp_path / "run") == []
+    assert manifest(tmp_path / "run")["workers"] == 2  # the cluster's room
+    assert manifest(tmp_path / "run")["cpu"] == manifest(twin_run)["cpu"]
+    assert below(b"spawn_main") == []
+
+
+def test_a_run_goes_on_elsewhere_than_it_began(run, run_here, campaign, twin_run, tmp_path):
+    small = campaign(*TWIN, "stop.episodes=160")
+    run_here(small, tmp_path / "run")
+    run(campaign(*TWIN, ON_RAY), tmp_path / "run", resume=True)
+    assert unlike_columns(twin_run, tmp_path / "run") == []
+
+
+def test_shadow_runs_come_to_the_machines(run, campaign, tmp_path):
+    settings = (*SHELLS, SHADOWS, f"av={of('Speeds')}", TWIN[0])
+    a = run(campaign(*settings), tmp_path / "local", workers=2)
+    b = run(campaign(*settings, ON_RAY), tmp_path / "ray")
+    assert unlike_columns(a.folder, b.folder) == []
+    assert a.estimates == b.estimates
+
+
+def test_a_controller_that_ends_its_process_leaves_the_same_records(run, campaign, tmp_path, monkeypatch):
+    monkeypatch.chdir(ROOT)
+    bad = json.dumps({"bad": {"17": "ends_the_process", "230": "crashes", "231": "ends_the_process_in_start"}})
+    av = f"av={{controller: 'tests.controllers.misbehaving:Misbehaving', parameters: {bad}}}"
+    settings = (*FORCED, TWIN[0], av, "run.max_failed_share=0.1")
+    a = run(campaign(*settings), tmp_path / "local", workers=2)
+    b = run(campaign(*settings, ON_RAY), tmp_path / "ray")
+    assert unlike_columns(a.folder, b.folder) == []
+
+
+@pytest.mark.parametrize("victim", [b"ray::OnMachine", b"spawn_main"])
+def test_a_killed_actor_or_worker_takes_nothing_along(run, campaign, tmp_path, victim):
+    settings = (*FORCED, TWIN[0], "stop.episodes=12000", "run.shard_size=400")
+    a = run(campaign(*settings), tmp_path / "local", workers=2)
+    struck: list[int] = []
+
+    def strike() -> None:
+        while not shard_files(tmp_path / "ray"):
+            time.sleep(0.02)
+        struck.extend(below(victim)[:1])
+        os.kill(struck[0], signal.SIGKILL)
+
+    thread = threading.Thread(target=strike)
+    thread.start()
+    b = run(campaign(*settings, ON_RAY), tmp_path / "ray")
+    thread.join()
+    assert struck
+    assert unlike_columns(a.folder, b.folder) == []
+
+
+def test_a_shard_that_is_lost_thrice_with_its_machine_is_named(run, campaign, tmp_path, monkeypatch):
+    monkeypatch.setattr(ray_executor.RayWorker, "answer", lambda self: self.kill() or Ended(None, None))
+    with pytest.raises(HarnessError, match="3 worker processes that died, the last with its machine") as lost:
+        run(campaign(*TWIN, ON_RAY), tmp_path / "run")
+    assert lost.value.exit_code == EXIT_TOO_MANY_FAILED
+
+
+def test_no_room_for_one_worker(run, campaign, tmp_path):
+    with pytest.raises(HarnessError, match=r"run\.ray\.resources: found a cluster of 2 CPUs and 0 GPUs"):
+        run(campaign(*TWIN, ON_RAY, "run.ray.resources.gpus=0.25"), tmp_path / "run")
+    assert not (tmp_path / "run/manifest.json").exists()
+
+
+def test_an_environment_that_cannot_be_set_up(run, campaign, tmp_path):
+    with pytest.raises(HarnessError, match=r"run\.ray\.runtime_env"):
+        run(campaign(*TWIN, ON_RAY, "run.ray.runtime_env={working_dir: nowhere-at-all}"), tmp_path / "run")
+
+
+def test_another_version_on_a_machine_is_refused(run, campaign, tmp_path, monkeypatch):
+    monkeypatch.setattr(ray_executor, "source_hash", lambda: "0123456789abcdef")
+    with pytest.raises(HarnessError, match="a machine with sources of its kernels"):
+        run(campaign(*TWIN, ON_RAY), tmp_path / "run")
+
+
+def test_without_the_package(run, campaign, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    monkeypatch.delitem(sys.modules, "harness.runner.ray_executor")
+    with pytest.raises(CampaignError, match=r"pip install 'harness\[ray\]'"):
+        run(campaign(*TWIN, ON_RAY), tmp_path / "run")
+
+
+def test_folders_of_the_environment_are_relative_to_the_campaign(campaign):
+    asked = campaign("run.ray.runtime_env={working_dir: controllers, py_modules: [s3://bucket/a.zip, b]}")
+    scenarios = ROOT / "scenarios"
+    environment = asked.run.ray.runtime_env
+    assert environment["working_dir"] == str(scenarios / "controllers")
+    assert environment["py_modules"] == ["s3://bucket/a.zip", str(scenarios / "b")]
