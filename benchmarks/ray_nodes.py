@@ -20,6 +20,8 @@ PORT = 6379
 SWITCH = "harness-switch"
 LONGEST_START_S = 120.0
 HEAD = 0
+TOKEN = "0123456789abcdef" * 4
+"""By which machines of a cluster know each other."""
 
 
 def missing() -> str | None:
@@ -113,7 +115,12 @@ class Nodes:
     def _environment(self, k: int) -> dict[str, str]:
         kept = {name: value for name, value in os.environ.items() if not name.lower().endswith("_proxy")}
         home = self._folder / self._name(k)
-        ours = {"HOME": str(home), "HARNESS_CACHE_DIR": str(home / "cache"), "RAY_AUTH_MODE": "disabled"}
+        ours = {
+            "HOME": str(home),
+            "HARNESS_CACHE_DIR": str(home / "cache"),
+            "RAY_AUTH_MODE": "token",
+            "RAY_AUTH_TOKEN": TOKEN,
+        }
         ours |= {"RAY_ADDRESS": self.address, "PYTHONPATH": str(Path(__file__).parents[1])}
         return {**kept, **ours}
 

@@ -94,3 +94,27 @@ def test_slurm_says_what_is_missing(tmp_path):
     done = subprocess.run(["bash", str(SLURM)], capture_output=True, text=True, check=False, cwd=tmp_path)
     assert done.returncode != 0
     assert "campaign file" in done.stderr
+
+
+def test_ray_on_slurm_starts_the_head_and_the_others_and_then_the_campaign(tmp_path):
+    for name in ("ray", "srun", "harness"):
+        stub = tmp_path / name
+        stub.write_text(f'#!/bin/sh\nsleep 0.2\necho {name} "$@" "${{RAY_AUTH_TOKEN:+secret}}" >> {tmp_path}/calls\n')
+        stub.chmod(0o755)
+    variables = {"SLURM_JOB_ID": "123456", "SLURM_JOB_NUM_NODES": "4", "SLURM_CPUS_PER_TASK": "16"}
+    done = subprocess.run(
+        ["bash", str(EXAMPLES / "slurm_ray.sh"), "c.yaml", "out", "--set", "stop.rhw=0.2"],
+        env={"PATH": f"{tmp_path}:{os.environ['PATH']}", "SLURMD_NODENAME": "n1", **variables},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    head, *others = (tmp_path / "calls").read_text().splitlines()
+    assert head == "ray start --head --port=23456 --num-cpus=16 --disable-usage-stats secret"
+    (joining,) = (words for words in others if words.startswith("srun"))
+    assert "--nodes=3 --ntasks=3 --exclude=n1 ray start --address=" in joining
+    assert ":23456 --num-cpus=16 --block secret" in joining
+    (run,) = (words for words in others if words.startswith("harness"))
+    assert run == "harness run c.yaml --set stop.rhw=0.2 --out out --executor ray --resume --workers 64 secret"
