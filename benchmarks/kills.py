@@ -1,11 +1,14 @@
-"""Kill workers and parents of running campaigns at random moments: nothing on record may differ, nobody may live on.
+"""Kill what a running campaign consists of at random moments: nothing on record may differ, nobody may live on.
 
     python -m benchmarks.kills runs/kills --kills 1000
+    sudo python -m benchmarks.kills runs/kills --kills 200 --machines 3
 
 runs a campaign of each of three methods in the twin, once undisturbed and once with SIGKILL to a worker or to the
-parent at random moments, again and again with ``--resume``, until all kills are spent. Then it compares every file of
-records, and ``estimates.json``, byte by byte. A parent's workers must be gone `GRACE_S` after its death. Kills follow
-from ``--seed``; what they strike depends on the machine's load, and so differs each time.
+run's own process at random moments, again and again with ``--resume``, until all kills are spent; with ``--machines``
+on a Ray cluster of so many (namespaces of this one), also to actors, and to the raylets of machines, which are then
+started again. Then it compares every file of records, and ``estimates.json``, byte by byte. What a killed run had
+started must be gone soon after. Kills follow from ``--seed``; what they strike depends on the machine's load, and so
+differs each time.
 """
 
 from __future__ import annotations
@@ -23,27 +26,71 @@ from contextlib import suppress
 from pathlib import Path
 
 from benchmarks.contenders import SCENARIOS
+from benchmarks.ray_nodes import Nodes, missing
 from harness.records.folder import TABLES
 
 METHODS = {"forced": "overtaking_forced", "step_mixture": "overtaking_nade", "shells": "smoke"}
 """Method and its scenario."""
 SETTINGS = ("world.engine=twin", "world.cells=64", "stop.rhw=null", "run.shard_size=100", "records.trace_share=0.01")
-GRACE_S = 5.0
-WORKERS_SHARE = 0.5
-"""Of the kills."""
 LONGEST_WAIT_S = 600.0
 DONE, LOST = (0, 4), 3
 """Exit codes; the last when workers were killed three times on the same shard."""
 _POLL_S = 0.02
 
 
-def start(method: str, out: Path, episodes: int) -> subprocess.Popen[bytes]:
-    """`harness run --resume` with two workers."""
+def command(method: str, out: Path, episodes: int) -> list[str]:
+    """`harness run --resume`."""
     settings = (*SETTINGS, f"stop.episodes={episodes}")
-    command = [sys.executable, "-m", "harness", "run", str(SCENARIOS / f"{METHODS[method]}.yaml"), "--resume"]
-    command += ["--quiet", "--workers", "2", "--out", str(out)]
-    command += [word for setting in settings for word in ("--set", setting)]
-    return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+    words = [sys.executable, "-m", "harness", "run", str(SCENARIOS / f"{METHODS[method]}.yaml"), "--resume", "--quiet"]
+    return [*words, "--out", str(out), *(word for setting in settings for word in ("--set", setting))]
+
+
+class Here:
+    """Runs with two workers that are processes of their own."""
+
+    grace_s = 5.0
+
+    def start(self, words: list[str]) -> subprocess.Popen[bytes]:
+        """Start a run."""
+        return subprocess.Popen([*words, "--workers", "2"], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+
+    def targets(self, run: subprocess.Popen[bytes]) -> dict[str, list[int]]:
+        """What can be killed."""
+        return {"run": [run.pid], "worker": [pid for pid in descendants(run.pid) if started_by(pid, b"spawn_main")]}
+
+    def mend(self) -> None:
+        """Nothing is broken for long."""
+
+
+class OnMachines(Here):
+    """Runs on a Ray cluster that outlives them."""
+
+    grace_s = 30.0  # Ray has to notice
+
+    def __init__(self, nodes: Nodes) -> None:
+        self._nodes = nodes
+
+    def start(self, words: list[str]) -> subprocess.Popen[bytes]:
+        """See `Here`."""
+        words = [*words, "--executor", "ray", "--workers", str(self._nodes.n)]
+        return self._nodes.start(*words, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+
+    def targets(self, run: subprocess.Popen[bytes]) -> dict[str, list[int]]:
+        """See `Here`; the head's raylet is spared: a cluster without its head is none."""
+        machines = [descendants(self._nodes.init(k)) for k in range(self._nodes.n)]
+        everywhere = [pid for machine in machines for pid in machine]
+        return {
+            "run": [pid for pid in descendants(run.pid) if started_by(pid, b"harness\0run")],
+            "worker": [pid for pid in everywhere if started_by(pid, b"spawn_main")],
+            "actor": [pid for pid in everywhere if started_by(pid, b"ray::OnMachine")],
+            "raylet": [pid for machine in machines[1:] for pid in machine if started_by(pid, b"/raylet/raylet")],
+        }
+
+    def mend(self) -> None:
+        """Start machines again that ended with their raylet."""
+        for k in range(1, self._nodes.n):
+            if self._nodes.is_off(k):
+                self._nodes.power_on(k)
 
 
 def finish(process: subprocess.Popen[bytes]) -> None:
@@ -63,10 +110,10 @@ def descendants(pid: int) -> list[int]:
     return below
 
 
-def is_worker(pid: int) -> bool:
-    """Whether a process is a worker, not the library's own that looks after its resources."""
+def started_by(pid: int, words: bytes) -> bool:
+    """Whether a process was started by these words."""
     try:
-        return b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()
+        return words in Path(f"/proc/{pid}/cmdline").read_bytes()
     except OSError:
         return False
 
@@ -79,41 +126,47 @@ def is_alive(pid: int) -> bool:
         return False
 
 
-def orphans(pids: list[int]) -> list[int]:
-    """Those of a killed parent's processes that are still there after a while."""
-    until = time.monotonic() + GRACE_S
+def orphans(pids: list[int], grace_s: float) -> list[int]:
+    """Those of a killed run's processes that are still there after a while."""
+    until = time.monotonic() + grace_s
     while (left := [pid for pid in pids if is_alive(pid)]) and time.monotonic() < until:
         time.sleep(_POLL_S)
     return left
 
 
 def disturbed(
-    method: str, out: Path, episodes: int, chance: random.Random, kills: int, longest_s: float
+    place: Here, method: str, out: Path, episodes: int, chance: random.Random, kills: int, longest_s: float
 ) -> Counter[str]:
-    """Run a campaign to its end in spite of so many kills, and count them."""
+    """Run a campaign to its end in spite of so many kills, and count them; orphans under a name of their own."""
     done: Counter[str] = Counter()
-    while done["parent"] + done["worker"] < kills:
-        process = start(method, out, episodes)
-        while process.poll() is None and done["parent"] + done["worker"] < kills:
+
+    def left() -> bool:
+        return done.total() - done["orphan"] < kills
+
+    while left():
+        process = place.start(command(method, out, episodes))
+        while process.poll() is None and left():
             with suppress(subprocess.TimeoutExpired):
                 process.wait(chance.uniform(0.0, longest_s))
                 continue
-            below = descendants(process.pid)
-            workers = [pid for pid in below if is_worker(pid)]
-            if workers and chance.random() < WORKERS_SHARE:
-                with suppress(ProcessLookupError):
-                    os.kill(chance.choice(workers), signal.SIGKILL)
-                    done["worker"] += 1
-                continue
-            process.kill()
-            done["parent"] += 1
-            done["orphan"] += len(orphans(below))
+            place.mend()
+            targets = place.targets(process)
+            kind = chance.choice(sorted(kind for kind in targets if targets[kind]) or ["nothing"])
+            if kind == "nothing":
+                continue  # it has not begun
+            below = [pid for other in ("worker", "actor") for pid in targets.get(other, [])]
+            with suppress(ProcessLookupError):
+                os.kill(chance.choice(targets[kind]), signal.SIGKILL)
+                done[kind] += 1
+            if kind == "run":
+                done["orphan"] += len(orphans(below, place.grace_s))
         _, complaints = process.communicate(timeout=LONGEST_WAIT_S)
-        if process.returncode not in (*DONE, LOST, -signal.SIGKILL):
+        if process.returncode not in (*DONE, LOST, -signal.SIGKILL, 128 + signal.SIGKILL):
             raise RuntimeError(f"the run ended with {process.returncode}: {complaints.decode()}")
-        if process.returncode in DONE and done["parent"] + done["worker"] < kills:
+        if process.returncode in DONE and left():
             shutil.rmtree(out)  # it was faster than the kills: once more from the beginning
-    finish(start(method, out, episodes))
+    place.mend()
+    finish(place.start(command(method, out, episodes)))
     return done
 
 
@@ -136,21 +189,34 @@ def main() -> int:
     parser.add_argument("--episodes", type=int, default=20_000, help="of each campaign")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--only", choices=METHODS)
+    parser.add_argument("--machines", type=int, help="run on a Ray cluster of so many")
+    parser.add_argument("--cache", type=Path, help="what the machines' caches begin with; default: nothing")
     options = parser.parse_args()
+    folder = options.folder.resolve()
+    if options.machines is None:
+        return campaigns(Here(), folder, options)
+    if why := missing():
+        parser.error(f"this machine cannot play several: {why}")
+    with Nodes(folder / "machines", options.machines, cache=options.cache) as nodes:
+        return campaigns(OnMachines(nodes), folder, options)
+
+
+def campaigns(place: Here, folder: Path, options: argparse.Namespace) -> int:
+    """Each method: undisturbed, disturbed, compared."""
     chance, failed = random.Random(options.seed), False
     methods = [options.only] if options.only else list(METHODS)
     for k, method in enumerate(methods):
-        calm, struck = options.folder / method / "undisturbed", options.folder / method / "killed"
-        shutil.rmtree(options.folder / method, ignore_errors=True)
+        calm, struck = folder / method / "undisturbed", folder / method / "killed"
+        shutil.rmtree(folder / method, ignore_errors=True)
         began = time.monotonic()
-        finish(start(method, calm, options.episodes))
+        finish(Here().start(command(method, calm, options.episodes)))
         kills = (options.kills + k) // len(methods)
-        done = disturbed(method, struck, options.episodes, chance, kills, 0.7 * (time.monotonic() - began))
+        done = disturbed(place, method, struck, options.episodes, chance, kills, 0.7 * (time.monotonic() - began))
         differing = unlike(calm, struck)
         failed |= bool(differing or done["orphan"])
         verdict = f"DIFFERENT: {', '.join(differing)}" if differing else "records equal, byte for byte"
-        struck_down = f"{done['parent']} parents and {done['worker']} workers killed, {done['orphan']} orphans"
-        print(f"{method}: {struck_down}; {verdict}", flush=True)
+        killed = ", ".join(f"{n} {kind}s" for kind, n in sorted(done.items()) if kind != "orphan")
+        print(f"{method}: {killed} killed, {done['orphan']} orphans; {verdict}", flush=True)
     return int(failed)
 
 

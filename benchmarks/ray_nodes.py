@@ -42,16 +42,16 @@ class Nodes:
     """
 
     def __init__(self, folder: Path, n: int, *, cpus: int = 1, cache: Path | None = None) -> None:
-        self._folder, self._n, self._cpus, self._cache = folder, n, cpus, cache
+        self._folder, self.n, self._cpus, self._cache = folder, n, cpus, cache
         self._running: dict[int, subprocess.Popen[bytes]] = {}
 
     def __enter__(self) -> Nodes:
-        for k in range(self._n):
+        for k in range(self.n):
             _ip("netns", "del", self._name(k), check=False)
         _ip("netns", "del", SWITCH, check=False)
         try:
             self._connect()
-            for k in range(self._n):
+            for k in range(self.n):
                 self.power_on(k)
             self._wait_for_all()
         except BaseException:
@@ -64,7 +64,7 @@ class Nodes:
     ) -> None:
         for k in list(self._running):
             self.power_off(k)
-        for name in [*map(self._name, range(self._n)), SWITCH]:
+        for name in [*map(self._name, range(self.n)), SWITCH]:
             _ip("netns", "del", name, check=False)
 
     def _name(self, k: int) -> str:
@@ -79,7 +79,7 @@ class Nodes:
         _ip("netns", "add", SWITCH)
         _ip("-n", SWITCH, "link", "add", "switch", "type", "bridge")
         _ip("-n", SWITCH, "link", "set", "switch", "up")
-        for k in range(self._n):
+        for k in range(self.n):
             name = self._name(k)
             _ip("netns", "add", name)
             _ip("link", "add", "cable", "netns", name, "type", "veth", "peer", "name", f"port{k}", "netns", SWITCH)
@@ -157,6 +157,10 @@ class Nodes:
         process.kill()
         process.wait()
 
+    def is_off(self, k: int) -> bool:
+        """Whether a machine has ended by itself."""
+        return self._running[k].poll() is not None
+
     def cut(self, k: int) -> None:
         """Pull the cable of a machine, which goes on."""
         _ip("-n", SWITCH, "link", "set", f"port{k}", "down")
@@ -172,10 +176,10 @@ class Nodes:
         while time.monotonic() < until and all(process.poll() is None for process in self._running.values()):
             asked = self.start(sys.executable, "-c", script, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
             said = asked.communicate()[0].split()
-            if asked.returncode == 0 and int(said[-1]) == self._n:
+            if asked.returncode == 0 and int(said[-1]) == self.n:
                 return
             time.sleep(0.5)
-        logs = "\n".join((self._folder / self._name(k) / "log").read_text() for k in range(self._n))
+        logs = "\n".join((self._folder / self._name(k) / "log").read_text() for k in range(self.n))
         raise RuntimeError(f"the machines do not come together:\n{logs}")
 
 
