@@ -36,6 +36,7 @@ from harness.runner.local_executor import LocalExecutor, WorkerProcess
 from harness.runner.manifest import cpu_name
 from harness.runner.prepare import cached_files
 from harness.runner.shadow_runs import SHADOW
+from harness.runner.shards import WorkerLostError
 from harness.runner.worker import Done, ShardSpec, Spec
 
 try:
@@ -59,12 +60,6 @@ PATIENCE_S = 30.0
 """After this time without any worker the user is told what is waited for."""
 STARTS = 3
 """As many workers in a row may be lost before they are ready."""
-
-
-class LostAtStartError(HarnessError):
-    """The cluster cannot bring up a worker."""
-
-    exit_code = 3
 
 
 @dataclass(frozen=True)
@@ -145,6 +140,8 @@ class RayWorker:
         answer = self.result()
         if isinstance(answer, Ended):
             self._executor.take_back(self)  # its actor lives, and will start another process
+        elif answer is None:
+            self.kill()  # it may live, where it cannot be reached
         return answer or Ended(None, None)
 
     def result(self) -> Any:
@@ -192,11 +189,15 @@ class RayExecutor:
         if is_ours := not ray.is_initialized():
             _connect(address, environment)
         self._is_ours = is_ours
-        self.n_workers = n_workers or _room(settings)
         self._here = Machine.this(resolved, resolved.controller_sha256)
         self._there: set[str] = set()
         self._starting: list[RayWorker] = []
         self._ready: list[RayWorker] = []
+        try:
+            self.n_workers = n_workers or _room(settings)
+        except HarnessError:
+            self.close()
+            raise
         self._lost_at_start = 0
         self._told = False
         self._since = time.monotonic()
@@ -254,7 +255,7 @@ class RayExecutor:
         if machine is None:
             self._lost_at_start += 1
             if self._lost_at_start == STARTS:
-                raise LostAtStartError(
+                raise WorkerLostError(
                     "run.executor",
                     found=f"{STARTS} workers in a row that were lost while they began",
                     expected="machines on which the harness starts",
@@ -303,7 +304,7 @@ def _wrong_environment(error: Exception) -> CampaignError:
         "run.ray.runtime_env",
         found=f"an environment that Ray cannot set up: {error}",
         expected="what ray.init takes as runtime_env",
-        mend="Correct it; docs/cluster.md has an example.",
+        mend="Correct it; docs/ray.md has an example.",
     )
 
 

@@ -41,7 +41,7 @@ _Done = TypeVar("_Done", bound=Done)
 
 
 class WorkerLostError(HarnessError):
-    """Workers die again and again on the same shard."""
+    """Workers die again and again, on the same shard or before they have one."""
 
     exit_code = 3
 
