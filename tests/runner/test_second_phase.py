@@ -4,6 +4,7 @@ refused."""
 from __future__ import annotations
 
 import json
+import math
 import shutil
 import signal
 import subprocess
@@ -236,6 +237,15 @@ def test_a_first_phase_at_the_budget_plans_nothing(campaign, plan_here, tmp_path
     assert (more.exit_code, manifest(tmp_path / "plan")["ending"]) == (0, None)
 
 
+@pytest.mark.parametrize(("cut_ins", "planned", "expected"), [(100, False, math.inf), (250, True, 1.7)])
+def test_a_pool_that_is_too_small(cut_ins, planned, expected, campaign, plan_here, tmp_path):
+    """For the first phase already, or for what is asked of the second."""
+    found = plan_here(campaign(*TWIN, f"pool.cut_ins_per_shell={cut_ins}"), tmp_path / "plan")
+    assert (found.exit_code, found.n_planned > 0) == (4, planned)
+    assert found.expected_rhw == pytest.approx(expected, rel=0.02)
+    assert "raise pool.cut_ins_per_shell and use a new folder" in found.ending
+
+
 @pytest.mark.parametrize("room", [0, 20])
 def test_a_second_phase_that_the_budget_cuts(room, planned, campaign, run_here, plan_here, part_here, merged, tmp_path):
     """It is what one machine would have run; nobody is told that the precision is to be expected."""
@@ -345,9 +355,11 @@ def test_a_part_tests_what_was_planned_for(folders, part_here, tmp_path):
 def test_a_plan_says_what_it_is(planned, tmp_path, capsys):
     plan, one, *_ = map(str, planned)
     n_first, n_planned = manifest(planned[0])["n_episodes"], sum(manifest(planned[0])["plan"]["tests"])
-    text = complaint_of(capsys, "estimate", plan)
-    assert f"found: a plan of {n_planned} tests, after a first phase of {n_first} expected: a whole run" in text
-    assert "--part K/N" in text
+    for command in ("estimate", "report"):
+        text = complaint_of(capsys, command, plan)
+        assert f"found: a plan of {n_planned} tests, after a first phase of {n_first} expected: a whole run" in text
+        assert "--part K/N" in text
+    assert "found: part 1 of 3" in complaint_of(capsys, "report", one)
     same = [word for override in (*SMALL, *TWIN, TWO_PHASE) for word in ("--set", override)]
     text = complaint_of(capsys, "run", MIXTURE_FILE, "--out", plan, "--resume", *same)
     assert "found: a plan of this campaign expected: a whole run" in text
