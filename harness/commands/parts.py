@@ -68,8 +68,8 @@ def plan(
     itself (docs/estimators.md).
 
     Two settings are those of a plan: testing.shells.stopping is two_phase, and run.shard_size is 1 unless --set says
-    otherwise, so that each test can go to another part; of fast vehicles 16 or so make fewer files. A slow vehicle
-    takes --set testing.shells.smallest_round, too: as many tests as there are --workers here.
+    otherwise, so that each test can go to another part; of fast vehicles 16 or so make fewer files. For a slow vehicle
+    --set testing.shells.smallest_round, too: 128 for 64 --workers (docs/performance.md).
 
     A plan that is complete is only read again. With --resume and a larger stop.episodes it may plan more; parts that
     were begun before then do not belong to it any more.
