@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import errno
 import json
+import shlex
 from contextlib import suppress
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +17,7 @@ from harness.errors import HarnessError
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from harness.runner import PartResult
+    from harness.runner import PartResult, PlanResult
 
 
 def show_error(error: HarnessError) -> None:
@@ -33,6 +35,7 @@ def show_error(error: HarnessError) -> None:
 
 _HOW_TO_GO_ON = {
     "run": " Finished shards are kept: the same command with --resume goes on.",
+    "plan": " Finished shards are kept: the same command with --resume goes on.",
     "compare": " Finished shards are kept: the same command goes on.",
 }
 
@@ -104,6 +107,21 @@ def print_part(part: PartResult, *, as_json: bool) -> None:
         return
     click.echo(f"{part.kind}: {part.n_crashes:,} crashed, {part.n_failed:,} failed. `harness merge` takes all parts.")
     click.echo(str(part.folder))
+
+
+def print_planned(plan: PlanResult, *, as_json: bool) -> None:
+    """Print what a first phase has planned, or why nothing."""
+    if as_json:
+        facts = {key: value for key, value in asdict(plan).items() if key != "exit_code"}
+        expected = plan.expected_rhw if plan.n_planned else None
+        print_json({**facts, "expected_rhw": expected, "folder": str(plan.folder)})
+        return
+    click.echo(plan.ending)
+    if plan.n_planned:
+        folder = shlex.quote(str(plan.folder))
+        click.echo(f"They make up to {plan.n_shards:,} parts: `harness run {folder} --part K/N --out PART`.")
+        click.echo(f"`harness merge {folder} PART... --out DIR` makes one run of the plan and all of its parts.")
+    click.echo(str(plan.folder))
 
 
 def print_plan(plan: dict[str, Any]) -> None:

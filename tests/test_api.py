@@ -38,6 +38,7 @@ def test_all_that_is_promised_is_there():
         "run",
         "run_part",
         "merge",
+        "plan",
         "estimate",
         "ladder",
         "read",

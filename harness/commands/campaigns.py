@@ -23,6 +23,7 @@ from harness.commands.options import (
     set_option,
     workers_option,
 )
+from harness.commands.parts import named_plan
 from harness.console import print_json, print_part, print_plan
 from harness.console_tables import print_result
 from harness.errors import HarnessError
@@ -69,6 +70,7 @@ def check(campaign_file: Path, overrides: Sequence[str], av: str | None, *, as_j
         "harness run scenarios/smoke.yaml --out runs/gate --accept 3e-7 --junit gate.xml",
         "harness run scenarios/smoke.yaml --out runs/cluster --executor ray",
         "harness run scenarios/overtaking_forced.yaml --set stop.rhw=null --part 3/64 --out runs/part3",
+        "harness run runs/plan --part 3/64 --out runs/part3   # of what `harness plan` has planned",
     )
     + "\n\n"
     + examples(
@@ -126,10 +128,16 @@ def run(
     makes one run of all parts. The number of tests has to be fixed beforehand (stop.rhw: null; any method but shells).
     K counts from 1, and N stays the same when only some parts are run again. With --resume a part goes on, or begins if
     nothing is there. Give --workers: a scheduler may grant fewer cores than the machine has.
+
+    Shells are planned first: the folder that 'harness plan' has made takes the campaign's place, for it holds the
+    campaign and what of it is left to test. It has to be there only when a part begins.
     """
+    given = {"--accept": accept, "--set": overrides, "--av": av, "--executor": executor}
+    refused = [option for option, value in given.items() if value]
+    planned = named_plan(campaign_file, folder, part, refused, resume=resume)
     limit = [] if accept is None else [f"accept.crash_rate_below={accept!r}"]
     where = [] if executor is None else [f"run.executor={executor}"]
-    campaign = loaded(campaign_file, [*overrides, *limit, *where], av)
+    campaign = loaded(campaign_file, [*overrides, *limit, *where], av) if planned is None else planned.campaign
     from harness.progress import shown_progress  # noqa: PLC0415 - keeps --help fast
     from harness.runner import run_campaign  # noqa: PLC0415 - slow to import: only once the campaign is right
 
@@ -141,7 +149,7 @@ def run(
         from harness.runner import run_part  # noqa: PLC0415 - as above
 
         with bar:
-            done = run_part(campaign, part, folder, workers=workers, resume=resume, progress=bar)
+            done = run_part(planned or campaign, part, folder, workers=workers, resume=resume, progress=bar)
         print_part(done, as_json=as_json)
         return
     with bar:

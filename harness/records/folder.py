@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import json
 import os
+import shutil
 import tempfile
 import uuid
 from collections.abc import Callable, Iterator, Mapping
@@ -134,6 +135,16 @@ def _lock(handle: int, folder: Path) -> None:
 def write_bytes(path: Path, content: bytes) -> None:
     """Write a file atomically."""
     write_atomically(path, lambda temporary: temporary.write_bytes(content))
+
+
+def link_or_copy(file: Path, to: Path) -> None:
+    """A second name of the same bytes, or a copy where there can be none; nobody writes into a finished file."""
+    with writing(to):
+        to.parent.mkdir(exist_ok=True)
+        try:
+            os.link(file, to)
+        except OSError:  # another file system, or one without links
+            write_atomically(to, lambda temporary: shutil.copyfile(file, temporary))
 
 
 def write_text(path: Path, text: str) -> None:

@@ -12,6 +12,7 @@ import pyarrow.parquet as pq
 
 from harness.errors import RunFolderError
 from harness.records.folder import MEND_SHARD, TABLES, damaged, read_manifest, read_table
+from harness.records.stored_manifest import PLAN, WHOLE, kind_of
 
 
 def read_shards(
@@ -131,3 +132,23 @@ def footer(path: Path) -> pq.FileMetaData:
         return pq.read_metadata(path)
     except (OSError, pa.ArrowException) as error:
         raise damaged(path, error) from error
+
+
+def require_whole(folder: Path) -> dict[str, Any]:
+    """Manifest of a run, and not of a part or a plan of one.
+
+    Raises
+    ------
+    RunFolderError
+        It is a part or a plan, or no run.
+    """
+    manifest = read_manifest(folder)
+    if (kind := kind_of(manifest)) != WHOLE:
+        found, mend = kind, "Bring all parts together with `harness merge PART... --out DIR`."
+        if kind == PLAN:
+            n_planned = sum(manifest["plan"]["tests"])
+            found = f"{kind} of {n_planned:,} tests, after a first phase of {manifest['n_episodes']:,}"
+            mend = f"Run its parts (`harness run {folder} --part K/N --out PART`), then bring them together with it "
+            mend += f"(`harness merge {folder} PART... --out DIR`)."
+        raise RunFolderError(str(folder), found=found, expected=WHOLE, mend=mend)
+    return manifest

@@ -19,8 +19,8 @@ from harness.campaign.loading import load_campaign
 from harness.campaign.models import Campaign
 from harness.errors import CampaignError, RunFolderError
 from harness.estimators.shells import ShellDetails, Within
-from harness.records.folder import MANIFEST, NO_RUN, read_json, read_manifest, require_schema
-from harness.records.reader import read_shards
+from harness.records.folder import MANIFEST, NO_RUN, read_json, require_schema
+from harness.records.reader import read_shards, require_whole
 from harness.records.stored_manifest import Count, Stored, StoredManifest
 from harness.strata import ASSUMPTION_FREE
 
@@ -194,9 +194,9 @@ def read_run_folder(path: Path, *, typed: str | None = None) -> RunFolder:
     Raises
     ------
     RunFolderError
-        If a file is missing, is not what its name says, or belongs to another campaign.
+        If a file is missing, is not what its name says, or belongs to another campaign; or it is a part or a plan.
     """
-    manifest = read_manifest(path)
+    manifest = require_whole(path)
     require_schema(manifest, ShownManifest, path / MANIFEST, mend=NO_RUN)
     estimates = _read_estimates(path, manifest["campaign_hash"])
     shells = _shells(path, estimates.estimates[estimates.headline])

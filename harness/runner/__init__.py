@@ -8,12 +8,15 @@ from harness.runner.parts import PartResult, run_part
 from harness.runner.plan import plan_campaign
 from harness.runner.replay import ReplayResult, replay_episode
 from harness.runner.run_result import RunResult
+from harness.runner.second_phase import Plan, PlanResult, plan_folder, plan_second_phase, read_plan
 from harness.runner.stored_estimates import estimate_run
 
 __all__ = [
     "AvCheck",
     "Comparison",
     "PartResult",
+    "Plan",
+    "PlanResult",
     "ReplayResult",
     "RunResult",
     "check_av",
@@ -21,6 +24,9 @@ __all__ = [
     "estimate_run",
     "merge_parts",
     "plan_campaign",
+    "plan_folder",
+    "plan_second_phase",
+    "read_plan",
     "replay_episode",
     "run_campaign",
     "run_part",

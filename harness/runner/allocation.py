@@ -116,15 +116,12 @@ class Allocation:
 
         No more than ``available``, shape (S,), and together at most ``budget``.
         """
-        p, n_paths, level = self.design.p, self.design.n_paths, Level.two_sided(confidence)
-        watched = slice(0, self.n_asked)
 
         def tests(factor: float) -> IntArray:
             return np.asarray(np.minimum(np.ceil(factor * first.tests).astype(np.int64), available))
 
         def too_wide(factor: float) -> bool:
-            expected = first.scaled(tests(factor)).part(watched)
-            return combined(p[watched], expected, n_paths, level).rhw > rhw
+            return self.expected_rhw(first, tests(factor), confidence) > rhw
 
         low, high = 0.0, 1.0
         while too_wide(high) and tests(high).sum() < budget and np.any(tests(2.0 * high) > tests(high)):
@@ -133,6 +130,12 @@ class Allocation:
             middle = (low + high) / 2.0
             low, high = (middle, high) if too_wide(middle) and tests(middle).sum() < budget else (low, middle)
         return _cut(tests(high), budget)
+
+    def expected_rhw(self, first: Tally, tests: IntArray, confidence: float) -> float:
+        """Relative half-width of what is asked about after so many tests per stratum, if they go as the first did."""
+        watched = slice(0, self.n_asked)
+        expected, level = first.scaled(tests).part(watched), Level.two_sided(confidence)
+        return combined(self.design.p[watched], expected, self.design.n_paths, level).rhw
 
     def _used_up(self, tally: Tally) -> bool:
         """Whether nearly all that is left to know lies in strata without further cut-ins."""

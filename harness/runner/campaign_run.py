@@ -46,7 +46,7 @@ from harness.runner.manifest import (
 from harness.runner.planner import PartPlanner, Planner, planner_of
 from harness.runner.prepare import Prepared, distance_per_test_m, prepare, require_ready, require_same_pool
 from harness.runner.retrace import Retracing
-from harness.runner.run_result import ESTIMATES, RunResult, earlier_result, exit_code, results_of
+from harness.runner.run_result import ESTIMATES, RunResult, earlier_result, exit_code, results_of, what_stopped
 from harness.runner.shadow_runs import (
     as_recorded,
     require_few_failed,
@@ -121,7 +121,7 @@ class Run:
 
     Notes
     -----
-    ``n_runs`` are at work in turns; ``facts`` are keys of the manifest of what is only a part of a run.
+    ``n_runs`` are at work in turns; ``facts`` are keys of the manifest of what is only a part of a run, or its plan.
     """
 
     def __init__(
@@ -158,7 +158,7 @@ class Run:
         if prepared.shadow_paths is None:
             self._plan(prepared)
         self._workers = ShardPool(resolved.campaign, self._executor)
-        self.prefix = Prefix(of_part=bool(facts))
+        self.prefix = Prefix(of_part="part" in facts)
         self._ungathered: list[dict[str, Any]] = []
 
     def run_all(self) -> None:
@@ -278,15 +278,17 @@ class Run:
         if others := self._executor.cpus():
             self._manifest.note(cpu=", ".join(sorted({cpu_name(), *others})))
 
-    def leave(self) -> None:
-        """Write the manifest of a finished part: it is estimated with the others."""
+    def leave(self, *, stopped_by: StoppedBy | None = None, ending: str | None = None, **facts: Any) -> None:
+        """Write the manifest of a finished part, or of a plan with what it plans: it is estimated with the others."""
         self._note_cpus()
-        self._manifest.write(self.prefix, "done", retraced=self._retracing.summary(self.prefix.n_retraced))
+        self._manifest.note(**facts)
+        retraced = self._retracing.summary(self.prefix.n_retraced)
+        self._manifest.write(self.prefix, "done", stopped_by=stopped_by, ending=ending, retraced=retraced)
 
     def finish(self) -> RunResult:
         """Write manifest, estimates and report."""
         stop, rule, n = self._campaign.stop, self.planner.rule, self.prefix.n_episodes
-        stopped_by = self._stopped_by()
+        stopped_by = what_stopped(self._campaign, rule, n, self.prefix.reported_from)
         asked = stop.rhw is not None or rule.decision is not None
         said = ending(stopped_by, n, rule.waited_for, precision_asked=asked)
         if stopped_by == "rhw" and self.planner.remark:
@@ -307,18 +309,6 @@ class Run:
         verdict = None if rule.decision is None else rule.decision.verdict
         code = exit_code(self._campaign, stopped_by, verdict)
         return RunResult(self._out, report, estimates, stopped_by, said, code)
-
-    def _stopped_by(self) -> StoppedBy:
-        rule = self.planner.rule
-        if self.prefix.reported_from and self.prefix.n_episodes < self._campaign.stop.episodes:
-            return "two_phase"
-        if rule.reached:
-            return "rhw" if rule.decision is None else "accept"
-        if rule.decision is not None and rule.decision.is_final:
-            return "contradicted"
-        if rule.pool_error_above_target:  # whatever else is spent: more of it would not help
-            return "pool_error"
-        return "episodes" if self.prefix.n_episodes >= self._campaign.stop.episodes else "pool"
 
 
 def episodes_on_disk(folder: Path, listed: Sequence[Mapping[str, Any]] = ()) -> int:

@@ -18,7 +18,7 @@ from harness.estimators.paired_shells import PairedEstimate
 from harness.importance.build import mixture_weights
 from harness.progress import Progress
 from harness.records.folder import MANIFEST, read_json, read_manifest, require_place, require_schema, write_json
-from harness.records.reader import read_shards
+from harness.records.reader import read_shards, require_whole
 from harness.records.stored_manifest import StoredStops
 from harness.resolved import Resolved
 from harness.runner.campaign_run import run_campaign
@@ -26,7 +26,6 @@ from harness.runner.compare_shells import PAIRING, compare_shells, exit_code, sh
 from harness.runner.manifest import require_own_folder
 from harness.runner.prepare import require_ready
 from harness.runner.run_result import RunResult
-from harness.runner.stored_estimates import require_whole
 from harness.state import STATE_COLUMNS
 
 Side = Literal["a", "b"]

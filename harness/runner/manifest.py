@@ -17,7 +17,7 @@ from harness.campaign.models import Campaign
 from harness.errors import RunFolderError, TooManyFailedError
 from harness.records.folder import MANIFEST, read_manifest, require_place, write_json, write_text
 from harness.records.gathered import Fingerprint
-from harness.records.stored_manifest import WHOLE, kind_of
+from harness.records.stored_manifest import PLAN, WHOLE, kind_of
 from harness.resolved import Resolved
 from harness.runner.shards import SURELY_TOO_MANY
 from harness.runner.worker import Repeated, ShardDone, ShardSpec
@@ -78,6 +78,10 @@ def require_own_folder(folder: Path, resolved: Resolved, *, resume: bool, kind: 
         )
     if (held := kind_of(manifest)) != kind:
         mend = "Repeat --part and stop.episodes as they were when it was begun, or choose another folder with --out."
+        if held == PLAN:
+            mend = f"Run its parts, `harness run {folder} --part K/N --out PART`, or choose another folder with --out."
+        elif kind == PLAN:
+            mend = elsewhere
         raise refusal(f"{held} of this campaign", kind, mend)
     if not resume:
         mend = "Continue it with --resume, or choose another folder with --out."

@@ -1,4 +1,4 @@
-"""A part of a campaign whose tests are known beforehand: the very tests that a whole run would make, and no others.
+"""A part of a run whose tests are known beforehand: the very tests that a whole run would make, and no others.
 
 A job array runs each part by itself, on any machine; `harness.runner.merge` makes of all of them what one process
 would have left.
@@ -9,9 +9,10 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from harness.campaign.models import Campaign
-from harness.errors import CampaignError
+from harness.errors import CampaignError, RunFolderError
 from harness.part import Part
 from harness.progress import Progress, SilentProgress
 from harness.records.folder import sole_use
@@ -20,6 +21,7 @@ from harness.runner.campaign_run import Run
 from harness.runner.manifest import require_own_folder
 from harness.runner.planner import PartPlanner, known_specs
 from harness.runner.prepare import require_ready
+from harness.runner.second_phase import Plan
 from harness.runner.worker import ShardSpec
 
 
@@ -32,23 +34,21 @@ class PartResult:
     folder : Path
     described : dict
         Its number, of how many, its first test and how many it has.
+    kind : str
+        Which part it is, in words.
     n_crashes, n_failed : int
         Of its tests; not yet an estimate.
     """
 
     folder: Path
     described: dict[str, int]
+    kind: str
     n_crashes: int
     n_failed: int
 
-    @property
-    def kind(self) -> str:
-        """Which part it is, in words."""
-        return kind_of({"part": self.described})
-
 
 def run_part(
-    campaign: Campaign,
+    source: Campaign | Plan,
     part: Part,
     out: Path,
     *,
@@ -56,12 +56,12 @@ def run_part(
     resume: bool = False,
     progress: Progress | None = None,
 ) -> PartResult:
-    """Run one part of a campaign into a folder.
+    """Run one part of a campaign, or of the second phase that a plan has, into a folder.
 
     Parameters
     ----------
-    campaign : Campaign
-        With a fixed number of tests.
+    source : Campaign or Plan
+        The former with a fixed number of tests.
     part : Part
     out, workers, resume, progress
         See `harness.runner.run_campaign`.
@@ -69,24 +69,32 @@ def run_part(
     Raises
     ------
     HarnessError
-        The campaign decides while it runs what it tests or when it ends, or has fewer shards than parts; or as
-        `harness.runner.run_campaign`.
+        The campaign decides while it runs what it tests or when it ends; it, or the plan, has fewer shards than parts;
+        what is tested is not what was planned for; or as `harness.runner.run_campaign`.
     """
     began = time.monotonic()
-    specs = fixed_specs(campaign, part)
+    campaign, plan = (source.campaign, source) if isinstance(source, Plan) else (source, None)
+    specs = fixed_specs(campaign, part) if plan is None else planned_specs(plan, part)
     resolved = require_ready(campaign)
+    described = _described(part, specs)
+    facts: dict[str, Any] = {"part": described, **({} if plan is None else {"plan": plan.second})}
+    if plan is not None:
+        plan.require_same(resolved)
     with sole_use(out):
-        facts = {"part": _described(part, specs)}
         earlier = require_own_folder(out, resolved, resume=resume, kind=kind_of(facts))
         progress = progress or SilentProgress()
-        run = Run(resolved, out, earlier, workers, progress, began, part=facts["part"])
+        run = Run(resolved, out, earlier, workers, progress, began, **facts)
         with run.under_way():
-            run.make_ready(facts["part"]["n_episodes"])
+            if plan is not None:
+                plan.lend_shadows(out)
+            run.make_ready(described["n_episodes"])
+            if plan is not None and run.prescribed is not None:
+                plan.require_pool(run.prescribed.design.pool)
             run.planner = PartPlanner(campaign, specs)
             run.run_round(iter(specs))
         run.discard_uncounted()
         run.leave()
-        return PartResult(out, facts["part"], run.prefix.n_crashes, run.prefix.n_failed)
+        return PartResult(out, described, kind_of(facts), run.prefix.n_crashes, run.prefix.n_failed)
 
 
 def _described(part: Part, specs: list[ShardSpec]) -> dict[str, int]:
@@ -109,7 +117,8 @@ def fixed_specs(campaign: Campaign, part: Part) -> list[ShardSpec]:
             "testing.method",
             found="shells, with --part",
             expected="nde, forced, step_mixture or episode_mixture: shells decide after each round what is tested next",
-            mend="Run it on one machine with many --workers (shells need few tests), or choose another method.",
+            mend="Plan it (`harness plan CAMPAIGN --out PLAN`), then `harness run PLAN --part K/N`; or run it on one "
+            "machine with many --workers, or choose another method.",
         )
     if stop.rhw is not None:
         raise CampaignError(
@@ -130,3 +139,26 @@ def fixed_specs(campaign: Campaign, part: Part) -> list[ShardSpec]:
             mend=mend,
         )
     return list(known_specs(campaign, *part.bounds(n_shards)))
+
+
+def planned_specs(plan: Plan, part: Part) -> list[ShardSpec]:
+    """Shards of a part of the second phase.
+
+    Raises
+    ------
+    RunFolderError
+        It has fewer shards than parts.
+    """
+    specs = plan.specs()
+    n_tests = sum(plan.second["tests"])
+    if len(specs) < part.of:
+        mend = f"Take at most {len(specs)} part{'s' * (len(specs) > 1)}."
+        if n_tests >= part.of:
+            mend += f" Or plan again, into another folder, with --set run.shard_size={n_tests // part.of}."
+        raise RunFolderError(
+            str(plan.folder),
+            found=f"a plan of {n_tests:,} tests in {len(specs):,} shards, for {part.of:,} parts",
+            expected="a shard for each part, at least",
+            mend=mend,
+        )
+    return specs[slice(*part.bounds(len(specs)))]

@@ -94,7 +94,8 @@ class ShellPlanner:
     number does not depend on their results.
 
     ``available``, shape (S,), are the most tests of each stratum, ``held`` see `RoundRule`; ``seen`` are the tests of
-    this phase, ``reported_from`` the first test of the second one, ``remark`` what to say of stopping.
+    this phase, ``reported_from`` the first test of the second one, ``expected_rhw`` what is expected of that,
+    ``remark`` what to say of stopping.
     """
 
     def __init__(self, campaign: Campaign, design: ShellDesign, available: IntArray, held: int = 0) -> None:
@@ -103,7 +104,7 @@ class ShellPlanner:
         self.rule = RoundRule(campaign, held, FIRST_PHASE if self._plans else 1.0)
         wide = campaign.stop.rhw is not None and campaign.stop.rhw > BIASED_RHW and not self._plans
         self.remark = TOO_WIDE if wide else ""
-        self.reported_from = 0
+        self.reported_from, self.expected_rhw = 0, math.inf
         self._campaign = campaign
         self._available = available
         self._first_tests = first_tests(design, shells.first_tests)
@@ -152,6 +153,8 @@ class ShellPlanner:
         stop, left = self._campaign.stop, self._available - self._drawn
         rhw = stop.rhw or math.inf
         self._planned = self._allocation.second_phase(self.tally, left, budget, rhw, stop.confidence)
+        if self._planned.any():
+            self.expected_rhw = self._allocation.expected_rhw(self.tally, self._planned, stop.confidence)
         self.rule, self.reported_from = RoundRule(self._campaign), self._n_episodes
         self._begin_phase()
         return False

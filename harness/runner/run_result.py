@@ -16,6 +16,7 @@ from harness.records.gathered import Fingerprint, fingerprint
 from harness.resolved import Resolved
 from harness.runner.gathered_blocks import GatheredBlocks
 from harness.runner.manifest import versions
+from harness.runner.planner import Rule
 from harness.stopped_by import StoppedBy
 
 EXIT_OF: Mapping[Verdict, int] = {"accepted": EXIT_DONE, "rejected": EXIT_REFUTED, "undecided": EXIT_BUDGET_SPENT}
@@ -56,6 +57,19 @@ def exit_code(campaign: Campaign, stopped_by: StoppedBy, verdict: Verdict | None
         return EXIT_OF[verdict]
     missed = campaign.stop.rhw is not None and stopped_by not in ("rhw", "two_phase")
     return EXIT_BUDGET_SPENT if missed else EXIT_DONE
+
+
+def what_stopped(campaign: Campaign, rule: Rule, n_episodes: int, reported_from: int) -> StoppedBy:
+    """Why a campaign ended after so many tests, of which the ones from ``reported_from`` on are reported."""
+    if 0 < reported_from < n_episodes < campaign.stop.episodes:
+        return "two_phase"
+    if rule.reached:
+        return "rhw" if rule.decision is None else "accept"
+    if rule.decision is not None and rule.decision.is_final:
+        return "contradicted"
+    if rule.pool_error_above_target:  # whatever else is spent: more of it would not help
+        return "pool_error"
+    return "episodes" if n_episodes >= campaign.stop.episodes else "pool"
 
 
 def results_of(folder: Path) -> dict[str, Fingerprint | None]:

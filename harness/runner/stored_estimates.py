@@ -19,8 +19,8 @@ from harness.methods import EstimatorName
 from harness.pool.storage import cached_pool, read_pool
 from harness.pool.surrogate_replay import PATH_COLUMNS, SurrogateReplay
 from harness.records.folder import SHELLS, no_episodes, read_json, read_manifest, require_schema
-from harness.records.reader import read_shard, stored_columns
-from harness.records.stored_manifest import WHOLE, StoredShells, kind_of
+from harness.records.reader import read_shard, require_whole, stored_columns
+from harness.records.stored_manifest import StoredShells
 from harness.resolved import resolve
 from harness.runner.gathered_blocks import GatheredBlocks
 from harness.strata import ShellDesign
@@ -145,25 +145,6 @@ def _gathered(gathered: GatheredBlocks, shard: Mapping[str, Any]) -> Block | Non
     files = {"episodes": shard["files"]["episodes"]}
     taken = gathered.take(shard["index"], shard["first_episode"], shard["n_episodes"], files)
     return None if taken is None else taken.block
-
-
-def require_whole(folder: Path) -> dict[str, Any]:
-    """Manifest of a run, and not of a part of one.
-
-    Raises
-    ------
-    RunFolderError
-        It is a part, or no run.
-    """
-    manifest = read_manifest(folder)
-    if (kind := kind_of(manifest)) != WHOLE:
-        raise RunFolderError(
-            str(folder),
-            found=kind,
-            expected=WHOLE,
-            mend="Bring all parts together with `harness merge PART... --out DIR`.",
-        )
-    return manifest
 
 
 def read_shells(folder: Path) -> ShellDesign:

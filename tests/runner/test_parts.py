@@ -21,7 +21,7 @@ from harness.part import Part
 from harness.records.folder import TABLES
 from harness.runner import merge_parts, run_part
 from harness.runner.manifest import Prefix
-from harness.runner.merge import ranges
+from harness.runner.parts_together import ranges
 from tests.runner.conftest import MIXTURE_FILE, TWIN, one_process
 from tests.runner.stored_runs import copy_of, manifest, shard_files, truncate, unlike_columns
 from tests.runner.test_runner_same_bits import struck
@@ -196,7 +196,7 @@ def test_parts_are_copied_where_there_are_no_links(parts, merged, twin_run, tmp_
 # -- what is refused --
 
 
-@pytest.mark.parametrize("place", ["harness.runner.merge.shutil.copyfile", "harness.runner.merge.write_json"])
+@pytest.mark.parametrize("place", ["harness.records.folder.shutil.copyfile", "harness.runner.merge.write_json"])
 def test_a_full_disk_leaves_no_folder(place, parts, tmp_path, capsys, monkeypatch):
     def full(*_):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
