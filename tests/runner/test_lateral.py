@@ -83,6 +83,7 @@ def test_the_page_shows_the_onset(lateral_run):
     assert "onset" in page
 
 
+@pytest.mark.usefixtures("lateral_run")  # it builds the pool
 def test_stored_forced_tests_can_be_asked_what_surrogates_would_have_done(campaign, run_here, tmp_path):
     forced = campaign("testing.method=forced", "world.engine=twin", *SHELLS[1:], "stop.rhw=null", "stop.episodes=800")
     folder = run_here(forced, tmp_path / "run").folder
