@@ -167,9 +167,12 @@ class KnownRates:
         Surrogates from careful to careless.
     mu, covariance : ndarray, shape (D,) and (D, D)
         Crash rates per test, and the covariance of their errors.
+    p_cut_in_at_crash : ndarray, shape (D,)
+        Mean P(cut-in | path) of the cut-ins on which each crashes, at most.
     """
 
     pool: str
     names: tuple[str, ...]
     mu: FloatArray
     covariance: FloatArray
+    p_cut_in_at_crash: FloatArray

@@ -123,12 +123,19 @@ class Block:
         with np.errstate(over="ignore"):
             return np.exp(self.log_q + self.log_weight[:, None])
 
+    @property
+    def forced_share(self) -> float:
+        """Share of forced cut-ins among what the method draws from."""
+        sampling = SAMPLING[self.method]
+        if not sampling.forces:
+            return 0.0
+        return float(self.alpha[0]) if sampling.mixes else 1.0  # the defensive component is the first
+
     def log_path_cap(self) -> float:
         """Log of the largest P(cut-in | path)/share of forced cut-ins, a bound on Y of these paths; inf if unknown."""
-        if self.log_p_cut_in is None or not SAMPLING[self.method].forces:
+        if self.log_p_cut_in is None or not (share := self.forced_share):
             return math.inf
-        share = float(self.alpha[0]) if SAMPLING[self.method].mixes else 1.0  # the defensive component is the first
-        return float(np.max(self.log_p_cut_in, initial=-math.inf)) - math.log(share) if share else math.inf
+        return float(np.max(self.log_p_cut_in, initial=-math.inf)) - math.log(share)
 
     def failed_as_crashes(self) -> Block:
         """The same episodes had every failed one crashed, each with the weight that it has on record.

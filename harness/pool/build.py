@@ -153,6 +153,7 @@ def pool_of(
         p_cut_in_se=float(rates[:, -1].std() / np.sqrt(n)),
         mu=ordered.mean(0),
         mu_covariance=np.atleast_2d(np.cov(ordered.T, bias=True)) / n,
+        p_cut_in_at_crash=_p_cut_in_at_crash(ordered, rates[:, -1] / paths.weight),
         cell_shell=kinds >> n_references,
         cell_references=cell_references,
         cell_p=by_path.mean(0),
@@ -160,6 +161,14 @@ def pool_of(
         reference_square=(by_reference * by_reference).mean(0),
         cut_ins=sample,
     )
+
+
+def _p_cut_in_at_crash(rates: FloatArray, p_cut_in: FloatArray) -> FloatArray:
+    """Mean P(cut-in | path), shape (D,), where surrogates crash: of weighted ``rates`` (n, D) and ``p_cut_in`` (n,)."""
+    both, mean = rates * p_cut_in[:, None], rates.mean(0)
+    at_most = both.mean(0) + 3.0 * both.std(0) / np.sqrt(len(rates))
+    found: FloatArray = np.divide(at_most, mean, out=np.ones_like(mean), where=mean > 0.0)
+    return found
 
 
 def _cells(mass: FloatArray, kind: IntArray) -> tuple[IntArray, FloatArray, IntArray]:

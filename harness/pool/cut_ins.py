@@ -79,6 +79,8 @@ class Pool:
         Probability that BV cuts in in a test, and its standard error.
     mu, mu_covariance : ndarray, shapes (D,) and (D, D)
         Crash rates of the surrogates, per test, and the covariance of their errors.
+    p_cut_in_at_crash : ndarray, shape (D,)
+        Mean P(cut-in | path) of the cut-ins on which each surrogate crashes, and three standard errors on top.
     cell_shell, cell_references : ndarray of int64, shape (C,)
         Cells divide shells by which references crash: the shell of each, and one bit per reference.
     cell_p : ndarray, shape (C,)
@@ -98,6 +100,7 @@ class Pool:
     p_cut_in_se: float
     mu: FloatArray
     mu_covariance: FloatArray
+    p_cut_in_at_crash: FloatArray
     cell_shell: IntArray
     cell_references: IntArray
     cell_p: FloatArray

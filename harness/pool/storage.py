@@ -25,7 +25,7 @@ from harness.records.folder import require_place, write_atomically
 from harness.resolved import Resolved
 from harness.state import STATE_COLUMNS, states_from
 
-_FORMAT = 4
+_FORMAT = 5
 """Raise it when the meaning of a pool changes."""
 _MADE_BY = ("aimed_paths.py", "build.py", "cut_ins.py")
 """Code that decides what is in a pool, beside the kernels."""

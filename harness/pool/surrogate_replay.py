@@ -45,7 +45,7 @@ class SurrogateReplay:
     def __init__(self, resolved: Resolved, pool: Pool) -> None:
         self._environment, self._seed = resolved.environment, resolved.campaign.seed
         _require_same_environment(self._environment, pool)
-        self.known = KnownRates(pool.key, pool.names, pool.mu, pool.mu_covariance)
+        self.known = KnownRates(pool.key, pool.names, pool.mu, pool.mu_covariance, pool.p_cut_in_at_crash)
         self.columns = (*PATH_COLUMNS, *((LEAD,) if self._environment.lateral.present else ()))
         names = list(pool.library.surrogates)
         self._drivers, self._envelope = (

@@ -267,6 +267,7 @@ def _template(
         p_cut_in_se=0.0,
         mu=np.zeros(d),
         mu_covariance=np.zeros((d, d)),
+        p_cut_in_at_crash=np.ones(d),
         cell_shell=kind[0],
         cell_references=kind[1],
         cell_p=mass.mean(0),

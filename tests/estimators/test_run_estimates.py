@@ -126,7 +126,7 @@ def test_one_crash_that_could_double_the_rate_leads_the_sentence(n, doubts):
 
 
 def test_a_raised_alarm_leads_every_sentence():
-    rates = {"p_value_holm": 1e-9, "p_value_jointly": 0.5}
+    rates = {"p_value": 1e-9}
     (caution,) = alarm_cautions({"raised": True, "surrogate_crash_rates": rates})
     assert warned([caution], "The crash rate is 1.").startswith("WARNING: ALARM, replayed surrogates do not crash")
     assert "p-value 1.0e-09" in caution

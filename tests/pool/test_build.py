@@ -76,7 +76,7 @@ def test_the_same_settings_give_the_same_bits(campaign, pool, tmp_path, monkeypa
     again = campaign_pool(resolve(campaign))
     for field in dataclasses.fields(pool.cut_ins):
         assert np.array_equal(getattr(pool.cut_ins, field.name), getattr(again.cut_ins, field.name))
-    for name in ("mu", "mu_covariance", "cell_p", "cell_shell", "cell_references"):
+    for name in ("mu", "mu_covariance", "p_cut_in_at_crash", "cell_p", "cell_shell", "cell_references"):
         assert np.array_equal(getattr(pool, name), getattr(again, name))
 
 
