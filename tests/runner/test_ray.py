@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.kills import descendants
+from benchmarks.kills import descendants, started_by
 from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, HarnessError
 from harness.runner.executor import Ended
 from tests.runner.conftest import TWIN
@@ -42,22 +42,16 @@ def _cluster():
 
 def below(word: bytes) -> list[int]:
     """Processes that this one has started, itself or by others, with a word in their command."""
-    return [pid for pid in descendants(os.getpid()) if word in Path(f"/proc/{pid}/cmdline").read_bytes()]
+    return [pid for pid in descendants(os.getpid()) if started_by(pid, word)]
 
 
-def test_records_are_those_of_a_local_run(run, campaign, twin_run, tmp_path):
-    run(campaign(*TWIN, ON_RAY), tmp_path / "run")
+def test_a_run_begun_here_goes_on_there_with_the_same_records(run, run_here, campaign, twin_run, tmp_path):
+    run_here(campaign(*TWIN, "stop.episodes=160"), tmp_path / "run")
+    run(campaign(*TWIN, ON_RAY), tmp_path / "run", resume=True)
     assert unlike_columns(twin_run, tmp_path / "run") == []
     assert manifest(tmp_path / "run")["workers"] == 2  # the cluster's room
     assert manifest(tmp_path / "run")["cpu"] == manifest(twin_run)["cpu"]
     assert below(b"spawn_main") == []
-
-
-def test_a_run_goes_on_elsewhere_than_it_began(run, run_here, campaign, twin_run, tmp_path):
-    small = campaign(*TWIN, "stop.episodes=160")
-    run_here(small, tmp_path / "run")
-    run(campaign(*TWIN, ON_RAY), tmp_path / "run", resume=True)
-    assert unlike_columns(twin_run, tmp_path / "run") == []
 
 
 def test_shadow_runs_come_to_the_machines(run, campaign, tmp_path):
@@ -78,23 +72,23 @@ def test_a_controller_that_ends_its_process_leaves_the_same_records(run, campaig
     assert unlike_columns(a.folder, b.folder) == []
 
 
-@pytest.mark.parametrize("victim", [b"ray::OnMachine", b"spawn_main"])
-def test_a_killed_actor_or_worker_takes_nothing_along(run, campaign, tmp_path, victim):
+def test_killed_actors_and_workers_take_nothing_along(run, campaign, tmp_path):
     settings = (*FORCED, TWIN[0], "stop.episodes=12000", "run.shard_size=400")
     a = run(campaign(*settings), tmp_path / "local", workers=2)
     struck: list[int] = []
 
     def strike() -> None:
-        while not shard_files(tmp_path / "ray"):
-            time.sleep(0.02)
-        struck.extend(below(victim)[:1])
-        os.kill(struck[0], signal.SIGKILL)
+        for victim, n_done in ((b"ray::OnMachine", 1), (b"spawn_main", 6)):
+            while len(shard_files(tmp_path / "ray")) < n_done:
+                time.sleep(0.02)
+            struck.extend(below(victim)[:1])
+            os.kill(struck[-1], signal.SIGKILL)
 
     thread = threading.Thread(target=strike)
     thread.start()
     b = run(campaign(*settings, ON_RAY), tmp_path / "ray")
     thread.join()
-    assert struck
+    assert len(struck) == 2
     assert unlike_columns(a.folder, b.folder) == []
 
 
