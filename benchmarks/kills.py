@@ -209,7 +209,7 @@ def campaigns(place: Here, folder: Path, options: argparse.Namespace) -> int:
         calm, struck = folder / method / "undisturbed", folder / method / "killed"
         shutil.rmtree(folder / method, ignore_errors=True)
         began = time.monotonic()
-        finish(Here().start(command(method, calm, options.episodes)))
+        finish(place.start(command(method, calm, options.episodes)))
         kills = (options.kills + k) // len(methods)
         done = disturbed(place, method, struck, options.episodes, chance, kills, 0.7 * (time.monotonic() - began))
         differing = unlike(calm, struck)

@@ -147,7 +147,12 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, help="place of run folders and caches; what is there goes")
     parser.add_argument("--only", choices=("bits", "losses", "overhead", "memory"))
-    parser.add_argument("--cache", type=Path, help="what the machines' caches begin with; default: nothing")
+    parser.add_argument(
+        "--cache",
+        type=Path,
+        help="what the machines' caches begin with; default: nothing. $HARNESS_CACHE_DIR, for estimates of forced "
+        "cut-ins to be equal, too: they are compared with surrogates where a pool is cached",
+    )
     parser.add_argument(
         "--episodes", type=int, help="default: 200,000 for losses, 100,000 for overhead, 1e6 for memory"
     )
