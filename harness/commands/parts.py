@@ -14,6 +14,7 @@ from harness.commands.options import (
     RUN_FOLDER,
     av_option,
     examples,
+    executor_option,
     json_option,
     loaded,
     quiet_option,
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
 @click.argument("campaign_file", metavar="CAMPAIGN", type=CAMPAIGN)
 @click.option("--out", "folder", type=FOLDER, required=True, help="Folder of the plan; made if it is not there.")
 @workers_option
+@executor_option
 @click.option("--resume", is_flag=True, help="Go on with what the folder already holds.")
 @quiet_option
 @av_option
@@ -52,6 +54,7 @@ def plan(
     folder: Path,
     *,
     workers: int | None,
+    executor: str | None,
     resume: bool,
     quiet: bool,
     av: str | None,
@@ -76,7 +79,8 @@ def plan(
 
     Exit code 4 says that stop.episodes or the pool allows no second phase, or none from which stop.rhw is expected.
     """
-    campaign = loaded(campaign_file, ["run.shard_size=1", *overrides], av)
+    where = [] if executor is None else [f"run.executor={executor}"]
+    campaign = loaded(campaign_file, ["run.shard_size=1", *overrides, *where], av)
     from harness.progress import shown_progress  # noqa: PLC0415 - keeps --help fast
     from harness.runner import plan_second_phase  # noqa: PLC0415 - slow to import: only once the campaign is right
     from harness.runner.planner import FIRST_PHASE  # noqa: PLC0415 - as above

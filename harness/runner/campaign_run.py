@@ -174,7 +174,7 @@ class Run:
         """Run shadow runs, if there are any to make: rounds of ``most`` tests may begin (None: not known)."""
         if (paths := self._prepared.shadow_paths) is not None:
             self._plan(self._prepared.after(self._run_shadows(paths)))
-        self._progress.stage("episodes", most, done=episodes_on_disk(self._out, self._listed))
+        self._progress.stage(f"episodes{self._executor.where}", most, done=episodes_on_disk(self._out, self._listed))
 
     def run_round(self, specs: Iterator[ShardSpec]) -> bool:
         """Run the shards of a round; True, at once, when the campaign is to stop."""
@@ -208,7 +208,7 @@ class Run:
     def _run_shadows(self, paths: ShadowPaths) -> ShadowRuns:
         """Drive the vehicle along all paths without a cut-in, but for what an earlier run has done of it."""
         environment, n = self._resolved.environment, len(paths)
-        self._progress.stage("shadow runs", n)
+        self._progress.stage(f"shadow runs{self._executor.where}", n)
         tables, causes = [], Counter[str]()
         for done in self._workers.run(shadow_specs(n), partial(stored_shadows, self._out, paths)):
             if done.parquet:

@@ -65,6 +65,8 @@ class Executor(Protocol, Generic[AnyWorker]):
     """Makes workers, ``n_workers`` at most at a time."""
 
     n_workers: int
+    where: str
+    """Said of it where its work is shown; empty for this machine."""
 
     def cpus(self) -> set[str]:
         """Names of the processors of other machines that have worked: bits are promised for one family."""

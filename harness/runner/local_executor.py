@@ -85,6 +85,8 @@ def first_to_answer(workers: Sequence[WorkerProcess]) -> WorkerProcess:
 class LocalExecutor:
     """Starts a process for each worker, when it is first needed."""
 
+    where = ""
+
     def __init__(self, resolved: Resolved, folder: Path, n_workers: int) -> None:
         self._resolved, self._folder, self.n_workers = resolved, folder, n_workers
         self._black_boxes = TemporaryDirectory(prefix="harness-workers-")

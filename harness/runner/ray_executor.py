@@ -10,6 +10,7 @@ from __future__ import annotations
 import logging
 import os
 import signal
+import socket
 import sys
 import threading
 import time
@@ -58,6 +59,8 @@ LOCAL = "local"
 LOOK_S = 1.0
 PATIENCE_S = 30.0
 """After this time without any worker the user is told what is waited for."""
+ANSWER_S = 10.0
+"""Time in which a cluster has to answer."""
 STARTS = 3
 """As many workers in a row may be lost before they are ready."""
 
@@ -198,6 +201,8 @@ class RayExecutor:
         except HarnessError:
             self.close()
             raise
+        n_machines = sum(node["Alive"] for node in ray.nodes())
+        self.where = f" on {n_machines} machine{'s' * (n_machines > 1)} at {address}"
         self._lost_at_start = 0
         self._told = False
         self._since = time.monotonic()
@@ -314,8 +319,12 @@ def _connect(address: str, environment: dict[str, Any] | None) -> None:
     before = {number: signal.getsignal(number) for number in FROM_USER} if in_main_thread else {}
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     ours: dict[str, Any] = {"include_dashboard": False} if address == LOCAL else {}
+    ended_by: int | None = None
     try:
+        _require_answer(address)
         ray.init(address=address, logging_level=logging.ERROR, runtime_env=environment, **ours)
+    except SystemExit as error:  # Ray's own answer to SIGTERM, while it connects
+        ended_by = int(error.code or 0)
     except (RayError, OSError, RuntimeError, ValueError) as error:
         raise HarnessError(
             "run.ray.address",
@@ -327,6 +336,15 @@ def _connect(address: str, environment: dict[str, Any] | None) -> None:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+    if ended_by is not None:
+        signal.raise_signal(ended_by)
+
+
+def _require_answer(address: str) -> None:
+    """Raise an OSError where nobody listens: Ray itself would wait for minutes, without a word."""
+    host, _, port = address.rpartition(":")
+    if host and port.isdigit() and "/" not in host:
+        socket.create_connection((host.strip("[]"), int(port)), ANSWER_S).close()
 
 
 def _room(settings: RaySettings) -> int:

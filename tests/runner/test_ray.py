@@ -105,6 +105,34 @@ def test_no_room_for_one_worker(run, campaign, tmp_path):
     assert not (tmp_path / "run/manifest.json").exists()
 
 
+def test_nobody_answers_at_the_address(run, campaign, tmp_path, monkeypatch):
+    monkeypatch.setattr(ray, "is_initialized", lambda: False)
+    with pytest.raises(HarnessError, match=r"run\.ray\.address: found 127\.0\.0\.1:9: .*refused"):
+        run(campaign(*TWIN, ON_RAY, "run.ray.address='127.0.0.1:9'"), tmp_path / "run")
+
+
+def test_sigterm_while_it_connects_is_the_harness_s(run, campaign, tmp_path, monkeypatch):
+    def init(**_: object) -> None:
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # Ray puts its own handler in, which exits with the number
+        sys.exit(signal.SIGTERM)
+
+    monkeypatch.setattr(ray, "is_initialized", lambda: False)
+    monkeypatch.setattr(ray, "init", init)
+    seen: list[int] = []
+
+    def note(number: int, _: object) -> None:
+        seen.append(number)
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, note)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            run(campaign(*TWIN, ON_RAY), tmp_path / "run")
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert seen == [signal.SIGTERM]
+
+
 def test_an_environment_that_cannot_be_set_up(run, campaign, tmp_path):
     with pytest.raises(HarnessError, match=r"run\.ray\.runtime_env"):
         run(campaign(*TWIN, ON_RAY, "run.ray.runtime_env={working_dir: nowhere-at-all}"), tmp_path / "run")

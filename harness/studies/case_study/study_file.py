@@ -166,6 +166,7 @@ class Study(Section):
     version: Literal[1]
     name: str = Field(pattern=NAME_PATTERN)
     title: str
+    summary: str = Field("", description="what came out, in a few lines; left out where sizes allow no conclusions")
     rhw: Positive = Field(0.3, description="relative half-width that required numbers of tests are for")
     confidence: float = Field(0.9, gt=0.0, lt=1.0)
     steps: dict[StepName, Step] = Field(min_length=1, description="in the order in which they are made")
