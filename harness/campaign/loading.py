@@ -75,7 +75,9 @@ def _with_absolute_paths(campaign: Campaign, folder: Path) -> dict[str, Any]:
     def absolute(value: Any) -> Any:
         if isinstance(value, list):
             return [absolute(each) for each in value]
-        return str((folder / Path(value).expanduser()).resolve()) if "://" not in str(value) else value
+        if isinstance(value, str) and "://" not in value:
+            return str((folder / Path(value).expanduser()).resolve())
+        return value
 
     environment = campaign.run.ray.runtime_env
     return {

@@ -6,7 +6,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -141,8 +141,17 @@ class Run:
             left.unlink()
         prepared = prepare(resolved, progress)
         self._executor = executor_of(resolved, out, workers, n_runs=n_runs)
+        self._workers = ShardPool(resolved.campaign, self._executor)
+        with ExitStack() as refused:
+            refused.callback(self._workers.close)
+            self._begin(prepared, earlier, began, facts)
+            refused.pop_all()
+
+    def _begin(self, prepared: Prepared, earlier: dict[str, Any], began: float, facts: dict[str, Any]) -> None:
+        """Write the manifest, and plan the tests if they can be known already."""
+        resolved = self._resolved
         self._manifest = Manifest(
-            out,
+            self._out,
             resolved,
             earlier,
             began=began,
@@ -157,7 +166,6 @@ class Run:
         self._prepared = prepared
         if prepared.shadow_paths is None:
             self._plan(prepared)
-        self._workers = ShardPool(resolved.campaign, self._executor)
         self.prefix = Prefix(of_part="part" in facts)
         self._ungathered: list[dict[str, Any]] = []
 

@@ -39,8 +39,8 @@ def values(node: dict[str, Any]) -> st.SearchStrategy[Any]:
         optional = {key: values(child) for key, child in node["properties"].items() if key not in required}
         return st.fixed_dictionaries(required, optional=optional)
     named = [*node.get("patternProperties", {}).values(), node.get("additionalProperties")]
-    if isinstance(named[0], dict):
-        return st.dictionaries(_NAMES, values(named[0]), min_size=1, max_size=3)
+    if named[0]:  # True: whatever somebody else's options are
+        return st.dictionaries(_NAMES, _PLAIN if named[0] is True else values(named[0]), min_size=1, max_size=3)
     return _scalars(node)
 
 
