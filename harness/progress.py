@@ -209,7 +209,8 @@ class LineProgress(ShownProgress):
 
     def _print_lines(self) -> None:
         while not self._ended.wait(self._interval_s):
-            print(self.line(), file=self._stream, flush=True)
+            if self._name:  # until a stage begins there is nothing to say
+                print(self.line(), file=self._stream, flush=True)
 
     def line(self) -> str:
         """What there is to say now, with the time of day."""

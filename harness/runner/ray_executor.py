@@ -1,8 +1,8 @@
 """Workers on the machines of a Ray cluster (extra ``harness[ray]``).
 
-On each machine actors stand in for the run: an actor starts a worker process as a run does on its own machine, and
-learns as it does how a controller ended one. Shards come back as encoded Parquet, and are written by the run alone.
-Pools and tables lie once in each machine's part of the object store, and from there in its cache.
+On each machine actors stand in for the run (`harness.runner.ray_machine`). Shards come back as encoded Parquet, and are
+written by the run alone. Pools and tables lie once in each machine's part of the object store, and from there in its
+cache.
 """
 
 from __future__ import annotations
@@ -15,45 +15,27 @@ import sys
 import threading
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from importlib import metadata
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+import ray
+from ray.exceptions import RayError, RayTaskError, RuntimeEnvSetupError
+from ray.runtime_env import RuntimeEnv
 
 from harness.campaign.testing import RaySettings
-from harness.compiled import cache_root, source_hash
-from harness.controllers.apart import fit_to_travel
+from harness.compiled import cache_root
 from harness.controllers.black_box import Death
-from harness.controllers.loading import require_controller
 from harness.errors import CampaignError, HarnessError
 from harness.interruption import FROM_USER
-from harness.records.folder import write_bytes
 from harness.resolved import Resolved
 from harness.runner.executor import CLOSING_S, Ended
-from harness.runner.local_executor import LocalExecutor, WorkerProcess
-from harness.runner.manifest import cpu_name
 from harness.runner.prepare import cached_files
+from harness.runner.ray_machine import Files, Machine, OnMachine
 from harness.runner.shadow_runs import SHADOW
 from harness.runner.shards import WorkerLostError
 from harness.runner.worker import Done, ShardSpec, Spec
 
-try:
-    import ray
-    from ray.exceptions import RayError, RayTaskError, RuntimeEnvSetupError
-    from ray.runtime_env import RuntimeEnv
-except ImportError as error:
-    raise CampaignError(
-        "run.executor",
-        found="ray, but no package ray",
-        expected="the extra for clusters",
-        mend="Install it here and on all machines of the cluster: pip install 'harness[ray]'.",
-    ) from error
-
-Files = Mapping[str, "ray.ObjectRef[Any]"]
-"""Content of files in the object store, by their names below some folder."""
 LOCAL = "local"
 """Ray's word for a cluster of this machine alone, which ends with the run."""
 LOOK_S = 1.0
@@ -63,68 +45,6 @@ ANSWER_S = 10.0
 """Time in which a cluster has to answer."""
 STARTS = 3
 """As many workers in a row may be lost before they are ready."""
-
-
-@dataclass(frozen=True)
-class Machine:
-    """What must be equal on all machines, ``made_of``, and what is said of one."""
-
-    made_of: dict[str, str | None]
-    cpu: str
-
-    @classmethod
-    def this(cls, resolved: Resolved, controller_sha256: str | None) -> Machine:
-        """The one that this runs on."""
-        packages = ["harness", *(["libsumo"] if resolved.campaign.world.engine == "sumo" else [])]
-        made_of: dict[str, str | None] = {package: metadata.version(package) for package in packages}
-        made_of["sources of its kernels"] = source_hash()
-        made_of["source of the controller"] = controller_sha256
-        return cls(made_of, cpu_name())
-
-
-class OnMachine:
-    """What an actor is: it runs shards in a worker process beside it, and tells how that ended if it did."""
-
-    def __init__(self, resolved: Resolved) -> None:
-        self._resolved = resolved
-        self._folder = TemporaryDirectory(prefix="harness-shadow-runs-")
-        self._executor = LocalExecutor(resolved, Path(self._folder.name), n_workers=1)
-        self._worker: WorkerProcess | None = None
-
-    def begin(self, cached: Files) -> Machine | Exception:
-        """Fill the cache, and say what there is."""
-        try:
-            _place(cached, cache_root())
-            return Machine.this(self._resolved, require_controller(self._resolved.campaign))
-        except Exception as error:  # noqa: BLE001 - whatever goes wrong here is the run's to judge
-            return fit_to_travel(error)
-
-    def run(self, spec: Spec, doomed: Mapping[int, Death], shadows: Files) -> Done | Ended | Exception:
-        """Run a shard; tests may follow from the ``shadows``, files of the run folder."""
-        try:
-            _place(shadows, Path(self._folder.name))
-            worker = self._worker or self._executor.new_worker(0)
-            worker.give(spec, doomed)  # if it is dead, it has no answer either
-            answer = self._executor.first_to_answer([worker]).answer()
-        except Exception as error:  # noqa: BLE001 - as above
-            return fit_to_travel(error)
-        self._worker = None if isinstance(answer, Ended) else worker
-        return answer
-
-    def close(self) -> None:
-        """Let the worker release its controllers."""
-        if self._worker is not None:
-            self._worker.dismiss()
-            self._worker.wait()
-        self._executor.close()
-        self._folder.cleanup()
-
-
-def _place(files: Files, folder: Path) -> None:
-    for name, content in files.items():
-        if not (path := folder / name).exists():
-            path.parent.mkdir(parents=True, exist_ok=True)
-            write_bytes(path, ray.get(content))
 
 
 class RayWorker:

@@ -17,7 +17,7 @@ from scipy.special import bdtrc
 from harness.campaign.models import Campaign
 from harness.controllers.black_box import OF_EPISODE, Call, Death
 from harness.controllers.time_limit import death_cause
-from harness.errors import HarnessError, TooManyFailedError
+from harness.errors import CampaignError, HarnessError, TooManyFailedError
 from harness.records.folder import read_table, shard_files
 from harness.records.tables import ShardTables
 from harness.resolved import Resolved
@@ -87,8 +87,17 @@ def executor_of(resolved: Resolved, folder: Path, n_workers: int | None, *, n_ru
     """
     if resolved.campaign.run.executor == "local":
         return LocalExecutor(resolved, folder, n_workers or os.cpu_count() or 1)
-    from harness.runner.ray_executor import RayExecutor  # noqa: PLC0415 - an extra
-
+    try:
+        from harness.runner.ray_executor import RayExecutor  # noqa: PLC0415 - an extra
+    except ModuleNotFoundError as error:
+        if error.name != "ray":
+            raise
+        raise CampaignError(
+            "run.executor",
+            found="ray, but no package ray",
+            expected="the extra for clusters",
+            mend="Install it here and on all machines of the cluster: pip install 'harness[ray]'.",
+        ) from error
     return RayExecutor(resolved, folder, n_workers, n_runs=n_runs)
 
 

@@ -23,7 +23,7 @@ from tests.runner.stored_runs import manifest, shard_files, unlike_columns
 from tests.runner.test_shadow_runs import FORCED, SHADOWS, SHELLS, of
 
 ray = pytest.importorskip("ray")
-from harness.runner import ray_executor  # noqa: E402 - not without the extra
+from harness.runner import ray_executor, ray_machine  # noqa: E402 - not without the extra
 
 ROOT = Path(__file__).parents[2]
 ON_RAY = "run.executor=ray"
@@ -139,14 +139,15 @@ def test_an_environment_that_cannot_be_set_up(run, campaign, tmp_path):
 
 
 def test_another_version_on_a_machine_is_refused(run, campaign, tmp_path, monkeypatch):
-    monkeypatch.setattr(ray_executor, "source_hash", lambda: "0123456789abcdef")
+    monkeypatch.setattr(ray_machine, "source_hash", lambda: "0123456789abcdef")
     with pytest.raises(HarnessError, match="a machine with sources of its kernels"):
         run(campaign(*TWIN, ON_RAY), tmp_path / "run")
 
 
 def test_without_the_package(run, campaign, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
-    monkeypatch.delitem(sys.modules, "harness.runner.ray_executor")
+    for name in ("ray_executor", "ray_machine"):
+        monkeypatch.delitem(sys.modules, f"harness.runner.{name}")
     with pytest.raises(CampaignError, match=r"pip install 'harness\[ray\]'"):
         run(campaign(*TWIN, ON_RAY), tmp_path / "run")
 
