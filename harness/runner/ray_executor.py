@@ -105,7 +105,7 @@ class RayExecutor:
     """
 
     def __init__(self, resolved: Resolved, folder: Path, n_workers: int | None, *, n_runs: int = 1) -> None:
-        self._resolved, self._folder = resolved, folder
+        self._folder = folder
         self._settings = settings = resolved.campaign.run.ray
         address = settings.address or os.environ.get("RAY_ADDRESS") or LOCAL
         environment = _runtime_env(settings)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -12,7 +12,7 @@ from harness.campaign.loading import load_campaign
 from harness.campaign.models import Campaign
 from harness.controllers.black_box import Death
 from harness.resolved import Resolved
-from harness.runner import RunResult, local_executor, run_campaign
+from harness.runner import RunResult, local_executor, merge_parts, run_campaign
 from harness.runner.worker import ShardDone, ShardRunner, ShardSpec
 
 MIXTURE_FILE = Path(__file__).parents[2] / "scenarios" / "overtaking_mixture.yaml"
@@ -79,6 +79,18 @@ def run_here(run) -> Callable[..., RunResult]:
             return run(campaign, out, workers=1, **options)
 
     return run_in_this_process
+
+
+@pytest.fixture(scope="session")
+def merged() -> Callable[..., RunResult]:
+    """`merge_parts` without the page."""
+
+    def merge_without_page(folders: Sequence[Path], out: Path) -> RunResult:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("harness.report.write_report", lambda folder, final: folder / "report.html")
+            return merge_parts(folders, out)
+
+    return merge_without_page
 
 
 @pytest.fixture(scope="session")

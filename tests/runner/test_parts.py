@@ -19,7 +19,7 @@ from harness.cli import main
 from harness.errors import CampaignError, HarnessError, RunFolderError, TooManyFailedError
 from harness.part import Part
 from harness.records.folder import TABLES
-from harness.runner import merge_parts, run_part
+from harness.runner import run_part
 from harness.runner.manifest import Prefix
 from harness.runner.parts_together import ranges
 from tests.runner.conftest import MIXTURE_FILE, TWIN, one_process
@@ -42,18 +42,6 @@ def part_here():
             return run_part(campaign, Part(number, of), out, workers=1, **options)
 
     return run_in_this_process
-
-
-@pytest.fixture(scope="module")
-def merged():
-    """`merge_parts` without the page."""
-
-    def merge_without_page(folders, out):
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("harness.report.write_report", lambda folder, final: folder / "report.html")
-            return merge_parts(folders, out)
-
-    return merge_without_page
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,7 @@ from harness import estimate, replay
 from harness.cli import main
 from harness.errors import CampaignError, HarnessError, RunFolderError
 from harness.part import Part
-from harness.runner import merge_parts, plan_second_phase, read_plan, run_part
+from harness.runner import plan_second_phase, read_plan, run_part
 from harness.runner.parts import planned_specs
 from tests.pool.conftest import SMALL_POOL
 from tests.pool.test_vehicle_pool import ACTING
@@ -48,18 +48,6 @@ def part_here():
             return run_part(read_plan(plan), Part(number, of), out, workers=1, **options)
 
     return run_in_this_process
-
-
-@pytest.fixture(scope="module")
-def merged():
-    """`merge_parts` without the page."""
-
-    def merge_without_page(folders, out):
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("harness.report.write_report", lambda folder, final: folder / "report.html")
-            return merge_parts(folders, out)
-
-    return merge_without_page
 
 
 @pytest.fixture(scope="module")
