@@ -4,11 +4,12 @@
     sudo python -m benchmarks.kills runs/kills --kills 200 --machines 3
 
 runs a campaign of each of three methods in the twin, once undisturbed and once with SIGKILL to a worker or to the
-run's own process at random moments, again and again with ``--resume``, until all kills are spent; with ``--machines``
-on a Ray cluster of so many (namespaces of this one), also to actors, and to the raylets of machines, which are then
-started again. Then it compares every file of records, and ``estimates.json``, byte by byte. What a killed run had
-started must be gone soon after. Kills follow from ``--seed``; what they strike depends on the machine's load, and so
-differs each time.
+run's own process, whichever chance picks, at random moments less than ``--pause`` seconds apart, again and again with
+``--resume``, until all kills are spent (a run that comes to its end before is begun anew); with ``--machines`` on a
+Ray cluster of so many (namespaces of this one), also to actors, and to the raylets of machines, which are then started
+again. Then it compares every file of records, and ``estimates.json``, byte by byte. What a killed run had started must
+be gone soon after. Kills follow from ``--seed``; what they strike depends on the machine's load, and so differs each
+time.
 """
 
 from __future__ import annotations
@@ -135,7 +136,7 @@ def orphans(pids: list[int], grace_s: float) -> list[int]:
 
 
 def disturbed(
-    place: Here, method: str, out: Path, episodes: int, chance: random.Random, kills: int, longest_s: float
+    place: Here, method: str, out: Path, episodes: int, chance: random.Random, kills: int, pause_s: float
 ) -> Counter[str]:
     """Run a campaign to its end in spite of so many kills, and count them; orphans under a name of their own."""
     done: Counter[str] = Counter()
@@ -147,16 +148,16 @@ def disturbed(
         process = place.start(command(method, out, episodes))
         while process.poll() is None and left():
             with suppress(subprocess.TimeoutExpired):
-                process.wait(chance.uniform(0.0, longest_s))
+                process.wait(chance.uniform(0.0, pause_s))
                 continue
             place.mend()
             targets = place.targets(process)
-            kind = chance.choice(sorted(kind for kind in targets if targets[kind]) or ["nothing"])
-            if kind == "nothing":
+            if not (living := [(kind, pid) for kind in sorted(targets) for pid in targets[kind]]):
                 continue  # it has not begun
+            kind, victim = chance.choice(living)
             below = [pid for other in ("worker", "actor") for pid in targets.get(other, [])]
             with suppress(ProcessLookupError):
-                os.kill(chance.choice(targets[kind]), signal.SIGKILL)
+                os.kill(victim, signal.SIGKILL)
                 done[kind] += 1
             if kind == "run":
                 done["orphan"] += len(orphans(below, place.grace_s))
@@ -187,6 +188,7 @@ def main() -> int:
     parser.add_argument("folder", type=Path, help="place of the run folders; what is there goes")
     parser.add_argument("--kills", type=int, default=20)
     parser.add_argument("--episodes", type=int, default=20_000, help="of each campaign")
+    parser.add_argument("--pause", type=float, default=5.0, help="longest time from one kill to the next, s")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--only", choices=METHODS)
     parser.add_argument("--machines", type=int, help="run on a Ray cluster of so many")
@@ -208,10 +210,9 @@ def campaigns(place: Here, folder: Path, options: argparse.Namespace) -> int:
     for k, method in enumerate(methods):
         calm, struck = folder / method / "undisturbed", folder / method / "killed"
         shutil.rmtree(folder / method, ignore_errors=True)
-        began = time.monotonic()
         finish(place.start(command(method, calm, options.episodes)))
         kills = (options.kills + k) // len(methods)
-        done = disturbed(place, method, struck, options.episodes, chance, kills, 0.7 * (time.monotonic() - began))
+        done = disturbed(place, method, struck, options.episodes, chance, kills, options.pause)
         differing = unlike(calm, struck)
         failed |= bool(differing or done["orphan"])
         verdict = f"DIFFERENT: {', '.join(differing)}" if differing else "records equal, byte for byte"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import pickle
 import time
 from collections.abc import Mapping, Sequence
 from itertools import count
@@ -23,7 +24,7 @@ CLOSING_LOOK_S = 0.05
 class WorkerProcess:
     """A process that runs one shard after another, at the end of a pipe of its own."""
 
-    def __init__(self, resolved: Resolved, folder: Path, black_box: Path) -> None:
+    def __init__(self, resolved: Path, folder: Path, black_box: Path) -> None:
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
         self._black_box = black_box
         self.connection, theirs = spawn_context().Pipe()
@@ -88,8 +89,11 @@ class LocalExecutor:
     where = ""
 
     def __init__(self, resolved: Resolved, folder: Path, n_workers: int) -> None:
-        self._resolved, self._folder, self.n_workers = resolved, folder, n_workers
-        self._black_boxes = TemporaryDirectory(prefix="harness-workers-")
+        self._folder, self.n_workers = folder, n_workers
+        self._own = TemporaryDirectory(prefix="harness-workers-")
+        # As a file: what a pipe cannot hold is waited for until the new process has imported all that it needs.
+        self._resolved = Path(self._own.name) / "resolved"
+        self._resolved.write_bytes(pickle.dumps(resolved))
         self._numbers = count()
 
     def cpus(self) -> set[str]:
@@ -98,7 +102,7 @@ class LocalExecutor:
 
     def new_worker(self, n_there: int) -> WorkerProcess:  # noqa: ARG002 - as many as are asked for
         """See `harness.runner.executor.Executor`."""
-        return WorkerProcess(self._resolved, self._folder, Path(self._black_boxes.name) / str(next(self._numbers)))
+        return WorkerProcess(self._resolved, self._folder, Path(self._own.name) / str(next(self._numbers)))
 
     def first_to_answer(self, busy: Sequence[WorkerProcess]) -> WorkerProcess:
         """See `harness.runner.executor.Executor`."""
@@ -106,4 +110,4 @@ class LocalExecutor:
 
     def close(self) -> None:
         """See `harness.runner.executor.Executor`."""
-        self._black_boxes.cleanup()
+        self._own.cleanup()

@@ -9,6 +9,7 @@ cells does not; its tests cannot be replayed, and depend on what ran beside them
 from __future__ import annotations
 
 import json
+import pickle
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
@@ -95,10 +96,11 @@ Done = ShardDone | ShadowDone
 Spec = ShardSpec | ShadowSpec
 
 
-def serve(connection: Connection, resolved: Resolved, folder: Path, black_box: Path) -> None:
+def serve(connection: Connection, resolved: Path, folder: Path, black_box: Path) -> None:
     """Prepare with the first shard, run shards until the parent is gone or has no more.
 
-    In the run's ``folder`` stand the shadow runs that tests follow from, once there are some.
+    The file ``resolved`` holds the campaign. In the run's ``folder`` stand the shadow runs that tests follow from, once
+    there are some.
     """
     runner: ShardRunner | None = None
     while True:
@@ -107,7 +109,8 @@ def serve(connection: Connection, resolved: Resolved, folder: Path, black_box: P
         except (EOFError, OSError):
             break
         try:
-            runner = runner or ShardRunner(resolved, folder, black_box)
+            if runner is None:
+                runner = ShardRunner(pickle.loads(resolved.read_bytes()), folder, black_box)  # noqa: S301 - our own
             answer: Done | Exception = runner.run(spec, doomed)
         except Exception as error:  # noqa: BLE001 - whatever goes wrong here is the parent's to judge
             answer = fit_to_travel(error)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,7 +12,6 @@ import pytest
 from harness.campaign.loading import load_campaign
 from harness.campaign.models import Campaign
 from harness.controllers.black_box import Death
-from harness.resolved import Resolved
 from harness.runner import RunResult, local_executor, merge_parts, run_campaign
 from harness.runner.worker import ShardDone, ShardRunner, ShardSpec
 
@@ -41,8 +41,8 @@ def run() -> Callable[..., RunResult]:
 class WorkerInThisProcess:
     """Stands in for `WorkerProcess` where the tests are not about processes: spares starting one."""
 
-    def __init__(self, resolved: Resolved, folder: Path, black_box: Path) -> None:
-        self._runner = ShardRunner(resolved, folder)
+    def __init__(self, resolved: Path, folder: Path, black_box: Path) -> None:
+        self._runner = ShardRunner(pickle.loads(resolved.read_bytes()), folder)
 
     def give(self, spec: ShardSpec, doomed: Mapping[int, Death]) -> bool:
         self._done = self._runner.run(spec, doomed)

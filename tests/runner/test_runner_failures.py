@@ -144,7 +144,9 @@ def serve(campaign, tmp_path, monkeypatch):
                 events.append("closed")
 
         monkeypatch.setattr(worker, "ShardRunner", Runner)
-        worker.serve(pipe, campaign(), tmp_path, tmp_path / "black-box")
+        resolved = tmp_path / "resolved"
+        resolved.write_bytes(pickle.dumps(campaign()))
+        worker.serve(pipe, resolved, tmp_path, tmp_path / "black-box")
         return events
 
     return served
