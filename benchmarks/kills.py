@@ -4,7 +4,7 @@
     sudo python -m benchmarks.kills runs/kills --kills 200 --machines 3
 
 runs a campaign of each of three methods in the twin, once undisturbed and once with SIGKILL to a worker or to the
-run's own process, whichever chance picks, at random moments less than ``--pause`` seconds apart, again and again with
+run's own process, with equal chances, at random moments less than ``--pause`` seconds apart, again and again with
 ``--resume``, until all kills are spent (a run that comes to its end before is begun anew); with ``--machines`` on a
 Ray cluster of so many (namespaces of this one), also to actors, and to the raylets of machines, which are then started
 again. Then it compares every file of records, and ``estimates.json``, byte by byte. What a killed run had started must
@@ -32,7 +32,7 @@ from harness.records.folder import TABLES
 
 METHODS = {"forced": "overtaking_forced", "step_mixture": "overtaking_nade", "shells": "smoke"}
 """Method and its scenario."""
-SETTINGS = ("world.engine=twin", "world.cells=64", "stop.rhw=null", "run.shard_size=100", "records.trace_share=0.01")
+SETTINGS = ("world.engine=twin", "world.cells=64", "stop.rhw=null", "run.shard_size=500", "records.trace_share=0.01")
 LONGEST_WAIT_S = 600.0
 DONE, LOST = (0, 4), 3
 """Exit codes; the last when workers were killed three times on the same shard."""
@@ -152,12 +152,12 @@ def disturbed(
                 continue
             place.mend()
             targets = place.targets(process)
-            if not (living := [(kind, pid) for kind in sorted(targets) for pid in targets[kind]]):
-                continue  # it has not begun
-            kind, victim = chance.choice(living)
+            kind = chance.choice(sorted(targets))
+            if not targets[kind]:
+                continue  # not yet, or not at the moment
             below = [pid for other in ("worker", "actor") for pid in targets.get(other, [])]
             with suppress(ProcessLookupError):
-                os.kill(victim, signal.SIGKILL)
+                os.kill(chance.choice(targets[kind]), signal.SIGKILL)
                 done[kind] += 1
             if kind == "run":
                 done["orphan"] += len(orphans(below, place.grace_s))

@@ -7,10 +7,13 @@ tests), the twin and SUMO all end here, so that an estimator cannot tell them ap
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from harness.arrays import BoolArray, FloatArray, IntArray
 from harness.methods import SAMPLING, Method
@@ -152,12 +155,28 @@ class Block:
             raise ValueError("a block holds consecutive episodes: the slice must have step 1")
         if (start, stop) == (0, len(self)):
             return self
-        taken = copy(self)  # not checked again: that takes longer than all the rest
-        for name, array in vars(self).items():
-            if isinstance(array, np.ndarray) and name != "alpha":
-                object.__setattr__(taken, name, array[start:stop])
-        object.__setattr__(taken, "first_episode", self.first_episode + start)
-        return taken
+        columns: dict[str, Any] = {name: column[start:stop] for name, column in columns_of(self).items()}
+        return _unchecked(self, first_episode=self.first_episode + start, **columns)
+
+
+def joined(blocks: Sequence[Block]) -> Block:
+    """One block of consecutive ones of the same campaign."""
+    if len(blocks) == 1:
+        return blocks[0]
+    parts = [columns_of(block) for block in blocks]
+    return _unchecked(blocks[0], **{name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
+
+
+def columns_of(block: Block) -> dict[str, NDArray[Any]]:
+    """All arrays that have a row for each test."""
+    return {name: array for name, array in vars(block).items() if isinstance(array, np.ndarray) and name != "alpha"}
+
+
+def _unchecked(block: Block, **columns: Any) -> Block:
+    """The block with other columns; checking them again takes longer than all the rest."""
+    other = copy(block)
+    vars(other).update(columns)
+    return other
 
 
 def _fits(shape: tuple[int, ...], expected: tuple[int | None, ...]) -> bool:

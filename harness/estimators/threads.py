@@ -1,4 +1,4 @@
-"""Both cores for one pass: strata side by side, and the next block read while the present one is being used.
+"""All cores for one pass: strata side by side, and the next blocks read while the present one is being used.
 
 What is done, and in which order within a stratum, is the same as without threads, so every bit is.
 """
@@ -6,10 +6,10 @@ What is done, and in which order within a stratum, is the same as without thread
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cache
-from itertools import islice
 from typing import TypeVar
 
 from threadpoolctl import ThreadpoolController
@@ -35,10 +35,20 @@ def side_by_side(
         return list(threads.map(function, items)) if worthwhile else [function(item) for item in items]
 
 
-def read_ahead(items: Iterator[_Item]) -> Iterator[_Item]:
-    """The same items, the next one being made in a thread while the present one is in use."""
-    with ThreadPoolExecutor(1, thread_name_prefix="read-ahead") as thread:
-        coming = thread.submit(list, islice(items, 1))
-        while following := coming.result():
-            coming = thread.submit(list, islice(items, 1))
-            yield following[0]
+def made_ahead(
+    make: Callable[[_Item], _Result], items: Iterable[_Item], n_threads: int | None = None
+) -> Iterator[_Result]:
+    """What is made of each item, in order; the next ones are being made in threads while the present one is in use.
+
+    ``n_threads`` (as many as there are cores by default) of them at a time: one where ``make`` is not to be called by
+    two threads at once.
+    """
+    n_threads = n_threads or os.cpu_count() or 1
+    with ThreadPoolExecutor(n_threads, thread_name_prefix="made-ahead") as threads:
+        coming: deque[Future[_Result]] = deque()
+        for item in items:
+            coming.append(threads.submit(make, item))
+            if len(coming) > n_threads:
+                yield coming.popleft().result()
+        while coming:
+            yield coming.popleft().result()

@@ -4,21 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any
+
+import pyarrow as pa
 
 from harness.campaign.loading import load_campaign
 from harness.campaign.models import Campaign
 from harness.errors import HarnessError, RunFolderError
 from harness.estimators import ESTIMATORS, CampaignFacts, estimate_blocks
-from harness.estimators.block import Block
+from harness.estimators.block import Block, joined
 from harness.estimators.from_records import EPISODE_COLUMNS, MOMENT_COLUMNS, SHELL_COLUMNS, block_from_tables
-from harness.estimators.threads import read_ahead
+from harness.estimators.one_pass import SPACING
+from harness.estimators.threads import made_ahead
 from harness.importance.build import importance_names, mixture_weights
 from harness.methods import EstimatorName
 from harness.pool.storage import cached_pool, read_pool
 from harness.pool.surrogate_replay import PATH_COLUMNS, SurrogateReplay
-from harness.records.folder import SHELLS, no_episodes, read_json, read_manifest, require_schema
+from harness.records.folder import SHELLS, damaged, no_episodes, read_json, read_manifest, require_schema
 from harness.records.reader import read_shard, require_whole, stored_columns
 from harness.records.stored_manifest import StoredShells
 from harness.resolved import resolve
@@ -27,7 +32,11 @@ from harness.strata import ShellDesign
 
 MOST_UNASKED = 100_000
 """Tests that are replayed without being asked to, for the alarm: some 30 µs each."""
+MOST_GROUPED = 5_000
+"""Tests of small shards that are read as one."""
 _FINISH = "Run `harness run` with --resume, which makes missing shards."
+
+_Shards = Sequence[Mapping[str, Any]]
 
 
 def estimate_run(
@@ -85,7 +94,7 @@ def estimate_run(
         surrogates=None if isinstance(surrogates, str) else surrogates,
         n_asked=MOST_UNASKED if pool is None else int(manifest["n_episodes"]),
     )
-    return estimate_blocks(read_ahead(blocks), facts, estimators=estimators)
+    return estimate_blocks(blocks, facts, estimators=estimators)
 
 
 def stored_blocks(
@@ -117,18 +126,32 @@ def stored_blocks(
     needed = [*EPISODE_COLUMNS, *(SHELL_COLUMNS if shells else ())]
     ratios = list(MOMENT_COLUMNS) if moments and method == "step_mixture" else []
     gathered = None if ratios or shells else GatheredBlocks(folder, campaign)
+
+    def read(group: _Shards, asking: SurrogateReplay | None = None) -> Block:
+        columns = dict.fromkeys([*needed, *(asking.columns if asking else ())])
+        stored = [read_shard(folder, shard, episode_columns=list(columns), moment_columns=ratios) for shard in group]
+        try:
+            episodes = pa.concat_tables(table for table, _ in stored)
+            kept = [table for _, table in stored if table is not None]
+            steps = pa.concat_tables(kept) if kept else None
+        except pa.ArrowException as error:  # a column of another type
+            raise damaged(folder / group[0]["files"]["episodes"], error) from error
+        block = block_from_tables(episodes, steps, method=method, alpha=alpha, shells=shells)
+        if asking is None:
+            return block
+        return replace(block, surrogates_crash=asking.crashes(episodes), known_rates=asking.known)
+
+    def taken(group: _Shards) -> Block:
+        blocks = [block for shard in group if gathered and (block := _gathered(gathered, shard)) is not None]
+        return joined(blocks) if len(blocks) == len(group) else read(group)
+
+    groups = list(_groups(manifest["shards"], n_asked))
+    n_asked_groups = 0 if surrogates is None else sum(group[0]["first_episode"] < n_asked for group in groups)
     n = 0
-    for shard in manifest["shards"]:
-        asked = surrogates is not None and n < n_asked
-        block = None if asked or gathered is None else _gathered(gathered, shard)
-        if block is None:
-            columns = [*needed, *(surrogates.columns if surrogates and asked else ())]
-            episodes, steps = read_shard(
-                folder, shard, episode_columns=list(dict.fromkeys(columns)), moment_columns=ratios
-            )
-            block = block_from_tables(episodes, steps, method=method, alpha=alpha, shells=shells)
-            if surrogates is not None and asked:
-                block = replace(block, surrogates_crash=surrogates.crashes(episodes), known_rates=surrogates.known)
+    for block in chain(
+        made_ahead(partial(read, asking=surrogates), groups[:n_asked_groups]),
+        made_ahead(taken, groups[n_asked_groups:], 1),  # only one may take from gathered parts
+    ):
         if block.first_episode != n:
             raise _incomplete(folder, f"a shard that begins at episode {block.first_episode}", f"episode {n}")
         counted = block.take(slice(max(reported_from - n, 0), n_counted - n))
@@ -138,6 +161,24 @@ def stored_blocks(
         if n == n_counted:
             return
     raise _incomplete(folder, f"{n} episodes on record", f"{n_counted} (manifest.json)")
+
+
+def _groups(shards: _Shards, edge: int) -> Iterator[_Shards]:
+    """Consecutive shards to be read as one: small ones cost more to hand over than to use.
+
+    A group brings as many tests as `one_pass` waits for until it looks again, or `MOST_GROUPED`, or ends at the
+    ``edge``, where shards begin that are read otherwise.
+    """
+    n, begin = 0, 0
+    group: list[Mapping[str, Any]] = []
+    for shard in shards:
+        group.append(shard)
+        n += shard["n_episodes"]
+        if n >= min(begin * SPACING, begin + MOST_GROUPED) or begin < edge <= n:
+            yield group
+            group, begin = [], n
+    if group:
+        yield group
 
 
 def _gathered(gathered: GatheredBlocks, shard: Mapping[str, Any]) -> Block | None:

@@ -15,16 +15,15 @@ in shards, and not by the estimator, so that two estimators of one run see the s
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import norm
 
 from harness.arrays import BoolArray, FloatArray, IntArray
-from harness.estimators.block import Block
+from harness.estimators.block import Block, columns_of
 from harness.estimators.estimate import BothWays
 from harness.estimators.scv import Scv
 
@@ -215,18 +214,5 @@ def shuffled(seed: int, shuffle: int, placed: BoolArray) -> IntArray:
 
 def rows_of(tests: Block, rows: IntArray) -> Block:
     """Block of any rows in any order; numbered anew, for the order is what is asked about."""
-    taken: dict[str, Any] = {name: column[rows] for name, column in _columns(tests).items()}
+    taken: dict[str, Any] = {name: column[rows] for name, column in columns_of(tests).items()}
     return replace(tests, first_episode=0, **taken)
-
-
-def joined(blocks: Sequence[Block]) -> Block:
-    """One block of consecutive ones."""
-    parts = [_columns(block) for block in blocks]
-    whole: dict[str, Any] = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    return replace(blocks[0], **whole)
-
-
-def _columns(block: Block) -> dict[str, NDArray[Any]]:
-    """All arrays that have a row for each test."""
-    values = {field.name: getattr(block, field.name) for field in fields(Block) if field.name != "alpha"}
-    return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}

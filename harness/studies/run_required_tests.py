@@ -12,7 +12,7 @@ import numpy as np
 from harness.arrays import BoolArray, FloatArray
 from harness.campaign.loading import load_campaign
 from harness.errors import HarnessError
-from harness.estimators.block import Block
+from harness.estimators.block import Block, joined
 from harness.estimators.estimate import finite_json
 from harness.estimators.nade import Nade, Nde
 from harness.estimators.scv import Scv
@@ -22,7 +22,6 @@ from harness.studies.required_tests import (
     Procedure,
     RequiredTests,
     acceleration,
-    joined,
     plain_rhw,
     required_tests,
     scv_rhw,

@@ -1,8 +1,9 @@
 import threading
+import time
 
 import pytest
 
-from harness.estimators.threads import read_ahead, side_by_side
+from harness.estimators.threads import made_ahead, side_by_side
 
 
 @pytest.mark.parametrize("worthwhile", [True, False])
@@ -16,29 +17,38 @@ def test_an_error_of_one_item_is_raised(worthwhile):
         side_by_side(lambda i: 1 // i, [1, 0, 1], worthwhile=worthwhile)
 
 
-def test_items_read_ahead_are_the_same_items():
-    assert list(read_ahead(iter([None, 1, (), 2]))) == [None, 1, (), 2]
-    assert list(read_ahead(iter([]))) == []
+@pytest.mark.parametrize("n_threads", [None, 1, 3])
+def test_what_is_made_ahead_comes_in_the_order_of_the_items(n_threads):
+    assert list(made_ahead(lambda i: i * i, range(20), n_threads)) == [i * i for i in range(20)]
+    assert list(made_ahead(str, [], n_threads)) == []
 
 
 def test_the_next_item_is_made_while_the_present_one_is_in_use():
     second_made = threading.Event()
 
-    def items():
-        yield 1
-        second_made.set()
-        yield 2
+    def make(i):
+        if i == 2:
+            second_made.set()
+        return i
 
-    for item in read_ahead(items()):
+    for item in made_ahead(make, [1, 2], 1):
         assert item == 2 or second_made.wait(10)
 
 
-def test_an_error_while_reading_is_raised_where_the_items_are_used():
-    def items():
-        yield 1
-        raise OSError("disk")
+def test_one_thread_makes_one_item_at_a_time():
+    at_work = threading.Lock()
 
-    ahead = read_ahead(items())
+    def make(i):
+        assert at_work.acquire(blocking=False)
+        time.sleep(1e-4)
+        at_work.release()
+        return i
+
+    assert list(made_ahead(make, range(50), 1)) == list(range(50))
+
+
+def test_an_error_while_reading_is_raised_where_the_item_is_used():
+    ahead = made_ahead(lambda i: 1 // i, [1, 0, 1])
     assert next(ahead) == 1
-    with pytest.raises(OSError, match="disk"):
+    with pytest.raises(ZeroDivisionError):
         next(ahead)

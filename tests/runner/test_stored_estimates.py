@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 
+import numpy as np
+import pyarrow.parquet as pq
 import pytest
 
 from harness.campaign import models
 from harness.campaign.models import AutomatedVehicle, Campaign, PoolSettings
 from harness.cli import main
 from harness.errors import RunFolderError
+from harness.estimators.block import columns_of, joined
 from harness.pool import storage
 from harness.pool.surrogate_replay import PATH_COLUMNS
-from harness.runner import estimate_run
-from harness.runner.stored_estimates import surrogates_of
+from harness.runner import estimate_run, stored_estimates
+from harness.runner.stored_estimates import stored_blocks, surrogates_of
 from tests.runner.stored_runs import copy_of, stored_table
 
 
@@ -48,6 +52,38 @@ def test_rate_and_counts_can_be_had_from_the_table_alone(sumo_run):
     nade = estimate_run(sumo_run)["estimates"]["nade"]
     assert math.isclose(nade["crash_rate"], math.fsum(weights) / rows.num_rows, rel_tol=1e-12)
     assert nade["n_crashes"] == len(weights)
+
+
+@pytest.mark.parametrize(
+    ("most", "edge", "sizes"),
+    [(90, 0, [80, 160, 160]), (170, 0, [80, 240, 80]), (5_000, 0, [80, 320]), (5_000, 240, [80, 160, 160])],
+)
+@pytest.mark.parametrize("gathered", [True, False])
+def test_shards_are_read_in_groups_without_changing_a_bit(most, edge, sizes, gathered, twin_run, tmp_path, monkeypatch):
+    """Five shards of 80 tests: `joined` blocks of gathered shards, or one block of several tables."""
+    folder = copy_of(twin_run, tmp_path / "run")
+    if not gathered:
+        shutil.rmtree(folder / "gathered")
+    one_by_one = list(stored_blocks(folder, moments=False))
+    monkeypatch.setattr(stored_estimates, "SPACING", 100.0)
+    monkeypatch.setattr(stored_estimates, "MOST_GROUPED", most)
+    grouped = list(stored_blocks(folder, moments=False, n_asked=edge))
+    assert ([len(block) for block in one_by_one], [len(block) for block in grouped]) == ([80] * 5, sizes)
+    whole, again = joined(one_by_one), joined(grouped)
+    assert columns_of(whole).keys() == columns_of(again).keys()
+    assert all(np.array_equal(column, columns_of(again)[name]) for name, column in columns_of(whole).items())
+
+
+def test_shards_with_columns_of_other_types_are_refused(twin_run, tmp_path, monkeypatch):
+    folder = copy_of(twin_run, tmp_path / "run")
+    shutil.rmtree(folder / "gathered")
+    path = folder / "episodes" / sorted(path.name for path in (folder / "episodes").iterdir())[2]
+    table = pq.read_table(path)
+    column = table.schema.get_field_index("cut_in_step")
+    pq.write_table(table.set_column(column, "cut_in_step", table.column(column).cast("float64")), path)
+    monkeypatch.setattr(stored_estimates, "SPACING", 100.0)
+    with pytest.raises(RunFolderError, match="Schema"):
+        list(stored_blocks(folder, moments=False))
 
 
 COLUMNS = set(PATH_COLUMNS)

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from harness.estimators.block import joined
 from harness.estimators.nade import Nade
 from harness.estimators.scv import Scv
 from harness.studies.chains.named import overtaking
@@ -18,7 +19,6 @@ from harness.studies.required_tests import (
     Procedure,
     RequiredTests,
     acceleration,
-    joined,
     plain_rhw,
     required_tests,
     rows_of,

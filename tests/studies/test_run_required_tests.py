@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from harness.cli import main
+from harness.estimators.block import joined
 from harness.studies.chains.named import overtaking
 from harness.studies.chains.sampler import blocks
-from harness.studies.required_tests import Procedure, joined, plain_rhw, required_tests, scv_rhw
+from harness.studies.required_tests import Procedure, plain_rhw, required_tests, scv_rhw
 from harness.studies.run_required_tests import SCV_REMARK, required_tests_of_runs
 from tests.chains.seed import SEED
 from tests.estimators.run_folder import write_run

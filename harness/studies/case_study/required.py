@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pyarrow as pa
 
-from harness.estimators.block import Block
+from harness.estimators.block import Block, joined
 from harness.runner.stored_estimates import stored_blocks
 from harness.studies.case_study.context import Context, Made
 from harness.studies.case_study.figures import figure, marked, mean_of, ratio_of_means
@@ -19,7 +19,6 @@ from harness.studies.required_tests import (
     Procedure,
     RequiredTests,
     acceleration,
-    joined,
     plain_rhw,
     required_tests,
     scv_rhw_of,
