@@ -249,7 +249,8 @@ def _connect(address: str, environment: dict[str, Any] | None) -> None:
         raise HarnessError(
             "run.ray.address",
             found=f"{address}: {error}",
-            expected="the address of a Ray cluster, whose machines run the same versions of Ray and Python",
+            expected="the address of a Ray cluster whose machines have the same versions of Ray and Python, and "
+            "the same RAY_AUTH_MODE and RAY_AUTH_TOKEN",
             mend="Start it with `ray start --head` and give its address, such as 10.0.0.1:6379, or none for a cluster "
             "of this machine.",
         ) from error
