@@ -106,7 +106,8 @@ def read_pool(path: Path) -> Pool:
         The file is missing, damaged, or not a pool.
     """
     try:
-        table = pq.read_table(path, partitioning=None)
+        with pq.ParquetFile(path) as file:  # read_table would import, for 0.3 s, what reads folders
+            table = file.read()
         return _pool(table, _sound_facts(table))
     except (OSError, pa.ArrowException, KeyError, TypeError, ValueError) as error:
         raise RunFolderError(
