@@ -6,12 +6,15 @@ import inspect
 import json
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
+from unittest.mock import create_autospec
 
 import pytest
 
 import harness
 from harness.errors import CampaignError, RunFolderError
+from harness.part import Part
 
 MIXTURE_FILE = Path(__file__).parents[1] / "scenarios" / "overtaking_mixture.yaml"
 SMALL = [
@@ -105,3 +108,36 @@ def test_a_run_is_not_written_over(result):
     campaign = harness.load_campaign(MIXTURE_FILE, SMALL)
     with pytest.raises(harness.HarnessError, match="--resume"):
         harness.run(campaign, result.folder)
+
+
+@pytest.mark.parametrize(
+    ("behind", "call", "handed_on"),
+    [
+        (
+            "runner.plan_second_phase",
+            lambda c: harness.plan(c, "out", resume=True),
+            {"out": Path("out"), "resume": True},
+        ),
+        (
+            "runner.run_part",
+            lambda c: harness.run_part(c, 2, 3, "out", workers=1),
+            {"part": Part(2, 3), "out": Path("out"), "workers": 1},
+        ),
+        ("runner.merge_parts", lambda _: harness.merge(["a", "b"], "out"), {"folders": [Path("a"), Path("b")]}),
+        ("runner.check_av", lambda c: harness.av_check(c, 12), {"n_episodes": 12}),
+        (
+            "runner.compare_campaigns",
+            lambda c: harness.compare(c, c, "out", stored="a", margin=0.1),
+            {"out": Path("out"), "stored": Path("a"), "margin": 0.1},
+        ),
+        ("pool.refined_ladder.refine_ladder", lambda _: harness.ladder("run", "out"), {"folder": Path("run")}),
+    ],
+)
+def test_what_is_called_behind_takes_what_it_is_handed(behind, call, handed_on, monkeypatch):
+    """The commands test the work itself; here, that each argument arrives under its name."""
+    module, name = f"harness.{behind}".rsplit(".", 1)
+    asked = create_autospec(getattr(import_module(module), name))
+    monkeypatch.setattr(f"{module}.{name}", asked)
+    assert call(harness.load_campaign(MIXTURE_FILE)) is asked.return_value
+    arrived = inspect.signature(asked).bind(*asked.call_args.args, **asked.call_args.kwargs).arguments
+    assert handed_on.items() <= arrived.items()
