@@ -1,10 +1,11 @@
-"""What it costs to come back to a large run folder: `harness run --resume` of a finished run, and `harness estimate`.
+"""What it costs to come back to a large run folder: `harness run --resume` of a finished run, or with one more shard
+until a worker is started for it, and `harness estimate`.
 
     python -m benchmarks.resume runs/resume
 
 makes two folders of 1e6 tests of the forced cut-in (unless they are there: 0.3 GB), one of 200 shards, one of 10,000,
-and measures both commands in processes of their own. Only the first shards are simulated; the others repeat them under
-other indices, which is all the same to whoever reads them.
+and measures the commands in processes of their own. Only the first shards are simulated; the others repeat them under
+other indices, which is all the same to whoever reads them. They are gathered before anything is measured.
 """
 
 from __future__ import annotations
@@ -12,10 +13,10 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import signal
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -76,16 +77,34 @@ def make_run(folder: Path, size: int) -> None:
     write_json(path, {**manifest, "n_episodes": EPISODES, "status": "interrupted"})
 
 
+def until_worker(*arguments: str) -> float:
+    """Wall time (s) of a command until its first worker process is there; it is killed then."""
+    started = time.perf_counter()
+    with subprocess.Popen([sys.executable, "-m", "harness", *arguments], stdout=subprocess.DEVNULL) as process:
+        children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
+        while process.poll() is None and not children.read_text():
+            time.sleep(0.005)
+        seconds = time.perf_counter() - started
+        process.kill()
+    if process.returncode != -signal.SIGKILL:
+        raise RuntimeError(f"harness {' '.join(arguments)} ended with {process.returncode} without a worker")
+    return seconds
+
+
 def measured(folder: Path, size: Size, repetitions: int) -> None:
     """Print what the commands take."""
-    commands: dict[str, tuple[Sequence[str], float]] = {
-        "resume": (run_words(folder, size.shard_size, EPISODES), size.resume_s),
-        "estimate": (["estimate", str(folder), "--json"], size.estimate_s),
-    }
-    for name, (command, asked_s) in commands.items():
+    finished = run_words(folder, size.shard_size, EPISODES)
+    harness(*finished)
+    for name, command, asked_s in (
+        ("resume", finished, size.resume_s),
+        ("estimate", ["estimate", str(folder), "--json"], size.estimate_s),
+    ):
         for _ in range(repetitions):
             wall_s, cpu_s = harness(*command)
             print(f"  {name}: {wall_s:.1f} s ({cpu_s:.1f} s of CPU); asked <= {asked_s:.0f} s", flush=True)
+    for _ in range(repetitions):
+        wall_s = until_worker(*run_words(folder, size.shard_size, EPISODES + size.shard_size))
+        print(f"  one more shard: {wall_s:.1f} s until a worker starts; asked <= {size.resume_s:.0f} s", flush=True)
 
 
 def main() -> None:

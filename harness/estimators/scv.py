@@ -20,9 +20,9 @@ import numpy as np
 from harness.arrays import FloatArray, IntArray
 from harness.estimators.block import MAX_CONTROL_STEPS, Block
 from harness.estimators.estimate import Estimate, require_episodes
-from harness.estimators.threads import side_by_side
 from harness.estimators.triangular_factor import empty_factor, fold_rows
 from harness.estimators.weighted_sums import WeightedSums, weighted_estimate
+from harness.threads import side_by_side
 
 WARNING = (
     "this interval is known to be too narrow; use nade's (docs/scv-defect.md). The published variance is not that of "

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -15,6 +16,7 @@ from harness.environment.loading import load_environment
 from harness.pool.library import LibraryDriver, library_records
 from harness.pool.surrogate_replay import PATH_COLUMNS, drivers_crash
 from harness.records.folder import read_manifest, read_table
+from harness.threads import made_ahead
 
 _COLUMNS = [*PATH_COLUMNS, "outcome", "component", "log_weight"]
 
@@ -91,8 +93,8 @@ def replay_drivers(folder: Path, campaign: Campaign, drivers: Sequence[LibraryDr
     """
     environment = load_environment(campaign.environment)
     records = library_records(drivers, environment)
-    parts = []
-    for shard in read_manifest(folder)["shards"]:
+
+    def replayed(shard: dict[str, Any]) -> list[np.ndarray]:
         table = read_table(folder / shard["files"]["episodes"], _COLUMNS)
         outcome = np.array(table.column("outcome").cast(pa.string()).to_pylist())
         component = np.asarray(table.column("component")).astype(np.int64)
@@ -103,5 +105,7 @@ def replay_drivers(folder: Path, campaign: Campaign, drivers: Sequence[LibraryDr
             outcome == "crash",
             drivers_crash(table, campaign.seed, environment, records, -1),
         )
-        parts.append([values[outcome != "failed"] for values in columns])
+        return [values[outcome != "failed"] for values in columns]
+
+    parts = made_ahead(replayed, read_manifest(folder)["shards"])
     return Replayed(*(np.concatenate(column) for column in zip(*parts, strict=True)))

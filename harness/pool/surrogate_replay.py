@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-from concurrent.futures import ThreadPoolExecutor
-
 import numpy as np
 import pyarrow as pa
 
@@ -23,8 +20,6 @@ PATH_COLUMNS = ("episode", *STATE_COLUMNS, "n_steps", "cut_in_step", "lv_maneuve
 """What of the episodes table determines LV's and BV's motion."""
 LEAD = "lead_steps"
 """And since when BV shows what it will do, where cut-ins take time."""
-_PART = 512
-"""Episodes that a thread replays at a time."""
 
 
 class SurrogateReplay:
@@ -86,40 +81,17 @@ def drivers_crash(
         An episode's maneuvers do not fit its steps.
     """
     stored = stored_paths(episodes, seed)
-
-    def replayed(begin: int) -> IntArray:
-        part = _rows_of(stored, begin, begin + _PART)
-        bits = np.zeros(part.cut_step.size, np.int64)
-        wrong = replay_surrogates(part, environment, drivers, envelope, empty_trajectory(environment), bits)
-        if wrong >= 0:
-            raise RunFolderError(
-                f"episodes, episode {part.first + wrong}",
-                found=f"maneuvers that do not lead to a cut-in in step {part.cut_step[wrong]}",
-                expected="the maneuvers that were driven: they determine the episode",
-                mend=MEND_SHARD,
-            )
-        return bits
-
-    if episodes.num_rows <= _PART:  # small shards may be many: threads would cost more than the work
-        bits = replayed(0)
-    else:
-        with ThreadPoolExecutor(os.cpu_count()) as threads:
-            bits = np.concatenate(list(threads.map(replayed, range(0, episodes.num_rows, _PART))))
+    bits = np.zeros(episodes.num_rows, np.int64)
+    wrong = replay_surrogates(stored, environment, drivers, envelope, empty_trajectory(environment), bits)
+    if wrong >= 0:
+        raise RunFolderError(
+            f"episodes, episode {stored.first + wrong}",
+            found=f"maneuvers that do not lead to a cut-in in step {stored.cut_step[wrong]}",
+            expected="the maneuvers that were driven: they determine the episode",
+            mend=MEND_SHARD,
+        )
     found: BoolArray = ((bits[:, None] >> np.arange(drivers.size)) & 1).astype(np.bool_)
     return found
-
-
-def _rows_of(stored: StoredPaths, begin: int, end: int) -> StoredPaths:
-    rows, edges = slice(begin, end), slice(begin, end + 1)
-    return stored._replace(
-        first=stored.first + begin,
-        state=stored.state[rows],
-        n_steps=stored.n_steps[rows],
-        cut_step=stored.cut_step[rows],
-        lv_begin=stored.lv_begin[edges],
-        bv_begin=stored.bv_begin[edges],
-        lead=stored.lead[rows],
-    )
 
 
 def stored_paths(episodes: pa.Table, seed: int) -> StoredPaths:

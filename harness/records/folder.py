@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import fcntl
+import fnmatch
 import json
 import os
 import shutil
 import tempfile
 import uuid
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -50,7 +51,10 @@ def shard_files(folder: Path, index: int) -> dict[str, str]:
 
 def shards_on_disk(folder: Path, table: str) -> list[Path]:
     """Files of a table, whether they count or not."""
-    return sorted((folder / table).glob("shard-*.parquet"))
+    with suppress(FileNotFoundError):
+        names = fnmatch.filter(os.listdir(folder / table), "shard-*.parquet")  # noqa: PTH208 - glob takes three times as long
+        return [folder / table / name for name in sorted(names)]
+    return []
 
 
 def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
@@ -199,11 +203,35 @@ def read_table(path: Path, columns: list[str] | None = None, rows: pc.Expression
         if rows is not None:
             return pq.read_table(path, columns=columns, filters=rows, memory_map=False, partitioning=None)
         with pq.ParquetFile(path) as file:  # a millisecond faster than read_table, which matters with many shards
-            if missing := sorted(set(columns or ()).difference(file.schema_arrow.names)):
-                raise pa.ArrowInvalid(f"no column {missing[0]!r}")
-            return file.read(columns, use_threads=file.metadata.num_rows > ROWS_FOR_THREADS)
+            table = file.read(columns, use_threads=file.metadata.num_rows > ROWS_FOR_THREADS)
     except (OSError, pa.ArrowException, KeyError) as error:
         raise damaged(path, error) from error
+    if missing := sorted(set(columns or ()).difference(table.column_names)):
+        raise damaged(path, pa.ArrowInvalid(f"no column {missing[0]!r}"))
+    return table
+
+
+def concatenated(tables: Sequence[pa.Table], folder: Path) -> pa.Table:
+    """Tables of several shards of a run as one, in one chunk.
+
+    Raises
+    ------
+    RunFolderError
+        A column is not of the same type in all of them.
+    """
+    try:
+        return pa.concat_tables(tables).unify_dictionaries().combine_chunks()
+    except pa.ArrowException as error:
+        types: dict[str, set[str]] = {}
+        for field in (field for table in tables for field in table.schema):
+            types.setdefault(field.name, set()).add(str(field.type))
+        mixed = [f"{name} as {' and '.join(sorted(found))}" for name, found in types.items() if len(found) > 1]
+        raise RunFolderError(
+            str(folder),
+            found=f"shards of different types: {'; '.join(mixed) or error}",
+            expected="records that one version of the harness has written",
+            mend="Run the campaign again into a new folder.",
+        ) from error
 
 
 def damaged(path: Path, error: Exception) -> RunFolderError:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,6 +14,7 @@ import pyarrow.parquet as pq
 from harness.errors import RunFolderError
 from harness.records.folder import MEND_SHARD, TABLES, damaged, read_manifest, read_table
 from harness.records.stored_manifest import PLAN, WHOLE, kind_of
+from harness.threads import made_ahead
 
 
 def read_shards(
@@ -37,8 +39,8 @@ def read_shards(
     RunFolderError
         A file is missing or damaged, or holds another number of episodes than the manifest says.
     """
-    for shard in read_manifest(folder)["shards"]:
-        yield read_shard(folder, shard, episode_columns=episode_columns, moment_columns=moment_columns)
+    read = partial(read_shard, folder, episode_columns=episode_columns, moment_columns=moment_columns)
+    yield from made_ahead(read, read_manifest(folder)["shards"])
 
 
 def read_shard(
@@ -114,9 +116,15 @@ def table_sizes(folder: Path) -> list[TableSize]:
     shards = read_manifest(folder)["shards"]
     sizes = []
     for table in TABLES:
-        files = [folder / shard["files"][table] for shard in shards if shard["files"].get(table)]
-        n_rows = sum(footer(file).num_rows for file in files)
-        sizes.append(TableSize(table, len(files), n_rows, sum(file.stat().st_size for file in files)))
+        kept = [shard for shard in shards if shard["files"].get(table)]
+        files = [folder / shard["files"][table] for shard in kept]
+        episodes = (shard["n_episodes"] for shard in kept)  # a row each
+        n_rows = sum(episodes if table == "episodes" else (footer(file).num_rows for file in files))
+        try:
+            n_bytes = sum(file.stat().st_size for file in files)
+        except OSError as error:
+            raise damaged(Path(error.filename), error) from error
+        sizes.append(TableSize(table, len(files), n_rows, n_bytes))
     return sizes
 
 

@@ -19,10 +19,13 @@ from harness.campaign.loading import load_campaign
 from harness.campaign.models import Campaign
 from harness.errors import CampaignError, RunFolderError
 from harness.estimators.shells import ShellDetails, Within
-from harness.records.folder import MANIFEST, NO_RUN, read_json, require_schema
+from harness.records.folder import MANIFEST, NO_RUN, concatenated, read_json, require_schema
 from harness.records.reader import read_shards, require_whole
 from harness.records.stored_manifest import Count, Stored, StoredManifest
 from harness.strata import ASSUMPTION_FREE
+
+ROWS_TOGETHER = 5_000
+"""Of small shards: each batch costs a millisecond."""
 
 
 class ShownManifest(StoredManifest):
@@ -155,7 +158,7 @@ class RunFolder:
         return None if asked == ASSUMPTION_FREE else asked
 
     def episodes(self, *columns: str) -> Iterator[pa.RecordBatch]:
-        """Columns of the tests that count, shard by shard in index order.
+        """Columns of the tests that count, in index order; small shards come together.
 
         Raises
         ------
@@ -163,10 +166,13 @@ class RunFolder:
             If a shard is missing, damaged, misses a column, or holds another number of tests than the manifest says.
         """
         counted = self.n_episodes
+        together: list[pa.Table] = []
         for table, _ in read_shards(self.path, episode_columns=list(columns), moment_columns=[]):
-            for batch in table.slice(0, counted).combine_chunks().to_batches():
-                yield batch
-                counted -= batch.num_rows
+            together.append(table.slice(0, counted))
+            counted -= together[-1].num_rows
+            if counted == 0 or sum(part.num_rows for part in together) >= ROWS_TOGETHER:
+                yield from concatenated(together, self.path).to_batches()
+                together = []
 
 
 def floats(column: pa.Array) -> FloatArray:

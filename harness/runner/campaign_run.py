@@ -5,9 +5,9 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from functools import partial
+from functools import cache, partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,6 @@ from harness.progress import Progress, SilentProgress
 from harness.records.folder import (
     SHELLS,
     TABLES,
-    shard_files,
     shards_on_disk,
     sole_use,
     write_bytes,
@@ -191,7 +190,6 @@ class Run:
     @contextmanager
     def under_way(self) -> Iterator[None]:
         """Rounds are run within this: the manifest follows, so that an interrupted run can be read, and workers end."""
-        threading.Thread(target=import_module, args=("harness.report",), daemon=True).start()
         try:
             yield
             self.prefix.require_few_failed(self._campaign)
@@ -210,8 +208,17 @@ class Run:
         self.prescribed = prepared.prescribed
         self._gathers = self.prescribed is None and self._campaign.stop.estimator != "scv"  # which needs moments
         gathered = GatheredBlocks(self._out, self._campaign, same_sources=True) if self._gathers else None
-        self._stored = partial(stored_shard, self._out, prepared, self._retracing, gathered)
+        self._stored = partial(
+            self._stored_or_wanted, partial(stored_shard, self._out, prepared, self._retracing, gathered)
+        )
         self.planner: Planner = planner_of(self._campaign, prepared.prescribed, held=self._held)
+
+    @staticmethod
+    def _stored_or_wanted(stored: Callable[[ShardSpec], ShardDone | None], spec: ShardSpec) -> ShardDone | None:
+        """What `stored_shard` says; workers are about to be busy with the first shard that it does not know."""
+        if (done := stored(spec)) is None:
+            load_report_meanwhile()
+        return done
 
     def _run_shadows(self, paths: ShadowPaths) -> ShadowRuns:
         """Drive the vehicle along all paths without a cut-in, but for what an earlier run has done of it."""
@@ -233,10 +240,11 @@ class Run:
 
     def _is_enough(self, done: ShardDone) -> bool:
         """Take the next shard; True when the campaign is to stop."""
+        files = done.files
         if done.parquet:
             self._manifest.forget_replaced(done.spec)
-            write_shard(self._out, done.spec.index, done.parquet)
-        self.prefix.add(done, shard_files(self._out, done.spec.index))
+            files = write_shard(self._out, done.spec.index, done.parquet)
+        self.prefix.add(done, files)
         self._remember(done)
         self.prefix.require_few_failed(self._campaign, at_least=SMALLEST_FAILED_SAMPLE)
         enough = self.planner.add(done.block)
@@ -317,6 +325,12 @@ class Run:
         verdict = None if rule.decision is None else rule.decision.verdict
         code = exit_code(self._campaign, stopped_by, verdict)
         return RunResult(self._out, report, estimates, stopped_by, said, code)
+
+
+@cache
+def load_report_meanwhile() -> None:
+    """Load matplotlib beside busy workers, once: no earlier, because it would slow down what makes them wait."""
+    threading.Thread(target=import_module, args=("harness.report",), daemon=True).start()
 
 
 def episodes_on_disk(folder: Path, listed: Sequence[Mapping[str, Any]] = ()) -> int:

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from itertools import groupby
+from operator import attrgetter
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import pyarrow as pa
 
 from harness.campaign.models import Campaign
-from harness.estimators.block import Block
+from harness.estimators.block import Block, joined
 from harness.estimators.from_records import EPISODE_COLUMNS, block_from_tables
 from harness.importance.build import mixture_weights
 from harness.records.gathered import Gathered, GatheredShard
@@ -56,6 +58,22 @@ class GatheredBlocks:
         block = part.block.take(slice(shard.row, shard.row + n_episodes))
         causes = part.failure.slice(shard.row, n_episodes).drop_null().to_pylist()
         return Taken(block, Counter(causes), shard)
+
+    def take_together(self, shards: Sequence[Mapping[str, Any]]) -> Block | None:
+        """Consecutive shards, as the manifest lists them, as one; None if the episodes of one are not gathered."""
+        found = []
+        for shard in shards:
+            files = {"episodes": shard["files"]["episodes"]}
+            if (one := self._gathered.find(shard["index"], shard["first_episode"], shard["n_episodes"], files)) is None:
+                return None
+            found.append(one)
+        blocks = []
+        for path, group in groupby(found, key=attrgetter("path")):  # in a part they stand one after another
+            several = list(group)
+            if (part := self._part(path)) is None:
+                return None
+            blocks.append(part.block.take(slice(several[0].row, several[-1].row + several[-1].n_episodes)))
+        return joined(blocks)
 
     def _part(self, path: Path) -> _Part | None:
         if self._held is None or self._held.path != path:

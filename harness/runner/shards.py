@@ -6,7 +6,7 @@ import os
 import signal
 from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
 from typing import Any, Generic, TypeVar
@@ -65,7 +65,9 @@ def stored_shard(
         return None
     if gathered is not None and (taken := gathered.take(spec.index, spec.first_episode, spec.n_episodes, files)):
         repeated = repeated_of(taken.shard.metadata)
-        return ShardDone(spec, taken.block, taken.shard.n_retraced, taken.failures, repeated, gathered=True)
+        return ShardDone(
+            spec, taken.block, taken.shard.n_retraced, taken.failures, repeated, files=files, gathered=True
+        )
     tables = {name: read_table(folder / path) for name, path in files.items()}
     kept = ShardTables(tables["episodes"], tables.get("moments"), tables.get("traces"))
     if kept.episodes.num_rows != spec.n_episodes:
@@ -74,7 +76,7 @@ def stored_shard(
         cut_ins = kept.episodes.column("pool_cut_in")
         if cut_ins.null_count or not np.array_equal(cut_ins.to_numpy(), prescribed.rows(spec.draws)[0]):
             return None  # the last round of a smaller budget
-    return finished(spec, kept, campaign, prescribed, retracing, {})
+    return replace(finished(spec, kept, campaign, prescribed, retracing, {}), files=files)
 
 
 def executor_of(resolved: Resolved, folder: Path, n_workers: int | None, *, n_runs: int = 1) -> Executor[Any]:

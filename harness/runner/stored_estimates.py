@@ -9,28 +9,26 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
-import pyarrow as pa
-
 from harness.campaign.loading import load_campaign
 from harness.campaign.models import Campaign
 from harness.errors import HarnessError, RunFolderError
 from harness.estimators import ESTIMATORS, CampaignFacts, estimate_blocks
-from harness.estimators.block import Block, joined
+from harness.estimators.block import Block
 from harness.estimators.from_records import EPISODE_COLUMNS, MOMENT_COLUMNS, SHELL_COLUMNS, block_from_tables
 from harness.estimators.one_pass import SPACING
-from harness.estimators.threads import made_ahead
 from harness.importance.build import importance_names, mixture_weights
 from harness.methods import EstimatorName
 from harness.pool.storage import cached_pool, read_pool
 from harness.pool.surrogate_replay import PATH_COLUMNS, SurrogateReplay
-from harness.records.folder import SHELLS, damaged, no_episodes, read_json, read_manifest, require_schema
+from harness.records.folder import SHELLS, concatenated, no_episodes, read_json, read_manifest, require_schema
 from harness.records.reader import read_shard, require_whole, stored_columns
 from harness.records.stored_manifest import StoredShells
 from harness.resolved import resolve
 from harness.runner.gathered_blocks import GatheredBlocks
 from harness.strata import ShellDesign
+from harness.threads import made_ahead
 
-MOST_UNASKED = 100_000
+MOST_UNASKED = 50_000
 """Tests that are replayed without being asked to, for the alarm: some 30 µs each."""
 MOST_GROUPED = 5_000
 """Tests of small shards that are read as one."""
@@ -130,20 +128,16 @@ def stored_blocks(
     def read(group: _Shards, asking: SurrogateReplay | None = None) -> Block:
         columns = dict.fromkeys([*needed, *(asking.columns if asking else ())])
         stored = [read_shard(folder, shard, episode_columns=list(columns), moment_columns=ratios) for shard in group]
-        try:
-            episodes = pa.concat_tables(table for table, _ in stored)
-            kept = [table for _, table in stored if table is not None]
-            steps = pa.concat_tables(kept) if kept else None
-        except pa.ArrowException as error:  # a column of another type
-            raise damaged(folder / group[0]["files"]["episodes"], error) from error
+        episodes = concatenated([table for table, _ in stored], folder)
+        kept = [table for _, table in stored if table is not None]
+        steps = concatenated(kept, folder) if kept else None
         block = block_from_tables(episodes, steps, method=method, alpha=alpha, shells=shells)
         if asking is None:
             return block
         return replace(block, surrogates_crash=asking.crashes(episodes), known_rates=asking.known)
 
     def taken(group: _Shards) -> Block:
-        blocks = [block for shard in group if gathered and (block := _gathered(gathered, shard)) is not None]
-        return joined(blocks) if len(blocks) == len(group) else read(group)
+        return (gathered.take_together(group) if gathered else None) or read(group)
 
     groups = list(_groups(manifest["shards"], n_asked))
     n_asked_groups = 0 if surrogates is None else sum(group[0]["first_episode"] < n_asked for group in groups)
@@ -179,13 +173,6 @@ def _groups(shards: _Shards, edge: int) -> Iterator[_Shards]:
             group, begin = [], n
     if group:
         yield group
-
-
-def _gathered(gathered: GatheredBlocks, shard: Mapping[str, Any]) -> Block | None:
-    """A shard whose episodes file is what it was when it was gathered."""
-    files = {"episodes": shard["files"]["episodes"]}
-    taken = gathered.take(shard["index"], shard["first_episode"], shard["n_episodes"], files)
-    return None if taken is None else taken.block
 
 
 def read_shells(folder: Path) -> ShellDesign:

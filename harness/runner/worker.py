@@ -78,8 +78,8 @@ class Repeated:
 class ShardDone:
     """A finished shard: what the stop rule needs of it, how many episodes the twin has retraced, causes of failures.
 
-    ``repeated`` is None where no test was run twice; ``parquet``, its tables as files, is empty where they are on disk;
-    ``gathered`` says whether it comes from columns gathered of many shards.
+    ``repeated`` is None where no test was run twice; ``parquet`` are its tables as files, or, where they are on disk
+    already, ``files`` their paths by table; ``gathered`` says whether it comes from columns gathered of many shards.
     """
 
     spec: ShardSpec
@@ -88,6 +88,7 @@ class ShardDone:
     failures: Counter[str]
     repeated: Repeated | None
     parquet: dict[str, bytes] = field(default_factory=dict)
+    files: dict[str, str] = field(default_factory=dict)
     gathered: bool = False
 
 

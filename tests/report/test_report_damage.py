@@ -62,8 +62,18 @@ def test_an_unknown_outcome_is_named(run_folder):
     shard = run_folder / "episodes" / "shard-000000.parquet"
     table = pq.read_table(shard)
     place = table.schema.get_field_index("outcome")
-    pq.write_table(table.set_column(place, "outcome", pa.array(["flew away"] * table.num_rows)), shard)
+    field = table.schema.field(place)
+    pq.write_table(table.set_column(place, field, pa.array(["flew away"] * table.num_rows).cast(field.type)), shard)
     with pytest.raises(RunFolderError, match="flew away"):
+        write_report(run_folder)
+
+
+def test_a_column_of_another_type_in_one_shard_is_named(run_folder):
+    shard = run_folder / "episodes" / "shard-000001.parquet"
+    table = pq.read_table(shard)
+    place = table.schema.get_field_index("log_weight")
+    pq.write_table(table.set_column(place, "log_weight", table.column("log_weight").cast(pa.float32())), shard)
+    with pytest.raises(RunFolderError, match="log_weight as double and float"):
         write_report(run_folder)
 
 
