@@ -19,7 +19,8 @@ import numpy as np
 
 from harness.arrays import BoolArray, FloatArray, IntArray
 from harness.estimators.block import Block
-from harness.estimators.likelihood_ratio import Level, contrast_limit, ratio_limits, spread
+from harness.estimators.likelihood_ratio import contrast_limit, ratio_limits, spread
+from harness.estimators.likelihood_search import Level
 from harness.estimators.stratified import Tally, mean_square
 from harness.strata import ShellDesign
 

@@ -26,7 +26,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from harness.arrays import BoolArray, FloatArray, IntArray
-from harness.estimators.likelihood_ratio import Level, ratio_limits
+from harness.estimators.likelihood_ratio import ratio_limits
+from harness.estimators.likelihood_search import Level
 from harness.estimators.stratified import Tally, mean_square, pool_variance
 from harness.strata import ShellDesign
 

@@ -23,7 +23,8 @@ from harness.estimators.block import Block
 from harness.estimators.crash_paths import FEWEST_PATHS, CrashPaths
 from harness.estimators.estimate import Estimate, require_episodes
 from harness.estimators.intervals import clopper_pearson
-from harness.estimators.likelihood_ratio import Level, likelihood_limit
+from harness.estimators.likelihood_ratio import likelihood_limit
+from harness.estimators.likelihood_search import Level
 from harness.estimators.reference import Comparison, compared
 from harness.estimators.stratified import Limits, Tally, combined, empty_tally, pool_variance
 from harness.strata import ShellDesign

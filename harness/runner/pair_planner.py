@@ -14,7 +14,7 @@ import numpy as np
 from harness.arrays import IntArray
 from harness.campaign.models import Campaign
 from harness.estimators.decision import Decision
-from harness.estimators.likelihood_ratio import Level
+from harness.estimators.likelihood_search import Level
 from harness.estimators.pairs import PairCounts, Verdict
 from harness.estimators.stratified import Tally
 from harness.runner.allocation import CONFIDENCE, Allocation, first_tests

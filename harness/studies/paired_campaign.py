@@ -14,7 +14,7 @@ import numpy as np
 
 from harness.arrays import IntArray
 from harness.campaign.models import Campaign
-from harness.estimators.likelihood_ratio import Level
+from harness.estimators.likelihood_search import Level
 from harness.estimators.pairs import CRASH, NO_CRASH, PairCounts, no_pairs
 from harness.runner.pair_planner import PairPlanner, PairRule
 from harness.strata import LIBRARY_STATEMENT

@@ -19,7 +19,7 @@ from harness.arrays import FloatArray, IntArray
 from harness.campaign.models import Accept, Campaign
 from harness.estimators.block import Block
 from harness.estimators.estimate import Estimate
-from harness.estimators.likelihood_ratio import Level
+from harness.estimators.likelihood_search import Level
 from harness.estimators.shells import Shells
 from harness.runner.planner import RoundRule, ShellPlanner
 from harness.strata import ShellDesign
