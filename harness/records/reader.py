@@ -16,6 +16,9 @@ from harness.records.folder import MEND_SHARD, TABLES, damaged, read_manifest, r
 from harness.records.stored_manifest import PLAN, WHOLE, kind_of
 from harness.threads import made_ahead
 
+_READERS = 2
+"""Threads; each holds a shard."""
+
 
 def read_shards(
     folder: Path, *, episode_columns: list[str] | None = None, moment_columns: list[str] | None = None
@@ -40,7 +43,7 @@ def read_shards(
         A file is missing or damaged, or holds another number of episodes than the manifest says.
     """
     read = partial(read_shard, folder, episode_columns=episode_columns, moment_columns=moment_columns)
-    yield from made_ahead(read, read_manifest(folder)["shards"])
+    yield from made_ahead(read, read_manifest(folder)["shards"], _READERS)
 
 
 def read_shard(
