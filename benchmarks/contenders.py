@@ -25,7 +25,7 @@ from harness.records.tables import shard_tables
 from harness.resolved import resolve
 from harness.runner.local_executor import LocalExecutor
 from harness.runner.prepare import Prepared, prepare
-from harness.runner.shards import ShardPool
+from harness.runner.shard_pool import ShardPool
 from harness.runner.worker import ShardSpec
 from harness.sumo.network import sumo_program
 from harness.sumo.shim import shim_library

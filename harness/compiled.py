@@ -40,7 +40,7 @@ WORLD_SOURCES = (
     "twin.py",
 )
 """All files that decide what happens in a test; pools and tables are made again when one changes."""
-KERNEL_SOURCES = (*WORLD_SOURCES, "estimators/likelihood_search.py")
+KERNEL_SOURCES = (*WORLD_SOURCES, "estimators/limit_search.py")
 """All files that compiled code may come from, or take constants from (a test holds this against the imports)."""
 
 

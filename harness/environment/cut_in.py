@@ -3,7 +3,9 @@
 Drivers decide about once a second with probability p_1s; a step of 0.1 s has p = 1 - (1 - p_1s)^0.1, so its cumulative
 hazard is -0.1 ln(1 - p_1s). A cut-in time is drawn by one exponential clock: it happens in the first step whose
 accumulated hazard exceeds -ln(1 - U). Given that no cut-in has happened before, this is the Bernoulli(p) draw of the
-step, and the same clock runs unchanged under importance functions and under the forced cut-in.
+step, and the same clock runs unchanged under importance functions and under the forced cut-in. Those that draw a path
+beforehand sum its hazards (`harness.episode.trajectory.weigh_cut_ins`); all others go step by step
+(`harness.episode.critical_moment.choose_lane`).
 """
 
 from __future__ import annotations
@@ -17,7 +19,7 @@ from harness.state import State
 
 @compiled_inline
 def opportunity(state: State, environment: Environment) -> float:
-    """OL, the rate per one-second decision at which BV wants to leave its lane (before the level is limited)."""
+    """OL, the rate per one-second decision at which BV wants to leave its lane, times the campaign's level."""
     n = environment.numbers
     u = fit_u(state.v_bv_mps, environment)
     gap = clamp(state.r1_m, n.fit_range__r1_min_m, n.fit_range__r1_max_m)

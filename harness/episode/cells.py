@@ -28,13 +28,13 @@ CELL_DTYPE = np.dtype(
         ("row", _i8),  # row of the shard, -1: idle
         ("episode", _i8),  # index in the campaign
         ("told", _i8),  # index that the AV is told, and that its random stream follows from
-        ("motion", np.uint64),  # hash of the AV's motion, through the step of the cut-in
+        ("motion", np.uint64),  # hash of the AV's motion, through the step of the onset
         ("step", _i8),  # t, in steps
         ("cut_step", _i8),  # -1 before the cut-in
         ("planned", _i8),  # step in which BV will cut in, where cut-ins take time; -1: it will not
         ("lead", _i8),  # steps from the onset of its lateral motion to overlap
         ("onset_step", _i8),  # from the step after it on the AV may act; -1: nobody knows of an onset yet
-        ("component", _i8),  # importance function drawn for the episode, -1 without an episode mixture
+        ("component", _i8),  # episode mixture: importance function drawn; shells: the shell; else -1
         ("lv_maneuver", _i8),
         ("bv_maneuver", _i8),
         ("n_lv", _i8),  # draws so far
@@ -47,7 +47,7 @@ CELL_DTYPE = np.dtype(
         ("hazard", _f8),  # hazard accumulated under p
         ("hazard_total", _f8),  # hazard of the whole path without cut-in (methods that draw the path ahead)
         ("log_p_cut_in", _f8),
-        ("log_sampled", _f8),  # step mixture: sum of log q_alpha/p
+        ("log_sampled", _f8),  # step mixture: sum of log q_alpha/p; shells: -log p_s
         ("min_ttc", _f8),
         ("cut_r2", _f8),
         ("cut_r2dot", _f8),
@@ -273,7 +273,7 @@ class Bench(NamedTuple):
     ``first_episode`` is the campaign index of row 0, ``states`` (rows,) are initial states. ``x``, ``v`` (K, 3) are the
     world's positions (m) and speeds (m/s) of LV, BV, AV. ``driver`` is (1,) for a built-in AV, else (0,). ``passed_m``
     is the R2 at which the AV has passed. ``observation`` is what a controller outside of the kernels sees, and
-    ``acts_before_cut_in`` whether it acts from the start; else from the step after the cut-in. ``boundary`` is (1,)
+    ``acts_before_cut_in`` whether it acts from the start; else from the step after the onset. ``boundary`` is (1,)
     where the AV is compared with a driver beside it, else (0,).
     """
 

@@ -1,4 +1,7 @@
-"""What LV and BV do in the coming step: drawn at their hold clocks, or repeated where the traffic is prescribed."""
+"""What LV and BV do in the coming step: accelerations drawn at their hold clocks, the cut-in in every step.
+
+Where the traffic is prescribed they repeat it.
+"""
 
 from __future__ import annotations
 

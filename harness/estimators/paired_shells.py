@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from harness.estimators.estimate import BothWays, Estimate, finite_json
-from harness.estimators.likelihood_search import Level
+from harness.estimators.limit_search import Level
 from harness.estimators.pairs import Interval, PairCounts
 from harness.estimators.shells import Shells
 

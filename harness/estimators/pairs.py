@@ -2,7 +2,7 @@
 
 Each cut-in is driven by A and by B. A pair of tests has one of four outcomes: both crash, only A, only B, neither. The
 rates, their difference and their ratio are weighted sums of the shares of these outcomes, and their limits those of
-the likelihood ratio (`harness.estimators.likelihood_ratio`). Cut-ins on which both do the same say nothing against
+the likelihood ratio (`harness.estimators.likelihood_limits`). Cut-ins on which both do the same say nothing against
 either, so that a difference takes far fewer tests than two rates.
 
 What a failed test would have come to is not known. Each limit takes A's failed tests for crashes and B's for none, or
@@ -19,8 +19,8 @@ import numpy as np
 
 from harness.arrays import BoolArray, FloatArray, IntArray
 from harness.estimators.block import Block
-from harness.estimators.likelihood_ratio import contrast_limit, ratio_limits, spread
-from harness.estimators.likelihood_search import Level
+from harness.estimators.likelihood_limits import contrast_limit, ratio_limits, spread
+from harness.estimators.limit_search import Level
 from harness.estimators.stratified import Tally, mean_square
 from harness.strata import ShellDesign
 

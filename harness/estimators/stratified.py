@@ -14,8 +14,8 @@ from scipy.special import ndtr
 
 from harness.arrays import BoolArray, FloatArray, IntArray
 from harness.estimators.intervals import clopper_pearson
-from harness.estimators.likelihood_ratio import likelihood_limit
-from harness.estimators.likelihood_search import Counts, Level
+from harness.estimators.likelihood_limits import likelihood_limit
+from harness.estimators.limit_search import Counts, Level
 
 
 class Limits(NamedTuple):

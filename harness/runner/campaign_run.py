@@ -53,8 +53,9 @@ from harness.runner.shadow_runs import (
     shadow_specs,
     stored_shadows,
 )
-from harness.runner.shards import ShardPool, executor_of, stored_shard
+from harness.runner.shard_pool import ShardPool, executor_of
 from harness.runner.stored_estimates import estimate_run
+from harness.runner.stored_shard import stored_shard
 from harness.runner.table_accuracy import table_errors
 from harness.runner.worker import ShardDone, ShardSpec
 from harness.stopped_by import StoppedBy, ending

@@ -21,6 +21,7 @@ from harness.estimators.block import Block
 from harness.estimators.paired_shells import PairedEstimate, paired_estimate
 from harness.estimators.paired_statement import conditional_paired_statement, margin_statement, paired_statement
 from harness.estimators.pairs import PairCounts, PairedShells, Verdict
+from harness.estimators.round_stopping import LOOKS, PairRule
 from harness.pool.shells import Draw, PrescribedEpisodes, acceleration_limit
 from harness.progress import Progress, SilentProgress
 from harness.records.folder import sole_use
@@ -28,7 +29,7 @@ from harness.records.reader import read_shards
 from harness.resolved import Resolved
 from harness.runner.campaign_run import Run
 from harness.runner.manifest import require_own_folder
-from harness.runner.pair_planner import LOOKS, PairPlanner, PairRule
+from harness.runner.pair_planner import PairPlanner
 from harness.runner.planner import round_specs
 from harness.runner.worker import ShardSpec
 from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT

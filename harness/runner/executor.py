@@ -1,7 +1,7 @@
 """Where shards are run: a worker takes one after another, an executor makes workers.
 
 `harness.runner.local_executor` makes processes of this machine, `harness.runner.ray_executor` those of a cluster. What
-is done with a worker that dies is the same for both, and stands in `harness.runner.shards`.
+is done with a worker that dies is the same for both, and stands in `harness.runner.shard_pool`.
 """
 
 from __future__ import annotations

@@ -19,7 +19,7 @@ from harness.records.folder import MANIFEST, read_manifest, require_place, write
 from harness.records.gathered import Fingerprint
 from harness.records.stored_manifest import PLAN, WHOLE, kind_of
 from harness.resolved import Resolved
-from harness.runner.shards import SURELY_TOO_MANY
+from harness.runner.shard_pool import SURELY_TOO_MANY
 from harness.runner.worker import Repeated, ShardDone, ShardSpec
 
 INTERVAL_S = 5.0

@@ -11,6 +11,7 @@ from typing import Any
 from harness.campaign.models import Campaign
 from harness.errors import RunFolderError
 from harness.estimators import Shells
+from harness.estimators.round_stopping import RoundRule
 from harness.progress import Progress, SilentProgress
 from harness.records.folder import (
     MANIFEST,
@@ -25,7 +26,6 @@ from harness.records.folder import (
 from harness.records.reader import footer
 from harness.runner.manifest import require_few_failed
 from harness.runner.parts_together import CAMPAIGN, PartFolder, in_order, one_campaign
-from harness.runner.planner import RoundRule
 from harness.runner.run_result import RunResult, exit_code, what_stopped
 from harness.runner.shadow_runs import SHADOW
 from harness.runner.stored_estimates import estimate_run, stored_blocks

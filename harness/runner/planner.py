@@ -1,4 +1,4 @@
-"""What a campaign tests next, why, and when it is enough.
+"""What a campaign tests next; its rule says when it is enough.
 
 Most methods know all their tests beforehand. Shells decide from each round what the next one tests, so that a round is
 run to its end before the next begins, whatever the number of workers; the result is looked at between rounds. Rounds
@@ -21,7 +21,8 @@ from harness.campaign.models import Campaign
 from harness.estimators import Shells, StopRule, accumulator
 from harness.estimators.block import Block
 from harness.estimators.decision import Decision
-from harness.estimators.stratified import Limits, Tally, empty_tally
+from harness.estimators.round_stopping import RoundRule
+from harness.estimators.stratified import Tally, empty_tally
 from harness.pool.shells import Draw, PrescribedEpisodes
 from harness.runner.allocation import Allocation, first_tests
 from harness.runner.worker import ShardSpec
@@ -37,8 +38,6 @@ TOO_WIDE = (
 )
 FIRST_PHASE = 1.7
 """Precision of the first of two phases over that of the second (measured: docs/estimators.md)."""
-POOL_SHARE = 0.5
-"""Share of the squared width from the pool's own error above which more tests hardly narrow an interval."""
 
 
 class FixedPlanner:
@@ -203,75 +202,6 @@ def planner_of(campaign: Campaign, prescribed: PrescribedEpisodes | None, held: 
     if prescribed is None:
         return FixedPlanner(campaign)
     return ShellPlanner(campaign, prescribed.design, prescribed.available, held)
-
-
-class RoundRule:
-    """Looks after each round, and is content with one pass.
-
-    That limits within shells hold at a fixed number of tests says nothing about the number at which a rule stops;
-    that intervals cover there, and how far the rate is biased, is measured (docs/estimators.md).
-
-    Parameters
-    ----------
-    campaign : Campaign
-    held : int
-        Tests that the run folder holds: before them nothing is given up, whatever precision is asked for now.
-    factor : float
-        By which the precision is wider than the one that the campaign asks for.
-
-    Attributes
-    ----------
-    decision : Decision or None
-        What is known about the limit that the campaign asks about, if it does; that, not a precision, is then waited
-        for.
-    of_first_tests : bool
-        Whether the round brings the tests that every shell gets before anything is decided about it.
-    reached, rhw, heaviest, waited_for, pool_error_above_target
-        See `StopRule`.
-    """
-
-    def __init__(self, campaign: Campaign, held: int = 0, factor: float = 1.0) -> None:
-        self._held = held
-        self._target = None if campaign.stop.rhw is None else factor * campaign.stop.rhw
-        self._min_crashes, self._confidence = campaign.min_crashes, campaign.stop.confidence
-        self._statement, self._accept = campaign.testing.shells.statement, campaign.accept
-        self.decision: Decision | None = None
-        self.reached = self.pool_error_above_target = False
-        self.rhw = float("inf")
-        self.heaviest = 0.0  # limits within shells allow for every crash that has not been seen
-        self.of_first_tests = False
-        self.waited_for: tuple[str, ...] = ()
-
-    def observe(self, seen: Shells) -> bool:
-        """Whether to stop at the end of a round, with all tests so far."""
-        watched, n_crashes = seen.limits_of(self._statement, self._confidence), int(seen.tally.crashes.sum())
-        self.rhw, from_pool = watched.rhw, watched.from_pool_relative()
-        if self._accept is not None:
-            return self._decide(watched, self._accept.crash_rate_below, contradicted=seen.contradicts(self._statement))
-        if self._target is None:
-            return False
-        met = {
-            f"stop.rhw ({self._target:g})": self.rhw <= self._target,
-            f"stop.min_crashes ({self._min_crashes:,})": n_crashes >= self._min_crashes,
-        }
-        missing = tuple(condition for condition, is_met in met.items() if not is_met)
-        if missing:
-            self.waited_for = missing
-        elif self.of_first_tests:
-            self.waited_for = ("the first tests of each shell (testing.shells.first_tests)",)
-        if n_crashes < self._min_crashes:
-            return False
-        self.reached = not missing
-        self.pool_error_above_target = from_pool["rhw_from_pool_at_least"] > self._target
-        hopeless = self.pool_error_above_target and from_pool["rhw_from_pool"] ** 2 >= POOL_SHARE * self.rhw**2
-        return self.reached or (hopeless and seen.tally.tests.sum() >= self._held)
-
-    def _decide(self, watched: Limits, limit: float, *, contradicted: bool) -> bool:
-        one_sided = (1.0 + self._confidence) / 2.0
-        self.decision = Decision(limit, self._statement, one_sided, watched.low, watched.high, contradicted)
-        self.reached = self.decision.verdict != "undecided"
-        self.waited_for = (f"accept.crash_rate_below ({limit:g})",)
-        return self.decision.is_final
 
 
 def round_specs(tests: IntArray, added: IntArray, index: int, first_episode: int, shard_size: int) -> list[ShardSpec]:

@@ -33,7 +33,7 @@ from harness.runner.executor import CLOSING_S, Ended
 from harness.runner.prepare import cached_files
 from harness.runner.ray_machine import Files, Machine, OnMachine
 from harness.runner.shadow_runs import SHADOW
-from harness.runner.shards import WorkerLostError
+from harness.runner.shard_pool import WorkerLostError
 from harness.runner.worker import Done, ShardSpec, Spec
 
 LOCAL = "local"

@@ -14,9 +14,10 @@ import numpy as np
 
 from harness.arrays import IntArray
 from harness.campaign.models import Campaign
-from harness.estimators.likelihood_search import Level
+from harness.estimators.limit_search import Level
 from harness.estimators.pairs import CRASH, NO_CRASH, PairCounts, no_pairs
-from harness.runner.pair_planner import PairPlanner, PairRule
+from harness.estimators.round_stopping import PairRule
+from harness.runner.pair_planner import PairPlanner
 from harness.strata import LIBRARY_STATEMENT
 from harness.studies.experiment import Fault
 from harness.studies.judgement import Row

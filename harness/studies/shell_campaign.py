@@ -19,9 +19,10 @@ from harness.arrays import FloatArray, IntArray
 from harness.campaign.models import Accept, Campaign
 from harness.estimators.block import Block
 from harness.estimators.estimate import Estimate
-from harness.estimators.likelihood_search import Level
+from harness.estimators.limit_search import Level
+from harness.estimators.round_stopping import RoundRule
 from harness.estimators.shells import Shells
-from harness.runner.planner import RoundRule, ShellPlanner
+from harness.runner.planner import ShellPlanner
 from harness.strata import ShellDesign
 from harness.studies.experiment import Fault
 from harness.studies.judgement import Row, estimate_row

@@ -19,7 +19,8 @@ from harness.arrays import BoolArray, FloatArray, Int8Array, IntArray
 from harness.campaign.models import TraciProcess
 from harness.errors import WorldDisagreementError
 from harness.outcomes import AV, BV, LV
-from harness.sumo.network import LEFT, NEVER_PLAN_S, OBEY, PLAN_NOW_S, RIGHT, Cells
+from harness.sumo.cells import SumoCells
+from harness.sumo.network import LEFT, NEVER_PLAN_S, OBEY, PLAN_NOW_S, RIGHT
 from harness.sumo.program import BatchConnection, ConnectedProgram
 from harness.twin import advance
 from harness.world import AVLostError
@@ -27,7 +28,7 @@ from harness.world import AVLostError
 _SUBSCRIBED = (tc.VAR_LANEPOSITION, tc.VAR_SPEED, tc.VAR_LANE_INDEX)
 
 
-class TraciWorld(Cells):
+class TraciWorld(SumoCells):
     """World whose AVs are driven by a connected program; see `harness.world.World` and `harness.world.DrivingWorld`.
 
     Parameters

@@ -18,8 +18,9 @@ import numpy as np
 from harness.arrays import BoolArray, FloatArray, Int8Array, IntArray
 from harness.errors import CampaignError, WorldDisagreementError
 from harness.outcomes import AV, BV, LV
+from harness.sumo.cells import SumoCells
 from harness.sumo.gui import start_gui
-from harness.sumo.network import NEVER_PLAN_S, PLAN_NOW_S, RIGHT, Cells
+from harness.sumo.network import NEVER_PLAN_S, PLAN_NOW_S, RIGHT
 from harness.sumo.shim import Shim, open_shim
 from harness.sumo.system_libraries import not_importable
 from harness.twin import advance
@@ -32,7 +33,7 @@ except ImportError as error:
 SPEED_CHECK_STEPS = 10
 
 
-class SumoWorld(Cells):
+class SumoWorld(SumoCells):
     """World in SUMO; see `harness.world.World`.
 
     Parameters

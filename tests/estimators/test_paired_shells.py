@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from harness.estimators.likelihood_search import Level
+from harness.estimators.limit_search import Level
 from harness.estimators.paired_shells import paired_estimate
 from harness.estimators.paired_statement import conditional_paired_statement, margin_statement, paired_statement
 from harness.estimators.pairs import (

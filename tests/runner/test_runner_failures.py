@@ -17,7 +17,7 @@ from harness.cli import main
 from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, WorldDisagreementError
 from harness.progress import LineProgress
 from harness.runner import campaign_run, local_executor, shards, worker
-from harness.runner.shards import WorkerLostError
+from harness.runner.shard_pool import WorkerLostError
 from harness.runner.worker import ShardSpec
 from tests.runner import bad_workers
 from tests.runner.conftest import MIXTURE_FILE, SMALL, TWIN

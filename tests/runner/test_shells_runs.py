@@ -13,7 +13,7 @@ import pytest
 
 from harness import estimate, replay
 from harness.errors import CampaignError, RunFolderError
-from harness.estimators.likelihood_search import Level
+from harness.estimators.limit_search import Level
 from harness.estimators.stratified import Tally, combined
 from harness.runner.allocation import GROWTH, Allocation, first_tests
 from harness.runner.campaign_run import episodes_on_disk

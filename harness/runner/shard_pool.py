@@ -1,4 +1,4 @@
-"""The shards of a campaign: taken over from an earlier run, or run by workers; handed back in order."""
+"""Workers that run shards, whose results are handed back in order; what happens to the shard of one that dies."""
 
 from __future__ import annotations
 
@@ -6,27 +6,21 @@ import os
 import signal
 from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-import numpy as np
 from scipy.special import bdtrc
 
 from harness.campaign.models import Campaign
 from harness.controllers.black_box import OF_EPISODE, Call, Death
 from harness.controllers.time_limit import death_cause
 from harness.errors import CampaignError, HarnessError, TooManyFailedError
-from harness.records.folder import read_table, shard_files
-from harness.records.tables import ShardTables
 from harness.resolved import Resolved
 from harness.runner.executor import AnyWorker, Ended, Executor
-from harness.runner.gathered_blocks import GatheredBlocks
 from harness.runner.local_executor import LocalExecutor
-from harness.runner.prepare import Prepared
-from harness.runner.retrace import Retracing
-from harness.runner.worker import Done, ShardDone, ShardSpec, Spec, finished, repeated_of
+from harness.runner.worker import Done, Spec
 
 ATTEMPTS = 3
 """A shard whose worker dies is given to another one, this many times in all."""
@@ -44,39 +38,6 @@ class WorkerLostError(HarnessError):
     """Workers die again and again, on the same shard or before they have one."""
 
     exit_code = 3
-
-
-def stored_shard(
-    folder: Path, prepared: Prepared, retracing: Retracing, gathered: GatheredBlocks | None, spec: ShardSpec
-) -> ShardDone | None:
-    """A shard that an earlier run has finished, or None; retraced again, unless it has been ``gathered`` after that.
-
-    Raises
-    ------
-    RunFolderError
-        One of its files is damaged.
-    WorldDisagreementError
-        The twin retraces an episode differently.
-    """
-    campaign, prescribed = prepared.campaign, prepared.prescribed
-    files = shard_files(folder, spec.index)
-    needed = {"episodes"} | ({"moments"} if campaign.records.moments != "none" else set())
-    if not needed <= files.keys():
-        return None
-    if gathered is not None and (taken := gathered.take(spec.index, spec.first_episode, spec.n_episodes, files)):
-        repeated = repeated_of(taken.shard.metadata)
-        return ShardDone(
-            spec, taken.block, taken.shard.n_retraced, taken.failures, repeated, files=files, gathered=True
-        )
-    tables = {name: read_table(folder / path) for name, path in files.items()}
-    kept = ShardTables(tables["episodes"], tables.get("moments"), tables.get("traces"))
-    if kept.episodes.num_rows != spec.n_episodes:
-        return None  # the last shard of a smaller budget
-    if prescribed is not None:
-        cut_ins = kept.episodes.column("pool_cut_in")
-        if cut_ins.null_count or not np.array_equal(cut_ins.to_numpy(), prescribed.rows(spec.draws)[0]):
-            return None  # the last round of a smaller budget
-    return replace(finished(spec, kept, campaign, prescribed, retracing, {}), files=files)
 
 
 def executor_of(resolved: Resolved, folder: Path, n_workers: int | None, *, n_runs: int = 1) -> Executor[Any]:
@@ -187,9 +148,9 @@ class ShardPool(Generic[AnyWorker]):
             self._idle.append(worker)
             return
         waiting.appendleft(job)
-        self._judge(job, answer)
+        self._blame(job, answer)
 
-    def _judge(self, job: _Job, ended: Ended) -> None:
+    def _blame(self, job: _Job, ended: Ended) -> None:
         """Say whose doing the death of a worker was: a test's that is run no more, or nobody's knows."""
         call = ended.call
         first_time = call != job.suspected

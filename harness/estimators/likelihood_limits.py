@@ -26,7 +26,7 @@ import numpy as np
 from scipy.optimize import brentq
 
 from harness.arrays import FloatArray, IntArray
-from harness.estimators.likelihood_search import Counts, Level, Seen, give, outermost
+from harness.estimators.limit_search import Counts, Level, Seen, give, outermost
 
 PORTIONS = 6
 """Of further tests; with 4 or 12 campaigns take as many within 1 % (measured: IDM, brakes-8)."""

@@ -1,4 +1,4 @@
-"""The search for a limit of Σ w_sj θ_sj along its Lagrange multiplier; see `harness.estimators.likelihood_ratio`."""
+"""The search for a limit of Σ w_sj θ_sj along its Lagrange multiplier; see `harness.estimators.likelihood_limits`."""
 
 from __future__ import annotations
 
