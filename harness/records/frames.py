@@ -11,7 +11,7 @@ import pandas as pd
 import pyarrow as pa
 
 from harness.errors import RunFolderError
-from harness.records.folder import SHELLS, no_episodes, read_manifest, read_table
+from harness.records.folder import SHELLS, concatenated, no_episodes, read_manifest, read_table
 from harness.records.reader import read_shards, stored_columns
 
 _WEIGHT = pa.field(
@@ -68,7 +68,7 @@ class StoredRun:
             )
         needed = None if asked is None else sorted(asked | {"log_weight", "component"})
         shards = read_shards(self.folder, episode_columns=needed, moment_columns=[])
-        table = _one([episodes for episodes, _ in shards])
+        table = concatenated([episodes for episodes, _ in shards], self.folder)
         frame = table.to_pandas()
         # The weight of a failed test, which counts as no crash, may be unknown.
         frame[_WEIGHT.name] = np.exp(frame["log_weight"].fillna(0.0))
@@ -95,13 +95,8 @@ class StoredRun:
                 expected=f"a run whose campaign kept {name}",
                 mend=f"Run it into another folder with --set records.{name}=all.",
             )
-        table = _one(tables)
+        table = concatenated(tables, self.folder)
         return _described(table.to_pandas(), table.schema)
-
-
-def _one(tables: Sequence[pa.Table]) -> pa.Table:
-    """One table of those of the shards, each of which has its own dictionaries."""
-    return pa.concat_tables(tables).unify_dictionaries()
 
 
 def _described(frame: pd.DataFrame, schema: pa.Schema) -> pd.DataFrame:

@@ -12,7 +12,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from harness.errors import RunFolderError
-from harness.records.folder import MEND_SHARD, TABLES, damaged, read_manifest, read_table
+from harness.records.folder import MEND_SHARD, TABLES, concatenated, damaged, read_manifest, read_table
 from harness.records.stored_manifest import PLAN, WHOLE, kind_of
 from harness.threads import made_ahead
 
@@ -84,7 +84,7 @@ def read_traces(folder: Path, episodes: Collection[int], columns: list[str]) -> 
         if shard["files"].get("traces") and any(episode in held for episode in episodes):
             tables.append(read_table(folder / shard["files"]["traces"], columns, wanted))
     found = [table for table in tables if table.num_rows]
-    return pa.concat_tables(found).unify_dictionaries() if found else None
+    return concatenated(found, folder) if found else None
 
 
 def stored_columns(folder: Path, manifest: Mapping[str, Any] | None = None) -> set[str]:

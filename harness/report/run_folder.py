@@ -170,9 +170,11 @@ class RunFolder:
         for table, _ in read_shards(self.path, episode_columns=list(columns), moment_columns=[]):
             together.append(table.slice(0, counted))
             counted -= together[-1].num_rows
-            if counted == 0 or sum(part.num_rows for part in together) >= ROWS_TOGETHER:
+            if sum(part.num_rows for part in together) >= ROWS_TOGETHER:
                 yield from concatenated(together, self.path).to_batches()
                 together = []
+        if together:
+            yield from concatenated(together, self.path).to_batches()
 
 
 def floats(column: pa.Array) -> FloatArray:

@@ -16,7 +16,7 @@ import pytest
 from harness.cli import main
 from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, WorldDisagreementError
 from harness.progress import LineProgress
-from harness.runner import campaign_run, local_executor, shards, worker
+from harness.runner import campaign_run, local_executor, shard_pool, worker
 from harness.runner.shard_pool import WorkerLostError
 from harness.runner.worker import ShardSpec
 from tests.runner import bad_workers
@@ -28,7 +28,7 @@ SHARDS_BEFORE_FAILURE = 3
 
 def test_a_shard_that_kills_every_worker_ends_the_run_and_is_named(run, campaign, tmp_path, monkeypatch):
     monkeypatch.setattr(local_executor, "serve", bad_workers.dying)
-    monkeypatch.setattr(shards, "ATTEMPTS", 2)
+    monkeypatch.setattr(shard_pool, "ATTEMPTS", 2)
     with pytest.raises(
         WorkerLostError, match=r"shard 0 \(from episode 0\): found 2 worker processes that died"
     ) as lost:
