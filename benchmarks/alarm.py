@@ -28,6 +28,7 @@ from harness.pool.surrogate_replay import SurrogateReplay
 from harness.records.tables import episodes_table
 from harness.resolved import resolve
 from harness.runner.prepare import prepare
+from harness.runner.stored_estimates import MOST_UNASKED
 from harness.strata import KnownRates
 from harness.twin import TwinWorld
 
@@ -94,14 +95,14 @@ def noticed(block: Block, n: int) -> str:
 
 def main(replications: int) -> None:
     """Print both tables."""
-    blocks = [asked(method, TESTS) for method in METHODS]
+    blocks = [asked(method, MOST_UNASKED) for method in METHODS]
     print("| method | tests | false by the sample's variance | false as reported |\n| --- | --- | --- | --- |")
     for block in blocks:
         for n in SIZES:
-            print(false_alarms(block, n, replications), flush=True)
+            print(false_alarms(block.take(slice(0, TESTS)), n, replications), flush=True)
     print("\n| method | tests | all weights times, at most | or at least |\n| --- | --- | --- | --- |")
     for block in blocks:
-        for n in (4_000, TESTS):
+        for n in (4_000, TESTS, MOST_UNASKED):
             print(noticed(block, n), flush=True)
 
 
