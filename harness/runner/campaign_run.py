@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from functools import cache, partial
 from importlib import import_module
@@ -207,17 +207,15 @@ class Run:
             require_same_pool(self._out, prepared)
             write_json(self._out / SHELLS, prepared.prescribed.design.to_json())
         self.prescribed = prepared.prescribed
-        self._gathers = self.prescribed is None and self._campaign.stop.estimator != "scv"  # which needs moments
-        gathered = GatheredBlocks(self._out, self._campaign, same_sources=True) if self._gathers else None
-        self._stored = partial(
-            self._stored_or_wanted, partial(stored_shard, self._out, prepared, self._retracing, gathered)
-        )
+        gathers = self.prescribed is None and self._campaign.stop.estimator != "scv"  # which needs moments
+        self._gathered = GatheredBlocks(self._out, self._campaign, same_sources=True) if gathers else None
+        self._prepared = prepared
         self.planner: Planner = planner_of(self._campaign, prepared.prescribed, held=self._held)
 
-    @staticmethod
-    def _stored_or_wanted(stored: Callable[[ShardSpec], ShardDone | None], spec: ShardSpec) -> ShardDone | None:
-        """What `stored_shard` says; workers are about to be busy with the first shard that it does not know."""
-        if (done := stored(spec)) is None:
+    def _stored(self, spec: ShardSpec) -> ShardDone | None:
+        """See `stored_shard`; workers are about to be busy with the first shard that it does not know."""
+        done = stored_shard(self._out, self._prepared, self._retracing, self._gathered, spec)
+        if done is None:
             load_report_meanwhile()
         return done
 
@@ -257,7 +255,7 @@ class Run:
 
     def _remember(self, done: ShardDone) -> None:
         """Keep in mind what to gather: consecutive shards, a part's worth of them."""
-        if done.gathered or not self._gathers:
+        if done.gathered or self._gathered is None:
             self._gather()
             return
         self._ungathered.append({**self.prefix.shards[-1], "n_retraced": done.n_retraced})
