@@ -12,11 +12,11 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
-from scipy.stats import binomtest, norm
+from scipy.stats import binomtest
 
 from harness.arrays import FloatArray
 from harness.estimators.estimate import Estimate, finite_json
-from harness.estimators.intervals import clopper_pearson
+from harness.estimators.intervals import clopper_pearson, normal_half_width
 from harness.studies.truths import Known
 
 COVERAGE_CONFIDENCE = 0.95
@@ -68,18 +68,9 @@ def estimate_row(result: str, replication: int, found: Estimate, *, reached: boo
 class Subject:
     """What the experimenter knows about a vehicle or a chain.
 
-    Attributes
-    ----------
-    crash_rate : Known
-        The truth for all results that estimate it.
-    others : dict of Known
-        The truth for results that estimate something else.
-    crashes_outside : dict
-        For each result that assumes a boundary, the share of its crash rate beyond it.
-    left_out : tuple of str
-        Surrogates that are its equals.
-    boundary : str or None
-        Surrogate up to which strata are inside.
+    Its crash rate is the truth for all results but ``others``. ``crashes_outside`` is, for each result that assumes a
+    boundary, the share of its crash rate beyond it. Surrogates that are its equals are ``left_out``; strata up to that
+    of the surrogate ``boundary`` are inside.
     """
 
     name: str
@@ -172,14 +163,9 @@ class Judgement:
 
 
 def judge(subject: Subject, result: str, rows: Sequence[Row], confidence: float) -> Judgement:
-    """Judge one method on one vehicle; `corrected` then fills in the corrected p-values.
+    """Judge one method on one vehicle by its rows; `corrected` then fills in the corrected p-values.
 
-    Parameters
-    ----------
-    rows : sequence of Row
-        Of this vehicle and result.
-    confidence : float
-        Nominal coverage.
+    ``confidence`` is the nominal coverage.
     """
     columns = {field.name: np.array([getattr(row, field.name) for row in rows]) for field in fields(Row)}
     tests, reached = columns["n_tests"], columns["reached"]
@@ -193,7 +179,7 @@ def judge(subject: Subject, result: str, rows: Sequence[Row], confidence: float)
     tests_5, median, tests_95 = (float(q) for q in np.quantile(tests, [0.05, 0.5, 0.95]))
     relvar = _mean(errors**2)
     fixed = not reached.any() and bool(np.all(tests == tests[0]))
-    z = float(norm.isf((1.0 - confidence) / 2.0))
+    z = normal_half_width(1.0, confidence)
     return Judgement(
         subject=subject.name,
         result=result,

@@ -42,14 +42,8 @@ _COLUMNS = ("path", "mass", "bits")
 class SuperPopulation:
     """Cut-ins of n paths on which at least one driver crashes.
 
-    Attributes
-    ----------
-    cut_in : ndarray, shape (n,)
-        Weighted probability of a cut-in, by path.
-    path, mass : ndarray of int64 and float64, shape (m,)
-        Path of each cut-in, ascending, and its weighted probability.
-    bits : ndarray of int64, shape (m,)
-        One bit per driver that crashes.
+    ``cut_in`` (n,) is the weighted probability of a cut-in, by path; ``path`` and ``mass`` (m,) are the path of each
+    cut-in, ascending, and its weighted probability; ``bits`` (m,) have one bit per driver that crashes.
     """
 
     cut_in: FloatArray
@@ -88,17 +82,9 @@ class Mixed:
 
 @dataclass(frozen=True, eq=False)
 class Drivers:
-    """All drivers of an enumeration, which are asked about the same cut-ins.
+    """All drivers of an enumeration (D,), which are asked about the same cut-ins.
 
-    Attributes
-    ----------
-    records : structured ndarray, shape (D,)
-    envelope : int
-        The driver that crashes wherever another one does; -1 if there is none.
-    vehicles : dict of Mixed
-        By name.
-    references : dict of int
-        The library's reference drivers by name.
+    The ``envelope`` crashes wherever another one does; -1 if there is none. Vehicles and reference drivers are by name.
     """
 
     records: RecordArray
@@ -110,9 +96,7 @@ class Drivers:
     def of(cls, library: Library, avs: Mapping[str, AutomatedVehicle], *, see_onset: bool = False) -> Drivers:
         """The library's, references last, in the order of its file, and then vehicles with built-in models.
 
-        ``see_onset`` is that of `harness.vehicles.models.driver_records`.
-
-        The envelope is the library's, unless a vehicle accelerates harder.
+        The envelope is the library's, unless a vehicle accelerates harder; ``see_onset`` is that of `driver_records`.
         """
         models = [*library.surrogates.values(), *library.references.values()]
         parameters: list[BuiltInParameters] = [model.parameters for model in models]

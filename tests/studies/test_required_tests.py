@@ -116,7 +116,7 @@ def test_bernoulli_crashes_need_what_the_formula_says(p):
     1.1 of the formula, five standard deviations on either side (error probability below 1e-6).
     """
     procedure = Procedure(rhw=0.1, n_shuffles=50, ratio=1.00001)
-    expected = procedure.z() ** 2 * (1 - p) / (p * 0.1**2)
+    expected = procedure.z**2 * (1 - p) / (p * 0.1**2)
     n = int(10 * expected)
     grid, rhw = procedure.grid(n), plain_rhw(np.ones(int(n * p)), n, procedure)
     assert (np.diff(grid) == 1).all()
@@ -136,7 +136,7 @@ def test_the_width_on_a_prefix_is_that_of_its_mean_and_sample_variance():
         y = tests.weighted_crashes()[shuffled(procedure.seed, shuffle, tests.crash)]
         for at, n in enumerate(grid):
             mean, error = np.mean(y[:n]), np.std(y[:n], ddof=1) / np.sqrt(n)
-            expected = procedure.z() * error / mean if mean else np.inf
+            expected = procedure.z * error / mean if mean else np.inf
             assert rhw[shuffle, at] == pytest.approx(expected, rel=1e-9)
         assert sorted(shuffled(procedure.seed, shuffle, tests.crash)) == list(range(800))
 

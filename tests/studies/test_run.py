@@ -17,8 +17,11 @@ import pytest
 from harness.campaign.models import Campaign
 from harness.cli import main
 from harness.methods import SAMPLING
-from harness.studies.run import worker_processes
-from harness.studies.weighted_campaign import TwinEpisodes, WeightedCampaign
+from harness.studies import run
+from harness.studies.weighted_campaign import WeightedCampaign, twin_episodes
+from harness.studies.work import worker_processes
+
+from .here import Here
 
 CHAINS = """
 format: validation-experiment
@@ -48,9 +51,11 @@ avs: {table-1: {}}
 def folders(tmp_path_factory):
     root = tmp_path_factory.mktemp("validate")
     (root / "x.yaml").write_text(CHAINS)
-    for workers in ("1", "2"):
-        assert main(["validate", str(root / "x.yaml"), "--out", str(root / workers), "--workers", workers]) == 0
-    return root / "1", root / "2"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(run, "worker_processes", lambda workers: Here())
+        assert main(["validate", str(root / "x.yaml"), "--out", str(root / "here")]) == 0
+    assert main(["validate", str(root / "x.yaml"), "--out", str(root / "2"), "--workers", "2"]) == 0
+    return root / "here", root / "2"
 
 
 def test_the_folder_holds_everything(folders):
@@ -81,13 +86,14 @@ def test_every_result_that_may_be_asked_for_is_given(method):
     settings = {"environment": {"lane_change_level": 1e3}, "testing": {"method": method}, "stop": {"episodes": 300}}
     campaign = Campaign.model_validate({"name": "x", "world": {"engine": "twin"}, **settings})
     estimators = sorted(SAMPLING[method].estimators)
-    rows = WeightedCampaign(campaign, TwinEpisodes(campaign, 5, estimators), estimators).run(range(2))
+    rows = WeightedCampaign(campaign, twin_episodes(campaign, 5, estimators), estimators).run(range(2))
     assert [row.result for row in rows] == [*estimators, *estimators]
 
 
-def test_weighted_methods_run_in_the_twin(tmp_path, capsys):
+def test_weighted_methods_run_in_the_twin(tmp_path, capsys, monkeypatch):
     (tmp_path / "x.yaml").write_text(TWIN)
-    assert main(["validate", str(tmp_path / "x.yaml"), "--out", str(tmp_path / "out"), "--workers", "1"]) == 0
+    monkeypatch.setattr(run, "worker_processes", lambda workers: Here())
+    assert main(["validate", str(tmp_path / "x.yaml"), "--out", str(tmp_path / "out")]) == 0
     assert "table-1" in capsys.readouterr().out
     (found,) = json.loads((tmp_path / "out" / "results.json").read_text())["judgements"]
     assert found["result"] == "nade"
@@ -97,7 +103,7 @@ def test_weighted_methods_run_in_the_twin(tmp_path, capsys):
 
 PARENT = """
 import os, time
-from harness.studies.run import worker_processes
+from harness.studies.work import worker_processes
 
 if __name__ == "__main__":
     with worker_processes(1) as executor:

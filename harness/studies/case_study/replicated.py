@@ -19,10 +19,8 @@ from harness.studies.case_study.figures import (
     tests_for,
 )
 from harness.studies.case_study.study_file import Replications
-from harness.studies.case_study.tested import PARTS
 from harness.studies.experiment import load_experiment
-from harness.studies.results import REPLICATIONS
-from harness.studies.run import validate
+from harness.studies.run import REPLICATIONS, validate
 
 
 def replicate(step: Replications, context: Context) -> dict[str, Any]:
@@ -30,14 +28,14 @@ def replicate(step: Replications, context: Context) -> dict[str, Any]:
 
     Where the mean of all replications is below the truth by more than chance, what each of them claims means nothing.
     """
-    experiment, parts = load_experiment(Path(step.experiment), step.set), context.folder / PARTS
-    done = validate(experiment, context.folder, workers=context.workers, progress=context.progress, parts=parts)
+    experiment, parts = load_experiment(Path(step.experiment), step.set), context.parts
+    judgements = validate(experiment, context.folder, workers=context.workers, progress=context.progress, parts=parts)
     rows = pq.read_table(context.folder / REPLICATIONS).to_pandas()
     n, confidence = experiment.campaign.stop.episodes, context.confidence
     per_relvar = tests_for(n, context.rhw, confidence)
     figures: dict[str, Any] = {}
     claims, rates, settled = {}, {}, True
-    for one in done.judgements:
+    for one in judgements:
         missed = one.bias + 2.0 * one.bias_std_error < 0.0
         settled &= not missed
         own = rows[rows["result"] == one.result]
@@ -57,8 +55,8 @@ def replicate(step: Replications, context: Context) -> dict[str, Any]:
         gain = ratio_of_means(claims[plain], claims[other], confidence)
         figures[f"{other}_gain_claimed"] = marked(gain, settled=settled)
         figures[f"{other}_gain_true"] = ratio_of_variances(rates[plain], rates[other], confidence)
-    judgements = [one.to_json() for one in done.judgements]
-    return {"tests": n, "replications": experiment.replications, "judgements": judgements, "figures": figures}
+    said = [one.to_json() for one in judgements]
+    return {"tests": n, "replications": experiment.replications, "judgements": said, "figures": figures}
 
 
 def _scattered(value: float, replications: int, *, missed: bool) -> dict[str, Any]:

@@ -15,14 +15,13 @@ from harness.methods import EstimatorName
 from harness.resolved import resolve
 from harness.runner.campaign_run import run_campaign
 from harness.runner.prepare import prepare
-from harness.studies.case_study.claimed import Claims
 from harness.studies.case_study.context import Context
+from harness.studies.case_study.control_variates import Claims
 from harness.studies.case_study.figures import marked, mean_of, ratio_of_means, ratio_of_variances
 from harness.studies.case_study.study_file import Variants
-from harness.studies.case_study.tested import AT_ONCE, PARTS, figures_of_shells
-from harness.studies.kept_parts import kept_parts, write_table
-from harness.studies.run import worker_processes
-from harness.studies.weighted_campaign import TwinEpisodes, prepared_twin
+from harness.studies.case_study.tested import AT_ONCE, figures_of_shells
+from harness.studies.weighted_campaign import prepared_twin, twin_episodes
+from harness.studies.work import write_table
 
 _IN_THE_TWIN = ("world.engine=twin", "records.traces=none", "records.trace_share=0.0")
 
@@ -47,9 +46,7 @@ def test_variants(step: Variants, context: Context) -> dict[str, Any]:
         prepare(resolve(campaign), context.progress)  # tables are built once, before the workers start
     make = partial(claims_in_twin, step.tests, step.replications, context.rhw, context.confidence)
     jobs = [campaign.model_dump_json() for campaign in campaigns.values()]
-    with worker_processes(context.workers) as executor:
-        parts = context.folder / PARTS, context.name
-        tables = kept_parts(*parts, jobs, make, context.progress, run=executor.map)
+    tables = context.by_workers(jobs, make)
     rows = [{"variant": name, **table.to_pylist()[0]} for name, table in zip(campaigns, tables, strict=True)]
     for k, (row, campaign) in enumerate(zip(rows, variants_of(step, shells=True).values(), strict=False)):
         folder = context.folder / f"shells-{k}"
@@ -70,11 +67,11 @@ def claims_in_twin(n: int, replications: int, rhw: float, confidence: float, cam
     """What NADE and SCV say of n tests each, in so many campaigns, and what these truly scatter by."""
     campaign = Campaign.model_validate_json(campaign_json)
     asked: tuple[EstimatorName, ...] = ("nade", "scv") if campaign.testing.method == "step_mixture" else ("nade",)
-    source, whole, rows = TwinEpisodes(campaign, campaign.seed, asked), Claims(with_scv=False), []
+    source, whole, rows = twin_episodes(campaign, campaign.seed, asked), Claims(with_scv=False), []
     for start in range(0, n * replications, n):
         claims = Claims()
         for first in range(start, start + n, AT_ONCE):
-            block = source.block(first, min(AT_ONCE, start + n - first))
+            block = source(first, min(AT_ONCE, start + n - first))
             whole.add(block)
             claims.add(block)
         rows.append(claims.row(rhw, confidence))

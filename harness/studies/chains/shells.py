@@ -19,7 +19,7 @@ from harness.studies.shell_campaign import DrawnPool
 
 
 class ChainShells:
-    """Source of a chain's pools (see `harness.studies.shell_source.ShellSource`); all surrogates are inside.
+    """A chain's pools; all surrogates are inside.
 
     Attributes
     ----------
@@ -50,8 +50,8 @@ class ChainShells:
             state = (state * (1.0 - chain.hazard)) @ chain.approach
         return total
 
-    def draw(self, rng: np.random.Generator) -> DrawnPool:
-        """A new pool."""
+    def draw(self, rng: np.random.Generator) -> list[DrawnPool]:
+        """A new pool; see `harness.studies.shell_campaign.Draw`."""
         chain, names = self._chain, self._names
         path = approach_paths(chain, self._pool_paths, rng)
         hazard = chain.hazard[path]
@@ -70,7 +70,7 @@ class ChainShells:
             p_cut_in=float(p.sum()),
             p_impossible=0.0,
         )
-        return DrawnPool(design, mass, crash_mass)
+        return [DrawnPool(design, mass, crash_mass)]
 
 
 def joint_outcomes(chain: Chain) -> FloatArray:
