@@ -20,7 +20,7 @@ from harness.studies.chains.single_choice import with_optimal_function
 
 from .coverage import replicate
 
-REPLICATIONS = 400
+REPLICATIONS = 200
 N = 2_000
 CONFIDENCE = 0.9
 FALSE_ALARM = 1e-4

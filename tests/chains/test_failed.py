@@ -19,7 +19,7 @@ from harness.studies.chains.shells import ChainShells
 
 from .coverage import replicate
 
-REPLICATIONS = 300
+REPLICATIONS = 150
 N = 2_000
 FAILING = 0.4
 CHAIN = frequent_decisive()

@@ -29,10 +29,11 @@ from harness.studies.case_study.figures import (
     weights_are_in,
 )
 from harness.studies.case_study.page import asked, count, shown
-from harness.studies.case_study.replicated import replicate
+from harness.studies.case_study.repeated import replicate
 from harness.studies.case_study.steps import run_study, step_keys
 from harness.studies.case_study.study_file import Replications, load_study
 from harness.studies.required_tests import RequiredTests
+from tests.pool.conftest import SMALL_POOL
 
 from .here import Here, Interrupting
 
@@ -297,12 +298,10 @@ steps:
     kind: variants
     title: Table
     campaign: {SCENARIOS}/overtaking_forced.yaml
-    set: [environment.lane_change_level=1e4]
     tests: 4_000
     avs: [alpha-0.5]
     shells: {SCENARIOS}/smoke.yaml
-    shells_set: [environment.lane_change_level=1e4, stop.rhw=0.3, testing.shells.first_tests=null,
-                 pool.relative_error=0.03, pool.cut_ins_per_shell=1500]
+    shells_set: [stop.rhw=0.3, testing.shells.first_tests=null, {", ".join(SMALL_POOL)}]
     reported: {{alpha-0.5: 11.52}}
 """)
     done = run_study(load_study(file), tmp_path / "out", workers=1)

@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from harness.estimators.block import joined
 from harness.estimators.nade import Nade
 from harness.estimators.scv import Scv
 from harness.studies.chains.named import overtaking
@@ -152,21 +148,6 @@ def test_without_a_crash_the_threshold_is_never_reached():
     found = required_tests(plain_rhw(np.empty(0), 500, QUICK), QUICK.grid(500), 0.3)
     assert found.never_reached.all()
     assert found.mean == 500
-
-
-@settings(deadline=None, max_examples=15)
-@given(st.lists(st.integers(1, 899), max_size=6, unique=True), st.integers(0, 2**31))
-def test_how_tests_lie_in_blocks_changes_nothing(cuts, seed):
-    (whole,) = blocks(CHAIN, "step_mixture", [900], SEED)
-    parts = [whole.take(slice(a, b)) for a, b in pairwise([0, *sorted(cuts), 900])]
-    again = joined(parts)
-    procedure = Procedure(n_shuffles=2, ratio=2.0, seed=seed)
-    np.testing.assert_array_equal(scv_rhw(again, procedure), scv_rhw(whole, procedure))
-    in_blocks = np.concatenate([part.weighted_crashes()[part.crash] for part in parts])
-    np.testing.assert_array_equal(
-        plain_rhw(in_blocks, 900, procedure),
-        plain_rhw(whole.weighted_crashes()[whole.crash], 900, procedure),
-    )
 
 
 def test_algorithm_1_grown_look_by_look_is_algorithm_1_on_each_prefix():

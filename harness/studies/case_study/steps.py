@@ -26,13 +26,12 @@ from harness.resolved import resolve
 from harness.studies.case_study.context import Context, Made
 from harness.studies.case_study.control_variates import compare_control_variates
 from harness.studies.case_study.page import write_page
-from harness.studies.case_study.replicated import replicate
+from harness.studies.case_study.repeated import replicate, test_variants, variants_of
 from harness.studies.case_study.required import count_required_tests, draw_convergence
 from harness.studies.case_study.small_case import answer_small_case
 from harness.studies.case_study.study_file import FILES, Step, Study, inputs_of
 from harness.studies.case_study.tested import keep_run, test_in_twin
 from harness.studies.case_study.theorems import check_theorems
-from harness.studies.case_study.variants import test_variants, variants_of
 from harness.studies.experiment import load_experiment
 
 RESULT = "result.json"

@@ -31,7 +31,7 @@ PART, AT_ONCE = 500_000, 50_000
 """Tests of a file that a killed step goes on from, and of a call of the twin."""
 GROUPS = 20
 CRASHES = "crashes.parquet"
-_IN_THE_TWIN = ("world.engine=twin", "records.moments=none", "records.traces=none", "records.trace_share=0.0")
+IN_THE_TWIN = ("world.engine=twin", "records.traces=none", "records.trace_share=0.0")
 _WEIGHT = b"sum_of_weights"
 
 
@@ -57,7 +57,8 @@ def campaign_of(step: TwinTests | Run) -> Campaign:
     HarnessError
         It is wrong, or draws from shells where crashes alone are to be kept.
     """
-    campaign = load_campaign(step.campaign, [*step.set, *(_IN_THE_TWIN if isinstance(step, TwinTests) else ())])
+    bare = (*IN_THE_TWIN, "records.moments=none") if isinstance(step, TwinTests) else ()
+    campaign = load_campaign(step.campaign, [*step.set, *bare])
     if isinstance(step, TwinTests) and campaign.testing.method == "shells":
         raise HarnessError(
             step.campaign,
