@@ -30,18 +30,9 @@ WANTED_RHW = 0.3
 class Row:
     """What one replication of a campaign reported, and nothing that only the experimenter knows.
 
-    Attributes
-    ----------
-    result : str
-        Estimator, a statement of shells, a comparison with a reference driver, or the difference of two vehicles.
-    crash_rate : float
-        What is judged: a crash rate, or the ratio, share or difference that the result names; NaN if there is none.
-    reached : bool
-        Whether the asked precision was reached; False when none was asked.
-    n_crashes_outside : int
-        Crashes beyond the boundary; 0 where there are no shells.
-    refused : bool
-        Whether no interval was made, because crashes lie on too few paths: it is as wide as can be.
+    The result is an estimator, a statement of shells, a comparison with a reference driver, or the difference of two
+    vehicles; ``crash_rate`` is a rate, or the ratio, share or difference that it names; NaN if there is none. An
+    interval is refused, and as wide as can be, where crashes lie on too few paths.
     """
 
     result: str
@@ -101,30 +92,13 @@ class Subject:
 
 @dataclass(frozen=True)
 class Judgement:
-    """One method on one vehicle.
+    """One method on one vehicle; `harness validate --help` says what is printed of it.
 
-    Attributes
-    ----------
-    truth, scale : float
-        What it should have found, and what deviations are relative to: see `harness.studies.truths.Known`.
-    assumption_met : bool
-        False for a statement about vehicles that do not crash outside, and one that does; coverage is then not judged.
-    bias, bias_std_error : float
-        Of the mean estimate, relative to the scale, as is all that follows.
-    true_relvar, claimed_relvar : float
-        Variance over the squared scale: of the estimates around the truth, and the mean that they claim.
-    coverage, coverage_low, coverage_high : float
-        Share of intervals that hold the truth, with its own exact 95 % interval.
-    p_value, p_value_holm : float or None
-        That the coverage is no lower than nominal; corrected; None where it is not judged.
-    tests_median, tests_5, tests_95 : float
-    tests_for_wanted_rhw : float or None
-        Tests for RHW 0.3 by the true variance at this number of tests; None if the number was not fixed.
-    reached, alarm : float
-        Share of replications that reached the precision asked for, and in which a crash was seen outside.
-    refused : float
-        Share of replications without an interval, which count as covered. Where they have no value either, nothing else
-        takes notice of them.
+    Bias and relative variances are over the ``scale`` of the truth (`harness.studies.truths.Known`). The assumption is
+    not met by a statement about vehicles that do not crash outside, and one that does; coverage is not judged then, and
+    has no p-values. Tests for the wanted RHW, 0.3, follow from the true variance at this number of tests, if it was
+    fixed. ``reached`` is the share of replications that reached the precision asked for. Those refused count as
+    covered; where they have no value either, nothing else takes notice of them.
     """
 
     subject: str

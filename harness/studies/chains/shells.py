@@ -21,12 +21,8 @@ from harness.studies.shell_campaign import DrawnPool
 class ChainShells:
     """A chain's pools; all surrogates are inside.
 
-    Attributes
-    ----------
-    shell_p, crash_p : ndarray, shape (S,)
-        Exact probability of each shell, and of a crash in it.
-    crashes_outside : float
-        Share of the crash rate that lies beyond the boundary.
+    Exact are ``shell_p`` and ``crash_p`` (S,), the probability of each shell, and of a crash in it, and the share of
+    the crash rate that lies beyond the boundary, ``crashes_outside``.
     """
 
     def __init__(self, chain: Chain, pool_paths: int) -> None:
