@@ -6,10 +6,10 @@ from collections.abc import Iterator, Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import permutations
 
 from harness.arrays import FloatArray
 from harness.campaign.models import Campaign
-from harness.environment.driving import Environment
 from harness.environment.loading import load_environment
 from harness.pool.library import Library, load_library
 from harness.pool.shells import acceleration_limit
@@ -40,13 +40,17 @@ def subjects(experiment: Experiment, executor: Executor, progress: Progress) -> 
     if experiment.holding:
         environment, library = load_environment(campaign.environment), load_library(campaign.pool.library)
         drivers = Drivers.of(library, experiment.holding, see_onset=environment.lateral.present)
+        together: dict[str, set[str]] = {}
+        for one, other in [each for pair in experiment.pairs.values() for each in permutations((pair.a, pair.b))]:
+            together.setdefault(one, set()).update({other} & set(drivers.vehicles))
+        size, seed = experiment.super_population, experiment.seed
+        truths = Truths(environment, drivers, seed + 1, size.reference_paths, progress, together)
         if campaign.testing.method == "shells":
-            pools = enumerate_paths(environment, drivers, experiment.seed, experiment.super_population.paths, progress)
-            truths = _truths(experiment, environment, drivers, progress)
+            pools = enumerate_paths(environment, drivers, seed, size.paths, progress)
             shells = _Shells(experiment, library, drivers, truths, pools)
             yield from shells.pairs() if experiment.pairs else shells.single()
         else:
-            yield from _weighted(experiment, _truths(experiment, environment, drivers, progress))
+            yield from _weighted(experiment, truths)
     if experiment.acting and not experiment.pairs:
         choose = chooser(campaign, progress)
         for name in experiment.acting:
@@ -97,15 +101,6 @@ def _weighted(experiment: Experiment, truths: Truths) -> Iterator[Tested]:
         tested, seed = experiment.subject(name), experiment.seed_of(list(experiment.avs).index(name))
         episodes = twin_episodes(tested, seed, experiment.results)
         yield Subject(name, truths.vehicle(name)[RATE]), WeightedCampaign(tested, episodes, experiment.results)
-
-
-def _truths(experiment: Experiment, environment: Environment, drivers: Drivers, progress: Progress) -> Truths:
-    together: dict[str, set[str]] = {}
-    for pair in experiment.pairs.values():
-        for one, other in ((pair.a, pair.b), (pair.b, pair.a)):
-            together.setdefault(one, set()).update({other} & set(drivers.vehicles))
-    n_paths = experiment.super_population.reference_paths
-    return Truths(environment, drivers, experiment.seed + 1, n_paths, progress, together)
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,6 @@ import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import cast
 
 import numpy as np
@@ -28,7 +27,7 @@ from harness.pool.cut_ins import environment_hash
 from harness.pool.library import Library
 from harness.pool.shells import acceleration_limit
 from harness.progress import Progress
-from harness.records.folder import write_atomically
+from harness.studies.work import write_table
 from harness.vehicles.models import driver_records
 
 MOST_DRIVERS = 62
@@ -164,9 +163,12 @@ def cached(key: str, make: Callable[[], SuperPopulation]) -> SuperPopulation:
     """A population of a key, read from the cache or made and kept there."""
     file = cache_root() / "super_populations" / f"{key}.parquet"
     if file.is_file():
-        return _read(file)
+        table = pq.read_table(file, partitioning=None)
+        cut_in = np.frombuffer(table.schema.metadata[b"cut_in"], np.float64)
+        return SuperPopulation(cut_in, *(np.asarray(table.column(name)) for name in _COLUMNS))
     population = make()
-    _write(file, population)
+    table = pa.table({name: getattr(population, name) for name in _COLUMNS})
+    write_table(file, table.replace_schema_metadata({b"cut_in": population.cut_in.tobytes()}))
     return population
 
 
@@ -191,15 +193,3 @@ def population_key(environment: Environment, *content_of: object) -> str:
     """Hash of all that a population depends on: plain content, an environment, and code."""
     content = [_FORMAT, source_hash(WORLD_SOURCES), environment_hash(environment), *content_of]
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:24]
-
-
-def _write(file: Path, population: SuperPopulation) -> None:
-    table = pa.table({name: getattr(population, name) for name in _COLUMNS})
-    table = table.replace_schema_metadata({b"cut_in": population.cut_in.tobytes()})
-    write_atomically(file, lambda temporary: pq.write_table(table, temporary, compression="zstd"))
-
-
-def _read(file: Path) -> SuperPopulation:
-    table = pq.read_table(file, partitioning=None)
-    cut_in = np.frombuffer(table.schema.metadata[b"cut_in"], np.float64)
-    return SuperPopulation(cut_in, *(np.asarray(table.column(name)) for name in _COLUMNS))

@@ -77,7 +77,7 @@ def compare_control_variates(step: ControlVariates, context: Context) -> dict[st
     claims, rows = pickle.loads(begun.read_bytes()) if begun.is_file() else (Claims(), [])  # noqa: S301
     done = rows[-1]["n"] if rows else 0
     context.progress.stage(context.name, sizes[-1] if sizes else 0, done=done)
-    for block in _cut_at(stored_blocks(run.folder / "run", moments=True), sizes):
+    for block in cut_at(stored_blocks(run.folder / "run", moments=True), sizes):
         n = block.first_episode + len(block)
         if n <= done:
             continue
@@ -104,7 +104,7 @@ def compare_control_variates(step: ControlVariates, context: Context) -> dict[st
     }
 
 
-def _cut_at(blocks: Iterator[Block], sizes: list[int]) -> Iterator[Block]:
+def cut_at(blocks: Iterator[Block], sizes: list[int]) -> Iterator[Block]:
     """The same tests in blocks that end where a size is reached, too."""
     for block in blocks:
         first, stop = block.first_episode, block.first_episode + len(block)

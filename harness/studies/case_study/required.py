@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from itertools import takewhile
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,6 +12,7 @@ from harness.arrays import FloatArray, IntArray
 from harness.estimators.block import Block, joined
 from harness.runner.stored_estimates import stored_blocks
 from harness.studies.case_study.context import Context, Made
+from harness.studies.case_study.control_variates import cut_at
 from harness.studies.case_study.figures import exactly, figure, marked, mean_of, ratio, ratio_of_means
 from harness.studies.case_study.study_file import Convergence, RequiredNumbers
 from harness.studies.case_study.tested import Tests, read_tests, settled
@@ -122,16 +123,10 @@ def _scv(made: Made, procedure: Procedure, context: Context, *, first: int) -> _
 
     def rhw_of(shuffle: int) -> pa.Table:
         if not tests:
-            tests.append(joined(list(_first(stored_blocks(made.folder / "run", moments=True), n))))
+            blocks = cut_at(stored_blocks(made.folder / "run", moments=True), [n])
+            tests.append(joined(list(takewhile(lambda block: block.first_episode < n, blocks))))
         return pa.table({"rhw": scv_rhw_of(tests[0], procedure, shuffle)})
 
     tables = kept_parts(context.parts, "scv", range(procedure.n_shuffles), rhw_of, context.progress)
     rhw = np.array([table.column("rhw").to_numpy() for table in tables])
     return _Found(required_tests(rhw, procedure.grid(n), procedure.rhw), n, settled(made))
-
-
-def _first(blocks: Iterator[Block], n: int) -> Iterator[Block]:
-    for block in blocks:
-        yield block.take(slice(0, n - block.first_episode))
-        if block.first_episode + len(block) >= n:
-            return

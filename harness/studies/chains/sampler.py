@@ -76,7 +76,7 @@ class Sampler:
             after = np.flatnonzero(self.cut_in & (self.after < self.chain.crashed - 1))
             self._step_before(t, np.flatnonzero(~self.cut_in))
             self._step_after(t, after)
-        log_q, none = self._log_q(), np.zeros(self.n, dtype=bool)
+        log_q, none, cap = self._log_q(), np.zeros(self.n, dtype=bool), self.chain.cut_in_cap
         return Block(
             first_episode=first_episode,
             method=self.method,
@@ -89,7 +89,7 @@ class Sampler:
             alpha=self.alpha,
             n_control_steps=self.n_control,
             first_ratios=self.ratios if self.method == "step_mixture" else None,
-            weight_cap=self._caps().get(self.method),
+            weight_cap={"nde": 1.0, "forced": cap, "episode_mixture": cap / DEFENSIVE_SHARE}.get(self.method),
             log_p_cut_in=self.log_p_cut if self.method in ("forced", "episode_mixture") else None,
         )
 
@@ -159,7 +159,3 @@ class Sampler:
         if self.method == "step_mixture":
             return self.log_step
         return -logsumexp(log_q + np.log(self.alpha), axis=1) if len(self.alpha) else np.zeros(self.n)
-
-    def _caps(self) -> dict[Method, float]:
-        cap = self.chain.cut_in_cap
-        return {"nde": 1.0, "forced": cap, "episode_mixture": cap / DEFENSIVE_SHARE}
