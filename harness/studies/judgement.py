@@ -146,7 +146,8 @@ def judge(subject: Subject, result: str, rows: Sequence[Row], confidence: float)
     known, n = subject.truth(result), len(rows)
     truth, scale = known.value, known.scale
     said = np.isfinite(columns["crash_rate"])
-    errors, claimed = (columns["crash_rate"][said] - truth) / scale, columns["std_error"][said] / scale
+    with np.errstate(divide="ignore", invalid="ignore"):  # of what never crashes nothing relative is known
+        errors, claimed = (columns["crash_rate"][said] - truth) / scale, columns["std_error"][said] / scale
     covered = int(np.count_nonzero((columns["ci_low"] <= truth) & (truth <= columns["ci_high"])))
     low, high = map(float, clopper_pearson(covered, n, (1.0 - COVERAGE_CONFIDENCE) / 2.0))
     met = subject.meets_assumption_of(result)

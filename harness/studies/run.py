@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 
+from harness.estimators.estimate import finite_json
 from harness.progress import Progress, SilentProgress
 from harness.records.folder import require_place, write_bytes, write_json
 from harness.report.plot_style import BLUE, FULL_WIDTH_IN, GREY, INK, VERMILLION, Plot, new_figure, png
@@ -23,8 +24,6 @@ from harness.studies.work import kept_parts, worker_processes, write_table
 
 TASKS_PER_SUBJECT = 8
 RESULTS, REPLICATIONS, PLOT = "results.json", "replications.parquet", "coverage.png"
-TRUTH_OF_CHAINS = "exact, by backward induction"
-TRUTH_OF_VEHICLES = "independent enumeration with another seed"
 
 
 def validate(
@@ -73,17 +72,15 @@ def _write(
     named = [table.add_column(0, "subject", [[one.name] * len(table)]) for (one, _), table in found]
     write_table(folder / REPLICATIONS, pa.concat_tables(named))
     write_bytes(folder / PLOT, png(coverage_plot(judgements, experiment.nominal)))
-    write_json(
-        folder / RESULTS,
-        {
-            "experiment": experiment.model_dump(mode="json"),
-            "confidence": experiment.nominal,
-            "truth": TRUTH_OF_CHAINS if experiment.chains else TRUTH_OF_VEHICLES,
-            "largest_relative_error_of_truth": max(one.relative_error for (one, _), _ in found),
-            "subjects": [asdict(one) for (one, _), _ in found],
-            "judgements": [one.to_json() for one in judgements],
-        },
-    )
+    content = {
+        "experiment": experiment.model_dump(mode="json"),
+        "confidence": experiment.nominal,
+        "truth": "exact, by backward induction" if experiment.chains else "independent enumeration with another seed",
+        "largest_relative_error_of_truth": max(one.relative_error for (one, _), _ in found),
+        "subjects": [asdict(one) for (one, _), _ in found],
+        "judgements": [one.to_json() for one in judgements],
+    }
+    write_json(folder / RESULTS, finite_json(content))  # of what never crashes nothing relative is known
 
 
 def coverage_plot(judgements: Sequence[Judgement], confidence: float) -> Plot:

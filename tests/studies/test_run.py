@@ -10,7 +10,9 @@ import subprocess
 import sys
 import time
 from concurrent.futures.process import BrokenProcessPool
+from dataclasses import asdict
 
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
@@ -18,6 +20,8 @@ from harness.campaign.models import Campaign
 from harness.cli import main
 from harness.methods import SAMPLING
 from harness.studies import run
+from harness.studies.experiment import load_experiment
+from harness.studies.judgement import Row, Subject, judge
 from harness.studies.weighted_campaign import WeightedCampaign, twin_episodes
 from harness.studies.work import worker_processes
 
@@ -78,6 +82,16 @@ def test_the_online_rule_is_followed(folders):
     for row in rows:
         rhw = (row["ci_high"] - row["ci_low"]) / 2.0 / row["crash_rate"] if row["crash_rate"] else float("inf")
         assert row["reached"] == (rhw <= 0.5 and row["n_crashes"] > 0)
+
+
+def test_what_never_crashes_has_results_too(tmp_path):
+    (tmp_path / "x.yaml").write_text(CHAINS)
+    never, rows = Subject.exact("never", 0.0), [Row("x", k, 9, 0, 0.0, 0.0, 0.0, 0.1, False) for k in range(5)]
+    table = pa.Table.from_pylist([asdict(row) for row in rows])
+    run._write(tmp_path, load_experiment(tmp_path / "x.yaml"), [judge(never, "x", rows, 0.9)], [((never, None), table)])
+    content = json.loads((tmp_path / "results.json").read_text())
+    assert content["largest_relative_error_of_truth"] is None
+    assert [(one["bias"], one["coverage"]) for one in content["judgements"]] == [(None, 1.0)]
 
 
 @pytest.mark.parametrize("method", ["nde", "forced", "step_mixture", "episode_mixture"])
