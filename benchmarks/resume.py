@@ -42,14 +42,22 @@ class Size(NamedTuple):
 SIZES = {"200 shards": Size(5_000, 3.0, 6.0), "10,000 shards": Size(100, 5.0, 6.0)}
 
 
-def harness(*arguments: str) -> tuple[float, float]:
-    """Wall time and CPU time (s) of a command, workers included."""
+class Cost(NamedTuple):
+    """Wall time and CPU time of a command, workers included, and its largest resident memory."""
+
+    wall_s: float
+    cpu_s: float
+    gib: float
+
+
+def harness(*arguments: str) -> Cost:
+    """Run a command in a process of its own."""
     started = time.perf_counter()
     process = subprocess.Popen([sys.executable, "-m", "harness", *arguments], stdout=subprocess.DEVNULL)
     _, status, usage = os.wait4(process.pid, 0)
     if status != 0:
         raise RuntimeError(f"harness {' '.join(arguments)} ended with {status}")
-    return time.perf_counter() - started, usage.ru_utime + usage.ru_stime
+    return Cost(time.perf_counter() - started, usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 2**20)
 
 
 def run_words(folder: Path, size: int, episodes: int) -> list[str]:
@@ -100,8 +108,8 @@ def measured(folder: Path, size: Size, repetitions: int) -> None:
         ("estimate", ["estimate", str(folder), "--json"], size.estimate_s),
     ):
         for _ in range(repetitions):
-            wall_s, cpu_s = harness(*command)
-            print(f"  {name}: {wall_s:.1f} s ({cpu_s:.1f} s of CPU); asked <= {asked_s:.0f} s", flush=True)
+            cost = harness(*command)
+            print(f"  {name}: {cost.wall_s:.1f} s ({cost.cpu_s:.1f} s of CPU); asked <= {asked_s:.0f} s", flush=True)
     for _ in range(repetitions):
         wall_s = until_worker(*run_words(folder, size.shard_size, EPISODES + size.shard_size))
         print(f"  one more shard: {wall_s:.1f} s until a worker starts; asked <= {size.resume_s:.0f} s", flush=True)

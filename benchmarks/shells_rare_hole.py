@@ -10,7 +10,7 @@ campaign; the tests of a shell are replaced by a binomial number. Prints the tab
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -29,17 +29,6 @@ ASKED = ((0.3, 0.9), (0.3, 0.95), (0.3, 0.99), (2.0, 0.9))
 SEED = 20_240
 
 
-@dataclass(frozen=True)
-class Fixed:
-    """A source of campaigns on one pool, without error of its own."""
-
-    pool: DrawnPool
-
-    def draw(self, _: np.random.Generator) -> DrawnPool:
-        """The same each time."""
-        return self.pool
-
-
 def main(replications: int, overrides: list[str]) -> None:
     """Print the table."""
     settings = ["stop.min_crashes=null", "testing.shells.first_tests=null", "stop.episodes=1e6", *overrides]
@@ -55,8 +44,9 @@ def main(replications: int, overrides: list[str]) -> None:
             share = np.array([IDM.get(name, 0.0) for name in design.strata])
             share[-1] = hole
             truth, one_path = float(design.p @ share), design.p[None]
-            source = ShellCampaign(campaign, Fixed(DrawnPool(design, one_path, one_path * share)), SEED)
-            rows = [row for row in source.run(range(replications)) if row.result == FREE]
+            drawn = [DrawnPool(design, one_path, one_path * share)]  # the same each time, without error of its own
+            repeated = ShellCampaign(campaign, lambda _, drawn=drawn: drawn, SEED)
+            rows = [row for row in repeated.run(range(replications)) if row.result == FREE]
             rate = np.array([row.crash_rate for row in rows])
             error = rate.std(ddof=1) / truth / np.sqrt(replications)
             covers = np.mean([row.ci_low <= truth <= row.ci_high for row in rows])

@@ -35,8 +35,8 @@ def main(replications: int) -> None:
     print("| --- | --- | --- | --- | --- |")
     for rhw in (0.1, 0.3, 0.5, 1.0, 2.0):
         with tempfile.TemporaryDirectory() as folder:
-            result = validate(stopped_at(experiment, rhw), Path(folder))
-        for found in result.judgements:
+            judgements = validate(stopped_at(experiment, rhw), Path(folder))
+        for found in judgements:
             if found.result == FREE:
                 bias = f"{100 * found.bias:+.1f} % ± {100 * found.bias_std_error:.1f} %"
                 print(f"| {rhw} | {found.subject} | {found.tests_median:,.0f} | {bias} | {found.coverage:.3f} |")

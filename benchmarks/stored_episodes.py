@@ -11,16 +11,13 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
-import subprocess
-import sys
-import time
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
 from benchmarks.contenders import SCENARIOS, TWIN_CELLS
+from benchmarks.resume import harness
 from harness.campaign.loading import load_campaign
 from harness.estimators import Block, one_pass
 from harness.estimators.from_records import EPISODE_COLUMNS, MOMENT_COLUMNS, block_from_tables
@@ -36,33 +33,10 @@ _AGREEMENT = 1e-9
 
 def make_run(folder: Path, episodes: int) -> None:
     """Published NADE in the twin, without traces."""
-    settings = {
-        "world.engine": "twin",
-        "world.cells": TWIN_CELLS,
-        "records.traces": "none",
-        "run.shard_size": SHARD,
-        "stop.rhw": "null",
-        "stop.episodes": episodes,
-    }
-    command = [sys.executable, "-m", "harness", "run", str(SCENARIOS / "overtaking_nade.yaml"), "--resume"]
-    command += ["--out", str(folder), *(word for item in settings.items() for word in ("--set", "{}={}".format(*item)))]
-    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
-
-
-def measure(folder: Path) -> dict[str, float]:
-    """Wall time, CPU time and largest resident memory of ``harness estimate`` in a process of its own."""
-    started = time.perf_counter()
-    process = subprocess.Popen(
-        [sys.executable, "-m", "harness", "estimate", str(folder), "--json"], stdout=subprocess.DEVNULL
-    )
-    _, status, usage = os.wait4(process.pid, 0)
-    if status != 0:
-        raise RuntimeError(f"harness estimate ended with {status}")
-    return {
-        "wall_s": time.perf_counter() - started,
-        "cpu_s": usage.ru_utime + usage.ru_stime,
-        "gib": usage.ru_maxrss / 2**20,
-    }
+    sizes = (f"world.cells={TWIN_CELLS}", f"run.shard_size={SHARD}", f"stop.episodes={episodes}")
+    settings = ("world.engine=twin", "records.traces=none", "stop.rhw=null", *sizes)
+    words = (word for setting in settings for word in ("--set", setting))
+    harness("run", str(SCENARIOS / "overtaking_nade.yaml"), "--resume", "--out", str(folder), *words)
 
 
 def largest_difference(folder: Path) -> float:
@@ -113,10 +87,10 @@ def main() -> None:
     disk = sum(path.stat().st_size for path in options.folder.rglob("*.parquet"))
     print(f"{episodes:,} episodes of published NADE, {disk / 1e9:.2f} GB, {disk / episodes:.0f} bytes each")
     for _ in range(options.repetitions):
-        found = measure(options.folder)
-        scaled = found["wall_s"] * ASKED_EPISODES / episodes
+        cost = harness("estimate", str(options.folder), "--json")
+        scaled = cost.wall_s * ASKED_EPISODES / episodes
         print(
-            f"  estimate: {found['wall_s']:.1f} s ({found['cpu_s']:.1f} s of CPU), {found['gib']:.2f} GiB; "
+            f"  estimate: {cost.wall_s:.1f} s ({cost.cpu_s:.1f} s of CPU), {cost.gib:.2f} GiB; "
             f"per 1e7 episodes {scaled:.0f} s; asked <= {ASKED_S:.0f} s and {ASKED_GIB:.0f} GiB"
         )
     difference = largest_difference(options.folder)

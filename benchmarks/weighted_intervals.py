@@ -22,7 +22,7 @@ from harness.estimators.intervals import hall_distances, normal_half_width
 from harness.estimators.nade import Nade
 from harness.estimators.stopping import StopRule
 from harness.methods import Method
-from harness.studies.weighted_campaign import TwinEpisodes
+from harness.studies.weighted_campaign import twin_episodes
 
 CONFIDENCE = 0.9
 SEED = 77
@@ -62,9 +62,9 @@ def _crashes(weights: FloatArray, cap: float) -> Block:
 def drive(name: str, av: dict[str, object], method: Method, n: int) -> Population:
     """Weighted crashes of an AV in the twin."""
     campaign = Campaign.model_validate({"name": "intervals", "av": av, "testing": {"method": method}})
-    source, parts, nade = TwinEpisodes(campaign, SEED, ()), [], Nade()
+    source, parts, nade = twin_episodes(campaign, SEED, ()), [], Nade()
     for first in range(0, n, CHUNK):
-        block = source.block(first, CHUNK)
+        block = source(first, CHUNK)
         nade.add(block)
         parts.append(np.exp(block.log_weight[block.crash]))
     weights = np.concatenate(parts)

@@ -125,16 +125,16 @@ def validate(
     if replications is not None:
         experiment = experiment.model_copy(update={"replications": replications})
     from harness.progress import shown_progress  # noqa: PLC0415 - keeps --help fast
-    from harness.studies.results import RESULTS, table_lines  # noqa: PLC0415
-    from harness.studies.run import validate as repeat  # noqa: PLC0415 - slow to import: only once the file is right
+    from harness.studies.run import RESULTS, table_lines  # noqa: PLC0415 - slow to import: once the file is right
+    from harness.studies.run import validate as repeat  # noqa: PLC0415
 
     bar = shown_progress(quiet=quiet)
     with bar:
-        done = repeat(experiment, folder, workers=workers, progress=bar)
+        judgements = repeat(experiment, folder, workers=workers, progress=bar)
     if as_json:
-        print_json([one.to_json() for one in done.judgements])
+        print_json([one.to_json() for one in judgements])
         return
-    for line in table_lines(done.judgements):
+    for line in table_lines(judgements):
         click.echo(line)
     click.echo(str(folder / RESULTS))
 

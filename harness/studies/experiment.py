@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
+from pydantic_core import PydanticCustomError
 
 from harness.campaign.models import AutomatedVehicle, BuiltInParameters, Campaign
 from harness.campaign.overrides import Places, apply_overrides, parse_override
@@ -136,67 +138,53 @@ class Experiment(Section):
         return {"name": "replicated", **value, "world": world}
 
     @model_validator(mode="after")
-    def _has_subjects(self) -> Self:
+    def _can_be_repeated(self) -> Self:
+        for broken in chain(self._about_subjects(), self._about_vehicles(), self._about_the_method()):
+            raise broken
+        return self
+
+    def _about_subjects(self) -> Iterator[PydanticCustomError]:
+        """What is wrong with subjects, and those made of others."""
         if bool(self.avs) == bool(self.chains):
-            raise broken_rule(
+            yield broken_rule(
                 "avs",
                 found="both avs and chains" if self.avs else "neither avs nor chains",
                 expected="one of the two",
                 mend="Name vehicles under avs for overtaking in the twin, or exact chains under chains.",
             )
-        if unknown := [name for name in self.chains if name not in CHAINS]:
-            expected = f"some of {', '.join(CHAINS)}"
-            raise broken_rule("chains", found=f"'{unknown[0]}'", expected=expected, mend="Choose one of them.")
-        return self
-
-    @model_validator(mode="after")
-    def _adversaries_are_made_of_vehicles(self) -> Self:
-        if self.adversaries and self.campaign.testing.method != "shells":
-            raise broken_rule(
-                "adversaries",
-                found=f"adversaries for {self.campaign.testing.method}",
-                expected="method shells: their crashes are drawn within shells",
-                mend="Delete them.",
-            )
-        for name, adversary in self.adversaries.items():
-            if adversary.of not in self.avs:
-                raise broken_rule(
-                    f"adversaries.{name}.of",
-                    found=f"'{adversary.of}'",
-                    expected=f"one of avs: {', '.join(self.avs)}",
-                    mend="Name one of them.",
-                )
+        for name in self.chains:
+            if name not in CHAINS:
+                expected = f"some of {', '.join(CHAINS)}"
+                yield broken_rule("chains", found=f"'{name}'", expected=expected, mend="Choose one of them.")
+        method = self.campaign.testing.method
+        if self.adversaries and method != "shells":
+            expected = "method shells: their crashes are drawn within shells"
+            yield broken_rule("adversaries", found=f"adversaries for {method}", expected=expected, mend="Delete them.")
+        for name, made in self.adversaries.items():
+            where, others = f"adversaries.{name}", ", ".join(self.avs)
+            if made.of not in self.avs:
+                expected = f"one of avs: {others}"
+                yield broken_rule(f"{where}.of", found=f"'{made.of}'", expected=expected, mend="Name one of them.")
             if name in self.avs:
-                raise broken_rule(
-                    f"adversaries.{name}", found="a name that avs has, too", expected="another", mend="Rename it."
-                )
-        return self
-
-    @model_validator(mode="after")
-    def _pairs_are_of_vehicles_that_hold_their_speed(self) -> Self:
-        if self.pairs and self.campaign.testing.method != "shells":
-            raise broken_rule(
-                "pairs",
-                found=f"pairs for {self.campaign.testing.method}",
-                expected="method shells: it compares on drawn cut-ins",
-                mend="Delete them.",
-            )
+                yield broken_rule(where, found="a name that avs has, too", expected="another", mend="Rename it.")
+        if self.pairs and method != "shells":
+            expected = "method shells: it compares on drawn cut-ins"
+            yield broken_rule("pairs", found=f"pairs for {method}", expected=expected, mend="Delete them.")
         known = [*self.holding, *(name for name, made in self.adversaries.items() if made.of in self.holding)]
         for name, pair in self.pairs.items():
-            for side in ("a", "b"):
-                if (asked := getattr(pair, side)) not in known:
-                    raise broken_rule(
+            for side, asked in (("a", pair.a), ("b", pair.b)):
+                if asked not in known:
+                    yield broken_rule(
                         f"pairs.{name}.{side}",
                         found=f"'{asked}'",
                         expected=f"a vehicle that holds its speed before the cut-in: {', '.join(known)}",
                         mend="Name one of them; `harness compare` takes no others under shells.",
                     )
-        return self
 
-    @model_validator(mode="after")
-    def _has_a_twin(self) -> Self:
+    def _about_vehicles(self) -> Iterator[PydanticCustomError]:
+        """What has no twin."""
         if self.campaign.world.engine != "twin":
-            raise broken_rule(
+            yield broken_rule(
                 "campaign.world.engine",
                 found=self.campaign.world.engine,
                 expected="twin: thousands of replications are not affordable in SUMO, whose records the twin's equal",
@@ -205,7 +193,7 @@ class Experiment(Section):
         for name, av in self.avs.items():
             built_in, acts = isinstance(av.parameters, BuiltInParameters), av.acts_before_cut_in
             if not (built_in or (av.source in ("controller", "fmu") and acts)):
-                raise broken_rule(
+                yield broken_rule(
                     f"avs.{name}",
                     found=f"an AV that av.{av.source} drives" + ("" if acts else " from the cut-in on"),
                     expected="a built-in model (idm, fvdm, constant), or a controller with before_cut_in controller: "
@@ -213,35 +201,30 @@ class Experiment(Section):
                     mend="Leave it out here, and test it in SUMO with `harness run`.",
                 )
             if acts and (built_in or self.campaign.testing.method != "shells"):
-                raise broken_rule(
+                yield broken_rule(
                     f"avs.{name}.before_cut_in",
                     found=av.before_cut_in,
                     expected="hold_speed, but for a controller with testing.method shells, which walks paths first",
                     mend="Leave the key out.",
                 )
-        return self
 
-    @model_validator(mode="after")
-    def _estimators_belong_to_the_method(self) -> Self:
+    def _about_the_method(self) -> Iterator[PydanticCustomError]:
+        """What the method does not allow."""
         method = self.campaign.testing.method
         judged = SAMPLING[method].estimators
         if wrong := set(self.results).difference(judged):
-            raise broken_rule(
-                "estimators",
-                found=", ".join(sorted(wrong)),
-                expected=f"for testing.method {method}: {', '.join(sorted(judged))}",
-                mend="Change one of the two.",
-            )
+            expected = f"for testing.method {method}: {', '.join(sorted(judged))}"
+            mend = "Change one of the two."
+            yield broken_rule("estimators", found=", ".join(sorted(wrong)), expected=expected, mend=mend)
         if self.limits and (method != "shells" or self.pairs):
-            raise broken_rule(
+            yield broken_rule(
                 "limits",
                 found="comparisons of two vehicles" if self.pairs else f"testing.method {method}",
                 expected="campaigns of single vehicles by testing.method shells, which alone decide",
                 mend="Delete the key.",
             )
         if self.fault is not None and method != "shells":
-            raise broken_rule("fault", found=f"a wrong shell for {method}", expected="method shells", mend="Delete it.")
-        return self
+            yield broken_rule("fault", found=f"a wrong shell for {method}", expected="method shells", mend="Delete it.")
 
 
 def load_experiment(path: Path, overrides: Sequence[str] = ()) -> Experiment:
@@ -255,8 +238,7 @@ def load_experiment(path: Path, overrides: Sequence[str] = ()) -> Experiment:
     data, lines = read_yaml(path)
     changes = [parse_override(text) for text in overrides]
     experiment = validated(apply_overrides(data, changes), Experiment, str(path), Places(lines, changes))
-    campaign = experiment.campaign
-    library = campaign.pool.library
+    library = experiment.campaign.pool.library
     if "/" not in library and not library.endswith((".yaml", ".yml")):
         return experiment
     file = (path.parent / library).resolve()
@@ -267,5 +249,4 @@ def load_experiment(path: Path, overrides: Sequence[str] = ()) -> Experiment:
             expected="a surrogate library, or the name of a shipped one",
             mend="Correct the path; it is relative to the folder of the experiment.",
         )
-    pool = campaign.pool.model_copy(update={"library": str(file)})
-    return experiment.model_copy(update={"campaign": campaign.model_copy(update={"pool": pool})})
+    return experiment.replaced(("campaign", "pool", "library"), str(file))

@@ -12,11 +12,11 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
-from scipy.stats import binomtest, norm
+from scipy.stats import binomtest
 
 from harness.arrays import FloatArray
 from harness.estimators.estimate import Estimate, finite_json
-from harness.estimators.intervals import clopper_pearson
+from harness.estimators.intervals import clopper_pearson, normal_half_width
 from harness.studies.truths import Known
 
 COVERAGE_CONFIDENCE = 0.95
@@ -30,18 +30,9 @@ WANTED_RHW = 0.3
 class Row:
     """What one replication of a campaign reported, and nothing that only the experimenter knows.
 
-    Attributes
-    ----------
-    result : str
-        Estimator, a statement of shells, a comparison with a reference driver, or the difference of two vehicles.
-    crash_rate : float
-        What is judged: a crash rate, or the ratio, share or difference that the result names; NaN if there is none.
-    reached : bool
-        Whether the asked precision was reached; False when none was asked.
-    n_crashes_outside : int
-        Crashes beyond the boundary; 0 where there are no shells.
-    refused : bool
-        Whether no interval was made, because crashes lie on too few paths: it is as wide as can be.
+    The result is an estimator, a statement of shells, a comparison with a reference driver, or the difference of two
+    vehicles; ``crash_rate`` is a rate, or the ratio, share or difference that it names; NaN if there is none. An
+    interval is refused, and as wide as can be, where crashes lie on too few paths.
     """
 
     result: str
@@ -68,18 +59,9 @@ def estimate_row(result: str, replication: int, found: Estimate, *, reached: boo
 class Subject:
     """What the experimenter knows about a vehicle or a chain.
 
-    Attributes
-    ----------
-    crash_rate : Known
-        The truth for all results that estimate it.
-    others : dict of Known
-        The truth for results that estimate something else.
-    crashes_outside : dict
-        For each result that assumes a boundary, the share of its crash rate beyond it.
-    left_out : tuple of str
-        Surrogates that are its equals.
-    boundary : str or None
-        Surrogate up to which strata are inside.
+    Its crash rate is the truth for all results but ``others``. ``crashes_outside`` is, for each result that assumes a
+    boundary, the share of its crash rate beyond it. Surrogates that are its equals are ``left_out``; strata up to that
+    of the surrogate ``boundary`` are inside.
     """
 
     name: str
@@ -110,30 +92,13 @@ class Subject:
 
 @dataclass(frozen=True)
 class Judgement:
-    """One method on one vehicle.
+    """One method on one vehicle; `harness validate --help` says what is printed of it.
 
-    Attributes
-    ----------
-    truth, scale : float
-        What it should have found, and what deviations are relative to: see `harness.studies.truths.Known`.
-    assumption_met : bool
-        False for a statement about vehicles that do not crash outside, and one that does; coverage is then not judged.
-    bias, bias_std_error : float
-        Of the mean estimate, relative to the scale, as is all that follows.
-    true_relvar, claimed_relvar : float
-        Variance over the squared scale: of the estimates around the truth, and the mean that they claim.
-    coverage, coverage_low, coverage_high : float
-        Share of intervals that hold the truth, with its own exact 95 % interval.
-    p_value, p_value_holm : float or None
-        That the coverage is no lower than nominal; corrected; None where it is not judged.
-    tests_median, tests_5, tests_95 : float
-    tests_for_wanted_rhw : float or None
-        Tests for RHW 0.3 by the true variance at this number of tests; None if the number was not fixed.
-    reached, alarm : float
-        Share of replications that reached the precision asked for, and in which a crash was seen outside.
-    refused : float
-        Share of replications without an interval, which count as covered. Where they have no value either, nothing else
-        takes notice of them.
+    Bias and relative variances are over the ``scale`` of the truth (`harness.studies.truths.Known`). The assumption is
+    not met by a statement about vehicles that do not crash outside, and one that does; coverage is not judged then, and
+    has no p-values. Tests for the wanted RHW, 0.3, follow from the true variance at this number of tests, if it was
+    fixed. ``reached`` is the share of replications that reached the precision asked for. Those refused count as
+    covered; where they have no value either, nothing else takes notice of them.
     """
 
     subject: str
@@ -172,28 +137,24 @@ class Judgement:
 
 
 def judge(subject: Subject, result: str, rows: Sequence[Row], confidence: float) -> Judgement:
-    """Judge one method on one vehicle; `corrected` then fills in the corrected p-values.
+    """Judge one method on one vehicle by its rows; `corrected` then fills in the corrected p-values.
 
-    Parameters
-    ----------
-    rows : sequence of Row
-        Of this vehicle and result.
-    confidence : float
-        Nominal coverage.
+    ``confidence`` is the nominal coverage.
     """
     columns = {field.name: np.array([getattr(row, field.name) for row in rows]) for field in fields(Row)}
     tests, reached = columns["n_tests"], columns["reached"]
     known, n = subject.truth(result), len(rows)
     truth, scale = known.value, known.scale
     said = np.isfinite(columns["crash_rate"])
-    errors, claimed = (columns["crash_rate"][said] - truth) / scale, columns["std_error"][said] / scale
+    with np.errstate(divide="ignore", invalid="ignore"):  # of what never crashes nothing relative is known
+        errors, claimed = (columns["crash_rate"][said] - truth) / scale, columns["std_error"][said] / scale
     covered = int(np.count_nonzero((columns["ci_low"] <= truth) & (truth <= columns["ci_high"])))
     low, high = map(float, clopper_pearson(covered, n, (1.0 - COVERAGE_CONFIDENCE) / 2.0))
     met = subject.meets_assumption_of(result)
     tests_5, median, tests_95 = (float(q) for q in np.quantile(tests, [0.05, 0.5, 0.95]))
     relvar = _mean(errors**2)
     fixed = not reached.any() and bool(np.all(tests == tests[0]))
-    z = float(norm.isf((1.0 - confidence) / 2.0))
+    z = normal_half_width(1.0, confidence)
     return Judgement(
         subject=subject.name,
         result=result,

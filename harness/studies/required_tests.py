@@ -20,26 +20,20 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.stats import norm
 
 from harness.arrays import BoolArray, FloatArray, IntArray
 from harness.estimators.block import Block, columns_of
 from harness.estimators.estimate import BothWays
+from harness.estimators.intervals import normal_half_width
 from harness.estimators.scv import Scv
 
 
 @dataclass(frozen=True)
 class Procedure:
-    """What the paper leaves to be chosen, and what it chose.
+    """What the paper leaves to be chosen, and what it chose: defaults of threshold, level and number of shuffles.
 
-    Attributes
-    ----------
-    rhw, confidence, n_shuffles : float, float, int
-        Threshold, level of the normal interval and orderings to average over; the defaults are the paper's.
-    first, ratio : int, float
-        Smallest prefix that is looked at, at least 2, and how much larger each next one is, above 1.
-    total : int or None
-        Largest prefix that is looked at; None, or more than there are tests, for all tests.
+    ``first`` is the smallest prefix that is looked at, at least 2, ``ratio`` how much larger each next one is, above 1,
+    ``total`` the largest one; None, or more than there are tests, for all tests.
     """
 
     rhw: float = 0.3
@@ -59,23 +53,18 @@ class Procedure:
             n = max(n + 1, int(n * self.ratio))
         return np.array([*sizes, total], dtype=np.int64)
 
+    @property
     def z(self) -> float:
         """Quantile of the normal interval."""
-        return float(norm.isf((1.0 - self.confidence) / 2.0))
+        return normal_half_width(1.0, self.confidence)
 
 
 @dataclass(frozen=True, eq=False)
 class RequiredTests:
-    """RNoT of every shuffle.
+    """RNoT ``n`` of every shuffle (s,), the total where the threshold is never reached.
 
-    Attributes
-    ----------
-    n : (s,) int
-        RNoT; the total where the threshold is never reached.
-    never_reached : (s,) bool
-        Shuffles that are above the threshold at the total.
-    never_above : (s,) bool
-        Shuffles that are nowhere above it; their n is that of the largest RHW, the smaller one of equals.
+    Shuffles ``never_reached`` (s,) are above it at the total. Those ``never_above`` (s,) it have the n of the largest
+    RHW, the smaller one of equals.
     """
 
     n: IntArray
@@ -98,15 +87,9 @@ class RequiredTests:
 
 
 def required_tests(rhw: FloatArray, grid: IntArray, threshold: float) -> RequiredTests:
-    """Read the RNoT off the RHW of every shuffle.
+    """Read the RNoT off the RHW (s, g) of every shuffle and prefix of the grid (g,).
 
-    Parameters
-    ----------
-    rhw : (s, g) float64
-        Per shuffle and prefix; infinite where nothing can be said. NaN counts as above any threshold.
-    grid : (g,) int
-        The prefixes, rising.
-    threshold : float
+    It is infinite where nothing can be said; NaN counts as above any threshold.
     """
     above = ~(rhw <= threshold)
     never_above = np.asarray(~above.any(axis=1))
@@ -135,19 +118,10 @@ def plain_rhw(
     hundred million naturalistic tests cost no more than their crashes. Failed tests count as no crash in the lower
     limit and as crashes in the upper one.
 
-    Parameters
-    ----------
-    weights : (k,) float64
-        Of the tests that crashed or failed, in the order of the records.
-    n_tests : int
-        All tests.
-    procedure : Procedure
-    done : callable
-        Called after each shuffle.
-    failed : (k,) bool, optional
-        Which of the ``weights`` are of failed tests.
+    ``weights`` (k,) are those of the tests that crashed or ``failed`` (k,), in the order of the records; ``done`` is
+    called after each shuffle.
     """
-    grid, z = procedure.grid(n_tests), procedure.z()
+    grid, z = procedure.grid(n_tests), procedure.z
     # A unit that makes equal weights 1, whose sums are exact; the smallest squares would underflow besides.
     worst = weights / np.max(weights, initial=0.0) if len(weights) else weights
     y = np.where(failed, 0.0, worst) if np.any(failed) else worst

@@ -42,7 +42,6 @@ class _Run:
     ``weights`` (k,) are those of the tests that crashed or failed, ``failed`` (k,) says which have failed.
     """
 
-    folder: Path
     n_tests: int
     weights: FloatArray
     failed: BoolArray
@@ -59,15 +58,7 @@ def required_tests_of_runs(
 ) -> dict[str, Any]:
     """RNoT of every run and estimator, and its AAR over the first of them, as JSON content.
 
-    Parameters
-    ----------
-    folders : sequence of Path
-        Run folders, of any method but ``shells``.
-    procedure : Procedure
-    estimators : sequence of str, optional
-        By default the plain one of each run: ``nde`` for naturalistic tests, ``nade`` for weighted ones.
-    progress : Progress, optional
-        Follows the shuffles.
+    The default estimator is the plain one of each run: ``nde`` for naturalistic tests, ``nade`` for weighted ones.
 
     Raises
     ------
@@ -80,14 +71,16 @@ def required_tests_of_runs(
     for folder in folders:
         run = _read(folder, with_ratios="scv" in estimators)
         plain: RnotEstimator = "nde" if run.sample.method == "nde" else "nade"
+        tests = {"n_episodes": run.n_tests, "n_crashes": int(np.count_nonzero(~run.failed))}
         for name in dict.fromkeys(estimators or [plain]):
             told.stage(f"{folder.name} {name}", procedure.n_shuffles)
+            row = {"run": str(folder), "estimator": name, **tests}
+            if reason := _REFUSAL[name](run.sample):
+                rows.append({**row, "mean": None, "reason": reason})
+                continue
             found = _found(run, name, procedure, told)
-            if isinstance(found, RequiredTests):
-                reference = reference or found
-                rows.append(_row(run, name, found, reference, procedure))
-            else:
-                rows.append({**_identity(run, name), "mean": None, "reason": found})
+            reference = reference or found
+            rows.append(row | _row(run, name, found, reference, procedure))
     content: dict[str, Any] = finite_json({**asdict(procedure), "rows": rows})
     return content
 
@@ -112,14 +105,10 @@ def _read(folder: Path, *, with_ratios: bool) -> _Run:
             kept.append(block)
     if sample is None:
         raise HarnessError(str(folder), found="no tests on record", expected="a run", mend="Run the campaign first.")
-    return _Run(folder, n, np.concatenate(weights), np.concatenate(failed), sample, joined(kept) if kept else None)
+    return _Run(n, np.concatenate(weights), np.concatenate(failed), sample, joined(kept) if kept else None)
 
 
-def _found(run: _Run, name: RnotEstimator, procedure: Procedure, progress: Progress) -> RequiredTests | str:
-    """RNoT, or the reason why there is none."""
-    if reason := _REFUSAL[name](run.sample):
-        return reason
-
+def _found(run: _Run, name: RnotEstimator, procedure: Procedure, progress: Progress) -> RequiredTests:
     def done() -> None:
         progress.advance(1)
 
@@ -131,18 +120,12 @@ def _found(run: _Run, name: RnotEstimator, procedure: Procedure, progress: Progr
     return required_tests(rhw, procedure.grid(run.n_tests), procedure.rhw)
 
 
-def _identity(run: _Run, name: RnotEstimator) -> dict[str, Any]:
-    tests = {"n_episodes": run.n_tests, "n_crashes": int(np.count_nonzero(~run.failed))}
-    return {"run": str(run.folder), "estimator": name, **tests}
-
-
 def _row(
     run: _Run, name: RnotEstimator, found: RequiredTests, reference: RequiredTests, procedure: Procedure
 ) -> dict[str, Any]:
     grid = procedure.grid(run.n_tests)
     ratio, side = acceleration(reference, found)
     return {
-        **_identity(run, name),
         "grid": f"{grid[0]:,} to {grid[-1]:,} by {procedure.ratio - 1.0:.3g} n ({len(grid)} looks)",
         "grid_points": len(grid),
         "total": int(grid[-1]),

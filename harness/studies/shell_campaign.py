@@ -1,17 +1,17 @@
-"""One shells campaign on a drawn pool: allocation, rounds, stop rule and estimator are those of a real campaign.
+"""Shells campaigns and comparisons on drawn pools: allocation, rounds, stop rule and estimator are those of real ones.
 
 Given the pool, the tests of a stratum are independent draws, so that the world is replaced by a few random numbers per
-stratum and round: how many tests fall into each of its cells, and how many of those crash. A real campaign draws from a
-systematic sample of the pool's cut-ins without replacement, which scatters no more than that.
+stratum and round: how many tests fall into each of its cells, and how many of those crash; of two vehicles, how many
+pairs end in which way. A real campaign draws from a systematic sample of the pool's cut-ins without replacement, which
+scatters no more than that.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Protocol
 
 import numpy as np
 
@@ -20,15 +20,20 @@ from harness.campaign.models import Accept, Campaign
 from harness.estimators.block import Block
 from harness.estimators.estimate import Estimate
 from harness.estimators.limit_search import Level
-from harness.estimators.round_stopping import RoundRule
+from harness.estimators.pairs import CRASH, NO_CRASH, PairCounts, no_pairs
+from harness.estimators.round_stopping import PairRule, RoundRule
 from harness.estimators.shells import Shells
+from harness.runner.pair_planner import PairPlanner
 from harness.runner.planner import ShellPlanner
-from harness.strata import ShellDesign
+from harness.strata import LIBRARY_STATEMENT, ShellDesign
 from harness.studies.experiment import Fault
 from harness.studies.judgement import Row, estimate_row
-from harness.studies.truths import preventable_by, ratio_to
+from harness.studies.truths import CONDITIONAL_DIFFERENCE, DIFFERENCE, preventable_by, ratio_to
 
 FREE = "shells"
+_CRASHING = ((CRASH, CRASH), (CRASH, NO_CRASH), (NO_CRASH, CRASH))
+"""How A and B end: both crash, only A, only B."""
+_STATEMENT = ("testing", "shells", "statement")
 
 
 def limit_at(factor: float) -> str:
@@ -67,14 +72,12 @@ class DrawnPool:
 
     def tests_of_cells(self, added: IntArray, rng: np.random.Generator) -> IntArray:
         """How many of so many tests of each stratum (S,) are of each cell, shape (C,)."""
-        found: IntArray = added if added.size == self.mass.shape[1] else rng.multinomial(added, self._cells).sum(0)
-        return found
-
-    @cached_property
-    def _cells(self) -> FloatArray:
-        """Probability of each cell given the stratum, shape (S, C)."""
+        if added.size == self.mass.shape[1]:
+            return added
         within = (self.design.joined * self.mass.sum(0)[:, None]).T
-        return np.asarray(within / np.maximum(within.sum(1, keepdims=True), np.finfo(np.float64).tiny))
+        p = within / np.maximum(within.sum(1, keepdims=True), np.finfo(np.float64).tiny)
+        found: IntArray = rng.multinomial(added, p).sum(0)
+        return found
 
     def crashed_paths(self, cell: int, n: int, rng: np.random.Generator) -> FloatArray:
         """Mass (n, C) of the paths of n crashed tests of a cell."""
@@ -83,41 +86,55 @@ class DrawnPool:
         return paths
 
 
-class ShellSource(Protocol):
-    """Where the pools of replications come from."""
-
-    def draw(self, rng: np.random.Generator) -> DrawnPool:
-        """A new pool."""
-        ...
+Draw = Callable[[np.random.Generator], Sequence[DrawnPool]]
+"""Draws a new pool: with the crashes of a vehicle, or without references where both of two crash, only A, only B."""
 
 
 @dataclass(frozen=True, eq=False)
-class ShellCampaign:
-    """A shells campaign to replicate; its stop rule, statement and first tests are used.
-
-    With ``limits``, by name, it is repeated until all of these are decided, as by ``accept``.
-    """
+class _Redrawn:
+    """A campaign to repeat, each time on a new pool."""
 
     campaign: Campaign
-    source: ShellSource
+    draw: Draw
     seed: int
     fault: Fault | None = None
-    limits: Mapping[str, float] = field(default_factory=dict)
 
     def run(self, replications: range) -> list[Row]:
-        """Rows of all statements for each replication, and of the comparisons with reference drivers; or of limits."""
-        rows = self._decide if self.limits else self._replicate
-        return [row for replication in replications for row in rows(replication)]
+        """Rows of all results for each replication."""
+        return [row for replication in replications for row in self.rows(replication)]
 
-    def _begin(self, replication: int) -> tuple[np.random.Generator, DrawnPool, ShellPlanner]:
+    def rows(self, replication: int) -> Iterator[Row]:
+        """Those of one replication."""
+        raise NotImplementedError
+
+    def _begin(self, replication: int) -> tuple[np.random.Generator, list[DrawnPool], IntArray]:
+        """Random numbers, the pool, and the most tests of each stratum."""
         rng = np.random.default_rng([self.seed, replication])
-        drawn = with_fault(self.source.draw(rng), self.fault)
-        available = np.full(drawn.design.p.size, self.campaign.pool.cut_ins_per_shell, np.int64)
-        return rng, drawn, ShellPlanner(self.campaign, drawn.design, available)
+        drawn = [_with_fault(pool, self.fault) for pool in self.draw(rng)]
+        return rng, drawn, np.full(drawn[0].design.p.size, self.campaign.pool.cut_ins_per_shell, np.int64)
 
-    def _decide(self, replication: int) -> Iterator[Row]:
+
+@dataclass(frozen=True, eq=False)
+class ShellCampaign(_Redrawn):
+    """A shells campaign to replicate; its stop rule, statement and first tests are used.
+
+    Judged are all statements and the comparisons with reference drivers. With ``limits``, by name, it is repeated until
+    all of these are decided, as by ``accept``, and they are judged instead.
+    """
+
+    limits: Mapping[str, float] = field(default_factory=dict)
+
+    def rows(self, replication: int) -> Iterator[Row]:
+        """See `_Redrawn`."""
+        rng, (drawn,), available = self._begin(replication)
+        planner = ShellPlanner(self.campaign, drawn.design, available)
+        rounds = self._decide if self.limits else self._replicate
+        return rounds(replication, rng, drawn, planner)
+
+    def _decide(
+        self, replication: int, rng: np.random.Generator, drawn: DrawnPool, planner: ShellPlanner
+    ) -> Iterator[Row]:
         """All limits from the same tests: what is tested next does not depend on any."""
-        rng, drawn, planner = self._begin(replication)
         pending = {
             name: RoundRule(self.campaign.model_copy(update={"accept": Accept(crash_rate_below=limit)}))
             for name, limit in self.limits.items()
@@ -145,10 +162,11 @@ class ShellCampaign:
             reached=verdict != "undecided",
         )
 
-    def _replicate(self, replication: int) -> Iterator[Row]:
-        rng, drawn, planner = self._begin(replication)
-        design = drawn.design
-        rules = {each.name: RoundRule(asking(self.campaign, each.name)) for each in design.statements}
+    def _replicate(
+        self, replication: int, rng: np.random.Generator, drawn: DrawnPool, planner: ShellPlanner
+    ) -> Iterator[Row]:
+        names = [each.name for each in drawn.design.statements]
+        rules = {name: RoundRule(self.campaign.replaced(_STATEMENT, name)) for name in names}
         known: dict[str, Row] = {}
         enough = False
         while not enough and (added := planner.next_round()).any():
@@ -159,9 +177,9 @@ class ShellCampaign:
         estimate = planner.seen.result(self.campaign.stop.confidence)
         outside = int(estimate.details["statements"][0]["n_crashes_outside"])
         yield estimate_row(FREE, replication, estimate, reached=planner.rule.reached, outside=outside)
-        for name in rules:
+        for name in names:
             yield known.get(name) or self._statement_row(planner.seen, name, replication, reached=False)
-        for reference in design.references:
+        for reference in drawn.design.references:
             yield from _reference_rows(estimate, reference.name, replication, reached=planner.rule.reached)
 
     def _statement_row(self, seen: Shells, name: str, replication: int, *, reached: bool) -> Row:
@@ -181,13 +199,7 @@ class ShellCampaign:
         )
 
 
-def asking(campaign: Campaign, statement: str) -> Campaign:
-    """The campaign, were it to end with a statement."""
-    shells = campaign.testing.shells.model_copy(update={"statement": statement})
-    return campaign.model_copy(update={"testing": campaign.testing.model_copy(update={"shells": shells})})
-
-
-def with_fault(drawn: DrawnPool, fault: Fault | None) -> DrawnPool:
+def _with_fault(drawn: DrawnPool, fault: Fault | None) -> DrawnPool:
     """The pool with probabilities that are not those of its paths."""
     if fault is None:
         return drawn
@@ -233,15 +245,55 @@ def _reference_rows(estimate: Estimate, reference: str, replication: int, *, rea
         (preventable_by(reference), "preventable", (math.nan, 0.0, 1.0)),
     ):
         value, low, high = widest if found is None else (found[key], found[f"{key}_low"], found[f"{key}_high"])
-        yield Row(
-            name,
+        counts, error = (estimate.n_episodes, estimate.n_crashes), (high - low) / 2.0 / z
+        yield Row(name, replication, *counts, value, error, low, high, reached, refused=found is None)
+
+
+@dataclass(frozen=True, eq=False)
+class PairedCampaign(_Redrawn):
+    """A comparison of two vehicles to replicate, by both statements; ``campaign`` is that of either vehicle."""
+
+    def rows(self, replication: int) -> Iterator[Row]:
+        """See `_Redrawn`."""
+        rng, drawn, available = self._begin(replication)
+        planner = PairPlanner(self.campaign, drawn[0].design, available, None)
+        pairs, early = no_pairs(drawn[0].design), None
+        inside, enough = PairRule(self.campaign.replaced(_STATEMENT, LIBRARY_STATEMENT), None), False
+        while not enough and (added := planner.next_round(pairs)).any():
+            pairs = _with_round(pairs, drawn, added, rng)
+            enough = planner.rule.observe(pairs)
+            if early is None:
+                inside.observe(pairs)
+                early = pairs.inside() if inside.reached else None
+        yield self._row(DIFFERENCE, replication, pairs, reached=planner.rule.reached)
+        yield self._row(CONDITIONAL_DIFFERENCE, replication, early or pairs.inside(), reached=early is not None)
+
+    def _row(self, result: str, replication: int, pairs: PairCounts, *, reached: bool) -> Row:
+        level = Level.two_sided(self.campaign.stop.confidence)
+        found = pairs.difference(level)
+        outside = pairs.ends[pairs.design.library.n_inside :]
+        return Row(
+            result,
             replication,
-            n_tests=estimate.n_episodes,
-            n_crashes=estimate.n_crashes,
-            crash_rate=value,
-            std_error=(high - low) / 2.0 / z,
-            ci_low=low,
-            ci_high=high,
+            n_tests=int(pairs.tests.sum()),
+            n_crashes=pairs.n_differing,
+            crash_rate=found.value,
+            std_error=found.half_width / level.z,
+            ci_low=found.ci_low,
+            ci_high=found.ci_high,
             reached=reached,
-            refused=found is None,
+            n_crashes_outside=int(outside.sum() - outside[:, NO_CRASH, NO_CRASH].sum()),
         )
+
+
+def _with_round(pairs: PairCounts, drawn: Sequence[DrawnPool], added: IntArray, rng: np.random.Generator) -> PairCounts:
+    """The pairs after a round of so many more of each stratum (S,), by a multinomial of each."""
+    share = np.column_stack([pool.share for pool in drawn])
+    share = np.column_stack([share, np.maximum(1.0 - share.sum(1), 0.0)])
+    counts = rng.multinomial(added, share / share.sum(1, keepdims=True))
+    ends, mass = pairs.ends.copy(), pairs.mass.copy()
+    ends[:, NO_CRASH, NO_CRASH] += counts[:, -1]
+    for kind, pool, of_kind in zip(_CRASHING, drawn, counts.T[:-1], strict=True):
+        ends[:, *kind] += of_kind
+        mass[:, *kind] += [pool.crashed_paths(s, k, rng).sum(0) for s, k in enumerate(of_kind.tolist())]
+    return PairCounts(pairs.design, ends, mass)

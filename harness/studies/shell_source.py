@@ -26,16 +26,9 @@ EQUAL_RATE = 0.02
 class DrawnCells:
     """Cells of a super-population's paths, of which pools are drawn.
 
-    Attributes
-    ----------
-    template : Pool
-        Pool without cut-ins, whose probabilities each draw replaces; ``n_paths`` is that of a pool.
-    left_out : tuple of str
-        Surrogates that are equals of a vehicle.
-    limit_mps2 : float
-        Hardest acceleration of the vehicles.
-    mass : ndarray, shape (n, C)
-        Probability of a cut-in of each cell, by path of the super-population.
+    The ``template`` is a pool without cut-ins, whose probabilities each draw replaces; ``left_out`` are surrogates that
+    are equals of a vehicle, ``limit_mps2`` is the hardest acceleration of the vehicles, and ``mass`` (n, C) the
+    probability of a cut-in of each cell, by path of the super-population.
     """
 
     template: Pool
@@ -83,50 +76,24 @@ class DrawnCells:
 
 @dataclass(frozen=True, eq=False)
 class OvertakingShells:
-    """Pools of one vehicle; see `harness.studies.shell_campaign.ShellSource`.
+    """Pools of a vehicle, or of two.
 
-    ``crashing`` (n, C) is the part of ``cells.mass`` on which the vehicle crashes, ``failing`` the share of its crashes
-    that end as failed tests.
+    ``crashing`` are the parts (n, C) of ``cells.mass`` on which the vehicle crashes, or both of two, only A, only B.
+    ``failing`` is the share of crashes that end as failed tests.
     """
 
     cells: DrawnCells
-    crashing: FloatArray
+    crashing: tuple[FloatArray, ...]
     failing: float = 0.0
 
-    @property
-    def crash_rate(self) -> float:
-        """That of the super-population."""
-        return float(self.crashing.sum() / len(self.crashing))
-
-    def draw(self, rng: np.random.Generator) -> DrawnPool:
-        """A new pool."""
-        design, (mass, crashing) = self.cells.draw(rng, [self.cells.mass, self.crashing])
-        return DrawnPool(design, mass, crashing, self.failing)
-
-
-@dataclass(frozen=True, eq=False)
-class OvertakingPairs:
-    """Pools of two vehicles; see `harness.studies.paired_campaign.PairSource`.
-
-    ``crashing`` are the masses (n, C) of cut-ins on which both crash, only A, and only B.
-    """
-
-    cells: DrawnCells
-    crashing: tuple[FloatArray, FloatArray, FloatArray]
-
     def draw(self, rng: np.random.Generator) -> list[DrawnPool]:
-        """A new pool: where both crash, only A, only B."""
+        """A new pool; see `harness.studies.shell_campaign.Draw`."""
         design, (mass, *crashing) = self.cells.draw(rng, [self.cells.mass, *self.crashing])
-        return [DrawnPool(design, mass, each) for each in crashing]
+        return [DrawnPool(design, mass, each, self.failing) for each in crashing]
 
 
 class Division:
-    """Cut-ins of a super-population, divided by a library without the equals of some vehicles.
-
-    Attributes
-    ----------
-    cells : DrawnCells
-    """
+    """Cut-ins of a super-population, divided into ``cells`` by a library without the equals of some vehicles."""
 
     def __init__(
         self,
@@ -171,9 +138,9 @@ class Division:
 
     def of_vehicle(self, crashing: FloatArray, failing: float = 0.0) -> OvertakingShells:
         """Pools of a vehicle that crashes on this mass of cut-ins (m,)."""
-        return OvertakingShells(self.cells, self.by_cell(crashing), failing)
+        return OvertakingShells(self.cells, (self.by_cell(crashing),), failing)
 
-    def of_pair(self, a: FloatArray, b: FloatArray) -> OvertakingPairs:
+    def of_pair(self, a: FloatArray, b: FloatArray) -> OvertakingShells:
         """Pools of two vehicles that crash on these masses of cut-ins (m,).
 
         Where either crashes on a share of a cut-in's episodes, by inattention or by what an adversary is made of, the
@@ -182,7 +149,7 @@ class Division:
         mass = self._population.mass
         both = a * np.divide(b, mass, out=np.zeros_like(mass), where=mass > 0.0)
         only_a, only_b = (np.maximum(one - both, 0.0) for one in (a, b))
-        return OvertakingPairs(self.cells, (self.by_cell(both), self.by_cell(only_a), self.by_cell(only_b)))
+        return OvertakingShells(self.cells, (self.by_cell(both), self.by_cell(only_a), self.by_cell(only_b)))
 
     def as_adversary(self, made: Adversary, crashing: FloatArray) -> FloatArray:
         """The mass of crashes (m,) of an adversary made of a vehicle; see `harness.studies.experiment.Adversary`."""
@@ -213,15 +180,8 @@ def equals(library: Library, population: SuperPopulation, crashing: FloatArray) 
 def leave_out(library: Library, names: set[str], careful_first: tuple[str, ...]) -> Library:
     """The library without a vehicle's equals; the envelope stays, and another surrogate takes over as boundary.
 
-    That is the next more careful one that is left, or the next more careless one if none is.
-
-    Parameters
-    ----------
-    library : Library
-    names : set of str
-        What to leave out.
-    careful_first : tuple of str
-        All surrogates, from careful to careless.
+    That is the next more careful one that is left, or the next more careless one if none is; ``careful_first`` are all
+    surrogates.
 
     Raises
     ------

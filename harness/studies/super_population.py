@@ -11,7 +11,6 @@ import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import cast
 
 import numpy as np
@@ -28,7 +27,7 @@ from harness.pool.cut_ins import environment_hash
 from harness.pool.library import Library
 from harness.pool.shells import acceleration_limit
 from harness.progress import Progress
-from harness.records.folder import write_atomically
+from harness.studies.work import write_table
 from harness.vehicles.models import driver_records
 
 MOST_DRIVERS = 62
@@ -42,14 +41,8 @@ _COLUMNS = ("path", "mass", "bits")
 class SuperPopulation:
     """Cut-ins of n paths on which at least one driver crashes.
 
-    Attributes
-    ----------
-    cut_in : ndarray, shape (n,)
-        Weighted probability of a cut-in, by path.
-    path, mass : ndarray of int64 and float64, shape (m,)
-        Path of each cut-in, ascending, and its weighted probability.
-    bits : ndarray of int64, shape (m,)
-        One bit per driver that crashes.
+    ``cut_in`` (n,) is the weighted probability of a cut-in, by path; ``path`` and ``mass`` (m,) are the path of each
+    cut-in, ascending, and its weighted probability; ``bits`` (m,) have one bit per driver that crashes.
     """
 
     cut_in: FloatArray
@@ -88,17 +81,9 @@ class Mixed:
 
 @dataclass(frozen=True, eq=False)
 class Drivers:
-    """All drivers of an enumeration, which are asked about the same cut-ins.
+    """All drivers of an enumeration (D,), which are asked about the same cut-ins.
 
-    Attributes
-    ----------
-    records : structured ndarray, shape (D,)
-    envelope : int
-        The driver that crashes wherever another one does; -1 if there is none.
-    vehicles : dict of Mixed
-        By name.
-    references : dict of int
-        The library's reference drivers by name.
+    The ``envelope`` crashes wherever another one does; -1 if there is none. Vehicles and reference drivers are by name.
     """
 
     records: RecordArray
@@ -110,9 +95,7 @@ class Drivers:
     def of(cls, library: Library, avs: Mapping[str, AutomatedVehicle], *, see_onset: bool = False) -> Drivers:
         """The library's, references last, in the order of its file, and then vehicles with built-in models.
 
-        ``see_onset`` is that of `harness.vehicles.models.driver_records`.
-
-        The envelope is the library's, unless a vehicle accelerates harder.
+        The envelope is the library's, unless a vehicle accelerates harder; ``see_onset`` is that of `driver_records`.
         """
         models = [*library.surrogates.values(), *library.references.values()]
         parameters: list[BuiltInParameters] = [model.parameters for model in models]
@@ -180,9 +163,12 @@ def cached(key: str, make: Callable[[], SuperPopulation]) -> SuperPopulation:
     """A population of a key, read from the cache or made and kept there."""
     file = cache_root() / "super_populations" / f"{key}.parquet"
     if file.is_file():
-        return _read(file)
+        table = pq.read_table(file, partitioning=None)
+        cut_in = np.frombuffer(table.schema.metadata[b"cut_in"], np.float64)
+        return SuperPopulation(cut_in, *(np.asarray(table.column(name)) for name in _COLUMNS))
     population = make()
-    _write(file, population)
+    table = pa.table({name: getattr(population, name) for name in _COLUMNS})
+    write_table(file, table.replace_schema_metadata({b"cut_in": population.cut_in.tobytes()}))
     return population
 
 
@@ -207,15 +193,3 @@ def population_key(environment: Environment, *content_of: object) -> str:
     """Hash of all that a population depends on: plain content, an environment, and code."""
     content = [_FORMAT, source_hash(WORLD_SOURCES), environment_hash(environment), *content_of]
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:24]
-
-
-def _write(file: Path, population: SuperPopulation) -> None:
-    table = pa.table({name: getattr(population, name) for name in _COLUMNS})
-    table = table.replace_schema_metadata({b"cut_in": population.cut_in.tobytes()})
-    write_atomically(file, lambda temporary: pq.write_table(table, temporary, compression="zstd"))
-
-
-def _read(file: Path) -> SuperPopulation:
-    table = pq.read_table(file, partitioning=None)
-    cut_in = np.frombuffer(table.schema.metadata[b"cut_in"], np.float64)
-    return SuperPopulation(cut_in, *(np.asarray(table.column(name)) for name in _COLUMNS))

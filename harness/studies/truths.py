@@ -80,47 +80,41 @@ def of_pair(population: SuperPopulation, a: FloatArray, b: FloatArray) -> dict[s
     return {DIFFERENCE: difference, CONDITIONAL_DIFFERENCE: difference}
 
 
-@dataclass(frozen=True, eq=False)
 class Truths:
-    """Paths that vehicles' truths are from: those of all, and those of some that they leave too imprecise."""
+    """Paths that vehicles' truths are from: aimed at all drivers, and again at some that these leave imprecise.
 
-    all: tuple[Drivers, SuperPopulation]
-    imprecise: tuple[Drivers, SuperPopulation] | None
+    Those mostly crash in quite other places than the rest. They are enumerated again with more paths, aimed at them
+    alone, and at vehicles that they are to be seen ``beside``.
+    """
 
-    @classmethod
-    def of(
-        cls,
+    def __init__(
+        self,
         environment: Environment,
         drivers: Drivers,
         seed: int,
         n_paths: int,
         progress: Progress,
         beside: Mapping[str, set[str]] | None = None,
-    ) -> Truths:
-        """Enumerate paths that are aimed at all drivers together.
-
-        Vehicles that this leaves too imprecise, mostly those that crash in quite other places than the rest, are
-        enumerated again with more paths, aimed at them alone, and at vehicles that they are to be seen ``beside``.
-        """
+    ) -> None:
         population = enumerate_paths(environment, drivers, seed, n_paths, progress)
-        first = cls((drivers, population), None)
-        imprecise = {name for name in drivers.vehicles if first.vehicle(name)[RATE].relative_error > LARGEST_ERROR}
-        if not imprecise:
-            return first
-        again = drivers.only(imprecise.union(*((beside or {}).get(name, set()) for name in imprecise)))
-        return cls(first.all, (again, enumerate_paths(environment, again, seed + 1, MORE_PATHS * n_paths, progress)))
+        self._enumerated = [(drivers, population)]
+        imprecise = {name for name in drivers.vehicles if self.vehicle(name)[RATE].relative_error > LARGEST_ERROR}
+        if imprecise:
+            again = drivers.only(imprecise.union(*((beside or {}).get(name, set()) for name in imprecise)))
+            population = enumerate_paths(environment, again, seed + 1, MORE_PATHS * n_paths, progress)
+            self._enumerated.insert(0, (again, population))
 
     def vehicle(self, name: str) -> dict[str, Known]:
         """Everything about one vehicle."""
-        drivers, population = self._where(name)
-        return of_vehicle(population, drivers.vehicles[name].crash_mass(population), drivers.references)
+        drivers, population, (crashing,) = self._where(name)
+        return of_vehicle(population, crashing, drivers.references)
 
     def pair(self, a: str, b: str) -> dict[str, Known]:
         """Everything about two vehicles."""
-        drivers, population = self._where(a, b)
-        return of_pair(population, *(drivers.vehicles[name].crash_mass(population) for name in (a, b)))
+        _, population, crashing = self._where(a, b)
+        return of_pair(population, *crashing)
 
-    def _where(self, *names: str) -> tuple[Drivers, SuperPopulation]:
-        if self.imprecise is not None and set(names) <= set(self.imprecise[0].vehicles):
-            return self.imprecise
-        return self.all
+    def _where(self, *names: str) -> tuple[Drivers, SuperPopulation, list[FloatArray]]:
+        """The most precise paths that have all of them, and their masses of crashes."""
+        drivers, population = next(found for found in self._enumerated if set(names) <= set(found[0].vehicles))
+        return drivers, population, [drivers.vehicles[name].crash_mass(population) for name in names]

@@ -41,11 +41,6 @@ CHUNK_PATHS = 1024
 """Paths that one task walks: some 15 MB of motion."""
 
 
-def vehicle_bit(resolved: Resolved) -> int:
-    """Which bit of a cut-in says whether the vehicle itself crashes: the one after the library's drivers."""
-    return resolved.library.n_drivers
-
-
 _SOURCES = ("studies/walked_population.py", "pool/shadow_paths.py", "pool/vehicle_pool.py", "controllers/hosts.py")
 """Files beside those of the world that decide what a vehicle meets, and is told."""
 Choose = Callable[[int, int], ShadowPaths]
@@ -115,7 +110,7 @@ def _walk(campaign_json: str, first: int, paths: ShadowPaths) -> SuperPopulation
     mass = probability * paths.weight[:, None]
     row, step = np.nonzero(mass > 0.0)
     crashes = _crashes(resolved, loop, first, paths, runs, row, step)
-    of_cut_ins = bits[row, step] | (crashes.astype(np.int64) << vehicle_bit(resolved))
+    of_cut_ins = bits[row, step] | (crashes.astype(np.int64) << library.n_drivers)  # the vehicle comes after these
     somebody = of_cut_ins != 0
     row, step = row[somebody], step[somebody]
     return SuperPopulation(mass.sum(1), first + row, mass[row, step], of_cut_ins[somebody])

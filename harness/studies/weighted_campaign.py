@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache
-from typing import Protocol
+from functools import cache, partial
 
 import numpy as np
 
@@ -29,49 +28,31 @@ CHUNK = 20_000
 """Episodes of several small replications that the twin runs at a time."""
 
 
-class EpisodeSource(Protocol):
-    """Where episodes come from: each index is an episode of its own, independent of all others."""
-
-    def block(self, first: int, n: int) -> Block:
-        """Episodes ``first … first + n - 1``."""
-        ...
+EpisodeSource = Callable[[int, int], Block]
+"""Gives so many episodes from a first one on: each index is an episode of its own, independent of all others."""
 
 
-@dataclass(frozen=True, eq=False)
-class ChainEpisodes:
+def chain_episodes(chain: Chain, method: Method, seed: int, first: int, n: int) -> Block:
     """Episodes of an exact chain; what is drawn depends on where a block begins."""
-
-    chain: Chain
-    method: Method
-    seed: int
-
-    def block(self, first: int, n: int) -> Block:
-        """See `EpisodeSource`."""
-        return draw(self.chain, self.method, n, np.random.default_rng([self.seed, first]), first_episode=first)
+    return draw(chain, method, n, np.random.default_rng([seed, first]), first_episode=first)
 
 
-class TwinEpisodes:
-    """Episodes of a campaign in the twin, without files; what the estimators need is kept.
+def twin_episodes(campaign: Campaign, seed: int, estimators: Sequence[EstimatorName]) -> EpisodeSource:
+    """Episodes of a campaign in the twin, without files; what the estimators need is kept."""
+    kept = "first_9" if "scv" in estimators else "none"
+    records = campaign.records.model_copy(update={"moments": kept, "traces": "none", "trace_share": 0.0})
+    return partial(_twin_block, campaign.model_copy(update={"seed": seed, "records": records}))
 
-    A process prepares the campaign when it is asked for the first block, and once only.
-    """
 
-    def __init__(self, campaign: Campaign, seed: int, estimators: Sequence[EstimatorName]) -> None:
-        self._moments = "scv" in estimators
-        kept = "first_9" if self._moments else "none"
-        records = campaign.records.model_copy(update={"moments": kept, "traces": "none", "trace_share": 0.0})
-        self._campaign = campaign.model_copy(update={"seed": seed, "records": records})
-
-    def block(self, first: int, n: int) -> Block:
-        """See `EpisodeSource`."""
-        prepared, loop = prepared_twin(self._campaign.model_dump_json())
-        tables = shard_tables(loop.run(first, prepared.states(first, n)), self._campaign.seed, keep_traces=False)
-        return block_from_tables(
-            tables.episodes,
-            tables.moments if self._moments else None,
-            method=self._campaign.testing.method,
-            alpha=mixture_weights(self._campaign),
-        )
+def _twin_block(campaign: Campaign, first: int, n: int) -> Block:
+    prepared, loop = prepared_twin(campaign.model_dump_json())
+    tables = shard_tables(loop.run(first, prepared.states(first, n)), campaign.seed, keep_traces=False)
+    return block_from_tables(
+        tables.episodes,
+        None if campaign.records.moments == "none" else tables.moments,
+        method=campaign.testing.method,
+        alpha=mixture_weights(campaign),
+    )
 
 
 @cache
@@ -97,7 +78,7 @@ class WeightedCampaign:
         at_once = max(1, CHUNK // each)
         for first in range(replications.start, replications.stop, at_once):
             n = min(at_once, replications.stop - first)
-            block = self.source.block(first * each, n * each)
+            block = self.source(first * each, n * each)
             for k in range(n):
                 rows += self._results(first + k, [block.take(slice(k * each, (k + 1) * each))])
         return rows
@@ -118,7 +99,7 @@ class WeightedCampaign:
         rule = StopRule(stop, campaign.testing.method, campaign.run.shard_size, min_crashes=campaign.min_crashes)
         watched, blocks, n = accumulator(rule.estimator), [], 0
         for look in rule.looks:
-            block = self.source.block(replication * stop.episodes + n, look - n)
+            block = self.source(replication * stop.episodes + n, look - n)
             watched.add(block)
             blocks.append(block)
             n = look

@@ -6,19 +6,17 @@ import numpy as np
 import pytest
 from scipy.stats import binomtest
 
-from harness.studies.chains.enumeration import enumerate_episodes
-from harness.studies.chains.named import frequent_decisive, overtaking, panel, rare_decisive
-from harness.studies.chains.sampler import draw
+from harness.studies.case_study.theorems import small_chains
+from harness.studies.chains.chain import enumerate_episodes
+from harness.studies.chains.named import frequent_decisive, overtaking, panel
+from harness.studies.chains.sampler import draw, mixture_weights
 
 from .seed import SEED
 
 
 def small() -> list:
-    return [
-        overtaking("small", skill=0.6, surrogates=[0.6, 0.3], level=0.05, horizon=4),
-        overtaking("immediate", skill=0.6, surrogates=[0.6, 0.3], level=0.05, horizon=4, challenge="immediate"),
-        rare_decisive(),
-    ]
+    immediate = {"surrogates": [0.6, 0.3], "challenge": "immediate"}
+    return [*small_chains(), overtaking("immediate", skill=0.6, level=0.05, horizon=4, **immediate)]
 
 
 def test_crash_rates_span_the_rare_range():
@@ -32,6 +30,26 @@ def test_backward_induction_is_the_sum_over_all_episodes(chain):
     episodes = enumerate_episodes(chain)
     assert episodes.p.sum() == pytest.approx(1.0, rel=1e-12)
     assert episodes.p @ episodes.crash == pytest.approx(chain.crash_rate, rel=1e-11)
+
+
+@pytest.mark.parametrize("chain", small_chains(), ids=lambda c: c.name)
+def test_whole_episodes_have_columns_of_mean_zero_and_lemma_1_bounds_their_variance(chain):
+    """Episode mixture with the forced cut-in as component 0: by that of the best component, and of no columns."""
+    episodes, alpha = enumerate_episodes(chain), mixture_weights(chain, "episode_mixture")
+    p, crashes = episodes.p, episodes.crash
+    ratios = np.column_stack([episodes.forced, episodes.ratios.prod(axis=1)])
+    mixture = ratios @ alpha
+    drawn = p * mixture
+    assert drawn.sum() == pytest.approx(1.0, rel=1e-11)
+    y, h = crashes / mixture, ratios / mixture[:, None] - 1.0
+    np.testing.assert_allclose(drawn @ h, 0.0, atol=1e-11)
+    assert drawn @ y == pytest.approx(chain.crash_rate, rel=1e-11)
+    single = (p * crashes) @ (1.0 / np.where(crashes[:, None], ratios, 1.0)) - chain.crash_rate**2
+    plain = drawn @ (y - chain.crash_rate) ** 2
+    covariance = drawn @ (h * (y - chain.crash_rate)[:, None])
+    best = plain - covariance @ np.linalg.pinv((h * drawn[:, None]).T @ h) @ covariance
+    assert best <= np.min(single / alpha) * (1.0 + 1e-9)
+    assert best <= plain * (1.0 + 1e-9)
 
 
 @pytest.mark.parametrize("chain", panel(), ids=lambda c: c.name)

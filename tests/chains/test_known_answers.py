@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 from scipy.stats import binomtest
 
 from harness.estimators import Estimate, one_pass
 from harness.estimators.nade import Nade
 from harness.studies.chains.named import frequent_decisive, panel, rare_decisive
-from harness.studies.chains.sampler import blocks
+from harness.studies.chains.sampler import Sampler, blocks
 
 from .seed import SEED
 
@@ -63,10 +64,19 @@ def test_diagnostics_of_the_defensive_mixture(chain):
     assert abs(cut_in["mean"] - chain.cut_in_rate) < 4.0 * cut_in["std_error"]
 
 
+class ForgetsTheCutIn(Sampler):
+    """Mutant: weights without the ratio of the step in which the cut-in was drawn."""
+
+    def _step_before(self, t, rows):
+        before = self.log_step.copy()
+        super()._step_before(t, rows)
+        cut = rows[self.cut_in[rows]]
+        self.log_step[cut] = before[cut]
+
+
 @pytest.mark.parametrize("chain", [panel()[0], frequent_decisive()], ids=lambda c: c.name)
 def test_a_dropped_ratio_is_caught(chain):
     """The check has teeth: leave the cut-in's own ratio out and the answer is off by far more than four errors."""
     wrong = Nade()
-    for block in blocks(chain, "step_mixture", SIZES, SEED, forget_cut_in=True):
-        wrong.add(block)
+    wrong.add(ForgetsTheCutIn(chain, "step_mixture", sum(SIZES), np.random.default_rng(SEED)).run(0))
     assert standard_errors_off(chain, wrong.result(0.9)) > 8.0

@@ -15,9 +15,9 @@ from harness.cli import main
 from harness.progress import Progress
 from harness.report.number_format import number
 from harness.studies import run as studies_run
-from harness.studies.case_study import required, tested
-from harness.studies.case_study.claimed import Claims, weights_are_in
+from harness.studies.case_study import context, required, tested
 from harness.studies.case_study.context import Context, Made
+from harness.studies.case_study.control_variates import Claims
 from harness.studies.case_study.figures import (
     exactly,
     figure,
@@ -26,12 +26,16 @@ from harness.studies.case_study.figures import (
     ratio_of_means,
     ratio_of_variances,
     verdict,
+    weights_are_in,
 )
 from harness.studies.case_study.page import asked, count, shown
-from harness.studies.case_study.replicated import replicate
+from harness.studies.case_study.repeated import replicate
 from harness.studies.case_study.steps import run_study, step_keys
 from harness.studies.case_study.study_file import Replications, load_study
 from harness.studies.required_tests import RequiredTests
+from tests.pool.conftest import SMALL_POOL
+
+from .here import Here, Interrupting
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
 SHIPPED = SCENARIOS / "case_study" / "study.yaml"
@@ -75,21 +79,6 @@ claims:
   - {{says: "a | bound", where: V-B, paper: 1, ours: theorems.variance_over_bound, at_most: true}}
   - {{says: wrong, where: nowhere, paper: 123.0, ours: theorems.best_over_plain, why: it was made up}}
 """
-
-
-class Interrupting(Progress):
-    """Ends the work after some advances within a stage, as Ctrl-C would."""
-
-    def __init__(self, stage: str, after: int) -> None:
-        self._asked, self._left, self._stage = stage, after, ""
-
-    def stage(self, name: str, total: int | None, *, done: int = 0) -> None:
-        self._stage = name
-
-    def advance(self, n: int) -> None:
-        self._left -= self._stage.startswith(self._asked)
-        if self._left == 0:
-            raise KeyboardInterrupt
 
 
 def written(folder: Path) -> dict[str, tuple[int, bytes]]:
@@ -148,23 +137,11 @@ def test_a_killed_step_goes_on_from_its_parts(tmp_path, monkeypatch, made):
     seen: list[tuple[int, int]] = []
     really = tested.crashes_in_twin
     monkeypatch.setattr(tested, "crashes_in_twin", lambda campaign, part: seen.append(part) or really(campaign, part))
-    monkeypatch.setattr(tested, "worker_processes", lambda workers: Here())
+    monkeypatch.setattr(context, "worker_processes", lambda workers: Here())
     run_study(asked_for, folder, workers=1)
     assert [first for first, _ in seen] == [4_000]
     assert pq.read_table(step / "crashes.parquet").equals(pq.read_table(made["nde"].folder / "crashes.parquet"))
     assert not (step / "parts").exists()
-
-
-class Here:
-    """An executor in this process."""
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *error):
-        return None
-
-    map = staticmethod(map)
 
 
 def test_a_killed_run_goes_on_from_its_shards(tmp_path, study, made):
@@ -225,9 +202,8 @@ def test_killed_replications_go_on_from_the_last_ones(tmp_path, monkeypatch):
     results = []
     for folder, progress in ((whole, Progress()), (killed, Interrupting("replications", 2)), (killed, Progress())):
         folder.mkdir(exist_ok=True)
-        context = Context(folder, 0.3, 0.9, {}, 1, progress)
         try:
-            results.append(replicate(step, context))
+            results.append(replicate(step, Context(folder, 0.3, 0.9, {}, 1, progress)))
         except KeyboardInterrupt:
             assert seen[4:] == [range(1), range(1, 2)]
             seen.clear()
@@ -322,12 +298,10 @@ steps:
     kind: variants
     title: Table
     campaign: {SCENARIOS}/overtaking_forced.yaml
-    set: [environment.lane_change_level=1e4]
     tests: 4_000
     avs: [alpha-0.5]
     shells: {SCENARIOS}/smoke.yaml
-    shells_set: [environment.lane_change_level=1e4, stop.rhw=0.3, testing.shells.first_tests=null,
-                 pool.relative_error=0.03, pool.cut_ins_per_shell=1500]
+    shells_set: [stop.rhw=0.3, testing.shells.first_tests=null, {", ".join(SMALL_POOL)}]
     reported: {{alpha-0.5: 11.52}}
 """)
     done = run_study(load_study(file), tmp_path / "out", workers=1)
@@ -343,8 +317,8 @@ def test_the_theorems_hold_on_exact_chains(made):
     assert figures["largest_bias"]["value"] < 1e-10
     assert figures["variance_over_bound"]["value"] <= 1.0
     assert figures["best_over_plain"]["value"] <= 1.0 + 1e-9
-    assert figures["largest_error_known"]["value"] < 1e-9
-    assert figures["claimed_error_estimated"]["value"] < 1e-9
+    assert figures["largest_error_known"]["value"] < 1e-12
+    assert figures["claimed_error_estimated"]["value"] < 1e-12
     assert figures["scatter_estimated"]["value"] > 0.01
 
 
@@ -467,7 +441,7 @@ def test_relative_variance_of_known_weights():
     n = 4_000
     episode = np.arange(0, n, 10)
     weight = np.where(episode % 20 == 0, 1.0, 3.0)
-    tests = tested.Tests(n, episode, weight, np.ones_like(episode), np.zeros(len(episode), bool))
+    tests = tested.Tests(n, episode, weight, np.zeros(len(episode), bool))
     found = tested.relative_variance(tests)
     assert found["value"] == pytest.approx(0.5 / 0.2**2 - 1.0, rel=1e-12)
     assert found["low"] == pytest.approx(found["value"], rel=1e-9)

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 
 from harness.studies.judgement import Row, Subject, corrected, holm, judge
+from harness.studies.truths import Known
 
 
 def rows(rates, half: float, tests: int = 100, outside: int = 0) -> list[Row]:
@@ -58,3 +61,29 @@ def test_the_number_of_tests_is_described_by_its_quantiles():
     found = judge(Subject.exact("a", 1.0), "x", of, 0.9)
     assert (found.tests_5, found.tests_median, found.tests_95) == (6.0, 51.0, 96.0)
     assert found.tests_for_wanted_rhw is None
+
+
+def test_a_difference_of_nothing_is_judged_relative_to_the_rates():
+    subject = Subject("equal", Known(2.0, 0.0, 2.0), {"x": Known(0.0, 0.0, 2.0)})
+    errors = np.random.default_rng(2).normal(0.0, 0.2, 2000)
+    found = judge(subject, "x", rows(errors, 0.329), 0.9)
+    assert found.truth == 0.0
+    assert found.true_relvar == pytest.approx(0.01, rel=0.1)
+    assert found.claimed_relvar == pytest.approx(0.01, rel=1e-3)
+    assert abs(found.bias) < 4.0 * found.bias_std_error
+    assert found.coverage_low < 0.9 < found.coverage_high
+    shifted = judge(subject, "x", rows(errors + 0.2, 0.329), 0.9)
+    assert shifted.p_value < 1e-6
+    assert shifted.bias == pytest.approx(0.1, abs=0.01)
+
+
+def test_a_refusal_counts_as_covered_and_says_nothing_else():
+    subject = Subject("a", Known(1.0, 0.0, 1.0))
+    said = rows([1.1] * 6, 0.2)
+    refused = [Row("x", k, 100, 5, math.nan, math.inf, 0.0, math.inf, False, refused=True) for k in range(4)]
+    found = judge(subject, "x", said + refused, 0.9)
+    assert (found.covered, found.refused) == (10, 0.4)
+    assert found.bias == pytest.approx(0.1)
+    assert found.to_json()["true_relvar"] == pytest.approx(0.01)
+    nothing = judge(subject, "x", refused, 0.9)
+    assert nothing.to_json()["bias"] is None

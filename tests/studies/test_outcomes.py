@@ -55,7 +55,7 @@ def test_shells_add_up(chain):
 
 def test_drawn_pools_scatter_around_the_exact_probabilities(chain):
     source = ChainShells(chain, 512)
-    drawn = [source.draw(np.random.default_rng([1, k])) for k in range(200)]
+    drawn = [source.draw(np.random.default_rng([1, k]))[0] for k in range(200)]
     p = np.array([each.design.p for each in drawn])
     crash = np.array([each.design.p * each.share for each in drawn])
     for found, exact in ((p, source.shell_p), (crash, source.crash_p)):

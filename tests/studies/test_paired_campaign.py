@@ -9,8 +9,8 @@ import pytest
 
 from harness.campaign.loading import load_campaign
 from harness.strata import ShellDesign, Statement
-from harness.studies.paired_campaign import CONDITIONAL_DIFFERENCE, DIFFERENCE, PairedCampaign
-from harness.studies.shell_campaign import DrawnPool
+from harness.studies.shell_campaign import DrawnPool, PairedCampaign
+from harness.studies.truths import CONDITIONAL_DIFFERENCE, DIFFERENCE
 
 SMOKE = Path(__file__).parents[2] / "scenarios/smoke.yaml"
 P = np.array([1e-7, 2e-7, 3e-6])
@@ -21,22 +21,20 @@ REPLICATIONS = 120
 """At 0.9 a standard error of 0.027: three of them below 0.9 is 0.818."""
 
 
-class KnownPool:
+def known_pool(_rng):
     """A pool without error of its own."""
-
-    def draw(self, _rng):
-        design = ShellDesign(
-            pool="0" * 24, strata=("a", "b", "outside"), cell_stratum=(0, 1, 2), cell_p=P, n_paths=10**12,
-            statements=(Statement("library", "b", "keeps to b", 2),), p_cut_in=float(P.sum()), p_impossible=0.0,
-        )  # fmt: skip
-        mass = np.diag(P)
-        return [DrawnPool(design, mass, mass * share) for share in (BOTH, ONLY_A, ONLY_B)]
+    design = ShellDesign(
+        pool="0" * 24, strata=("a", "b", "outside"), cell_stratum=(0, 1, 2), cell_p=P, n_paths=10**12,
+        statements=(Statement("library", "b", "keeps to b", 2),), p_cut_in=float(P.sum()), p_impossible=0.0,
+    )  # fmt: skip
+    mass = np.diag(P)
+    return [DrawnPool(design, mass, mass * share) for share in (BOTH, ONLY_A, ONLY_B)]
 
 
 @pytest.fixture(scope="module")
 def rows():
     campaign = load_campaign(SMOKE, ["world.engine=twin", "stop.rhw=0.5", "testing.shells.first_tests=12"])
-    found = PairedCampaign(campaign, KnownPool(), seed=3).run(range(REPLICATIONS))
+    found = PairedCampaign(campaign, known_pool, seed=3).run(range(REPLICATIONS))
     return {name: [row for row in found if row.result == name] for name in (DIFFERENCE, CONDITIONAL_DIFFERENCE)}
 
 

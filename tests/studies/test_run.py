@@ -10,15 +10,22 @@ import subprocess
 import sys
 import time
 from concurrent.futures.process import BrokenProcessPool
+from dataclasses import asdict
 
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
 from harness.campaign.models import Campaign
 from harness.cli import main
 from harness.methods import SAMPLING
-from harness.studies.run import worker_processes
-from harness.studies.weighted_campaign import TwinEpisodes, WeightedCampaign
+from harness.studies import run
+from harness.studies.experiment import load_experiment
+from harness.studies.judgement import Row, Subject, judge
+from harness.studies.weighted_campaign import WeightedCampaign, twin_episodes
+from harness.studies.work import worker_processes
+
+from .here import Here
 
 CHAINS = """
 format: validation-experiment
@@ -48,9 +55,11 @@ avs: {table-1: {}}
 def folders(tmp_path_factory):
     root = tmp_path_factory.mktemp("validate")
     (root / "x.yaml").write_text(CHAINS)
-    for workers in ("1", "2"):
-        assert main(["validate", str(root / "x.yaml"), "--out", str(root / workers), "--workers", workers]) == 0
-    return root / "1", root / "2"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(run, "worker_processes", lambda workers: Here())
+        assert main(["validate", str(root / "x.yaml"), "--out", str(root / "here")]) == 0
+    assert main(["validate", str(root / "x.yaml"), "--out", str(root / "2"), "--workers", "2"]) == 0
+    return root / "here", root / "2"
 
 
 def test_the_folder_holds_everything(folders):
@@ -75,19 +84,30 @@ def test_the_online_rule_is_followed(folders):
         assert row["reached"] == (rhw <= 0.5 and row["n_crashes"] > 0)
 
 
+def test_what_never_crashes_has_results_too(tmp_path):
+    (tmp_path / "x.yaml").write_text(CHAINS)
+    never, rows = Subject.exact("never", 0.0), [Row("x", k, 9, 0, 0.0, 0.0, 0.0, 0.1, False) for k in range(5)]
+    table = pa.Table.from_pylist([asdict(row) for row in rows])
+    run._write(tmp_path, load_experiment(tmp_path / "x.yaml"), [judge(never, "x", rows, 0.9)], [((never, None), table)])
+    content = json.loads((tmp_path / "results.json").read_text())
+    assert content["largest_relative_error_of_truth"] is None
+    assert [(one["bias"], one["coverage"]) for one in content["judgements"]] == [(None, 1.0)]
+
+
 @pytest.mark.parametrize("method", ["nde", "forced", "step_mixture", "episode_mixture"])
 def test_every_result_that_may_be_asked_for_is_given(method):
     """At a level of lane changing at which crashes are frequent."""
     settings = {"environment": {"lane_change_level": 1e3}, "testing": {"method": method}, "stop": {"episodes": 300}}
     campaign = Campaign.model_validate({"name": "x", "world": {"engine": "twin"}, **settings})
     estimators = sorted(SAMPLING[method].estimators)
-    rows = WeightedCampaign(campaign, TwinEpisodes(campaign, 5, estimators), estimators).run(range(2))
+    rows = WeightedCampaign(campaign, twin_episodes(campaign, 5, estimators), estimators).run(range(2))
     assert [row.result for row in rows] == [*estimators, *estimators]
 
 
-def test_weighted_methods_run_in_the_twin(tmp_path, capsys):
+def test_weighted_methods_run_in_the_twin(tmp_path, capsys, monkeypatch):
     (tmp_path / "x.yaml").write_text(TWIN)
-    assert main(["validate", str(tmp_path / "x.yaml"), "--out", str(tmp_path / "out"), "--workers", "1"]) == 0
+    monkeypatch.setattr(run, "worker_processes", lambda workers: Here())
+    assert main(["validate", str(tmp_path / "x.yaml"), "--out", str(tmp_path / "out")]) == 0
     assert "table-1" in capsys.readouterr().out
     (found,) = json.loads((tmp_path / "out" / "results.json").read_text())["judgements"]
     assert found["result"] == "nade"
@@ -97,7 +117,7 @@ def test_weighted_methods_run_in_the_twin(tmp_path, capsys):
 
 PARENT = """
 import os, time
-from harness.studies.run import worker_processes
+from harness.studies.work import worker_processes
 
 if __name__ == "__main__":
     with worker_processes(1) as executor:

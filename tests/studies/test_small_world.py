@@ -8,12 +8,14 @@ import pytest
 from harness.campaign.models import AutomatedVehicle
 from harness.estimators.nade import Nade
 from harness.progress import Progress
-from harness.studies.case_study import small_case
+from harness.studies.case_study import context, small_case
 from harness.studies.case_study.context import Context
 from harness.studies.case_study.small_world import AV_MPS, HOLD, Proposal, _crashes, small_world
 from harness.studies.case_study.study_file import SmallCase
 from harness.vehicles.models import av_records
 from tests.chains.seed import SEED
+
+from .here import Here
 
 
 @pytest.fixture(scope="module")
@@ -78,32 +80,12 @@ def test_nothing_is_controlled_below_the_threshold(world):
     assert world.relvar(some) > world.relvar(every)
 
 
-class Here:
-    """An executor in this process."""
-
-    map = staticmethod(map)
-    __enter__ = __exit__ = lambda self, *_: self if not _ else None
-
-
-class Interrupting(Progress):
-    """Ends the work after its first part, as Ctrl-C would."""
-
-    def advance(self, n: int) -> None:
-        raise KeyboardInterrupt
-
-
-def test_the_case_is_answered_and_goes_on_when_killed(world, tmp_path, monkeypatch):
+def test_the_case_is_answered(world, tmp_path, monkeypatch):
     monkeypatch.setattr(small_case, "_world", lambda level: world)
-    monkeypatch.setattr(small_case, "worker_processes", lambda workers: Here())
+    monkeypatch.setattr(context, "worker_processes", lambda workers: Here())
     sizes = {"epsilons": [0.8], "thresholds": [0.0, 4.5e-4], "tests": 2_000, "draws": 3}
     step = SmallCase(kind="small_case", lane_change_level=1e4, **sizes, reported={"nade": 385.0, "scv": 12.0})
-    contexts = [Context(tmp_path, 0.3, 0.9, {}, 1, progress) for progress in (Interrupting(), Progress())]
-    with pytest.raises(KeyboardInterrupt):
-        small_case.answer_small_case(step, contexts[0])
-    (part,) = (tmp_path / "parts").iterdir()
-    first = part.stat().st_mtime_ns
-    found = small_case.answer_small_case(step, contexts[1])
-    assert part.stat().st_mtime_ns == first
+    found = small_case.answer_small_case(step, Context(tmp_path, 0.3, 0.9, {}, 1, Progress()))
     assert [(row["challenge"], row["threshold"]) for row in found["settings"]] == [
         ("immediate", 0.0),
         ("immediate", 4.5e-4),

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import pyarrow as pa
+
 from harness.progress import Progress
+from harness.studies.work import kept_parts, worker_processes
 
 
 class Made(NamedTuple):
@@ -21,16 +24,9 @@ class Made(NamedTuple):
 class Context:
     """Where and how a step is made.
 
-    Attributes
-    ----------
-    folder : Path
-        The step's own; what it finds there it has left itself when it was killed.
-    rhw, confidence : float
-        What required numbers of tests are for.
-    made : mapping
-        Steps made before, by name.
-    workers : int or None
-        Processes; None for one per core.
+    The folder is the step's own: what it finds there it has left itself when it was killed. Required numbers of tests
+    are for ``rhw`` at a ``confidence``; ``made`` are the steps made before, by name. Without ``workers`` there is one
+    for each core.
     """
 
     folder: Path
@@ -44,3 +40,15 @@ class Context:
     def name(self) -> str:
         """The step's, which its folder's begins with."""
         return self.folder.name.rpartition("-")[0]
+
+    @property
+    def parts(self) -> Path:
+        """Where what is finished is kept until the step is."""
+        return self.folder / "parts"
+
+    def by_workers(
+        self, jobs: Sequence[Any], make: Callable[[Any], pa.Table], size: Callable[[Any], int] = lambda _job: 1
+    ) -> list[pa.Table]:
+        """Tables of all jobs, made by worker processes; see `kept_parts`."""
+        with worker_processes(self.workers) as executor:
+            return kept_parts(self.parts, self.name, jobs, make, self.progress, run=executor.map, size=size)

@@ -7,8 +7,11 @@ from collections.abc import Iterable, Sequence
 from typing import Any, Literal
 
 import numpy as np
-from scipy.stats import norm
 from scipy.stats import t as student
+
+from harness.estimators.diagnostics import CARELESS_MEAN
+from harness.estimators.intervals import normal_half_width
+from harness.methods import Method
 
 Verdict = Literal["reproduced", "not reproduced", "cannot be told", "ours to choose"]
 
@@ -32,6 +35,11 @@ def marked(found: dict[str, Any], *, settled: bool) -> dict[str, Any]:
 def is_settled(*found: dict[str, Any]) -> bool:
     """Whether none of them is marked."""
     return all(each.get("settled", True) for each in found)
+
+
+def weights_are_in(method: Method, mean_weight: float) -> bool:
+    """Whether the large weights of the step mixture, which nothing bounds, have come in: their mean is 1 if so."""
+    return method != "step_mixture" or mean_weight >= CARELESS_MEAN
 
 
 def mean_of(values: Iterable[float | None], confidence: float) -> dict[str, Any]:
@@ -69,22 +77,24 @@ def ratio_of_variances(above: Sequence[float], below: Sequence[float], confidenc
     return figure(value, max(value - half, 0.0), value + half)
 
 
+def ratio(above: dict[str, Any], below: dict[str, Any]) -> dict[str, Any]:
+    """Ratio of two independent results, its limits from theirs on the logarithmic scale (Zou and Donner's MOVER)."""
+    if not above["value"] or not below["value"]:
+        return figure(None)
+    value = above["value"] / below["value"]
+    if not (above["low"] and below["low"]):
+        return figure(value)
+    down = math.hypot(math.log(above["value"] / above["low"]), math.log(below["high"] / below["value"]))
+    up = math.hypot(math.log(above["high"] / above["value"]), math.log(below["value"] / below["low"]))
+    return marked(figure(value, value * math.exp(-down), value * math.exp(up)), settled=is_settled(above, below))
+
+
 def verdict(paper: float, found: dict[str, Any], *, within: float, tolerance: float | None, at_most: bool) -> Verdict:
     """Whether the whole interval of our number agrees with the paper's, or all of it differs.
 
     An interval that does neither leaves it open, as does a number that is not known, or is marked as not settled.
-
-    Parameters
-    ----------
-    paper : float
-    found : dict
-        As `figure` gives it; an end that is None is open.
-    within : float
-        Factor up to which numbers agree.
-    tolerance : float or None
-        Distance up to which they agree, instead: where the paper's number is 0.
-    at_most : bool
-        Whether the paper's number is a limit that ours is not to exceed, whatever the factor.
+    Numbers agree up to the factor ``within``, or up to the distance ``tolerance``, where the paper's is 0; with
+    ``at_most`` the paper's is a limit that ours is not to exceed.
     """
     if not is_settled(found) or (found["value"] is None and found["low"] is None):
         return "cannot be told"
@@ -94,18 +104,12 @@ def verdict(paper: float, found: dict[str, Any], *, within: float, tolerance: fl
     if tolerance is not None:
         least, most = paper - tolerance, paper + tolerance
     if at_most:
-        least = -math.inf
-        most = paper
+        least, most = -math.inf, paper
     if least <= low and high <= most:
         return "reproduced"
     return "not reproduced" if high < least or low > most else "cannot be told"
 
 
-def z_of(confidence: float) -> float:
-    """Quantile of the two-sided normal interval."""
-    return float(norm.isf((1.0 - confidence) / 2.0))
-
-
 def tests_for(relvar: float, rhw: float, confidence: float) -> float:
     """Tests after which a mean of this relative variance per test has the relative half-width."""
-    return relvar * (z_of(confidence) / rhw) ** 2
+    return relvar * (normal_half_width(1.0, confidence) / rhw) ** 2

@@ -30,8 +30,8 @@ from harness.report.plot_style import (
     tick_label,
 )
 from harness.studies.case_study.context import Made
-from harness.studies.case_study.convergence import CURVES
 from harness.studies.case_study.figures import is_settled
+from harness.studies.case_study.required import CURVES
 from harness.studies.case_study.study_file import Convergence, Line, Study
 
 _COLOURS = (INK, BLUE, VERMILLION, GREEN)

@@ -1,20 +1,21 @@
-"""Required numbers of tests over shuffles, and their ratios: the paper's averages (RNoT, AAR)."""
+"""Required numbers of tests: as rate and half-width settle, and the paper's averages over shuffles (RNoT, AAR)."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from itertools import takewhile
 from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
 
+from harness.arrays import FloatArray, IntArray
 from harness.estimators.block import Block, joined
 from harness.runner.stored_estimates import stored_blocks
 from harness.studies.case_study.context import Context, Made
-from harness.studies.case_study.figures import figure, marked, mean_of, ratio_of_means
-from harness.studies.case_study.study_file import RequiredNumbers
-from harness.studies.case_study.tested import PARTS, read_tests, settled
-from harness.studies.kept_parts import kept_parts, write_table
+from harness.studies.case_study.control_variates import cut_at
+from harness.studies.case_study.figures import exactly, figure, marked, mean_of, ratio, ratio_of_means
+from harness.studies.case_study.study_file import Convergence, RequiredNumbers
+from harness.studies.case_study.tested import Tests, read_tests, settled
 from harness.studies.required_tests import (
     Procedure,
     RequiredTests,
@@ -22,7 +23,40 @@ from harness.studies.required_tests import (
     plain_rhw,
     required_tests,
     scv_rhw_of,
+    total_and_half_width,
 )
+from harness.studies.work import kept_parts, write_table
+
+CURVES = "curves.parquet"
+
+
+def draw_convergence(step: Convergence, context: Context) -> dict[str, Any]:
+    """Curves as Parquet; how many tests each needed in the order in which it was tested; rates over the reference's."""
+    procedure = Procedure(context.rhw, context.confidence)
+    tables, figures = list[pa.Table](), dict[str, Any]()
+    reference = context.made[step.reference].result["figures"]["crash_rate"]
+    for name in step.of:
+        tests = read_tests(context.made[name])
+        n, rate, half = curve(tests, procedure)
+        tables.append(pa.table({"step": [name] * len(n), "n": n, "crash_rate": rate, "half_width": half}))
+        rhw = np.divide(half, rate, out=np.full(len(n), np.inf), where=rate > 0.0)
+        required = required_tests(rhw[None, :], n, procedure.rhw)
+        found = {
+            "settled": figure(None, tests.n) if required.is_lower_limit else exactly(required.n[0]),
+            "rhw": exactly(rhw[-1]) if np.isfinite(rhw[-1]) else figure(None),
+            "over_reference": ratio(context.made[name].result["figures"]["crash_rate"], reference),
+        }
+        is_in = settled(context.made[name])
+        figures |= {f"{name}.{key}": marked(each, settled=is_in) for key, each in found.items()}
+    write_table(context.folder / CURVES, pa.concat_tables(tables))
+    return {"figures": figures}
+
+
+def curve(tests: Tests, procedure: Procedure) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Numbers of tests (g,), and after each the mean of Y and the half-width of its normal interval."""
+    n = procedure.grid(tests.n)
+    total, half = total_and_half_width(tests.y, np.searchsorted(tests.episode, n), n, procedure.z)
+    return n, total / n, half / n
 
 
 class _Found(NamedTuple):
@@ -89,17 +123,10 @@ def _scv(made: Made, procedure: Procedure, context: Context, *, first: int) -> _
 
     def rhw_of(shuffle: int) -> pa.Table:
         if not tests:
-            tests.append(joined(list(_first(stored_blocks(made.folder / "run", moments=True), n))))
+            blocks = cut_at(stored_blocks(made.folder / "run", moments=True), [n])
+            tests.append(joined(list(takewhile(lambda block: block.first_episode < n, blocks))))
         return pa.table({"rhw": scv_rhw_of(tests[0], procedure, shuffle)})
 
-    parts = context.folder / PARTS, "scv"
-    tables = kept_parts(*parts, range(procedure.n_shuffles), rhw_of, context.progress)
+    tables = kept_parts(context.parts, "scv", range(procedure.n_shuffles), rhw_of, context.progress)
     rhw = np.array([table.column("rhw").to_numpy() for table in tables])
     return _Found(required_tests(rhw, procedure.grid(n), procedure.rhw), n, settled(made))
-
-
-def _first(blocks: Iterator[Block], n: int) -> Iterator[Block]:
-    for block in blocks:
-        yield block.take(slice(0, n - block.first_episode))
-        if block.first_episode + len(block) >= n:
-            return

@@ -9,14 +9,12 @@ from typing import Any, NamedTuple
 import numpy as np
 import pyarrow as pa
 
-from harness.studies.case_study.claimed import Claims
 from harness.studies.case_study.context import Context
+from harness.studies.case_study.control_variates import Claims
 from harness.studies.case_study.figures import exactly, figure, marked, mean_of, tests_for
 from harness.studies.case_study.small_world import SmallWorld, small_world
 from harness.studies.case_study.study_file import SmallCase
-from harness.studies.case_study.tested import PARTS
-from harness.studies.kept_parts import kept_parts, write_table
-from harness.studies.run import worker_processes
+from harness.studies.work import write_table
 
 _world = cache(small_world)
 TRUE_WITHIN = 2.0
@@ -37,10 +35,7 @@ def answer_small_case(step: SmallCase, context: Context) -> dict[str, Any]:
     every = product((False, True), step.thresholds, step.epsilons)
     settings = [_Setting(place, *setting) for place, setting in enumerate(every)]
     make = partial(claims_of_setting, step, context.confidence)
-    with worker_processes(context.workers) as executor:
-        parts = context.folder / PARTS, context.name
-        tables = kept_parts(*parts, settings, make, context.progress, run=executor.map)
-    rows = [table.to_pylist()[0] for table in tables]
+    rows = [table.to_pylist()[0] for table in context.by_workers(settings, make)]
     write_table(context.folder / "settings.parquet", pa.Table.from_pylist(rows))
     rate, published = _world(step.lane_change_level).crash_rate, rows[0]
     nearest = {name: _nearest(name, wanted, rows) for name, wanted in step.reported.items()}

@@ -184,8 +184,7 @@ class _Situations(NamedTuple):
 
     def taken(self, rows: IntArray) -> _Situations:
         """Some of them."""
-        of = self.speed[rows], self.r1[rows], self.r2[rows], self.acceleration[rows]
-        return _Situations(*of, self.parent[rows], self.share[rows])
+        return self._make(column[rows] for column in self)
 
 
 def small_world(level: float, *, nodes: int = NODES) -> SmallWorld:

@@ -13,9 +13,8 @@ import json
 import shutil
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from harness.campaign.loading import load_campaign
 from harness.compiled import WORLD_SOURCES, source_hash
@@ -26,19 +25,22 @@ from harness.records.folder import read_json, sole_use, write_json
 from harness.resolved import resolve
 from harness.studies.case_study.context import Context, Made
 from harness.studies.case_study.control_variates import compare_control_variates
-from harness.studies.case_study.convergence import draw_convergence
 from harness.studies.case_study.page import write_page
-from harness.studies.case_study.replicated import replicate
-from harness.studies.case_study.required import count_required_tests
+from harness.studies.case_study.repeated import replicate, test_variants, variants_of
+from harness.studies.case_study.required import count_required_tests, draw_convergence
 from harness.studies.case_study.small_case import answer_small_case
 from harness.studies.case_study.study_file import FILES, Step, Study, inputs_of
-from harness.studies.case_study.tested import PARTS, keep_run, test_in_twin
+from harness.studies.case_study.tested import keep_run, test_in_twin
 from harness.studies.case_study.theorems import check_theorems
-from harness.studies.case_study.variants import test_variants, variants_of
 from harness.studies.experiment import load_experiment
 
 RESULT = "result.json"
-_SHARED = (*(f"studies/case_study/{name}.py" for name in ("claimed", "figures", "small_world")), "studies/*.py")
+_SHARED = (
+    "studies/*.py",
+    "studies/chains/*.py",
+    *(f"studies/case_study/{name}.py" for name in ("control_variates", "figures", "small_world", "tested")),
+)
+"""What makers have from other files than their own."""
 _MAKERS: dict[str, Callable[[Any, Context], dict[str, Any]]] = {
     "twin_tests": test_in_twin,
     "run": keep_run,
@@ -52,8 +54,7 @@ _MAKERS: dict[str, Callable[[Any, Context], dict[str, Any]]] = {
 }
 
 
-@dataclass(frozen=True)
-class StudyResult:
+class StudyResult(NamedTuple):
     """Outcome of a study: its page, its claims with verdicts, and seconds of each step, None if it was there before."""
 
     page: Path
@@ -69,18 +70,10 @@ def run_study(
     progress: Progress | None = None,
     told: Callable[[str, float | None], None] = lambda _name, _seconds: None,
 ) -> StudyResult:
-    """Make what is missing, and the page.
+    """Make what is missing, and the page, in a folder that is new, empty, or that of an earlier study.
 
-    Parameters
-    ----------
-    study : Study
-    folder : Path
-        New, empty, or that of an earlier study, of which equal steps are taken.
-    workers : int, optional
-        Processes; one per core by default. They change no result.
-    progress : Progress, optional
-    told : callable
-        Receives each step's name and seconds when it is finished.
+    Worker processes, one per core by default, change no result. ``told`` receives each step's name and seconds when it
+    is finished, None for one that was there before.
 
     Raises
     ------
@@ -93,14 +86,14 @@ def run_study(
     with sole_use(folder):
         for name, step in study.steps.items():
             place = folder / "steps" / f"{name}-{keys[name]}"
+            context = Context(place, study.rhw, study.confidence, made, workers, progress or SilentProgress())
             seconds[name] = None
             if not (place / RESULT).is_file():
                 began = time.monotonic()
                 place.mkdir(parents=True, exist_ok=True)
-                context = Context(place, study.rhw, study.confidence, made, workers, progress or SilentProgress())
                 write_json(place / RESULT, finite_json({"kind": step.kind, **_MAKERS[step.kind](step, context)}))
                 seconds[name] = time.monotonic() - began
-            shutil.rmtree(place / PARTS, ignore_errors=True)  # what they were kept for is there
+            shutil.rmtree(context.parts, ignore_errors=True)  # what they were kept for is there
             result = read_json(place / RESULT, mend="Delete the folder of this step; it is made again.")
             made[name] = Made(place, result)
             told(name, seconds[name])

@@ -189,12 +189,12 @@ class Study(Section):
                         expected=f"one of the steps above it: {', '.join(before) or 'there is none'}",
                         mend="Name one of them, or move that step up.",
                     )
-                sources = _SOURCES[key, step.kind]
-                if not isinstance(self.steps[wanted], sources):
+                kind, kinds = self.steps[wanted].kind, _READS[key, step.kind]
+                if kind not in kinds:
                     raise broken_rule(
                         f"steps.{name}.{key}",
-                        found=f"'{wanted}', a step of kind {self.steps[wanted].kind}",
-                        expected="one of kind " + " or ".join(_kind_of(source) for source in sources),
+                        found=f"'{wanted}', a step of kind {kind}",
+                        expected=f"one of kind {' or '.join(kinds)}",
                         mend="Name such a step.",
                     )
             before.append(name)
@@ -213,18 +213,14 @@ class Study(Section):
 
 
 FILES = ("campaign", "experiment", "shells")
-_TESTED: tuple[type[Section], ...] = (TwinTests, Run)
-_SOURCES: dict[tuple[str, str], tuple[type[Section], ...]] = {
-    ("of", "convergence"): _TESTED,
-    ("reference", "convergence"): _TESTED,
-    ("of", "control_variates"): (Run,),
-    ("of", "required_tests"): _TESTED,
-    ("scv", "required_tests"): (Run,),
+_READS = {
+    ("of", "convergence"): ("twin_tests", "run"),
+    ("reference", "convergence"): ("twin_tests", "run"),
+    ("of", "control_variates"): ("run",),
+    ("of", "required_tests"): ("twin_tests", "run"),
+    ("scv", "required_tests"): ("run",),
 }
-
-
-def _kind_of(model: type[Section]) -> str:
-    return str(model.model_fields["kind"].annotation.__args__[0])  # type: ignore[union-attr]
+"""Kinds of steps that a key of a kind of step may name."""
 
 
 def inputs_of(step: Step) -> list[tuple[str, str]]:

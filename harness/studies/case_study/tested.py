@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -14,8 +13,7 @@ from harness.arrays import BoolArray, FloatArray, IntArray
 from harness.campaign.loading import load_campaign
 from harness.campaign.models import Campaign
 from harness.errors import HarnessError
-from harness.estimators.block import Block
-from harness.estimators.intervals import clopper_pearson
+from harness.estimators.intervals import clopper_pearson, normal_half_width
 from harness.methods import Method
 from harness.outcomes import CRASH, FAILED
 from harness.records.folder import read_table
@@ -23,31 +21,26 @@ from harness.resolved import resolve
 from harness.runner import RunResult, run_campaign
 from harness.runner.prepare import prepare
 from harness.runner.stored_estimates import stored_blocks
-from harness.studies.case_study.claimed import weights_are_in
 from harness.studies.case_study.context import Context, Made
-from harness.studies.case_study.figures import exactly, figure, is_settled, marked, tests_for, z_of
+from harness.studies.case_study.figures import exactly, figure, is_settled, marked, tests_for, weights_are_in
 from harness.studies.case_study.study_file import Run, TwinTests
-from harness.studies.kept_parts import kept_parts, write_table
-from harness.studies.run import worker_processes
 from harness.studies.weighted_campaign import prepared_twin
+from harness.studies.work import write_table
 
 PART, AT_ONCE = 500_000, 50_000
 """Tests of a file that a killed step goes on from, and of a call of the twin."""
 GROUPS = 20
-CRASHES, PARTS = "crashes.parquet", "parts"
-_IN_THE_TWIN = ("world.engine=twin", "records.moments=none", "records.traces=none", "records.trace_share=0.0")
+CRASHES = "crashes.parquet"
+IN_THE_TWIN = ("world.engine=twin", "records.traces=none", "records.trace_share=0.0")
 _WEIGHT = b"sum_of_weights"
-_COLUMNS = ("episode", "weight", "n_control_steps", "failed")
 
 
-@dataclass(frozen=True)
-class Tests:
+class Tests(NamedTuple):
     """Tests of a step: ``n`` of them, and (k,) rows in index order of those that crashed or failed."""
 
     n: int
     episode: IntArray
     weight: FloatArray
-    n_control_steps: IntArray
     failed: BoolArray
 
     @property
@@ -64,7 +57,8 @@ def campaign_of(step: TwinTests | Run) -> Campaign:
     HarnessError
         It is wrong, or draws from shells where crashes alone are to be kept.
     """
-    campaign = load_campaign(step.campaign, [*step.set, *(_IN_THE_TWIN if isinstance(step, TwinTests) else ())])
+    bare = (*IN_THE_TWIN, "records.moments=none") if isinstance(step, TwinTests) else ()
+    campaign = load_campaign(step.campaign, [*step.set, *bare])
     if isinstance(step, TwinTests) and campaign.testing.method == "shells":
         raise HarnessError(
             step.campaign,
@@ -81,24 +75,18 @@ def test_in_twin(step: TwinTests, context: Context) -> dict[str, Any]:
     prepare(resolve(campaign), context.progress)  # tables and kernels are built once, before the workers start
     make = partial(crashes_in_twin, campaign.model_dump_json())
     jobs = [(first, min(PART, step.tests - first)) for first in range(0, step.tests, PART)]
-    with worker_processes(context.workers) as executor:
-        parts = context.folder / PARTS, context.name
-        tables = kept_parts(*parts, jobs, make, context.progress, run=executor.map, size=lambda job: job[1])
-    return _kept(context, campaign.testing.method, step.tests, tables)
+    return _kept(context, campaign.testing.method, step.tests, context.by_workers(jobs, make, size=lambda job: job[1]))
 
 
 def crashes_in_twin(campaign_json: str, part: tuple[int, int]) -> pa.Table:
     """Crashed and failed ones of the tests ``first … first + n - 1``."""
     prepared, loop = prepared_twin(campaign_json)
-    (first, n), tables, weight = part, [], 0.0
+    (first, n), tables = part, []
     for start in range(first, first + n, AT_ONCE):
-        size = min(AT_ONCE, first + n - start)
-        rows = loop.run(start, prepared.states(start, size)).results.episode
-        weight += float(np.exp(rows["log_weight"]).sum())
-        at = np.flatnonzero((rows["outcome"] == CRASH) | (rows["outcome"] == FAILED))
-        failed = rows["outcome"][at] == FAILED
-        tables.append(_rows(start + at, rows["log_weight"][at], rows["n_control_steps"][at], failed))
-    return _with_weight(pa.concat_tables(tables), weight)
+        rows = loop.run(start, prepared.states(start, min(AT_ONCE, first + n - start))).results.episode
+        ends = rows["outcome"] == CRASH, rows["outcome"] == FAILED
+        tables.append(_crashes(start, *ends, rows["log_weight"], rows["n_control_steps"]))
+    return pa.concat_tables(tables).replace_schema_metadata({_WEIGHT: repr(sum(map(_weight_of, tables)))})
 
 
 def keep_run(step: Run, context: Context) -> dict[str, Any]:
@@ -107,7 +95,10 @@ def keep_run(step: Run, context: Context) -> dict[str, Any]:
     begun = (run / "manifest.json").is_file()
     done = run_campaign(campaign, run, workers=context.workers, resume=begun, progress=context.progress)
     if campaign.testing.method != "shells":
-        tables = [_crashes_of(block) for block in stored_blocks(run, moments=False)]
+        tables = [
+            _crashes(block.first_episode, block.crash, block.failed, block.log_weight, block.n_control_steps)
+            for block in stored_blocks(run, moments=False)
+        ]
         n, method = int(done.estimates["n_episodes"]), campaign.testing.method
         return {"engine": campaign.world.engine, **_kept(context, method, n, tables)}
     return {"engine": campaign.world.engine, "figures": figures_of_shells(done, context.rhw)}
@@ -125,25 +116,24 @@ def figures_of_shells(done: RunResult, rhw: float) -> dict[str, Any]:
     }
 
 
-def _crashes_of(block: Block) -> pa.Table:
-    at = np.flatnonzero(block.crash | block.failed)
-    table = _rows(block.first_episode + at, block.log_weight[at], block.n_control_steps[at], block.failed[at])
-    return _with_weight(table, float(block.weights().sum()))
+def _crashes(
+    first: int, crash: BoolArray, failed: BoolArray, log_weight: FloatArray, n_control_steps: IntArray
+) -> pa.Table:
+    """Rows of tests (n,) from a first one on that crashed or failed, together with the sum of the weights of all."""
+    at = np.flatnonzero(crash | failed)
+    weight = np.exp(np.where(np.isfinite(log_weight[at]), log_weight[at], 0.0))
+    columns = {"episode": first + at, "weight": weight, "n_control_steps": n_control_steps[at].astype(np.int64)}
+    with np.errstate(over="ignore"):
+        total = float(np.exp(log_weight).sum())
+    return pa.table({**columns, "failed": failed[at]}).replace_schema_metadata({_WEIGHT: repr(total)})
 
 
-def _with_weight(table: pa.Table, total: float) -> pa.Table:
-    """Rows of crashes, together with the sum of the weights of all tests."""
-    return table.replace_schema_metadata({_WEIGHT: repr(total)})
-
-
-def _rows(episode: IntArray, log_weight: FloatArray, n_control_steps: IntArray, failed: BoolArray) -> pa.Table:
-    known = np.where(np.isfinite(log_weight), log_weight, 0.0)
-    columns = episode.astype(np.int64), np.exp(known), n_control_steps.astype(np.int64), failed
-    return pa.table(dict(zip(_COLUMNS, columns, strict=True)))
+def _weight_of(table: pa.Table) -> float:
+    return float(table.schema.metadata[_WEIGHT])
 
 
 def _kept(context: Context, method: Method, n: int, tables: list[pa.Table]) -> dict[str, Any]:
-    mean_weight = math.fsum(float(table.schema.metadata[_WEIGHT]) for table in tables) / n
+    mean_weight = math.fsum(map(_weight_of, tables)) / n
     table = pa.concat_tables(tables)
     write_table(context.folder / CRASHES, table)
     tests, is_in = _tests(n, table), weights_are_in(method, mean_weight)
@@ -164,7 +154,7 @@ def _kept(context: Context, method: Method, n: int, tables: list[pa.Table]) -> d
 
 
 def _tests(n: int, table: pa.Table) -> Tests:
-    return Tests(n, *(table.column(name).to_numpy() for name in _COLUMNS))
+    return Tests(n, *(table.column(name).to_numpy() for name in Tests._fields[1:]))
 
 
 def read_tests(made: Made) -> Tests:
@@ -197,7 +187,7 @@ def crash_rate(tests: Tests, confidence: float) -> dict[str, Any]:
     if np.all(y[~tests.failed] == 1.0):
         low, high = map(float, clopper_pearson(np.count_nonzero(y), n, (1.0 - confidence) / 2.0))
         return figure(rate, low, high)
-    half = z_of(confidence) * np.sqrt(max(float(y @ y) / n - rate * rate, 0.0) / max(n - 1, 1))
+    half = normal_half_width(np.sqrt(max(float(y @ y) / n - rate * rate, 0.0) / max(n - 1, 1)), confidence)
     return figure(rate, max(rate - half, 0.0), rate + half)
 
 

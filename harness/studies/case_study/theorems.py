@@ -20,11 +20,10 @@ from harness.estimators.scv import Scv
 from harness.studies.case_study.context import Context
 from harness.studies.case_study.figures import exactly
 from harness.studies.case_study.study_file import Theorems
-from harness.studies.chains.chain import Chain
-from harness.studies.chains.enumeration import StepEpisodes, enumerate_step_mixture
+from harness.studies.chains.chain import Chain, Episodes, enumerate_episodes
 from harness.studies.chains.named import overtaking, rare_decisive
 from harness.studies.chains.single_choice import with_optimal_function
-from harness.studies.kept_parts import write_table
+from harness.studies.work import write_table
 
 
 def small_chains() -> list[Chain]:
@@ -69,7 +68,7 @@ def check_theorems(step: Theorems, context: Context) -> dict[str, Any]:
 
 def _chain(chain: Chain) -> dict[str, Any]:
     """Exact results of a chain under the step mixture with equal weights; variances per test over μ²."""
-    episodes = enumerate_step_mixture(chain)
+    episodes = enumerate_episodes(chain)
     sampled = episodes.p * episodes.mixture
     y = episodes.crash / episodes.mixture
     mean = float(sampled @ y)
@@ -93,7 +92,7 @@ def _chain(chain: Chain) -> dict[str, Any]:
     }
 
 
-def _columns(episodes: StepEpisodes) -> Iterator[FloatArray]:
+def _columns(episodes: Episodes) -> Iterator[FloatArray]:
     """Columns q_{j1…jl}/q_alpha of every stratum l ≥ 1, zero outside of it."""
     for level in range(1, int(episodes.n_control_steps.max()) + 1):
         within = episodes.n_control_steps == level
@@ -101,12 +100,12 @@ def _columns(episodes: StepEpisodes) -> Iterator[FloatArray]:
             yield np.where(within, _ratio(episodes, chosen) / episodes.mixture, 0.0)
 
 
-def _ratio(episodes: StepEpisodes, chosen: tuple[int, ...]) -> FloatArray:
+def _ratio(episodes: Episodes, chosen: tuple[int, ...]) -> FloatArray:
     """q_{j1…jl}/p, shape (k,)."""
     return np.asarray(np.prod([episodes.ratios[:, t, j] for t, j in enumerate(chosen)], axis=0))
 
 
-def bound(episodes: StepEpisodes) -> float:
+def bound(episodes: Episodes) -> float:
     """Right-hand side of Theorem 2 with equal weights."""
     levels, n_surrogates = episodes.n_control_steps, episodes.ratios.shape[2]
     uncontrolled = episodes.crash * (levels == 0)

@@ -1,14 +1,15 @@
-"""The chain: tables, its crash probability by backward induction, and the importance functions of its surrogates."""
+"""The chain: tables, crash rate by backward induction, importance functions of its surrogates, all of its episodes."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
 
 import numpy as np
 
-from harness.arrays import BoolArray, FloatArray
+from harness.arrays import BoolArray, FloatArray, IntArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,3 +139,81 @@ def importance_function(p: FloatArray, challenge: FloatArray, epsilon: float) ->
     safe = np.where(value > 0.0, value, 1.0)[..., None]
     q = epsilon * p + (1.0 - epsilon) * p * challenge / safe
     return np.where(value[..., None] > 0.0, q, p), value
+
+
+@dataclass(frozen=True, eq=False)
+class Episodes:
+    """Every episode that p can draw from a small chain.
+
+    Probability under p (k,), q_j/p of each control step (k, T, J), 1 beyond the last one, how many there are (k,), that
+    of forced cut-ins over p (k,), and whether it crashes (k,).
+    """
+
+    p: FloatArray
+    ratios: FloatArray
+    n_control_steps: IntArray
+    forced: FloatArray
+    crash: BoolArray
+
+    @property
+    def mixture(self) -> FloatArray:
+        """q_alpha/p under the step mixture with equal weights."""
+        return np.asarray(self.ratios.mean(axis=2).prod(axis=1))
+
+
+_Row = tuple[float, list[FloatArray], bool]
+"""Probability, q_j/p of each control step, whether it crashes."""
+
+
+def enumerate_episodes(chain: Chain) -> Episodes:
+    """All episodes of the chain."""
+    rows = [row for path, p in _paths(chain) for row in _episodes(chain, path, p)]
+    (p, controlled, crash), forced = zip(*(row for row, _ in rows), strict=True), [forced for _, forced in rows]
+    ratios = np.ones((len(p), max(map(len, controlled)), chain.n_surrogates))
+    for row, steps in enumerate(controlled):
+        for t, step in enumerate(steps):
+            ratios[row, t] = step
+    n_control_steps = np.array([len(steps) for steps in controlled])
+    return Episodes(np.array(p), ratios, n_control_steps, np.array(forced), np.array(crash))
+
+
+def _paths(chain: Chain) -> list[tuple[list[int], float]]:
+    """Staying paths with their probabilities."""
+    paths = [([g], float(p)) for g, p in enumerate(chain.start) if p > 0.0]
+    for _ in range(chain.horizon - 1):
+        paths = [
+            ([*path, g], p * float(step))
+            for path, p in paths
+            for g, step in enumerate(chain.approach[path[-1]])
+            if step > 0.0
+        ]
+    return paths
+
+
+def _episodes(chain: Chain, path: list[int], p: float) -> Iterator[tuple[_Row, float]]:
+    """On one staying path: no cut-in, or a cut-in at each step with everything that can follow."""
+    p_cut = 1.0 - float(np.prod(1.0 - chain.hazard[path]))
+    before: list[FloatArray] = []
+    for t, g in enumerate(path):
+        hazard, q = float(chain.hazard[g]), chain.proposals.cut[:, t, g]
+        critical = bool(chain.proposals.critical_before[t, g])
+        if hazard > 0.0:
+            here = [*before, q / hazard] if critical else before
+            for d in np.flatnonzero(chain.entry[g]):
+                for row in _after(chain, t + 1, p * hazard * float(chain.entry[g, d]), here, int(d)):
+                    yield row, 1.0 / p_cut
+        p *= 1.0 - hazard
+        before = [*before, (1.0 - q) / (1.0 - hazard)] if critical else before
+    yield (p, before, False), 0.0
+
+
+def _after(chain: Chain, t: int, p: float, before: list[FloatArray], d: int) -> Iterator[_Row]:
+    if t == chain.horizon or d >= chain.crashed - 1:
+        yield p, before, d == chain.crashed
+        return
+    critical = bool(chain.proposals.critical_after[t, d])
+    for a, exposure in enumerate(chain.exposure[d]):
+        here = [*before, chain.proposals.maneuver[:, t, d, a] / exposure] if critical else before
+        for following in np.flatnonzero(chain.response[d, a]):
+            weight = p * float(exposure) * float(chain.response[d, a, following])
+            yield from _after(chain, t + 1, weight, here, int(following))

@@ -15,11 +15,11 @@ from harness.studies.chains.chain import Chain
 DEFENSIVE_SHARE = 0.1
 
 
-def blocks(chain: Chain, method: Method, sizes: list[int], seed: int, **settings: bool) -> Iterator[Block]:
+def blocks(chain: Chain, method: Method, sizes: list[int], seed: int) -> Iterator[Block]:
     """Consecutive blocks of the given sizes; each has its own random stream."""
     first = 0
     for k, size in enumerate(sizes):
-        yield draw(chain, method, size, np.random.default_rng([seed, k]), first_episode=first, **settings)
+        yield draw(chain, method, size, np.random.default_rng([seed, k]), first_episode=first)
         first += size
 
 
@@ -31,21 +31,9 @@ def mixture_weights(chain: Chain, method: Method) -> FloatArray:
     return {"nde": np.empty(0), "forced": np.ones(1)}.get(method, equal)
 
 
-def draw(
-    chain: Chain,
-    method: Method,
-    n: int,
-    rng: np.random.Generator,
-    *,
-    first_episode: int = 0,
-    forget_cut_in: bool = False,
-) -> Block:
-    """Draw n episodes: path before the cut-in ahead, then maneuvers and responses step by step.
-
-    `forget_cut_in` leaves the cut-in's own ratio out of the step mixture's weights: wrong on purpose, to show that the
-    tests notice.
-    """
-    return _Sampler(chain, method, n, rng, forget_cut_in).run(first_episode)
+def draw(chain: Chain, method: Method, n: int, rng: np.random.Generator, *, first_episode: int = 0) -> Block:
+    """Draw n episodes."""
+    return Sampler(chain, method, n, rng).run(first_episode)
 
 
 def approach_paths(chain: Chain, n: int, rng: np.random.Generator) -> IntArray:
@@ -64,9 +52,11 @@ def _choose(p: FloatArray, rng: np.random.Generator) -> IntArray:
     return chosen
 
 
-class _Sampler:
-    def __init__(self, chain: Chain, method: Method, n: int, rng: np.random.Generator, forget_cut_in: bool) -> None:
-        self.chain, self.method, self.n, self.rng, self.forget_cut_in = chain, method, n, rng, forget_cut_in
+class Sampler:
+    """Episodes on their way: path before the cut-in ahead, then maneuvers and responses step by step."""
+
+    def __init__(self, chain: Chain, method: Method, n: int, rng: np.random.Generator) -> None:
+        self.chain, self.method, self.n, self.rng = chain, method, n, rng
         self.alpha = mixture_weights(chain, method)
         self.path = approach_paths(chain, n, rng)
         stay = np.log1p(-chain.hazard[self.path])
@@ -81,11 +71,12 @@ class _Sampler:
         self.cut_in = np.zeros(n, dtype=bool)
 
     def run(self, first_episode: int) -> Block:
+        """Draw them to their end."""
         for t in range(self.chain.horizon):
             after = np.flatnonzero(self.cut_in & (self.after < self.chain.crashed - 1))
             self._step_before(t, np.flatnonzero(~self.cut_in))
             self._step_after(t, after)
-        log_q, none = self._log_q(), np.zeros(self.n, dtype=bool)
+        log_q, none, cap = self._log_q(), np.zeros(self.n, dtype=bool), self.chain.cut_in_cap
         return Block(
             first_episode=first_episode,
             method=self.method,
@@ -98,7 +89,7 @@ class _Sampler:
             alpha=self.alpha,
             n_control_steps=self.n_control,
             first_ratios=self.ratios if self.method == "step_mixture" else None,
-            weight_cap=self._caps().get(self.method),
+            weight_cap={"nde": 1.0, "forced": cap, "episode_mixture": cap / DEFENSIVE_SHARE}.get(self.method),
             log_p_cut_in=self.log_p_cut if self.method in ("forced", "episode_mixture") else None,
         )
 
@@ -135,8 +126,7 @@ class _Sampler:
         if self.method == "step_mixture":
             mixed = picked_q @ self.alpha
             step = self.n_control[episode]
-            forgotten = self.forget_cut_in & self.cut_in[episode] & (self.after[episode] < 0)
-            self.log_step[episode] += np.where(forgotten, 0.0, np.log(picked_p / mixed))
+            self.log_step[episode] += np.log(picked_p / mixed)
             kept = step < MAX_CONTROL_STEPS
             self.ratios[episode[kept], step[kept]] = (picked_q / mixed[:, None])[kept]
         self.n_control[episode] += 1
@@ -169,7 +159,3 @@ class _Sampler:
         if self.method == "step_mixture":
             return self.log_step
         return -logsumexp(log_q + np.log(self.alpha), axis=1) if len(self.alpha) else np.zeros(self.n)
-
-    def _caps(self) -> dict[Method, float]:
-        cap = self.chain.cut_in_cap
-        return {"nde": 1.0, "forced": cap, "episode_mixture": cap / DEFENSIVE_SHARE}

@@ -19,14 +19,10 @@ from harness.studies.shell_campaign import DrawnPool
 
 
 class ChainShells:
-    """Source of a chain's pools (see `harness.studies.shell_source.ShellSource`); all surrogates are inside.
+    """A chain's pools; all surrogates are inside.
 
-    Attributes
-    ----------
-    shell_p, crash_p : ndarray, shape (S,)
-        Exact probability of each shell, and of a crash in it.
-    crashes_outside : float
-        Share of the crash rate that lies beyond the boundary.
+    Exact are ``shell_p`` and ``crash_p`` (S,), the probability of each shell, and of a crash in it, and the share of
+    the crash rate that lies beyond the boundary, ``crashes_outside``.
     """
 
     def __init__(self, chain: Chain, pool_paths: int) -> None:
@@ -50,8 +46,8 @@ class ChainShells:
             state = (state * (1.0 - chain.hazard)) @ chain.approach
         return total
 
-    def draw(self, rng: np.random.Generator) -> DrawnPool:
-        """A new pool."""
+    def draw(self, rng: np.random.Generator) -> list[DrawnPool]:
+        """A new pool; see `harness.studies.shell_campaign.Draw`."""
         chain, names = self._chain, self._names
         path = approach_paths(chain, self._pool_paths, rng)
         hazard = chain.hazard[path]
@@ -70,7 +66,7 @@ class ChainShells:
             p_cut_in=float(p.sum()),
             p_impossible=0.0,
         )
-        return DrawnPool(design, mass, crash_mass)
+        return [DrawnPool(design, mass, crash_mass)]
 
 
 def joint_outcomes(chain: Chain) -> FloatArray:

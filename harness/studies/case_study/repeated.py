@@ -1,13 +1,16 @@
-"""One campaign in several forms: Table I's vehicles, or other settings of the method, and what each claims."""
+"""Campaigns repeated, of one vehicle or in several forms: what they claim, beside what they truly scatter by."""
 
 from __future__ import annotations
 
 import math
 from functools import partial
-from itertools import product
+from itertools import pairwise, product
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
+import pyarrow.parquet as pq
 
 from harness.campaign.loading import load_campaign
 from harness.campaign.models import Campaign
@@ -15,16 +18,70 @@ from harness.methods import EstimatorName
 from harness.resolved import resolve
 from harness.runner.campaign_run import run_campaign
 from harness.runner.prepare import prepare
-from harness.studies.case_study.claimed import Claims
 from harness.studies.case_study.context import Context
-from harness.studies.case_study.figures import marked, mean_of, ratio_of_means, ratio_of_variances
-from harness.studies.case_study.study_file import Variants
-from harness.studies.case_study.tested import AT_ONCE, PARTS, figures_of_shells
-from harness.studies.kept_parts import kept_parts, write_table
-from harness.studies.run import worker_processes
-from harness.studies.weighted_campaign import TwinEpisodes, prepared_twin
+from harness.studies.case_study.control_variates import Claims
+from harness.studies.case_study.figures import (
+    figure,
+    marked,
+    mean_of,
+    ratio_of_means,
+    ratio_of_variances,
+    tests_for,
+)
+from harness.studies.case_study.study_file import Replications, Variants
+from harness.studies.case_study.tested import AT_ONCE, IN_THE_TWIN, figures_of_shells
+from harness.studies.experiment import load_experiment
+from harness.studies.run import REPLICATIONS, validate
+from harness.studies.weighted_campaign import prepared_twin, twin_episodes
+from harness.studies.work import write_table
 
-_IN_THE_TWIN = ("world.engine=twin", "records.traces=none", "records.trace_share=0.0")
+
+def replicate(step: Replications, context: Context) -> dict[str, Any]:
+    """Results of `harness validate`, and what one estimator gains over the one named before it, claimed and true.
+
+    Where the mean of all replications is below the truth by more than chance, what each of them claims means nothing.
+    """
+    experiment, parts = load_experiment(Path(step.experiment), step.set), context.parts
+    judgements = validate(experiment, context.folder, workers=context.workers, progress=context.progress, parts=parts)
+    rows = pq.read_table(context.folder / REPLICATIONS).to_pandas()
+    n, confidence = experiment.campaign.stop.episodes, context.confidence
+    per_relvar = tests_for(n, context.rhw, confidence)
+    figures: dict[str, Any] = {}
+    claims, rates, settled = {}, {}, True
+    for one in judgements:
+        missed = one.bias + 2.0 * one.bias_std_error < 0.0
+        settled &= not missed
+        own = rows[rows["result"] == one.result]
+        rates[one.result] = own["crash_rate"].to_numpy()
+        with np.errstate(divide="ignore", invalid="ignore"):
+            claims[one.result] = (own["std_error"].to_numpy() / rates[one.result]) ** 2 * per_relvar
+        found = {
+            "true": _scattered(one.true_relvar * per_relvar, one.replications, missed=missed),
+            "claimed": marked(mean_of(claims[one.result], confidence), settled=not missed),
+            "covers": figure(one.coverage, one.coverage_low, one.coverage_high),
+            "over_truth": figure(
+                1.0 + one.bias, *(1.0 + one.bias + side * 2.0 * one.bias_std_error for side in (-1.0, 1.0))
+            ),
+        }
+        figures |= {f"{one.result}_{key}": each for key, each in found.items()}
+    for plain, other in pairwise(claims):
+        gain = ratio_of_means(claims[plain], claims[other], confidence)
+        figures[f"{other}_gain_claimed"] = marked(gain, settled=settled)
+        figures[f"{other}_gain_true"] = ratio_of_variances(rates[plain], rates[other], confidence)
+    said = [one.to_json() for one in judgements]
+    return {"tests": n, "replications": experiment.replications, "judgements": said, "figures": figures}
+
+
+def _scattered(value: float, replications: int, *, missed: bool) -> dict[str, Any]:
+    """Tests by the spread of replications, with two standard errors as if errors were normal.
+
+    Where their mean is below the truth, what has not occurred in any of them is missing from the spread, too: it is a
+    lower limit.
+    """
+    if missed:
+        return figure(None, value)
+    error = value * np.sqrt(2.0 / replications)
+    return figure(value, max(value - 2.0 * error, 0.0), value + 2.0 * error)
 
 
 def variants_of(step: Variants, *, shells: bool = False) -> dict[str, Campaign]:
@@ -32,7 +89,7 @@ def variants_of(step: Variants, *, shells: bool = False) -> dict[str, Campaign]:
     file, always = (step.shells, step.shells_set) if shells else (step.campaign, step.set)
     if file is None:
         return {}
-    always = [*always, *_IN_THE_TWIN]
+    always = [*always, *IN_THE_TWIN]
     settings = dict(step.settings)
     for chosen in product(*(options.items() for options in step.each_of)) if step.each_of else ():
         settings[", ".join(name for name, _ in chosen)] = [value for _, values in chosen for value in values]
@@ -47,9 +104,7 @@ def test_variants(step: Variants, context: Context) -> dict[str, Any]:
         prepare(resolve(campaign), context.progress)  # tables are built once, before the workers start
     make = partial(claims_in_twin, step.tests, step.replications, context.rhw, context.confidence)
     jobs = [campaign.model_dump_json() for campaign in campaigns.values()]
-    with worker_processes(context.workers) as executor:
-        parts = context.folder / PARTS, context.name
-        tables = kept_parts(*parts, jobs, make, context.progress, run=executor.map)
+    tables = context.by_workers(jobs, make)
     rows = [{"variant": name, **table.to_pylist()[0]} for name, table in zip(campaigns, tables, strict=True)]
     for k, (row, campaign) in enumerate(zip(rows, variants_of(step, shells=True).values(), strict=False)):
         folder = context.folder / f"shells-{k}"
@@ -70,11 +125,11 @@ def claims_in_twin(n: int, replications: int, rhw: float, confidence: float, cam
     """What NADE and SCV say of n tests each, in so many campaigns, and what these truly scatter by."""
     campaign = Campaign.model_validate_json(campaign_json)
     asked: tuple[EstimatorName, ...] = ("nade", "scv") if campaign.testing.method == "step_mixture" else ("nade",)
-    source, whole, rows = TwinEpisodes(campaign, campaign.seed, asked), Claims(with_scv=False), []
+    source, whole, rows = twin_episodes(campaign, campaign.seed, asked), Claims(with_scv=False), []
     for start in range(0, n * replications, n):
         claims = Claims()
         for first in range(start, start + n, AT_ONCE):
-            block = source.block(first, min(AT_ONCE, start + n - first))
+            block = source(first, min(AT_ONCE, start + n - first))
             whole.add(block)
             claims.add(block)
         rows.append(claims.row(rhw, confidence))
