@@ -42,7 +42,7 @@ from harness.runner.manifest import (
     require_no_fewer,
     require_own_folder,
 )
-from harness.runner.planner import PartPlanner, Planner, planner_of
+from harness.runner.planner import Planner, planner_of
 from harness.runner.prepare import Prepared, distance_per_test_m, prepare, require_ready, require_same_pool
 from harness.runner.retrace import Retracing
 from harness.runner.run_result import ESTIMATES, RunResult, earlier_result, exit_code, results_of, what_stopped
@@ -275,7 +275,7 @@ class Run:
 
         Only what a rule asks for is called ``rhw``: a bar reckons from it when the campaign will stop.
         """
-        if isinstance(self.planner, PartPlanner):
+        if self.prefix.of_part:
             return {"crashes": self.prefix.n_crashes}
         watched = "half_width" if self._campaign.stop.rhw is None else "rhw"
         figures: dict[str, int | float] = {"crashes": self.prefix.n_crashes, watched: self.planner.rule.rhw}

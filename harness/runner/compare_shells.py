@@ -29,8 +29,7 @@ from harness.records.reader import read_shards
 from harness.resolved import Resolved
 from harness.runner.campaign_run import Run
 from harness.runner.manifest import require_own_folder
-from harness.runner.pair_planner import PairPlanner
-from harness.runner.planner import round_specs
+from harness.runner.planner import PairPlanner, Planner, round_specs
 from harness.runner.worker import ShardSpec
 from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT
 
@@ -38,17 +37,13 @@ PAIRING = "the i-th cut-in that A meets of a shell is the i-th that B meets: sam
 EXIT_OF: Mapping[Verdict, int] = {"proven": EXIT_DONE, "refuted": EXIT_REFUTED, "open": EXIT_BUDGET_SPENT}
 
 
-class _Side:
-    """One vehicle's run, which is told from outside what to test; also its `harness.runner.planner.Planner`."""
+class _Side(Planner):
+    """One vehicle's run, which is told from outside what to test."""
 
     def __init__(self, run: Run, side: int, pairs: PairedShells, rule: PairRule, shard_size: int) -> None:
-        self.run, self.rule, self.reported_from, self.remark = run, rule, 0, ""
-        self._side, self._pairs, self._shard_size = side, pairs, shard_size
-        self.run.planner = self
-
-    def rounds(self) -> Iterator[Iterator[ShardSpec]]:
-        """None of its own."""
-        return iter(())
+        super().__init__(rule)
+        self._run, self._side, self._pairs, self._shard_size = run, side, pairs, shard_size
+        run.planner = self
 
     def add(self, block: Block) -> bool:
         """Hand on the tests of a shard."""
@@ -57,12 +52,11 @@ class _Side:
 
     def drive(self, n_pairs: IntArray) -> None:
         """Test what is missing of the first cut-ins of each stratum."""
-        held, prefix = self._pairs.tests(self._side), self.run.prefix
+        held, prefix = self._pairs.tests(self._side), self._run.prefix
         missing = np.maximum(n_pairs - held, 0)
         if missing.any():
-            self.run.run_round(
-                iter(round_specs(held, missing, len(prefix.shards), prefix.n_episodes, self._shard_size))
-            )
+            specs = round_specs(held, missing, len(prefix.shards), prefix.n_episodes, self._shard_size)
+            self._run.run_round(iter(specs))
 
 
 def compare_shells(

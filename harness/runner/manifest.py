@@ -116,7 +116,7 @@ class Prefix:
     """Finished shards in order, from the first on, as the manifest lists them, and what is counted over them."""
 
     def __init__(self, *, of_part: bool = False) -> None:
-        self._of_part = of_part
+        self.of_part = of_part
         self.shards: list[dict[str, Any]] = []
         self.n_episodes = self.n_crashes = self.n_failed = self.n_retraced = self.reported_from = 0
         self.repeated: Repeated | None = None
@@ -146,7 +146,7 @@ class Prefix:
             More episodes failed than the campaign allows.
         """
         most = campaign.run.max_failed_share
-        by_chance = self._of_part and bdtrc(self.n_failed - 1, self.n_episodes, most) >= SURELY_TOO_MANY
+        by_chance = self.of_part and bdtrc(self.n_failed - 1, self.n_episodes, most) >= SURELY_TOO_MANY
         if self.n_episodes >= at_least and not by_chance:
             require_few_failed(self.n_failed, self.n_episodes, self._causes, most)
 

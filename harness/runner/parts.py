@@ -19,7 +19,7 @@ from harness.records.folder import sole_use
 from harness.records.stored_manifest import kind_of
 from harness.runner.campaign_run import Run
 from harness.runner.manifest import require_own_folder
-from harness.runner.planner import PartPlanner, known_specs
+from harness.runner.planner import Planner, known_specs
 from harness.runner.prepare import require_ready
 from harness.runner.second_phase import Plan
 from harness.runner.worker import ShardSpec
@@ -90,7 +90,7 @@ def run_part(
             run.make_ready(described["n_episodes"])
             if plan is not None and run.prescribed is not None:
                 plan.require_pool(run.prescribed.design.pool)
-            run.planner = PartPlanner(campaign, specs)
+            run.planner = Planner(run.planner.rule)
             run.run_round(iter(specs))
         run.discard_uncounted()
         run.leave()

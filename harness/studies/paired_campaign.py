@@ -17,7 +17,7 @@ from harness.campaign.models import Campaign
 from harness.estimators.limit_search import Level
 from harness.estimators.pairs import CRASH, NO_CRASH, PairCounts, no_pairs
 from harness.estimators.round_stopping import PairRule
-from harness.runner.pair_planner import PairPlanner
+from harness.runner.planner import PairPlanner
 from harness.strata import LIBRARY_STATEMENT
 from harness.studies.experiment import Fault
 from harness.studies.judgement import Row

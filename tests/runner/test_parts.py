@@ -273,7 +273,7 @@ def test_a_part_is_not_refused_for_failures_that_chance_may_bring(campaign):
     few.require_few_failed(campaign())
     with pytest.raises(TooManyFailedError, match="20 of 100"):
         many.require_few_failed(campaign())
-    few._of_part = False
+    few.of_part = False
     with pytest.raises(TooManyFailedError, match="4 of 100"):
         few.require_few_failed(campaign())
 
