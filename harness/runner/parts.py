@@ -27,17 +27,9 @@ from harness.runner.worker import ShardSpec
 
 @dataclass(frozen=True)
 class PartResult:
-    """What a finished part left.
+    """What a finished part left; its counts are not yet an estimate.
 
-    Attributes
-    ----------
-    folder : Path
-    described : dict
-        Its number, of how many, its first test and how many it has.
-    kind : str
-        Which part it is, in words.
-    n_crashes, n_failed : int
-        Of its tests; not yet an estimate.
+    ``described`` is its number, of how many, its first test and how many it has; ``kind`` says in words which it is.
     """
 
     folder: Path
@@ -76,7 +68,8 @@ def run_part(
     campaign, plan = (source.campaign, source) if isinstance(source, Plan) else (source, None)
     specs = fixed_specs(campaign, part) if plan is None else planned_specs(plan, part)
     resolved = require_ready(campaign)
-    described = _described(part, specs)
+    first, n_episodes = specs[0].first_episode, sum(spec.n_episodes for spec in specs)
+    described = {"number": part.number, "of": part.of, "first_episode": first, "n_episodes": n_episodes}
     facts: dict[str, Any] = {"part": described, **({} if plan is None else {"plan": plan.second})}
     if plan is not None:
         plan.require_same(resolved)
@@ -87,7 +80,7 @@ def run_part(
         with run.under_way():
             if plan is not None:
                 plan.lend_shadows(out)
-            run.make_ready(described["n_episodes"])
+            run.make_ready(n_episodes)
             if plan is not None and run.prescribed is not None:
                 plan.require_pool(run.prescribed.design.pool)
             run.planner = Planner(run.planner.rule)
@@ -97,20 +90,8 @@ def run_part(
         return PartResult(out, described, kind_of(facts), run.prefix.n_crashes, run.prefix.n_failed)
 
 
-def _described(part: Part, specs: list[ShardSpec]) -> dict[str, int]:
-    """As the manifest has it."""
-    n_episodes = sum(spec.n_episodes for spec in specs)
-    return {"number": part.number, "of": part.of, "first_episode": specs[0].first_episode, "n_episodes": n_episodes}
-
-
 def fixed_specs(campaign: Campaign, part: Part) -> list[ShardSpec]:
-    """Shards of a part of a campaign with a fixed number of tests.
-
-    Raises
-    ------
-    CampaignError
-        It has no fixed number, or fewer shards than parts.
-    """
+    """Shards of a part of a campaign; a `CampaignError` if their number is not fixed, or below that of parts."""
     stop, size = campaign.stop, campaign.run.shard_size
     if campaign.testing.method == "shells":
         raise CampaignError(
@@ -127,38 +108,29 @@ def fixed_specs(campaign: Campaign, part: Part) -> list[ShardSpec]:
             expected="null: no part knows when all together are precise enough",
             mend=f"Write --set stop.rhw=null; all parts together make stop.episodes ({stop.episodes:,}) tests.",
         )
-    n_shards = -(-stop.episodes // size)
+    n_shards, of_size = -(-stop.episodes // size), stop.episodes // part.of
     if n_shards < part.of:
-        mend = f"Take at most {n_shards} part{'s' * (n_shards > 1)}."
-        if stop.episodes >= part.of:
-            mend += f" Or write --set run.shard_size={stop.episodes // part.of} for all of them."
+        again = f"write --set run.shard_size={of_size} for all of them" if of_size else ""
         raise CampaignError(
             "run.shard_size",
             found=f"{size:,}, of which stop.episodes ({stop.episodes:,}) makes {n_shards} in all, for {part.of} parts",
-            expected="a shard for each part, at least",
-            mend=mend,
+            **_fewer(n_shards, again),
         )
     return list(known_specs(campaign, *part.bounds(n_shards)))
 
 
 def planned_specs(plan: Plan, part: Part) -> list[ShardSpec]:
-    """Shards of a part of the second phase.
-
-    Raises
-    ------
-    RunFolderError
-        It has fewer shards than parts.
-    """
-    specs = plan.specs()
-    n_tests = sum(plan.second["tests"])
+    """Shards of a part of the second phase; a `RunFolderError` if it has fewer shards than parts."""
+    specs, n_tests = plan.specs(), sum(plan.second["tests"])
     if len(specs) < part.of:
-        mend = f"Take at most {len(specs)} part{'s' * (len(specs) > 1)}."
-        if n_tests >= part.of:
-            mend += f" Or plan again, into another folder, with --set run.shard_size={n_tests // part.of}."
-        raise RunFolderError(
-            str(plan.folder),
-            found=f"a plan of {n_tests:,} tests in {len(specs):,} shards, for {part.of:,} parts",
-            expected="a shard for each part, at least",
-            mend=mend,
-        )
+        of_size = n_tests // part.of
+        again = f"plan again, into another folder, with --set run.shard_size={of_size}" if of_size else ""
+        found = f"a plan of {n_tests:,} tests in {len(specs):,} shards, for {part.of:,} parts"
+        raise RunFolderError(str(plan.folder), found=found, **_fewer(len(specs), again))
     return specs[slice(*part.bounds(len(specs)))]
+
+
+def _fewer(n_shards: int, again: str) -> dict[str, str]:
+    """What to say where there are more parts than shards."""
+    mend = f"Take at most {n_shards} part{'s' * (n_shards > 1)}." + (f" Or {again}." if again else "")
+    return {"expected": "a shard for each part, at least", "mend": mend}

@@ -172,17 +172,8 @@ class PairPlanner:
     """Says which pairs of tests of two vehicles are driven next, from counts alone.
 
     Rounds are those of one vehicle, with pairs in place of tests; within a round pairs go to where the likelihood ratio
-    says that one more narrows the interval of the difference most.
-
-    Parameters
-    ----------
-    campaign : Campaign
-        Of either vehicle: both are equal but for the vehicle.
-    design : ShellDesign
-    available : ndarray of int64, shape (S,)
-        Most pairs of each stratum.
-    margin : float, optional
-        See `PairRule`.
+    says that one more narrows the interval of the difference most. The campaigns are equal but for the vehicle;
+    ``available``, shape (S,), are the most pairs of each stratum, for ``margin`` see `PairRule`.
     """
 
     def __init__(self, campaign: Campaign, design: ShellDesign, available: IntArray, margin: float | None) -> None:

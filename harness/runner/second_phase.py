@@ -24,28 +24,20 @@ from harness.runner.campaign_run import Run
 from harness.runner.manifest import require_no_fewer, require_own_folder
 from harness.runner.planner import ShellPlanner, round_specs
 from harness.runner.prepare import require_ready
-from harness.runner.run_result import what_stopped
+from harness.runner.run_result import conclusion
 from harness.runner.shadow_runs import SHADOW
 from harness.runner.worker import ShardSpec
-from harness.stopped_by import MENDS, ending
+from harness.stopped_by import MENDS
 from harness.strata import ShellDesign
 
 
 @dataclass(frozen=True)
 class PlanResult:
-    """What a first phase left.
+    """What a first phase left, and an ending in a sentence.
 
-    Attributes
-    ----------
-    folder : Path
-    n_first, n_planned, n_shards : int
-        Tests of the first phase, those planned, and the shards of these: the most parts there can be.
-    expected_rhw : float
-        Relative half-width that is expected of them.
-    ending : str
-        In a sentence.
-    exit_code : int
-        0, or 4 when the budget or the pool allows no tests that could reach the asked precision.
+    ``n_shards`` is in how many shards the ``n_planned`` tests are, the most parts there can be; ``expected_rhw`` is the
+    relative half-width that is expected of them. The exit code is 4 where the budget or the pool allows no tests that
+    could reach the asked precision.
     """
 
     folder: Path
@@ -77,13 +69,7 @@ class Plan:
         return round_specs(drawn, tests, *first, size)
 
     def require_same(self, resolved: Resolved) -> None:
-        """Refuse to test another vehicle, or in other traffic, than the first phase.
-
-        Raises
-        ------
-        RunFolderError
-            A file has been changed since.
-        """
+        """Refuse (`RunFolderError`) to test another vehicle, or in other traffic, than the first phase."""
         now = {"campaign_hash": resolved.content_hash, "controller_sha256": resolved.controller_sha256}
         for key, value in now.items():
             if self.manifest.get(key) != value:
@@ -101,13 +87,7 @@ class Plan:
                 link_or_copy(file, to)
 
     def require_pool(self, pool: str) -> None:
-        """Refuse cut-ins of another pool.
-
-        Raises
-        ------
-        RunFolderError
-            The machine makes another one, or the vehicle does something else.
-        """
+        """Refuse (`RunFolderError`) another pool: another machine's, or that of a vehicle that does something else."""
         if (planned := self.second["pool"]) != pool:
             raise RunFolderError(
                 str(self.folder),
@@ -217,9 +197,8 @@ def _leave(run: Run, campaign: Campaign, specs: list[ShardSpec], out: Path) -> P
     if not isinstance(planner, ShellPlanner) or run.prescribed is None or stop.rhw is None:
         raise TypeError("only shells in two phases are planned")
     if not specs:
-        by = what_stopped(campaign, planner.rule, n_first, planner.reported_from)
-        missing = planner.rule.waited_for or ("room for a second phase",)
-        said = ending(by, n_first, missing, precision_asked=True)
+        missing = ("room for a second phase",)
+        by, said = conclusion(campaign, planner.rule, n_first, planner.reported_from, missing)
         run.leave(stopped_by=by, ending=said)
         return PlanResult(out, n_first, 0, 0, planner.expected_rhw, said, EXIT_BUDGET_SPENT)
     second = _second(specs, run.prescribed.design)

@@ -12,7 +12,7 @@ import pytest
 from harness.campaign.loading import load_campaign
 from harness.campaign.models import Campaign
 from harness.controllers.black_box import Death
-from harness.runner import RunResult, local_executor, merge_parts, run_campaign
+from harness.runner import RunResult, executor, merge_parts, run_campaign
 from harness.runner.worker import ShardDone, ShardRunner, ShardSpec
 
 MIXTURE_FILE = Path(__file__).parents[2] / "scenarios" / "overtaking_mixture.yaml"
@@ -65,8 +65,8 @@ class WorkerInThisProcess:
 def one_process() -> Iterator[None]:
     """Where shards are run, it is here."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(local_executor, "WorkerProcess", WorkerInThisProcess)
-        patch.setattr(local_executor, "first_to_answer", lambda workers: workers[0])
+        patch.setattr(executor, "WorkerProcess", WorkerInThisProcess)
+        patch.setattr(executor.LocalExecutor, "first_to_answer", lambda _, busy: busy[0])
         yield
 
 

@@ -9,8 +9,8 @@ import pytest
 
 from harness.records import gathered
 from harness.records.gathered import Gathered, gather, parts
-from harness.runner import campaign_run, estimate_run, stored_estimates, stored_shard
-from harness.runner.gathered_blocks import COLUMNS
+from harness.runner import campaign_run, estimate_run, stored_estimates, stored_shards
+from harness.runner.stored_shards import COLUMNS
 from tests.runner.conftest import TWIN
 from tests.runner.stored_runs import copy_of, manifest, shard_files, unlike_columns
 
@@ -57,7 +57,7 @@ def test_a_run_goes_on_without_opening_a_shard(run_here, campaign, twin_run, tmp
     out = tmp_path / "run"
     run_here(campaign(*TWIN, "stop.episodes=240"), out)
     with monkeypatch.context() as patch:
-        patch.setattr(stored_shard, "read_table", refuse)
+        patch.setattr(stored_shards, "read_table", refuse)
         run_here(campaign(*TWIN), out, resume=True)
     assert unlike_columns(twin_run, out) == []
     assert [path.name for path in parts(out)] == ["part-000000.parquet", "part-000001.parquet"]

@@ -21,7 +21,7 @@ from harness.part import Part
 from harness.records.folder import TABLES
 from harness.runner import run_part
 from harness.runner.manifest import Prefix
-from harness.runner.parts_together import ranges
+from harness.runner.merge import ranges
 from tests.runner.conftest import MIXTURE_FILE, TWIN, one_process
 from tests.runner.stored_runs import copy_of, manifest, shard_files, truncate, unlike_columns
 from tests.runner.test_runner_same_bits import struck

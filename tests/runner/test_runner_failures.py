@@ -16,7 +16,7 @@ import pytest
 from harness.cli import main
 from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, WorldDisagreementError
 from harness.progress import LineProgress
-from harness.runner import campaign_run, local_executor, shard_pool, worker
+from harness.runner import campaign_run, executor, shard_pool, worker
 from harness.runner.shard_pool import WorkerLostError
 from harness.runner.worker import ShardSpec
 from tests.runner import bad_workers
@@ -27,7 +27,7 @@ SHARDS_BEFORE_FAILURE = 3
 
 
 def test_a_shard_that_kills_every_worker_ends_the_run_and_is_named(run, campaign, tmp_path, monkeypatch):
-    monkeypatch.setattr(local_executor, "serve", bad_workers.dying)
+    monkeypatch.setattr(executor, "serve", bad_workers.dying)
     monkeypatch.setattr(shard_pool, "ATTEMPTS", 2)
     with pytest.raises(
         WorkerLostError, match=r"shard 0 \(from episode 0\): found 2 worker processes that died"
@@ -40,7 +40,7 @@ def test_a_shard_that_kills_every_worker_ends_the_run_and_is_named(run, campaign
 
 
 def test_a_disagreement_in_a_worker_ends_the_run_and_all_workers(run, campaign, tmp_path, monkeypatch):
-    monkeypatch.setattr(local_executor, "serve", bad_workers.disobedient)
+    monkeypatch.setattr(executor, "serve", bad_workers.disobedient)
     with pytest.raises(WorldDisagreementError, match="SUMO, BV3, m"):
         run(campaign(*TWIN), tmp_path, workers=2)
     assert manifest(tmp_path)["status"] == "interrupted"

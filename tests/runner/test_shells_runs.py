@@ -16,7 +16,6 @@ from harness.errors import CampaignError, RunFolderError
 from harness.estimators.limit_search import Level
 from harness.estimators.stratified import Tally, combined
 from harness.runner.allocation import GROWTH, Allocation, first_tests
-from harness.runner.campaign_run import episodes_on_disk
 from harness.runner.manifest import Manifest, Prefix
 from harness.runner.planner import round_specs
 from harness.strata import ShellDesign, Statement
@@ -170,10 +169,6 @@ def test_a_continuation_that_dies_leaves_a_manifest_that_is_true(campaign, run_h
         for shard in shards
     )
     assert estimate(out)["n_episodes"] == manifest(out)["n_episodes"]
-
-
-def test_the_bar_begins_where_the_run_was(shells_run):
-    assert episodes_on_disk(shells_run.folder) == shells_run.estimates["n_episodes"]
 
 
 @pytest.mark.parametrize(("asked", "place"), [("library", 0), ("need-based", 1)])
