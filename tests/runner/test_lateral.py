@@ -24,19 +24,15 @@ COLUMNS = ["lead_steps", "onset_step", "onset_r2_m", "onset_r2dot_mps", "onset_t
 
 
 @pytest.fixture(scope="module")
-def lateral_run(campaign, run, tmp_path_factory):
+def lateral_run(campaign, run_here, tmp_path_factory):
     """In SUMO, eight cells. Never written to."""
     out = tmp_path_factory.mktemp("lateral") / "run"
-    return run(campaign(*SHELLS, "world.cells=8"), out, workers=1)
+    return run_here(campaign(*SHELLS, "world.cells=8"), out)
 
 
 def test_it_reaches_the_precision_and_the_twin_has_retraced_every_test(lateral_run):
     assert (lateral_run.exit_code, lateral_run.stopped_by) == (0, "rhw")
-    retraced = (
-        lateral_run.estimates["retraced"]
-        if "retraced" in lateral_run.estimates
-        else manifest(lateral_run.folder)["retraced"]
-    )
+    retraced = manifest(lateral_run.folder)["retraced"]
     assert retraced["n_equal"] > 500
     assert retraced["compared"][:2] == ["onset_r2_m", "onset_r2dot_mps"]
     shells = lateral_run.estimates["estimates"]["shells"]

@@ -22,9 +22,9 @@ from harness.records.folder import TABLES
 from harness.runner import run_part
 from harness.runner.manifest import Prefix
 from harness.runner.merge import ranges
-from tests.runner.conftest import MIXTURE_FILE, TWIN, one_process
+from tests.runner.conftest import MIXTURE_FILE, TWIN
 from tests.runner.stored_runs import copy_of, manifest, shard_files, truncate, unlike_columns
-from tests.runner.test_runner_same_bits import struck
+from tests.runner.test_runner_same_bits import struck_run
 from tests.runner.test_runner_wrong_folders import SAME, complaint_of
 
 METHODS = {
@@ -33,15 +33,6 @@ METHODS = {
     "published": ("testing.method=step_mixture", "testing.challenge=immediate", "stop.estimator=scv"),
 }
 OF_THE_MACHINE = {"created", "wall_time_s", "workers", "results"}
-
-
-@pytest.fixture(scope="module")
-def part_here():
-    def run_in_this_process(campaign, number, of, out, **options):
-        with one_process():
-            return run_part(campaign, Part(number, of), out, workers=1, **options)
-
-    return run_in_this_process
 
 
 @pytest.fixture(scope="module")
@@ -91,7 +82,7 @@ def test_merged_parts_are_the_whole_run(method, campaign, run_here, part_here, m
 
 def test_in_sumo_with_a_part_that_was_killed(sumo_run, campaign, part_here, merged, tmp_path):
     parts = [tmp_path / f"part{number}" for number in (1, 2, 3)]
-    killed = struck(parts[1], signal.SIGKILL, 2, "--part", "2/3")
+    killed = struck_run(parts[1], signal.SIGKILL, 2, "--part", "2/3")
     assert killed.returncode == -signal.SIGKILL
     assert len(shard_files(parts[1])) == 1
     for number in (1, 3):

@@ -20,7 +20,7 @@ from harness.runner import campaign_run, executor, shard_pool, worker
 from harness.runner.shard_pool import WorkerLostError
 from harness.runner.worker import ShardSpec
 from tests.runner import bad_workers
-from tests.runner.conftest import MIXTURE_FILE, SMALL, TWIN
+from tests.runner.conftest import MIXTURE_FILE, SMALL, TWIN, sets
 from tests.runner.stored_runs import copy_of, manifest, shard_files, unlike_columns
 
 SHARDS_BEFORE_FAILURE = 3
@@ -51,7 +51,6 @@ def test_a_full_disk_is_said_in_words_and_the_run_can_be_resumed(
     run_here, campaign, twin_run, tmp_path, monkeypatch, capsys
 ):
     out = tmp_path / "run"
-    options = [word for override in (*SMALL, *TWIN) for word in ("--set", override)]
     write = Path.write_bytes
 
     def write_or_fail(path: Path, content: bytes) -> int:
@@ -62,7 +61,7 @@ def test_a_full_disk_is_said_in_words_and_the_run_can_be_resumed(
 
     with monkeypatch.context() as patch:
         patch.setattr(Path, "write_bytes", write_or_fail)
-        assert main(["run", str(MIXTURE_FILE), "--out", str(out), "--workers", "1", *options]) == 2
+        assert main(["run", str(MIXTURE_FILE), "--out", str(out), "--workers", "1", *sets(*SMALL, *TWIN)]) == 2
     complaint = capsys.readouterr().err
     assert "no space left" in complaint
     assert "--resume" in complaint

@@ -74,12 +74,6 @@ def test_a_refused_resumption_costs_no_shorter_shard_either(run_here, campaign, 
     assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
 
 
-def test_a_finished_run_resumed_as_it_is_does_nothing(runs, run_here, campaign, tmp_path):
-    out = copy_of(runs["loose"].folder, tmp_path / "run")
-    run_here(campaign(*COMMON, LOOSE), out, resume=True)
-    assert unlike_columns(runs["loose"].folder, out) == []
-
-
 def test_a_spent_budget_is_exit_code_4_and_can_be_enlarged(runs, run_here, campaign, tmp_path):
     out = tmp_path / "run"
     small = [*COMMON[:1], "stop.episodes=130", *COMMON[2:], LOOSE]

@@ -26,10 +26,10 @@ SHELLS = ("testing.method=shells", "stop.rhw=0.5", "stop.episodes=3000", "stop.m
 
 
 @pytest.fixture(scope="session")
-def shells_run(campaign, run, tmp_path_factory):
-    """One worker, eight cells, in SUMO. Never written to."""
+def shells_run(campaign, run_here, tmp_path_factory):
+    """Eight cells, in SUMO. Never written to."""
     out = tmp_path_factory.mktemp("shells") / "run"
-    return run(campaign(*SHELLS, "world.cells=8"), out, workers=1)
+    return run_here(campaign(*SHELLS, "world.cells=8"), out)
 
 
 def test_it_reaches_the_precision_and_says_both_things(shells_run):
