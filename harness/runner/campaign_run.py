@@ -131,32 +131,26 @@ class Run:
         prepared = prepare(resolved, progress)
         self._executor = executor_of(resolved, out, workers, n_runs=n_runs)
         self._workers = ShardPool(resolved.campaign, self._executor)
-        with ExitStack() as refused:
-            refused.callback(self._workers.close)
-            self._begin(prepared, earlier, began, facts)
-            refused.pop_all()
-
-    def _begin(self, prepared: Prepared, earlier: dict[str, Any], began: float, facts: dict[str, Any]) -> None:
-        """Write the manifest, and plan the tests if they can be known already."""
-        resolved = self._resolved
-        self._manifest = Manifest(
-            self._out,
-            resolved,
-            earlier,
-            began=began,
-            workers=self._executor.n_workers,
-            distance_per_test_m=distance_per_test_m(resolved.environment),
-            table_errors=table_errors(resolved, prepared.tables),
-            **facts,
-        )
-        self._held: int = earlier["n_episodes"]
         self._retracing = Retracing(resolved)
         self.prescribed: PrescribedEpisodes | None = None
-        self._prepared = prepared
-        if prepared.shadow_paths is None:
-            self._plan(prepared)
+        self._prepared, self._held = prepared, int(earlier["n_episodes"])
         self.prefix = Prefix(of_part="part" in facts)
         self._ungathered: list[dict[str, Any]] = []
+        with ExitStack() as refused:
+            refused.callback(self._workers.close)
+            self._manifest = Manifest(
+                out,
+                resolved,
+                earlier,
+                began=began,
+                workers=self._executor.n_workers,
+                distance_per_test_m=distance_per_test_m(resolved.environment),
+                table_errors=table_errors(resolved, prepared.tables),
+                **facts,
+            )
+            if prepared.shadow_paths is None:
+                self._plan(prepared)
+            refused.pop_all()
 
     def run_all(self) -> None:
         """Run shadow runs, if there are any to make, and then rounds of shards until the stop rule is content."""

@@ -22,7 +22,7 @@ from harness.estimators.paired_shells import PairedEstimate, paired_estimate
 from harness.estimators.paired_statement import conditional_paired_statement, margin_statement, paired_statement
 from harness.estimators.pairs import PairCounts, PairedShells, Verdict
 from harness.estimators.round_stopping import LOOKS, PairRule
-from harness.pool.shells import Draw, PrescribedEpisodes, acceleration_limit
+from harness.pool.shells import Draw, acceleration_limit
 from harness.progress import Progress, SilentProgress
 from harness.records.folder import sole_use
 from harness.records.reader import read_shards
@@ -93,7 +93,8 @@ def compare_shells(
             earlier = require_own_folder(folder, resolved, resume=True)
             held.append(list(_held_specs(folder, earlier)))
             runs.append(Run(resolved, folder, earlier, workers, progress, began, n_runs=2))
-        prescribed = _same_cut_ins(runs)
+        if (prescribed := runs[0].prescribed) is None:  # those of both: one environment and one library make one pool
+            raise ValueError("the campaigns do not draw from shells")
         planner = PairPlanner(campaign, prescribed.design, prescribed.available, margin)
         pairs = PairedShells(prescribed.design)
         both = [_Side(run, side, pairs, planner.rule, campaign.run.shard_size) for side, run in enumerate(runs)]
@@ -108,14 +109,6 @@ def compare_shells(
             run.discard_uncounted()
             run.finish()
     return paired_estimate(counts, campaign.stop.confidence), planner.rule
-
-
-def _same_cut_ins(runs: list[Run]) -> PrescribedEpisodes:
-    """Cut-ins of both: one environment and one library make one pool."""
-    a, b = (run.prescribed for run in runs)
-    if a is None or b is None:
-        raise ValueError("the campaigns do not draw from shells")
-    return a
 
 
 def _drive(planner: PairPlanner, pairs: PairedShells, both: list[_Side]) -> PairCounts:

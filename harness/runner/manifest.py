@@ -5,6 +5,7 @@ from __future__ import annotations
 import platform
 import time
 from collections import Counter
+from dataclasses import asdict
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
@@ -237,7 +238,7 @@ class Manifest:
             "ending": ending,
             "retraced": retraced,
             "reproducible": self._reproducible and not (repeated and repeated.differing),
-            "repeated": None if repeated is None else repeated.to_json(),
+            "repeated": None if repeated is None else asdict(repeated),
             "wall_time_s": round(self._written - self._began, 3),
             "n_episodes": prefix.n_episodes,
             "reported_from": prefix.reported_from if prefix.reported_from < prefix.n_episodes else 0,

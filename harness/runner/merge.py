@@ -105,11 +105,6 @@ class PartFolder:
         """Of a part, from 1 on."""
         return int(self.manifest["part"]["number"])
 
-    @property
-    def of(self) -> int:
-        """How many parts there are."""
-        return int(self.manifest["part"]["of"])
-
 
 def in_order(folders: Sequence[Path]) -> list[PartFolder]:
     """All that makes one run, in the order of its tests: the plan, if its parts have one, comes first.
@@ -131,8 +126,8 @@ def in_order(folders: Sequence[Path]) -> list[PartFolder]:
         (plans if kind == PLAN else parts).append(PartFolder(folder, manifest))
     parts.sort(key=lambda part: part.number)
     _require_a_plan(plans, parts)
-    _require_alike(parts, {"a number of parts of": lambda manifest: manifest["part"]["of"]})
-    _require_alike([*plans, *parts], _OF_ONE_RUN)
+    _require_alike(parts, lambda manifest: {"a number of parts of": manifest["part"]["of"]})
+    _require_alike([*plans, *parts], _making)
     _require_each_once(parts)
     return [*plans, *parts]
 
@@ -158,32 +153,30 @@ def _require_a_plan(plans: Sequence[PartFolder], parts: Sequence[PartFolder]) ->
             raise refusal(plans, "a plan by itself", "all parts of its second phase", mend)
 
 
-def _require_alike(folders: Sequence[PartFolder], values: Mapping[str, Callable[[Mapping[str, Any]], Any]]) -> None:
+def _require_alike(folders: Sequence[PartFolder], making: Callable[[Mapping[str, Any]], dict[str, Any]]) -> None:
     """Refuse parts that could not have come from one run."""
     first, *others = folders
-    for what, value in values.items():
+    for what, expected in making(first.manifest).items():
         for other in others:
-            if value(other.manifest) != value(first.manifest):
-                raise RunFolderError(
-                    str(other.folder),
-                    found=f"{what} {value(other.manifest)}",
-                    expected=f"{value(first.manifest)}, as in {first.folder}",
-                    mend=_AGAIN,
-                )
+            if (found := making(other.manifest)[what]) != expected:
+                as_first = f"{expected}, as in {first.folder}"
+                raise RunFolderError(str(other.folder), found=f"{what} {found}", expected=as_first, mend=_AGAIN)
 
 
-_OF_ONE_RUN: dict[str, Callable[[Mapping[str, Any]], Any]] = {
-    "campaign": lambda manifest: manifest["campaign_hash"],
-    "plan": lambda manifest: plan_hash(manifest.get("plan")),
-    "harness": lambda manifest: manifest["versions"].get("harness"),
-    "libsumo": lambda manifest: manifest["versions"].get("libsumo") if manifest["engine"] == "sumo" else None,
-    "a controller's source file with hash": lambda manifest: manifest.get("controller_sha256"),
-}
-"""What must be equal; the campaign's hash covers the environment's parameters."""
+def _making(manifest: Mapping[str, Any]) -> dict[str, Any]:
+    """What must be equal; the campaign's hash covers the environment's parameters."""
+    versions = manifest["versions"]
+    return {
+        "campaign": manifest["campaign_hash"],
+        "plan": plan_hash(manifest.get("plan")),
+        "harness": versions.get("harness"),
+        "libsumo": versions.get("libsumo") if manifest["engine"] == "sumo" else None,
+        "a controller's source file with hash": manifest.get("controller_sha256"),
+    }
 
 
 def _require_each_once(parts: Sequence[PartFolder]) -> None:
-    of = parts[0].of
+    of = parts[0].manifest["part"]["of"]
     numbers = Counter(part.number for part in parts)
     wrong = {
         "given twice": ([n for n in numbers if numbers[n] > 1], "Name each folder once"),

@@ -17,14 +17,12 @@ from harness.controllers.apart import AvEndedProcessError, run_apart
 from harness.controllers.hosts import BatchHost, ControllerHost
 from harness.controllers.loading import build_host
 from harness.controllers.protocol import BatchObservation
-from harness.criticality.tables import tables_cached
 from harness.environment.lateral import DISTANCE_M as OVERLAP_M
 from harness.importance.build import needs_tables
-from harness.pool.shadow_paths import shadow_paths_file
 from harness.pool.shells import acceleration_limit, design_shells
 from harness.pool.storage import cached_pool
 from harness.resolved import Resolved
-from harness.runner.prepare import build_world, require_ready
+from harness.runner.prepare import build_world, cached_files, require_ready
 from harness.strata import ASSUMPTION_FREE
 from harness.sumo.shim import shim_library
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
@@ -146,18 +144,17 @@ def _rounded(value: float) -> float:
 
 
 def _tables(resolved: Resolved) -> str:
-    campaign = resolved.campaign
-    if campaign.testing.method == "shells" and campaign.has_shadow_runs:
-        known = "cached" if shadow_paths_file(resolved).is_file() else f"to choose ({POOL_S} on two cores)"
-        return f"paths of {campaign.pool.shadow_paths:,} shadow runs: {known}"
-    if campaign.testing.method == "shells":
-        return "pool of cut-ins: " + ("cached" if cached_pool(resolved) else f"to build ({POOL_S} on two cores)")
-    if not needs_tables(campaign):
+    campaign, files = resolved.campaign, cached_files(resolved)
+    if not files:
         return "none needed"
-    if tables_cached(resolved.environment, resolved.surrogates, campaign.testing.challenge):
-        return "cached"
-    seconds = 5 if campaign.environment.acceleration_hold_s >= 0.5 else 40
-    return f"to build (about {seconds * len(campaign.surrogates)} s of one core)"
+    cached = all(file.is_file() for file in files)
+    if campaign.testing.method != "shells":
+        seconds = (5 if campaign.environment.acceleration_hold_s >= 0.5 else 40) * len(campaign.surrogates)
+        return "cached" if cached else f"to build (about {seconds} s of one core)"
+    what, make = "pool of cut-ins", "build"
+    if campaign.has_shadow_runs:
+        what, make = f"paths of {campaign.pool.shadow_paths:,} shadow runs", "choose"
+    return f"{what}: " + ("cached" if cached else f"to {make} ({POOL_S} on two cores)")
 
 
 class _FailedError(Exception):

@@ -103,7 +103,8 @@ class ShellPlanner(Planner):
     number does not depend on their results.
 
     ``available``, shape (S,), are the most tests of each stratum, ``held`` see `RoundRule`; ``seen`` are the tests of
-    this phase, ``reported_from`` the first test of the second one, ``expected_rhw`` what is expected of that.
+    this phase, ``drawn`` those of both, (S,); ``reported_from`` is the first test of the second phase, ``planned`` its
+    tests, (S,), once they are, ``expected_rhw`` what is expected of them.
     """
 
     rule: RoundRule
@@ -117,8 +118,8 @@ class ShellPlanner(Planner):
         self.expected_rhw = math.inf
         self._campaign = campaign
         self._allocation = Allocation.of(shells, design, available)
-        self._drawn = np.zeros(design.p.size, np.int64)
-        self._planned: IntArray | None = None
+        self.drawn = np.zeros(design.p.size, np.int64)
+        self.planned: IntArray | None = None
         self._begin_phase()
 
     def _begin_phase(self) -> None:
@@ -128,22 +129,22 @@ class ShellPlanner(Planner):
     @property
     def tally(self) -> Tally:
         """What the tests of each stratum have come to so far."""
-        return self.seen.tally if self._n_episodes else empty_tally(self._drawn.size)
+        return self.seen.tally if self._n_episodes else empty_tally(self.drawn.size)
 
     def rounds(self) -> Iterator[Iterator[ShardSpec]]:
         """See `Planner`."""
         n_shards = 0
         while (added := self.next_round()).any():
             first = self.reported_from + self._n_episodes
-            specs = round_specs(self._drawn, added, n_shards, first, self._campaign.run.shard_size)
-            self._drawn = self._drawn + added
+            specs = round_specs(self.drawn, added, n_shards, first, self._campaign.run.shard_size)
+            self.drawn = self.drawn + added
             n_shards += len(specs)
             yield iter(specs)
 
     def next_round(self) -> IntArray:
         """Tests to add per stratum, shape (S,); all 0 when no stratum or no budget is left."""
         tally, budget = self.tally, self._campaign.stop.episodes - self.reported_from - self._n_episodes
-        added = self._allocation.next_round(tally, budget) if self._planned is None else self._planned - tally.tests
+        added = self._allocation.next_round(tally, budget) if self.planned is None else self.planned - tally.tests
         self.rule.of_first_tests = self._allocation.is_first(tally.tests, added)
         self._look = self._n_episodes + int(added.sum())
         return added
@@ -155,14 +156,14 @@ class ShellPlanner(Planner):
         if self._n_episodes != self._look:
             return False
         enough = self.rule.observe(self.seen)
-        if not (enough and self._plans and self.rule.reached and self._planned is None):
-            return enough or self._planned is not None
+        if not (enough and self._plans and self.rule.reached and self.planned is None):
+            return enough or self.planned is not None
         budget = self._campaign.stop.episodes - self._n_episodes
-        stop, left = self._campaign.stop, self._allocation.available - self._drawn
+        stop, left = self._campaign.stop, self._allocation.available - self.drawn
         rhw = stop.rhw or math.inf
-        self._planned = self._allocation.second_phase(self.tally, left, budget, rhw, stop.confidence)
-        if self._planned.any():
-            self.expected_rhw = self._allocation.expected_rhw(self.tally, self._planned, stop.confidence)
+        self.planned = self._allocation.second_phase(self.tally, left, budget, rhw, stop.confidence)
+        if self.planned.any():
+            self.expected_rhw = self._allocation.expected_rhw(self.tally, self.planned, stop.confidence)
         self.rule, self.reported_from = RoundRule(self._campaign), self._n_episodes
         self._begin_phase()
         return False

@@ -15,7 +15,6 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -65,10 +64,6 @@ class Repeated:
 
     n_episodes: int
     differing: tuple[int, ...]
-
-    def to_json(self) -> dict[str, Any]:
-        """As the manifest has it."""
-        return {**asdict(self), "differing": list(self.differing)}
 
 
 @dataclass(frozen=True)
@@ -162,7 +157,7 @@ class ShardRunner:
         tables = shard_tables(shard, campaign.seed, keep_traces=keep_traces)
         # A vehicle must show that it does the same again: built-in models do, and outside programs need not.
         if spec.index == 0 and campaign.av.model is None and campaign.av.traci is None:
-            metadata = {**(tables.episodes.schema.metadata or {}), REPEATED: json.dumps(self._repeat(shard).to_json())}
+            metadata = {**(tables.episodes.schema.metadata or {}), REPEATED: json.dumps(asdict(self._repeat(shard)))}
             tables = tables._replace(episodes=tables.episodes.replace_schema_metadata(metadata))
         return replace(finished(self._prepared, self._retracing, spec, tables), parquet=encoded(tables))
 

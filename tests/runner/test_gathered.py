@@ -78,7 +78,7 @@ def test_a_damaged_part_is_passed_over(stored, monkeypatch):
     (part,) = parts(stored)
     size, expected = part.stat().st_size, estimate_run(stored, estimators=WITHOUT_SCV)
     whole = part.read_bytes()
-    for at in (0, 10, size // 4, size // 2, size - 200, size - 6, size - 1):
+    for at in (0, size // 2, size - 200, size - 1):
         part.write_bytes(whole)
         flip(part, at)
         assert estimate_run(stored, estimators=WITHOUT_SCV) == expected

@@ -308,9 +308,3 @@ def test_a_folder_keeps_to_its_part(parts, twin_run, tmp_path, capsys):
         text = complaint_of(capsys, command, two)
         assert f"found: {held} expected: a whole run" in text
         assert "harness merge" in text
-
-
-def test_junit_wants_a_result(tmp_path, capsys):
-    junit = ["--junit", tmp_path / "gate.xml"]
-    text = complaint_of(capsys, "run", MIXTURE_FILE, "--out", tmp_path / "part", "--part", "1/2", *SAME, *junit)
-    assert "a part has no result" in text
