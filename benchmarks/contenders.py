@@ -23,7 +23,7 @@ from harness.episode.loop import Shard
 from harness.records.folder import encoded, write_shard
 from harness.records.tables import shard_tables
 from harness.resolved import resolve
-from harness.runner.local_executor import LocalExecutor
+from harness.runner.executor import LocalExecutor
 from harness.runner.prepare import Prepared, prepare
 from harness.runner.shard_pool import ShardPool
 from harness.runner.worker import ShardSpec

@@ -6,7 +6,6 @@ import math
 import sys
 import threading
 import time
-from types import TracebackType
 from typing import Self, TextIO
 
 from rich.console import Console
@@ -93,18 +92,9 @@ class ShownProgress(Progress):
         self._figures: dict[str, Figure] = {}
 
     def __enter__(self) -> Self:
-        self._open()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._close()
-
-    def _open(self) -> None:
-        """Begin to show."""
-
-    def _close(self) -> None:
+    def __exit__(self, *_: object) -> None:
         """Show no more."""
 
     def stage(self, name: str, total: int | None, *, done: int = 0) -> None:
@@ -151,10 +141,11 @@ class RichProgress(ShownProgress):
         )
         self._task: TaskID | None = None
 
-    def _open(self) -> None:
+    def __enter__(self) -> Self:
         self._bars.start()
+        return self
 
-    def _close(self) -> None:
+    def __exit__(self, *_: object) -> None:
         self._bars.stop()
 
     def stage(self, name: str, total: int | None, *, done: int = 0) -> None:
@@ -200,10 +191,11 @@ class LineProgress(ShownProgress):
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._print_lines, daemon=True)  # a shard may take longer than that
 
-    def _open(self) -> None:
+    def __enter__(self) -> Self:
         self._thread.start()
+        return self
 
-    def _close(self) -> None:
+    def __exit__(self, *_: object) -> None:
         self._ended.set()
         self._thread.join()
 

@@ -51,12 +51,9 @@ class Resolved:
 
 
 def require_lead_is_drawn(campaign: Campaign) -> None:
-    """Refuse what does not know how long a cut-in shows itself before BV overlaps.
+    """Refuse (`CampaignError`) what does not know how long a cut-in shows itself before BV overlaps.
 
-    Raises
-    ------
-    CampaignError
-        The method's tables are for cut-ins of one step, or nobody could draw the lead.
+    The method's tables are for cut-ins of one step, or nobody could draw the lead.
     """
     method, acts = campaign.testing.method, campaign.av.acts_before_cut_in
     if SAMPLING[method].mixes:

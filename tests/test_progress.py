@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from harness.progress import LineProgress, RichProgress, ShownProgress, SilentProgress, episodes_left, shown_progress
+from harness.progress import LineProgress, RichProgress, ShownProgress, episodes_left, shown_progress
 
 
 class Terminal(io.StringIO):
@@ -157,14 +157,6 @@ def test_a_stage_of_unknown_length_is_named():
     lines = LineProgress()
     lines.stage("estimates and report", None)
     assert lines.line().endswith(" estimates and report")
-
-
-def test_silence(capsys):
-    silent = SilentProgress()
-    silent.stage("episodes", total=3)
-    silent.advance(1)
-    silent.status(crashes=1)
-    assert capsys.readouterr() == ("", "")
 
 
 def test_a_precision_that_is_not_known_is_not_shown_as_one(monkeypatch):

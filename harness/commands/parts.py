@@ -86,8 +86,7 @@ def plan(
     from harness.runner.planner import FIRST_PHASE  # noqa: PLC0415 - as above
 
     first_rhw = None if campaign.stop.rhw is None else FIRST_PHASE * campaign.stop.rhw
-    bar = shown_progress(first_rhw, campaign.min_crashes, quiet=quiet)
-    with bar:
+    with shown_progress(first_rhw, campaign.min_crashes, quiet=quiet) as bar:
         planned = plan_second_phase(campaign, folder, workers=workers, resume=resume, progress=bar)
     print_planned(planned, as_json=as_json)
     ctx.exit(planned.exit_code)
@@ -101,12 +100,17 @@ def named_plan(named: Path, out: Path, part: Part | None, given: Sequence[str], 
     HarnessError
         It has not planned anything; no part of it is asked for; or options are ``given`` for which it leaves no room.
     """
-    if not named.is_dir() and (named.exists() or not resume):
-        return None
-    from harness.runner import plan_folder, read_plan  # noqa: PLC0415 - slow to import
+    where = named
+    if not named.is_dir():
+        if named.exists() or not resume:
+            return None
+        from harness.records.folder import MANIFEST, read_manifest  # noqa: PLC0415 - slow to import
 
-    if (where := plan_folder(named, out)) is None:
-        return None
+        if not (out / MANIFEST).is_file() or not read_manifest(out).get("plan"):
+            return None
+        where = out  # a plan that is gone is no loss to a part that was begun
+    from harness.runner import read_plan  # noqa: PLC0415 - slow to import
+
     found = read_plan(where)
     if part is None:
         mend = "Write --part K/N, or --part 1/1 for all of it, and `harness merge` makes the run."
@@ -145,8 +149,7 @@ def merge(ctx: click.Context, parts: Sequence[Path], folder: Path, *, quiet: boo
     from harness.progress import shown_progress  # noqa: PLC0415 - keeps --help fast
     from harness.runner import merge_parts  # noqa: PLC0415 - keeps --help fast
 
-    bar = shown_progress(quiet=quiet)
-    with bar:
+    with shown_progress(quiet=quiet) as bar:
         result = merge_parts(parts, folder, progress=bar)
     if as_json:
         print_json(result.estimates)

@@ -4,11 +4,10 @@ from harness.runner.av_check import AvCheck, check_av
 from harness.runner.campaign_run import run_campaign
 from harness.runner.compare import Comparison, compare_campaigns
 from harness.runner.merge import merge_parts
-from harness.runner.parts import PartResult, run_part
+from harness.runner.parts import PartResult, Plan, PlanResult, plan_second_phase, read_plan, run_part
 from harness.runner.plan import plan_campaign
 from harness.runner.replay import ReplayResult, replay_episode
 from harness.runner.run_result import RunResult
-from harness.runner.second_phase import Plan, PlanResult, plan_folder, plan_second_phase, read_plan
 from harness.runner.stored_estimates import estimate_run
 
 __all__ = [
@@ -24,7 +23,6 @@ __all__ = [
     "estimate_run",
     "merge_parts",
     "plan_campaign",
-    "plan_folder",
     "plan_second_phase",
     "read_plan",
     "replay_episode",

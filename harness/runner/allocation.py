@@ -9,6 +9,7 @@ from functools import partial
 import numpy as np
 
 from harness.arrays import BoolArray, IntArray
+from harness.campaign.testing import ShellSettings
 from harness.estimators.intervals import clopper_pearson
 from harness.estimators.likelihood_limits import spread
 from harness.estimators.limit_search import Level
@@ -64,6 +65,16 @@ class Allocation:
     available: IntArray
     statement: str = ASSUMPTION_FREE
     smallest_round: int = 1
+
+    @classmethod
+    def of(cls, shells: ShellSettings, design: ShellDesign, available: IntArray) -> Allocation:
+        """That of a campaign's ``testing.shells``."""
+        first = first_tests(design, shells.first_tests)
+        return cls(design, first, available, shells.statement, shells.smallest_round)
+
+    def is_first(self, tests: IntArray, added: IntArray) -> bool:
+        """Whether a round after so many tests per stratum, (S,) each, brings some that a stratum gets in any case."""
+        return bool(np.any((tests < self.first_tests)[added > 0]))
 
     @property
     def n_asked(self) -> int:

@@ -71,18 +71,10 @@ class Speed:
 
 @dataclass(frozen=True)
 class AvCheck:
-    """What a few dozen episodes say about an AV.
+    """What a few dozen episodes say about an AV, run on an engine with cut-ins that a method brought about.
 
-    Attributes
-    ----------
-    source, engine, method : str
-        Which AV, where it ran, and how cut-ins were brought about.
-    failures : dict
-        Cause → number of episodes of the first run that failed with it.
-    differing : tuple of int
-        Episodes whose motion was not the same bits in the two layouts.
-    limits_mps2 : (float, float)
-        Accelerations that count as its limits.
+    ``failures`` are numbers of episodes of the first run by the cause that they failed with, ``differing`` those whose
+    motion was not the same bits in the two layouts, ``limits_mps2`` the accelerations that count as its limits.
     """
 
     source: str
@@ -164,14 +156,9 @@ def _require_immediate(tested: Campaign) -> None:
 
 
 def check_av_apart(campaign: Campaign, n_episodes: int = EPISODES) -> AvCheck:
-    """`check_av` in a process of its own where the AV is a user's code, so that code which ends its process is told.
+    """`check_av` in a process of its own where the AV is a user's code.
 
-    Raises
-    ------
-    HarnessError
-        As `check_av`.
-    AvEndedProcessError
-        The controller ended the process; its last call is named.
+    If that ends the process, the `AvEndedProcessError` names its last call.
     """
     if not has_foreign_code(campaign):
         return check_av(campaign, n_episodes)

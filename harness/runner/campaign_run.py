@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from functools import cache, partial
 from importlib import import_module
@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from harness.campaign.models import Campaign
 from harness.errors import RunFolderError
@@ -33,32 +32,31 @@ from harness.records.folder import (
 )
 from harness.records.gathered import MOST_EPISODES, MOST_SHARDS, gather
 from harness.resolved import Resolved
-from harness.runner.gathered_blocks import COLUMNS, GatheredBlocks
 from harness.runner.manifest import (
     SMALLEST_FAILED_SAMPLE,
     Manifest,
     Prefix,
     cpu_name,
+    require_few_failed,
     require_no_fewer,
     require_own_folder,
 )
-from harness.runner.planner import PartPlanner, Planner, planner_of
+from harness.runner.planner import Planner, planner_of
 from harness.runner.prepare import Prepared, distance_per_test_m, prepare, require_ready, require_same_pool
 from harness.runner.retrace import Retracing
-from harness.runner.run_result import ESTIMATES, RunResult, earlier_result, exit_code, results_of, what_stopped
+from harness.runner.run_result import ESTIMATES, RunResult, conclusion, earlier_result, exit_code, results_of
 from harness.runner.shadow_runs import (
     as_recorded,
-    require_few_failed,
     shadow_file,
     shadow_specs,
     stored_shadows,
 )
 from harness.runner.shard_pool import ShardPool, executor_of
 from harness.runner.stored_estimates import estimate_run
-from harness.runner.stored_shard import stored_shard
+from harness.runner.stored_shards import COLUMNS, GatheredBlocks, stored_shard
 from harness.runner.table_accuracy import table_errors
 from harness.runner.worker import ShardDone, ShardSpec
-from harness.stopped_by import StoppedBy, ending
+from harness.stopped_by import StoppedBy
 
 
 def run_campaign(
@@ -110,18 +108,9 @@ def run_campaign(
 class Run:
     """A campaign on its way into a folder, in which nobody but this process writes.
 
-    Attributes
-    ----------
-    prefix : Prefix
-        What is finished.
-    prescribed : PrescribedEpisodes or None
-        Cut-ins to draw from, where they are prescribed.
-    planner : Planner
-        The campaign's own; another may take its place before the first round.
-
-    Notes
-    -----
-    ``n_runs`` are at work in turns; ``facts`` are keys of the manifest of what is only a part of a run, or its plan.
+    ``prefix`` is what is finished, ``prescribed`` are cut-ins to draw from, if there are; another ``planner`` may take
+    the place of the campaign's own before the first round. ``n_runs`` are at work in turns; ``facts`` are keys of the
+    manifest of what is only a part of a run, or its plan.
     """
 
     def __init__(
@@ -142,32 +131,26 @@ class Run:
         prepared = prepare(resolved, progress)
         self._executor = executor_of(resolved, out, workers, n_runs=n_runs)
         self._workers = ShardPool(resolved.campaign, self._executor)
-        with ExitStack() as refused:
-            refused.callback(self._workers.close)
-            self._begin(prepared, earlier, began, facts)
-            refused.pop_all()
-
-    def _begin(self, prepared: Prepared, earlier: dict[str, Any], began: float, facts: dict[str, Any]) -> None:
-        """Write the manifest, and plan the tests if they can be known already."""
-        resolved = self._resolved
-        self._manifest = Manifest(
-            self._out,
-            resolved,
-            earlier,
-            began=began,
-            workers=self._executor.n_workers,
-            distance_per_test_m=distance_per_test_m(resolved.environment),
-            table_errors=table_errors(resolved, prepared.tables),
-            **facts,
-        )
-        self._held, self._listed = earlier["n_episodes"], earlier["shards"]
         self._retracing = Retracing(resolved)
         self.prescribed: PrescribedEpisodes | None = None
-        self._prepared = prepared
-        if prepared.shadow_paths is None:
-            self._plan(prepared)
+        self._prepared, self._held = prepared, int(earlier["n_episodes"])
         self.prefix = Prefix(of_part="part" in facts)
         self._ungathered: list[dict[str, Any]] = []
+        with ExitStack() as refused:
+            refused.callback(self._workers.close)
+            self._manifest = Manifest(
+                out,
+                resolved,
+                earlier,
+                began=began,
+                workers=self._executor.n_workers,
+                distance_per_test_m=distance_per_test_m(resolved.environment),
+                table_errors=table_errors(resolved, prepared.tables),
+                **facts,
+            )
+            if prepared.shadow_paths is None:
+                self._plan(prepared)
+            refused.pop_all()
 
     def run_all(self) -> None:
         """Run shadow runs, if there are any to make, and then rounds of shards until the stop rule is content."""
@@ -182,7 +165,7 @@ class Run:
         """Run shadow runs, if there are any to make: rounds of ``most`` tests may begin (None: not known)."""
         if (paths := self._prepared.shadow_paths) is not None:
             self._plan(self._prepared.after(self._run_shadows(paths)))
-        self._progress.stage(f"episodes{self._executor.where}", most, done=episodes_on_disk(self._out, self._listed))
+        self._progress.stage(f"episodes{self._executor.where}", most, done=self._held)
 
     def run_round(self, specs: Iterator[ShardSpec]) -> bool:
         """Run the shards of a round; True, at once, when the campaign is to stop."""
@@ -232,7 +215,8 @@ class Run:
             self._progress.advance(done.spec.n_episodes)
             self._manifest.note(shadow_runs={"n_runs": sum(map(len, tables)), "n_failed": causes.total()})
             self._manifest.follow(self.prefix)
-        require_few_failed(causes, n, self._campaign.run.max_failed_share)
+        most, where = self._campaign.run.max_failed_share, "the run folder's shadow/ tables"
+        require_few_failed(causes.total(), n, causes, most, "shadow runs", where)
         runs = as_recorded(tables, environment)
         self._manifest.note(distance_per_test_m=runs.mean_distance_m(paths.weight))
         return runs
@@ -248,7 +232,7 @@ class Run:
         self.prefix.require_few_failed(self._campaign, at_least=SMALLEST_FAILED_SAMPLE)
         enough = self.planner.add(done.block)
         self.prefix.reported_from = self.planner.reported_from
-        self._progress.advance(done.spec.n_episodes if done.parquet else 0)
+        self._progress.advance(min(max(self.prefix.n_episodes - self._held, 0), done.spec.n_episodes))
         self._progress.status(**self._figures())
         self._manifest.follow(self.prefix)
         return enough
@@ -275,7 +259,7 @@ class Run:
 
         Only what a rule asks for is called ``rhw``: a bar reckons from it when the campaign will stop.
         """
-        if isinstance(self.planner, PartPlanner):
+        if self.prefix.of_part:
             return {"crashes": self.prefix.n_crashes}
         watched = "half_width" if self._campaign.stop.rhw is None else "rhw"
         figures: dict[str, int | float] = {"crashes": self.prefix.n_crashes, watched: self.planner.rule.rhw}
@@ -288,31 +272,22 @@ class Run:
         for path in {path for table in TABLES for path in shards_on_disk(self._out, table)} - counted:
             path.unlink()
 
-    def _note_cpus(self) -> None:
-        """Name all processors that bits may have come from."""
-        if others := self._executor.cpus():
-            self._manifest.note(cpu=", ".join(sorted({cpu_name(), *others})))
-
     def leave(self, *, stopped_by: StoppedBy | None = None, ending: str | None = None, **facts: Any) -> None:
-        """Write the manifest of a finished part, or of a plan with what it plans: it is estimated with the others."""
-        self._note_cpus()
+        """Write the manifest of what is finished; of a part or a plan that is all, as all are estimated together."""
+        if others := self._executor.cpus():  # bits may have come from any of them
+            self._manifest.note(cpu=", ".join(sorted({cpu_name(), *others})))
         self._manifest.note(**facts)
         retraced = self._retracing.summary(self.prefix.n_retraced)
         self._manifest.write(self.prefix, "done", stopped_by=stopped_by, ending=ending, retraced=retraced)
 
     def finish(self) -> RunResult:
         """Write manifest, estimates and report."""
-        stop, rule, n = self._campaign.stop, self.planner.rule, self.prefix.n_episodes
-        stopped_by = what_stopped(self._campaign, rule, n, self.prefix.reported_from)
-        asked = stop.rhw is not None or rule.decision is not None
-        said = ending(stopped_by, n, rule.waited_for, precision_asked=asked)
+        rule, prefix = self.planner.rule, self.prefix
+        stopped_by, said = conclusion(self._campaign, rule, prefix.n_episodes, prefix.reported_from)
         if stopped_by == "rhw" and self.planner.remark:
             said += f" {self.planner.remark}"
-        retraced = self._retracing.summary(self.prefix.n_retraced)
-        self._note_cpus()
-        if rule.decision is not None:
-            self._manifest.note(decision=rule.decision.to_json())
-        self._manifest.write(self.prefix, "done", stopped_by=stopped_by, ending=said, retraced=retraced)
+        decided = {} if rule.decision is None else {"decision": rule.decision.to_json()}
+        self.leave(stopped_by=stopped_by, ending=said, **decided)
         self._progress.stage("estimates and report", None)
         estimates = estimate_run(self._out)
         write_json(self._out / ESTIMATES, estimates)
@@ -330,13 +305,3 @@ class Run:
 def load_report_meanwhile() -> None:
     """Load matplotlib beside busy workers, once: no earlier, because it would slow down what makes them wait."""
     threading.Thread(target=import_module, args=("harness.report",), daemon=True).start()
-
-
-def episodes_on_disk(folder: Path, listed: Sequence[Mapping[str, Any]] = ()) -> int:
-    """Episodes that an earlier run has finished, for the progress bar; ``listed`` are shards of its manifest."""
-    known = {shard["files"]["episodes"]: int(shard["n_episodes"]) for shard in listed}
-    n = 0
-    for path in shards_on_disk(folder, "episodes"):
-        with suppress(OSError, pa.ArrowException):  # a damaged file is refused when its turn comes
-            n += known.get(f"episodes/{path.name}") or pq.read_metadata(path).num_rows
-    return n

@@ -36,19 +36,10 @@ MAY_DIFFER = frozenset({"av", "name", "description"})
 
 @dataclass(frozen=True)
 class Comparison:
-    """Two finished campaigns and what lies between them.
+    """Two finished campaigns, in run folders ``a`` and ``b``, and the difference, under shells a `PairedEstimate`.
 
-    Attributes
-    ----------
-    folder : Path
-        Holds the run folders ``a`` and ``b``, and ``compare.json``.
-    difference : Difference or PairedEstimate
-        The latter under shells.
-    content : dict
-        Content of ``compare.json``.
-    exit_code : int
-        0; 4 when the budget was spent before the asked precision, or with the margin open; 5 when B is worse than A by
-        more than the margin.
+    ``content`` is that of ``compare.json``. The exit code is 4 when the budget was spent before the asked precision, or
+    with the margin open, and 5 when B is worse than A by more than the margin.
     """
 
     folder: Path
@@ -146,13 +137,7 @@ def _compare_weighted(
 
 
 def require_comparable(a: Campaign, b: Campaign) -> None:
-    """Refuse campaigns that differ in more than the vehicle.
-
-    Raises
-    ------
-    CampaignError
-        Names every key that differs, with both values.
-    """
+    """Refuse campaigns that differ in more than the vehicle, by a `CampaignError` that names every key that differs."""
     keys = set(MAY_DIFFER)
     apart = list(_differing("", a.model_dump(exclude=keys), b.model_dump(exclude=keys)))
     if not apart:
@@ -258,13 +243,7 @@ def _content(
 
 
 def _take_over(stored: Path, folder: Path, resolved: Resolved) -> None:
-    """Copy a stored run to where A is to be run, unless an earlier call has done so.
-
-    Raises
-    ------
-    RunFolderError
-        It is no run of this campaign.
-    """
+    """Copy a stored run of A, and no other (`RunFolderError`), to where A is to be run, unless it is there already."""
     if folder.exists() and any(folder.iterdir()):
         return
     manifest = require_whole(stored)

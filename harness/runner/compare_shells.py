@@ -22,15 +22,14 @@ from harness.estimators.paired_shells import PairedEstimate, paired_estimate
 from harness.estimators.paired_statement import conditional_paired_statement, margin_statement, paired_statement
 from harness.estimators.pairs import PairCounts, PairedShells, Verdict
 from harness.estimators.round_stopping import LOOKS, PairRule
-from harness.pool.shells import Draw, PrescribedEpisodes, acceleration_limit
+from harness.pool.shells import Draw, acceleration_limit
 from harness.progress import Progress, SilentProgress
 from harness.records.folder import sole_use
 from harness.records.reader import read_shards
 from harness.resolved import Resolved
 from harness.runner.campaign_run import Run
 from harness.runner.manifest import require_own_folder
-from harness.runner.pair_planner import PairPlanner
-from harness.runner.planner import round_specs
+from harness.runner.planner import PairPlanner, Planner, round_specs
 from harness.runner.worker import ShardSpec
 from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT
 
@@ -38,17 +37,13 @@ PAIRING = "the i-th cut-in that A meets of a shell is the i-th that B meets: sam
 EXIT_OF: Mapping[Verdict, int] = {"proven": EXIT_DONE, "refuted": EXIT_REFUTED, "open": EXIT_BUDGET_SPENT}
 
 
-class _Side:
-    """One vehicle's run, which is told from outside what to test; also its `harness.runner.planner.Planner`."""
+class _Side(Planner):
+    """One vehicle's run, which is told from outside what to test."""
 
     def __init__(self, run: Run, side: int, pairs: PairedShells, rule: PairRule, shard_size: int) -> None:
-        self.run, self.rule, self.reported_from, self.remark = run, rule, 0, ""
-        self._side, self._pairs, self._shard_size = side, pairs, shard_size
-        self.run.planner = self
-
-    def rounds(self) -> Iterator[Iterator[ShardSpec]]:
-        """None of its own."""
-        return iter(())
+        super().__init__(rule)
+        self._run, self._side, self._pairs, self._shard_size = run, side, pairs, shard_size
+        run.planner = self
 
     def add(self, block: Block) -> bool:
         """Hand on the tests of a shard."""
@@ -57,12 +52,11 @@ class _Side:
 
     def drive(self, n_pairs: IntArray) -> None:
         """Test what is missing of the first cut-ins of each stratum."""
-        held, prefix = self._pairs.tests(self._side), self.run.prefix
+        held, prefix = self._pairs.tests(self._side), self._run.prefix
         missing = np.maximum(n_pairs - held, 0)
         if missing.any():
-            self.run.run_round(
-                iter(round_specs(held, missing, len(prefix.shards), prefix.n_episodes, self._shard_size))
-            )
+            specs = round_specs(held, missing, len(prefix.shards), prefix.n_episodes, self._shard_size)
+            self._run.run_round(iter(specs))
 
 
 def compare_shells(
@@ -99,7 +93,8 @@ def compare_shells(
             earlier = require_own_folder(folder, resolved, resume=True)
             held.append(list(_held_specs(folder, earlier)))
             runs.append(Run(resolved, folder, earlier, workers, progress, began, n_runs=2))
-        prescribed = _same_cut_ins(runs)
+        if (prescribed := runs[0].prescribed) is None:  # those of both: one environment and one library make one pool
+            raise ValueError("the campaigns do not draw from shells")
         planner = PairPlanner(campaign, prescribed.design, prescribed.available, margin)
         pairs = PairedShells(prescribed.design)
         both = [_Side(run, side, pairs, planner.rule, campaign.run.shard_size) for side, run in enumerate(runs)]
@@ -114,14 +109,6 @@ def compare_shells(
             run.discard_uncounted()
             run.finish()
     return paired_estimate(counts, campaign.stop.confidence), planner.rule
-
-
-def _same_cut_ins(runs: list[Run]) -> PrescribedEpisodes:
-    """Cut-ins of both: one environment and one library make one pool."""
-    a, b = (run.prescribed for run in runs)
-    if a is None or b is None:
-        raise ValueError("the campaigns do not draw from shells")
-    return a
 
 
 def _drive(planner: PairPlanner, pairs: PairedShells, both: list[_Side]) -> PairCounts:

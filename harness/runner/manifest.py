@@ -5,6 +5,7 @@ from __future__ import annotations
 import platform
 import time
 from collections import Counter
+from dataclasses import asdict
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
@@ -96,13 +97,7 @@ def require_own_folder(folder: Path, resolved: Resolved, *, resume: bool, kind: 
 
 
 def require_no_fewer(folder: Path, earlier: dict[str, Any], n_episodes: int) -> None:
-    """Refuse to throw away tests that an earlier run has finished.
-
-    Raises
-    ------
-    RunFolderError
-        The folder holds more tests than the stop rule that is asked for now would keep.
-    """
+    """Refuse (`RunFolderError`) to throw away finished tests, which the stop rule asked for now would not keep."""
     if n_episodes < (held := earlier["n_episodes"]):
         raise RunFolderError(
             str(folder),
@@ -116,7 +111,7 @@ class Prefix:
     """Finished shards in order, from the first on, as the manifest lists them, and what is counted over them."""
 
     def __init__(self, *, of_part: bool = False) -> None:
-        self._of_part = of_part
+        self.of_part = of_part
         self.shards: list[dict[str, Any]] = []
         self.n_episodes = self.n_crashes = self.n_failed = self.n_retraced = self.reported_from = 0
         self.repeated: Repeated | None = None
@@ -139,34 +134,25 @@ class Prefix:
         """Refuse an answer from tests of which too many failed, once there are ``at_least`` so many.
 
         A part of a run is refused when its share is too large beyond all chance: the whole is judged by `merge`.
-
-        Raises
-        ------
-        TooManyFailedError
-            More episodes failed than the campaign allows.
         """
         most = campaign.run.max_failed_share
-        by_chance = self._of_part and bdtrc(self.n_failed - 1, self.n_episodes, most) >= SURELY_TOO_MANY
+        by_chance = self.of_part and bdtrc(self.n_failed - 1, self.n_episodes, most) >= SURELY_TOO_MANY
         if self.n_episodes >= at_least and not by_chance:
             require_few_failed(self.n_failed, self.n_episodes, self._causes, most)
 
 
-def require_few_failed(n_failed: int, n_episodes: int, causes: Counter[str], most: float) -> None:
-    """Refuse an answer from tests of which more than the share ``most`` failed.
-
-    Raises
-    ------
-    TooManyFailedError
-        They did.
-    """
-    if n_failed > most * n_episodes:
-        cause = "".join(f", {n} of them with: {why}" for why, n in causes.most_common(1))
+def require_few_failed(
+    n_failed: int, n: int, causes: Counter[str], most: float, what: str = "episodes", where: str = "the episodes table"
+) -> None:
+    """Refuse (`TooManyFailedError`) an answer where more than the share ``most`` of tests, or ``what`` else, failed."""
+    if n_failed > most * n:
+        cause = "".join(f", {n_such} of them with: {why}" for why, n_such in causes.most_common(1))
         raise TooManyFailedError(
             "run.max_failed_share",
-            found=f"{n_failed} of {n_episodes} episodes failed{cause}",
+            found=f"{n_failed} of {n} {what} failed{cause}",
             expected=f"a share of at most {most:g}",
             mend="Mend the AV (`harness av-check` looks at it in seconds), or raise the share to go on. All causes "
-            "are in the column 'failure' of the episodes table.",
+            f"are in the column 'failure' of {where}.",
         )
 
 
@@ -252,7 +238,7 @@ class Manifest:
             "ending": ending,
             "retraced": retraced,
             "reproducible": self._reproducible and not (repeated and repeated.differing),
-            "repeated": None if repeated is None else repeated.to_json(),
+            "repeated": None if repeated is None else asdict(repeated),
             "wall_time_s": round(self._written - self._began, 3),
             "n_episodes": prefix.n_episodes,
             "reported_from": prefix.reported_from if prefix.reported_from < prefix.n_episodes else 0,

@@ -10,9 +10,9 @@ stated about them is roughly known, some ten tests; then those inside the next o
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
+from functools import partial
 from itertools import pairwise
-from typing import Protocol
 
 import numpy as np
 
@@ -20,11 +20,12 @@ from harness.arrays import IntArray
 from harness.campaign.models import Campaign
 from harness.estimators import Shells, StopRule, accumulator
 from harness.estimators.block import Block
-from harness.estimators.decision import Decision
-from harness.estimators.round_stopping import RoundRule
+from harness.estimators.limit_search import Level
+from harness.estimators.pairs import PairCounts
+from harness.estimators.round_stopping import PairRule, RoundRule
 from harness.estimators.stratified import Tally, empty_tally
 from harness.pool.shells import Draw, PrescribedEpisodes
-from harness.runner.allocation import Allocation, first_tests
+from harness.runner.allocation import CONFIDENCE, Allocation
 from harness.runner.worker import ShardSpec
 from harness.strata import ShellDesign
 
@@ -40,23 +41,48 @@ FIRST_PHASE = 1.7
 """Precision of the first of two phases over that of the second (measured: docs/estimators.md)."""
 
 
-class FixedPlanner:
+Rule = StopRule | RoundRule | PairRule
+
+
+class Planner:
+    """Says what is tested next, in rounds; by itself nothing, for tests that are planned elsewhere, as those of a part.
+
+    ``rule`` says why it stops, ``reported_from`` is the first test of those that the answer is from (0 where all are),
+    ``remark`` what the ending is to say besides; mostly nothing.
+    """
+
+    rule: Rule
+
+    def __init__(self, rule: Rule) -> None:
+        self.rule, self.reported_from, self.remark = rule, 0, ""
+
+    def rounds(self) -> Iterator[Iterator[ShardSpec]]:
+        """Shards of each round; the next round is asked for when all of the last one have been added."""
+        return iter(())
+
+    def add(self, block: Block) -> bool:  # noqa: ARG002 - nothing is decided
+        """Add the tests of the next shard; True when the campaign is to stop."""
+        return False
+
+
+class FixedPlanner(Planner):
     """All tests are known beforehand, in one round; a stop rule looks at some of their shards."""
+
+    rule: StopRule
 
     def __init__(self, campaign: Campaign) -> None:
         self._campaign = campaign
         stop, method, size = campaign.stop, campaign.testing.method, campaign.run.shard_size
-        self.reported_from, self.remark = 0, ""
-        self.rule = StopRule(stop, method, size, min_crashes=campaign.min_crashes)
+        super().__init__(StopRule(stop, method, size, min_crashes=campaign.min_crashes))
         self._sums = accumulator(self.rule.estimator)
         self._n_episodes = 0
 
     def rounds(self) -> Iterator[Iterator[ShardSpec]]:
-        """See `ShellPlanner`."""
+        """See `Planner`."""
         yield known_specs(self._campaign)
 
     def add(self, block: Block) -> bool:
-        """See `ShellPlanner`."""
+        """See `Planner`."""
         self._sums.add(block)
         self._n_episodes += len(block)
         if not self.rule.due(self._n_episodes):
@@ -70,46 +96,30 @@ def known_specs(campaign: Campaign, begin: int = 0, end: int | None = None) -> I
     return (ShardSpec(first // size, first, min(size, total - first)) for first in range(0, total, size)[begin:end])
 
 
-class PartPlanner:
-    """Some of a campaign's tests that are known beforehand: nobody looks at what they come to before all are there."""
-
-    def __init__(self, campaign: Campaign, specs: Sequence[ShardSpec]) -> None:
-        self.specs, self.reported_from, self.remark = specs, 0, ""
-        self.rule = StopRule(campaign.stop, campaign.testing.method, campaign.run.shard_size)
-
-    def rounds(self) -> Iterator[Iterator[ShardSpec]]:
-        """See `ShellPlanner`."""
-        yield iter(self.specs)
-
-    def add(self, block: Block) -> bool:  # noqa: ARG002 - nothing is decided
-        """See `ShellPlanner`."""
-        return False
-
-
-class ShellPlanner:
-    """Fed with finished tests in order; says what is tested next, and when it is enough.
+class ShellPlanner(Planner):
+    """Fed with finished tests of shells in order; says what is tested next, and when it is enough.
 
     In two phases the tests up to a wider precision only plan the number of the others, which alone are reported: that
     number does not depend on their results.
 
     ``available``, shape (S,), are the most tests of each stratum, ``held`` see `RoundRule`; ``seen`` are the tests of
-    this phase, ``reported_from`` the first test of the second one, ``expected_rhw`` what is expected of that,
-    ``remark`` what to say of stopping.
+    this phase, ``drawn`` those of both, (S,); ``reported_from`` is the first test of the second phase, ``planned`` its
+    tests, (S,), once they are, ``expected_rhw`` what is expected of them.
     """
+
+    rule: RoundRule
 
     def __init__(self, campaign: Campaign, design: ShellDesign, available: IntArray, held: int = 0) -> None:
         shells = campaign.testing.shells
         self._plans = shells.stopping == "two_phase" and campaign.stop.rhw is not None
-        self.rule = RoundRule(campaign, held, FIRST_PHASE if self._plans else 1.0)
+        super().__init__(RoundRule(campaign, held, FIRST_PHASE if self._plans else 1.0))
         wide = campaign.stop.rhw is not None and campaign.stop.rhw > BIASED_RHW and not self._plans
         self.remark = TOO_WIDE if wide else ""
-        self.reported_from, self.expected_rhw = 0, math.inf
+        self.expected_rhw = math.inf
         self._campaign = campaign
-        self._available = available
-        self._first_tests = first_tests(design, shells.first_tests)
-        self._allocation = Allocation(design, self._first_tests, available, shells.statement, shells.smallest_round)
-        self._drawn = np.zeros(design.p.size, np.int64)
-        self._planned: IntArray | None = None
+        self._allocation = Allocation.of(shells, design, available)
+        self.drawn = np.zeros(design.p.size, np.int64)
+        self.planned: IntArray | None = None
         self._begin_phase()
 
     def _begin_phase(self) -> None:
@@ -119,82 +129,77 @@ class ShellPlanner:
     @property
     def tally(self) -> Tally:
         """What the tests of each stratum have come to so far."""
-        return self.seen.tally if self._n_episodes else empty_tally(self._drawn.size)
+        return self.seen.tally if self._n_episodes else empty_tally(self.drawn.size)
 
     def rounds(self) -> Iterator[Iterator[ShardSpec]]:
-        """Shards of each round; the next round is asked for when all of the last one have been added."""
+        """See `Planner`."""
         n_shards = 0
         while (added := self.next_round()).any():
             first = self.reported_from + self._n_episodes
-            specs = round_specs(self._drawn, added, n_shards, first, self._campaign.run.shard_size)
-            self._drawn = self._drawn + added
+            specs = round_specs(self.drawn, added, n_shards, first, self._campaign.run.shard_size)
+            self.drawn = self.drawn + added
             n_shards += len(specs)
             yield iter(specs)
 
     def next_round(self) -> IntArray:
         """Tests to add per stratum, shape (S,); all 0 when no stratum or no budget is left."""
         tally, budget = self.tally, self._campaign.stop.episodes - self.reported_from - self._n_episodes
-        added = self._allocation.next_round(tally, budget) if self._planned is None else self._planned - tally.tests
-        self.rule.of_first_tests = bool(np.any((tally.tests < self._first_tests)[added > 0]))
+        added = self._allocation.next_round(tally, budget) if self.planned is None else self.planned - tally.tests
+        self.rule.of_first_tests = self._allocation.is_first(tally.tests, added)
         self._look = self._n_episodes + int(added.sum())
         return added
 
     def add(self, block: Block) -> bool:
-        """Add the tests of the next shard; True when the campaign is to stop."""
+        """See `Planner`."""
         self.seen.add(block)
         self._n_episodes += len(block)
         if self._n_episodes != self._look:
             return False
         enough = self.rule.observe(self.seen)
-        if not (enough and self._plans and self.rule.reached and self._planned is None):
-            return enough or self._planned is not None
+        if not (enough and self._plans and self.rule.reached and self.planned is None):
+            return enough or self.planned is not None
         budget = self._campaign.stop.episodes - self._n_episodes
-        stop, left = self._campaign.stop, self._available - self._drawn
+        stop, left = self._campaign.stop, self._allocation.available - self.drawn
         rhw = stop.rhw or math.inf
-        self._planned = self._allocation.second_phase(self.tally, left, budget, rhw, stop.confidence)
-        if self._planned.any():
-            self.expected_rhw = self._allocation.expected_rhw(self.tally, self._planned, stop.confidence)
+        self.planned = self._allocation.second_phase(self.tally, left, budget, rhw, stop.confidence)
+        if self.planned.any():
+            self.expected_rhw = self._allocation.expected_rhw(self.tally, self.planned, stop.confidence)
         self.rule, self.reported_from = RoundRule(self._campaign), self._n_episodes
         self._begin_phase()
         return False
 
 
-class Rule(Protocol):
-    """What a run says about why it ended; see `StopRule` and `RoundRule`."""
+class PairPlanner:
+    """Says which pairs of tests of two vehicles are driven next, from counts alone.
 
-    reached: bool
-    decision: Decision | None
-    pool_error_above_target: bool
-    rhw: float
-    heaviest: float
-    waited_for: tuple[str, ...]
+    Rounds are those of one vehicle, with pairs in place of tests; within a round pairs go to where the likelihood ratio
+    says that one more narrows the interval of the difference most. The campaigns are equal but for the vehicle;
+    ``available``, shape (S,), are the most pairs of each stratum, for ``margin`` see `PairRule`.
+    """
+
+    def __init__(self, campaign: Campaign, design: ShellDesign, available: IntArray, margin: float | None) -> None:
+        self.rule, self._budget = PairRule(campaign, margin), campaign.stop.episodes
+        self._allocation = Allocation.of(campaign.testing.shells, design, available)
+        self._level = Level.two_sided(CONFIDENCE)
+
+    def next_round(self, pairs: PairCounts) -> IntArray:
+        """Pairs to add per stratum, shape (S,); all 0 when no stratum or no budget is left."""
+        added = self._allocation.next_round(
+            _differing(pairs),
+            self._budget - int(pairs.tests.sum()),
+            inner_rhw=lambda n: pairs.inside(n).rhw(self._level),
+            given_by=partial(pairs.spread, self._level),
+        )
+        self.rule.of_first_tests = self._allocation.is_first(pairs.tests, added)
+        return added
 
 
-class Planner(Protocol):
-    """Says what is tested next, in rounds."""
-
-    @property
-    def rule(self) -> Rule:
-        """Why it stops."""
-        ...
-
-    @property
-    def reported_from(self) -> int:
-        """First test of those that the answer is from; 0 where all are."""
-        ...
-
-    @property
-    def remark(self) -> str:
-        """What the ending is to say besides; mostly nothing."""
-        ...
-
-    def rounds(self) -> Iterator[Iterator[ShardSpec]]:
-        """Shards of each round; the next round is asked for when all of the last one have been added."""
-        ...
-
-    def add(self, block: Block) -> bool:
-        """Add the tests of the next shard; True when the campaign is to stop."""
-        ...
+def _differing(pairs: PairCounts) -> Tally:
+    """Pairs of which one vehicle has crashed and the other has not, in the crashes' place."""
+    differing = pairs.outcomes()[:, 1:3].sum(1)
+    may_differ = np.maximum(pairs.tally(0).failed, pairs.tally(1).failed)
+    no_mass = np.zeros((differing.size, differing.size))
+    return Tally(pairs.tests, differing, np.minimum(may_differ, pairs.tests - differing), no_mass, no_mass)
 
 
 def planner_of(campaign: Campaign, prescribed: PrescribedEpisodes | None, held: int) -> Planner:

@@ -11,7 +11,7 @@ from harness.arrays import RecordArray
 from harness.campaign.models import Campaign
 from harness.controllers.black_box import Death
 from harness.controllers.loading import build_host, require_controller
-from harness.criticality.tables import Tables, build_tables, table_path, tables_cached
+from harness.criticality.tables import Tables, build_tables, table_path
 from harness.environment.driving import Environment
 from harness.environment.initial_state import InitialStates
 from harness.episode.loop import MOMENT_LIMITS, NOBODY, EpisodeLoop, Keep, Policy
@@ -125,36 +125,35 @@ def require_world(campaign: Campaign) -> None:
 
 
 def prepare(resolved: Resolved, progress: Progress | None = None) -> Prepared:
-    """Build (or read) a campaign's challenge tables or its pool of cut-ins."""
-    progress = progress or SilentProgress()
+    """Build (or read) a campaign's challenge tables, its pool of cut-ins, or the paths of its shadow runs."""
     campaign, environment = resolved.campaign, resolved.environment
-    tables: Tables | None = None
-    prescribed: PrescribedEpisodes | None = None
-    shadow_paths: ShadowPaths | None = None
     with ThreadPoolExecutor(1) as thread:
-        if needs_tables(campaign):
-            drivers, challenge = resolved.surrogates, campaign.testing.challenge
-            progress.stage("criticality tables", len(drivers))
-            building = thread.submit(build_tables, environment, drivers, challenge, progress.advance)
-            if not tables_cached(environment, drivers, challenge):
-                compile_kernels(resolved)
-            tables = building.result()
-        if campaign.testing.method == "shells" and campaign.has_shadow_runs:
-            choosing = thread.submit(campaign_shadow_paths, resolved, progress)
-            if not shadow_paths_file(resolved).is_file():
-                compile_kernels(resolved)
-            shadow_paths = choosing.result()
-        elif campaign.testing.method == "shells":
-            pooling = thread.submit(campaign_pool, resolved, progress)
-            if not pool_path(campaign_pool_key(resolved)).is_file():
-                compile_kernels(resolved)
-            prescribed = PrescribedEpisodes(campaign, pooling.result())
+        building = thread.submit(_built, resolved, progress or SilentProgress())
+        if not all(file.is_file() for file in cached_files(resolved)):
+            compile_kernels(resolved)
+        tables, prescribed, shadow_paths = building.result()
     importance = build_importance(campaign, tables)
     if campaign.has_shadow_runs:  # what happens then is prescribed, cut-in included
         importance = importance._replace(method=PRESCRIBED)
     boundary = NOBODY if prescribed is None else checked_boundary(resolved.library, prescribed.design, environment)
     policy = Policy(campaign.seed, environment, importance, resolved.av, boundary)
     return Prepared(resolved, policy, InitialStates(environment.numbers), tables, prescribed, shadow_paths)
+
+
+def _built(
+    resolved: Resolved, progress: Progress
+) -> tuple[Tables | None, PrescribedEpisodes | None, ShadowPaths | None]:
+    """What a campaign's method draws from, which takes time to build."""
+    campaign, drivers = resolved.campaign, resolved.surrogates
+    if needs_tables(campaign):
+        progress.stage("criticality tables", len(drivers))
+        tables = build_tables(resolved.environment, drivers, campaign.testing.challenge, progress.advance)
+        return tables, None, None
+    if campaign.testing.method != "shells":
+        return None, None, None
+    if campaign.has_shadow_runs:
+        return None, None, campaign_shadow_paths(resolved, progress)
+    return None, PrescribedEpisodes(campaign, campaign_pool(resolved, progress)), None
 
 
 def cached_files(resolved: Resolved) -> list[Path]:
@@ -168,12 +167,9 @@ def cached_files(resolved: Resolved) -> list[Path]:
 
 
 def require_same_pool(folder: Path, prepared: Prepared) -> None:
-    """Refuse to go on with a run whose cut-ins came from another pool.
+    """Refuse (`RunFolderError`) to go on with a run whose cut-ins came from another pool.
 
-    Raises
-    ------
-    RunFolderError
-        The pool has changed since: its library, or the harness itself.
+    Its library, or the harness itself, has changed since.
     """
     path = folder / SHELLS
     if prepared.prescribed is None or not path.exists():

@@ -16,8 +16,7 @@ from harness.controllers.black_box import Death
 from harness.controllers.loading import require_controller
 from harness.records.folder import write_bytes
 from harness.resolved import Resolved
-from harness.runner.executor import Ended
-from harness.runner.local_executor import LocalExecutor, WorkerProcess
+from harness.runner.executor import Ended, LocalExecutor, WorkerProcess
 from harness.runner.manifest import cpu_name
 from harness.runner.worker import Done, Spec
 

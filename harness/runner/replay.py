@@ -31,21 +31,10 @@ _UNLIKE_BITS = ("episode", "seed", "failure")
 
 @dataclass(frozen=True)
 class ReplayResult:
-    """An episode run again.
+    """An episode run again: its row of the episodes table, and its motion with the schema of the traces table.
 
-    Attributes
-    ----------
-    outcome : str
-    row : dict
-        Its row of the episodes table.
-    trace : pyarrow.Table
-        Its motion, with the schema of the traces table.
-    bit_equal : bool or None
-        Whether the stored row, and the stored trace where there is one, were reproduced in every bit.
-    compared : tuple of str
-        Which tables were compared.
-    suspects : str or None
-        If it was not reproduced, what may be why.
+    ``bit_equal`` says whether what is stored, in the tables ``compared``, was reproduced in every bit, None where
+    nothing is; ``suspects`` is what may be why if it was not.
     """
 
     outcome: str
@@ -197,17 +186,6 @@ def _stored(folder: Path, manifest: dict[str, Any], episode: int) -> dict[str, p
 
 
 def _equal(again: pa.Table, stored: pa.Table) -> bool:
+    """By bits: what is written of a float is that float alone, 0.0 and -0.0 differ, and NaN equals itself."""
     columns = [name for name in again.column_names if name not in _UNLIKE_BITS]
-    return all(_bits(again[name]) == _bits(stored[name]) for name in columns)
-
-
-def _bits(column: pa.ChunkedArray) -> list[Any]:
-    plain = column.cast(column.type.value_type) if pa.types.is_dictionary(column.type) else column
-    return [_hex(value) for value in plain.to_pylist()]
-
-
-def _hex(value: Any) -> Any:
-    """Floats by their bits: 0.0 and -0.0 differ, NaN equals itself."""
-    if isinstance(value, float):
-        return value.hex()
-    return [_hex(item) for item in value] if isinstance(value, list) else value
+    return repr(again.select(columns).to_pylist()) == repr(stored.select(columns).to_pylist())

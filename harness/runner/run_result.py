@@ -12,14 +12,14 @@ from harness.campaign.models import Campaign
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED
 from harness.estimators.decision import Verdict
 from harness.records.folder import NO_RUN, read_json
-from harness.records.gathered import Fingerprint, fingerprint
+from harness.records.gathered import Fingerprint, Gathered, fingerprint
 from harness.resolved import Resolved
-from harness.runner.gathered_blocks import GatheredBlocks
 from harness.runner.manifest import versions
 from harness.runner.planner import Rule
-from harness.stopped_by import StoppedBy
+from harness.stopped_by import StoppedBy, ending
 
 EXIT_OF: Mapping[Verdict, int] = {"accepted": EXIT_DONE, "rejected": EXIT_REFUTED, "undecided": EXIT_BUDGET_SPENT}
+_SHARD = ("index", "first_episode", "n_episodes", "files")
 ESTIMATES, REPORT = "estimates.json", "report.html"
 
 
@@ -59,17 +59,26 @@ def exit_code(campaign: Campaign, stopped_by: StoppedBy, verdict: Verdict | None
     return EXIT_BUDGET_SPENT if missed else EXIT_DONE
 
 
-def what_stopped(campaign: Campaign, rule: Rule, n_episodes: int, reported_from: int) -> StoppedBy:
-    """Why a campaign ended after so many tests, of which the ones from ``reported_from`` on are reported."""
+def conclusion(
+    campaign: Campaign, rule: Rule, n_episodes: int, reported_from: int, missing: tuple[str, ...] = ()
+) -> tuple[StoppedBy, str]:
+    """Why a campaign ended after so many tests, of which those from ``reported_from`` on are reported; in a sentence.
+
+    ``missing`` is said where the rule itself waited for nothing.
+    """
+    by: StoppedBy
     if 0 < reported_from < n_episodes < campaign.stop.episodes:
-        return "two_phase"
-    if rule.reached:
-        return "rhw" if rule.decision is None else "accept"
-    if rule.decision is not None and rule.decision.is_final:
-        return "contradicted"
-    if rule.pool_error_above_target:  # whatever else is spent: more of it would not help
-        return "pool_error"
-    return "episodes" if n_episodes >= campaign.stop.episodes else "pool"
+        by = "two_phase"
+    elif rule.reached:
+        by = "rhw" if rule.decision is None else "accept"
+    elif rule.decision is not None and rule.decision.is_final:
+        by = "contradicted"
+    elif rule.pool_error_above_target:  # whatever else is spent: more of it would not help
+        by = "pool_error"
+    else:
+        by = "episodes" if n_episodes >= campaign.stop.episodes else "pool"
+    asked = campaign.stop.rhw is not None or rule.decision is not None
+    return by, ending(by, n_episodes, rule.waited_for or missing, precision_asked=asked)
 
 
 def results_of(folder: Path) -> dict[str, Fingerprint | None]:
@@ -86,10 +95,11 @@ def earlier_result(folder: Path, resolved: Resolved, earlier: Mapping[str, Any])
     if earlier.get("status") != "done" or not earlier.get("results") or earlier.get("versions") != versions():
         return None
     now = {name: None if found is None else list(found) for name, found in results_of(folder).items()}
-    if now != earlier["results"] or None in now.values() or not _says(folder / "campaign.yaml", campaign):
+    file, text = folder / "campaign.yaml", dump_campaign(campaign).encode()
+    if now != earlier["results"] or None in now.values() or not (file.is_file() and file.read_bytes() == text):
         return None
-    gathered = GatheredBlocks(folder, campaign, same_sources=True)
-    if not all(gathered.holds(*(shard[key] for key in _SHARD)) for shard in earlier["shards"]):
+    gathered = Gathered(folder, same_sources=True)
+    if not all(gathered.find(*(shard[key] for key in _SHARD)) for shard in earlier["shards"]):
         return None
     verdict = None if decision is None else decision["verdict"]
     return RunResult(
@@ -100,10 +110,3 @@ def earlier_result(folder: Path, resolved: Resolved, earlier: Mapping[str, Any])
         earlier["ending"],
         exit_code(campaign, earlier["stopped_by"], verdict),
     )
-
-
-_SHARD = ("index", "first_episode", "n_episodes", "files")
-
-
-def _says(path: Path, campaign: Campaign) -> bool:
-    return path.is_file() and path.read_bytes() == dump_campaign(campaign).encode()

@@ -23,7 +23,7 @@ from harness.episode.cells import PrescribedTraffic, drawn_traffic
 from harness.episode.loop import EpisodeLoop, Keep, Shard
 from harness.episode.motion import motion_hashes
 from harness.episode.trajectory import empty_trajectory
-from harness.errors import RunFolderError, TooManyFailedError
+from harness.errors import RunFolderError
 from harness.outcomes import AV, FAILED
 from harness.pool.cut_ins import onset_steps
 from harness.pool.enumeration import draw_leads, write_pairs
@@ -84,13 +84,7 @@ def run_shadows(loop: EpisodeLoop, paths: ShadowPaths, environment: Environment,
 
 
 def stored_shadows(folder: Path, paths: ShadowPaths, spec: ShadowSpec) -> ShadowDone | None:
-    """A range that an earlier run has finished, or None.
-
-    Raises
-    ------
-    RunFolderError
-        Its file is damaged, or of other paths.
-    """
+    """A range that an earlier run has finished, or None; a `RunFolderError` if it is damaged, or of other paths."""
     file = shadow_file(folder, spec)
     if not file.exists():
         return None
@@ -118,13 +112,7 @@ def _causes(table: pa.Table) -> Counter[str]:
 
 
 def read_shadows(folder: Path, paths: ShadowPaths, environment: Environment) -> ShadowRuns:
-    """All shadow runs of a run folder.
-
-    Raises
-    ------
-    RunFolderError
-        Some are missing or damaged.
-    """
+    """All shadow runs of a run folder; a `RunFolderError` if some are missing or damaged."""
     found = [stored_shadows(folder, paths, spec) for spec in shadow_specs(len(paths))]
     if any(done is None for done in found):
         raise RunFolderError(
@@ -150,25 +138,6 @@ def _padded(column: pa.ChunkedArray, n_steps: IntArray, width: int) -> FloatArra
     values = np.zeros((len(column), width))
     values[np.arange(width) <= n_steps[:, None]] = column.combine_chunks().flatten().to_numpy()
     return values
-
-
-def require_few_failed(causes: Counter[str], n: int, most: float) -> None:
-    """Refuse to test a vehicle that fails on too many of its paths.
-
-    Raises
-    ------
-    TooManyFailedError
-        More shadow runs failed than the campaign allows.
-    """
-    if (n_failed := causes.total()) > most * n:
-        raise TooManyFailedError(
-            "run.max_failed_share",
-            found=f"{n_failed} of {n} shadow runs failed, {causes.most_common(1)[0][1]} of them with: "
-            f"{causes.most_common(1)[0][0]}",
-            expected=f"a share of at most {most:g}",
-            mend="Mend the AV (`harness av-check` looks at it in seconds), or raise the share to go on. All causes "
-            "are in the column 'failure' of the run folder's shadow/ tables.",
-        )
 
 
 def without_cut_in(

@@ -18,8 +18,7 @@ from harness.controllers.black_box import OF_EPISODE, Call, Death
 from harness.controllers.time_limit import death_cause
 from harness.errors import CampaignError, HarnessError, TooManyFailedError
 from harness.resolved import Resolved
-from harness.runner.executor import AnyWorker, Ended, Executor
-from harness.runner.local_executor import LocalExecutor
+from harness.runner.executor import AnyWorker, Ended, Executor, LocalExecutor
 from harness.runner.worker import Done, Spec
 
 ATTEMPTS = 3

@@ -24,7 +24,7 @@ from harness.records.folder import SHELLS, concatenated, no_episodes, read_json,
 from harness.records.reader import read_shard, require_whole, stored_columns
 from harness.records.stored_manifest import StoredShells
 from harness.resolved import resolve
-from harness.runner.gathered_blocks import GatheredBlocks
+from harness.runner.stored_shards import GatheredBlocks
 from harness.strata import ShellDesign
 from harness.threads import made_ahead
 
@@ -176,13 +176,7 @@ def _groups(shards: _Shards, edge: int) -> Iterator[_Shards]:
 
 
 def read_shells(folder: Path) -> ShellDesign:
-    """Strata of a shells campaign.
-
-    Raises
-    ------
-    RunFolderError
-        The file is missing, damaged, or of a version that knew neither statements nor reference drivers.
-    """
+    """Strata of a shells campaign; a `RunFolderError` where the file is missing, damaged, or of a too early version."""
     content = read_json(folder / SHELLS, mend=_FINISH)
     if "n_inside" in content and "statements" not in content:
         version = read_manifest(folder).get("versions", {}).get("harness", "that made it")
@@ -201,15 +195,9 @@ def _incomplete(folder: Path, found: str, expected: str) -> RunFolderError:
 
 
 def surrogates_of(campaign: Campaign, columns: set[str], file: Path | None = None) -> SurrogateReplay | str:
-    """The surrogates that can be asked about a stored run, or the reason why none can.
+    """The surrogates that can be asked about a run that has stored these ``columns``, or the reason why none can.
 
-    Parameters
-    ----------
-    campaign : Campaign
-    columns : set of str
-        Names in the stored episodes table.
-    file : Path, optional
-        A pool to be used instead of the campaign's own, which is used only if it has been built.
+    They are those of a pool's ``file``, or of the campaign's own pool if it has been built.
 
     Raises
     ------

@@ -12,15 +12,12 @@ import json
 import pickle
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import pyarrow as pa
 
-from harness.campaign.models import Campaign
 from harness.controllers.apart import fit_to_travel
 from harness.controllers.black_box import Death
 from harness.episode.cells import PrescribedTraffic
@@ -29,8 +26,7 @@ from harness.estimators.block import Block
 from harness.estimators.from_records import block_from_tables
 from harness.importance.build import mixture_weights
 from harness.outcomes import FAILED
-from harness.pool.shadow_paths import ShadowPaths
-from harness.pool.shells import Draw, PrescribedEpisodes
+from harness.pool.shells import Draw
 from harness.records.folder import encoded
 from harness.records.tables import ShardTables, shard_tables
 from harness.resolved import Resolved
@@ -68,10 +64,6 @@ class Repeated:
 
     n_episodes: int
     differing: tuple[int, ...]
-
-    def to_json(self) -> dict[str, Any]:
-        """As the manifest has it."""
-        return {**asdict(self), "differing": list(self.differing)}
 
 
 @dataclass(frozen=True)
@@ -152,25 +144,22 @@ class ShardRunner:
         self._doomed.clear()  # a shadow run may have the number of a test
         self._doomed.update(doomed or {})
         if isinstance(spec, ShadowSpec):
-            return run_shadows(self._loop, self._paths(), self._prepared.policy.environment, spec)
+            if self._prepared.shadow_paths is None:
+                raise ValueError("this campaign has no shadow runs")
+            return run_shadows(self._loop, self._prepared.shadow_paths, self._prepared.policy.environment, spec)
         return self._tests(spec)
 
-    def _paths(self) -> ShadowPaths:
-        if (paths := self._prepared.shadow_paths) is None:
-            raise ValueError("this campaign has no shadow runs")
-        return paths
-
     def _tests(self, spec: ShardSpec) -> ShardDone:
-        if self._prepared.shadow_paths is not None and self._prepared.prescribed is None:
-            runs = read_shadows(self._folder, self._paths(), self._prepared.policy.environment)
-            self._prepared = self._prepared.after(runs)
-        campaign, prescribed = self._prepared.campaign, self._prepared.prescribed
-        shard = self._run(spec)
+        if (paths := self._prepared.shadow_paths) is not None and self._prepared.prescribed is None:
+            self._prepared = self._prepared.after(read_shadows(self._folder, paths, self._prepared.policy.environment))
+        campaign, shard = self._prepared.campaign, self._run(spec)
         keep_traces = campaign.records.traces != "none" or campaign.records.trace_share > 0.0
         tables = shard_tables(shard, campaign.seed, keep_traces=keep_traces)
-        if spec.index == 0 and _has_to_repeat(campaign):
-            tables = tables._replace(episodes=_with_repeated(tables.episodes, self._repeat(shard)))
-        return finished(spec, tables, campaign, prescribed, self._retracing, encoded(tables))
+        # A vehicle must show that it does the same again: built-in models do, and outside programs need not.
+        if spec.index == 0 and campaign.av.model is None and campaign.av.traci is None:
+            metadata = {**(tables.episodes.schema.metadata or {}), REPEATED: json.dumps(asdict(self._repeat(shard)))}
+            tables = tables._replace(episodes=tables.episodes.replace_schema_metadata(metadata))
+        return replace(finished(self._prepared, self._retracing, spec, tables), parquet=encoded(tables))
 
     def _run(self, spec: ShardSpec) -> Shard:
         prescribed, first = self._prepared.prescribed, spec.first_episode
@@ -204,30 +193,18 @@ def run_drawn(loop: EpisodeLoop, prepared: Prepared, first: int, n: int) -> Shar
     return loop.run(first, states, forced_traffic(loop, policy.seed, first, states, policy.environment))
 
 
-def finished(
-    spec: ShardSpec,
-    tables: ShardTables,
-    campaign: Campaign,
-    prescribed: PrescribedEpisodes | None,
-    retracing: Retracing,
-    parquet: dict[str, bytes],
-) -> ShardDone:
+def finished(prepared: Prepared, retracing: Retracing, spec: ShardSpec, tables: ShardTables) -> ShardDone:
     """What is to be known of a shard's tables, after the twin has retraced them."""
-    n_retraced = retracing.check(tables.episodes)
+    n_retraced, campaign = retracing.check(tables.episodes), prepared.campaign
     block = block_from_tables(
         tables.episodes,
         tables.moments if campaign.stop.estimator == "scv" else None,
         method=campaign.testing.method,
         alpha=mixture_weights(campaign),
-        shells=None if prescribed is None else prescribed.design,
+        shells=None if prepared.prescribed is None else prepared.prescribed.design,
     )
     failures = Counter(tables.episodes.column("failure").drop_null().to_pylist())
-    return ShardDone(spec, block, n_retraced, failures, repeated_of(tables.episodes.schema.metadata), parquet)
-
-
-def _has_to_repeat(campaign: Campaign) -> bool:
-    """Whether a vehicle must show that it does the same again: built-in models do, and outside programs need not."""
-    return campaign.av.model is None and campaign.av.traci is None
+    return ShardDone(spec, block, n_retraced, failures, repeated_of(tables.episodes.schema.metadata))
 
 
 def _rows_to_repeat(shard: Shard, seed: int, *, acts_early: bool) -> list[int]:
@@ -247,13 +224,8 @@ def bits_of(shard: Shard, row: int) -> Bits:
     return record, b"" if trace is None else trace.tobytes(), shard.failures.get(row)
 
 
-def _with_repeated(episodes: pa.Table, repeated: Repeated) -> pa.Table:
-    metadata = {**(episodes.schema.metadata or {}), REPEATED: json.dumps(repeated.to_json())}
-    return episodes.replace_schema_metadata(metadata)
-
-
 def repeated_of(metadata: Mapping[bytes, bytes] | None) -> Repeated | None:
-    """What `_with_repeated` has put into a table's metadata."""
+    """What the metadata of an episodes table say of tests that were run twice; None of all but the first shard's."""
     found = (metadata or {}).get(REPEATED)
     if found is None:
         return None

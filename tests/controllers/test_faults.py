@@ -13,7 +13,7 @@ from harness.cli import main
 from harness.controllers.loading import build_host
 from harness.errors import EXIT_BAD_INPUT, EXIT_DONE, EXIT_TOO_MANY_FAILED
 from harness.resolved import resolve
-from harness.runner import local_executor, plan_campaign
+from harness.runner import executor, plan_campaign
 from harness.runner.prepare import prepare
 from harness.twin import TwinWorld
 from tests.controllers.misbehaving import ChangesItsParameters
@@ -189,8 +189,8 @@ def test_a_batch_controllers_other_faults_fail_all_that_were_asked(tmp_path):
 @pytest.mark.parametrize("where", ["constructor", "start", "step", "step_batch"])
 def test_a_controller_that_always_ends_its_process_is_named_after_a_few_workers(where, tmp_path, capsys, monkeypatch):
     started = []
-    start = local_executor.start_process
-    monkeypatch.setattr(local_executor, "start_process", lambda *words: (started.append(words), start(*words))[1])
+    start = executor.start_process
+    monkeypatch.setattr(executor, "start_process", lambda *words: (started.append(words), start(*words))[1])
     code = _run(tmp_path, _other("EndsTheProcess", f"{{where: {where}}}"), "run.max_failed_share=0.01")
     err = capsys.readouterr().err
     assert "the controller ended the worker process (exit code 7)" in err

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import pickle
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -12,12 +13,28 @@ import pytest
 from harness.campaign.loading import load_campaign
 from harness.campaign.models import Campaign
 from harness.controllers.black_box import Death
-from harness.runner import RunResult, local_executor, merge_parts, run_campaign
+from harness.part import Part
+from harness.runner import (
+    PartResult,
+    PlanResult,
+    RunResult,
+    executor,
+    merge_parts,
+    plan_second_phase,
+    read_plan,
+    run_campaign,
+    run_part,
+)
 from harness.runner.worker import ShardDone, ShardRunner, ShardSpec
 
 MIXTURE_FILE = Path(__file__).parents[2] / "scenarios" / "overtaking_mixture.yaml"
 SMALL = ("stop.episodes=1600", "stop.rhw=null", "run.shard_size=80", "records.trace_share=0.05")
 TWIN = ("world.engine=twin", "stop.episodes=400")
+
+
+def sets(*overrides: str) -> list[str]:
+    """The same on a command line."""
+    return [word for override in overrides for word in ("--set", override)]
 
 
 @pytest.fixture(scope="session")
@@ -26,16 +43,18 @@ def campaign() -> Callable[..., Campaign]:
     return lambda *overrides: load_campaign(MIXTURE_FILE, [*SMALL, *overrides])
 
 
+@contextmanager
+def without_page() -> Iterator[None]:
+    """It takes longer than these campaigns; test_api.py looks at it."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("harness.report.write_report", lambda folder, final=None: folder / "report.html")
+        yield
+
+
 @pytest.fixture(scope="session")
 def run() -> Callable[..., RunResult]:
-    """`run_campaign` without the page, which takes longer than these campaigns; test_api.py looks at the page."""
-
-    def run_without_page(*arguments, **options) -> RunResult:
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("harness.report.write_report", lambda folder: folder / "report.html")
-            return run_campaign(*arguments, **options)
-
-    return run_without_page
+    """`run_campaign` without the page."""
+    return without_page()(run_campaign)
 
 
 class WorkerInThisProcess:
@@ -65,18 +84,31 @@ class WorkerInThisProcess:
 def one_process() -> Iterator[None]:
     """Where shards are run, it is here."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(local_executor, "WorkerProcess", WorkerInThisProcess)
-        patch.setattr(local_executor, "first_to_answer", lambda workers: workers[0])
+        patch.setattr(executor, "WorkerProcess", WorkerInThisProcess)
+        patch.setattr(executor.LocalExecutor, "first_to_answer", lambda _, busy: busy[0])
         yield
 
 
 @pytest.fixture(scope="session")
-def run_here(run) -> Callable[..., RunResult]:
+def run_here() -> Callable[..., RunResult]:
     """`run` with one worker that is this process."""
+    return one_process()(without_page()(partial(run_campaign, workers=1)))
 
-    def run_in_this_process(campaign: Campaign, out: Path, **options) -> RunResult:
-        with one_process():
-            return run(campaign, out, workers=1, **options)
+
+@pytest.fixture(scope="session")
+def plan_here() -> Callable[..., PlanResult]:
+    """`plan_second_phase` in this process."""
+    return one_process()(partial(plan_second_phase, workers=1))
+
+
+@pytest.fixture(scope="session")
+def part_here() -> Callable[..., PartResult]:
+    """`run_part` in this process, of a campaign or of the plan in a folder."""
+
+    @one_process()
+    def run_in_this_process(source: Campaign | Path, number: int, of: int, out: Path, **options) -> PartResult:
+        source = read_plan(source) if isinstance(source, Path) else source
+        return run_part(source, Part(number, of), out, workers=1, **options)
 
     return run_in_this_process
 
@@ -84,13 +116,7 @@ def run_here(run) -> Callable[..., RunResult]:
 @pytest.fixture(scope="session")
 def merged() -> Callable[..., RunResult]:
     """`merge_parts` without the page."""
-
-    def merge_without_page(folders: Sequence[Path], out: Path) -> RunResult:
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("harness.report.write_report", lambda folder, final: folder / "report.html")
-            return merge_parts(folders, out)
-
-    return merge_without_page
+    return without_page()(merge_parts)
 
 
 @pytest.fixture(scope="session")

@@ -3,13 +3,15 @@
 import json
 from pathlib import Path
 
-import pyarrow.parquet as pq
+import numpy as np
 import pytest
 
 from harness.campaign.loading import load_campaign
 from harness.cli import main
 from harness.errors import CampaignError
 from harness.runner.compare import compare_campaigns, require_comparable
+from tests.runner.conftest import one_process, sets, without_page
+from tests.runner.stored_runs import stored_table
 
 FORCED = str(Path(__file__).parents[2] / "scenarios/overtaking_forced.yaml")
 SMALL = [
@@ -23,6 +25,12 @@ SMALL = [
 HARDER = "av.parameters.min_acceleration_mps2=-8"
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _here():
+    with one_process(), without_page():
+        yield
+
+
 @pytest.fixture(scope="module")
 def campaigns():
     return load_campaign(FORCED, SMALL), load_campaign(FORCED, [*SMALL, HARDER])
@@ -34,11 +42,7 @@ def done(campaigns, tmp_path_factory):
 
 
 def episodes(folder, column):
-    return [
-        value
-        for path in sorted((folder / "episodes").glob("shard-*.parquet"))
-        for value in pq.read_table(path, columns=[column])[column].to_pylist()
-    ]
+    return stored_table(folder, "episodes")[column].to_pylist()
 
 
 def test_both_have_the_same_episodes_and_meet_the_same_cut_ins(done):
@@ -52,13 +56,8 @@ def test_both_have_the_same_episodes_and_meet_the_same_cut_ins(done):
 def test_the_difference_is_that_of_the_records(done):
     means = []
     for side in "ab":
-        y = [
-            2.718281828459045**log_weight if outcome == "crash" else 0.0
-            for log_weight, outcome in zip(
-                episodes(done.folder / side, "log_weight"), episodes(done.folder / side, "outcome"), strict=True
-            )
-        ]
-        means.append(sum(y) / len(y))
+        rows = stored_table(done.folder / side, "episodes").to_pandas()
+        means.append((np.exp(rows.log_weight) * (rows.outcome == "crash")).mean())
     assert done.difference.difference == pytest.approx(means[0] - means[1], rel=1e-9)
     assert done.difference.variance_ratio > 1.0
     assert json.loads((done.folder / "compare.json").read_text()) == done.content
@@ -84,8 +83,7 @@ def test_only_the_vehicle_may_differ(campaigns, override, where):
 
 
 def test_the_command_line(done, capsys):
-    sets = [part for value in SMALL for part in ("--set", value)]
-    assert main(["compare", FORCED, "--against", HARDER, "--out", str(done.folder), *sets]) == done.exit_code
+    assert main(["compare", FORCED, "--against", HARDER, "--out", str(done.folder), *sets(*SMALL)]) == done.exit_code
     out = capsys.readouterr().out
     assert f"B (overtaking-forced, {HARDER})" in out
     assert out.splitlines()[-1] == str(done.folder / "compare.json")

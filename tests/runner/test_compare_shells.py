@@ -11,11 +11,11 @@ import pytest
 from harness.cli import main
 from harness.errors import CampaignError, RunFolderError
 from harness.records.reader import read_shards
-from harness.runner import compare_campaigns, local_executor
+from harness.runner import compare_campaigns
 from harness.runner.campaign_run import Run
 from harness.runner.worker import ShardRunner
 from tests.pool.conftest import SMALL_POOL
-from tests.runner.conftest import MIXTURE_FILE, WorkerInThisProcess
+from tests.runner.conftest import MIXTURE_FILE, one_process, without_page
 from tests.runner.stored_runs import manifest
 
 SHELLS = (
@@ -27,10 +27,7 @@ HARDER = "av.parameters.min_acceleration_mps2=-8"
 
 @pytest.fixture(scope="module", autouse=True)
 def _here():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(local_executor, "WorkerProcess", WorkerInThisProcess)
-        patch.setattr(local_executor, "first_to_answer", lambda workers: workers[0])
-        patch.setattr("harness.report.write_report", lambda folder: folder / "report.html")
+    with one_process(), without_page():
         yield
 
 

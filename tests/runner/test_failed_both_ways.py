@@ -16,7 +16,7 @@ TRUTH = json.loads((ROOT / "tests/reference/default.json").read_text())["crash_r
 BUSY = json.loads((ROOT / "docs/validation/nde_1e4.json").read_text())["crash_rate"]
 METHODS = {
     "shells": (TRUTH, ("testing.method=shells", "stop.rhw=null", "stop.episodes=1500", *SMALL_POOL)),
-    "forced": (TRUTH, ("testing.method=forced", "stop.episodes=6000", "records.moments=none")),
+    "forced": (TRUTH, ("testing.method=forced", "stop.episodes=4000", "records.moments=none")),
     "episode_mixture": (TRUTH, ("testing.method=episode_mixture", "stop.episodes=2000")),
     "nde": (BUSY, ("testing.method=nde", "environment.lane_change_level=1e4", "stop.episodes=8000")),
 }

@@ -58,12 +58,8 @@ def finished(process: subprocess.Popen) -> tuple[int, str]:
     return process.returncode, complaints
 
 
-@pytest.mark.parametrize(("number", "to_all"), [(signal.SIGTERM, False), (signal.SIGHUP, True), (signal.SIGINT, True)])
-def test_a_signal_ends_a_run_in_order(tmp_path, number, to_all):
-    out = tmp_path / "run"
-    process = begin(out)
-    wait_for(process, lambda: len(shard_files(out)) >= 2)  # the first has been counted then
-    (os.killpg if to_all else os.kill)(process.pid, number)
+def require_order(process: subprocess.Popen, out: Path, number: signal.Signals) -> None:
+    """A run ends as one that the signal has reached."""
     code, complaints = finished(process)
     assert code == CODES[number]
     assert "the same command with --resume goes on" in complaints
@@ -73,8 +69,17 @@ def test_a_signal_ends_a_run_in_order(tmp_path, number, to_all):
     assert not list(out.rglob(".*"))
 
 
+@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGINT])
+def test_a_signal_of_the_terminal_to_all_processes_ends_a_run_in_order(tmp_path, number):
+    out = tmp_path / "run"
+    process = begin(out)
+    wait_for(process, lambda: len(shard_files(out)) >= 2)  # the first has been counted then
+    os.killpg(process.pid, number)
+    require_order(process, out, number)
+
+
 def test_what_is_ignored_stays_ignored(tmp_path):
-    """As under nohup; the end by SIGTERM shows that the run was alive."""
+    """As under nohup; SIGTERM, to the run alone, ends it in order."""
     out = tmp_path / "run"
     process = begin(out, ignored=(signal.SIGHUP, signal.SIGINT))
     wait_for(process, lambda: len(shard_files(out)) >= 2)
@@ -83,7 +88,7 @@ def test_what_is_ignored_stays_ignored(tmp_path):
     n = len(shard_files(out))
     wait_for(process, lambda: len(shard_files(out)) >= n + 2)
     process.send_signal(signal.SIGTERM)
-    assert finished(process)[0] == 143
+    require_order(process, out, signal.SIGTERM)
 
 
 LAUNCH = """

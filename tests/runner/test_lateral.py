@@ -24,19 +24,15 @@ COLUMNS = ["lead_steps", "onset_step", "onset_r2_m", "onset_r2dot_mps", "onset_t
 
 
 @pytest.fixture(scope="module")
-def lateral_run(campaign, run, tmp_path_factory):
+def lateral_run(campaign, run_here, tmp_path_factory):
     """In SUMO, eight cells. Never written to."""
     out = tmp_path_factory.mktemp("lateral") / "run"
-    return run(campaign(*SHELLS, "world.cells=8"), out, workers=1)
+    return run_here(campaign(*SHELLS, "world.cells=8"), out)
 
 
 def test_it_reaches_the_precision_and_the_twin_has_retraced_every_test(lateral_run):
     assert (lateral_run.exit_code, lateral_run.stopped_by) == (0, "rhw")
-    retraced = (
-        lateral_run.estimates["retraced"]
-        if "retraced" in lateral_run.estimates
-        else manifest(lateral_run.folder)["retraced"]
-    )
+    retraced = manifest(lateral_run.folder)["retraced"]
     assert retraced["n_equal"] > 500
     assert retraced["compared"][:2] == ["onset_r2_m", "onset_r2dot_mps"]
     shells = lateral_run.estimates["estimates"]["shells"]
@@ -60,10 +56,9 @@ def test_records_say_when_it_began_and_how_it_ended(lateral_run):
     assert (traces[traces.vehicle != "BV"].lateral_m == 0.0).all()
 
 
-def test_without_a_lead_records_have_no_column_more(campaign, run_here, tmp_path):
-    without = run_here(campaign("testing.method=forced", "world.engine=twin", "stop.episodes=160"), tmp_path / "run")
-    assert not set(COLUMNS) & set(stored_table(without.folder, "episodes").column_names)
-    assert "lateral_m" not in stored_table(without.folder, "traces").column_names
+def test_without_a_lead_records_have_no_column_more(twin_run):
+    assert not set(COLUMNS) & set(stored_table(twin_run, "episodes").column_names)
+    assert "lateral_m" not in stored_table(twin_run, "traces").column_names
 
 
 def test_a_test_is_replayed_bit_for_bit(lateral_run):
@@ -96,13 +91,13 @@ def test_stored_forced_tests_can_be_asked_what_surrogates_would_have_done(campai
 
 def test_a_vehicle_that_acts_before_the_onset_is_tested_after_shadow_runs(campaign, run_here, tmp_path):
     """With forced cut-ins: in a test it must do what it did in its shadow run, through the step of the onset."""
-    asked = ("testing.method=forced", "world.engine=twin", LEAD, "stop.rhw=null", "stop.episodes=240")
+    asked = ("testing.method=forced", "world.engine=twin", LEAD, "stop.rhw=null", "stop.episodes=120")
     speeds = f"av={ACTING.format('Speeds')}"
     forced, again = (
         run_here(campaign(*asked, speeds, f"world.cells={cells}"), tmp_path / str(cells)) for cells in (64, 5)
     )
     rows = stored_table(forced.folder, "episodes")
-    assert rows.column("failure").null_count == rows.num_rows == 240
+    assert rows.column("failure").null_count == rows.num_rows == 120
     assert set(rows.column("lead_steps").to_pylist()) == {5}
     assert unlike_columns(forced.folder, again.folder) == []
 

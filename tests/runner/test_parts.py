@@ -21,10 +21,10 @@ from harness.part import Part
 from harness.records.folder import TABLES
 from harness.runner import run_part
 from harness.runner.manifest import Prefix
-from harness.runner.parts_together import ranges
-from tests.runner.conftest import MIXTURE_FILE, TWIN, one_process
+from harness.runner.merge import ranges
+from tests.runner.conftest import MIXTURE_FILE, TWIN
 from tests.runner.stored_runs import copy_of, manifest, shard_files, truncate, unlike_columns
-from tests.runner.test_runner_same_bits import struck
+from tests.runner.test_runner_same_bits import struck_run
 from tests.runner.test_runner_wrong_folders import SAME, complaint_of
 
 METHODS = {
@@ -33,15 +33,6 @@ METHODS = {
     "published": ("testing.method=step_mixture", "testing.challenge=immediate", "stop.estimator=scv"),
 }
 OF_THE_MACHINE = {"created", "wall_time_s", "workers", "results"}
-
-
-@pytest.fixture(scope="module")
-def part_here():
-    def run_in_this_process(campaign, number, of, out, **options):
-        with one_process():
-            return run_part(campaign, Part(number, of), out, workers=1, **options)
-
-    return run_in_this_process
 
 
 @pytest.fixture(scope="module")
@@ -91,7 +82,7 @@ def test_merged_parts_are_the_whole_run(method, campaign, run_here, part_here, m
 
 def test_in_sumo_with_a_part_that_was_killed(sumo_run, campaign, part_here, merged, tmp_path):
     parts = [tmp_path / f"part{number}" for number in (1, 2, 3)]
-    killed = struck(parts[1], signal.SIGKILL, 2, "--part", "2/3")
+    killed = struck_run(parts[1], signal.SIGKILL, 2, "--part", "2/3")
     assert killed.returncode == -signal.SIGKILL
     assert len(shard_files(parts[1])) == 1
     for number in (1, 3):
@@ -273,7 +264,7 @@ def test_a_part_is_not_refused_for_failures_that_chance_may_bring(campaign):
     few.require_few_failed(campaign())
     with pytest.raises(TooManyFailedError, match="20 of 100"):
         many.require_few_failed(campaign())
-    few._of_part = False
+    few.of_part = False
     with pytest.raises(TooManyFailedError, match="4 of 100"):
         few.require_few_failed(campaign())
 
@@ -317,9 +308,3 @@ def test_a_folder_keeps_to_its_part(parts, twin_run, tmp_path, capsys):
         text = complaint_of(capsys, command, two)
         assert f"found: {held} expected: a whole run" in text
         assert "harness merge" in text
-
-
-def test_junit_wants_a_result(tmp_path, capsys):
-    junit = ["--junit", tmp_path / "gate.xml"]
-    text = complaint_of(capsys, "run", MIXTURE_FILE, "--out", tmp_path / "part", "--part", "1/2", *SAME, *junit)
-    assert "a part has no result" in text

@@ -23,10 +23,9 @@ ALL_SAME = {"n_episodes": 10, "differing": []}
 
 
 @pytest.fixture
-def run_av(run, tmp_path):
-    def run_one(av, *overrides, name="run", **options):
-        run(load_campaign(FORCED, [*SMALL, f"av={av}", *overrides]), tmp_path / name, **options)
-        return tmp_path / name
+def run_av(run_here, tmp_path):
+    def run_one(av, *overrides, name="run", run=run_here, **options):
+        return run(load_campaign(FORCED, [*SMALL, f"av={av}", *overrides]), tmp_path / name, **options).folder
 
     return run_one
 
@@ -39,14 +38,14 @@ def statement(folder):
     ("av", "overrides"), [(GOOD, ()), (BATCH, ("world.engine=sumo",)), (SUMO, ("world.engine=sumo", "world.cells=8"))]
 )
 def test_a_vehicle_that_does_the_same_again_is_said_to(av, overrides, run_av):
-    folder = run_av(av, *overrides, workers=1)
+    folder = run_av(av, *overrides)
     manifest = read_manifest(folder)
     assert (manifest["repeated"], manifest["reproducible"]) == (ALL_SAME, True)
     assert statement(folder).endswith("10 of these tests were run a second time: same bits.")
 
 
-def test_a_vehicle_that_does_not_is_found_out_for_any_number_of_workers_and_after_a_resume(run_av, tmp_path):
-    folders = [run_av(GLOBAL, name=str(n), workers=n) for n in (1, 2)]
+def test_a_vehicle_that_does_not_is_found_out_for_any_number_of_workers_and_after_a_resume(run_av, run, tmp_path):
+    folders = [run_av(GLOBAL, name="1"), run_av(GLOBAL, name="2", run=run, workers=2)]
     one, two = (read_manifest(folder) for folder in folders)
     assert one["repeated"] == two["repeated"]
     assert len(one["repeated"]["differing"]) == one["repeated"]["n_episodes"] == 10
@@ -55,25 +54,24 @@ def test_a_vehicle_that_does_not_is_found_out_for_any_number_of_workers_and_afte
     with pytest.raises(CampaignError, match="10 of 10 tests that it repeated itself came out otherwise"):
         replay_episode(folders[0], 3)
     copied = copy_of(folders[0], tmp_path / "copy")
-    run_av(GLOBAL, "stop.episodes=500", name=copied.name, workers=1, resume=True)
+    run_av(GLOBAL, "stop.episodes=500", name=copied.name, resume=True)
     longer = read_manifest(copied)
     assert (longer["repeated"], longer["reproducible"], longer["n_episodes"]) == (one["repeated"], False, 500)
 
 
-def test_a_built_in_vehicle_need_not_show_anything(run_av):
-    folder = run_av("{model: idm}", workers=1)
-    manifest = read_manifest(folder)
+def test_a_built_in_vehicle_need_not_show_anything(twin_run):
+    manifest = read_manifest(twin_run)
     assert (manifest["repeated"], manifest["reproducible"]) == (None, True)
-    assert "repeated" not in statement(folder)
+    assert "repeated" not in statement(twin_run)
 
 
 def test_a_short_run_repeats_two(run_av):
-    folder = run_av(GOOD, "stop.episodes=12", workers=1)
+    folder = run_av(GOOD, "stop.episodes=12")
     assert read_manifest(folder)["repeated"]["n_episodes"] == 2
 
 
 def test_a_replay_that_differs_names_what_it_knows(run_av):
-    folder = run_av(GOOD, workers=1)
+    folder = run_av(GOOD, "stop.episodes=100")
     manifest = read_manifest(folder)
     path = folder / "estimates.json"
     path.unlink()

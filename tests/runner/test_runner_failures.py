@@ -16,18 +16,18 @@ import pytest
 from harness.cli import main
 from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, WorldDisagreementError
 from harness.progress import LineProgress
-from harness.runner import campaign_run, local_executor, shard_pool, worker
+from harness.runner import campaign_run, executor, shard_pool, worker
 from harness.runner.shard_pool import WorkerLostError
 from harness.runner.worker import ShardSpec
 from tests.runner import bad_workers
-from tests.runner.conftest import MIXTURE_FILE, SMALL, TWIN
+from tests.runner.conftest import MIXTURE_FILE, SMALL, TWIN, sets
 from tests.runner.stored_runs import copy_of, manifest, shard_files, unlike_columns
 
 SHARDS_BEFORE_FAILURE = 3
 
 
 def test_a_shard_that_kills_every_worker_ends_the_run_and_is_named(run, campaign, tmp_path, monkeypatch):
-    monkeypatch.setattr(local_executor, "serve", bad_workers.dying)
+    monkeypatch.setattr(executor, "serve", bad_workers.dying)
     monkeypatch.setattr(shard_pool, "ATTEMPTS", 2)
     with pytest.raises(
         WorkerLostError, match=r"shard 0 \(from episode 0\): found 2 worker processes that died"
@@ -40,7 +40,7 @@ def test_a_shard_that_kills_every_worker_ends_the_run_and_is_named(run, campaign
 
 
 def test_a_disagreement_in_a_worker_ends_the_run_and_all_workers(run, campaign, tmp_path, monkeypatch):
-    monkeypatch.setattr(local_executor, "serve", bad_workers.disobedient)
+    monkeypatch.setattr(executor, "serve", bad_workers.disobedient)
     with pytest.raises(WorldDisagreementError, match="SUMO, BV3, m"):
         run(campaign(*TWIN), tmp_path, workers=2)
     assert manifest(tmp_path)["status"] == "interrupted"
@@ -51,7 +51,6 @@ def test_a_full_disk_is_said_in_words_and_the_run_can_be_resumed(
     run_here, campaign, twin_run, tmp_path, monkeypatch, capsys
 ):
     out = tmp_path / "run"
-    options = [word for override in (*SMALL, *TWIN) for word in ("--set", override)]
     write = Path.write_bytes
 
     def write_or_fail(path: Path, content: bytes) -> int:
@@ -62,7 +61,7 @@ def test_a_full_disk_is_said_in_words_and_the_run_can_be_resumed(
 
     with monkeypatch.context() as patch:
         patch.setattr(Path, "write_bytes", write_or_fail)
-        assert main(["run", str(MIXTURE_FILE), "--out", str(out), "--workers", "1", *options]) == 2
+        assert main(["run", str(MIXTURE_FILE), "--out", str(out), "--workers", "1", *sets(*SMALL, *TWIN)]) == 2
     complaint = capsys.readouterr().err
     assert "no space left" in complaint
     assert "--resume" in complaint

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from harness.campaign.loading import load_campaign
-from harness.errors import CampaignError, RunFolderError
+from harness.errors import CampaignError
 from harness.resolved import resolve
 from harness.runner.prepare import prepare
 from harness.twin import TwinWorld
@@ -40,11 +40,6 @@ def test_another_inattention_is_noticed(whole, campaign, run_here, tmp_path):
     more = AV.replace("probability: 0.4", "probability: 0.45")
     run_here(campaign(*TWIN, *FORCED[:-1], more), tmp_path / "run")
     assert "traces.a_mps2" in unlike_columns(whole, tmp_path / "run")
-
-
-def test_resuming_with_other_reflexes_is_refused(whole, campaign, run_here):
-    with pytest.raises(RunFolderError):
-        run_here(campaign(*TWIN, *FORCED[:-1], AV.replace("0.4, max", "0.5, max")), whole, resume=True)
 
 
 @pytest.mark.parametrize("method", ["nde", "step_mixture"])

@@ -10,7 +10,6 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
-from pyarrow import csv
 
 from harness.cli import main
 from harness.records.schemas import traces_schema
@@ -88,15 +87,6 @@ def test_the_command_prints_json_and_nothing_else_on_stdout(sumo_run, tmp_path, 
     assert answer["bit_equal"] is True
     assert answer["files"] == [str(trace)]
     assert pq.read_table(trace).schema.equals(traces_schema(), check_metadata=True)
-
-
-def test_the_trace_as_csv(twin_run, tmp_path):
-    path = tmp_path / "trace.csv"
-    assert main(["replay", str(twin_run), "3", "--out", str(path)]) == 0
-    rows = csv.read_csv(path)
-    replayed = replay_episode(twin_run, 3).trace
-    assert rows.num_rows == replayed.num_rows
-    assert rows["x_m"].to_pylist() == replayed["x_m"].to_pylist()
 
 
 @pytest.mark.parametrize("engine", ["sumo", "twin"])

@@ -13,7 +13,7 @@ import numpy as np
 import pyarrow.parquet as pq
 
 from harness.progress import SilentProgress
-from tests.runner.conftest import MIXTURE_FILE, SMALL
+from tests.runner.conftest import MIXTURE_FILE, SMALL, sets
 from tests.runner.stored_runs import copy_of, manifest, shard_files, stored_table, unlike_columns
 
 PATIENCE_S = 300.0
@@ -85,24 +85,27 @@ sys.exit(main(sys.argv[3:]))
 """
 
 
-def struck(out: Path, number: signal.Signals, nth_shard: int, *options: str) -> subprocess.CompletedProcess:
-    """`harness run`, which a signal reaches when a file of the n-th shard that it makes is half written."""
-    command = [sys.executable, "-c", STRUCK, str(number.value), str(nth_shard)]
-    command += ["run", str(MIXTURE_FILE), "--out", str(out), "--workers", "1", *options]
-    for override in (*SMALL, "world.cells=16"):
-        command += ["--set", override]
+def struck(number: signal.Signals, nth_shard: int, *words: object) -> subprocess.CompletedProcess:
+    """A command that a signal reaches when a file of the n-th shard that it makes is half written."""
+    command = [sys.executable, "-c", STRUCK, str(number.value), str(nth_shard), *map(str, words), "--workers", "1"]
     return subprocess.run(command, capture_output=True, text=True, check=False, timeout=PATIENCE_S)
+
+
+def struck_run(out: Path, number: signal.Signals, nth_shard: int, *options: str) -> subprocess.CompletedProcess:
+    """The same of `harness run`."""
+    settings = sets(*SMALL, "world.cells=16")
+    return struck(number, nth_shard, "run", MIXTURE_FILE, "--out", out, *options, *settings)
 
 
 def test_interrupted_then_killed_then_resumed(sumo_run, campaign, run_here, tmp_path):
     out = tmp_path / "run"
-    first = struck(out, signal.SIGINT, 4)
+    first = struck_run(out, signal.SIGINT, 4)
     assert (first.returncode, "--resume" in first.stderr) == (130, True)
     assert (manifest(out)["status"], manifest(out)["n_episodes"]) == ("interrupted", 240)
     assert len(shard_files(out)) == 3
     assert not list(out.rglob("*.part"))
 
-    assert struck(out, signal.SIGKILL, 4, "--resume").returncode == -signal.SIGKILL
+    assert struck_run(out, signal.SIGKILL, 4, "--resume").returncode == -signal.SIGKILL
     assert manifest(out)["status"] != "done"
     assert len(shard_files(out)) == 6
     assert len(list(out.rglob("*.part"))) == 1

@@ -7,6 +7,7 @@ import json
 import pytest
 
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, RunFolderError
+from harness.progress import SilentProgress
 from harness.runner.manifest import Prefix
 from tests.runner.conftest import TWIN
 from tests.runner.stored_runs import copy_of, manifest, shard_files, stored_table, unlike_columns
@@ -44,11 +45,24 @@ def test_the_asked_precision_is_reached_and_nothing_beyond_it_is_kept(runs):
     assert manifest(loose)["n_episodes"] < manifest(tight)["n_episodes"] < 4000
 
 
+class Bar(SilentProgress):
+    """Where the bar of tests begins and ends."""
+
+    def stage(self, name, total, *, done=0):
+        if name == "episodes":
+            self.begin = self.end = done
+
+    def advance(self, n):
+        self.end += n
+
+
 def test_a_run_resumed_to_a_smaller_rhw_extends_the_same_records(runs, run_here, campaign, tmp_path):
     out = copy_of(runs["loose"].folder, tmp_path / "run")
     before = {path.name: path.stat().st_mtime_ns for path in shard_files(out)}
-    result = run_here(campaign(*COMMON, TIGHT), out, resume=True)
+    bar = Bar()
+    result = run_here(campaign(*COMMON, TIGHT), out, resume=True, progress=bar)
     assert result.exit_code == EXIT_DONE
+    assert (bar.begin, bar.end) == tuple(manifest(runs[name].folder)["n_episodes"] for name in ("loose", "tight"))
     after = {path.name: path.stat().st_mtime_ns for path in shard_files(out)}
     assert {name: after[name] for name in before} == before, "finished shards are not written again"
     assert len(after) > len(before)
@@ -72,12 +86,6 @@ def test_a_refused_resumption_costs_no_shorter_shard_either(run_here, campaign, 
     with pytest.raises(RunFolderError, match="130 finished tests, of which"):
         run_here(campaign(*COMMON, "stop.rhw=5", "stop.min_crashes=1"), out, resume=True)
     assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
-
-
-def test_a_finished_run_resumed_as_it_is_does_nothing(runs, run_here, campaign, tmp_path):
-    out = copy_of(runs["loose"].folder, tmp_path / "run")
-    run_here(campaign(*COMMON, LOOSE), out, resume=True)
-    assert unlike_columns(runs["loose"].folder, out) == []
 
 
 def test_a_spent_budget_is_exit_code_4_and_can_be_enlarged(runs, run_here, campaign, tmp_path):

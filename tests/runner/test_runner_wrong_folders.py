@@ -14,10 +14,10 @@ from harness.errors import RunFolderError
 from harness.records.folder import read_manifest, require_place, sole_use
 from harness.resolved import resolve
 from harness.runner.manifest import require_own_folder
-from tests.runner.conftest import MIXTURE_FILE, SMALL, TWIN
+from tests.runner.conftest import MIXTURE_FILE, SMALL, TWIN, one_process, sets, without_page
 from tests.runner.stored_runs import copy_of, manifest, shard_files, truncate, unlike_columns
 
-SAME = [word for override in (*SMALL, *TWIN) for word in ("--set", override)]
+SAME = sets(*SMALL, *TWIN)
 
 
 def complaint_of(capsys, *arguments: object) -> str:
@@ -99,13 +99,15 @@ class Careful:
 """
 
 
+@one_process()
+@without_page()
 def test_another_version_of_the_controller_is_refused(tmp_path, capsys, monkeypatch):
     file = tmp_path / "versioned_controller.py"
     file.write_text(CONTROLLER.format(acceleration=-2.0))
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("sys.path", [str(tmp_path), *sys.path])
-    source = ["--set", "av={}", "--set", "av.controller=versioned_controller:Careful"]
-    settings = [*SAME, *source, "--set", "world.engine=sumo", "--set", "stop.episodes=20", "--workers", "1", "--quiet"]
+    changes = sets("av={}", "av.controller=versioned_controller:Careful", "stop.episodes=20")
+    settings = [*SAME, *changes, "--workers", "1", "--quiet"]
     out = tmp_path / "run"
     assert main(["run", str(MIXTURE_FILE), "--out", str(out), *settings]) == 0
     capsys.readouterr()
@@ -208,8 +210,8 @@ def test_resuming_with_a_truncated_shard_names_it_and_its_mend_works(
 @pytest.mark.parametrize(
     ("name", "content"),
     [
-        *(("manifest.json", content) for content in (None, "{", "{}", "[]")),
-        *(("campaign.yaml", content) for content in (None, "{")),
+        *(("manifest.json", content) for content in (None, "{", "{}", "[]", '{"shards": 5}')),
+        *(("campaign.yaml", content) for content in (None, "{", "{}")),
     ],
 )
 def test_a_missing_or_damaged_manifest_or_campaign(name, content, stored, capsys):
@@ -217,20 +219,20 @@ def test_a_missing_or_damaged_manifest_or_campaign(name, content, stored, capsys
     path.unlink()
     if content is not None:
         path.write_text(content)
-    for command in (("estimate", stored), ("report", stored), ("replay", stored, 0)):
-        text = complaint_of(capsys, *command)
-        assert str(path) in text
-        assert "Errno" not in text
+    more = {"replay": [0], "ladder": ["--out", stored / "ladder.yaml"]}
+    for command in ("estimate", "report", "rnot", "replay", "ladder"):
+        text = complaint_of(capsys, command, stored, *more.get(command, []))
+        assert (str(path) in text, text.count("error:"), "Errno" in text) == (True, 1, False)
     if name == "manifest.json":
         assert "Give a folder that `harness run` has written" in text
 
 
-def test_a_manifest_cut_at_every_byte_is_named_and_nothing_is_touched(stored, campaign):
+def test_a_manifest_cut_anywhere_is_named_and_nothing_is_touched(stored, campaign):
     """Nothing of it is taken for the whole: neither read nor gone on with."""
     path, resolved = stored / "manifest.json", resolve(campaign(*TWIN))
     whole = path.read_bytes()
     files = sorted(stored.rglob("*"))
-    for n in range(len(whole) - len(b"}\n") + 1):
+    for n in (*range(0, len(whole) - len(b"}\n"), 7), len(whole) - len(b"}\n")):
         path.write_bytes(whole[:n])
         for read in (read_manifest, partial(require_own_folder, resolved=resolved, resume=True)):
             with pytest.raises(RunFolderError) as raised:

@@ -7,8 +7,6 @@ import json
 import math
 import shutil
 import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -17,37 +15,19 @@ from harness import estimate, replay
 from harness.cli import main
 from harness.errors import CampaignError, HarnessError, RunFolderError
 from harness.part import Part
-from harness.runner import plan_second_phase, read_plan, run_part
+from harness.runner import read_plan, run_part
 from harness.runner.parts import planned_specs
 from tests.pool.conftest import SMALL_POOL
 from tests.pool.test_vehicle_pool import ACTING
-from tests.runner.conftest import MIXTURE_FILE, SMALL, one_process
+from tests.runner.conftest import MIXTURE_FILE, SMALL, one_process, sets
 from tests.runner.stored_runs import copy_of, manifest, shard_files, stored_table, unlike_columns
 from tests.runner.test_parts import edit, without_what_is_the_machines
-from tests.runner.test_runner_same_bits import PATIENCE_S, STRUCK
+from tests.runner.test_runner_same_bits import struck
 from tests.runner.test_runner_wrong_folders import complaint_of
 
 ALIKE = ("testing.method=shells", "stop.rhw=1.0", "stop.episodes=3000", "run.shard_size=20", *SMALL_POOL)
 TWIN = (*ALIKE, "world.engine=twin")
 TWO_PHASE = "testing.shells.stopping=two_phase"
-
-
-@pytest.fixture(scope="module")
-def plan_here():
-    def plan_in_this_process(campaign, out, **options):
-        with one_process():
-            return plan_second_phase(campaign, out, workers=1, **options)
-
-    return plan_in_this_process
-
-
-@pytest.fixture(scope="module")
-def part_here():
-    def run_in_this_process(plan, number, of, out, **options):
-        with one_process():
-            return run_part(read_plan(plan), Part(number, of), out, workers=1, **options)
-
-    return run_in_this_process
 
 
 @pytest.fixture(scope="module")
@@ -94,21 +74,15 @@ def test_a_plan_and_its_parts_are_the_run_in_two_phases(planned, whole, merged, 
     assert (result.exit_code, result.stopped_by) == (0, "two_phase")
 
 
-def struck(number: signal.Signals, nth_shard: int, *words: object) -> int:
-    """Exit code of a command that a signal reaches when a file of the n-th shard that it makes is half written."""
-    command = [sys.executable, "-c", STRUCK, str(number.value), str(nth_shard), *map(str, words), "--workers", "1"]
-    return subprocess.run(command, capture_output=True, check=False, timeout=PATIENCE_S).returncode
-
-
 def test_in_sumo_with_a_plan_and_a_part_that_were_killed(whole, campaign, plan_here, part_here, merged, tmp_path):
     plan, parts = tmp_path / "plan", [tmp_path / "part1", tmp_path / "part2"]
-    overrides = [word for override in (*SMALL, *ALIKE, "world.cells=16") for word in ("--set", override)]
-    assert struck(signal.SIGKILL, 4, "plan", MIXTURE_FILE, "--out", plan, *overrides) == -signal.SIGKILL
+    overrides = sets(*SMALL, *ALIKE, "world.cells=16")
+    assert struck(signal.SIGKILL, 4, "plan", MIXTURE_FILE, "--out", plan, *overrides).returncode == -signal.SIGKILL
     assert len(shard_files(plan)) == 3
     with pytest.raises(RunFolderError, match="a plan that is not finished"):
         read_plan(plan)
     plan_here(campaign(*ALIKE, "world.cells=64"), plan, resume=True)
-    assert struck(signal.SIGKILL, 3, "run", plan, "--part", "1/2", "--out", parts[0]) == -signal.SIGKILL
+    assert struck(signal.SIGKILL, 3, "run", plan, "--part", "1/2", "--out", parts[0]).returncode == -signal.SIGKILL
     assert len(shard_files(parts[0])) == 2
     part_here(plan, 2, 2, parts[1], resume=True)  # as job scripts do
     with pytest.raises(RunFolderError, match="not finished: part 1 of 2"):
@@ -183,7 +157,7 @@ def test_merged_parts_can_be_estimated_replayed_and_continued(planned, merged, w
 
 def test_the_command_line(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    overrides = [word for override in (*SMALL, *TWIN, "stop.rhw=2.0") for word in ("--set", override)]
+    overrides = sets(*SMALL, *TWIN, "stop.rhw=2.0")
     quick = ["--workers", "1", "--quiet"]
     with one_process():
         assert main(["plan", str(MIXTURE_FILE), "--out", "plan", *overrides, *quick, "--json"]) == 0
@@ -196,7 +170,6 @@ def test_the_command_line(tmp_path, capsys, monkeypatch):
         assert capsys.readouterr().out.startswith("part 1 of 1 (tests ")
     assert main(["merge", "part", "plan", "--out", "run", "--quiet"]) == 0
     assert "as many as the first phase had planned" in capsys.readouterr().out
-    assert main(["report", "run"]) == 0
 
 
 def test_each_test_is_a_shard_of_its_own_unless_it_is_asked_for(tmp_path, monkeypatch, capsys):
@@ -348,7 +321,7 @@ def test_a_plan_says_what_it_is(planned, tmp_path, capsys):
         assert f"found: a plan of {n_planned} tests, after a first phase of {n_first} expected: a whole run" in text
         assert "--part K/N" in text
     assert "found: part 1 of 3" in complaint_of(capsys, "report", one)
-    same = [word for override in (*SMALL, *TWIN, TWO_PHASE) for word in ("--set", override)]
+    same = sets(*SMALL, *TWIN, TWO_PHASE)
     text = complaint_of(capsys, "run", MIXTURE_FILE, "--out", plan, "--resume", *same)
     assert "found: a plan of this campaign expected: a whole run" in text
     for words, said in (

@@ -30,10 +30,10 @@ def files_of(folder):
 
 
 @pytest.fixture(scope="module")
-def early_run(campaign, run, tmp_path_factory):
-    """One worker, eight cells, in SUMO. Never written to."""
+def early_run(campaign, run_here, tmp_path_factory):
+    """Eight cells, in SUMO. Never written to."""
     out = tmp_path_factory.mktemp("early") / "run"
-    return run(campaign(*SHELLS, SHADOWS, f"av={of('Speeds')}", "world.cells=8"), out, workers=1)
+    return run_here(campaign(*SHELLS, SHADOWS, f"av={of('Speeds')}", "world.cells=8"), out)
 
 
 def test_it_reaches_the_precision_and_keeps_the_shadow_runs(early_run):

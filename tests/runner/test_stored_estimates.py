@@ -29,13 +29,6 @@ def test_estimating_again_gives_the_same_content(sumo_run, twin_run, capsys):
     assert json.loads(capsys.readouterr().out) == json.loads((twin_run / "estimates.json").read_text())
 
 
-def test_writing_it_again_gives_the_same_file(twin_run, tmp_path):
-    folder = copy_of(twin_run, tmp_path / "run")
-    (folder / "estimates.json").unlink()
-    assert main(["estimate", str(folder), "--write"]) == 0
-    assert (folder / "estimates.json").read_bytes() == (twin_run / "estimates.json").read_bytes()
-
-
 def test_another_confidence_changes_intervals_and_not_the_rate(twin_run):
     stored = json.loads((twin_run / "estimates.json").read_text())
     wider = estimate_run(twin_run, confidence=0.99)
