@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -146,7 +146,9 @@ class Block:
         That is the weight up to the step in which it failed. The step depends on nothing that comes after it, so that
         the mean of these weights is the probability to fail, whatever the episodes were drawn by.
         """
-        return replace(self, crash=self.crash | self.failed, failed=np.zeros_like(self.failed))
+        if not self.failed.any():
+            return self
+        return _unchecked(self, crash=self.crash | self.failed, failed=np.zeros_like(self.failed))
 
     def take(self, rows: slice) -> Block:
         """Cut out the block of some consecutive rows, a slice with step 1."""

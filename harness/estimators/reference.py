@@ -14,7 +14,7 @@ The pool knows on which cut-ins a reference driver would have crashed: cells div
   the place of strata. Paths may carry crashes of both kinds, which makes the contrast's variance smaller; how many do
   is not known, so that E[PU] is taken for its least value, 0.
 
-Each limit is a root of `harness.estimators.likelihood_limits.ratio_limits`. Tests that failed count as whatever makes
+Each limit is a root of `harness.estimators.stratified.ratio_limits`. Tests that failed count as whatever makes
 an interval wider.
 """
 
@@ -26,9 +26,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from harness.arrays import BoolArray, FloatArray, IntArray
-from harness.estimators.likelihood_limits import ratio_limits
 from harness.estimators.limit_search import Level
-from harness.estimators.stratified import Tally, mean_square, pool_variance
+from harness.estimators.stratified import Tally, mean_square, pool_variance, ratio_limits
 from harness.strata import ShellDesign
 
 

@@ -6,7 +6,7 @@ refutes it. Where a boundary is checked in each test, one in which the vehicle w
 believe in the statement.
 
 The rate is Σ p_s c_s, c_s being the share of a stratum's tests that crash. Its limits are those of the likelihood
-ratio (`harness.estimators.likelihood_limits`), with the error of the p_s in the same root. A stratum without a crash
+ratio (`harness.estimators.stratified`), with the error of the p_s in the same root. A stratum without a crash
 widens the upper limit only.
 Failed tests count against the vehicle (`harness.estimators.stratified`).
 """
@@ -23,10 +23,9 @@ from harness.estimators.block import Block
 from harness.estimators.crash_paths import FEWEST_PATHS, CrashPaths
 from harness.estimators.estimate import Estimate, require_episodes
 from harness.estimators.intervals import clopper_pearson
-from harness.estimators.likelihood_limits import likelihood_limit
 from harness.estimators.limit_search import Level
 from harness.estimators.reference import Comparison, compared
-from harness.estimators.stratified import Limits, Tally, combined, empty_tally, pool_variance
+from harness.estimators.stratified import Limits, Tally, combined, empty_tally, likelihood_limit, pool_variance
 from harness.strata import ShellDesign
 
 MOST_NAMED = 10

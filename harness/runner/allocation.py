@@ -10,9 +10,8 @@ import numpy as np
 
 from harness.arrays import BoolArray, IntArray
 from harness.estimators.intervals import clopper_pearson
-from harness.estimators.likelihood_limits import spread
 from harness.estimators.limit_search import Level
-from harness.estimators.stratified import Tally, combined
+from harness.estimators.stratified import Tally, combined, spread
 from harness.strata import ASSUMPTION_FREE, ShellDesign
 
 GROWTH = 1.1

@@ -18,8 +18,13 @@ import numpy as np
 from harness.arrays import IntArray
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED, CampaignError
 from harness.estimators.block import Block
-from harness.estimators.paired_shells import PairedEstimate, paired_estimate
-from harness.estimators.paired_statement import conditional_paired_statement, margin_statement, paired_statement
+from harness.estimators.paired_shells import (
+    PairedEstimate,
+    conditional_paired_statement,
+    margin_statement,
+    paired_estimate,
+    paired_statement,
+)
 from harness.estimators.pairs import PairCounts, PairedShells, Verdict
 from harness.estimators.round_stopping import LOOKS, PairRule
 from harness.pool.shells import Draw, PrescribedEpisodes, acceleration_limit

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from scipy.optimize import brentq, minimize
 from scipy.special import gammaln, xlogy
 
-from harness.estimators.likelihood_limits import contrast_limit, likelihood_limit, ratio_limits, spread
 from harness.estimators.limit_search import Level
+from harness.estimators.stratified import contrast_limit, likelihood_limit, ratio_limits, spread
 
 MANY = 1e6
 """A quantile so large that the threshold for few crashes always holds."""

@@ -11,10 +11,9 @@ from scipy.optimize import brentq
 from scipy.special import xlogy
 from scipy.stats import binom, binomtest
 
-from harness.estimators.likelihood_limits import likelihood_limit
 from harness.estimators.limit_search import Level
 from harness.estimators.reference import compared, preventable_share, rate_ratio_limits
-from harness.estimators.stratified import Tally, empty_tally
+from harness.estimators.stratified import Tally, empty_tally, likelihood_limit
 from harness.strata import Reference, ShellDesign, Statement
 
 LEVEL = Level.two_sided(0.9)

@@ -9,10 +9,9 @@ import pytest
 from scipy.stats import binom
 
 from harness.estimators import Estimate, one_pass
-from harness.estimators.likelihood_limits import likelihood_limit
 from harness.estimators.limit_search import Level
 from harness.estimators.statement import boundary_statements, statement
-from harness.estimators.stratified import Tally, combined, pool_variance
+from harness.estimators.stratified import Tally, combined, likelihood_limit, pool_variance
 from harness.strata import Statement
 
 from .small_blocks import SHELLS, in_shells

@@ -12,8 +12,8 @@ from scipy.optimize import minimize
 from scipy.special import betaincinv, xlogy
 from scipy.stats import binom
 
-from harness.estimators.likelihood_limits import likelihood_limit
 from harness.estimators.limit_search import Level
+from harness.estimators.stratified import likelihood_limit
 
 COUNTS = st.lists(
     st.tuples(st.floats(0.01, 100.0), st.integers(0, 60), st.integers(0, 60)).map(
