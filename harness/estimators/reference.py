@@ -25,9 +25,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from harness.arrays import BoolArray, FloatArray, IntArray
+from harness.arrays import BoolArray, FloatArray
 from harness.estimators.limit_search import Level
-from harness.estimators.stratified import Tally, mean_square, pool_variance, ratio_limits
+from harness.estimators.stratified import CRASH, Tally, mean_square, pool_variance, ratio_limits
 from harness.strata import ShellDesign
 
 
@@ -109,10 +109,9 @@ def rate_ratio_limits(
     def variance(x: float) -> float:
         return max(of_paths - 2.0 * x * covariance + x * x * of_reference, 0.0)
 
-    nothing = np.zeros_like(p)
     # A constant as a sum over strata: the same for either outcome.
     below = np.full((p.size, 2), rate / p.size)
-    return ratio_limits(np.column_stack([p, nothing]), below, _outcomes(tally), level, variance)
+    return ratio_limits(np.outer(p, CRASH), below, tally.outcomes, level, variance)
 
 
 def preventable_share(
@@ -146,11 +145,5 @@ def _share_limits(p: FloatArray, cells: Tally, prevented: BoolArray, n_paths: in
         mean = rest * of_prevented - y * of_others
         return max(rest * rest * first + y * y * second - mean * mean, 0.0) / n_paths
 
-    nothing = np.zeros_like(p)
-    above, below = np.column_stack([p * prevented, nothing]), np.column_stack([p, nothing])
-    return ratio_limits(above, below, _outcomes(cells), level, variance)
-
-
-def _outcomes(tally: Tally) -> IntArray:
-    """Crashes and other tests of each stratum, shape (S, 2)."""
-    return np.column_stack([tally.crashes, tally.tests - tally.crashes])
+    above, below = np.outer(p * prevented, CRASH), np.outer(p, CRASH)
+    return ratio_limits(above, below, cells.outcomes, level, variance)

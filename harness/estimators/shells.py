@@ -215,8 +215,8 @@ class Shells:
 
     def limits_of(self, statement: str, confidence: float) -> Limits:
         """Rate and interval of a statement, or of all strata."""
-        inside = {each.name: each.n_inside for each in self._design.statements}
-        return self._limits(self.tally.part(slice(0, inside.get(statement))), Level.two_sided(confidence))
+        within = slice(0, self._design.n_within(statement))
+        return self._limits(self.tally.part(within), Level.two_sided(confidence))
 
     def contradicts(self, statement: str) -> bool:
         """Whether a test crashed beyond the boundary of a statement, or was ahead of it where that is checked."""

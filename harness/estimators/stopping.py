@@ -18,6 +18,7 @@ With two passes a campaign uses about 20 % more tests than a fixed size would ne
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 from harness.campaign.models import Stop
 from harness.estimators.decision import Decision
@@ -44,7 +45,41 @@ def look_grid(n_episodes: int, shard_size: int, ratio: float = LOOK_RATIO) -> tu
     return (*looks, n_episodes)
 
 
-class StopRule:
+class Rule:
+    """Looks at results, and says why a run ended.
+
+    Attributes
+    ----------
+    reached : bool
+        Whether the asked precision, or decision, was reached; always False when none was asked.
+    rhw : float
+        Relative half-width at the last look; infinite where the interval may be wrong.
+    heaviest : float
+        By how much of itself one more crash of the largest weight would have moved the last look's estimate; 0 for
+        limits within shells, which allow for every crash that has not been seen.
+    waited_for : tuple of str
+        Conditions that were missing when a look last failed: what decided, or what is still missing.
+    pool_error_above_target : bool
+        Whether the error of the pool, which no test narrows, is too large for the asked precision.
+    decision : Decision or None
+        What is known about the limit that the campaign asks about, if it does; that, not a precision, is then waited
+        for.
+    """
+
+    def __init__(self, target: float | None, min_crashes: int) -> None:
+        self._target, self._min_crashes = target, min_crashes
+        self.reached = self.pool_error_above_target = False
+        self.rhw, self.heaviest = math.inf, 0.0
+        self.waited_for: tuple[str, ...] = ()
+        self.decision: Decision | None = None
+
+
+def missing(met: Mapping[str, bool]) -> tuple[str, ...]:
+    """Names of the conditions that are not met."""
+    return tuple(condition for condition, is_met in met.items() if not is_met)
+
+
+class StopRule(Rule):
     """Fed with the estimate at each look in turn; says when to stop.
 
     Parameters
@@ -64,18 +99,7 @@ class StopRule:
         Whose estimate `observe` wants.
     looks : tuple of int
         Numbers of episodes at which it wants it.
-    reached : bool
-        Whether the asked precision was reached; always False when none was asked.
-    rhw : float
-        Relative half-width at the last look; infinite where the interval may be wrong.
-    waited_for : tuple of str
-        Conditions that were missing when a look last failed: what decided, or what is still missing.
-    heaviest : float
-        By how much of itself one more crash of the largest weight would have moved the last look's estimate.
     """
-
-    pool_error_above_target = False  # no pool is behind these estimates
-    decision: Decision | None = None  # limits are decided by the intervals of shells alone
 
     def __init__(
         self,
@@ -86,13 +110,10 @@ class StopRule:
         *,
         min_crashes: int = DEFAULT_MIN_CRASHES,
     ) -> None:
+        super().__init__(campaign_stop.rhw, campaign_stop.min_crashes or min_crashes)
         self.estimator: EstimatorName = campaign_stop.estimator or SAMPLING[method].headline
         self.looks = look_grid(campaign_stop.episodes, shard_size, ratio)
-        self.reached = False
-        self.rhw = self.heaviest = math.inf
-        self.waited_for: tuple[str, ...] = ()
-        self._target = campaign_stop.rhw
-        self._min_crashes = campaign_stop.min_crashes or min_crashes
+        self.heaviest = math.inf
         self._n_seen = self._n_passes = 0
 
     def due(self, n: int) -> bool:
@@ -118,20 +139,20 @@ class StopRule:
         self.rhw = estimate.precision
         total = n * estimate.crash_rate
         self.heaviest = estimate.weight_cap / total if total > 0.0 else math.inf
-        if self._target is not None:
-            missing = self._missing(estimate, self._target)
-            self._n_passes = 0 if missing else self._n_passes + 1
-            self.reached = self._n_passes >= PASSES_NEEDED
-            self.waited_for = missing or self.waited_for
         last = self._n_seen == len(self.looks)
+        if self._target is None:
+            return last
+        found = missing(
+            {
+                f"stop.rhw ({self._target:g})": self.rhw <= self._target,
+                f"stop.rhw ({self._target:g}) for one more crash of the largest possible weight": self.heaviest
+                <= self._target,
+                f"stop.min_crashes ({self._min_crashes:,})": estimate.n_crashes >= self._min_crashes,
+            }
+        )
+        self._n_passes = 0 if found else self._n_passes + 1
+        self.reached = self._n_passes >= PASSES_NEEDED
+        self.waited_for = found or self.waited_for
         if last and self._n_passes and not self.reached:
             self.waited_for = ("the same at a second look",)
         return self.reached or last
-
-    def _missing(self, estimate: Estimate, target: float) -> tuple[str, ...]:
-        met = {
-            f"stop.rhw ({target:g})": self.rhw <= target,
-            f"stop.rhw ({target:g}) for one more crash of the largest possible weight": self.heaviest <= target,
-            f"stop.min_crashes ({self._min_crashes:,})": estimate.n_crashes >= self._min_crashes,
-        }
-        return tuple(condition for condition, is_met in met.items() if not is_met)

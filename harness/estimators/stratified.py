@@ -35,6 +35,8 @@ from harness.arrays import BoolArray, FloatArray, IntArray
 from harness.estimators.intervals import clopper_pearson
 from harness.estimators.limit_search import Counts, Level, Seen, give, outermost
 
+CRASH = np.array([1.0, 0.0])
+"""What outcomes count for where a test can only crash or not."""
 PORTIONS = 6
 """Of further tests; with 4 or 12 campaigns take as many within 1 % (measured: IDM, brakes-8)."""
 _MOST_OCTAVES = 7
@@ -96,6 +98,11 @@ class Tally(NamedTuple):
         return Tally(
             self.tests, self.crashes + failed, self.failed - failed, self.crash_mass + mass, self.failed_mass - mass
         )
+
+    @property
+    def outcomes(self) -> Counts:
+        """Crashes and other tests, shape (S, 2)."""
+        return np.column_stack([self.crashes, self.tests - self.crashes])
 
     def scaled(self, tests: IntArray) -> Tally:
         """What so many tests of each stratum are expected to come to."""
@@ -169,8 +176,8 @@ def likelihood_limit(
     ``weights`` (known factors, negative for what is subtracted), ``crashes`` and ``tests`` have shape (S,); the rest
     see `contrast_limit`.
     """
-    of_outcomes = np.column_stack([weights, np.zeros(weights.size)])
-    return contrast_limit(of_outcomes, np.column_stack([crashes, tests - crashes]), level, side, variance)
+    outcomes = np.column_stack([crashes, tests - crashes])
+    return contrast_limit(np.outer(weights, CRASH), outcomes, level, side, variance)
 
 
 def contrast_limit(weights: FloatArray, counts: Counts, level: Level, side: float, variance: float = 0.0) -> float:
@@ -217,7 +224,7 @@ def spread(weights: FloatArray, lower: Counts, upper: Counts, level: Level, size
 def ratio_limits(
     above: FloatArray,
     below: FloatArray,
-    counts: IntArray,
+    counts: Counts,
     level: Level,
     variance: Callable[[float], float] = lambda _: 0.0,
 ) -> tuple[float, float]:

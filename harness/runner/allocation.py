@@ -67,8 +67,7 @@ class Allocation:
     @property
     def n_asked(self) -> int:
         """Strata that may be tested, which come first."""
-        inside = {each.name: each.n_inside for each in self.design.statements}
-        return inside.get(self.statement, self.design.p.size)
+        return self.design.n_within(self.statement)
 
     def next_round(
         self,

@@ -20,8 +20,8 @@ from harness.arrays import IntArray
 from harness.campaign.models import Campaign
 from harness.estimators import Shells, StopRule, accumulator
 from harness.estimators.block import Block
-from harness.estimators.decision import Decision
 from harness.estimators.round_stopping import RoundRule
+from harness.estimators.stopping import Rule
 from harness.estimators.stratified import Tally, empty_tally
 from harness.pool.shells import Draw, PrescribedEpisodes
 from harness.runner.allocation import Allocation, first_tests
@@ -157,17 +157,6 @@ class ShellPlanner:
         self.rule, self.reported_from = RoundRule(self._campaign), self._n_episodes
         self._begin_phase()
         return False
-
-
-class Rule(Protocol):
-    """What a run says about why it ended; see `StopRule` and `RoundRule`."""
-
-    reached: bool
-    decision: Decision | None
-    pool_error_above_target: bool
-    rhw: float
-    heaviest: float
-    waited_for: tuple[str, ...]
 
 
 class Planner(Protocol):
