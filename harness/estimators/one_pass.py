@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -167,7 +167,8 @@ def estimate_blocks(
         "retraced": facts.retraced or {"reason": "the run did not retrace its episodes"},
         "surrogate_crash_rates": rates,
     }
-    statements = _statements(estimates, facts, distance_km, say.alarm_cautions(alarm))
+    cautions = say.alarm_cautions(alarm)
+    statements = {name: _said(found, facts, distance_km, cautions) for name, found in estimates.items()}
     return finite_json(
         {
             "campaign": facts.name,
@@ -193,19 +194,12 @@ def estimate_blocks(
     )
 
 
-def _statements(
-    estimates: Mapping[EstimatorName, Estimate | Unavailable],
-    facts: CampaignFacts,
-    distance_km: float | None,
-    alarm: Sequence[str],
-) -> dict[str, str]:
-    """What each estimator says, what it must be warned of first; of one without a value, why."""
-    first = [*alarm, *say.repeated_cautions(facts.repeated)]
-    return {
-        name: say.warned(first, say.answer(found, facts.lane_change_level, distance_km))
-        + say.failed_statement(found.details)
-        + say.repeated_statement(facts.repeated)
-        if isinstance(found, Estimate)
-        else f"No crash rate from these records: {found.reason.rstrip('.')}."
-        for name, found in estimates.items()
-    }
+def _said(found: Estimate | Unavailable, facts: CampaignFacts, distance_km: float | None, alarm: Sequence[str]) -> str:
+    """What an estimator says, led by what it must be warned of and the first reference driver; or why it cannot."""
+    if isinstance(found, Unavailable):
+        return f"No crash rate from these records: {found.reason.rstrip('.')}."
+    answer = say.statement(found, facts.lane_change_level, distance_km)
+    text = say.warned(
+        [*alarm, *say.repeated_cautions(facts.repeated)], " ".join([*say.reference_statements(found)[:1], answer])
+    )
+    return text + say.failed_statement(found.details) + say.repeated_statement(facts.repeated)

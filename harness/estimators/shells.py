@@ -118,7 +118,6 @@ class Shells:
 
     def __init__(self) -> None:
         self._cells = empty_tally(0)
-        self._tally: Tally | None = None  # of the cells, once it is asked for
         self._paths = CrashPaths()
         self._crashed: dict[int, list[int]] = {}  # stratum → its first few tests that crashed
         self._n_checked = self._n_ahead = 0
@@ -127,9 +126,7 @@ class Shells:
     @property
     def tally(self) -> Tally:
         """Counts by stratum; of no strata before the first block."""
-        if self._tally is None:
-            self._tally = self._cells.joined(self._design.joined) if self._cells.tests.size else self._cells
-        return self._tally
+        return self._cells.joined(self._design.joined) if self._cells.tests.size else self._cells
 
     @classmethod
     def of(cls, design: ShellDesign, tally: Tally) -> Shells:
@@ -152,7 +149,7 @@ class Shells:
         if not self._cells.tests.size:
             self._design = block.shells
             self._cells = empty_tally(block.shells.cell_p.size)
-        tally, self._tally = self._cells, None
+        tally = self._cells
         np.add.at(tally.tests, block.cell, 1)
         for rows, counts, sums in (
             (block.crash, tally.crashes, tally.crash_mass),
@@ -220,11 +217,9 @@ class Shells:
 
     def contradicts(self, statement: str) -> bool:
         """Whether a test crashed beyond the boundary of a statement, or was ahead of it where that is checked."""
-        return any(
-            bool(self.tally.crashes[each.n_inside :].any()) or (each.checked and self._n_ahead > 0)
-            for each in self._design.statements
-            if each.name == statement
-        )
+        beyond = self.tally.crashes[self._design.n_within(statement) :]
+        checked = any(each.checked and each.name == statement for each in self._design.statements)
+        return bool(beyond.any()) or (checked and self._n_ahead > 0)
 
     def _limits(self, tally: Tally, level: Level) -> Limits:
         """Of the first strata, those of a tally; anything is possible where crashes lie on too few paths."""
@@ -313,11 +308,10 @@ class Shells:
                 f"all cut-ins that the pool has kept of {used_up} were tested: for more precision raise "
                 "pool.cut_ins_per_shell, and run into a new folder"
             )
-        outside = {each: int(tally.crashes[each.n_inside :].sum()) for each in design.statements}
         found += [
             f"{crashes:,} crashes beyond {each.boundary}: the statement {each.name} does not hold for this vehicle"
-            for each, crashes in outside.items()
-            if crashes
+            for each in design.statements
+            if (crashes := int(tally.crashes[each.n_inside :].sum()))
         ]
         if design.checked is not None and self._n_ahead:
             found.append(
