@@ -1,12 +1,9 @@
 """Two vehicles on common random numbers: their rates, the difference and the ratio, from pairs of weighted outcomes.
 
-Episode i of both campaigns has the same random numbers, so Y_A,i and Y_B,i go together: the pairs are independent of
-each other, the two of a pair are not. The mean of D_i = Y_A,i - Y_B,i is unbiased for the difference of the rates
-whatever the dependence, and its variance is the sample variance of D_i: Var(Y_A) + Var(Y_B) - 2 Cov(Y_A, Y_B). What
-the covariance takes away is what pairing saves.
-
-The lower limit of A - B is that of a B whose failed tests have all crashed while none of A's has, the upper limit the
-other way round (see `BothWays`).
+Episode i of both campaigns has the same random numbers: the pairs are independent of each other, the two of a pair are
+not. The mean of D_i = Y_A,i - Y_B,i is unbiased for the difference of the rates whatever the dependence, and its
+variance is the sample variance of D_i. The lower limit of A - B is that of a B whose failed tests have all crashed
+while none of A's has, the upper limit the other way round (see `BothWays`).
 """
 
 from __future__ import annotations
@@ -45,8 +42,7 @@ class Difference:
     correlation : float
         Of the two outcomes of a pair; NaN where one of them never varies.
     variance_ratio : float
-        Variance of the difference from independent runs over that from pairs: so many times as many tests would
-        independent runs need. Infinite where no pair differs.
+        Variance of the difference from independent runs over that from pairs. Infinite where no pair differs.
     n_pairs, n_differing : int
         Pairs of episodes, and those whose weighted outcomes differ.
     n_effective : float

@@ -126,7 +126,7 @@ class CampaignFacts:
     ending : str or None
         When the run ended and which condition decided, in a sentence; None while it goes on.
     decision : dict or None
-        What the run has found about the limit that it was asked about; `harness.estimators.decision.Decision`.
+        What the run has found about the limit that it was asked about; `harness.estimators.stopping.Decision`.
     no_surrogates : str
         Why surrogates were not asked about the tests, where they were not.
     """

@@ -16,21 +16,10 @@ from harness.estimators.shells import Shells
 
 @dataclass(frozen=True)
 class Contrast:
-    """What lies between A and B; rates are crashes per test.
+    """What lies between A and B, difference A - B and ratio A/B; rates are crashes per test.
 
-    Attributes
-    ----------
-    difference, ci_low, ci_high : float
-        A - B.
-    rhw : float
-        Half-width of that interval over the larger of the two rates.
-    rhw_from_pool : float
-        What the pool's own error alone would leave of it.
-    ratio, ratio_low, ratio_high : float
-        A/B.
-    only_a, only_b : Interval
-        Rate of cut-ins on which only A, or only B crashes.
-    n_pairs, n_differing : int
+    ``rhw`` is the half-width of the difference over the larger of the two rates, ``rhw_from_pool`` what the pool's own
+    error alone would leave of it; ``only_a`` and ``only_b`` are rates of cut-ins on which only one of the two crashes.
     """
 
     difference: float
@@ -61,17 +50,10 @@ class Contrast:
 
 @dataclass(frozen=True)
 class PairedEstimate:
-    """Two vehicles compared.
+    """Two vehicles compared: each by itself, and what lies between them.
 
-    Attributes
-    ----------
-    a, b : Estimate
-        Crash rate of each, from the tests of the pairs.
-    free, conditional : Contrast
-        Over all strata, and over those inside: if neither vehicle crashes beyond the boundary.
-    refuted : bool
-        Whether one of them has crashed there.
-    pairs : PairCounts
+    ``free`` is over all strata, ``conditional`` over those inside: if neither vehicle crashes beyond the boundary,
+    ``refuted`` once one has.
     """
 
     a: Estimate

@@ -1,12 +1,9 @@
 """Pairs of tests of two vehicles on the same cut-ins, drawn within shells: counts, and limits of what they say.
 
-Each cut-in is driven by A and by B. A pair of tests has one of four outcomes: both crash, only A, only B, neither. The
-rates, their difference and their ratio are weighted sums of the shares of these outcomes, and their limits those of
-the likelihood ratio (`harness.estimators.stratified`). Cut-ins on which both do the same say nothing against
-either, so that a difference takes far fewer tests than two rates.
-
-What a failed test would have come to is not known. Each limit takes A's failed tests for crashes and B's for none, or
-the other way round, whichever takes it farther.
+A pair of tests has one of four outcomes: both crash, only A, only B, neither. The rates, their difference and their
+ratio are weighted sums of the shares of these outcomes, and their limits those of the likelihood ratio
+(`harness.estimators.stratified`). Each limit takes A's failed tests for crashes and B's for none, or the other way
+round, whichever takes it farther.
 """
 
 from __future__ import annotations

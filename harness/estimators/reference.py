@@ -1,21 +1,16 @@
 """How a vehicle compares with a reference driver in the same traffic, from tests of the vehicle alone.
 
-The pool knows on which cut-ins a reference driver would have crashed: cells divide strata by that. So its crash rate
-μ_R is known to the pool's error, and
+Ratio x = μ/μ_R and preventable share y are tested as the contrasts of docs/estimators.md; each limit is a root of
+`harness.estimators.stratified.ratio_limits`. Of the pool's part of their variance:
 
-- the **ratio** x = μ/μ_R is tested as the contrast Σ p_s θ_s - x μ_R = 0. Both rates come from the same paths. With X
-  and R a path's probabilities that the vehicle and the reference crash, the pool's part of the contrast's variance is
-  (E[(X - xR)²] - (μ - xμ_R)²)/n. E[X²] is what `mean_square` says, and E[R²] the pool knows. E[XR] follows from the
-  crashed tests: one of stratum s is a draw in proportion to X there, so that Σ p_s/n_s times the sum of R over them has
-  that mean;
-- the **preventable** share y of the vehicle's crashes, those on cut-ins on which the reference does not crash, is
-  tested as (1 - y) P - y U = 0, with P and U the rates of preventable and of unavoidable crashes. Within a stratum the
-  tests fall into cells by chance; given how many did, those of each cell are independent binomials, so that cells take
-  the place of strata. Paths may carry crashes of both kinds, which makes the contrast's variance smaller; how many do
-  is not known, so that E[PU] is taken for its least value, 0.
+- with X and R a path's probabilities that the vehicle and the reference crash, `mean_square` bounds E[X²], the pool
+  knows E[R²], and E[XR] follows from the crashed tests: one of stratum s is a draw in proportion to X there, so that
+  Σ p_s/n_s times the sum of R over them has that mean;
+- paths may carry preventable and unavoidable crashes, of rates P and U, which makes the contrast's variance smaller;
+  how many do is not known, so that E[PU] is taken for its least value, 0.
 
-Each limit is a root of `harness.estimators.stratified.ratio_limits`. Tests that failed count as whatever makes
-an interval wider.
+Given how many tests fell into each cell of a stratum, those of each cell are independent binomials, so that cells take
+the place of strata. Tests that failed count as whatever makes an interval wider.
 """
 
 from __future__ import annotations

@@ -8,11 +8,10 @@ stops: that intervals cover there, and how far rates are biased, is measured (do
 from __future__ import annotations
 
 from harness.campaign.models import Campaign
-from harness.estimators.decision import Decision
 from harness.estimators.limit_search import Level
 from harness.estimators.pairs import PairCounts, Verdict
 from harness.estimators.shells import Shells
-from harness.estimators.stopping import Rule, missing
+from harness.estimators.stopping import Decision, Rule, missing
 from harness.estimators.stratified import Limits
 from harness.strata import ASSUMPTION_FREE
 

@@ -1,14 +1,8 @@
-"""`shells`: crashes counted within shells of known probability p_s, and the statements that they allow.
-
-The assumption-free statement counts every shell, tested or empty. Each of the others holds for vehicles that crash
-only where its boundary surrogate, or a more careful one, crashes too: it needs far fewer tests, and one crash outside
-refutes it. Where a boundary is checked in each test, one in which the vehicle was ahead of it takes away the reason to
-believe in the statement.
+"""`shells`: crashes counted within shells of known probability p_s, and the statements (docs/shells.md) they allow.
 
 The rate is Σ p_s c_s, c_s being the share of a stratum's tests that crash. Its limits are those of the likelihood
-ratio (`harness.estimators.stratified`), with the error of the p_s in the same root. A stratum without a crash
-widens the upper limit only.
-Failed tests count against the vehicle (`harness.estimators.stratified`).
+ratio, with the error of the p_s in the same root, and failed tests counted against the vehicle
+(`harness.estimators.stratified`). A stratum without a crash widens the upper limit only.
 """
 
 from __future__ import annotations

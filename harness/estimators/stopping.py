@@ -1,29 +1,26 @@
 """When a campaign may stop: a precision asked for beforehand, looked for at places fixed beforehand.
 
-Looking after every test and stopping at the first narrow interval favours runs that were narrow by luck. So the rule
-looks only at shard boundaries nearest to a geometric grid, only at the contiguous prefix of finished episodes, needs a
-floor of crashes and two consecutive passes. Looks depend on the campaign alone, never on workers or time.
-
-With weights that is not enough. While the rare crashes of large weight have not occurred, mean, standard error and
-largest weight seen are all too small, and the rule would stop just then. So it trusts an interval only when one more
-crash of the largest weight that the design allows would move the estimate by no more than the half-width asked for:
-cap/(n·rate) ≤ RHW. Where no cap is known (step mixture) no precision can be promised, and none may be asked for.
+Looking after every test and stopping at the first narrow interval favours runs that were narrow by luck; and while the
+rare crashes of large weight have not occurred, mean, standard error and largest weight seen are all too small. So looks
+follow from the campaign alone, two in a row must pass, and one more crash of the largest weight that the design allows
+may move the estimate by no more than the half-width asked for: cap/(n·rate) ≤ RHW (docs/estimators.md).
 
 Ratio 1.1: since the half-width shrinks with 1/√n, neighbouring looks differ by 5 % in precision, which is the noise of
 the half-width itself at the default floor of 100 crashes (half of 1/√100); a finer grid mostly repeats the same look.
-With two passes a campaign uses about 20 % more tests than a fixed size would need, where a ratio of 1.25 costs nearly
-50 %, and both keep their coverage (measured in docs/estimators.md).
+With two passes a campaign uses about 20 % more tests than a fixed size would need, with a ratio of 1.25 nearly 50 %.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
 
 from harness.campaign.models import Stop
-from harness.estimators.decision import Decision
 from harness.estimators.estimate import Estimate
 from harness.methods import SAMPLING, EstimatorName, Method
+from harness.strata import ASSUMPTION_FREE
 
 LOOK_RATIO = 1.1
 PASSES_NEEDED = 2
@@ -43,6 +40,76 @@ def look_grid(n_episodes: int, shard_size: int, ratio: float = LOOK_RATIO) -> tu
             looks.append(boundary)
         target *= ratio
     return (*looks, n_episodes)
+
+
+Verdict = Literal["accepted", "rejected", "undecided"]
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What is known about a limit, by an interval that is looked at after each round.
+
+    Looks inflate errors, and limits by the likelihood ratio are wider than a level needs where crashes are few. What is
+    left is measured: decisions are wrong in at most 1 % where 5 % are allowed (docs/gate.md).
+
+    Attributes
+    ----------
+    crash_rate_below : float
+        The limit, per test.
+    statement : str
+        Which statement decides.
+    confidence : float
+        That the crash rate lies on the side which is said: an interval leaves out half as much there as at both sides.
+    low, high : float
+        The interval.
+    contradicted : bool
+        Whether a test has shown that the vehicle does not do what the statement assumes. Its upper limit then says
+        nothing, while what crashed, crashed.
+    """
+
+    crash_rate_below: float
+    statement: str
+    confidence: float
+    low: float
+    high: float
+    contradicted: bool = False
+
+    @property
+    def verdict(self) -> Verdict:
+        """On which side of the limit the interval lies, if that can be said."""
+        if self.low > self.crash_rate_below:
+            return "rejected"
+        return "accepted" if self.high < self.crash_rate_below and not self.contradicted else "undecided"
+
+    @property
+    def is_final(self) -> bool:
+        """Whether further tests would change nothing."""
+        return self.verdict != "undecided" or self.high < self.crash_rate_below
+
+    @property
+    def sentence(self) -> str:
+        """The verdict in words."""
+        given = "" if self.statement == ASSUMPTION_FREE else f", given statement {self.statement},"
+        level, limit = f"{self.confidence:.3g}", f"{self.crash_rate_below:.3g}"
+        if self.contradicted and self.verdict == "undecided":
+            return (
+                f"UNDECIDED: whether the crash rate is below {limit} per test is not known: the vehicle does not do "
+                f"what statement {self.statement} assumes. Ask for accept.statement: {ASSUMPTION_FREE}, and use a new "
+                "folder."
+            )
+        if self.verdict == "undecided":
+            between = f"it may be {self.low:.3g} as well as {self.high:.3g}"
+            return f"UNDECIDED: whether the crash rate{given} is below {limit} per test is not known; {between}."
+        side, shown = ("below", self.high) if self.verdict == "accepted" else ("above", self.low)
+        word = "upper" if side == "below" else "lower"
+        return (
+            f"{self.verdict.upper()}: with confidence {level} the crash rate{given} is {side} {limit} per test "
+            f"({word} limit {shown:.3g})."
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """All of it."""
+        return {"verdict": self.verdict, **asdict(self), "sentence": self.sentence}
 
 
 class Rule:

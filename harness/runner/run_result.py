@@ -10,8 +10,7 @@ from typing import Any
 from harness.campaign.dumping import dump_campaign
 from harness.campaign.models import Campaign
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED
-from harness.estimators.decision import Verdict
-from harness.estimators.stopping import Rule
+from harness.estimators.stopping import Rule, Verdict
 from harness.records.folder import NO_RUN, read_json
 from harness.records.gathered import Fingerprint, fingerprint
 from harness.resolved import Resolved

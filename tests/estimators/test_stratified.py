@@ -1,4 +1,4 @@
-"""Likelihood-ratio limits: against the definition, by identities, and by their coverage."""
+"""Likelihood-ratio limits: against the definition, identities, and coverage by exact enumeration."""
 
 from __future__ import annotations
 
@@ -8,53 +8,241 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.optimize import minimize
+from scipy.optimize import brentq, minimize
 from scipy.special import betaincinv, xlogy
-from scipy.stats import binom
 
 from harness.estimators.limit_search import Level
-from harness.estimators.stratified import likelihood_limit
+from harness.estimators.stratified import contrast_limit, likelihood_limit, ratio_limits, spread
 
-COUNTS = st.lists(
-    st.tuples(st.floats(0.01, 100.0), st.integers(0, 60), st.integers(0, 60)).map(
-        lambda t: (t[0], min(t[1:]), max(t[1:]))
-    ),
-    min_size=1,
-    max_size=6,
-)
-"""Weight, crashes, tests of each stratum."""
+from .enumerated import coverage
+
 MANY = 1e6
 """A quantile so large that the threshold for few crashes always holds."""
+STRATA = st.lists(
+    st.tuples(st.floats(0.01, 100.0), *[st.integers(0, 30)] * 4), min_size=1, max_size=4, unique_by=lambda t: t[0]
+)
+"""Probability, and counts of the outcomes both, only A, only B, neither."""
+DIFFERENCE = np.array([0.0, 1.0, -1.0, 0.0])
 
 
-def both(weights, crashes, tests, level, variance=0.0):
+def both(weights, counts, level, variance=0.0):
+    return tuple(contrast_limit(np.array(weights, float), np.array(counts), level, side, variance) for side in (-1, 1))
+
+
+def closed_form(weights, crashes, tests, threshold, side):
+    """Limit of binomial strata by the two roots of a quadratic, without cancellation only in the middle."""
+    c = crashes / tests
+
+    def at(nu):
+        a = nu * weights / tests
+        root = np.sqrt((1 - a) ** 2 + 4 * a * c)
+        theta = np.where(a <= 1, 2 * c / (1 - a + root), (a - 1 + root) / (2 * np.where(a > 1, a, 1)))
+        cost = xlogy(c, c) - xlogy(c, theta) + xlogy(1 - c, 1 - c) - xlogy(1 - c, 1 - theta)
+        return weights @ theta, (tests * cost).sum() - threshold
+
+    nu = brentq(lambda nu: at(nu)[1], 0.0, side * 1e4, xtol=1e-14, rtol=1e-15)
+    return at(nu)[0]
+
+
+def test_two_outcomes_are_a_binomial_stratum_to_nine_digits():
+    rng = np.random.default_rng(3)
+    for _ in range(50):
+        tests = rng.integers(3, 400, 4)
+        crashes, weights = rng.integers(1, tests), rng.uniform(0.1, 3.0, 4) * [1, -1, 1, 1]
+        for side in (-1.0, 1.0):
+            expected = closed_form(weights, crashes, tests, 2.6, side)
+            assert likelihood_limit(weights, crashes, tests, Level(2.6, MANY), side) == pytest.approx(
+                expected, rel=1e-9, abs=1e-9
+            )
+
+
+def test_outcomes_of_equal_weight_are_one_outcome():
+    split = both([[1.0, 1.0, 0.0], [2.0, 0.0, 0.0]], [[3, 4, 13], [1, 20, 9]], Level.two_sided(0.9))
+    joined = both([[1.0, 0.0], [2.0, 0.0]], [[7, 13], [1, 29]], Level.two_sided(0.9))
+    assert split == pytest.approx(joined, rel=1e-12)
+
+
+@pytest.mark.parametrize("counts", [[(3, 8, 2, 27), (0, 1, 0, 89)], [(0, 4, 0, 16), (5, 0, 0, 35)]])
+def test_the_limit_is_the_largest_sum_that_shares_within_the_threshold_give(counts):
+    k, w, level = np.array(counts), np.array([[1.0], [0.3]]) * [0.2, 1.0, -1.5, 0.0], Level(2.6, MANY)
+    n = k.sum(1, keepdims=True)
+
+    def shares(x):
+        return np.exp(x.reshape(k.shape)) / np.exp(x.reshape(k.shape)).sum(1, keepdims=True)
+
+    def room(x):
+        return level.threshold - (xlogy(k, k / n) - xlogy(k, shares(x))).sum()
+
+    for side in (-1.0, 1.0):
+        found = minimize(
+            lambda x, s=side: -s * (w * shares(x)).sum(),
+            np.log(k + 0.3).ravel(),
+            constraints={"type": "ineq", "fun": room},
+            method="SLSQP",
+            options={"maxiter": 2000, "ftol": 1e-12},
+        )
+        assert contrast_limit(w, k, level, side) == pytest.approx(-side * found.fun, rel=1e-3)
+
+
+@given(STRATA, st.sampled_from([0.9, 0.95, 0.99]), st.floats(0.0, 0.1))
+@settings(deadline=None)
+def test_identities(strata, confidence, relative):
+    p, *columns = (np.array(column) for column in zip(*strata, strict=True))
+    counts, weights = np.column_stack(columns), p[:, None] * DIFFERENCE
+    level, variance, slack = Level.two_sided(confidence), relative * float(p @ p), 1e-9 * float(p.sum())
+    low, high = both(weights, counts, level, variance)
+    shares = counts / np.maximum(counts.sum(1, keepdims=True), 1)
+    assert low - slack <= (weights * shares).sum() <= high + slack
+    assert both(-weights, counts, level, variance) == pytest.approx((-high, -low), rel=1e-6, abs=slack)
+    scaled = both(5.0 * weights, counts, level, 25.0 * variance)
+    assert scaled == pytest.approx((5.0 * low, 5.0 * high), rel=1e-6, abs=slack)
+    order = [2, 0, 3, 1]
+    assert both(weights[:, order], counts[:, order], level, variance) == pytest.approx((low, high), rel=1e-6, abs=slack)
+    if counts[0, 3]:  # one pair more in which only A crashes
+        more = counts + np.outer(np.eye(len(p), dtype=int)[0], [0, 1, 0, -1])
+        assert np.all(np.array(both(weights, more, level, variance)) >= np.array((low, high)) - slack)
+
+
+def test_a_stratum_without_a_test_may_have_any_outcome():
+    assert both([[1.0, -2.0, 0.0]], [[0, 0, 0]], Level.two_sided(0.9)) == (-2.0, 1.0)
+    tested = both([[1.0, -2.0, 0.0]], [[5, 1, 90]], Level.two_sided(0.9))
+    more = both([[1.0, -2.0, 0.0], [0.5, -0.25, 0.0]], [[5, 1, 90], [0, 0, 0]], Level.two_sided(0.9))
+    assert more == pytest.approx((tested[0] - 0.25, tested[1] + 0.5))
+
+
+RATES = np.array([1.0, 1.0, 0.0, 0.0]), np.array([1.0, 0.0, 1.0, 0.0])
+"""A crashes; B crashes."""
+
+
+def ratio(p, counts, level):
+    a, b = (np.array(p)[:, None] * of for of in RATES)
+    return ratio_limits(a, b, np.array(counts), level)
+
+
+@given(STRATA)
+@settings(deadline=None, max_examples=40)
+def test_ratios_are_where_the_contrast_may_be_0_and_turn_over_with_the_vehicles(strata):
+    p, *columns = (np.array(column) for column in zip(*strata, strict=True))
+    counts, level = np.column_stack(columns), Level.two_sided(0.9)
+    low, high = ratio(p, counts, level)
+    assert low <= high
+    for x in (0.1, 0.5, 1.0, 3.0):
+        a, b = (p[:, None] * of for of in RATES)
+        lower, upper = both(a - x * b, counts, level)
+        if not min(abs(math.log(x / end)) if 0.0 < end < math.inf else 1.0 for end in (low, high)) < 1e-6:
+            assert (low <= x <= high) == (lower <= 0.0 <= upper)
+    swapped = ratio(p, counts[:, [0, 2, 1, 3]], level)
+    inverse = tuple(1.0 / end if end > 0.0 else math.inf for end in (high, low))
+    assert swapped == pytest.approx(inverse, rel=1e-6)
+
+
+def test_a_ratio_is_open_where_a_vehicle_has_not_crashed():
+    assert ratio([1.0], [[0, 9, 0, 91]], Level.two_sided(0.9))[1] == math.inf
+    assert ratio([1.0], [[0, 0, 9, 91]], Level.two_sided(0.9))[0] == 0.0
+    assert ratio([1.0], [[0, 0, 0, 100]], Level.two_sided(0.9)) == (0.0, math.inf)
+    low, high = ratio([1.0], [[50, 0, 0, 0]], Level.two_sided(0.9))
+    assert low < 1.0 < high
+
+
+def covering(truth, limits):
+    """Whether limits of counts hold the truth, up to rounding."""
+
+    def covers(counts):
+        low, high = limits(counts)
+        return low - 1e-9 <= truth <= high + 1e-9
+
+    return covers
+
+
+def difference(share, p):
+    return sum(w * (a - b) for w, (a, b) in zip(p, share, strict=True))
+
+
+def paired(p, confidence):
+    return lambda counts: both(np.array(p)[:, None] * [1.0, -1.0, 0.0], counts, Level.two_sided(confidence))
+
+
+def independent(p, confidence):
+    """Each vehicle's crashes as if from tests of its own: what pairs must not be taken for."""
+    w = np.array([*p, *(-x for x in p)])
+
+    def limits(k):
+        crashes, tests = np.concatenate([k[:, 0], k[:, 1]]), np.tile(k.sum(1), 2)
+        return tuple(likelihood_limit(w, crashes, tests, Level.two_sided(confidence), side) for side in (-1.0, 1.0))
+
+    return limits
+
+
+@pytest.mark.parametrize("confidence", [0.9, 0.95, 0.99])
+@pytest.mark.parametrize(
+    ("share", "tests", "p"),
+    [
+        (((0.45, 0.45),), (25,), (1.0,)),
+        (((0.03, 0.03),), (50,), (1.0,)),
+        (((0.12, 0.0),), (25,), (1.0,)),
+        (((0.0, 0.2),), (12,), (1.0,)),
+        (((0.5, 0.4), (0.02, 0.0)), (8, 60), (1.0, 6.0)),
+        (((0.05, 0.0), (0.0, 0.1)), (30, 15), (1.0, 1.0)),
+    ],
+)
+def test_limits_of_a_difference_cover(confidence, share, tests, p):
+    """Shares of tests in which only A crashes, and only B."""
+    assert coverage(share, tests, covering(difference(share, p), paired(p, confidence))) >= confidence
+
+
+def test_pairs_taken_for_independent_tests_do_not_cover():
+    assert coverage([(0.47, 0.47)], (60,), covering(0.0, paired([1.0], 0.95))) >= 0.95
+    assert coverage([(0.47, 0.47)], (60,), covering(0.0, independent([1.0], 0.95))) < 0.92
+
+
+@pytest.mark.parametrize("confidence", [0.9, 0.95, 0.99])
+def test_limits_of_a_ratio_cover(confidence):
+    """Of vehicles that crash together in 40 %, A alone in 25 %, B alone in 5 %: 1.44."""
+    covers = covering(0.65 / 0.45, lambda counts: ratio([1.0], counts, Level.two_sided(confidence)))
+    assert coverage([(0.4, 0.25, 0.05)], (16,), covers) >= confidence - 1e-3  # what was left out
+
+
+LEVEL = Level(Level.two_sided(0.9).threshold, MANY)
+
+
+def test_further_tests_go_where_one_more_narrows_the_interval_most():
+    """Against the interval itself, with a little more of each stratum; nowhere but where there is room."""
+    rng = np.random.default_rng(5)
+    decided = 0
+    for _ in range(200):
+        weights = 10.0 ** rng.uniform(-2.0, 0.0, (4, 1)) * np.array([1.0, 0.0])
+        tests = rng.integers(5, 400, 4)
+        crashes = rng.binomial(tests, rng.beta(0.3, 1.0, 4))
+        counts = np.column_stack([crashes, tests - crashes])
+
+        def width(s, counts=counts, weights=weights, tests=tests):
+            grown = counts * np.where(np.arange(4) == s, 1.0 + 1e-3 / tests, 1.0)[:, None]
+            return sum(side * contrast_limit(weights, grown, LEVEL, side) for side in (-1.0, 1.0))
+
+        narrowed = np.array([width(None) - width(s) for s in range(4)])
+        best, second = np.argsort(-narrowed)[:2]
+        if narrowed[best] > 1.1 * max(narrowed[second], 1e-9):
+            decided += 1
+            room = np.full(4, 10)
+            np.testing.assert_array_equal(spread(weights, counts, counts, LEVEL, 1, room), np.arange(4) == best)
+            assert spread(weights, counts, counts, LEVEL, 100, np.where(np.arange(4) == best, 0, room))[best] == 0
+    assert decided > 100
+
+
+def test_strata_without_a_test_come_first_and_all_that_there_is_is_given():
+    weights, counts = np.array([[1.0, 0.0], [1e-9, 0.0]]), np.array([[3, 7], [0, 0]])
+    np.testing.assert_array_equal(spread(weights, counts, counts, LEVEL, 1, np.array([5, 5])), [0, 1])
+    np.testing.assert_array_equal(spread(weights, counts, counts, LEVEL, 100, np.array([5, 7])), [5, 7])
+
+
+def binomial(weights, crashes, tests, level, variance=0.0):
     w, k, n = np.array(weights, float), np.array(crashes), np.array(tests)
     return tuple(likelihood_limit(w, k, n, level, side, variance) for side in (-1.0, 1.0))
 
 
-def divergence(share, other):
-    return xlogy(share, share) - xlogy(share, other) + xlogy(1 - share, 1 - share) - xlogy(1 - share, 1 - other)
-
-
-@pytest.mark.parametrize(("crashes", "tests"), [(0, 20), (1, 20), (7, 20), (20, 20)])
-def test_limits_of_one_stratum_are_where_the_divergence_meets_the_threshold(crashes, tests):
-    level = Level(2.6, MANY)
-    low, high = both([1.0], [crashes], [tests], level)
-    for limit, at_end in ((low, crashes == 0), (high, crashes == tests)):
-        if at_end:
-            assert limit == pytest.approx(crashes / tests, abs=1e-12)
-        else:
-            assert tests * divergence(crashes / tests, limit) == pytest.approx(level.threshold, rel=1e-9)
-
-
-def test_the_limit_is_the_largest_sum_that_shares_within_the_threshold_give():
-    w, k, n, level = np.array([3.0, 1.0, 0.2]), np.array([1, 0, 9]), np.array([40, 90, 10]), Level(2.6, MANY)
-    allowed = {"type": "ineq", "fun": lambda x: level.threshold - (n * divergence(k / n, x)).sum()}
-    for side in (-1.0, 1.0):
-        found = minimize(
-            lambda x, s=side: -s * w @ x, [0.03, 0.005, 0.9], bounds=[(1e-9, 1 - 1e-9)] * 3, constraints=allowed
-        )
-        assert likelihood_limit(w, k, n, level, side) == pytest.approx(w @ found.x, rel=2e-4)
+def test_shares_end_at_0_and_1():
+    assert binomial([1.0], [0], [20], LEVEL)[0] == pytest.approx(0.0, abs=1e-12)
+    assert binomial([1.0], [20], [20], LEVEL)[1] == pytest.approx(1.0, abs=1e-12)
 
 
 def test_without_a_crash_the_one_sided_bound_is_the_exact_one():
@@ -62,46 +250,11 @@ def test_without_a_crash_the_one_sided_bound_is_the_exact_one():
     assert bound == pytest.approx(betaincinv(1, 50, 0.95), rel=1e-9)
 
 
-@given(COUNTS, st.sampled_from([0.9, 0.95, 0.99]), st.floats(0.0, 0.1))
-@settings(deadline=None)
-def test_identities(counts, confidence, relative):
-    w, k, n = (np.array(column) for column in zip(*counts, strict=True))
-    level, variance = Level.two_sided(confidence), relative * float(w @ w)
-    low, high = both(w, k, n, level, variance)
-    rate, slack = float(w @ (k / np.maximum(n, 1))), 1e-9 * float(w.sum())
-    assert low - slack <= rate if n.all() else low <= high
-    assert high + slack >= rate
-    assert both(5.0 * w, k, n, level, 25.0 * variance) == pytest.approx((5.0 * low, 5.0 * high), rel=1e-6, abs=slack)
-    assert both(-w, k, n, level, variance) == pytest.approx((-high, -low), rel=1e-6, abs=slack)
-    one_more = np.minimum(k + np.eye(len(n), dtype=int)[0], n)
-    more_low, more_high = both(w, one_more, n, level, variance)
-    assert more_low >= low - slack
-    assert more_high >= high - slack
-
-
-def test_a_stratum_without_a_test_may_crash_always():
-    low, high = both([1.0, 0.5], [10, 0], [100, 0], Level.two_sided(0.9))
-    alone = both([1.0], [10], [100], Level.two_sided(0.9))
-    assert (low, high) == pytest.approx((alone[0], alone[1] + 0.5))
-
-
 def test_an_error_of_the_weights_alone_gives_the_normal_interval():
     level = Level.two_sided(0.9)
     many = 10**12
-    low, high = both([1.0], [many // 4], [many], level, variance=0.01)
+    low, high = binomial([1.0], [many // 4], [many], level, 0.01)
     assert (low, high) == pytest.approx((0.25 - 1.6449 * 0.1, 0.25 + 1.6449 * 0.1), abs=2e-3)
-
-
-def coverage(share, tests, weights, limits):
-    """Exact, over all pairs of counts that are likely enough to matter."""
-    truth = float(np.dot(weights, share))
-    chances = [binom.pmf(np.arange(n + 1), n, x) for n, x in zip(tests, share, strict=True)]
-    covered = 0.0
-    for a in np.flatnonzero(chances[0] > 1e-7):
-        for b in np.flatnonzero(chances[1] > 1e-7):
-            low, high = limits([int(a), int(b)], tests, weights)
-            covered += chances[0][a] * chances[1][b] * (low <= truth * (1 + 1e-9) and truth <= high * (1 + 1e-9))
-    return covered
 
 
 def squares(confidence):
@@ -127,8 +280,9 @@ RARE = [
 @pytest.mark.parametrize("confidence", [0.9, 0.95, 0.99])
 @pytest.mark.parametrize(("share", "tests", "weights"), RARE)
 def test_limits_cover_where_few_crashes_decide(confidence, share, tests, weights):
-    level = Level.two_sided(confidence)
-    assert coverage(share, tests, weights, lambda k, n, w: both(w, k, n, level)) >= confidence
+    level, truth = Level.two_sided(confidence), float(np.dot(weights, share))
+    covers = covering(truth, lambda counts: binomial(weights, counts[:, 0], tests, level))
+    assert coverage([(each,) for each in share], tests, covers) >= confidence
 
 
 def test_eight_strata_with_few_crashes_each_at_99_percent():
@@ -142,5 +296,5 @@ def test_eight_strata_with_few_crashes_each_at_99_percent():
         found = [limits(k, counts, weights) for k in crashes]
         return np.mean([low <= truth <= high for low, high in found])
 
-    assert covered(lambda k, n, w: both(w, k, n, Level.two_sided(0.99))) >= 0.99 - 0.0042
+    assert covered(lambda k, n, w: binomial(w, k, n, Level.two_sided(0.99))) >= 0.99 - 0.0042
     assert covered(squares(0.99)) < 0.98
