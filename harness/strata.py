@@ -107,6 +107,10 @@ class ShellDesign:
         """Probability per test that a cut-in of each stratum happens, shape (S,)."""
         return np.asarray(np.bincount(self.cell_stratum, self.cell_p, minlength=len(self.strata)), np.float64)
 
+    def n_within(self, statement: str) -> int:
+        """Strata up to the boundary of a statement; all where it has none."""
+        return next((each.n_inside for each in self.statements if each.name == statement), len(self.strata))
+
     @property
     def n_inside(self) -> int:
         """Strata up to the widest boundary."""

@@ -1,19 +1,14 @@
 """The alarm that weights, traffic and pool do not belong together: surrogates must crash as often as the pool says.
 
-W f_k has mean μ_k whatever the tests were drawn from and whatever the AV is. A sample mean far from it means that a
-likelihood ratio, a maneuver on record, the twin or the pool is wrong, or that heavy weights have not occurred yet. The
-sample cannot tell these two apart: its own variance misses what has not occurred. So nothing is taken from it.
-
-μ_k is tested by bets (I. Waudby-Smith, A. Ramdas, Estimating means of bounded random variables by betting, JRSS B 86,
-2024): a capital of 1 is multiplied in every test by a factor that has mean 1 if μ_k is right. So has the product, which
-then exceeds 1/p with a probability of p at most, after any number of tests and for any weights.
+W f_k has mean μ_k whatever the tests were drawn from and whatever the AV is. μ_k is tested by bets (I. Waudby-Smith, A.
+Ramdas, JRSS B 86, 2024; why nothing is taken from the sample's variance: docs/estimators.md): a capital of 1 is
+multiplied in every test by a factor that has mean 1 if μ_k is right. So has the product, which then exceeds 1/p with a
+probability of p at most, after any number of tests and for any weights.
 
 * Too many crashes: (1 + λ W f_k)/(1 + λ μ_k).
 * Too few: exp(-λ W f_k) over its mean, which is at most 1 - (μ_k/c)(1 - exp(-λc)) where W f_k has the mean square cμ_k
   at most (Jensen's inequality; it makes W. Hoeffding's, JASA 58, 1963, out of a mean square instead of a bound). With
   forced cut-ins at a share α_0, W is P(cut-in | path)/α_0 at most, and the pool knows its mean where surrogates crash.
-
-Under the step mixture nothing bounds the weights: the figures are shown and nothing is concluded.
 """
 
 from __future__ import annotations

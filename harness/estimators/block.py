@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -80,28 +80,15 @@ class Block:
 
     def __post_init__(self) -> None:
         n = len(self.crash)
-        columns = (
-            "failed",
-            "cut_in",
-            "bv_lv_contact",
-            "log_weight",
-            "n_control_steps",
-            "log_p_cut_in",
-            "stratum",
-            "cell",
-            "ahead",
-        )
-        expected = {
-            **dict.fromkeys(columns, (n,)),
+        wide = {
             "log_q": (n, len(self.alpha)),
             "first_ratios": (n, MAX_CONTROL_STEPS, None),
             "surrogates_crash": (n, None),
             "cell_mass": (n, None),
         }
-        for name, shape in expected.items():
-            array = getattr(self, name)
-            if array is not None and not _fits(array.shape, shape):
-                raise ValueError(f"Block.{name} has shape {array.shape}, expected {shape}")
+        for name, array in columns_of(self).items():
+            if not _fits(array.shape, expected := wide.get(name, (n,))):
+                raise ValueError(f"Block.{name} has shape {array.shape}, expected {expected}")
         if np.any(self.crash & self.failed):
             raise ValueError("Block: an episode is both crashed and failed")
         if np.isnan(self.log_weight).any():
@@ -146,7 +133,9 @@ class Block:
         That is the weight up to the step in which it failed. The step depends on nothing that comes after it, so that
         the mean of these weights is the probability to fail, whatever the episodes were drawn by.
         """
-        return replace(self, crash=self.crash | self.failed, failed=np.zeros_like(self.failed))
+        if not self.failed.any():
+            return self
+        return _unchecked(self, crash=self.crash | self.failed, failed=np.zeros_like(self.failed))
 
     def take(self, rows: slice) -> Block:
         """Cut out the block of some consecutive rows, a slice with step 1."""

@@ -1,19 +1,15 @@
 """Two vehicles on common random numbers: their rates, the difference and the ratio, from pairs of weighted outcomes.
 
-Episode i of both campaigns has the same random numbers, so Y_A,i and Y_B,i go together: the pairs are independent of
-each other, the two of a pair are not. The mean of D_i = Y_A,i - Y_B,i is unbiased for the difference of the rates
-whatever the dependence, and its variance is the sample variance of D_i: Var(Y_A) + Var(Y_B) - 2 Cov(Y_A, Y_B). What
-the covariance takes away is what pairing saves.
-
-The lower limit of A - B is that of a B whose failed tests have all crashed while none of A's has, the upper limit the
-other way round (see `BothWays`).
+Episode i of both campaigns has the same random numbers: the pairs are independent of each other, the two of a pair are
+not. The mean of D_i = Y_A,i - Y_B,i is unbiased for the difference of the rates whatever the dependence, and its
+variance is the sample variance of D_i. The lower limit of A - B is that of a B whose failed tests have all crashed
+while none of A's has, the upper limit the other way round (see `BothWays`).
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from copy import deepcopy
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -46,8 +42,7 @@ class Difference:
     correlation : float
         Of the two outcomes of a pair; NaN where one of them never varies.
     variance_ratio : float
-        Variance of the difference from independent runs over that from pairs: so many times as many tests would
-        independent runs need. Infinite where no pair differs.
+        Variance of the difference from independent runs over that from pairs. Infinite where no pair differs.
     n_pairs, n_differing : int
         Pairs of episodes, and those whose weighted outcomes differ.
     n_effective : float
@@ -123,16 +118,13 @@ def paired_difference(pairs: Iterable[tuple[Block, Block]], confidence: float) -
 def _summed(pairs: Iterable[tuple[Block, Block]]) -> tuple[tuple[BothWays, BothWays], _Pairs, _Pairs, _Pairs]:
     """Estimators of A and B, and pairs as seen, with A - B as low and as high as failed tests may have made it."""
     each = BothWays(Nade()), BothWays(Nade())
-    seen = lowest = highest = _Pairs()  # one and the same until a test fails
+    seen, lowest, highest = _Pairs(), _Pairs(), _Pairs()
     for a, b in pairs:
         if (a.first_episode, len(a)) != (b.first_episode, len(b)):
             raise ValueError(f"episodes {a.first_episode}+{len(a)} and {b.first_episode}+{len(b)} are no pairs")
-        if lowest is seen and (a.failed.any() or b.failed.any()):
-            lowest, highest = deepcopy(seen), deepcopy(seen)
         seen.add(a, b)
-        if lowest is not seen:
-            lowest.add(a, b.failed_as_crashes())
-            highest.add(a.failed_as_crashes(), b)
+        lowest.add(a, b.failed_as_crashes())
+        highest.add(a.failed_as_crashes(), b)
         each[0].add(a)
         each[1].add(b)
     return each, seen, lowest, highest

@@ -1,8 +1,7 @@
 """What an estimator is and answers: `Accumulator`, `Estimate`; and how failed tests count, both ways, for all of them.
 
-What a failed test would have come to is not known. Had all of them ended without a crash, the crash rate would be one
-number, had all of them crashed, another, and the truth lies between. So an interval reaches from the lower limit of the
-first to the upper limit of the second: it covers wherever each of the two does.
+What a failed test would have come to is not known. So an interval reaches from the lower limit had none crashed to the
+upper limit had all: it covers wherever each of the two does.
 """
 
 from __future__ import annotations

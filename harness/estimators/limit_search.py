@@ -1,4 +1,4 @@
-"""The search for a limit of Σ w_sj θ_sj along its Lagrange multiplier; see `harness.estimators.likelihood_limits`."""
+"""The search for a limit of Σ w_sj θ_sj along its Lagrange multiplier; see `harness.estimators.stratified`."""
 
 from __future__ import annotations
 

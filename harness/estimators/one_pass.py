@@ -1,14 +1,15 @@
-"""All estimators from one pass over the blocks of a campaign; which there are, and which answers for which method."""
+"""All estimators from one pass over the blocks of a campaign, and what they make of ``estimates.json``."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from harness.estimators import statement as say
 from harness.estimators.block import Block
 from harness.estimators.diagnostics import Diagnostics
-from harness.estimators.estimate import Accumulator, BothWays, Estimate, Unavailable, require_episodes
+from harness.estimators.estimate import Accumulator, BothWays, Estimate, Unavailable, finite_json, require_episodes
 from harness.estimators.mixture_cv import MixtureCv
 from harness.estimators.nade import Nade, Nde
 from harness.estimators.scv import Scv
@@ -106,3 +107,99 @@ def _point(estimate: Estimate) -> dict[str, Any]:
         "rhw": estimate.precision,
         "n_crashes": estimate.n_crashes,
     }
+
+
+@dataclass(frozen=True)
+class CampaignFacts:
+    """What estimates must say about the campaign that they belong to.
+
+    Attributes
+    ----------
+    distance_per_test_m : float or None
+        Mean distance that the AV drives in a naturalistic test; None if unknown, and then nothing is said per km.
+    importance_names : tuple of str
+        Names of the importance functions, in order.
+    retraced : dict
+        What the run says about the twin retracing its episodes.
+    repeated : dict
+        What the run says about tests that it ran twice.
+    ending : str or None
+        When the run ended and which condition decided, in a sentence; None while it goes on.
+    decision : dict or None
+        What the run has found about the limit that it was asked about; `harness.estimators.stopping.Decision`.
+    no_surrogates : str
+        Why surrogates were not asked about the tests, where they were not.
+    """
+
+    name: str
+    content_hash: str
+    lane_change_level: float
+    confidence: float = 0.9
+    distance_per_test_m: float | None = None
+    importance_names: tuple[str, ...] = ()
+    retraced: dict[str, Any] | None = None
+    repeated: dict[str, Any] | None = None
+    ending: str | None = None
+    decision: dict[str, Any] | None = None
+    no_surrogates: str = "the blocks do not say what surrogates would have done"
+
+
+def estimate_blocks(
+    blocks: Iterable[Block], facts: CampaignFacts, *, estimators: Collection[EstimatorName] | None = None
+) -> dict[str, Any]:
+    """Estimates of blocks that cover a campaign's episodes, as JSON content.
+
+    Parameters
+    ----------
+    blocks : iterable of Block
+        Contiguous and in index order.
+    facts : CampaignFacts
+    estimators : collection of str, optional
+        Which to report beside the method's own; all by default.
+    """
+    done = one_pass(blocks, estimators or ESTIMATORS, confidence=facts.confidence)
+    best = done.headline_estimate
+    estimates = {done.headline: best, **done.estimates}
+    distance_km = None if facts.distance_per_test_m is None else facts.distance_per_test_m / 1000.0
+    rates = done.diagnostics.alarm.result() or {"reason": facts.no_surrogates}
+    alarm = {
+        "raised": bool(rates.get("raised")),
+        "retraced": facts.retraced or {"reason": "the run did not retrace its episodes"},
+        "surrogate_crash_rates": rates,
+    }
+    cautions = say.alarm_cautions(alarm)
+    statements = {name: _said(found, facts, distance_km, cautions) for name, found in estimates.items()}
+    return finite_json(
+        {
+            "campaign": facts.name,
+            "campaign_hash": facts.content_hash,
+            "lane_change_level": facts.lane_change_level,
+            "confidence": facts.confidence,
+            "n_episodes": best.n_episodes,
+            "n_crashes": best.n_crashes,
+            "headline": done.headline,
+            "distance_per_test_km": distance_km,
+            "crash_rate_per_1e6_km": None if distance_km is None else say.per_distance(best, distance_km),
+            "estimates": {name: estimate.to_json() for name, estimate in estimates.items()},
+            "diagnostics": {**done.diagnostics.result(facts.importance_names), "alarm": alarm},
+            "convergence": done.convergence,
+            "statement": statements[done.headline],
+            "statements": statements,
+            "reference_statements": say.reference_statements(best),
+            "boundary_statements": say.boundary_statements(best),
+            "scope": say.SCOPE,
+            "ending": facts.ending,
+            "decision": facts.decision,
+        }
+    )
+
+
+def _said(found: Estimate | Unavailable, facts: CampaignFacts, distance_km: float | None, alarm: Sequence[str]) -> str:
+    """What an estimator says, led by what it must be warned of and the first reference driver; or why it cannot."""
+    if isinstance(found, Unavailable):
+        return f"No crash rate from these records: {found.reason.rstrip('.')}."
+    answer = say.statement(found, facts.lane_change_level, distance_km)
+    text = say.warned(
+        [*alarm, *say.repeated_cautions(facts.repeated)], " ".join([*say.reference_statements(found)[:1], answer])
+    )
+    return text + say.failed_statement(found.details) + say.repeated_statement(facts.repeated)

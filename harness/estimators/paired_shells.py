@@ -2,32 +2,24 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from harness.estimators.difference import apart_statement, failed_pairs_statement, rates_statement
 from harness.estimators.estimate import BothWays, Estimate, finite_json
 from harness.estimators.limit_search import Level
-from harness.estimators.pairs import Interval, PairCounts
+from harness.estimators.pairs import Interval, PairCounts, Verdict
 from harness.estimators.shells import Shells
 
 
 @dataclass(frozen=True)
 class Contrast:
-    """What lies between A and B; rates are crashes per test.
+    """What lies between A and B, difference A - B and ratio A/B; rates are crashes per test.
 
-    Attributes
-    ----------
-    difference, ci_low, ci_high : float
-        A - B.
-    rhw : float
-        Half-width of that interval over the larger of the two rates.
-    rhw_from_pool : float
-        What the pool's own error alone would leave of it.
-    ratio, ratio_low, ratio_high : float
-        A/B.
-    only_a, only_b : Interval
-        Rate of cut-ins on which only A, or only B crashes.
-    n_pairs, n_differing : int
+    ``rhw`` is the half-width of the difference over the larger of the two rates, ``rhw_from_pool`` what the pool's own
+    error alone would leave of it; ``only_a`` and ``only_b`` are rates of cut-ins on which only one of the two crashes.
     """
 
     difference: float
@@ -46,17 +38,9 @@ class Contrast:
     @classmethod
     def of(cls, pairs: PairCounts, level: Level) -> Contrast:
         """Of the strata that ``pairs`` holds."""
-        difference, ratio = pairs.difference(level), pairs.ratio(level)
-        return cls(
-            *difference,
-            pairs.rhw(level),
-            pairs.rhw_from_pool(level),
-            *ratio,
-            pairs.only_a(level),
-            pairs.only_b(level),
-            int(pairs.tests.sum()),
-            pairs.n_differing,
-        )
+        widths, alone = (pairs.rhw(level), pairs.rhw_from_pool(level)), (pairs.alone(0, level), pairs.alone(1, level))
+        n_pairs = int(pairs.tests.sum())
+        return cls(*pairs.difference(level), *widths, *pairs.ratio(level), *alone, n_pairs, pairs.n_differing)
 
     def to_json(self) -> dict[str, Any]:
         """Plain content."""
@@ -66,17 +50,10 @@ class Contrast:
 
 @dataclass(frozen=True)
 class PairedEstimate:
-    """Two vehicles compared.
+    """Two vehicles compared: each by itself, and what lies between them.
 
-    Attributes
-    ----------
-    a, b : Estimate
-        Crash rate of each, from the tests of the pairs.
-    free, conditional : Contrast
-        Over all strata, and over those inside: if neither vehicle crashes beyond the boundary.
-    refuted : bool
-        Whether one of them has crashed there.
-    pairs : PairCounts
+    ``free`` is over all strata, ``conditional`` over those inside: if neither vehicle crashes beyond the boundary,
+    ``refuted`` once one has.
     """
 
     a: Estimate
@@ -148,3 +125,63 @@ def _shells(pairs: PairCounts) -> list[dict[str, Any]]:
         }
         for s, row in enumerate(pairs.outcomes())
     ]
+
+
+def paired_statement(found: PairedEstimate, name_a: str, name_b: str) -> str:
+    """Without an assumption: both rates, what lies between them, and where only one of the two crashes."""
+    free = found.free
+    return (
+        f"{rates_statement(found.a, found.b, name_a, name_b)}: {_apart(free, found.a.confidence)}, from "
+        f"{free.n_pairs:,} pairs of tests. Alone, where the other one does not, "
+        f"A crashes {_alone(free.only_a)} times per test, B {_alone(free.only_b)}."
+        f"{failed_pairs_statement(found.a, found.b)}"
+    )
+
+
+def conditional_paired_statement(found: PairedEstimate) -> str:
+    """If both crash only where the boundary surrogate or a more careful one does."""
+    boundary, inside = found.pairs.design.library.boundary, found.conditional
+    if found.refuted:
+        who = " and ".join(_crashed_outside(found))
+        return (
+            f"{who} crashed where the surrogate {boundary} does not crash: nothing can be said under the assumption "
+            f"that they crash only where {boundary} does."
+        )
+    text = (
+        f"If A and B crash only where the surrogate {boundary} or a more careful one crashes: "
+        f"{_apart(inside, found.a.confidence)}, from {inside.n_pairs:,} pairs of tests."
+    )
+    if inside.n_pairs == found.free.n_pairs:
+        return f"{text} Nothing was tested outside: whether the assumption holds is not known."
+    return f"{text} In {found.free.n_pairs - inside.n_pairs:,} pairs of tests outside neither crashed."
+
+
+def margin_statement(verdict: Verdict, margin: float, level: float, *, conditional: bool) -> str:
+    """Whether B is worse than A by more than a margin."""
+    answer = {
+        "proven": "B is not worse than A by more than",
+        "refuted": "B IS WORSE than A by more than",
+        "open": "It is open whether B is worse than A by more than",
+    }[verdict]
+    given = ", given the library" if conditional else ""
+    looks = f" (decided at {level:.1%}, which allows for a look after each round)"
+    return f"{answer} {margin:.3g} times A's rate{given}{looks}."
+
+
+def _apart(found: Contrast, confidence: float) -> str:
+    differs = found.n_differing > 0
+    apart = apart_statement(found.difference, found.ci_low, found.ci_high, confidence, differs=differs)
+    if not math.isfinite(found.ratio):
+        return apart
+    high = f"{found.ratio_high:.3g}" if math.isfinite(found.ratio_high) else "no limit"
+    return f"{apart}, A/B = {found.ratio:.3g} ({found.ratio_low:.3g} to {high})"
+
+
+def _alone(found: Interval) -> str:
+    return f"{found.value:.3g} ({found.ci_low:.3g} to {found.ci_high:.3g})"
+
+
+def _crashed_outside(found: PairedEstimate) -> Iterator[str]:
+    for side, name in enumerate("AB"):
+        if n := int(found.pairs.tally(side).crashes[found.pairs.design.library.n_inside :].sum()):
+            yield f"{name} has {n:,} times"

@@ -1,12 +1,9 @@
 """Pairs of tests of two vehicles on the same cut-ins, drawn within shells: counts, and limits of what they say.
 
-Each cut-in is driven by A and by B. A pair of tests has one of four outcomes: both crash, only A, only B, neither. The
-rates, their difference and their ratio are weighted sums of the shares of these outcomes, and their limits those of
-the likelihood ratio (`harness.estimators.likelihood_limits`). Cut-ins on which both do the same say nothing against
-either, so that a difference takes far fewer tests than two rates.
-
-What a failed test would have come to is not known. Each limit takes A's failed tests for crashes and B's for none, or
-the other way round, whichever takes it farther.
+A pair of tests has one of four outcomes: both crash, only A, only B, neither. The rates, their difference and their
+ratio are weighted sums of the shares of these outcomes, and their limits those of the likelihood ratio
+(`harness.estimators.stratified`). Each limit takes A's failed tests for crashes and B's for none, or the other way
+round, whichever takes it farther.
 """
 
 from __future__ import annotations
@@ -19,9 +16,8 @@ import numpy as np
 
 from harness.arrays import BoolArray, FloatArray, IntArray
 from harness.estimators.block import Block
-from harness.estimators.likelihood_limits import contrast_limit, ratio_limits, spread
 from harness.estimators.limit_search import Level
-from harness.estimators.stratified import Tally, mean_square
+from harness.estimators.stratified import Tally, contrast_limit, mean_square, ratio_limits, spread
 from harness.strata import ShellDesign
 
 NO_CRASH, CRASH, FAILED = range(3)
@@ -30,6 +26,7 @@ N_ENDS = 3
 A_CRASHES, B_CRASHES = np.array([1.0, 1.0, 0.0, 0.0]), np.array([1.0, 0.0, 1.0, 0.0])
 """Of the outcomes: both crash, only A, only B, neither."""
 ONLY_A, ONLY_B = np.array([0.0, 1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0, 0.0])
+DIFFERENCE = A_CRASHES - B_CRASHES
 
 
 def _kinds(failed_a: bool, failed_b: bool) -> tuple[BoolArray, ...]:
@@ -101,9 +98,9 @@ class PairCounts:
         return int(self.ends[:, CRASH, NO_CRASH].sum() + self.ends[:, NO_CRASH, CRASH].sum())
 
     @property
-    def any_failed(self) -> bool:
-        """Whether a test has failed."""
-        return bool(self.ends[:, FAILED].any() or self.ends[:, :, FAILED].any())
+    def n_crashes(self) -> int:
+        """Crashes of both vehicles."""
+        return int(self.ends[:, CRASH].sum() + self.ends[:, :, CRASH].sum())
 
     def rate(self, weights: FloatArray) -> float:
         """Weighted sum over outcomes (4,) and strata, as seen."""
@@ -135,26 +132,16 @@ class PairCounts:
         variance = self.pool_variance(weights, **worst)
         return contrast_limit(self.p[:, None] * weights, self.outcomes(**worst), level, side, variance)
 
-    def interval(self, weights: FloatArray, level: Level) -> Interval:
-        """The sum with both limits; see `limit`."""
-        low, high = (self.limit(weights, level, side) for side in (-1.0, 1.0))
-        return Interval(self.rate(weights), low, high)
-
     def difference(self, level: Level) -> Interval:
         """A - B in crashes per test."""
-        return self.interval(A_CRASHES - B_CRASHES, level)
+        low, high = (self.limit(DIFFERENCE, level, side) for side in (-1.0, 1.0))
+        return Interval(self.rate(DIFFERENCE), low, high)
 
-    def only_a(self, level: Level) -> Interval:
-        """Rate of cut-ins on which A crashes and B does not."""
-        return self._of_one(self.interval(ONLY_A, level))
-
-    def only_b(self, level: Level) -> Interval:
-        """Rate of cut-ins on which B crashes and A does not."""
-        low, high = (-self.limit(-ONLY_B, level, side) for side in (1.0, -1.0))
-        return self._of_one(Interval(self.rate(ONLY_B), low, high))
-
-    def _of_one(self, found: Interval) -> Interval:
-        return Interval(found.value, max(found.ci_low, 0.0) + 0.0, min(found.ci_high, float(self.p.sum())))
+    def alone(self, side: int, level: Level) -> Interval:
+        """Rate of cut-ins on which A (0), or B (1), crashes and the other one does not."""
+        sign, weights = ((1.0, ONLY_A), (-1.0, ONLY_B))[side]  # `limit` is of what does not fall where A crashes more
+        low, high = sorted(sign * self.limit(sign * weights, level, end) for end in (-1.0, 1.0))
+        return Interval(self.rate(weights), max(low, 0.0) + 0.0, min(high, float(self.p.sum())))
 
     def ratio(self, level: Level) -> Interval:
         """A over B; NaN where B has no crash, and open upwards where it may have none."""
@@ -168,8 +155,7 @@ class PairCounts:
 
             return ratio_limits(p * A_CRASHES, p * B_CRASHES, self.outcomes(**worst), level, variance)
 
-        low, high = limits(-1.0)
-        return Interval(a / b if b > 0.0 else math.nan, low, limits(1.0)[1] if self.any_failed else high)
+        return Interval(a / b if b > 0.0 else math.nan, limits(-1.0)[0], limits(1.0)[1])
 
     def rhw(self, level: Level) -> float:
         """Half-width of the difference over the larger of the two rates; infinite where neither has crashed."""
@@ -177,18 +163,12 @@ class PairCounts:
 
     def rhw_from_pool(self, level: Level) -> float:
         """What the pool's own error alone would leave of `rhw`."""
-        return level.z * math.sqrt(self.pool_variance(A_CRASHES - B_CRASHES)) / self.larger_rate
-
-    @property
-    def n_crashes(self) -> int:
-        """Crashes of both vehicles."""
-        return int(self.ends[:, CRASH].sum() + self.ends[:, :, CRASH].sum())
+        return level.z * math.sqrt(self.pool_variance(DIFFERENCE)) / self.larger_rate
 
     def spread(self, level: Level, size: int, most: IntArray) -> IntArray:
         """Divide further pairs among strata, (S,), at most so many each, to where they narrow the difference most."""
-        weights = self.p[:, None] * (A_CRASHES - B_CRASHES)
-        lower, upper = self.outcomes(failed_a=False, failed_b=True), self.outcomes(failed_a=True, failed_b=False)
-        return spread(weights, lower, upper, level, size, most)
+        lower, upper = self.outcomes(failed_b=True), self.outcomes(failed_a=True)
+        return spread(self.p[:, None] * DIFFERENCE, lower, upper, level, size, most)
 
     def verdict(self, margin: float, level: Level) -> Verdict:
         """Whether B's rate is at most 1 + margin times A's: proven, refuted, or open."""

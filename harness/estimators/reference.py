@@ -1,21 +1,16 @@
 """How a vehicle compares with a reference driver in the same traffic, from tests of the vehicle alone.
 
-The pool knows on which cut-ins a reference driver would have crashed: cells divide strata by that. So its crash rate
-μ_R is known to the pool's error, and
+Ratio x = μ/μ_R and preventable share y are tested as the contrasts of docs/estimators.md; each limit is a root of
+`harness.estimators.stratified.ratio_limits`. Of the pool's part of their variance:
 
-- the **ratio** x = μ/μ_R is tested as the contrast Σ p_s θ_s - x μ_R = 0. Both rates come from the same paths. With X
-  and R a path's probabilities that the vehicle and the reference crash, the pool's part of the contrast's variance is
-  (E[(X - xR)²] - (μ - xμ_R)²)/n. E[X²] is what `mean_square` says, and E[R²] the pool knows. E[XR] follows from the
-  crashed tests: one of stratum s is a draw in proportion to X there, so that Σ p_s/n_s times the sum of R over them has
-  that mean;
-- the **preventable** share y of the vehicle's crashes, those on cut-ins on which the reference does not crash, is
-  tested as (1 - y) P - y U = 0, with P and U the rates of preventable and of unavoidable crashes. Within a stratum the
-  tests fall into cells by chance; given how many did, those of each cell are independent binomials, so that cells take
-  the place of strata. Paths may carry crashes of both kinds, which makes the contrast's variance smaller; how many do
-  is not known, so that E[PU] is taken for its least value, 0.
+- with X and R a path's probabilities that the vehicle and the reference crash, `mean_square` bounds E[X²], the pool
+  knows E[R²], and E[XR] follows from the crashed tests: one of stratum s is a draw in proportion to X there, so that
+  Σ p_s/n_s times the sum of R over them has that mean;
+- paths may carry preventable and unavoidable crashes, of rates P and U, which makes the contrast's variance smaller;
+  how many do is not known, so that E[PU] is taken for its least value, 0.
 
-Each limit is a root of `harness.estimators.likelihood_limits.ratio_limits`. Tests that failed count as whatever makes
-an interval wider.
+Given how many tests fell into each cell of a stratum, those of each cell are independent binomials, so that cells take
+the place of strata. Tests that failed count as whatever makes an interval wider.
 """
 
 from __future__ import annotations
@@ -25,10 +20,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from harness.arrays import BoolArray, FloatArray, IntArray
-from harness.estimators.likelihood_limits import ratio_limits
+from harness.arrays import BoolArray, FloatArray
 from harness.estimators.limit_search import Level
-from harness.estimators.stratified import Tally, mean_square, pool_variance
+from harness.estimators.stratified import CRASH, Tally, mean_square, pool_variance, ratio_limits
 from harness.strata import ShellDesign
 
 
@@ -110,10 +104,9 @@ def rate_ratio_limits(
     def variance(x: float) -> float:
         return max(of_paths - 2.0 * x * covariance + x * x * of_reference, 0.0)
 
-    nothing = np.zeros_like(p)
     # A constant as a sum over strata: the same for either outcome.
     below = np.full((p.size, 2), rate / p.size)
-    return ratio_limits(np.column_stack([p, nothing]), below, _outcomes(tally), level, variance)
+    return ratio_limits(np.outer(p, CRASH), below, tally.outcomes, level, variance)
 
 
 def preventable_share(
@@ -147,11 +140,5 @@ def _share_limits(p: FloatArray, cells: Tally, prevented: BoolArray, n_paths: in
         mean = rest * of_prevented - y * of_others
         return max(rest * rest * first + y * y * second - mean * mean, 0.0) / n_paths
 
-    nothing = np.zeros_like(p)
-    above, below = np.column_stack([p * prevented, nothing]), np.column_stack([p, nothing])
-    return ratio_limits(above, below, _outcomes(cells), level, variance)
-
-
-def _outcomes(tally: Tally) -> IntArray:
-    """Crashes and other tests of each stratum, shape (S, 2)."""
-    return np.column_stack([tally.crashes, tally.tests - tally.crashes])
+    above, below = np.outer(p * prevented, CRASH), np.outer(p, CRASH)
+    return ratio_limits(above, below, cells.outcomes, level, variance)

@@ -7,16 +7,15 @@ stops: that intervals cover there, and how far rates are biased, is measured (do
 
 from __future__ import annotations
 
-import math
-
 from harness.campaign.models import Campaign
-from harness.estimators.decision import Decision
 from harness.estimators.limit_search import Level
 from harness.estimators.pairs import PairCounts, Verdict
 from harness.estimators.shells import Shells
+from harness.estimators.stopping import Decision, Rule, missing
 from harness.estimators.stratified import Limits
 from harness.strata import ASSUMPTION_FREE
 
+FIRST_TESTS = "the first tests of each shell (testing.shells.first_tests)"
 POOL_SHARE = 0.5
 """Share of the squared width from the pool's own error above which more tests hardly narrow an interval."""
 LOOKS = 6
@@ -24,11 +23,22 @@ LOOKS = 6
 round. Measured where B's rate is 1 + margin times A's, by looks from 40 to 3,000 pairs: docs/compare.md."""
 
 
-class RoundRule:
+class _AfterRounds(Rule):
     """Looks after each round, and is content with one pass.
 
-    That limits within shells hold at a fixed number of tests says nothing about the number at which a rule stops;
-    that intervals cover there, and how far the rate is biased, is measured (docs/estimators.md).
+    ``of_first_tests`` says whether the round brings the tests that every shell gets before anything is decided of it.
+    """
+
+    of_first_tests = False
+
+    def _is_hopeless(self, target: float, pool: float, at_least: float) -> bool:
+        """Whether the pool's own error, as seen and at least, is too large, and nearly all that is left."""
+        self.pool_error_above_target = at_least > target
+        return self.pool_error_above_target and pool**2 >= POOL_SHARE * self.rhw**2
+
+
+class RoundRule(_AfterRounds):
+    """Looks at a crash rate, or whether it is below a limit.
 
     Parameters
     ----------
@@ -37,52 +47,35 @@ class RoundRule:
         Tests that the run folder holds: before them nothing is given up, whatever precision is asked for now.
     factor : float
         By which the precision is wider than the one that the campaign asks for.
-
-    Attributes
-    ----------
-    decision : Decision or None
-        What is known about the limit that the campaign asks about, if it does; that, not a precision, is then waited
-        for.
-    of_first_tests : bool
-        Whether the round brings the tests that every shell gets before anything is decided about it.
-    reached, rhw, heaviest, waited_for, pool_error_above_target
-        See `StopRule`.
     """
 
     def __init__(self, campaign: Campaign, held: int = 0, factor: float = 1.0) -> None:
-        self._held = held
-        self._target = None if campaign.stop.rhw is None else factor * campaign.stop.rhw
-        self._min_crashes, self._confidence = campaign.min_crashes, campaign.stop.confidence
+        rhw = campaign.stop.rhw
+        super().__init__(None if rhw is None else factor * rhw, campaign.min_crashes)
+        self._held, self._confidence = held, campaign.stop.confidence
         self._statement, self._accept = campaign.testing.shells.statement, campaign.accept
-        self.decision: Decision | None = None
-        self.reached = self.pool_error_above_target = False
-        self.rhw = float("inf")
-        self.heaviest = 0.0  # limits within shells allow for every crash that has not been seen
-        self.of_first_tests = False
-        self.waited_for: tuple[str, ...] = ()
 
     def observe(self, seen: Shells) -> bool:
         """Whether to stop at the end of a round, with all tests so far."""
         watched, n_crashes = seen.limits_of(self._statement, self._confidence), int(seen.tally.crashes.sum())
-        self.rhw, from_pool = watched.rhw, watched.from_pool_relative()
+        self.rhw = watched.rhw
         if self._accept is not None:
             return self._decide(watched, self._accept.crash_rate_below, contradicted=seen.contradicts(self._statement))
         if self._target is None:
             return False
-        met = {
-            f"stop.rhw ({self._target:g})": self.rhw <= self._target,
-            f"stop.min_crashes ({self._min_crashes:,})": n_crashes >= self._min_crashes,
-        }
-        missing = tuple(condition for condition, is_met in met.items() if not is_met)
-        if missing:
-            self.waited_for = missing
-        elif self.of_first_tests:
-            self.waited_for = ("the first tests of each shell (testing.shells.first_tests)",)
+        found = missing(
+            {
+                f"stop.rhw ({self._target:g})": self.rhw <= self._target,
+                f"stop.min_crashes ({self._min_crashes:,})": n_crashes >= self._min_crashes,
+            }
+        )
+        if found or self.of_first_tests:
+            self.waited_for = found or (FIRST_TESTS,)
         if n_crashes < self._min_crashes:
             return False
-        self.reached = not missing
-        self.pool_error_above_target = from_pool["rhw_from_pool_at_least"] > self._target
-        hopeless = self.pool_error_above_target and from_pool["rhw_from_pool"] ** 2 >= POOL_SHARE * self.rhw**2
+        self.reached = not found
+        pool = watched.from_pool_relative()
+        hopeless = self._is_hopeless(self._target, pool["rhw_from_pool"], pool["rhw_from_pool_at_least"])
         return self.reached or (hopeless and seen.tally.tests.sum() >= self._held)
 
     def _decide(self, watched: Limits, limit: float, *, contradicted: bool) -> bool:
@@ -93,65 +86,50 @@ class RoundRule:
         return self.decision.is_final
 
 
-def decision_level(confidence: float) -> Level:
-    """Level at which a margin is decided, by looks after every round."""
-    return Level.two_sided(1.0 - (1.0 - confidence) / LOOKS)
+def decision_confidence(confidence: float) -> float:
+    """Confidence at which a margin is decided, by looks after every round."""
+    return 1.0 - (1.0 - confidence) / LOOKS
 
 
-class PairRule:
-    """Looks after each round at the difference, or whether B is worse than A by more than a margin.
+class PairRule(_AfterRounds):
+    """Looks at the difference, or whether B is worse than A by more than a margin.
 
     Attributes
     ----------
+    rhw : float
+        That of the difference, over the larger rate.
     verdict : {"proven", "refuted", "open"} or None
         Whether B's rate is at most 1 + margin times A's; None without a margin.
     conditional : bool
         Whether only what lies within the boundary is looked at.
-    of_first_tests, reached, rhw, heaviest, waited_for, pool_error_above_target
-        See `RoundRule`; ``rhw`` is that of the difference over the larger rate.
     """
 
-    decision: Decision | None = None  # it is a margin that comparisons decide
-
     def __init__(self, campaign: Campaign, margin: float | None) -> None:
-        self._target, self._margin = campaign.stop.rhw, margin
-        self._min_crashes = campaign.min_crashes
-        self._level = Level.two_sided(campaign.stop.confidence)
-        self._decision = decision_level(campaign.stop.confidence)
+        super().__init__(campaign.stop.rhw, campaign.min_crashes)
+        self._margin, self._confidence = margin, campaign.stop.confidence
         self._statement = campaign.testing.shells.statement
         self.conditional = self._statement != ASSUMPTION_FREE
-        self.reached = self.pool_error_above_target = self.of_first_tests = False
-        self.rhw, self.heaviest = math.inf, 0.0
-        self.waited_for: tuple[str, ...] = ()
         self.verdict: Verdict | None = None if margin is None else "open"
 
     def observe(self, pairs: PairCounts) -> bool:
         """Whether to stop at the end of a round."""
-        inside = {each.name: each.n_inside for each in pairs.design.statements}
-        watched = pairs.inside(inside[self._statement]) if self.conditional else pairs
-        self.rhw = watched.rhw(self._level)
+        watched, level = pairs.inside(pairs.design.n_within(self._statement)), Level.two_sided(self._confidence)
+        self.rhw = watched.rhw(level)
         if self._margin is not None:
-            return self._decide(watched, self._margin)
+            self.verdict = watched.verdict(self._margin, Level.two_sided(decision_confidence(self._confidence)))
+            self.reached = self.verdict != "open"
+            self.waited_for = (f"--margin ({self._margin:g})",)
+            return self.reached
         if self._target is None:
             return False
-        met = {
-            f"stop.rhw ({self._target:g}, of the difference)": self.rhw <= self._target,
-            f"stop.min_crashes ({self._min_crashes:,})": pairs.n_crashes >= self._min_crashes,
-            "the first tests of each shell (testing.shells.first_tests)": not self.of_first_tests,
-        }
-        missing = tuple(condition for condition, is_met in met.items() if not is_met)
-        self.waited_for = missing or self.waited_for
-        self.reached = not missing
-        return self.reached or self._is_hopeless(watched, self._target)
-
-    def _decide(self, watched: PairCounts, margin: float) -> bool:
-        self.verdict = watched.verdict(margin, self._decision)
-        self.reached = self.verdict != "open"
-        self.waited_for = (f"--margin ({margin:g})",)
-        return self.reached
-
-    def _is_hopeless(self, watched: PairCounts, target: float) -> bool:
-        """Whether the pool's own error, which no test narrows, is too large for the asked precision."""
-        pool = watched.rhw_from_pool(self._level)
-        self.pool_error_above_target = pool > target
-        return self.pool_error_above_target and pool**2 >= POOL_SHARE * self.rhw**2
+        found = missing(
+            {
+                f"stop.rhw ({self._target:g}, of the difference)": self.rhw <= self._target,
+                f"stop.min_crashes ({self._min_crashes:,})": pairs.n_crashes >= self._min_crashes,
+                FIRST_TESTS: not self.of_first_tests,
+            }
+        )
+        self.waited_for = found or self.waited_for
+        self.reached = not found
+        pool = watched.rhw_from_pool(level)
+        return self.reached or self._is_hopeless(self._target, pool, pool)

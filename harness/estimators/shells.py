@@ -1,14 +1,8 @@
-"""`shells`: crashes counted within shells of known probability p_s, and the statements that they allow.
-
-The assumption-free statement counts every shell, tested or empty. Each of the others holds for vehicles that crash
-only where its boundary surrogate, or a more careful one, crashes too: it needs far fewer tests, and one crash outside
-refutes it. Where a boundary is checked in each test, one in which the vehicle was ahead of it takes away the reason to
-believe in the statement.
+"""`shells`: crashes counted within shells of known probability p_s, and the statements (docs/shells.md) they allow.
 
 The rate is Σ p_s c_s, c_s being the share of a stratum's tests that crash. Its limits are those of the likelihood
-ratio (`harness.estimators.likelihood_limits`), with the error of the p_s in the same root. A stratum without a crash
-widens the upper limit only.
-Failed tests count against the vehicle (`harness.estimators.stratified`).
+ratio, with the error of the p_s in the same root, and failed tests counted against the vehicle
+(`harness.estimators.stratified`). A stratum without a crash widens the upper limit only.
 """
 
 from __future__ import annotations
@@ -23,10 +17,9 @@ from harness.estimators.block import Block
 from harness.estimators.crash_paths import FEWEST_PATHS, CrashPaths
 from harness.estimators.estimate import Estimate, require_episodes
 from harness.estimators.intervals import clopper_pearson
-from harness.estimators.likelihood_limits import likelihood_limit
 from harness.estimators.limit_search import Level
 from harness.estimators.reference import Comparison, compared
-from harness.estimators.stratified import Limits, Tally, combined, empty_tally, pool_variance
+from harness.estimators.stratified import Limits, Tally, combined, empty_tally, likelihood_limit, pool_variance
 from harness.strata import ShellDesign
 
 MOST_NAMED = 10
@@ -119,7 +112,6 @@ class Shells:
 
     def __init__(self) -> None:
         self._cells = empty_tally(0)
-        self._tally: Tally | None = None  # of the cells, once it is asked for
         self._paths = CrashPaths()
         self._crashed: dict[int, list[int]] = {}  # stratum → its first few tests that crashed
         self._n_checked = self._n_ahead = 0
@@ -128,9 +120,7 @@ class Shells:
     @property
     def tally(self) -> Tally:
         """Counts by stratum; of no strata before the first block."""
-        if self._tally is None:
-            self._tally = self._cells.joined(self._design.joined) if self._cells.tests.size else self._cells
-        return self._tally
+        return self._cells.joined(self._design.joined) if self._cells.tests.size else self._cells
 
     @classmethod
     def of(cls, design: ShellDesign, tally: Tally) -> Shells:
@@ -153,7 +143,7 @@ class Shells:
         if not self._cells.tests.size:
             self._design = block.shells
             self._cells = empty_tally(block.shells.cell_p.size)
-        tally, self._tally = self._cells, None
+        tally = self._cells
         np.add.at(tally.tests, block.cell, 1)
         for rows, counts, sums in (
             (block.crash, tally.crashes, tally.crash_mass),
@@ -216,16 +206,14 @@ class Shells:
 
     def limits_of(self, statement: str, confidence: float) -> Limits:
         """Rate and interval of a statement, or of all strata."""
-        inside = {each.name: each.n_inside for each in self._design.statements}
-        return self._limits(self.tally.part(slice(0, inside.get(statement))), Level.two_sided(confidence))
+        within = slice(0, self._design.n_within(statement))
+        return self._limits(self.tally.part(within), Level.two_sided(confidence))
 
     def contradicts(self, statement: str) -> bool:
         """Whether a test crashed beyond the boundary of a statement, or was ahead of it where that is checked."""
-        return any(
-            bool(self.tally.crashes[each.n_inside :].any()) or (each.checked and self._n_ahead > 0)
-            for each in self._design.statements
-            if each.name == statement
-        )
+        beyond = self.tally.crashes[self._design.n_within(statement) :]
+        checked = any(each.checked and each.name == statement for each in self._design.statements)
+        return bool(beyond.any()) or (checked and self._n_ahead > 0)
 
     def _limits(self, tally: Tally, level: Level) -> Limits:
         """Of the first strata, those of a tally; anything is possible where crashes lie on too few paths."""
@@ -314,11 +302,10 @@ class Shells:
                 f"all cut-ins that the pool has kept of {used_up} were tested: for more precision raise "
                 "pool.cut_ins_per_shell, and run into a new folder"
             )
-        outside = {each: int(tally.crashes[each.n_inside :].sum()) for each in design.statements}
         found += [
             f"{crashes:,} crashes beyond {each.boundary}: the statement {each.name} does not hold for this vehicle"
-            for each, crashes in outside.items()
-            if crashes
+            for each in design.statements
+            if (crashes := int(tally.crashes[each.n_inside :].sum()))
         ]
         if design.checked is not None and self._n_ahead:
             found.append(

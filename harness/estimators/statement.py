@@ -75,15 +75,12 @@ def failed_statement(found: Mapping[str, Any]) -> str:
 
 def reference_statements(estimate: Estimate) -> list[str]:
     """How the vehicle compares with each reference driver, a sentence each; none unless drawn from shells."""
-    return [_beside(found, estimate.confidence) for found in estimate.details.get("references", ()) if _known(found)]
+    references, level = estimate.details.get("references", ()), f"{estimate.confidence:.0%}"
+    return [_beside(found, level) for found in references if found["crash_rate"] > 0.0]
 
 
-def _known(found: Mapping[str, Any]) -> bool:
-    return bool(found["crash_rate"] > 0.0)
-
-
-def _beside(found: Mapping[str, Any], confidence: float) -> str:
-    who, level = f"{found['described']} ({found['reference']})", f"{confidence:.0%}"
+def _beside(found: Mapping[str, Any], level: str) -> str:
+    who = f"{found['described']} ({found['reference']})"
     if found["ratio"] == 0.0:
         return (
             f"In the same traffic this vehicle crashes less than {found['ratio_high']:.3g} times as often as {who} "
@@ -100,12 +97,6 @@ def _beside(found: Mapping[str, Any], confidence: float) -> str:
 def _percent(share: float) -> str:
     """A share to two figures at least: whether it is 0.1 or 0 % may matter."""
     return f"{100.0 * share:.2g} %" if share < 0.1 else f"{100.0 * share:.0f} %"
-
-
-def answer(estimate: Estimate, lane_change_level: float, distance_per_test_km: float | None) -> str:
-    """The `statement`, led by the comparison with the first reference driver where there is one."""
-    told = statement(estimate, lane_change_level, distance_per_test_km)
-    return " ".join([*reference_statements(estimate)[:1], told])
 
 
 def boundary_statements(estimate: Estimate) -> dict[str, str]:

@@ -1,28 +1,26 @@
 """When a campaign may stop: a precision asked for beforehand, looked for at places fixed beforehand.
 
-Looking after every test and stopping at the first narrow interval favours runs that were narrow by luck. So the rule
-looks only at shard boundaries nearest to a geometric grid, only at the contiguous prefix of finished episodes, needs a
-floor of crashes and two consecutive passes. Looks depend on the campaign alone, never on workers or time.
-
-With weights that is not enough. While the rare crashes of large weight have not occurred, mean, standard error and
-largest weight seen are all too small, and the rule would stop just then. So it trusts an interval only when one more
-crash of the largest weight that the design allows would move the estimate by no more than the half-width asked for:
-cap/(n·rate) ≤ RHW. Where no cap is known (step mixture) no precision can be promised, and none may be asked for.
+Looking after every test and stopping at the first narrow interval favours runs that were narrow by luck; and while the
+rare crashes of large weight have not occurred, mean, standard error and largest weight seen are all too small. So looks
+follow from the campaign alone, two in a row must pass, and one more crash of the largest weight that the design allows
+may move the estimate by no more than the half-width asked for: cap/(n·rate) ≤ RHW (docs/estimators.md).
 
 Ratio 1.1: since the half-width shrinks with 1/√n, neighbouring looks differ by 5 % in precision, which is the noise of
 the half-width itself at the default floor of 100 crashes (half of 1/√100); a finer grid mostly repeats the same look.
-With two passes a campaign uses about 20 % more tests than a fixed size would need, where a ratio of 1.25 costs nearly
-50 %, and both keep their coverage (measured in docs/estimators.md).
+With two passes a campaign uses about 20 % more tests than a fixed size would need, with a ratio of 1.25 nearly 50 %.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
 
 from harness.campaign.models import Stop
-from harness.estimators.decision import Decision
 from harness.estimators.estimate import Estimate
 from harness.methods import SAMPLING, EstimatorName, Method
+from harness.strata import ASSUMPTION_FREE
 
 LOOK_RATIO = 1.1
 PASSES_NEEDED = 2
@@ -44,7 +42,111 @@ def look_grid(n_episodes: int, shard_size: int, ratio: float = LOOK_RATIO) -> tu
     return (*looks, n_episodes)
 
 
-class StopRule:
+Verdict = Literal["accepted", "rejected", "undecided"]
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What is known about a limit, by an interval that is looked at after each round.
+
+    Looks inflate errors, and limits by the likelihood ratio are wider than a level needs where crashes are few. What is
+    left is measured: decisions are wrong in at most 1 % where 5 % are allowed (docs/gate.md).
+
+    Attributes
+    ----------
+    crash_rate_below : float
+        The limit, per test.
+    statement : str
+        Which statement decides.
+    confidence : float
+        That the crash rate lies on the side which is said: an interval leaves out half as much there as at both sides.
+    low, high : float
+        The interval.
+    contradicted : bool
+        Whether a test has shown that the vehicle does not do what the statement assumes. Its upper limit then says
+        nothing, while what crashed, crashed.
+    """
+
+    crash_rate_below: float
+    statement: str
+    confidence: float
+    low: float
+    high: float
+    contradicted: bool = False
+
+    @property
+    def verdict(self) -> Verdict:
+        """On which side of the limit the interval lies, if that can be said."""
+        if self.low > self.crash_rate_below:
+            return "rejected"
+        return "accepted" if self.high < self.crash_rate_below and not self.contradicted else "undecided"
+
+    @property
+    def is_final(self) -> bool:
+        """Whether further tests would change nothing."""
+        return self.verdict != "undecided" or self.high < self.crash_rate_below
+
+    @property
+    def sentence(self) -> str:
+        """The verdict in words."""
+        given = "" if self.statement == ASSUMPTION_FREE else f", given statement {self.statement},"
+        level, limit = f"{self.confidence:.3g}", f"{self.crash_rate_below:.3g}"
+        if self.contradicted and self.verdict == "undecided":
+            return (
+                f"UNDECIDED: whether the crash rate is below {limit} per test is not known: the vehicle does not do "
+                f"what statement {self.statement} assumes. Ask for accept.statement: {ASSUMPTION_FREE}, and use a new "
+                "folder."
+            )
+        if self.verdict == "undecided":
+            between = f"it may be {self.low:.3g} as well as {self.high:.3g}"
+            return f"UNDECIDED: whether the crash rate{given} is below {limit} per test is not known; {between}."
+        side, shown = ("below", self.high) if self.verdict == "accepted" else ("above", self.low)
+        word = "upper" if side == "below" else "lower"
+        return (
+            f"{self.verdict.upper()}: with confidence {level} the crash rate{given} is {side} {limit} per test "
+            f"({word} limit {shown:.3g})."
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """All of it."""
+        return {"verdict": self.verdict, **asdict(self), "sentence": self.sentence}
+
+
+class Rule:
+    """Looks at results, and says why a run ended.
+
+    Attributes
+    ----------
+    reached : bool
+        Whether the asked precision, or decision, was reached; always False when none was asked.
+    rhw : float
+        Relative half-width at the last look; infinite where the interval may be wrong.
+    heaviest : float
+        By how much of itself one more crash of the largest weight would have moved the last look's estimate; 0 for
+        limits within shells, which allow for every crash that has not been seen.
+    waited_for : tuple of str
+        Conditions that were missing when a look last failed: what decided, or what is still missing.
+    pool_error_above_target : bool
+        Whether the error of the pool, which no test narrows, is too large for the asked precision.
+    decision : Decision or None
+        What is known about the limit that the campaign asks about, if it does; that, not a precision, is then waited
+        for.
+    """
+
+    def __init__(self, target: float | None, min_crashes: int) -> None:
+        self._target, self._min_crashes = target, min_crashes
+        self.reached = self.pool_error_above_target = False
+        self.rhw, self.heaviest = math.inf, 0.0
+        self.waited_for: tuple[str, ...] = ()
+        self.decision: Decision | None = None
+
+
+def missing(met: Mapping[str, bool]) -> tuple[str, ...]:
+    """Names of the conditions that are not met."""
+    return tuple(condition for condition, is_met in met.items() if not is_met)
+
+
+class StopRule(Rule):
     """Fed with the estimate at each look in turn; says when to stop.
 
     Parameters
@@ -64,18 +166,7 @@ class StopRule:
         Whose estimate `observe` wants.
     looks : tuple of int
         Numbers of episodes at which it wants it.
-    reached : bool
-        Whether the asked precision was reached; always False when none was asked.
-    rhw : float
-        Relative half-width at the last look; infinite where the interval may be wrong.
-    waited_for : tuple of str
-        Conditions that were missing when a look last failed: what decided, or what is still missing.
-    heaviest : float
-        By how much of itself one more crash of the largest weight would have moved the last look's estimate.
     """
-
-    pool_error_above_target = False  # no pool is behind these estimates
-    decision: Decision | None = None  # limits are decided by the intervals of shells alone
 
     def __init__(
         self,
@@ -86,13 +177,10 @@ class StopRule:
         *,
         min_crashes: int = DEFAULT_MIN_CRASHES,
     ) -> None:
+        super().__init__(campaign_stop.rhw, campaign_stop.min_crashes or min_crashes)
         self.estimator: EstimatorName = campaign_stop.estimator or SAMPLING[method].headline
         self.looks = look_grid(campaign_stop.episodes, shard_size, ratio)
-        self.reached = False
-        self.rhw = self.heaviest = math.inf
-        self.waited_for: tuple[str, ...] = ()
-        self._target = campaign_stop.rhw
-        self._min_crashes = campaign_stop.min_crashes or min_crashes
+        self.heaviest = math.inf
         self._n_seen = self._n_passes = 0
 
     def due(self, n: int) -> bool:
@@ -118,20 +206,20 @@ class StopRule:
         self.rhw = estimate.precision
         total = n * estimate.crash_rate
         self.heaviest = estimate.weight_cap / total if total > 0.0 else math.inf
-        if self._target is not None:
-            missing = self._missing(estimate, self._target)
-            self._n_passes = 0 if missing else self._n_passes + 1
-            self.reached = self._n_passes >= PASSES_NEEDED
-            self.waited_for = missing or self.waited_for
         last = self._n_seen == len(self.looks)
+        if self._target is None:
+            return last
+        found = missing(
+            {
+                f"stop.rhw ({self._target:g})": self.rhw <= self._target,
+                f"stop.rhw ({self._target:g}) for one more crash of the largest possible weight": self.heaviest
+                <= self._target,
+                f"stop.min_crashes ({self._min_crashes:,})": estimate.n_crashes >= self._min_crashes,
+            }
+        )
+        self._n_passes = 0 if found else self._n_passes + 1
+        self.reached = self._n_passes >= PASSES_NEEDED
+        self.waited_for = found or self.waited_for
         if last and self._n_passes and not self.reached:
             self.waited_for = ("the same at a second look",)
         return self.reached or last
-
-    def _missing(self, estimate: Estimate, target: float) -> tuple[str, ...]:
-        met = {
-            f"stop.rhw ({target:g})": self.rhw <= target,
-            f"stop.rhw ({target:g}) for one more crash of the largest possible weight": self.heaviest <= target,
-            f"stop.min_crashes ({self._min_crashes:,})": estimate.n_crashes >= self._min_crashes,
-        }
-        return tuple(condition for condition, is_met in met.items() if not is_met)

@@ -11,9 +11,8 @@ import numpy as np
 from harness.arrays import BoolArray, IntArray
 from harness.campaign.testing import ShellSettings
 from harness.estimators.intervals import clopper_pearson
-from harness.estimators.likelihood_limits import spread
 from harness.estimators.limit_search import Level
-from harness.estimators.stratified import Tally, combined
+from harness.estimators.stratified import Tally, combined, spread
 from harness.strata import ASSUMPTION_FREE, ShellDesign
 
 GROWTH = 1.1
@@ -79,8 +78,7 @@ class Allocation:
     @property
     def n_asked(self) -> int:
         """Strata that may be tested, which come first."""
-        inside = {each.name: each.n_inside for each in self.design.statements}
-        return inside.get(self.statement, self.design.p.size)
+        return self.design.n_within(self.statement)
 
     def next_round(
         self,

@@ -18,10 +18,15 @@ import numpy as np
 from harness.arrays import IntArray
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED, CampaignError
 from harness.estimators.block import Block
-from harness.estimators.paired_shells import PairedEstimate, paired_estimate
-from harness.estimators.paired_statement import conditional_paired_statement, margin_statement, paired_statement
+from harness.estimators.paired_shells import (
+    PairedEstimate,
+    conditional_paired_statement,
+    margin_statement,
+    paired_estimate,
+    paired_statement,
+)
 from harness.estimators.pairs import PairCounts, PairedShells, Verdict
-from harness.estimators.round_stopping import LOOKS, PairRule
+from harness.estimators.round_stopping import PairRule, decision_confidence
 from harness.pool.shells import Draw, acceleration_limit
 from harness.progress import Progress, SilentProgress
 from harness.records.folder import sole_use
@@ -180,7 +185,7 @@ def shells_content(
     found: PairedEstimate, rule: PairRule, margin: float | None, labels: tuple[str, str]
 ) -> dict[str, Any]:
     """What ``compare.json`` says under shells."""
-    level = 1.0 - (1.0 - found.a.confidence) / LOOKS
+    level = decision_confidence(found.a.confidence)
     free, given = paired_statement(found, *labels), conditional_paired_statement(found)
     statements = [given, free] if rule.conditional else [free, given]
     decided = None

@@ -23,6 +23,7 @@ from harness.estimators.block import Block
 from harness.estimators.limit_search import Level
 from harness.estimators.pairs import PairCounts
 from harness.estimators.round_stopping import PairRule, RoundRule
+from harness.estimators.stopping import Rule
 from harness.estimators.stratified import Tally, empty_tally
 from harness.pool.shells import Draw, PrescribedEpisodes
 from harness.runner.allocation import CONFIDENCE, Allocation
@@ -39,9 +40,6 @@ TOO_WIDE = (
 )
 FIRST_PHASE = 1.7
 """Precision of the first of two phases over that of the second (measured: docs/estimators.md)."""
-
-
-Rule = StopRule | RoundRule | PairRule
 
 
 class Planner:

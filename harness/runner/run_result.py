@@ -10,12 +10,11 @@ from typing import Any
 from harness.campaign.dumping import dump_campaign
 from harness.campaign.models import Campaign
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED
-from harness.estimators.decision import Verdict
+from harness.estimators.stopping import Rule, Verdict
 from harness.records.folder import NO_RUN, read_json
 from harness.records.gathered import Fingerprint, Gathered, fingerprint
 from harness.resolved import Resolved
 from harness.runner.manifest import versions
-from harness.runner.planner import Rule
 from harness.stopped_by import StoppedBy, ending
 
 EXIT_OF: Mapping[Verdict, int] = {"accepted": EXIT_DONE, "rejected": EXIT_REFUTED, "undecided": EXIT_BUDGET_SPENT}

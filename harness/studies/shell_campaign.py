@@ -23,8 +23,7 @@ from harness.estimators.limit_search import Level
 from harness.estimators.pairs import CRASH, NO_CRASH, PairCounts, no_pairs
 from harness.estimators.round_stopping import PairRule, RoundRule
 from harness.estimators.shells import Shells
-from harness.runner.planner import PairPlanner
-from harness.runner.planner import ShellPlanner
+from harness.runner.planner import PairPlanner, ShellPlanner
 from harness.strata import LIBRARY_STATEMENT, ShellDesign
 from harness.studies.experiment import Fault
 from harness.studies.judgement import Row, estimate_row

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from harness.estimators.decision import Decision
+from harness.estimators.stopping import Decision
 from harness.strata import ASSUMPTION_FREE
 
 RATES = st.floats(1e-9, 1e-3)

@@ -10,8 +10,12 @@ import numpy as np
 import pytest
 
 from harness.estimators.limit_search import Level
-from harness.estimators.paired_shells import paired_estimate
-from harness.estimators.paired_statement import conditional_paired_statement, margin_statement, paired_statement
+from harness.estimators.paired_shells import (
+    conditional_paired_statement,
+    margin_statement,
+    paired_estimate,
+    paired_statement,
+)
 from harness.estimators.pairs import (
     A_CRASHES,
     B_CRASHES,
@@ -74,7 +78,7 @@ def test_vehicles_changed_over_change_signs():
     swapped = PairCounts(DESIGN, PAIRS.ends.transpose(0, 2, 1), PAIRS.mass.transpose(0, 2, 1, 3))
     there, back = PAIRS.difference(LEVEL), swapped.difference(LEVEL)
     assert (-back.ci_high, -back.ci_low) == pytest.approx((there.ci_low, there.ci_high))
-    assert swapped.only_b(LEVEL) == pytest.approx(PAIRS.only_a(LEVEL))
+    assert swapped.alone(1, LEVEL) == pytest.approx(PAIRS.alone(0, LEVEL))
 
 
 def test_failed_tests_widen_both_ways():

@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 from scipy.special import xlogy
-from scipy.stats import binom, binomtest
+from scipy.stats import binomtest
 
-from harness.estimators.likelihood_limits import likelihood_limit
 from harness.estimators.limit_search import Level
 from harness.estimators.reference import compared, preventable_share, rate_ratio_limits
-from harness.estimators.stratified import Tally, empty_tally
+from harness.estimators.stratified import Tally, empty_tally, likelihood_limit
 from harness.strata import Reference, ShellDesign, Statement
+
+from .enumerated import coverage
 
 LEVEL = Level.two_sided(0.9)
 FEW = Level(2.6, 1e6)
@@ -108,24 +109,21 @@ def test_failed_tests_count_as_whatever_is_worse():
     assert plain[2] < failed[2]
 
 
-def enumerated_coverage(tests, share, prevented, level) -> float:
-    """Exact probability that the interval holds the true preventable share."""
-    true = P * share
-    truth, covered = true[prevented].sum() / true.sum(), 0.0
-    for crashes in product(*(range(n + 1) for n in tests)):
-        chance = float(np.prod(binom.pmf(crashes, tests, share)))
-        if chance > 1e-7:
-            _, low, high = preventable_share(P, tally(crashes, tests), prevented, EXACT, level)
-            covered += chance * (low - 1e-9 <= truth <= high + 1e-9)
-    return covered
-
-
 @pytest.mark.parametrize("share", [(0.9, 0.4, 0.0), (0.3, 0.1, 0.01), (0.02, 0.9, 0.05)])
 def test_the_preventable_share_is_held_often_enough_whatever_the_counts(share):
     """Known answers: coverage summed over outcomes, nominal 0.90; and too narrow a level does not hold it."""
-    where = np.array([8, 9, 14]), np.array(share), np.array([True, False, True])
-    assert enumerated_coverage(*where, LEVEL) >= 0.90
-    assert enumerated_coverage(*where, Level(0.3, 0.5)) < 0.85
+    tests, prevented, true = (8, 9, 14), np.array([True, False, True]), P * share
+    truth = true[prevented].sum() / true.sum()
+
+    def covered(level):
+        def covers(counts):
+            _, low, high = preventable_share(P, tally(counts[:, 0], tests), prevented, EXACT, level)
+            return low - 1e-9 <= truth <= high + 1e-9
+
+        return coverage([(each,) for each in share], tests, covers)
+
+    assert covered(LEVEL) >= 0.90
+    assert covered(Level(0.3, 0.5)) < 0.85
 
 
 N_PATHS, REPLICATIONS = 300, 1_000

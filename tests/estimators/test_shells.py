@@ -1,20 +1,18 @@
 """Shells: limits of the weighted sum; counts that merge; statements that say what they rest on."""
 
-import itertools
 import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.stats import binom
 
 from harness.estimators import Estimate, one_pass
-from harness.estimators.likelihood_limits import likelihood_limit
 from harness.estimators.limit_search import Level
 from harness.estimators.statement import boundary_statements, statement
-from harness.estimators.stratified import Tally, combined, pool_variance
+from harness.estimators.stratified import Tally, combined, likelihood_limit, pool_variance
 from harness.strata import Statement
 
+from .enumerated import coverage
 from .small_blocks import SHELLS, in_shells
 
 P = SHELLS.p
@@ -223,29 +221,27 @@ def test_others_are_refused():
     assert "testing.method shells" in one_pass([other], ("shells",)).estimates["shells"].reason
 
 
-def coverage(tests: np.ndarray, share: np.ndarray) -> float:
-    """Exact probability that the interval covers, by summing over all outcomes of three strata."""
-    truth, covered = float(P @ share), 0.0
-    for crashes in itertools.product(*(range(n + 1) for n in tests)):
-        chance = np.prod(binom.pmf(crashes, tests, share))
-        if chance > 1e-9:
-            limits = combined(P, tally(crashes, tests), EXACT, LEVEL)
-            covered += chance * (limits.low <= truth * (1 + 1e-12) and truth <= limits.high * (1 + 1e-12))
-    return float(covered)
+TESTS = np.array([12, 12, 30])
 
 
 @pytest.mark.parametrize("share", [(1.0, 0.3, 0.0), (0.6, 0.1, 0.002), (0.9, 0.5, 0.1)])
 def test_the_interval_covers_exactly_enough(share):
     """Known answers: coverage summed over all outcomes, nominal 0.90."""
-    assert coverage(np.array([12, 12, 30]), np.array(share)) >= 0.90
+    truth = float(P @ share)
+
+    def covers(counts):
+        limits = combined(P, tally(counts[:, 0], TESTS), EXACT, LEVEL)
+        return limits.low <= truth * (1 + 1e-12) and truth <= limits.high * (1 + 1e-12)
+
+    assert coverage([(each,) for each in share], TESTS, covers) >= 0.90
 
 
 def test_without_the_empty_stratum_it_does_not():
     """The sibling that must fail: a stratum that was tested without a crash is left out of the limits."""
-    tests, share = np.array([12, 12, 30]), np.array([1.0, 0.3, 0.02])
-    without = P * [1.0, 1.0, 0.0]
-    truth, covered = float(P @ share), 0.0
-    for b in range(13):
-        limits = combined(without, tally((12, b, 0), tests), EXACT, LEVEL)
-        covered += binom.pmf(b, 12, 0.3) * (limits.low <= truth <= limits.high)
-    assert covered < 0.5
+    truth = float(P @ [1.0, 0.3, 0.02])
+
+    def covers(counts):
+        limits = combined(P * [1.0, 1.0, 0.0], tally((12, counts[0, 0], 0), TESTS), EXACT, LEVEL)
+        return limits.low <= truth <= limits.high
+
+    assert coverage([(0.3,)], [12], covers) < 0.5

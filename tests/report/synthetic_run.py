@@ -14,7 +14,7 @@ import pyarrow.parquet as pq
 from synthetic_overtaking import N_COMPONENTS, Episodes, simulate
 
 from harness.campaign.models import Campaign
-from harness.estimators.run_estimates import CampaignFacts, estimate_blocks
+from harness.estimators.one_pass import CampaignFacts, estimate_blocks
 from harness.importance.build import importance_names
 from harness.maneuvers import CUT_IN, STAY
 from harness.outcomes import VEHICLES

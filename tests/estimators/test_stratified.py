@@ -1,19 +1,20 @@
-"""Limits of contrasts of several outcomes: against the definition, identities, and coverage by exact enumeration."""
+"""Likelihood-ratio limits: against the definition, identities, and coverage by exact enumeration."""
 
 from __future__ import annotations
 
 import math
-from itertools import product
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import brentq, minimize
-from scipy.special import gammaln, xlogy
+from scipy.special import betaincinv, xlogy
 
-from harness.estimators.likelihood_limits import contrast_limit, likelihood_limit, ratio_limits, spread
 from harness.estimators.limit_search import Level
+from harness.estimators.stratified import contrast_limit, likelihood_limit, ratio_limits, spread
+
+from .enumerated import coverage
 
 MANY = 1e6
 """A quantile so large that the threshold for few crashes always holds."""
@@ -93,6 +94,8 @@ def test_identities(strata, confidence, relative):
     shares = counts / np.maximum(counts.sum(1, keepdims=True), 1)
     assert low - slack <= (weights * shares).sum() <= high + slack
     assert both(-weights, counts, level, variance) == pytest.approx((-high, -low), rel=1e-6, abs=slack)
+    scaled = both(5.0 * weights, counts, level, 25.0 * variance)
+    assert scaled == pytest.approx((5.0 * low, 5.0 * high), rel=1e-6, abs=slack)
     order = [2, 0, 3, 1]
     assert both(weights[:, order], counts[:, order], level, variance) == pytest.approx((low, high), rel=1e-6, abs=slack)
     if counts[0, 3]:  # one pair more in which only A crashes
@@ -141,38 +144,29 @@ def test_a_ratio_is_open_where_a_vehicle_has_not_crashed():
     assert low < 1.0 < high
 
 
-def coverage(share, tests, weights, limits):
-    """Exact, over all counts of (only A, only B, the rest) that are likely enough to matter, one list per stratum."""
-    per_stratum = []
-    for (a, b), n in zip(share, tests, strict=True):
-        i, j = (x.ravel() for x in np.meshgrid(np.arange(n + 1), np.arange(n + 1), indexing="ij"))
-        i, j = i[i + j <= n], j[i + j <= n]
-        log_p = gammaln(n + 1) - gammaln(i + 1) - gammaln(j + 1) - gammaln(n - i - j + 1)
-        chance = np.exp(log_p + xlogy(i, a) + xlogy(j, b) + xlogy(n - i - j, 1 - a - b))
-        likely = chance > 1e-6
-        per_stratum.append(list(zip(chance[likely], i[likely], j[likely], (n - i - j)[likely], strict=True)))
-    truth = float(sum(w * (a - b) for w, (a, b) in zip(weights, share, strict=True)))
-    covered = 0.0
-    for drawn in product(*per_stratum):
-        chance = math.prod(one[0] for one in drawn)
-        if chance > 1e-8:
-            low, high = limits([one[1:] for one in drawn], weights)
-            covered += chance * (low - 1e-9 <= truth <= high + 1e-9)
-    return covered
+def covering(truth, limits):
+    """Whether limits of counts hold the truth, up to rounding."""
+
+    def covers(counts):
+        low, high = limits(counts)
+        return low - 1e-9 <= truth <= high + 1e-9
+
+    return covers
 
 
-def paired(confidence):
-    def limits(counts, p):
-        return both(np.array(p)[:, None] * [1.0, -1.0, 0.0], counts, Level.two_sided(confidence))
-
-    return limits
+def difference(share, p):
+    return sum(w * (a - b) for w, (a, b) in zip(p, share, strict=True))
 
 
-def independent(confidence):
+def paired(p, confidence):
+    return lambda counts: both(np.array(p)[:, None] * [1.0, -1.0, 0.0], counts, Level.two_sided(confidence))
+
+
+def independent(p, confidence):
     """Each vehicle's crashes as if from tests of its own: what pairs must not be taken for."""
+    w = np.array([*p, *(-x for x in p)])
 
-    def limits(counts, p):
-        k, w = np.array(counts), np.array([*p, *(-x for x in p)])
+    def limits(k):
         crashes, tests = np.concatenate([k[:, 0], k[:, 1]]), np.tile(k.sum(1), 2)
         return tuple(likelihood_limit(w, crashes, tests, Level.two_sided(confidence), side) for side in (-1.0, 1.0))
 
@@ -192,26 +186,20 @@ def independent(confidence):
     ],
 )
 def test_limits_of_a_difference_cover(confidence, share, tests, p):
-    assert coverage(share, tests, p, paired(confidence)) >= confidence
+    """Shares of tests in which only A crashes, and only B."""
+    assert coverage(share, tests, covering(difference(share, p), paired(p, confidence))) >= confidence
 
 
 def test_pairs_taken_for_independent_tests_do_not_cover():
-    assert coverage([(0.47, 0.47)], (60,), (1.0,), paired(0.95)) >= 0.95
-    assert coverage([(0.47, 0.47)], (60,), (1.0,), independent(0.95)) < 0.92
+    assert coverage([(0.47, 0.47)], (60,), covering(0.0, paired([1.0], 0.95))) >= 0.95
+    assert coverage([(0.47, 0.47)], (60,), covering(0.0, independent([1.0], 0.95))) < 0.92
 
 
 @pytest.mark.parametrize("confidence", [0.9, 0.95, 0.99])
 def test_limits_of_a_ratio_cover(confidence):
     """Of vehicles that crash together in 40 %, A alone in 25 %, B alone in 5 %: 1.44."""
-    share, n, covered = np.array([0.4, 0.25, 0.05, 0.3]), 16, 0.0
-    for k in product(range(n + 1), repeat=3):
-        if sum(k) <= n:
-            counts = np.array([*k, n - sum(k)])
-            chance = math.exp(gammaln(n + 1) - gammaln(counts + 1).sum() + xlogy(counts, share).sum())
-            if chance > 1e-5:
-                low, high = ratio([1.0], [counts], Level.two_sided(confidence))
-                covered += chance * (low <= 0.65 / 0.45 <= high)
-    assert covered >= confidence - 1e-3  # what was left out
+    covers = covering(0.65 / 0.45, lambda counts: ratio([1.0], counts, Level.two_sided(confidence)))
+    assert coverage([(0.4, 0.25, 0.05)], (16,), covers) >= confidence - 1e-3  # what was left out
 
 
 LEVEL = Level(Level.two_sided(0.9).threshold, MANY)
@@ -245,3 +233,68 @@ def test_strata_without_a_test_come_first_and_all_that_there_is_is_given():
     weights, counts = np.array([[1.0, 0.0], [1e-9, 0.0]]), np.array([[3, 7], [0, 0]])
     np.testing.assert_array_equal(spread(weights, counts, counts, LEVEL, 1, np.array([5, 5])), [0, 1])
     np.testing.assert_array_equal(spread(weights, counts, counts, LEVEL, 100, np.array([5, 7])), [5, 7])
+
+
+def binomial(weights, crashes, tests, level, variance=0.0):
+    w, k, n = np.array(weights, float), np.array(crashes), np.array(tests)
+    return tuple(likelihood_limit(w, k, n, level, side, variance) for side in (-1.0, 1.0))
+
+
+def test_shares_end_at_0_and_1():
+    assert binomial([1.0], [0], [20], LEVEL)[0] == pytest.approx(0.0, abs=1e-12)
+    assert binomial([1.0], [20], [20], LEVEL)[1] == pytest.approx(1.0, abs=1e-12)
+
+
+def test_without_a_crash_the_one_sided_bound_is_the_exact_one():
+    bound = likelihood_limit(np.ones(1), np.zeros(1, int), np.array([50]), Level.one_sided(0.95, 50), 1.0)
+    assert bound == pytest.approx(betaincinv(1, 50, 0.95), rel=1e-9)
+
+
+def test_an_error_of_the_weights_alone_gives_the_normal_interval():
+    level = Level.two_sided(0.9)
+    many = 10**12
+    low, high = binomial([1.0], [many // 4], [many], level, 0.01)
+    assert (low, high) == pytest.approx((0.25 - 1.6449 * 0.1, 0.25 + 1.6449 * 0.1), abs=2e-3)
+
+
+def squares(confidence):
+    """Separate exact limits, their distances combined by squares: what these limits took the place of."""
+
+    def limits(crashes, tests, weights):
+        k, n, w, tail = np.array(crashes), np.array(tests), np.array(weights), (1 - confidence) / 2
+        low = np.where(k > 0, betaincinv(np.maximum(k, 0.5), n - k + 1, tail), 0.0)
+        high = np.where(k < n, betaincinv(k + 1.0, np.maximum(n - k, 0.5), 1 - tail), 1.0)
+        c = k / n
+        return w @ c - math.sqrt(((w * (c - low)) ** 2).sum()), w @ c + math.sqrt(((w * (high - c)) ** 2).sum())
+
+    return limits
+
+
+RARE = [
+    ((1.3 / 40, 1.7 / 40), (40, 40), (1.0, 1.0)),
+    ((0.12, 0.004), (30, 400), (1.0, 12.0)),
+    ((0.9, 0.02), (20, 60), (1.0, 2.0)),
+]
+
+
+@pytest.mark.parametrize("confidence", [0.9, 0.95, 0.99])
+@pytest.mark.parametrize(("share", "tests", "weights"), RARE)
+def test_limits_cover_where_few_crashes_decide(confidence, share, tests, weights):
+    level, truth = Level.two_sided(confidence), float(np.dot(weights, share))
+    covers = covering(truth, lambda counts: binomial(weights, counts[:, 0], tests, level))
+    assert coverage([(each,) for each in share], tests, covers) >= confidence
+
+
+def test_eight_strata_with_few_crashes_each_at_99_percent():
+    """4,000 replications: 0.0042 is three standard errors at 0.99, so that 1.6 % fewer tell squares apart."""
+    rng, shells, tests, expected = np.random.default_rng(11), 8, 100, 1.6
+    weights, counts = np.ones(shells), np.full(shells, tests)
+    crashes = rng.binomial(tests, expected / tests, (4_000, shells))
+    truth = shells * expected / tests
+
+    def covered(limits):
+        found = [limits(k, counts, weights) for k in crashes]
+        return np.mean([low <= truth <= high for low, high in found])
+
+    assert covered(lambda k, n, w: binomial(w, k, n, Level.two_sided(0.99))) >= 0.99 - 0.0042
+    assert covered(squares(0.99)) < 0.98

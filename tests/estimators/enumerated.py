@@ -1,0 +1,27 @@
+"""Coverage of limits from counts, by summing over all outcomes of small campaigns."""
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from itertools import product
+
+import numpy as np
+from scipy.special import gammaln, xlogy
+
+
+def _outcomes(share: Sequence[float], n: int) -> Iterator[tuple[float, np.ndarray]]:
+    """How often ``n`` tests may have each outcome, the last being all that have no ``share``, and its probability."""
+    counts = np.array([(*k, n - sum(k)) for k in product(range(n + 1), repeat=len(share)) if sum(k) <= n])
+    shares = np.array([*share, max(1.0 - sum(share), 0.0)])
+    chance = np.exp(gammaln(n + 1) - gammaln(counts + 1).sum(1) + xlogy(counts, shares).sum(1))
+    likely = chance > 1e-6
+    return zip(chance[likely].tolist(), counts[likely], strict=True)
+
+
+def coverage(shares: Sequence[Sequence[float]], tests: Sequence[int], covers: Callable[[np.ndarray], bool]) -> float:
+    """Probability that ``covers`` is true of counts (S, J) of independent strata, unlikely ones being misses."""
+    covered = 0.0
+    for drawn in product(*(list(_outcomes(share, n)) for share, n in zip(shares, tests, strict=True))):
+        chance = math.prod(probability for probability, _ in drawn)
+        if chance > 1e-8:
+            covered += chance * bool(covers(np.array([counts for _, counts in drawn])))
+    return covered
