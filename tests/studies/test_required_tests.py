@@ -22,6 +22,7 @@ from harness.studies.required_tests import (
     shuffled,
 )
 from tests.chains.seed import SEED
+from tests.estimators.small_blocks import fed
 
 CHAIN = overtaking("two surrogates", skill=0.5, surrogates=[0.5, 0.2], level=0.02, horizon=6)
 GRID = np.array([10, 20, 30, 40, 50])
@@ -157,8 +158,7 @@ def test_algorithm_1_grown_look_by_look_is_algorithm_1_on_each_prefix():
     for shuffle in range(2):
         order = shuffled(procedure.seed, shuffle, tests.crash)
         for at, n in enumerate(procedure.grid(3_000)):
-            anew = Scv()
-            anew.add(rows_of(tests, order[:n]))
+            anew = fed(Scv(), [rows_of(tests, order[:n])])
             assert grown[shuffle, at] == anew.result(procedure.confidence).rhw
 
 
@@ -173,7 +173,4 @@ def test_scv_claims_the_width_of_nade_where_it_has_no_columns_and_less_where_it_
 
 
 def _nade_over_scv(tests) -> float:
-    nade, scv = Nade(), Scv()
-    nade.add(tests)
-    scv.add(tests)
-    return nade.result(0.9).std_error / scv.result(0.9).std_error
+    return fed(Nade(), [tests]).result(0.9).std_error / fed(Scv(), [tests]).result(0.9).std_error
