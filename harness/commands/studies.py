@@ -24,7 +24,7 @@ from harness.console import print_json
 from harness.console_tables import print_pool, print_required_tests
 
 if TYPE_CHECKING:
-    from harness.studies.run_required_tests import RnotEstimator
+    from harness.studies.required_tests import RnotEstimator
 
 
 @click.command(
@@ -208,8 +208,7 @@ def rnot(
     minutes: a larger --ratio and a smaller --total make it quicker. Its RHW rests on a variance that is too small.
     """
     from harness.progress import shown_progress  # noqa: PLC0415 - keeps --help fast
-    from harness.studies.required_tests import Procedure  # noqa: PLC0415 - keeps --help fast
-    from harness.studies.run_required_tests import required_tests_of_runs  # noqa: PLC0415 - keeps --help fast
+    from harness.studies.required_tests import Procedure, required_tests_of_runs  # noqa: PLC0415 - keeps --help fast
 
     procedure = Procedure(rhw, confidence, shuffles, seed, first, ratio, total)
     bar = shown_progress()

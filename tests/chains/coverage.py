@@ -9,6 +9,7 @@ import numpy as np
 from harness.estimators.block import Block
 from harness.estimators.estimate import Accumulator
 from harness.studies.judgement import Judgement, Row, Subject, estimate_row, judge
+from tests.estimators.small_blocks import fed
 
 
 def replicate(
@@ -23,7 +24,5 @@ def replicate(
     for k in range(replications):
         block = draw(np.random.default_rng([seed, k]))
         for name, new in make.items():
-            state = new()
-            state.add(block)
-            rows[name].append(estimate_row(name, k, state.result(0.9), reached=False))
+            rows[name].append(estimate_row(name, k, fed(new(), [block]).result(0.9), reached=False))
     return {name: judge(Subject.exact("", truth), name, of_name, 0.9) for name, of_name in rows.items()}

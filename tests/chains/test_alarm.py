@@ -20,6 +20,7 @@ from harness.estimators.alarm import LEVEL, Alarm
 from harness.estimators.block import Block
 from harness.strata import KnownRates
 from harness.studies.chains.single_choice import SingleChoice
+from tests.estimators.small_blocks import block, fed
 
 from .seed import SEED
 
@@ -51,15 +52,13 @@ def replayed(rng: np.random.Generator, *, corrupt: float = 1.0, n: int = N) -> B
     pool = truth * (1.0 + ERROR * rng.normal(size=3)) * [corrupt, 1.0, 1.0]
     at_crash = MEAN_WEIGHT * WORLD.alpha[0]  # as if the first were forced cut-ins
     known = KnownRates("pool", ("careful", "careless", "other"), pool, np.diag((ERROR * truth) ** 2), at_crash)
-    block = WORLD.block("episode_mixture", maneuver)
-    return replace(block, surrogates_crash=SURROGATES[:, maneuver].T, known_rates=known)
+    tests = WORLD.block("episode_mixture", maneuver)
+    return replace(tests, surrogates_crash=SURROGATES[:, maneuver].T, known_rates=known)
 
 
-def told(block: Block) -> dict[str, Any]:
+def told(tests: Block) -> dict[str, Any]:
     """What the alarm says of some tests."""
-    alarm = Alarm()
-    alarm.add(block)
-    return alarm.result()
+    return fed(Alarm(), [tests]).result()
 
 
 @pytest.mark.parametrize(("corrupt", "raised"), [(1.0, False), (1.3, True), (0.8, True)])
@@ -91,20 +90,14 @@ def weighted(
 
     They are bounded by a ``cap``, or are those of forced cut-ins with a mean ``p_cut_in`` where it crashes.
     """
-    n, none = len(h), np.zeros(len(h), dtype=bool)
-    crashes = np.array(h) > 0.0
+    n, crashes = len(h), np.array(h) > 0.0
     rates = np.array([mu]), np.array([[error**2]]), np.array([1.0 if p_cut_in is None else p_cut_in])
-    return Block(
-        first_episode=0,
+    return block(
+        [False] * n,
+        np.log(np.where(crashes, h, 1.0)),
         method="episode_mixture" if p_cut_in is None else "forced",
-        crash=none,
-        failed=none,
-        cut_in=~none,
-        bv_lv_contact=none,
-        log_weight=np.log(np.where(crashes, h, 1.0)),
         log_q=np.zeros((n, 1)),
         alpha=np.zeros(1),
-        n_control_steps=np.ones(n, dtype=np.int64),
         weight_cap=cap,
         surrogates_crash=crashes[:, None],
         known_rates=KnownRates("pool", ("one",), *rates),

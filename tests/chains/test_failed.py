@@ -16,6 +16,7 @@ from harness.estimators.one_pass import ACCUMULATORS, accumulator
 from harness.studies.chains.named import frequent_decisive
 from harness.studies.chains.sampler import draw
 from harness.studies.chains.shells import ChainShells
+from harness.studies.shell_campaign import DrawnPool, campaign_block
 
 from .coverage import replicate
 
@@ -51,27 +52,8 @@ def shells_block(rng: np.random.Generator) -> Block:
     """Fixed numbers of tests in the shells of a pool that is exactly known."""
     source = ChainShells(CHAIN, 20)
     design = replace(source.draw(rng)[0].design, cell_p=source.shell_p, n_paths=10**12)
-    stratum = np.repeat(np.arange(len(design.p)), 300)
-    share = source.crash_p / source.shell_p
-    n = len(stratum)
-    no = np.zeros(n, np.bool_)
-    crash = rng.random(n) < share[stratum]
-    return Block(
-        first_episode=0,
-        method="shells",
-        crash=crash,
-        failed=no,
-        cut_in=~no,
-        bv_lv_contact=no,
-        log_weight=np.zeros(n),
-        log_q=np.zeros((n, 0)),
-        alpha=np.zeros(0),
-        n_control_steps=np.ones(n, np.int64),
-        stratum=stratum,
-        cell=stratum,
-        cell_mass=np.tile(source.shell_p, (n, 1)),
-        shells=design,
-    )
+    drawn = DrawnPool(design, source.shell_p[None], source.crash_p[None])
+    return campaign_block(drawn, np.full(len(design.p), 300), 0, rng)
 
 
 class FailedAsSafe(ACCUMULATORS["shells"]):

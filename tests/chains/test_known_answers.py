@@ -15,6 +15,7 @@ from harness.estimators import Estimate, one_pass
 from harness.estimators.nade import Nade
 from harness.studies.chains.named import frequent_decisive, panel, rare_decisive
 from harness.studies.chains.sampler import Sampler, blocks
+from tests.estimators.small_blocks import fed
 
 from .seed import SEED
 
@@ -77,6 +78,5 @@ class ForgetsTheCutIn(Sampler):
 @pytest.mark.parametrize("chain", [panel()[0], frequent_decisive()], ids=lambda c: c.name)
 def test_a_dropped_ratio_is_caught(chain):
     """The check has teeth: leave the cut-in's own ratio out and the answer is off by far more than four errors."""
-    wrong = Nade()
-    wrong.add(ForgetsTheCutIn(chain, "step_mixture", sum(SIZES), np.random.default_rng(SEED)).run(0))
-    assert standard_errors_off(chain, wrong.result(0.9)) > 8.0
+    wrong = ForgetsTheCutIn(chain, "step_mixture", sum(SIZES), np.random.default_rng(SEED)).run(0)
+    assert standard_errors_off(chain, fed(Nade(), [wrong]).result(0.9)) > 8.0

@@ -144,19 +144,20 @@ def test_a_killed_step_goes_on_from_its_parts(tmp_path, monkeypatch, made):
     assert not (step / "parts").exists()
 
 
-def test_a_killed_run_goes_on_from_its_shards(tmp_path, study, made):
-    file = tmp_path / "study.yaml"
-    nade = STUDY[STUDY.index("  nade:") : STUDY.index("  curves:")]
-    file.write_text(STUDY[: STUDY.index("  nde:")] + nade)
-    asked_for, folder = load_study(file), tmp_path / "out"
-    with pytest.raises(KeyboardInterrupt):
-        run_study(asked_for, folder, workers=1, progress=Interrupting("episodes", 2))
-    (step,) = (folder / "steps").iterdir()
-    shards = {path: path.stat().st_mtime_ns for path in step.rglob("episodes/*.parquet")}
+def test_a_run_without_its_result_goes_on_from_its_shards(study, made, tmp_path):
+    """How a killed run goes on is what the runner's tests show; here, that the step asks for it."""
+    file, folder = study
+    again = tmp_path / "out"
+    shutil.copytree(folder, again)
+    place = again / "steps" / made["nade"].folder.name
+    (place / "result.json").unlink()
+    crashes = (place / "crashes.parquet").read_bytes()
+    shards = {path: path.stat().st_mtime_ns for path in place.rglob("episodes/*.parquet")}
     assert shards
-    run_study(asked_for, folder, workers=1)
+    assert run_study(load_study(file), again, workers=1).seconds["nade"] is not None
     assert {path: path.stat().st_mtime_ns for path in shards} == shards
-    assert (step / "crashes.parquet").read_bytes() == (made["nade"].folder / "crashes.parquet").read_bytes()
+    assert (place / "crashes.parquet").read_bytes() == crashes
+    assert json.loads((place / "result.json").read_text()) == made["nade"].result
 
 
 def resumed(study, made, tmp_path, step, progress):
@@ -285,8 +286,9 @@ def test_variants_are_tested_on_the_same_traffic(made):
     assert mean == pytest.approx(np.mean([one for one in gains if one is not None]))
 
 
-def test_variants_are_tested_with_shells_too(tmp_path):
+def test_variants_are_tested_with_shells_too(tmp_path, monkeypatch):
     """One run of shells beside plain simulation: two rates of the same vehicle on the same traffic."""
+    monkeypatch.setattr(context, "worker_processes", lambda workers: Here())
     file = tmp_path / "study.yaml"
     file.write_text(f"""
 format: case-study

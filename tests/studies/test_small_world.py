@@ -14,6 +14,7 @@ from harness.studies.case_study.small_world import AV_MPS, HOLD, Proposal, _cras
 from harness.studies.case_study.study_file import SmallCase
 from harness.vehicles.models import av_records
 from tests.chains.seed import SEED
+from tests.estimators.small_blocks import fed
 
 from .here import Here
 
@@ -56,9 +57,7 @@ def test_drawn_tests_meet_rate_and_variance(world, recursive, epsilon):
     """Within four standard errors; forgetting the weights, the sibling, is seen."""
     proposals = world.proposals(epsilon, recursive=recursive)
     block = world.draw(proposals, 60_000, np.random.default_rng(SEED))
-    state = Nade()
-    state.add(block)
-    found = state.result(0.9)
+    found = fed(Nade(), [block]).result(0.9)
     assert abs(found.crash_rate - world.crash_rate) < 4.0 * found.std_error
     relvar = len(block) * (found.std_error / world.crash_rate) ** 2
     assert relvar == pytest.approx(world.relvar(proposals), rel=0.2)

@@ -184,7 +184,7 @@ class _Situations(NamedTuple):
 
     def taken(self, rows: IntArray) -> _Situations:
         """Some of them."""
-        return self._make(column[rows] for column in self)
+        return _Situations._make(column[rows] for column in self)
 
 
 def small_world(level: float, *, nodes: int = NODES) -> SmallWorld:
