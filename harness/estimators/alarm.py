@@ -31,7 +31,6 @@ BETS = 2.0 ** -np.arange(1.0, 25.0)
 """λ μ_k of the bets, whose capitals are averaged. The best λ is within a factor of 1.5 of one of them, which costs a
 tenth of its growth; smaller ones would win nothing below 1e8 tests."""
 _UNBOUNDED = "weights of the step mixture are not bounded: rare large ones may be missing, so that nothing is concluded"
-_LOST = "{n} failed tests have no cut-in, and what surrogates would have done in them is not known"
 
 
 class Alarm:
@@ -71,7 +70,10 @@ class Alarm:
         effective = np.divide(self._sum**2, self._squares, out=np.zeros_like(mean), where=self._squares > 0.0)
         log_capital = self._log_capital(known)
         p_value = _p_value(float(logsumexp(log_capital)) - math.log(mean.size))
-        no_verdict = self._no_verdict()
+        no_verdict = _UNBOUNDED if self._method == "step_mixture" else None
+        if no_verdict is None and self._n_lost:
+            lost = "failed tests have no cut-in, and what surrogates would have done in them is not known"
+            no_verdict = f"{self._n_lost} {lost}"
         return {
             "raised": no_verdict is None and p_value <= LEVEL,
             "no_verdict": no_verdict,
@@ -91,11 +93,6 @@ class Alarm:
                 for k, name in enumerate(known.names)
             ],
         }
-
-    def _no_verdict(self) -> str | None:
-        if self._method == "step_mixture":
-            return _UNBOUNDED
-        return _LOST.format(n=self._n_lost) if self._n_lost else None
 
     def _log_capital(self, known: KnownRates) -> FloatArray:
         """Log of the mean capital of all bets on each surrogate, shape (D,).

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from copy import deepcopy
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -19,9 +20,8 @@ from harness.estimators.block import Block
 from harness.estimators.estimate import BothWays, Estimate, finite_json, require_episodes
 from harness.estimators.intervals import capped_mean_upper, normal_half_width, skewed_distances
 from harness.estimators.moments import Moments
-from harness.estimators.nade import Nade
+from harness.estimators.nade import FEW_EFFECTIVE, Nade, WeightedSums
 from harness.estimators.statement import warned
-from harness.estimators.weighted_sums import FEW_EFFECTIVE, WeightedSums
 
 FEW_PAIRS = 50
 
@@ -118,13 +118,16 @@ def paired_difference(pairs: Iterable[tuple[Block, Block]], confidence: float) -
 def _summed(pairs: Iterable[tuple[Block, Block]]) -> tuple[tuple[BothWays, BothWays], _Pairs, _Pairs, _Pairs]:
     """Estimators of A and B, and pairs as seen, with A - B as low and as high as failed tests may have made it."""
     each = BothWays(Nade()), BothWays(Nade())
-    seen, lowest, highest = _Pairs(), _Pairs(), _Pairs()
+    seen = lowest = highest = _Pairs()  # one and the same until a test fails
     for a, b in pairs:
         if (a.first_episode, len(a)) != (b.first_episode, len(b)):
             raise ValueError(f"episodes {a.first_episode}+{len(a)} and {b.first_episode}+{len(b)} are no pairs")
+        if lowest is seen and (a.failed.any() or b.failed.any()):
+            lowest, highest = deepcopy(seen), deepcopy(seen)
         seen.add(a, b)
-        lowest.add(a, b.failed_as_crashes())
-        highest.add(a.failed_as_crashes(), b)
+        if lowest is not seen:
+            lowest.add(a, b.failed_as_crashes())
+            highest.add(a.failed_as_crashes(), b)
         each[0].add(a)
         each[1].add(b)
     return each, seen, lowest, highest

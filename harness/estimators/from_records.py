@@ -150,8 +150,11 @@ def _first_ratios(moments: pa.Table, index: IntArray, n_control_steps: IntArray)
             f"rows of episodes {row.min() + index[0]} to {row.max() + index[0]}, or out of order",
             f"episodes {index[0]} to {index[-1]}, in order",
         )
-    counts = np.bincount(row, minlength=len(index))
-    _require_moments(counts, np.minimum(n_control_steps, MAX_CONTROL_STEPS), int(index[0]))
+    counts, needed = np.bincount(row, minlength=len(index)), np.minimum(n_control_steps, MAX_CONTROL_STEPS)
+    if (counts < needed).any():
+        at = int(np.argmax(counts < needed))
+        expected = f"{needed[at]} as the episodes table says"
+        raise _damaged(f"moments, episode {index[at]}", f"{counts[at]} control steps", expected)
     rank = np.arange(len(row)) - (np.cumsum(counts) - counts)[row]
     n_surrogates = moments.schema.field("q").type.list_size
     q, q_sampled = _nested(moments, "q", n_surrogates), moments.column("q_sampled").to_numpy()
@@ -159,12 +162,3 @@ def _first_ratios(moments: pa.Table, index: IntArray, n_control_steps: IntArray)
     ratios = np.ones((len(index), MAX_CONTROL_STEPS, n_surrogates))
     ratios[row[kept], rank[kept]] = q[kept] / q_sampled[kept, None]
     return ratios
-
-
-def _require_moments(counts: IntArray, needed: IntArray, first: int) -> None:
-    """Each episode must have all its control steps on record, or its first nine."""
-    short = counts < needed
-    if short.any():
-        at = int(np.argmax(short))
-        expected = f"{needed[at]} as the episodes table says"
-        raise _damaged(f"moments, episode {first + at}", f"{counts[at]} control steps", expected)

@@ -9,7 +9,6 @@ most min_j σ²_j/(n alpha_j) up to the estimation of β ([paper] Lemma 1, which
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
@@ -17,8 +16,8 @@ from harness.arrays import FloatArray
 from harness.estimators.block import Block
 from harness.estimators.estimate import Estimate, require_episodes
 from harness.estimators.moments import ThirdMoments
+from harness.estimators.nade import FEW_FOR_RESIDUALS, WeightedSums, weighted_estimate
 from harness.estimators.triangular_factor import empty_factor, fold_rows
-from harness.estimators.weighted_sums import FEW_FOR_RESIDUALS, WeightedSums, weighted_estimate
 
 
 class MixtureCv:
@@ -58,9 +57,9 @@ class MixtureCv:
         require_episodes(n)
         assert self._factor is not None
         assert self._cubes is not None
-        fit = _regression(self._factor, n)
-        residual = std_error = math.sqrt(fit.variance)
-        third_moment = self._cubes.of(np.array([*-fit.coefficients, 1.0])) / n**3
+        coefficients, rank, variance = _regression(self._factor, n)
+        residual = std_error = math.sqrt(variance)
+        third_moment = self._cubes.of(np.array([*-coefficients, 1.0])) / n**3
         plain, warnings = y.std_error(n), []
         if self.sums.n_crashes and y.n_effective < FEW_FOR_RESIDUALS and residual < plain:
             std_error, third_moment = plain, y.third_moment(n)
@@ -70,15 +69,15 @@ class MixtureCv:
             )
         return weighted_estimate(
             self.sums,
-            float(fit.coefficients[0]),
+            float(coefficients[0]),
             std_error,
             confidence,
             third_moment=third_moment,
             method="mean of weighted crashes with the episode mixture's known-mean control variates",
             warnings=warnings,
             details={
-                "beta": fit.coefficients[1:].tolist(),
-                "rank": fit.rank,
+                "beta": coefficients[1:].tolist(),
+                "rank": rank,
                 "residual_std_error": residual,
                 "plain_mean": y.mean(n),
                 "plain_std_error": plain,
@@ -86,15 +85,7 @@ class MixtureCv:
         )
 
 
-class _Regression(NamedTuple):
-    """Intercept and β, shape (1 + M,); rank of [1, H]; variance of the intercept from that of the residuals."""
-
-    coefficients: FloatArray
-    rank: int
-    variance: float
-
-
-def _regression(factor: FloatArray, n: int) -> _Regression:
+def _regression(factor: FloatArray, n: int) -> tuple[FloatArray, int, float]:
     """Least squares of Y on [1, H], of the smallest norm where columns depend on each other.
 
     Parameters
@@ -103,6 +94,10 @@ def _regression(factor: FloatArray, n: int) -> _Regression:
         Upper triangular factor of [1, H, Y].
     n : int
         Rows behind the factor; it scales the tolerance for the rank (Σ_j alpha_j h_j = 0 always costs one).
+
+    Returns
+    -------
+    Intercept and β, shape (1 + M,); rank of [1, H]; variance of the intercept from that of the residuals.
     """
     design, target = factor[:-1, :-1], factor[:-1, -1]
     left, singular, right = np.linalg.svd(design)
@@ -113,4 +108,4 @@ def _regression(factor: FloatArray, n: int) -> _Regression:
     leverage = float(np.sum((right[kept, 0] / singular[kept]) ** 2))  # of the intercept, [(XᵀX)⁺]_00
     rank = int(np.count_nonzero(kept))
     variance = residual_squares / (n - rank) * leverage if n > rank else math.inf
-    return _Regression(coefficients, rank, variance)
+    return coefficients, rank, variance

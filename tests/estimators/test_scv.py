@@ -7,7 +7,7 @@ import pytest
 
 from harness.estimators.block import Block
 from harness.estimators.nade import Nade
-from harness.estimators.scv import CHUNK_ROWS, WARNING, Scv, Stratum, fill_product_columns, n_columns, steps_used
+from harness.estimators.scv import CHUNK_ROWS, Scv, Stratum, fill_product_columns, n_columns, steps_used
 from harness.studies.chains.named import frequent_decisive, overtaking, panel
 from harness.studies.chains.sampler import blocks
 from tests.chains.seed import SEED
@@ -52,13 +52,6 @@ def test_equals_an_independently_solved_regression_and_nade(chain):
     found = {s["n_control_steps"]: (s["n"], s["columns"], s["rank"]) for s in estimate.details["strata"]}
     assert {level: fit[:2] for level, fit in found.items()} == {level: fit[:2] for level, fit in strata.items()}
     assert all(abs(found[level][2] - strata[level][2]) <= 1 for level in found)
-
-
-def test_claims_less_variance_than_nade_and_always_warns():
-    estimate = fed(Scv(), blocks(SMALL, "step_mixture", [5_000], SEED)).result(0.9)
-    assert estimate.details["var_z"] < estimate.details["var_y"]
-    assert estimate.std_error < estimate.details["nade_std_error"]
-    assert WARNING in estimate.warnings
 
 
 @pytest.mark.parametrize(

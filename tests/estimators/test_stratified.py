@@ -85,7 +85,7 @@ def test_the_limit_is_the_largest_sum_that_shares_within_the_threshold_give(coun
 
 
 @given(STRATA, st.sampled_from([0.9, 0.95, 0.99]), st.floats(0.0, 0.1))
-@settings(deadline=None)
+@settings(deadline=None, max_examples=50)
 def test_identities(strata, confidence, relative):
     p, *columns = (np.array(column) for column in zip(*strata, strict=True))
     counts, weights = np.column_stack(columns), p[:, None] * DIFFERENCE
