@@ -16,11 +16,11 @@ from harness.controllers.apart import AvEndedProcessError, run_apart
 from harness.controllers.hosts import BatchHost, ControllerHost
 from harness.controllers.loading import build_host
 from harness.controllers.protocol import BatchObservation
-from harness.criticality.tables import tables_cached
+from harness.criticality.tables import table_path
 from harness.environment.lateral import DISTANCE_M as OVERLAP_M
 from harness.importance.build import needs_tables
-from harness.pool.shadow_paths import shadow_paths_file
 from harness.pool.storage import cached_pool
+from harness.pool.vehicle_pool import shadow_paths_file
 from harness.resolved import Resolved
 from harness.runner.prepare import build_world, require_ready
 from harness.runner.reach import reach_of_statements
@@ -128,7 +128,7 @@ def _tables(resolved: Resolved) -> str:
         return "pool of cut-ins: " + ("cached" if cached_pool(resolved) else f"to build ({POOL_S} on two cores)")
     if not needs_tables(campaign):
         return "none needed"
-    if tables_cached(resolved.environment, resolved.surrogates, campaign.testing.challenge):
+    if table_path(resolved.environment, resolved.surrogates, campaign.testing.challenge).is_file():
         return "cached"
     seconds = 5 if campaign.environment.acceleration_hold_s >= 0.5 else 40
     return f"to build (about {seconds * len(campaign.surrogates)} s of one core)"

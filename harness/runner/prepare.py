@@ -11,7 +11,7 @@ from harness.arrays import RecordArray
 from harness.campaign.models import Campaign
 from harness.controllers.black_box import Death
 from harness.controllers.loading import build_host, require_controller
-from harness.criticality.tables import Tables, build_tables, table_path, tables_cached
+from harness.criticality.tables import Tables, build_tables, table_path
 from harness.environment.driving import Environment
 from harness.environment.initial_state import InitialStates
 from harness.episode.loop import MOMENT_LIMITS, NOBODY, EpisodeLoop, Keep, Policy
@@ -19,10 +19,10 @@ from harness.episode.trajectory import empty_trajectory, mean_test_distance
 from harness.errors import RunFolderError
 from harness.importance.build import build_importance, needs_tables
 from harness.outcomes import SHELLS as PRESCRIBED
-from harness.pool.shadow_paths import ShadowPaths, campaign_shadow_paths, shadow_paths_file
+from harness.pool.enumeration import ShadowRuns
 from harness.pool.shells import PrescribedEpisodes, checked_boundary
 from harness.pool.storage import campaign_pool, campaign_pool_key, pool_path
-from harness.pool.vehicle_pool import ShadowRuns, vehicle_pool
+from harness.pool.vehicle_pool import ShadowPaths, campaign_shadow_paths, shadow_paths_file, vehicle_pool
 from harness.progress import Progress, SilentProgress
 from harness.records.folder import SHELLS, read_json
 from harness.resolved import Resolved, resolve
@@ -136,7 +136,7 @@ def prepare(resolved: Resolved, progress: Progress | None = None) -> Prepared:
             drivers, challenge = resolved.surrogates, campaign.testing.challenge
             progress.stage("criticality tables", len(drivers))
             building = thread.submit(build_tables, environment, drivers, challenge, progress.advance)
-            if not tables_cached(environment, drivers, challenge):
+            if not table_path(environment, drivers, challenge).is_file():
                 compile_kernels(resolved)
             tables = building.result()
         if campaign.testing.method == "shells" and campaign.has_shadow_runs:

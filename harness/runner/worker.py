@@ -29,8 +29,8 @@ from harness.estimators.block import Block
 from harness.estimators.from_records import block_from_tables
 from harness.importance.build import mixture_weights
 from harness.outcomes import FAILED
-from harness.pool.shadow_paths import ShadowPaths
 from harness.pool.shells import Draw, PrescribedEpisodes
+from harness.pool.vehicle_pool import ShadowPaths
 from harness.records.folder import encoded
 from harness.records.tables import ShardTables, shard_tables
 from harness.resolved import Resolved
