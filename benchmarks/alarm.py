@@ -23,8 +23,8 @@ from harness.estimators.block import Block
 from harness.estimators.from_records import block_from_tables
 from harness.importance.build import mixture_weights
 from harness.methods import Method
+from harness.pool.replay import SurrogateReplay
 from harness.pool.storage import campaign_pool
-from harness.pool.surrogate_replay import SurrogateReplay
 from harness.records.tables import episodes_table
 from harness.resolved import resolve
 from harness.runner.prepare import prepare

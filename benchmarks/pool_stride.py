@@ -28,13 +28,13 @@ def main() -> None:
     environment, library = load_environment(campaign.environment), load_library(campaign.pool.library)
     names = list(library.surrogates)
     before = names[: names.index(library.boundary) + 1]
-    asked, envelope = (environment, library.drivers_in(environment)), names.index(library.envelope)
-    pilot = Enumerator(*asked, envelope, SEED)
+    followers = library.followers_in(environment)
+    pilot = Enumerator(environment, followers, SEED)
     pilot_rates = pilot.run(0, PILOT_PATHS, SilentProgress()).rates(len(names))[:, : len(before)]
     print("stride  ms/path  cost  " + "  ".join(before))
     first = 0.0
     for stride in STRIDES:
-        enumerator = Enumerator(*asked, envelope, SEED, stride=stride).aimed(pilot_rates)
+        enumerator = Enumerator(environment, followers, SEED, stride=stride).aimed(pilot_rates)
         begin = time.process_time()
         paths = enumerator.run(PILOT_PATHS, PATHS, SilentProgress())
         milliseconds = (time.process_time() - begin) / PATHS * 1e3

@@ -40,7 +40,7 @@ def main() -> None:
     described = {"format": "surrogate-library", "version": 1, "boundary": "need-based", "surrogates": drivers}
     library = Library.model_validate({**described, "envelope": "full-throttle-2"})
     environment, names = load_environment(load_campaign("scenarios/smoke.yaml").environment), list(drivers)
-    pilot = Enumerator(environment, library.drivers_in(environment), names.index("full-throttle-2"), SEED)
+    pilot = Enumerator(environment, library.followers_in(environment), SEED)
     rates = pilot.run(0, PILOT_PATHS, SilentProgress()).rates(len(names))
     # Aimed at the careful ones: the others, and the cut-in itself, are known well enough anyway.
     share = [0.2 if name in ("need-based", "full-throttle-2") else 1.0 for name in names]

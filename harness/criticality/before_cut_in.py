@@ -110,18 +110,9 @@ def naturalistic_pmf(environment: Environment) -> FloatArray:
 
 
 def build_before_cut_in(environment: Environment, value: Float32Array) -> Float32Array:
-    """G of one surrogate at every redraw time.
+    """G of one surrogate at every redraw time, from its U after the cut-in: ``value`` (levels + 1, v, R2, R2dot).
 
-    Parameters
-    ----------
-    environment : Environment
-    value : ndarray of float32, shape (levels + 1, v, R2, R2dot)
-        The surrogate's U after the cut-in.
-
-    Returns
-    -------
-    ndarray of float32, shape (redraw times + 1, v, R2, R2dot)
-        Challenge per unit of OL (dimensionless); zero at R2 = 0 and at the end of the episode.
+    Its shape is (redraw times + 1, v, R2, R2dot); it is zero at R2 = 0 and at the end of the episode.
     """
     points, pmf = points_of(BEFORE), naturalistic_pmf(environment)
     hold, steps = int(environment.numbers["hold_steps"]), int(environment.numbers["max_steps"])

@@ -91,16 +91,9 @@ def build_one(environment: Environment, driver: RecordArray, challenge: str) -> 
 def build_tables(
     environment: Environment, drivers: RecordArray, challenge: str, done: Callable[[int], None] = lambda _: None
 ) -> Tables:
-    """Tables of all surrogates, read-only, from the cache if they are there.
+    """Tables of all surrogates, ``drivers`` (J,), read-only, from the cache if they are there.
 
-    Parameters
-    ----------
-    environment : Environment
-    drivers : structured ndarray, shape (J,)
-    challenge : str
-        ``recursive`` or ``immediate``.
-    done : callable
-        Called with the number of surrogates that have become ready.
+    ``challenge`` is ``recursive`` or ``immediate``; ``done`` is called with the number of those that have become ready.
     """
     path = table_path(environment, drivers, challenge)
     if (tables := _load(path)) is not None:
@@ -116,8 +109,3 @@ def build_tables(
         parts = list(threads.map(one, range(drivers.size)))
     _save(path, Tables(*(np.stack(arrays) for arrays in zip(*parts, strict=True))))
     return build_tables(environment, drivers, challenge, lambda _: None)
-
-
-def tables_cached(environment: Environment, drivers: RecordArray, challenge: str) -> bool:
-    """Whether they are on disk."""
-    return table_path(environment, drivers, challenge).exists()

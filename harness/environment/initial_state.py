@@ -13,18 +13,7 @@ _SPEED_POINTS = 8001
 
 
 class InitialStates:
-    """Sampler of initial states.
-
-    Parameters
-    ----------
-    numbers : record
-        Parameters of the environment.
-
-    Attributes
-    ----------
-    speed_cdf : ndarray
-        P(v_BV ≤ v) on a grid over the fit range.
-    """
+    """Sampler of initial states; ``speed_cdf`` is P(v_BV ≤ v) on a grid over the fit range."""
 
     def __init__(self, numbers: Record) -> None:
         self._n = n = numbers

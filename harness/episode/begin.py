@@ -8,9 +8,8 @@ from harness.arrays import FloatArray
 from harness.compiled import compiled, compiled_inline
 from harness.environment.lateral import draw_lead, onset_of
 from harness.episode.cells import Bench
-from harness.episode.critical_moment import record_moment, update_ratios
-from harness.episode.trajectory import place, state_in, walk_without_cut_in
-from harness.maneuvers import CUT_IN as CUT_IN_MANEUVER
+from harness.episode.critical_moment import take_down
+from harness.episode.trajectory import place, state_in, walk, weigh_cut_ins
 from harness.outcomes import AV, EPISODE_MIXTURE, FORCED, SHELLS
 from harness.random_stream import CUT_IN, uniform
 
@@ -72,7 +71,9 @@ def begin_cell(k: int, row: int, bench: Bench) -> None:
     cell.target = -math.log1p(-u)
     environment, path, takes_time = bench.environment, bench.scratch.path, bench.environment.lateral.cumulative.size > 0
     if method in (FORCED, EPISODE_MIXTURE) or takes_time:
-        steps, hazard_total = walk_without_cut_in(bench.states[row], seed, episode, environment, path)
+        max_steps = environment.numbers.max_steps
+        steps = walk(bench.states[row], seed, episode, 0, max_steps, True, environment, path)
+        hazard_total = weigh_cut_ins(steps, environment, path)
         if method in (FORCED, EPISODE_MIXTURE):
             cell.hazard_total = hazard_total
             p_cut_in = -math.expm1(-cell.hazard_total)
@@ -91,22 +92,12 @@ def look_for_cut_in(k: int, steps: int, bench: Bench) -> None:
         cell.clock += hazard[step]
         cut = cell.clock >= cell.target
         if bench.importance.method == FORCED:
-            follow_ratios(k, step, cut, hazard[step], bench)
+            state = state_in(step, bench.scratch.path)
+            take_down(k, step, state, cut, -math.expm1(-hazard[step]), hazard[step], False, bench)
         if cut:
             lead = draw_lead(step, bench.seed, cell.episode, bench.environment.lateral)
             plan_cut_in(k, step, lead, bench)
             return
-
-
-@compiled_inline
-def follow_ratios(k: int, step: int, cut: bool, hazard: float, bench: Bench) -> None:
-    """What `harness.episode.critical_moment` does in each step with forced cut-ins that come as they are drawn."""
-    p = -math.expm1(-hazard)
-    sampled = update_ratios(k, cut, p, hazard, False, bench)
-    bench.cells.cell[k].hazard += hazard
-    if cut:
-        bench.cells.cell[k].n_control += 1
-        record_moment(k, step, state_in(step, bench.scratch.path), CUT_IN_MANEUVER, p, p * sampled, bench)
 
 
 @compiled_inline

@@ -31,18 +31,27 @@ def choose_lane(k: int, state: State, bench: Bench) -> None:
         critical = propose_cut_in(p, wish, cut_challenge, stay_challenge, importance, scratch.q, scratch.challenge)
     cell.clock += sampling_hazard(hazard, critical, method, cell.component, importance.alpha, scratch.q)
     cut = cell.clock >= cell.target
+    take_down(k, cell.step, state, cut, p, hazard, critical, bench)
+    if cut:
+        begin_cut_in(k, state, bench)
+
+
+@compiled_inline
+def take_down(
+    k: int, step: int, state: State, cut: bool, p: float, hazard: float, critical: bool, bench: Bench
+) -> None:
+    """Likelihood ratios of having stayed or cut in, and the moment if it was one of control."""
+    cell, scratch, importance = bench.cells.cell[k], bench.scratch, bench.importance
     sampled = 1.0
     if critical or importance.first == 1:
         sampled = update_ratios(k, cut, p, hazard, critical, bench)
     cell.hazard += hazard
-    if cut:
-        begin_cut_in(k, state, bench)
-    if critical or (method == FORCED and cut):
+    if critical or (importance.method == FORCED and cut):
         cell.n_control += 1
         exposure = p if cut else 1.0 - p
         for j in range(importance.n_surrogates):
             scratch.q[j] = scratch.q[j] if cut else 1.0 - scratch.q[j]
-        record_moment(k, cell.step, state, CUT_IN if cut else STAY, exposure, exposure * sampled, bench)
+        record_moment(k, step, state, CUT_IN if cut else STAY, exposure, exposure * sampled, bench)
 
 
 @compiled_inline

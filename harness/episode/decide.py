@@ -47,7 +47,9 @@ def draw_maneuvers(k: int, state: State, bench: Bench) -> None:
         if redraw:
             redraw_following(k, state, bench)
         if bench.environment.lateral.cumulative.size > 0:
-            follow_plan(k, state, bench)
+            note_onset(k, state, bench)
+            if cell.step == cell.planned:  # it was decided before anybody could see it
+                begin_cut_in(k, state, bench)
         else:
             choose_lane(k, state, bench)
     elif (cell.step - cell.cut_step - 1) % hold_steps == 0:
@@ -102,14 +104,6 @@ def repeat_traffic(k: int, state: State, bench: Bench) -> None:
     if cell.step == traffic.cut_step[cell.row]:
         begin_cut_in(k, state, bench)
         cell.n_control += 1
-
-
-@compiled_inline
-def follow_plan(k: int, state: State, bench: Bench) -> None:
-    """Cut in when it has been decided, before anybody could see it."""
-    note_onset(k, state, bench)
-    if bench.cells.cell[k].step == bench.cells.cell[k].planned:
-        begin_cut_in(k, state, bench)
 
 
 @compiled_inline

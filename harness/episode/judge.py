@@ -12,16 +12,7 @@ from harness.episode.beside import note_if_ahead
 from harness.episode.cells import Bench, state_of
 from harness.episode.motion import mixed
 from harness.importance.likelihood import log_weight
-from harness.outcomes import (
-    AV,
-    BV,
-    BV_LV_CONTACT,
-    CRASH,
-    FAILED,
-    PASSED,
-    RUNNING,
-    TIMEOUT,
-)
+from harness.outcomes import AV, BV, BV_LV_CONTACT, CRASH, FAILED, PASSED, RUNNING, TIMEOUT
 from harness.state import State
 from harness.vehicles.kinematics import CONTACT_M, STEP_S, overlaps
 

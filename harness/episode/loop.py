@@ -126,16 +126,9 @@ class EpisodeLoop:
         self._cells = idle_cells(world.n_cells, environment, importance, keep_traces=keep.any_trace)
 
     def run(self, first_episode: int, states: RecordArray, traffic: PrescribedTraffic | None = None) -> Shard:
-        """Run episodes ``first_episode … first_episode + n − 1``.
+        """Run episodes ``first_episode … first_episode + n − 1`` of the campaign, from initial ``states`` (n,).
 
-        Parameters
-        ----------
-        first_episode : int
-            Campaign index of the first episode.
-        states : structured ndarray, shape (n,)
-            Initial states.
-        traffic : PrescribedTraffic, optional
-            What LV and BV do, where it is not drawn.
+        ``traffic`` is what LV and BV do, where it is not drawn.
 
         Raises
         ------
@@ -157,7 +150,8 @@ class EpisodeLoop:
             ended += self._step_and_judge(bench, shard, placed)
             given += placed
             if recorded > shard.results.moment.size - self._world.n_cells:
-                bench = self._with_more_room(shard)
+                shard.results = with_more_room(shard.results, 2 * shard.results.moment.size)
+                bench = self._bench(shard)
 
     def beside(self, world: World | None = None, keep: Keep | None = None) -> EpisodeLoop:
         """Another loop with the same AV and policy, in a world of no more cells, or with other records."""
@@ -204,11 +198,6 @@ class EpisodeLoop:
             )
         )
 
-    def _with_more_room(self, shard: Shard) -> Bench:
-        """The bench of the same shard with room for twice as many control steps."""
-        shard.results = with_more_room(shard.results, 2 * shard.results.moment.size)
-        return self._bench(shard)
-
     def _respond(self, bench: Bench, shard: Shard, placed: int) -> int:
         """What the AVs do, the user's controller or a built-in one; returns how many controllers failed."""
         if self._av is None:
@@ -243,7 +232,8 @@ class EpisodeLoop:
             raise _disagreement(cells.cell[-1 - ended], bool(contact[-1 - ended]))
         if ended:
             self._keep_traces(ended, shard)
-            shard.failures.update((row, STRAYED) for _, row in self._ended(ended) if _has_failed(shard, row))
+            outcome = shard.results.episode["outcome"]
+            shard.failures.update((row, STRAYED) for _, row in self._ended(ended) if outcome[row] == FAILED)
         return ended
 
     def _lose(self, cause: str, bench: Bench, shard: Shard) -> int:
@@ -277,10 +267,6 @@ class EpisodeLoop:
                 trace = shard.traces[row] = self._cells.trace[k, : int(episode["n_steps"]) + 1].copy()
                 if self._driving is not None:  # nobody commanded what the AV did: its speeds say it
                     trace[:-1, AV, 2] = np.diff(trace[:, AV, 1]) / STEP_S
-
-
-def _has_failed(shard: Shard, row: int) -> bool:
-    return int(shard.results.episode["outcome"][row]) == FAILED
 
 
 def _disagreement(cell: np.void, contact: bool) -> WorldDisagreementError:

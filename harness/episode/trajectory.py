@@ -15,7 +15,7 @@ from harness.arrays import FloatArray, Int8Array, Record, RecordArray
 from harness.compiled import compiled_inline, compiled_threads
 from harness.environment.cut_in import acceptance, cut_in_hazard, opportunity
 from harness.environment.driving import Environment, car_following, draw_acceleration, free_driving
-from harness.environment.lateral import LateralMotion, onset_of, perceived_in
+from harness.environment.lateral import onset_of, perceived_in
 from harness.maneuvers import acceleration
 from harness.outcomes import AV, BV, BV_LV_CONTACT, LV, PASSED, RUNNING
 from harness.random_stream import BV_DRAWS, BV_FREE_DRAWS, LV_DRAWS, uniform
@@ -51,6 +51,17 @@ class Trajectory(NamedTuple):
     free: Int8Array
     x_after: FloatArray
     v_after: FloatArray
+
+
+class Followers(NamedTuple):
+    """Drivers (D,) to be put in the AV's place: at most 62, without inattention.
+
+    ``envelope`` is the place of the one that crashes wherever another one does: where it does not, nobody else is
+    asked; -1 for none.
+    """
+
+    drivers: RecordArray
+    envelope: int = -1
 
 
 def lengths(environment: Environment) -> tuple[int, int, int]:
@@ -101,14 +112,6 @@ def end_in(step: int, path: Trajectory) -> int:
 
 
 @compiled_inline
-def set_out(state: State, path: Trajectory) -> None:
-    """LV and BV before the first step."""
-    place(state, path.x, path.v)
-    path.x_lv[0], path.x_bv[0] = path.x[LV], path.x[BV]
-    path.v_lv[0], path.v_bv[0] = path.v[LV], path.v[BV]
-
-
-@compiled_inline
 def take_step(step: int, seed: int, episode: int, known: int, environment: Environment, path: Trajectory) -> None:
     """LV and BV move on; their first ``known`` maneuvers stand in ``path``, those after them are drawn."""
     m = step // environment.numbers.hold_steps
@@ -126,32 +129,30 @@ def take_step(step: int, seed: int, episode: int, known: int, environment: Envir
 
 @compiled_inline
 def walk(
-    state: State, seed: int, episode: int, known: int, until: int, environment: Environment, path: Trajectory
+    state: State,
+    seed: int,
+    episode: int,
+    known: int,
+    until: int,
+    ends_passed: bool,
+    environment: Environment,
+    path: Trajectory,
 ) -> int:
     """Walk from an initial state to a step, or to the end that an episode without cut-in finds; returns the step.
 
-    The AV keeps its speed. The first ``known`` maneuvers of LV and BV stand in ``path``; what comes after them is
-    drawn, and written there.
+    The AV keeps its speed, and ``ends_passed`` says whether the walk ends where it has passed BV. The first ``known``
+    maneuvers of LV and BV stand in ``path``; what comes after them is drawn, and written there.
     """
-    set_out(state, path)
-    path.x_av[0], path.v_av[0] = path.x[AV], path.v[AV]
+    place(state, path.x, path.v)
+    path.x_lv[0], path.x_bv[0], path.x_av[0] = path.x[LV], path.x[BV], path.x[AV]
+    path.v_lv[0], path.v_bv[0], path.v_av[0] = path.v[LV], path.v[BV], path.v[AV]
     for step in range(until):
-        if end_in(step, path) != RUNNING:
+        end = end_in(step, path)
+        if end == BV_LV_CONTACT or (end == PASSED and ends_passed):
             return step
         take_step(step, seed, episode, known, environment, path)
         path.x_av[step + 1] = next_position(path.x_av[step], path.v[AV], path.v[AV])
         path.v_av[step + 1] = path.v[AV]
-    return until
-
-
-@compiled_inline
-def walk_traffic(state: State, seed: int, episode: int, until: int, environment: Environment, path: Trajectory) -> int:
-    """LV and BV alone, to a step or to where they touch; returns the step. ``path`` says where the AV is."""
-    set_out(state, path)
-    for step in range(until):
-        if step > 0 and gap(path.x_lv[step], path.x_bv[step]) < CONTACT_M:
-            return step
-        take_step(step, seed, episode, 0, environment, path)
     return until
 
 
@@ -165,15 +166,6 @@ def weigh_cut_ins(steps: int, environment: Environment, path: Trajectory) -> flo
         path.hazard[step] = cut_in_hazard(opportunity(state, environment), accepted, environment)
         total += path.hazard[step]
     return total
-
-
-@compiled_inline
-def walk_without_cut_in(
-    state: State, seed: int, episode: int, environment: Environment, path: Trajectory
-) -> tuple[int, float]:
-    """Walk to the end, writing the cut-in hazard of each step; returns the number of steps, and the sum of hazards."""
-    steps = walk(state, seed, episode, 0, environment.numbers.max_steps, environment, path)
-    return steps, weigh_cut_ins(steps, environment, path)
 
 
 @compiled_inline
@@ -211,18 +203,28 @@ def leave(
 
 @compiled_inline
 def follow(
-    driver: Record, first: int, used_up: float, cut: int, onset: int, until: int, encloses: bool, path: Trajectory
+    driver: Record,
+    late: int,
+    cut: int,
+    lead: int,
+    until: int,
+    encloses: bool,
+    environment: Environment,
+    path: Trajectory,
 ) -> tuple[int, float]:
     """Step after which a driver has run into BV, `NO_CRASH` or `WAS_AHEAD`, and its speed (m/s) at the end.
 
-    It takes over from the AV after the step of the onset, and reacts from step ``first`` on; ``used_up`` steps of its
-    delay have passed by then. One that is to enclose others also counts as having run into BV where it has passed it
-    before the overlap: a slower one may not have.
+    BV shows ``lead`` steps before its cut-in that it will come over. The driver takes over from the AV after the step
+    of the onset, and reacts ``late`` steps after it has perceived it. One that is to enclose others acts from the
+    onset, and also counts as having run into BV where it has passed it before the overlap: a slower one may not have.
     """
+    onset = onset_of(cut, lead)
     x, v = path.x_av[onset + 1], path.v_av[onset + 1]
     if onset == cut and gap(path.x_after[cut + 1], x) < CONTACT_M:
         return cut + 1, v
-    memory = nothing_yet(used_up)
+    perceives_m = 0.0 if encloses else driver.perceives_lateral_m
+    perceived, earlier = perceived_in(perceives_m, cut, lead, environment.lateral.distance_m)
+    first, memory = perceived + late, nothing_yet(driver.used_up_steps + earlier)
     for step in range(onset + 1, until):
         if step >= first:
             x_bv, v_bv = path.x_after[step], path.v_after[step]
@@ -238,36 +240,18 @@ def follow(
 
 
 @compiled_inline
-def crashes(
-    driver: Record, cut: int, lead: int, until: int, encloses: bool, lateral: LateralMotion, path: Trajectory
-) -> bool:
-    """Whether an attentive driver runs into BV; one that encloses others acts from the onset."""
-    perceives_m = 0.0 if encloses else driver.perceives_lateral_m
-    first, earlier = perceived_in(perceives_m, cut, lead, lateral.distance_m)
-    first, used_up = first + driver.delay_steps, driver.used_up_steps + earlier
-    return follow(driver, first, used_up, cut, onset_of(cut, lead), until, encloses, path)[0] >= 0
-
-
-@compiled_inline
-def who_crashes(
-    drivers: RecordArray,
-    envelope: int,
-    cut: int,
-    lead: int,
-    until: int,
-    lateral: LateralMotion,
-    path: Trajectory,
-) -> int:
-    """One bit for each driver that runs into BV, which shows ``lead`` steps before its cut-in that it will come over.
-
-    ``envelope`` is the driver that crashes wherever another one does: where it does not, nobody else is asked; -1 for
-    none.
-    """
-    if envelope >= 0 and not crashes(drivers[envelope], cut, lead, until, True, lateral, path):
-        return 0
+def who_crashes(followers: Followers, cut: int, lead: int, environment: Environment, path: Trajectory) -> int:
+    """One bit for each attentive driver that runs into BV; see `follow`."""
+    drivers, envelope, until = followers.drivers, followers.envelope, environment.numbers.max_steps
+    if envelope >= 0:
+        driver = drivers[envelope]
+        if follow(driver, driver.delay_steps, cut, lead, until, True, environment, path)[0] < 0:
+            return 0
     found = 0
     for d in range(drivers.size):
-        if d == envelope or crashes(drivers[d], cut, lead, until, is_boundary(drivers[d]), lateral, path):
+        driver = drivers[d]
+        encloses = is_boundary(driver)
+        if d == envelope or follow(driver, driver.delay_steps, cut, lead, until, encloses, environment, path)[0] >= 0:
             found |= 1 << d
     return found
 
@@ -283,6 +267,6 @@ def mean_test_distance(seed: int, states: RecordArray, environment: Environment,
     """Mean distance (m) that the AV drives in an overtaking without cut-in; ``path`` is room to work in."""
     total = 0.0
     for i in range(states.size):
-        steps = walk(states[i], seed, i, 0, environment.numbers.max_steps, environment, path)
+        steps = walk(states[i], seed, i, 0, environment.numbers.max_steps, True, environment, path)
         total += path.v[AV] * (0.1 * steps)
     return float(total / states.size)

@@ -7,17 +7,17 @@ Phys. 27, 1978, 192), mixed with a share of the naturalistic density that bounds
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 
-from harness.arrays import FloatArray, Int8Array, IntArray, RecordArray
+from harness.arrays import FloatArray, IntArray, RecordArray
 from harness.environment.driving import Environment
 from harness.environment.initial_state import InitialStates
-from harness.episode.trajectory import empty_trajectory
-from harness.pool.enumeration import FREE_DRAWS_PER_CUT_IN, STRIDE, draw_leads, enumerate_cut_ins, write_pairs
+from harness.episode.trajectory import Followers
+from harness.pool.enumeration import STRIDE, enumerate_cut_ins
 from harness.progress import Progress
 from harness.random_stream import DIAGNOSTIC, INITIAL, uniforms
 from harness.state import STATE_COLUMNS
@@ -31,35 +31,28 @@ AIMED_DRAW, OFFSET_DRAW = 0, 1
 """Draws of a path within the diagnostic stream."""
 
 
-@dataclass(frozen=True)
-class Proposal:
-    """Product density on the unit cube, mixed with the uniform one.
+def aimed_points(density: FloatArray, u: FloatArray, choice: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Points (n, dimensions) drawn from a proposal, and their weights (n,): naturalistic density over the proposal's.
 
-    ``density`` (dimensions, N_BINS) is that within each bin; its mean over the bins is 1.
+    The proposal is a product ``density`` (dimensions, N_BINS) on the unit cube, that within each bin with mean 1, mixed
+    with the uniform one: ``choice`` (n,) are the uniforms that decide which points stay naturalistic. ``u``
+    (n, dimensions) are those that become points.
     """
-
-    density: FloatArray
-
-    def map(self, u: FloatArray, choice: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Points (n, dimensions) drawn from the proposal, and their weights (n,): naturalistic density over its own.
-
-        ``u`` (n, dimensions) are uniforms, and ``choice`` (n,) those that decide which points stay naturalistic.
-        """
-        edges = np.linspace(0.0, 1.0, N_BINS + 1)
-        aimed = choice >= NATURALISTIC_SHARE
-        points = u.copy()
-        density = np.ones(len(u))
-        for d, levels in enumerate(self.density):
-            cumulative = np.concatenate([[0.0], np.cumsum(levels) / N_BINS])
-            cumulative[-1] = 1.0
-            points[aimed, d] = np.interp(u[aimed, d], cumulative, edges)
-            density *= levels[_bin_of(points[:, d])]
-        weights: FloatArray = 1.0 / (NATURALISTIC_SHARE + (1.0 - NATURALISTIC_SHARE) * density)
-        return points, weights
+    edges = np.linspace(0.0, 1.0, N_BINS + 1)
+    aimed = choice >= NATURALISTIC_SHARE
+    points = u.copy()
+    own = np.ones(len(u))
+    for d, levels in enumerate(density):
+        cumulative = np.concatenate([[0.0], np.cumsum(levels) / N_BINS])
+        cumulative[-1] = 1.0
+        points[aimed, d] = np.interp(u[aimed, d], cumulative, edges)
+        own *= levels[_bin_of(points[:, d])]
+    weights: FloatArray = 1.0 / (NATURALISTIC_SHARE + (1.0 - NATURALISTIC_SHARE) * own)
+    return points, weights
 
 
-def fit_proposal(u: FloatArray, contribution: FloatArray) -> Proposal:
-    """Proposal from the uniforms (n, dimensions) of a naturalistic pilot run, and what each point contributes (n,).
+def fit_proposal(u: FloatArray, contribution: FloatArray) -> FloatArray:
+    """Density of a proposal from the uniforms (n, dimensions) of a naturalistic pilot run, and each one's part (n,).
 
     The best density of one variable is the root of the contribution's mean square within each bin.
     """
@@ -72,7 +65,7 @@ def fit_proposal(u: FloatArray, contribution: FloatArray) -> Proposal:
         smooth = np.convolve(np.concatenate([root[:1], root, root[-1:]]), [0.25, 0.5, 0.25], "valid")
         if smooth.sum() > 0.0:
             density[d] = smooth * (N_BINS / smooth.sum())
-    return Proposal(density)
+    return density
 
 
 def _bin_of(u: FloatArray) -> IntArray:
@@ -90,7 +83,7 @@ def contributions(rates: FloatArray, share: FloatArray | float = 1.0) -> FloatAr
     return found
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class EnumeratedPaths:
     """Initial states (n,) of some paths, and their cut-ins.
 
@@ -111,11 +104,10 @@ class EnumeratedPaths:
         return np.column_stack([*columns, self.mass.sum(1)])
 
 
-def joined(parts: Sequence[EnumeratedPaths]) -> EnumeratedPaths:
+def joined(parts: Iterable[EnumeratedPaths]) -> EnumeratedPaths:
     """Consecutive paths in one."""
-    return EnumeratedPaths(
-        *(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(EnumeratedPaths))
-    )
+    columns = zip(*(vars(part).values() for part in parts), strict=True)
+    return EnumeratedPaths(*map(np.concatenate, columns))
 
 
 class Enumerator:
@@ -124,14 +116,13 @@ class Enumerator:
     def __init__(
         self,
         environment: Environment,
-        drivers: RecordArray,
-        envelope: int,
+        followers: Followers,
         seed: int,
-        proposal: Proposal | None = None,
+        proposal: FloatArray | None = None,
         stride: int = STRIDE,
     ) -> None:
-        self._environment, self._drivers, self._envelope = environment, drivers, envelope
-        self._seed, self._proposal, self._stride = seed, proposal, stride
+        self._environment, self._followers, self._seed = environment, followers, seed
+        self._proposal, self._stride = proposal, stride
         self._states = InitialStates(environment.numbers)
         # Compiled here, by one thread: of two that want a new kernel at once, the second would have to wait for
         # whatever else is compiled meanwhile.
@@ -140,7 +131,7 @@ class Enumerator:
     def aimed(self, rates: FloatArray, share: FloatArray | float = 1.0) -> Enumerator:
         """The same, aimed at what contributes to the rates (n, columns) of its first paths; see `contributions`."""
         proposal = fit_proposal(self.uniforms(0, len(rates)), contributions(rates, share))
-        return Enumerator(self._environment, self._drivers, self._envelope, self._seed, proposal, self._stride)
+        return Enumerator(self._environment, self._followers, self._seed, proposal, self._stride)
 
     def uniforms(self, first: int, n: int) -> FloatArray:
         """Uniforms of the initial states of consecutive paths, shape (n, 5)."""
@@ -148,7 +139,7 @@ class Enumerator:
 
     def run(self, first: int, n: int, progress: Progress) -> EnumeratedPaths:
         """Paths ``first … first + n - 1``; ``n`` is a multiple of `BLOCK_PATHS`."""
-        blocks = []
+        blocks: list[EnumeratedPaths] = []
         with ThreadPoolExecutor(os.cpu_count()) as threads:
             for block in threads.map(self._block, range(first, first + n, BLOCK_PATHS)):
                 blocks.append(block)
@@ -160,29 +151,8 @@ class Enumerator:
         drawn = uniforms(self._seed, first, n, DIAGNOSTIC, 2)
         offset = (drawn[:, OFFSET_DRAW] * self._stride).astype(np.int64)
         if self._proposal is not None:
-            u, weight = self._proposal.map(u, drawn[:, AIMED_DRAW])
-        state, max_steps = self._states.from_uniforms(u), int(self._environment.numbers["max_steps"])
-        probability, crashes = np.zeros((n, max_steps)), np.zeros((n, max_steps), np.int64)
-        path = empty_trajectory(self._environment)
-        where = self._environment, self._drivers, self._envelope
-        enumerate_cut_ins(self._seed, first, state, *where, self._stride, offset, path, probability, crashes)
-        return EnumeratedPaths(first + np.arange(n), state, weight, probability * weight[:, None], crashes)
-
-    def leads(self, path: IntArray, step: IntArray) -> IntArray:
-        """Leads (steps) of chosen (path, cut-in step) pairs, shape (n,); (0,) where cut-ins are one step."""
-        lateral = self._environment.lateral
-        found = np.zeros(len(path) if lateral.present else 0, np.int64)
-        if lateral.present:
-            draw_leads(self._seed, path, step, lateral, found)
-        return found
-
-    def pairs(
-        self, path: IntArray, step: IntArray, state: RecordArray
-    ) -> tuple[Int8Array, Int8Array, IntArray, IntArray]:
-        """Maneuvers of chosen (path, cut-in step) pairs: LV's and BV's (n, draws), and how many of each (n,)."""
-        room = empty_trajectory(self._environment)
-        n, draws = len(path), room.lv.size
-        lv, bv = np.zeros((n, draws), np.int8), np.zeros((n, draws), np.int8)
-        n_lv, n_bv = np.zeros(n, np.int64), np.zeros(n, np.int64)
-        write_pairs(self._seed, path, step, state, FREE_DRAWS_PER_CUT_IN, self._environment, room, lv, bv, n_lv, n_bv)
-        return lv, bv, n_lv, n_bv
+            u, weight = aimed_points(self._proposal, u, drawn[:, AIMED_DRAW])
+        index, state = first + np.arange(n), self._states.from_uniforms(u)
+        asked = self._environment, self._followers
+        found = enumerate_cut_ins(self._seed, index, state, *asked, stride=self._stride, offset=offset)
+        return EnumeratedPaths(index, state, weight, found.probability * weight[:, None], found.crashes)

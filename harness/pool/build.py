@@ -11,6 +11,7 @@ from harness.campaign.models import PoolSettings
 from harness.environment.driving import Environment
 from harness.pool.aimed_paths import PILOT_PATHS, EnumeratedPaths, Enumerator, joined
 from harness.pool.cut_ins import FAR_OFF, CutIns, Pool, environment_hash, shells_of
+from harness.pool.enumeration import write_script
 from harness.pool.library import Library
 from harness.progress import Progress, SilentProgress
 from harness.random_stream import DIAGNOSTIC, uniforms
@@ -33,9 +34,9 @@ def build_pool(
     """Build a pool in the twin, which will carry the content hash ``key``."""
     progress = progress or SilentProgress()
     aim = take_aim(environment, library, settings, progress)
-    paths = _until_known(aim.enumerator, aim.pilot, aim.careful, settings, progress)
+    paths = _until_known(aim, settings, progress)
     order = careful_first(paths.rates(len(library.surrogates)))
-    return pool_of(paths, aim.enumerator, order, library, settings, key, environment_hash(environment))
+    return pool_of(paths, settings.seed ^ POOL_SEED, order, environment, library, settings, key)
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,9 +56,7 @@ class Aim:
 def take_aim(environment: Environment, library: Library, settings: PoolSettings, progress: Progress) -> Aim:
     """Find out by a pilot run of naturalistic paths where surrogates crash."""
     names = list(library.surrogates)
-    pilot = Enumerator(
-        environment, library.drivers_in(environment), names.index(library.envelope), settings.seed ^ POOL_SEED
-    )
+    pilot = Enumerator(environment, library.followers_in(environment), settings.seed ^ POOL_SEED)
     progress.stage("pool: pilot", PILOT_PATHS)
     rates = pilot.run(0, PILOT_PATHS, progress).rates(len(names))
     aim = Aim(pilot, rates, _careful(rates, names.index(library.boundary)))
@@ -82,16 +81,15 @@ def _careful(rates: FloatArray, boundary: int) -> BoolArray:
     return careful
 
 
-def _until_known(
-    aimed: Enumerator, pilot: FloatArray, careful: BoolArray, settings: PoolSettings, progress: Progress
-) -> EnumeratedPaths:
+def _until_known(aim: Aim, settings: PoolSettings, progress: Progress) -> EnumeratedPaths:
     """Enumerate paths until the relative errors are small enough; what is left of them is part of every interval."""
+    pilot, careful = aim.pilot, aim.careful
     wanted = settings.relative_error * np.where(careful, 1.0, CARELESS_ERROR)
     progress.stage("pool of cut-ins", _paths_needed(pilot, wanted))
     rounds: list[EnumeratedPaths] = []
     rates = np.zeros((0, pilot.shape[1]))
     while len(rates) < MOST_PATHS:
-        rounds.append(aimed.run(PILOT_PATHS + len(rates), ROUND_PATHS, progress))
+        rounds.append(aim.enumerator.run(PILOT_PATHS + len(rates), ROUND_PATHS, progress))
         rates = np.concatenate([rates, rounds[-1].rates(pilot.shape[1] - 1)])
         mean = rates.mean(0)
         known = mean > 0.0
@@ -113,14 +111,17 @@ def _paths_needed(pilot: FloatArray, wanted: FloatArray) -> int:
 
 def pool_of(
     paths: EnumeratedPaths,
-    enumerator: Enumerator,
+    seed: int,
     order: IntArray,
+    environment: Environment,
     library: Library,
     settings: PoolSettings,
     key: str,
-    environment: str,
 ) -> Pool:
-    """Sort the cut-ins of paths into shells, by surrogates in this order, and cells; keep a sample of each shell."""
+    """Sort the cut-ins of paths into shells, by surrogates in this order, and cells; keep a sample of each shell.
+
+    ``seed`` is that of the paths.
+    """
     n_surrogates, n_references = len(library.surrogates), len(library.references)
     rates, mass = paths.rates(n_surrogates), paths.mass
     n = len(rates)
@@ -130,7 +131,7 @@ def pool_of(
     cell_references = kinds & ((1 << n_references) - 1)
     by_reference = by_path @ ((cell_references[:, None] >> np.arange(n_references)) & 1)
     path, step = _keep(mass, shell, n_surrogates + 1, settings)
-    pairs = enumerator.pairs(paths.index[path], step, paths.state[path])
+    script = write_script(seed, paths.index[path], step, paths.state[path], environment)
     asked = np.concatenate([order, n_surrogates + np.arange(n_references)])
     crashes = ((paths.crashes[path, step][:, None] >> asked[None, :]) & 1).astype(np.bool_)
     sample = CutIns(
@@ -138,14 +139,14 @@ def pool_of(
         step,
         cell[path, step],
         paths.state[path],
-        *pairs,
+        *script[:-1],
         crashes,
         by_path[path].astype(np.float32),
-        lead=enumerator.leads(paths.index[path], step),
+        lead=script.lead,
     )
     return Pool(
         key=key,
-        environment=environment,
+        environment=environment_hash(environment),
         library=library,
         names=tuple(np.array(list(library.surrogates))[order].tolist()),
         n_paths=n,

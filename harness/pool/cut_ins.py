@@ -121,11 +121,6 @@ class Pool:
         return found
 
     @property
-    def _reference_error(self) -> FloatArray:
-        """Standard errors of the references' crash rates, shape (R,)."""
-        return np.sqrt(np.maximum(self.reference_square - self.reference_rate**2, 0.0) / self.n_paths)
-
-    @property
     def boundary(self) -> int:
         """Index of the outermost shell that the statement library keeps."""
         return self.names.index(self.library.boundary)
@@ -133,7 +128,10 @@ class Pool:
     def to_json(self) -> dict[str, Any]:
         """What is known of surrogates and shells, as plain content."""
         p = self.shell_p.tolist()
-        columns = self.names, self.mu.tolist(), np.sqrt(np.diag(self.mu_covariance)).tolist(), p[:-1]
+        error = np.sqrt(np.diag(self.mu_covariance))
+        reference_error = np.sqrt(np.maximum(self.reference_square - self.reference_rate**2, 0.0) / self.n_paths)
+        surrogates = zip(self.names, self.mu.tolist(), error.tolist(), p[:-1], strict=True)
+        references = zip(self.library.references, self.reference_rate.tolist(), reference_error.tolist(), strict=True)
         keys = "name", "crash_rate", "std_error", "shell_probability"
         return {
             "pool": self.key,
@@ -143,14 +141,9 @@ class Pool:
             "boundary": self.library.boundary,
             "envelope": self.library.envelope,
             "delays_after_cut_in_s": {} if self.cut_ins.lead.size else self.library.delays_after_cut_in_s,
-            "surrogates": [dict(zip(keys, row, strict=True)) for row in zip(*columns, strict=True)],
+            "surrogates": [dict(zip(keys, row, strict=True)) for row in surrogates],
             "no_surrogate_crashes": p[-1],
-            "references": [
-                {"name": name, "crash_rate": rate, "std_error": error}
-                for name, rate, error in zip(
-                    self.library.references, self.reference_rate.tolist(), self._reference_error.tolist(), strict=True
-                )
-            ],
+            "references": [dict(zip(keys[:-1], row, strict=True)) for row in references],
         }
 
 

@@ -12,19 +12,24 @@ paths the crash rates become known about three times sooner.
 
 from __future__ import annotations
 
+import hashlib
 import math
+from typing import NamedTuple
 
-from harness.arrays import FloatArray, Int8Array, IntArray, RecordArray
+import numpy as np
+
+from harness.arrays import BoolArray, FloatArray, Int8Array, IntArray, RecordArray
 from harness.compiled import compiled_inline, compiled_threads
 from harness.environment.cut_in import cut_in_hazard, opportunity
 from harness.environment.driving import Environment, draw_acceleration, free_driving
-from harness.environment.lateral import LateralMotion, draw_lead
+from harness.environment.lateral import draw_lead
 from harness.episode.trajectory import (
+    Followers,
     Trajectory,
+    empty_trajectory,
     leave,
     state_in,
-    walk_traffic,
-    walk_without_cut_in,
+    walk,
     weigh_cut_ins,
     who_crashes,
 )
@@ -39,179 +44,186 @@ STRIDE = 4
 """Steps between the cut-ins of a path that are asked; `benchmarks.pool_stride` says what other numbers would cost."""
 
 
-@compiled_threads
+class ShadowRuns(NamedTuple):
+    """What vehicles did without a cut-in, on paths (n,); for one that keeps its speed, `HOLDING` (0,).
+
+    ``n_steps``, ``failed`` (n,): steps that are on record, and whether the vehicle failed then. ``x_m``, ``v_mps``
+    (n, steps + 1) are its positions and speeds, undefined beyond.
+    """
+
+    n_steps: IntArray
+    failed: BoolArray
+    x_m: FloatArray
+    v_mps: FloatArray
+
+    def mean_distance_m(self, weight: FloatArray) -> float:
+        """Mean distance that the vehicle drives where nobody cuts in; paths have the ``weight`` (n,)."""
+        whole, rows = ~self.failed, np.arange(len(self.n_steps))
+        distance = self.x_m[rows, self.n_steps] - self.x_m[:, 0]
+        return float((weight * distance)[whole].sum() / weight[whole].sum())
+
+    def digest(self) -> str:
+        """Hash of what is on record."""
+        digest = hashlib.sha256(self.n_steps.tobytes() + self.failed.tobytes())
+        known = np.arange(self.x_m.shape[1]) <= self.n_steps[:, None]
+        for values in (self.x_m, self.v_mps):
+            digest.update(values[known].tobytes())
+        return digest.hexdigest()
+
+
+HOLDING = ShadowRuns(np.zeros(0, np.int64), np.zeros(0, np.bool_), np.zeros((0, 1)), np.zeros((0, 1)))
+
+
+class CutInsOnPaths(NamedTuple):
+    """All cut-ins that are asked of paths: rows are paths, columns steps.
+
+    ``probability`` (n, steps) is ``stride`` · P(BV cuts in in that step | path) where it is asked, else 0: with uniform
+    offsets the sum over any set of cut-ins has its probability as mean. ``crashes`` (n, steps) has one bit per driver.
+    ``unknown`` (n,) is the most that the probability of a cut-in after a failure of the AV can be, wherever it may be
+    then: every wish to change lanes is carried out.
+    """
+
+    probability: FloatArray
+    crashes: IntArray
+    unknown: FloatArray
+
+
+class Script(NamedTuple):
+    """Maneuvers of LV and BV on paths (n,), as an episode records them.
+
+    ``lv``, ``bv`` (n, draws), 31 marking the cut-in; ``n_lv``, ``n_bv`` (n,) how many there are. ``lead`` (n,) is how
+    many steps earlier BV begins to move sideways; (0,) where cut-ins are one step.
+    """
+
+    lv: Int8Array
+    bv: Int8Array
+    n_lv: IntArray
+    n_bv: IntArray
+    lead: IntArray
+
+
 def enumerate_cut_ins(
     seed: int,
-    first: int,
-    states: RecordArray,
+    index: IntArray,
+    state: RecordArray,
     environment: Environment,
-    drivers: RecordArray,
-    envelope: int,
-    stride: int,
-    offset: IntArray,
-    path: Trajectory,
-    probability: FloatArray,
-    crashes: IntArray,
-) -> None:
-    """Every ``stride``-th cut-in of consecutive paths, from index ``first`` and initial ``states`` (n,) on.
+    followers: Followers,
+    runs: ShadowRuns = HOLDING,
+    stride: int = 1,
+    offset: IntArray | None = None,
+) -> CutInsOnPaths:
+    """Every ``stride``-th cut-in of paths, ``index`` and initial ``state`` (n,); ``offset`` (n,) is each one's first.
 
-    Parameters
-    ----------
-    drivers : structured ndarray, shape (D,)
-        At most 62 of them, without inattention; ``envelope`` as in `harness.episode.trajectory.who_crashes`.
-    offset : ndarray of int64, shape (n,)
-        Step of each path's first cut-in that is asked, less than ``stride``.
-    path : Trajectory
-        Room to work in.
-    probability : ndarray, shape (n, steps)
-        Receives ``stride`` · P(BV cuts in in that step | path) where it is asked, else 0. With uniform offsets the sum
-        over any set of cut-ins has its probability as mean.
-    crashes : ndarray of int64, shape (n, steps)
-        Receives one bit per driver.
+    Drivers take over from the AV after the step of the onset.
     """
-    probability[:, :] = 0.0
-    crashes[:, :] = 0
-    for i in range(states.size):
-        steps, _ = walk_without_cut_in(states[i], seed, first + i, environment, path)
-        hazard = 0.0
-        for cut in range(steps):
-            before = hazard
-            hazard += path.hazard[cut]
-            if cut % stride != offset[i] or path.hazard[cut] == 0.0:
-                continue
-            probability[i, cut] = stride * (math.exp(-before) * -math.expm1(-path.hazard[cut]))
-            crashes[i, cut] = who_crashes_after(cut, seed, first + i, drivers, envelope, environment, path)
+    shape = index.size, int(environment.numbers["max_steps"])
+    found = CutInsOnPaths(np.zeros(shape), np.zeros(shape, np.int64), np.zeros(index.size))
+    first = np.zeros(index.size, np.int64) if offset is None else offset
+    _enumerate(seed, index, state, environment, followers, runs, stride, first, empty_trajectory(environment), found)
+    return found
 
 
 @compiled_threads
-def draw_leads(seed: int, indices: IntArray, cuts: IntArray, lateral: LateralMotion, leads: IntArray) -> None:
-    """Leads (steps) of chosen (path, cut-in step) pairs, (n,) each."""
-    for i in range(indices.size):
-        leads[i] = draw_lead(cuts[i], seed, indices[i], lateral)
-
-
-@compiled_inline
-def who_crashes_after(
-    cut: int, seed: int, index: int, drivers: RecordArray, envelope: int, environment: Environment, path: Trajectory
-) -> int:
-    """One bit for each driver that crashes if BV cuts in in a step of a path that has been walked."""
-    max_steps = environment.numbers.max_steps
-    leave(cut, max_steps, seed, index, cut * FREE_DRAWS_PER_CUT_IN, 0, environment, path)
-    if gap(path.x_lv[cut + 1], path.x_after[cut + 1]) < CONTACT_M:
-        return 0  # the episode ends as bv_lv_contact
-    lead = draw_lead(cut, seed, index, environment.lateral)
-    return who_crashes(drivers, envelope, cut, lead, max_steps, environment.lateral, path)
-
-
-@compiled_threads
-def enumerate_recorded(
+def _enumerate(
     seed: int,
-    indices: IntArray,
-    states: RecordArray,
-    n_steps: IntArray,
-    x_av: FloatArray,
-    v_av: FloatArray,
+    index: IntArray,
+    state: RecordArray,
     environment: Environment,
-    drivers: RecordArray,
-    envelope: int,
+    followers: Followers,
+    runs: ShadowRuns,
     stride: int,
     offset: IntArray,
     path: Trajectory,
-    probability: FloatArray,
-    unknown: FloatArray,
-    crashes: IntArray,
+    found: CutInsOnPaths,
 ) -> None:
-    """Cut-ins of chosen paths, ``indices`` and ``states`` (n,), beside an AV whose motion has been recorded.
-
-    Parameters
-    ----------
-    n_steps : ndarray of int64, shape (n,)
-        Steps that are on record; less than the path has where the AV failed.
-    x_av, v_av : ndarray, shape (n, steps + 1)
-        The AV's positions (m) and speeds (m/s).
-    stride, offset, probability, crashes
-        As for `enumerate_cut_ins`. Drivers take over from the AV after the step of the cut-in.
-    unknown : ndarray, shape (n,)
-        Receives the most that the probability of a cut-in after the recorded steps can be, wherever the AV may be then:
-        every wish to change lanes is carried out. It means something where the AV has failed.
-    """
     max_steps = environment.numbers.max_steps
-    probability[:, :] = 0.0
-    crashes[:, :] = 0
-    for i in range(states.size):
-        reach = walk_traffic(states[i], seed, indices[i], max_steps, environment, path)
-        steps = min(n_steps[i], reach)
-        for step in range(steps + 1):
-            path.x_av[step], path.v_av[step] = x_av[i, step], v_av[i, step]
+    for i in range(index.size):
+        if runs.n_steps.size == 0:
+            steps = reach = walk(state[i], seed, index[i], 0, max_steps, True, environment, path)
+        else:
+            reach = walk(state[i], seed, index[i], 0, max_steps, False, environment, path)
+            steps = min(runs.n_steps[i], reach)
+            for step in range(steps + 1):
+                path.x_av[step], path.v_av[step] = runs.x_m[i, step], runs.v_mps[i, step]
         weigh_cut_ins(steps, environment, path)
         hazard = 0.0
         for cut in range(steps):
             if path.hazard[cut] > 0.0 and cut % stride == offset[i]:
-                probability[i, cut] = stride * (math.exp(-hazard) * -math.expm1(-path.hazard[cut]))
-                if drivers.size > 0:
-                    crashes[i, cut] = who_crashes_after(cut, seed, indices[i], drivers, envelope, environment, path)
+                found.probability[i, cut] = stride * (math.exp(-hazard) * -math.expm1(-path.hazard[cut]))
+                if followers.drivers.size > 0:
+                    found.crashes[i, cut] = who_crashes_after(cut, seed, index[i], followers, environment, path)
             hazard += path.hazard[cut]
-        most = 0.0
-        for step in range(steps, reach):
-            most += cut_in_hazard(opportunity(state_in(step, path), environment), 1.0, environment)
-        unknown[i] = math.exp(-hazard) * -math.expm1(-most)
+        if runs.failed.size > 0 and runs.failed[i]:
+            most = 0.0
+            for step in range(steps, reach):
+                most += cut_in_hazard(opportunity(state_in(step, path), environment), 1.0, environment)
+            found.unknown[i] = math.exp(-hazard) * -math.expm1(-most)
 
 
-@compiled_threads
-def write_traffic(
+@compiled_inline
+def who_crashes_after(
+    cut: int, seed: int, index: int, followers: Followers, environment: Environment, path: Trajectory
+) -> int:
+    """One bit for each driver that crashes if BV cuts in in a step of a path that has been walked."""
+    leave(cut, environment.numbers.max_steps, seed, index, cut * FREE_DRAWS_PER_CUT_IN, 0, environment, path)
+    if gap(path.x_lv[cut + 1], path.x_after[cut + 1]) < CONTACT_M:
+        return 0  # the episode ends as bv_lv_contact
+    return who_crashes(followers, cut, draw_lead(cut, seed, index, environment.lateral), environment, path)
+
+
+def write_script(
     seed: int,
-    indices: IntArray,
-    states: RecordArray,
+    index: IntArray,
+    cut: IntArray,
+    state: RecordArray,
     environment: Environment,
-    path: Trajectory,
-    lv: Int8Array,
-    bv: Int8Array,
-) -> None:
-    """Maneuvers of LV and BV on chosen paths, ``indices`` and ``states`` (n,), where nobody cuts in: (n, draws)."""
-    n = environment.numbers
-    for i in range(indices.size):
-        steps = walk_traffic(states[i], seed, indices[i], n.max_steps, environment, path)
-        for m in range((steps - 1) // n.hold_steps + 1):
-            lv[i, m], bv[i, m] = path.lv[m], path.bv[m]
+    draws_per_cut_in: int = FREE_DRAWS_PER_CUT_IN,
+) -> Script:
+    """What LV and BV do on paths, ``index`` and initial ``state`` (n,), with cut-ins in steps ``cut`` (n,), -1: none.
+
+    After a cut-in LV goes on to draw, to the end of the episode. ``draws_per_cut_in`` is 0 for an episode.
+    """
+    room, n = empty_trajectory(environment), index.size
+    lv, bv = np.zeros((2, n, room.lv.size), np.int8)
+    n_lv, n_bv = np.zeros((2, n), np.int64)
+    script = Script(lv, bv, n_lv, n_bv, np.zeros(n if environment.lateral.present else 0, np.int64))
+    _write(seed, index, cut, state, draws_per_cut_in, environment, room, script)
+    return script
 
 
 @compiled_threads
-def write_pairs(
+def _write(
     seed: int,
-    indices: IntArray,
-    cuts: IntArray,
-    states: RecordArray,
+    index: IntArray,
+    cut: IntArray,
+    state: RecordArray,
     draws_per_cut_in: int,
     environment: Environment,
     path: Trajectory,
-    lv: Int8Array,
-    bv: Int8Array,
-    n_lv: IntArray,
-    n_bv: IntArray,
+    script: Script,
 ) -> None:
-    """Maneuvers of chosen (path, cut-in step) pairs, ``indices`` and ``cuts`` (n,), as an episode records them.
-
-    ``lv``, ``bv`` (n, draws) receive them, 31 marking the cut-in; ``n_lv``, ``n_bv`` (n,) how many there are. LV goes
-    on to draw, to the end of the episode. ``draws_per_cut_in`` is `FREE_DRAWS_PER_CUT_IN` for a pool, 0 for an episode.
-    ``path`` is room to work in.
-    """
-    n = environment.numbers
-    for i in range(indices.size):
-        cut = cuts[i]
-        walk_traffic(states[i], seed, indices[i], cut + 1, environment, path)
-        before = cut // n.hold_steps + 1
+    n, lv, bv = environment.numbers, script.lv, script.bv
+    for i in range(index.size):
+        until = cut[i] + 1 if cut[i] >= 0 else n.max_steps
+        steps = walk(state[i], seed, index[i], 0, until, False, environment, path)
+        before = (steps - 1) // n.hold_steps + 1
         for m in range(before):
             lv[i, m], bv[i, m] = path.lv[m], path.bv[m]
+        script.n_lv[i] = script.n_bv[i] = before
+        if cut[i] < 0:
+            continue
         bv[i, before] = CUT_IN
-        drawn = leave(cut, n.max_steps, seed, indices[i], cut * draws_per_cut_in, 0, environment, path)
+        drawn = leave(cut[i], n.max_steps, seed, index[i], cut[i] * draws_per_cut_in, 0, environment, path)
         for m in range(drawn):
             bv[i, before + 1 + m] = path.free[m]
-        n_bv[i] = before + 1 + drawn
-        n_lv[i] = (n.max_steps - 1) // n.hold_steps + 1
+        script.n_bv[i] += 1 + drawn
+        if script.lead.size > 0:
+            script.lead[i] = draw_lead(cut[i], seed, index[i], environment.lateral)
+        script.n_lv[i] = (n.max_steps - 1) // n.hold_steps + 1
         v = path.v[LV]
         for step in range(n.max_steps):
             m = step // n.hold_steps
             if step % n.hold_steps == 0 and m >= before:
-                u = uniform(seed, indices[i], LV_DRAWS, m)
+                u = uniform(seed, index[i], LV_DRAWS, m)
                 lv[i, m] = draw_acceleration(u, free_driving(v, environment), environment)
             v = next_speed(v, acceleration(lv[i, m]))

@@ -16,6 +16,7 @@ from harness.campaign.problems import read_model
 from harness.campaign.section import Section, SurrogateName, broken_rule
 from harness.campaign.testing import ShellSettings, StatementSettings, checked_statements
 from harness.environment.driving import Environment
+from harness.episode.trajectory import Followers
 from harness.errors import CampaignError
 from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT
 from harness.vehicles.models import driver_records
@@ -25,40 +26,32 @@ MOST_SURROGATES = 60
 """Outcomes of a cut-in are bits of one integer."""
 
 
-class LibraryIDM(IDM):
+class _WithReflexes(Section):
+    reaction: Reflexes = Reflexes()
+
+
+class LibraryIDM(_WithReflexes, IDM):
     """An IDM driver with its reflexes."""
 
-    reaction: Reflexes = Reflexes()
 
-
-class LibraryFVDM(FVDM):
+class LibraryFVDM(_WithReflexes, FVDM):
     """An FVDM driver with its reflexes."""
 
-    reaction: Reflexes = Reflexes()
 
-
-class LibraryConstant(Constant):
+class LibraryConstant(_WithReflexes, Constant):
     """A driver that does not react."""
 
-    reaction: Reflexes = Reflexes()
 
-
-class LibraryCarefulCompetent(CarefulCompetent):
+class LibraryCarefulCompetent(_WithReflexes, CarefulCompetent):
     """A careful and competent human driver with its reflexes."""
 
-    reaction: Reflexes = Reflexes()
 
-
-class LibraryFuzzySafety(FuzzySafety):
+class LibraryFuzzySafety(_WithReflexes, FuzzySafety):
     """A driver by the fuzzy safety model with its reflexes."""
 
-    reaction: Reflexes = Reflexes()
 
-
-class LibraryNeedBased(NeedBased):
+class LibraryNeedBased(_WithReflexes, NeedBased):
     """A driver that brakes once it needs to, with its reflexes."""
-
-    reaction: Reflexes = Reflexes()
 
 
 LibraryDriver = Annotated[
@@ -100,9 +93,10 @@ class Library(Section):
         default_factory=dict, description="drivers that the vehicle is compared with; no shell is made of them"
     )
 
-    def drivers_in(self, environment: Environment) -> RecordArray:
-        """The surrogates and then the references as kernels read them, in the order of the file, shape (D + R,)."""
-        return library_records([*self.surrogates.values(), *self.references.values()], environment)
+    def followers_in(self, environment: Environment) -> Followers:
+        """The surrogates and then the references as kernels read them, in the order of the file, D + R of them."""
+        drivers = library_records([*self.surrogates.values(), *self.references.values()], environment)
+        return Followers(drivers, list(self.surrogates).index(self.envelope))
 
     @property
     def n_drivers(self) -> int:

@@ -13,8 +13,9 @@ import pyarrow as pa
 from harness.arrays import BoolArray, FloatArray, IntArray
 from harness.campaign.models import Campaign
 from harness.environment.loading import load_environment
+from harness.episode.trajectory import Followers
 from harness.pool.library import LibraryDriver, library_records
-from harness.pool.surrogate_replay import PATH_COLUMNS, drivers_crash
+from harness.pool.replay import PATH_COLUMNS, drivers_crash
 from harness.records.folder import read_manifest, read_table
 from harness.threads import made_ahead
 
@@ -92,7 +93,7 @@ def replay_drivers(folder: Path, campaign: Campaign, drivers: Sequence[LibraryDr
         Records are missing or damaged.
     """
     environment = load_environment(campaign.environment)
-    records = library_records(drivers, environment)
+    followers = Followers(library_records(drivers, environment))
 
     def replayed(shard: dict[str, Any]) -> list[np.ndarray]:
         table = read_table(folder / shard["files"]["episodes"], _COLUMNS)
@@ -103,7 +104,7 @@ def replay_drivers(folder: Path, campaign: Campaign, drivers: Sequence[LibraryDr
             np.exp(np.asarray(table.column("log_weight"))),
             component if campaign.testing.method == "shells" else np.zeros_like(component),
             outcome == "crash",
-            drivers_crash(table, campaign.seed, environment, records, -1),
+            drivers_crash(table, campaign.seed, environment, followers),
         )
         return [values[outcome != "failed"] for values in columns]
 

@@ -144,7 +144,7 @@ def _refined(
     folder: Path, campaign: Campaign, library: Library, fitted: FittedDriver, to_fit: Observed, to_check: Observed
 ) -> RefinedLadder:
     careless = more_careless(fitted.driver)
-    names = _free_names(library)
+    names = free_names(library)
     drivers: list[LibraryDriver] = [fitted.driver, careless, library.surrogates[library.boundary]]
     replayed = replay_drivers(folder, campaign, drivers).apart_from(to_fit.episode)
     prediction, of_careless, of_boundary = (predict(replayed, driver) for driver in range(3))
@@ -182,7 +182,7 @@ def describe(driver: LibraryIDM) -> str:
     )
 
 
-def _free_names(library: Library) -> tuple[str, str]:
+def free_names(library: Library) -> tuple[str, str]:
     """Names for the two drivers that the library does not have yet."""
     endings = chain([""], (f"-{k}" for k in count(2)))
     pairs = ((f"fitted{ending}", f"fitted{ending}-careless") for ending in endings)
@@ -216,23 +216,12 @@ def _text(refined: RefinedLadder, folder: Path) -> str:
         f"{refined.careless} brakes {100.0 * (1.0 - CARELESS_BRAKING):.0f} % less and "
         f"{CARELESS_DELAY_STEPS / 10.0:g} s later.",
     ]
-    head = [
-        f"format: {library.format}",
-        f"version: {library.version}",
-        f"description: {_line(library.description)}",
-        f"boundary: {library.boundary}",
-        f"assumes: {_line(library.assumes)}",
-        f"statements: {_line({name: each.model_dump() for name, each in library.statements.items()})}",
-        f"envelope: {library.envelope}",
-    ]
-    drivers = ["surrogates:", *_drivers(library.surrogates), "references:", *_drivers(library.references)]
-    if not library.references:
-        drivers[-1] += " {}"
-    return "\n".join([*(f"# {line}".rstrip() for line in comment), "", *head, *drivers, ""])
-
-
-def _drivers(drivers: dict[str, LibraryDriver]) -> list[str]:
-    return [f"  {name}: {_line(model.model_dump(exclude_unset=True))}" for name, model in drivers.items()]
+    content = library.model_dump(exclude={"surrogates", "references"})
+    lines = [f"{key}: {_line(value)}" for key, value in content.items()]
+    for key, drivers in (("surrogates", library.surrogates), ("references", library.references)):
+        lines.append(f"{key}:" if drivers else f"{key}: {{}}")
+        lines += [f"  {name}: {_line(model.model_dump(exclude_unset=True))}" for name, model in drivers.items()]
+    return "\n".join([*(f"# {line}".rstrip() for line in comment), "", *lines, ""])
 
 
 def _line(value: Any) -> str:

@@ -10,14 +10,19 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from harness.arrays import FloatArray, Int8Array, IntArray, RecordArray
+import numpy as np
+import pyarrow as pa
+
+from harness.arrays import BoolArray, FloatArray, Int8Array, IntArray, RecordArray
 from harness.compiled import compiled_inline, compiled_threads
 from harness.environment.driving import Environment
-from harness.environment.lateral import onset_of, perceived_in
+from harness.environment.lateral import onset_of
 from harness.episode.trajectory import (
     NO_CRASH,
     WAS_AHEAD,
+    Followers,
     Trajectory,
+    empty_trajectory,
     end_in,
     follow,
     leave,
@@ -25,9 +30,20 @@ from harness.episode.trajectory import (
     walk,
     who_crashes,
 )
+from harness.errors import CampaignError, RunFolderError
 from harness.maneuvers import CUT_IN
 from harness.outcomes import BV_LV_CONTACT, CRASH, FAILED, PASSED, RUNNING, TIMEOUT
+from harness.pool.cut_ins import Pool, environment_hash
+from harness.records.folder import MEND_SHARD
+from harness.resolved import Resolved
+from harness.state import STATE_COLUMNS, states_from
+from harness.strata import KnownRates
 from harness.vehicles.reaction import reaction_steps
+
+PATH_COLUMNS = ("episode", *STATE_COLUMNS, "n_steps", "cut_in_step", "lv_maneuvers", "bv_maneuvers")
+"""What of the episodes table determines LV's and BV's motion."""
+LEAD = "lead_steps"
+"""And since when BV shows what it will do, where cut-ins take time."""
 
 
 class StoredPaths(NamedTuple):
@@ -49,6 +65,35 @@ class StoredPaths(NamedTuple):
     bv: Int8Array
     bv_begin: IntArray
     lead: IntArray
+
+
+def stored_paths(episodes: pa.Table, seed: int) -> StoredPaths:
+    """Initial states and maneuvers of consecutive rows of the episodes table; needs `PATH_COLUMNS`."""
+    return StoredPaths(
+        seed,
+        int(episodes.column("episode")[0].as_py()),
+        states_from(np.asarray(episodes.column(name)) for name in STATE_COLUMNS),
+        np.asarray(episodes.column("n_steps")).astype(np.int64),
+        np.asarray(episodes.column("cut_in_step").fill_null(-1)).astype(np.int64),
+        *_lists(episodes.column("lv_maneuvers")),
+        *_lists(episodes.column("bv_maneuvers")),
+        _leads(episodes),
+    )
+
+
+def _leads(episodes: pa.Table) -> IntArray:
+    """Leads (steps) of the cut-ins, shape (n,); zero where those were one step."""
+    if LEAD not in episodes.column_names:
+        return np.zeros(episodes.num_rows, np.int64)
+    return np.asarray(episodes.column(LEAD).fill_null(0)).astype(np.int64)
+
+
+def _lists(column: pa.ChunkedArray) -> tuple[Int8Array, IntArray]:
+    """All entries of a list column one after another, and where each row begins, with the end (n + 1,)."""
+    lists = column.combine_chunks()
+    lengths = np.asarray(lists.value_lengths()).astype(np.int64)
+    values = np.array(lists.flatten(), dtype=np.int8)  # a copy: Arrow's own memory is read-only
+    return values, np.concatenate([[0], np.cumsum(lengths)])
 
 
 class Retraced(NamedTuple):
@@ -77,7 +122,7 @@ def approach(i: int, until: int, stored: StoredPaths, environment: Environment, 
     for m in range(known):
         path.lv[m], path.bv[m] = stored.lv[lv + m], stored.bv[bv + m]
     reach = min(until, known * environment.numbers.hold_steps, environment.numbers.max_steps)
-    step = walk(stored.state[i], stored.seed, stored.first + i, known, reach, environment, path)
+    step = walk(stored.state[i], stored.seed, stored.first + i, known, reach, True, environment, path)
     decided = end_in(step, path)
     return FAILED if decided == RUNNING and step < until else decided, step
 
@@ -117,14 +162,13 @@ def retrace_episode(
     max_steps = environment.numbers.max_steps
     cut, end = stored.cut_step[i], min(stored.n_steps[i], max_steps)
     lead = stored.lead[i]
-    onset = onset_of(cut, lead)
     twin.onset_r2[i] = twin.onset_r2dot[i] = twin.impact[i] = float("nan")
     if cut < 0 or cut >= end:
         twin.outcome[i], twin.n_steps[i] = approach(i, end, stored, environment, path)
     else:
         twin.outcome[i], twin.n_steps[i] = approach_cut_in(i, stored, environment, path)
     if 0 <= cut <= twin.n_steps[i]:
-        state = state_in(onset, path)
+        state = state_in(onset_of(cut, lead), path)
         twin.onset_r2[i], twin.onset_r2dot[i] = state.r2_m, state.r2dot_mps
     if twin.outcome[i] != RUNNING:
         return
@@ -138,9 +182,7 @@ def retrace_episode(
         return
     if driver.size > 0:
         late = reaction_steps(driver[0], stored.seed, stored.first + i)
-        first, earlier = perceived_in(driver[0].perceives_lateral_m, cut, lead, environment.lateral.distance_m)
-        used_up = driver[0].used_up_steps + earlier
-        crash, speed = follow(driver[0], first + late, used_up, cut, onset, end, False, path)
+        crash, speed = follow(driver[0], late, cut, lead, end, False, environment, path)
         if crash == WAS_AHEAD:
             twin.outcome[i], twin.n_steps[i] = PASSED, cut + 1
         elif crash != NO_CRASH:
@@ -167,14 +209,12 @@ def retrace(
 def replay_surrogates(
     stored: StoredPaths,
     environment: Environment,
-    drivers: RecordArray,
-    envelope: int,
+    followers: Followers,
     path: Trajectory,
     crashes: IntArray,
 ) -> int:
-    """Which surrogates would have crashed in each stored episode of an AV that keeps its speed until the cut-in.
+    """Which drivers would have crashed in each stored episode of an AV that keeps its speed until the cut-in.
 
-    ``drivers`` (D,) are at most 62, without inattention; ``envelope`` as in `harness.episode.trajectory.who_crashes`.
     ``crashes`` (n,) receives one bit per driver, none without a cut-in; ``path`` is room to work in. Returns the row
     of the first episode whose maneuvers do not fit its steps, or -1.
     """
@@ -189,5 +229,65 @@ def replay_surrogates(
             continue
         if decided != RUNNING or not leave_stored(i, max_steps, stored, environment, path):
             return i
-        crashes[i] = who_crashes(drivers, envelope, cut, stored.lead[i], max_steps, environment.lateral, path)
+        crashes[i] = who_crashes(followers, cut, stored.lead[i], environment, path)
     return -1
+
+
+def drivers_crash(episodes: pa.Table, seed: int, environment: Environment, followers: Followers) -> BoolArray:
+    """Which drivers (D,) would have crashed in the place of the AV, shape (n, D).
+
+    ``episodes`` are consecutive rows of the episodes table, with `PATH_COLUMNS`; ``seed`` is that of the campaign.
+
+    Raises
+    ------
+    RunFolderError
+        An episode's maneuvers do not fit its steps.
+    """
+    stored = stored_paths(episodes, seed)
+    bits = np.zeros(episodes.num_rows, np.int64)
+    wrong = replay_surrogates(stored, environment, followers, empty_trajectory(environment), bits)
+    if wrong >= 0:
+        raise RunFolderError(
+            f"episodes, episode {stored.first + wrong}",
+            found=f"maneuvers that do not lead to a cut-in in step {stored.cut_step[wrong]}",
+            expected="the maneuvers that were driven: they determine the episode",
+            mend=MEND_SHARD,
+        )
+    found: BoolArray = ((bits[:, None] >> np.arange(followers.drivers.size)) & 1).astype(np.bool_)
+    return found
+
+
+class SurrogateReplay:
+    """The surrogates of a pool, in the place of a campaign's AV.
+
+    Raises
+    ------
+    CampaignError
+        The pool is of another environment.
+
+    Attributes
+    ----------
+    known : KnownRates
+    columns : tuple of str
+        What of the episodes table it needs.
+    """
+
+    def __init__(self, resolved: Resolved, pool: Pool) -> None:
+        self._environment, self._seed = resolved.environment, resolved.campaign.seed
+        if pool.environment != (own := environment_hash(self._environment)):
+            raise CampaignError(
+                "pool",
+                found=f"a pool of another environment ({pool.environment})",
+                expected=f"one of the campaign's ({own}): crash rates of surrogates depend on traffic, level of lane "
+                "changing and hold time",
+                mend="Leave the pool out: the right one is built, which takes about 15 s.",
+            )
+        self.known = KnownRates(pool.key, pool.names, pool.mu, pool.mu_covariance, pool.p_cut_in_at_crash)
+        self.columns = (*PATH_COLUMNS, *((LEAD,) if self._environment.lateral.present else ()))
+        names = list(pool.library.surrogates)
+        self._followers = pool.library.followers_in(resolved.environment)
+        self._order = [names.index(name) for name in pool.names]
+
+    def crashes(self, episodes: pa.Table) -> BoolArray:
+        """Which surrogates would have crashed, shape (n, D), in the order of ``known.names``; see `drivers_crash`."""
+        return drivers_crash(episodes, self._seed, self._environment, self._followers)[:, self._order]

@@ -13,15 +13,14 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from harness.arrays import IntArray
-from harness.campaign.models import PoolSettings
 from harness.compiled import WORLD_SOURCES, cache_root, source_hash
-from harness.environment.driving import Environment
 from harness.errors import RunFolderError
 from harness.pool.build import build_pool
 from harness.pool.cut_ins import CutIns, Pool, environment_hash
 from harness.pool.library import Library
 from harness.progress import Progress
 from harness.records.folder import require_place, write_atomically
+from harness.records.tables import prefixes, rows
 from harness.resolved import Resolved
 from harness.state import STATE_COLUMNS, states_from
 
@@ -32,17 +31,18 @@ _MADE_BY = ("aimed_paths.py", "build.py", "cut_ins.py")
 _METADATA, _DIGEST = b"harness_pool", b"harness_pool_sha256"
 
 
-def pool_key(environment: Environment, library: Library, settings: PoolSettings) -> str:
+def campaign_pool_key(resolved: Resolved) -> str:
     """Hash of all that a pool depends on: environment, level of lane changing, library, settings, and code."""
+    library = resolved.library
     content = [
         _FORMAT,
         source_hash(WORLD_SOURCES),
         *(hashlib.sha256((Path(__file__).parent / name).read_bytes()).hexdigest() for name in _MADE_BY),
-        environment_hash(environment),
+        environment_hash(resolved.environment),
         {name: model.model_dump() for name, model in library.surrogates.items()},
         [(name, model.model_dump()) for name, model in library.references.items()],
         [sorted(library.boundaries), library.boundary, library.envelope],
-        settings.model_dump(exclude={"library", "shadow_paths"}),
+        resolved.campaign.pool.model_dump(exclude={"library", "shadow_paths"}),
     ]
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:24]
 
@@ -50,11 +50,6 @@ def pool_key(environment: Environment, library: Library, settings: PoolSettings)
 def pool_path(key: str) -> Path:
     """Where a pool is cached."""
     return cache_root() / "pools" / f"{key}.parquet"
-
-
-def campaign_pool_key(resolved: Resolved) -> str:
-    """Key of the pool that belongs to a campaign's environment and library."""
-    return pool_key(resolved.environment, resolved.library, resolved.campaign.pool)
 
 
 def campaign_pool(resolved: Resolved, progress: Progress | None = None) -> Pool:
@@ -75,20 +70,14 @@ def campaign_pool(resolved: Resolved, progress: Progress | None = None) -> Pool:
 
 
 def cached_pool(resolved: Resolved) -> Pool | None:
-    """The pool of a campaign if it has been built on this machine, else None."""
-    cached = _cached(campaign_pool_key(resolved))
-    # The key does not hold the words of statements: they are those of today.
-    return None if cached is None else replace(cached, library=resolved.library)
-
-
-def _cached(key: str) -> Pool | None:
-    """The pool kept under a key; None if there is none, or the file is damaged or of another key."""
-    path = pool_path(key)
+    """The pool of a campaign; None if none has been built on this machine, or its file is damaged or another's."""
+    key = campaign_pool_key(resolved)
     try:
-        pool = read_pool(path) if path.is_file() else None
+        pool = read_pool(pool_path(key)) if pool_path(key).is_file() else None
     except RunFolderError:
         return None
-    return pool if pool is not None and pool.key == key else None
+    # The key does not hold the words of statements: they are those of today.
+    return replace(pool, library=resolved.library) if pool is not None and pool.key == key else None
 
 
 def write_pool(path: Path, pool: Pool) -> None:
@@ -108,7 +97,7 @@ def read_pool(path: Path) -> Pool:
     try:
         with pq.ParquetFile(path) as file:  # read_table would import, for 0.3 s, what reads folders
             table = file.read()
-        return _pool(table, _sound_facts(table))
+        return _pool(table, sound_facts(table))
     except (OSError, pa.ArrowException, KeyError, TypeError, ValueError) as error:
         raise RunFolderError(
             str(path),
@@ -118,7 +107,20 @@ def read_pool(path: Path) -> Pool:
         ) from error
 
 
-def _sound_facts(table: pa.Table) -> dict[str, Any]:
+def stamped(table: pa.Table, facts: dict[str, Any]) -> pa.Table:
+    """The table with facts, and a hash of both: Parquet notices a truncated file, but hardly any flipped bit."""
+    known = json.dumps({"format": _FORMAT, **facts}).encode()
+    return table.replace_schema_metadata({_METADATA: known, _DIGEST: _digest(table, known)})
+
+
+def sound_facts(table: pa.Table) -> dict[str, Any]:
+    """The facts of a `stamped` table.
+
+    Raises
+    ------
+    KeyError, TypeError, ValueError
+        It is none of this version, or its content has changed.
+    """
     metadata = table.schema.metadata or {}
     facts: dict[str, Any] = json.loads(metadata[_METADATA])
     if facts["format"] != _FORMAT:
@@ -129,7 +131,6 @@ def _sound_facts(table: pa.Table) -> dict[str, Any]:
 
 
 def _digest(table: pa.Table, facts: bytes) -> str:
-    """Hash of all that a pool says: Parquet notices a truncated file, but hardly any flipped bit."""
     digest = hashlib.sha256(facts)
     for column in table.columns:
         array = column.combine_chunks()
@@ -151,68 +152,58 @@ def _table(pool: Pool) -> pa.Table:
         "shell": (pa.array(pool.shell.astype(np.int8)), "first surrogate that crashes; the last shell: none does"),
         "cell": (pa.array(c.cell.astype(np.int16)), "shell and references that crash, as the metadata lists cells"),
         "crashes": (
-            pa.FixedSizeListArray.from_arrays(pa.array(c.crashes.ravel()), c.crashes.shape[1]),
+            rows(c.crashes),
             "which surrogates crash, in the order of the metadata's names, and which references",
         ),
         "path_mass": (
-            pa.FixedSizeListArray.from_arrays(pa.array(c.path_mass.ravel()), c.path_mass.shape[1]),
+            rows(c.path_mass),
             "P of a cut-in of each cell on the same path, times naturalistic over proposal density of the path",
         ),
-        "lv_maneuvers": (_lists(c.lv, c.n_lv), "LV's draws, one per hold period"),
-        "bv_maneuvers": (_lists(c.bv, c.n_bv), "BV's draws; 31 marks the cut-in"),
+        "lv_maneuvers": (prefixes(c.lv, c.n_lv), "LV's draws, one per hold period"),
+        "bv_maneuvers": (prefixes(c.bv, c.n_bv), "BV's draws; 31 marks the cut-in"),
     }
     if c.lead.size:
         columns["lead_steps"] = pa.array(c.lead.astype(np.int16)), "steps from the onset of lateral motion to overlap"
     schema = pa.schema(
         [pa.field(name, array.type, nullable=False, metadata={"doc": doc}) for name, (array, doc) in columns.items()]
     )
-    table, facts = pa.table([array for array, _ in columns.values()], schema=schema), json.dumps(_facts(pool)).encode()
-    return table.replace_schema_metadata({_METADATA: facts, _DIGEST: _digest(table, facts)})
-
-
-def _facts(pool: Pool) -> dict[str, Any]:
     known = {each.name: getattr(pool, each.name) for each in fields(pool) if each.name not in ("library", "cut_ins")}
     plain = {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in known.items()}
-    return {"format": _FORMAT, "library": pool.library.model_dump(), **plain}
+    table = pa.table([array for array, _ in columns.values()], schema=schema)
+    return stamped(table, {"library": pool.library.model_dump(), **plain})
 
 
-def _lists(values: np.ndarray, lengths: IntArray) -> pa.Array:
-    used = np.arange(values.shape[1]) < lengths[:, None]
-    offsets = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32)
-    return pa.ListArray.from_arrays(pa.array(offsets), pa.array(values[used]))
-
-
-def _padded(column: pa.ChunkedArray, width: int) -> tuple[np.ndarray, IntArray]:
+def padded(column: pa.ChunkedArray, width: int) -> tuple[np.ndarray, IntArray]:
+    """Lists (n,) as rows of zeros beyond their lengths, shape (n, width), and their lengths (n,)."""
     lists = column.combine_chunks()
-    lengths = np.asarray(lists.value_lengths()).astype(np.int64)
-    values = np.zeros((len(lists), width), np.int8)
-    values[np.arange(width) < lengths[:, None]] = np.asarray(lists.flatten())
+    lengths, flat = np.asarray(lists.value_lengths()).astype(np.int64), np.asarray(lists.flatten())
+    values = np.zeros((len(lists), width), flat.dtype)
+    values[np.arange(width) < lengths[:, None]] = flat
     return values, lengths
 
 
 def _pool(table: pa.Table, facts: dict[str, Any]) -> Pool:
-    bv_column = table.column("bv_maneuvers")
-    width = int(np.asarray(bv_column.combine_chunks().value_lengths()).max(initial=0))
-    lv, n_lv = _padded(table.column("lv_maneuvers"), width)
-    bv, n_bv = _padded(bv_column, width)
-    crashes, mass = (
-        table.column(name).combine_chunks().flatten().to_numpy(zero_copy_only=False)
-        for name in ("crashes", "path_mass")
-    )
+    def whole(name: str) -> IntArray:
+        return np.asarray(table.column(name)).astype(np.int64)
+
+    def matrix(name: str) -> np.ndarray:
+        values = table.column(name).combine_chunks().flatten().to_numpy(zero_copy_only=False)
+        return np.asarray(values).reshape(table.num_rows, -1)
+
+    width = int(np.asarray(table.column("bv_maneuvers").combine_chunks().value_lengths()).max(initial=0))
+    (lv, n_lv), (bv, n_bv) = (padded(table.column(name), width) for name in ("lv_maneuvers", "bv_maneuvers"))
     cut_ins = CutIns(
-        path=np.asarray(table.column("path")),
-        step=np.asarray(table.column("cut_in_step")).astype(np.int64),
-        cell=np.asarray(table.column("cell")).astype(np.int64),
+        path=whole("path"),
+        step=whole("cut_in_step"),
+        cell=whole("cell"),
         state=states_from(np.asarray(table.column(name)) for name in STATE_COLUMNS),
         lv=lv,
         bv=bv,
         n_lv=n_lv,
         n_bv=n_bv,
-        crashes=np.asarray(crashes).reshape(table.num_rows, -1),
-        path_mass=np.asarray(mass).reshape(table.num_rows, -1),
-        lead=np.asarray(table.column("lead_steps")).astype(np.int64)
-        if "lead_steps" in table.column_names
-        else np.zeros(0, np.int64),
+        crashes=matrix("crashes"),
+        path_mass=matrix("path_mass"),
+        lead=whole("lead_steps") if "lead_steps" in table.column_names else np.zeros(0, np.int64),
     )
     known: dict[str, Any] = {
         name: np.array(value) if isinstance(value, list) else value for name, value in facts.items()

@@ -36,8 +36,8 @@ def _nullable(values: FloatArray) -> pa.Array:
     return pa.array(values, mask=~np.isfinite(values))
 
 
-def _rows(values: FloatArray) -> pa.Array:
-    """List column of one float64 per importance function or surrogate."""
+def rows(values: np.ndarray) -> pa.Array:
+    """List column of the rows of a matrix."""
     n, width = values.shape
     flat = pa.array(np.ascontiguousarray(values).ravel())
     if width:
@@ -45,7 +45,7 @@ def _rows(values: FloatArray) -> pa.Array:
     return pa.ListArray.from_arrays(pa.array(np.zeros(n + 1, np.int32)), flat)
 
 
-def _prefixes(values: Int8Array, lengths: FloatArray) -> pa.Array:
+def prefixes(values: Int8Array, lengths: IntArray) -> pa.Array:
     """List column of the first ``lengths[i]`` entries of each row."""
     used = np.arange(values.shape[1]) < lengths[:, None]
     offsets = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32)
@@ -72,17 +72,17 @@ def episodes_table(shard: Shard, seed: int) -> pa.Table:
         "cut_in_step": pa.array(e["cut_in_step"], mask=never),
         "log_weight": pa.array(e["log_weight"]),
         "av_distance_m": pa.array(e["av_distance_m"]),
-        "log_q": _rows(shard.results.log_q),
-        "martingale": _rows(shard.results.martingale),
-        "lv_maneuvers": _prefixes(shard.results.lv_path, e["n_lv"].astype(np.int64)),
-        "bv_maneuvers": _prefixes(shard.results.bv_path, e["n_bv"].astype(np.int64)),
+        "log_q": rows(shard.results.log_q),
+        "martingale": rows(shard.results.martingale),
+        "lv_maneuvers": prefixes(shard.results.lv_path, e["n_lv"].astype(np.int64)),
+        "bv_maneuvers": prefixes(shard.results.bv_path, e["n_bv"].astype(np.int64)),
         "failure": pa.array([shard.failures.get(row) for row in range(n)], pa.string()),
     }
     if prescribed is None:
         columns["pool_cut_in"] = pa.nulls(n, pa.int64())
     else:
         columns["pool_cut_in"], columns["cell"] = pa.array(prescribed.row), pa.array(prescribed.cell.astype(np.int16))
-        columns["cell_mass"] = _rows(prescribed.cell_mass)
+        columns["cell_mass"] = rows(prescribed.cell_mass)
         columns["ahead_step"] = pa.array(e["ahead_step"], mask=e["ahead_step"] < 0)
     for name in ("n_steps", "n_control_steps", "component"):
         columns[name] = pa.array(e[name])
@@ -120,7 +120,7 @@ def moments_table(shard: Shard) -> pa.Table:
     order = np.lexsort((m["step"], m["row"]))
     m, q, v = m[order], shard.results.moment_q[:used][order], shard.results.moment_v[:used][order]
     schema = moments_schema(q.shape[1])
-    columns = {"episode": pa.array(shard.first_episode + m["row"]), "q": _rows(q), "v": _rows(v)}
+    columns = {"episode": pa.array(shard.first_episode + m["row"]), "q": rows(q), "v": rows(v)}
     for name in schema.names:
         if name not in columns:
             columns[name] = pa.array(np.ascontiguousarray(m[name]))
@@ -182,8 +182,8 @@ def shadow_table(shard: Shard, path: IntArray, weight: FloatArray) -> pa.Table:
         **{name: pa.array(np.ascontiguousarray(shard.states[name])) for name in STATE_COLUMNS},
         "outcome": _names(e["outcome"], OUTCOMES),
         "n_steps": pa.array(e["n_steps"]),
-        "lv_maneuvers": _prefixes(shard.results.lv_path, e["n_lv"].astype(np.int64)),
-        "bv_maneuvers": _prefixes(shard.results.bv_path, e["n_bv"].astype(np.int64)),
+        "lv_maneuvers": prefixes(shard.results.lv_path, e["n_lv"].astype(np.int64)),
+        "bv_maneuvers": prefixes(shard.results.bv_path, e["n_bv"].astype(np.int64)),
         "av_position_m": pa.array([shard.traces[row][:, AV, 0] for row in range(n)], pa.list_(pa.float64())),
         "av_speed_mps": pa.array([shard.traces[row][:, AV, 1] for row in range(n)], pa.list_(pa.float64())),
         "failure": pa.array([shard.failures.get(row) for row in range(n)], pa.string()),

@@ -17,9 +17,9 @@ import pyarrow as pa
 from harness.campaign.models import Campaign
 from harness.errors import RunFolderError
 from harness.methods import SAMPLING
-from harness.pool.shadow_paths import ShadowPaths
+from harness.pool.enumeration import ShadowRuns
 from harness.pool.shells import PrescribedEpisodes
-from harness.pool.vehicle_pool import ShadowRuns
+from harness.pool.vehicle_pool import ShadowPaths
 from harness.progress import Progress, SilentProgress
 from harness.records.folder import (
     SHELLS,

@@ -19,10 +19,10 @@ from harness.episode.trajectory import empty_trajectory, mean_test_distance
 from harness.errors import RunFolderError
 from harness.importance.build import build_importance, needs_tables
 from harness.outcomes import SHELLS as PRESCRIBED
-from harness.pool.shadow_paths import ShadowPaths, campaign_shadow_paths, shadow_paths_file
+from harness.pool.enumeration import ShadowRuns
 from harness.pool.shells import PrescribedEpisodes, checked_boundary
 from harness.pool.storage import campaign_pool, campaign_pool_key, pool_path
-from harness.pool.vehicle_pool import ShadowRuns, vehicle_pool
+from harness.pool.vehicle_pool import ShadowPaths, campaign_shadow_paths, shadow_paths_file, vehicle_pool
 from harness.progress import Progress, SilentProgress
 from harness.records.folder import SHELLS, read_json
 from harness.resolved import Resolved, resolve

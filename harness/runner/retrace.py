@@ -16,8 +16,7 @@ from harness.arrays import BoolArray, FloatArray, IntArray
 from harness.episode.trajectory import empty_trajectory
 from harness.errors import WorldDisagreementError
 from harness.outcomes import CRASH, FAILED, OUTCOMES, RUNNING
-from harness.pool.replay import Retraced, StoredPaths, retrace
-from harness.pool.surrogate_replay import stored_paths
+from harness.pool.replay import Retraced, StoredPaths, retrace, stored_paths
 from harness.resolved import Resolved
 from harness.vehicles.kinematics import STEP_S
 

@@ -16,23 +16,23 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from harness.arrays import FloatArray, Int8Array, IntArray, RecordArray
+from harness.arrays import IntArray, RecordArray
 from harness.environment.driving import Environment
 from harness.episode.begin import CUT_IN_DRAW
 from harness.episode.cells import PrescribedTraffic, drawn_traffic
 from harness.episode.loop import EpisodeLoop, Keep, Shard
 from harness.episode.motion import motion_hashes
-from harness.episode.trajectory import empty_trajectory
+from harness.episode.trajectory import Followers
 from harness.errors import RunFolderError
 from harness.outcomes import AV, FAILED
 from harness.pool.cut_ins import onset_steps
-from harness.pool.enumeration import draw_leads, write_pairs
-from harness.pool.shadow_paths import ShadowPaths, traffic_without_cut_in
-from harness.pool.vehicle_pool import ShadowRuns, recorded_cut_ins
+from harness.pool.enumeration import ShadowRuns, enumerate_cut_ins, write_script
+from harness.pool.storage import padded
+from harness.pool.vehicle_pool import ShadowPaths
 from harness.random_stream import CUT_IN, uniforms
 from harness.records.folder import COMPRESSION, read_table
 from harness.records.tables import shadow_table
-from harness.vehicles.models import DRIVER_DTYPE
+from harness.vehicles.models import driver_records
 
 SHADOW = "shadow"
 """Folder of the shadow runs within a run folder."""
@@ -130,24 +130,20 @@ def as_recorded(tables: list[pa.Table], environment: Environment) -> ShadowRuns:
     width = int(environment.numbers["max_steps"]) + 1
     n_steps = table.column("n_steps").to_numpy().astype(np.int64)
     failed = np.asarray(pc.equal(table.column("outcome").cast(pa.string()), "failed"))
-    motion = (_padded(table.column(name), n_steps, width) for name in ("av_position_m", "av_speed_mps"))
+    motion = (padded(table.column(name), width)[0] for name in ("av_position_m", "av_speed_mps"))
     return ShadowRuns(n_steps, failed, *motion)
 
 
-def _padded(column: pa.ChunkedArray, n_steps: IntArray, width: int) -> FloatArray:
-    values = np.zeros((len(column), width))
-    values[np.arange(width) <= n_steps[:, None]] = column.combine_chunks().flatten().to_numpy()
-    return values
 
 
 def without_cut_in(
     loop: EpisodeLoop, seed: int, first: int, index: IntArray, state: RecordArray, environment: Environment
 ) -> Shard:
     """Drive the loop's vehicle along paths (n,) on which nobody cuts in; the first is its episode ``first``."""
-    lv, bv = traffic_without_cut_in(seed, index, state, environment)
     none = np.full(len(index), -1, np.int64)
-    script = drawn_traffic()._replace(lv=lv, bv=bv, cut_step=none, stratum=none, log_weight=np.zeros(len(index)))
-    return loop.beside(keep=ALL_MOTION).run(first, state, script)
+    lv, bv, *_ = write_script(seed, index, none, state, environment)
+    traffic = drawn_traffic()._replace(lv=lv, bv=bv, cut_step=none, stratum=none, log_weight=np.zeros(len(index)))
+    return loop.beside(keep=ALL_MOTION).run(first, state, traffic)
 
 
 def forced_traffic(
@@ -168,32 +164,16 @@ def _forced(
 ) -> PrescribedTraffic:
     n, index = len(state), first + np.arange(len(state))
     runs = recorded(without_cut_in(loop, seed, first, index, state, environment), environment)
-    nobody = np.zeros(0, DRIVER_DTYPE), -1
-    probability, _, unknown = recorded_cut_ins(runs, seed, index, state, environment, *nobody)
+    nobody = Followers(driver_records([]))
+    probability, _, unknown = enumerate_cut_ins(seed, index, state, environment, nobody, runs)
     cumulative = np.cumsum(probability, axis=1)
     p_cut_in = cumulative[:, -1]
     u = uniforms(seed, first, n, CUT_IN, CUT_IN_DRAW + 1)[:, CUT_IN_DRAW]
     step = np.minimum((cumulative <= (u * p_cut_in)[:, None]).sum(1), (cumulative < p_cut_in[:, None]).sum(1))
-    lv, bv = traffic_without_cut_in(seed, index, state, environment)
-    went = np.flatnonzero(~runs.failed)
-    lv[went], bv[went] = _with_cut_in(seed, index[went], step[went], state[went], environment)
-    lead = np.zeros(n if environment.lateral.present else 0, np.int64)
-    if lead.size:
-        draw_leads(seed, index, step, environment.lateral, lead)
-    motion = motion_hashes(runs.x_m, runs.v_mps)[np.arange(n), onset_steps(step, lead)]
     step[runs.failed] = -1
+    lv, bv, _, _, lead = write_script(seed, index, step, state, environment, draws_per_cut_in=0)
+    motion = motion_hashes(runs.x_m, runs.v_mps)[np.arange(n), onset_steps(step, lead)]
     return PrescribedTraffic(lv, bv, step, np.full(n, -1), np.log(p_cut_in + unknown), index, motion, lead)
-
-
-def _with_cut_in(
-    seed: int, index: IntArray, step: IntArray, state: RecordArray, environment: Environment
-) -> tuple[Int8Array, Int8Array]:
-    """Maneuvers of LV and BV on paths (n,) with a cut-in in given steps, (n, draws) each."""
-    room = empty_trajectory(environment)
-    lv, bv = np.zeros((2, index.size, room.lv.size), np.int8)
-    n_lv, n_bv = np.zeros((2, index.size), np.int64)
-    write_pairs(seed, index, step, state, 0, environment, room, lv, bv, n_lv, n_bv)
-    return lv, bv
 
 
 def recorded(shard: Shard, environment: Environment) -> ShadowRuns:

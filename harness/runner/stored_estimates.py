@@ -18,8 +18,8 @@ from harness.estimators.from_records import EPISODE_COLUMNS, MOMENT_COLUMNS, SHE
 from harness.estimators.one_pass import SPACING
 from harness.importance.build import importance_names, mixture_weights
 from harness.methods import EstimatorName
+from harness.pool.replay import PATH_COLUMNS, SurrogateReplay
 from harness.pool.storage import cached_pool, read_pool
-from harness.pool.surrogate_replay import PATH_COLUMNS, SurrogateReplay
 from harness.records.folder import SHELLS, concatenated, no_episodes, read_json, read_manifest, require_schema
 from harness.records.reader import read_shard, require_whole, stored_columns
 from harness.records.stored_manifest import StoredShells

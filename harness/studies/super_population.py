@@ -21,6 +21,7 @@ from harness.arrays import BoolArray, FloatArray, IntArray, RecordArray
 from harness.campaign.models import AutomatedVehicle, BuiltInParameters, Reflexes
 from harness.compiled import WORLD_SOURCES, cache_root, source_hash
 from harness.environment.driving import Environment
+from harness.episode.trajectory import Followers
 from harness.errors import CampaignError
 from harness.pool.aimed_paths import PILOT_PATHS, Enumerator
 from harness.pool.cut_ins import environment_hash
@@ -148,7 +149,7 @@ def enumerate_paths(
     environment: Environment, drivers: Drivers, seed: int, n_paths: int, progress: Progress
 ) -> SuperPopulation:
     """Enumerate paths that are aimed at the drivers' crashes, or read them from the cache."""
-    asked = environment, drivers.records, drivers.envelope, seed
+    asked = environment, Followers(drivers.records, drivers.envelope), seed
 
     def enumerated() -> SuperPopulation:
         pilot = Enumerator(*asked)
@@ -156,7 +157,7 @@ def enumerate_paths(
         rates = pilot.run(0, PILOT_PATHS, progress).rates(drivers.records.size)
         return _compressed(pilot.aimed(rates), n_paths, progress)
 
-    return cached(population_key(environment, drivers.records.tolist(), *asked[2:], n_paths), enumerated)
+    return cached(population_key(environment, drivers.records.tolist(), drivers.envelope, seed, n_paths), enumerated)
 
 
 def cached(key: str, make: Callable[[], SuperPopulation]) -> SuperPopulation:

@@ -25,11 +25,9 @@ from harness.errors import HarnessError
 from harness.importance.build import build_importance
 from harness.outcomes import CRASH
 from harness.outcomes import SHELLS as PRESCRIBED
-from harness.pool.aimed_paths import Enumerator
 from harness.pool.cut_ins import onset_steps
-from harness.pool.enumeration import STRIDE
-from harness.pool.shadow_paths import CANDIDATES, ShadowPaths, choose_paths
-from harness.pool.vehicle_pool import ShadowRuns, recorded_cut_ins
+from harness.pool.enumeration import STRIDE, ShadowRuns, enumerate_cut_ins, write_script
+from harness.pool.vehicle_pool import CANDIDATES, ShadowPaths, walk_candidates
 from harness.progress import Progress
 from harness.resolved import Resolved, resolve
 from harness.runner.shadow_runs import recorded, without_cut_in
@@ -41,7 +39,7 @@ CHUNK_PATHS = 1024
 """Paths that one task walks: some 15 MB of motion."""
 
 
-_SOURCES = ("studies/walked_population.py", "pool/shadow_paths.py", "pool/vehicle_pool.py", "controllers/hosts.py")
+_SOURCES = ("studies/walked_population.py", "pool/vehicle_pool.py", "controllers/hosts.py")
 """Files beside those of the world that decide what a vehicle meets, and is told."""
 Choose = Callable[[int, int], ShadowPaths]
 """Chooses paths from a seed, so many of them; all vehicles of an experiment walk the same."""
@@ -53,9 +51,9 @@ def chooser(campaign: Campaign, progress: Progress, candidates: int = CANDIDATES
 
     @cache
     def choose(seed: int, n_paths: int) -> ShadowPaths:
-        settings = campaign.pool.model_copy(update={"seed": seed, "shadow_paths": n_paths})
-        most = max(n_paths, candidates)
-        return choose_paths(resolved.environment, resolved.library, settings, "walked", progress, most)
+        settings = campaign.pool.model_copy(update={"seed": seed})
+        where, most = (resolved.environment, resolved.library), max(n_paths, candidates)
+        return walk_candidates(*where, settings, "walked", progress, most).draw(n_paths)
 
     return choose
 
@@ -72,7 +70,7 @@ def walk_paths(
     """
     code = require_controller(campaign), source_hash(_SOURCES)
     resolved = resolve(campaign)
-    drivers = resolved.library.drivers_in(resolved.environment).tolist()
+    drivers = resolved.library.followers_in(resolved.environment).drivers.tolist()
     asked = drivers, campaign.av.identity(), *code, campaign.seed, seed, n_paths
 
     def walked() -> SuperPopulation:
@@ -103,10 +101,9 @@ def _walk(campaign_json: str, first: int, paths: ShadowPaths) -> SuperPopulation
     loop = _loop(resolved)
     runs = recorded(without_cut_in(loop, paths.seed, first, paths.index, paths.state, environment), environment)
     _require_none_failed(resolved, int(runs.failed.sum()), len(paths), "shadow runs")
-    envelope = list(library.surrogates).index(library.envelope)
     offset = np.random.default_rng([paths.seed, first]).integers(0, STRIDE, len(paths))
-    where = environment, library.drivers_in(environment), envelope
-    probability, bits, _ = recorded_cut_ins(runs, paths.seed, paths.index, paths.state, *where, offset)
+    where = paths.seed, paths.index, paths.state, environment, library.followers_in(environment)
+    probability, bits, _ = enumerate_cut_ins(*where, runs, STRIDE, offset)
     mass = probability * paths.weight[:, None]
     row, step = np.nonzero(mass > 0.0)
     crashes = _crashes(resolved, loop, first, paths, runs, row, step)
@@ -135,12 +132,8 @@ def _crashes(
     step: IntArray,
 ) -> BoolArray:
     """Drive the vehicle on cut-ins of paths in given rows and steps (n,): whether it crashed on each."""
-    environment, library = resolved.environment, resolved.library
-    drivers, envelope = library.drivers_in(environment), list(library.surrogates).index(library.envelope)
-    enumerator = Enumerator(environment, drivers, envelope, paths.seed)
-    lead = enumerator.leads(paths.index[row], step)
+    lv, bv, _, _, lead = write_script(paths.seed, paths.index[row], step, paths.state[row], resolved.environment)
     motion = motion_hashes(runs.x_m, runs.v_mps)[row, onset_steps(step, lead)]
-    lv, bv, _, _ = enumerator.pairs(paths.index[row], step, paths.state[row])
     nowhere, weightless = np.full(row.size, -1), np.zeros(row.size)
     traffic = PrescribedTraffic(lv, bv, step, nowhere, weightless, first + row, motion, lead)
     outcome = loop.run(0, paths.state[row], traffic)

@@ -54,18 +54,9 @@ def expected_accelerations(
     Starting from the observed acceleration of the step before, a driver that hardly changes it would seem to explain
     any vehicle.
 
-    Parameters
-    ----------
-    driver : structured ndarray, shape (1,)
-        Without inattention.
-    begin : ndarray, shape (m + 1,)
-        Where each cut-in's steps begin, the cut-in step first; and the end.
-    speed, lead_speed : ndarray, shape (n,)
-        Of the vehicle, and of the one that cut in (m/s).
-    gap : ndarray, shape (n,)
-        Bumper to bumper (m).
-    out : ndarray, shape (n,)
-        Receives accelerations (m/s²).
+    ``driver`` (1,) is without inattention; ``begin`` (m + 1,) says where each cut-in's steps begin, the cut-in step
+    first, and the end. ``speed``, ``lead_speed`` (n,) are those of the vehicle and of the one that cut in (m/s),
+    ``gap`` (n,) is bumper to bumper (m); ``out`` (n,) receives accelerations (m/s²).
     """
     for e in range(begin.size - 1):
         memory = nothing_yet(driver[0].used_up_steps)

@@ -25,16 +25,6 @@ def test_the_hazard_is_the_formula(v, r1, r1dot, r2, r2dot, level):
     assert 0.0 <= hazard <= 0.1 * np.log(2.0) * (1.0 + 1e-15)  # never above one half a second
 
 
-def test_ten_steps_make_one_decision():
-    """p = 1 - (1 - p_1s)^0.1: ten steps in an unchanged state have the probability of one decision."""
-    wish, accepted, hazard = cut_in_terms((30.0, 35.0, 0.3, 80.0, -5.0), 350.0)[0]
-    assert -np.expm1(-10.0 * hazard) == pytest.approx(wish * accepted, rel=1e-12)
-
-
-def test_the_cap_is_reached():
-    assert cut_in_terms((30.0, 35.0, 0.3, 80.0, 1.0), 1e8)[0, 2] == pytest.approx(0.1 * np.log(2.0), rel=1e-15)
-
-
 @pytest.mark.parametrize(
     ("r2", "r2dot", "accepted"),
     [
@@ -52,17 +42,3 @@ def test_acceptance(r2, r2dot, accepted):
     terms = cut_in_terms((30.0, 35.0, 0.0, r2, r2dot), 1e4)[0]
     assert terms[1] == pytest.approx(accepted, rel=1e-13)
     assert (terms[2] > 0.0) == (r2 > 0.0)
-
-
-@given(speeds, gaps, rates, st.floats(1e-6, 110.0), rates)
-def test_the_level_multiplies_the_wish_alone(v, r1, r1dot, r2, r2dot):
-    one, hundred = cut_in_terms((v, r1, r1dot, r2, r2dot), 1.0)[0], cut_in_terms((v, r1, r1dot, r2, r2dot), 100.0)[0]
-    assert hundred[0] == pytest.approx(100.0 * one[0], rel=1e-15)
-    assert hundred[1] == one[1]
-
-
-@given(rates, rates, st.floats(1.0, 110.0))
-def test_outside_of_the_fits_the_border_holds(r1dot, r2dot, r2):
-    inside = cut_in_terms([(20.0, 0.0, r1dot, r2, r2dot), (40.0, 115.0, r1dot, r2, r2dot)])
-    outside = cut_in_terms([(5.0, -0.001, r1dot, r2, r2dot), (55.0, 300.0, r1dot, r2, r2dot)])
-    np.testing.assert_array_equal(inside, outside)

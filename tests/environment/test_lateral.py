@@ -11,21 +11,25 @@ import yaml
 from harness.campaign.loading import load_campaign
 from harness.campaign.models import EnvironmentSettings
 from harness.campaign.problems import read_model
-from harness.environment.lateral import constant_lead, in_one_step, lateral_position, log_normal_speed, perceived_in
+from harness.environment.lateral import (
+    constant_lead,
+    draw_lead,
+    in_one_step,
+    lateral_position,
+    log_normal_speed,
+    perceived_in,
+)
 from harness.environment.loading import load_environment, load_parameters, parameter_file
 from harness.environment.parameters import EnvironmentParameters
 from harness.errors import CampaignError
 from harness.pool.cut_ins import environment_hash
-from harness.pool.enumeration import draw_leads
 from harness.resolved import resolve
 
 PAPER, LATERAL = "ndd-overtaking-1", "ndd-overtaking-1-lateral"
 
 
 def leads(lateral, n=20_000, seed=1):
-    out = np.zeros(n, np.int64)
-    draw_leads(seed, np.arange(n), np.full(n, 57), lateral, out)
-    return out
+    return np.array([draw_lead(57, seed, path, lateral) for path in range(n)])
 
 
 @pytest.mark.parametrize("lead_s", [0.0, 0.1, 0.5, 2.0])
@@ -54,12 +58,9 @@ def test_leads_of_a_log_normal_speed_have_its_quantiles():
 
 
 def test_leads_depend_on_path_and_cut_in_step_alone():
-    lateral, out = log_normal_speed(1.7, 0.69, 0.35, 4.0), np.zeros(2, np.int64)
-    draw_leads(3, np.array([5, 5]), np.array([80, 80]), lateral, out)
-    assert out[0] == out[1]
-    many = np.zeros(200, np.int64)
-    draw_leads(3, np.full(200, 5), np.arange(200), lateral, many)
-    assert np.unique(many).size > 10
+    lateral = log_normal_speed(1.7, 0.69, 0.35, 4.0)
+    assert draw_lead(80, 3, 5, lateral) == draw_lead(80, 3, 5, lateral)
+    assert len({draw_lead(cut, 3, 5, lateral) for cut in range(200)}) > 10
 
 
 @pytest.mark.parametrize(

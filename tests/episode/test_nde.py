@@ -7,7 +7,7 @@ from scipy import stats
 from harness.outcomes import BV_LV_CONTACT, CRASH, FAILED, PASSED, TIMEOUT
 from tests.episode.twin_runs import run
 
-N = 400_000
+N = 200_000
 
 
 def upper_limit(count, n, confidence=0.95):

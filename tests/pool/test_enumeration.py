@@ -8,88 +8,54 @@ from scipy.stats import chisquare
 
 from harness.campaign.models import PoolSettings
 from harness.environment.initial_state import InitialStates
-from harness.episode.loop import EpisodeLoop, Keep, Policy
-from harness.episode.trajectory import empty_trajectory
-from harness.importance.build import build_importance
 from harness.outcomes import CRASH
 from harness.pool.aimed_paths import Enumerator
-from harness.pool.enumeration import STRIDE, enumerate_cut_ins
+from harness.pool.enumeration import STRIDE
 from harness.pool.library import load_library
-from harness.pool.shells import Draw, PrescribedEpisodes, design_shells
+from harness.pool.shells import design_shells
 from harness.progress import SilentProgress
-from harness.twin import TwinWorld
 from tests.chains.seed import SEED
-from tests.pool.walked import p_cut_in_of_paths
+from tests.pool.walked import driven, enumerated, p_cut_in_of_paths
 
 LIBRARY = load_library("ladder-1")
 NAMES = list(LIBRARY.surrogates)
-
-
 ENVELOPE = NAMES.index(LIBRARY.envelope)
-
-
-def enumerated(environment, n: int, envelope: int = ENVELOPE, stride: int = 1, offset: int = 0):
-    steps = int(environment.numbers["max_steps"])
-    states, offsets = InitialStates(environment.numbers).draw(SEED, 0, n), np.full(n, offset)
-    probability, crashes = np.zeros((n, steps)), np.zeros((n, steps), np.int64)
-    asked = environment, LIBRARY.drivers_in(environment), envelope, stride, offsets
-    enumerate_cut_ins(SEED, 0, states, *asked, empty_trajectory(environment), probability, crashes)
-    return probability, crashes
-
-
-def test_full_throttle_crashes_wherever_anyone_does(environment):
-    probability, crashes = enumerated(environment, 150, -1)
-    someone = crashes != 0
-    assert someone.sum() > 5_000
-    assert np.all((crashes[someone] >> ENVELOPE) & 1 == 1)
-    assert np.any((crashes == 0) & (probability > 0.0))  # there are cut-ins that nobody can make a crash of
-    with_shortcut = enumerated(environment, 150)
-    assert np.array_equal(with_shortcut[0], probability)
-    assert np.array_equal(with_shortcut[1], crashes)
 
 
 def test_a_slower_vehicle_is_no_envelope(environment):
     """The sibling that must fail: with a vehicle at constant speed as envelope, crashes would be missed."""
-    _, crashes = enumerated(environment, 150, -1)
+    _, crashes = enumerated(LIBRARY, environment, 150, enclosed=False)
     constant = NAMES.index("never-brakes")
     assert np.any(((crashes >> constant) & 1 == 0) & (crashes != 0))
 
 
 @pytest.mark.parametrize("surrogate", NAMES)
-def test_a_prescribed_episode_ends_as_the_pool_says(campaign, pool, environment, surrogate):
+def test_a_prescribed_episode_ends_as_the_pool_says(campaign, pool, surrogate):
     """LV's and BV's paths, the cut-in and the surrogate's answer, driven by the episode loop instead of the pool."""
-    prescribed = PrescribedEpisodes(campaign, pool)
-    shells = [Draw(s, 0, 60) for s in range(prescribed.design.p.size)]
-    states, traffic, cut_ins = prescribed.episodes(tuple(shells))
-    rows = cut_ins.row
-    driver = LIBRARY.drivers_in(environment)[NAMES.index(surrogate)][None]
-    policy = Policy(1, environment, build_importance(campaign, None), driver)
-    shard = EpisodeLoop(TwinWorld(16), policy, Keep(0, "none", 0.0)).run(0, states, traffic)
-    episode = shard.results.episode
-    crashed = episode["outcome"] == CRASH
-    assert np.array_equal(crashed, pool.cut_ins.crashes[rows, pool.names.index(surrogate)])
+    rows, episode, log_p = driven(campaign, pool, LIBRARY, surrogate)
+    assert np.array_equal(episode["outcome"] == CRASH, pool.cut_ins.crashes[rows, pool.names.index(surrogate)])
     assert np.array_equal(episode["cut_in_step"], pool.cut_ins.step[rows])
-    assert np.allclose(episode["log_weight"], np.log(prescribed.design.p[traffic.stratum]), rtol=1e-15)
+    assert np.allclose(episode["log_weight"], log_p, rtol=1e-15)
 
 
 def test_the_probabilities_of_a_path_add_up_to_that_of_a_cut_in(environment):
     """Against an independent walk of the same path: 1 - exp(-hazard)."""
-    probability, _ = enumerated(environment, 40)
+    probability, _ = enumerated(LIBRARY, environment, 40)
     expected = p_cut_in_of_paths(SEED, InitialStates(environment.numbers).draw(SEED, 0, 40), environment)
     assert np.allclose(probability.sum(1), expected, rtol=1e-12, atol=0.0)
 
 
 def test_a_stride_asks_the_same_cut_ins_and_each_stands_for_as_many(environment):
     """Over all offsets every cut-in is asked once, with the same answer, so that any sum has the same mean."""
-    probability, crashes = enumerated(environment, 40)
-    strided = [enumerated(environment, 40, stride=STRIDE, offset=offset) for offset in range(STRIDE)]
+    probability, crashes = enumerated(LIBRARY, environment, 40)
+    strided = [enumerated(LIBRARY, environment, 40, stride=STRIDE, offset=offset) for offset in range(STRIDE)]
     assert np.array_equal(np.sum([p for p, _ in strided], axis=0), STRIDE * probability)
     assert np.array_equal(np.sum([c for _, c in strided], axis=0), crashes)
     assert np.max([p > 0.0 for p, _ in strided], axis=0).sum() > 1000
 
 
 def test_blocks_use_every_offset_about_equally(environment):
-    paths = Enumerator(environment, LIBRARY.drivers_in(environment), ENVELOPE, 5).run(0, 2048, SilentProgress())
+    paths = Enumerator(environment, LIBRARY.followers_in(environment), 5).run(0, 2048, SilentProgress())
     asked = paths.mass > 0.0
     offsets = [np.flatnonzero(row) % STRIDE for row in asked if row.any()]
     assert all(np.unique(found).size == 1 for found in offsets)
@@ -98,7 +64,7 @@ def test_blocks_use_every_offset_about_equally(environment):
 
 
 def test_the_number_of_cores_changes_no_bit(environment, monkeypatch):
-    enumerator = Enumerator(environment, LIBRARY.drivers_in(environment), ENVELOPE, PoolSettings().seed)
+    enumerator = Enumerator(environment, LIBRARY.followers_in(environment), PoolSettings().seed)
     many = enumerator.run(0, 512, SilentProgress())
     monkeypatch.setattr("os.cpu_count", lambda: 1)
     one = enumerator.run(0, 512, SilentProgress())

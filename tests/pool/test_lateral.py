@@ -7,24 +7,20 @@ import pytest
 
 from harness.campaign.loading import load_campaign
 from harness.controllers.loading import build_host
-from harness.environment.initial_state import InitialStates
 from harness.environment.loading import load_environment
 from harness.episode.loop import EpisodeLoop, Keep, Policy
-from harness.episode.trajectory import empty_trajectory
 from harness.importance.build import build_importance
 from harness.outcomes import CRASH, PASSED, SHELLS
-from harness.pool.enumeration import enumerate_cut_ins
 from harness.pool.library import load_library
-from harness.pool.shadow_paths import choose_paths
-from harness.pool.shells import Draw, PrescribedEpisodes
+from harness.pool.shells import PrescribedEpisodes
 from harness.pool.storage import campaign_pool, read_pool, write_pool
-from harness.pool.vehicle_pool import vehicle_pool
+from harness.pool.vehicle_pool import vehicle_pool, walk_candidates
 from harness.resolved import resolve
 from harness.runner.shadow_runs import recorded, without_cut_in
 from harness.twin import TwinWorld
-from tests.chains.seed import SEED
 from tests.pool.conftest import MIXTURE_FILE, SMALL_POOL
 from tests.pool.test_vehicle_pool import ACTING
+from tests.pool.walked import driven, enumerated
 
 LIBRARY = load_library("ladder-lateral-1")
 NAMES = list(LIBRARY.surrogates)
@@ -47,26 +43,18 @@ def lateral_pool(lateral):
     return campaign_pool(resolve(lateral))
 
 
-def enumerated(environment, n, envelope=ENVELOPE):
-    steps = int(environment.numbers["max_steps"])
-    states, offsets = InitialStates(environment.numbers).draw(SEED, 0, n), np.zeros(n, np.int64)
-    probability, crashes = np.zeros((n, steps)), np.zeros((n, steps), np.int64)
-    asked = environment, LIBRARY.drivers_in(environment), envelope, 1, offsets
-    enumerate_cut_ins(SEED, 0, states, *asked, empty_trajectory(environment), probability, crashes)
-    return probability, crashes
-
-
-@pytest.mark.parametrize("lead_s", [None, 4.0])
+@pytest.mark.parametrize("lead_s", [0.0, None, 4.0])
 def test_full_throttle_contains_every_driver_also_where_it_passes(lateral, lead_s):
     settings = lateral.environment.model_copy(update={"cut_in_lead_s": lead_s})
     environment = load_environment(settings)
-    _, crashes = enumerated(environment, 150, -1)
+    probability, crashes = enumerated(LIBRARY, environment, 150, enclosed=False)
     someone = crashes != 0
     assert someone.sum() > 3_000
+    assert np.any(~someone & (probability > 0.0))  # there are cut-ins that nobody can make a crash of
     # Asked as one among many it stops where it has passed; as envelope it does not, and leaves nobody out.
     if lead_s == 4.0:
         assert np.any((crashes[someone] >> ENVELOPE) & 1 == 0)
-    _, enclosed = enumerated(environment, 150)
+    _, enclosed = enumerated(LIBRARY, environment, 150)
     others = ~np.int64(1 << ENVELOPE)
     assert np.array_equal(enclosed & others, crashes & others)
     assert np.all((enclosed[someone] >> ENVELOPE) & 1 == 1)
@@ -74,16 +62,7 @@ def test_full_throttle_contains_every_driver_also_where_it_passes(lateral, lead_
 
 @pytest.mark.parametrize("name", [*NAMES, *LIBRARY.references])
 def test_a_prescribed_episode_ends_as_the_pool_says(lateral, lateral_pool, name):
-    prescribed = PrescribedEpisodes(lateral, lateral_pool)
-    states, traffic, cut_ins = prescribed.episodes(tuple(Draw(s, 0, 60) for s in range(prescribed.design.p.size)))
-    rows = cut_ins.row
-    everybody = [*NAMES, *LIBRARY.references]
-    environment = load_environment(lateral.environment)
-    driver = LIBRARY.drivers_in(environment)[everybody.index(name)][None].copy()
-    if name == LIBRARY.envelope:
-        driver["perceives_lateral_m"] = 0.0
-    policy = Policy(1, environment, build_importance(lateral, None), driver)
-    episode = EpisodeLoop(TwinWorld(16), policy, Keep(0, "none", 0.0)).run(0, states, traffic).results.episode
+    rows, episode, _ = driven(lateral, lateral_pool, LIBRARY, name)
     reached = episode["outcome"] == CRASH
     if name == LIBRARY.envelope:
         reached |= episode["outcome"] == PASSED
@@ -106,8 +85,7 @@ def test_a_vehicle_that_acts_before_has_a_pool_of_its_own_that_its_tests_follow(
     acts = of("environment.parameters=ndd-overtaking-1-lateral", f"av={ACTING.format('Speeds')}", "world.engine=twin")
     resolved = resolve(acts)
     environment, library = resolved.environment, resolved.library
-    settings = acts.pool.model_copy(update={"shadow_paths": 60})
-    paths = choose_paths(environment, library, settings, "test", candidates=1024)
+    paths = walk_candidates(environment, library, acts.pool, "test", candidates=1024).draw(60)
     policy = Policy(1, environment, build_importance(acts, None)._replace(method=SHELLS), resolved.av)
     loop = EpisodeLoop(TwinWorld(32), policy, Keep(0, "none", 0.0), build_host(acts.av, n_cells=32, seed=1))
     motion = without_cut_in(loop, paths.seed, 0, paths.index, paths.state, environment)

@@ -1,12 +1,14 @@
-"""The adaptive ladder: known drivers are found again, in SUMO as in the twin, and what is no driver is called so."""
+"""The adaptive ladder: known drivers are found again, and what is no driver is called so."""
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from harness.campaign.dumping import dump_campaign
 from harness.campaign.loading import load_campaign
 from harness.campaign.models import IDMParameters, Reflexes
 from harness.cli import main
@@ -16,7 +18,7 @@ from harness.pool.fit_driver import expected, fit_driver
 from harness.pool.library import LibraryIDM, load_library
 from harness.pool.observed import WINDOW_STEPS, read_observed
 from harness.pool.predicted import predict, replay_drivers
-from harness.pool.refined_ladder import more_careless, refine_ladder
+from harness.pool.refined_ladder import free_names, more_careless, refine_ladder
 from harness.runner import run_campaign
 from tests.pool.conftest import SMALL_POOL
 
@@ -46,8 +48,9 @@ class WhiteNoise:
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    """Run a campaign without its page; returns folder and campaign."""
+    """Run a campaign without its page, each once; returns folder and campaign."""
 
+    @cache
     def run_without_page(*overrides, n=140):
         folder = tmp_path_factory.mktemp("ladder") / "run"
         campaign = load_campaign(FORCED_FILE, [*SMALL, f"stop.episodes={n}", *overrides])
@@ -88,11 +91,6 @@ def test_a_late_driver_is_found_again_and_predicts_every_crash(ladder):
     assert refined.n_checked + refined.fitted.n_cut_ins == 140
 
 
-def test_sumo_and_twin_give_the_same_ladder(run, ladder, tmp_path):
-    folder, _, _ = run(LATE, ALL)
-    assert refine_ladder(folder, tmp_path / "sumo.yaml").to_json() == ladder[0].to_json()
-
-
 def test_a_jerk_limit_is_told_from_a_delay(run, tmp_path):
     folder, _, _ = run(SMOOTH, TWIN, ALL)
     driver = refine_ladder(folder, tmp_path / "mine.yaml").fitted.driver
@@ -122,11 +120,9 @@ def test_the_library_is_the_runs_with_two_drivers_more(late, ladder):
     assert "reacts after 0.6 s" in text
 
 
-def test_a_second_ladder_finds_new_names(run, ladder, tmp_path):
-    folder, _, _ = run(LATE, TWIN, ALL, f"pool.library={ladder[1]}")
-    second = refine_ladder(folder, tmp_path / "second.yaml")
-    assert (second.name, second.careless) == ("fitted-2", "fitted-2-careless")
-    assert {"fitted", "fitted-careless", "fitted-2"} <= load_library(str(tmp_path / "second.yaml")).surrogates.keys()
+def test_a_second_ladder_finds_new_names(ladder):
+    assert free_names(load_library("ladder-2")) == ("fitted", "fitted-careless")
+    assert free_names(load_library(str(ladder[1]))) == ("fitted-2", "fitted-2-careless")
 
 
 def test_an_av_beyond_the_boundary_moves_it(run, tmp_path):
@@ -209,12 +205,19 @@ def test_the_avs_own_model_crashes_exactly_where_the_av_does(run):
 # -- refusals --
 
 
-@pytest.mark.parametrize("records", ["records.traces=none", "records.traces=crash", "records.traces=critical"])
-def test_without_an_outcome_independent_share_there_is_no_ladder(run, tmp_path, records, capsys):
-    folder, _, _ = run(LATE, TWIN, records, n=60)
+def unrun(folder, *overrides):
+    """A folder with nothing but a campaign: what can be refused by that alone."""
+    folder.mkdir()
+    text = dump_campaign(load_campaign(FORCED_FILE, overrides))
+    (folder / "campaign.yaml").write_text(text, encoding="utf-8")
+    return folder
+
+
+def test_without_an_outcome_independent_share_there_is_no_ladder(tmp_path, capsys):
+    folder = unrun(tmp_path / "run", "records.traces=crash")
     assert main(["ladder", str(folder), "--out", str(tmp_path / "mine.yaml")]) == 2
     assert "records.trace_share=0.2" in capsys.readouterr().err
-    assert list(tmp_path.iterdir()) == []
+    assert list(tmp_path.iterdir()) == [folder]
 
 
 def test_too_few_cut_ins_are_refused(run, tmp_path):
@@ -223,11 +226,10 @@ def test_too_few_cut_ins_are_refused(run, tmp_path):
         refine_ladder(folder, tmp_path / "mine.yaml")
 
 
-def test_an_av_that_acts_before_the_cut_in_is_refused(run, tmp_path):
+def test_an_av_that_acts_before_the_cut_in_is_refused(tmp_path):
     early = NOISY.replace("}", ", before_cut_in: controller}")
-    folder, _, _ = run(early, TWIN, ALL, "testing={method: nde}", n=20)
     with pytest.raises(CampaignError, match="as all surrogates do"):
-        refine_ladder(folder, tmp_path / "mine.yaml")
+        refine_ladder(unrun(tmp_path / "run", early), tmp_path / "mine.yaml")
 
 
 def test_a_library_is_never_written_over(late, tmp_path):

@@ -14,6 +14,7 @@ import pytest
 
 from harness.campaign.models import AutomatedVehicle, Campaign, IDMParameters, PoolSettings, Reaction
 from harness.episode.loop import Shard
+from harness.episode.trajectory import Followers
 from harness.errors import CampaignError, RunFolderError
 from harness.estimators.alarm import Alarm
 from harness.estimators.block import Block
@@ -21,8 +22,8 @@ from harness.estimators.from_records import block_from_tables
 from harness.importance.build import mixture_weights
 from harness.outcomes import CRASH
 from harness.pool.cut_ins import Pool
+from harness.pool.replay import SurrogateReplay, drivers_crash
 from harness.pool.storage import campaign_pool
-from harness.pool.surrogate_replay import SurrogateReplay, drivers_crash
 from harness.records.tables import episodes_table
 from harness.resolved import resolve
 from harness.runner.prepare import prepare
@@ -30,7 +31,7 @@ from harness.twin import TwinWorld
 from harness.vehicles.models import driver_records
 from tests.chains.seed import SEED
 
-SMALL = PoolSettings(relative_error=0.03, cut_ins_per_shell=600)
+SMALL = PoolSettings(relative_error=0.03, cut_ins_per_shell=1500)
 N = 10_000
 LATE = AutomatedVehicle(parameters=IDMParameters(min_acceleration_mps2=-3.0), reaction=Reaction(delay_s=0.7))
 
@@ -84,7 +85,7 @@ def test_a_driver_that_remembers_is_the_same_as_av_and_as_surrogate(model):
     crash = np.array(table.column("outcome").cast(pa.string()).to_pylist()) == "crash"
     environment = resolve(one).environment
     records = driver_records([AutomatedVehicle(model=name).parameters for name in (model, "idm")])
-    own, idm = drivers_crash(table, one.seed, environment, records, -1).T
+    own, idm = drivers_crash(table, one.seed, environment, Followers(records)).T
     assert crash.sum() > 10
     np.testing.assert_array_equal(own, crash)
     assert not np.array_equal(idm, crash)
@@ -98,8 +99,9 @@ def test_other_draws_after_the_end_do_not_change_what_was_driven(hold_s):
     shard, table = drive(one, 400)
     other = campaign("forced", av=AutomatedVehicle(), acceleration_hold_s=hold_s)
     _, longer = drive(other, 400)
-    pool = campaign_pool(resolve(one))
-    short, long = (replayed(c, t, pool).surrogates_crash for c, t in ((one, table), (other, longer)))
+    environment = resolve(one).environment
+    followers = resolve(one).library.followers_in(environment)
+    short, long = (drivers_crash(paths, one.seed, environment, followers) for paths in (table, longer))
     assert np.count_nonzero(shard.results.episode["outcome"] == CRASH) > 100
     np.testing.assert_array_equal(short, long)
 

@@ -8,17 +8,19 @@ import pytest
 from harness.campaign.loading import load_campaign
 from harness.environment.cut_in import acceptance, cut_in_hazard, opportunity
 from harness.episode.motion import motion_hashes
+from harness.episode.trajectory import Followers
 from harness.errors import HarnessError
-from harness.outcomes import AV, BV, CRASH, LV
+from harness.outcomes import CRASH
 from harness.pool.aimed_paths import Enumerator
-from harness.pool.shadow_paths import CANDIDATES, EVENLY, ShadowPaths, chances
-from harness.pool.vehicle_pool import ShadowRuns, recorded_cut_ins, vehicle_pool
+from harness.pool.enumeration import ShadowRuns, enumerate_cut_ins
+from harness.pool.vehicle_pool import CANDIDATES, EVENLY, chances, vehicle_pool
 from harness.progress import SilentProgress
 from harness.resolved import resolve
 from harness.runner.prepare import prepare
 from harness.runner.shadow_runs import as_recorded, run_shadows, shadow_specs, without_cut_in
 from harness.state import State
 from harness.twin import TwinWorld
+from harness.vehicles.models import driver_records
 from tests.pool.conftest import MIXTURE_FILE, SMALL_POOL
 
 N = 256
@@ -48,18 +50,15 @@ def speeds():
 
 def test_a_vehicle_that_holds_its_speed_has_the_cut_ins_of_one_that_holds(environment, campaign):
     """Every bit: same hazards, same probabilities, same crashes, on naturalistic paths."""
-    library = resolve(campaign).library
-    envelope = list(library.surrogates).index(library.envelope)
-    enumerator = Enumerator(environment, library.drivers_in(environment), envelope, 5, stride=1)
-    held = enumerator.run(0, N, SilentProgress())
+    followers = resolve(campaign).library.followers_in(environment)
+    held = Enumerator(environment, followers, 5, stride=1).run(0, N, SilentProgress())
     steps = np.arange(int(environment.numbers["max_steps"]) + 1)
     v = np.repeat((held.state["v_bv_mps"] - held.state["r2dot_mps"])[:, None], steps.size, 1)
     x = np.full(v.shape, 100.0)
     for step in steps[1:]:
         x[:, step] = x[:, step - 1] + v[:, step] * 0.1
     runs = ShadowRuns(np.full(N, steps[-1]), np.zeros(N, np.bool_), x, v)
-    where = 5, held.index, held.state, environment, library.drivers_in(environment), envelope
-    probability, crashes, unknown = recorded_cut_ins(runs, *where)
+    probability, crashes, unknown = enumerate_cut_ins(5, held.index, held.state, environment, followers, runs)
     asked = held.mass > 0.0
     assert asked.sum() > 10_000
     np.testing.assert_array_equal(probability[asked], held.mass[asked])
@@ -74,10 +73,9 @@ def test_probabilities_are_those_of_the_states_that_were_driven(speeds):
     paths, environment = ready.shadow_paths, ready.policy.environment
     rows = slice(0, 10)
     shard = without_cut_in(loop, paths.seed, 0, paths.index[rows], paths.state[rows], environment)
-    nobody = np.zeros(0, ready.resolved.library.drivers_in(environment).dtype), -1
-    some = ShadowRuns(runs.n_steps[rows], runs.failed[rows], runs.x_m[rows], runs.v_mps[rows])
-    given = paths.seed, paths.index[rows], paths.state[rows], environment, *nobody
-    probability, _, _ = recorded_cut_ins(some, *given)
+    some = ShadowRuns._make(values[rows] for values in runs)
+    given = paths.seed, paths.index[rows], paths.state[rows], environment, Followers(driver_records([]))
+    probability = enumerate_cut_ins(*given, some).probability
     for row in range(10):
         trace, stays = shard.traces[row], 1.0
         for step in range(len(trace) - 1):
@@ -88,7 +86,6 @@ def test_probabilities_are_those_of_the_states_that_were_driven(speeds):
             assert probability[row, step] == pytest.approx(stays * cut, rel=1e-9)
             stays *= 1.0 - cut
         assert np.all(probability[row, len(trace) - 1 :] == 0.0)
-    assert (LV, BV, AV) == (0, 1, 2)
 
 
 def test_a_vehicle_that_is_a_surrogate_from_the_cut_in_on_crashes_where_that_one_does(speeds):
@@ -156,7 +153,6 @@ def test_hashes_tell_motions_apart_from_the_first_step_that_differs_on():
 
 def test_a_vehicle_that_never_moves_is_refused(speeds):
     ready, _, runs = speeds
-    paths: ShadowPaths = ready.shadow_paths
-    parked = ShadowRuns(np.zeros_like(runs.n_steps), np.ones_like(runs.failed), runs.x_m, runs.v_mps)
+    parked = runs._replace(n_steps=np.zeros_like(runs.n_steps), failed=np.ones_like(runs.failed))
     with pytest.raises(HarnessError, match="no cut-in on 120 paths"):
-        vehicle_pool(ready.resolved, paths, parked)
+        vehicle_pool(ready.resolved, ready.shadow_paths, parked)

@@ -1,4 +1,4 @@
-"""P(cut-in | path), the path walked a second time: only draws, hazards and a vehicle's step are shared."""
+"""Cut-ins as a pool enumerates them, as the episode loop drives them, and by a second walk of the path."""
 
 from __future__ import annotations
 
@@ -7,10 +7,42 @@ import numpy as np
 from harness.compiled import compiled_threads
 from harness.environment.cut_in import acceptance, cut_in_hazard, opportunity
 from harness.environment.driving import Environment, car_following, draw_acceleration, free_driving
+from harness.environment.initial_state import InitialStates
+from harness.environment.loading import load_environment
+from harness.episode.loop import EpisodeLoop, Keep, Policy
+from harness.episode.trajectory import Followers
+from harness.importance.build import build_importance
 from harness.maneuvers import acceleration
+from harness.pool.enumeration import enumerate_cut_ins
+from harness.pool.shells import Draw, PrescribedEpisodes
 from harness.random_stream import BV_DRAWS, LV_DRAWS, uniform
 from harness.state import State
+from harness.twin import TwinWorld
 from harness.vehicles.kinematics import CONTACT_M, next_position, next_speed
+from tests.chains.seed import SEED
+
+
+def enumerated(library, environment: Environment, n: int, *, enclosed=True, stride=1, offset=0):
+    """Probability of each cut-in of n paths, and who crashes on it; with or without an envelope that is asked first."""
+    states, offsets = InitialStates(environment.numbers).draw(SEED, 0, n), np.full(n, offset)
+    followers = library.followers_in(environment)
+    asked = environment, followers if enclosed else Followers(followers.drivers)
+    found = enumerate_cut_ins(SEED, np.arange(n), states, *asked, stride=stride, offset=offsets)
+    return found.probability, found.crashes
+
+
+def driven(campaign, pool, library, name: str):
+    """Sixty cut-ins of each stratum, as rows of the pool; the episodes that a driver has met them in; their log p."""
+    prescribed = PrescribedEpisodes(campaign, pool)
+    states, traffic, cut_ins = prescribed.episodes(tuple(Draw(s, 0, 60) for s in range(prescribed.design.p.size)))
+    environment = load_environment(campaign.environment)
+    place = [*library.surrogates, *library.references].index(name)
+    driver = library.followers_in(environment).drivers[place][None].copy()
+    if name == library.envelope:  # it acts from the onset
+        driver["perceives_lateral_m"] = 0.0
+    policy = Policy(1, environment, build_importance(campaign, None), driver)
+    shard = EpisodeLoop(TwinWorld(16), policy, Keep(0, "none", 0.0)).run(0, states, traffic)
+    return cut_ins.row, shard.results.episode, np.log(prescribed.design.p[traffic.stratum])
 
 
 @compiled_threads
@@ -38,6 +70,7 @@ def _hazards(seed: int, states: np.ndarray, environment: Environment, out: np.nd
 
 
 def p_cut_in_of_paths(seed: int, states: np.ndarray, environment: Environment) -> np.ndarray:
+    """P(cut-in | path), the path walked a second time: only draws, hazards and a vehicle's step are shared."""
     hazards = np.zeros(len(states))
     _hazards(seed, states, environment, hazards)
     return -np.expm1(-hazards)

@@ -16,7 +16,7 @@ from harness.cli import main
 from harness.errors import RunFolderError
 from harness.estimators.block import columns_of, joined
 from harness.pool import storage
-from harness.pool.surrogate_replay import PATH_COLUMNS
+from harness.pool.replay import PATH_COLUMNS
 from harness.runner import estimate_run, stored_estimates
 from harness.runner.stored_estimates import stored_blocks, surrogates_of
 from tests.runner.stored_runs import copy_of, stored_table

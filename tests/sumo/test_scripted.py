@@ -8,13 +8,12 @@ import pytest
 from harness.environment.loading import load_environment
 from harness.episode.cells import PrescribedTraffic, drawn_traffic
 from harness.episode.loop import EpisodeLoop, Keep, Policy, Shard
-from harness.episode.trajectory import empty_trajectory
+from harness.episode.trajectory import Followers, empty_trajectory
 from harness.importance.build import build_importance
 from harness.maneuvers import CUT_IN
 from harness.outcomes import BV_LV_CONTACT, CRASH, TIMEOUT
 from harness.pool.library import load_library
-from harness.pool.replay import replay_surrogates
-from harness.pool.surrogate_replay import stored_paths
+from harness.pool.replay import replay_surrogates, stored_paths
 from harness.records.tables import episodes_table
 from harness.resolved import resolve
 from harness.runner.retrace import Retracing
@@ -66,7 +65,8 @@ def test_contact_in_the_step_of_the_cut_in_is_retraced_and_no_surrogate_crashes(
     assert Retracing(resolve(campaign)).check(episodes) == len(STATES)
     crashes = np.full(len(STATES), -1, np.int64)
     stored, room = stored_paths(episodes, campaign.seed), empty_trajectory(environment)
-    assert replay_surrogates(stored, environment, library.drivers_in(environment), -1, room, crashes) == -1
+    followers = Followers(library.followers_in(environment).drivers)
+    assert replay_surrogates(stored, environment, followers, room, crashes) == -1
     everybody = 2 ** len(library.surrogates) - 1
     assert crashes.tolist()[::2] == [0, everybody]
     assert crashes[3] == 0

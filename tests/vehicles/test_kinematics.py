@@ -26,23 +26,6 @@ def test_distance_is_mean_speed_times_the_step(x, v, a):
     assert after - x == pytest.approx(0.5 * (v + speed) * 0.1, abs=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("v", "a", "speed", "distance"),
-    [
-        (30.0, -4.0, 29.6, 2.98),
-        (30.0, 0.0, 30.0, 3.0),
-        (0.4, -4.0, 0.0, 0.02),  # stops exactly at the end of the step
-        (0.2, -4.0, 0.0, 0.01),  # would stop within it: braking is only as hard as the step allows
-        (0.0, -4.0, 0.0, 0.0),
-        (0.0, 2.0, 0.2, 0.01),
-    ],
-)
-def test_worked_by_hand(v, a, speed, distance):
-    after, found = motions((100.0, v, a))[0]
-    assert found == pytest.approx(speed, abs=1e-15)
-    assert after - 100.0 == pytest.approx(distance, abs=1e-12)
-
-
 @given(positions, st.floats(0.0, 2.0))
 def test_braking_to_a_standstill_and_staying_there(x, v):
     state = (x, v)

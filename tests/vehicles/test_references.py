@@ -63,28 +63,11 @@ def test_the_delay_stated_is_the_one_kept(section, lateral_speed):
 # -- careful and competent: 30 m/s behind 20, 15 m ahead: time to collision 1.5 s --
 
 
-def test_it_coasts_and_brakes_harder_by_the_jerk_to_the_cap():
-    found = driven(CarefulCompetentParameters(**HALF_A_SECOND), (14, (30.0, 20.0, 15.0)))
-    assert found[:5] == pytest.approx([-0.4] * 5)
-    assert found[5:] == pytest.approx([-min(0.4 + JERK * k, CAP) for k in range(1, 10)], abs=1e-12)
-    assert pytest.approx(7.59, abs=0.005) == CAP
-    assert found[-1] == -7.59294
-
-
 def test_in_the_step_in_which_the_delay_ends_it_brakes_for_the_rest_of_it():
     found = driven(CarefulCompetentParameters(), (7, (30.0, 20.0, 15.0)))
     part = 5.0 - 10.0 * (0.75 - 0.505 / 1.8)  # 0.31 of the fifth step
     assert found[:4] == pytest.approx([-0.4] * 4)
     assert found[4:] == pytest.approx([-0.4 - JERK * (part + k) for k in range(3)])
-
-
-def test_it_goes_on_until_it_is_no_faster_than_the_vehicle_ahead():
-    driver = CarefulCompetentParameters(**HALF_A_SECOND)
-    far = (30.0, 20.0, 150.0)  # time to collision 15 s, which alone is no danger
-    found = driven(driver, (14, (30.0, 20.0, 15.0)), (9, far), (1, (20.0, 20.0, 44.0)), (3, far))
-    assert (found[14:23] == -7.59294).all()
-    assert found[23] == pytest.approx(1.375)  # as the IDM: 2 [1 - 1/16 - (22/44)^2]
-    assert found[24:] == pytest.approx(accelerations(IDMParameters(), far)[0])
 
 
 def test_a_danger_that_comes_later_takes_the_whole_reaction_time():
@@ -93,11 +76,6 @@ def test_a_danger_that_comes_later_takes_the_whole_reaction_time():
     assert found[:10] == pytest.approx(0.0, abs=1e-6)
     assert found[10:17] == pytest.approx([-0.4] * 7)
     assert found[17:] == pytest.approx([-0.4 - JERK * k for k in (0.5, 1.5, 2.5)])
-
-
-def test_without_a_danger_it_follows_once_it_has_seen_the_cut_in():
-    found = driven(CarefulCompetentParameters(**HALF_A_SECOND), (7, (20.0, 20.0, 44.0)))
-    assert found == pytest.approx([0.0] * 5 + [1.375] * 2)
 
 
 # -- fuzzy safety model --
@@ -148,17 +126,6 @@ def test_going_faster_is_never_safer_nor_a_slower_vehicle_ahead(own, leads, gap,
     )
     assert (careless >= careful - 1e-9).all()
     assert (calm <= careful + 1e-9).all()
-
-
-def test_it_brakes_between_the_comfortable_and_the_hard_rate():
-    driver = FuzzySafetyParameters(**HALF_A_SECOND, **ALONE)
-    for gap, wanted in ((12.0, 6.0), (80.0, 4.0 * (108.4286 - 78.0) / 39.5)):
-        found = driven(driver, (16, (30.0, 20.0, gap)))
-        assert (found[:5] == 0.0).all()
-        assert found[5] == pytest.approx(-min(JERK, wanted), abs=1e-3)
-        assert found.min() >= -wanted - 1e-3
-        assert gap == 12.0 or found[-1] == pytest.approx(-wanted, abs=1e-3)
-    assert driven(driver, (30, (30.0, 20.0, 112.0))) == pytest.approx(0.0, abs=1e-6)
 
 
 # -- need-based --
@@ -262,12 +229,12 @@ def smallest_safe_gap(kind, evaluated_at, lateral_speed, v, v_lead, **more):
 
 
 def agrees(published, **more):
-    found = []
-    for (kind, evaluated_at, lateral_speed), gaps_of in published.items():
-        for (v, v_lead), gap in gaps_of.items():
-            own = smallest_safe_gap(kind, evaluated_at, lateral_speed, v / 3.6, v_lead / 3.6, **more)
-            found.append((gap - own) / ((v - v_lead) / 3.6))
-    return all(-0.01 <= late_s <= LATEST_S for late_s in found)
+    def late_s(kind, evaluated_at, lateral_speed, v, v_lead, gap):
+        own = smallest_safe_gap(kind, evaluated_at, lateral_speed, v / 3.6, v_lead / 3.6, **more)
+        return (gap - own) / ((v - v_lead) / 3.6)
+
+    cases = ((*driver, *pair, gap) for driver, gaps_of in published.items() for pair, gap in gaps_of.items())
+    return all(-0.01 <= late_s(*case) <= LATEST_S for case in cases)
 
 
 def test_outcomes_of_cut_ins_are_those_of_the_published_code():
