@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
+from functools import cache
 from typing import Any
 
 from pydantic import BaseModel
@@ -21,6 +22,7 @@ def campaign_schema() -> Schema:
     return {**about, **schema_of(Campaign)}
 
 
+@cache
 def schema_of(model: type[BaseModel]) -> Schema:
     """JSON schema of a file: a campaign, a panel of vehicles, or parameters of an environment."""
     schema = model.model_json_schema()
