@@ -48,7 +48,7 @@ class Guard:
     def __init__(self, limits: Limits, black_box: Path | None) -> None:
         self.time_limit = TimeLimit(limits.step_time_s, may_exit=black_box is not None)
         self.limits = limits
-        self.black_box = BlackBox(black_box)
+        self._black_box = BlackBox(black_box)
 
     def call(
         self,
@@ -60,17 +60,17 @@ class Guard:
         check: Callable[[Any], str | None] | None = None,
     ) -> tuple[Any, str | None]:
         """What a call returns, and what went wrong; ``check`` looks at an answer under the same protection."""
-        self.black_box.enter(kind, episode, step)
+        self._black_box.enter(kind, episode, step)
         self.time_limit.begin()
         try:
             answer = function(*arguments)
-            return answer, self.black_box.misdeed() or (check(answer) if check else None)
+            return answer, self._black_box.misdeed() or (check(answer) if check else None)
         except BaseException as error:  # noqa: BLE001 - whatever a user's code raises is its episode's end
             require_fault(error)
             return None, cause_of(error)
         finally:
             self.time_limit.end()
-            self.black_box.leave()
+            self._black_box.leave()
 
     def close(self, controller: Any) -> None:
         """Close a controller; what it raises is nobody's concern: it has failed before, or the run is over."""

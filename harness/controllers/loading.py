@@ -86,21 +86,21 @@ def build_host(
     CampaignError
         The controller cannot be found or made, or is of neither kind.
     """
-    if av.source not in ("controller", "fmu"):
-        return None
-    guard, early = Guard(av.limits, black_box), av.acts_before_cut_in
+    early = av.acts_before_cut_in
     make: Callable[[], Any]
-    if av.fmu is not None:
+    if av.source == "controller":
+        make = _maker(av)
+        first = _make_first(make, av, BlackBox(black_box))
+        if callable(getattr(first, "step_batch", None)) and callable(getattr(first, "start_batch", None)):
+            return BatchHost(first, seed, Guard(av.limits, black_box), acts_before_cut_in=early)
+        _require_vehicle_controller(first, str(av.controller))
+    elif av.fmu is not None:
         from harness.controllers.fmu import fmu_maker  # noqa: PLC0415 - an extra
 
         make = fmu_maker(av.fmu)
     else:
-        make = _maker(av)
-        first = _make_first(make, av, guard.black_box)
-        if callable(getattr(first, "step_batch", None)) and callable(getattr(first, "start_batch", None)):
-            return BatchHost(first, seed, guard, acts_before_cut_in=early)
-        _require_vehicle_controller(first, str(av.controller))
-    return VehicleHost(make, n_cells, seed, guard, doomed=doomed, acts_before_cut_in=early)
+        return None
+    return VehicleHost(make, n_cells, seed, Guard(av.limits, black_box), doomed=doomed, acts_before_cut_in=early)
 
 
 def require_controller(campaign: Campaign) -> str | None:

@@ -20,7 +20,7 @@ from harness.arrays import BoolArray, FloatArray, Int8Array, IntArray
 from harness.controllers.hosts import episode_random
 from harness.outcomes import AV
 from harness.sumo.av_type import TYPE_NAME, refused, type_xml
-from harness.sumo.network import OBEY
+from harness.sumo.cells import OBEY
 from harness.sumo.world import SumoWorld
 
 SUMO_DECIDES = 31

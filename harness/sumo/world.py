@@ -20,8 +20,7 @@ import numpy as np
 from harness.arrays import BoolArray, FloatArray, Int8Array, IntArray
 from harness.errors import CampaignError, WorldDisagreementError
 from harness.outcomes import AV, BV, LV
-from harness.sumo.cells import SumoCells
-from harness.sumo.network import NEVER_PLAN_S, PLAN_NOW_S, RIGHT, sumo_program
+from harness.sumo.cells import NEVER_PLAN_S, PLAN_NOW_S, RIGHT, SumoCells, sumo_program
 from harness.sumo.shim import Shim, open_shim
 from harness.sumo.system_libraries import not_importable
 from harness.twin import advance
