@@ -16,7 +16,7 @@ import time
 from collections.abc import Callable
 from operator import methodcaller
 from pathlib import Path
-from types import FrameType, TracebackType
+from types import FrameType
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -116,8 +116,10 @@ class TimeLimit:
 
     def __init__(self, seconds: float, *, may_exit: bool = False) -> None:
         self._seconds = seconds
-        self._inside = False
-        self._watchdog = _Watchdog(2.0 * seconds + 1.0) if may_exit else None
+        self._since: float | None = None
+        """When the call under way began, None between calls: the harness itself may take its time."""
+        if may_exit:
+            threading.Thread(target=self._watch, name="controller watchdog", daemon=True).start()
 
     def __enter__(self) -> Self:
         if TimeLimit._current is not self:  # the handler stays: installing it costs more than a controller's step
@@ -125,9 +127,7 @@ class TimeLimit:
             TimeLimit._current = self
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         signal.setitimer(signal.ITIMER_REAL, 0.0)
 
     def close(self) -> None:
@@ -138,36 +138,23 @@ class TimeLimit:
 
     def begin(self) -> None:
         """A call begins: its time starts to run."""
-        if self._watchdog is not None:
-            self._watchdog.since = time.monotonic()
-        self._inside = True
+        self._since = time.monotonic()
         signal.setitimer(signal.ITIMER_REAL, self._seconds)
 
     def end(self) -> None:
         """The call is over; the timer itself is set again by the next one."""
-        self._inside = False
-        if self._watchdog is not None:
-            self._watchdog.since = None
+        self._since = None
 
     def _interrupt(self, _signal: int, _frame: FrameType | None) -> None:
-        if self._inside:  # the harness itself may take its time
+        if self._since is not None:
             raise StepTimeoutError(f"no answer within {self._seconds:g} s (av.limits.step_time_s)")
 
-
-class _Watchdog(threading.Thread):
-    """Ends the process when a call outlasts the exception that should have ended it."""
-
-    def __init__(self, seconds: float) -> None:
-        super().__init__(name="controller watchdog", daemon=True)
-        self.since: float | None = None
-        self._seconds = seconds
-        self.start()
-
-    def run(self) -> None:
+    def _watch(self) -> None:
+        """End the process when a call outlasts the exception that should have ended it."""
         while True:
             time.sleep(0.5)
-            since = self.since
-            if since is not None and time.monotonic() - since > self._seconds:
+            since = self._since
+            if since is not None and time.monotonic() - since > 2.0 * self._seconds + 1.0:
                 os._exit(HUNG_EXIT_CODE)
 
 
