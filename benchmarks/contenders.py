@@ -27,7 +27,7 @@ from harness.runner.executor import LocalExecutor
 from harness.runner.prepare import Prepared, prepare
 from harness.runner.shard_pool import ShardPool
 from harness.runner.worker import ShardSpec
-from harness.sumo.network import sumo_program
+from harness.sumo.cells import sumo_program
 from harness.sumo.shim import shim_library
 from harness.sumo.world import SumoWorld
 from harness.twin import TwinWorld

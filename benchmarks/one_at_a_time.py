@@ -20,7 +20,7 @@ from sumolib.miscutils import getFreeSocketPort
 
 from harness.arrays import BoolArray, FloatArray, Int8Array, IntArray
 from harness.outcomes import AV, BV, VEHICLES
-from harness.sumo.network import EXACT_OPTIONS, committed_file, network_file
+from harness.sumo.cells import EXACT_OPTIONS, committed_file, network_file
 
 LEFT, RIGHT = 1, 0
 

@@ -65,7 +65,15 @@ def load_campaign(
     campaign = campaign.replaced(("run", "ray", "runtime_env"), _with_absolute_paths(campaign, Path(path).parent))
     name = campaign.environment.parameters
     if check_files and not names_a_file(name) and name not in shipped_parameters():
-        raise _unknown_parameters(name, place(("environment", "parameters")))
+        shipped = shipped_parameters()
+        close = difflib.get_close_matches(name, shipped, n=1)
+        mend = f"Did you mean '{close[0]}'?" if close else "For a file of your own write its path, such as ./mine.yaml."
+        raise CampaignError(
+            place(("environment", "parameters")),
+            found=f"'{name}', which is not shipped",
+            expected=f"the name of a shipped parameter file: {', '.join(shipped)}; or a path that ends in .yaml",
+            mend=mend,
+        )
     return campaign
 
 
@@ -107,14 +115,3 @@ def shipped_parameters() -> list[str]:
 def names_a_file(parameters: str) -> bool:
     """Tell a path to a parameter file from the name of a shipped one."""
     return parameters.endswith((".yaml", ".yml")) or "/" in parameters
-
-
-def _unknown_parameters(parameters: str, where: str) -> CampaignError:
-    shipped = shipped_parameters()
-    close = difflib.get_close_matches(parameters, shipped, n=1)
-    return CampaignError(
-        where,
-        found=f"'{parameters}', which is not shipped",
-        expected=f"the name of a shipped parameter file: {', '.join(shipped)}; or a path that ends in .yaml",
-        mend=f"Did you mean '{close[0]}'?" if close else "For a file of your own write its path, such as ./mine.yaml.",
-    )

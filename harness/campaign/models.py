@@ -153,9 +153,9 @@ class Campaign(Section):
         return self
 
     @model_validator(mode="after")
-    def _paths_need_an_av_that_holds_its_speed(self) -> Self:
-        method = self.testing.method
-        if self.av.acts_before_cut_in and SAMPLING[method].holds_speed:
+    def _av_suits_method_and_world(self) -> Self:
+        method, av, world = self.testing.method, self.av, self.world
+        if av.acts_before_cut_in and SAMPLING[method].holds_speed:
             raise broken_rule(
                 "av.before_cut_in",
                 found=f"controller, with testing.method {method}",
@@ -163,55 +163,40 @@ class Campaign(Section):
                 mend="Choose hold_speed, or testing.method shells (or forced), which drives the AV along its paths "
                 "first.",
             )
-        return self
-
-    @model_validator(mode="after")
-    def _built_in_models_wait_for_the_cut_in(self) -> Self:
-        if self.av.acts_before_cut_in and self.av.model is not None:
+        if av.acts_before_cut_in and av.model is not None:
             raise broken_rule(
                 "av.before_cut_in",
-                found=f"controller, with the built-in model {self.av.model}",
+                found=f"controller, with the built-in model {av.model}",
                 expected="hold_speed: a built-in model has nothing to follow before the cut-in",
                 mend="Delete the key, or bring a controller of your own.",
             )
-        return self
-
-    @model_validator(mode="after")
-    def _engine_can_drive_the_av(self) -> Self:
-        if self.world.engine == "twin" and self.av.source in ("sumo", "traci"):
+        if world.engine == "twin" and av.source in ("sumo", "traci"):
             raise broken_rule(
                 "world.engine",
-                found=f"twin, with an AV that SUMO moves (av.{self.av.source})",
+                found=f"twin, with an AV that SUMO moves (av.{av.source})",
                 expected="sumo",
                 mend="Write engine: sumo.",
             )
-        return self
-
-    @model_validator(mode="after")
-    def _network_has_the_cells(self) -> Self:
-        if self.world.engine == "sumo" and self.world.cells > MOST_SUMO_CELLS:
+        if world.engine == "sumo" and world.cells > MOST_SUMO_CELLS:
             raise broken_rule(
                 "world.cells",
-                found=f"{self.world.cells}, with engine sumo",
+                found=f"{world.cells}, with engine sumo",
                 expected=f"at most {MOST_SUMO_CELLS}: so many roads has the largest network",
                 mend="Lower it; about 64 is fastest. It never changes a result.",
             )
         return self
 
     @model_validator(mode="after")
-    def _mixture_has_surrogates(self) -> Self:
-        if not self.surrogates and SAMPLING[self.testing.method].mixes:
+    def _method_has_surrogates_and_bounded_weights(self) -> Self:
+        sampling = SAMPLING[self.testing.method]
+        if not self.surrogates and sampling.mixes:
             raise broken_rule(
                 "surrogates",
                 found="none",
                 expected=f"at least one surrogate for testing.method {self.testing.method}",
                 mend="Leave surrogates out for the three of the paper, or choose method forced or nde.",
             )
-        return self
-
-    @model_validator(mode="after")
-    def _precision_can_be_promised(self) -> Self:
-        if self.stop.rhw is not None and not SAMPLING[self.testing.method].bounded:
+        if self.stop.rhw is not None and not sampling.bounded:
             raise broken_rule(
                 "stop.rhw",
                 found=f"{self.stop.rhw:g}, with testing.method step_mixture",
@@ -250,26 +235,6 @@ class Campaign(Section):
         """Whether the AV is first driven along its paths without a cut-in."""
         return self.av.acts_before_cut_in and SAMPLING[self.testing.method].shadows
 
-    def _pool_content(self) -> dict[str, object] | None:
-        """What of the pool's settings changes an episode's bits."""
-        if self.testing.method != "shells":
-            return None
-        return self.pool.model_dump(exclude=set() if self.av.acts_before_cut_in else {"shadow_paths"})
-
-    def _environment_content(self) -> dict[str, object]:
-        """What the environment's settings say beside its parameters; no lead of their own, nothing of it."""
-        content = self.environment.model_dump(exclude={"parameters"})
-        if self.environment.cut_in_lead_s is None:
-            del content["cut_in_lead_s"]
-        return content
-
-    def _testing_content(self) -> dict[str, Any]:
-        """How it is tested; rounds as they come, nothing of them."""
-        content = self.testing.model_dump()
-        if self.testing.shells.smallest_round == 1:
-            del content["shells"]["smallest_round"]
-        return content
-
     @property
     def min_crashes(self) -> int:
         """Sampled crashes needed before RHW may stop the campaign; limits within shells are exact, without a floor."""
@@ -289,16 +254,24 @@ class Campaign(Section):
         Cells, workers, stop rule, trace policy and names are left out, so that a campaign can be continued to a
         smaller RHW or with other resources.
         """
-        planned = self.testing.method == "shells" and self.testing.shells.stopping == "two_phase"
+        shells = self.testing.method == "shells"
+        planned = shells and self.testing.shells.stopping == "two_phase"
+        environment, testing = self.environment.model_dump(exclude={"parameters"}), self.testing.model_dump()
+        # What came later changes no hash of before where it is left as it is.
+        if environment["cut_in_lead_s"] is None:
+            del environment["cut_in_lead_s"]
+        if testing["shells"]["smallest_round"] == 1:
+            del testing["shells"]["smallest_round"]
+        unused = {"shadow_paths"} if not self.av.acts_before_cut_in else set()
         content = {
             **({"rhw": self.stop.rhw} if planned else {}),  # it decides where the second phase begins
             "seed": self.seed,
-            "environment": self._environment_content(),
+            "environment": environment,
             "environment_parameters": environment_parameters,
             "av": self.av.identity(),
             "surrogates": [(name, model.model_dump()) for name, model in self.surrogates.items()],
-            "testing": self._testing_content(),
-            "pool": self._pool_content(),
+            "testing": testing,
+            "pool": self.pool.model_dump(exclude=unused) if shells else None,
             "engine": self.world.engine,
             "moments": self.records.moments,
             "shard_size": self.run.shard_size,

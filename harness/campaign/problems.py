@@ -80,8 +80,7 @@ _Words = tuple[YamlPath, str, str, str]
 
 
 def _words(details: ErrorDetails, view: SchemaView, data: Any) -> _Words:
-    path = view.path_of(details["loc"], data)
-    kind = details["type"]
+    path, kind = _path_of(details, data), details["type"]
     if kind == "broken_rule":
         parts = details["ctx"]
         return (*path, *filter(None, parts["key"].split("."))), parts["found"], parts["expected"], parts["mend"]
@@ -100,6 +99,17 @@ def _words(details: ErrorDetails, view: SchemaView, data: Any) -> _Words:
         describe_expected(schema, dotted(path[-1:])) if schema else details["msg"].removeprefix("Input should be ")
     )
     return path, describe_found(details["input"]), expected, _how_to_mend(details["input"], schema)
+
+
+def _path_of(details: ErrorDetails, data: Any) -> tuple[str | int, ...]:
+    """Path in the document for pydantic's ``loc``, which also holds tags of unions and ``[key]`` marks."""
+    path: list[str | int] = []
+    for part in details["loc"]:
+        is_step = part in data if isinstance(data, dict) else isinstance(data, list) and isinstance(part, int)
+        if is_step:
+            path.append(part)
+            data = data[part]
+    return (*path, details["loc"][-1]) if details["type"] == "missing" else tuple(path)
 
 
 def _wrong_tag(details: ErrorDetails, path: YamlPath) -> _Words:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
+from functools import cache
 from typing import Any
 
 from pydantic import BaseModel
@@ -21,6 +22,7 @@ def campaign_schema() -> Schema:
     return {**about, **schema_of(Campaign)}
 
 
+@cache
 def schema_of(model: type[BaseModel]) -> Schema:
     """JSON schema of a file: a campaign, a panel of vehicles, or parameters of an environment."""
     schema = model.model_json_schema()
@@ -107,24 +109,6 @@ class SchemaView:
             node = self._resolve(self._child(node, part), data)
         return node
 
-    def path_of(self, loc: Sequence[str | int], data: Any) -> tuple[str | int, ...]:
-        """Path in the document for a pydantic ``loc``, which also holds union tags and ``[key]`` marks."""
-        path: list[str | int] = []
-        node = self._deref(self._root)
-        parts = iter(loc)
-        for part in parts:
-            if "discriminator" in node:
-                node = self._resolve(node, data)
-                next_part = next(parts, None)
-                if next_part is None:
-                    break
-                part = next_part  # noqa: PLW2901 - the tag of a union is no part of the path
-            if part == "[key]" or _is_choice(node):
-                break  # what follows names an alternative, not a place
-            path.append(part)
-            node, data = self._deref(self._child(self._resolve(node, data), part)), _step(data, part)
-        return tuple(path)
-
     def paths_of_key(self, key: str) -> Iterator[str]:
         """Dotted paths of every place that knows ``key``, names of one's own choice written as ``NAME``."""
         yield from self._search(self._root, key, "")
@@ -182,12 +166,6 @@ def _holds(test: Schema, value: Any) -> bool:
     if any(_step(value, key) != wanted["const"] for key, wanted in test.get("properties", {}).items()):
         return False
     return "anyOf" not in test or any(_holds(option, value) for option in test["anyOf"])
-
-
-def _is_choice(node: Schema) -> bool:
-    """Whether a value may be of several simple kinds, such as text or a number."""
-    simple = [option for option in node.get("anyOf", ()) if option.get("type", "null") != "null"]
-    return len(simple) > 1
 
 
 def _step(data: Any, part: str | int) -> Any:

@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 
 from harness.campaign.models import AutomatedVehicle, Campaign
 from harness.controllers.black_box import last_call
-from harness.controllers.time_limit import death_cause
+from harness.controllers.guard import death_cause
 from harness.errors import EXIT_TOO_MANY_FAILED, HarnessError
 from harness.interruption import leave_signals_to_parent
 from harness.spawning import spawn_context

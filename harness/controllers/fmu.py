@@ -9,54 +9,38 @@ from __future__ import annotations
 
 import errno
 import hashlib
+import re
 import shutil
 import zipfile
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
 from tempfile import mkdtemp
-from typing import Any
+from typing import Any, NamedTuple
 
 from harness.campaign.models import FmuController
 from harness.compiled import cache_root
-from harness.controllers.protocol import EpisodeStart, Observation, VehicleController
+from harness.controllers.protocol import BatchObservation, EpisodeStart, Observation, VehicleController
 from harness.errors import CampaignError, writing
 from harness.vehicles.kinematics import STEP_S
 
 OBSERVATIONS: dict[str, Callable[[Observation], float]] = {
-    "time_s": lambda seen: seen.time_s,
-    "position_m": lambda seen: seen.position_m,
-    "speed_mps": lambda seen: seen.speed_mps,
-    "acceleration_mps2": lambda seen: seen.acceleration_mps2,
-    "gap_m": lambda seen: seen.gap_m,
-    "lead_speed_mps": lambda seen: seen.lead_speed_mps,
-    "bv_position_m": lambda seen: seen.bv.position_m,
-    "bv_speed_mps": lambda seen: seen.bv.speed_mps,
-    "bv_lane": lambda seen: float(seen.bv.lane),
-    "lv_position_m": lambda seen: seen.lv.position_m,
-    "lv_speed_mps": lambda seen: seen.lv.speed_mps,
-    "bv_lateral_m": lambda seen: seen.bv_lateral_m,
-    "bv_lateral_speed_mps": lambda seen: seen.bv_lateral_speed_mps,
-    "bv_overlaps": lambda seen: float(seen.bv_overlaps),
+    name: attrgetter(re.sub("^(bv|lv)_(position|speed|lane)", r"\1.\2", name)) for name in BatchObservation._fields[2:]
 }
-"""What an FMU's inputs can be connected to."""
+"""What an FMU's inputs can be connected to, named as in `BatchObservation`: ``bv_lane`` is ``bv.lane``."""
 _OF_THE_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EACCES, errno.EPERM, errno.EROFS)
 """Errors that unpacking a sound FMU meets as well."""
 
 
-@dataclass(frozen=True)
-class Wiring:
-    """A description checked against a campaign: value references (FMI 2.0 section 2.2.7) in a fixed order."""
+class Wiring(NamedTuple):
+    """A campaign checked against a description: value references (FMI 2.0 section 2.2.7) in a fixed order."""
 
-    guid: str
-    identifier: str
-    inputs: tuple[int, ...]
-    readings: tuple[Callable[[Observation], float], ...]
+    inputs: list[int]
+    readings: list[Callable[[Observation], float]]
     output: int
-    start_references: tuple[int, ...]
-    start_values: tuple[float, ...]
-    only_one_per_process: bool
+    start_references: list[int]
+    start_values: list[float]
 
 
 def fmu_maker(fmu: FmuController) -> Callable[[], VehicleController]:
@@ -85,9 +69,9 @@ def fmu_maker(fmu: FmuController) -> Callable[[], VehicleController]:
     made: list[FmuVehicleController] = []
 
     def make() -> VehicleController:
-        if wiring.only_one_per_process and made:
+        if description.coSimulation.canBeInstantiatedOnlyOncePerProcess and made:
             raise RuntimeError("the FMU can be instantiated only once per process: set world.cells to 1")
-        made[:] = [FmuVehicleController(wiring, folder)]
+        made[:] = [FmuVehicleController(wiring, description, folder)]
         return made[0]
 
     return make
@@ -154,16 +138,8 @@ def wire(fmu: FmuController, description: Any) -> Wiring:
     inputs = [_reference(f"av.fmu.inputs.{key}", name, description, ("input",)) for key, name in fmu.inputs.items()]
     starts = [_reference("av.fmu.start_values", name, description, ("parameter", "input", "local", "output"))
               for name in fmu.start_values]  # fmt: skip
-    return Wiring(
-        description.guid,
-        description.coSimulation.modelIdentifier,
-        tuple(inputs),
-        tuple(OBSERVATIONS[key] for key in fmu.inputs),
-        _reference("av.fmu.output", fmu.output, description, ("output",)),
-        tuple(starts),
-        tuple(fmu.start_values.values()),
-        bool(description.coSimulation.canBeInstantiatedOnlyOncePerProcess),
-    )
+    output = _reference("av.fmu.output", fmu.output, description, ("output",))
+    return Wiring(inputs, [OBSERVATIONS[key] for key in fmu.inputs], output, starts, [*fmu.start_values.values()])
 
 
 def _reference(where: str, name: str, description: Any, causalities: Sequence[str]) -> int:
@@ -183,9 +159,13 @@ def _reference(where: str, name: str, description: Any, causalities: Sequence[st
 class FmuVehicleController:
     """One instance of an FMU, which is unpacked in ``folder``."""
 
-    def __init__(self, wiring: Wiring, folder: Path) -> None:
+    def __init__(self, wiring: Wiring, description: Any, folder: Path) -> None:
         self._wiring = wiring
-        self._folder = folder
+        self._instance = {
+            "guid": description.guid,
+            "modelIdentifier": description.coSimulation.modelIdentifier,
+            "unzipDirectory": str(folder),
+        }
         self._fmu: Any = None
         self._begun = False
 
@@ -208,8 +188,7 @@ class FmuVehicleController:
         from fmpy.fmi2 import FMU2Slave  # noqa: PLC0415 - an extra
 
         if self._fmu is None:
-            wiring = self._wiring
-            self._fmu = FMU2Slave(guid=wiring.guid, modelIdentifier=wiring.identifier, unzipDirectory=str(self._folder))
+            self._fmu = FMU2Slave(**self._instance)
             self._fmu.instantiate()
         self._fmu.setupExperiment(startTime=time_s)
         if self._wiring.start_references:

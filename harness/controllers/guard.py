@@ -2,23 +2,30 @@
 
 Whatever goes wrong, an exception, NaN, an answer outside of av.limits or one too late, ends the episode as failed, with
 these words in its row; its controller is dropped (of a batch only the cells fail), and the run goes on until failed
-tests exceed run.max_failed_share.
+tests exceed run.max_failed_share. A call that takes too long meets an exception where Python runs, else the end of the
+process.
 """
 
 from __future__ import annotations
 
 import math
+import os
 import signal
+import threading
+import time
 from collections.abc import Callable
 from operator import methodcaller
 from pathlib import Path
-from typing import Any
+from types import FrameType
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
 from harness.campaign.models import Limits
 from harness.controllers.black_box import CLOSE, START, BlackBox
-from harness.controllers.time_limit import TimeLimit
+
+HUNG_EXIT_CODE = 75
+"""Exit code of a worker whose controller could not be interrupted."""
 
 
 def require_fault(error: BaseException) -> None:
@@ -40,7 +47,7 @@ class Guard:
 
     def __init__(self, limits: Limits, black_box: Path | None) -> None:
         self.time_limit = TimeLimit(limits.step_time_s, may_exit=black_box is not None)
-        self._limits = limits
+        self.limits = limits
         self._black_box = BlackBox(black_box)
 
     def call(
@@ -76,7 +83,83 @@ class Guard:
             return f"returned {type(value).__name__}, expected an acceleration in m/s2 as a number"
         if not math.isfinite(value):
             return f"returned {value}, expected a finite acceleration in m/s2"
-        low, high = self._limits.min_acceleration_mps2, self._limits.max_acceleration_mps2
+        low, high = self.limits.min_acceleration_mps2, self.limits.max_acceleration_mps2
         if not low <= value <= high:
             return f"asked for {value:g} m/s2, outside of av.limits ({low:g} to {high:g})"
         return None
+
+
+class StepTimeoutError(BaseException):
+    """A controller took longer than ``av.limits.step_time_s``.
+
+    Not an `Exception`, so that ``except Exception`` in the user's code does not swallow it.
+    """
+
+
+class TimeLimit:
+    """Limits each of the calls made inside the block; signals need the main thread, where workers run controllers.
+
+    With ``may_exit`` a call that the exception does not end (compiled code, a bare ``except``) ends the process.
+
+    Examples
+    --------
+    >>> with limit:
+    ...     for controller in controllers:
+    ...         limit.begin()
+    ...         try:
+    ...             controller.step(observation)
+    ...         finally:
+    ...             limit.end()
+    """
+
+    _current: ClassVar[TimeLimit | None] = None
+
+    def __init__(self, seconds: float, *, may_exit: bool = False) -> None:
+        self._seconds = seconds
+        self._since: float | None = None
+        """When the call under way began, None between calls: the harness itself may take its time."""
+        if may_exit:
+            threading.Thread(target=self._watch, name="controller watchdog", daemon=True).start()
+
+    def __enter__(self) -> Self:
+        if TimeLimit._current is not self:  # the handler stays: installing it costs more than a controller's step
+            signal.signal(signal.SIGALRM, self._interrupt)
+            TimeLimit._current = self
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+
+    def close(self) -> None:
+        """Leave SIGALRM as it is by default."""
+        if TimeLimit._current is self:
+            signal.signal(signal.SIGALRM, signal.SIG_DFL)
+            TimeLimit._current = None
+
+    def begin(self) -> None:
+        """A call begins: its time starts to run."""
+        self._since = time.monotonic()
+        signal.setitimer(signal.ITIMER_REAL, self._seconds)
+
+    def end(self) -> None:
+        """The call is over; the timer itself is set again by the next one."""
+        self._since = None
+
+    def _interrupt(self, _signal: int, _frame: FrameType | None) -> None:
+        if self._since is not None:
+            raise StepTimeoutError(f"no answer within {self._seconds:g} s (av.limits.step_time_s)")
+
+    def _watch(self) -> None:
+        """End the process when a call outlasts the exception that should have ended it."""
+        while True:
+            time.sleep(0.5)
+            since = self._since
+            if since is not None and time.monotonic() - since > 2.0 * self._seconds + 1.0:
+                os._exit(HUNG_EXIT_CODE)
+
+
+def death_cause(exit_code: int | None, seconds: float) -> str:
+    """Cause for the record of an episode whose controller took the worker process along."""
+    if exit_code == HUNG_EXIT_CODE:
+        return f"no answer within {seconds:g} s (av.limits.step_time_s), and the call could not be interrupted"
+    return f"the controller ended the worker process (exit code {exit_code})"

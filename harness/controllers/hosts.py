@@ -6,13 +6,11 @@ The episode loop calls `start`, `act` and `close`, and knows nothing else of a c
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from harness.arrays import FloatArray, IntArray, read_only
-from harness.campaign.models import Limits
 from harness.controllers.black_box import OF_EPISODE, START, START_BATCH, STEP_BATCH, Death
 from harness.controllers.guard import Guard
 from harness.controllers.protocol import (
@@ -68,9 +66,8 @@ class VehicleHost:
         make: Callable[[], VehicleController],
         n_cells: int,
         seed: int,
-        limits: Limits,
+        guard: Guard,
         *,
-        black_box: Path | None = None,
         doomed: Mapping[int, Death] | None = None,
         acts_before_cut_in: bool = False,
     ) -> None:
@@ -79,7 +76,7 @@ class VehicleHost:
         self._controllers: list[VehicleController | None] = [None] * n_cells
         self._episodes = [-1] * n_cells
         self._seed = seed
-        self._guard = Guard(limits, black_box)
+        self._guard = guard
         self._doomed = {} if doomed is None else doomed
 
     def start(self, cells: IntArray, episodes: IntArray, told: IntArray) -> Failures:
@@ -153,19 +150,12 @@ class BatchHost:
     """One controller object for all cells. A fault that cannot be laid at one cell's door fails all that were asked."""
 
     def __init__(
-        self,
-        controller: BatchController,
-        seed: int,
-        limits: Limits,
-        *,
-        black_box: Path | None = None,
-        acts_before_cut_in: bool = False,
+        self, controller: BatchController, seed: int, guard: Guard, *, acts_before_cut_in: bool = False
     ) -> None:
         self.acts_before_cut_in = acts_before_cut_in
         self._controller = controller
         self._seed = seed
-        self._limits = limits
-        self._guard = Guard(limits, black_box)
+        self._guard = guard
 
     def start(self, cells: IntArray, episodes: IntArray, told: IntArray) -> Failures:  # noqa: ARG002 - see there
         """As `VehicleHost.start`."""
@@ -186,7 +176,7 @@ class BatchHost:
             wrong = f"returned an array of shape {answer.shape}, expected ({n},)"
         if wrong is not None:
             return np.zeros(n), dict.fromkeys(cells.tolist(), f"step_batch: {wrong}")
-        low, high = self._limits.min_acceleration_mps2, self._limits.max_acceleration_mps2
+        low, high = self._guard.limits.min_acceleration_mps2, self._guard.limits.max_acceleration_mps2
         outside = np.flatnonzero(~((answer >= low) & (answer <= high)))  # NaN is neither
         return answer, {
             int(cells[i]): f"step_batch: {self._guard.wrong_answer(float(answer[i]))}" for i in outside.tolist()

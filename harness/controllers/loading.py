@@ -16,7 +16,7 @@ from typing import Any
 from harness.campaign.models import AutomatedVehicle, Campaign
 from harness.controllers.apart import AvEndedProcessError, has_foreign_code, run_apart
 from harness.controllers.black_box import CONSTRUCTOR, BlackBox, Death
-from harness.controllers.guard import cause_of, require_fault
+from harness.controllers.guard import Guard, cause_of, require_fault
 from harness.controllers.hosts import BatchHost, ControllerHost, VehicleHost
 from harness.errors import CampaignError
 
@@ -86,13 +86,13 @@ def build_host(
     CampaignError
         The controller cannot be found or made, or is of neither kind.
     """
-    acts_early = av.acts_before_cut_in
+    early = av.acts_before_cut_in
     make: Callable[[], Any]
     if av.source == "controller":
         make = _maker(av)
         first = _make_first(make, av, BlackBox(black_box))
         if callable(getattr(first, "step_batch", None)) and callable(getattr(first, "start_batch", None)):
-            return BatchHost(first, seed, av.limits, black_box=black_box, acts_before_cut_in=acts_early)
+            return BatchHost(first, seed, Guard(av.limits, black_box), acts_before_cut_in=early)
         _require_vehicle_controller(first, str(av.controller))
     elif av.fmu is not None:
         from harness.controllers.fmu import fmu_maker  # noqa: PLC0415 - an extra
@@ -100,9 +100,7 @@ def build_host(
         make = fmu_maker(av.fmu)
     else:
         return None
-    return VehicleHost(
-        make, n_cells, seed, av.limits, black_box=black_box, doomed=doomed, acts_before_cut_in=acts_early
-    )
+    return VehicleHost(make, n_cells, seed, Guard(av.limits, black_box), doomed=doomed, acts_before_cut_in=early)
 
 
 def require_controller(campaign: Campaign) -> str | None:

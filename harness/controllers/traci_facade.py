@@ -1,16 +1,16 @@
 """What a TraCI script sees of its cell: TraCI's own names over three vehicles, commands for the AV alone.
 
-Names, units and answers are those of the ``traci`` package 1.28; docs/controllers.md lists every difference.
+Names, units and answers are those of the ``traci`` package 1.28; docs/controllers.md lists every difference. What a
+script may not do here is refused with the reason.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, ClassVar, NoReturn
 
 from harness.controllers.protocol import Observation
-from harness.controllers.traci_refusals import WOULD_MOVE, Domain, TraCIException
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
 
 VEH_ID = "AV"
@@ -19,6 +19,58 @@ LANE_CENTRES_M = (-1.6, 1.6)
 MAX_SPEED_MPS = 100.0
 HEADING_DEGREES = 90.0
 _ROUNDING = 1e-9
+
+_WOULD_MOVE = "it would move vehicles past the harness and invalidate the likelihood ratios"
+_STEPS = "the harness itself starts, steps and ends the simulation"
+_EXACT = "it has no effect here: what the AV is told it does exactly, as under speed mode 32"
+_WHY = {
+    "setSpeedMode": _EXACT,
+    "setLaneChangeMode": "it has no effect here: the AV stays on its lane",
+    "addStepListener": "name the listener in the campaign: see StepListenerController",
+    "changeLane": "the AV stays on its lane; " + _WOULD_MOVE,
+}
+_REFUSED_BEGINNINGS = ("set", "add", "remove", "move", "change", "reroute", "openGap", "replace", "insert", "resume")
+_REFUSED_OF_SIMULATION = (
+    *("start", "init", "connect", "switch", "setOrder", "close"),
+    *("load", "loadState", "saveState", "simulationStep", "step", "executeMove", "addStepListener"),
+)
+
+
+class TraCIException(Exception):  # noqa: N818 - TraCI's own name
+    """A command or question that TraCI, or the harness, does not answer."""
+
+
+class Domain:
+    """Part of the facade: what it lacks is refused with the reason, or unknown with a list of what there is."""
+
+    _path: ClassVar[str]
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_"):
+            raise AttributeError(name)
+        why = _WHY.get(name)
+        if why is None and name in _REFUSED_OF_SIMULATION:
+            why = _STEPS
+        if why is None and name.startswith(_REFUSED_BEGINNINGS):
+            why = _WOULD_MOVE
+        if why is None:
+            there = ", ".join(entry for entry in dir(self) if not entry.startswith("_") and entry != "see")
+            raise AttributeError(f"{self._path} has no {name} here; it has {there}")
+
+        def refused(*_arguments: Any, **_named: Any) -> NoReturn:
+            raise TraCIException(f"{self._path}.{name} is refused: {why}.")
+
+        return refused
+
+
+def _reading(table: str, about: str) -> Callable[[VehicleDomain, str], float]:
+    """A question that one of the tables by vehicle answers."""
+
+    def answer(self: VehicleDomain, vehID: str) -> float:
+        return float(self._of(getattr(self, table), vehID))
+
+    answer.__doc__ = about
+    return answer
 
 
 def _same_for_all(value: Any, about: str) -> Callable[[VehicleDomain, str], Any]:
@@ -83,30 +135,20 @@ class VehicleDomain(Domain):
         """Their number."""
         return len(self._speed)
 
-    def getSpeed(self, vehID: str) -> float:
-        """Speed (m/s)."""
-        return float(self._of(self._speed, vehID))
-
-    def getAcceleration(self, vehID: str) -> float:
-        """Acceleration of the last step (m/s²); of LV and BV 0 at the first call of an episode."""
-        return float(self._of(self._acceleration, vehID))
+    getSpeed = _reading("_speed", "Speed (m/s).")
+    getAcceleration = _reading(
+        "_acceleration", "Acceleration of the last step (m/s²); of LV and BV 0 at the first call of an episode."
+    )
+    getLanePosition = _reading("_position", "Front bumper along the lane (m).")
+    getLateralLanePosition = _reading(
+        "_lateral_m", "How far (m) to the left of the middle of its lane; a BV that comes over is on the right of it."
+    )
+    getLateralSpeed = _reading("_lateral_mps", "Speed (m/s) to the left.")
 
     def getPosition(self, vehID: str) -> tuple[float, float]:
         """Front bumper (m) along, and the vehicle's middle across, the cell's own road."""
         along = self._of(self._position, vehID)
         return along, LANE_CENTRES_M[self._lane[vehID]] + self._lateral_m[vehID]
-
-    def getLateralLanePosition(self, vehID: str) -> float:
-        """How far (m) to the left of the middle of its lane; a BV that comes over is on the right of it."""
-        return float(self._of(self._lateral_m, vehID))
-
-    def getLateralSpeed(self, vehID: str) -> float:
-        """Speed (m/s) to the left."""
-        return float(self._of(self._lateral_mps, vehID))
-
-    def getLanePosition(self, vehID: str) -> float:
-        """Front bumper along the lane (m)."""
-        return float(self._of(self._position, vehID))
 
     def getLaneIndex(self, vehID: str) -> int:
         """0 right, 1 left."""
@@ -212,7 +254,7 @@ class VehicleDomain(Domain):
         if vehID != VEH_ID:
             self._of(self._lane, vehID)
             raise TraCIException(
-                f"vehicle.{name}('{vehID}') is refused: {why or WOULD_MOVE}. Commands are for 'AV' only."
+                f"vehicle.{name}('{vehID}') is refused: {why or _WOULD_MOVE}. Commands are for 'AV' only."
             )
 
 

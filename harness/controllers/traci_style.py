@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 
 from harness.controllers.protocol import EpisodeStart, Observation
-from harness.controllers.traci_facade import VEH_ID, Traci
-from harness.controllers.traci_refusals import TraCIException
+from harness.controllers.traci_facade import VEH_ID, Traci, TraCIException
 
 __all__ = ["StepListenerController", "TraCIException", "TraciStyleController"]
 

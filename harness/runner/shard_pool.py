@@ -15,7 +15,7 @@ from scipy.special import bdtrc
 
 from harness.campaign.models import Campaign
 from harness.controllers.black_box import OF_EPISODE, Call, Death
-from harness.controllers.time_limit import death_cause
+from harness.controllers.guard import death_cause
 from harness.errors import CampaignError, HarnessError, TooManyFailedError
 from harness.resolved import Resolved
 from harness.runner.executor import AnyWorker, Ended, Executor, LocalExecutor

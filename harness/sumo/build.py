@@ -21,7 +21,7 @@ def build_sumo_world(
     Raises
     ------
     CampaignError
-        SUMO refuses the AV's attributes, or more cells are asked for than there are roads.
+        SUMO refuses the AV's attributes.
     """
     cells = n_cells or campaign.world.cells
     av = campaign.av

@@ -20,7 +20,7 @@ from traci.exceptions import FatalTraCIError
 
 from harness.campaign.models import TraciProcess
 from harness.errors import CampaignError, WorldDisagreementError
-from harness.sumo.network import sumo_program
+from harness.sumo.cells import sumo_program
 from harness.world import AVLostError
 
 HARNESS_ORDER = 2

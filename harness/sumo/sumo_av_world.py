@@ -17,10 +17,10 @@ from typing import Any
 import numpy as np
 
 from harness.arrays import BoolArray, FloatArray, Int8Array, IntArray
+from harness.controllers.hosts import episode_random
 from harness.outcomes import AV
-from harness.random_stream import AV_DRAWS
 from harness.sumo.av_type import TYPE_NAME, refused, type_xml
-from harness.sumo.network import OBEY
+from harness.sumo.cells import OBEY
 from harness.sumo.world import SumoWorld
 
 SUMO_DECIDES = 31
@@ -140,8 +140,7 @@ class FreshWorld(SumoAvWorld):
 
 def sumo_seed(seed: int, episode: int) -> int:
     """SUMO's seed (31 bits) for an episode: from the AV's own stream of random numbers."""
-    random = np.random.Generator(np.random.Philox(key=seed, counter=[0, episode, AV_DRAWS, 0]))
-    return int(random.integers(2**31))
+    return int(episode_random(seed, episode).integers(2**31))
 
 
 @contextmanager

@@ -19,8 +19,7 @@ from harness.arrays import BoolArray, FloatArray, Int8Array, IntArray
 from harness.campaign.models import TraciProcess
 from harness.errors import WorldDisagreementError
 from harness.outcomes import AV, BV, LV
-from harness.sumo.cells import SumoCells
-from harness.sumo.network import LEFT, NEVER_PLAN_S, OBEY, PLAN_NOW_S, RIGHT
+from harness.sumo.cells import LEFT, NEVER_PLAN_S, OBEY, PLAN_NOW_S, RIGHT, SumoCells
 from harness.sumo.program import BatchConnection, ConnectedProgram
 from harness.twin import advance
 from harness.world import AVLostError

@@ -9,6 +9,8 @@ shim after each step, without it after every tenth. A difference stops the run.
 from __future__ import annotations
 
 import atexit
+import os
+import sys
 from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
@@ -18,9 +20,7 @@ import numpy as np
 from harness.arrays import BoolArray, FloatArray, Int8Array, IntArray
 from harness.errors import CampaignError, WorldDisagreementError
 from harness.outcomes import AV, BV, LV
-from harness.sumo.cells import SumoCells
-from harness.sumo.gui import start_gui
-from harness.sumo.network import NEVER_PLAN_S, PLAN_NOW_S, RIGHT
+from harness.sumo.cells import NEVER_PLAN_S, PLAN_NOW_S, RIGHT, SumoCells, sumo_program
 from harness.sumo.shim import Shim, open_shim
 from harness.sumo.system_libraries import not_importable
 from harness.twin import advance
@@ -74,7 +74,12 @@ class SumoWorld(SumoCells):
         self._n_steps = 0
         self._running = False
         self._options = tuple(options)
-        self._api: Any = self._start(gui=gui)
+        if not gui:
+            libsumo.start(["sumo", *self._arguments()])
+        self._api: Any = start_gui(self._arguments()) if gui else libsumo
+        self._running = SumoWorld._open = True
+        atexit.register(self.close)
+        self._populate(self._api)
         # What is called in every step is called without libsumo's Python wrappers, which cost a quarter.
         self._set_speed = self._function("vehicle", "setSpeed")
         self._get_position = self._function("vehicle", "getLanePosition")
@@ -82,15 +87,6 @@ class SumoWorld(SumoCells):
         self._get_collisions = self._function("simulation", "getCollisions")
         self._simulation_step = self._function("simulation", "step")
         self._shim = open_shim(self._flat, self._told, self.x, self.v) if shim and not gui else None
-
-    def _start(self, *, gui: bool) -> Any:
-        if not gui:
-            libsumo.start(["sumo", *self._arguments()])
-        api = start_gui(self._arguments()) if gui else libsumo
-        self._running = SumoWorld._open = True
-        atexit.register(self.close)
-        self._populate(api)
-        return api
 
     def _function(self, domain: str, name: str) -> Callable[..., Any]:
         inner = getattr(self._api, "_libsumo", None)
@@ -201,4 +197,38 @@ def _disobeyed(where: str, found: float, expected: float) -> WorldDisagreementEr
         found=float(found).hex(),
         expected=f"{float(expected).hex()}, as commanded",
         mend="The bits are promised for libsumo 1.28.0; check `pip show libsumo`. Otherwise please report it.",
+    )
+
+
+def start_gui(arguments: Sequence[str]) -> Any:
+    """Start sumo-gui and connect to it; returns traci, which has libsumo's functions.
+
+    Raises
+    ------
+    CampaignError
+        It is not installed, or has no screen to open its window on.
+    """
+    import traci  # noqa: PLC0415 - comes with libsumo, wanted only here
+
+    program = sumo_program("sumo-gui")
+    if program is None:
+        raise CampaignError(
+            "--gui", found="no sumo-gui", expected="the extra 'sumo'", mend="Install it: pip install 'harness[sumo]'."
+        )
+    display = os.environ.get("DISPLAY")
+    if sys.platform.startswith("linux") and not display:
+        raise _no_window("no screen (the environment variable DISPLAY is not set)")
+    try:
+        traci.start([str(program), "--start", "--delay", "100", *arguments])
+    except (traci.TraCIException, traci.FatalTraCIError) as error:
+        raise _no_window(f"a sumo-gui that cannot be reached ({error}; DISPLAY is {display})") from error
+    return traci
+
+
+def _no_window(found: str) -> CampaignError:
+    return CampaignError(
+        "--gui",
+        found=found,
+        expected="a desktop that sumo-gui can open its window on",
+        mend="Start it from a desktop session (or with ssh -X), or write the motion to a file: --out FILE.csv.",
     )

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from harness.controllers import EpisodeStart, Neighbour, Observation
-from harness.controllers.traci_facade import Traci
-from harness.controllers.traci_refusals import TraCIException
+from harness.controllers.traci_facade import Traci, TraCIException
 from harness.controllers.traci_style import StepListenerController, TraciStyleController
 
 
@@ -60,10 +59,6 @@ def test_accelerations_of_traffic_are_differences_of_speeds(traci):
     traci.see(seen(0.1, lead_speed=19.8))
     assert traci.vehicle.getAcceleration("BV") == pytest.approx(-2.0)
     assert traci.vehicle.getAcceleration("LV") == 0.0
-
-
-def test_without_a_command_the_speed_is_kept(traci):
-    assert drive(traci, 3, 20.0) == [20.0] * 3
 
 
 def test_slow_down_is_linear_as_in_sumo(traci):

@@ -12,13 +12,11 @@ import numpy as np
 import pytest
 import traci
 
-from harness.campaign.testing import MOST_SUMO_CELLS
 from harness.episode.loop import EpisodeLoop, Keep, Shard
 from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, WorldDisagreementError
 from harness.outcomes import AV, BV, CRASH, LV
 from harness.resolved import resolve
 from harness.runner.prepare import prepare
-from harness.sumo.network import network_file
 from harness.twin import TwinWorld
 
 X, V = (np.tile(values, (8, 1)) for values in ([300.0, 200.0, 100.0], [30.0, 28.0, 35.0]))
@@ -53,13 +51,6 @@ def test_a_second_simulation_is_refused_and_the_first_goes_on(open_world, drivin
     assert world.x[1, LV] == pytest.approx(303.0)
 
 
-def test_after_closing_another_world_may_be_opened(open_world):
-    open_world(2).close()
-    world = open_world(3)
-    assert world.n_cells == 3
-    assert len(libsumo.vehicle.getIDList()) == 9
-
-
 def test_closing_a_world_twice_leaves_the_next_one_alone(open_world, driving):
     first = open_world(2)
     first.close()
@@ -70,11 +61,6 @@ def test_closing_a_world_twice_leaves_the_next_one_alone(open_world, driving):
         open_world(2)
 
 
-def test_more_cells_than_the_largest_network_has_are_refused():
-    with pytest.raises(CampaignError, match=r"world\.cells: found 257; expected at most 256"):
-        network_file(MOST_SUMO_CELLS + 1)
-
-
 def test_without_its_extra_the_gui_is_refused_in_words(open_world, monkeypatch):
     monkeypatch.setitem(sys.modules, "sumo", None)
     with pytest.raises(CampaignError, match=r"--gui: found no sumo-gui; expected the extra 'sumo'"):
@@ -83,7 +69,7 @@ def test_without_its_extra_the_gui_is_refused_in_words(open_world, monkeypatch):
 
 
 def test_without_a_screen_the_gui_is_refused_in_words(monkeypatch, open_world):
-    monkeypatch.setattr("harness.sumo.gui.sumo_program", Path)
+    monkeypatch.setattr("harness.sumo.world.sumo_program", Path)
     monkeypatch.delenv("DISPLAY", raising=False)
     with pytest.raises(CampaignError, match="DISPLAY is not set"):
         open_world(1, gui=True)
