@@ -134,8 +134,6 @@ def as_recorded(tables: list[pa.Table], environment: Environment) -> ShadowRuns:
     return ShadowRuns(n_steps, failed, *motion)
 
 
-
-
 def without_cut_in(
     loop: EpisodeLoop, seed: int, first: int, index: IntArray, state: RecordArray, environment: Environment
 ) -> Shard:
