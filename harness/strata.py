@@ -117,11 +117,6 @@ class ShellDesign:
         return self.statements[-1].n_inside
 
     @property
-    def boundary(self) -> str:
-        """The widest boundary."""
-        return self.statements[-1].boundary
-
-    @property
     def library(self) -> Statement:
         """The statement whose boundary is the library's own; the narrowest one if there is none of that name."""
         return next((each for each in self.statements if each.name == LIBRARY_STATEMENT), self.statements[0])

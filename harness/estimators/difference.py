@@ -20,9 +20,8 @@ from harness.estimators.block import Block
 from harness.estimators.estimate import BothWays, Estimate, finite_json, require_episodes
 from harness.estimators.intervals import capped_mean_upper, normal_half_width, skewed_distances
 from harness.estimators.moments import Moments
-from harness.estimators.nade import Nade
+from harness.estimators.nade import FEW_EFFECTIVE, Nade, WeightedSums
 from harness.estimators.statement import warned
-from harness.estimators.weighted_sums import FEW_EFFECTIVE, WeightedSums
 
 FEW_PAIRS = 50
 

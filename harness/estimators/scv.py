@@ -20,8 +20,8 @@ import numpy as np
 from harness.arrays import FloatArray, IntArray
 from harness.estimators.block import MAX_CONTROL_STEPS, Block
 from harness.estimators.estimate import Estimate, require_episodes
+from harness.estimators.nade import WeightedSums, weighted_estimate
 from harness.estimators.triangular_factor import empty_factor, fold_rows
-from harness.estimators.weighted_sums import WeightedSums, weighted_estimate
 from harness.threads import side_by_side
 
 WARNING = (
