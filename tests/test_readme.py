@@ -112,12 +112,15 @@ def test_python_lines_run(tmp_path):
     lines = [(page, text) for page in PAGES for text in _blocks(page, "python")]
     assert lines[0][0] == README
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"}
-    for i, (page, text) in enumerate(lines):
-        (tmp_path / f"lines_{i}.py").write_text(text, encoding="utf-8")
-        command = [sys.executable, "-W", "error", f"lines_{i}.py"]
-        done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
-        assert done.returncode == 0, f"{page}: {done.stderr}"
-        assert done.stdout
+    names = [f"lines_{i}.py" for i in range(len(lines))]
+    for name, (_, text) in zip(names, lines, strict=True):
+        (tmp_path / name).write_text(text, encoding="utf-8")
+    each = "print('====', name)\n    runpy.run_path(name, run_name='__main__')"
+    one_by_one = f"import runpy\nfor name in {names}:\n    {each}"
+    command = [sys.executable, "-W", "error", "-c", one_by_one]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert all(len(said.splitlines()) > 1 for said in done.stdout.split("==== ")[1:])
 
 
 def test_generated_parts_are_current():

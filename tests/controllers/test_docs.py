@@ -1,5 +1,6 @@
 """Every recipe of docs/controllers.md is run, as it stands on the page, by ``harness run``."""
 
+import contextlib
 import os
 import re
 import shlex
@@ -10,6 +11,8 @@ from pathlib import Path
 
 import pyarrow.parquet as pq
 import pytest
+
+from harness.cli import main
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs/controllers.md").read_text(encoding="utf-8")
@@ -58,10 +61,9 @@ def run(folder, recipe):
         pytest.importorskip("sumo", reason="the extra sumo")
     (folder / f"c{number}.yaml").write_text(CAMPAIGN + recipe, encoding="utf-8")
     out = folder / f"run{number}"
-    command = [sys.executable, "-m", "harness", "run", f"c{number}.yaml", "--out", str(out), "--workers", "1"]
-    environment = os.environ | {"PYTHONPATH": str(ROOT), "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
-    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
+    with contextlib.chdir(folder), pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PATH", f"{Path(sys.executable).parent}:{os.environ['PATH']}")
+        assert main(["run", f"c{number}.yaml", "--out", str(out), "--workers", "1", "--quiet"]) == 0
     rows = pq.read_table(out / "episodes").to_pylist()
     assert [row["failure"] for row in rows] == [None] * 60
     return rows

@@ -26,15 +26,6 @@ def _in_the_checkout(monkeypatch):
     monkeypatch.chdir(ROOT)
 
 
-@pytest.fixture(scope="module")
-def fmu(tmp_path_factory):
-    builder = pytest.importorskip("pythonfmu.builder", reason="pythonfmu builds the FMU")
-    folder = tmp_path_factory.mktemp("fmu")
-    return builder.FmuBuilder.build_FMU(
-        ROOT / "examples/idm_fmu.py", dest=folder, project_files=[ROOT / "examples/idm.py"]
-    )
-
-
 def fmu_av(file, more=""):
     inputs = "{speed_mps: v, lead_speed_mps: v_lead, gap_m: gap}"
     return f"{{fmu: {{file: '{file}', inputs: {inputs}, output: a}}{more}}}"

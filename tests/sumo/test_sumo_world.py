@@ -198,30 +198,6 @@ def test_a_collision_in_the_first_step_of_a_refilled_cell_is_flagged(open_world)
     assert world.step(speed, nobody).tolist() == [False, True]
 
 
-def test_an_episode_after_many_others_is_the_same_as_in_a_fresh_simulation(smoke, open_world):
-    prepared = prepare(resolve(smoke()))
-    used = open_world(4)
-    loop = prepared.loop(used, traces="all")
-    loop.run(0, prepared.states(0, 100))
-    after_others = loop.run(100, prepared.states(100, 12))
-    used.close()
-    fresh = prepared.loop(open_world(4), traces="all").run(100, prepared.states(100, 12))
-    assert (fresh.results.episode["outcome"] == CRASH).any()
-    assert after_others.results.episode.tobytes() == fresh.results.episode.tobytes()
-    for row in range(12):
-        assert after_others.traces[row].tobytes() == fresh.traces[row].tobytes()
-
-
-@pytest.mark.parametrize("shim", [True, False])
-def test_fewer_episodes_than_cells_are_run(shim, smoke, open_world):
-    prepared = prepare(resolve(smoke()))
-    few = prepared.loop(open_world(8, shim=shim)).run(0, prepared.states(0, 3))
-    assert (
-        few.results.episode.tobytes()
-        == prepared.loop(TwinWorld(2)).run(0, prepared.states(0, 3)).results.episode.tobytes()
-    )
-
-
 def test_a_cut_in_changes_only_its_own_cell(driving):
     world = driving(4)
     world.step(V[:4], np.array([0, 1, 0, 0], np.int8))

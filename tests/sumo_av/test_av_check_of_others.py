@@ -3,48 +3,46 @@
 from __future__ import annotations
 
 import json
-import subprocess
 import sys
 
 import pytest
 
-from tests.controllers.test_same_bits import fmu, fmu_av  # noqa: F401 - a fixture
+from harness.cli import main
+from tests.controllers.test_same_bits import fmu_av
 from tests.sumo_av.running import EXAMPLE, ROOT
 
 
-def check(av: str, *overrides: str, episodes: int = 6) -> tuple[int, dict]:
-    """In a process of its own: SUMO's library allows one simulation per process."""
-    command = [sys.executable, "-m", "harness", "av-check", str(ROOT / "scenarios/overtaking_forced.yaml"), "--json"]
-    for override in (f"av={av}", *overrides):
-        command += ["--set", override]
-    done = subprocess.run(
-        [*command, "--episodes", str(episodes)], cwd=ROOT, capture_output=True, text=True, check=False
-    )
-    assert done.returncode in (0, 3), done.stderr
-    return done.returncode, json.loads(done.stdout)
+@pytest.fixture
+def check(capfd):
+    def checked(av: str) -> tuple[int, dict]:
+        campaign = str(ROOT / "scenarios/overtaking_forced.yaml")
+        code = main(["av-check", campaign, "--json", "--episodes", "6", "--set", f"av={av}"])
+        return code, json.loads(capfd.readouterr().out)
+
+    return checked
 
 
 @pytest.mark.parametrize("model", ["ACC", "EIDM"])
-def test_models_of_sumo(model):
+def test_models_of_sumo(model, check):
     code, found = check(f"{{sumo: {{carFollowModel: {model}}}}}")
     assert (code, found["deterministic"], found["failures"]) == (0, True, {})
     assert (found["engine"], found["behaviour"]["n_cut_ins"]) == ("sumo", 6)
     assert found["behaviour"]["min_acceleration_mps2"] < -1.0
 
 
-def test_a_program():
+def test_a_program(check):
     code, found = check(f"{{traci: {{command: '{sys.executable} {EXAMPLE} --port {{port}} --cells {{cells}}'}}}}")
     assert (code, found["deterministic"], found["failures"]) == (0, True, {})
     assert found["behaviour"]["min_acceleration_mps2"] == pytest.approx(-4.0)
 
 
-def test_an_fmu(fmu):  # noqa: F811 - the fixture
+def test_an_fmu(fmu, check):
     code, found = check(fmu_av(fmu))
     assert (code, found["deterministic"], found["failures"]) == (0, True, {})
     assert found["behaviour"]["min_acceleration_mps2"] == pytest.approx(-4.0)
 
 
-def test_a_program_that_dies_is_found_out():
+def test_a_program_that_dies_is_found_out(check):
     code, found = check("{traci: {command: 'false', connect_time_s: 5, restarts: 0}}")
     assert code == 3
     assert sum(found["failures"].values()) == 6

@@ -23,15 +23,6 @@ def _in_the_checkout(monkeypatch):
     monkeypatch.chdir(ROOT)
 
 
-@pytest.fixture(scope="module")
-def fmu(tmp_path_factory):
-    builder = pytest.importorskip("pythonfmu.builder", reason="pythonfmu builds the FMU")
-    folder = tmp_path_factory.mktemp("fmu")
-    return builder.FmuBuilder.build_FMU(
-        ROOT / "examples/idm_fmu.py", dest=folder, project_files=[ROOT / "examples/idm.py"]
-    )
-
-
 def acting(av: str, engine: str):
     changes = [f"av={av}", "testing.method=shells", f"world.engine={engine}", "world.cells=8", *SMALL_POOL]
     return load_campaign(MIXTURE_FILE, [*changes, "pool.shadow_paths=120"])

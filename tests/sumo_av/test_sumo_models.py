@@ -9,8 +9,8 @@ from harness.sumo.sumo_av_world import FreshWorld, SumoAvWorld
 from tests.sumo_av.running import ROOT, bits, run, run_idm, run_in, sumo_av
 
 
-def driven(av, ranges, *, cells=4):
-    world = SumoAvWorld(cells, av.sumo)
+def driven(av, ranges, *, cells=4, **options):
+    world = SumoAvWorld(cells, av.sumo, **options)
     try:
         return run_in(world, av, ranges)
     finally:
@@ -100,22 +100,12 @@ def test_the_speed_mode_of_a_released_av_does_not_matter_as_nothing_is_commanded
 
 def test_python_and_shim_move_alike():
     av = sumo_av(carFollowModel="CACC")
-    world = SumoAvWorld(4, av.sumo, shim=False)
-    try:
-        (without,) = run_in(world, av, [(0, 12)])
-    finally:
-        world.close()
-    (with_shim,) = driven(av, [(0, 12)])
+    (without,), (with_shim,) = driven(av, [(0, 12)], shim=False), driven(av, [(0, 12)])
     assert [bits(without, row) for row in range(12)] == [bits(with_shim, row) for row in range(12)]
 
 
 def test_an_av_that_acts_from_the_start_changes_its_speed_before_the_cut_in():
-    av = sumo_av(carFollowModel="IDM")
-    world = SumoAvWorld(4, av.sumo, acts_before_cut_in=True)
-    try:
-        (shard,) = run_in(world, av, [(0, 12)])
-    finally:
-        world.close()
+    (shard,) = driven(sumo_av(carFollowModel="IDM"), [(0, 12)], acts_before_cut_in=True)
     assert all(trace[1, AV, 1] != trace[0, AV, 1] for trace in shard.traces.values())
 
 
