@@ -38,8 +38,8 @@ def print_av_check(found: AvCheck) -> None:
         click.echo(f"{count} × failed: {cause}")
 
 
-def _defined(value: float, style: str = ".2f") -> str:
-    return format(value, style) if math.isfinite(value) else "-"
+def _defined(value: float | None, style: str = ".2f") -> str:
+    return "-" if value is None or not math.isfinite(value) else format(value, style)
 
 
 def print_estimates(content: dict[str, Any], asked: Sequence[str] = ()) -> None:
@@ -149,20 +149,16 @@ def _print_shells(shells: list[dict[str, Any]]) -> None:
 def _cells(entry: dict[str, Any]) -> list[str]:
     if entry["crash_rate"] is None:
         return ["-"] * 5
-    interval = f"{_number(entry['ci_low'], '.3e')} to {_number(entry['ci_high'], '.3e')}"
+    interval = f"{_defined(entry['ci_low'], '.3e')} to {_defined(entry['ci_high'], '.3e')}"
     formats = {"n_effective": ",.1f", "largest_weight_share": ".2%"}
-    others = [_number(entry[key], style) for key, style in formats.items()]
+    others = [_defined(entry[key], style) for key, style in formats.items()]
     return [f"{entry['crash_rate']:.4e}", interval, _half_width(entry["rhw"]), *others]
 
 
 def _half_width(rhw: float | None) -> str:
     from harness.estimators.estimate import WIDEST_RHW  # noqa: PLC0415 - keeps --help fast
 
-    return f"> {WIDEST_RHW:g}" if rhw is not None and rhw > WIDEST_RHW else _number(rhw, ".3f")
-
-
-def _number(value: float | None, style: str) -> str:
-    return "-" if value is None else format(value, style)
+    return f"> {WIDEST_RHW:g}" if rhw is not None and rhw > WIDEST_RHW else _defined(rhw, ".3f")
 
 
 def _print_table(title: str, headings: Sequence[str], rows: Iterable[Sequence[str]], *, texts: Collection[str]) -> None:

@@ -1,4 +1,7 @@
-"""Where things are in a run folder, and atomic writing: a file is there completely, or not at all."""
+"""Where things are in a run folder, and atomic writing: a file is there completely, or not at all.
+
+Whatever reads raises a `RunFolderError` that names a file which is missing, damaged, or not what a run has written.
+"""
 
 from __future__ import annotations
 
@@ -74,18 +77,10 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
 
 
 def require_place(folder: Path, *, mend: str = "Choose another place, or change its permissions.") -> None:
-    """Refuse a folder in which nothing can be written, before work is spent on it; leaves it as it was.
-
-    Raises
-    ------
-    RunFolderError
-        It cannot be made, or nothing can be made in it.
-    """
-    missing: list[Path] = []
+    """Refuse a folder in which nothing can be written, before work is spent on it; leaves it as it was."""
     try:
-        missing = [path for path in (folder, *folder.parents) if not path.exists()]
-        folder.mkdir(parents=True, exist_ok=True)
-        tempfile.TemporaryFile(dir=folder).close()
+        with _made(folder):
+            tempfile.TemporaryFile(dir=folder).close()
     except OSError as error:
         raise RunFolderError(
             str(folder),
@@ -93,33 +88,32 @@ def require_place(folder: Path, *, mend: str = "Choose another place, or change 
             expected="a folder, or a place where one can be made",
             mend=mend,
         ) from error
+
+
+@contextmanager
+def _made(folder: Path) -> Iterator[None]:
+    """Make a folder; what of it and of those above was new and stays empty, goes again."""
+    new = [path for path in (folder, *folder.parents) if not path.exists()]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        yield
     finally:
         with suppress(OSError):
-            for path in missing:
+            for path in new:
                 path.rmdir()
 
 
 @contextmanager
 def sole_use(folder: Path) -> Iterator[None]:
-    """Make a run folder and keep other processes from running into it; if it was new and stays empty, it goes again.
-
-    Raises
-    ------
-    RunFolderError
-        Another process is at it, or nothing can be written there.
-    """
+    """Make a run folder and keep other processes from running into it; if it was new and stays empty, it goes again."""
     require_place(folder)
-    new = [path for path in (folder, *folder.parents) if not path.exists()]
-    folder.mkdir(parents=True, exist_ok=True)
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        _lock(handle, folder)
-        yield
-    finally:
-        os.close(handle)
-        with suppress(OSError):
-            for path in new:
-                path.rmdir()
+    with _made(folder):
+        handle = os.open(folder, os.O_RDONLY)
+        try:
+            _lock(handle, folder)
+            yield
+        finally:
+            os.close(handle)
 
 
 def _lock(handle: int, folder: Path) -> None:
@@ -176,12 +170,7 @@ def _parquet(table: pa.Table) -> bytes:
 def write_shard(folder: Path, index: int, shard: Mapping[str, bytes]) -> dict[str, str]:
     """Write what `encoded` has made; ``episodes`` last, so that its presence means that the shard is complete.
 
-    What an earlier, shorter round has left of the shard goes first, for the same reason.
-
-    Returns
-    -------
-    dict
-        See `shard_files`.
+    What an earlier, shorter round has left of the shard goes first, for the same reason. Returns its `shard_files`.
     """
     for file in shard_files(folder, index).values():
         (folder / file).unlink()
@@ -192,13 +181,7 @@ def write_shard(folder: Path, index: int, shard: Mapping[str, bytes]) -> dict[st
 
 
 def read_table(path: Path, columns: list[str] | None = None, rows: pc.Expression | None = None) -> pa.Table:
-    """Read one Parquet file of a run; row groups that cannot hold one of the asked ``rows`` are skipped.
-
-    Raises
-    ------
-    RunFolderError
-        The file is missing or damaged, or lacks a column.
-    """
+    """Read one Parquet file of a run; row groups that cannot hold one of the asked ``rows`` are skipped."""
     try:
         if rows is not None:
             return pq.read_table(path, columns=columns, filters=rows, memory_map=False, partitioning=None)
@@ -212,13 +195,7 @@ def read_table(path: Path, columns: list[str] | None = None, rows: pc.Expression
 
 
 def concatenated(tables: Sequence[pa.Table], folder: Path) -> pa.Table:
-    """Tables of several shards of a run as one, in one chunk.
-
-    Raises
-    ------
-    RunFolderError
-        A column is not of the same type in all of them.
-    """
+    """Tables of several shards of a run as one, in one chunk; refused where a column is not of one type."""
     try:
         return pa.concat_tables(tables).unify_dictionaries().combine_chunks()
     except pa.ArrowException as error:
@@ -256,13 +233,7 @@ def no_episodes(folder: Path) -> RunFolderError:
 
 
 def read_manifest(folder: Path, *, mend: str = NO_RUN) -> dict[str, Any]:
-    """Read ``manifest.json`` of a run; ``mend`` is the advice where it cannot be.
-
-    Raises
-    ------
-    RunFolderError
-        There is none, or it is not one that a run has written; see `StoredManifest`.
-    """
+    """Read ``manifest.json`` of a run, as `StoredManifest` says; ``mend`` is the advice where it cannot be."""
     path = folder / MANIFEST
     if not path.exists():
         expected = "a run folder, which holds a manifest.json"
@@ -273,13 +244,7 @@ def read_manifest(folder: Path, *, mend: str = NO_RUN) -> dict[str, Any]:
 
 
 def require_schema(content: dict[str, Any], model: type[BaseModel], path: Path, *, mend: str) -> None:
-    """Refuse the content of a JSON file that is not what a run writes.
-
-    Raises
-    ------
-    RunFolderError
-        Names the first value that is wrong.
-    """
+    """Refuse the content of a JSON file that is not what a run writes, by the first value that is wrong."""
     try:
         model.model_validate(content)
     except ValidationError as error:
@@ -296,13 +261,7 @@ def require_schema(content: dict[str, Any], model: type[BaseModel], path: Path, 
 
 
 def read_json(path: Path, *, mend: str) -> dict[str, Any]:
-    """Read a JSON object of a run.
-
-    Raises
-    ------
-    RunFolderError
-        The file is missing or not a JSON object.
-    """
+    """Read a JSON object of a run."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:

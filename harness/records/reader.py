@@ -1,4 +1,7 @@
-"""Read the shards that count, in index order, one at a time: the one way to stored rows."""
+"""Read the shards that count, in index order, one at a time: the one way to stored rows.
+
+Every function raises a `RunFolderError` that names a file which is missing or damaged.
+"""
 
 from __future__ import annotations
 
@@ -23,24 +26,10 @@ _READERS = 2
 def read_shards(
     folder: Path, *, episode_columns: list[str] | None = None, moment_columns: list[str] | None = None
 ) -> Iterator[tuple[pa.Table, pa.Table | None]]:
-    """Episodes and moments of every shard that the manifest lists.
+    """Episodes and moments of every shard that the manifest lists; moments are None where the campaign kept none.
 
-    Parameters
-    ----------
-    folder : Path
-        Run folder.
-    episode_columns, moment_columns : list of str, optional
-        Columns to read; all by default, and no moments at all for an empty list.
-
-    Yields
-    ------
-    (episodes, moments)
-        ``moments`` is None where the campaign kept none.
-
-    Raises
-    ------
-    RunFolderError
-        A file is missing or damaged, or holds another number of episodes than the manifest says.
+    Columns are all by default, and no moments at all for an empty list. A shard with another number of episodes than
+    the manifest says is refused.
     """
     read = partial(read_shard, folder, episode_columns=episode_columns, moment_columns=moment_columns)
     yield from made_ahead(read, read_manifest(folder)["shards"], _READERS)
@@ -70,13 +59,7 @@ def read_shard(
 
 
 def read_traces(folder: Path, episodes: Collection[int], columns: list[str]) -> pa.Table | None:
-    """Trace rows of a few episodes; None where none of them was traced.
-
-    Raises
-    ------
-    RunFolderError
-        A shard that could hold one of them is missing or damaged.
-    """
+    """Trace rows of a few episodes; None where none of them was traced."""
     wanted = pc.field("episode").isin(sorted(episodes))
     tables = []
     for shard in read_manifest(folder)["shards"]:
@@ -88,13 +71,7 @@ def read_traces(folder: Path, episodes: Collection[int], columns: list[str]) -> 
 
 
 def stored_columns(folder: Path, manifest: Mapping[str, Any] | None = None) -> set[str]:
-    """Columns of the episodes table of a run; none if it has no shard. A ``manifest`` at hand spares reading it.
-
-    Raises
-    ------
-    RunFolderError
-        The first shard is missing or damaged.
-    """
+    """Columns of the episodes table of a run; none if it has no shard. A ``manifest`` at hand spares reading it."""
     shards = (manifest or read_manifest(folder))["shards"]
     return set(footer(folder / shards[0]["files"]["episodes"]).schema.to_arrow_schema().names) if shards else set()
 
@@ -109,13 +86,7 @@ class TableSize(NamedTuple):
 
 
 def table_sizes(folder: Path) -> list[TableSize]:
-    """Files, rows and bytes per table.
-
-    Raises
-    ------
-    RunFolderError
-        A listed file is missing or damaged.
-    """
+    """Files, rows and bytes per table."""
     shards = read_manifest(folder)["shards"]
     sizes = []
     for table in TABLES:
@@ -132,13 +103,7 @@ def table_sizes(folder: Path) -> list[TableSize]:
 
 
 def footer(path: Path) -> pq.FileMetaData:
-    """What a Parquet file says of itself.
-
-    Raises
-    ------
-    RunFolderError
-        It is missing or damaged.
-    """
+    """What a Parquet file says of itself."""
     try:
         return pq.read_metadata(path)
     except (OSError, pa.ArrowException) as error:
@@ -146,13 +111,7 @@ def footer(path: Path) -> pq.FileMetaData:
 
 
 def require_whole(folder: Path) -> dict[str, Any]:
-    """Manifest of a run, and not of a part or a plan of one.
-
-    Raises
-    ------
-    RunFolderError
-        It is a part or a plan, or no run.
-    """
+    """Manifest of a run; one of a part or a plan of a run is refused."""
     manifest = read_manifest(folder)
     if (kind := kind_of(manifest)) != WHOLE:
         found, mend = kind, "Bring all parts together with `harness merge PART... --out DIR`."

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -31,9 +31,19 @@ def shard_tables(shard: Shard, seed: int, *, keep_traces: bool) -> ShardTables:
     )
 
 
-def _nullable(values: FloatArray) -> pa.Array:
-    """Float64 with null for NaN and infinity, which stand for «there is none»."""
-    return pa.array(values, mask=~np.isfinite(values))
+def _table(schema: pa.Schema, columns: dict[str, Any], records: RecordArray | None = None) -> pa.Table:
+    """A table of ``columns``, and of fields of ``records`` where there is no column of the name.
+
+    Null stands for «there is none»: for NaN and infinity where a number may be null, and for a step below zero.
+    """
+    arrays = []
+    for field in schema:
+        values = columns[field.name] if records is None or field.name in columns else records[field.name]
+        if isinstance(values, np.ndarray):
+            none = (values < 0 if values.dtype.kind == "i" else ~np.isfinite(values)) if field.nullable else None
+            values = pa.array(np.ascontiguousarray(values), mask=none)
+        arrays.append(values)
+    return pa.table(arrays, schema=schema)
 
 
 def rows(values: np.ndarray) -> pa.Array:
@@ -56,52 +66,45 @@ def _names(codes: Int8Array, names: tuple[str, ...]) -> pa.Array:
     return pa.DictionaryArray.from_arrays(pa.array(codes.astype(np.int8)), pa.array(names))
 
 
+def _driven(shard: Shard) -> dict[str, Any]:
+    """Columns that tests and shadow runs have in common."""
+    results = shard.results
+    e = results.episode
+    return {
+        **{name: shard.states[name] for name in STATE_COLUMNS},
+        "outcome": _names(e["outcome"], OUTCOMES),
+        "lv_maneuvers": prefixes(results.lv_path, e["n_lv"].astype(np.int64)),
+        "bv_maneuvers": prefixes(results.bv_path, e["n_bv"].astype(np.int64)),
+        "failure": pa.array([shard.failures.get(row) for row in range(e.size)], pa.string()),
+    }
+
+
 def episodes_table(shard: Shard, seed: int) -> pa.Table:
     """One row per episode, in index order."""
-    e, n = shard.results.episode, shard.results.episode.size
-    prescribed = shard.cut_ins
-    n_cells = 0 if prescribed is None else prescribed.cell_mass.shape[1]
-    of_all = shard.results.log_q.shape[1], shard.results.martingale.shape[1], n_cells
-    schema = episodes_schema(*of_all, takes_time=shard.lateral.present)
-    never = e["cut_in_step"] < 0
-    columns = {
-        "episode": pa.array(shard.first_episode + np.arange(n)),
-        "seed": pa.array(np.full(n, seed, np.int64)),
-        **{name: pa.array(np.ascontiguousarray(shard.states[name])) for name in STATE_COLUMNS},
-        "outcome": _names(e["outcome"], OUTCOMES),
-        "cut_in_step": pa.array(e["cut_in_step"], mask=never),
-        "log_weight": pa.array(e["log_weight"]),
-        "av_distance_m": pa.array(e["av_distance_m"]),
+    e, n, prescribed = shard.results.episode, shard.results.episode.size, shard.cut_ins
+    columns = _driven(shard) | {
+        "episode": shard.first_episode + np.arange(n),
+        "seed": np.full(n, seed, np.int64),
         "log_q": rows(shard.results.log_q),
         "martingale": rows(shard.results.martingale),
-        "lv_maneuvers": prefixes(shard.results.lv_path, e["n_lv"].astype(np.int64)),
-        "bv_maneuvers": prefixes(shard.results.bv_path, e["n_bv"].astype(np.int64)),
-        "failure": pa.array([shard.failures.get(row) for row in range(n)], pa.string()),
+        "pool_cut_in": pa.nulls(n, pa.int64()) if prescribed is None else prescribed.row,
     }
-    if prescribed is None:
-        columns["pool_cut_in"] = pa.nulls(n, pa.int64())
-    else:
-        columns["pool_cut_in"], columns["cell"] = pa.array(prescribed.row), pa.array(prescribed.cell.astype(np.int16))
-        columns["cell_mass"] = rows(prescribed.cell_mass)
-        columns["ahead_step"] = pa.array(e["ahead_step"], mask=e["ahead_step"] < 0)
-    for name in ("n_steps", "n_control_steps", "component"):
-        columns[name] = pa.array(e[name])
-    for name in ("cut_in_r2_m", "cut_in_r2dot_mps", "crash_time_s", "impact_speed_mps", "min_ttc_s", "log_p_cut_in"):
-        columns[name] = _nullable(e[name])
+    if prescribed is not None:
+        columns |= {"cell": prescribed.cell.astype(np.int16), "cell_mass": rows(prescribed.cell_mass)}
     if shard.lateral.present:
         columns |= _lateral_columns(e)
-    return pa.table([columns[name] for name in schema.names], schema=schema)
+    of_all = shard.results.log_q.shape[1], shard.results.martingale.shape[1]
+    n_cells = 0 if prescribed is None else prescribed.cell_mass.shape[1]
+    return _table(episodes_schema(*of_all, n_cells, takes_time=shard.lateral.present), columns, e)
 
 
-def _lateral_columns(e: RecordArray) -> dict[str, pa.Array]:
-    """When BV showed what it would do, and what that was like."""
-    none = e["onset_step"] < 0
+def _lateral_columns(e: RecordArray) -> dict[str, Any]:
+    """What BV's lateral motion was like; `onset_step` and the like are in ``e`` itself."""
     side = np.where(e["n_steps"] == e["cut_in_step"] + 1, "side", "rear")
     return {
-        **{name: pa.array(e[name], mask=none) for name in ("lead_steps", "onset_step")},
-        **{name: _nullable(e[name]) for name in ("onset_r2_m", "onset_r2dot_mps")},
-        "onset_ttc_s": _nullable(_time_to_collision(e["onset_r2_m"], e["onset_r2dot_mps"])),
-        "overlap_ttc_s": _nullable(_time_to_collision(e["cut_in_r2_m"], e["cut_in_r2dot_mps"])),
+        "lead_steps": pa.array(e["lead_steps"], mask=e["onset_step"] < 0),
+        "onset_ttc_s": _time_to_collision(e["onset_r2_m"], e["onset_r2dot_mps"]),
+        "overlap_ttc_s": _time_to_collision(e["cut_in_r2_m"], e["cut_in_r2dot_mps"]),
         "contact": pa.array(side, pa.string(), mask=e["outcome"] != CRASH),
     }
 
@@ -119,12 +122,8 @@ def moments_table(shard: Shard) -> pa.Table:
     m = shard.results.moment[:used]
     order = np.lexsort((m["step"], m["row"]))
     m, q, v = m[order], shard.results.moment_q[:used][order], shard.results.moment_v[:used][order]
-    schema = moments_schema(q.shape[1])
-    columns = {"episode": pa.array(shard.first_episode + m["row"]), "q": rows(q), "v": rows(v)}
-    for name in schema.names:
-        if name not in columns:
-            columns[name] = pa.array(np.ascontiguousarray(m[name]))
-    return pa.table([columns[name] for name in schema.names], schema=schema)
+    columns = {"episode": shard.first_episode + m["row"], "q": rows(q), "v": rows(v)}
+    return _table(moments_schema(q.shape[1]), columns, m)
 
 
 def traces_table(shard: Shard) -> pa.Table:
@@ -134,10 +133,7 @@ def traces_table(shard: Shard) -> pa.Table:
         return schema.empty_table()
     parts = [_trace_columns(shard, row) for row in sorted(shard.traces)]
     joined = {name: np.concatenate([part[name] for part in parts]) for name in schema.names}
-    columns = {name: pa.array(values) for name, values in joined.items()}
-    columns["vehicle"] = _names(joined["vehicle"], VEHICLES)
-    columns["a_mps2"] = _nullable(joined["a_mps2"])
-    return pa.table([columns[name] for name in schema.names], schema=schema)
+    return _table(schema, joined | {"vehicle": _names(joined["vehicle"], VEHICLES)})
 
 
 def _trace_columns(shard: Shard, row: int) -> dict[str, np.ndarray]:
@@ -174,19 +170,12 @@ def _came_over(shard: Shard, row: int, state: np.ndarray) -> FloatArray:
 
 def shadow_table(shard: Shard, path: IntArray, weight: FloatArray) -> pa.Table:
     """One row per shadow run of a shard that has kept all motion; ``path``, ``weight`` (n,) as in the schema."""
-    e, n = shard.results.episode, shard.results.episode.size
-    columns = {
-        "shadow": pa.array(shard.first_episode + np.arange(n)),
-        "path": pa.array(path),
-        "weight": pa.array(weight),
-        **{name: pa.array(np.ascontiguousarray(shard.states[name])) for name in STATE_COLUMNS},
-        "outcome": _names(e["outcome"], OUTCOMES),
-        "n_steps": pa.array(e["n_steps"]),
-        "lv_maneuvers": prefixes(shard.results.lv_path, e["n_lv"].astype(np.int64)),
-        "bv_maneuvers": prefixes(shard.results.bv_path, e["n_bv"].astype(np.int64)),
-        "av_position_m": pa.array([shard.traces[row][:, AV, 0] for row in range(n)], pa.list_(pa.float64())),
-        "av_speed_mps": pa.array([shard.traces[row][:, AV, 1] for row in range(n)], pa.list_(pa.float64())),
-        "failure": pa.array([shard.failures.get(row) for row in range(n)], pa.string()),
+    e, traces = shard.results.episode, [shard.traces[row] for row in range(shard.results.episode.size)]
+    columns = _driven(shard) | {
+        "shadow": shard.first_episode + np.arange(e.size),
+        "path": path,
+        "weight": weight,
+        "av_position_m": pa.array([trace[:, AV, 0] for trace in traces], pa.list_(pa.float64())),
+        "av_speed_mps": pa.array([trace[:, AV, 1] for trace in traces], pa.list_(pa.float64())),
     }
-    schema = shadow_schema()
-    return pa.table([columns[name] for name in schema.names], schema=schema)
+    return _table(shadow_schema(), columns, e)

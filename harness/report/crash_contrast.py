@@ -2,24 +2,29 @@
 
 Of tests from shells those outside the library's boundary are compared: they are one stratum, drawn by naturalistic
 probability, so that every test counts the same. Under the other methods all cut-ins are, with their likelihood ratios.
+
+What LV, BV and AV were doing when BV decided to cut in is worked out from the stored rows. A row holds the initial
+state and LV's and BV's draws, which determine their motion up to the cut-in; the AV's speed there follows from BV's and
+the recorded R2dot, whether it kept its speed or not.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 from matplotlib.axes import Axes
 
-from harness.arrays import FloatArray
+from harness.arrays import FloatArray, IntArray
+from harness.maneuvers import ACCELERATIONS_MPS2, CUT_IN
 from harness.outcomes import CRASH, FAILED, OUTCOMES
-from harness.report.cut_in_conditions import COLUMNS, CONDITIONS, cut_in_conditions
 from harness.report.number_format import count, decimal, percent
 from harness.report.plot_style import FULL_WIDTH_IN, GREY, MUTED, VERMILLION, Plot, new_figure, only_horizontal_grid
-from harness.report.run_folder import RunFolder
+from harness.report.run_folder import RunFolder, floats
 from harness.report.telling_bands import Band, telling_bands
 from harness.vehicles.kinematics import STEP_S
 
@@ -33,6 +38,80 @@ TICKED_CRASHES = 60
 """Up to so many crashes each get a mark of their own below the bars."""
 OTHERS_SHOWN, CRASHES_SHOWN = (0.005, 0.995), (0.25, 0.75)
 """Quantiles that a panel reaches at least; of crashes fewer, because some need a braking of hundreds of m/s²."""
+
+
+class Condition(NamedTuple):
+    """A quantity at the cut-in: its name in a table, and in a sentence after «had»."""
+
+    name: str
+    phrase: str
+    unit: str
+
+
+CONDITIONS = (
+    Condition("AV speed", "an AV speed", "m/s"),
+    Condition("BV speed", "a BV speed", "m/s"),
+    Condition("R2, gap BV–AV", "a gap R2", "m"),
+    Condition("R2dot", "a rate R2dot", "m/s"),
+    Condition("time to collision R2/−R2dot", "a time to collision", "s"),
+    Condition("braking needed R2dot²/(2 R2)", "a needed braking", "m/s²"),
+    Condition("R1, gap LV–BV", "a gap R1", "m"),
+    Condition("R1dot", "a rate R1dot", "m/s"),
+    Condition("time of the cut-in", "a cut-in time", "s"),
+    Condition("BV acceleration at the cut-in", "a BV acceleration at the cut-in", "m/s²"),
+    Condition("BV acceleration after the cut-in", "a BV acceleration right after the cut-in", "m/s²"),
+)
+NUMBERS = ("v_bv_mps", "r1_m", "r1dot_mps", "cut_in_r2_m", "cut_in_r2dot_mps")
+COLUMNS = (*NUMBERS, "cut_in_step", "lv_maneuvers", "bv_maneuvers")
+
+
+def cut_in_conditions(batch: pa.RecordBatch, hold_steps: int) -> FloatArray:
+    """Values of `CONDITIONS`, shape (Q, n), in rows of the episodes table that all have a cut-in.
+
+    LV and BV hold an acceleration for ``hold_steps``. NaN where there is no such value: the acceleration after a cut-in
+    that ended the test at once.
+    """
+    v_bv0, r1_0, r1dot0, r2, r2dot = (floats(batch.column(name)) for name in NUMBERS)
+    cut = batch.column("cut_in_step").to_numpy(zero_copy_only=False).astype(np.int64)
+    lv, bv = (_draws(batch.column(name)) for name in ("lv_maneuvers", "bv_maneuvers"))
+    x_lv, v_lv = _moved(np.maximum(v_bv0 + r1dot0, 0.0), lv, cut, hold_steps)
+    x_bv, v_bv = _moved(v_bv0, bv, cut, hold_steps)
+    closing = np.maximum(-r2dot, 0.0)
+    with np.errstate(divide="ignore"):
+        ttc = np.where(closing > 0.0, r2 / closing, np.inf)
+        needed = np.where(closing > 0.0, closing * closing / (2.0 * r2), 0.0)
+    held = cut // hold_steps  # the draw that the cut-in falls into; the mark of the cut-in and BV's next draw follow it
+    at, after = (_accelerations(bv, held + ahead) for ahead in (0, 2))
+    return np.stack(
+        [v_bv - r2dot, v_bv, r2, r2dot, ttc, needed, r1_0 + x_lv - x_bv, v_lv - v_bv, STEP_S * cut, at, after]
+    )
+
+
+def _draws(column: pa.ListArray) -> IntArray:
+    """Maneuver indices, shape (n, most draws), -1 beyond the last of a row."""
+    lengths = column.value_lengths().to_numpy(zero_copy_only=False).astype(np.int64)
+    drawn = np.full((lengths.size, int(lengths.max(initial=0)) + 1), -1, np.int64)
+    drawn[np.arange(drawn.shape[1]) < lengths[:, None]] = column.flatten().to_numpy(zero_copy_only=False)
+    return drawn
+
+
+def _accelerations(draws: IntArray, which: IntArray) -> FloatArray:
+    """Acceleration (m/s²) of one draw per row; NaN where it is none."""
+    draw = np.take_along_axis(draws, np.minimum(which, draws.shape[1] - 1)[:, None], axis=1)[:, 0]
+    known = (draw >= 0) & (draw < CUT_IN)
+    return np.where(known, ACCELERATIONS_MPS2[np.where(known, draw, 0)], np.nan)
+
+
+def _moved(v: FloatArray, draws: IntArray, steps: IntArray, hold_steps: int) -> tuple[FloatArray, FloatArray]:
+    """Distance (m) and speed (m/s) after ``steps`` steps, a draw held for ``hold_steps`` of them; nobody reverses."""
+    x = np.zeros_like(v)
+    for period in range(int(steps.max(initial=0)) // hold_steps + 1):
+        seconds = STEP_S * np.clip(steps - period * hold_steps, 0, hold_steps)
+        a = np.where(seconds > 0.0, _accelerations(draws, np.full(v.size, period)), 0.0)
+        moving = np.where(a < 0.0, np.minimum(seconds, v / np.maximum(-a, 1e-12)), seconds)
+        x += (v + 0.5 * a * moving) * moving
+        v = np.maximum(v + a * moving, 0.0)
+    return x, v
 
 
 class Group:
@@ -49,9 +128,10 @@ class Group:
 
     def add(self, rows: pa.RecordBatch, hold_steps: int, *, weighted: bool) -> None:
         """Add rows of the episodes table, all of them with a cut-in."""
-        log_weight = rows.column("log_weight").to_numpy(zero_copy_only=False)
         self.values = np.hstack([self.values, cut_in_conditions(rows, hold_steps)])
-        self.weight = np.r_[self.weight, np.exp(log_weight) if weighted else np.ones(rows.num_rows)]
+        self.weight = np.r_[
+            self.weight, np.exp(floats(rows.column("log_weight"))) if weighted else np.ones(rows.num_rows)
+        ]
 
 
 @dataclass(frozen=True)
@@ -113,13 +193,7 @@ def band_in_words(band: Band) -> str:
 
 
 def crash_contrast(run: RunFolder) -> Contrast:
-    """Compare the tests of a run.
-
-    Raises
-    ------
-    RunFolderError
-        If a shard is damaged.
-    """
+    """Compare the tests of a run."""
     first_outside = None if run.shells is None else run.shells.n_inside
     crashes, others = Group(), Group()
     hold_steps = round(run.campaign.environment.acceleration_hold_s / STEP_S)

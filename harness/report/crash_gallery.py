@@ -18,7 +18,7 @@ from harness.outcomes import VEHICLES
 from harness.records.reader import read_traces, stored_columns
 from harness.report.number_format import decimal, number
 from harness.report.plot_style import HALF_WIDTH_IN, INK, VEHICLE_COLOURS, Plot, new_figure, note
-from harness.report.run_folder import RunFolder
+from harness.report.run_folder import RunFolder, floats
 from harness.report.summary import Crash, RunSummary
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
 
@@ -44,11 +44,6 @@ def crash_gallery(run: RunFolder, summary: RunSummary) -> list[GalleryRow]:
     """Hardest impacts first, then the largest weights (of shells: the outermost) that are not among them.
 
     Traced crashes go first where some of the worst have no trace: a diagram is worth more than a rank.
-
-    Raises
-    ------
-    RunFolderError
-        If a traces shard is damaged.
     """
     rankings = [(summary.hardest.crashes, "impact")]
     if summary.from_shells:
@@ -95,46 +90,43 @@ def _diagram(run: RunFolder, summary: RunSummary, crash: Crash, traces: pa.Table
 
 @dataclass(frozen=True)
 class Track:
-    """One vehicle's motion; all of shape (n_steps,): time in s, front bumper in m, speed in m/s, lane (0 right).
+    """One vehicle's motion; all of shape (n_steps,): time (s), front bumper (m), speed (m/s), lane (0 right).
 
-    ``lateral_m`` is how far it has come over, None where cut-ins are one step.
+    The front bumper is in a frame that moves with BV's initial speed. ``lateral_m`` is how far the vehicle has come
+    over, zeros where cut-ins are one step.
     """
 
     time_s: FloatArray
-    x_m: FloatArray
+    front_m: FloatArray
     v_mps: FloatArray
     lane: FloatArray
-    lateral_m: FloatArray | None = None
-
-    @property
-    def came_over_m(self) -> FloatArray:
-        """How far it has come over: not at all where that is not known."""
-        return np.zeros(self.time_s.shape) if self.lateral_m is None else self.lateral_m
+    lateral_m: FloatArray
 
     @property
     def onset_s(self) -> float | None:
         """When it begins to move sideways; None if it does not, or that takes no time."""
-        moved = self.came_over_m > 0.0
+        moved = self.lateral_m > 0.0
         return float(self.time_s[max(int(np.argmax(moved)) - 1, 0)]) if moved.any() else None
 
-    def front_m(self, time_s: float, frame_mps: float) -> float:
-        """Front bumper in the moving frame at one time."""
-        return float(np.interp(time_s, self.time_s, self.x_m)) - frame_mps * time_s
+    def front_at(self, time_s: float) -> float:
+        """Front bumper (m) at one time."""
+        return float(np.interp(time_s, self.time_s, self.front_m))
 
-    def speed_mps(self, time_s: float) -> float:
-        """Speed at one time."""
+    def speed_at(self, time_s: float) -> float:
+        """Speed (m/s) at one time."""
         return float(np.interp(time_s, self.time_s, self.v_mps))
 
 
 def _tracks(traces: pa.Table, episode: int) -> dict[str, Track]:
     """Tracks of an episode by vehicle."""
-    rows = traces.filter(pc.equal(traces.column("episode"), episode))
+    rows = traces.filter(pc.equal(traces.column("episode"), episode)).sort_by("step")
+    of = {name: rows.filter(pc.equal(rows.column("vehicle").cast(pa.string()), name)) for name in VEHICLES}
+    frame_mps = of["BV"].column("v_mps")[0].as_py()
     tracks = {}
-    for vehicle in VEHICLES:
-        part = rows.filter(pc.equal(rows.column("vehicle").cast(pa.string()), vehicle)).sort_by("step")
-        names = ["step", "x_m", "v_mps", "lane", *(name for name in part.column_names if name == "lateral_m")]
-        columns = [part.column(name).to_numpy().astype(np.float64) for name in names]
-        tracks[vehicle] = Track(STEP_S * columns[0], *columns[1:])
+    for vehicle, part in of.items():
+        step, x, v, lane = (floats(part.column(name)) for name in ("step", "x_m", "v_mps", "lane"))
+        over = floats(part.column("lateral_m")) if "lateral_m" in part.column_names else np.zeros(v.shape)
+        tracks[vehicle] = Track(STEP_S * step, x - frame_mps * STEP_S * step, v, lane, over)
     return tracks
 
 
@@ -148,16 +140,20 @@ def time_space_plot(crash: Crash, tracks: dict[str, Track], *, worth: str) -> Pl
     position, speed, *lateral = figure.subplots(
         2 if onset_s is None else 3, 1, sharex=True, height_ratios=(3, 2) if onset_s is None else (3, 2, 1)
     )
-    frame_mps = float(tracks["BV"].v_mps[0])
     for vehicle, track in tracks.items():
-        _draw_positions(position, vehicle, track, frame_mps)
+        _draw_positions(position, vehicle, track)
         speed.plot(track.time_s, track.v_mps, color=VEHICLE_COLOURS[vehicle])
     for axes in (position, speed, *lateral):
         axes.axvline(crash.cut_in_time_s, color=INK, linewidth=0.9, linestyle=(0, (4, 3)))
     place = ("data", "axes fraction")
     note(position, "cut-in", (crash.cut_in_time_s, 0.0), (-4, 5), xycoords=place, ha="right", color=INK, fontsize=8)
-    _mark_crash(position, speed, crash.crash_time_s, tracks, frame_mps)
-    _label(position, speed, crash, tracks, frame_mps)
+    position.plot(
+        [crash.crash_time_s], [tracks["AV"].front_at(crash.crash_time_s)], "X", color=INK, markersize=9, clip_on=False,
+        zorder=5,
+    )  # fmt: skip
+    ends = [tracks[vehicle].speed_at(crash.crash_time_s) for vehicle in ("BV", "AV")]
+    speed.plot([crash.crash_time_s] * 2, ends, color=INK, linewidth=1.4, clip_on=False, zorder=4)
+    _label(position, speed, crash, tracks)
     came = "" if onset_s is None else _draw_lateral(speed, lateral[0], tracks["BV"], onset_s, crash)
     alt = (
         f"Time-space diagram of episode {crash.episode}: BV cuts in at {decimal(crash.cut_in_time_s)} s, "
@@ -173,7 +169,7 @@ def time_space_plot(crash: Crash, tracks: dict[str, Track], *, worth: str) -> Pl
 
 def _draw_lateral(above: Axes, axes: Axes, bv: Track, onset_s: float, crash: Crash) -> str:
     """How far BV has come over, from the onset on; returns what the caption says of it."""
-    axes.plot(bv.time_s, bv.came_over_m, color=VEHICLE_COLOURS["BV"])
+    axes.plot(bv.time_s, bv.lateral_m, color=VEHICLE_COLOURS["BV"])
     for panel in above.figure.axes:
         panel.axvline(onset_s, color=INK, linewidth=0.9, linestyle=(0, (1, 2)))
     place = ("data", "axes fraction")
@@ -185,33 +181,25 @@ def _draw_lateral(above: Axes, axes: Axes, bv: Track, onset_s: float, crash: Cra
     return f"BV came over for {decimal(crash.cut_in_time_s + STEP_S - onset_s)} s before; "
 
 
-def _draw_positions(axes: Axes, vehicle: str, track: Track, frame_mps: float) -> None:
+def _draw_positions(axes: Axes, vehicle: str, track: Track) -> None:
     """Draw the vehicle as a band from rear to front bumper; paler while it is on the left lane."""
-    front = track.x_m - frame_mps * track.time_s
-    rear, colour = front - VEHICLE_LENGTH_M, VEHICLE_COLOURS[vehicle]
+    rear, colour = track.front_m - VEHICLE_LENGTH_M, VEHICLE_COLOURS[vehicle]
     for lane, alpha in ((1, 0.28), (0, 0.62)):
         on_lane = track.lane == lane
         # A band drawn over the mask alone would leave a gap of one step at the lane change.
         on_lane = on_lane | np.r_[False, on_lane[:-1]] if lane == 1 else on_lane
-        axes.fill_between(track.time_s, rear, front, where=on_lane, color=colour, alpha=alpha, linewidth=0)
-    axes.plot(track.time_s, front, color=colour, linewidth=1.2)
+        axes.fill_between(track.time_s, rear, track.front_m, where=on_lane, color=colour, alpha=alpha, linewidth=0)
+    axes.plot(track.time_s, track.front_m, color=colour, linewidth=1.2)
 
 
-def _mark_crash(position: Axes, speed: Axes, time_s: float, tracks: dict[str, Track], frame_mps: float) -> None:
-    at_crash = tracks["AV"].front_m(time_s, frame_mps)
-    position.plot([time_s], [at_crash], "X", color=INK, markersize=9, clip_on=False, zorder=5)
-    ends = [tracks[vehicle].speed_mps(time_s) for vehicle in ("BV", "AV")]
-    speed.plot([time_s] * 2, ends, color=INK, linewidth=1.4, clip_on=False, zorder=4)
-
-
-def _label(position: Axes, speed: Axes, crash: Crash, tracks: dict[str, Track], frame_mps: float) -> None:
+def _label(position: Axes, speed: Axes, crash: Crash, tracks: dict[str, Track]) -> None:
     start = max(min(crash.cut_in_time_s - SECONDS_BEFORE_CUT_IN, crash.crash_time_s - 4.0), 0.0)
     end = crash.crash_time_s + 0.06 * (crash.crash_time_s - start)
     position.set_xlim(start, end)
-    _fit_height(position, tracks, frame_mps, start, crash.crash_time_s)
-    _name_vehicles(position, tracks, frame_mps, start)
+    _fit_height(position, tracks, start, crash.crash_time_s)
+    _name_vehicles(position, tracks, start)
     position.set_title(f"Episode {crash.episode:,}: impact at {decimal(crash.impact_speed_mps)} m/s")
-    position.set_ylabel(f"position in a frame\nmoving at {frame_mps:.1f} m/s, m")
+    position.set_ylabel(f"position in a frame\nmoving at {tracks['BV'].v_mps[0]:.1f} m/s, m")
     _name_speeds(speed, tracks, crash.crash_time_s)
     speed.set_ylabel("speed, m/s")
     speed.set_xlabel("time, s")
@@ -219,36 +207,33 @@ def _label(position: Axes, speed: Axes, crash: Crash, tracks: dict[str, Track], 
         axis.set_major_formatter(lambda value, _: f"{value:g}")
 
 
-def _fit_height(axes: Axes, tracks: dict[str, Track], frame_mps: float, start: float, end: float) -> None:
+def _fit_height(axes: Axes, tracks: dict[str, Track], start: float, end: float) -> None:
     """Fit AV and BV; an LV far ahead may leave the panel rather than flatten what matters."""
-    fronts = {
-        vehicle: (track.x_m - frame_mps * track.time_s)[(track.time_s >= start) & (track.time_s <= end)]
-        for vehicle, track in tracks.items()
-    }
-    near = np.concatenate([fronts["BV"], fronts["AV"]])
-    low, high = float(near.min()) - VEHICLE_LENGTH_M, float(near.max())
-    high = max(high, min(float(fronts["LV"].max()), high + 1.5 * (high - low)))
+    lv, bv, av = (
+        tracks[vehicle].front_m[(tracks[vehicle].time_s >= start) & (tracks[vehicle].time_s <= end)]
+        for vehicle in VEHICLES
+    )
+    low, high = float(min(bv.min(), av.min())) - VEHICLE_LENGTH_M, float(max(bv.max(), av.max()))
+    high = max(high, min(float(lv.max()), high + 1.5 * (high - low)))
     margin = 0.07 * (high - low)
     axes.set_ylim(low - margin, high + 2.0 * margin)
 
 
-def _name_vehicles(axes: Axes, tracks: dict[str, Track], frame_mps: float, start: float) -> None:
+def _name_vehicles(axes: Axes, tracks: dict[str, Track], start: float) -> None:
     """Name each band at its left end; an LV beyond the panel is named at the panel's edge."""
     top = axes.get_ylim()[1]
     for vehicle, track in tracks.items():
-        front = track.front_m(start, frame_mps)
-        colour = VEHICLE_COLOURS[vehicle]
+        front = track.front_at(start)
+        text, place, offset, va = vehicle, front, (5, 4), "bottom"
         if front > top:
-            text = f"{vehicle}, {front - top:.0f} m further"
-            note(axes, text, (start, top), (5, -3), va="top", color=colour, fontweight="bold")
-        else:
-            note(axes, vehicle, (start, front), (5, 4), va="bottom", color=colour, fontweight="bold")
+            text, place, offset, va = f"{vehicle}, {front - top:.0f} m further", top, (5, -3), "top"
+        note(axes, text, (start, place), offset, va=va, color=VEHICLE_COLOURS[vehicle], fontweight="bold")
 
 
 def _name_speeds(axes: Axes, tracks: dict[str, Track], end: float) -> None:
     """Name each line right of the panel, at its height at the crash; names of nearly equal speeds move apart."""
     low, high = axes.get_ylim()
-    heights = {vehicle: track.speed_mps(end) for vehicle, track in tracks.items()}
+    heights = {vehicle: track.speed_at(end) for vehicle, track in tracks.items()}
     lowest = -math.inf
     for vehicle in sorted(heights, key=lambda name: heights[name]):
         lowest = max((heights[vehicle] - low) / (high - low), lowest + NAME_HEIGHT)

@@ -9,7 +9,6 @@ from matplotlib.patches import Patch, PathPatch
 from matplotlib.path import Path
 
 from harness.arrays import FloatArray, IntArray
-from harness.report.histograms import UsedCells
 from harness.report.number_format import count, number
 from harness.report.plot_style import BLUES, FULL_WIDTH_IN, MUTED, REDS, Plot, new_figure, note
 from harness.report.summary import RunSummary
@@ -21,15 +20,17 @@ TTC_LINES_S = (1.0, 2.0, 4.0, 8.0)
 
 def cut_in_plot(summary: RunSummary) -> Plot | None:
     """Four maps of (R2, R2dot) at the cut-in; None when BV never cut in."""
-    cells = summary.cut_in.used()
-    if cells is None:
+    block = summary.cut_in.used()
+    if block is None:
         return None
+    r2dot_mps, r2_m = (axis.edges(of.start, of.stop) for axis, of in zip(summary.cut_in.axes, block, strict=True))
     maps = _maps(summary)
     n_rows = len(maps) // 2
     figure = new_figure(FULL_WIDTH_IN, 3.0 * n_rows + 0.4)
     panels = figure.subplots(n_rows, 2, sharex=True, sharey=True, squeeze=False)
     for axes, (values, ramp, title) in zip(panels.flat, maps, strict=True):
-        _draw_map(axes, values, cells, ramp, title)
+        _draw_map(axes, values[block], r2_m, r2dot_mps, ramp)
+        axes.set_title(title)
     for axes in panels[:, 0]:
         axes.set_ylabel("R2dot at the cut-in, m/s")
     for axes in panels[-1]:
@@ -55,17 +56,17 @@ def _maps(summary: RunSummary) -> list[tuple[FloatArray, tuple[str, ...], str]]:
     ]
 
 
-def _draw_map(axes: Axes, values: FloatArray, cells: UsedCells, ramp: tuple[str, ...], title: str) -> None:
+def _draw_map(axes: Axes, values: FloatArray, r2_m: FloatArray, r2dot_mps: FloatArray, ramp: tuple[str, ...]) -> None:
     """Fill the cells of each level as one path: small files, no seams, and colours that can follow the page."""
-    level = _levels(values[cells.place], len(ramp))
+    level = _levels(values, len(ramp))
     for index, colour in enumerate(ramp):
         rows, columns = np.nonzero(level == index)
         if rows.size:
-            axes.add_patch(PathPatch(_cells_path(rows, columns, cells), facecolor=colour, edgecolor="none"))
-    _draw_ttc_lines(axes, cells)
-    axes.set_xlim(float(cells.r2_m[0]), float(cells.r2_m[-1]))
-    axes.set_ylim(float(cells.r2dot_mps[0]), float(cells.r2dot_mps[-1]))
-    axes.set_title(title)
+            path = _cells_path(rows, columns, r2_m, r2dot_mps)
+            axes.add_patch(PathPatch(path, facecolor=colour, edgecolor="none"))
+    axes.set_xlim(float(r2_m[0]), float(r2_m[-1]))
+    axes.set_ylim(float(r2dot_mps[0]), float(r2dot_mps[-1]))
+    _draw_ttc_lines(axes)
 
 
 def _levels(values: FloatArray, n_levels: int) -> FloatArray:
@@ -78,27 +79,24 @@ def _levels(values: FloatArray, n_levels: int) -> FloatArray:
     return np.where(values > 0.0, np.maximum(n_levels - 1 - below, 0), -1.0)
 
 
-def _cells_path(rows: IntArray, columns: IntArray, cells: UsedCells) -> Path:
+def _cells_path(rows: IntArray, columns: IntArray, r2_m: FloatArray, r2dot_mps: FloatArray) -> Path:
     """One compound path of all cells, neighbours in a row merged into one rectangle."""
     starts = np.flatnonzero(np.r_[True, (np.diff(rows) != 0) | (np.diff(columns) != 1)])
     ends = np.r_[starts[1:], rows.size] - 1
-    vertices, codes = [], []
-    for start, end in zip(starts, ends, strict=True):
-        left, right = cells.r2_m[columns[start]], cells.r2_m[columns[end] + 1]
-        low, high = cells.r2dot_mps[rows[start]], cells.r2dot_mps[rows[start] + 1]
-        vertices += [(left, low), (right, low), (right, high), (left, high), (left, low)]
-        codes += [Path.MOVETO, Path.LINETO, Path.LINETO, Path.LINETO, Path.CLOSEPOLY]
-    return Path(vertices, codes)
+    left, right = r2_m[columns[starts]], r2_m[columns[ends] + 1]
+    low, high = r2dot_mps[rows[starts]], r2dot_mps[rows[starts] + 1]
+    corners = np.array([[left, low], [right, low], [right, high], [left, high]])
+    return Path.make_compound_path_from_polys(corners.transpose(2, 0, 1))
 
 
-def _draw_ttc_lines(axes: Axes, cells: UsedCells) -> None:
+def _draw_ttc_lines(axes: Axes) -> None:
     """Lines of equal time to collision R2/-R2dot, labelled where they leave the panel."""
-    right, low = float(cells.r2_m[-1]), float(cells.r2dot_mps[0])
+    (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
     for ttc_s in TTC_LINES_S:
         axes.plot([0.0, 1e3], [0.0, -1e3 / ttc_s], color=MUTED, linewidth=0.8, linestyle=(0, (4, 3)))
         at_bottom = -low * ttc_s
         x, y = (at_bottom, low) if at_bottom < right else (right, -right / ttc_s)
-        if y > float(cells.r2dot_mps[-1]) or x <= float(cells.r2_m[0]):
+        if y > high or x <= left:
             continue
         offset, align = ((3, 3), "left") if at_bottom < 0.9 * right else ((-3, 12), "right")
         note(axes, f"{ttc_s:g} s", (x, y), offset, ha=align, color=MUTED, fontsize=8)

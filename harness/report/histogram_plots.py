@@ -37,8 +37,7 @@ def weight_plot(summary: RunSummary) -> Plot | None:
     used = summary.log10_weight.used()
     if used is None or summary.all_weights_one:
         return None
-    everything = summary.log10_weight.bins(WEIGHT_BINS, used)
-    crashes = summary.log10_weight_crash.bins(WEIGHT_BINS, used)
+    everything, crashes = (h.bins(WEIGHT_BINS, *used) for h in (summary.log10_weight, summary.log10_weight_crash))
     has_crashes = summary.n_crashes > 0
     figure = new_figure(FULL_WIDTH_IN, 4.2 if has_crashes else 2.7)
     panels = figure.subplots(2 if has_crashes else 1, 1, sharex=True, squeeze=False)[:, 0]
@@ -89,7 +88,7 @@ def _weight_caption(crashes: Bins, has_crashes: bool) -> str:
 def strata_plot(summary: RunSummary) -> Plot | None:
     """Draw sampled crashes and share of the estimate per number of control steps; None unless there are several."""
     used = summary.stratum_crash.used()
-    if used is None or used[1] - used[0] == 1:
+    if used is None or used[0].stop - used[0].start == 1:
         return None
     bins = summary.stratum_crash.bins(STRATUM_BINS)
     figure = new_figure(FULL_WIDTH_IN, 2.9)

@@ -39,10 +39,7 @@ def number(value: float | None, digits: int = 3) -> str:
 
 def significant(value: float, digits: int = 3) -> str:
     """Plain digits with ``digits`` significant ones, trailing zeros kept, whole numbers not cut."""
-    if value == 0.0:
-        return "0"
-    decimals = max(digits - 1 - math.floor(math.log10(abs(rounded(value, digits)))), 0)
-    return f"{value:,.{decimals}f}".replace("-", MINUS)
+    return fixed(value, 0, rounded(value, digits), digits)
 
 
 def rounded(value: float, digits: int) -> float:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from inspect import getmembers, isfunction
 from pathlib import Path
-from typing import NamedTuple
 
 import matplotlib.style
 from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -16,51 +15,20 @@ from harness.records.reader import table_sizes
 from harness.report import number_format
 from harness.report.answer_plot import answer_plot, rate_exponent
 from harness.report.convergence_plot import convergence_plot
-from harness.report.crash_contrast import Contrast, band_in_words, contrast_plot, crash_contrast
+from harness.report.crash_contrast import CONDITIONS, Contrast, band_in_words, contrast_plot, crash_contrast
 from harness.report.crash_gallery import GalleryRow, crash_gallery
-from harness.report.cut_in_conditions import CONDITIONS
 from harness.report.cut_in_plot import cut_in_plot
 from harness.report.histogram_plots import crash_time_plot, impact_speed_plot, strata_plot, weight_plot
-from harness.report.lateral import lateral_facts
 from harness.report.plot_style import RC, Plot, inline_svg, png, svg
 from harness.report.run_folder import RunFolder, read_run_folder, typed_folder
 from harness.report.shells_plot import shells_plot
-from harness.report.summary import RunSummary, summarise
+from harness.report.summary import RunSummary, lateral_facts, summarise
 from harness.report.tables import RateUnit, details, diagnostics, outcome_rows, run_notes, setting_sections, verdict
 from harness.report.telling_bands import RELABELINGS, SIGNIFICANT
 
 PLOT_NAMES = re.compile(
     r"(answer|shells|convergence|weights|strata|contrast|cut_ins|impact_speed|crash_time|crash-\d+)\.(png|svg)"
 )
-FILTERS: dict[str, Callable[..., str]] = {
-    written.__name__: written
-    for written in (
-        band_in_words,
-        number_format.coarse_percent,
-        number_format.count,
-        number_format.decimal,
-        number_format.duration,
-        number_format.half_width,
-        number_format.interval,
-        number_format.number,
-        number_format.percent,
-        number_format.plain,
-        number_format.result,
-        number_format.sentence,
-        number_format.signed_percent,
-        number_format.size,
-        number_format.value,
-        verdict,
-    )
-}
-
-
-class Figure(NamedTuple):
-    """A plot as the template needs it: markup that is ours, texts that are escaped."""
-
-    markup: Markup
-    alt: str
-    caption: str
 
 
 def write_report(folder: Path, *, final: Path | None = None) -> Path:
@@ -102,7 +70,7 @@ def write_report(folder: Path, *, final: Path | None = None) -> Path:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters.update(FILTERS)
+    environment.filters.update(getmembers(number_format, isfunction), band_in_words=band_in_words, verdict=verdict)
     page = environment.get_template("report.html.j2").render(
         run=run,
         summary=summary,
@@ -145,14 +113,15 @@ def _plots(run: RunFolder, summary: RunSummary, contrast: Contrast, gallery: lis
     return [plot for plot in plots if plot is not None]
 
 
-def _rendered(plots: list[Plot]) -> tuple[dict[str, bytes], dict[str, Figure]]:
-    files: dict[str, bytes] = {}
-    figures: dict[str, Figure] = {}
+def _rendered(plots: list[Plot]) -> tuple[dict[str, bytes], dict[str, dict[str, str]]]:
+    """Files by name, and by plot what the template needs: markup that is ours, and texts that it escapes."""
+    files, figures = {}, {}
     for plot in plots:
         drawing = svg(plot)
         files[f"{plot.name}.svg"], files[f"{plot.name}.png"] = drawing, png(plot)
         # The SVG is matplotlib's own output, in which every text is escaped: the one place that is not autoescaped.
-        figures[plot.name] = Figure(Markup(inline_svg(drawing)), plot.alt, plot.caption)  # noqa: S704
+        markup = Markup(inline_svg(drawing))  # noqa: S704
+        figures[plot.name] = {"markup": markup, "alt": plot.alt, "caption": plot.caption}
     return files, figures
 
 

@@ -1,4 +1,7 @@
-"""What a run folder holds, read and checked before anything is drawn from it."""
+"""What a run folder holds, read and checked before anything is drawn from it.
+
+Whatever reads raises a `RunFolderError` that names a file which is missing, damaged, or of another run.
+"""
 
 from __future__ import annotations
 
@@ -96,11 +99,6 @@ class ShownShells(ShellDetails):
         return self.statements[-1]
 
     @property
-    def boundary(self) -> str:
-        """The widest boundary."""
-        return self.widest.boundary
-
-    @property
     def n_inside(self) -> int:
         """Number of shells within the widest boundary, which come first."""
         return self.widest.n_shells
@@ -158,13 +156,7 @@ class RunFolder:
         return None if asked == ASSUMPTION_FREE else asked
 
     def episodes(self, *columns: str) -> Iterator[pa.RecordBatch]:
-        """Columns of the tests that count, in index order; small shards come together.
-
-        Raises
-        ------
-        RunFolderError
-            If a shard is missing, damaged, misses a column, or holds another number of tests than the manifest says.
-        """
+        """Columns of the tests that count, in index order; small shards come together."""
         counted = self.n_episodes
         together: list[pa.Table] = []
         for table, _ in read_shards(self.path, episode_columns=list(columns), moment_columns=[]):
@@ -197,13 +189,7 @@ def typed_folder(folder: Path) -> str:
 
 
 def read_run_folder(path: Path, *, typed: str | None = None) -> RunFolder:
-    """Read campaign, manifest and estimates of a run; ``typed`` see `RunFolder`.
-
-    Raises
-    ------
-    RunFolderError
-        If a file is missing, is not what its name says, or belongs to another campaign; or it is a part or a plan.
-    """
+    """Read campaign, manifest and estimates of a run, and not of a part or a plan of one; ``typed`` see `RunFolder`."""
     manifest = require_whole(path)
     require_schema(manifest, ShownManifest, path / MANIFEST, mend=NO_RUN)
     estimates = _read_estimates(path, manifest["campaign_hash"])

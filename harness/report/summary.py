@@ -5,21 +5,24 @@ from __future__ import annotations
 import math
 from collections import Counter
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 
 from harness.arrays import BoolArray, FloatArray, IntArray
 from harness.errors import RunFolderError
 from harness.outcomes import CRASH, FAILED, OUTCOMES
-from harness.report.histograms import CutInGrid, FineHistogram
+from harness.records.reader import stored_columns
+from harness.report.histograms import Axis, FineHistogram
 from harness.report.run_folder import RunFolder, floats
 from harness.vehicles.kinematics import STEP_S
 
 MOST_CAUSES = 1_000
 CANDIDATES = 50
 """Crashes kept per ranking: more than are shown, because with a share of traces only some of the worst have one."""
+R2DOT_MPS, R2_M = Axis(-30.0, 20.0, 0.5), Axis(0.0, 150.0, 2.5)
 
 
 @dataclass(frozen=True)
@@ -87,6 +90,8 @@ class RunSummary:
         Failed episodes per cause.
     stratum_crash, response_time_s : FineHistogram
         Of crashes: number of control steps, time from cut-in to crash.
+    cut_in, cut_in_crash : FineHistogram
+        Of all cut-ins and of those that crash: R2dot (rows) and R2.
     hardest, heaviest, outermost : WorstCrashes
         By impact speed, by weight, and (of tests from shells) from the most careless shell inwards.
     """
@@ -96,11 +101,11 @@ class RunSummary:
         self.count, self.weight = np.zeros(len(OUTCOMES)), np.zeros(len(OUTCOMES))
         self.causes: Counter[str] = Counter()
         self.log_weight_range = (math.inf, -math.inf)
-        self.log10_weight, self.log10_weight_crash = (FineHistogram(-80.0, 20.0, 0.02) for _ in range(2))
-        self.stratum_crash = FineHistogram(-0.5, 600.5, 1.0)
-        self.impact_speed_mps = FineHistogram(0.0, 80.0, 0.1)
-        self.crash_time_s, self.response_time_s = (FineHistogram(0.0, 60.0, 0.1) for _ in range(2))
-        self.cut_in, self.cut_in_crash = CutInGrid(), CutInGrid()
+        self.log10_weight, self.log10_weight_crash = (FineHistogram(Axis(-80.0, 20.0, 0.02)) for _ in range(2))
+        self.stratum_crash = FineHistogram(Axis(-0.5, 600.5, 1.0))
+        self.impact_speed_mps = FineHistogram(Axis(0.0, 80.0, 0.1))
+        self.crash_time_s, self.response_time_s = (FineHistogram(Axis(0.0, 60.0, 0.1)) for _ in range(2))
+        self.cut_in, self.cut_in_crash = (FineHistogram(R2DOT_MPS, R2_M) for _ in range(2))
         self.hardest, self.heaviest = WorstCrashes("impact_speed_mps"), WorstCrashes("log_weight")
         self.outermost = WorstCrashes("component")
 
@@ -145,7 +150,7 @@ class RunSummary:
         self._add_causes(batch.column("failure"))
         self._add_weights(columns["log_weight"], weight, valid, crash)
         for grid, rows in ((self.cut_in, valid), (self.cut_in_crash, crash)):
-            grid.add(columns["cut_in_r2_m"][rows], columns["cut_in_r2dot_mps"][rows], weight[rows])
+            grid.add(weight[rows], columns["cut_in_r2dot_mps"][rows], columns["cut_in_r2_m"][rows])
         self._add_crashes(columns, weight, crash)
 
     def _add_causes(self, failure: pa.Array) -> None:
@@ -160,7 +165,7 @@ class RunSummary:
         seen = log_weight[valid]
         self.log_weight_range = (float(seen.min(initial=low)), float(seen.max(initial=high)))
         for histogram, rows in ((self.log10_weight, valid), (self.log10_weight_crash, crash)):
-            histogram.add(log_weight[rows] / math.log(10.0), weight[rows])
+            histogram.add(weight[rows], log_weight[rows] / math.log(10.0))
 
     def _add_crashes(self, columns: dict[str, FloatArray], weight: FloatArray, crash: BoolArray) -> None:
         for histogram, values in (
@@ -169,19 +174,13 @@ class RunSummary:
             (self.crash_time_s, columns["crash_time_s"]),
             (self.response_time_s, columns["crash_time_s"] - STEP_S * columns["cut_in_step"]),
         ):
-            histogram.add(values[crash], weight[crash])
+            histogram.add(weight[crash], values[crash])
         for ranking in (self.hardest, self.heaviest, self.outermost):
             ranking.add(columns, crash)
 
 
 def summarise(run: RunFolder) -> RunSummary:
-    """Stream over all episodes of a run, in index order.
-
-    Raises
-    ------
-    RunFolderError
-        If a shard is damaged or holds an unknown outcome.
-    """
+    """Stream over all episodes of a run, in index order; a `RunFolderError` where one has an unknown outcome."""
     summary = RunSummary(_log_scales(run) if run.campaign.testing.method == "shells" else None)
     for batch in run.episodes(*NUMBERS, "outcome", "failure"):
         summary.add(batch, _outcome_index(batch.column("outcome"), run))
@@ -210,15 +209,35 @@ def _log_scales(run: RunFolder) -> FloatArray:
 
 
 def _outcome_index(column: pa.Array, run: RunFolder) -> IntArray:
-    encoded = column if isinstance(column, pa.DictionaryArray) else column.dictionary_encode()
-    names = encoded.dictionary.to_pylist()
-    unknown = sorted({str(name) for name in names} - set(OUTCOMES))
-    if unknown or encoded.null_count:
+    index = pc.index_in(column.cast(pa.string()), pa.array(OUTCOMES), skip_nulls=True)
+    if index.null_count:
+        unknown = column.filter(pc.is_null(index))[0].as_py()
         raise RunFolderError(
             str(run.path / "episodes"),
-            found=f"the outcome {unknown[0]!r}" if unknown else "an episode without outcome",
+            found="an episode without outcome" if unknown is None else f"the outcome {unknown!r}",
             expected=f"one of {', '.join(OUTCOMES)}",
             mend="The records are from another version of the harness: use that version, or run again.",
         )
-    index_of = np.array([OUTCOMES.index(name) for name in names], dtype=np.int64)
-    return np.asarray(index_of[encoded.indices.to_numpy(zero_copy_only=False)])
+    return np.asarray(index).astype(np.int64)
+
+
+class LateralFacts(NamedTuple):
+    """Of the tests as sampled: 5 %, 50 % and 95 % quantiles of the leads (s) of cut-ins, and crashes by contact."""
+
+    n_cut_ins: int
+    lead_s: list[float]
+    n_crashes: int
+    n_side: int
+
+
+def lateral_facts(run: RunFolder) -> LateralFacts | None:
+    """How cut-ins showed themselves before BV overlapped; None where they are one step."""
+    if "lead_steps" not in stored_columns(run.path):
+        return None
+    leads, contacts = [np.zeros(0)], Counter[str]()
+    for batch in run.episodes("lead_steps", "cut_in_step", "contact"):
+        leads.append(floats(batch.filter(pc.is_valid(batch.column("cut_in_step"))).column("lead_steps")))
+        contacts.update(batch.column("contact").drop_null().to_pylist())
+    lead_s = STEP_S * np.concatenate(leads)
+    quantiles = np.quantile(lead_s, (0.05, 0.5, 0.95)).tolist() if lead_s.size else [math.nan] * 3
+    return LateralFacts(lead_s.size, quantiles, contacts.total(), contacts["side"])

@@ -33,10 +33,6 @@ def test_the_policy_says_which(policy, wanted, record):
         assert 0 < len(traced(recorded)) < 400
 
 
-def test_none_means_none(record):
-    assert record("records.traces=none", n=20).tables.traces is None
-
-
 def test_a_share_is_chosen_by_index_whatever_the_outcome(record):
     share = ("records.traces=none", "records.trace_share=0.2")
     mixture = record(*share, n=400)

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from synthetic_run import RECIPES, write_run
+from made_run import RECIPES, write_run
 
 from harness.report import write_report
 from harness.report.run_folder import RunFolder, read_run_folder
@@ -24,26 +24,24 @@ class OnDemand(dict):
 
 
 @pytest.fixture(scope="session")
-def reports(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """One run folder with its report per recipe; tests must not change them."""
-
-    def written(name: str) -> Path:
-        folder = write_run(tmp_path_factory.mktemp(name) / "run", RECIPES[name])
-        write_report(folder)
-        return folder
-
-    return OnDemand(written)
+def folders(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """One run folder per recipe, without its report unless `reports` was asked for it; tests must not change them."""
+    return OnDemand(lambda name: write_run(tmp_path_factory.mktemp(name) / "run", RECIPES[name]))
 
 
 @pytest.fixture(scope="session")
-def runs(reports: dict[str, Path]) -> dict[str, RunFolder]:
+def reports(folders: dict[str, Path]) -> dict[str, Path]:
+    """The same folders with their reports."""
+    return OnDemand(lambda name: write_report(folders[name]).parent)
+
+
+@pytest.fixture(scope="session")
+def runs(folders: dict[str, Path]) -> dict[str, RunFolder]:
     """The same folders, read."""
-    return OnDemand(lambda name: read_run_folder(reports[name]))
+    return OnDemand(lambda name: read_run_folder(folders[name]))
 
 
 @pytest.fixture
-def run_folder(reports: dict[str, Path], tmp_path: Path) -> Path:
-    """A copy of a full run, to be damaged."""
-    copy = tmp_path / "run"
-    shutil.copytree(reports["full"], copy)
-    return copy
+def run_folder(folders: dict[str, Path], tmp_path: Path) -> Path:
+    """A copy of a full run without report, to be damaged."""
+    return shutil.copytree(folders["full"], tmp_path / "run", ignore=shutil.ignore_patterns("plots", "report.html"))

@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 import json
+import re
 from html.parser import HTMLParser
 from pathlib import Path
+from xml.etree import ElementTree
+
+from harness.report.crash_contrast import contrast_plot, crash_contrast
+from harness.report.run_folder import read_run_folder
 
 VOID = {"meta", "br", "link", "img", "hr", "input"}
 
@@ -53,3 +58,51 @@ def edit(path: Path, **changes) -> dict:
     content = json.loads(path.read_text())
     path.write_text(json.dumps(content | changes))
     return content
+
+
+def require_sound_page(folder: Path, plots: set[str]) -> None:
+    """What every page must do: say all, be self-contained, and show exactly the plots that make sense."""
+    html, page = (folder / "report.html").read_text(encoding="utf-8"), page_of(folder)
+    _require_all_is_said(folder, page)
+    _require_self_contained(html, page)
+    files = list((folder / "plots").iterdir())
+    stems = {path.stem for path in files}
+    assert {stem for stem in stems if not stem.startswith("crash-")} == plots
+    assert {path.name for path in files} == {f"{stem}.{kind}" for stem in stems for kind in ("png", "svg")}
+    for stem in stems:
+        assert (folder / "plots" / f"{stem}.png").read_bytes().startswith(b"\x89PNG")
+        ElementTree.parse(folder / "plots" / f"{stem}.svg")
+        assert f"plot-{stem}" in page.ids
+    figures = re.findall(r"<figure.*?</figure>", html, flags=re.DOTALL)
+    assert len(figures) == len(stems)
+    for figure in figures:
+        assert len(re.search(r'aria-label="([^"]*)"', figure).group(1)) > 40
+        assert len(re.search(r"<figcaption>(.*?)<span", figure, re.DOTALL).group(1)) > 40
+
+
+def _require_all_is_said(folder: Path, page: Page) -> None:
+    estimates = json.loads((folder / "estimates.json").read_text())
+    assert estimates["statement"] in page.text
+    for estimator, content in estimates["estimates"].items():
+        assert estimator in page.text
+        for text in [*content.get("warnings", []), *([content["reason"]] if "reason" in content else [])]:
+            assert text[1:] in page.text
+    assert "sampling error in this environment" in page.text
+    assert f"lane-change level {estimates['lane_change_level']:g}" in page.text
+    contrast = crash_contrast(read_run_folder(folder))
+    assert contrast.sentence in page.words
+    assert ("nothing to compare" in contrast.sentence) == (contrast.crashes.n == 0)
+    assert (contrast_plot(contrast) is None) == (not contrast.telling)
+
+
+def _require_self_contained(html: str, page: Page) -> None:
+    """Nothing is fetched or run, ids are unique, and no link is dead."""
+    assert "://" not in html
+    assert len(page.ids) == len(set(page.ids))
+    for tag, attribute, value in page.attributes:
+        assert tag not in {"script", "link", "iframe"}
+        assert not attribute.startswith("on")
+        if attribute in {"href", "xlink:href", "src"}:
+            assert value.startswith("#")
+            assert value[1:] in page.ids
+    assert {reference[1:] for reference in re.findall(r"url\(([^)]*)\)", html)} <= set(page.ids)

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from report_page import page_of
 from scipy.stats import binomtest
 
 from harness.report import telling_bands as scan
-from harness.report.crash_contrast import Contrast, Group, contrast_plot, crash_contrast
-from harness.report.cut_in_conditions import CONDITIONS
+from harness.report.crash_contrast import CONDITIONS, Contrast, Group, crash_contrast
 from harness.report.telling_bands import SIGNIFICANT, telling_bands
 
 Q = len(CONDITIONS)
@@ -49,7 +47,7 @@ def test_an_open_end_and_missing_and_infinite_values():
 @pytest.mark.parametrize("weighted", [False, True])
 def test_chance_is_seldom_called_telling(weighted, monkeypatch):
     """Over 200 worlds without any difference, p ≤ 0.1 must not come more often than in a tenth (level 1e-4)."""
-    monkeypatch.setattr(scan, "RELABELINGS", 39)
+    monkeypatch.setattr(scan, "RELABELINGS", 19)  # of which an exact test has p ≤ 2/20 in one world of ten
     rng = np.random.default_rng(3)
     low = 0
     for _ in range(200):
@@ -71,20 +69,10 @@ def contrast_of(runs):
     return lambda name: crash_contrast(runs[name])
 
 
-@pytest.mark.parametrize("name", ["full", "nde", "no_crashes", "nde_no_crashes", "failed"])
-def test_the_page_says_the_sentence(runs, contrast_of, name):
-    found = contrast_of(name)
-    assert found.sentence in page_of(runs[name].path).words
-    assert not found.outside
-    assert ("nothing to compare" in found.sentence) == (found.crashes.n == 0)
-    assert (contrast_plot(found) is None) == (not found.telling)
-
-
 @pytest.mark.parametrize("name", ["shells", "shells_no_crashes", "shells_inside_only"])
-def test_without_crashes_outside_there_is_nothing_to_compare(runs, contrast_of, name):
+def test_without_crashes_outside_there_is_nothing_to_compare(contrast_of, name):
     found = contrast_of(name)
     assert found.sentence == "No test outside the boundary crashed, so there is nothing to compare."
-    assert found.sentence in page_of(runs[name].path).words
 
 
 def test_of_shells_only_the_outside_is_compared(runs, contrast_of):
@@ -92,13 +80,12 @@ def test_of_shells_only_the_outside_is_compared(runs, contrast_of):
     assert found.outside
     assert found.crashes.n == outside.n_crashes
     assert 0 < found.others.n <= outside.n_episodes - outside.n_crashes  # those that had a cut-in
-    assert page_of(runs["shells_refuted"].path).words.count(found.sentence) == 2
 
 
 def test_failed_tests_are_on_neither_side(runs, contrast_of):
     found = contrast_of("failed")
-    episodes = runs["failed"].n_episodes
-    assert found.crashes.n + found.others.n <= episodes - 25
+    assert not found.outside
+    assert found.crashes.n + found.others.n <= runs["failed"].n_episodes - 25
 
 
 def test_a_few_crashes_have_nothing_in_common():

@@ -129,8 +129,9 @@ def test_speeds_are_named_apart_even_if_equal():
     )  # fmt: skip
     time_s = np.arange(0.0, 8.05, 0.1)
     speeds = {"LV": 20.0, "BV": 20.0, "AV": 30.0}
+    still = np.zeros(time_s.size)
     tracks = {
-        name: Track(time_s, 10.0 * k + speed * time_s, np.full(time_s.size, speed), np.zeros(time_s.size))
+        name: Track(time_s, 10.0 * k + (speed - 20.0) * time_s, still + speed, still, still)
         for k, (name, speed) in enumerate(speeds.items())
     }
     speed = time_space_plot(crash, tracks, worth="weight 1").figure.axes[1]

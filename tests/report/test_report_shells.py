@@ -8,25 +8,32 @@ from dataclasses import replace
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from report_page import edit, page_of
-from synthetic_run import DESIGN, PATH_MASS, RECIPES, P
+from made_run import DESIGN, PATH_MASS, SHELLS, P
+from report_page import edit, page_of, require_sound_page
 
 from harness.errors import RunFolderError
 from harness.estimators.stratified import Tally, pool_variance
 from harness.outcomes import OUTCOMES
 from harness.report import write_report
 from harness.report.answer_plot import answer_plot
+from harness.report.crash_contrast import crash_contrast
 from harness.report.run_folder import read_run_folder, typed_folder
 from harness.report.shells_plot import POOL, shells_plot
 from harness.report.summary import RunSummary, summarise
 from harness.report.tables import run_notes, verdict
 
-SHELLS = [name for name, recipe in RECIPES.items() if recipe.method == "shells"]
+PLOTS = {
+    "shells": {"cut_ins", "impact_speed", "crash_time"},
+    "shells_refuted": {"cut_ins", "impact_speed", "crash_time", "contrast"},
+    "shells_no_crashes": {"cut_ins"},
+    "shells_inside_only": {"cut_ins", "impact_speed", "crash_time"},
+}
 
 
 @pytest.mark.parametrize("name", SHELLS)
-def test_both_statements_lead_the_page_and_every_shell_is_named(runs, name):
-    page, estimates = page_of(runs[name].path), runs[name].estimates
+def test_both_statements_lead_the_page_and_every_shell_is_named(reports, runs, name):
+    require_sound_page(reports[name], {"answer", "convergence", "shells"} | PLOTS[name])
+    page, estimates = page_of(reports[name]), runs[name].estimates
     text, (told,) = page.words, estimates.boundary_statements.values()
     told = told.replace("FOLDER", typed_folder(runs[name].path))
     places = [
@@ -40,11 +47,6 @@ def test_both_statements_lead_the_page_and_every_shell_is_named(runs, name):
     assert DESIGN.pool in text
     assert "2.87 × 10⁻⁶: not even full throttle" in text
     assert "3.30 × 10⁻⁵" in text
-
-
-@pytest.mark.parametrize("name", SHELLS)
-def test_nothing_is_said_about_weights_or_control_steps(reports, name):
-    page = page_of(reports[name])
     assert "weights" not in page.ids
     for absent in ("How often each weight occurs", "mean_weight", "By stratum", "control step", "likelihood ratio"):
         assert absent not in page.text.split("All settings of the campaign")[0]
@@ -55,28 +57,31 @@ def rows_of_answer(run) -> list[str]:
     return [label.get_text() for label in axes.get_yticklabels()]
 
 
-def test_a_refuted_assumption_is_said_so_and_its_interval_is_gone(runs):
+def test_a_refuted_assumption_is_said_so_and_its_interval_is_gone(reports, runs):
     run = runs["shells_refuted"]
-    text, found = page_of(run.path).words, run.shells
+    text, found = page_of(reports["shells_refuted"]).words, run.shells
     outside = found.shells[-1]
     assert found.widest.refuted
     assert "Statement library: refuted by these tests" in text
     assert f"by episode {found.widest.refuted_by[0]}," in text
     assert f"crashed in {outside.n_crashes:,} of {outside.n_episodes:,} tests there" in text
     assert "Of statement library" not in text
+    assert text.count(crash_contrast(run).sentence) == 2
     assert rows_of_answer(run) == ["shells"]
 
 
-def test_a_safe_outside_gives_its_bound_and_the_conditional_interval(runs):
-    text = page_of(runs["shells"].path).words
+def test_a_safe_outside_gives_its_bound_and_the_conditional_interval(reports, runs):
+    text = page_of(reports["shells"]).words
+    assert "4 more need other records than these: nde, nade, mixture_cv, scv" in text
+    assert "No value" not in text
     assert "refuted by these tests" not in text
     assert "None of" in text.split("Outside every boundary")[1]
     assert rows_of_answer(runs["shells"]) == ["shells", "given library"]
 
 
-def test_an_outside_without_tests_is_said_and_runs_out_of_the_plot(runs):
+def test_an_outside_without_tests_is_said_and_runs_out_of_the_plot(reports, runs):
     run = runs["shells_inside_only"]
-    assert "Statement library: not put to the test" in page_of(run.path).words
+    assert "Statement library: not put to the test" in page_of(reports["shells_inside_only"]).words
     rates, widths = shells_plot(run.shells).figure.axes
     assert [text.get_text() for text in rates.texts if "not tested" in text.get_text()] == [
         "not tested: up to 3.00 × 10⁻⁵"
@@ -100,7 +105,7 @@ def test_the_label_says_what_tests_have_shown(runs, changed, said):
     assert verdict(replace(runs["shells"].shells.widest, **changed)) == said
 
 
-def test_the_half_width_that_was_asked_for_is_that_of_the_statement_it_was_asked_of(runs):
+def test_the_half_width_that_was_asked_for_is_that_of_the_statement_it_was_asked_of(reports, runs):
     """Inside alone the assumption-free half-width stays wide: only the conditional one may be held against the run."""
     run = runs["shells_inside_only"]
     assert run.headline.rhw > 10.0
@@ -108,7 +113,10 @@ def test_the_half_width_that_was_asked_for_is_that_of_the_statement_it_was_asked
     notes = run_notes(run, summarise(run))
     assert any("not reached" in note for note in notes) == (rhw > 0.1)
     assert not any("it is 1" in note for note in notes)
-    assert "Of statement library (asked: 0.1)" in page_of(run.path).words
+    text = page_of(reports["shells_inside_only"]).words
+    assert "Of statement library (asked: 0.1)" in text
+    assert "Relative half-width> 10" in text
+    assert "still open upwards" in text
 
 
 @pytest.fixture(scope="module", params=["shells", "shells_refuted"])
@@ -135,13 +143,13 @@ def test_all_tests_together_stand_for_all_shells(runs):
     assert summary.per_test(float(summary.weight.sum())) == pytest.approx(P.sum(), rel=1e-12)
 
 
-def test_outermost_crashes_and_what_each_adds(runs):
+def test_outermost_crashes_and_what_each_adds(reports, runs):
     run = runs["shells_refuted"]
     outside = run.shells.shells[-1]
     worst = summarise(run).outermost.crashes[0]
     assert worst.component == 2
     assert worst.weight == pytest.approx(outside.p / outside.n_episodes, rel=1e-12)
-    text = page_of(run.path).words
+    text = page_of(reports["shells_refuted"]).words
     assert "outermost no. 1" in text
     assert "in the shell outside, adding" in text
 
@@ -185,14 +193,8 @@ def test_the_caption_names_the_colours_that_are_there(runs, name, blue, orange):
     assert blue is None or blue == (True in seen)
 
 
-def test_a_half_width_that_says_nothing_is_not_written_out(reports):
-    text = page_of(reports["shells_inside_only"]).words
-    assert "Relative half-width> 10" in text
-    assert "still open upwards" in text
-
-
-def test_estimates_without_part_of_the_shells_are_named(reports, tmp_path):
-    folder = shutil.copytree(reports["shells"], tmp_path / "run")
+def test_estimates_without_part_of_the_shells_are_named(folders, tmp_path):
+    folder = shutil.copytree(folders["shells"], tmp_path / "run")
     estimates = edit(folder / "estimates.json")["estimates"]
     del estimates["shells"]["details"]["shells"][0]["p"]
     edit(folder / "estimates.json", estimates=estimates)
@@ -200,9 +202,9 @@ def test_estimates_without_part_of_the_shells_are_named(reports, tmp_path):
         read_run_folder(folder)
 
 
-def test_tests_without_shell_are_refused(reports, tmp_path):
+def test_tests_without_shell_are_refused(folders, tmp_path):
     """A run whose campaign says shells over records that were drawn otherwise."""
-    folder = shutil.copytree(reports["nde"], tmp_path / "run")
+    folder = shutil.copytree(folders["nde"], tmp_path / "run")
     edit(folder / "campaign.yaml", testing={"method": "shells"})
     with pytest.raises(RunFolderError, match="without shell"):
         write_report(folder)

@@ -11,14 +11,14 @@ from report_page import edit
 
 from harness.outcomes import OUTCOMES
 from harness.report.crash_gallery import crash_gallery
-from harness.report.histograms import FineHistogram
+from harness.report.histograms import Axis, FineHistogram
 from harness.report.run_folder import read_run_folder
 from harness.report.summary import NUMBERS, RunSummary, summarise
 
 
 @pytest.fixture(scope="module")
-def table(reports):
-    return pq.read_table(reports["full"] / "episodes").to_pandas().sort_values("episode", ignore_index=True)
+def table(folders):
+    return pq.read_table(folders["full"] / "episodes").to_pandas().sort_values("episode", ignore_index=True)
 
 
 @pytest.fixture(scope="module")
@@ -52,11 +52,13 @@ def test_strata_are_exact(summary, table):
 
 def test_cut_in_grid_agrees_with_numpy(summary, table):
     cuts = table.dropna(subset=["cut_in_r2_m"])
-    cells = summary.cut_in.used()
+    grid = summary.cut_in
+    block = grid.used()
+    edges = [axis.edges(of.start, of.stop) for axis, of in zip(grid.axes, block, strict=True)]
     expected, _, _ = np.histogram2d(
-        cuts.cut_in_r2dot_mps, cuts.cut_in_r2_m, bins=[cells.r2dot_mps, cells.r2_m], weights=np.exp(cuts.log_weight)
+        cuts.cut_in_r2dot_mps, cuts.cut_in_r2_m, bins=edges, weights=np.exp(cuts.log_weight)
     )
-    np.testing.assert_allclose(summary.cut_in.weight[cells.place], expected, rtol=1e-9)
+    np.testing.assert_allclose(grid.weight[block], expected, rtol=1e-9)
 
 
 @pytest.mark.parametrize(("ranking", "key"), [("hardest", "impact_speed_mps"), ("heaviest", "log_weight")])
@@ -98,8 +100,8 @@ def test_gallery_prefers_traced_crashes_where_few_are_traced(run_folder, summary
 
 @given(st.lists(st.floats(-3.0, 13.0), min_size=1, max_size=40), st.integers(1, 40))
 def test_merging_fine_bins_loses_nothing_and_keeps_the_limit(values, most):
-    histogram = FineHistogram(0.0, 10.0, 0.1)
-    histogram.add(np.array(values), np.full(len(values), 0.5))
+    histogram = FineHistogram(Axis(0.0, 10.0, 0.1))
+    histogram.add(np.full(len(values), 0.5), np.array(values))
     bins = histogram.bins(most)
     assert bins.counts.sum() == len(values)
     assert bins.weights.sum() == pytest.approx(0.5 * len(values))
@@ -111,8 +113,8 @@ def test_merging_fine_bins_loses_nothing_and_keeps_the_limit(values, most):
 
 
 def test_weighted_quantile():
-    histogram = FineHistogram(0.0, 10.0, 0.1)
-    histogram.add(np.array([1.0, 2.0, 9.0]), np.array([1.0, 1.0, 8.0]))
+    histogram = FineHistogram(Axis(0.0, 10.0, 0.1))
+    histogram.add(np.array([1.0, 1.0, 8.0]), np.array([1.0, 2.0, 9.0]))
     assert histogram.weighted_quantile(0.5) == pytest.approx(9.05)
     assert histogram.weighted_quantile(0.15) == pytest.approx(2.05)
-    assert np.isnan(FineHistogram(0.0, 1.0, 0.1).weighted_quantile(0.5))
+    assert np.isnan(FineHistogram(Axis(0.0, 1.0, 0.1)).weighted_quantile(0.5))

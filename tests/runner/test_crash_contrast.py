@@ -6,8 +6,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from harness.report.crash_contrast import crash_contrast
-from harness.report.cut_in_conditions import CONDITIONS, cut_in_conditions
+from harness.report.crash_contrast import CONDITIONS, crash_contrast, cut_in_conditions
 from harness.report.run_folder import read_run_folder
 from tests.controllers.with_holes import BAND_MPS
 from tests.runner.test_shells_runs import SHELLS
