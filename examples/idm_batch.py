@@ -16,7 +16,7 @@ class IDM:
         """Accelerations (m/s²)."""
         gap, speed = np.maximum(seen.gap_m, 0.1), seen.speed_mps
         closing = (speed * (speed - seen.lead_speed_mps)) / (2.0 * math.sqrt(2.0 * 3.0))
-        desired = 2.0 + np.maximum(0.0, speed * 1.0 + closing)
+        desired = 2.0 + np.fmax(0.0, speed * 1.0 + closing)  # fmax: no speed (NaN) where nobody is ahead
         ratio = speed / 40.0
         squared, close = ratio * ratio, desired / gap
         return np.minimum(np.maximum(2.0 * (1.0 - squared * squared - close * close), -4.0), 2.0)

@@ -54,6 +54,14 @@ def test_every_form_gives_the_bits_of_the_built_in_model(form, built_in):
     assert all(other.traces[i].tobytes() == built_in.traces[i].tobytes() for i in range(EPISODES))
 
 
+def test_over_arrays_it_knows_too_what_to_do_while_nobody_is_ahead():
+    """Where cut-ins take time, controllers act from the onset on: then the gap is infinite and the speed ahead NaN."""
+    lateral = "environment.parameters=ndd-overtaking-1-lateral"
+    one, batch = (run(FORMS[form], lateral, n=30) for form in ("per vehicle", "batch"))
+    assert one.failures == batch.failures == {}
+    assert all(batch.traces[i].tobytes() == one.traces[i].tobytes() for i in range(30))
+
+
 def test_an_fmu_gives_the_same_motion(fmu, built_in):
     other = run(fmu_av(fmu))
     assert other.failures == {}
