@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import cast
 
@@ -163,7 +164,7 @@ def enumerate_paths(
 def cached(key: str, make: Callable[[], SuperPopulation]) -> SuperPopulation:
     """A population of a key, read from the cache or made and kept there."""
     file = cache_root() / "super_populations" / f"{key}.parquet"
-    if file.is_file():
+    with suppress(OSError, pa.ArrowException, KeyError, TypeError, ValueError):  # a damaged one is made anew
         table = pq.read_table(file, partitioning=None)
         cut_in = np.frombuffer(table.schema.metadata[b"cut_in"], np.float64)
         return SuperPopulation(cut_in, *(np.asarray(table.column(name)) for name in _COLUMNS))

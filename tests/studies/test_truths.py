@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from harness.studies.super_population import SuperPopulation
+from harness.studies.super_population import SuperPopulation, cached
 from harness.studies.truths import (
     DIFFERENCE,
     RATE,
@@ -28,6 +28,16 @@ POPULATION = SuperPopulation(
 
 def crashing(driver):
     return POPULATION.mass * POPULATION.crashes(driver)
+
+
+def test_a_damaged_population_is_made_anew(tmp_path, monkeypatch):
+    monkeypatch.setenv("HARNESS_CACHE_DIR", str(tmp_path))
+    cached("key", lambda: POPULATION)
+    (file,) = tmp_path.rglob("*.parquet")
+    for text in (file.read_bytes()[:-9], b""):
+        file.write_bytes(text)
+        assert cached("key", lambda: POPULATION).mass.tolist() == POPULATION.mass.tolist()
+        assert cached("key", pytest.fail).bits.tolist() == POPULATION.bits.tolist()
 
 
 def test_a_vehicle_beside_a_reference():
