@@ -135,6 +135,7 @@ class Run:
         self.prescribed: PrescribedEpisodes | None = None
         self._prepared, self._held = prepared, int(earlier["n_episodes"])
         self.prefix = Prefix(of_part="part" in facts)
+        self._ends_in_report = not facts
         self._ungathered: list[dict[str, Any]] = []
         with ExitStack() as refused:
             refused.callback(self._workers.close)
@@ -198,7 +199,7 @@ class Run:
     def _stored(self, spec: ShardSpec) -> ShardDone | None:
         """See `stored_shard`; workers are about to be busy with the first shard that it does not know."""
         done = stored_shard(self._out, self._prepared, self._retracing, self._gathered, spec)
-        if done is None:
+        if done is None and self._ends_in_report:
             load_report_meanwhile()
         return done
 
