@@ -19,7 +19,7 @@ from harness.environment.loading import load_environment
 from harness.pool.aimed_paths import PILOT_PATHS
 from harness.pool.build import take_aim
 from harness.pool.library import load_library
-from harness.progress import SilentProgress
+from harness.progress import Progress
 
 LIBRARY = Path(__file__).parent / "lateral_rows.yaml"
 PAPER, LATERAL = "ndd-overtaking-1", "ndd-overtaking-1-lateral"
@@ -35,8 +35,8 @@ COMPETENT = "competent"
 def rates(settings: EnvironmentSettings, n_paths: int) -> tuple[np.ndarray, np.ndarray]:
     """Crash rates of the library's drivers and the covariance of their errors, from so many aimed paths."""
     library = load_library(str(LIBRARY))
-    aim = take_aim(load_environment(settings), library, PoolSettings(), SilentProgress())
-    found = aim.enumerator.run(PILOT_PATHS, n_paths, SilentProgress()).rates(len(library.surrogates))[:, :-1]
+    aim = take_aim(load_environment(settings), library, PoolSettings(), Progress())
+    found = aim.enumerator.run(PILOT_PATHS, n_paths, Progress()).rates(len(library.surrogates))[:, :-1]
     return found.mean(0), np.cov(found.T) / n_paths
 
 

@@ -15,7 +15,7 @@ from harness import load_campaign
 from harness.environment.loading import load_environment
 from harness.pool.aimed_paths import PILOT_PATHS, Enumerator
 from harness.pool.library import load_library
-from harness.progress import SilentProgress
+from harness.progress import Progress
 
 PATHS = 8192
 STRIDES = (1, 2, 3, 4, 6, 8)
@@ -30,13 +30,13 @@ def main() -> None:
     before = names[: names.index(library.boundary) + 1]
     followers = library.followers_in(environment)
     pilot = Enumerator(environment, followers, SEED)
-    pilot_rates = pilot.run(0, PILOT_PATHS, SilentProgress()).rates(len(names))[:, : len(before)]
+    pilot_rates = pilot.run(0, PILOT_PATHS, Progress()).rates(len(names))[:, : len(before)]
     print("stride  ms/path  cost  " + "  ".join(before))
     first = 0.0
     for stride in STRIDES:
         enumerator = Enumerator(environment, followers, SEED, stride=stride).aimed(pilot_rates)
         begin = time.process_time()
-        paths = enumerator.run(PILOT_PATHS, PATHS, SilentProgress())
+        paths = enumerator.run(PILOT_PATHS, PATHS, Progress())
         milliseconds = (time.process_time() - begin) / PATHS * 1e3
         rates = paths.rates(len(names))[:, : len(before)]
         relvar = rates.var(0) / rates.mean(0) ** 2

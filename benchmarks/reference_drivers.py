@@ -15,7 +15,7 @@ from harness.arrays import BoolArray
 from harness.environment.loading import load_environment
 from harness.pool.aimed_paths import PILOT_PATHS, EnumeratedPaths, Enumerator
 from harness.pool.library import Library
-from harness.progress import SilentProgress
+from harness.progress import Progress
 
 PATHS = 16_384
 SEED = 12_345
@@ -41,10 +41,10 @@ def main() -> None:
     library = Library.model_validate({**described, "envelope": "full-throttle-2"})
     environment, names = load_environment(load_campaign("scenarios/smoke.yaml").environment), list(drivers)
     pilot = Enumerator(environment, library.followers_in(environment), SEED)
-    rates = pilot.run(0, PILOT_PATHS, SilentProgress()).rates(len(names))
+    rates = pilot.run(0, PILOT_PATHS, Progress()).rates(len(names))
     # Aimed at the careful ones: the others, and the cut-in itself, are known well enough anyway.
     share = [0.2 if name in ("need-based", "full-throttle-2") else 1.0 for name in names]
-    paths = pilot.aimed(rates, np.array([*share, 0.0])).run(PILOT_PATHS, PATHS, SilentProgress())
+    paths = pilot.aimed(rates, np.array([*share, 0.0])).run(PILOT_PATHS, PATHS, Progress())
     crash = {name: ((paths.crashes >> d) & 1).astype(np.bool_) for d, name in enumerate(names)}
     print(f"{'driver':18}{'crashes per test':>22}" + "".join(f"{'avoids of ' + name:>24}" for name in TESTED))
     for name in (*TESTED, *REFERENCES):

@@ -23,7 +23,10 @@ _RECKONED_WITH = ("rhw", "crashes", "heaviest")
 
 
 class Progress:
-    """What the runner tells about its work, and nobody shows. Nothing that is told here changes a result."""
+    """What the runner tells about its work; shown to nobody, as for files, pipes and the Python API.
+
+    Nothing that is told here changes a result.
+    """
 
     def stage(self, name: str, total: int | None, *, done: int = 0) -> None:
         """Begin a stage of ``total`` units (None: not known), ``done`` of which were finished by an earlier run."""
@@ -33,10 +36,6 @@ class Progress:
 
     def status(self, **figures: Figure) -> None:
         """Show figures beside the bar; ``crashes`` and ``rhw`` also give the time left."""
-
-
-class SilentProgress(Progress):
-    """Shows nothing: for files, pipes, tests and the Python API."""
 
 
 def episodes_left(

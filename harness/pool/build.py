@@ -13,7 +13,7 @@ from harness.pool.aimed_paths import PILOT_PATHS, EnumeratedPaths, Enumerator, j
 from harness.pool.cut_ins import FAR_OFF, CutIns, Pool, environment_hash, shells_of
 from harness.pool.enumeration import write_script
 from harness.pool.library import Library
-from harness.progress import Progress, SilentProgress
+from harness.progress import Progress
 from harness.random_stream import DIAGNOSTIC, uniforms
 
 ROUND_PATHS = 1024
@@ -32,7 +32,7 @@ def build_pool(
     environment: Environment, library: Library, settings: PoolSettings, key: str, progress: Progress | None = None
 ) -> Pool:
     """Build a pool in the twin, which will carry the content hash ``key``."""
-    progress = progress or SilentProgress()
+    progress = progress or Progress()
     aim = take_aim(environment, library, settings, progress)
     paths = _until_known(aim, settings, progress)
     order = careful_first(paths.rates(len(library.surrogates)))

@@ -33,7 +33,7 @@ from harness.pool.cut_ins import Pool
 from harness.pool.enumeration import ShadowRuns, enumerate_cut_ins
 from harness.pool.library import Library
 from harness.pool.storage import campaign_pool_key, sound_facts, stamped
-from harness.progress import Progress, SilentProgress
+from harness.progress import Progress
 from harness.random_stream import DIAGNOSTIC, uniforms
 from harness.records.folder import require_place, write_atomically
 from harness.resolved import Resolved
@@ -103,7 +103,7 @@ def walk_candidates(
     candidates: int = CANDIDATES,
 ) -> Candidates:
     """Walk so many paths beside an AV that holds its speed."""
-    progress = progress or SilentProgress()
+    progress = progress or Progress()
     aim = take_aim(environment, library, settings, progress)
     progress.stage("paths for shadow runs", candidates)
     n_surrogates = len(library.surrogates)

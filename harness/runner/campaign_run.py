@@ -20,7 +20,7 @@ from harness.methods import SAMPLING
 from harness.pool.enumeration import ShadowRuns
 from harness.pool.shells import PrescribedEpisodes
 from harness.pool.vehicle_pool import ShadowPaths
-from harness.progress import Progress, SilentProgress
+from harness.progress import Progress
 from harness.records.folder import (
     SHELLS,
     TABLES,
@@ -97,7 +97,7 @@ def run_campaign(
             require_no_fewer(out, earlier, resolved.campaign.stop.episodes)
         if (result := earlier_result(out, resolved, earlier)) is not None:
             return result
-        run = Run(resolved, out, earlier, workers, progress or SilentProgress(), began)
+        run = Run(resolved, out, earlier, workers, progress or Progress(), began)
         run.run_all()
         if not shorten:
             require_no_fewer(out, earlier, run.prefix.n_episodes)

@@ -28,7 +28,7 @@ from harness.estimators.paired_shells import (
 from harness.estimators.pairs import PairCounts, PairedShells, Verdict
 from harness.estimators.round_stopping import PairRule, decision_confidence
 from harness.pool.shells import Draw, acceleration_limit
-from harness.progress import Progress, SilentProgress
+from harness.progress import Progress
 from harness.records.folder import sole_use
 from harness.records.reader import read_shards
 from harness.resolved import Resolved
@@ -89,7 +89,7 @@ def compare_shells(
         The vehicles do not have the same shells.
     """
     require_same_shells(sides)
-    began, progress = time.monotonic(), progress or SilentProgress()
+    began, progress = time.monotonic(), progress or Progress()
     campaign = sides[0].campaign
     with ExitStack() as locks:
         runs, held = [], []

@@ -18,7 +18,7 @@ from harness.campaign.models import Campaign
 from harness.errors import RunFolderError
 from harness.estimators import Shells
 from harness.estimators.round_stopping import RoundRule
-from harness.progress import Progress, SilentProgress
+from harness.progress import Progress
 from harness.records.folder import (
     MANIFEST,
     SHELLS,
@@ -61,7 +61,7 @@ def merge_parts(folders: Sequence[Path], out: Path, *, progress: Progress | None
     TooManyFailedError
         More episodes failed than the campaign allows.
     """
-    progress = progress or SilentProgress()
+    progress = progress or Progress()
     if out.exists() or out.is_symlink():
         mend = "Choose another folder with --out, or remove this one."
         raise RunFolderError(str(out), found="a folder or file that is there already", expected="a new name", mend=mend)

@@ -19,7 +19,7 @@ from harness.campaign.loading import load_campaign
 from harness.campaign.models import Campaign
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, CampaignError, RunFolderError
 from harness.part import Part
-from harness.progress import Progress, SilentProgress
+from harness.progress import Progress
 from harness.records.folder import link_or_copy, read_manifest, sole_use
 from harness.records.stored_manifest import PLAN, StoredPlan, kind_of
 from harness.resolved import Resolved
@@ -83,7 +83,7 @@ def run_part(
         plan.require_same(resolved)
     with sole_use(out):
         earlier = require_own_folder(out, resolved, resume=resume, kind=kind_of(facts))
-        progress = progress or SilentProgress()
+        progress = progress or Progress()
         run = Run(resolved, out, earlier, workers, progress, began, **facts)
         with run.under_way():
             if plan is not None:
@@ -259,7 +259,7 @@ def plan_second_phase(
     with sole_use(out):
         earlier = require_own_folder(out, resolved, resume=resume, kind=PLAN)
         require_no_fewer(out, earlier, resolved.campaign.stop.episodes)
-        unplanned, progress = StoredPlan().model_dump(), progress or SilentProgress()
+        unplanned, progress = StoredPlan().model_dump(), progress or Progress()
         run = Run(resolved, out, earlier, workers, progress, began, plan=unplanned)
         with run.under_way():
             run.make_ready(campaign.stop.episodes)

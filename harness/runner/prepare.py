@@ -23,7 +23,7 @@ from harness.pool.enumeration import ShadowRuns
 from harness.pool.shells import PrescribedEpisodes, checked_boundary
 from harness.pool.storage import campaign_pool, campaign_pool_key, pool_path
 from harness.pool.vehicle_pool import ShadowPaths, campaign_shadow_paths, shadow_paths_file, vehicle_pool
-from harness.progress import Progress, SilentProgress
+from harness.progress import Progress
 from harness.records.folder import SHELLS, read_json
 from harness.resolved import Resolved, resolve
 from harness.sumo.av_type import av_type
@@ -128,7 +128,7 @@ def prepare(resolved: Resolved, progress: Progress | None = None) -> Prepared:
     """Build (or read) a campaign's challenge tables, its pool of cut-ins, or the paths of its shadow runs."""
     campaign, environment = resolved.campaign, resolved.environment
     with ThreadPoolExecutor(1) as thread:
-        building = thread.submit(_built, resolved, progress or SilentProgress())
+        building = thread.submit(_built, resolved, progress or Progress())
         if not all(file.is_file() for file in cached_files(resolved)):
             compile_kernels(resolved)
         tables, prescribed, shadow_paths = building.result()

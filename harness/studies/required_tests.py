@@ -32,7 +32,7 @@ from harness.estimators.estimate import BothWays, finite_json
 from harness.estimators.intervals import normal_half_width
 from harness.estimators.nade import Nade, Nde
 from harness.estimators.scv import Scv
-from harness.progress import Progress, SilentProgress
+from harness.progress import Progress
 from harness.runner.stored_estimates import stored_blocks
 
 RnotEstimator = Literal["nde", "nade", "scv"]
@@ -237,7 +237,7 @@ def required_tests_of_runs(
     HarnessError
         If a folder is not a run, its records are damaged or incomplete, or its tests were drawn from shells.
     """
-    told = progress or SilentProgress()
+    told = progress or Progress()
     reference: RequiredTests | None = None
     rows = []
     for folder in folders:

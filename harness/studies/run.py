@@ -14,7 +14,7 @@ import numpy as np
 import pyarrow as pa
 
 from harness.estimators.estimate import finite_json
-from harness.progress import Progress, SilentProgress
+from harness.progress import Progress
 from harness.records.folder import require_place, write_bytes, write_json
 from harness.report.plot_style import BLUE, FULL_WIDTH_IN, GREY, INK, VERMILLION, Plot, new_figure, png
 from harness.studies.experiment import Experiment
@@ -39,7 +39,7 @@ def validate(
     Worker processes, one per core by default, change no bit. In ``parts`` finished replications of this very experiment
     are kept, and taken from there.
     """
-    progress = progress or SilentProgress()
+    progress = progress or Progress()
     require_place(folder)
     n, found = experiment.replications, list[tuple[Tested, pa.Table]]()
     size = -(-n // TASKS_PER_SUBJECT)

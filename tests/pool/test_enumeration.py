@@ -13,7 +13,7 @@ from harness.pool.aimed_paths import Enumerator
 from harness.pool.enumeration import STRIDE
 from harness.pool.library import load_library
 from harness.pool.shells import design_shells
-from harness.progress import SilentProgress
+from harness.progress import Progress
 from tests.chains.seed import SEED
 from tests.pool.walked import driven, enumerated, p_cut_in_of_paths
 
@@ -55,7 +55,7 @@ def test_a_stride_asks_the_same_cut_ins_and_each_stands_for_as_many(environment)
 
 
 def test_blocks_use_every_offset_about_equally(environment):
-    paths = Enumerator(environment, LIBRARY.followers_in(environment), 5).run(0, 2048, SilentProgress())
+    paths = Enumerator(environment, LIBRARY.followers_in(environment), 5).run(0, 2048, Progress())
     asked = paths.mass > 0.0
     offsets = [np.flatnonzero(row) % STRIDE for row in asked if row.any()]
     assert all(np.unique(found).size == 1 for found in offsets)
@@ -65,9 +65,9 @@ def test_blocks_use_every_offset_about_equally(environment):
 
 def test_the_number_of_cores_changes_no_bit(environment, monkeypatch):
     enumerator = Enumerator(environment, LIBRARY.followers_in(environment), PoolSettings().seed)
-    many = enumerator.run(0, 512, SilentProgress())
+    many = enumerator.run(0, 512, Progress())
     monkeypatch.setattr("os.cpu_count", lambda: 1)
-    one = enumerator.run(0, 512, SilentProgress())
+    one = enumerator.run(0, 512, Progress())
     assert np.array_equal(many.mass, one.mass)
     assert np.array_equal(many.crashes, one.crashes)
 

@@ -14,7 +14,7 @@ from harness.outcomes import CRASH
 from harness.pool.aimed_paths import Enumerator
 from harness.pool.enumeration import ShadowRuns, enumerate_cut_ins
 from harness.pool.vehicle_pool import CANDIDATES, EVENLY, chances, vehicle_pool
-from harness.progress import SilentProgress
+from harness.progress import Progress
 from harness.resolved import resolve
 from harness.runner.prepare import prepare
 from harness.runner.shadow_runs import as_recorded, run_shadows, shadow_specs, without_cut_in
@@ -51,7 +51,7 @@ def speeds():
 def test_a_vehicle_that_holds_its_speed_has_the_cut_ins_of_one_that_holds(environment, campaign):
     """Every bit: same hazards, same probabilities, same crashes, on naturalistic paths."""
     followers = resolve(campaign).library.followers_in(environment)
-    held = Enumerator(environment, followers, 5, stride=1).run(0, N, SilentProgress())
+    held = Enumerator(environment, followers, 5, stride=1).run(0, N, Progress())
     steps = np.arange(int(environment.numbers["max_steps"]) + 1)
     v = np.repeat((held.state["v_bv_mps"] - held.state["r2dot_mps"])[:, None], steps.size, 1)
     x = np.full(v.shape, 100.0)

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 
-from harness.progress import SilentProgress
+from harness.progress import Progress
 from tests.runner.conftest import MIXTURE_FILE, SMALL, sets
 from tests.runner.stored_runs import copy_of, manifest, shard_files, stored_table, unlike_columns
 
@@ -43,7 +43,7 @@ def test_two_workers_and_sixty_four_cells(sumo_run, campaign, run, tmp_path):
     assert unlike_columns(sumo_run, tmp_path / "run") == []
 
 
-class KillOneWorker(SilentProgress):
+class KillOneWorker(Progress):
     """Kills a worker process when the fourth shard is handed back."""
 
     def __init__(self) -> None:

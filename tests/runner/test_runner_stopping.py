@@ -7,7 +7,7 @@ import json
 import pytest
 
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, RunFolderError
-from harness.progress import SilentProgress
+from harness.progress import Progress
 from harness.runner.manifest import Prefix
 from tests.runner.conftest import TWIN
 from tests.runner.stored_runs import copy_of, manifest, shard_files, stored_table, unlike_columns
@@ -45,7 +45,7 @@ def test_the_asked_precision_is_reached_and_nothing_beyond_it_is_kept(runs):
     assert manifest(loose)["n_episodes"] < manifest(tight)["n_episodes"] < 4000
 
 
-class Bar(SilentProgress):
+class Bar(Progress):
     """Where the bar of tests begins and ends."""
 
     def stage(self, name, total, *, done=0):

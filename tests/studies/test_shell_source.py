@@ -11,7 +11,7 @@ from harness.errors import CampaignError
 from harness.pool.build import build_pool
 from harness.pool.library import load_library
 from harness.pool.shells import acceleration_limit
-from harness.progress import SilentProgress
+from harness.progress import Progress
 from harness.studies.experiment import Adversary
 from harness.studies.shell_campaign import campaign_block
 from harness.studies.shell_source import Division, equals, leave_out
@@ -45,7 +45,7 @@ def drivers():
 
 
 def enumerated(drivers, paths=PATHS):
-    return enumerate_paths(ENVIRONMENT, drivers, 3, paths, SilentProgress())
+    return enumerate_paths(ENVIRONMENT, drivers, 3, paths, Progress())
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +61,7 @@ def shells_of(drivers, population, name="own", paths=256):
 
 
 def test_imprecise_truths_are_enumerated_again_and_agree():
-    truths = Truths(ENVIRONMENT, drivers_of("own", "wild"), 3, PATHS, SilentProgress())
+    truths = Truths(ENVIRONMENT, drivers_of("own", "wild"), 3, PATHS, Progress())
     own, wild = (truths.vehicle(name)[RATE] for name in ("own", "wild"))
     assert own.value == pytest.approx(1.343e-7, abs=4.0 * own.std_error)
     assert own.relative_error < 0.02  # once would leave some 2 %

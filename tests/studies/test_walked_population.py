@@ -8,7 +8,7 @@ import pytest
 from harness.campaign.models import Campaign
 from harness.errors import HarnessError
 from harness.pool.library import load_library
-from harness.progress import SilentProgress
+from harness.progress import Progress
 from harness.studies.experiment import Fault
 from harness.studies.judgement import Subject, judge
 from harness.studies.shell_campaign import FREE, ShellCampaign
@@ -39,10 +39,10 @@ def campaign(controller: str, **parameters) -> Campaign:
 
 @pytest.fixture(scope="module")
 def walk():
-    choose = chooser(campaign("examples.acting:Holds"), SilentProgress(), 2048)
+    choose = chooser(campaign("examples.acting:Holds"), Progress(), 2048)
 
     def walked(of: Campaign, n_paths: int):
-        return walk_paths(of, choose, 5, n_paths, Here(), SilentProgress())
+        return walk_paths(of, choose, 5, n_paths, Here(), Progress())
 
     return walked
 

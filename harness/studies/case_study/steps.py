@@ -20,7 +20,7 @@ from harness.campaign.loading import load_campaign
 from harness.compiled import WORLD_SOURCES, source_hash
 from harness.environment.loading import load_parameters
 from harness.estimators.estimate import finite_json
-from harness.progress import Progress, SilentProgress
+from harness.progress import Progress
 from harness.records.folder import read_json, sole_use, write_json
 from harness.resolved import resolve
 from harness.studies.case_study.context import Context, Made
@@ -86,7 +86,7 @@ def run_study(
     with sole_use(folder):
         for name, step in study.steps.items():
             place = folder / "steps" / f"{name}-{keys[name]}"
-            context = Context(place, study.rhw, study.confidence, made, workers, progress or SilentProgress())
+            context = Context(place, study.rhw, study.confidence, made, workers, progress or Progress())
             seconds[name] = None
             if not (place / RESULT).is_file():
                 began = time.monotonic()
