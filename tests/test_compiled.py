@@ -2,6 +2,9 @@
 
 import ast
 import os
+import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -98,3 +101,24 @@ def test_every_pattern_names_a_file():
 
 def test_the_cache_is_named_after_the_hash():
     assert os.environ["NUMBA_CACHE_DIR"].endswith(f"kernels-{source_hash()}")
+
+
+def test_a_copy_of_the_package_finds_what_another_has_compiled(tmp_path):
+    (tmp_path / "of_a_user.py").write_text("import numba\n@numba.njit(cache=True)\ndef twice(x):\n    return 2 * x\n")
+    say_hits = (
+        "from harness import random_stream; random_stream.uniforms(1, 0, 1, 0, 1); "
+        "from of_a_user import twice; twice(2);"
+        "print(*(sum(kernel.stats.cache_hits.values()) for kernel in (random_stream._fill_uniforms, twice)))"
+    )
+    hits = []
+    for copy in ("one", "another"):
+        shutil.copytree(ROOT, tmp_path / copy / "harness", ignore=shutil.ignore_patterns("__pycache__"))
+        said = subprocess.run(
+            [sys.executable, "-c", say_hits],
+            env={**os.environ, "HARNESS_CACHE_DIR": str(tmp_path), "PYTHONPATH": f"{tmp_path / copy}:{tmp_path}"},
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        hits.append(said.stdout.split())
+    assert hits == [["0", "0"], ["1", "1"]]
