@@ -228,7 +228,7 @@ def apart_statement(difference: float, low: float, high: float, confidence: floa
 def _ratio(found: Difference) -> str:
     if not math.isfinite(found.ratio):
         return ""
-    if not found.n_differing:
+    if math.isnan(found.ratio_low) or math.isnan(found.ratio_high):
         return f", A/B = {found.ratio:.3g} (its interval is not known: no pair differs)"
     return f", A/B = {found.ratio:.3g} ({found.ratio_low:.3g} to {found.ratio_high:.3g})"
 

@@ -172,7 +172,7 @@ def equals(library: Library, population: SuperPopulation, crashing: FloatArray) 
     found = set()
     for driver, name in enumerate(library.surrogates):
         mass = population.mass * population.crashes(driver)
-        if abs(mass.sum() / rate - 1.0) <= EQUAL_RATE or np.array_equal(mass, crashing):
+        if abs(mass.sum() - rate) <= EQUAL_RATE * rate or np.array_equal(mass, crashing):
             found.add(name)
     return found
 

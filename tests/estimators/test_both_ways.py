@@ -110,6 +110,14 @@ def test_a_difference_allows_for_the_worst_of_each_side():
     assert "A FAILED in 40 and B in 60" in difference_statement(found, "one", "other")
 
 
+def test_where_only_failed_tests_can_differ_the_ratio_has_the_limits_of_those():
+    k = np.arange(2_000)
+    a, b = (block((k < 200).tolist(), method="nde", failed=(k >= n).tolist(), weight_cap=1.0) for n in (1960, 1940))
+    found = paired_difference([(a, b)], 0.9)
+    assert found.n_differing == 0
+    assert f"A/B = 1 ({found.ratio_low:.3g} to {found.ratio_high:.3g})" in difference_statement(found, "one", "other")
+
+
 def test_required_numbers_of_tests_grow_with_failures():
     whole = joined(some_failed(list(blocks(CHAIN, "step_mixture", [500] * 4, SEED)), first=0))
     counted = whole.crash | whole.failed

@@ -93,6 +93,7 @@ def test_equals_are_found_and_left_out(drivers, population):
     assert source.cells.left_out == ("brakes-3",)
     assert "brakes-3" not in source.cells.template.names
     assert equals(LIBRARY, population, drivers.vehicles["own"].crash_mass(population)) == set()
+    assert equals(LIBRARY, population, np.zeros_like(vehicle)) == set()  # one that never crashes is nobody's equal
 
 
 def test_the_envelope_stays_and_another_surrogate_becomes_the_boundary():
