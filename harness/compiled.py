@@ -85,9 +85,15 @@ class KernelCacheLocator(caching.UserProvidedCacheLocator):
         return "-".join(("harness", *Path(py_file).relative_to(_PACKAGE).parent.parts))
 
 
+_settings: Any = numba.config
+if _settings.USING_SVML:
+    raise ImportError(
+        "numba was imported before harness, and uses Intel's short-vector math library, which changes results: "
+        "import harness first, or set NUMBA_DISABLE_INTEL_SVML=1"
+    )
+_settings.CACHE_DIR = os.environ["NUMBA_CACHE_DIR"]  # where numba was imported before, it has not read it
 # Not by numba's environment variable: programs that a controller starts inherit that, and may not have this package.
 _OTHERS = "UserProvidedCacheLocator,InTreeCacheLocator,UserWideCacheLocator,IPythonCacheLocator,ZipCacheLocator"
-_settings: Any = numba.config
 _settings.CACHE_LOCATOR_CLASSES = (
     f"{__name__}.{KernelCacheLocator.__name__},{_settings.CACHE_LOCATOR_CLASSES or _OTHERS}"
 )

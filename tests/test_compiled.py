@@ -103,6 +103,23 @@ def test_the_cache_is_named_after_the_hash():
     assert os.environ["NUMBA_CACHE_DIR"].endswith(f"kernels-{source_hash()}")
 
 
+def of_another_process(lines: str, **environment: str) -> subprocess.CompletedProcess:
+    command, variables = [sys.executable, "-c", lines], {**os.environ, **environment}
+    return subprocess.run(command, env=variables, capture_output=True, text=True, check=False)
+
+
+def test_it_is_the_cache_also_where_numba_was_imported_before():
+    say = "import numba; from harness import random_stream; print(random_stream._fill_uniforms._cache.cache_path)"
+    said = of_another_process(say).stdout.strip()
+    assert said == str(Path(os.environ["NUMBA_CACHE_DIR"]) / "harness")
+
+
+def test_numba_with_a_vector_library_is_refused():
+    refused = of_another_process("import numba; numba.config.USING_SVML = True; import harness.compiled")
+    assert refused.returncode != 0
+    assert "ImportError: numba was imported before harness" in refused.stderr
+
+
 def test_a_copy_of_the_package_finds_what_another_has_compiled(tmp_path):
     (tmp_path / "of_a_user.py").write_text("import numba\n@numba.njit(cache=True)\ndef twice(x):\n    return 2 * x\n")
     say_hits = (
@@ -113,12 +130,7 @@ def test_a_copy_of_the_package_finds_what_another_has_compiled(tmp_path):
     hits = []
     for copy in ("one", "another"):
         shutil.copytree(ROOT, tmp_path / copy / "harness", ignore=shutil.ignore_patterns("__pycache__"))
-        said = subprocess.run(
-            [sys.executable, "-c", say_hits],
-            env={**os.environ, "HARNESS_CACHE_DIR": str(tmp_path), "PYTHONPATH": f"{tmp_path / copy}:{tmp_path}"},
-            capture_output=True,
-            text=True,
-            check=True,
-        )
+        path = f"{tmp_path / copy}:{tmp_path}"
+        said = of_another_process(say_hits, HARNESS_CACHE_DIR=str(tmp_path), PYTHONPATH=path)
         hits.append(said.stdout.split())
     assert hits == [["0", "0"], ["1", "1"]]
