@@ -11,4 +11,5 @@ RUNNING = -1
 VEHICLES = ("LV", "BV", "AV")
 LV, BV, AV = range(len(VEHICLES))
 
-NDE, FORCED, STEP_MIXTURE, EPISODE_MIXTURE, SHELLS = range(len(METHODS))
+NDE, FORCED, STEP_MIXTURE, EPISODE_MIXTURE, PRESCRIBED = range(len(METHODS))
+"""Methods as kernels know them; PRESCRIBED is shells, and any method where shadow runs prescribe the traffic."""

@@ -1,4 +1,6 @@
-"""From a pydantic `ValidationError` to one error that lists every problem of a file in plain words.
+"""Error messages for unknown keys and wrong values of a file: each place and line, found, expected, how to mend it.
+
+From a pydantic `ValidationError` to one error that lists every problem; lines are `harness.campaign.yaml_text.Lines`'s.
 
 A problem is a `CampaignError`: where, what was found (`describe_found`), what the JSON schema expects there
 (`describe_expected`), and how to mend it.

@@ -1,9 +1,11 @@
-"""A call of a user's code: noted in the black box, limited in time, and its faults put in words.
+"""A call of a user's code: what becomes of an exception, NaN, or an answer too late; a black box and a time limit.
 
-Whatever goes wrong, an exception, NaN, an answer outside of av.limits or one too late, ends the episode as failed, with
-these words in its row; its controller is dropped (of a batch only the cells fail), and the run goes on until failed
-tests exceed run.max_failed_share. A call that takes too long meets an exception where Python runs, else the end of the
-process.
+Whatever goes wrong, also an answer outside of av.limits, ends the episode (`harness.episode.loop`) with the outcome
+``failed``, these words in the column ``failure`` of its row, and the weight that it has so far. Its controller is
+dropped (of a batch only the cells fail), and the run goes on until failed tests exceed run.max_failed_share
+(`harness.runner.manifest.require_few_failed`). Rate and lower limit count it as no crash, upper limits as a crash
+(`harness.estimators.estimate.BothWays`). A call that takes too long meets an exception where Python runs, else the end
+of the process.
 """
 
 from __future__ import annotations

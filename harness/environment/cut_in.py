@@ -1,4 +1,4 @@
-"""Hazard of BV's cut-in.
+"""Probability of BV's cut-in (its lane change): wish times acceptance, as a hazard per step.
 
 Drivers decide about once a second with probability p_1s; a step of 0.1 s has p = 1 - (1 - p_1s)^0.1, so its cumulative
 hazard is -0.1 ln(1 - p_1s). A cut-in time is drawn by one exponential clock: it happens in the first step whose

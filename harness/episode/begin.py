@@ -10,7 +10,7 @@ from harness.environment.lateral import draw_lead, onset_of
 from harness.episode.cells import Bench
 from harness.episode.critical_moment import take_down
 from harness.episode.trajectory import place, state_in, walk, weigh_cut_ins
-from harness.outcomes import AV, EPISODE_MIXTURE, FORCED, SHELLS
+from harness.outcomes import AV, EPISODE_MIXTURE, FORCED, PRESCRIBED
 from harness.random_stream import CUT_IN, uniform
 
 COMPONENT_DRAW, CUT_IN_DRAW = 0, 1
@@ -55,7 +55,7 @@ def begin_cell(k: int, row: int, bench: Bench) -> None:
     cells.acceleration[k, AV] = 0.0
     cells.log_ratio[k, :] = 0.0
     cells.martingale[k, :] = 0.0
-    if method == SHELLS:
+    if method == PRESCRIBED:
         log_weight = bench.traffic.log_weight[row]
         cell.component, cell.log_sampled = bench.traffic.stratum[row], -log_weight
         if bench.importance.first == 1:  # a forced cut-in whose path has been walked by the AV itself

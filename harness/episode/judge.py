@@ -1,4 +1,4 @@
-"""After a step: which episodes are over and how they ended, and what stays of them."""
+"""After a step: which episodes are over and how (crash, impact speed, ...), and what stays of them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Intervals and bounds for a crash rate: Clopper-Pearson, skewness-corrected, and Hoeffding's for capped weights."""
+"""Limits of a mean of weighted tests: Clopper-Pearson, skewness-corrected, Hoeffding's (of shells: `stratified`)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""The search for a limit of Σ w_sj θ_sj along its Lagrange multiplier; see `harness.estimators.stratified`."""
+"""The search for a limit of Σ w_sj θ_sj along its Lagrange multiplier, and the stratum whose next tests move it most.
+
+The equations are in `harness.estimators.stratified`.
+"""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """`shells`: crashes counted within shells of known probability p_s, and the statements (docs/shells.md) they allow.
 
 The rate is Σ p_s c_s, c_s being the share of a stratum's tests that crash. Its limits are those of the likelihood
-ratio, with the error of the p_s in the same root, and failed tests counted against the vehicle
+ratio, with the error of the p_s in the same root, and failed tests as crashes in the upper one alone
 (`harness.estimators.stratified`). A stratum without a crash widens the upper limit only.
 """
 

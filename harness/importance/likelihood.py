@@ -1,4 +1,4 @@
-"""Likelihood ratios and the weight of an episode.
+"""Likelihood ratios and the weight of an episode: log p/q_sampled, which estimators take the exponential of.
 
 Per importance function j the logarithm L_j = Σ log(q_j/p) over the control steps so far is kept. The probability that a
 step was sampled with, *given the shared history*, is the mixture Σ_j w_j q_j with
@@ -8,6 +8,8 @@ step was sampled with, *given the shared history*, is the mixture Σ_j w_j q_j w
 
 Hence log q_sampled/p accumulates to Σ log Σ_j α_j q_j/p (step), or to log Σ_j α_j exp(L_j) (episode). Forced cut-ins
 and shells know it at the beginning of the episode (`harness.episode.begin`): P(cut-in | path), and the shell's p_s.
+Each control step adds its ratios (`harness.episode.critical_moment.update_ratios`), and the end of the episode asks for
+`log_weight`, which is the record's (`harness.episode.judge.end_episode`).
 """
 
 from __future__ import annotations

@@ -1,9 +1,10 @@
-"""Arrow schemas of the tables that a run leaves, with units in the field metadata.
+"""Columns of the tables that a run leaves: Arrow schemas with units and meanings in the field metadata.
 
 ``episodes``: one row per episode, failed ones included. ``moments``: one row per control step. ``traces``: one row
 per step and vehicle. ``shadow``: one row per path that a vehicle which acts before the cut-in was driven along without
 one. Importance functions are in the order of `importance_names`: for the episode mixture the
-defensive ``forced`` cut-in first, then the surrogates; for the others the surrogates alone.
+defensive ``forced`` cut-in first, then the surrogates; for the others the surrogates alone. Values are from
+`harness.episode.judge.end_episode`, and in the tables of a shard by `harness.records.tables`.
 """
 
 from __future__ import annotations

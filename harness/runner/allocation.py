@@ -1,4 +1,4 @@
-"""Which shells get the tests of the next round: first a few of each, then where they narrow the interval most."""
+"""Which shells are tested next, and why: first a few tests of each, then where one more narrows the interval most."""
 
 from __future__ import annotations
 

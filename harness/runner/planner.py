@@ -1,10 +1,10 @@
-"""What a campaign tests next; its rule says when it is enough.
+"""In which rounds and shards a campaign is tested (`allocation`: with which shells), and when it is enough.
 
 Most methods know all their tests beforehand. Shells decide from each round what the next one tests, so that a round is
 run to its end before the next begins, whatever the number of workers; the result is looked at between rounds. Rounds
 grow geometrically, to where they narrow the interval most. That depends on counts alone, not on the stop rule or on
 time: a run can be continued to a smaller RHW. First the strata inside the narrowest boundary are tested until what is
-stated about them is roughly known, some ten tests; then those inside the next one, and at last all.
+stated about them is roughly known; then those inside the next one, and at last all.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ from harness.episode.loop import MOMENT_LIMITS, NOBODY, EpisodeLoop, Keep, Polic
 from harness.episode.trajectory import empty_trajectory, mean_test_distance
 from harness.errors import RunFolderError
 from harness.importance.build import build_importance, needs_tables
-from harness.outcomes import SHELLS as PRESCRIBED
+from harness.outcomes import PRESCRIBED
 from harness.pool.enumeration import ShadowRuns
 from harness.pool.shells import PrescribedEpisodes, checked_boundary
 from harness.pool.storage import campaign_pool, campaign_pool_key, pool_path

@@ -1,4 +1,7 @@
-"""What is taken over of shards that are on disk: by a run that goes on, and block by block by estimates.
+"""What ``--resume`` takes over of shards on disk, and what estimates read of them block by block.
+
+A shard whose file of episodes is there is complete: `harness.records.folder.write_shard` writes that last. Shadow runs
+are taken over in `harness.runner.shadow_runs`.
 
 Before a run looks at any shard, `harness.runner.manifest.require_own_folder` has refused folders of another campaign or
 controller, `harness.runner.prepare.require_same_pool` other pools; a finished run that is asked for unchanged is

@@ -23,8 +23,7 @@ from harness.episode.loop import EpisodeLoop, Keep, Policy
 from harness.episode.motion import motion_hashes
 from harness.errors import HarnessError
 from harness.importance.build import build_importance
-from harness.outcomes import CRASH
-from harness.outcomes import SHELLS as PRESCRIBED
+from harness.outcomes import CRASH, PRESCRIBED
 from harness.pool.cut_ins import onset_steps
 from harness.pool.enumeration import STRIDE, ShadowRuns, enumerate_cut_ins, write_script
 from harness.pool.vehicle_pool import CANDIDATES, ShadowPaths, walk_candidates

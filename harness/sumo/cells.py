@@ -1,6 +1,7 @@
-"""K roads in a SUMO, each with LV, BV and AV: how they are placed, and who touched whom.
+"""The settings under which SUMO does exactly what it is told, and K roads in it, each with LV, BV and AV.
 
-With the committed networks, and the settings under which SUMO does exactly what it is told.
+With the committed networks, whose ``vehicles.add.xml`` holds the vehicle types; `harness.sumo.world` checks what SUMO
+did. Also how cells are placed, and who touched whom.
 """
 
 from __future__ import annotations

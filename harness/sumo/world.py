@@ -1,4 +1,4 @@
-"""K cells in one libsumo simulation, moved exactly and checked at every step.
+"""K cells in one libsumo simulation: told every speed, and every position compared with it after each step.
 
 SUMO is told the speed of every vehicle in every step; a speed that it has been told already it keeps until the next
 command. A finished cell is refilled by moving its three vehicles back: nothing is removed or added. After each step

@@ -1,4 +1,4 @@
-"""Motion within a step, in exactly the floating-point form that SUMO uses (ballistic update)."""
+"""Motion within a step, and when two vehicles overlap, in exactly SUMO's floating-point form (ballistic update)."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ from harness.controllers.loading import build_host
 from harness.environment.loading import load_environment
 from harness.episode.loop import EpisodeLoop, Keep, Policy
 from harness.importance.build import build_importance
-from harness.outcomes import CRASH, PASSED, SHELLS
+from harness.outcomes import CRASH, PASSED, PRESCRIBED
 from harness.pool.library import load_library
 from harness.pool.shells import PrescribedEpisodes
 from harness.pool.storage import campaign_pool, read_pool, write_pool
@@ -86,7 +86,7 @@ def test_a_vehicle_that_acts_before_has_a_pool_of_its_own_that_its_tests_follow(
     resolved = resolve(acts)
     environment, library = resolved.environment, resolved.library
     paths = walk_candidates(environment, library, acts.pool, "test", candidates=1024).draw(60)
-    policy = Policy(1, environment, build_importance(acts, None)._replace(method=SHELLS), resolved.av)
+    policy = Policy(1, environment, build_importance(acts, None)._replace(method=PRESCRIBED), resolved.av)
     loop = EpisodeLoop(TwinWorld(32), policy, Keep(0, "none", 0.0), build_host(acts.av, n_cells=32, seed=1))
     motion = without_cut_in(loop, paths.seed, 0, paths.index, paths.state, environment)
     pool = vehicle_pool(resolved, paths, recorded(motion, environment))
