@@ -9,6 +9,7 @@ from pathlib import Path
 
 from harness.arrays import RecordArray
 from harness.campaign.models import Campaign
+from harness.compiled import is_cached
 from harness.controllers.black_box import Death
 from harness.controllers.loading import build_host, require_controller
 from harness.criticality.tables import Tables, build_tables, table_path
@@ -25,7 +26,9 @@ from harness.pool.storage import campaign_pool, campaign_pool_key, pool_path
 from harness.pool.vehicle_pool import ShadowPaths, campaign_shadow_paths, shadow_paths_file, vehicle_pool
 from harness.progress import Progress
 from harness.records.folder import SHELLS, read_json
+from harness.records.tables import shard_tables
 from harness.resolved import Resolved, resolve
+from harness.runner.retrace import Retracing
 from harness.sumo.av_type import av_type
 from harness.sumo.public_address import require_private
 from harness.sumo.system_libraries import require_libraries
@@ -129,7 +132,7 @@ def prepare(resolved: Resolved, progress: Progress | None = None) -> Prepared:
     campaign, environment = resolved.campaign, resolved.environment
     with ThreadPoolExecutor(1) as thread:
         building = thread.submit(_built, resolved, progress or Progress())
-        if not all(file.is_file() for file in cached_files(resolved)):
+        if not is_cached(mean_test_distance):
             compile_kernels(resolved)
         tables, prescribed, shadow_paths = building.result()
     importance = build_importance(campaign, tables)
@@ -187,15 +190,18 @@ def require_same_pool(folder: Path, prepared: Prepared) -> None:
 def compile_kernels(resolved: Resolved) -> None:
     """Compile what episodes will need, while threads build tables: neither waits for the other.
 
-    Kernels are the same for all methods and worlds, so one naturalistic episode in the twin compiles them into the
-    cache, where worker processes find them.
+    Kernels are the same for all methods and worlds, so one naturalistic episode in the twin, retraced as if SUMO had
+    driven it, compiles them into the cache, where worker processes find them; the last is `mean_test_distance`.
     """
     from harness.twin import TwinWorld  # noqa: PLC0415 - only a cold start needs it
 
     campaign, environment = resolved.campaign, resolved.environment
     naturalistic = campaign.model_copy(update={"testing": campaign.testing.model_copy(update={"method": "nde"})})
-    policy = Policy(campaign.seed, environment, build_importance(naturalistic, None), resolved.av)
-    EpisodeLoop(TwinWorld(1), policy, Keep(0, "none", 0.0)).run(0, InitialStates(environment.numbers).draw(0, 0, 1))
+    importance = build_importance(naturalistic, None)
+    policy = Policy(campaign.seed, environment, importance, resolved.av, boundary=resolved.surrogates[:1])
+    states = InitialStates(environment.numbers).draw(0, 0, 1)
+    shard = EpisodeLoop(TwinWorld(1), policy, Keep(0, "none", 0.0)).run(0, states)
+    Retracing(resolved).check(shard_tables(shard, campaign.seed, keep_traces=False).episodes)
     distance_per_test_m(environment)
 
 

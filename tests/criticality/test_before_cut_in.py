@@ -8,8 +8,12 @@ from harness.environment.cut_in import acceptance
 from tests.criticality import simulation
 from tests.environment.kernels import environment
 from tests.episode.twin_runs import Mean, prepared, run
+from tests.kernels import alone
 
 each_surrogate = pytest.mark.parametrize("j", range(3), ids=simulation.SURROGATES)
+
+
+acceptance = alone(acceptance)
 
 
 @pytest.fixture(scope="module")

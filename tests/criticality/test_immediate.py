@@ -16,10 +16,13 @@ from tests.chains.seed import SEED
 from tests.criticality import simulation
 from tests.criticality.kernels import after_cut_in
 from tests.episode.twin_runs import SURROGATES, prepared
+from tests.kernels import alone
 
 KEEP_SPEED = 20
 HOLD, STEPS_PER_LEVEL, LEVELS = 10, 20, 10
 ALLOWED_SHARE = {"SM-I": 0.001, "SM-II": 0.006, "SM-III": 0.002}
+
+driver_acceleration, smallest_gaps = map(alone, (driver_acceleration, smallest_gaps))
 
 
 @pytest.fixture(scope="module", params=["two", pytest.param("default", marks=pytest.mark.slow)])

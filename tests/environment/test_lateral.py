@@ -24,7 +24,9 @@ from harness.environment.parameters import EnvironmentParameters
 from harness.errors import CampaignError
 from harness.pool.cut_ins import environment_hash
 from harness.resolved import resolve
+from tests.kernels import alone
 
+draw_lead = alone(draw_lead)
 PAPER, LATERAL = "ndd-overtaking-1", "ndd-overtaking-1-lateral"
 
 

@@ -21,6 +21,7 @@ from harness.runner.shadow_runs import as_recorded, run_shadows, shadow_specs, w
 from harness.state import State
 from harness.twin import TwinWorld
 from harness.vehicles.models import driver_records
+from tests.kernels import alone
 from tests.pool.conftest import MIXTURE_FILE, SMALL_POOL
 
 N = 256
@@ -41,6 +42,9 @@ def prepared_after(campaign):
     specs = shadow_specs(len(ready.shadow_paths))
     runs = as_recorded([run_shadows(loop, ready.shadow_paths, environment, spec).table for spec in specs], environment)
     return ready.after(runs), loop, runs
+
+
+acceptance, cut_in_hazard, opportunity = map(alone, (acceptance, cut_in_hazard, opportunity))
 
 
 @pytest.fixture(scope="module")
