@@ -4,7 +4,8 @@ Bit-exactness rests on three choices made here. No fast-math and no fused operat
 be matched. No short-vector math library, whose `exp` and `log` differ from the scalar ones depending on how a loop was
 vectorised. And a cache folder named after a hash of *all* sources of compiled code: numba's own cache looks only at the
 file that a function stands in and would keep a caller compiled with yesterday's callee. In it a file is known by its
-place in the package, not on the disk, so that the same sources are compiled once, wherever they are installed.
+place in the package, not on the disk, so that the same sources are compiled once, wherever they are installed; by two
+versions of numba in two folders, since each throws away what the other has kept.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import functools
 import hashlib
 import os
 from collections.abc import Callable
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -63,7 +65,7 @@ def cache_root() -> Path:
 
 
 os.environ.setdefault("NUMBA_DISABLE_INTEL_SVML", "1")
-os.environ["NUMBA_CACHE_DIR"] = str(cache_root() / f"kernels-{source_hash()}")
+os.environ["NUMBA_CACHE_DIR"] = str(cache_root() / f"kernels-{source_hash()}-numba-{version('numba')}")
 
 import numba  # noqa: E402  (its settings are read at import)
 from numba import extending  # noqa: E402

@@ -1,16 +1,20 @@
 """The hash that names the kernel cache covers every file that machine code can come from."""
 
 import ast
+import inspect
 import os
 import shutil
 import subprocess
 import sys
 from pathlib import Path
 
+import numba
 import pytest
 
 import harness
-from harness.compiled import KERNEL_SOURCES, source_hash
+from harness.compiled import KERNEL_SOURCES, compiled_inline, is_cached, source_hash
+from harness.random_stream import _fill_uniforms, uniform, uniforms
+from tests.kernels import alone
 
 ROOT = Path(harness.__file__).parent
 DECORATORS = {"compiled", "compiled_inline", "compiled_threads"}
@@ -100,7 +104,7 @@ def test_every_pattern_names_a_file():
 
 
 def test_the_cache_is_named_after_the_hash():
-    assert os.environ["NUMBA_CACHE_DIR"].endswith(f"kernels-{source_hash()}")
+    assert os.environ["NUMBA_CACHE_DIR"].endswith(f"kernels-{source_hash()}-numba-{numba.__version__}")
 
 
 def of_another_process(lines: str, **environment: str) -> subprocess.CompletedProcess:
@@ -134,3 +138,21 @@ def test_a_copy_of_the_package_finds_what_another_has_compiled(tmp_path):
         said = of_another_process(say_hits, HARNESS_CACHE_DIR=str(tmp_path), PYTHONPATH=path)
         hits.append(said.stdout.split())
     assert hits == [["0", "0"], ["1", "1"]]
+
+
+def test_a_part_of_kernels_is_a_function_of_python_elsewhere_and_says_the_same_alone():
+    def third(x):
+        return x / 3.0
+
+    assert compiled_inline(third) is third
+    assert inspect.isfunction(uniform)
+    uniform_alone = alone(uniform)
+    assert [uniform_alone(7, 5, 2, i) for i in range(9)] == uniforms(7, 5, 1, 2, 9)[0].tolist()
+
+
+def test_whether_a_kernel_is_cached_is_asked_of_the_disk(tmp_path):
+    uniforms(1, 0, 1, 0, 1)
+    assert is_cached(_fill_uniforms)
+    say = "from harness import compiled, random_stream; print(compiled.is_cached(random_stream._fill_uniforms))"
+    assert of_another_process(say).stdout.strip() == "True"
+    assert of_another_process(say, HARNESS_CACHE_DIR=str(tmp_path)).stdout.strip() == "False"
