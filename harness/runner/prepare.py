@@ -15,6 +15,7 @@ from harness.controllers.loading import build_host, require_controller
 from harness.criticality.tables import Tables, build_tables, table_path
 from harness.environment.driving import Environment
 from harness.environment.initial_state import InitialStates
+from harness.episode.judge import judge
 from harness.episode.loop import MOMENT_LIMITS, NOBODY, EpisodeLoop, Keep, Policy
 from harness.episode.trajectory import empty_trajectory, mean_test_distance
 from harness.errors import RunFolderError
@@ -132,7 +133,7 @@ def prepare(resolved: Resolved, progress: Progress | None = None) -> Prepared:
     campaign, environment = resolved.campaign, resolved.environment
     with ThreadPoolExecutor(1) as thread:
         building = thread.submit(_built, resolved, progress or Progress())
-        if not is_cached(mean_test_distance):
+        if not is_cached(judge):
             compile_kernels(resolved)
         tables, prescribed, shadow_paths = building.result()
     importance = build_importance(campaign, tables)
@@ -191,7 +192,7 @@ def compile_kernels(resolved: Resolved) -> None:
     """Compile what episodes will need, while threads build tables: neither waits for the other.
 
     Kernels are the same for all methods and worlds, so one naturalistic episode in the twin, retraced as if SUMO had
-    driven it, compiles them into the cache, where worker processes find them; the last is `mean_test_distance`.
+    driven it, compiles them into the cache, where worker processes find them.
     """
     from harness.twin import TwinWorld  # noqa: PLC0415 - only a cold start needs it
 

@@ -4,16 +4,11 @@ import numpy as np
 import pytest
 
 from harness.criticality.grid import BEFORE, points_of
-from harness.environment.cut_in import acceptance
 from tests.criticality import simulation
-from tests.environment.kernels import environment
+from tests.environment.kernels import cut_in_terms
 from tests.episode.twin_runs import Mean, prepared, run
-from tests.kernels import alone
 
 each_surrogate = pytest.mark.parametrize("j", range(3), ids=simulation.SURROGATES)
-
-
-acceptance = alone(acceptance)
 
 
 @pytest.fixture(scope="module")
@@ -42,8 +37,8 @@ def test_less_than_if_every_cut_in_crashed(tables, j):
         assert rates[k] == rate
         for g in (40, 70, 99):
             times = np.arange(0.0, min(20.0, gaps[g] / -rate), 0.1)
-            left = sum(0.1 * acceptance(gaps[g] + rate * t, rate, environment()) for t in times)
-            assert tables.before[j, 0, 2, g, k] <= 1.1 * left + 0.01
+            accepted = cut_in_terms([(30.0, 50.0, 0.0, gaps[g] + rate * t, rate) for t in times])[:, 1]
+            assert tables.before[j, 0, 2, g, k] <= 1.1 * (0.1 * accepted).sum() + 0.01
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from harness.campaign.loading import load_campaign
-from harness.environment.cut_in import acceptance, cut_in_hazard, opportunity
 from harness.episode.motion import motion_hashes
 from harness.episode.trajectory import Followers
 from harness.errors import HarnessError
@@ -18,10 +17,9 @@ from harness.progress import Progress
 from harness.resolved import resolve
 from harness.runner.prepare import prepare
 from harness.runner.shadow_runs import as_recorded, run_shadows, shadow_specs, without_cut_in
-from harness.state import State
 from harness.twin import TwinWorld
 from harness.vehicles.models import driver_records
-from tests.kernels import alone
+from tests.environment.kernels import cut_in_terms
 from tests.pool.conftest import MIXTURE_FILE, SMALL_POOL
 
 N = 256
@@ -42,9 +40,6 @@ def prepared_after(campaign):
     specs = shadow_specs(len(ready.shadow_paths))
     runs = as_recorded([run_shadows(loop, ready.shadow_paths, environment, spec).table for spec in specs], environment)
     return ready.after(runs), loop, runs
-
-
-acceptance, cut_in_hazard, opportunity = map(alone, (acceptance, cut_in_hazard, opportunity))
 
 
 @pytest.fixture(scope="module")
@@ -84,9 +79,8 @@ def test_probabilities_are_those_of_the_states_that_were_driven(speeds):
         trace, stays = shard.traces[row], 1.0
         for step in range(len(trace) - 1):
             (lv, bv, av), (v_lv, v_bv, v_av) = trace[step, :, 0], trace[step, :, 1]
-            state = State(v_bv, lv - 5.0 - bv, v_lv - v_bv, bv - 5.0 - av, v_bv - v_av)
-            wish = opportunity(state, environment)
-            cut = -np.expm1(-cut_in_hazard(wish, acceptance(state.r2_m, state.r2dot_mps, environment), environment))
+            state = (v_bv, lv - 5.0 - bv, v_lv - v_bv, bv - 5.0 - av, v_bv - v_av)
+            cut = -np.expm1(-cut_in_terms(state)[0, 2])
             assert probability[row, step] == pytest.approx(stays * cut, rel=1e-9)
             stays *= 1.0 - cut
         assert np.all(probability[row, len(trace) - 1 :] == 0.0)
