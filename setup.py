@@ -5,8 +5,8 @@ from setuptools import Extension, setup
 setup(
     ext_modules=[
         Extension(
-            "harness.sumo._shim",
-            ["harness/sumo/shim.cpp"],
+            "harness.worlds._shim",
+            ["harness/worlds/shim.cpp"],
             language="c++",
             extra_compile_args=["-O2", "-std=c++17"],
             libraries=["dl"],

@@ -16,13 +16,11 @@ from dataclasses import replace
 import numpy as np
 from scipy.special import ndtr
 
-from harness.arrays import IntArray
 from harness.campaign.models import Campaign
 from harness.estimators.alarm import LEVEL, Alarm
 from harness.estimators.block import Block
 from harness.estimators.from_records import block_from_tables
 from harness.importance.build import mixture_weights
-from harness.methods import Method
 from harness.pool.replay import SurrogateReplay
 from harness.pool.storage import campaign_pool
 from harness.records.tables import episodes_table
@@ -30,7 +28,8 @@ from harness.resolved import resolve
 from harness.runner.prepare import prepare
 from harness.runner.stored_estimates import MOST_UNASKED
 from harness.strata import KnownRates
-from harness.twin import TwinWorld
+from harness.vocabulary import IntArray, Method
+from harness.worlds.twin import TwinWorld
 
 SEED = 77
 TESTS = 20_000

@@ -27,11 +27,11 @@ from harness.runner.executor import LocalExecutor
 from harness.runner.prepare import Prepared, prepare
 from harness.runner.shard_pool import ShardPool
 from harness.runner.worker import ShardSpec
-from harness.sumo.cells import sumo_program
-from harness.sumo.shim import shim_library
-from harness.sumo.world import SumoWorld
-from harness.twin import TwinWorld
-from harness.world import World
+from harness.worlds.cells import sumo_program
+from harness.worlds.protocol import World
+from harness.worlds.shim import shim_library
+from harness.worlds.sumo import SumoWorld
+from harness.worlds.twin import TwinWorld
 
 SCENARIOS = Path(__file__).parents[1] / "scenarios"
 TWIN_CELLS = 1024

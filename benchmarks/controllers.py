@@ -20,7 +20,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 from harness.campaign.loading import load_campaign
 from harness.resolved import resolve
 from harness.runner.prepare import build_world, prepare
-from harness.sumo.world import SumoWorld
+from harness.worlds.sumo import SumoWorld
 
 ROOT = Path(__file__).parents[1]
 CELLS = 64

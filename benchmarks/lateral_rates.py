@@ -15,11 +15,11 @@ from pathlib import Path
 import numpy as np
 
 from harness.campaign.models import EnvironmentSettings, PoolSettings
-from harness.environment.loading import load_environment
 from harness.pool.aimed_paths import PILOT_PATHS
 from harness.pool.build import take_aim
 from harness.pool.library import load_library
 from harness.progress import Progress
+from harness.traffic.loading import load_environment
 
 LIBRARY = Path(__file__).parent / "lateral_rows.yaml"
 PAPER, LATERAL = "ndd-overtaking-1", "ndd-overtaking-1-lateral"

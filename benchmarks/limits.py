@@ -22,8 +22,8 @@ from scipy import special
 
 import harness
 from harness.campaign.loading import load_campaign
-from harness.environment.initial_state import InitialStates
-from harness.environment.loading import load_environment
+from harness.traffic.initial_state import InitialStates
+from harness.traffic.loading import load_environment
 
 FAST_MPS = 40.0
 """144 km/h: the end of the speeds that the traffic was fitted to."""

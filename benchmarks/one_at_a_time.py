@@ -18,9 +18,8 @@ import numpy as np
 import traci
 from sumolib.miscutils import getFreeSocketPort
 
-from harness.arrays import BoolArray, FloatArray, Int8Array, IntArray
-from harness.outcomes import AV, BV, VEHICLES
-from harness.sumo.cells import EXACT_OPTIONS, committed_file, network_file
+from harness.vocabulary import AV, BV, VEHICLES, BoolArray, FloatArray, Int8Array, IntArray
+from harness.worlds.cells import EXACT_OPTIONS, committed_file, network_file
 
 LEFT, RIGHT = 1, 0
 
@@ -31,7 +30,7 @@ def sumo_arguments() -> list[str]:
 
 
 class OneAtATime:
-    """World of one cell over either API of SUMO; see `harness.world.World`."""
+    """World of one cell over either API of SUMO; see `harness.worlds.protocol.World`."""
 
     n_cells = 1
 

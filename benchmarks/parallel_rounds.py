@@ -20,7 +20,6 @@ import numpy as np
 
 from benchmarks.contenders import SCENARIOS
 from benchmarks.shells_rare_hole import IDM
-from harness.arrays import FloatArray
 from harness.campaign.loading import load_campaign
 from harness.campaign.models import Campaign
 from harness.pool.shells import design_shells
@@ -28,6 +27,7 @@ from harness.pool.storage import campaign_pool
 from harness.resolved import resolve
 from harness.runner.planner import ShellPlanner, round_specs
 from harness.studies.shell_campaign import DrawnPool, campaign_block
+from harness.vocabulary import FloatArray
 
 WORKERS = (8, 64, 512)
 TEST_S = (0.01, 1.0, 20.0)

@@ -12,10 +12,10 @@ from __future__ import annotations
 import time
 
 from harness import load_campaign
-from harness.environment.loading import load_environment
 from harness.pool.aimed_paths import PILOT_PATHS, Enumerator
 from harness.pool.library import load_library
 from harness.progress import Progress
+from harness.traffic.loading import load_environment
 
 PATHS = 8192
 STRIDES = (1, 2, 3, 4, 6, 8)

@@ -11,11 +11,11 @@ from __future__ import annotations
 import numpy as np
 
 from harness import load_campaign
-from harness.arrays import BoolArray
-from harness.environment.loading import load_environment
 from harness.pool.aimed_paths import PILOT_PATHS, EnumeratedPaths, Enumerator
 from harness.pool.library import Library
 from harness.progress import Progress
+from harness.traffic.loading import load_environment
+from harness.vocabulary import BoolArray
 
 PATHS = 16_384
 SEED = 12_345

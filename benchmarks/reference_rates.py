@@ -23,10 +23,10 @@ import numpy as np
 
 from harness.campaign.loading import load_campaign
 from harness.campaign.models import Campaign
-from harness.outcomes import BV_LV_CONTACT, CRASH
 from harness.resolved import resolve
 from harness.runner.prepare import Prepared, prepare
-from harness.twin import TwinWorld
+from harness.vocabulary import BV_LV_CONTACT, CRASH
+from harness.worlds.twin import TwinWorld
 
 CELLS = 1024
 CHUNK = 50_000

@@ -14,15 +14,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from harness.arrays import FloatArray
 from harness.campaign.models import Campaign, Stop
 from harness.estimators.block import Block
 from harness.estimators.estimate import Estimate
 from harness.estimators.intervals import hall_distances, normal_half_width
 from harness.estimators.nade import Nade
 from harness.estimators.stopping import StopRule
-from harness.methods import Method
 from harness.studies.weighted_campaign import twin_episodes
+from harness.vocabulary import FloatArray, Method
 
 CONFIDENCE = 0.9
 SEED = 77

@@ -27,8 +27,8 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from harness.campaign.models import Campaign, EnvironmentSettings
-from harness.environment.loading import load_parameters
 from harness.records.schemas import episodes_schema, moments_schema, shadow_schema, traces_schema
+from harness.traffic.loading import load_parameters
 
 FOLDER = Path(__file__).parent
 _PART = re.compile(r"(<!-- generated: (\S+) -->\n).*?(<!-- end -->)", re.DOTALL)

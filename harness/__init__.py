@@ -22,11 +22,11 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from harness.campaign.models import Campaign
-    from harness.methods import EstimatorName
     from harness.pool.refined_ladder import RefinedLadder
     from harness.progress import Progress
     from harness.records.frames import StoredRun
     from harness.runner import AvCheck, Comparison, PartResult, PlanResult, ReplayResult, RunResult
+    from harness.vocabulary import EstimatorName
 
 __all__ = [
     "HarnessError",

@@ -25,22 +25,18 @@ _PACKAGE = Path(__file__).parent
 
 
 WORLD_SOURCES = (
-    "arrays.py",
     "compiled.py",
     "maneuvers.py",
-    "methods.py",
-    "outcomes.py",
     "random_stream.py",
-    "state.py",
     "unboxed.py",
-    "environment/*.py",
+    "vocabulary.py",
+    "traffic/*.py",
     "vehicles/*.py",
     "controllers/protocol.py",
-    "criticality/*.py",
     "importance/*.py",
     "episode/*.py",
     "pool/enumeration.py",
-    "twin.py",
+    "worlds/twin.py",
 )
 """All files that decide what happens in a test; pools and tables are made again when one changes."""
 KERNEL_SOURCES = (*WORLD_SOURCES, "pool/replay.py", "estimators/limit_search.py")

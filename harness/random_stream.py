@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from harness.arrays import FloatArray
 from harness.compiled import compiled, compiled_inline
+from harness.vocabulary import FloatArray
 
 INITIAL, LV_DRAWS, BV_DRAWS, BV_FREE_DRAWS, CUT_IN, AV_DRAWS, DIAGNOSTIC, LATERAL = range(8)
 """Streams. A stream is one purpose, so that adding a purpose never shifts the numbers of another."""

@@ -5,14 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
-from harness.arrays import RecordArray
 from harness.campaign.models import Campaign
-from harness.environment.driving import Environment
-from harness.environment.loading import load_environment, load_parameters
 from harness.errors import CampaignError
-from harness.methods import SAMPLING
 from harness.pool.library import Library, load_library
+from harness.traffic.driving import Environment
+from harness.traffic.loading import load_environment, load_parameters
 from harness.vehicles.models import av_records, surrogate_records
+from harness.vocabulary import SAMPLING, RecordArray
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from harness.arrays import FloatArray
+from harness.vocabulary import FloatArray
 
 OUTSIDE = "outside"
 """Name of the stratum of everything beyond the boundary."""

@@ -18,8 +18,8 @@ from pyarrow import csv, parquet
 from harness.campaign.loading import load_campaign
 from harness.cli import cli, main
 from harness.errors import EXIT_BAD_INPUT, RunFolderError, TooManyFailedError
-from harness.methods import EstimatorName
 from harness.progress import LineProgress
+from harness.vocabulary import EstimatorName
 
 SCENARIOS = Path(__file__).parents[1] / "scenarios"
 SMOKE = str(SCENARIOS / "smoke.yaml")

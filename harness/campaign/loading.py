@@ -14,7 +14,7 @@ from harness.campaign.problems import validated
 from harness.campaign.yaml_text import read_yaml
 from harness.errors import CampaignError
 
-SHIPPED_PARAMETERS = Path(__file__).parent.parent / "environment"
+SHIPPED_PARAMETERS = Path(__file__).parent.parent / "traffic"
 
 
 def load_campaign(

@@ -46,7 +46,7 @@ from harness.campaign.testing import (
     World,
 )
 from harness.campaign.vehicle import AutomatedVehicle, FmuController, Limits, TraciProcess
-from harness.methods import METHODS, SAMPLING
+from harness.vocabulary import METHODS, SAMPLING
 
 __all__ = [
     "FVDM",

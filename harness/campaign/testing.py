@@ -19,8 +19,8 @@ from harness.campaign.section import (
     listed,
     whole,
 )
-from harness.methods import EstimatorName, Method
 from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT
+from harness.vocabulary import EstimatorName, Method
 
 MOST_SUMO_CELLS = 256
 """Roads of the largest committed network."""

@@ -195,7 +195,7 @@ def setup(*, dry_run: bool) -> None:
 
     Exit code 2 says that they could not be installed; the message names the packages.
     """
-    from harness.sumo.system_libraries import (  # noqa: PLC0415 - keeps --help fast
+    from harness.worlds.system_libraries import (  # noqa: PLC0415 - keeps --help fast
         install,
         install_commands,
         missing_libraries,

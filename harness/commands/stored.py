@@ -12,10 +12,10 @@ from harness.commands.options import FILE, RUN_FOLDER, examples, json_option, wr
 from harness.console import print_json, write_trace
 from harness.console_tables import print_estimates
 from harness.errors import EXIT_BAD_INPUT, WorldDisagreementError
-from harness.methods import ESTIMATORS
+from harness.vocabulary import ESTIMATORS
 
 if TYPE_CHECKING:
-    from harness.methods import EstimatorName
+    from harness.vocabulary import EstimatorName
 
 
 LATERAL = ("lead_steps", "onset_step", "onset_r2_m", "onset_ttc_s", "overlap_ttc_s", "contact")

@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from harness.arrays import IntArray
 from harness.errors import writing
+from harness.vocabulary import IntArray
 
 START = -1
 """Stands for the call of ``start``, which comes before step 0."""

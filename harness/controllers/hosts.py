@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from harness.arrays import FloatArray, IntArray, read_only
 from harness.controllers.black_box import OF_EPISODE, START, START_BATCH, STEP_BATCH, Death
 from harness.controllers.guard import Guard
 from harness.controllers.protocol import (
@@ -23,6 +22,7 @@ from harness.controllers.protocol import (
 )
 from harness.random_stream import AV_DRAWS
 from harness.vehicles.kinematics import STEP_S
+from harness.vocabulary import FloatArray, IntArray, read_only
 
 Failures = dict[int, str]
 """Cell → cause."""

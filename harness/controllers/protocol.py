@@ -12,7 +12,7 @@ from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
-from harness.arrays import FloatArray, IntArray
+from harness.vocabulary import FloatArray, IntArray
 
 
 class Neighbour(NamedTuple):

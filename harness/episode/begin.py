@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 
-from harness.arrays import FloatArray
 from harness.compiled import compiled, compiled_inline
-from harness.environment.lateral import draw_lead, onset_of
 from harness.episode.cells import Bench
 from harness.episode.critical_moment import take_down
 from harness.episode.trajectory import place, state_in, walk, weigh_cut_ins
-from harness.outcomes import AV, EPISODE_MIXTURE, FORCED, PRESCRIBED
 from harness.random_stream import CUT_IN, uniform
+from harness.traffic.lateral import draw_lead, onset_of
+from harness.vocabulary import AV, EPISODE_MIXTURE, FORCED, PRESCRIBED, FloatArray
 
 COMPONENT_DRAW, CUT_IN_DRAW = 0, 1
 """Indices within the cut-in stream."""

@@ -11,10 +11,10 @@ import math
 
 from harness.compiled import compiled, compiled_inline
 from harness.episode.cells import Bench
-from harness.outcomes import AV, BV
 from harness.vehicles.kinematics import CONTACT_M, gap, next_position, next_speed
 from harness.vehicles.reaction import react
 from harness.vehicles.references import Memory
+from harness.vocabulary import AV, BV
 
 AHEAD_M = 1e-6
 """What counts as ahead: more than a rounding of positions."""

@@ -10,16 +10,25 @@ from typing import NamedTuple
 
 import numpy as np
 
-from harness.arrays import FloatArray, Int8Array, IntArray, RecordArray, UInt64Array
 from harness.compiled import compiled_inline
 from harness.controllers.protocol import BatchObservation
-from harness.environment.driving import Environment
 from harness.episode.trajectory import Trajectory, empty_trajectory, lengths
 from harness.importance.functions import Importance
 from harness.maneuvers import N_ACCELERATIONS
-from harness.outcomes import AV, BV, LV
-from harness.state import STATE_COLUMNS, State
+from harness.traffic.driving import Environment
 from harness.vehicles.kinematics import gap
+from harness.vocabulary import (
+    AV,
+    BV,
+    LV,
+    STATE_COLUMNS,
+    FloatArray,
+    Int8Array,
+    IntArray,
+    RecordArray,
+    State,
+    UInt64Array,
+)
 
 _f8, _i8 = np.float64, np.int64
 

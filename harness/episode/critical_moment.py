@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import math
 
-from harness.arrays import FloatArray
 from harness.compiled import compiled_inline
-from harness.environment.cut_in import acceptance, cut_in_hazard, opportunity
-from harness.environment.driving import acceleration_pmf, draw_acceleration, free_driving
 from harness.episode.cells import Bench
 from harness.importance.functions import challenges_nobody, propose_acceleration, propose_cut_in
 from harness.importance.likelihood import accumulate, forced_ratio
 from harness.maneuvers import CUT_IN, N_ACCELERATIONS, STAY
-from harness.outcomes import EPISODE_MIXTURE, FORCED, NDE, STEP_MIXTURE
-from harness.state import State
+from harness.traffic.cut_in import acceptance, cut_in_hazard, opportunity
+from harness.traffic.driving import acceleration_pmf, draw_acceleration, free_driving
+from harness.vocabulary import EPISODE_MIXTURE, FORCED, NDE, STEP_MIXTURE, FloatArray, State
 
 
 @compiled_inline

@@ -6,14 +6,13 @@ Where the traffic is prescribed they repeat it.
 from __future__ import annotations
 
 from harness.compiled import compiled, compiled_inline
-from harness.environment.driving import car_following, draw_acceleration, free_driving
 from harness.episode.cells import Bench, state_of
 from harness.episode.critical_moment import begin_cut_in, choose_lane, controlled_draw
 from harness.importance.functions import look_ahead
 from harness.maneuvers import acceleration
-from harness.outcomes import BV, LV
 from harness.random_stream import BV_DRAWS, BV_FREE_DRAWS, LV_DRAWS, uniform
-from harness.state import State
+from harness.traffic.driving import car_following, draw_acceleration, free_driving
+from harness.vocabulary import BV, LV, State
 
 
 @compiled

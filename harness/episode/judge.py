@@ -6,15 +6,27 @@ import math
 
 import numpy as np
 
-from harness.arrays import BoolArray, FloatArray, Int8Array, IntArray
 from harness.compiled import compiled, compiled_inline
 from harness.episode.beside import note_if_ahead
 from harness.episode.cells import Bench, state_of
 from harness.episode.motion import mixed
 from harness.importance.likelihood import log_weight
-from harness.outcomes import AV, BV, BV_LV_CONTACT, CRASH, FAILED, PASSED, RUNNING, TIMEOUT
-from harness.state import State
 from harness.vehicles.kinematics import CONTACT_M, STEP_S, overlaps
+from harness.vocabulary import (
+    AV,
+    BV,
+    BV_LV_CONTACT,
+    CRASH,
+    FAILED,
+    PASSED,
+    RUNNING,
+    TIMEOUT,
+    BoolArray,
+    FloatArray,
+    Int8Array,
+    IntArray,
+    State,
+)
 
 PASSED_M, PASSED_UNDER_CONTROL_M = 0.0, -10.0
 """R2 at which the AV has passed BV: at once if it holds its speed, with a margin if its controller acts."""

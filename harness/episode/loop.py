@@ -8,10 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from harness.arrays import BoolArray, FloatArray, IntArray, RecordArray
 from harness.controllers.hosts import ControllerHost
-from harness.environment.driving import Environment
-from harness.environment.lateral import LateralMotion, in_one_step
 from harness.episode.begin import refill
 from harness.episode.beside import drive_beside
 from harness.episode.cells import (
@@ -30,11 +27,13 @@ from harness.episode.judge import PASSED_M, PASSED_UNDER_CONTROL_M, fail, judge
 from harness.episode.respond import command, empty_observation, first, observe, respond
 from harness.errors import WorldDisagreementError
 from harness.importance.functions import Importance
-from harness.outcomes import AV, CRASH, FAILED
+from harness.traffic.driving import Environment
+from harness.traffic.lateral import LateralMotion, in_one_step
 from harness.unboxed import unboxed
 from harness.vehicles.kinematics import STEP_S
 from harness.vehicles.models import driver_records
-from harness.world import AVLostError, DrivingWorld, World
+from harness.vocabulary import AV, CRASH, FAILED, BoolArray, FloatArray, IntArray, RecordArray
+from harness.worlds.protocol import AVLostError, DrivingWorld, World
 
 NOBODY = driver_records([])
 MOMENT_LIMITS = {"all": 32767, "first_9": 9, "none": 0}

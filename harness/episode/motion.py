@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from harness.arrays import FloatArray, UInt64Array
 from harness.compiled import compiled, compiled_inline
+from harness.vocabulary import FloatArray, UInt64Array
 
 _MULTIPLIER = np.uint64(0xBF58476D1CE4E5B9)
 _SHIFT = np.uint64(31)

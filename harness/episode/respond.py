@@ -7,15 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from harness.arrays import FloatArray, IntArray, read_only
 from harness.compiled import compiled
 from harness.controllers.protocol import BatchObservation
-from harness.environment.lateral import lateral_position, perceived_in
 from harness.episode.cells import Bench
-from harness.outcomes import AV, BV, LV
+from harness.traffic.lateral import lateral_position, perceived_in
 from harness.vehicles.kinematics import STEP_S, gap, next_speed
 from harness.vehicles.reaction import react, reaction_steps
 from harness.vehicles.references import Memory
+from harness.vocabulary import AV, BV, LV, FloatArray, IntArray, read_only
 
 
 @compiled

@@ -11,18 +11,28 @@ from typing import NamedTuple
 
 import numpy as np
 
-from harness.arrays import FloatArray, Int8Array, Record, RecordArray
 from harness.compiled import compiled_inline, compiled_threads
-from harness.environment.cut_in import acceptance, cut_in_hazard, opportunity
-from harness.environment.driving import Environment, car_following, draw_acceleration, free_driving
-from harness.environment.lateral import onset_of, perceived_in
 from harness.maneuvers import acceleration
-from harness.outcomes import AV, BV, BV_LV_CONTACT, LV, PASSED, RUNNING
 from harness.random_stream import BV_DRAWS, BV_FREE_DRAWS, LV_DRAWS, uniform
-from harness.state import State
+from harness.traffic.cut_in import acceptance, cut_in_hazard, opportunity
+from harness.traffic.driving import Environment, car_following, draw_acceleration, free_driving
+from harness.traffic.lateral import onset_of, perceived_in
 from harness.vehicles.kinematics import CONTACT_M, VEHICLE_LENGTH_M, gap, next_position, next_speed, overlaps
 from harness.vehicles.models import NEED_BASED_KIND
 from harness.vehicles.reaction import nothing_yet, react
+from harness.vocabulary import (
+    AV,
+    BV,
+    BV_LV_CONTACT,
+    LV,
+    PASSED,
+    RUNNING,
+    FloatArray,
+    Int8Array,
+    Record,
+    RecordArray,
+    State,
+)
 
 AV_START_M = 100.0
 NO_CRASH, WAS_AHEAD = -1, -2

@@ -8,7 +8,7 @@ from harness.estimators.estimate import Estimate, Unavailable
 from harness.estimators.one_pass import CampaignFacts, accumulator, estimate_blocks, one_pass
 from harness.estimators.shells import Shells
 from harness.estimators.stopping import StopRule
-from harness.methods import ESTIMATORS
+from harness.vocabulary import ESTIMATORS
 
 __all__ = [
     "ESTIMATORS",

@@ -20,10 +20,9 @@ from typing import Any
 import numpy as np
 from scipy.special import logsumexp
 
-from harness.arrays import FloatArray
 from harness.estimators.block import Block
-from harness.methods import Method
 from harness.strata import KnownRates
+from harness.vocabulary import FloatArray, Method
 
 LEVEL = 1e-4
 """Probability of a false alarm, at most, after any given number of tests."""

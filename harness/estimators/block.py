@@ -15,9 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from harness.arrays import BoolArray, FloatArray, IntArray
-from harness.methods import SAMPLING, Method
 from harness.strata import KnownRates, ShellDesign
+from harness.vocabulary import SAMPLING, BoolArray, FloatArray, IntArray, Method
 
 MAX_CONTROL_STEPS = 9
 """Control steps that sparse control variates are built from, at most ([paper] section VI-E)."""

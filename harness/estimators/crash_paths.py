@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from harness.arrays import FloatArray, IntArray
+from harness.vocabulary import FloatArray, IntArray
 
 FEWEST_PATHS = 40.0
 """Below so many paths that count there is no interval: their error alone would be above 16 %, and is not known."""

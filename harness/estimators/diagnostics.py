@@ -14,7 +14,7 @@ import numpy as np
 from harness.estimators.alarm import Alarm
 from harness.estimators.block import Block
 from harness.estimators.moments import Moments
-from harness.methods import SAMPLING, Method
+from harness.vocabulary import SAMPLING, Method
 
 NOTE = (
     "Diagnostics, never tests: each mean is 1 in expectation, except that of W·1{cut-in}, which is P(cut-in). Under "

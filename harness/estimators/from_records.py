@@ -8,12 +8,11 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from harness.arrays import BoolArray, FloatArray, IntArray
 from harness.errors import RunFolderError
 from harness.estimators.block import MAX_CONTROL_STEPS, Block
-from harness.methods import Method
 from harness.records.folder import MEND_SHARD
 from harness.strata import ShellDesign
+from harness.vocabulary import BoolArray, FloatArray, IntArray, Method
 
 EPISODE_COLUMNS = ("episode", "outcome", "cut_in_step", "n_control_steps", "log_weight", "log_p_cut_in", "log_q")
 SHELL_COLUMNS = ("component", "cell", "cell_mass", "ahead_step")

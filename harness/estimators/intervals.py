@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from scipy.optimize import brentq
 from scipy.special import betaincinv, ndtri
 
-from harness.arrays import FloatArray
+from harness.vocabulary import FloatArray
 
 
 def clopper_pearson(

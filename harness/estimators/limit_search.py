@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import ndtri
 
-from harness.arrays import FloatArray, IntArray
 from harness.compiled import compiled
+from harness.vocabulary import FloatArray, IntArray
 
 Counts = IntArray | FloatArray
 """Of outcomes; where tests are planned, expected ones."""

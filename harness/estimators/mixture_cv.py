@@ -12,12 +12,12 @@ import math
 
 import numpy as np
 
-from harness.arrays import FloatArray
 from harness.estimators.block import Block
 from harness.estimators.estimate import Estimate, require_episodes
 from harness.estimators.moments import ThirdMoments
 from harness.estimators.nade import FEW_FOR_RESIDUALS, WeightedSums, weighted_estimate
 from harness.estimators.triangular_factor import empty_factor, fold_rows
+from harness.vocabulary import FloatArray
 
 
 class MixtureCv:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from harness.arrays import FloatArray
+from harness.vocabulary import FloatArray
 
 _ROWS_AT_ONCE = 4096
 

@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from harness.arrays import FloatArray
 from harness.estimators.block import Block
 from harness.estimators.estimate import Estimate, require_episodes
 from harness.estimators.intervals import capped_mean_upper, clopper_pearson, skewed_distances
 from harness.estimators.moments import Moments
+from harness.vocabulary import FloatArray
 
 FEW_CRASHES = 50
 FEW_EFFECTIVE = 30.0

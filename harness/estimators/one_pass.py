@@ -14,7 +14,7 @@ from harness.estimators.mixture_cv import MixtureCv
 from harness.estimators.nade import Nade, Nde
 from harness.estimators.scv import Scv
 from harness.estimators.shells import Shells
-from harness.methods import ESTIMATORS, SAMPLING, EstimatorName
+from harness.vocabulary import ESTIMATORS, SAMPLING, EstimatorName
 
 ACCUMULATORS: dict[EstimatorName, type[Accumulator]] = {
     "nde": Nde,

@@ -14,11 +14,11 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from harness.arrays import BoolArray, FloatArray, IntArray
 from harness.estimators.block import Block
 from harness.estimators.limit_search import Level
 from harness.estimators.stratified import Tally, contrast_limit, mean_square, ratio_limits, spread
 from harness.strata import ShellDesign
+from harness.vocabulary import BoolArray, FloatArray, IntArray
 
 NO_CRASH, CRASH, FAILED = range(3)
 """How a test of a pair ended."""

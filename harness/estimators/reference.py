@@ -20,10 +20,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from harness.arrays import BoolArray, FloatArray
 from harness.estimators.limit_search import Level
 from harness.estimators.stratified import CRASH, Tally, mean_square, pool_variance, ratio_limits
 from harness.strata import ShellDesign
+from harness.vocabulary import BoolArray, FloatArray
 
 
 @dataclass(frozen=True)

@@ -17,12 +17,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from harness.arrays import FloatArray, IntArray
 from harness.estimators.block import MAX_CONTROL_STEPS, Block
 from harness.estimators.estimate import Estimate, require_episodes
 from harness.estimators.nade import WeightedSums, weighted_estimate
 from harness.estimators.triangular_factor import empty_factor, fold_rows
 from harness.threads import side_by_side
+from harness.vocabulary import FloatArray, IntArray
 
 WARNING = (
     "this interval is known to be too narrow; use nade's (docs/scv-defect.md). The published variance is not that of "

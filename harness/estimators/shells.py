@@ -12,7 +12,6 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from harness.arrays import BoolArray
 from harness.estimators.block import Block
 from harness.estimators.crash_paths import FEWEST_PATHS, CrashPaths
 from harness.estimators.estimate import Estimate, require_episodes
@@ -21,6 +20,7 @@ from harness.estimators.limit_search import Level
 from harness.estimators.reference import Comparison, compared
 from harness.estimators.stratified import Limits, Tally, combined, empty_tally, likelihood_limit, pool_variance
 from harness.strata import ShellDesign
+from harness.vocabulary import BoolArray
 
 MOST_NAMED = 10
 """Tests that are named of those that refute a statement, or show that its reason fails."""

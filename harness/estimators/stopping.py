@@ -19,8 +19,8 @@ from typing import Any, Literal
 
 from harness.campaign.models import Stop
 from harness.estimators.estimate import Estimate
-from harness.methods import SAMPLING, EstimatorName, Method
 from harness.strata import ASSUMPTION_FREE
+from harness.vocabulary import SAMPLING, EstimatorName, Method
 
 LOOK_RATIO = 1.1
 PASSES_NEEDED = 2

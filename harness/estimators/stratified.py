@@ -31,9 +31,9 @@ import numpy as np
 from scipy.optimize import brentq
 from scipy.special import ndtr
 
-from harness.arrays import BoolArray, FloatArray, IntArray
 from harness.estimators.intervals import clopper_pearson
 from harness.estimators.limit_search import Counts, Level, Seen, give, outermost
+from harness.vocabulary import BoolArray, FloatArray, IntArray
 
 CRASH = np.array([1.0, 0.0])
 """What outcomes count for where a test can only crash or not."""

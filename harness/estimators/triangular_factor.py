@@ -13,7 +13,7 @@ import ctypes
 import numpy as np
 from numba.extending import get_cython_function_address
 
-from harness.arrays import FloatArray
+from harness.vocabulary import FloatArray
 
 _PANEL = 32
 _DTPQRT = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 12)(

@@ -1,1 +1,1 @@
-"""What maneuvers are drawn from at critical moments, and the likelihood ratios that this costs."""
+"""Challenge of surrogates, importance functions made of it, and the likelihood ratios of what is drawn from them."""

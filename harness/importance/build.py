@@ -4,14 +4,21 @@ from __future__ import annotations
 
 import numpy as np
 
-from harness.arrays import BoolArray, Float32Array, read_only
 from harness.campaign.models import Campaign
-from harness.criticality.after_cut_in import level_steps
-from harness.criticality.tables import Tables
+from harness.importance.after_cut_in import level_steps
 from harness.importance.functions import Importance
-from harness.methods import METHODS, SAMPLING
-from harness.outcomes import EPISODE_MIXTURE, FORCED, STEP_MIXTURE
+from harness.importance.tables import Tables
 from harness.vehicles.kinematics import CONTACT_M
+from harness.vocabulary import (
+    EPISODE_MIXTURE,
+    FORCED,
+    METHODS,
+    SAMPLING,
+    STEP_MIXTURE,
+    BoolArray,
+    Float32Array,
+    read_only,
+)
 
 _ROUNDING_M = 1e-9
 """More than interpolation between gaps of up to a kilometre can lose."""

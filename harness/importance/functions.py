@@ -11,25 +11,24 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from harness.arrays import BoolArray, Float32Array, FloatArray
 from harness.compiled import compiled_inline
-from harness.criticality.before_cut_in import level_of
-from harness.criticality.grid import AFTER, BEFORE, interpolate, interpolate_maneuvers, locate
-from harness.environment.cut_in import acceptance
-from harness.environment.driving import Environment
+from harness.importance.before_cut_in import level_of
+from harness.importance.grid import AFTER, BEFORE, interpolate, interpolate_maneuvers, locate
 from harness.maneuvers import N_ACCELERATIONS
-from harness.state import State
+from harness.traffic.cut_in import acceptance
+from harness.traffic.driving import Environment
 from harness.vehicles.kinematics import CONTACT_M, STEP_S, next_speed
+from harness.vocabulary import BoolArray, Float32Array, FloatArray, State
 
 
 class Importance(NamedTuple):
     """All that kernels need to sample critical moments.
 
-    ``method`` is one of `harness.methods.METHODS`; ``recursive`` says which challenge; ``n_surrogates`` is 0 where
+    ``method`` is one of `harness.vocabulary.METHODS`; ``recursive`` says which challenge; ``n_surrogates`` is 0 where
     nobody is asked; ``first`` is the index of the first surrogate among the importance functions: 1 when the forced
     cut-in is component 0. ``steps_per_level`` lie between two levels of ``value``.
     ``alpha`` (M,) are the mixture weights. ``value`` (J, levels + 1, v, R2, R2dot), ``maneuvers`` (J, v, R2, R2dot, 31)
-    and ``before`` (J, redraw times + 1, v, R2, R2dot) are the challenge tables (see `harness.criticality.tables`).
+    and ``before`` (J, redraw times + 1, v, R2, R2dot) are the challenge tables (see `harness.importance.tables`).
     ``harmless`` (J, v - 1, R2 - 1, R2dot - 1) marks the grid cells after the cut-in in which no acceleration challenges
     a surrogate: most of what is driven lies there, and nothing needs to be interpolated.
     """

@@ -16,9 +16,8 @@ from __future__ import annotations
 
 import math
 
-from harness.arrays import FloatArray
 from harness.compiled import compiled_inline
-from harness.outcomes import EPISODE_MIXTURE, FORCED
+from harness.vocabulary import EPISODE_MIXTURE, FORCED, FloatArray
 
 
 @compiled_inline

@@ -13,14 +13,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from harness.arrays import FloatArray, IntArray, RecordArray
-from harness.environment.driving import Environment
-from harness.environment.initial_state import InitialStates
 from harness.episode.trajectory import Followers
 from harness.pool.enumeration import STRIDE, enumerate_cut_ins
 from harness.progress import Progress
 from harness.random_stream import DIAGNOSTIC, INITIAL, uniforms
-from harness.state import STATE_COLUMNS
+from harness.traffic.driving import Environment
+from harness.traffic.initial_state import InitialStates
+from harness.vocabulary import STATE_COLUMNS, FloatArray, IntArray, RecordArray
 
 PILOT_PATHS = 2048
 BLOCK_PATHS = 256

@@ -6,15 +6,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from harness.arrays import BoolArray, FloatArray, Int8Array, IntArray
 from harness.campaign.models import PoolSettings
-from harness.environment.driving import Environment
 from harness.pool.aimed_paths import PILOT_PATHS, EnumeratedPaths, Enumerator, joined
 from harness.pool.cut_ins import FAR_OFF, CutIns, Pool, environment_hash, shells_of
 from harness.pool.enumeration import write_script
 from harness.pool.library import Library
 from harness.progress import Progress
 from harness.random_stream import DIAGNOSTIC, uniforms
+from harness.traffic.driving import Environment
+from harness.vocabulary import BoolArray, FloatArray, Int8Array, IntArray
 
 ROUND_PATHS = 1024
 MOST_PATHS = 1 << 20

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from harness.arrays import BoolArray, Float32Array, FloatArray, Int8Array, IntArray, RecordArray, UInt64Array
-from harness.environment.driving import Environment
 from harness.pool.aimed_paths import PILOT_PATHS
 from harness.pool.library import Library
+from harness.traffic.driving import Environment
+from harness.vocabulary import BoolArray, Float32Array, FloatArray, Int8Array, IntArray, RecordArray, UInt64Array
 
 FAR_OFF = 10.0
 """A surrogate whose rate varies this much more from path to path than the boundary's (relvar) crashes in traffic of its

@@ -18,11 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from harness.arrays import BoolArray, FloatArray, Int8Array, IntArray, RecordArray
 from harness.compiled import compiled_inline, compiled_threads
-from harness.environment.cut_in import cut_in_hazard, opportunity
-from harness.environment.driving import Environment, draw_acceleration, free_driving
-from harness.environment.lateral import draw_lead
 from harness.episode.trajectory import (
     Followers,
     Trajectory,
@@ -34,9 +30,12 @@ from harness.episode.trajectory import (
     who_crashes,
 )
 from harness.maneuvers import CUT_IN, acceleration
-from harness.outcomes import LV
 from harness.random_stream import LV_DRAWS, uniform
+from harness.traffic.cut_in import cut_in_hazard, opportunity
+from harness.traffic.driving import Environment, draw_acceleration, free_driving
+from harness.traffic.lateral import draw_lead
 from harness.vehicles.kinematics import CONTACT_M, gap, next_speed
+from harness.vocabulary import LV, BoolArray, FloatArray, Int8Array, IntArray, RecordArray
 
 FREE_DRAWS_PER_CUT_IN = 256
 """Stride of the uniforms for BV's free driving: each cut-in time of a path has draws of its own."""

@@ -17,12 +17,12 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import least_squares
 
-from harness.arrays import FloatArray
 from harness.campaign.models import IDMParameters, Reflexes
 from harness.pool.library import LibraryIDM
 from harness.pool.observed import Observed
 from harness.vehicles.models import driver_records
 from harness.vehicles.reaction import expected_accelerations
+from harness.vocabulary import FloatArray
 
 MOST_DELAY_STEPS = 20
 ROUGH_EVALUATIONS, LAST_EVALUATIONS = 6, 60

@@ -9,17 +9,17 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from harness.arrays import RecordArray
 from harness.campaign.loading import names_a_file
 from harness.campaign.models import FVDM, IDM, CarefulCompetent, Constant, FuzzySafety, NeedBased, Reference, Reflexes
 from harness.campaign.problems import read_model
 from harness.campaign.section import Section, SurrogateName, broken_rule
 from harness.campaign.testing import ShellSettings, StatementSettings, checked_statements
-from harness.environment.driving import Environment
 from harness.episode.trajectory import Followers
 from harness.errors import CampaignError
 from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT
+from harness.traffic.driving import Environment
 from harness.vehicles.models import driver_records
+from harness.vocabulary import RecordArray
 
 SHIPPED_FOLDER = Path(__file__).parent
 MOST_SURROGATES = 60

@@ -8,13 +8,12 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 
-from harness.arrays import BoolArray, FloatArray, IntArray
 from harness.campaign.models import Campaign
 from harness.episode.loop import traced_by_index
 from harness.errors import RunFolderError
-from harness.outcomes import AV, BV, VEHICLES
 from harness.records.folder import MEND_SHARD, read_manifest, read_table
 from harness.vehicles.kinematics import VEHICLE_LENGTH_M
+from harness.vocabulary import AV, BV, VEHICLES, BoolArray, FloatArray, IntArray
 
 WINDOW_STEPS = 60
 """Steps after a cut-in that are looked at: within 6 s it is decided whether it was dangerous."""

@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from harness.arrays import BoolArray, FloatArray, IntArray
 from harness.campaign.models import Campaign
-from harness.environment.loading import load_environment
 from harness.episode.trajectory import Followers
 from harness.pool.library import LibraryDriver, library_records
 from harness.pool.replay import PATH_COLUMNS, drivers_crash
 from harness.records.folder import read_manifest, read_table
 from harness.threads import made_ahead
+from harness.traffic.loading import load_environment
+from harness.vocabulary import BoolArray, FloatArray, IntArray
 
 _COLUMNS = [*PATH_COLUMNS, "outcome", "component", "log_weight"]
 

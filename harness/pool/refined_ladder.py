@@ -17,13 +17,13 @@ import numpy as np
 from harness.campaign.dumping import yaml_text
 from harness.campaign.loading import load_campaign
 from harness.campaign.models import Campaign, Reflexes
-from harness.environment.loading import load_environment
 from harness.errors import CampaignError, RunFolderError
 from harness.pool.fit_driver import MOST_DELAY_STEPS, FittedDriver, agreement, fit_driver
 from harness.pool.library import Library, LibraryDriver, LibraryIDM, load_library
 from harness.pool.observed import Observed, read_observed
 from harness.pool.predicted import Prediction, predict, replay_drivers
 from harness.records.folder import read_manifest, write_text
+from harness.traffic.loading import load_environment
 
 MOST_FITTED = 200
 """Cut-ins that a driver is fitted to; more change nothing but the time."""

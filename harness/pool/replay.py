@@ -13,10 +13,7 @@ from typing import NamedTuple
 import numpy as np
 import pyarrow as pa
 
-from harness.arrays import BoolArray, FloatArray, Int8Array, IntArray, RecordArray
 from harness.compiled import compiled_inline, compiled_threads
-from harness.environment.driving import Environment
-from harness.environment.lateral import onset_of
 from harness.episode.trajectory import (
     NO_CRASH,
     WAS_AHEAD,
@@ -32,13 +29,28 @@ from harness.episode.trajectory import (
 )
 from harness.errors import CampaignError, RunFolderError
 from harness.maneuvers import CUT_IN
-from harness.outcomes import BV_LV_CONTACT, CRASH, FAILED, PASSED, RUNNING, TIMEOUT
 from harness.pool.cut_ins import Pool, environment_hash
 from harness.records.folder import MEND_SHARD
 from harness.resolved import Resolved
-from harness.state import STATE_COLUMNS, states_from
 from harness.strata import KnownRates
+from harness.traffic.driving import Environment
+from harness.traffic.lateral import onset_of
 from harness.vehicles.reaction import reaction_steps
+from harness.vocabulary import (
+    BV_LV_CONTACT,
+    CRASH,
+    FAILED,
+    PASSED,
+    RUNNING,
+    STATE_COLUMNS,
+    TIMEOUT,
+    BoolArray,
+    FloatArray,
+    Int8Array,
+    IntArray,
+    RecordArray,
+    states_from,
+)
 
 PATH_COLUMNS = ("episode", *STATE_COLUMNS, "n_steps", "cut_in_step", "lv_maneuvers", "bv_maneuvers")
 """What of the episodes table determines LV's and BV's motion."""

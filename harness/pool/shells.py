@@ -11,15 +11,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from harness.arrays import IntArray, RecordArray
 from harness.campaign.models import AutomatedVehicle, BuiltInParameters, Campaign
 from harness.campaign.models import Reference as ReferenceParameters
 from harness.campaign.testing import ShellSettings, StatementSettings
-from harness.environment.driving import Environment
 from harness.episode.cells import PrescribedCutIns, PrescribedTraffic
 from harness.pool.cut_ins import Pool
 from harness.pool.library import Library, LibraryDriver, library_records
 from harness.strata import FAILED_SHADOWS, OUTSIDE, Reference, ShellDesign, Statement
+from harness.traffic.driving import Environment
+from harness.vocabulary import IntArray, RecordArray
 
 _REFERENCES = {
     "r157-cc": "a careful and competent driver",

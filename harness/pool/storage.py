@@ -12,7 +12,6 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from harness.arrays import IntArray
 from harness.compiled import WORLD_SOURCES, cache_root, source_hash
 from harness.errors import RunFolderError
 from harness.pool.build import build_pool
@@ -22,7 +21,7 @@ from harness.progress import Progress
 from harness.records.folder import require_place, write_atomically
 from harness.records.tables import prefixes, rows
 from harness.resolved import Resolved
-from harness.state import STATE_COLUMNS, states_from
+from harness.vocabulary import STATE_COLUMNS, IntArray, states_from
 
 _FORMAT = 5
 """Raise it when the meaning of a pool changes."""

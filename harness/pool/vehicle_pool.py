@@ -21,10 +21,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from harness.arrays import FloatArray, IntArray, RecordArray
 from harness.campaign.models import PoolSettings
 from harness.compiled import cache_root
-from harness.environment.driving import Environment
 from harness.episode.motion import motion_hashes
 from harness.errors import HarnessError
 from harness.pool.aimed_paths import PILOT_PATHS, EnumeratedPaths, contributions
@@ -37,7 +35,8 @@ from harness.progress import Progress
 from harness.random_stream import DIAGNOSTIC, uniforms
 from harness.records.folder import require_place, write_atomically
 from harness.resolved import Resolved
-from harness.state import STATE_COLUMNS, states_from
+from harness.traffic.driving import Environment
+from harness.vocabulary import STATE_COLUMNS, FloatArray, IntArray, RecordArray, states_from
 
 CANDIDATES = 32_768
 """Paths of an AV that holds its speed to choose from: they cost milliseconds each, and save two of three shadow runs.

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import pyarrow as pa
 
-from harness.state import STATE_COLUMNS
+from harness.vocabulary import STATE_COLUMNS
 
 _F8, _I1, _I2, _I8 = pa.float64(), pa.int8(), pa.int16(), pa.int64()
 _NAME = pa.dictionary(_I1, pa.string())

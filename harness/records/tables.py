@@ -7,11 +7,20 @@ from typing import Any, NamedTuple
 import numpy as np
 import pyarrow as pa
 
-from harness.arrays import FloatArray, Int8Array, IntArray, RecordArray
 from harness.episode.loop import Shard
-from harness.outcomes import AV, BV, CRASH, OUTCOMES, VEHICLES
 from harness.records.schemas import episodes_schema, moments_schema, shadow_schema, traces_schema
-from harness.state import STATE_COLUMNS
+from harness.vocabulary import (
+    AV,
+    BV,
+    CRASH,
+    OUTCOMES,
+    STATE_COLUMNS,
+    VEHICLES,
+    FloatArray,
+    Int8Array,
+    IntArray,
+    RecordArray,
+)
 
 
 class ShardTables(NamedTuple):

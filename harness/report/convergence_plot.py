@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.axes import Axes
 
-from harness.arrays import FloatArray
 from harness.report.number_format import count, number, percent, plain
 from harness.report.plot_style import (
     BLUE,
@@ -21,6 +20,7 @@ from harness.report.plot_style import (
     scaled,
 )
 from harness.report.run_folder import StoredEstimates, StoredPoint
+from harness.vocabulary import FloatArray
 
 _WEIGHTED = (
     "Left, the band should narrow around a level line: a rate that still climbs, or drops between jumps, has not "

@@ -19,14 +19,13 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from matplotlib.axes import Axes
 
-from harness.arrays import FloatArray, IntArray
 from harness.maneuvers import ACCELERATIONS_MPS2, CUT_IN
-from harness.outcomes import CRASH, FAILED, OUTCOMES
 from harness.report.number_format import count, decimal, percent
 from harness.report.plot_style import FULL_WIDTH_IN, GREY, MUTED, VERMILLION, Plot, new_figure, only_horizontal_grid
 from harness.report.run_folder import RunFolder, floats
 from harness.report.telling_bands import Band, telling_bands
 from harness.vehicles.kinematics import STEP_S
+from harness.vocabulary import CRASH, FAILED, OUTCOMES, FloatArray, IntArray
 
 MOST_CRASHES, MOST_OTHERS = 5_000, 20_000
 """Tests compared, the first of each kind: tests come in random order, so that this is a fair sample."""

@@ -13,14 +13,13 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from matplotlib.axes import Axes
 
-from harness.arrays import FloatArray
-from harness.outcomes import VEHICLES
 from harness.records.reader import read_traces, stored_columns
 from harness.report.number_format import decimal, number
 from harness.report.plot_style import HALF_WIDTH_IN, INK, VEHICLE_COLOURS, Plot, new_figure, note
 from harness.report.run_folder import RunFolder, floats
 from harness.report.summary import Crash, RunSummary
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
+from harness.vocabulary import VEHICLES, FloatArray
 
 SHOWN_PER_RANKING = 3
 SECONDS_BEFORE_CUT_IN = 2.0

@@ -8,10 +8,10 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch, PathPatch
 from matplotlib.path import Path
 
-from harness.arrays import FloatArray, IntArray
 from harness.report.number_format import count, number
 from harness.report.plot_style import BLUES, FULL_WIDTH_IN, MUTED, REDS, Plot, new_figure, note
 from harness.report.summary import RunSummary
+from harness.vocabulary import FloatArray, IntArray
 
 LEVELS_PER_DECADE = 2
 """Each colour step is a factor √10, so that six colours span three decades below the fullest cell."""

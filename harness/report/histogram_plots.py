@@ -8,7 +8,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
-from harness.arrays import FloatArray
 from harness.report.histograms import Bins, FineHistogram
 from harness.report.number_format import count, percent, power_of_ten
 from harness.report.plot_style import (
@@ -22,6 +21,7 @@ from harness.report.plot_style import (
     only_horizontal_grid,
 )
 from harness.report.summary import RunSummary
+from harness.vocabulary import FloatArray
 
 WEIGHT_BINS, STRATUM_BINS, CRASH_BINS = 70, 40, 36
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from harness.arrays import FloatArray, IntArray
+from harness.vocabulary import FloatArray, IntArray
 
 MERGE_FACTORS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1_000, 2_000)
 

@@ -17,7 +17,6 @@ import numpy as np
 import pyarrow as pa
 from pydantic import TypeAdapter, ValidationError
 
-from harness.arrays import FloatArray
 from harness.campaign.loading import load_campaign
 from harness.campaign.models import Campaign
 from harness.errors import CampaignError, RunFolderError
@@ -26,6 +25,7 @@ from harness.records.folder import MANIFEST, NO_RUN, concatenated, read_json, re
 from harness.records.reader import read_shards, require_whole
 from harness.records.stored_manifest import Count, Stored, StoredManifest
 from harness.strata import ASSUMPTION_FREE
+from harness.vocabulary import FloatArray
 
 ROWS_TOGETHER = 5_000
 """Of small shards: each batch costs a millisecond."""

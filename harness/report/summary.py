@@ -11,13 +11,12 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from harness.arrays import BoolArray, FloatArray, IntArray
 from harness.errors import RunFolderError
-from harness.outcomes import CRASH, FAILED, OUTCOMES
 from harness.records.reader import stored_columns
 from harness.report.histograms import Axis, FineHistogram
 from harness.report.run_folder import RunFolder, floats
 from harness.vehicles.kinematics import STEP_S
+from harness.vocabulary import CRASH, FAILED, OUTCOMES, BoolArray, FloatArray, IntArray
 
 MOST_CAUSES = 1_000
 CANDIDATES = 50

@@ -10,7 +10,6 @@ from pydantic import BaseModel
 from harness.campaign.dumping import written_out
 from harness.campaign.models import Campaign
 from harness.estimators.shells import ShellDetails, Within
-from harness.outcomes import OUTCOMES
 from harness.report.number_format import (
     MISSING,
     count,
@@ -26,6 +25,7 @@ from harness.report.number_format import (
 from harness.report.run_folder import RunFolder
 from harness.report.summary import RunSummary
 from harness.stopped_by import MENDS
+from harness.vocabulary import OUTCOMES
 
 
 @dataclass(frozen=True)

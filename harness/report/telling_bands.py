@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import xlogy
 
-from harness.arrays import BoolArray, FloatArray, IntArray
+from harness.vocabulary import BoolArray, FloatArray, IntArray
 
 BINS = 50
 """Per quantity, equally full: a band that holds 2 % of all tests is a bin of its own."""

@@ -8,12 +8,12 @@ from functools import partial
 
 import numpy as np
 
-from harness.arrays import BoolArray, IntArray
 from harness.campaign.testing import ShellSettings
 from harness.estimators.intervals import clopper_pearson
 from harness.estimators.limit_search import Level
 from harness.estimators.stratified import Tally, combined, spread
 from harness.strata import ASSUMPTION_FREE, ShellDesign
+from harness.vocabulary import BoolArray, IntArray
 
 GROWTH = 1.1
 """Tests after a round over tests before it; also the distance of the looks at the result."""

@@ -12,18 +12,17 @@ from typing import Any
 
 import numpy as np
 
-from harness.arrays import FloatArray
 from harness.campaign.models import AutomatedVehicle, Campaign
 from harness.controllers.apart import has_foreign_code, run_apart
-from harness.environment.loading import load_environment
 from harness.episode.loop import EpisodeLoop, Shard
 from harness.errors import EXIT_DONE, EXIT_TOO_MANY_FAILED, CampaignError
 from harness.estimators.estimate import finite_json
-from harness.outcomes import AV, CRASH, FAILED
 from harness.resolved import resolve
 from harness.runner.prepare import Prepared, build_world, prepare, require_world
 from harness.runner.worker import Bits, bits_of
+from harness.traffic.loading import load_environment
 from harness.vehicles.kinematics import STEP_S
+from harness.vocabulary import AV, CRASH, FAILED, FloatArray
 
 EPISODES = 48
 CELLS, OTHER_CELLS = 16, 5

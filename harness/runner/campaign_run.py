@@ -16,7 +16,6 @@ import pyarrow as pa
 
 from harness.campaign.models import Campaign
 from harness.errors import RunFolderError
-from harness.methods import SAMPLING
 from harness.pool.enumeration import ShadowRuns
 from harness.pool.shells import PrescribedEpisodes
 from harness.pool.vehicle_pool import ShadowPaths
@@ -57,6 +56,7 @@ from harness.runner.stored_shards import COLUMNS, GatheredBlocks, stored_shard
 from harness.runner.table_accuracy import table_errors
 from harness.runner.worker import ShardDone, ShardSpec
 from harness.stopped_by import StoppedBy
+from harness.vocabulary import SAMPLING
 
 
 def run_campaign(

@@ -26,7 +26,7 @@ from harness.runner.compare_shells import PAIRING, compare_shells, exit_code, sh
 from harness.runner.manifest import require_own_folder
 from harness.runner.prepare import require_ready
 from harness.runner.run_result import RunResult
-from harness.state import STATE_COLUMNS
+from harness.vocabulary import STATE_COLUMNS
 
 Side = Literal["a", "b"]
 SIDES: tuple[Side, Side] = ("a", "b")

@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 
-from harness.arrays import IntArray
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED, CampaignError
 from harness.estimators.block import Block
 from harness.estimators.paired_shells import (
@@ -37,6 +36,7 @@ from harness.runner.manifest import require_own_folder
 from harness.runner.planner import PairPlanner, Planner, round_specs
 from harness.runner.worker import ShardSpec
 from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT
+from harness.vocabulary import IntArray
 
 PAIRING = "the i-th cut-in that A meets of a shell is the i-th that B meets: same initial state, paths and cut-in"
 EXIT_OF: Mapping[Verdict, int] = {"proven": EXIT_DONE, "refuted": EXIT_REFUTED, "open": EXIT_BUDGET_SPENT}

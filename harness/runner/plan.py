@@ -11,22 +11,22 @@ from typing import Any
 
 import numpy as np
 
-from harness.arrays import FloatArray, IntArray
 from harness.campaign.models import Campaign, Stop
 from harness.controllers.apart import AvEndedProcessError, run_apart
 from harness.controllers.hosts import BatchHost, ControllerHost
 from harness.controllers.loading import build_host
 from harness.controllers.protocol import BatchObservation
-from harness.environment.lateral import DISTANCE_M as OVERLAP_M
 from harness.importance.build import needs_tables
 from harness.pool.shells import acceleration_limit, design_shells
 from harness.pool.storage import cached_pool
 from harness.resolved import Resolved
 from harness.runner.prepare import build_world, cached_files, require_ready
 from harness.strata import ASSUMPTION_FREE
-from harness.sumo.shim import shim_library
+from harness.traffic.lateral import DISTANCE_M as OVERLAP_M
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
-from harness.world import AVLostError, DrivingWorld, World
+from harness.vocabulary import FloatArray, IntArray
+from harness.worlds.protocol import AVLostError, DrivingWorld, World
+from harness.worlds.shim import shim_library
 
 EPISODES_PER_SECOND_PER_CORE = {
     "sumo": {"nde": 3500, "forced": 1500, "step_mixture": 1600, "episode_mixture": 2000, "shells": 1700},

@@ -16,7 +16,6 @@ from itertools import pairwise
 
 import numpy as np
 
-from harness.arrays import IntArray
 from harness.campaign.models import Campaign
 from harness.estimators import Shells, StopRule, accumulator
 from harness.estimators.block import Block
@@ -29,6 +28,7 @@ from harness.pool.shells import Draw, PrescribedEpisodes
 from harness.runner.allocation import CONFIDENCE, Allocation
 from harness.runner.worker import ShardSpec
 from harness.strata import ShellDesign
+from harness.vocabulary import IntArray
 
 MOST_SHARDS_PER_ROUND = 16
 SMALLEST_SHARD = 64

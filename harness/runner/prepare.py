@@ -7,20 +7,16 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from harness.arrays import RecordArray
 from harness.campaign.models import Campaign
 from harness.compiled import is_cached
 from harness.controllers.black_box import Death
 from harness.controllers.loading import build_host, require_controller
-from harness.criticality.tables import Tables, build_tables, table_path
-from harness.environment.driving import Environment
-from harness.environment.initial_state import InitialStates
 from harness.episode.judge import judge
 from harness.episode.loop import MOMENT_LIMITS, NOBODY, EpisodeLoop, Keep, Policy
 from harness.episode.trajectory import empty_trajectory, mean_test_distance
 from harness.errors import RunFolderError
 from harness.importance.build import build_importance, needs_tables
-from harness.outcomes import PRESCRIBED
+from harness.importance.tables import Tables, build_tables, table_path
 from harness.pool.enumeration import ShadowRuns
 from harness.pool.shells import PrescribedEpisodes, checked_boundary
 from harness.pool.storage import campaign_pool, campaign_pool_key, pool_path
@@ -30,10 +26,13 @@ from harness.records.folder import SHELLS, read_json
 from harness.records.tables import shard_tables
 from harness.resolved import Resolved, resolve
 from harness.runner.retrace import Retracing
-from harness.sumo.av_type import av_type
-from harness.sumo.public_address import require_private
-from harness.sumo.system_libraries import require_libraries
-from harness.world import World
+from harness.traffic.driving import Environment
+from harness.traffic.initial_state import InitialStates
+from harness.vocabulary import PRESCRIBED, RecordArray
+from harness.worlds.av_type import av_type
+from harness.worlds.protocol import World
+from harness.worlds.public_address import require_private
+from harness.worlds.system_libraries import require_libraries
 
 DISTANCE_SEED = 20_000
 DISTANCE_PATHS = 20_000
@@ -194,7 +193,7 @@ def compile_kernels(resolved: Resolved) -> None:
     Kernels are the same for all methods and worlds, so one naturalistic episode in the twin, retraced as if SUMO had
     driven it, compiles them into the cache, where worker processes find them.
     """
-    from harness.twin import TwinWorld  # noqa: PLC0415 - only a cold start needs it
+    from harness.worlds.twin import TwinWorld  # noqa: PLC0415 - only a cold start needs it
 
     campaign, environment = resolved.campaign, resolved.environment
     naturalistic = campaign.model_copy(update={"testing": campaign.testing.model_copy(update={"method": "nde"})})
@@ -209,10 +208,10 @@ def compile_kernels(resolved: Resolved) -> None:
 def build_world(campaign: Campaign, n_cells: int | None = None) -> World:
     """The world that a campaign names, with its number of cells or another."""
     if campaign.world.engine == "twin":
-        from harness.twin import TwinWorld  # noqa: PLC0415 - a run needs one of the two worlds
+        from harness.worlds.twin import TwinWorld  # noqa: PLC0415 - a run needs one of the two worlds
 
         return TwinWorld(n_cells or campaign.world.cells)
-    from harness.sumo.build import build_sumo_world  # noqa: PLC0415 - libsumo takes half a second to import
+    from harness.worlds.build import build_sumo_world  # noqa: PLC0415 - libsumo takes half a second to import
 
     return build_sumo_world(campaign, n_cells)
 

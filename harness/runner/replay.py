@@ -23,8 +23,8 @@ from harness.runner.manifest import cpu_name, versions
 from harness.runner.prepare import build_world, prepare, require_same_pool, require_world
 from harness.runner.shadow_runs import read_shadows
 from harness.runner.worker import run_drawn
-from harness.sumo.system_libraries import require_libraries
-from harness.world import World
+from harness.worlds.protocol import World
+from harness.worlds.system_libraries import require_libraries
 
 _UNLIKE_BITS = ("episode", "seed", "failure")
 
@@ -163,7 +163,7 @@ def _require_reproducible(manifest: dict[str, Any]) -> None:
 def _world(campaign: Campaign, *, gui: bool, fcd: Path | None) -> World:
     if not gui and fcd is None:
         return build_world(campaign, n_cells=1)
-    from harness.sumo.build import build_sumo_world  # noqa: PLC0415 - libsumo takes half a second to import
+    from harness.worlds.build import build_sumo_world  # noqa: PLC0415 - libsumo takes half a second to import
 
     options = () if fcd is None else ("--fcd-output", str(fcd), "--precision", "9")
     return build_sumo_world(campaign, 1, gui=gui, options=options)

@@ -12,13 +12,12 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from harness.arrays import BoolArray, FloatArray, IntArray
 from harness.episode.trajectory import empty_trajectory
 from harness.errors import WorldDisagreementError
-from harness.outcomes import CRASH, FAILED, OUTCOMES, RUNNING
 from harness.pool.replay import Retraced, StoredPaths, retrace, stored_paths
 from harness.resolved import Resolved
 from harness.vehicles.kinematics import STEP_S
+from harness.vocabulary import CRASH, FAILED, OUTCOMES, RUNNING, BoolArray, FloatArray, IntArray
 
 
 class Retracing:

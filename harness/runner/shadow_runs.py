@@ -16,15 +16,12 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from harness.arrays import IntArray, RecordArray
-from harness.environment.driving import Environment
 from harness.episode.begin import CUT_IN_DRAW
 from harness.episode.cells import PrescribedTraffic, drawn_traffic
 from harness.episode.loop import EpisodeLoop, Keep, Shard
 from harness.episode.motion import motion_hashes
 from harness.episode.trajectory import Followers
 from harness.errors import RunFolderError
-from harness.outcomes import AV, FAILED
 from harness.pool.cut_ins import onset_steps
 from harness.pool.enumeration import ShadowRuns, enumerate_cut_ins, write_script
 from harness.pool.storage import padded
@@ -32,7 +29,9 @@ from harness.pool.vehicle_pool import ShadowPaths
 from harness.random_stream import CUT_IN, uniforms
 from harness.records.folder import COMPRESSION, read_table
 from harness.records.tables import shadow_table
+from harness.traffic.driving import Environment
 from harness.vehicles.models import driver_records
+from harness.vocabulary import AV, FAILED, IntArray, RecordArray
 
 SHADOW = "shadow"
 """Folder of the shadow runs within a run folder."""

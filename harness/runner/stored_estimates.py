@@ -17,7 +17,6 @@ from harness.estimators.block import Block
 from harness.estimators.from_records import EPISODE_COLUMNS, MOMENT_COLUMNS, SHELL_COLUMNS, block_from_tables
 from harness.estimators.one_pass import SPACING
 from harness.importance.build import importance_names, mixture_weights
-from harness.methods import EstimatorName
 from harness.pool.replay import PATH_COLUMNS, SurrogateReplay
 from harness.pool.storage import cached_pool, read_pool
 from harness.records.folder import SHELLS, concatenated, no_episodes, read_json, read_manifest, require_schema
@@ -27,6 +26,7 @@ from harness.resolved import resolve
 from harness.runner.stored_shards import GatheredBlocks
 from harness.strata import ShellDesign
 from harness.threads import made_ahead
+from harness.vocabulary import EstimatorName
 
 MOST_UNASKED = 50_000
 """Tests that are replayed without being asked to, for the alarm: some 30 µs each."""

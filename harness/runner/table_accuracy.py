@@ -14,16 +14,15 @@ from typing import Any
 
 import numpy as np
 
-from harness.arrays import FloatArray
 from harness.compiled import WORLD_SOURCES, cache_root, source_hash
-from harness.criticality.tables import Tables, tables_hash
-from harness.environment.initial_state import InitialStates
 from harness.episode.loop import MOMENT_LIMITS, EpisodeLoop, Keep, Policy, Shard
 from harness.importance.build import build_importance
-from harness.outcomes import CRASH
+from harness.importance.tables import Tables, tables_hash
 from harness.records.folder import write_json
 from harness.resolved import Resolved
-from harness.twin import TwinWorld
+from harness.traffic.initial_state import InitialStates
+from harness.vocabulary import CRASH, FloatArray
+from harness.worlds.twin import TwinWorld
 
 EPISODES = 6_000
 SEED = 40_001

@@ -25,7 +25,6 @@ from harness.episode.loop import EpisodeLoop, Shard, hash_of_index
 from harness.estimators.block import Block
 from harness.estimators.from_records import block_from_tables
 from harness.importance.build import mixture_weights
-from harness.outcomes import FAILED
 from harness.pool.shells import Draw
 from harness.records.folder import encoded
 from harness.records.tables import ShardTables, shard_tables
@@ -33,7 +32,8 @@ from harness.resolved import Resolved
 from harness.runner.prepare import Prepared, build_world, prepare
 from harness.runner.retrace import Retracing
 from harness.runner.shadow_runs import ShadowDone, ShadowSpec, forced_traffic, read_shadows, run_shadows
-from harness.twin import TwinWorld
+from harness.vocabulary import FAILED
+from harness.worlds.twin import TwinWorld
 
 REPEATED = b"harness.repeated"
 """Key in the metadata of an episodes file: what repeating showed is there with the shard, or not at all."""

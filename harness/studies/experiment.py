@@ -16,8 +16,8 @@ from harness.campaign.problems import validated
 from harness.campaign.section import NAME_PATTERN, Positive, Section, Whole, broken_rule
 from harness.campaign.yaml_text import read_yaml
 from harness.errors import CampaignError
-from harness.methods import SAMPLING, EstimatorName
 from harness.studies.chains.named import CHAINS
+from harness.vocabulary import SAMPLING, EstimatorName
 
 AvName = Annotated[str, Field(pattern=NAME_PATTERN)]
 

@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 from scipy.stats import binomtest
 
-from harness.arrays import FloatArray
 from harness.estimators.estimate import Estimate, finite_json
 from harness.estimators.intervals import clopper_pearson, normal_half_width
 from harness.studies.truths import Known
+from harness.vocabulary import FloatArray
 
 COVERAGE_CONFIDENCE = 0.95
 SIGNIFICANCE = 0.05

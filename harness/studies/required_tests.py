@@ -24,7 +24,6 @@ from typing import Any, Literal
 
 import numpy as np
 
-from harness.arrays import BoolArray, FloatArray, IntArray
 from harness.campaign.loading import load_campaign
 from harness.errors import HarnessError
 from harness.estimators.block import Block, columns_of, joined
@@ -34,6 +33,7 @@ from harness.estimators.nade import Nade, Nde
 from harness.estimators.scv import Scv
 from harness.progress import Progress
 from harness.runner.stored_estimates import stored_blocks
+from harness.vocabulary import BoolArray, FloatArray, IntArray
 
 RnotEstimator = Literal["nde", "nade", "scv"]
 _REFUSAL = {"nde": Nde.refusal, "nade": Nade.refusal, "scv": Scv.refusal}

@@ -15,7 +15,6 @@ from functools import cached_property
 
 import numpy as np
 
-from harness.arrays import FloatArray, IntArray
 from harness.campaign.models import Accept, Campaign
 from harness.estimators.block import Block
 from harness.estimators.estimate import Estimate
@@ -28,6 +27,7 @@ from harness.strata import LIBRARY_STATEMENT, ShellDesign
 from harness.studies.experiment import Fault
 from harness.studies.judgement import Row, estimate_row
 from harness.studies.truths import CONDITIONAL_DIFFERENCE, DIFFERENCE, preventable_by, ratio_to
+from harness.vocabulary import FloatArray, IntArray
 
 FREE = "shells"
 _CRASHING = ((CRASH, CRASH), (CRASH, NO_CRASH), (NO_CRASH, CRASH))

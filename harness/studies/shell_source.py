@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from harness.arrays import BoolArray, FloatArray, IntArray
 from harness.campaign.testing import ShellSettings
 from harness.errors import CampaignError
 from harness.pool.cut_ins import CutIns, Pool, shells_of
@@ -17,6 +16,7 @@ from harness.strata import ShellDesign
 from harness.studies.experiment import Adversary
 from harness.studies.shell_campaign import DrawnPool
 from harness.studies.super_population import SuperPopulation, reference_drivers
+from harness.vocabulary import BoolArray, FloatArray, IntArray
 
 EQUAL_RATE = 0.02
 """A surrogate whose crash rate is this close to the vehicle's counts as its equal."""

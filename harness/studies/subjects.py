@@ -8,9 +8,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from itertools import permutations
 
-from harness.arrays import FloatArray
 from harness.campaign.models import Campaign
-from harness.environment.loading import load_environment
 from harness.pool.library import Library, load_library
 from harness.pool.shells import acceleration_limit
 from harness.progress import Progress
@@ -25,6 +23,8 @@ from harness.studies.super_population import Drivers, Mixed, SuperPopulation, en
 from harness.studies.truths import CONDITIONAL_DIFFERENCE, RATE, Known, Truths, of_pair, of_vehicle
 from harness.studies.walked_population import Choose, chooser, walk_paths
 from harness.studies.weighted_campaign import WeightedCampaign, chain_episodes, twin_episodes
+from harness.traffic.loading import load_environment
+from harness.vocabulary import FloatArray
 
 Repeated = ShellCampaign | PairedCampaign | WeightedCampaign
 """A campaign that can be repeated, in any process."""

@@ -18,10 +18,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from harness.arrays import BoolArray, FloatArray, IntArray, RecordArray
 from harness.campaign.models import AutomatedVehicle, BuiltInParameters, Reflexes
 from harness.compiled import WORLD_SOURCES, cache_root, source_hash
-from harness.environment.driving import Environment
 from harness.episode.trajectory import Followers
 from harness.errors import CampaignError
 from harness.pool.aimed_paths import PILOT_PATHS, Enumerator
@@ -30,7 +28,9 @@ from harness.pool.library import Library
 from harness.pool.shells import acceleration_limit
 from harness.progress import Progress
 from harness.studies.work import write_table
+from harness.traffic.driving import Environment
 from harness.vehicles.models import driver_records
+from harness.vocabulary import BoolArray, FloatArray, IntArray, RecordArray
 
 MOST_DRIVERS = 62
 NO_ENVELOPE = -1

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from harness.arrays import FloatArray
-from harness.environment.driving import Environment
 from harness.progress import Progress
 from harness.studies.super_population import Drivers, SuperPopulation, enumerate_paths
+from harness.traffic.driving import Environment
+from harness.vocabulary import FloatArray
 
 LARGEST_ERROR = 0.005
 """Standard error of a crash rate, over the rate, that a truth should have at most."""

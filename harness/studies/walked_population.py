@@ -14,7 +14,6 @@ from functools import cache
 
 import numpy as np
 
-from harness.arrays import BoolArray, IntArray
 from harness.campaign.models import Campaign
 from harness.compiled import source_hash
 from harness.controllers.loading import build_host, require_controller
@@ -23,7 +22,6 @@ from harness.episode.loop import EpisodeLoop, Keep, Policy
 from harness.episode.motion import motion_hashes
 from harness.errors import HarnessError
 from harness.importance.build import build_importance
-from harness.outcomes import CRASH, PRESCRIBED
 from harness.pool.cut_ins import onset_steps
 from harness.pool.enumeration import STRIDE, ShadowRuns, enumerate_cut_ins, write_script
 from harness.pool.vehicle_pool import CANDIDATES, ShadowPaths, walk_candidates
@@ -31,7 +29,8 @@ from harness.progress import Progress
 from harness.resolved import Resolved, resolve
 from harness.runner.shadow_runs import recorded, without_cut_in
 from harness.studies.super_population import SuperPopulation, cached, joined, population_key
-from harness.twin import TwinWorld
+from harness.vocabulary import CRASH, PRESCRIBED, BoolArray, IntArray
+from harness.worlds.twin import TwinWorld
 
 CELLS = 1024
 CHUNK_PATHS = 1024

@@ -14,14 +14,14 @@ from harness.estimators import StopRule, accumulator
 from harness.estimators.block import Block
 from harness.estimators.from_records import block_from_tables
 from harness.importance.build import mixture_weights
-from harness.methods import EstimatorName, Method
 from harness.records.tables import shard_tables
 from harness.resolved import resolve
 from harness.runner.prepare import Prepared, prepare
 from harness.studies.chains.chain import Chain
 from harness.studies.chains.sampler import draw
 from harness.studies.judgement import Row, estimate_row
-from harness.twin import TwinWorld
+from harness.vocabulary import EstimatorName, Method
+from harness.worlds.twin import TwinWorld
 
 CELLS = 1024
 CHUNK = 20_000

@@ -15,7 +15,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from harness.arrays import Record, RecordArray
 from harness.campaign.models import (
     FVDM,
     IDM,
@@ -32,6 +31,7 @@ from harness.campaign.models import (
     Reflexes,
 )
 from harness.compiled import compiled_inline
+from harness.vocabulary import Record, RecordArray
 
 IDM_KIND, FVDM_KIND, CONSTANT_KIND = 0, 1, 2
 CAREFUL_COMPETENT_KIND, FUZZY_SAFETY_KIND, NEED_BASED_KIND = -1, -2, -3

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 
-from harness.arrays import FloatArray, IntArray, Record, RecordArray
 from harness.compiled import compiled_inline, compiled_threads
 from harness.random_stream import AV_DRAWS, uniform
 from harness.vehicles.kinematics import STEP_S
 from harness.vehicles.models import CAREFUL_COMPETENT_KIND, FUZZY_SAFETY_KIND, driver_acceleration
 from harness.vehicles.references import Memory, careful_competent, fuzzy_safety, need_based
+from harness.vocabulary import FloatArray, IntArray, Record, RecordArray
 
 
 @compiled_inline

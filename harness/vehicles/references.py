@@ -15,10 +15,10 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from harness.arrays import Record
 from harness.compiled import compiled_inline
 from harness.vehicles.kinematics import STEP_S
 from harness.vehicles.models import SMALLEST_GAP_M, idm_acceleration
+from harness.vocabulary import Record
 
 
 class Memory(NamedTuple):

@@ -8,7 +8,7 @@ from benchmarks.contender_process import Measurement, descendants_cpu_s
 from benchmarks.contenders import CONTENDERS, Recorded, Workers, campaign
 from benchmarks.one_at_a_time import in_libsumo
 from benchmarks.speed import RATES, RATIOS, Ratio, ratio, require_equal_rows
-from harness.twin import TwinWorld
+from harness.worlds.twin import TwinWorld
 
 
 def measured(episodes, cpu_s, wall_s=1.0, cell_steps=100):

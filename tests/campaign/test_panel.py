@@ -7,8 +7,8 @@ from harness.campaign.models import IDM, AutomatedVehicle, IDMParameters
 from harness.campaign.panel import SHIPPED_PANEL, load_panel, panel_av
 from harness.cli import main
 from harness.errors import CampaignError
-from harness.sumo.av_type import recyclable
 from harness.vehicles.models import av_records
+from harness.worlds.av_type import recyclable
 
 HEAD = "format: av-panel\nversion: 1\navs:\n"
 

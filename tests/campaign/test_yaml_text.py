@@ -5,8 +5,8 @@ import pytest
 from harness.campaign.loading import SHIPPED_PARAMETERS
 from harness.campaign.problems import InvalidFileError, read_model
 from harness.campaign.yaml_text import parse_value, read_yaml
-from harness.environment.parameters import EnvironmentParameters
 from harness.errors import CampaignError
+from harness.traffic.parameters import EnvironmentParameters
 
 
 @pytest.fixture

@@ -6,10 +6,10 @@ import pytest
 from harness.campaign.loading import load_campaign
 from harness.controllers.hosts import EpisodeRandom
 from harness.errors import CampaignError
-from harness.outcomes import PASSED
 from harness.resolved import resolve
 from harness.runner.prepare import prepare
-from harness.twin import TwinWorld
+from harness.vocabulary import PASSED
+from harness.worlds.twin import TwinWorld
 from tests.controllers.test_same_bits import ROOT
 
 EARLY = "{controller: 'tests.controllers.test_before_cut_in:Faster', before_cut_in: controller}"

@@ -15,7 +15,7 @@ from harness.errors import EXIT_BAD_INPUT, EXIT_DONE, EXIT_TOO_MANY_FAILED
 from harness.resolved import resolve
 from harness.runner import executor, plan_campaign
 from harness.runner.prepare import prepare
-from harness.twin import TwinWorld
+from harness.worlds.twin import TwinWorld
 from tests.controllers.misbehaving import ChangesItsParameters
 
 ROOT = Path(__file__).parents[2]

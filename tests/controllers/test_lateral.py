@@ -15,7 +15,7 @@ from harness.controllers.traci_facade import Traci
 from harness.controllers.traci_style import TraciStyleController
 from harness.resolved import resolve
 from harness.runner.prepare import prepare
-from harness.twin import TwinWorld
+from harness.worlds.twin import TwinWorld
 
 N = 400
 LATERAL = "environment.parameters=ndd-overtaking-1-lateral"

@@ -8,7 +8,7 @@ import pytest
 from harness.campaign.loading import load_campaign
 from harness.resolved import resolve
 from harness.runner.prepare import prepare
-from harness.twin import TwinWorld
+from harness.worlds.twin import TwinWorld
 
 ROOT = Path(__file__).parents[2]
 EPISODES = 150

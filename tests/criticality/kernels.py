@@ -6,7 +6,7 @@ Import this module as ``tests.…`` everywhere: numba's cache remembers the name
 import numpy as np
 
 from harness.compiled import compiled_threads
-from harness.criticality.grid import AFTER, interpolate, locate
+from harness.importance.grid import AFTER, interpolate, locate
 
 
 @compiled_threads

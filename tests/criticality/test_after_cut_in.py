@@ -7,7 +7,7 @@ small error on average over states near the edge, no bias, and a small error at 
 import numpy as np
 import pytest
 
-from harness.criticality.grid import AFTER, points_of
+from harness.importance.grid import AFTER, points_of
 from tests.chains.seed import SEED
 from tests.criticality import simulation
 from tests.criticality.kernels import after_cut_in

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from harness.criticality.grid import BEFORE, points_of
+from harness.importance.grid import BEFORE, points_of
 from tests.criticality import simulation
 from tests.environment.kernels import cut_in_terms
 from tests.episode.twin_runs import Mean, prepared, run

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from harness.campaign.models import FVDMParameters, IDMParameters
-from harness.criticality.immediate import smallest_gaps
+from harness.importance.immediate import smallest_gaps
 from harness.maneuvers import acceleration
 from harness.vehicles.kinematics import CONTACT_M, STEP_S, next_speed
 from harness.vehicles.models import driver_acceleration, driver_records

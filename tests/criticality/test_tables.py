@@ -7,9 +7,9 @@ import pytest
 
 from harness.campaign.loading import load_campaign
 from harness.campaign.models import IDMParameters
-from harness.criticality import tables as cache
-from harness.criticality.tables import Tables, build_tables, table_path, tables_hash
+from harness.importance import tables as cache
 from harness.importance.build import build_importance
+from harness.importance.tables import Tables, build_tables, table_path, tables_hash
 from harness.vehicles.models import MODEL_FIELDS, driver_records
 from tests.environment.kernels import environment
 

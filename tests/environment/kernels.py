@@ -10,9 +10,9 @@ import numpy as np
 
 from harness.campaign.models import EnvironmentSettings
 from harness.compiled import compiled_threads
-from harness.environment import cut_in, driving
-from harness.environment.loading import load_environment
-from harness.state import State
+from harness.traffic import cut_in, driving
+from harness.traffic.loading import load_environment
+from harness.vocabulary import State
 
 
 @functools.cache

@@ -6,9 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from harness.environment.initial_state import InitialStates
 from harness.episode.trajectory import place
-from harness.state import STATE_COLUMNS, State
+from harness.traffic.initial_state import InitialStates
+from harness.vocabulary import STATE_COLUMNS, State
 from tests.chains.seed import SEED
 from tests.environment.kernels import environment
 

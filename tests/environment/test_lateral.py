@@ -11,7 +11,10 @@ import yaml
 from harness.campaign.loading import load_campaign
 from harness.campaign.models import EnvironmentSettings
 from harness.campaign.problems import read_model
-from harness.environment.lateral import (
+from harness.errors import CampaignError
+from harness.pool.cut_ins import environment_hash
+from harness.resolved import resolve
+from harness.traffic.lateral import (
     constant_lead,
     draw_lead,
     in_one_step,
@@ -19,11 +22,8 @@ from harness.environment.lateral import (
     log_normal_speed,
     perceived_in,
 )
-from harness.environment.loading import load_environment, load_parameters, parameter_file
-from harness.environment.parameters import EnvironmentParameters
-from harness.errors import CampaignError
-from harness.pool.cut_ins import environment_hash
-from harness.resolved import resolve
+from harness.traffic.loading import load_environment, load_parameters, parameter_file
+from harness.traffic.parameters import EnvironmentParameters
 from tests.kernels import alone
 
 draw_lead = alone(draw_lead)

@@ -11,13 +11,13 @@ from pydantic import ValidationError
 
 from harness.campaign.models import Campaign, EnvironmentSettings
 from harness.campaign.yaml_text import read_yaml
-from harness.environment.loading import load_environment, load_parameters, parameter_file, require_sound_laws
-from harness.environment.parameters import EnvironmentParameters
 from harness.errors import CampaignError
 from harness.resolved import resolve
 from harness.runner.prepare import prepare
-from harness.state import STATE_COLUMNS
-from harness.twin import TwinWorld
+from harness.traffic.loading import load_environment, load_parameters, parameter_file, require_sound_laws
+from harness.traffic.parameters import EnvironmentParameters
+from harness.vocabulary import STATE_COLUMNS
+from harness.worlds.twin import TwinWorld
 
 SHIPPED = parameter_file("ndd-overtaking-1")
 TEXT = SHIPPED.read_text(encoding="utf-8")

@@ -18,13 +18,12 @@ from harness.episode.cells import PrescribedTraffic, drawn_traffic
 from harness.episode.loop import EpisodeLoop, Keep, Policy
 from harness.importance.build import build_importance
 from harness.maneuvers import CUT_IN
-from harness.outcomes import AV, BV, CRASH, PASSED
 from harness.records.tables import episodes_table
 from harness.resolved import resolve
 from harness.runner.prepare import prepare
 from harness.runner.retrace import Retracing
-from harness.state import STATE_DTYPE
-from harness.twin import TwinWorld
+from harness.vocabulary import AV, BV, CRASH, PASSED, STATE_DTYPE
+from harness.worlds.twin import TwinWorld
 from tests.chains.seed import SEED
 
 N = 3000

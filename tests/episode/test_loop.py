@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from harness.twin import TwinWorld
+from harness.worlds.twin import TwinWorld
 from tests.episode.twin_runs import prepared
 
 N = 600

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from harness.outcomes import BV_LV_CONTACT, CRASH, FAILED, PASSED, TIMEOUT
+from harness.vocabulary import BV_LV_CONTACT, CRASH, FAILED, PASSED, TIMEOUT
 from tests.episode.twin_runs import run
 
 N = 200_000

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from harness.maneuvers import CUT_IN
-from harness.outcomes import BV_LV_CONTACT, CRASH, PASSED, TIMEOUT
+from harness.vocabulary import BV_LV_CONTACT, CRASH, PASSED, TIMEOUT
 from tests.episode.twin_runs import run
 
 METHODS = {"nde": {"level": 1e6}, "forced": {}, "step_mixture": {}, "episode_mixture": {}}

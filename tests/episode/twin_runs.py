@@ -16,10 +16,10 @@ from harness.campaign.models import (
     Testing,
 )
 from harness.episode.loop import Shard
-from harness.outcomes import CRASH
 from harness.resolved import resolve
 from harness.runner.prepare import Prepared, prepare
-from harness.twin import TwinWorld
+from harness.vocabulary import CRASH
+from harness.worlds.twin import TwinWorld
 from tests.chains.seed import SEED
 
 CELLS = 512

@@ -8,8 +8,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from harness.estimators.block import Block
-from harness.outcomes import OUTCOMES
 from harness.records.schemas import episodes_schema, moments_schema
+from harness.vocabulary import OUTCOMES
 
 CAMPAIGN = """
 name: chain

@@ -7,8 +7,8 @@ from typing import TypeVar
 import numpy as np
 
 from harness.estimators.block import Block
-from harness.methods import Method
 from harness.strata import ShellDesign, Statement
+from harness.vocabulary import Method
 
 State = TypeVar("State")
 SHELLS = ShellDesign(

@@ -17,10 +17,10 @@ from harness.estimators import (
     one_pass,
 )
 from harness.estimators.statement import alarm_cautions, warned
-from harness.methods import SAMPLING
 from harness.runner import estimate_run
 from harness.studies.chains.named import overtaking
 from harness.studies.chains.sampler import blocks
+from harness.vocabulary import SAMPLING
 from tests.chains.seed import SEED
 
 from .run_folder import write_run

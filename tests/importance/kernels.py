@@ -8,12 +8,12 @@ from typing import NamedTuple
 import numpy as np
 
 from harness.compiled import compiled_threads
-from harness.environment.cut_in import acceptance, cut_in_hazard, opportunity
-from harness.environment.driving import acceleration_pmf, free_driving
 from harness.episode.critical_moment import draw_from
 from harness.importance import functions, likelihood
 from harness.maneuvers import acceleration
-from harness.state import State
+from harness.traffic.cut_in import acceptance, cut_in_hazard, opportunity
+from harness.traffic.driving import acceleration_pmf, free_driving
+from harness.vocabulary import State
 
 
 class Proposals(NamedTuple):

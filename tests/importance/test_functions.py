@@ -10,13 +10,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from harness.criticality.grid import interpolate, interpolate_maneuvers
 from harness.importance.build import harmless_cells
 from harness.importance.functions import as_challenge
+from harness.importance.grid import interpolate, interpolate_maneuvers
 from harness.maneuvers import CUT_IN, STAY
-from harness.outcomes import EPISODE_MIXTURE, STEP_MIXTURE
-from harness.state import STATE_COLUMNS
 from harness.vehicles.kinematics import CONTACT_M
+from harness.vocabulary import EPISODE_MIXTURE, STATE_COLUMNS, STEP_MIXTURE
 from tests.episode.twin_runs import prepared, run
 from tests.importance.kernels import after_cut_in, before_cut_in, drawn
 

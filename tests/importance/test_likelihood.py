@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.special import logsumexp
 
-from harness.outcomes import EPISODE_MIXTURE, STEP_MIXTURE
+from harness.vocabulary import EPISODE_MIXTURE, STEP_MIXTURE
 from tests.importance.kernels import accumulated, log_mixtures
 
 ratio = st.one_of(st.just(0.0), st.floats(1e-6, 1e6))

@@ -8,11 +8,11 @@ import pytest
 
 from harness.campaign.loading import load_campaign
 from harness.campaign.models import Campaign
-from harness.environment.driving import Environment
-from harness.environment.loading import load_environment
 from harness.pool.cut_ins import Pool
 from harness.pool.storage import campaign_pool
 from harness.resolved import resolve
+from harness.traffic.driving import Environment
+from harness.traffic.loading import load_environment
 
 MIXTURE_FILE = Path(__file__).parents[2] / "scenarios" / "overtaking_mixture.yaml"
 SMALL_POOL = ("pool.relative_error=0.03", "pool.cut_ins_per_shell=1500")

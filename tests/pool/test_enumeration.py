@@ -7,13 +7,13 @@ import pytest
 from scipy.stats import chisquare
 
 from harness.campaign.models import PoolSettings
-from harness.environment.initial_state import InitialStates
-from harness.outcomes import CRASH
 from harness.pool.aimed_paths import Enumerator
 from harness.pool.enumeration import STRIDE
 from harness.pool.library import load_library
 from harness.pool.shells import design_shells
 from harness.progress import Progress
+from harness.traffic.initial_state import InitialStates
+from harness.vocabulary import CRASH
 from tests.chains.seed import SEED
 from tests.pool.walked import driven, enumerated, p_cut_in_of_paths
 

@@ -7,17 +7,17 @@ import pytest
 
 from harness.campaign.loading import load_campaign
 from harness.controllers.loading import build_host
-from harness.environment.loading import load_environment
 from harness.episode.loop import EpisodeLoop, Keep, Policy
 from harness.importance.build import build_importance
-from harness.outcomes import CRASH, PASSED, PRESCRIBED
 from harness.pool.library import load_library
 from harness.pool.shells import PrescribedEpisodes
 from harness.pool.storage import campaign_pool, read_pool, write_pool
 from harness.pool.vehicle_pool import vehicle_pool, walk_candidates
 from harness.resolved import resolve
 from harness.runner.shadow_runs import recorded, without_cut_in
-from harness.twin import TwinWorld
+from harness.traffic.loading import load_environment
+from harness.vocabulary import CRASH, PASSED, PRESCRIBED
+from harness.worlds.twin import TwinWorld
 from tests.pool.conftest import MIXTURE_FILE, SMALL_POOL
 from tests.pool.test_vehicle_pool import ACTING
 from tests.pool.walked import driven, enumerated

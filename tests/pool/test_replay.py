@@ -20,15 +20,15 @@ from harness.estimators.alarm import Alarm
 from harness.estimators.block import Block
 from harness.estimators.from_records import block_from_tables
 from harness.importance.build import mixture_weights
-from harness.outcomes import CRASH
 from harness.pool.cut_ins import Pool
 from harness.pool.replay import SurrogateReplay, drivers_crash
 from harness.pool.storage import campaign_pool
 from harness.records.tables import episodes_table
 from harness.resolved import resolve
 from harness.runner.prepare import prepare
-from harness.twin import TwinWorld
 from harness.vehicles.models import driver_records
+from harness.vocabulary import CRASH
+from harness.worlds.twin import TwinWorld
 from tests.chains.seed import SEED
 
 SMALL = PoolSettings(relative_error=0.03, cut_ins_per_shell=1500)

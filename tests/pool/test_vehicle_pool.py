@@ -9,7 +9,6 @@ from harness.campaign.loading import load_campaign
 from harness.episode.motion import motion_hashes
 from harness.episode.trajectory import Followers
 from harness.errors import HarnessError
-from harness.outcomes import CRASH
 from harness.pool.aimed_paths import Enumerator
 from harness.pool.enumeration import ShadowRuns, enumerate_cut_ins
 from harness.pool.vehicle_pool import CANDIDATES, EVENLY, chances, vehicle_pool
@@ -17,8 +16,9 @@ from harness.progress import Progress
 from harness.resolved import resolve
 from harness.runner.prepare import prepare
 from harness.runner.shadow_runs import as_recorded, run_shadows, shadow_specs, without_cut_in
-from harness.twin import TwinWorld
 from harness.vehicles.models import driver_records
+from harness.vocabulary import CRASH
+from harness.worlds.twin import TwinWorld
 from tests.environment.kernels import cut_in_terms
 from tests.pool.conftest import MIXTURE_FILE, SMALL_POOL
 

@@ -5,10 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from harness.compiled import compiled_threads
-from harness.environment.cut_in import acceptance, cut_in_hazard, opportunity
-from harness.environment.driving import Environment, car_following, draw_acceleration, free_driving
-from harness.environment.initial_state import InitialStates
-from harness.environment.loading import load_environment
 from harness.episode.loop import EpisodeLoop, Keep, Policy
 from harness.episode.trajectory import Followers
 from harness.importance.build import build_importance
@@ -16,9 +12,13 @@ from harness.maneuvers import acceleration
 from harness.pool.enumeration import enumerate_cut_ins
 from harness.pool.shells import Draw, PrescribedEpisodes
 from harness.random_stream import BV_DRAWS, LV_DRAWS, uniform
-from harness.state import State
-from harness.twin import TwinWorld
+from harness.traffic.cut_in import acceptance, cut_in_hazard, opportunity
+from harness.traffic.driving import Environment, car_following, draw_acceleration, free_driving
+from harness.traffic.initial_state import InitialStates
+from harness.traffic.loading import load_environment
 from harness.vehicles.kinematics import CONTACT_M, next_position, next_speed
+from harness.vocabulary import State
+from harness.worlds.twin import TwinWorld
 from tests.chains.seed import SEED
 
 

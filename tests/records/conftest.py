@@ -14,7 +14,7 @@ from harness.episode.loop import Shard
 from harness.records.tables import ShardTables, shard_tables
 from harness.resolved import resolve
 from harness.runner.prepare import prepare
-from harness.twin import TwinWorld
+from harness.worlds.twin import TwinWorld
 
 MIXTURE_FILE = Path(__file__).parents[2] / "scenarios" / "overtaking_mixture.yaml"
 

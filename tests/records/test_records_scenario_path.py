@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from harness.maneuvers import CUT_IN, acceleration
-from harness.outcomes import AV, BV, LV
 from harness.vehicles.kinematics import VEHICLE_LENGTH_M, next_position, next_speed
+from harness.vocabulary import AV, BV, LV
 from tests.episode.twin_runs import TWO
 
 STEP_PER_S = 10

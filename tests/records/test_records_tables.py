@@ -9,9 +9,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from harness.outcomes import OUTCOMES
 from harness.records.folder import encoded, read_table, write_shard
 from harness.records.schemas import episodes_schema, moments_schema, traces_schema
+from harness.vocabulary import OUTCOMES
 
 METHODS = {"nde": (0, 0), "forced": (1, 0), "step_mixture": (3, 3), "episode_mixture": (4, 3)}
 """Method → numbers of importance functions and of surrogates."""

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from harness.episode.loop import traced_by_index
-from harness.outcomes import AV
+from harness.vocabulary import AV
 
 
 def traced(recorded) -> list[int]:

@@ -17,14 +17,14 @@ from harness.episode.cells import PrescribedCutIns
 from harness.episode.loop import Shard
 from harness.estimators.one_pass import CampaignFacts, estimate_blocks
 from harness.importance.build import importance_names
-from harness.outcomes import CRASH, FAILED, TIMEOUT
 from harness.records.folder import encoded, write_shard
 from harness.records.tables import shard_tables
 from harness.resolved import resolve
 from harness.runner.prepare import prepare
 from harness.runner.stored_estimates import stored_blocks
 from harness.strata import ShellDesign, Statement
-from harness.twin import TwinWorld
+from harness.vocabulary import CRASH, FAILED, TIMEOUT
+from harness.worlds.twin import TwinWorld
 
 HASH = "0123456789abcdef"
 LARGEST_P_CUT_IN = 1e-6

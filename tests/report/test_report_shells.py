@@ -13,7 +13,6 @@ from report_page import edit, page_of, require_sound_page
 
 from harness.errors import RunFolderError
 from harness.estimators.stratified import Tally, pool_variance
-from harness.outcomes import OUTCOMES
 from harness.report import write_report
 from harness.report.answer_plot import answer_plot
 from harness.report.crash_contrast import crash_contrast
@@ -21,6 +20,7 @@ from harness.report.run_folder import read_run_folder, typed_folder
 from harness.report.shells_plot import POOL, shells_plot
 from harness.report.summary import RunSummary, summarise
 from harness.report.tables import run_notes, verdict
+from harness.vocabulary import OUTCOMES
 
 PLOTS = {
     "shells": {"cut_ins", "impact_speed", "crash_time"},

@@ -9,11 +9,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from report_page import edit
 
-from harness.outcomes import OUTCOMES
 from harness.report.crash_gallery import crash_gallery
 from harness.report.histograms import Axis, FineHistogram
 from harness.report.run_folder import read_run_folder
 from harness.report.summary import NUMBERS, RunSummary, summarise
+from harness.vocabulary import OUTCOMES
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from harness.records.tables import episodes_table
 from harness.resolved import resolve
 from harness.runner.prepare import prepare
 from harness.runner.retrace import Retracing
-from harness.twin import TwinWorld
+from harness.worlds.twin import TwinWorld
 from tests.chains.seed import SEED
 from tests.runner.stored_runs import copy_of, manifest, shard_files, stored_table
 

@@ -8,7 +8,7 @@ from harness.campaign.loading import load_campaign
 from harness.errors import CampaignError
 from harness.resolved import resolve
 from harness.runner.prepare import prepare
-from harness.twin import TwinWorld
+from harness.worlds.twin import TwinWorld
 from tests.runner.conftest import MIXTURE_FILE, TWIN
 from tests.runner.stored_runs import stored_table, unlike_columns
 

@@ -18,12 +18,12 @@ import pytest
 
 from harness.campaign.models import Campaign
 from harness.cli import main
-from harness.methods import SAMPLING
 from harness.studies import run
 from harness.studies.experiment import load_experiment
 from harness.studies.judgement import Row, Subject, judge
 from harness.studies.weighted_campaign import WeightedCampaign, twin_episodes
 from harness.studies.work import worker_processes
+from harness.vocabulary import SAMPLING
 
 from .here import Here
 

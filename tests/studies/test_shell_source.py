@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from harness.campaign.models import AutomatedVehicle, EnvironmentSettings, PoolSettings
-from harness.environment.loading import load_environment
 from harness.errors import CampaignError
 from harness.pool.build import build_pool
 from harness.pool.library import load_library
@@ -17,6 +16,7 @@ from harness.studies.shell_campaign import campaign_block
 from harness.studies.shell_source import Division, equals, leave_out
 from harness.studies.super_population import NO_ENVELOPE, Drivers, enumerate_paths
 from harness.studies.truths import RATE, Truths
+from harness.traffic.loading import load_environment
 from harness.vehicles.models import av_records
 
 PATHS = 1024

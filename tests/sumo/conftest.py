@@ -16,7 +16,7 @@ MIXTURE_FILE = Path(__file__).parents[2] / "scenarios" / "overtaking_mixture.yam
 @pytest.fixture
 def open_world() -> Iterator[Callable]:
     """Make SUMO worlds that are closed after the test, whatever happens in it."""
-    from harness.sumo.world import SumoWorld
+    from harness.worlds.sumo import SumoWorld
 
     worlds: list[SumoWorld] = []
 

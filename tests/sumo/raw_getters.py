@@ -15,9 +15,9 @@ import numpy as np
 
 from harness.campaign.models import Campaign
 from harness.episode.loop import Shard
-from harness.outcomes import BV_LV_CONTACT, CRASH, VEHICLES
 from harness.resolved import resolve
 from harness.runner.prepare import prepare
+from harness.vocabulary import BV_LV_CONTACT, CRASH, VEHICLES
 
 
 class Job(NamedTuple):
@@ -68,7 +68,7 @@ def _record_all(jobs: dict[str, Job], folder: Path) -> None:
 def _record(job: Job) -> dict[str, np.ndarray]:
     import libsumo
 
-    from harness.sumo.world import SumoWorld
+    from harness.worlds.sumo import SumoWorld
 
     names = [f"{vehicle}{k}" for k in range(job.n_cells) for vehicle in VEHICLES]
     seen: dict[str, list[np.ndarray]] = {"x": [], "v": [], "lane": [], "contact": [], "placed": []}

@@ -5,21 +5,20 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from harness.environment.loading import load_environment
 from harness.episode.cells import PrescribedTraffic, drawn_traffic
 from harness.episode.loop import EpisodeLoop, Keep, Policy, Shard
 from harness.episode.trajectory import Followers, empty_trajectory
 from harness.importance.build import build_importance
 from harness.maneuvers import CUT_IN
-from harness.outcomes import BV_LV_CONTACT, CRASH, TIMEOUT
 from harness.pool.library import load_library
 from harness.pool.replay import replay_surrogates, stored_paths
 from harness.records.tables import episodes_table
 from harness.resolved import resolve
 from harness.runner.retrace import Retracing
-from harness.state import STATE_DTYPE
-from harness.twin import TwinWorld
+from harness.traffic.loading import load_environment
 from harness.vehicles.models import av_records
+from harness.vocabulary import BV_LV_CONTACT, CRASH, STATE_DTYPE, TIMEOUT
+from harness.worlds.twin import TwinWorld
 from tests.episode.test_lateral import BESIDE, NEVER, beside, policy_of
 
 KEEP_SPEED, BRAKE = 20, 0

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from harness.errors import WorldDisagreementError
-from harness.sumo.shim import Shim, open_shim, shim_library
+from harness.worlds.shim import Shim, open_shim, shim_library
 
 pytestmark = pytest.mark.skipif(shim_library() is None, reason="no compiled shim")
 

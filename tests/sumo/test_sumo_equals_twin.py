@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 
 from harness.episode.loop import Shard
-from harness.outcomes import AV, BV, BV_LV_CONTACT, CRASH, LV, PASSED
-from harness.state import STATE_DTYPE
-from harness.twin import TwinWorld
+from harness.vocabulary import AV, BV, BV_LV_CONTACT, CRASH, LV, PASSED, STATE_DTYPE
+from harness.worlds.twin import TwinWorld
 from tests.episode.twin_runs import TWO
 from tests.sumo.raw_getters import (
     Job,

@@ -6,8 +6,8 @@ import libsumo
 import numpy as np
 import pytest
 
-from harness.outcomes import AV, BV, LV, VEHICLES
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M, gap, next_position
+from harness.vocabulary import AV, BV, LV, VEHICLES
 
 CELLS, ROUNDS, SEED = 64, 40, 20_261_121
 

@@ -14,10 +14,10 @@ import traci
 
 from harness.episode.loop import EpisodeLoop, Keep, Shard
 from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, WorldDisagreementError
-from harness.outcomes import AV, BV, CRASH, LV
 from harness.resolved import resolve
 from harness.runner.prepare import prepare
-from harness.twin import TwinWorld
+from harness.vocabulary import AV, BV, CRASH, LV
+from harness.worlds.twin import TwinWorld
 
 X, V = (np.tile(values, (8, 1)) for values in ([300.0, 200.0, 100.0], [30.0, 28.0, 35.0]))
 """Positions and speeds of vehicles that do not meet."""
@@ -69,7 +69,7 @@ def test_without_its_extra_the_gui_is_refused_in_words(open_world, monkeypatch):
 
 
 def test_without_a_screen_the_gui_is_refused_in_words(monkeypatch, open_world):
-    monkeypatch.setattr("harness.sumo.world.sumo_program", Path)
+    monkeypatch.setattr("harness.worlds.sumo.sumo_program", Path)
     monkeypatch.delenv("DISPLAY", raising=False)
     with pytest.raises(CampaignError, match="DISPLAY is not set"):
         open_world(1, gui=True)

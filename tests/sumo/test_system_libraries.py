@@ -12,8 +12,8 @@ from elftools.elf.elffile import ELFFile
 
 from harness.cli import main
 from harness.errors import EXIT_BAD_INPUT, HarnessError
-from harness.sumo import system_libraries
-from harness.sumo.system_libraries import LIBRARIES, SystemLibrary, missing_libraries
+from harness.worlds import system_libraries
+from harness.worlds.system_libraries import LIBRARIES, SystemLibrary, missing_libraries
 
 SMOKE = str(Path(__file__).parents[2] / "scenarios" / "smoke.yaml")
 NOWHERE = SystemLibrary("libnowhere.so.7", "libnowhere7", "nowhere-libs", "nowhere")
@@ -118,7 +118,7 @@ def test_the_twin_needs_none(bare_machine, capsys):
 
 
 def test_a_libsumo_that_does_not_load_for_another_reason_is_told_too():
-    code = "import sys; sys.modules['libsumo'] = None; import harness.sumo.build"
+    code = "import sys; sys.modules['libsumo'] = None; import harness.worlds.build"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert "HarnessError: libsumo: found that it cannot be imported" in done.stderr
 

@@ -10,7 +10,7 @@ from harness.campaign.models import AutomatedVehicle, Campaign, Limits, Records,
 from harness.episode.loop import Shard
 from harness.resolved import resolve
 from harness.runner.prepare import build_world, prepare
-from harness.twin import TwinWorld
+from harness.worlds.twin import TwinWorld
 
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "examples" / "traci_client" / "idm_client.py"

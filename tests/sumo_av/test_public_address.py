@@ -7,7 +7,7 @@ import pytest
 from harness.campaign.loading import load_campaign
 from harness.errors import CampaignError, WorldDisagreementError
 from harness.runner import plan_campaign
-from harness.sumo import program, public_address
+from harness.worlds import program, public_address
 from tests.sumo_av.running import EXAMPLE, ROOT
 
 FORCED = ROOT / "scenarios/overtaking_forced.yaml"

@@ -9,7 +9,7 @@ from harness.campaign.loading import load_campaign
 from harness.resolved import resolve
 from harness.runner.prepare import build_world, prepare
 from harness.runner.shadow_runs import as_recorded, run_shadows, shadow_specs
-from harness.sumo.sumo_av_world import FreshWorld, SumoAvWorld
+from harness.worlds.sumo_driven import FreshWorld, SumoAvWorld
 from tests.controllers.test_same_bits import ROOT, fmu_av
 from tests.pool.conftest import MIXTURE_FILE, SMALL_POOL
 from tests.sumo_av.running import EXAMPLE, program

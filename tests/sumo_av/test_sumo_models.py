@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 
 from harness.errors import CampaignError
-from harness.outcomes import AV, BV, CRASH, LV
-from harness.sumo import sumo_av_world
-from harness.sumo.av_type import DEFAULTS, recyclable
-from harness.sumo.sumo_av_world import FreshWorld, SumoAvWorld
+from harness.vocabulary import AV, BV, CRASH, LV
+from harness.worlds import sumo_av_world
+from harness.worlds.av_type import DEFAULTS, recyclable
+from harness.worlds.sumo_driven import FreshWorld, SumoAvWorld
 from tests.sumo_av.running import ROOT, bits, run, run_idm, run_in, sumo_av
 
 

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from harness.errors import CampaignError, TooManyFailedError, WorldDisagreementError
-from harness.outcomes import AV, FAILED
 from harness.runner.campaign_run import run_campaign
 from harness.runner.replay import replay_episode
-from harness.sumo.traci_world import TraciWorld
+from harness.vocabulary import AV, FAILED
+from harness.worlds.traci_driven import TraciWorld
 from tests.sumo_av.misbehaving_client import FAULT_STEP
 from tests.sumo_av.running import EXAMPLE, MISBEHAVING, bits, campaign, program, run, run_idm, run_in
 

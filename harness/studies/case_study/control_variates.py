@@ -15,13 +15,13 @@ from harness.estimators.estimate import BothWays
 from harness.estimators.intervals import normal_half_width
 from harness.estimators.nade import Nade
 from harness.estimators.scv import Scv, StratumFit
-from harness.methods import Method
 from harness.records.folder import write_bytes
 from harness.runner.stored_estimates import stored_blocks
 from harness.studies.case_study.context import Context
 from harness.studies.case_study.figures import exactly, figure, marked, tests_for, weights_are_in
 from harness.studies.case_study.study_file import ControlVariates
 from harness.studies.work import write_table
+from harness.vocabulary import Method
 
 
 class Claims:

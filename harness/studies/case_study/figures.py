@@ -11,7 +11,7 @@ from scipy.stats import t as student
 
 from harness.estimators.diagnostics import CARELESS_MEAN
 from harness.estimators.intervals import normal_half_width
-from harness.methods import Method
+from harness.vocabulary import Method
 
 Verdict = Literal["reproduced", "not reproduced", "cannot be told", "ours to choose"]
 

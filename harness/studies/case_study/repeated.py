@@ -14,7 +14,6 @@ import pyarrow.parquet as pq
 
 from harness.campaign.loading import load_campaign
 from harness.campaign.models import Campaign
-from harness.methods import EstimatorName
 from harness.resolved import resolve
 from harness.runner.campaign_run import run_campaign
 from harness.runner.prepare import prepare
@@ -34,6 +33,7 @@ from harness.studies.experiment import load_experiment
 from harness.studies.run import REPLICATIONS, validate
 from harness.studies.weighted_campaign import prepared_twin, twin_episodes
 from harness.studies.work import write_table
+from harness.vocabulary import EstimatorName
 
 
 def replicate(step: Replications, context: Context) -> dict[str, Any]:

@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import pyarrow as pa
 
-from harness.arrays import FloatArray, IntArray
 from harness.estimators.block import Block, joined
 from harness.runner.stored_estimates import stored_blocks
 from harness.studies.case_study.context import Context, Made
@@ -26,6 +25,7 @@ from harness.studies.required_tests import (
     total_and_half_width,
 )
 from harness.studies.work import kept_parts, write_table
+from harness.vocabulary import FloatArray, IntArray
 
 CURVES = "curves.parquet"
 

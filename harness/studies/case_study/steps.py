@@ -18,7 +18,6 @@ from typing import Any, NamedTuple
 
 from harness.campaign.loading import load_campaign
 from harness.compiled import WORLD_SOURCES, source_hash
-from harness.environment.loading import load_parameters
 from harness.estimators.estimate import finite_json
 from harness.progress import Progress
 from harness.records.folder import read_json, sole_use, write_json
@@ -33,6 +32,7 @@ from harness.studies.case_study.study_file import FILES, Step, Study, inputs_of
 from harness.studies.case_study.tested import keep_run, test_in_twin
 from harness.studies.case_study.theorems import check_theorems
 from harness.studies.experiment import load_experiment
+from harness.traffic.loading import load_parameters
 
 RESULT = "result.json"
 _SHARED = (

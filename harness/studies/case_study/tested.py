@@ -9,13 +9,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import pyarrow as pa
 
-from harness.arrays import BoolArray, FloatArray, IntArray
 from harness.campaign.loading import load_campaign
 from harness.campaign.models import Campaign
 from harness.errors import HarnessError
 from harness.estimators.intervals import clopper_pearson, normal_half_width
-from harness.methods import Method
-from harness.outcomes import CRASH, FAILED
 from harness.records.folder import read_table
 from harness.resolved import resolve
 from harness.runner import RunResult, run_campaign
@@ -26,6 +23,7 @@ from harness.studies.case_study.figures import exactly, figure, is_settled, mark
 from harness.studies.case_study.study_file import Run, TwinTests
 from harness.studies.weighted_campaign import prepared_twin
 from harness.studies.work import write_table
+from harness.vocabulary import CRASH, FAILED, BoolArray, FloatArray, IntArray, Method
 
 PART, AT_ONCE = 500_000, 50_000
 """Tests of a file that a killed step goes on from, and of a call of the twin."""

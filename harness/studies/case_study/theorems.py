@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from harness.arrays import FloatArray
 from harness.estimators.mixture_cv import MixtureCv
 from harness.estimators.scv import Scv
 from harness.studies.case_study.context import Context
@@ -24,6 +23,7 @@ from harness.studies.chains.chain import Chain, Episodes, enumerate_episodes
 from harness.studies.chains.named import overtaking, rare_decisive
 from harness.studies.chains.single_choice import with_optimal_function
 from harness.studies.work import write_table
+from harness.vocabulary import FloatArray
 
 
 def small_chains() -> list[Chain]:

@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from harness.arrays import BoolArray, FloatArray, IntArray
+from harness.vocabulary import BoolArray, FloatArray, IntArray
 
 
 @dataclass(frozen=True, eq=False)

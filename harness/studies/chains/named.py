@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from harness.arrays import FloatArray
 from harness.studies.chains.chain import Chain
+from harness.vocabulary import FloatArray
 
 N_APPROACH = 6
 N_DANGER = 4

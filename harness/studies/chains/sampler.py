@@ -7,10 +7,9 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.special import logsumexp
 
-from harness.arrays import BoolArray, FloatArray, IntArray
 from harness.estimators.block import MAX_CONTROL_STEPS, Block
-from harness.methods import Method
 from harness.studies.chains.chain import Chain
+from harness.vocabulary import BoolArray, FloatArray, IntArray, Method
 
 DEFENSIVE_SHARE = 0.1
 

@@ -10,12 +10,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from harness.arrays import FloatArray, IntArray
 from harness.pool.cut_ins import shells_of
 from harness.strata import LIBRARY_STATEMENT, OUTSIDE, ShellDesign, Statement
 from harness.studies.chains.chain import Chain
 from harness.studies.chains.sampler import approach_paths
 from harness.studies.shell_campaign import DrawnPool
+from harness.vocabulary import FloatArray, IntArray
 
 
 class ChainShells:

@@ -6,9 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from harness.arrays import BoolArray, FloatArray, IntArray
 from harness.estimators.block import Block
-from harness.methods import Method
+from harness.vocabulary import BoolArray, FloatArray, IntArray, Method
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,13 +17,12 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from harness.arrays import BoolArray, FloatArray, Int8Array, IntArray
 from harness.errors import CampaignError, WorldDisagreementError
-from harness.outcomes import AV, BV, LV
-from harness.sumo.cells import NEVER_PLAN_S, PLAN_NOW_S, RIGHT, SumoCells, sumo_program
-from harness.sumo.shim import Shim, open_shim
-from harness.sumo.system_libraries import not_importable
-from harness.twin import advance
+from harness.vocabulary import AV, BV, LV, BoolArray, FloatArray, Int8Array, IntArray
+from harness.worlds.cells import NEVER_PLAN_S, PLAN_NOW_S, RIGHT, SumoCells, sumo_program
+from harness.worlds.shim import Shim, open_shim
+from harness.worlds.system_libraries import not_importable
+from harness.worlds.twin import advance
 
 try:
     import libsumo
@@ -34,7 +33,7 @@ SPEED_CHECK_STEPS = 10
 
 
 class SumoWorld(SumoCells):
-    """World in SUMO; see `harness.world.World`.
+    """World in SUMO; see `harness.worlds.protocol.World`.
 
     Parameters
     ----------
@@ -110,7 +109,7 @@ class SumoWorld(SumoCells):
             self._shim.find_vehicles()
 
     def place(self, cells: IntArray, x: FloatArray, v: FloatArray) -> None:
-        """See `harness.world.World`; positions and speeds are read back and compared."""
+        """See `harness.worlds.protocol.World`; positions and speeds are read back and compared."""
         positions, speeds = x[cells], v[cells]
         for k, at, driving in zip(cells.tolist(), positions.tolist(), speeds.tolist(), strict=True):
             for vehicle in (LV, BV, AV):
@@ -121,7 +120,7 @@ class SumoWorld(SumoCells):
         self._require_equal("m/s", self._get_speed, speeds, names)
 
     def step(self, speed: FloatArray, cut_in: Int8Array) -> BoolArray:
-        """See `harness.world.World`."""
+        """See `harness.worlds.protocol.World`."""
         changing = cut_in.nonzero()[0].tolist()
         for k in changing:
             self._begin_cut_in(self._names[k][BV])

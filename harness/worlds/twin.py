@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from harness.arrays import BoolArray, FloatArray, Int8Array, IntArray
 from harness.compiled import compiled
-from harness.outcomes import AV, BV, LV
 from harness.vehicles.kinematics import CONTACT_M, gap, next_position, overlaps
+from harness.vocabulary import AV, BV, LV, BoolArray, FloatArray, Int8Array, IntArray
 
 
 @compiled
@@ -49,13 +48,13 @@ class TwinWorld:
         return int(self.x.shape[0])
 
     def place(self, cells: IntArray, x: FloatArray, v: FloatArray) -> None:
-        """See `harness.world.World`."""
+        """See `harness.worlds.protocol.World`."""
         self.x[cells] = x[cells]
         self.v[cells] = v[cells]
         self._on_right[cells] = 0
 
     def step(self, speed: FloatArray, cut_in: Int8Array) -> BoolArray:
-        """See `harness.world.World`."""
+        """See `harness.worlds.protocol.World`."""
         self._on_right |= cut_in
         advance(self.x, self.v, speed)
         contacts(self.x, self._on_right, cut_in, self._contact)

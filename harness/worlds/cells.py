@@ -1,6 +1,6 @@
 """The settings under which SUMO does exactly what it is told, and K roads in it, each with LV, BV and AV.
 
-With the committed networks, whose ``vehicles.add.xml`` holds the vehicle types; `harness.sumo.world` checks what SUMO
+With the committed networks, whose ``vehicles.add.xml`` holds the vehicle types; `harness.worlds.sumo` checks what SUMO
 did. Also how cells are placed, and who touched whom.
 """
 
@@ -12,10 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from harness.arrays import BoolArray, FloatArray
 from harness.campaign.testing import MOST_SUMO_CELLS
 from harness.errors import CampaignError
-from harness.outcomes import AV, BV, LV, VEHICLES
+from harness.vocabulary import AV, BV, LV, VEHICLES, BoolArray, FloatArray
 
 _CHECKOUT = Path(__file__).parents[2] / "sumo_networks"
 _INSTALLED = Path(__file__).parents[1] / "sumo_networks"
@@ -46,7 +45,7 @@ PARKED_M = {LV: 300.0, BV: 200.0, AV: 100.0}
 class SumoCells:
     """K roads in a SUMO, each with LV, BV and AV.
 
-    ``x``, ``v`` (K, 3) are as of `harness.world.World`.
+    ``x``, ``v`` (K, 3) are as of `harness.worlds.protocol.World`.
     """
 
     def __init__(self, n_cells: int) -> None:

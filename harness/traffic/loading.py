@@ -13,19 +13,18 @@ from pathlib import Path
 
 import numpy as np
 
-from harness.arrays import BoolArray, FloatArray
 from harness.campaign.loading import names_a_file
 from harness.campaign.models import EnvironmentSettings
 from harness.campaign.problems import read_model
 from harness.compiled import compiled_threads
-from harness.environment.cut_in import acceptance, opportunity
-from harness.environment.driving import Environment, acceleration_pmf, build_environment, car_following, free_driving
-from harness.environment.initial_state import InitialStates
-from harness.environment.lateral import constant_lead
-from harness.environment.parameters import SHIPPED_FOLDER, EnvironmentParameters, parameter_record
 from harness.errors import CampaignError
 from harness.maneuvers import N_ACCELERATIONS
-from harness.state import State
+from harness.traffic.cut_in import acceptance, opportunity
+from harness.traffic.driving import Environment, acceleration_pmf, build_environment, car_following, free_driving
+from harness.traffic.initial_state import InitialStates
+from harness.traffic.lateral import constant_lead
+from harness.traffic.parameters import SHIPPED_FOLDER, EnvironmentParameters, parameter_record
+from harness.vocabulary import BoolArray, FloatArray, State
 
 PROBABILITIES = np.array([2.0**-53, 1e-6, 1e-3, 0.01, 0.1, 0.5, 0.9, 0.99, 0.999, 1.0 - 1e-6, 1.0 - 2.0**-53])
 """Where quantiles are evaluated: the ends are the smallest and the largest uniform that is drawn, but zero."""

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from harness.arrays import FloatArray
+from harness.vocabulary import FloatArray
 
 _POINTER = ctypes.c_void_p
 _OBEYED, _FAILED = 0, 1

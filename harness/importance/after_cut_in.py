@@ -13,13 +13,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from harness.arrays import Float32Array, FloatArray, RecordArray
 from harness.compiled import compiled_inline, compiled_threads
-from harness.criticality.grid import AFTER, GridPoints, interpolate, locate, points_of, shape_of, state_at
-from harness.environment.driving import Environment, acceleration_pmf, free_driving
+from harness.importance.grid import AFTER, GridPoints, interpolate, locate, points_of, shape_of, state_at
 from harness.maneuvers import N_ACCELERATIONS, acceleration
+from harness.traffic.driving import Environment, acceleration_pmf, free_driving
 from harness.vehicles.kinematics import CONTACT_M, STEP_S, next_speed
 from harness.vehicles.models import driver_acceleration
+from harness.vocabulary import Float32Array, FloatArray, RecordArray
 
 LEVELS = 12
 """Seconds of remaining time that are told apart; later crashes are counted in the last level."""

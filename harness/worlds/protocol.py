@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Protocol, runtime_checkable
 
-from harness.arrays import BoolArray, FloatArray, Int8Array, IntArray
+from harness.vocabulary import BoolArray, FloatArray, Int8Array, IntArray
 
 
 class World(Protocol):

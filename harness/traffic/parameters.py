@@ -10,12 +10,12 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, model_validator
 
-from harness.arrays import Record
 from harness.campaign.drivers import MAX_CONFIGURED_SPEED_MPS
 from harness.campaign.section import broken_rule
-from harness.environment.lateral import LateralMotion, constant_lead, in_one_step, log_normal_speed
 from harness.maneuvers import ACCELERATIONS_MPS2
+from harness.traffic.lateral import LateralMotion, constant_lead, in_one_step, log_normal_speed
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
+from harness.vocabulary import Record
 
 SHIPPED_FOLDER = Path(__file__).parent
 FIXED = {"step_s": STEP_S, "vehicle_length_m": VEHICLE_LENGTH_M}
@@ -52,7 +52,7 @@ def _within(low: float, high: float) -> AfterValidator:
 
 _HARDEST, _FASTEST = float(ACCELERATIONS_MPS2[0]), float(ACCELERATIONS_MPS2[-1])
 
-# Wide limits: what a law makes of its numbers is judged by `harness.environment.loading`.
+# Wide limits: what a law makes of its numbers is judged by `harness.traffic.loading`.
 Coefficient = Annotated[Number, _within(-1000.0, 1000.0)]
 LogScale = Annotated[Number, _within(-50.0, 50.0)]
 Scale = Annotated[Number, _within(0.001, 1000.0)]

@@ -14,15 +14,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from harness.arrays import Float32Array, FloatArray, RecordArray
 from harness.compiled import compiled_inline, compiled_threads
-from harness.criticality.after_cut_in import level_steps
-from harness.criticality.grid import AFTER, BEFORE, GridPoints, interpolate, locate, points_of, shape_of, state_at
-from harness.environment.cut_in import acceptance
-from harness.environment.driving import Environment, acceleration_pmf, car_following
-from harness.environment.initial_state import InitialStates
+from harness.importance.after_cut_in import level_steps
+from harness.importance.grid import AFTER, BEFORE, GridPoints, interpolate, locate, points_of, shape_of, state_at
 from harness.maneuvers import N_ACCELERATIONS, acceleration
+from harness.traffic.cut_in import acceptance
+from harness.traffic.driving import Environment, acceleration_pmf, car_following
+from harness.traffic.initial_state import InitialStates
 from harness.vehicles.kinematics import STEP_S, next_speed
+from harness.vocabulary import Float32Array, FloatArray, RecordArray
 
 _NEGLIGIBLE = 1e-7
 """Accelerations rarer than this are left out of the induction (the table steers, it never enters a weight)."""

@@ -15,20 +15,19 @@ import numpy as np
 import traci.constants as tc
 from traci.exceptions import TraCIException
 
-from harness.arrays import BoolArray, FloatArray, Int8Array, IntArray
 from harness.campaign.models import TraciProcess
 from harness.errors import WorldDisagreementError
-from harness.outcomes import AV, BV, LV
-from harness.sumo.cells import LEFT, NEVER_PLAN_S, OBEY, PLAN_NOW_S, RIGHT, SumoCells
-from harness.sumo.program import BatchConnection, ConnectedProgram
-from harness.twin import advance
-from harness.world import AVLostError
+from harness.vocabulary import AV, BV, LV, BoolArray, FloatArray, Int8Array, IntArray
+from harness.worlds.cells import LEFT, NEVER_PLAN_S, OBEY, PLAN_NOW_S, RIGHT, SumoCells
+from harness.worlds.program import BatchConnection, ConnectedProgram
+from harness.worlds.protocol import AVLostError
+from harness.worlds.twin import advance
 
 _SUBSCRIBED = (tc.VAR_LANEPOSITION, tc.VAR_SPEED, tc.VAR_LANE_INDEX)
 
 
 class TraciWorld(SumoCells):
-    """World whose AVs are driven by a connected program; see `harness.world.World` and `harness.world.DrivingWorld`.
+    """World whose AVs are driven by a connected program; see `World` and `DrivingWorld` in `harness.worlds.protocol`.
 
     Parameters
     ----------
@@ -53,7 +52,7 @@ class TraciWorld(SumoCells):
         atexit.register(self.close)
 
     def announce(self, cells: IntArray, episodes: IntArray) -> None:  # noqa: ARG002 - the program is not told
-        """See `harness.world.DrivingWorld`; SUMO and the program are started with the first episodes.
+        """See `harness.worlds.protocol.DrivingWorld`; SUMO and the program are started with the first episodes.
 
         Raises
         ------
@@ -85,7 +84,7 @@ class TraciWorld(SumoCells):
         super()._move(to, k, vehicle, x, v)
 
     def place(self, cells: IntArray, x: FloatArray, v: FloatArray) -> None:
-        """See `harness.world.World`; the AVs of these cells are taken back under command."""
+        """See `harness.worlds.protocol.World`; the AVs of these cells are taken back under command."""
         program = self._running()
         to = program.connection.vehicle
         for k in cells.tolist():
@@ -96,7 +95,7 @@ class TraciWorld(SumoCells):
         self._on_right[cells] = False
 
     def step(self, speed: FloatArray, cut_in: Int8Array) -> BoolArray:
-        """See `harness.world.World`; speeds of released AVs are ignored.
+        """See `harness.worlds.protocol.World`; speeds of released AVs are ignored.
 
         Raises
         ------
@@ -153,7 +152,7 @@ class TraciWorld(SumoCells):
             raise _meddled(where, repr(float(found[k, vehicle])), f"{float(wanted[k, vehicle])!r}, as commanded")
 
     def restart(self) -> None:
-        """See `harness.world.DrivingWorld`; once the restarts are used up, all further episodes fail."""
+        """See `harness.worlds.protocol.DrivingWorld`; once the restarts are used up, all further episodes fail."""
         self._end_program()
         if self._restarts_left == 0:
             self._given_up = (

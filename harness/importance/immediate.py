@@ -12,14 +12,14 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
-from harness.arrays import Float32Array, FloatArray, Record, RecordArray
 from harness.compiled import compiled_inline, compiled_threads
-from harness.criticality.after_cut_in import LEVELS, level_steps
-from harness.criticality.grid import AFTER, GridPoints, points_of, shape_of, state_at
-from harness.environment.driving import Environment
+from harness.importance.after_cut_in import LEVELS, level_steps
+from harness.importance.grid import AFTER, GridPoints, points_of, shape_of, state_at
 from harness.maneuvers import N_ACCELERATIONS, acceleration
+from harness.traffic.driving import Environment
 from harness.vehicles.kinematics import STEP_S, next_speed
 from harness.vehicles.models import FVDM_KIND, SMALLEST_GAP_M, driver_acceleration, fvdm_acceleration, fvdm_shape
+from harness.vocabulary import Float32Array, FloatArray, Record, RecordArray
 
 _KEEP_SPEED = 20
 """Maneuver index of 0 m/s²."""

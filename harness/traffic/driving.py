@@ -15,11 +15,10 @@ from typing import NamedTuple
 import numpy as np
 from scipy import special
 
-from harness.arrays import FloatArray, Record
 from harness.compiled import compiled_inline
-from harness.environment.lateral import LateralMotion
 from harness.maneuvers import ACCELERATIONS_MPS2, N_ACCELERATIONS, acceleration, upper_edge
-from harness.state import State
+from harness.traffic.lateral import LateralMotion
+from harness.vocabulary import FloatArray, Record, State
 
 FREE_DRIVING, CAR_FOLLOWING = 0, 1
 """Which table of noise a law has."""

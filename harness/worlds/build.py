@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from harness.campaign.models import Campaign
-from harness.sumo.av_type import recyclable
-from harness.sumo.sumo_av_world import FreshWorld, SumoAvWorld
-from harness.sumo.world import SumoWorld
-from harness.world import World
+from harness.worlds.av_type import recyclable
+from harness.worlds.protocol import World
+from harness.worlds.sumo import SumoWorld
+from harness.worlds.sumo_driven import FreshWorld, SumoAvWorld
 
 
 def build_sumo_world(
@@ -27,7 +27,7 @@ def build_sumo_world(
     av = campaign.av
     early = av.acts_before_cut_in
     if av.traci is not None:
-        from harness.sumo.traci_world import TraciWorld  # noqa: PLC0415 - few campaigns need it
+        from harness.worlds.traci_driven import TraciWorld  # noqa: PLC0415 - few campaigns need it
 
         return TraciWorld(cells, av.traci, av.limits.step_time_s, acts_before_cut_in=early)
     if av.sumo is None:

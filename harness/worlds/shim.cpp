@@ -2,7 +2,7 @@
 //
 // The functions are SUMO's own, taken from the copy of libsumo that Python has already loaded, so that they act on the
 // same simulation; only their names are needed, no SUMO headers. Vehicles are looked up by name once, by libsumo's own
-// look-up. Everything here is also done in Python (harness/sumo/world.py); tests hold the two against each other, bit
+// look-up. Everything here is also done in Python (harness/worlds/sumo.py); tests hold the two against each other, bit
 // for bit.
 
 #include <dlfcn.h>

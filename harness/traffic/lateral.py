@@ -18,10 +18,10 @@ from typing import NamedTuple
 import numpy as np
 from scipy import special
 
-from harness.arrays import FloatArray
 from harness.compiled import compiled_inline
 from harness.random_stream import LATERAL, uniform
 from harness.vehicles.kinematics import STEP_S
+from harness.vocabulary import FloatArray
 
 DISTANCE_M = 1.7
 """Lane of 3.6 m less a car of 1.9 m [derived]."""

@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from harness.arrays import Float32Array, FloatArray
 from harness.compiled import compiled_inline
+from harness.vocabulary import Float32Array, FloatArray
 
 
 class Axis(NamedTuple):

@@ -13,8 +13,8 @@ from __future__ import annotations
 import math
 
 from harness.compiled import compiled_inline
-from harness.environment.driving import Environment, clamp, fit_u
-from harness.state import State
+from harness.traffic.driving import Environment, clamp, fit_u
+from harness.vocabulary import State
 
 
 @compiled_inline

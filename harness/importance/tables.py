@@ -16,15 +16,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from harness.arrays import Float32Array, RecordArray
 from harness.compiled import cache_root
-from harness.criticality.after_cut_in import LEVELS, build_after_cut_in
-from harness.criticality.before_cut_in import build_before_cut_in
-from harness.criticality.grid import AFTER, BEFORE
-from harness.criticality.immediate import build_immediate
-from harness.environment.driving import Environment
 from harness.errors import writing
+from harness.importance.after_cut_in import LEVELS, build_after_cut_in
+from harness.importance.before_cut_in import build_before_cut_in
+from harness.importance.grid import AFTER, BEFORE
+from harness.importance.immediate import build_immediate
+from harness.traffic.driving import Environment
 from harness.vehicles.models import MODEL_FIELDS
+from harness.vocabulary import Float32Array, RecordArray
 
 _FORMAT = 3
 """Raise it when the meaning of a table changes."""

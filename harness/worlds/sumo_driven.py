@@ -16,12 +16,11 @@ from typing import Any
 
 import numpy as np
 
-from harness.arrays import BoolArray, FloatArray, Int8Array, IntArray
 from harness.controllers.hosts import episode_random
-from harness.outcomes import AV
-from harness.sumo.av_type import TYPE_NAME, refused, type_xml
-from harness.sumo.cells import OBEY
-from harness.sumo.world import SumoWorld
+from harness.vocabulary import AV, BoolArray, FloatArray, Int8Array, IntArray
+from harness.worlds.av_type import TYPE_NAME, refused, type_xml
+from harness.worlds.cells import OBEY
+from harness.worlds.sumo import SumoWorld
 
 SUMO_DECIDES = 31
 """Speed mode in which all of SUMO's own checks hold: its default."""
@@ -36,7 +35,7 @@ class SumoAvWorld(SumoWorld):
     ----------
     n_cells : int
     av : mapping
-        vType attributes (``av.sumo``); see `harness.sumo.av_type`.
+        vType attributes (``av.sumo``); see `harness.worlds.av_type`.
     acts_before_cut_in : bool
         Release the AV at the start of an episode already.
     options
@@ -82,13 +81,13 @@ class SumoAvWorld(SumoWorld):
         return TYPE_NAME if vehicle == AV else super()._type_of(vehicle)
 
     def announce(self, cells: IntArray, episodes: IntArray) -> None:
-        """See `harness.world.DrivingWorld`; vehicles are recycled, whatever the episode."""
+        """See `harness.worlds.protocol.DrivingWorld`; vehicles are recycled, whatever the episode."""
 
     def restart(self) -> None:
-        """See `harness.world.DrivingWorld`; SUMO's models are never lost."""
+        """See `harness.worlds.protocol.DrivingWorld`; SUMO's models are never lost."""
 
     def place(self, cells: IntArray, x: FloatArray, v: FloatArray) -> None:
-        """See `harness.world.World`; the AVs of these cells are taken back under command."""
+        """See `harness.worlds.protocol.World`; the AVs of these cells are taken back under command."""
         for k in cells.tolist():
             self._api.vehicle.setSpeedMode(self._names[k][AV], OBEY)
         super().place(cells, x, v)
@@ -97,7 +96,7 @@ class SumoAvWorld(SumoWorld):
             self._let_go(cells)
 
     def step(self, speed: FloatArray, cut_in: Int8Array) -> BoolArray:
-        """See `harness.world.World`; speeds of released AVs are ignored."""
+        """See `harness.worlds.protocol.World`; speeds of released AVs are ignored."""
         self._wanted[:] = speed
         self._wanted[self._released, AV] = RELEASE
         contact = super().step(self._wanted, cut_in)

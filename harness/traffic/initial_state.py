@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy import special
 
-from harness.arrays import FloatArray, Record, RecordArray
 from harness.random_stream import INITIAL, uniforms
-from harness.state import STATE_COLUMNS, states_from
+from harness.vocabulary import STATE_COLUMNS, FloatArray, Record, RecordArray, states_from
 
 _SPEED_POINTS = 8001
 

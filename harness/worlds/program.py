@@ -20,8 +20,8 @@ from traci.exceptions import FatalTraCIError
 
 from harness.campaign.models import TraciProcess
 from harness.errors import CampaignError, WorldDisagreementError
-from harness.sumo.cells import sumo_program
-from harness.world import AVLostError
+from harness.worlds.cells import sumo_program
+from harness.worlds.protocol import AVLostError
 
 HARNESS_ORDER = 2
 """SUMO serves its clients in this order within a step, and the program is 1: the harness has the last word."""

@@ -1,1 +1,0 @@
-"""SUMO: the only importer of libsumo and traci."""

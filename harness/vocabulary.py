@@ -1,0 +1,114 @@
+"""The vocabulary in code: array types, the state's five numbers, outcomes, vehicles, methods of drawing, estimators."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple, TypeAlias, TypeVar, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray: TypeAlias = NDArray[np.float64]
+Float32Array: TypeAlias = NDArray[np.float32]
+IntArray: TypeAlias = NDArray[np.int64]
+UInt64Array: TypeAlias = NDArray[np.uint64]
+Int8Array: TypeAlias = NDArray[np.int8]
+BoolArray: TypeAlias = NDArray[np.bool_]
+RecordArray: TypeAlias = NDArray[Any]
+"""A structured array; its fields are described where its dtype is."""
+Record: TypeAlias = Any
+"""One element of a structured array, as kernels see it: fields are attributes."""
+
+
+_Scalar = TypeVar("_Scalar", bound=np.generic)
+
+
+def read_only(array: NDArray[_Scalar]) -> NDArray[_Scalar]:
+    """The array itself, from now on closed to writing; views that are made of it later are closed, too."""
+    array.setflags(write=False)
+    return array
+
+
+class State(NamedTuple):
+    """Ranges are bumper to bumper, rates the leader's minus the follower's speed; R1 is LV-BV, R2 is BV-AV.
+
+    Compiled code passes it as it stands; many of them are a structured array of `STATE_DTYPE`, whose records have the
+    same fields.
+    """
+
+    v_bv_mps: float
+    r1_m: float
+    r1dot_mps: float
+    r2_m: float
+    r2dot_mps: float
+
+
+STATE_COLUMNS = State._fields
+STATE_DTYPE = np.dtype([(name, np.float64) for name in STATE_COLUMNS])
+
+
+def states_from(columns: Iterable[FloatArray]) -> RecordArray:
+    """States (n,) from their five columns (n,) each."""
+    states: RecordArray = np.column_stack(list(columns)).view(STATE_DTYPE)[:, 0]
+    return states
+
+
+Method = Literal["nde", "forced", "step_mixture", "episode_mixture", "shells"]
+EstimatorName = Literal["nde", "nade", "mixture_cv", "scv", "shells"]
+
+METHODS: tuple[Method, ...] = get_args(Method)
+ESTIMATORS: tuple[EstimatorName, ...] = get_args(EstimatorName)
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """One method of drawing tests.
+
+    Attributes
+    ----------
+    estimators : tuple of str
+        Those that its records allow, the first being the method's own, which answers the campaign's question; `scv`
+        needs control steps on record besides.
+    mixes : bool
+        Whether it mixes importance functions of the surrogates, and so needs some, and their challenge tables.
+    forces : bool
+        Whether forced cut-ins are among what it draws from.
+    holds_speed : bool
+        Whether the AV must hold its speed until the cut-in, because what is drawn before the episode depends on it.
+    shadows : bool
+        Whether an AV that does not is driven along each path without a cut-in first.
+    bounded : bool
+        Whether something bounds the weights; else no precision can be promised.
+    """
+
+    estimators: tuple[EstimatorName, ...]
+    mixes: bool = False
+    forces: bool = False
+    holds_speed: bool = False
+    shadows: bool = False
+    bounded: bool = True
+
+    @property
+    def headline(self) -> EstimatorName:
+        """The method's own estimator."""
+        return self.estimators[0]
+
+
+SAMPLING: dict[Method, Sampling] = {
+    "nde": Sampling(("nde", "nade")),
+    "forced": Sampling(("nade",), forces=True, shadows=True),
+    "step_mixture": Sampling(("nade", "scv"), mixes=True, bounded=False),
+    "episode_mixture": Sampling(("mixture_cv", "nade"), mixes=True, forces=True, holds_speed=True),
+    "shells": Sampling(("shells",), shadows=True),
+}
+
+OUTCOMES = ("crash", "passed", "timeout", "bv_lv_contact", "failed")
+CRASH, PASSED, TIMEOUT, BV_LV_CONTACT, FAILED = range(len(OUTCOMES))
+RUNNING = -1
+
+VEHICLES = ("LV", "BV", "AV")
+LV, BV, AV = range(len(VEHICLES))
+
+NDE, FORCED, STEP_MIXTURE, EPISODE_MIXTURE, PRESCRIBED = range(len(METHODS))
+"""Methods as kernels know them; PRESCRIBED is shells, and any method where shadow runs prescribe the traffic."""
