@@ -156,7 +156,7 @@ def test_fvdm_vehicle_has_fvdm_defaults(load):
 
 def test_parameter_file_is_found_beside_the_campaign(load, tmp_path, monkeypatch):
     (tmp_path / "deep").mkdir()
-    shipped = Path(load_campaign.__code__.co_filename).parent.parent / "environment" / f"{shipped_parameters()[0]}.yaml"
+    shipped = Path(load_campaign.__code__.co_filename).parent.parent / "traffic" / f"{shipped_parameters()[0]}.yaml"
     shutil.copy(shipped, tmp_path / "deep" / "mine.yaml")
     monkeypatch.chdir("/")
     assert load("environment: {parameters: deep/mine.yaml}").environment.parameters == str(tmp_path / "deep/mine.yaml")
