@@ -5,7 +5,7 @@
 The default IDM, assumption-free, RHW 0.3, on the shipped pool; allocation, rounds and stop rule are those of a campaign
 and the tests of a shell are a binomial number, as in `benchmarks.shells_rare_hole`. A round's shards go to workers as
 they become idle, and the next round begins when all have ended. Times of tests vary by a half around their mean
-(assumed); one process hands shards out and takes them back. Prints the table of docs/performance.md.
+(assumed); one process hands shards out and takes them back. Prints the table of docs/internals/performance.md.
 """
 
 from __future__ import annotations

@@ -11,7 +11,6 @@ campaign, Arrow schemas) or the committed results in ``docs/validation/``, so th
 from __future__ import annotations
 
 import argparse
-import ast
 import json
 import math
 import re
@@ -364,25 +363,7 @@ def _method_cells(one: dict[str, Any]) -> tuple[str, ...]:
     )
 
 
-def files_table() -> str:
-    """All files of the package by folder, each with the first line of its docstring."""
-    package = FOLDER.parent / "harness"
-    parts = []
-    for folder in (package, *(path.parent for path in sorted(package.rglob("*/__init__.py")))):
-        rows = [
-            (f"`{path.name}`", _first_line(path)) for path in sorted(folder.glob("*.py")) if path.stem != "__init__"
-        ]
-        name, about = folder.relative_to(FOLDER.parent), _first_line(folder / "__init__.py")
-        parts.append(f"\n## {name}\n\n{about}\n\n" + _table(("file", "what it is for"), rows))
-    return "".join(parts)
-
-
-def _first_line(path: Path) -> str:
-    return (ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or "").partition("\n")[0].replace("``", "`")
-
-
 PARTS: dict[str, Callable[[], str]] = {
-    "files": files_table,
     "settings": settings_reference,
     "environment": environment_table,
     "validated-methods": methods_table,
