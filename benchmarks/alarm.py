@@ -16,7 +16,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.special import ndtr
 
-from harness.campaign.models import Campaign
+from harness.campaign.campaign import Campaign
 from harness.estimators.alarm import LEVEL, Alarm
 from harness.estimators.block import Block
 from harness.estimators.from_records import block_from_tables

@@ -16,8 +16,8 @@ from typing import NamedTuple
 import numpy as np
 
 from benchmarks.one_at_a_time import OverTraci, in_libsumo
-from harness.campaign.loading import load_campaign
-from harness.campaign.models import Campaign
+from harness.campaign.campaign import Campaign
+from harness.campaign.files import load_campaign
 from harness.episode import loop
 from harness.episode.loop import Shard
 from harness.records.folder import encoded, write_shard

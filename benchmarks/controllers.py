@@ -17,7 +17,7 @@ from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-from harness.campaign.loading import load_campaign
+from harness.campaign.files import load_campaign
 from harness.resolved import resolve
 from harness.runner.prepare import build_world, prepare
 from harness.worlds.sumo import SumoWorld

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from harness.campaign.models import EnvironmentSettings, PoolSettings
+from harness.campaign.sections import EnvironmentSettings, PoolSettings
 from harness.pool.aimed_paths import PILOT_PATHS
 from harness.pool.build import take_aim
 from harness.pool.library import load_library

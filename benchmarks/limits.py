@@ -21,7 +21,7 @@ import pandas as pd
 from scipy import special
 
 import harness
-from harness.campaign.loading import load_campaign
+from harness.campaign.files import load_campaign
 from harness.traffic.initial_state import InitialStates
 from harness.traffic.loading import load_environment
 

@@ -20,8 +20,8 @@ import numpy as np
 
 from benchmarks.contenders import SCENARIOS
 from benchmarks.shells_rare_hole import IDM
-from harness.campaign.loading import load_campaign
-from harness.campaign.models import Campaign
+from harness.campaign.campaign import Campaign
+from harness.campaign.files import load_campaign
 from harness.pool.shells import design_shells
 from harness.pool.storage import campaign_pool
 from harness.resolved import resolve

@@ -21,8 +21,8 @@ from functools import cache
 
 import numpy as np
 
-from harness.campaign.loading import load_campaign
-from harness.campaign.models import Campaign
+from harness.campaign.campaign import Campaign
+from harness.campaign.files import load_campaign
 from harness.resolved import resolve
 from harness.runner.prepare import Prepared, prepare
 from harness.vocabulary import BV_LV_CONTACT, CRASH

@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 
 from benchmarks.contenders import SCENARIOS
-from harness.campaign.loading import load_campaign
+from harness.campaign.files import load_campaign
 from harness.pool.shells import design_shells
 from harness.pool.storage import campaign_pool
 from harness.resolved import resolve

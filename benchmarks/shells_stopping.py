@@ -13,7 +13,8 @@ import tempfile
 from pathlib import Path
 
 from benchmarks.contenders import SCENARIOS
-from harness.campaign.models import Campaign, Stop
+from harness.campaign.campaign import Campaign
+from harness.campaign.sections import Stop
 from harness.studies.experiment import Experiment, load_experiment
 from harness.studies.run import validate
 from harness.studies.shell_campaign import FREE

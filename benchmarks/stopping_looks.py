@@ -12,7 +12,7 @@ import sys
 
 import numpy as np
 
-from harness.campaign.models import Stop
+from harness.campaign.sections import Stop
 from harness.estimators.nade import Nde
 from harness.estimators.stopping import StopRule
 

@@ -14,7 +14,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from harness.campaign.models import Campaign, Stop
+from harness.campaign.campaign import Campaign
+from harness.campaign.sections import Stop
 from harness.estimators.block import Block
 from harness.estimators.estimate import Estimate
 from harness.estimators.intervals import hall_distances, normal_half_width

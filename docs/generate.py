@@ -25,7 +25,8 @@ import pyarrow as pa
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-from harness.campaign.models import Campaign, EnvironmentSettings
+from harness.campaign.campaign import Campaign
+from harness.campaign.sections import EnvironmentSettings
 from harness.records.schemas import episodes_schema, moments_schema, shadow_schema, traces_schema
 from harness.traffic.loading import load_parameters
 

@@ -21,7 +21,7 @@ from harness.errors import HarnessError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from harness.campaign.models import Campaign
+    from harness.campaign.campaign import Campaign
     from harness.pool.refined_ladder import RefinedLadder
     from harness.progress import Progress
     from harness.records.frames import StoredRun
@@ -48,8 +48,8 @@ __all__ = [
 
 
 def load_campaign(path: str | Path, overrides: Sequence[str] = (), *, av: str | None = None) -> Campaign:
-    """Read and validate a campaign; ``overrides`` are ``section.key=value`` each (see `harness.campaign.loading`)."""
-    from harness.campaign.loading import load_campaign as load  # noqa: PLC0415
+    """Read and validate a campaign; ``overrides`` are ``section.key=value`` each (see `harness.campaign.files`)."""
+    from harness.campaign.files import load_campaign as load  # noqa: PLC0415
 
     return load(path, overrides, av=av)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
-from harness.campaign.models import Campaign
+from harness.campaign.campaign import Campaign
 from harness.errors import CampaignError
 from harness.pool.library import Library, load_library
 from harness.traffic.driving import Environment

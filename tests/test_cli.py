@@ -15,7 +15,7 @@ import pytest
 from click.testing import CliRunner
 from pyarrow import csv, parquet
 
-from harness.campaign.loading import load_campaign
+from harness.campaign.files import load_campaign
 from harness.cli import cli, main
 from harness.errors import EXIT_BAD_INPUT, RunFolderError, TooManyFailedError
 from harness.progress import LineProgress

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from harness.campaign.models import Stop
+from harness.campaign.sections import Stop
 from harness.estimators import StopRule
 from harness.stopped_by import ending
 from tests.estimators.test_stopping import passing

@@ -17,7 +17,7 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 from harness.campaign.schema import Schema, SchemaView, schema_of
-from harness.campaign.section import NAME_PATTERN, SURROGATE_PATTERN
+from harness.campaign.sections import NAME_PATTERN, SURROGATE_PATTERN
 from harness.campaign.yaml_text import YamlPath, dotted, read_yaml
 from harness.errors import CampaignError
 

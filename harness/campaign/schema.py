@@ -9,9 +9,8 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from harness.campaign.drivers import PARAMETERS
-from harness.campaign.models import Campaign
-from harness.campaign.vehicle import AV_SOURCES
+from harness.campaign.campaign import Campaign
+from harness.campaign.vehicle import AV_SOURCES, PARAMETERS
 
 Schema = dict[str, Any]
 

@@ -49,7 +49,7 @@ def check(campaign_file: Path, overrides: Sequence[str], av: str | None, *, as_j
     The output is itself a campaign file; its cost stands in comments.
     """
     campaign = loaded(campaign_file, overrides, av)
-    from harness.campaign.dumping import dump_campaign  # noqa: PLC0415 - keeps --help fast
+    from harness.campaign.files import dump_campaign  # noqa: PLC0415 - keeps --help fast
     from harness.runner import plan_campaign  # noqa: PLC0415 - slow to import: only once the campaign is right
 
     plan = plan_campaign(campaign)

@@ -12,7 +12,7 @@ from harness.errors import HarnessError
 from harness.part import Part
 
 if TYPE_CHECKING:
-    from harness.campaign.models import Campaign
+    from harness.campaign.campaign import Campaign
 
 FOLDER = click.Path(path_type=Path, file_okay=False)
 RUN_FOLDER = click.Path(path_type=Path, file_okay=False, exists=True)
@@ -91,6 +91,6 @@ def examples(*lines: str, heading: str = "Examples:") -> str:
 
 def loaded(campaign_file: Path, overrides: Sequence[str], av: str | None = None) -> Campaign:
     """Read the campaign that a command was given, with what was replaced on the command line."""
-    from harness.campaign.loading import load_campaign  # noqa: PLC0415 - keeps --help fast
+    from harness.campaign.files import load_campaign  # noqa: PLC0415 - keeps --help fast
 
     return load_campaign(campaign_file, overrides, av=av)

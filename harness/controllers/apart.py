@@ -16,7 +16,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
 
-from harness.campaign.models import AutomatedVehicle, Campaign
+from harness.campaign.campaign import Campaign
+from harness.campaign.vehicle import AutomatedVehicle
 from harness.controllers.black_box import last_call
 from harness.controllers.guard import death_cause
 from harness.errors import EXIT_TOO_MANY_FAILED, HarnessError

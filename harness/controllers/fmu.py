@@ -19,7 +19,7 @@ from pathlib import Path
 from tempfile import mkdtemp
 from typing import Any, NamedTuple
 
-from harness.campaign.models import FmuController
+from harness.campaign.vehicle import FmuController
 from harness.compiled import cache_root
 from harness.controllers.protocol import BatchObservation, EpisodeStart, Observation, VehicleController
 from harness.errors import CampaignError, writing

@@ -23,7 +23,7 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from harness.campaign.models import Limits
+from harness.campaign.vehicle import Limits
 from harness.controllers.black_box import CLOSE, START, BlackBox
 
 HUNG_EXIT_CODE = 75

@@ -13,7 +13,8 @@ from inspect import signature
 from pathlib import Path
 from typing import Any
 
-from harness.campaign.models import AutomatedVehicle, Campaign
+from harness.campaign.campaign import Campaign
+from harness.campaign.vehicle import AutomatedVehicle
 from harness.controllers.apart import AvEndedProcessError, has_foreign_code, run_apart
 from harness.controllers.black_box import CONSTRUCTOR, BlackBox, Death
 from harness.controllers.guard import Guard, cause_of, require_fault

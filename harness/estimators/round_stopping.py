@@ -7,7 +7,7 @@ stops: that intervals cover there, and how far rates are biased, is measured (do
 
 from __future__ import annotations
 
-from harness.campaign.models import Campaign
+from harness.campaign.campaign import Campaign
 from harness.estimators.limit_search import Level
 from harness.estimators.pairs import PairCounts, Verdict
 from harness.estimators.shells import Shells

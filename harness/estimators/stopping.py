@@ -17,7 +17,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
-from harness.campaign.models import Stop
+from harness.campaign.sections import Stop
 from harness.estimators.estimate import Estimate
 from harness.strata import ASSUMPTION_FREE
 from harness.vocabulary import SAMPLING, EstimatorName, Method

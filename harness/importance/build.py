@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from harness.campaign.models import Campaign
+from harness.campaign.campaign import Campaign
 from harness.importance.after_cut_in import level_steps
 from harness.importance.functions import Importance
 from harness.importance.tables import Tables

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from harness.campaign.models import PoolSettings
+from harness.campaign.sections import PoolSettings
 from harness.pool.aimed_paths import PILOT_PATHS, EnumeratedPaths, Enumerator, joined
 from harness.pool.cut_ins import FAR_OFF, CutIns, Pool, environment_hash, shells_of
 from harness.pool.enumeration import write_script

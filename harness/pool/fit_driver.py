@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import least_squares
 
-from harness.campaign.models import IDMParameters, Reflexes
+from harness.campaign.vehicle import IDMParameters, Reflexes
 from harness.pool.library import LibraryIDM
 from harness.pool.observed import Observed
 from harness.vehicles.models import driver_records

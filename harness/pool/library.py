@@ -9,11 +9,17 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from harness.campaign.loading import names_a_file
-from harness.campaign.models import FVDM, IDM, CarefulCompetent, Constant, FuzzySafety, NeedBased, Reference, Reflexes
+from harness.campaign.files import names_a_file
 from harness.campaign.problems import read_model
-from harness.campaign.section import Section, SurrogateName, broken_rule
-from harness.campaign.testing import ShellSettings, StatementSettings, checked_statements
+from harness.campaign.sections import (
+    Section,
+    ShellSettings,
+    StatementSettings,
+    SurrogateName,
+    broken_rule,
+    checked_statements,
+)
+from harness.campaign.vehicle import FVDM, IDM, CarefulCompetent, Constant, FuzzySafety, NeedBased, Reference, Reflexes
 from harness.episode.trajectory import Followers
 from harness.errors import CampaignError
 from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 
-from harness.campaign.models import Campaign
+from harness.campaign.campaign import Campaign
 from harness.episode.loop import traced_by_index
 from harness.errors import RunFolderError
 from harness.records.folder import MEND_SHARD, read_manifest, read_table

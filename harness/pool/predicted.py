@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from harness.campaign.models import Campaign
+from harness.campaign.campaign import Campaign
 from harness.episode.trajectory import Followers
 from harness.pool.library import LibraryDriver, library_records
 from harness.pool.replay import PATH_COLUMNS, drivers_crash

@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from harness.campaign.dumping import yaml_text
-from harness.campaign.loading import load_campaign
-from harness.campaign.models import Campaign, Reflexes
+from harness.campaign.campaign import Campaign
+from harness.campaign.files import load_campaign, yaml_text
+from harness.campaign.vehicle import Reflexes
 from harness.errors import CampaignError, RunFolderError
 from harness.pool.fit_driver import MOST_DELAY_STEPS, FittedDriver, agreement, fit_driver
 from harness.pool.library import Library, LibraryDriver, LibraryIDM, load_library

@@ -11,9 +11,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from harness.campaign.models import AutomatedVehicle, BuiltInParameters, Campaign
-from harness.campaign.models import Reference as ReferenceParameters
-from harness.campaign.testing import ShellSettings, StatementSettings
+from harness.campaign.campaign import Campaign
+from harness.campaign.sections import ShellSettings, StatementSettings
+from harness.campaign.vehicle import AutomatedVehicle, BuiltInParameters
+from harness.campaign.vehicle import Reference as ReferenceParameters
 from harness.episode.cells import PrescribedCutIns, PrescribedTraffic
 from harness.pool.cut_ins import Pool
 from harness.pool.library import Library, LibraryDriver, library_records

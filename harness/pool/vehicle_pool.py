@@ -21,7 +21,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from harness.campaign.models import PoolSettings
+from harness.campaign.sections import PoolSettings
 from harness.compiled import cache_root
 from harness.episode.motion import motion_hashes
 from harness.errors import HarnessError

@@ -17,8 +17,8 @@ import numpy as np
 import pyarrow as pa
 from pydantic import TypeAdapter, ValidationError
 
-from harness.campaign.loading import load_campaign
-from harness.campaign.models import Campaign
+from harness.campaign.campaign import Campaign
+from harness.campaign.files import load_campaign
 from harness.errors import CampaignError, RunFolderError
 from harness.estimators.shells import ShellDetails, Within
 from harness.records.folder import MANIFEST, NO_RUN, concatenated, read_json, require_schema

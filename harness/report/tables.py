@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 
 from pydantic import BaseModel
 
-from harness.campaign.dumping import written_out
-from harness.campaign.models import Campaign
+from harness.campaign.campaign import Campaign
+from harness.campaign.files import written_out
 from harness.estimators.shells import ShellDetails, Within
 from harness.report.number_format import (
     MISSING,

@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 
-from harness.campaign.testing import ShellSettings
+from harness.campaign.sections import ShellSettings
 from harness.estimators.intervals import clopper_pearson
 from harness.estimators.limit_search import Level
 from harness.estimators.stratified import Tally, combined, spread

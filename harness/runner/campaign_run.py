@@ -14,7 +14,7 @@ from typing import Any
 
 import pyarrow as pa
 
-from harness.campaign.models import Campaign
+from harness.campaign.campaign import Campaign
 from harness.errors import RunFolderError
 from harness.pool.enumeration import ShadowRuns
 from harness.pool.shells import PrescribedEpisodes

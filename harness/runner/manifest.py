@@ -13,8 +13,8 @@ from typing import Any
 
 from scipy.special import bdtrc
 
-from harness.campaign.dumping import dump_campaign
-from harness.campaign.models import Campaign
+from harness.campaign.campaign import Campaign
+from harness.campaign.files import dump_campaign
 from harness.errors import RunFolderError, TooManyFailedError
 from harness.records.folder import MANIFEST, read_manifest, require_place, write_json, write_text
 from harness.records.gathered import Fingerprint

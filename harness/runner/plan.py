@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from harness.campaign.models import Campaign, Stop
+from harness.campaign.campaign import Campaign
+from harness.campaign.sections import Stop
 from harness.controllers.apart import AvEndedProcessError, run_apart
 from harness.controllers.hosts import BatchHost, ControllerHost
 from harness.controllers.loading import build_host

@@ -16,7 +16,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from harness.campaign.models import Campaign
+from harness.campaign.campaign import Campaign
 from harness.estimators import Shells, StopRule, accumulator
 from harness.estimators.block import Block
 from harness.estimators.limit_search import Level

@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from harness.campaign.models import Campaign
+from harness.campaign.campaign import Campaign
 from harness.compiled import is_cached
 from harness.controllers.black_box import Death
 from harness.controllers.loading import build_host, require_controller

@@ -23,7 +23,7 @@ import ray
 from ray.exceptions import RayError, RayTaskError, RuntimeEnvSetupError
 from ray.runtime_env import RuntimeEnv
 
-from harness.campaign.testing import RaySettings
+from harness.campaign.sections import RaySettings
 from harness.compiled import cache_root
 from harness.controllers.black_box import Death
 from harness.errors import CampaignError, HarnessError

@@ -11,8 +11,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from harness.campaign.loading import load_campaign
-from harness.campaign.models import Campaign
+from harness.campaign.campaign import Campaign
+from harness.campaign.files import load_campaign
 from harness.controllers.apart import has_foreign_code, run_apart
 from harness.controllers.loading import require_controller
 from harness.errors import CampaignError, RunFolderError

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from harness.campaign.dumping import dump_campaign
-from harness.campaign.models import Campaign
+from harness.campaign.campaign import Campaign
+from harness.campaign.files import dump_campaign
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED
 from harness.estimators.stopping import Rule, Verdict
 from harness.records.folder import NO_RUN, read_json

@@ -13,7 +13,7 @@ from typing import Any, Generic, TypeVar
 
 from scipy.special import bdtrc
 
-from harness.campaign.models import Campaign
+from harness.campaign.campaign import Campaign
 from harness.controllers.black_box import OF_EPISODE, Call, Death
 from harness.controllers.guard import death_cause
 from harness.errors import CampaignError, HarnessError, TooManyFailedError

@@ -9,8 +9,8 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
-from harness.campaign.loading import load_campaign
-from harness.campaign.models import Campaign
+from harness.campaign.campaign import Campaign
+from harness.campaign.files import load_campaign
 from harness.errors import HarnessError, RunFolderError
 from harness.estimators import ESTIMATORS, CampaignFacts, estimate_blocks
 from harness.estimators.block import Block

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pyarrow as pa
 
-from harness.campaign.models import Campaign
+from harness.campaign.campaign import Campaign
 from harness.estimators.block import Block, joined
 from harness.estimators.from_records import EPISODE_COLUMNS, block_from_tables
 from harness.importance.build import mixture_weights

@@ -10,10 +10,11 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import Field, field_validator, model_validator
 from pydantic_core import PydanticCustomError
 
-from harness.campaign.models import AutomatedVehicle, BuiltInParameters, Campaign
-from harness.campaign.overrides import Places, apply_overrides, parse_override
+from harness.campaign.campaign import Campaign
+from harness.campaign.files import Places, apply_overrides, parse_override
 from harness.campaign.problems import validated
-from harness.campaign.section import NAME_PATTERN, Positive, Section, Whole, broken_rule
+from harness.campaign.sections import NAME_PATTERN, Positive, Section, Whole, broken_rule
+from harness.campaign.vehicle import AutomatedVehicle, BuiltInParameters
 from harness.campaign.yaml_text import read_yaml
 from harness.errors import CampaignError
 from harness.studies.chains.named import CHAINS

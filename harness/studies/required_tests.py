@@ -24,7 +24,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from harness.campaign.loading import load_campaign
+from harness.campaign.files import load_campaign
 from harness.errors import HarnessError
 from harness.estimators.block import Block, columns_of, joined
 from harness.estimators.estimate import BothWays, finite_json

@@ -15,7 +15,8 @@ from functools import cached_property
 
 import numpy as np
 
-from harness.campaign.models import Accept, Campaign
+from harness.campaign.campaign import Campaign
+from harness.campaign.sections import Accept
 from harness.estimators.block import Block
 from harness.estimators.estimate import Estimate
 from harness.estimators.limit_search import Level

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from itertools import permutations
 
-from harness.campaign.models import Campaign
+from harness.campaign.campaign import Campaign
 from harness.pool.library import Library, load_library
 from harness.pool.shells import acceleration_limit
 from harness.progress import Progress

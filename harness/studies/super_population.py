@@ -18,7 +18,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from harness.campaign.models import AutomatedVehicle, BuiltInParameters, Reflexes
+from harness.campaign.vehicle import AutomatedVehicle, BuiltInParameters, Reflexes
 from harness.compiled import WORLD_SOURCES, cache_root, source_hash
 from harness.episode.trajectory import Followers
 from harness.errors import CampaignError

@@ -14,7 +14,7 @@ from functools import cache
 
 import numpy as np
 
-from harness.campaign.models import Campaign
+from harness.campaign.campaign import Campaign
 from harness.compiled import source_hash
 from harness.controllers.loading import build_host, require_controller
 from harness.episode.cells import PrescribedTraffic

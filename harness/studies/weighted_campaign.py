@@ -8,7 +8,7 @@ from functools import cache, partial
 
 import numpy as np
 
-from harness.campaign.models import Campaign
+from harness.campaign.campaign import Campaign
 from harness.episode.loop import EpisodeLoop
 from harness.estimators import StopRule, accumulator
 from harness.estimators.block import Block

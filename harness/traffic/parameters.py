@@ -10,8 +10,8 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, model_validator
 
-from harness.campaign.drivers import MAX_CONFIGURED_SPEED_MPS
-from harness.campaign.section import broken_rule
+from harness.campaign.sections import broken_rule
+from harness.campaign.vehicle import MAX_CONFIGURED_SPEED_MPS
 from harness.maneuvers import ACCELERATIONS_MPS2
 from harness.traffic.lateral import LateralMotion, constant_lead, in_one_step, log_normal_speed
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M

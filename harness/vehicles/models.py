@@ -15,7 +15,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from harness.campaign.models import (
+from harness.campaign.vehicle import (
     FVDM,
     IDM,
     AutomatedVehicle,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from harness.campaign.models import Campaign
+from harness.campaign.campaign import Campaign
 from harness.worlds.av_type import recyclable
 from harness.worlds.protocol import World
 from harness.worlds.sumo import SumoWorld

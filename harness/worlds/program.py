@@ -18,7 +18,7 @@ import traci.constants as tc
 from traci.connection import Connection
 from traci.exceptions import FatalTraCIError
 
-from harness.campaign.models import TraciProcess
+from harness.campaign.vehicle import TraciProcess
 from harness.errors import CampaignError, WorldDisagreementError
 from harness.worlds.cells import sumo_program
 from harness.worlds.protocol import AVLostError

@@ -12,7 +12,7 @@ import re
 import socket
 from pathlib import Path
 
-from harness.campaign.models import TraciProcess
+from harness.campaign.vehicle import TraciProcess
 from harness.errors import CampaignError
 
 _ROUTES = Path("/proc/net/fib_trie")

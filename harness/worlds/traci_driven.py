@@ -15,7 +15,7 @@ import numpy as np
 import traci.constants as tc
 from traci.exceptions import TraCIException
 
-from harness.campaign.models import TraciProcess
+from harness.campaign.vehicle import TraciProcess
 from harness.errors import WorldDisagreementError
 from harness.vocabulary import AV, BV, LV, BoolArray, FloatArray, Int8Array, IntArray
 from harness.worlds.cells import LEFT, NEVER_PLAN_S, OBEY, PLAN_NOW_S, RIGHT, SumoCells

@@ -6,10 +6,9 @@ from typing import Any
 
 from hypothesis import strategies as st
 
-from harness.campaign.drivers import PARAMETERS
 from harness.campaign.schema import campaign_schema
-from harness.campaign.testing import MOST_SUMO_CELLS
-from harness.campaign.vehicle import AV_SOURCES
+from harness.campaign.sections import MOST_SUMO_CELLS
+from harness.campaign.vehicle import AV_SOURCES, PARAMETERS
 
 SCHEMA = campaign_schema()
 BUILT_IN = {name: section.__name__ for name, section in PARAMETERS.items()}

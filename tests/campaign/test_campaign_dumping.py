@@ -7,9 +7,8 @@ import pytest
 from campaign_strategies import SCHEMA, campaigns
 from hypothesis import Phase, given, settings
 
-from harness.campaign.dumping import dump_campaign, written_out
-from harness.campaign.loading import load_campaign
-from harness.campaign.models import Campaign
+from harness.campaign.campaign import Campaign
+from harness.campaign.files import dump_campaign, load_campaign, written_out
 from harness.campaign.yaml_text import read_yaml
 
 

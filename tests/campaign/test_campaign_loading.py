@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from harness.campaign.loading import load_campaign, shipped_parameters
+from harness.campaign.files import load_campaign, shipped_parameters
 from harness.campaign.problems import InvalidFileError
 from harness.errors import EXIT_BAD_INPUT, CampaignError
 

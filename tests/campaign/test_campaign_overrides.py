@@ -2,7 +2,7 @@
 
 import pytest
 
-from harness.campaign.loading import load_campaign
+from harness.campaign.files import load_campaign
 from harness.errors import CampaignError
 
 

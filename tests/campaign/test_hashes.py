@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from harness.campaign.loading import load_campaign
-from harness.campaign.panel import load_panel
+from harness.campaign.files import load_campaign, load_panel
 from harness.resolved import resolve
 
 FOLDER = Path(__file__).parents[2] / "scenarios"

@@ -2,9 +2,8 @@
 
 import pytest
 
-from harness.campaign.loading import load_campaign
-from harness.campaign.models import IDM, AutomatedVehicle, IDMParameters
-from harness.campaign.panel import SHIPPED_PANEL, load_panel, panel_av
+from harness.campaign.files import SHIPPED_PANEL, load_campaign, load_panel, panel_av
+from harness.campaign.vehicle import IDM, AutomatedVehicle, IDMParameters
 from harness.cli import main
 from harness.errors import CampaignError
 from harness.vehicles.models import av_records

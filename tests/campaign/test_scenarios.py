@@ -8,8 +8,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from harness.campaign.dumping import yaml_text
-from harness.campaign.loading import load_campaign
+from harness.campaign.files import load_campaign, yaml_text
 from harness.campaign.schema import campaign_schema
 from harness.campaign.yaml_text import read_yaml
 from harness.errors import CampaignError

@@ -2,7 +2,7 @@
 
 import pytest
 
-from harness.campaign.loading import SHIPPED_PARAMETERS
+from harness.campaign.files import SHIPPED_PARAMETERS
 from harness.campaign.problems import InvalidFileError, read_model
 from harness.campaign.yaml_text import parse_value, read_yaml
 from harness.errors import CampaignError

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from harness.campaign.loading import load_campaign
+from harness.campaign.files import load_campaign
 from harness.controllers.hosts import EpisodeRandom
 from harness.errors import CampaignError
 from harness.resolved import resolve

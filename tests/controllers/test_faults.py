@@ -8,7 +8,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from harness.campaign.loading import load_campaign
+from harness.campaign.files import load_campaign
 from harness.cli import main
 from harness.controllers.loading import build_host
 from harness.errors import EXIT_BAD_INPUT, EXIT_DONE, EXIT_TOO_MANY_FAILED

@@ -8,7 +8,7 @@ import zipfile
 
 import pytest
 
-from harness.campaign.loading import load_campaign
+from harness.campaign.files import load_campaign
 from harness.console import system_error
 from harness.controllers import EpisodeStart, Neighbour, Observation
 from harness.controllers.fmu import fmu_maker

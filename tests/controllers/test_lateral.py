@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from examples.idm import idm_acceleration
-from harness.campaign.loading import load_campaign
+from harness.campaign.files import load_campaign
 from harness.controllers.protocol import Neighbour, Observation
 from harness.controllers.traci_facade import Traci
 from harness.controllers.traci_style import TraciStyleController

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from harness.campaign.loading import load_campaign
+from harness.campaign.files import load_campaign
 from harness.resolved import resolve
 from harness.runner.prepare import prepare
 from harness.worlds.twin import TwinWorld

@@ -7,7 +7,7 @@ which hardly brakes, may catch up a second time, where its smallest gap jumps: i
 import numpy as np
 import pytest
 
-from harness.campaign.models import FVDMParameters, IDMParameters
+from harness.campaign.vehicle import FVDMParameters, IDMParameters
 from harness.importance.immediate import smallest_gaps
 from harness.maneuvers import acceleration
 from harness.vehicles.kinematics import CONTACT_M, STEP_S, next_speed

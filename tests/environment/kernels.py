@@ -8,7 +8,7 @@ import functools
 
 import numpy as np
 
-from harness.campaign.models import EnvironmentSettings
+from harness.campaign.sections import EnvironmentSettings
 from harness.compiled import compiled_threads
 from harness.traffic import cut_in, driving
 from harness.traffic.loading import load_environment

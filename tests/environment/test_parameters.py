@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from harness.campaign.models import Campaign, EnvironmentSettings
+from harness.campaign.campaign import Campaign
+from harness.campaign.sections import EnvironmentSettings
 from harness.campaign.yaml_text import read_yaml
 from harness.errors import CampaignError
 from harness.resolved import resolve

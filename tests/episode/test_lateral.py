@@ -7,13 +7,9 @@ from functools import cache
 import numpy as np
 import pytest
 
-from harness.campaign.models import (
-    AutomatedVehicle,
-    Campaign,
-    ConstantParameters,
-    EnvironmentSettings,
-    Reaction,
-)
+from harness.campaign.campaign import Campaign
+from harness.campaign.sections import EnvironmentSettings
+from harness.campaign.vehicle import AutomatedVehicle, ConstantParameters, Reaction
 from harness.episode.cells import PrescribedTraffic, drawn_traffic
 from harness.episode.loop import EpisodeLoop, Keep, Policy
 from harness.importance.build import build_importance

@@ -5,16 +5,9 @@ from functools import cache, cached_property
 
 import numpy as np
 
-from harness.campaign.models import (
-    IDM,
-    AutomatedVehicle,
-    Campaign,
-    EnvironmentSettings,
-    FVDMParameters,
-    IDMParameters,
-    Records,
-    Testing,
-)
+from harness.campaign.campaign import Campaign
+from harness.campaign.sections import EnvironmentSettings, Records, Testing
+from harness.campaign.vehicle import IDM, AutomatedVehicle, FVDMParameters, IDMParameters
 from harness.episode.loop import Shard
 from harness.resolved import resolve
 from harness.runner.prepare import Prepared, prepare

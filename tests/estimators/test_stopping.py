@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from harness.campaign.models import Stop
+from harness.campaign.sections import Stop
 from harness.estimators import StopRule, accumulator
 from harness.estimators.stopping import LOOK_RATIO, Decision, look_grid
 from harness.strata import ASSUMPTION_FREE

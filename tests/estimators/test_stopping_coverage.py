@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.stats import binomtest
 
-from harness.campaign.models import Stop
+from harness.campaign.sections import Stop
 from harness.estimators import Estimate, StopRule
 from harness.estimators.block import Block
 from harness.estimators.nade import Nade

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from harness.campaign.loading import load_campaign
-from harness.campaign.models import Campaign
+from harness.campaign.campaign import Campaign
+from harness.campaign.files import load_campaign
 from harness.pool.cut_ins import Pool
 from harness.pool.storage import campaign_pool
 from harness.resolved import resolve

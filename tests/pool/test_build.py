@@ -8,7 +8,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from harness.campaign.loading import load_campaign
+from harness.campaign.files import load_campaign
 from harness.errors import RunFolderError
 from harness.pool.aimed_paths import NATURALISTIC_SHARE, aimed_points, fit_proposal
 from harness.pool.cut_ins import FAR_OFF

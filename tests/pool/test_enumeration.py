@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import chisquare
 
-from harness.campaign.models import PoolSettings
+from harness.campaign.sections import PoolSettings
 from harness.pool.aimed_paths import Enumerator
 from harness.pool.enumeration import STRIDE
 from harness.pool.library import load_library

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from harness.campaign.loading import load_campaign
+from harness.campaign.files import load_campaign
 from harness.controllers.loading import build_host
 from harness.episode.loop import EpisodeLoop, Keep, Policy
 from harness.importance.build import build_importance

@@ -8,9 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from harness.campaign.dumping import dump_campaign
-from harness.campaign.loading import load_campaign
-from harness.campaign.models import IDMParameters, Reflexes
+from harness.campaign.files import dump_campaign, load_campaign
+from harness.campaign.vehicle import IDMParameters, Reflexes
 from harness.cli import main
 from harness.episode.loop import traced_by_index
 from harness.errors import CampaignError, RunFolderError

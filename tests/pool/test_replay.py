@@ -12,7 +12,9 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from harness.campaign.models import AutomatedVehicle, Campaign, IDMParameters, PoolSettings, Reaction
+from harness.campaign.campaign import Campaign
+from harness.campaign.sections import PoolSettings
+from harness.campaign.vehicle import AutomatedVehicle, IDMParameters, Reaction
 from harness.episode.loop import Shard
 from harness.episode.trajectory import Followers
 from harness.errors import CampaignError, RunFolderError

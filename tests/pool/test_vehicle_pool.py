@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from harness.campaign.loading import load_campaign
+from harness.campaign.files import load_campaign
 from harness.episode.motion import motion_hashes
 from harness.episode.trajectory import Followers
 from harness.errors import HarnessError

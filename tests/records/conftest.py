@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import pytest
 
-from harness.campaign.loading import load_campaign
-from harness.campaign.models import Campaign
+from harness.campaign.campaign import Campaign
+from harness.campaign.files import load_campaign
 from harness.episode.loop import Shard
 from harness.records.tables import ShardTables, shard_tables
 from harness.resolved import resolve

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from harness.campaign.models import Campaign
+from harness.campaign.campaign import Campaign
 from harness.episode.cells import PrescribedCutIns
 from harness.episode.loop import Shard
 from harness.estimators.one_pass import CampaignFacts, estimate_blocks

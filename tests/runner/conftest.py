@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from harness.campaign.loading import load_campaign
-from harness.campaign.models import Campaign
+from harness.campaign.campaign import Campaign
+from harness.campaign.files import load_campaign
 from harness.controllers.black_box import Death
 from harness.part import Part
 from harness.runner import (

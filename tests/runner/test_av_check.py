@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from harness.campaign.loading import load_campaign
+from harness.campaign.files import load_campaign
 from harness.cli import main
 from harness.runner.av_check import check_av
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from harness.campaign.loading import load_campaign
+from harness.campaign.files import load_campaign
 from harness.errors import CampaignError
 from harness.records.folder import read_manifest
 from harness.runner.replay import replay_episode, suspects

@@ -7,7 +7,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from harness.campaign.models import AutomatedVehicle, Campaign, IDMParameters, Reaction
+from harness.campaign.campaign import Campaign
+from harness.campaign.vehicle import AutomatedVehicle, IDMParameters, Reaction
 from harness.errors import WorldDisagreementError
 from harness.records.tables import episodes_table
 from harness.resolved import resolve

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from harness.campaign.loading import load_campaign
+from harness.campaign.files import load_campaign
 from tests.runner.conftest import MIXTURE_FILE
 
 SHARD, WARM_UP, EPISODES = 1_000, 10_000, 200_000

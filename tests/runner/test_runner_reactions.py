@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from harness.campaign.loading import load_campaign
+from harness.campaign.files import load_campaign
 from harness.errors import CampaignError
 from harness.resolved import resolve
 from harness.runner.prepare import prepare

@@ -11,7 +11,9 @@ import pyarrow.parquet as pq
 import pytest
 
 from harness.campaign import models
-from harness.campaign.models import AutomatedVehicle, Campaign, PoolSettings
+from harness.campaign.campaign import Campaign
+from harness.campaign.sections import PoolSettings
+from harness.campaign.vehicle import AutomatedVehicle
 from harness.cli import main
 from harness.errors import RunFolderError
 from harness.estimators.block import columns_of, joined

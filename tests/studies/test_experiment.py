@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from harness.campaign.panel import load_panel
+from harness.campaign.files import load_panel
 from harness.cli import main
 from harness.errors import CampaignError
 from harness.studies.experiment import load_experiment

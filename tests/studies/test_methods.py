@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from harness.campaign.models import Campaign
+from harness.campaign.campaign import Campaign
 from harness.strata import LIBRARY_STATEMENT
 from harness.studies.chains.chain import Chain
 from harness.studies.chains.named import CHAINS, replayed

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from harness.campaign.loading import load_campaign
+from harness.campaign.files import load_campaign
 from harness.strata import ShellDesign, Statement
 from harness.studies.shell_campaign import DrawnPool, PairedCampaign
 from harness.studies.truths import CONDITIONAL_DIFFERENCE, DIFFERENCE

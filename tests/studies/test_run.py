@@ -16,7 +16,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from harness.campaign.models import Campaign
+from harness.campaign.campaign import Campaign
 from harness.cli import main
 from harness.studies import run
 from harness.studies.experiment import load_experiment

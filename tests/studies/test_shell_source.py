@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from harness.campaign.models import AutomatedVehicle, EnvironmentSettings, PoolSettings
+from harness.campaign.sections import EnvironmentSettings, PoolSettings
+from harness.campaign.vehicle import AutomatedVehicle
 from harness.errors import CampaignError
 from harness.pool.build import build_pool
 from harness.pool.library import load_library

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from harness.campaign.models import AutomatedVehicle
+from harness.campaign.vehicle import AutomatedVehicle
 from harness.estimators.nade import Nade
 from harness.progress import Progress
 from harness.studies.case_study import context, small_case

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from harness.campaign.models import Campaign
+from harness.campaign.campaign import Campaign
 from harness.errors import HarnessError
 from harness.pool.library import load_library
 from harness.progress import Progress

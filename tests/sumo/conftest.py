@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from harness.campaign.loading import load_campaign
-from harness.campaign.models import Campaign
+from harness.campaign.campaign import Campaign
+from harness.campaign.files import load_campaign
 
 MIXTURE_FILE = Path(__file__).parents[2] / "scenarios" / "overtaking_mixture.yaml"
 

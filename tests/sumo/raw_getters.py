@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from harness.campaign.models import Campaign
+from harness.campaign.campaign import Campaign
 from harness.episode.loop import Shard
 from harness.resolved import resolve
 from harness.runner.prepare import prepare

@@ -6,7 +6,9 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from harness.campaign.models import AutomatedVehicle, Campaign, Limits, Records, Run, Stop, Testing, TraciProcess, World
+from harness.campaign.campaign import Campaign
+from harness.campaign.sections import Records, Run, Stop, Testing, World
+from harness.campaign.vehicle import AutomatedVehicle, Limits, TraciProcess
 from harness.episode.loop import Shard
 from harness.resolved import resolve
 from harness.runner.prepare import build_world, prepare

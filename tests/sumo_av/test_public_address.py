@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from harness.campaign.loading import load_campaign
+from harness.campaign.files import load_campaign
 from harness.errors import CampaignError, WorldDisagreementError
 from harness.runner import plan_campaign
 from harness.worlds import program, public_address

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from harness.campaign.loading import load_campaign
+from harness.campaign.files import load_campaign
 from harness.resolved import resolve
 from harness.runner.prepare import build_world, prepare
 from harness.runner.shadow_runs import as_recorded, run_shadows, shadow_specs

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from harness.campaign.models import (
+from harness.campaign.vehicle import (
     CarefulCompetentParameters,
     FuzzySafetyParameters,
     IDMParameters,

@@ -17,8 +17,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from harness.campaign.drivers import default_surrogates
-from harness.campaign.models import AutomatedVehicle, EnvironmentSettings
+from harness.campaign.sections import EnvironmentSettings
+from harness.campaign.vehicle import AutomatedVehicle, default_surrogates
 from harness.estimators.block import MAX_CONTROL_STEPS, Block
 from harness.importance.grid import GridPoints
 from harness.importance.immediate import roll_out

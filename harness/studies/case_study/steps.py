@@ -16,7 +16,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from harness.campaign.loading import load_campaign
+from harness.campaign.files import load_campaign
 from harness.compiled import WORLD_SOURCES, source_hash
 from harness.estimators.estimate import finite_json
 from harness.progress import Progress

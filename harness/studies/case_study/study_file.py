@@ -8,9 +8,9 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
-from harness.campaign.overrides import Override, Places, apply_overrides
+from harness.campaign.files import Override, Places, apply_overrides
 from harness.campaign.problems import validated
-from harness.campaign.section import NAME_PATTERN, Positive, Probability, Section, Whole, broken_rule
+from harness.campaign.sections import NAME_PATTERN, Positive, Probability, Section, Whole, broken_rule
 from harness.campaign.yaml_text import read_yaml
 from harness.errors import CampaignError
 

@@ -13,72 +13,29 @@ from typing import Any, Self
 
 from pydantic import Field, model_validator
 
-from harness.campaign.drivers import (
-    FVDM,
-    IDM,
-    BuiltInParameters,
-    CarefulCompetent,
-    CarefulCompetentParameters,
-    Constant,
-    ConstantParameters,
-    DriverModel,
-    FuzzySafety,
-    FuzzySafetyParameters,
-    FVDMParameters,
-    IDMParameters,
-    NeedBased,
-    NeedBasedParameters,
-    Reaction,
-    Reference,
-    Reflexes,
-    default_surrogates,
-)
-from harness.campaign.section import NAME_PATTERN, Section, SurrogateName, Whole, broken_rule, listed
-from harness.campaign.testing import (
+from harness.campaign.sections import (
     MOST_SUMO_CELLS,
+    NAME_PATTERN,
     Accept,
     EnvironmentSettings,
     PoolSettings,
     Records,
     Run,
+    Section,
     Stop,
+    SurrogateName,
     Testing,
+    Whole,
     World,
+    broken_rule,
+    listed,
 )
-from harness.campaign.vehicle import AutomatedVehicle, FmuController, Limits, TraciProcess
+from harness.campaign.vehicle import (
+    AutomatedVehicle,
+    DriverModel,
+    default_surrogates,
+)
 from harness.vocabulary import METHODS, SAMPLING
-
-__all__ = [
-    "FVDM",
-    "IDM",
-    "Accept",
-    "AutomatedVehicle",
-    "BuiltInParameters",
-    "Campaign",
-    "CarefulCompetent",
-    "CarefulCompetentParameters",
-    "Constant",
-    "ConstantParameters",
-    "EnvironmentSettings",
-    "FVDMParameters",
-    "FmuController",
-    "FuzzySafety",
-    "FuzzySafetyParameters",
-    "IDMParameters",
-    "Limits",
-    "NeedBased",
-    "NeedBasedParameters",
-    "PoolSettings",
-    "Reaction",
-    "Records",
-    "Reference",
-    "Reflexes",
-    "Run",
-    "Stop",
-    "Testing",
-    "TraciProcess",
-    "World",
-]
 
 
 class Campaign(Section):
