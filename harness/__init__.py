@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from harness.pool.refined_ladder import RefinedLadder
     from harness.progress import Progress
     from harness.records.frames import StoredRun
-    from harness.runner import AvCheck, Comparison, PartResult, PlanResult, ReplayResult, RunResult
+    from harness.runner import AvCheck, Comparison, ReplayResult, RunResult
     from harness.vocabulary import EstimatorName
 
 __all__ = [
@@ -35,12 +35,9 @@ __all__ = [
     "estimate",
     "ladder",
     "load_campaign",
-    "merge",
-    "plan",
     "read",
     "replay",
     "run",
-    "run_part",
     "write_report",
 ]
 
@@ -66,48 +63,6 @@ def run(
     from harness.runner import run_campaign  # noqa: PLC0415
 
     return run_campaign(campaign, Path(out), workers=workers, resume=resume, progress=progress)
-
-
-def plan(
-    campaign: Campaign,
-    out: str | Path,
-    *,
-    workers: int | None = None,
-    resume: bool = False,
-    progress: Progress | None = None,
-) -> PlanResult:
-    """Plan the tests of a shells campaign, to be run in parts (see `harness.runner.plan_second_phase`)."""
-    from harness.runner import plan_second_phase  # noqa: PLC0415
-
-    return plan_second_phase(campaign, Path(out), workers=workers, resume=resume, progress=progress)
-
-
-def run_part(
-    campaign: Campaign | str | Path,
-    number: int,
-    of: int,
-    out: str | Path,
-    *,
-    workers: int | None = None,
-    resume: bool = False,
-    progress: Progress | None = None,
-) -> PartResult:
-    """Run the ``number``-th, from 1 on, ``of`` so many parts of a campaign, or of the plan in a folder.
-
-    See `harness.runner.run_part`.
-    """
-    from harness.part import Part  # noqa: PLC0415
-    from harness.runner import read_plan, run_part  # noqa: PLC0415
-
-    source = read_plan(Path(campaign)) if isinstance(campaign, str | Path) else campaign
-    return run_part(source, Part(number, of), Path(out), workers=workers, resume=resume, progress=progress)
-
-
-def merge(parts: Sequence[str | Path], out: str | Path) -> RunResult:
-    """Make one run of all its parts, and their plan if they have one (see `harness.runner.merge_parts`)."""
-    from harness.runner import merge_parts  # noqa: PLC0415
-
-    return merge_parts([Path(part) for part in parts], Path(out))
 
 
 def av_check(campaign: Campaign, n_episodes: int = 48) -> AvCheck:

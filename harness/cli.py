@@ -14,7 +14,6 @@ import click
 
 from harness.commands.campaigns import check, run, schema, setup
 from harness.commands.options import examples
-from harness.commands.parts import merge, plan
 from harness.commands.stored import estimate, replay, report
 from harness.commands.studies import pool, rnot, study, validate
 from harness.commands.vehicles import av_check, compare, ladder
@@ -44,7 +43,7 @@ def cli() -> None:
     """
 
 
-_TESTING = check, av_check, run, plan, merge, compare, pool, ladder, estimate, rnot, report, replay
+_TESTING = check, av_check, run, compare, pool, ladder, estimate, rnot, report, replay
 for command in (*_TESTING, validate, study, schema, setup):
     cli.add_command(command)
 

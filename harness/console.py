@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import errno
 import json
-import shlex
 from contextlib import suppress
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,8 +14,6 @@ from harness.errors import HarnessError
 
 if TYPE_CHECKING:
     import pyarrow as pa
-
-    from harness.runner import PartResult, PlanResult
 
 
 def show_error(error: HarnessError) -> None:
@@ -35,7 +31,6 @@ def show_error(error: HarnessError) -> None:
 
 _HOW_TO_GO_ON = {
     "run": " Finished shards are kept: the same command with --resume goes on.",
-    "plan": " Finished shards are kept: the same command with --resume goes on.",
     "compare": " Finished shards are kept: the same command goes on.",
 }
 
@@ -96,32 +91,6 @@ def usage_error(error: click.UsageError, context: click.Context) -> HarnessError
 def print_json(content: Any) -> None:
     """Print strict JSON (no NaN) on stdout."""
     click.echo(json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False))
-
-
-def print_part(part: PartResult, *, as_json: bool) -> None:
-    """Print what a finished part of a run holds."""
-    if as_json:
-        print_json(
-            {**part.described, "n_crashes": part.n_crashes, "n_failed": part.n_failed, "folder": str(part.folder)}
-        )
-        return
-    click.echo(f"{part.kind}: {part.n_crashes:,} crashed, {part.n_failed:,} failed. `harness merge` takes all parts.")
-    click.echo(str(part.folder))
-
-
-def print_planned(plan: PlanResult, *, as_json: bool) -> None:
-    """Print what a first phase has planned, or why nothing."""
-    if as_json:
-        facts = {key: value for key, value in asdict(plan).items() if key != "exit_code"}
-        expected = plan.expected_rhw if plan.n_planned else None
-        print_json({**facts, "expected_rhw": expected, "folder": str(plan.folder)})
-        return
-    click.echo(plan.ending)
-    if plan.n_planned:
-        folder = shlex.quote(str(plan.folder))
-        click.echo(f"They make up to {plan.n_shards:,} parts: `harness run {folder} --part K/N --out PART`.")
-        click.echo(f"`harness merge {folder} PART... --out DIR` makes one run of the plan and all of its parts.")
-    click.echo(str(plan.folder))
 
 
 def print_plan(plan: dict[str, Any]) -> None:

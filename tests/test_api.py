@@ -14,7 +14,6 @@ import pytest
 
 import harness
 from harness.errors import CampaignError, RunFolderError
-from harness.part import Part
 
 MIXTURE_FILE = Path(__file__).parents[1] / "scenarios" / "overtaking_mixture.yaml"
 OUT = Path("out")
@@ -36,7 +35,7 @@ def result(tmp_path_factory):
 
 
 def test_all_that_is_promised_is_there():
-    commands = {"av_check", "compare", "run", "run_part", "merge", "plan", "estimate", "ladder", "read", "replay"}
+    commands = {"av_check", "compare", "run", "estimate", "ladder", "read", "replay"}
     assert set(harness.__all__) == {"HarnessError", "load_campaign", "write_report"} | commands
     for name in harness.__all__:
         assert inspect.getdoc(getattr(harness, name))
@@ -98,13 +97,6 @@ def test_a_run_is_not_written_over(result):
 @pytest.mark.parametrize(
     ("behind", "call", "handed_on"),
     [
-        ("runner.plan_second_phase", lambda c: harness.plan(c, "out", resume=True), {"out": OUT, "resume": True}),
-        (
-            "runner.run_part",
-            lambda c: harness.run_part(c, 2, 3, "out", workers=1),
-            {"part": Part(2, 3), "out": OUT, "workers": 1},
-        ),
-        ("runner.merge_parts", lambda _: harness.merge(["a", "b"], "out"), {"folders": [Path("a"), Path("b")]}),
         ("runner.check_av", lambda c: harness.av_check(c, 12), {"n_episodes": 12}),
         (
             "runner.compare_campaigns",

@@ -42,6 +42,9 @@ def _commands():
     for workflow in sorted((ROOT / "examples/ci").glob("*.yml")):
         for line in re.findall(r"^ *- run: (harness .*)$", workflow.read_text(encoding="utf-8"), re.MULTILINE):
             yield pytest.param(line, id=f"{workflow.name}: {line[:60]}")
+    for job in sorted((ROOT / "examples/cluster").glob("*.yaml")):
+        for line in re.findall(r"(harness run [^;]*);", job.read_text(encoding="utf-8")):
+            yield pytest.param(line, id=f"{job.name}: {line[:60]}")
     for campaign in sorted((ROOT / "scenarios").glob("*.yaml")):
         text = campaign.read_text(encoding="utf-8").replace("\\\n#", " ")
         for line in re.findall(r"^# +(harness \S.*)$", text, re.MULTILINE):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
@@ -18,18 +17,12 @@ from harness.commands.options import (
     json_option,
     junit_option,
     loaded,
-    part_option,
     quiet_option,
     set_option,
     workers_option,
 )
-from harness.commands.parts import named_plan
-from harness.console import print_json, print_part, print_plan
+from harness.console import print_json, print_plan
 from harness.console_tables import print_result
-from harness.errors import HarnessError
-
-if TYPE_CHECKING:
-    from harness.part import Part
 
 
 @click.command(
@@ -69,21 +62,10 @@ def check(campaign_file: Path, overrides: Sequence[str], av: str | None, *, as_j
         "harness run scenarios/smoke.yaml --out runs/late --av late-600ms",
         "harness run scenarios/smoke.yaml --out runs/gate --accept 3e-7 --junit gate.xml",
         "harness run scenarios/smoke.yaml --out runs/cluster --executor ray",
-        "harness run scenarios/overtaking_forced.yaml --set stop.rhw=null --part 3/64 --out runs/part3",
-        "harness run runs/plan --part 3/64 --out runs/part3   # of what `harness plan` has planned",
-    )
-    + "\n\n"
-    + examples(
-        "Slurm        --part $SLURM_ARRAY_TASK_ID/64             with --array=1-64",
-        "SGE, PBS     --part $SGE_TASK_ID/64, --part $PBS_ARRAY_INDEX/64",
-        "Kubernetes   --part $((JOB_COMPLETION_INDEX + 1))/64    of an Indexed job with 64 completions",
-        "AWS Batch    --part $((AWS_BATCH_JOB_ARRAY_INDEX + 1))/64",
-        heading="Job arrays:",
     ),
 )
 @click.argument("campaign_file", metavar="CAMPAIGN", type=CAMPAIGN)
 @click.option("--out", "folder", type=FOLDER, required=True, help="Run folder; made if it is not there.")
-@part_option
 @workers_option
 @executor_option
 @click.option("--resume", is_flag=True, help="Go on with what the run folder already holds.")
@@ -104,7 +86,6 @@ def run(
     campaign_file: Path,
     folder: Path,
     *,
-    part: Part | None,
     workers: int | None,
     executor: str | None,
     resume: bool,
@@ -123,36 +104,14 @@ def run(
 
     Exit code 4 says that stop.episodes or the pool was spent before stop.rhw was reached, or --accept decided; the
     results are there all the same. With --accept 0 means accepted, 5 rejected.
-
-    Job arrays: --part K/N runs the K-th of N equal slices of the very tests that a whole run makes; 'harness merge'
-    makes one run of all parts. The number of tests has to be fixed beforehand (stop.rhw: null; any method but shells).
-    K counts from 1, and N stays the same when only some parts are run again. With --resume a part goes on, or begins if
-    nothing is there. Give --workers: a scheduler may grant fewer cores than the machine has.
-
-    Shells are planned first: the folder that 'harness plan' has made takes the campaign's place, for it holds the
-    campaign and what of it is left to test. It has to be there only when a part begins.
     """
-    given = {"--accept": accept, "--set": overrides, "--av": av, "--executor": executor}
-    refused = [option for option, value in given.items() if value]
-    planned = named_plan(campaign_file, folder, part, refused, resume=resume)
     limit = [] if accept is None else [f"accept.crash_rate_below={accept!r}"]
     where = [] if executor is None else [f"run.executor={executor}"]
-    campaign = loaded(campaign_file, [*overrides, *limit, *where], av) if planned is None else planned.campaign
+    campaign = loaded(campaign_file, [*overrides, *limit, *where], av)
     from harness.progress import shown_progress  # noqa: PLC0415 - keeps --help fast
     from harness.runner import run_campaign  # noqa: PLC0415 - slow to import: only once the campaign is right
 
-    bar = shown_progress(campaign.stop.rhw, campaign.min_crashes, quiet=quiet)
-    if part is not None:
-        if junit is not None:
-            mend = "Leave out --junit."
-            raise HarnessError("--junit", found="--part", expected="a whole run: a part has no result", mend=mend)
-        from harness.runner import run_part  # noqa: PLC0415 - as above
-
-        with bar:
-            done = run_part(planned or campaign, part, folder, workers=workers, resume=resume, progress=bar)
-        print_part(done, as_json=as_json)
-        return
-    with bar:
+    with shown_progress(campaign.stop.rhw, campaign.min_crashes, quiet=quiet) as bar:
         result = run_campaign(campaign, folder, workers=workers, resume=resume, progress=bar)
     if junit is not None:
         from harness.report.junit import statement_cases, write_junit  # noqa: PLC0415 - keeps --help fast

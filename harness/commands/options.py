@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 import click
 
 from harness.errors import HarnessError
-from harness.part import Part
 
 if TYPE_CHECKING:
     from harness.campaign.campaign import Campaign
@@ -75,12 +74,6 @@ junit_option = click.option(
     help="Write the result as JUnit XML, too: a test case for each statement.",
 )
 
-part_option = click.option(
-    "--part",
-    metavar="K/N",
-    callback=lambda _ctx, _parameter, value: None if value is None else Part.parse(value),
-    help="Run only the K-th of N equal parts of the tests; see Job arrays.",
-)
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON on stdout instead of text.")
 
 

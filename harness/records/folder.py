@@ -9,7 +9,6 @@ import fcntl
 import fnmatch
 import json
 import os
-import shutil
 import tempfile
 import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -135,16 +134,6 @@ def write_bytes(path: Path, content: bytes) -> None:
     write_atomically(path, lambda temporary: temporary.write_bytes(content))
 
 
-def link_or_copy(file: Path, to: Path) -> None:
-    """A second name of the same bytes, or a copy where there can be none; nobody writes into a finished file."""
-    with writing(to):
-        to.parent.mkdir(exist_ok=True)
-        try:
-            os.link(file, to)
-        except OSError:  # another file system, or one without links
-            write_atomically(to, lambda temporary: shutil.copyfile(file, temporary))
-
-
 def write_text(path: Path, text: str) -> None:
     """Write a text file atomically."""
     write_bytes(path, text.encode("utf-8"))
@@ -233,13 +222,20 @@ def no_episodes(folder: Path) -> RunFolderError:
 
 
 def read_manifest(folder: Path, *, mend: str = NO_RUN) -> dict[str, Any]:
-    """Read ``manifest.json`` of a run, as `StoredManifest` says; ``mend`` is the advice where it cannot be."""
+    """Read ``manifest.json`` of a run, as `StoredManifest` says; ``mend`` is the advice where it cannot be.
+
+    Earlier versions could divide a run: a folder that holds only a part or the plan of one is refused.
+    """
     path = folder / MANIFEST
     if not path.exists():
         expected = "a run folder, which holds a manifest.json"
         raise RunFolderError(str(path), found="no such file: this is no run folder", expected=expected, mend=mend)
     content = read_json(path, mend=mend)
     require_schema(content, StoredManifest, path, mend=mend)
+    if kind := next((kind for kind in ("part", "plan") if content.get(kind)), None):
+        version = (content.get("versions") or {}).get("harness", "that made it")
+        again = f"Bring the parts together with version {version}, or run the campaign.yaml again into a new folder."
+        raise RunFolderError(str(folder), found=f"a {kind} of a run", expected="a whole run", mend=again)
     return content
 
 

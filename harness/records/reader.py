@@ -16,7 +16,6 @@ import pyarrow.parquet as pq
 
 from harness.errors import RunFolderError
 from harness.records.folder import MEND_SHARD, TABLES, concatenated, damaged, read_manifest, read_table
-from harness.records.stored_manifest import PLAN, WHOLE, kind_of
 from harness.threads import made_ahead
 
 _READERS = 2
@@ -108,17 +107,3 @@ def footer(path: Path) -> pq.FileMetaData:
         return pq.read_metadata(path)
     except (OSError, pa.ArrowException) as error:
         raise damaged(path, error) from error
-
-
-def require_whole(folder: Path) -> dict[str, Any]:
-    """Manifest of a run; one of a part or a plan of a run is refused."""
-    manifest = read_manifest(folder)
-    if (kind := kind_of(manifest)) != WHOLE:
-        found, mend = kind, "Bring all parts together with `harness merge PART... --out DIR`."
-        if kind == PLAN:
-            n_planned = sum(manifest["plan"]["tests"])
-            found = f"{kind} of {n_planned:,} tests, after a first phase of {manifest['n_episodes']:,}"
-            mend = f"Run its parts (`harness run {folder} --part K/N --out PART`), then bring them together with it "
-            mend += f"(`harness merge {folder} PART... --out DIR`)."
-        raise RunFolderError(str(folder), found=found, expected=WHOLE, mend=mend)
-    return manifest

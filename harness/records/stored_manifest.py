@@ -6,9 +6,6 @@ error, but for the three without which nothing can be read.
 
 from __future__ import annotations
 
-import hashlib
-import json
-from collections.abc import Mapping
 from typing import Annotated, Any, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
@@ -75,34 +72,6 @@ class StoredShadows(Stored):
     n_failed: Count
 
 
-class StoredPart(Stored):
-    """Which part of a run a folder holds."""
-
-    number: Count
-    of: Count
-    first_episode: Count
-    n_episodes: Count
-
-
-class StoredPlan(Stored):
-    """The second of two phases: tests of each stratum, after those that a first phase has ``drawn`` from a pool.
-
-    Without tests it is not planned yet, or could not be.
-    """
-
-    tests: list[Count] = []
-    drawn: list[Count] = []
-    pool: str = ""
-    first_shard: Count = 0
-    first_episode: Count = 0
-
-    @model_validator(mode="after")
-    def _of_one_size(self) -> Self:
-        if len(self.tests) != len(self.drawn):
-            raise ValueError("as many tests as drawn")
-        return self
-
-
 class StoredManifest(Stored):
     """The manifest of a run."""
 
@@ -130,44 +99,6 @@ class StoredManifest(Stored):
     reported_from: Count | None = None
     table_errors: list[TableError] | None = None
     results: dict[str, list[Count] | None] | None = None
-    part: StoredPart | None = None
-    plan: StoredPlan | None = None
-
-
-class PlanManifest(StoredManifest):
-    """A manifest of a plan or a part, with what bringing the parts together needs."""
-
-    created: str
-    engine: str
-    versions: dict[str, str]
-    cpu: str
-    workers: Count
-    status: str
-    wall_time_s: float
-
-
-class PartManifest(PlanManifest):
-    """Besides which part it is."""
-
-    part: StoredPart
-
-
-WHOLE, PLAN = "a whole run", "a plan"
-
-
-def kind_of(manifest: Mapping[str, Any]) -> str:
-    """What a folder with this manifest holds: `WHOLE`, `PLAN`, or which part of a run or of which plan."""
-    part, plan = manifest.get("part"), manifest.get("plan")
-    if part is None:
-        return WHOLE if plan is None else PLAN
-    first, n = part["first_episode"], part["n_episodes"]
-    told = f"part {part['number']} of {part['of']} (tests {first:,} to {first + n - 1:,})"
-    return told if plan is None else f"{told} of plan {plan_hash(plan)}"
-
-
-def plan_hash(plan: Mapping[str, Any] | None) -> str | None:
-    """Two plans with the same one plan the same tests; None where there is no plan."""
-    return None if plan is None else hashlib.sha256(json.dumps(plan, sort_keys=True).encode()).hexdigest()[:8]
 
 
 class StoredStatement(Stored):

@@ -21,8 +21,8 @@ from harness.campaign.campaign import Campaign
 from harness.campaign.files import load_campaign
 from harness.errors import CampaignError, RunFolderError
 from harness.estimators.shells import ShellDetails, Within
-from harness.records.folder import MANIFEST, NO_RUN, concatenated, read_json, require_schema
-from harness.records.reader import read_shards, require_whole
+from harness.records.folder import MANIFEST, NO_RUN, concatenated, read_json, read_manifest, require_schema
+from harness.records.reader import read_shards
 from harness.records.stored_manifest import Count, Stored, StoredManifest
 from harness.strata import ASSUMPTION_FREE
 from harness.vocabulary import FloatArray
@@ -189,8 +189,8 @@ def typed_folder(folder: Path) -> str:
 
 
 def read_run_folder(path: Path, *, typed: str | None = None) -> RunFolder:
-    """Read campaign, manifest and estimates of a run, and not of a part or a plan of one; ``typed`` see `RunFolder`."""
-    manifest = require_whole(path)
+    """Read campaign, manifest and estimates of a run; ``typed`` see `RunFolder`."""
+    manifest = read_manifest(path)
     require_schema(manifest, ShownManifest, path / MANIFEST, mend=NO_RUN)
     estimates = _read_estimates(path, manifest["campaign_hash"])
     shells = _shells(path, estimates.estimates[estimates.headline])

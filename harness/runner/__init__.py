@@ -3,8 +3,6 @@
 from harness.runner.av_check import AvCheck, check_av
 from harness.runner.campaign_run import run_campaign
 from harness.runner.compare import Comparison, compare_campaigns
-from harness.runner.merge import merge_parts
-from harness.runner.parts import PartResult, Plan, PlanResult, plan_second_phase, read_plan, run_part
 from harness.runner.plan import plan_campaign
 from harness.runner.replay import ReplayResult, replay_episode
 from harness.runner.run_result import RunResult
@@ -13,19 +11,12 @@ from harness.runner.stored_estimates import estimate_run
 __all__ = [
     "AvCheck",
     "Comparison",
-    "PartResult",
-    "Plan",
-    "PlanResult",
     "ReplayResult",
     "RunResult",
     "check_av",
     "compare_campaigns",
     "estimate_run",
-    "merge_parts",
     "plan_campaign",
-    "plan_second_phase",
-    "read_plan",
     "replay_episode",
     "run_campaign",
-    "run_part",
 ]

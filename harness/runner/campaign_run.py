@@ -109,8 +109,7 @@ class Run:
     """A campaign on its way into a folder, in which nobody but this process writes.
 
     ``prefix`` is what is finished, ``prescribed`` are cut-ins to draw from, if there are; another ``planner`` may take
-    the place of the campaign's own before the first round. ``n_runs`` are at work in turns; ``facts`` are keys of the
-    manifest of what is only a part of a run, or its plan.
+    the place of the campaign's own before the first round. ``n_runs`` are at work in turns.
     """
 
     def __init__(
@@ -123,7 +122,6 @@ class Run:
         began: float,
         *,
         n_runs: int = 1,
-        **facts: Any,
     ) -> None:
         self._resolved, self._campaign, self._out, self._progress = resolved, resolved.campaign, out, progress
         for left in out.rglob(".*.part"):  # of an earlier run that was killed
@@ -134,8 +132,7 @@ class Run:
         self._retracing = Retracing(resolved)
         self.prescribed: PrescribedEpisodes | None = None
         self._prepared, self._held = prepared, int(earlier["n_episodes"])
-        self.prefix = Prefix(of_part="part" in facts)
-        self._ends_in_report = not facts
+        self.prefix = Prefix()
         self._ungathered: list[dict[str, Any]] = []
         with ExitStack() as refused:
             refused.callback(self._workers.close)
@@ -147,7 +144,6 @@ class Run:
                 workers=self._executor.n_workers,
                 distance_per_test_m=distance_per_test_m(resolved.environment),
                 table_errors=table_errors(resolved, prepared.tables),
-                **facts,
             )
             if prepared.shadow_paths is None:
                 self._plan(prepared)
@@ -199,7 +195,7 @@ class Run:
     def _stored(self, spec: ShardSpec) -> ShardDone | None:
         """See `stored_shard`; workers are about to be busy with the first shard that it does not know."""
         done = stored_shard(self._out, self._prepared, self._retracing, self._gathered, spec)
-        if done is None and self._ends_in_report:
+        if done is None:
             load_report_meanwhile()
         return done
 
@@ -260,8 +256,6 @@ class Run:
 
         Only what a rule asks for is called ``rhw``: a bar reckons from it when the campaign will stop.
         """
-        if self.prefix.of_part:
-            return {"crashes": self.prefix.n_crashes}
         watched = "half_width" if self._campaign.stop.rhw is None else "rhw"
         figures: dict[str, int | float] = {"crashes": self.prefix.n_crashes, watched: self.planner.rule.rhw}
         weighted = SAMPLING[self._campaign.testing.method].forces
@@ -274,7 +268,7 @@ class Run:
             path.unlink()
 
     def leave(self, *, stopped_by: StoppedBy | None = None, ending: str | None = None, **facts: Any) -> None:
-        """Write the manifest of what is finished; of a part or a plan that is all, as all are estimated together."""
+        """Write the manifest of what is finished."""
         if others := self._executor.cpus():  # bits may have come from any of them
             self._manifest.note(cpu=", ".join(sorted({cpu_name(), *others})))
         self._manifest.note(**facts)

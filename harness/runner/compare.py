@@ -18,7 +18,7 @@ from harness.estimators.paired_shells import PairedEstimate
 from harness.importance.build import mixture_weights
 from harness.progress import Progress
 from harness.records.folder import MANIFEST, read_json, read_manifest, require_place, require_schema, write_json
-from harness.records.reader import read_shards, require_whole
+from harness.records.reader import read_shards
 from harness.records.stored_manifest import StoredStops
 from harness.resolved import Resolved
 from harness.runner.campaign_run import run_campaign
@@ -246,7 +246,7 @@ def _take_over(stored: Path, folder: Path, resolved: Resolved) -> None:
     """Copy a stored run of A, and no other (`RunFolderError`), to where A is to be run, unless it is there already."""
     if folder.exists() and any(folder.iterdir()):
         return
-    manifest = require_whole(stored)
+    manifest = read_manifest(stored)
     if manifest["campaign_hash"] != resolved.content_hash:
         raise RunFolderError(
             str(stored),

@@ -11,16 +11,12 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from scipy.special import bdtrc
-
 from harness.campaign.campaign import Campaign
 from harness.campaign.files import dump_campaign
 from harness.errors import RunFolderError, TooManyFailedError
 from harness.records.folder import MANIFEST, read_manifest, require_place, write_json, write_text
 from harness.records.gathered import Fingerprint
-from harness.records.stored_manifest import PLAN, WHOLE, kind_of
 from harness.resolved import Resolved
-from harness.runner.shard_pool import SURELY_TOO_MANY
 from harness.runner.worker import Repeated, ShardDone, ShardSpec
 
 INTERVAL_S = 5.0
@@ -49,15 +45,14 @@ def cpu_name() -> str:
     return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.machine())
 
 
-def require_own_folder(folder: Path, resolved: Resolved, *, resume: bool, kind: str = WHOLE) -> dict[str, Any]:
+def require_own_folder(folder: Path, resolved: Resolved, *, resume: bool) -> dict[str, Any]:
     """Refuse a folder that holds something else; return the manifest of a run to be continued, or one without shards.
 
     Raises
     ------
     RunFolderError
         The folder cannot be written to, holds another campaign, this one without ``--resume`` or with another
-        controller (one file may not mix two versions of it), not the ``kind`` of run that is asked for (`kind_of`), or
-        files that are no run.
+        controller (one file may not mix two versions of it), only a part of a run, or files that are no run.
     """
 
     def refusal(found: str, expected: str, mend: str) -> RunFolderError:
@@ -77,13 +72,6 @@ def require_own_folder(folder: Path, resolved: Resolved, *, resume: bool, kind: 
             f"a folder for this one ({resolved.content_hash})",
             "Choose another folder with --out, or run the campaign.yaml that it holds.",
         )
-    if (held := kind_of(manifest)) != kind:
-        mend = "Repeat --part and stop.episodes as they were when it was begun, or choose another folder with --out."
-        if held == PLAN:
-            mend = f"Run its parts, `harness run {folder} --part K/N --out PART`, or choose another folder with --out."
-        elif kind == PLAN:
-            mend = elsewhere
-        raise refusal(f"{held} of this campaign", kind, mend)
     if not resume:
         mend = "Continue it with --resume, or choose another folder with --out."
         raise refusal("this campaign, already begun", "a new or empty folder", mend)
@@ -110,8 +98,7 @@ def require_no_fewer(folder: Path, earlier: dict[str, Any], n_episodes: int) -> 
 class Prefix:
     """Finished shards in order, from the first on, as the manifest lists them, and what is counted over them."""
 
-    def __init__(self, *, of_part: bool = False) -> None:
-        self.of_part = of_part
+    def __init__(self) -> None:
         self.shards: list[dict[str, Any]] = []
         self.n_episodes = self.n_crashes = self.n_failed = self.n_retraced = self.reported_from = 0
         self.repeated: Repeated | None = None
@@ -131,14 +118,9 @@ class Prefix:
         self.repeated = self.repeated or done.repeated
 
     def require_few_failed(self, campaign: Campaign, *, at_least: int = 0) -> None:
-        """Refuse an answer from tests of which too many failed, once there are ``at_least`` so many.
-
-        A part of a run is refused when its share is too large beyond all chance: the whole is judged by `merge`.
-        """
-        most = campaign.run.max_failed_share
-        by_chance = self.of_part and bdtrc(self.n_failed - 1, self.n_episodes, most) >= SURELY_TOO_MANY
-        if self.n_episodes >= at_least and not by_chance:
-            require_few_failed(self.n_failed, self.n_episodes, self._causes, most)
+        """Refuse an answer from tests of which too many failed, once there are ``at_least`` so many."""
+        if self.n_episodes >= at_least:
+            require_few_failed(self.n_failed, self.n_episodes, self._causes, campaign.run.max_failed_share)
 
 
 def require_few_failed(
@@ -193,13 +175,12 @@ class Manifest:
         One of the same size whose file is missing is only made anew.
         """
         shards = self._earlier["shards"]
-        place = spec.index - shards[0]["index"] if shards else 0  # a part begins at a later one
-        if place >= len(shards):
+        if spec.index >= len(shards):
             return
-        shard = shards[place]
+        shard = shards[spec.index]
         if shard["n_episodes"] == spec.n_episodes and not (self._folder / shard["files"]["episodes"]).exists():
             return
-        kept = shards[:place]
+        kept = shards[: spec.index]
         cut = {"status": "interrupted", "stopped_by": None, "ending": None, "results": None}
         n_kept = sum(shard["n_episodes"] for shard in kept)
         self._earlier = {**self._earlier, **cut, "n_episodes": n_kept, "shards": kept}

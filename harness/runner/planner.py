@@ -43,7 +43,7 @@ FIRST_PHASE = 1.7
 
 
 class Planner:
-    """Says what is tested next, in rounds; by itself nothing, for tests that are planned elsewhere, as those of a part.
+    """Says what is tested next, in rounds; by itself nothing, for tests that are planned elsewhere.
 
     ``rule`` says why it stops, ``reported_from`` is the first test of those that the answer is from (0 where all are),
     ``remark`` what the ending is to say besides; mostly nothing.
@@ -88,10 +88,10 @@ class FixedPlanner(Planner):
         return self.rule.observe(self._n_episodes, self._sums.result(self._campaign.stop.confidence))
 
 
-def known_specs(campaign: Campaign, begin: int = 0, end: int | None = None) -> Iterator[ShardSpec]:
-    """Shards of a campaign all of whose tests are known beforehand, or those from ``begin`` to before ``end``."""
+def known_specs(campaign: Campaign) -> Iterator[ShardSpec]:
+    """Shards of a campaign all of whose tests are known beforehand."""
     size, total = campaign.run.shard_size, campaign.stop.episodes
-    return (ShardSpec(first // size, first, min(size, total - first)) for first in range(0, total, size)[begin:end])
+    return (ShardSpec(first // size, first, min(size, total - first)) for first in range(0, total, size))
 
 
 class ShellPlanner(Planner):
@@ -102,7 +102,7 @@ class ShellPlanner(Planner):
 
     ``available``, shape (S,), are the most tests of each stratum, ``held`` see `RoundRule`; ``seen`` are the tests of
     this phase, ``drawn`` those of both, (S,); ``reported_from`` is the first test of the second phase, ``planned`` its
-    tests, (S,), once they are, ``expected_rhw`` what is expected of them.
+    tests, (S,), once they are.
     """
 
     rule: RoundRule
@@ -113,7 +113,6 @@ class ShellPlanner(Planner):
         super().__init__(RoundRule(campaign, held, FIRST_PHASE if self._plans else 1.0))
         wide = campaign.stop.rhw is not None and campaign.stop.rhw > BIASED_RHW and not self._plans
         self.remark = TOO_WIDE if wide else ""
-        self.expected_rhw = math.inf
         self._campaign = campaign
         self._allocation = Allocation.of(shells, design, available)
         self.drawn = np.zeros(design.p.size, np.int64)
@@ -160,8 +159,6 @@ class ShellPlanner(Planner):
         stop, left = self._campaign.stop, self._allocation.available - self.drawn
         rhw = stop.rhw or math.inf
         self.planned = self._allocation.second_phase(self.tally, left, budget, rhw, stop.confidence)
-        if self.planned.any():
-            self.expected_rhw = self._allocation.expected_rhw(self.tally, self.planned, stop.confidence)
         self.rule, self.reported_from = RoundRule(self._campaign), self._n_episodes
         self._begin_phase()
         return False

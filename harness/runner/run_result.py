@@ -58,13 +58,8 @@ def exit_code(campaign: Campaign, stopped_by: StoppedBy, verdict: Verdict | None
     return EXIT_BUDGET_SPENT if missed else EXIT_DONE
 
 
-def conclusion(
-    campaign: Campaign, rule: Rule, n_episodes: int, reported_from: int, missing: tuple[str, ...] = ()
-) -> tuple[StoppedBy, str]:
-    """Why a campaign ended after so many tests, of which those from ``reported_from`` on are reported; in a sentence.
-
-    ``missing`` is said where the rule itself waited for nothing.
-    """
+def conclusion(campaign: Campaign, rule: Rule, n_episodes: int, reported_from: int) -> tuple[StoppedBy, str]:
+    """Why a campaign ended after so many tests; those from ``reported_from`` on are reported. In a sentence."""
     by: StoppedBy
     if 0 < reported_from < n_episodes < campaign.stop.episodes:
         by = "two_phase"
@@ -77,7 +72,7 @@ def conclusion(
     else:
         by = "episodes" if n_episodes >= campaign.stop.episodes else "pool"
     asked = campaign.stop.rhw is not None or rule.decision is not None
-    return by, ending(by, n_episodes, rule.waited_for or missing, precision_asked=asked)
+    return by, ending(by, n_episodes, rule.waited_for, precision_asked=asked)
 
 
 def results_of(folder: Path) -> dict[str, Fingerprint | None]:

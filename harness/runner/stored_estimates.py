@@ -20,7 +20,7 @@ from harness.importance.build import importance_names, mixture_weights
 from harness.pool.replay import PATH_COLUMNS, SurrogateReplay
 from harness.pool.storage import cached_pool, read_pool
 from harness.records.folder import SHELLS, concatenated, no_episodes, read_json, read_manifest, require_schema
-from harness.records.reader import read_shard, require_whole, stored_columns
+from harness.records.reader import read_shard, stored_columns
 from harness.records.stored_manifest import StoredShells
 from harness.resolved import resolve
 from harness.runner.stored_shards import GatheredBlocks
@@ -69,7 +69,7 @@ def estimate_run(
         If the folder is not a run, its records are damaged or incomplete, or the pool is of another environment.
     """
     folder = Path(folder)
-    manifest = require_whole(folder)
+    manifest = read_manifest(folder)
     campaign = load_campaign(folder / "campaign.yaml", check_files=False)
     distance = manifest.get("distance_per_test_m")
     surrogates = surrogates_of(campaign, stored_columns(folder, manifest), pool)
@@ -115,7 +115,7 @@ def stored_blocks(
         If the folder is not a run, or its records are damaged or incomplete.
     """
     campaign = load_campaign(folder / "campaign.yaml", check_files=False)
-    manifest = require_whole(folder)
+    manifest = read_manifest(folder)
     n_counted, reported_from = int(manifest["n_episodes"]), int(manifest.get("reported_from") or 0)
     if n_counted == 0:
         raise no_episodes(folder)

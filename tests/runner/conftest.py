@@ -13,18 +13,7 @@ import pytest
 from harness.campaign.campaign import Campaign
 from harness.campaign.files import load_campaign
 from harness.controllers.black_box import Death
-from harness.part import Part
-from harness.runner import (
-    PartResult,
-    PlanResult,
-    RunResult,
-    executor,
-    merge_parts,
-    plan_second_phase,
-    read_plan,
-    run_campaign,
-    run_part,
-)
+from harness.runner import RunResult, executor, run_campaign
 from harness.runner.worker import ShardDone, ShardRunner, ShardSpec
 
 MIXTURE_FILE = Path(__file__).parents[2] / "scenarios" / "overtaking_mixture.yaml"
@@ -93,30 +82,6 @@ def one_process() -> Iterator[None]:
 def run_here() -> Callable[..., RunResult]:
     """`run` with one worker that is this process."""
     return one_process()(without_page()(partial(run_campaign, workers=1)))
-
-
-@pytest.fixture(scope="session")
-def plan_here() -> Callable[..., PlanResult]:
-    """`plan_second_phase` in this process."""
-    return one_process()(partial(plan_second_phase, workers=1))
-
-
-@pytest.fixture(scope="session")
-def part_here() -> Callable[..., PartResult]:
-    """`run_part` in this process, of a campaign or of the plan in a folder."""
-
-    @one_process()
-    def run_in_this_process(source: Campaign | Path, number: int, of: int, out: Path, **options) -> PartResult:
-        source = read_plan(source) if isinstance(source, Path) else source
-        return run_part(source, Part(number, of), out, workers=1, **options)
-
-    return run_in_this_process
-
-
-@pytest.fixture(scope="session")
-def merged() -> Callable[..., RunResult]:
-    """`merge_parts` without the page."""
-    return without_page()(merge_parts)
 
 
 @pytest.fixture(scope="session")

@@ -54,6 +54,14 @@ def test_a_run_begun_already_needs_resume(stored, capsys, twin_run):
     assert unlike_columns(twin_run, stored) == []
 
 
+def test_a_part_of_a_run_as_earlier_versions_divided_it(stored, capsys):
+    whole = manifest(stored)
+    for kind in ("part", "plan"):
+        (stored / "manifest.json").write_text(json.dumps({**whole, kind: {"number": 1}}))
+        for command in (("estimate", stored), ("run", MIXTURE_FILE, "--out", stored, *SAME, "--resume")):
+            assert f"a {kind} of a run" in complaint_of(capsys, *command)
+
+
 @pytest.mark.parametrize("resume", [[], ["--resume"]])
 def test_a_folder_with_foreign_files(resume, tmp_path, capsys):
     (tmp_path / "thesis.tex").write_text("three years of work")
