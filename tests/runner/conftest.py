@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import pickle
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -12,9 +10,8 @@ import pytest
 
 from harness.campaign.campaign import Campaign
 from harness.campaign.files import load_campaign
-from harness.controllers.black_box import Death
-from harness.runner import RunResult, executor, run_campaign
-from harness.runner.worker import ShardDone, ShardRunner, ShardSpec
+from harness.runner import RunResult, run_campaign
+from tests.in_process import one_process, without_page
 
 MIXTURE_FILE = Path(__file__).parents[2] / "scenarios" / "overtaking_mixture.yaml"
 SMALL = ("stop.episodes=1600", "stop.rhw=null", "run.shard_size=80", "records.trace_share=0.05")
@@ -32,50 +29,10 @@ def campaign() -> Callable[..., Campaign]:
     return lambda *overrides: load_campaign(MIXTURE_FILE, [*SMALL, *overrides])
 
 
-@contextmanager
-def without_page() -> Iterator[None]:
-    """It takes longer than these campaigns; test_api.py looks at it."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("harness.report.write_report", lambda folder, final=None: folder / "report.html")
-        yield
-
-
 @pytest.fixture(scope="session")
 def run() -> Callable[..., RunResult]:
     """`run_campaign` without the page."""
     return without_page()(run_campaign)
-
-
-class WorkerInThisProcess:
-    """Stands in for `WorkerProcess` where the tests are not about processes: spares starting one."""
-
-    def __init__(self, resolved: Path, folder: Path, black_box: Path) -> None:
-        self._runner = ShardRunner(pickle.loads(resolved.read_bytes()), folder)
-
-    def give(self, spec: ShardSpec, doomed: Mapping[int, Death]) -> bool:
-        self._done = self._runner.run(spec, doomed)
-        return True
-
-    def answer(self) -> ShardDone:
-        return self._done
-
-    def kill(self) -> None:
-        self.dismiss()
-
-    def dismiss(self) -> None:
-        self._runner.close()
-        self._runner._loop._world.close()
-
-    def wait(self) -> None: ...
-
-
-@contextmanager
-def one_process() -> Iterator[None]:
-    """Where shards are run, it is here."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(executor, "WorkerProcess", WorkerInThisProcess)
-        patch.setattr(executor.LocalExecutor, "first_to_answer", lambda _, busy: busy[0])
-        yield
 
 
 @pytest.fixture(scope="session")

@@ -10,7 +10,8 @@ from harness.campaign.files import load_campaign
 from harness.cli import main
 from harness.errors import CampaignError
 from harness.runner.compare import compare_campaigns, require_comparable
-from tests.runner.conftest import one_process, sets, without_page
+from tests.in_process import one_process, without_page
+from tests.runner.conftest import sets
 from tests.runner.stored_runs import stored_table
 
 FORCED = str(Path(__file__).parents[2] / "scenarios/overtaking_forced.yaml")

@@ -14,8 +14,9 @@ from harness.records.reader import read_shards
 from harness.runner import compare_campaigns
 from harness.runner.campaign_run import Run
 from harness.runner.worker import ShardRunner
+from tests.in_process import one_process, without_page
 from tests.pool.conftest import SMALL_POOL
-from tests.runner.conftest import MIXTURE_FILE, one_process, without_page
+from tests.runner.conftest import MIXTURE_FILE
 from tests.runner.stored_runs import manifest
 
 SHELLS = (

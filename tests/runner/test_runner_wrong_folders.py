@@ -14,7 +14,8 @@ from harness.errors import RunFolderError
 from harness.records.folder import read_manifest, require_place, sole_use
 from harness.resolved import resolve
 from harness.runner.manifest import require_own_folder
-from tests.runner.conftest import MIXTURE_FILE, SMALL, TWIN, one_process, sets, without_page
+from tests.in_process import one_process, without_page
+from tests.runner.conftest import MIXTURE_FILE, SMALL, TWIN, sets
 from tests.runner.stored_runs import copy_of, manifest, shard_files, truncate, unlike_columns
 
 SAME = sets(*SMALL, *TWIN)

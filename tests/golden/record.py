@@ -1,0 +1,175 @@
+"""What is compared of golden runs, and how it is recorded: ``python -m tests.golden.record``.
+
+Recording again is allowed where a release means to change bits (another law of traffic, another random stream, another
+estimate), and its changelog says so. It is never allowed in a change of structure: there a golden run that differs
+shows a mistake. ``--processes N`` only looks whether workers that are processes give the same.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+import yaml
+
+import harness
+from tests.golden.campaigns import BASE, COMPARED, RUNS
+from tests.in_process import controllers_here, one_process, without_page
+
+GOLDEN = Path(__file__).parent / "golden.json"
+SCENARIOS = Path(__file__).parents[2] / "scenarios"
+TABLES = {"episodes": ["episode"], "moments": ["episode", "step"], "traces": ["episode", "step"], "shadow": ["shadow"]}
+"""By what each is sorted; vehicles of a step keep their order."""
+LEFT_OUT = {"diagnostics.alarm"}
+"""Of estimates.json: what features of earlier days wrote."""
+WORDLESS_TYPES = bool, int, float, type(None)
+
+
+def load(*overrides: str) -> Any:
+    """A golden campaign."""
+    return harness.load_campaign(BASE, overrides)
+
+
+def run_here(name: str, out: Path, *more: str, workers: int | None = None, resume: bool = False) -> Path:
+    """Run a golden campaign: in this process, or with ``workers`` that are processes; without its page."""
+    campaign = load(*RUNS[name], *more)
+    with without_page():
+        if workers is not None:
+            harness.run(campaign, out, workers=workers, resume=resume)
+        else:
+            with one_process(), controllers_here():
+                harness.run(campaign, out, workers=1, resume=resume)
+    return out
+
+
+def compare_here(out: Path, workers: int | None = None) -> Path:
+    """Run the golden comparison."""
+    shared, other = COMPARED
+    with without_page():
+        if workers is not None:
+            harness.compare(load(*shared), load(*shared, other), out, workers=workers)
+        else:
+            with one_process(), controllers_here():
+                harness.compare(load(*shared), load(*shared, other), out, workers=1)
+    return out
+
+
+def column_hash(column: pa.Array) -> str:
+    """Of type and bits; null is not zero, and a dictionary is what it stands for."""
+    digest = hashlib.sha256(str(column.type).encode())
+    _feed(digest, column)
+    return digest.hexdigest()[:10]
+
+
+def _feed(digest: Any, column: pa.Array) -> None:
+    if pa.types.is_dictionary(column.type):
+        column = column.cast(column.type.value_type)
+    digest.update(column.is_null().to_numpy(zero_copy_only=False).tobytes())
+    if pa.types.is_list(column.type) or pa.types.is_fixed_size_list(column.type):
+        digest.update(pc.fill_null(pc.list_value_length(column), 0).to_numpy(zero_copy_only=False).tobytes())
+        _feed(digest, column.flatten())
+    elif pa.types.is_floating(column.type) or pa.types.is_integer(column.type):
+        digest.update(pc.fill_null(column, 0).to_numpy(zero_copy_only=False).tobytes())
+    else:
+        digest.update(json.dumps(column.to_pylist()).encode())
+
+
+def tables_of(folder: Path) -> dict[str, dict[str, Any]]:
+    """Hash of each column of the folder's tables, sorted by their index, by table."""
+    found = {}
+    for name, keys in TABLES.items():
+        if files := sorted((folder / name).glob("*.parquet")):
+            rows = pa.concat_tables([pq.read_table(file, partitioning=None) for file in files]).combine_chunks()
+            rows = rows.take(pc.sort_indices(rows.select(keys), [(key, "ascending") for key in keys]))
+            columns = {column: column_hash(rows[column].combine_chunks()) for column in rows.column_names}
+            found[name] = {"rows": rows.num_rows, **columns}
+    return found
+
+
+def numbers_of(content: Any, path: str = "") -> dict[str, Any]:
+    """Numbers, truth values and nulls of a JSON document by their paths: no words, and no key of a pool."""
+    items = content.items() if isinstance(content, dict) else enumerate(content)
+    found: dict[str, Any] = {}
+    for key, value in items:
+        here = f"{path}.{key}" if path else str(key)
+        if here in LEFT_OUT:
+            continue
+        if isinstance(value, dict | list):
+            found |= numbers_of(value, here)
+        elif isinstance(value, WORDLESS_TYPES):
+            found[here] = value
+    return found
+
+
+def seen_in(folder: Path) -> dict[str, Any]:
+    """What is compared of a run folder."""
+    estimates = json.loads((folder / "estimates.json").read_text())
+    return {"campaign_hash": estimates["campaign_hash"], **tables_of(folder), "estimates": numbers_of(estimates)}
+
+
+def seen_in_comparison(folder: Path) -> dict[str, Any]:
+    """What is compared of a comparison."""
+    content = json.loads((folder / "compare.json").read_text())
+    return {"compare": numbers_of(content), **{side: seen_in(folder / side) for side in "ab"}}
+
+
+def campaign_hashes() -> dict[str, str]:
+    """Hashes of all shipped campaigns, and of smoke.yaml with each vehicle of the panel."""
+    smoke, panel = SCENARIOS / "smoke.yaml", SCENARIOS / "av_panel.yaml"
+    files = sorted(set(SCENARIOS.glob("*.yaml")) - {panel})
+    found = {file.name: harness.load_campaign(file) for file in files}
+    found |= {
+        f"smoke.yaml of {av}": harness.load_campaign(smoke, av=av) for av in yaml.safe_load(panel.read_text())["avs"]
+    }
+    return {name: campaign.content_hash("parameters") for name, campaign in found.items()}
+
+
+def unlike(found: Any, golden: Any, path: str = "") -> list[str]:
+    """Where two such trees differ in any bit or type."""
+    if isinstance(found, dict) and isinstance(golden, dict):
+        keys = sorted(found.keys() | golden.keys())
+        missing = [
+            f"{path}/{key}: {'new' if key in found else 'gone'}" for key in keys if (key in found) != (key in golden)
+        ]
+        both = [
+            line
+            for key in keys
+            if key in found and key in golden
+            for line in unlike(found[key], golden[key], f"{path}/{key}")
+        ]
+        return missing + both
+    same = type(found) is type(golden) and repr(found) == repr(golden)
+    return [] if same else [f"{path}: {found!r}, was {golden!r}"]
+
+
+def record(workers: int | None = None) -> dict[str, Any]:
+    """All golden runs, as they are now."""
+    with tempfile.TemporaryDirectory() as folder:
+        runs = {name: seen_in(run_here(name, Path(folder) / name, workers=workers)) for name in RUNS}
+        compared = seen_in_comparison(compare_here(Path(folder) / "compared", workers))
+    return json.loads(json.dumps({"campaign_hashes": campaign_hashes(), "runs": runs, "compared": compared}))
+
+
+def main() -> int:
+    """Record, or only look."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--processes", type=int, help="look whether so many workers that are processes give the same")
+    asked = parser.parse_args()
+    if asked.processes:
+        differences = unlike(record(asked.processes), json.loads(GOLDEN.read_text()))
+        sys.stdout.write("\n".join([*differences, "the same bits" if not differences else "other bits", ""]))
+        return bool(differences)
+    GOLDEN.write_text(json.dumps(record(), indent=0) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

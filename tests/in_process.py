@@ -1,0 +1,72 @@
+"""Stand-ins that spare tests what they are not about: starting processes, and drawing the page.
+
+Whoever moves what is patched here mends it here: no other file of the tests knows where it lies.
+"""
+
+from __future__ import annotations
+
+import pickle
+import tempfile
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from harness.controllers.black_box import Death
+from harness.runner import executor
+from harness.runner.worker import ShardDone, ShardRunner, ShardSpec
+
+
+@contextmanager
+def without_page() -> Iterator[None]:
+    """It takes longer than small campaigns; test_api.py looks at it."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("harness.report.write_report", lambda folder, **_: folder / "report.html")
+        yield
+
+
+class WorkerInThisProcess:
+    """Stands in for `WorkerProcess` where the tests are not about processes: spares starting one."""
+
+    def __init__(self, resolved: Path, folder: Path, black_box: Path) -> None:
+        self._runner = ShardRunner(pickle.loads(resolved.read_bytes()), folder)
+
+    def give(self, spec: ShardSpec, doomed: Mapping[int, Death]) -> bool:
+        self._done = self._runner.run(spec, doomed)
+        return True
+
+    def answer(self) -> ShardDone:
+        return self._done
+
+    def kill(self) -> None:
+        self.dismiss()
+
+    def dismiss(self) -> None:
+        self._runner.close()
+        self._runner._loop._world.close()
+
+    def wait(self) -> None: ...
+
+
+@contextmanager
+def one_process() -> Iterator[None]:
+    """Where shards are run, it is here."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(executor, "WorkerProcess", WorkerInThisProcess)
+        patch.setattr(executor.LocalExecutor, "first_to_answer", lambda _, busy: busy[0])
+        yield
+
+
+def _work_here(_: Any, work: Callable[..., Any], *arguments: Any) -> Any:
+    with tempfile.TemporaryDirectory() as folder:
+        return work(*arguments, black_box=Path(folder) / "black-box")
+
+
+@contextmanager
+def controllers_here() -> Iterator[None]:
+    """Where a controller is tried before a run, it is here: for those that are known to end no process."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("harness.controllers.loading.run_apart", _work_here)
+        yield
