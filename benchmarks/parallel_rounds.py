@@ -26,8 +26,8 @@ from harness.pool.shells import design_shells
 from harness.pool.storage import campaign_pool
 from harness.resolved import resolve
 from harness.runner.planner import ShellPlanner, round_specs
-from harness.studies.shell_campaign import DrawnPool, campaign_block
 from harness.vocabulary import FloatArray
+from studies.shell_campaign import DrawnPool, campaign_block
 
 WORKERS = (8, 64, 512)
 TEST_S = (0.01, 1.0, 20.0)

@@ -15,9 +15,9 @@ from pathlib import Path
 from benchmarks.contenders import SCENARIOS
 from harness.campaign.campaign import Campaign
 from harness.campaign.sections import Stop
-from harness.studies.experiment import Experiment, load_experiment
-from harness.studies.run import validate
-from harness.studies.shell_campaign import FREE
+from studies.experiment import Experiment, load_experiment
+from studies.run import validate
+from studies.shell_campaign import FREE
 
 BUDGET = 1_000_000
 

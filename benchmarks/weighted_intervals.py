@@ -21,8 +21,8 @@ from harness.estimators.estimate import Estimate
 from harness.estimators.intervals import hall_distances, normal_half_width
 from harness.estimators.nade import Nade
 from harness.estimators.stopping import StopRule
-from harness.studies.weighted_campaign import twin_episodes
 from harness.vocabulary import FloatArray, Method
+from studies.weighted_campaign import twin_episodes
 
 CONFIDENCE = 0.9
 SEED = 77

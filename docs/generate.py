@@ -2,7 +2,7 @@
 
     python docs/generate.py                                 rewrites them in place
     python docs/generate.py --check                         says which pages are out of date (exit code 1)
-    python docs/generate.py --case-study runs/case_study    takes page and plots of a full `harness study`
+    python docs/generate.py --case-study runs/case_study    takes page and plots of a full `python -m studies case`
 
 A generated part stands between ``<!-- generated: NAME -->`` and ``<!-- end -->``. Its source is the code (models of the
 campaign, Arrow schemas) or the committed results in ``docs/validation/``, so that it cannot drift from them.
@@ -259,7 +259,7 @@ METHODS = {
 
 
 def _command(name: str) -> str:
-    return f"`harness validate scenarios/validate/{name}.yaml --out DIR`"
+    return f"`python -m studies validate scenarios/validate/{name}.yaml --out DIR`"
 
 
 def validated_table(name: str) -> str:
@@ -388,7 +388,7 @@ def pages() -> Iterator[Path]:
 
 
 MADE_BY = (
-    "\n\nMade by `harness study scenarios/case_study/study.yaml --out runs/case_study` "
+    "\n\nMade by `python -m studies case scenarios/case_study/study.yaml --out runs/case_study` "
     "([how](validation.md#the-papers-case-study)).\n\n"
 )
 

@@ -12,10 +12,9 @@ from collections.abc import Sequence
 
 import click
 
-from harness.commands.campaigns import check, run, schema, setup
+from harness.commands.campaigns import check, pool, run, schema, setup
 from harness.commands.options import examples
 from harness.commands.stored import estimate, replay, report
-from harness.commands.studies import pool, rnot, study, validate
 from harness.commands.vehicles import av_check, compare, ladder
 from harness.console import show_error, show_interrupted, system_error, usage_error
 from harness.errors import EXIT_DONE, HarnessError, shortened
@@ -43,24 +42,24 @@ def cli() -> None:
     """
 
 
-_TESTING = check, av_check, run, compare, pool, ladder, estimate, rnot, report, replay
-for command in (*_TESTING, validate, study, schema, setup):
+_TESTING = check, av_check, run, compare, pool, ladder, estimate, report, replay
+for command in (*_TESTING, schema, setup):
     cli.add_command(command)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line and turn every error that a user can cause into plain words; returns the exit code.
+def main(arguments: Sequence[str] | None = None, group: click.Group = cli, name: str = "harness") -> int:
+    """Run a command line and turn every error that a user can cause into plain words; returns the exit code.
 
     Anything that is not a user's error is a defect and leaves as its own exception.
     """
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     with interruptible() as interruption:
-        return _main(arguments, interruption)
+        return _main(group, name, arguments, interruption)
 
 
-def _main(arguments: list[str], interruption: Interruption) -> int:
+def _main(group: click.Group, name: str, arguments: list[str], interruption: Interruption) -> int:
     try:
-        code = cli.main(arguments, prog_name="harness", standalone_mode=False)
+        code = group.main(arguments, prog_name=name, standalone_mode=False)
         sys.stdout.flush()
     except HarnessError as error:
         show_error(error)

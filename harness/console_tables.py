@@ -33,7 +33,7 @@ def print_av_check(found: AvCheck) -> None:
         "episodes per second": f"{speed.episodes_per_s:,.0f} (built-in IDM {speed.idm_episodes_per_s:,.0f})",
     }
     title = f"AV from av.{found.source}: {found.n_episodes} episodes ({found.method}, {found.engine})"
-    _print_table(title, ("question", "answer"), rows.items(), texts=("question", "answer"))
+    print_table(title, ("question", "answer"), rows.items(), texts=("question", "answer"))
     for cause, count in found.failures.items():
         click.echo(f"{count} × failed: {cause}")
 
@@ -52,7 +52,7 @@ def print_estimates(content: dict[str, Any], asked: Sequence[str] = ()) -> None:
     level = f"{content['confidence']:.0%} interval"
     headings = ("estimator", "crash rate per test", level, "RHW", "effective crashes", "largest weight share")
     rows = [(name + (" *" if name == content["headline"] else ""), *_cells(entry)) for name, entry in shown.items()]
-    _print_table(title, headings, rows, texts=("estimator",))
+    print_table(title, headings, rows, texts=("estimator",))
     answered = content["headline"] in shown
     for name, entry in shown.items():
         # Without the campaign's own estimator the reason is the answer, and comes last.
@@ -69,32 +69,6 @@ def print_estimates(content: dict[str, Any], asked: Sequence[str] = ()) -> None:
         click.echo(content["scope"])
 
 
-def print_required_tests(content: dict[str, Any]) -> None:
-    """Print required numbers of tests as a table, with what limits each of them below."""
-    level, n_shuffles = f"{content['confidence']:.0%}", f"{content['n_shuffles']:,}"
-    headings = ("run", "estimator", "tests on record", "grid", "shuffles", "mean RNoT", "5-95 %", "never", "AAR")
-    rows = []
-    for row in content["rows"]:
-        cells = ["-"] * 6
-        if row["mean"] is not None:
-            limit = "≥ " if row["mean_is_lower_limit"] else ""
-            aar = {"equal": "", "at least": "≥ ", "at most": "≤ "}.get(row["aar_is"])
-            cells = [
-                row["grid"],
-                n_shuffles,
-                f"{limit}{row['mean']:,.0f}",
-                f"{row['low_5']:,} to {row['high_95']:,}",
-                f"{row['never_reached']:,}",
-                "-" if aar is None else f"{aar}{row['aar']:.3g}",
-            ]
-        rows.append((row["run"], row["estimator"], f"{row['n_episodes']:,}", *cells))
-    title = f"Tests until RHW stays at most {content['rhw']:g} ({level} normal interval)"
-    _print_table(title, headings, rows, texts=("run", "estimator", "grid"))
-    for row in content["rows"]:
-        for remark in [*row.get("remarks", ()), *filter(None, [row.get("reason")])]:
-            click.echo(f"{row['run']} {row['estimator']}: {remark}")
-
-
 def print_pool(content: dict[str, Any]) -> None:
     """Print a pool: its surrogates from careful to careless, and the shells between them."""
     headings = ("surrogate", "crash rate per test", "std. error", "probability of its shell")
@@ -105,7 +79,7 @@ def print_pool(content: dict[str, Any]) -> None:
         rate, p = f"{entry['crash_rate']:.3e}", f"{entry['shell_probability']:.3e}"
         rows.append((entry["name"] + marks.get(entry["name"], ""), rate, _defined(error, ".2%"), p))
     rows.append(("nobody crashes", "", "", f"{content['no_surrogate_crashes']:.3e}"))
-    _print_table(f"Pool {content['pool']}: {content['n_paths']:,} paths", headings, rows, texts=("surrogate",))
+    print_table(f"Pool {content['pool']}: {content['n_paths']:,} paths", headings, rows, texts=("surrogate",))
     error = content["p_cut_in_std_error"] / content["p_cut_in"]
     click.echo(f"BV cuts in in {content['p_cut_in']:.3e} of all tests (standard error {error:.2%}).")
     for name, delay_s in content["delays_after_cut_in_s"].items():
@@ -143,7 +117,7 @@ def _print_shells(shells: list[dict[str, Any]]) -> None:
         )
         for shell in shells
     ]
-    _print_table("Shells, from careful to careless", headings, rows, texts=("first to crash",))
+    print_table("Shells, from careful to careless", headings, rows, texts=("first to crash",))
 
 
 def _cells(entry: dict[str, Any]) -> list[str]:
@@ -161,7 +135,7 @@ def _half_width(rhw: float | None) -> str:
     return f"> {WIDEST_RHW:g}" if rhw is not None and rhw > WIDEST_RHW else _defined(rhw, ".3f")
 
 
-def _print_table(title: str, headings: Sequence[str], rows: Iterable[Sequence[str]], *, texts: Collection[str]) -> None:
+def print_table(title: str, headings: Sequence[str], rows: Iterable[Sequence[str]], *, texts: Collection[str]) -> None:
     """Print a table; columns headed by one of ``texts`` are flush left, and nothing is cut off."""
     from rich.console import Console  # noqa: PLC0415 - keeps --help fast
     from rich.table import Table  # noqa: PLC0415 - keeps --help fast

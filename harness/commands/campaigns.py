@@ -10,6 +10,7 @@ import click
 
 from harness.commands.options import (
     CAMPAIGN,
+    FILE,
     FOLDER,
     av_option,
     examples,
@@ -20,9 +21,10 @@ from harness.commands.options import (
     quiet_option,
     set_option,
     workers_option,
+    written_file,
 )
 from harness.console import print_json, print_plan
-from harness.console_tables import print_result
+from harness.console_tables import print_pool, print_result
 
 
 @click.command(
@@ -123,6 +125,43 @@ def run(
     else:
         print_result(result)
     ctx.exit(result.exit_code)
+
+
+@click.command(
+    short_help="Build the pool of cut-ins, and show its shells.",
+    epilog=examples("harness pool scenarios/smoke.yaml", "harness pool scenarios/smoke.yaml --out pool.parquet"),
+)
+@click.argument("campaign_file", metavar="CAMPAIGN", type=CAMPAIGN)
+@click.option(
+    "--out",
+    type=FILE,
+    callback=written_file(".parquet"),
+    help="Write the pool there, too: FILE.parquet, one row per cut-in.",
+)
+@set_option
+@json_option
+def pool(campaign_file: Path, *, out: Path | None, overrides: Sequence[str], as_json: bool) -> None:
+    """Build the pool that belongs to CAMPAIGN's environment and surrogate library, and show what is in it.
+
+    Shown are the surrogates from careful to careless with their crash rates, and how probable it is that a cut-in is
+    the first in this order that a surrogate crashes on. A pool is built once and kept; `harness run` builds it, too.
+    """
+    campaign = loaded(campaign_file, overrides)
+    from harness.pool.storage import campaign_pool, write_pool  # noqa: PLC0415 - slow to import
+    from harness.progress import shown_progress  # noqa: PLC0415 - keeps --help fast
+    from harness.resolved import resolve  # noqa: PLC0415 - slow to import
+
+    bar = shown_progress()
+    with bar:
+        found = campaign_pool(resolve(campaign), bar)
+    if out is not None:
+        write_pool(out, found)
+    if as_json:
+        print_json(found.to_json() | ({} if out is None else {"file": str(out)}))
+        return
+    print_pool(found.to_json())
+    if out is not None:
+        click.echo(str(out))
 
 
 @click.command(

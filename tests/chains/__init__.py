@@ -1,1 +1,1 @@
-"""Estimators on the exact Markov chains of `harness.studies.chains`."""
+"""Estimators on the exact Markov chains of `studies.chains`."""

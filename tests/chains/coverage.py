@@ -8,7 +8,7 @@ import numpy as np
 
 from harness.estimators.block import Block
 from harness.estimators.estimate import Accumulator
-from harness.studies.judgement import Judgement, Row, Subject, estimate_row, judge
+from studies.judgement import Judgement, Row, Subject, estimate_row, judge
 from tests.estimators.small_blocks import fed
 
 

@@ -19,7 +19,7 @@ from scipy.stats import binom, norm
 from harness.estimators.alarm import LEVEL, Alarm
 from harness.estimators.block import Block
 from harness.strata import KnownRates
-from harness.studies.chains.single_choice import SingleChoice
+from studies.chains.single_choice import SingleChoice
 from tests.estimators.small_blocks import block, fed
 
 from .seed import SEED

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.stats import binomtest
 
-from harness.studies.case_study.theorems import small_chains
-from harness.studies.chains.chain import enumerate_episodes
-from harness.studies.chains.named import frequent_decisive, overtaking, panel
-from harness.studies.chains.sampler import draw, mixture_weights
+from studies.case_study.theorems import small_chains
+from studies.chains.chain import enumerate_episodes
+from studies.chains.named import frequent_decisive, overtaking, panel
+from studies.chains.sampler import draw, mixture_weights
 
 from .seed import SEED
 

@@ -14,9 +14,9 @@ from harness.estimators.block import Block
 from harness.estimators.mixture_cv import MixtureCv
 from harness.estimators.nade import Nade
 from harness.estimators.scv import Scv
-from harness.studies.chains.named import frequent_decisive, rare_decisive
-from harness.studies.chains.sampler import draw
-from harness.studies.chains.single_choice import with_optimal_function
+from studies.chains.named import frequent_decisive, rare_decisive
+from studies.chains.sampler import draw
+from studies.chains.single_choice import with_optimal_function
 
 from .coverage import replicate
 

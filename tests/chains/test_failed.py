@@ -13,10 +13,10 @@ import pytest
 
 from harness.estimators.block import Block
 from harness.estimators.one_pass import ACCUMULATORS, accumulator
-from harness.studies.chains.named import frequent_decisive
-from harness.studies.chains.sampler import draw
-from harness.studies.chains.shells import ChainShells
-from harness.studies.shell_campaign import DrawnPool, campaign_block
+from studies.chains.named import frequent_decisive
+from studies.chains.sampler import draw
+from studies.chains.shells import ChainShells
+from studies.shell_campaign import DrawnPool, campaign_block
 
 from .coverage import replicate
 

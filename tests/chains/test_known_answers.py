@@ -13,8 +13,8 @@ from scipy.stats import binomtest
 
 from harness.estimators import Estimate, one_pass
 from harness.estimators.nade import Nade
-from harness.studies.chains.named import frequent_decisive, panel, rare_decisive
-from harness.studies.chains.sampler import Sampler, blocks
+from studies.chains.named import frequent_decisive, panel, rare_decisive
+from studies.chains.sampler import Sampler, blocks
 from tests.estimators.small_blocks import fed
 
 from .seed import SEED

@@ -15,9 +15,9 @@ from scipy.stats import binomtest
 
 from harness.estimators.block import Block
 from harness.estimators.difference import Difference, difference_statement, paired_difference
-from harness.studies.chains.named import overtaking
-from harness.studies.chains.sampler import draw
-from harness.studies.chains.single_choice import with_optimal_function
+from studies.chains.named import overtaking
+from studies.chains.sampler import draw
+from studies.chains.single_choice import with_optimal_function
 
 from .seed import SEED
 

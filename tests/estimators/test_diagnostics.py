@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from harness.estimators.diagnostics import Diagnostics
-from harness.studies.chains.named import overtaking
-from harness.studies.chains.sampler import blocks
+from studies.chains.named import overtaking
+from studies.chains.sampler import blocks
 from tests.chains.seed import SEED
 
 from .small_blocks import block, fed

@@ -8,8 +8,8 @@ import pytest
 
 from harness.errors import RunFolderError
 from harness.estimators.from_records import block_from_tables
-from harness.studies.chains.named import overtaking
-from harness.studies.chains.sampler import draw
+from studies.chains.named import overtaking
+from studies.chains.sampler import draw
 from tests.chains.seed import SEED
 
 from .run_folder import episodes_table, moments_table

@@ -5,8 +5,8 @@ import pytest
 
 from harness.estimators.intervals import normal_half_width, skewed_distances
 from harness.estimators.mixture_cv import MixtureCv
-from harness.studies.chains.named import panel
-from harness.studies.chains.sampler import blocks, draw
+from studies.chains.named import panel
+from studies.chains.sampler import blocks, draw
 from tests.chains.seed import SEED
 
 from .small_blocks import block, fed

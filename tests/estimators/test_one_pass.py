@@ -18,9 +18,9 @@ from harness.estimators import (
 )
 from harness.estimators.statement import alarm_cautions, warned
 from harness.runner import estimate_run
-from harness.studies.chains.named import overtaking
-from harness.studies.chains.sampler import blocks
 from harness.vocabulary import SAMPLING
+from studies.chains.named import overtaking
+from studies.chains.sampler import blocks
 from tests.chains.seed import SEED
 
 from .run_folder import write_run

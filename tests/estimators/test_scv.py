@@ -8,8 +8,8 @@ import pytest
 from harness.estimators.block import Block
 from harness.estimators.nade import Nade
 from harness.estimators.scv import CHUNK_ROWS, Scv, Stratum, fill_product_columns, n_columns, steps_used
-from harness.studies.chains.named import frequent_decisive, overtaking, panel
-from harness.studies.chains.sampler import blocks
+from studies.chains.named import frequent_decisive, overtaking, panel
+from studies.chains.sampler import blocks
 from tests.chains.seed import SEED
 
 from .small_blocks import block, fed

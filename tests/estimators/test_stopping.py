@@ -12,8 +12,8 @@ from harness.campaign.sections import Stop
 from harness.estimators import StopRule, accumulator
 from harness.estimators.stopping import LOOK_RATIO, Decision, look_grid
 from harness.strata import ASSUMPTION_FREE
-from harness.studies.chains.named import frequent_decisive
-from harness.studies.chains.sampler import blocks
+from studies.chains.named import frequent_decisive
+from studies.chains.sampler import blocks
 from tests.chains.seed import SEED
 
 from .small_blocks import block

@@ -11,14 +11,14 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from harness.cli import main
 from harness.progress import Progress
 from harness.report.number_format import number
-from harness.studies import run as studies_run
-from harness.studies.case_study import context, required, tested
-from harness.studies.case_study.context import Context, Made
-from harness.studies.case_study.control_variates import Claims
-from harness.studies.case_study.figures import (
+from studies import run as studies_run
+from studies.__main__ import main
+from studies.case_study import context, required, tested
+from studies.case_study.context import Context, Made
+from studies.case_study.control_variates import Claims
+from studies.case_study.figures import (
     exactly,
     figure,
     marked,
@@ -28,11 +28,11 @@ from harness.studies.case_study.figures import (
     verdict,
     weights_are_in,
 )
-from harness.studies.case_study.page import asked, count, shown
-from harness.studies.case_study.repeated import replicate
-from harness.studies.case_study.steps import run_study, step_keys
-from harness.studies.case_study.study_file import Replications, load_study
-from harness.studies.required_tests import RequiredTests
+from studies.case_study.page import asked, count, shown
+from studies.case_study.repeated import replicate
+from studies.case_study.steps import run_study, step_keys
+from studies.case_study.study_file import Replications, load_study
+from studies.required_tests import RequiredTests
 from tests.pool.conftest import SMALL_POOL
 
 from .here import Here, Interrupting
@@ -91,7 +91,7 @@ def study(tmp_path_factory):
     file = tmp_path_factory.mktemp("study") / "study.yaml"
     file.write_text(STUDY)
     folder = file.parent / "out"
-    assert main(["study", str(file), "--out", str(folder), "--workers", "1"]) == 0
+    assert main(["case", str(file), "--out", str(folder), "--workers", "1"]) == 0
     return file, folder
 
 
@@ -108,7 +108,7 @@ def made(study):
 def test_a_second_run_changes_nothing(study, capsys):
     file, folder = study
     before = written(folder)
-    assert main(["study", str(file), "--out", str(folder), "--workers", "2"]) == 0
+    assert main(["case", str(file), "--out", str(folder), "--workers", "2"]) == 0
     assert written(folder) == before
     assert capsys.readouterr().out.count("there already") == 7
 
@@ -347,7 +347,7 @@ def test_a_wrong_file_is_refused_before_anything_is_made(tmp_path, capsys, wrong
     assert wrong[0] in STUDY
     file = tmp_path / "study.yaml"
     file.write_text(STUDY.replace(*wrong))
-    assert main(["study", str(file), "--out", str(tmp_path / "out")]) == 2
+    assert main(["case", str(file), "--out", str(tmp_path / "out")]) == 2
     assert said in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 

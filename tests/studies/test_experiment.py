@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from harness.campaign.files import load_panel
-from harness.cli import main
 from harness.errors import CampaignError
-from harness.studies.experiment import load_experiment
+from studies.__main__ import main
+from studies.experiment import load_experiment
 
 FOLDER = Path(__file__).parents[2] / "scenarios" / "validate"
 HEAD = "format: validation-experiment\nversion: 1\nname: x\n"

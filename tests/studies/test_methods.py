@@ -15,16 +15,16 @@ import pytest
 
 from harness.campaign.campaign import Campaign
 from harness.strata import LIBRARY_STATEMENT
-from harness.studies.chains.chain import Chain
-from harness.studies.chains.named import CHAINS, replayed
-from harness.studies.chains.sampler import approach_paths
-from harness.studies.chains.shells import ChainShells, joint_outcomes
-from harness.studies.experiment import Experiment, Fault, load_experiment
-from harness.studies.judgement import Judgement, Row, Subject, corrected, judge
-from harness.studies.run import validate
-from harness.studies.shell_campaign import FREE, ShellCampaign, limit_at, result_of
-from harness.studies.truths import preventable_by, ratio_to
-from harness.studies.weighted_campaign import WeightedCampaign, chain_episodes
+from studies.chains.chain import Chain
+from studies.chains.named import CHAINS, replayed
+from studies.chains.sampler import approach_paths
+from studies.chains.shells import ChainShells, joint_outcomes
+from studies.experiment import Experiment, Fault, load_experiment
+from studies.judgement import Judgement, Row, Subject, corrected, judge
+from studies.run import validate
+from studies.shell_campaign import FREE, ShellCampaign, limit_at, result_of
+from studies.truths import preventable_by, ratio_to
+from studies.weighted_campaign import WeightedCampaign, chain_episodes
 
 ROOT = Path(__file__).parents[2]
 CONFIDENCE = 0.9

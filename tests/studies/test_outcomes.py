@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from harness.studies.chains.named import replayed
-from harness.studies.chains.shells import ChainShells, joint_outcomes
+from studies.chains.named import replayed
+from studies.chains.shells import ChainShells, joint_outcomes
 
 
 @pytest.fixture(params=replayed(), ids=lambda c: c.name)

@@ -9,13 +9,13 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from harness.cli import main
 from harness.estimators.block import joined
 from harness.estimators.nade import Nade
 from harness.estimators.scv import Scv
-from harness.studies.chains.named import overtaking
-from harness.studies.chains.sampler import blocks
-from harness.studies.required_tests import (
+from studies.__main__ import main
+from studies.chains.named import overtaking
+from studies.chains.sampler import blocks
+from studies.required_tests import (
     SCV_REMARK,
     Procedure,
     RequiredTests,

@@ -11,19 +11,20 @@ import sys
 import time
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict
+from pathlib import Path
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
 from harness.campaign.campaign import Campaign
-from harness.cli import main
-from harness.studies import run
-from harness.studies.experiment import load_experiment
-from harness.studies.judgement import Row, Subject, judge
-from harness.studies.weighted_campaign import WeightedCampaign, twin_episodes
-from harness.studies.work import worker_processes
 from harness.vocabulary import SAMPLING
+from studies import run
+from studies.__main__ import main
+from studies.experiment import load_experiment
+from studies.judgement import Row, Subject, judge
+from studies.weighted_campaign import WeightedCampaign, twin_episodes
+from studies.work import worker_processes
 
 from .here import Here
 
@@ -117,7 +118,7 @@ def test_weighted_methods_run_in_the_twin(tmp_path, capsys, monkeypatch):
 
 PARENT = """
 import os, time
-from harness.studies.work import worker_processes
+from studies.work import worker_processes
 
 if __name__ == "__main__":
     with worker_processes(1) as executor:
@@ -130,7 +131,8 @@ if __name__ == "__main__":
 def test_a_worker_ends_when_the_experiment_is_killed(tmp_path):
     script = tmp_path / "parent.py"
     script.write_text(PARENT, encoding="utf-8")
-    with subprocess.Popen([sys.executable, str(script)], stdout=subprocess.PIPE, text=True) as parent:
+    found = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
+    with subprocess.Popen([sys.executable, str(script)], stdout=subprocess.PIPE, text=True, env=found) as parent:
         worker = os.pidfd_open(int(parent.stdout.readline()))  # can be read from when it ends
         assert select.select([worker], [], [], 0.0)[0] == []
         parent.send_signal(signal.SIGKILL)

@@ -12,13 +12,13 @@ from harness.pool.build import build_pool
 from harness.pool.library import load_library
 from harness.pool.shells import acceleration_limit
 from harness.progress import Progress
-from harness.studies.experiment import Adversary
-from harness.studies.shell_campaign import campaign_block
-from harness.studies.shell_source import Division, equals, leave_out
-from harness.studies.super_population import NO_ENVELOPE, Drivers, enumerate_paths
-from harness.studies.truths import RATE, Truths
 from harness.traffic.loading import load_environment
 from harness.vehicles.models import av_records
+from studies.experiment import Adversary
+from studies.shell_campaign import campaign_block
+from studies.shell_source import Division, equals, leave_out
+from studies.super_population import NO_ENVELOPE, Drivers, enumerate_paths
+from studies.truths import RATE, Truths
 
 PATHS = 1024
 ENVIRONMENT = load_environment(EnvironmentSettings())

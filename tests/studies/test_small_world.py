@@ -8,11 +8,11 @@ import pytest
 from harness.campaign.vehicle import AutomatedVehicle
 from harness.estimators.nade import Nade
 from harness.progress import Progress
-from harness.studies.case_study import context, small_case
-from harness.studies.case_study.context import Context
-from harness.studies.case_study.small_world import AV_MPS, HOLD, Proposal, _crashes, small_world
-from harness.studies.case_study.study_file import SmallCase
 from harness.vehicles.models import av_records
+from studies.case_study import context, small_case
+from studies.case_study.context import Context
+from studies.case_study.small_world import AV_MPS, HOLD, Proposal, _crashes, small_world
+from studies.case_study.study_file import SmallCase
 from tests.chains.seed import SEED
 from tests.estimators.small_blocks import fed
 

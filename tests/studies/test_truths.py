@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from harness.studies.super_population import SuperPopulation, cached
-from harness.studies.truths import (
+from studies.super_population import SuperPopulation, cached
+from studies.truths import (
     DIFFERENCE,
     RATE,
     of_pair,

@@ -9,13 +9,13 @@ from harness.campaign.campaign import Campaign
 from harness.errors import HarnessError
 from harness.pool.library import load_library
 from harness.progress import Progress
-from harness.studies.experiment import Fault
-from harness.studies.judgement import Subject, judge
-from harness.studies.shell_campaign import FREE, ShellCampaign
-from harness.studies.shell_source import Division
-from harness.studies.super_population import reference_drivers
-from harness.studies.truths import RATE, of_vehicle, preventable_by, ratio_to
-from harness.studies.walked_population import chooser, walk_paths
+from studies.experiment import Fault
+from studies.judgement import Subject, judge
+from studies.shell_campaign import FREE, ShellCampaign
+from studies.shell_source import Division
+from studies.super_population import reference_drivers
+from studies.truths import RATE, of_vehicle, preventable_by, ratio_to
+from studies.walked_population import chooser, walk_paths
 
 from .here import Here
 

@@ -1,0 +1,264 @@
+"""The command ``python -m studies``: what intervals are worth, tests that the paper would ask for, its case study."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from harness.cli import main as run_main
+from harness.commands.options import CAMPAIGN, FOLDER, RUN_FOLDER, examples, json_option, quiet_option
+from harness.console import print_json
+from harness.console_tables import print_table
+
+if TYPE_CHECKING:
+    from studies.required_tests import RnotEstimator
+
+
+@click.group(
+    epilog=examples(
+        "python -m studies validate scenarios/validate/shells_panel.yaml --out runs/shells_panel",
+        "python -m studies case scenarios/case_study/study.yaml --out runs/quick --quick",
+        "python -m studies rnot runs/nde runs/forced",
+    ),
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+)
+def cli() -> None:
+    """Studies of the methods behind `harness`, for those who develop or doubt them; run from a checkout.
+
+    Exit codes are those of `harness`: 0 done; 2 the file or the call is wrong, or the records do not allow what was
+    asked for; 130 interrupted by Ctrl-C: the same command goes on with what is finished, where it says so.
+    """
+
+
+@cli.command(
+    short_help="Repeat a campaign thousands of times: what are its intervals worth?",
+    epilog=examples(
+        "truth        crash rate that all replications should find, or ratio, share or difference",
+        "bias         mean of the estimates relative to the truth, ± its standard error; of a difference",
+        "             relative to the larger of the two rates, of a share in percentage points",
+        "relvar true  mean squared error of the estimates, over the square of the truth",
+        "claimed      the same, as the campaigns themselves estimate it",
+        "coverage     share of the intervals that hold the truth, with its 95 % interval",
+        "p (Holm)     of so low a coverage if the intervals were right, for as many lines",
+        "tests        that a campaign needed: median, 5 % and 95 % quantile",
+        "alarm        share of replications with a crash outside the library's boundary",
+        "refused      share without an interval, as crashes lie on too few paths; counted as covered",
+        heading="Columns:",
+    )
+    + "\n\n"
+    + examples(
+        "python -m studies validate scenarios/validate/shells_panel.yaml --out runs/shells_panel",
+        "python -m studies validate scenarios/validate/shells_panel.yaml --set campaign.stop.confidence=0.99 --out x",
+        "python -m studies validate scenarios/validate/shells_acting.yaml --out runs/acting   # walks paths first",
+        "python -m studies validate scenarios/validate/shells_pairs.yaml --out runs/pairs     # of `compare`",
+    ),
+)
+@click.argument("experiment_file", metavar="EXPERIMENT", type=CAMPAIGN)
+@click.option("--out", "folder", type=FOLDER, required=True, help="Folder of the results; made if it is not there.")
+@click.option("--replications", type=click.IntRange(min=2), help="Instead of the experiment's own number.")
+@click.option(
+    "--set",
+    "overrides",
+    multiple=True,
+    metavar="KEY=VALUE",
+    help="Instead of what the file says, e.g. campaign.stop.confidence=0.99; may be repeated.",
+)
+@click.option("--workers", type=click.IntRange(min=1), help="Processes. Default: one per core.")
+@quiet_option
+@json_option
+def validate(
+    experiment_file: Path,
+    folder: Path,
+    *,
+    replications: int | None,
+    overrides: Sequence[str],
+    workers: int | None,
+    quiet: bool,
+    as_json: bool,
+) -> None:
+    """Repeat the campaign of EXPERIMENT for each of its vehicles, pairs or chains, and judge its intervals by that.
+
+    Vehicles may be built-in models or, under shells, controllers that act before the cut-in: these walk all paths that
+    pools are drawn from once, which takes minutes and is kept. Under shells the ratio to each reference driver of the
+    library, and the share of crashes that it would have avoided, are judged as well.
+
+    Printed is a line per vehicle and result, with the columns below. The folder receives results.json,
+    replications.parquet (one row each) and coverage.png.
+    """
+    from studies.experiment import load_experiment  # noqa: PLC0415 - keeps --help fast
+
+    experiment = load_experiment(experiment_file, overrides)
+    if replications is not None:
+        experiment = experiment.model_copy(update={"replications": replications})
+    from harness.progress import shown_progress  # noqa: PLC0415 - keeps --help fast
+    from studies.run import RESULTS, table_lines  # noqa: PLC0415 - slow to import: once the file is right
+    from studies.run import validate as repeat  # noqa: PLC0415
+
+    bar = shown_progress(quiet=quiet)
+    with bar:
+        judgements = repeat(experiment, folder, workers=workers, progress=bar)
+    if as_json:
+        print_json([one.to_json() for one in judgements])
+        return
+    for line in table_lines(judgements):
+        click.echo(line)
+    click.echo(str(folder / RESULTS))
+
+
+@cli.command(
+    short_help="How many tests the paper's procedure would ask for (RNoT, AAR).",
+    epilog=examples(
+        "python -m studies rnot runs/nde runs/forced        # and the acceleration of the second over the first",
+        "python -m studies rnot runs/nade --rhw 0.1 --total 5000   # another threshold, and end of the grid",
+        "python -m studies rnot runs/nade -e nade -e scv --total 2000 --ratio 1.25   # takes minutes",
+    ),
+)
+@click.argument("folders", metavar="RUN...", type=RUN_FOLDER, nargs=-1, required=True)
+@click.option(
+    "--rhw",
+    type=click.FloatRange(0, min_open=True),
+    default=0.3,
+    show_default=True,
+    help="Relative half-width to reach.",
+)
+@click.option(
+    "--confidence",
+    type=click.FloatRange(0, 1, min_open=True, max_open=True),
+    default=0.9,
+    show_default=True,
+    help="Level of the normal interval.",
+)
+@click.option("--shuffles", type=click.IntRange(min=1), default=200, show_default=True, help="Orderings of the tests.")
+@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Seed of the orderings.")
+@click.option("--first", type=click.IntRange(min=2), default=10, show_default=True, help="First look of the grid.")
+@click.option(
+    "--ratio",
+    type=click.FloatRange(1, min_open=True),
+    default=1.05,
+    show_default=True,
+    help="From one look to the next.",
+)
+@click.option("--total", type=click.IntRange(min=2), help="Last look. Default, and at most: all tests on record.")
+@click.option(
+    "--estimator",
+    "-e",
+    "estimators",
+    type=click.Choice(["nde", "nade", "scv"]),
+    multiple=True,
+    help="Whose RHW; may be given several times. Default: nde for naturalistic runs, else nade.",
+)
+@json_option
+def rnot(
+    folders: Sequence[Path],
+    *,
+    rhw: float,
+    confidence: float,
+    shuffles: int,
+    seed: int,
+    first: int,
+    ratio: float,
+    total: int | None,
+    estimators: Sequence[RnotEstimator],
+    as_json: bool,
+) -> None:
+    """Count the tests that each RUN needed, the way the paper counts them; nothing is simulated.
+
+    The tests of a run are shuffled. The required number of tests (RNoT) of a shuffle is the first look at which the
+    relative half-width is at most --rhw and stays so until the last look. Printed are its mean over all shuffles, its
+    5-95 % range, and the average acceleration ratio (AAR): the mean of the first row over that of each row.
+
+    Shuffles that are above --rhw at the last look count as that many tests; how many these are is printed, and the mean
+    is a lower limit then. Runs that draw from shells are refused: their tests cannot change places.
+
+    'scv' is computed only when asked for. It solves its regressions anew at each look of each shuffle, which takes
+    minutes: a larger --ratio and a smaller --total make it quicker. Its RHW rests on a variance that is too small.
+    """
+    from harness.progress import shown_progress  # noqa: PLC0415 - keeps --help fast
+    from studies.required_tests import Procedure, required_tests_of_runs  # noqa: PLC0415 - keeps --help fast
+
+    procedure = Procedure(rhw, confidence, shuffles, seed, first, ratio, total)
+    bar = shown_progress()
+    with bar:
+        content = required_tests_of_runs(folders, procedure, estimators=estimators, progress=bar)
+    if as_json:
+        print_json(content)
+    else:
+        _print_required_tests(content)
+
+
+@cli.command(
+    name="case",
+    short_help="Reproduce a paper's case study, and answer its claims.",
+    epilog=examples(
+        "python -m studies case scenarios/case_study/study.yaml --out runs/quick --quick   # minutes: tiny sizes",
+        "python -m studies case scenarios/case_study/study.yaml --out runs/case_study      # an hour on two cores",
+    ),
+)
+@click.argument("study_file", metavar="STUDY", type=CAMPAIGN)
+@click.option("--out", "folder", type=FOLDER, required=True, help="Folder of the results; made if it is not there.")
+@click.option("--quick", is_flag=True, help="The sizes of the file's own section quick, too small for conclusions.")
+@click.option("--workers", type=click.IntRange(min=1), help="Processes. Default: one per core.")
+@quiet_option
+@json_option
+def study(study_file: Path, folder: Path, *, quick: bool, workers: int | None, quiet: bool, as_json: bool) -> None:
+    """Make the steps of STUDY that are not in the folder yet, and the page that puts them beside the paper's numbers.
+
+    Each step has a folder of its own under steps/, named after all that it depends on: a second run makes nothing
+    again, a killed one goes on, and a change in the file makes only what it concerns. The folder receives
+    case_study.md, claims.json (the verdicts) and plots/.
+    """
+    from studies.case_study.study_file import load_study  # noqa: PLC0415 - keeps --help fast
+
+    asked = load_study(study_file, quick=quick)
+    from harness.progress import shown_progress  # noqa: PLC0415 - keeps --help fast
+    from studies.case_study.steps import run_study  # noqa: PLC0415 - slow to import: once the file is right
+
+    def told(name: str, seconds: float | None) -> None:
+        if not (as_json or quiet):
+            click.echo(f"{name}: " + ("there already" if seconds is None else f"{seconds:.1f} s"))
+
+    bar = shown_progress(quiet=quiet)
+    with bar:
+        done = run_study(asked, folder, workers=workers, progress=bar, told=told)
+    if as_json:
+        print_json({"page": str(done.page), "claims": done.claims, "seconds": done.seconds})
+        return
+    click.echo(str(done.page))
+
+
+def _print_required_tests(content: dict[str, Any]) -> None:
+    """Print required numbers of tests as a table, with what limits each of them below."""
+    level, n_shuffles = f"{content['confidence']:.0%}", f"{content['n_shuffles']:,}"
+    headings = ("run", "estimator", "tests on record", "grid", "shuffles", "mean RNoT", "5-95 %", "never", "AAR")
+    rows = []
+    for row in content["rows"]:
+        cells = ["-"] * 6
+        if row["mean"] is not None:
+            limit = "≥ " if row["mean_is_lower_limit"] else ""
+            aar = {"equal": "", "at least": "≥ ", "at most": "≤ "}.get(row["aar_is"])
+            cells = [
+                row["grid"],
+                n_shuffles,
+                f"{limit}{row['mean']:,.0f}",
+                f"{row['low_5']:,} to {row['high_95']:,}",
+                f"{row['never_reached']:,}",
+                "-" if aar is None else f"{aar}{row['aar']:.3g}",
+            ]
+        rows.append((row["run"], row["estimator"], f"{row['n_episodes']:,}", *cells))
+    title = f"Tests until RHW stays at most {content['rhw']:g} ({level} normal interval)"
+    print_table(title, headings, rows, texts=("run", "estimator", "grid"))
+    for row in content["rows"]:
+        for remark in [*row.get("remarks", ()), *filter(None, [row.get("reason")])]:
+            click.echo(f"{row['run']} {row['estimator']}: {remark}")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line; returns the exit code."""
+    return run_main(arguments, cli, "python -m studies")
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

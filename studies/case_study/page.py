@@ -1,0 +1,144 @@
+"""The page of a study: results of its steps beside the paper's numbers, and a verdict for each claim."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import matplotlib.style
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from harness.errors import HarnessError
+from harness.estimators.block import MAX_CONTROL_STEPS
+from harness.estimators.diagnostics import CARELESS_MEAN
+from harness.records.folder import write_bytes
+from harness.report import number_format
+from harness.report.plot_style import RC, png
+from studies.case_study.context import Made
+from studies.case_study.figures import Verdict, is_settled, verdict
+from studies.case_study.plots import plots_of
+from studies.case_study.study_file import Study
+
+UNSETTLED = "†"
+PAGE, CLAIMS = "case_study.md", "claims.json"
+
+
+def write_page(study: Study, folder: Path, made: Mapping[str, Made]) -> tuple[Path, list[dict[str, Any]]]:
+    """Write ``case_study.md``, ``claims.json`` and ``plots/``; files that would not change are left as they are.
+
+    Returned are the page, and the content of ``claims.json``.
+
+    Raises
+    ------
+    HarnessError
+        A claim or the picture asks for a figure that its step does not have.
+    """
+    claims = [_answered(claim.model_dump(), made, conclusive=study.conclusive) for claim in study.claims]
+    with matplotlib.style.context(["default", RC]):
+        plots = plots_of(study, made, {label: asked(line.ours, made) for label, line in study.picture.items()})
+        for plot in plots.values():
+            _write(folder / "plots" / f"{plot.name}.png", png(plot))
+    environment = Environment(
+        loader=PackageLoader("studies.case_study", "."),
+        autoescape=False,  # noqa: S701 - Markdown, of our own results
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters.update(shown=shown, number=number_format.number, count=count, cell=cell)
+    steps = [(name, step, made[name].result) for name, step in study.steps.items()]
+    page = environment.get_template("case_study.md.j2").render(
+        study=study,
+        claims=claims,
+        steps=steps,
+        plots=plots,
+        answers=dict(Counter(claim["verdict"] for claim in claims)),
+        stratum_rows=stratum_rows,
+        UNSETTLED=UNSETTLED,
+        CARELESS_MEAN=CARELESS_MEAN,
+    )
+    _write(
+        folder / CLAIMS,
+        json.dumps({"conclusive": study.conclusive, "claims": claims}, indent=2, ensure_ascii=False).encode("utf-8")
+        + b"\n",
+    )
+    _write(folder / PAGE, page.encode("utf-8"))
+    return folder / PAGE, claims
+
+
+def asked(path: str, made: Mapping[str, Made]) -> dict[str, Any]:
+    """The figure of a step.
+
+    Raises
+    ------
+    HarnessError
+        The step has no such figure.
+    """
+    name, _, key = path.partition(".")
+    figures = made[name].result["figures"]
+    if key not in figures:
+        raise HarnessError(
+            path,
+            found=f"no figure '{key}' of the step {name}",
+            expected=f"one of {', '.join(figures) or 'none'}",
+            mend="Correct the name in the study; what is finished is kept.",
+        )
+    found: dict[str, Any] = figures[key]
+    return found
+
+
+def _answered(claim: dict[str, Any], made: Mapping[str, Made], *, conclusive: bool) -> dict[str, Any]:
+    """A claim with our number and the verdict; the reason of a difference only where there is one."""
+    found = asked(claim["ours"], made)
+    answer: Verdict = "ours to choose" if claim["ours_to_choose"] else "cannot be told"
+    if conclusive and not claim["ours_to_choose"]:
+        answer = verdict(claim["paper"], found, **{key: claim[key] for key in ("within", "tolerance", "at_most")})
+    return {**claim, "found": found, "verdict": answer, "why": "" if answer == "reproduced" else claim["why"]}
+
+
+def shown(found: dict[str, Any]) -> str:
+    """A figure with its interval, as the page has it, and its mark."""
+    return _plainly(found) + ("" if is_settled(found) else " " + UNSETTLED)
+
+
+def _plainly(found: dict[str, Any]) -> str:
+    value, low, high = found["value"], found["low"], found["high"]
+    if value is None:
+        return "–" if low is None else f"above {number_format.number(low)}"
+    if low is None and high is None:
+        return number_format.number(value)
+    if low == high:
+        return count(value) if float(value).is_integer() else number_format.number(value)
+    if value == 0.0:
+        return f"0 (to {number_format.number(high)})"
+    if high is None:
+        return f"at least {number_format.number(low)}"
+    return number_format.with_interval(value, 0.0 if low is None else low, high)
+
+
+def count(value: float | None) -> str:
+    """A whole number with all its digits up to a million, else three of them."""
+    return number_format.count(value) if value is None or abs(value) < 1e6 else number_format.number(value)
+
+
+def stratum_rows(result: Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Rows of the table of strata, with labels: those of up to nine steps, longer ones together, and all."""
+    yield from (
+        (str(row["control_steps"]), row) for row in result["strata"] if row["control_steps"] <= MAX_CONTROL_STEPS
+    )
+    yield f"{MAX_CONTROL_STEPS + 1} and more", result["beyond"]
+    yield "all together", result["all"]
+
+
+def cell(text: str) -> str:
+    """Text within a table of Markdown."""
+    return text.replace("|", "\\|").replace("\n", " ").strip()
+
+
+def _write(path: Path, content: bytes) -> None:
+    if not path.is_file() or path.read_bytes() != content:
+        path.parent.mkdir(exist_ok=True)
+        write_bytes(path, content)

@@ -1,0 +1,134 @@
+"""Make the steps of a study that are not made yet, each in a folder named after all that it depends on.
+
+A step's key is a hash of its settings, of the content of the campaign or experiment that it names, of the code that
+makes it, and of the keys of the steps that it reads. ``steps/NAME-KEY/result.json`` is written last, all at once: where
+it is, the step is finished, and where it is not, what the step kept before it was killed lies in the same folder.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+import json
+import shutil
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from harness.campaign.files import load_campaign
+from harness.compiled import WORLD_SOURCES, source_hash
+from harness.estimators.estimate import finite_json
+from harness.progress import Progress
+from harness.records.folder import read_json, sole_use, write_json
+from harness.resolved import resolve
+from harness.traffic.loading import load_parameters
+from studies.case_study.context import Context, Made
+from studies.case_study.control_variates import compare_control_variates
+from studies.case_study.page import write_page
+from studies.case_study.repeated import replicate, test_variants, variants_of
+from studies.case_study.required import count_required_tests, draw_convergence
+from studies.case_study.small_case import answer_small_case
+from studies.case_study.study_file import FILES, Step, Study, inputs_of
+from studies.case_study.tested import keep_run, test_in_twin
+from studies.case_study.theorems import check_theorems
+from studies.experiment import load_experiment
+from studies.work import sources_of
+
+RESULT = "result.json"
+_SHARED = (
+    "*.py",
+    "chains/*.py",
+    *(f"case_study/{name}.py" for name in ("control_variates", "figures", "small_world", "tested")),
+)
+"""What makers have from other files than their own."""
+_MAKERS: dict[str, Callable[[Any, Context], dict[str, Any]]] = {
+    "twin_tests": test_in_twin,
+    "run": keep_run,
+    "convergence": draw_convergence,
+    "control_variates": compare_control_variates,
+    "required_tests": count_required_tests,
+    "replications": replicate,
+    "variants": test_variants,
+    "theorems": check_theorems,
+    "small_case": answer_small_case,
+}
+
+
+class StudyResult(NamedTuple):
+    """Outcome of a study: its page, its claims with verdicts, and seconds of each step, None if it was there before."""
+
+    page: Path
+    claims: list[dict[str, Any]]
+    seconds: dict[str, float | None]
+
+
+def run_study(
+    study: Study,
+    folder: Path,
+    *,
+    workers: int | None = None,
+    progress: Progress | None = None,
+    told: Callable[[str, float | None], None] = lambda _name, _seconds: None,
+) -> StudyResult:
+    """Make what is missing, and the page, in a folder that is new, empty, or that of an earlier study.
+
+    Worker processes, one per core by default, change no result. ``told`` receives each step's name and seconds when it
+    is finished, None for one that was there before.
+
+    Raises
+    ------
+    HarnessError
+        A file that a step names is wrong, which shows before any step is made; or the folder cannot be used.
+    """
+    keys = step_keys(study)
+    made: dict[str, Made] = {}
+    seconds: dict[str, float | None] = {}
+    with sole_use(folder):
+        for name, step in study.steps.items():
+            place = folder / "steps" / f"{name}-{keys[name]}"
+            context = Context(place, study.rhw, study.confidence, made, workers, progress or Progress())
+            seconds[name] = None
+            if not (place / RESULT).is_file():
+                began = time.monotonic()
+                place.mkdir(parents=True, exist_ok=True)
+                write_json(place / RESULT, finite_json({"kind": step.kind, **_MAKERS[step.kind](step, context)}))
+                seconds[name] = time.monotonic() - began
+            shutil.rmtree(context.parts, ignore_errors=True)  # what they were kept for is there
+            result = read_json(place / RESULT, mend="Delete the folder of this step; it is made again.")
+            made[name] = Made(place, result)
+            told(name, seconds[name])
+        return StudyResult(*write_page(study, folder, made), seconds)
+
+
+def step_keys(study: Study) -> dict[str, str]:
+    """Key of every step, in their order; reads all files that the steps name."""
+    keys: dict[str, str] = {}
+    for name, step in study.steps.items():
+        maker = Path(str(inspect.getsourcefile(_MAKERS[step.kind])))
+        sources = WORLD_SOURCES if step.kind == "twin_tests" else (*WORLD_SOURCES, "estimators/*.py")
+        own = () if step.kind in ("twin_tests", "run") else _SHARED  # their records do not follow from any of these
+        content = {
+            "step": step.model_dump(mode="json", exclude=set(FILES)),
+            "file": _content(step),
+            "reads": [(key, keys[wanted]) for key, wanted in inputs_of(step)],
+            "asks": (study.rhw, study.confidence),
+            "code": (source_hash(sources), sources_of(*own), hashlib.sha256(maker.read_bytes()).hexdigest()),
+        }
+        keys[name] = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:12]
+    return keys
+
+
+def _content(step: Step) -> Any:
+    """What the file that a step names says, laid-over values included."""
+    if step.kind in ("twin_tests", "run"):
+        campaign = load_campaign(step.campaign, step.set)
+        return campaign.model_dump(mode="json", exclude={"run"}), resolve(campaign).content_hash
+    if step.kind == "variants":
+        forms = [*variants_of(step).items(), *variants_of(step, shells=True).items()]
+        return [(name, one.model_dump(mode="json", exclude={"run"}), resolve(one).content_hash) for name, one in forms]
+    if step.kind == "replications":
+        experiment = load_experiment(Path(step.experiment), step.set)
+        parameters = load_parameters(experiment.campaign.environment).content_hash()
+        return experiment.model_dump(mode="json"), parameters
+    return None

@@ -1,0 +1,274 @@
+"""What a study is: steps that name campaigns and experiments, sizes for a quick look, and claims to be answered."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import Field, model_validator
+
+from harness.campaign.files import Override, Places, apply_overrides
+from harness.campaign.problems import validated
+from harness.campaign.sections import NAME_PATTERN, Positive, Probability, Section, Whole, broken_rule
+from harness.campaign.yaml_text import read_yaml
+from harness.errors import CampaignError
+
+StepName = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
+Overrides = list[str]
+_OVERRIDES: Any = Field(default_factory=list, description="values laid over the file's, such as testing.epsilon=0.2")
+
+
+class TwinTests(Section):
+    """Tests in the twin, of which nothing is kept but those that crashed."""
+
+    kind: Literal["twin_tests"]
+    campaign: str = Field(description="campaign file, relative to the study's")
+    set: Overrides = _OVERRIDES
+    tests: Whole = Field(ge=1, le=1_000_000_000)
+
+
+class Run(Section):
+    """A campaign, run into a folder with all its records as `harness run` would."""
+
+    kind: Literal["run"]
+    campaign: str = Field(description="campaign file, relative to the study's")
+    set: Overrides = _OVERRIDES
+
+
+class Convergence(Section):
+    """Crash rate and relative half-width on growing numbers of tests, one curve for each step that is named."""
+
+    kind: Literal["convergence"]
+    of: list[StepName] = Field(min_length=1, max_length=4, description="steps of kind twin_tests or run")
+    reference: StepName = Field(description="step whose crash rate the others are compared with")
+
+
+class ControlVariates(Section):
+    """NADE with and without sparse control variates on growing parts of one run, and stratum by stratum."""
+
+    kind: Literal["control_variates"]
+    of: StepName = Field(description="step of kind run: a step mixture with records.moments first_9 or all")
+    sizes: list[Whole] = Field(min_length=1, description="numbers of tests, rising")
+
+    @model_validator(mode="after")
+    def _rises(self) -> Self:
+        if self.sizes[0] < 2 or any(a >= b for a, b in pairwise(self.sizes)):
+            raise broken_rule(
+                "sizes", found=f"{self.sizes}", expected="rising numbers from 2 on", mend="Put them in order."
+            )
+        return self
+
+
+class RequiredNumbers(Section):
+    """Required numbers of tests (RNoT) over shuffles of the same tests, and their ratios (AAR)."""
+
+    kind: Literal["required_tests"]
+    of: list[StepName] = Field(min_length=1, description="steps of kind twin_tests or run; ratios are over the first")
+    shuffles: Whole = Field(200, ge=1, le=10_000)
+    scv: StepName | None = Field(None, description="step of kind run of which SCV's numbers are asked, too")
+    scv_tests: Whole = Field(1_000_000, ge=10, description="first tests of that run that are shuffled for it")
+    scv_shuffles: Whole = Field(4, ge=1, le=10_000, description="a regression for each look of each shuffle: minutes")
+    scv_ratio: float = Field(1.5, gt=1.0, description="from one look of it to the next")
+
+
+class Replications(Section):
+    """A whole campaign repeated, as `python -m studies validate` does, to see what estimates truly scatter by."""
+
+    kind: Literal["replications"]
+    experiment: str = Field(description="experiment file, relative to the study's, of one vehicle or chain")
+    set: Overrides = _OVERRIDES
+
+
+class Variants(Section):
+    """One campaign with other vehicles or settings: what NADE and SCV claim of each, and shells beside it."""
+
+    kind: Literal["variants"]
+    title: str
+    campaign: str = Field(description="campaign file, relative to the study's; of any method but shells")
+    set: Overrides = _OVERRIDES
+    tests: Whole = Field(ge=2, le=100_000_000, description="of each campaign")
+    replications: Whole = Field(1, ge=1, le=10_000, description="campaigns with each of them")
+    shells: str | None = Field(None, description="campaign of shells, which each is tested with, too")
+    shells_set: Overrides = _OVERRIDES
+    avs: list[str] = Field(default_factory=list, description="vehicles of the shipped panel")
+    settings: dict[Annotated[str, Field(pattern=r"^[^.|]+$")], Overrides] = Field(
+        default_factory=dict, description="values laid over the campaign's, by a name for the table"
+    )
+    each_of: list[dict[Annotated[str, Field(pattern=r"^[^.|]+$")], Overrides]] = Field(
+        default_factory=list, description="lists of such settings, of which every combination is another variant"
+    )
+    reported: dict[str, Positive] = Field(default_factory=dict, description="the paper's gains, by variant")
+
+    @model_validator(mode="after")
+    def _has_any(self) -> Self:
+        if not (self.avs or self.settings or self.each_of):
+            found, expected = "no variant", "some under avs, settings or each_of"
+            raise broken_rule("avs", found=found, expected=expected, mend="Name some.")
+        return self
+
+
+class Theorems(Section):
+    """The paper's three theorems on small chains, by enumeration of all episodes."""
+
+    kind: Literal["theorems"]
+    draws: Whole = Field(200, ge=2, le=100_000, description="repetitions for Theorem 3's picture")
+    tests: Whole = Field(2_000, ge=10, description="tests of each repetition")
+
+
+class SmallCase(Section):
+    """The smaller case of the 2022 conference version, with its exact crash rate and variances."""
+
+    kind: Literal["small_case"]
+    lane_change_level: Positive = Field(description="multiplies the hazard of a cut-in")
+    rhw: Positive = Field(0.1, description="relative half-width that numbers of tests are for")
+    tests: Whole = Field(100_000, ge=100, description="drawn tests for each setting")
+    epsilons: list[Probability] = Field(default=[0.1], min_length=1)
+    thresholds: list[Probability] = Field(default=[0.0], min_length=1, description="of criticality")
+    draws: Whole = Field(200, ge=2, le=100_000, description="campaigns that are repeated to see the true spread")
+    tests_of_draw: Whole = Field(1_000, ge=10)
+    reported: dict[Literal["nade", "scv"], Positive] = Field(
+        default_factory=dict, description="numbers of tests that are looked for among the settings"
+    )
+
+
+Step = Annotated[
+    TwinTests | Run | Variants | Convergence | ControlVariates | RequiredNumbers | Replications | Theorems | SmallCase,
+    Field(discriminator="kind"),
+]
+
+
+class Claim(Section):
+    """A number of the paper, beside one of a step's."""
+
+    says: str = Field(description="what the paper says, in a few words")
+    where: str = Field(description="section, figure or table")
+    paper: float
+    ours: str = Field(pattern=r"^\w+\.[\w.-]+$", description="STEP.FIGURE that answers it")
+    within: float = Field(2.0, gt=1.0, description="factor within which our number counts as the same")
+    tolerance: Positive | None = Field(None, description="distance that counts as the same, instead of a factor")
+    at_most: bool = Field(False, description="whether the paper's number is a limit that ours does not exceed")
+    why: str = Field("", description="why ours differs, as far as known; printed unless it is reproduced")
+    ours_to_choose: bool = Field(False, description="whether a setting of ours decides it, so that nothing is judged")
+
+
+class Line(Section):
+    """A line of the last picture."""
+
+    ours: str = Field(pattern=r"^\w+\.[\w.-]+$", description="STEP.FIGURE")
+    paper: Positive | None = Field(None, description="what the paper reports")
+
+
+class Study(Section):
+    """A study, as one YAML file describes it."""
+
+    format: Literal["case-study"]
+    version: Literal[1]
+    name: str = Field(pattern=NAME_PATTERN)
+    title: str
+    summary: str = Field("", description="what came out, in a few lines; left out where sizes allow no conclusions")
+    rhw: Positive = Field(0.3, description="relative half-width that required numbers of tests are for")
+    confidence: float = Field(0.9, gt=0.0, lt=1.0)
+    steps: dict[StepName, Step] = Field(min_length=1, description="in the order in which they are made")
+    quick: dict[StepName, dict[str, Any]] = Field(
+        default_factory=dict, description="what --quick lays over steps, by step and key"
+    )
+    claims: list[Claim] = Field(default_factory=list)
+    conclusive: bool = Field(True, description="whether the sizes allow verdicts; those of --quick never do")
+    picture: dict[str, Line] = Field(default_factory=dict, description="numbers of tests, by a label for each line")
+
+    @model_validator(mode="after")
+    def _names_steps_before(self) -> Self:
+        before: list[str] = []
+        for name, step in self.steps.items():
+            for key, wanted in inputs_of(step):
+                if wanted not in before:
+                    raise broken_rule(
+                        f"steps.{name}.{key}",
+                        found=f"'{wanted}'",
+                        expected=f"one of the steps above it: {', '.join(before) or 'there is none'}",
+                        mend="Name one of them, or move that step up.",
+                    )
+                kind, kinds = self.steps[wanted].kind, _READS[key, step.kind]
+                if kind not in kinds:
+                    raise broken_rule(
+                        f"steps.{name}.{key}",
+                        found=f"'{wanted}', a step of kind {kind}",
+                        expected=f"one of kind {' or '.join(kinds)}",
+                        mend="Name such a step.",
+                    )
+            before.append(name)
+        return self
+
+    @model_validator(mode="after")
+    def _asks_steps_that_are_there(self) -> Self:
+        asked = [(f"claims.{k}.ours", claim.ours) for k, claim in enumerate(self.claims)]
+        asked += [(f"picture.{label}.ours", line.ours) for label, line in self.picture.items()]
+        asked += [(f"quick.{name}", f"{name}.") for name in self.quick]
+        for key, path in asked:
+            if (name := path.partition(".")[0]) not in self.steps:
+                expected = f"one of the steps {', '.join(self.steps)}"
+                raise broken_rule(key, found=f"the step '{name}'", expected=expected, mend="Name one of them.")
+        return self
+
+
+FILES = ("campaign", "experiment", "shells")
+_READS = {
+    ("of", "convergence"): ("twin_tests", "run"),
+    ("reference", "convergence"): ("twin_tests", "run"),
+    ("of", "control_variates"): ("run",),
+    ("of", "required_tests"): ("twin_tests", "run"),
+    ("scv", "required_tests"): ("run",),
+}
+"""Kinds of steps that a key of a kind of step may name."""
+
+
+def inputs_of(step: Step) -> list[tuple[str, str]]:
+    """Key and name of every step that a step reads."""
+    found: list[tuple[str, str]] = []
+    for key in ("of", "reference", "scv"):
+        value = getattr(step, key, None)
+        found += [(key, name) for name in ([value] if isinstance(value, str) else value or [])]
+    return found
+
+
+def load_study(path: Path, *, quick: bool = False) -> Study:
+    """Read a study, with its ``quick`` sizes laid over its steps if they are asked for.
+
+    Both forms are validated whichever is asked for, so that a file is right or wrong whatever is made of it.
+
+    Raises
+    ------
+    CampaignError
+        The file cannot be read or says something wrong; the error names every place.
+    """
+    data, lines = read_yaml(path)
+    full = validated(data, Study, str(path), lines.place)
+    changes = [
+        Override(("steps", name, key), value, f"steps.{name}.{key}", "quick:")
+        for name, values in full.quick.items()
+        for key, value in values.items()
+    ]
+    small = validated(apply_overrides(data, changes), Study, str(path), Places(lines, changes))
+    study = full
+    if quick:
+        title = f"{small.title} (quick: too few tests for conclusions)"
+        study = small.model_copy(update={"title": title, "conclusive": False})
+    return study.model_copy(update={"steps": {name: _placed(step, path, name) for name, step in study.steps.items()}})
+
+
+def _placed(step: Step, path: Path, name: str) -> Step:
+    """A step whose file is absolute, and there."""
+    for key in FILES:
+        if (named := getattr(step, key, None)) is None:
+            continue
+        file = (path.parent / named).resolve()
+        if not file.is_file():
+            raise CampaignError(
+                f"{path}: steps.{name}.{key}",
+                found=f"{named}, but there is no file {file}",
+                expected=f"a file with {'an experiment' if key == 'experiment' else 'a campaign'}",
+                mend="Correct the path; it is relative to the folder of the study.",
+            )
+        step = step.model_copy(update={key: str(file)})
+    return step

@@ -1,0 +1,124 @@
+"""The paper's three theorems, by enumeration of all episodes of small chains: known exactly, not sampled.
+
+Theorem 1 says that the mean stays μ, Theorem 2 bounds the variance with the best control parameters, and Theorem 3
+promises none at all under four assumptions. All three are about columns whose means θ_l are *known*; what becomes of
+the third when Algorithm 1 estimates them is drawn beside it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import product
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from harness.estimators.mixture_cv import MixtureCv
+from harness.estimators.scv import Scv
+from harness.vocabulary import FloatArray
+from studies.case_study.context import Context
+from studies.case_study.figures import exactly
+from studies.case_study.study_file import Theorems
+from studies.chains.chain import Chain, Episodes, enumerate_episodes
+from studies.chains.named import overtaking, rare_decisive
+from studies.chains.single_choice import with_optimal_function
+from studies.work import write_table
+
+
+def small_chains() -> list[Chain]:
+    """Chains of which all episodes can be listed."""
+    return [
+        overtaking("right and wrong", skill=0.6, surrogates=[0.6, 0.2], level=0.05, horizon=4),
+        overtaking("all wrong", skill=0.9, surrogates=[0.1, 0.3], level=1e-4, horizon=4),
+        rare_decisive(),
+    ]
+
+
+def check_theorems(step: Theorems, context: Context) -> dict[str, Any]:
+    """Exact means, variances and bounds of chains; estimates with known and with estimated means."""
+    chains = [_chain(chain) for chain in small_chains()]
+    known, estimated, claimed = [], [], []
+    world = with_optimal_function()
+    context.progress.stage("theorem 3", step.draws)
+    for k in range(step.draws):
+        maneuver = world.maneuvers(step.tests, np.random.default_rng([1, k]))
+        cv, scv = MixtureCv(), Scv()
+        cv.add(world.block("episode_mixture", maneuver))
+        scv.add(world.block("step_mixture", maneuver))
+        found = scv.result(context.confidence)
+        known.append(cv.result(context.confidence).crash_rate / world.crash_rate)
+        estimated.append(found.crash_rate / world.crash_rate)
+        claimed.append(found.std_error / world.crash_rate)
+        context.progress.advance(1)
+    write_table(context.folder / "theorem_3.parquet", pa.table({"known": known, "estimated": estimated}))
+    return {
+        "chains": chains,
+        "draws": {"estimated": estimated},
+        "figures": {
+            "largest_bias": exactly(max(abs(mean - 1.0) for chain in chains for mean in chain["means"].values())),
+            "variance_over_bound": exactly(max(chain["best"] / chain["bound"] for chain in chains)),
+            "best_over_plain": exactly(max(chain["best"] / chain["plain"] for chain in chains)),
+            "largest_error_known": exactly(float(np.max(np.abs(np.array(known) - 1.0)))),
+            "claimed_error_estimated": exactly(float(np.max(claimed))),
+            "scatter_estimated": exactly(float(np.std(estimated))),
+        },
+    }
+
+
+def _chain(chain: Chain) -> dict[str, Any]:
+    """Exact results of a chain under the step mixture with equal weights; variances per test over μ²."""
+    episodes = enumerate_episodes(chain)
+    sampled = episodes.p * episodes.mixture
+    y = episodes.crash / episodes.mixture
+    mean = float(sampled @ y)
+    plain = float(sampled @ (y - mean) ** 2)
+    columns = np.column_stack(list(_columns(episodes)))
+    columns -= sampled @ columns  # θ, exactly
+    root = np.sqrt(sampled)[:, None]
+    beta = np.linalg.lstsq(root * columns, root[:, 0] * (y - mean))[0]
+    best = float(sampled @ (y - mean - columns @ beta) ** 2)
+    square = mean * mean
+    choices = {"plain": 0.0 * beta, "best": beta, "any": np.cos(np.arange(len(beta))) * mean}
+    means = {name: float(sampled @ (y - columns @ each)) / chain.crash_rate for name, each in choices.items()}
+    return {
+        "chain": chain.name,
+        "truth": chain.crash_rate,
+        "episodes": len(y),
+        "means": means,
+        "plain": plain / square,
+        "best": best / square,
+        "bound": bound(episodes) / square,
+    }
+
+
+def _columns(episodes: Episodes) -> Iterator[FloatArray]:
+    """Columns q_{j1…jl}/q_alpha of every stratum l ≥ 1, zero outside of it."""
+    for level in range(1, int(episodes.n_control_steps.max()) + 1):
+        within = episodes.n_control_steps == level
+        for chosen in product(range(episodes.ratios.shape[2]), repeat=level):
+            yield np.where(within, _ratio(episodes, chosen) / episodes.mixture, 0.0)
+
+
+def _ratio(episodes: Episodes, chosen: tuple[int, ...]) -> FloatArray:
+    """q_{j1…jl}/p, shape (k,)."""
+    return np.asarray(np.prod([episodes.ratios[:, t, j] for t, j in enumerate(chosen)], axis=0))
+
+
+def bound(episodes: Episodes) -> float:
+    """Right-hand side of Theorem 2 with equal weights."""
+    levels, n_surrogates = episodes.n_control_steps, episodes.ratios.shape[2]
+    uncontrolled = episodes.crash * (levels == 0)
+    mean = float(episodes.p @ uncontrolled)
+    total = float(episodes.p @ (uncontrolled - mean) ** 2)
+    for level in range(1, int(levels.max()) + 1):
+        within, inverse = levels == level, float(n_surrogates) ** level
+        p, crash = episodes.p[within], episodes.crash[within]
+        mu = float(p @ crash)
+        terms = []
+        for chosen in product(range(n_surrogates), repeat=level):
+            ratio = _ratio(episodes, chosen)[within]
+            variance = float((p * ratio) @ (crash / ratio - mu) ** 2)
+            terms.append(variance * inverse + 3.0 * (mu * inverse) ** 2)
+        total += min(terms)
+    return total * (int(levels.max()) + 1)

@@ -1,0 +1,160 @@
+"""Draw episodes of a chain by any method, vectorised, and hand them over as the Block that SUMO's records become."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from scipy.special import logsumexp
+
+from harness.estimators.block import MAX_CONTROL_STEPS, Block
+from harness.vocabulary import BoolArray, FloatArray, IntArray, Method
+from studies.chains.chain import Chain
+
+DEFENSIVE_SHARE = 0.1
+
+
+def blocks(chain: Chain, method: Method, sizes: list[int], seed: int) -> Iterator[Block]:
+    """Consecutive blocks of the given sizes; each has its own random stream."""
+    first = 0
+    for k, size in enumerate(sizes):
+        yield draw(chain, method, size, np.random.default_rng([seed, k]), first_episode=first)
+        first += size
+
+
+def mixture_weights(chain: Chain, method: Method) -> FloatArray:
+    """Weights of the importance functions, with the forced cut-in as component 0 of the episode mixture, shape (M,)."""
+    equal = np.full(chain.n_surrogates, 1.0 / chain.n_surrogates)
+    if method == "episode_mixture":
+        return np.concatenate([[DEFENSIVE_SHARE], (1.0 - DEFENSIVE_SHARE) * equal])
+    return {"nde": np.empty(0), "forced": np.ones(1)}.get(method, equal)
+
+
+def draw(chain: Chain, method: Method, n: int, rng: np.random.Generator, *, first_episode: int = 0) -> Block:
+    """Draw n episodes."""
+    return Sampler(chain, method, n, rng).run(first_episode)
+
+
+def approach_paths(chain: Chain, n: int, rng: np.random.Generator) -> IntArray:
+    """States that staying would pass through, shape (n, T); no vehicle under test is involved."""
+    path = np.empty((n, chain.horizon), dtype=np.int64)
+    path[:, 0] = _choose(np.broadcast_to(chain.start, (n, len(chain.start))), rng)
+    for t in range(1, chain.horizon):
+        path[:, t] = _choose(chain.approach[path[:, t - 1]], rng)
+    return path
+
+
+def _choose(p: FloatArray, rng: np.random.Generator) -> IntArray:
+    """Index drawn from each row of probabilities (m, A), shape (m,)."""
+    u = rng.random(len(p))
+    chosen: IntArray = np.minimum((np.cumsum(p, axis=1) <= u[:, None]).sum(axis=1), p.shape[1] - 1)
+    return chosen
+
+
+class Sampler:
+    """Episodes on their way: path before the cut-in ahead, then maneuvers and responses step by step."""
+
+    def __init__(self, chain: Chain, method: Method, n: int, rng: np.random.Generator) -> None:
+        self.chain, self.method, self.n, self.rng = chain, method, n, rng
+        self.alpha = mixture_weights(chain, method)
+        self.path = approach_paths(chain, n, rng)
+        stay = np.log1p(-chain.hazard[self.path])
+        self.p_cut_later = -np.expm1(np.cumsum(stay[:, ::-1], axis=1)[:, ::-1])
+        self.component = rng.choice(len(self.alpha), size=n, p=self.alpha) if len(self.alpha) else np.empty(0, np.int64)
+        self.log_p_cut = np.log(np.maximum(self.p_cut_later[:, 0], np.finfo(float).tiny))
+        self.log_ratio = np.zeros((n, chain.n_surrogates))
+        self.log_step = np.zeros(n)
+        self.ratios = np.ones((n, MAX_CONTROL_STEPS, chain.n_surrogates))
+        self.n_control = np.zeros(n, dtype=np.int64)
+        self.after = np.full(n, -1)
+        self.cut_in = np.zeros(n, dtype=bool)
+
+    def run(self, first_episode: int) -> Block:
+        """Draw them to their end."""
+        for t in range(self.chain.horizon):
+            after = np.flatnonzero(self.cut_in & (self.after < self.chain.crashed - 1))
+            self._step_before(t, np.flatnonzero(~self.cut_in))
+            self._step_after(t, after)
+        log_q, none, cap = self._log_q(), np.zeros(self.n, dtype=bool), self.chain.cut_in_cap
+        return Block(
+            first_episode=first_episode,
+            method=self.method,
+            crash=self.after == self.chain.crashed,
+            failed=none,
+            cut_in=self.cut_in,
+            bv_lv_contact=none,
+            log_weight=self._log_weight(log_q),
+            log_q=log_q,
+            alpha=self.alpha,
+            n_control_steps=self.n_control,
+            first_ratios=self.ratios if self.method == "step_mixture" else None,
+            weight_cap={"nde": 1.0, "forced": cap, "episode_mixture": cap / DEFENSIVE_SHARE}.get(self.method),
+            log_p_cut_in=self.log_p_cut if self.method in ("forced", "episode_mixture") else None,
+        )
+
+    def _step_before(self, t: int, rows: IntArray) -> None:
+        chain, state = self.chain, self.path[rows, t]
+        p = np.stack([1.0 - chain.hazard[state], chain.hazard[state]], axis=1)
+        q_cut = chain.proposals.cut[:, t, state].T
+        q = np.stack([1.0 - q_cut, q_cut], axis=2)
+        later = self.p_cut_later[rows, t]
+        forced_cut = np.divide(p[:, 1], later, out=np.zeros(len(rows)), where=later > 0.0)
+        forced = np.stack([1.0 - forced_cut, forced_cut], axis=1)
+        cut = self._maneuver(rows, p, q, forced, chain.proposals.critical_before[t, state]) == 1
+        self.after[rows[cut]] = _choose(chain.entry[state[cut]], self.rng)
+
+    def _step_after(self, t: int, rows: IntArray) -> None:
+        chain, state = self.chain, self.after[rows]
+        p = chain.exposure[state]
+        q = np.moveaxis(chain.proposals.maneuver[:, t, state], 0, 1)
+        maneuver = self._maneuver(rows, p, q, p, chain.proposals.critical_after[t, state])
+        self.after[rows] = _choose(chain.response[state, maneuver], self.rng)
+
+    def _maneuver(
+        self, rows: IntArray, p: FloatArray, q: FloatArray, forced: FloatArray, critical: BoolArray
+    ) -> IntArray:
+        """Draw from what the method says and keep the likelihood ratios; p (m, A), q (m, J, A)."""
+        chosen = _choose(self._sampled(rows, p, q, forced, critical), self.rng)
+        self.cut_in[rows] |= (self.after[rows] < 0) & (chosen == 1)
+        if self.method in ("nde", "forced"):
+            return chosen
+        at = np.flatnonzero(critical)
+        picked_p, picked_q = p[at, chosen[at]], q[at, :, chosen[at]]
+        episode = rows[at]
+        self.log_ratio[episode] += np.log(picked_q / picked_p[:, None])
+        if self.method == "step_mixture":
+            mixed = picked_q @ self.alpha
+            step = self.n_control[episode]
+            self.log_step[episode] += np.log(picked_p / mixed)
+            kept = step < MAX_CONTROL_STEPS
+            self.ratios[episode[kept], step[kept]] = (picked_q / mixed[:, None])[kept]
+        self.n_control[episode] += 1
+        return chosen
+
+    def _sampled(
+        self, rows: IntArray, p: FloatArray, q: FloatArray, forced: FloatArray, critical: BoolArray
+    ) -> FloatArray:
+        match self.method:
+            case "nde":
+                return p
+            case "forced":
+                return forced
+            case "step_mixture":
+                return np.where(critical[:, None], np.einsum("mja,j->ma", q, self.alpha), p)
+        candidates = np.concatenate([forced[:, None, :], q], axis=1)
+        return candidates[np.arange(len(rows)), self.component[rows]]
+
+    def _log_q(self) -> FloatArray:
+        forced = np.where(self.cut_in, -self.log_p_cut, -np.inf)[:, None]
+        if self.method == "nde":
+            return np.empty((self.n, 0))
+        if self.method == "forced":
+            return forced
+        return self.log_ratio if self.method == "step_mixture" else np.concatenate([forced, self.log_ratio], axis=1)
+
+    def _log_weight(self, log_q: FloatArray) -> FloatArray:
+        if self.method == "forced":
+            return np.where(self.cut_in, self.log_p_cut, 0.0)
+        if self.method == "step_mixture":
+            return self.log_step
+        return -logsumexp(log_q + np.log(self.alpha), axis=1) if len(self.alpha) else np.zeros(self.n)

@@ -1,0 +1,205 @@
+"""What replications say about a method: bias, true and claimed variance, coverage, tests needed.
+
+A coverage is judged by the binomial test against its nominal value, one-sided, with Holm's correction (S. Holm, A
+simple sequentially rejective multiple test procedure, Scand. J. Statist. 6, 1979, 65) over all vehicles or chains.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
+from typing import Any
+
+import numpy as np
+from scipy.stats import binomtest
+
+from harness.estimators.estimate import Estimate, finite_json
+from harness.estimators.intervals import clopper_pearson, normal_half_width
+from harness.vocabulary import FloatArray
+from studies.truths import Known
+
+COVERAGE_CONFIDENCE = 0.95
+SIGNIFICANCE = 0.05
+NEGLIGIBLE_OUTSIDE = 1e-3
+"""Largest share of a vehicle's crashes beyond the boundary with which it still meets the assumption of a statement."""
+WANTED_RHW = 0.3
+
+
+@dataclass(frozen=True)
+class Row:
+    """What one replication of a campaign reported, and nothing that only the experimenter knows.
+
+    The result is an estimator, a statement of shells, a comparison with a reference driver, or the difference of two
+    vehicles; ``crash_rate`` is a rate, or the ratio, share or difference that it names; NaN if there is none. An
+    interval is refused, and as wide as can be, where crashes lie on too few paths.
+    """
+
+    result: str
+    replication: int
+    n_tests: int
+    n_crashes: int
+    crash_rate: float
+    std_error: float
+    ci_low: float
+    ci_high: float
+    reached: bool
+    n_crashes_outside: int = 0
+    refused: bool = False
+
+
+def estimate_row(result: str, replication: int, found: Estimate, *, reached: bool, outside: int = 0) -> Row:
+    """Row of an estimate with one interval."""
+    numbers = found.crash_rate, found.std_error, found.ci_low, found.ci_high
+    counts = found.n_episodes, found.n_crashes
+    return Row(result, replication, *counts, *numbers, reached, outside, refused=bool(found.cautions))
+
+
+@dataclass(frozen=True)
+class Subject:
+    """What the experimenter knows about a vehicle or a chain.
+
+    Its crash rate is the truth for all results but ``others``. ``crashes_outside`` is, for each result that assumes a
+    boundary, the share of its crash rate beyond it. Surrogates that are its equals are ``left_out``; strata up to that
+    of the surrogate ``boundary`` are inside.
+    """
+
+    name: str
+    crash_rate: Known
+    others: dict[str, Known] = field(default_factory=dict)
+    crashes_outside: dict[str, float] = field(default_factory=dict)
+    left_out: tuple[str, ...] = ()
+    boundary: str | None = None
+
+    @classmethod
+    def exact(cls, name: str, crash_rate: float, **more: Any) -> Subject:
+        """One whose crash rate is known without error."""
+        return cls(name, Known(crash_rate, 0.0, crash_rate), **more)
+
+    def truth(self, result: str) -> Known:
+        """What a result estimates."""
+        return self.others.get(result, self.crash_rate)
+
+    @property
+    def relative_error(self) -> float:
+        """The largest one of what is known about it, each over its scale."""
+        return max(known.relative_error for known in (self.crash_rate, *self.others.values()))
+
+    def meets_assumption_of(self, result: str) -> bool:
+        """Whether what a result assumes holds for it."""
+        return self.crashes_outside.get(result, 0.0) < NEGLIGIBLE_OUTSIDE
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """One method on one vehicle; `python -m studies validate --help` says what is printed of it.
+
+    Bias and relative variances are over the ``scale`` of the truth (`studies.truths.Known`). The assumption is
+    not met by a statement about vehicles that do not crash outside, and one that does; coverage is not judged then, and
+    has no p-values. Tests for the wanted RHW, 0.3, follow from the true variance at this number of tests, if it was
+    fixed. ``reached`` is the share of replications that reached the precision asked for. Those refused count as
+    covered; where they have no value either, nothing else takes notice of them.
+    """
+
+    subject: str
+    result: str
+    replications: int
+    truth: float
+    scale: float
+    assumption_met: bool
+    bias: float
+    bias_std_error: float
+    true_relvar: float
+    claimed_relvar: float
+    covered: int
+    coverage: float
+    coverage_low: float
+    coverage_high: float
+    p_value: float | None
+    p_value_holm: float | None
+    tests_median: float
+    tests_5: float
+    tests_95: float
+    tests_for_wanted_rhw: float | None
+    reached: float
+    alarm: float
+    refused: float
+
+    @property
+    def too_low(self) -> bool:
+        """Whether the coverage is significantly below nominal."""
+        return self.p_value_holm is not None and self.p_value_holm < SIGNIFICANCE
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain content."""
+        content: dict[str, Any] = finite_json({**asdict(self), "coverage_too_low": self.too_low})
+        return content
+
+
+def judge(subject: Subject, result: str, rows: Sequence[Row], confidence: float) -> Judgement:
+    """Judge one method on one vehicle by its rows; `corrected` then fills in the corrected p-values.
+
+    ``confidence`` is the nominal coverage.
+    """
+    columns = {field.name: np.array([getattr(row, field.name) for row in rows]) for field in fields(Row)}
+    tests, reached = columns["n_tests"], columns["reached"]
+    known, n = subject.truth(result), len(rows)
+    truth, scale = known.value, known.scale
+    said = np.isfinite(columns["crash_rate"])
+    with np.errstate(divide="ignore", invalid="ignore"):  # of what never crashes nothing relative is known
+        errors, claimed = (columns["crash_rate"][said] - truth) / scale, columns["std_error"][said] / scale
+    covered = int(np.count_nonzero((columns["ci_low"] <= truth) & (truth <= columns["ci_high"])))
+    low, high = map(float, clopper_pearson(covered, n, (1.0 - COVERAGE_CONFIDENCE) / 2.0))
+    met = subject.meets_assumption_of(result)
+    tests_5, median, tests_95 = (float(q) for q in np.quantile(tests, [0.05, 0.5, 0.95]))
+    relvar = _mean(errors**2)
+    fixed = not reached.any() and bool(np.all(tests == tests[0]))
+    z = normal_half_width(1.0, confidence)
+    return Judgement(
+        subject=subject.name,
+        result=result,
+        replications=n,
+        truth=truth,
+        scale=scale,
+        assumption_met=met,
+        bias=_mean(errors),
+        bias_std_error=float(errors.std(ddof=1)) / math.sqrt(errors.size) if errors.size > 1 else math.nan,
+        true_relvar=relvar,
+        claimed_relvar=_mean(claimed**2),
+        covered=covered,
+        coverage=covered / n,
+        coverage_low=low,
+        coverage_high=high,
+        p_value=float(binomtest(covered, n, confidence, alternative="less").pvalue) if met else None,
+        p_value_holm=None,
+        tests_median=median,
+        tests_5=tests_5,
+        tests_95=tests_95,
+        tests_for_wanted_rhw=(z / WANTED_RHW) ** 2 * (relvar * median) if fixed else None,
+        reached=float(reached.mean()),
+        alarm=float(np.mean(columns["n_crashes_outside"] > 0)),
+        refused=float(columns["refused"].mean()),
+    )
+
+
+def _mean(values: FloatArray) -> float:
+    """Mean of some numbers, NaN of none."""
+    return float(values.mean()) if values.size else math.nan
+
+
+def corrected(judgements: Sequence[Judgement]) -> list[Judgement]:
+    """The same with p-values corrected over all subjects, for each result by itself."""
+    found: dict[tuple[str, str], float] = {}
+    for result in {one.result for one in judgements}:
+        known = {one.subject: one.p_value for one in judgements if one.result == result and one.p_value is not None}
+        found |= {(name, result): p for name, p in zip(known, holm(list(known.values())), strict=True)}
+    return [replace(one, p_value_holm=found.get((one.subject, one.result))) for one in judgements]
+
+
+def holm(p_values: Sequence[float]) -> list[float]:
+    """Holm's corrected p-values, in the order given."""
+    order = np.argsort(p_values, kind="stable")
+    raised = np.minimum(1.0, np.arange(len(order), 0, -1) * np.array(p_values)[order])
+    adjusted = np.zeros(len(order))
+    adjusted[order] = np.maximum.accumulate(raised)
+    return adjusted.tolist()

@@ -1,0 +1,338 @@
+"""The required number of tests (RNoT) as published, and what `python -m studies rnot` prints of it for stored runs.
+
+It is where, in shuffled tests, the relative half-width settles.
+
+[paper] section VI-E. For one ordering of the tests the RNoT is the first n after which the relative half-width
+RHW = z·sqrt(var/n)/estimate stays at or below a threshold; it is averaged over shuffles of the tests of one run. Where
+a shuffle is never above the threshold, the paper takes the n at which RHW is largest. The average acceleration ratio
+(AAR) of one method over another is the ratio of two averages.
+
+The RHW is looked at on a grid, up to a total; both belong to the answer, for "stays" can only mean "up to the total". A
+shuffle that is still above the threshold at the total counts as the total, which makes the average a lower limit.
+
+A shuffle is decided by the seed, its number, how many tests there are and which of them crashed: not by how they lie
+in shards, and not by the estimator, so that two estimators of one run see the same orderings.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from harness.campaign.files import load_campaign
+from harness.errors import HarnessError
+from harness.estimators.block import Block, columns_of, joined
+from harness.estimators.estimate import BothWays, finite_json
+from harness.estimators.intervals import normal_half_width
+from harness.estimators.nade import Nade, Nde
+from harness.estimators.scv import Scv
+from harness.progress import Progress
+from harness.runner.stored_estimates import stored_blocks
+from harness.vocabulary import BoolArray, FloatArray, IntArray
+
+RnotEstimator = Literal["nde", "nade", "scv"]
+_REFUSAL = {"nde": Nde.refusal, "nade": Nade.refusal, "scv": Scv.refusal}
+SCV_REMARK = (
+    "rests on the variance that scv claims, which is too small (docs/scv-defect.md): this is the number that the "
+    "published procedure reports, not the number of tests that is needed"
+)
+
+
+@dataclass(frozen=True)
+class Procedure:
+    """What the paper leaves to be chosen, and what it chose: defaults of threshold, level and number of shuffles.
+
+    ``first`` is the smallest prefix that is looked at, at least 2, ``ratio`` how much larger each next one is, above 1,
+    ``total`` the largest one; None, or more than there are tests, for all tests.
+    """
+
+    rhw: float = 0.3
+    confidence: float = 0.9
+    n_shuffles: int = 200
+    seed: int = 1
+    first: int = 10
+    ratio: float = 1.05
+    total: int | None = None
+
+    def grid(self, n_tests: int) -> IntArray:
+        """Prefixes to look at, shape (g,): rising, the last one being the total."""
+        total = n_tests if self.total is None else min(self.total, n_tests)
+        sizes, n = [], self.first
+        while n < total:
+            sizes.append(n)
+            n = max(n + 1, int(n * self.ratio))
+        return np.array([*sizes, total], dtype=np.int64)
+
+    @property
+    def z(self) -> float:
+        """Quantile of the normal interval."""
+        return normal_half_width(1.0, self.confidence)
+
+
+@dataclass(frozen=True, eq=False)
+class RequiredTests:
+    """RNoT ``n`` of every shuffle (s,), the total where the threshold is never reached.
+
+    Shuffles ``never_reached`` (s,) are above it at the total. Those ``never_above`` (s,) it have the n of the largest
+    RHW, the smaller one of equals.
+    """
+
+    n: IntArray
+    never_reached: BoolArray
+    never_above: BoolArray
+
+    @property
+    def mean(self) -> float:
+        """Average RNoT."""
+        return float(np.mean(self.n))
+
+    @property
+    def is_lower_limit(self) -> bool:
+        """Whether some shuffle would have needed more tests than the total, and the mean is a lower limit."""
+        return bool(self.never_reached.any())
+
+    def quantile(self, share: float) -> int:
+        """Smallest RNoT that at least this share of the shuffles does not exceed."""
+        return int(np.quantile(self.n, share, method="inverted_cdf"))
+
+
+def required_tests(rhw: FloatArray, grid: IntArray, threshold: float) -> RequiredTests:
+    """Read the RNoT off the RHW (s, g) of every shuffle and prefix of the grid (g,).
+
+    It is infinite where nothing can be said; NaN counts as above any threshold.
+    """
+    above = ~(rhw <= threshold)
+    never_above = np.asarray(~above.any(axis=1))
+    behind_last_above = above.shape[1] - np.argmax(above[:, ::-1], axis=1)
+    settled = np.minimum(behind_last_above, above.shape[1] - 1)
+    at = np.where(never_above, np.argmax(rhw, axis=1), settled)
+    return RequiredTests(grid[at], above[:, -1], never_above)
+
+
+def acceleration(reference: RequiredTests, other: RequiredTests) -> tuple[float, str]:
+    """AAR of `other` over `reference`, and which side of the truth it is on ("unknown": both are lower limits)."""
+    words = {(False, False): "equal", (True, False): "at least", (False, True): "at most", (True, True): "unknown"}
+    return reference.mean / other.mean, words[reference.is_lower_limit, other.is_lower_limit]
+
+
+def plain_rhw(
+    weights: FloatArray,
+    n_tests: int,
+    procedure: Procedure,
+    done: Callable[[], None] = lambda: None,
+    failed: BoolArray | bool = False,
+) -> FloatArray:
+    """RHW of the mean of Y on prefixes of shuffled tests, shape (s, g); infinite before the first crash.
+
+    Tests without a crash only take up places, so that the places of the crashes are all that a shuffle has to draw: a
+    hundred million naturalistic tests cost no more than their crashes. Failed tests count as no crash in the lower
+    limit and as crashes in the upper one.
+
+    ``weights`` (k,) are those of the tests that crashed or ``failed`` (k,), in the order of the records; ``done`` is
+    called after each shuffle.
+    """
+    grid, z = procedure.grid(n_tests), procedure.z
+    # A unit that makes equal weights 1, whose sums are exact; the smallest squares would underflow besides.
+    worst = weights / np.max(weights, initial=0.0) if len(weights) else weights
+    y = np.where(failed, 0.0, worst) if np.any(failed) else worst
+    rhw = np.empty((procedure.n_shuffles, len(grid)))
+    for shuffle in range(procedure.n_shuffles):
+        _, places = _crash_places(procedure.seed, shuffle, n_tests, len(y))
+        order = np.argsort(places)
+        n_placed = np.searchsorted(places[order], grid)
+        total, below = total_and_half_width(y[order], n_placed, grid, z)
+        most, above = (total, below) if y is worst else total_and_half_width(worst[order], n_placed, grid, z)
+        rhw[shuffle] = ((most - total) + above + below) / 2.0 / total
+        done()
+    return rhw
+
+
+def total_and_half_width(y: FloatArray, k: IntArray, n: IntArray, z: float) -> tuple[FloatArray, FloatArray]:
+    """ΣY of the first ``k`` values among ``n`` tests, and z times its standard error; infinite if nothing is known."""
+    total, squares = (np.concatenate([[0.0], np.cumsum(power)])[k] for power in (y, y * y))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        variance = np.maximum(0.0, squares - total * total / n) / (n - 1)
+        half_width: FloatArray = z * np.sqrt(n * variance)
+    half_width[(total == 0.0) | (n < 2)] = np.inf
+    return total, half_width
+
+
+def scv_rhw(tests: Block, procedure: Procedure, done: Callable[[], None] = lambda: None) -> FloatArray:
+    """RHW that the published `scv` claims on prefixes of shuffled tests, shape (s, g): Algorithm 1 on each anew.
+
+    ``tests`` are all tests of a run in index order, with ``first_ratios``; ``done`` is called after each shuffle.
+    """
+    rhw = []
+    for shuffle in range(procedure.n_shuffles):
+        rhw.append(scv_rhw_of(tests, procedure, shuffle))
+        done()
+    return np.array(rhw)
+
+
+def scv_rhw_of(tests: Block, procedure: Procedure, shuffle: int) -> FloatArray:
+    """The same of one shuffle, shape (g,)."""
+    grid = procedure.grid(len(tests))
+    rhw, state = np.empty(len(grid)), BothWays(Scv())
+    order = shuffled(procedure.seed, shuffle, tests.crash | tests.failed)
+    for at, (start, stop) in enumerate(itertools.pairwise([0, *grid.tolist()])):
+        state.add(rows_of(tests, order[start:stop]))
+        rhw[at] = state.result(procedure.confidence).rhw
+    return rhw
+
+
+def _crash_places(seed: int, shuffle: int, n_tests: int, n_crashes: int) -> tuple[np.random.Generator, IntArray]:
+    """Place of every crash in a shuffle, shape (k,), and the generator to go on with."""
+    generator = np.random.default_rng([seed, shuffle])
+    return generator, generator.choice(n_tests, size=n_crashes, replace=False)
+
+
+def shuffled(seed: int, shuffle: int, placed: BoolArray) -> IntArray:
+    """Rows in the order of a shuffle, shape (n,): crashed and failed ones in their places, the others between them."""
+    n = len(placed)
+    generator, places = _crash_places(seed, shuffle, n, int(np.count_nonzero(placed)))
+    order = np.full(n, -1, dtype=np.int64)
+    order[places] = np.flatnonzero(placed)
+    order[order < 0] = generator.permutation(np.flatnonzero(~placed))
+    return order
+
+
+def rows_of(tests: Block, rows: IntArray) -> Block:
+    """Block of any rows in any order; numbered anew, for the order is what is asked about."""
+    taken: dict[str, Any] = {name: column[rows] for name, column in columns_of(tests).items()}
+    return replace(tests, first_episode=0, **taken)
+
+
+@dataclass(frozen=True)
+class _Run:
+    """Tests of a run, as far as the asked estimators read them; ``whole`` only where `scv` is to be fitted.
+
+    ``weights`` (k,) are those of the tests that crashed or failed, ``failed`` (k,) says which have failed.
+    """
+
+    n_tests: int
+    weights: FloatArray
+    failed: BoolArray
+    sample: Block
+    whole: Block | None
+
+
+def required_tests_of_runs(
+    folders: Sequence[Path],
+    procedure: Procedure,
+    *,
+    estimators: Sequence[RnotEstimator] = (),
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """RNoT of every run and estimator, and its AAR over the first of them, as JSON content.
+
+    The default estimator is the plain one of each run: ``nde`` for naturalistic tests, ``nade`` for weighted ones.
+
+    Raises
+    ------
+    HarnessError
+        If a folder is not a run, its records are damaged or incomplete, or its tests were drawn from shells.
+    """
+    told = progress or Progress()
+    reference: RequiredTests | None = None
+    rows = []
+    for folder in folders:
+        run = _read(folder, with_ratios="scv" in estimators)
+        plain: RnotEstimator = "nde" if run.sample.method == "nde" else "nade"
+        tests = {"n_episodes": run.n_tests, "n_crashes": int(np.count_nonzero(~run.failed))}
+        for name in dict.fromkeys(estimators or [plain]):
+            told.stage(f"{folder.name} {name}", procedure.n_shuffles)
+            row = {"run": str(folder), "estimator": name, **tests}
+            if reason := _REFUSAL[name](run.sample):
+                rows.append({**row, "mean": None, "reason": reason})
+                continue
+            found = _found(run, name, procedure, told)
+            reference = reference or found
+            rows.append(row | _row(run, name, found, reference, procedure))
+    content: dict[str, Any] = finite_json({**asdict(procedure), "rows": rows})
+    return content
+
+
+def _read(folder: Path, *, with_ratios: bool) -> _Run:
+    method = load_campaign(folder / "campaign.yaml", check_files=False).testing.method
+    if method == "shells":
+        raise HarnessError(
+            str(folder),
+            found="tests drawn from shells, of which each has its own probability",
+            expected="tests that can change places: drawn by nde, forced, step_mixture or episode_mixture",
+            mend="For shells the number of tests is what the run itself needed: see docs/shells.md.",
+        )
+    weights, failed, kept, sample, n = [], [], [], None, 0
+    for block in stored_blocks(folder, moments=with_ratios):
+        sample = sample or block
+        counted = block.crash | block.failed
+        weights.append(np.exp(block.log_weight[counted]))
+        failed.append(block.failed[counted])
+        n += len(block)
+        if with_ratios and Scv.refusal(block) is None:
+            kept.append(block)
+    if sample is None:
+        raise HarnessError(str(folder), found="no tests on record", expected="a run", mend="Run the campaign first.")
+    return _Run(n, np.concatenate(weights), np.concatenate(failed), sample, joined(kept) if kept else None)
+
+
+def _found(run: _Run, name: RnotEstimator, procedure: Procedure, progress: Progress) -> RequiredTests:
+    def done() -> None:
+        progress.advance(1)
+
+    if name == "scv":
+        assert run.whole is not None
+        rhw = scv_rhw(run.whole, procedure, done)
+    else:
+        rhw = plain_rhw(run.weights, run.n_tests, procedure, done, run.failed)
+    return required_tests(rhw, procedure.grid(run.n_tests), procedure.rhw)
+
+
+def _row(
+    run: _Run, name: RnotEstimator, found: RequiredTests, reference: RequiredTests, procedure: Procedure
+) -> dict[str, Any]:
+    grid = procedure.grid(run.n_tests)
+    ratio, side = acceleration(reference, found)
+    return {
+        "grid": f"{grid[0]:,} to {grid[-1]:,} by {procedure.ratio - 1.0:.3g} n ({len(grid)} looks)",
+        "grid_points": len(grid),
+        "total": int(grid[-1]),
+        "mean": found.mean,
+        "mean_is_lower_limit": found.is_lower_limit,
+        "low_5": found.quantile(0.05),
+        "high_95": found.quantile(0.95),
+        "never_reached": int(np.count_nonzero(found.never_reached)),
+        "never_above": int(np.count_nonzero(found.never_above)),
+        "aar": None if side == "unknown" else ratio,
+        "aar_is": side,
+        "remarks": _remarks(run, name, found, int(grid[-1]), procedure),
+    }
+
+
+def _remarks(run: _Run, name: RnotEstimator, found: RequiredTests, total: int, procedure: Procedure) -> list[str]:
+    remarks, n_shuffles = [SCV_REMARK] if name == "scv" else [], procedure.n_shuffles
+    if run.failed.any():
+        remarks.append(
+            f"{np.count_nonzero(run.failed)} tests failed: the lower limit counts them as no crash, the upper one "
+            "as crashes"
+        )
+    if found.is_lower_limit:
+        remarks.append(
+            f"{np.count_nonzero(found.never_reached)} of {n_shuffles} shuffles are above RHW {procedure.rhw:g} at "
+            f"{total:,} tests and count as {total:,}: the mean is a lower limit"
+        )
+    if found.never_above.any():
+        remarks.append(
+            f"{np.count_nonzero(found.never_above)} of {n_shuffles} shuffles are nowhere above RHW {procedure.rhw:g}: "
+            "each counts with the n of its largest RHW, as in the paper"
+        )
+    if not found.is_lower_limit and found.quantile(0.95) > run.n_tests / 2:
+        remarks.append(
+            f"above half of the {run.n_tests:,} tests on record shuffles of the same tests hardly differ: ask a longer "
+            "run for a mean and a range to rely on"
+        )
+    return remarks

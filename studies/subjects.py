@@ -1,0 +1,173 @@
+"""What an experiment repeats: a campaign or comparison for each of its subjects, and what is known about that."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from concurrent.futures import Executor
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import permutations
+
+from harness.campaign.campaign import Campaign
+from harness.pool.library import Library, load_library
+from harness.pool.shells import acceleration_limit
+from harness.progress import Progress
+from harness.strata import LIBRARY_STATEMENT
+from harness.traffic.loading import load_environment
+from harness.vocabulary import FloatArray
+from studies.chains.named import CHAINS
+from studies.chains.shells import ChainShells
+from studies.experiment import Experiment
+from studies.judgement import Subject
+from studies.shell_campaign import Draw, PairedCampaign, ShellCampaign, limit_at, result_of
+from studies.shell_source import Division, OvertakingShells
+from studies.super_population import Drivers, Mixed, SuperPopulation, enumerate_paths, reference_drivers
+from studies.truths import CONDITIONAL_DIFFERENCE, RATE, Known, Truths, of_pair, of_vehicle
+from studies.walked_population import Choose, chooser, walk_paths
+from studies.weighted_campaign import WeightedCampaign, chain_episodes, twin_episodes
+
+Repeated = ShellCampaign | PairedCampaign | WeightedCampaign
+"""A campaign that can be repeated, in any process."""
+Tested = tuple[Subject, Repeated]
+
+
+def subjects(experiment: Experiment, executor: Executor, progress: Progress) -> Iterator[Tested]:
+    """All subjects, in the order of the file, those of vehicles that act before the cut-in last."""
+    if experiment.chains:
+        yield from _chains(experiment)
+        return
+    campaign = experiment.campaign
+    if experiment.holding:
+        environment, library = load_environment(campaign.environment), load_library(campaign.pool.library)
+        drivers = Drivers.of(library, experiment.holding, see_onset=environment.lateral.present)
+        together: dict[str, set[str]] = {}
+        for one, other in [each for pair in experiment.pairs.values() for each in permutations((pair.a, pair.b))]:
+            together.setdefault(one, set()).update({other} & set(drivers.vehicles))
+        size, seed = experiment.super_population, experiment.seed
+        truths = Truths(environment, drivers, seed + 1, size.reference_paths, progress, together)
+        if campaign.testing.method == "shells":
+            pools = enumerate_paths(environment, drivers, seed, size.paths, progress)
+            shells = _Shells(experiment, library, drivers, truths, pools)
+            yield from shells.pairs() if experiment.pairs else shells.single()
+        else:
+            yield from _weighted(experiment, truths)
+    if experiment.acting and not experiment.pairs:
+        choose = chooser(campaign, progress)
+        for name in experiment.acting:
+            yield _acting(experiment, name, choose, executor, progress)
+
+
+def _chains(experiment: Experiment) -> Iterator[Tested]:
+    campaign, method = experiment.campaign, experiment.campaign.testing.method
+    for place, name in enumerate(experiment.chains):
+        chain, seed = CHAINS[name], experiment.seed_of(place)
+        subject = Subject.exact(name, chain.crash_rate)
+        if method == "shells":
+            source = ChainShells(chain, experiment.super_population.pool_paths)
+            subject = replace(subject, crashes_outside={result_of(LIBRARY_STATEMENT): source.crashes_outside})
+            yield _of_shells(experiment, campaign, source.draw, seed, subject)
+        else:
+            episodes = partial(chain_episodes, chain, method, seed)
+            yield subject, WeightedCampaign(campaign, episodes, experiment.results)
+
+
+def _of_shells(experiment: Experiment, campaign: Campaign, draw: Draw, seed: int, subject: Subject) -> Tested:
+    limits = {limit_at(factor): factor * subject.crash_rate.value for factor in experiment.limits}
+    return subject, ShellCampaign(campaign, draw, seed, experiment.fault, limits)
+
+
+def _vehicle(
+    experiment: Experiment, campaign: Campaign, name: str, source: OvertakingShells, known: Mapping[str, Known]
+) -> Tested:
+    """A vehicle by what is known about it, its crash rate among it; adversaries have the seed of what they are of."""
+    outside = {result_of(each): share for each, share in source.cells.crashes_outside(source.crashing[0]).items()}
+    asked = result_of(campaign.testing.shells.statement)
+    outside |= {limit_at(factor): outside.get(asked, 0.0) for factor in experiment.limits}
+    others = {result: value for result, value in known.items() if result != RATE}
+    facts = outside, source.cells.left_out, source.cells.template.library.boundary
+    of = experiment.adversaries[name].of if name in experiment.adversaries else name
+    seed = experiment.seed_of(list(experiment.avs).index(of))
+    return _of_shells(experiment, campaign, source.draw, seed, Subject(name, known[RATE], others, *facts))
+
+
+def _exactly(known: Mapping[str, Known]) -> dict[str, Known]:
+    """What a population says about itself."""
+    return {name: replace(each, std_error=0.0) for name, each in known.items()}
+
+
+def _weighted(experiment: Experiment, truths: Truths) -> Iterator[Tested]:
+    """Vehicles tested by a method that gives crashes weights."""
+    for name in experiment.holding:
+        tested, seed = experiment.subject(name), experiment.seed_of(list(experiment.avs).index(name))
+        episodes = twin_episodes(tested, seed, experiment.results)
+        yield Subject(name, truths.vehicle(name)[RATE]), WeightedCampaign(tested, episodes, experiment.results)
+
+
+@dataclass(frozen=True, eq=False)
+class _Shells:
+    """Vehicles that keep their speed before the cut-in, all enumerated together, and paths for their pools."""
+
+    experiment: Experiment
+    library: Library
+    drivers: Drivers
+    truths: Truths
+    pools: SuperPopulation
+
+    def single(self) -> Iterator[Tested]:
+        """Each vehicle, followed by the adversaries that are made of it."""
+        experiment = self.experiment
+        for name, av in experiment.holding.items():
+            tested, crashing = experiment.subject(name), self.drivers.vehicles[name].crash_mass(self.pools)
+            division = self._division(crashing, limit_mps2=acceleration_limit(av))
+            yield _vehicle(experiment, tested, name, division.of_vehicle(crashing), self.truths.vehicle(name))
+            for made_name, made in experiment.adversaries.items():
+                if made.of == name:
+                    of_adversary = division.as_adversary(made, crashing)
+                    source = division.of_vehicle(of_adversary, made.failing)
+                    known = _exactly(of_vehicle(self.pools, of_adversary, self.drivers.references))
+                    yield _vehicle(experiment, tested, made_name, source, known)
+
+    def pairs(self) -> Iterator[Tested]:
+        """Each comparison."""
+        experiment = self.experiment
+        for place, (name, pair) in enumerate(experiment.pairs.items()):
+            both = [pair.a, pair.b]
+            adversaries = [experiment.adversaries.get(one) for one in both]
+            base = [one if made is None else made.of for one, made in zip(both, adversaries, strict=True)]
+            of_base = [self.drivers.vehicles[one].crash_mass(self.pools) for one in base]
+            limit = max(acceleration_limit(experiment.avs[one]) for one in base)
+            division = self._division(*of_base, limit_mps2=limit)
+            a, b = (
+                crashing if made is None else division.as_adversary(made, crashing)
+                for made, crashing in zip(adversaries, of_base, strict=True)
+            )
+            known = self.truths.pair(*both) if both == base else _exactly(of_pair(self.pools, a, b))
+            source, scale = division.of_pair(a, b), known[CONDITIONAL_DIFFERENCE].scale
+            # Shares of the larger rate, as widths are; what only one of them does counts, whichever it is.
+            differing = source.crashing[1] + source.crashing[2]
+            rate = float(differing.sum()) / len(differing)
+            beyond = source.cells.crashes_outside(differing)[LIBRARY_STATEMENT] * rate / scale
+            facts = {CONDITIONAL_DIFFERENCE: beyond}, source.cells.left_out, source.cells.template.library.boundary
+            subject = Subject(name, Known(scale, 0.0, scale), dict(known), *facts)
+            campaign, seed = experiment.subject(base[0]), experiment.seed_of(place)
+            yield subject, PairedCampaign(campaign, source.draw, seed, experiment.fault)
+
+    def _division(self, *crashing: FloatArray, limit_mps2: float) -> Division:
+        library, paths = self.library, self.experiment.super_population.pool_paths
+        if self.experiment.pairs:
+            library = library.model_copy(update={"references": {}})
+        return Division(library, self.pools, crashing, paths, limit_mps2=limit_mps2)
+
+
+def _acting(experiment: Experiment, name: str, choose: Choose, executor: Executor, progress: Progress) -> Tested:
+    """A vehicle that acts before the cut-in, on paths of its own."""
+    campaign, size = experiment.subject(name), experiment.super_population
+    library = load_library(campaign.pool.library)
+    vehicle = Mixed((library.n_drivers,), (1.0,))
+    truth = walk_paths(campaign, choose, experiment.seed + 1, size.reference_paths, executor, progress)
+    pools = walk_paths(campaign, choose, experiment.seed, size.paths, executor, progress)
+    known = of_vehicle(truth, vehicle.crash_mass(truth), reference_drivers(library))
+    crashing, limit = vehicle.crash_mass(pools), acceleration_limit(campaign.av)
+    paths = campaign.pool.shadow_paths
+    division = Division(library, pools, [crashing], paths, limit_mps2=limit, shadow_runs=True)
+    return _vehicle(experiment, campaign, name, division.of_vehicle(crashing), known)
