@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from harness.campaign.campaign import Campaign
-    from harness.pool.refined_ladder import RefinedLadder
     from harness.progress import Progress
     from harness.records.frames import StoredRun
     from harness.runner import AvCheck, Comparison, ReplayResult, RunResult
@@ -33,7 +32,6 @@ __all__ = [
     "av_check",
     "compare",
     "estimate",
-    "ladder",
     "load_campaign",
     "read",
     "replay",
@@ -111,13 +109,6 @@ def write_report(folder: str | Path) -> Path:
     from harness.report import write_report as write  # noqa: PLC0415
 
     return write(Path(folder))
-
-
-def ladder(folder: str | Path, out: str | Path) -> RefinedLadder:
-    """Fit a driver to the AV of a stored run and write a library with it (see `harness.pool.refined_ladder`)."""
-    from harness.pool.refined_ladder import refine_ladder  # noqa: PLC0415
-
-    return refine_ladder(Path(folder), Path(out))
 
 
 def replay(folder: str | Path, episode: int, *, gui: bool = False, fcd: str | Path | None = None) -> ReplayResult:

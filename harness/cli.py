@@ -15,7 +15,7 @@ import click
 from harness.commands.campaigns import check, pool, run, schema, setup
 from harness.commands.options import examples
 from harness.commands.stored import estimate, replay, report
-from harness.commands.vehicles import av_check, compare, ladder
+from harness.commands.vehicles import av_check, compare
 from harness.console import show_error, show_interrupted, system_error, usage_error
 from harness.errors import EXIT_DONE, HarnessError, shortened
 from harness.interruption import Interruption, interruptible
@@ -42,7 +42,7 @@ def cli() -> None:
     """
 
 
-_TESTING = check, av_check, run, compare, pool, ladder, estimate, report, replay
+_TESTING = check, av_check, run, compare, pool, estimate, report, replay
 for command in (*_TESTING, schema, setup):
     cli.add_command(command)
 

@@ -35,7 +35,7 @@ def result(tmp_path_factory):
 
 
 def test_all_that_is_promised_is_there():
-    commands = {"av_check", "compare", "run", "estimate", "ladder", "read", "replay"}
+    commands = {"av_check", "compare", "run", "estimate", "read", "replay"}
     assert set(harness.__all__) == {"HarnessError", "load_campaign", "write_report"} | commands
     for name in harness.__all__:
         assert inspect.getdoc(getattr(harness, name))
@@ -103,7 +103,6 @@ def test_a_run_is_not_written_over(result):
             lambda c: harness.compare(c, c, "out", stored="a", margin=0.1),
             {"out": OUT, "stored": Path("a"), "margin": 0.1},
         ),
-        ("pool.refined_ladder.refine_ladder", lambda _: harness.ladder("run", "out"), {"folder": Path("run")}),
         ("report.write_report", lambda _: harness.write_report("run"), {"folder": Path("run")}),
     ],
 )

@@ -1,4 +1,4 @@
-"""Vehicles: look at one, compare two, fit a surrogate to one."""
+"""Vehicles: look at one, compare two."""
 
 from __future__ import annotations
 
@@ -9,9 +9,7 @@ import click
 
 from harness.commands.options import (
     CAMPAIGN,
-    FILE,
     FOLDER,
-    RUN_FOLDER,
     av_option,
     examples,
     json_option,
@@ -20,7 +18,6 @@ from harness.commands.options import (
     quiet_option,
     set_option,
     workers_option,
-    written_file,
 )
 from harness.console import print_json
 from harness.console_tables import print_av_check
@@ -153,32 +150,3 @@ def compare(
             click.echo(f"note: {remark}")
         click.echo(str(folder / "compare.json"))
     ctx.exit(found.exit_code)
-
-
-@click.command(
-    short_help="Fit a surrogate to the AV of a run.",
-    epilog=examples(
-        "harness run my.yaml --out runs/rough --set records.trace_share=0.2",
-        "harness ladder runs/rough --out my-ladder.yaml",
-        "harness run my.yaml --out runs/fine --set testing.method=shells --set pool.library=./my-ladder.yaml",
-    ),
-)
-@click.argument("folder", metavar="DIR", type=RUN_FOLDER)
-@click.option("--out", type=FILE, callback=written_file(), required=True, help="Library to write, a new .yaml file.")
-@json_option
-def ladder(folder: Path, out: Path, *, as_json: bool) -> None:
-    """Fit a driver to the AV of the run in DIR, and write the run's surrogate library with it.
-
-    The driver is an IDM with a reaction delay and limits to braking and jerk. It is fitted to accelerations in episodes
-    that were traced whatever came of them (records.trace_share, or records.traces all); how well it predicts the AV's
-    crashes is told by the tests that it was not fitted to. A more careless neighbour is added beside it.
-    """
-    from harness.pool.refined_ladder import refine_ladder  # noqa: PLC0415 - keeps --help fast
-
-    refined = refine_ladder(folder, out)
-    if as_json:
-        print_json({**refined.to_json(), "file": str(out)})
-        return
-    for sentence in refined.statements:
-        click.echo(sentence)
-    click.echo(str(out))

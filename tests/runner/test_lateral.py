@@ -9,7 +9,6 @@ import pytest
 
 from harness import estimate, replay
 from harness.errors import CampaignError
-from harness.pool.refined_ladder import refine_ladder
 from harness.report import write_report
 from harness.runner import plan_campaign
 from harness.runner.av_check import check_av
@@ -108,11 +107,6 @@ def test_av_check_looks_at_a_vehicle_from_the_onset_on_and_refuses_one_that_acts
     assert with_lead.behaviour.n_crashes <= without.behaviour.n_crashes
     with pytest.raises(CampaignError, match="shadow runs"):
         check_av(campaign(LEAD, "testing.method=forced", f"av={ACTING.format('Speeds')}"), 4)
-
-
-def test_no_driver_is_fitted_to_it(lateral_run, tmp_path):
-    with pytest.raises(CampaignError, match="cut-ins that take time"):
-        refine_ladder(lateral_run.folder, tmp_path / "mine.yaml")
 
 
 def test_check_says_what_is_within_reach(lateral_run, campaign):
