@@ -15,7 +15,6 @@ from harness.records.reader import table_sizes
 from harness.report import number_format
 from harness.report.answer_plot import answer_plot, rate_exponent
 from harness.report.convergence_plot import convergence_plot
-from harness.report.crash_contrast import CONDITIONS, Contrast, band_in_words, contrast_plot, crash_contrast
 from harness.report.crash_gallery import GalleryRow, crash_gallery
 from harness.report.cut_in_plot import cut_in_plot
 from harness.report.histogram_plots import crash_time_plot, impact_speed_plot, strata_plot, weight_plot
@@ -24,7 +23,6 @@ from harness.report.run_folder import RunFolder, read_run_folder, typed_folder
 from harness.report.shells_plot import shells_plot
 from harness.report.summary import RunSummary, lateral_facts, summarise
 from harness.report.tables import RateUnit, details, diagnostics, outcome_rows, run_notes, setting_sections, verdict
-from harness.report.telling_bands import RELABELINGS, SIGNIFICANT
 
 PLOT_NAMES = re.compile(
     r"(answer|shells|convergence|weights|strata|contrast|cut_ins|impact_speed|crash_time|crash-\d+)\.(png|svg)"
@@ -58,10 +56,10 @@ def write_report(folder: Path, *, final: Path | None = None) -> Path:
     folder = Path(folder)
     run = read_run_folder(folder, typed=typed_folder(final or folder))
     sizes = table_sizes(folder)
-    summary, contrast = summarise(run), crash_contrast(run)
+    summary = summarise(run)
     with matplotlib.style.context(["default", RC]):
         gallery = crash_gallery(run, summary)
-        files, figures = _rendered(_plots(run, summary, contrast, gallery))
+        files, figures = _rendered(_plots(run, summary, gallery))
     style = (Path(__file__).parent / "report.css").read_text(encoding="utf-8")
     environment = Environment(
         loader=PackageLoader("harness.report", "."),
@@ -70,18 +68,14 @@ def write_report(folder: Path, *, final: Path | None = None) -> Path:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters.update(getmembers(number_format, isfunction), band_in_words=band_in_words, verdict=verdict)
+    environment.filters.update(getmembers(number_format, isfunction), verdict=verdict)
     page = environment.get_template("report.html.j2").render(
         run=run,
         summary=summary,
-        contrast=contrast,
         sizes=sizes,
         gallery=gallery,
         figures=figures,
-        conditions=CONDITIONS,
         lateral=lateral_facts(run),
-        relabelings=RELABELINGS,
-        significant=SIGNIFICANT,
         estimators=sorted(run.estimates.estimates.items(), key=lambda item: item[0] != run.estimates.headline),
         unit=RateUnit(rate_exponent(run.estimates)),
         outcomes=outcome_rows(summary),
@@ -97,14 +91,13 @@ def write_report(folder: Path, *, final: Path | None = None) -> Path:
     return folder / "report.html"
 
 
-def _plots(run: RunFolder, summary: RunSummary, contrast: Contrast, gallery: list[GalleryRow]) -> list[Plot]:
+def _plots(run: RunFolder, summary: RunSummary, gallery: list[GalleryRow]) -> list[Plot]:
     # Within a shell all tests weigh the same and there is one control step, the cut-in: nothing to draw of either.
     drawn_by = [weight_plot(summary), strata_plot(summary)] if run.shells is None else [shells_plot(run.shells)]
     plots = [
         answer_plot(run.estimates, run.shells),
         convergence_plot(run.estimates, run.campaign.stop.rhw, of_statement=run.asked_statement),
         *drawn_by,
-        contrast_plot(contrast),
         cut_in_plot(summary),
         impact_speed_plot(summary),
         crash_time_plot(summary),

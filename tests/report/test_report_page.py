@@ -18,12 +18,12 @@ from harness.report.summary import summarise
 from harness.report.tables import run_notes
 
 ALWAYS, OF_CRASHES = {"answer", "convergence"}, {"cut_ins", "impact_speed", "crash_time"}
-OF_WEIGHTED_CRASHES = OF_CRASHES | {"weights", "strata", "contrast"}
+OF_WEIGHTED_CRASHES = OF_CRASHES | {"weights", "strata"}
 EXPECTED = {
     "full": ALWAYS | OF_WEIGHTED_CRASHES,
     "no_crashes": ALWAYS | {"weights", "cut_ins"},
     "bare": ALWAYS | OF_WEIGHTED_CRASHES,
-    "nde": ALWAYS | OF_CRASHES | {"contrast"},
+    "nde": ALWAYS | OF_CRASHES,
     "nde_no_crashes": ALWAYS,
     "failed": ALWAYS | OF_WEIGHTED_CRASHES,
 }
