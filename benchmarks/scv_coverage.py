@@ -13,8 +13,8 @@ import numpy as np
 
 from harness.estimators.block import Block
 from harness.estimators.estimate import Estimate
-from harness.estimators.nade import Nade
 from harness.estimators.scv import Scv
+from harness.estimators.weighted import Nade
 from studies.chains.named import frequent_decisive, rare_decisive
 from studies.chains.sampler import draw
 

@@ -13,8 +13,8 @@ import sys
 import numpy as np
 
 from harness.campaign.sections import Stop
-from harness.estimators.nade import Nde
 from harness.estimators.stopping import StopRule
+from harness.estimators.weighted import Nde
 
 RATE = 0.01
 SHARD = 200

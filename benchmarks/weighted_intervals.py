@@ -18,9 +18,9 @@ from harness.campaign.campaign import Campaign
 from harness.campaign.sections import Stop
 from harness.estimators.block import Block
 from harness.estimators.estimate import Estimate
-from harness.estimators.intervals import hall_distances, normal_half_width
-from harness.estimators.nade import Nade
+from harness.estimators.limits import hall_distances, normal_half_width
 from harness.estimators.stopping import StopRule
+from harness.estimators.weighted import Nade
 from harness.vocabulary import FloatArray, Method
 from studies.weighted_campaign import twin_episodes
 

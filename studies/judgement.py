@@ -15,7 +15,7 @@ import numpy as np
 from scipy.stats import binomtest
 
 from harness.estimators.estimate import Estimate, finite_json
-from harness.estimators.intervals import clopper_pearson, normal_half_width
+from harness.estimators.limits import clopper_pearson, normal_half_width
 from harness.vocabulary import FloatArray
 from studies.truths import Known
 

@@ -27,10 +27,10 @@ import numpy as np
 from harness.campaign.files import load_campaign
 from harness.errors import HarnessError
 from harness.estimators.block import Block, columns_of, joined
-from harness.estimators.estimate import BothWays, finite_json
-from harness.estimators.intervals import normal_half_width
-from harness.estimators.nade import Nade, Nde
+from harness.estimators.estimate import FailureBounds, finite_json
+from harness.estimators.limits import normal_half_width
 from harness.estimators.scv import Scv
+from harness.estimators.weighted import Nade, Nde
 from harness.progress import Progress
 from harness.runner.stored_estimates import stored_blocks
 from harness.vocabulary import BoolArray, FloatArray, IntArray
@@ -177,7 +177,7 @@ def scv_rhw(tests: Block, procedure: Procedure, done: Callable[[], None] = lambd
 def scv_rhw_of(tests: Block, procedure: Procedure, shuffle: int) -> FloatArray:
     """The same of one shuffle, shape (g,)."""
     grid = procedure.grid(len(tests))
-    rhw, state = np.empty(len(grid)), BothWays(Scv())
+    rhw, state = np.empty(len(grid)), FailureBounds(Scv())
     order = shuffled(procedure.seed, shuffle, tests.crash | tests.failed)
     for at, (start, stop) in enumerate(itertools.pairwise([0, *grid.tolist()])):
         state.add(rows_of(tests, order[start:stop]))

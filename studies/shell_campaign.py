@@ -19,10 +19,10 @@ from harness.campaign.campaign import Campaign
 from harness.campaign.sections import Accept
 from harness.estimators.block import Block
 from harness.estimators.estimate import Estimate
-from harness.estimators.limit_search import Level
+from harness.estimators.likelihood import Level
 from harness.estimators.pairs import CRASH, NO_CRASH, PairCounts, no_pairs
-from harness.estimators.round_stopping import PairRule, RoundRule
 from harness.estimators.shells import Shells
+from harness.estimators.stopping import PairRule, RoundRule
 from harness.runner.planner import PairPlanner, ShellPlanner
 from harness.strata import LIBRARY_STATEMENT, ShellDesign
 from harness.vocabulary import FloatArray, IntArray

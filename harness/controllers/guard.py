@@ -4,8 +4,8 @@ Whatever goes wrong, also an answer outside of av.limits, ends the episode (`har
 ``failed``, these words in the column ``failure`` of its row, and the weight that it has so far. Its controller is
 dropped (of a batch only the cells fail), and the run goes on until failed tests exceed run.max_failed_share
 (`harness.runner.manifest.require_few_failed`). Rate and lower limit count it as no crash, upper limits as a crash
-(`harness.estimators.estimate.BothWays`). A call that takes too long meets an exception where Python runs, else the end
-of the process.
+(`harness.estimators.estimate.FailureBounds`). A call that takes too long meets an exception where Python runs, else
+the end of the process.
 """
 
 from __future__ import annotations

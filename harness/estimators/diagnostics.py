@@ -13,7 +13,7 @@ import numpy as np
 
 from harness.estimators.alarm import Alarm
 from harness.estimators.block import Block
-from harness.estimators.moments import Moments
+from harness.estimators.weighted import Moments
 from harness.vocabulary import SAMPLING, Method
 
 NOTE = (

@@ -3,7 +3,7 @@
 Episode i of both campaigns has the same random numbers: the pairs are independent of each other, the two of a pair are
 not. The mean of D_i = Y_A,i - Y_B,i is unbiased for the difference of the rates whatever the dependence, and its
 variance is the sample variance of D_i. The lower limit of A - B is that of a B whose failed tests have all crashed
-while none of A's has, the upper limit the other way round (see `BothWays`).
+while none of A's has, the upper limit the other way round (see `FailureBounds`).
 """
 
 from __future__ import annotations
@@ -17,11 +17,10 @@ from typing import Any
 import numpy as np
 
 from harness.estimators.block import Block
-from harness.estimators.estimate import BothWays, Estimate, finite_json, require_episodes
-from harness.estimators.intervals import capped_mean_upper, normal_half_width, skewed_distances
-from harness.estimators.moments import Moments
-from harness.estimators.nade import FEW_EFFECTIVE, Nade, WeightedSums
+from harness.estimators.estimate import Estimate, FailureBounds, finite_json, require_episodes
+from harness.estimators.limits import capped_mean_upper, normal_half_width, skewed_distances
 from harness.estimators.statement import warned
+from harness.estimators.weighted import FEW_EFFECTIVE, Moments, Nade, WeightedSums
 
 FEW_PAIRS = 50
 
@@ -115,9 +114,9 @@ def paired_difference(pairs: Iterable[tuple[Block, Block]], confidence: float) -
     )
 
 
-def _summed(pairs: Iterable[tuple[Block, Block]]) -> tuple[tuple[BothWays, BothWays], _Pairs, _Pairs, _Pairs]:
+def _summed(pairs: Iterable[tuple[Block, Block]]) -> tuple[tuple[FailureBounds, FailureBounds], _Pairs, _Pairs, _Pairs]:
     """Estimators of A and B, and pairs as seen, with A - B as low and as high as failed tests may have made it."""
-    each = BothWays(Nade()), BothWays(Nade())
+    each = FailureBounds(Nade()), FailureBounds(Nade())
     seen = lowest = highest = _Pairs()  # one and the same until a test fails
     for a, b in pairs:
         if (a.first_episode, len(a)) != (b.first_episode, len(b)):

@@ -123,7 +123,7 @@ def require_episodes(n: int) -> None:
         raise ValueError("an estimate needs at least one episode")
 
 
-class BothWays:
+class FailureBounds:
     """An estimator that is fed twice from the first failed test on.
 
     Parameters

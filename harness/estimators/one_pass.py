@@ -9,11 +9,10 @@ from typing import Any
 from harness.estimators import statement as say
 from harness.estimators.block import Block
 from harness.estimators.diagnostics import Diagnostics
-from harness.estimators.estimate import Accumulator, BothWays, Estimate, Unavailable, finite_json, require_episodes
-from harness.estimators.mixture_cv import MixtureCv
-from harness.estimators.nade import Nade, Nde
-from harness.estimators.scv import Scv
+from harness.estimators.estimate import Accumulator, Estimate, FailureBounds, Unavailable, finite_json, require_episodes
+from harness.estimators.scv import MixtureCv, Scv
 from harness.estimators.shells import Shells
+from harness.estimators.weighted import Nade, Nde
 from harness.vocabulary import ESTIMATORS, SAMPLING, EstimatorName
 
 ACCUMULATORS: dict[EstimatorName, type[Accumulator]] = {
@@ -27,9 +26,9 @@ SPACING = 1.01
 """Prefixes closer than 1 % are one dot on a logarithmic axis; thinning them keeps long campaigns' files small."""
 
 
-def accumulator(name: EstimatorName) -> BothWays:
+def accumulator(name: EstimatorName) -> FailureBounds:
     """Empty state of an estimator, for those who feed it themselves (the runner does, for stopping)."""
-    return BothWays(ACCUMULATORS[name]())
+    return FailureBounds(ACCUMULATORS[name]())
 
 
 @dataclass(frozen=True)
@@ -73,7 +72,7 @@ def one_pass(
         If there is no episode, or a block does not follow the one before.
     """
     own: EstimatorName | None = None
-    states: dict[EstimatorName, BothWays] = {}
+    states: dict[EstimatorName, FailureBounds] = {}
     refusals: dict[EstimatorName, str | None] = {}
     diagnostics, convergence, n = Diagnostics(), list[dict[str, Any]](), 0
     for block in blocks:

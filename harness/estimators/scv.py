@@ -1,26 +1,36 @@
-"""`scv`: sparse control variates exactly as published ([paper] Algorithm 1), with the warning that they need.
+"""Control variates: `mixture_cv`, whose columns have means that are known exactly, and `scv`, exactly as published.
 
-Episodes are stratified by their number of control steps l; within each stratum Y is regressed by SVD on the products
-vec(Π_t q_{j_t}(a_t|s_t)/q_alpha(a_t|s_t)), centred by the stratum's *sample* mean; the estimate is
-Σ_l n_l·intercept_l/n and its variance is that of the pooled residuals Z = Y - H·β. Each j_t runs over 1 … J-1 (section
-IV-A would have J). Each l is a stratum of its own, also above nine: there the columns come from the first nine control
-steps (section VI-E), but Algorithm 1 does not pool the strata.
+`mixture_cv`. Under q_alpha(x) = Σ_j alpha_j q_j(x) over whole episodes, h_j(x) = q_j(x)/q_alpha(x) - 1 has mean exactly
+0, whatever the AV does. Regressing Y on [1, h_1 … h_M], with the columns *not* centred by their sample means, makes the
+intercept the estimate: it moves away from the plain mean by what the sample means of the h_j show to be luck. Its
+variance is at most min_j σ²_j/(n alpha_j) up to the estimation of β ([paper] Lemma 1, Theorem 2 of Owen and Zhou).
 
+`scv` ([paper] Algorithm 1), with the warning that it needs. Episodes are stratified by their number of control steps l;
+within each stratum Y is regressed by SVD on the products vec(Π_t q_{j_t}(a_t|s_t)/q_alpha(a_t|s_t)), centred by the
+stratum's *sample* mean; the estimate is Σ_l n_l·intercept_l/n and its variance is that of the pooled residuals
+Z = Y - H·β. Each j_t runs over 1 … J-1 (section IV-A would have J). Each l is a stratum of its own, also above nine:
+there the columns come from the first nine control steps (section VI-E), but Algorithm 1 does not pool the strata.
 Because sample-centred columns leave the intercept at the stratum's mean of Y, the estimate *is* that of `nade`, while
 its claimed variance leaves out the error of the centring. See docs/scv-defect.md.
+
+Both regressions rest on the triangular factor R of a tall matrix [1, H, Y] whose rows come in blocks (TSQR): factor the
+old R with the new rows below it. Unlike a Gram matrix this never squares the condition number, and the centring of H
+and Y by their means falls out of R for free: with the ones first, R without its first row and column is the factor of
+the centred columns.
 """
 
 from __future__ import annotations
 
+import ctypes
 import math
 from typing import NamedTuple
 
 import numpy as np
+from numba.extending import get_cython_function_address
 
 from harness.estimators.block import MAX_CONTROL_STEPS, Block
 from harness.estimators.estimate import Estimate, require_episodes
-from harness.estimators.nade import WeightedSums, weighted_estimate
-from harness.estimators.triangular_factor import empty_factor, fold_rows
+from harness.estimators.weighted import FEW_FOR_RESIDUALS, WeightedSums, weighted_estimate
 from harness.threads import side_by_side
 from harness.vocabulary import FloatArray, IntArray
 
@@ -32,6 +42,103 @@ WARNING = (
 MAX_COLUMNS = 729
 """Most columns of one stratum: J = 3 reaches 2^9 = 512, J = 4 3^6 = 729 at six steps, and uses no more steps then."""
 CHUNK_ROWS = 2_048
+_ROWS_AT_ONCE = 4096
+_PANEL = 32
+_DTPQRT = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 12)(
+    get_cython_function_address("scipy.linalg.cython_lapack", "dtpqrt")
+)
+"""LAPACK's own routine: scipy's Python wrapper of it keeps the interpreter lock, so that no two threads could fold."""
+
+
+class MixtureCv:
+    """Triangular factor and third moments of [1, H, Y], at most (M + 2)³ numbers however many episodes."""
+
+    def __init__(self) -> None:
+        self.sums = WeightedSums()
+        self._factor: FloatArray | None = None
+        self._cubes: ThirdMoments | None = None
+
+    @classmethod
+    def refusal(cls, block: Block) -> str | None:
+        """Only the episode mixture has few control variates whose means are known and whose values are bounded."""
+        if block.method == "step_mixture":
+            return (
+                "needs the episode mixture: under the step mixture the products of q_j/q_alpha have mean 1 too, "
+                "but tails too heavy for a regression"
+            )
+        if block.method != "episode_mixture":
+            return f"needs the episode mixture; {block.method} draws from a single distribution"
+        return None
+
+    def add(self, block: Block) -> None:
+        """Fold one block's rows into the factor, in index order."""
+        self.sums.add(block)
+        ones = np.ones((len(block), 1))
+        columns = [ones, block.mixture_ratios() - 1.0, block.weighted_crashes()[:, None]]
+        rows = np.asfortranarray(np.concatenate(columns, axis=1))
+        self._factor = empty_factor(rows.shape[1]) if self._factor is None else self._factor
+        self._cubes = self._cubes or ThirdMoments(rows.shape[1])
+        self._cubes.add(rows)
+        fold_rows(self._factor, rows)
+
+    def result(self, confidence: float) -> Estimate:
+        """Intercept of the regression, with the residual variance if crashes are many, else the plain mean's."""
+        n, y = self.sums.n, self.sums.y
+        require_episodes(n)
+        assert self._factor is not None
+        assert self._cubes is not None
+        coefficients, rank, variance = _regression(self._factor, n)
+        residual = std_error = math.sqrt(variance)
+        third_moment = self._cubes.of(np.array([*-coefficients, 1.0])) / n**3
+        plain, warnings = y.std_error(n), []
+        if self.sums.n_crashes and y.n_effective < FEW_FOR_RESIDUALS and residual < plain:
+            std_error, third_moment = plain, y.third_moment(n)
+            warnings.append(
+                f"fewer than {FEW_FOR_RESIDUALS:.0f} effective crashes: the interval is as wide as that of the plain "
+                "mean of weighted crashes"
+            )
+        return weighted_estimate(
+            self.sums,
+            float(coefficients[0]),
+            std_error,
+            confidence,
+            third_moment=third_moment,
+            method="mean of weighted crashes with the episode mixture's known-mean control variates",
+            warnings=warnings,
+            details={
+                "beta": coefficients[1:].tolist(),
+                "rank": rank,
+                "residual_std_error": residual,
+                "plain_mean": y.mean(n),
+                "plain_std_error": plain,
+            },
+        )
+
+
+def _regression(factor: FloatArray, n: int) -> tuple[FloatArray, int, float]:
+    """Least squares of Y on [1, H], of the smallest norm where columns depend on each other.
+
+    Parameters
+    ----------
+    factor : (k, k) float64
+        Upper triangular factor of [1, H, Y].
+    n : int
+        Rows behind the factor; it scales the tolerance for the rank (Σ_j alpha_j h_j = 0 always costs one).
+
+    Returns
+    -------
+    Intercept and β, shape (1 + M,); rank of [1, H]; variance of the intercept from that of the residuals.
+    """
+    design, target = factor[:-1, :-1], factor[:-1, -1]
+    left, singular, right = np.linalg.svd(design)
+    kept = singular > max(n, len(design)) * np.finfo(np.float64).eps * singular[0]
+    projected = left.T @ target
+    coefficients = right[kept].T @ (projected[kept] / singular[kept])
+    residual_squares = float(factor[-1, -1] ** 2 + np.sum(projected[~kept] ** 2))
+    leverage = float(np.sum((right[kept, 0] / singular[kept]) ** 2))  # of the intercept, [(XᵀX)⁺]_00
+    rank = int(np.count_nonzero(kept))
+    variance = residual_squares / (n - rank) * leverage if n > rank else math.inf
+    return coefficients, rank, variance
 
 
 class Scv:
@@ -232,3 +339,56 @@ def fill_product_columns(first_ratios: FloatArray, n_control_steps: int, out: Fl
     for ratios in by_step[:-1]:
         products = (products[:, None, :] * ratios[None, :, :]).reshape(-1, n_rows)
     np.multiply(products[:, None, :], by_step[-1][None, :, :], out=out.T.reshape(len(products), -1, n_rows))
+
+
+class ThirdMoments:
+    """Σ x_i x_j x_k over rows of k columns: the skewness of any linear combination of these is known afterwards."""
+
+    def __init__(self, n_columns: int) -> None:
+        self._sums: FloatArray = np.zeros((n_columns * n_columns, n_columns))
+
+    def add(self, rows: FloatArray) -> None:
+        """Add rows of shape (n, k)."""
+        for start in range(0, len(rows), _ROWS_AT_ONCE):
+            part = rows[start : start + _ROWS_AT_ONCE]
+            self._sums += (part[:, :, None] * part[:, None, :]).reshape(len(part), -1).T @ part
+
+    def of(self, coefficients: FloatArray) -> float:
+        """Σ (cᵀx)³ for coefficients c of shape (k,)."""
+        return float(np.outer(coefficients, coefficients).ravel() @ self._sums @ coefficients)
+
+
+def empty_factor(n_columns: int) -> FloatArray:
+    """Factor of a matrix without rows, shape (k, k)."""
+    return np.zeros((n_columns, n_columns), order="F")
+
+
+def fold_rows(factor: FloatArray, rows: FloatArray) -> None:
+    """Make `factor` that of the matrix behind it with more rows below.
+
+    Parameters
+    ----------
+    factor : (k, k) float64
+        Upper triangular, in Fortran order; receives the new factor. The signs of its rows are arbitrary.
+    rows : (m, k) float64
+        In Fortran order; destroyed.
+
+    Raises
+    ------
+    ValueError
+        If an array is not in Fortran order, or their widths differ.
+    """
+    m, k = rows.shape
+    if not (factor.flags.f_contiguous and rows.flags.f_contiguous and factor.shape == (k, k)):
+        raise ValueError(f"expected Fortran-ordered (k, k) and (m, k), got {factor.shape} and {rows.shape}")
+    if m == 0:
+        return
+    panel = min(_PANEL, k)
+    reflectors, work = np.empty((panel, k), order="F"), np.empty(panel * k)
+    sizes, info = [ctypes.c_int(value) for value in (m, k, 0, panel)], ctypes.c_int()
+    rows_, columns, rows_already_triangular, panel_ = map(ctypes.addressof, sizes)
+    a, b, t, scratch = (array.ctypes.data for array in (factor, rows, reflectors, work))
+    of_result = ctypes.addressof(info)
+    _DTPQRT(rows_, columns, rows_already_triangular, panel_, a, columns, b, rows_, t, panel_, scratch, of_result)
+    if info.value != 0:
+        raise ArithmeticError(f"LAPACK dtpqrt refused argument {-info.value}")

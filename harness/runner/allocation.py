@@ -9,9 +9,9 @@ from functools import partial
 import numpy as np
 
 from harness.campaign.sections import ShellSettings
-from harness.estimators.intervals import clopper_pearson
-from harness.estimators.limit_search import Level
-from harness.estimators.stratified import Tally, combined, spread
+from harness.estimators.likelihood import Level, spread
+from harness.estimators.limits import clopper_pearson
+from harness.estimators.tally import Tally, combined
 from harness.strata import ASSUMPTION_FREE, ShellDesign
 from harness.vocabulary import BoolArray, IntArray
 

@@ -14,7 +14,7 @@ from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, CampaignError, RunFolde
 from harness.estimators.block import Block
 from harness.estimators.difference import Difference, difference_statement, paired_difference
 from harness.estimators.from_records import EPISODE_COLUMNS, block_from_tables
-from harness.estimators.paired_shells import PairedEstimate
+from harness.estimators.pairs import PairedEstimate
 from harness.importance.build import mixture_weights
 from harness.progress import Progress
 from harness.records.folder import MANIFEST, read_json, read_manifest, require_place, require_schema, write_json

@@ -17,15 +17,17 @@ import numpy as np
 
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED, CampaignError
 from harness.estimators.block import Block
-from harness.estimators.paired_shells import (
+from harness.estimators.pairs import (
+    MarginVerdict,
+    PairCounts,
     PairedEstimate,
+    PairedShells,
     conditional_paired_statement,
     margin_statement,
     paired_estimate,
     paired_statement,
 )
-from harness.estimators.pairs import PairCounts, PairedShells, Verdict
-from harness.estimators.round_stopping import PairRule, decision_confidence
+from harness.estimators.stopping import PairRule, decision_confidence
 from harness.pool.shells import Draw, acceleration_limit
 from harness.progress import Progress
 from harness.records.folder import sole_use
@@ -39,7 +41,7 @@ from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT
 from harness.vocabulary import IntArray
 
 PAIRING = "the i-th cut-in that A meets of a shell is the i-th that B meets: same initial state, paths and cut-in"
-EXIT_OF: Mapping[Verdict, int] = {"proven": EXIT_DONE, "refuted": EXIT_REFUTED, "open": EXIT_BUDGET_SPENT}
+EXIT_OF: Mapping[MarginVerdict, int] = {"proven": EXIT_DONE, "refuted": EXIT_REFUTED, "open": EXIT_BUDGET_SPENT}
 
 
 class _Side(Planner):

@@ -19,11 +19,10 @@ import numpy as np
 from harness.campaign.campaign import Campaign
 from harness.estimators import Shells, StopRule, accumulator
 from harness.estimators.block import Block
-from harness.estimators.limit_search import Level
+from harness.estimators.likelihood import Level
 from harness.estimators.pairs import PairCounts
-from harness.estimators.round_stopping import PairRule, RoundRule
-from harness.estimators.stopping import Rule
-from harness.estimators.stratified import Tally, empty_tally
+from harness.estimators.stopping import PairRule, RoundRule, Rule
+from harness.estimators.tally import Tally, empty_tally
 from harness.pool.shells import Draw, PrescribedEpisodes
 from harness.runner.allocation import CONFIDENCE, Allocation
 from harness.runner.worker import ShardSpec

@@ -11,10 +11,10 @@ import numpy as np
 import pyarrow as pa
 
 from harness.estimators.block import MAX_CONTROL_STEPS, Block
-from harness.estimators.estimate import BothWays
-from harness.estimators.intervals import normal_half_width
-from harness.estimators.nade import Nade
+from harness.estimators.estimate import FailureBounds
+from harness.estimators.limits import normal_half_width
 from harness.estimators.scv import Scv, StratumFit
+from harness.estimators.weighted import Nade
 from harness.records.folder import write_bytes
 from harness.runner.stored_estimates import stored_blocks
 from harness.vocabulary import Method
@@ -28,8 +28,8 @@ class Claims:
     """Both estimators, fed with the same blocks; SCV only where it is defined and wanted."""
 
     def __init__(self, *, with_scv: bool = True) -> None:
-        self.nade, self.scv = BothWays(Nade()), Scv()
-        self._scv, self._with_scv = BothWays(self.scv), with_scv
+        self.nade, self.scv = FailureBounds(Nade()), Scv()
+        self._scv, self._with_scv = FailureBounds(self.scv), with_scv
         self._n, self._weight = 0, 0.0
         self._method: Method = "nde"
 

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.stats import t as student
 
 from harness.estimators.diagnostics import CARELESS_MEAN
-from harness.estimators.intervals import normal_half_width
+from harness.estimators.limits import normal_half_width
 from harness.vocabulary import Method
 
 Verdict = Literal["reproduced", "not reproduced", "cannot be told", "ours to choose"]

@@ -12,7 +12,7 @@ import pyarrow as pa
 from harness.campaign.campaign import Campaign
 from harness.campaign.files import load_campaign
 from harness.errors import HarnessError
-from harness.estimators.intervals import clopper_pearson, normal_half_width
+from harness.estimators.limits import clopper_pearson, normal_half_width
 from harness.records.folder import read_table
 from harness.resolved import resolve
 from harness.runner import RunResult, run_campaign

@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from harness.estimators.mixture_cv import MixtureCv
-from harness.estimators.scv import Scv
+from harness.estimators.scv import MixtureCv, Scv
 from harness.vocabulary import FloatArray
 from studies.case_study.context import Context
 from studies.case_study.figures import exactly

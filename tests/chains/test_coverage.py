@@ -11,9 +11,8 @@ import pytest
 from scipy.stats import binomtest
 
 from harness.estimators.block import Block
-from harness.estimators.mixture_cv import MixtureCv
-from harness.estimators.nade import Nade
-from harness.estimators.scv import Scv
+from harness.estimators.scv import MixtureCv, Scv
+from harness.estimators.weighted import Nade
 from studies.chains.named import frequent_decisive, rare_decisive
 from studies.chains.sampler import draw
 from studies.chains.single_choice import with_optimal_function

@@ -12,7 +12,7 @@ import pytest
 from scipy.stats import binomtest
 
 from harness.estimators import Estimate, one_pass
-from harness.estimators.nade import Nade
+from harness.estimators.weighted import Nade
 from studies.chains.named import frequent_decisive, panel, rare_decisive
 from studies.chains.sampler import Sampler, blocks
 from tests.estimators.small_blocks import fed

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from harness.estimators.crash_paths import FEWEST_PATHS, CrashPaths
+from harness.estimators.tally import FEWEST_PATHS, CrashPaths
 
 
 def counted(paths, strata, n_strata=2):

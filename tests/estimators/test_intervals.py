@@ -8,13 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import binom, binomtest
 
-from harness.estimators.intervals import (
-    _hall,
-    capped_mean_upper,
-    clopper_pearson,
-    normal_half_width,
-    skewed_distances,
-)
+from harness.estimators.limits import _hall, capped_mean_upper, clopper_pearson, normal_half_width, skewed_distances
 
 levels = st.floats(0.5, 0.999)
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from harness.estimators.intervals import normal_half_width, skewed_distances
-from harness.estimators.mixture_cv import MixtureCv
+from harness.estimators.limits import normal_half_width, skewed_distances
+from harness.estimators.scv import MixtureCv
 from studies.chains.named import panel
 from studies.chains.sampler import blocks, draw
 from tests.chains.seed import SEED

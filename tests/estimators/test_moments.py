@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from harness.estimators.moments import Moments
+from harness.estimators.weighted import Moments
 
 
 def moments(*blocks: list[float]) -> Moments:

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from harness.estimators.nade import Nade, Nde
+from harness.estimators.weighted import Nade, Nde
 
 from .small_blocks import block, fed
 

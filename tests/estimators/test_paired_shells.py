@@ -9,13 +9,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from harness.estimators.limit_search import Level
-from harness.estimators.paired_shells import (
-    conditional_paired_statement,
-    margin_statement,
-    paired_estimate,
-    paired_statement,
-)
+from harness.estimators.likelihood import Level
 from harness.estimators.pairs import (
     A_CRASHES,
     B_CRASHES,
@@ -24,7 +18,11 @@ from harness.estimators.pairs import (
     NO_CRASH,
     PairCounts,
     PairedShells,
+    conditional_paired_statement,
+    margin_statement,
     no_pairs,
+    paired_estimate,
+    paired_statement,
 )
 from harness.strata import ShellDesign, Statement
 from tests.estimators.small_blocks import SHELLS, in_shells

@@ -11,9 +11,9 @@ from scipy.optimize import brentq
 from scipy.special import xlogy
 from scipy.stats import binomtest
 
-from harness.estimators.limit_search import Level
-from harness.estimators.reference import compared, preventable_share, rate_ratio_limits
-from harness.estimators.stratified import Tally, empty_tally, likelihood_limit
+from harness.estimators.likelihood import Level, likelihood_limit
+from harness.estimators.shells import compared, preventable_share, rate_ratio_limits
+from harness.estimators.tally import Tally, empty_tally
 from harness.strata import Reference, ShellDesign, Statement
 
 from .enumerated import coverage

@@ -12,7 +12,7 @@ from scipy.stats import binomtest
 from harness.campaign.sections import Stop
 from harness.estimators import Estimate, StopRule
 from harness.estimators.block import Block
-from harness.estimators.nade import Nade
+from harness.estimators.weighted import Nade
 
 from .small_blocks import block
 

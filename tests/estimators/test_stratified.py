@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 from scipy.optimize import brentq, minimize
 from scipy.special import betaincinv, xlogy
 
-from harness.estimators.limit_search import Level
-from harness.estimators.stratified import contrast_limit, likelihood_limit, ratio_limits, spread
+from harness.estimators.likelihood import Level, contrast_limit, likelihood_limit, ratio_limits, spread
 
 from .enumerated import coverage
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from harness.estimators.triangular_factor import empty_factor, fold_rows
+from harness.estimators.scv import empty_factor, fold_rows
 
 
 @pytest.mark.parametrize("k", [1, 5, 33, 100])

@@ -12,7 +12,7 @@ from made_run import DESIGN, PATH_MASS, SHELLS, P
 from report_page import edit, page_of, require_sound_page
 
 from harness.errors import RunFolderError
-from harness.estimators.stratified import Tally, pool_variance
+from harness.estimators.tally import Tally, pool_variance
 from harness.report import write_report
 from harness.report.answer_plot import answer_plot
 from harness.report.run_folder import read_run_folder, typed_folder

@@ -13,8 +13,8 @@ import pytest
 
 from harness import estimate, replay
 from harness.errors import CampaignError, RunFolderError
-from harness.estimators.limit_search import Level
-from harness.estimators.stratified import Tally, combined
+from harness.estimators.likelihood import Level
+from harness.estimators.tally import Tally, combined
 from harness.runner.allocation import GROWTH, Allocation, first_tests
 from harness.runner.manifest import Manifest, Prefix
 from harness.runner.planner import round_specs

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from harness.estimators.block import joined
-from harness.estimators.nade import Nade
 from harness.estimators.scv import Scv
+from harness.estimators.weighted import Nade
 from studies.__main__ import main
 from studies.chains.named import overtaking
 from studies.chains.sampler import blocks

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from harness.campaign.vehicle import AutomatedVehicle
-from harness.estimators.nade import Nade
+from harness.estimators.weighted import Nade
 from harness.progress import Progress
 from harness.vehicles.models import av_records
 from studies.case_study import context, small_case

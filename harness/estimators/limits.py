@@ -1,4 +1,4 @@
-"""Limits of a mean of weighted tests: Clopper-Pearson, skewness-corrected, Hoeffding's (of shells: `stratified`)."""
+"""Limits of a mean of weighted tests: Clopper-Pearson, skewness-corrected, Hoeffding's (of shells: `likelihood`)."""
 
 from __future__ import annotations
 
