@@ -12,7 +12,7 @@ from harness.errors import CampaignError
 from harness.runner.compare import compare_campaigns, require_comparable
 from tests.in_process import one_process, without_page
 from tests.runner.conftest import sets
-from tests.runner.stored_runs import stored_table
+from tests.stored_runs import stored_table
 
 FORCED = str(Path(__file__).parents[2] / "scenarios/overtaking_forced.yaml")
 SMALL = [

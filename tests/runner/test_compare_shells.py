@@ -17,7 +17,7 @@ from harness.runner.worker import ShardRunner
 from tests.in_process import one_process, without_page
 from tests.pool.conftest import SMALL_POOL
 from tests.runner.conftest import MIXTURE_FILE
-from tests.runner.stored_runs import manifest
+from tests.stored_runs import manifest
 
 SHELLS = (
     *("testing.method=shells", "testing.shells.statement=library", "stop.rhw=0.15", "stop.episodes=3000"),

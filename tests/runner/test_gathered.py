@@ -12,7 +12,7 @@ from harness.records.gathered import Gathered, gather, parts
 from harness.runner import campaign_run, estimate_run, stored_estimates, stored_shards
 from harness.runner.stored_shards import COLUMNS
 from tests.runner.conftest import TWIN
-from tests.runner.stored_runs import copy_of, manifest, shard_files, unlike_columns
+from tests.stored_runs import copy_of, manifest, shard_files, unlike_columns
 
 WITHOUT_SCV = ("nade", "mixture_cv")
 """Which need no moments: these alone are estimated from gathered columns."""

@@ -14,7 +14,7 @@ from harness.runner import plan_campaign
 from harness.runner.av_check import check_av
 from tests.pool.conftest import SMALL_POOL
 from tests.pool.test_vehicle_pool import ACTING
-from tests.runner.stored_runs import manifest, stored_table, unlike_columns
+from tests.stored_runs import manifest, stored_table, unlike_columns
 
 LEAD = "environment.cut_in_lead_s=0.5"
 SHELLS = ("testing.method=shells", "pool.library=ladder-lateral-1", "stop.rhw=0.5", "stop.episodes=4000", LEAD)

@@ -21,7 +21,7 @@ from harness.runner.shard_pool import WorkerLostError
 from harness.runner.worker import ShardSpec
 from tests.runner import bad_workers
 from tests.runner.conftest import MIXTURE_FILE, SMALL, TWIN, sets
-from tests.runner.stored_runs import copy_of, manifest, shard_files, unlike_columns
+from tests.stored_runs import copy_of, manifest, shard_files, unlike_columns
 
 SHARDS_BEFORE_FAILURE = 3
 

@@ -16,7 +16,7 @@ from harness.resolved import resolve
 from harness.runner.manifest import require_own_folder
 from tests.in_process import one_process, without_page
 from tests.runner.conftest import MIXTURE_FILE, SMALL, TWIN, sets
-from tests.runner.stored_runs import copy_of, manifest, shard_files, truncate, unlike_columns
+from tests.stored_runs import copy_of, manifest, shard_files, truncate, unlike_columns
 
 SAME = sets(*SMALL, *TWIN)
 

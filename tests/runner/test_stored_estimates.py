@@ -21,7 +21,7 @@ from harness.pool import storage
 from harness.pool.replay import PATH_COLUMNS
 from harness.runner import estimate_run, stored_estimates
 from harness.runner.stored_estimates import stored_blocks, surrogates_of
-from tests.runner.stored_runs import copy_of, stored_table
+from tests.stored_runs import copy_of, stored_table
 
 
 def test_estimating_again_gives_the_same_content(sumo_run, twin_run, capsys):
