@@ -13,7 +13,7 @@ from tests.estimators.test_stopping import passing
 
 
 def looked_at(looks: list[dict], **stop) -> StopRule:
-    rule = StopRule(Stop(episodes=200 * len(looks), rhw=0.3, **stop), "forced", 200)
+    rule = StopRule(Stop(episodes=200 * len(looks), rhw=0.3, **stop), "forced", range(200, 10_000, 200))
     for n, changes in zip(rule.looks, looks, strict=True):
         if rule.observe(n, replace(passing(n), **changes)):
             break

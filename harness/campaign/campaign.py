@@ -231,6 +231,6 @@ class Campaign(Section):
             "pool": self.pool.model_dump(exclude=unused) if shells else None,
             "engine": self.world.engine,
             "moments": self.records.moments,
-            "shard_size": self.run.shard_size,
+            "shard_size": self.run.smallest_shard,
         }
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]

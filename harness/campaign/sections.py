@@ -292,10 +292,35 @@ class RaySettings(Section):
     )
 
 
+USUAL_SHARD, LARGEST_SHARD = 5_000, 1_000_000
+SHARD_SHARE = 32
+
+
 class Run(Section):
     """How the work is spread; nothing here changes a result."""
 
-    shard_size: Whole = Field(5_000, ge=1, le=1_000_000, description="episodes per file and per task")
+    shard_size: Annotated[int, Field(ge=1, le=LARGEST_SHARD), BeforeValidator(whole)] | None = Field(
+        None,
+        description="episodes per file and per task; null: 5,000, and in a long run a 32nd of the episodes before, so "
+        "that it has some 200 files",
+    )
     max_failed_share: Probability = Field(0.01, description="stop with exit code 3 above this share of failures")
     executor: Literal["local", "ray"] = Field("local", description="where workers run: on this machine, or a cluster")
     ray: RaySettings = RaySettings()
+
+    @property
+    def smallest_shard(self) -> int:
+        """Episodes of the first shard."""
+        return self.shard_size or USUAL_SHARD
+
+    def shard_ends(self, n_episodes: int) -> Sequence[int]:
+        """Where the shards of so many episodes end; the last may end beyond them.
+
+        They follow from the index alone, so that a run can be continued.
+        """
+        if self.shard_size is not None:
+            return range(self.shard_size, n_episodes + self.shard_size, self.shard_size)
+        ends = [USUAL_SHARD]
+        while ends[-1] < n_episodes:
+            ends.append(ends[-1] + min(max(USUAL_SHARD, ends[-1] // SHARD_SHARE), LARGEST_SHARD))
+        return ends

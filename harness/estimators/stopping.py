@@ -13,7 +13,8 @@ With two passes a campaign uses about 20 % more tests than a fixed size would ne
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from bisect import bisect_right
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
@@ -32,17 +33,19 @@ PASSES_NEEDED = 2
 DEFAULT_MIN_CRASHES = 100
 
 
-def look_grid(n_episodes: int, shard_size: int, ratio: float = LOOK_RATIO) -> tuple[int, ...]:
+def look_grid(n_episodes: int, shard_ends: Sequence[int], ratio: float = LOOK_RATIO) -> tuple[int, ...]:
     """Numbers of episodes at which a campaign is looked at, ascending.
 
-    The last is `n_episodes`, all others are multiples of ``shard_size``, nearest to a geometric grid of this ratio.
+    The last is `n_episodes`, all others are of ``shard_ends``, nearest to a geometric grid of this ratio.
     """
     looks: list[int] = []
-    target = float(shard_size)
+    target = float(shard_ends[0])
     while target < n_episodes:
-        boundary = max(1, math.floor(target / shard_size + 0.5)) * shard_size
-        if boundary < n_episodes and (not looks or boundary > looks[-1]):
-            looks.append(boundary)
+        place = bisect_right(shard_ends, target)
+        below, above = shard_ends[max(place - 1, 0)], shard_ends[place]
+        nearest = below if target - below < above - target else above
+        if nearest < n_episodes and (not looks or nearest > looks[-1]):
+            looks.append(nearest)
         target *= ratio
     return (*looks, n_episodes)
 
@@ -160,7 +163,7 @@ class StopRule(Rule):
         The campaign's ``stop`` section.
     method : str
         ``testing.method``; decides whose interval is watched unless ``stop.estimator`` does.
-    shard_size, ratio
+    shard_ends, ratio
         See `look_grid`.
     min_crashes : int
         Floor on sampled crashes where ``stop.min_crashes`` says nothing.
@@ -177,14 +180,14 @@ class StopRule(Rule):
         self,
         campaign_stop: Stop,
         method: Method,
-        shard_size: int,
+        shard_ends: Sequence[int],
         ratio: float = LOOK_RATIO,
         *,
         min_crashes: int = DEFAULT_MIN_CRASHES,
     ) -> None:
         super().__init__(campaign_stop.rhw, campaign_stop.min_crashes or min_crashes)
         self.estimator: EstimatorName = campaign_stop.estimator or SAMPLING[method].headline
-        self.looks = look_grid(campaign_stop.episodes, shard_size, ratio)
+        self.looks = look_grid(campaign_stop.episodes, shard_ends, ratio)
         self.heaviest = math.inf
         self._n_seen = self._n_passes = 0
 

@@ -98,7 +98,6 @@ class StoredManifest(Stored):
     shadow_runs: StoredShadows | None = None
     reported_from: Count | None = None
     table_errors: list[TableError] | None = None
-    results: dict[str, list[Count] | None] | None = None
 
 
 class StoredStatement(Stored):

@@ -104,7 +104,7 @@ def compare_shells(
             raise ValueError("the campaigns do not draw from shells")
         planner = PairPlanner(campaign, prescribed.design, prescribed.available, margin)
         pairs = PairedShells(prescribed.design)
-        both = [_Side(run, side, pairs, planner.rule, campaign.run.shard_size) for side, run in enumerate(runs)]
+        both = [_Side(run, side, pairs, planner.rule, campaign.run.smallest_shard) for side, run in enumerate(runs)]
         progress.stage("tests of A and B", 2 * campaign.stop.episodes)
         with ExitStack() as working:
             for run in runs:

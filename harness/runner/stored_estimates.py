@@ -23,7 +23,6 @@ from harness.records.folder import SHELLS, concatenated, no_episodes, read_json,
 from harness.records.reader import read_shard, stored_columns
 from harness.records.stored_manifest import StoredShells
 from harness.resolved import resolve
-from harness.runner.stored_shards import GatheredBlocks
 from harness.strata import ShellDesign
 from harness.threads import made_ahead
 from harness.vocabulary import EstimatorName
@@ -123,7 +122,6 @@ def stored_blocks(
     shells = read_shells(folder) if method == "shells" else None
     needed = [*EPISODE_COLUMNS, *(SHELL_COLUMNS if shells else ())]
     ratios = list(MOMENT_COLUMNS) if moments and method == "step_mixture" else []
-    gathered = None if ratios or shells else GatheredBlocks(folder, campaign)
 
     def read(group: _Shards, asking: SurrogateReplay | None = None) -> Block:
         columns = dict.fromkeys([*needed, *(asking.columns if asking else ())])
@@ -136,15 +134,12 @@ def stored_blocks(
             return block
         return replace(block, surrogates_crash=asking.crashes(episodes), known_rates=asking.known)
 
-    def taken(group: _Shards) -> Block:
-        return (gathered.take_together(group) if gathered else None) or read(group)
-
     groups = list(_groups(manifest["shards"], n_asked))
     n_asked_groups = 0 if surrogates is None else sum(group[0]["first_episode"] < n_asked for group in groups)
     n = 0
     for block in chain(
         made_ahead(partial(read, asking=surrogates), groups[:n_asked_groups]),
-        made_ahead(taken, groups[n_asked_groups:], 1),  # only one may take from gathered parts
+        made_ahead(read, groups[n_asked_groups:]),
     ):
         if block.first_episode != n:
             raise _incomplete(folder, f"a shard that begins at episode {block.first_episode}", f"episode {n}")
