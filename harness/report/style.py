@@ -9,8 +9,9 @@ from __future__ import annotations
 import io
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib as mpl
 from matplotlib.axes import Axes
@@ -19,7 +20,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from harness.report.number_format import exponent_of, plain, power_of_ten
+from harness.numbers import exponent_of, plain, power_of_ten
 
 INK, MUTED, GRID, PAPER = "#1c2126", "#5d6873", "#dde2e7", "#ffffff"
 BLUE, VERMILLION, GREEN, GREY = "#0067a8", "#c94f0a", "#00795a", "#8b95a0"
@@ -80,15 +81,27 @@ RC: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class Plot:
-    """A drawn plot with what a reader needs beside it."""
+    """A drawn plot with what a reader needs beside it.
+
+    ``name`` is its file's, without suffix, and seeds the ids inside the SVG; ``alt`` says what it shows to those who
+    cannot see it, ``caption`` what to read from it.
+    """
 
     name: str
-    """File name without suffix; also seeds the ids inside the SVG."""
     figure: Figure
     alt: str
-    """What the plot shows, in words, for those who cannot see it."""
     caption: str
-    """What to read from it."""
+
+
+class Row(NamedTuple):
+    """A row of `interval_bars`; without ``low`` and ``high`` it has no interval."""
+
+    name: str
+    value: float
+    colour: str
+    low: float | None = None
+    high: float | None = None
+    text: str = ""
 
 
 def new_figure(width_in: float, height_in: float) -> Figure:
@@ -96,6 +109,53 @@ def new_figure(width_in: float, height_in: float) -> Figure:
     figure = Figure(figsize=(width_in, height_in), layout="constrained")
     FigureCanvasAgg(figure)
     return figure
+
+
+def two_panels(height_in: float, xlabels: Sequence[str], **options: Any) -> tuple[Figure, Axes, Axes]:
+    """Two panels side by side; ``options`` are those of `Figure.subplots`."""
+    figure = new_figure(FULL_WIDTH_IN, height_in)
+    left, right = figure.subplots(1, 2, **options)
+    for axes, xlabel in zip((left, right), xlabels, strict=True):
+        axes.set_xlabel(xlabel)
+    return figure, left, right
+
+
+def interval_bars(axes: Axes, rows: Sequence[Row], *, filled: bool = False) -> None:
+    """Draw a row for each, from the top down, within the axis limits as they are.
+
+    A row is a point, or ``filled`` a bar from zero, with its interval, and its text right of the panel. What lies
+    beyond the limits is cut off: an interval then ends without a cap.
+    """
+    for place, row in enumerate(rows):
+        strong = row.colour == BLUE and not filled
+        if filled:
+            axes.barh(place, row.value, height=0.62, color=row.colour, alpha=0.85)
+        if row.low is not None and row.high is not None:
+            colour, width = (INK, 1.3) if filled else (row.colour, 3.2 if strong else 1.8)
+            ends = [[max(row.value - row.low, 0.0)], [max(row.high - row.value, 0.0)]]
+            axes.errorbar(
+                row.value, place, xerr=ends, color=colour, elinewidth=width, capsize=4.0, capthick=1.4,
+                fmt="none" if filled else "o", markersize=8 if strong else 6,
+            )  # fmt: skip
+        style = {"color": INK, "fontweight": "bold"} if strong else {"color": MUTED}
+        beside = {"xycoords": ("axes fraction", "data"), "annotation_clip": False}
+        note(axes, row.text, (1.0, place), (8, 0), va="center", **beside, **style)
+    axes.set_yticks(range(len(rows)), [row.name for row in rows])
+    axes.tick_params(axis="y", length=0, pad=8, labelcolor=INK)
+    axes.set_ylim(len(rows) - 0.4, -0.6)
+    axes.spines["left"].set_visible(filled)
+    axes.grid(visible=False, axis="y")
+
+
+def head(axes: Axes, title: str) -> None:
+    """Title, and below it the legend in one line: within the panel there is no place where no curve can be."""
+    handles, _ = axes.get_legend_handles_labels()
+    axes.set_title(title, pad=24.0 if handles else 8.0)
+    if handles:
+        axes.legend(
+            loc="lower left", bbox_to_anchor=(0.0, 1.0), borderaxespad=0.2, borderpad=0.3, ncols=len(handles),
+            fontsize=8, labelcolor=MUTED, columnspacing=1.1, handlelength=1.5,
+        )  # fmt: skip
 
 
 def only_horizontal_grid(axes: Axes) -> None:
