@@ -8,7 +8,7 @@ import pytest
 from harness.errors import RunFolderError
 from harness.records.folder import read_manifest, require_schema
 from harness.records.stored_manifest import StoredShells, StoredStops
-from harness.report.run_folder import read_run_folder
+from harness.report.summary import read_run_folder
 from tests.stored_runs import copy_of
 
 WRONG = [True, -1, 0.5, 10**400, "text", "\0", [1], {"x": 1}, [None], float("nan")]

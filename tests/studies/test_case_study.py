@@ -11,8 +11,8 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
+from harness.numbers import number
 from harness.progress import Progress
-from harness.report.number_format import number
 from studies import run as studies_run
 from studies.__main__ import main
 from studies.case_study import context, required, tested

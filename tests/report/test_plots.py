@@ -1,4 +1,4 @@
-"""The look of all plots, the answer's axis and intervals, and names of lines: where no line is, and one for each."""
+"""The look of all plots, scales of axes, intervals where they are, and names that no line can hide."""
 
 from __future__ import annotations
 
@@ -6,16 +6,13 @@ import re
 from pathlib import Path
 
 import matplotlib.style
-import numpy as np
 import pytest
 
 import harness.report
-from harness.report.answer_plot import answer_plot
-from harness.report.convergence_plot import convergence_plot
-from harness.report.crash_gallery import NAME_HEIGHT, Track, time_space_plot
-from harness.report.plot_style import CSS_NAMES, INK, RC, Plot, inline_svg, new_figure, svg
-from harness.report.run_folder import StoredEstimates
-from harness.report.summary import Crash
+from harness.report.rate_plots import POOL, answer_plot, convergence_plot, shells_plot
+from harness.report.style import CSS_NAMES, INK, RC, Plot, inline_svg, new_figure, svg, tick_label
+from harness.report.summary import StoredEstimates
+from tests.report.made_run import DESIGN
 
 CSS = (Path(harness.report.__file__).parent / "report.css").read_text(encoding="utf-8")
 LIGHT, DARK, PRINT = re.findall(r":root \{(.*?)\n\s*\}", CSS, flags=re.DOTALL)
@@ -23,15 +20,10 @@ LIGHT, DARK, PRINT = re.findall(r":root \{(.*?)\n\s*\}", CSS, flags=re.DOTALL)
 
 @pytest.mark.parametrize("block", [LIGHT, DARK, PRINT], ids=["light", "dark", "print"])
 def test_every_plot_colour_is_a_css_variable_in_every_scheme(block):
-    defined = set(re.findall(r"--([\w-]+): #[0-9a-f]{6};", block))
-    assert set(CSS_NAMES.values()) <= defined
-
-
-def test_plot_files_and_light_page_have_the_same_colours():
-    for colour, name in CSS_NAMES.items():
-        if name != "muted":
-            assert f"--{name}: {colour};" in LIGHT
-            assert f"--{name}: {colour};" in PRINT
+    defined = dict(re.findall(r"--([\w-]+): (#[0-9a-f]{6});", block))
+    assert set(CSS_NAMES.values()) <= set(defined)
+    if block != DARK:
+        assert [name for colour, name in CSS_NAMES.items() if defined[name] != colour and name != "muted"] == []
 
 
 def luminance(colour: str) -> float:
@@ -58,24 +50,26 @@ def test_inline_svg_is_themed_text_without_names_or_namespaces():
         axes.set_title("<b>a & b</b> $x$")
         markup = inline_svg(svg(Plot("tiny", figure, "alt", "caption")))
     assert markup.startswith("<svg viewBox=")
-    assert "xmlns" not in markup
-    assert "var(--ink)" in markup
-    assert '<g id="' not in markup
-    assert "&lt;b&gt;a &amp; b&lt;/b&gt; $x$" in markup
-    assert "var(--sans)" in markup
-    assert "DejaVu" not in markup
+    for there in ("var(--ink)", "&lt;b&gt;a &amp; b&lt;/b&gt; $x$", "var(--sans)"):
+        assert there in markup
+    for absent in ("xmlns", '<g id="', "DejaVu"):
+        assert absent not in markup
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(1e-7, "10⁻⁷"), (2e-7, "2·10⁻⁷"), (0.01, "0.01"), (0.5, "0.5"), (1e3, "1000"), (5e4, "5·10⁴"), (1e5, "10⁵")],
+)
+def test_tick_label(value, text):
+    assert tick_label(value) == text
 
 
 def estimates(**rates: tuple[float, float, float] | None) -> StoredEstimates:
-    entries = {
-        name: {"crash_rate": None, "reason": "not allowed"}
-        if rate is None
-        else dict(zip(("crash_rate", "ci_low", "ci_high"), rate, strict=True))
-        for name, rate in rates.items()
-    }
+    names = ("crash_rate", "ci_low", "ci_high")
     return StoredEstimates(
         campaign="c", campaign_hash="h", lane_change_level=1.0, confidence=0.9, headline=next(iter(rates)),
-        estimates=entries, statement="s", distance_per_test_km=0.3,
+        estimates={name: dict(zip(names, rate or (None,) * 3, strict=True)) for name, rate in rates.items()},
+        statement="s", distance_per_test_km=0.3,
     )  # fmt: skip
 
 
@@ -104,16 +98,20 @@ def test_intervals_are_drawn_where_they_are_with_the_headline_first():
     plot = answer_plot(estimates(cv=(2.0e-7, 1.5e-7, 2.5e-7), nade=(2.1e-7, 1.0e-7, 3.0e-7), scv=None), None)
     axes = plot.figure.axes[0]
     assert [label.get_text() for label in axes.get_yticklabels()] == ["cv", "nade"]
-    assert list(axes.lines[0].get_xdata()) == [1.5e-7, 2.5e-7]
+    (first,) = axes.containers[0].lines[2]
+    assert first.get_segments()[0][:, 0] == pytest.approx([1.5e-7, 2.5e-7])
     assert "2.00 (1.50 to 2.50) × 10⁻⁷" in [text.get_text() for text in axes.texts]
-
-
-def test_nothing_to_draw_without_any_rate():
     assert answer_plot(estimates(scv=None), None) is None
 
 
-@pytest.mark.parametrize("name", ["full", "shells", "shells_inside_only"])
-def test_legends_of_convergence_lie_outside_the_panels(runs, name):
+@pytest.mark.parametrize(("name", "rows"), [("shells", ["shells", "given library"]), ("shells_refuted", ["shells"])])
+def test_a_refuted_statement_has_no_interval(runs, name, rows):
+    axes = answer_plot(runs[name].estimates, runs[name].shells).figure.axes[0]
+    assert [label.get_text() for label in axes.get_yticklabels()] == rows
+
+
+@pytest.mark.parametrize("name", ["weighted", "shells", "shells_inside_only"])
+def test_legends_lie_outside_the_panels(runs, name):
     plot = convergence_plot(runs[name].estimates, 0.05)
     svg(plot)  # lays out
     for axes in plot.figure.axes:
@@ -122,20 +120,21 @@ def test_legends_of_convergence_lie_outside_the_panels(runs, name):
         assert legend.x1 <= plot.figure.bbox.x1
 
 
-def test_speeds_are_named_apart_even_if_equal():
-    crash = Crash(
-        episode=7, impact_speed_mps=10.0, crash_time_s=8.0, log_weight=0.0, cut_in_step=70.0, cut_in_r2_m=9.0,
-        cut_in_r2dot_mps=-10.0, component=0,
-    )  # fmt: skip
-    time_s = np.arange(0.0, 8.05, 0.1)
-    speeds = {"LV": 20.0, "BV": 20.0, "AV": 30.0}
-    still = np.zeros(time_s.size)
-    tracks = {
-        name: Track(time_s, 10.0 * k + (speed - 20.0) * time_s, still + speed, still, still)
-        for k, (name, speed) in enumerate(speeds.items())
-    }
-    speed = time_space_plot(crash, tracks, worth="weight 1").figure.axes[1]
-    heights = {text.get_text(): text.xy[1] for text in speed.texts}
-    assert set(heights) == set(speeds)
-    assert abs(heights["LV"] - heights["BV"]) >= NAME_HEIGHT
-    assert heights["AV"] == max(heights.values())
+def test_the_plot_shows_contributions_and_half_widths(runs):
+    found = runs["shells"].shells
+    rates, widths = shells_plot(found).figure.axes
+    assert [label.get_text() for label in rates.get_yticklabels()] == [*DESIGN.strata, POOL]
+    assert [bar.get_width() for bar in rates.patches] == [*(s.contribution for s in found.shells), 0.0]
+    half_widths = [*(s.half_width for s in found.shells), found.pool_half_width]
+    assert [bar.get_width() for bar in widths.patches] == half_widths
+
+
+def test_a_shell_without_tests_is_said_so_and_runs_out_of_the_plot(runs):
+    rates, widths = shells_plot(runs["shells_inside_only"].shells).figure.axes
+    assert rates.get_yticklabels()[2].get_text() == "outside\nnot tested: up to 3.00 × 10⁻⁵"
+    assert max(rates.get_xlim()[1], widths.get_xlim()[1]) < 1e-6
+
+
+@pytest.mark.parametrize(("name", "orange"), [("shells", False), ("shells_refuted", True)])
+def test_the_caption_names_the_colours_that_are_there(runs, name, orange):
+    assert ("orange" in shells_plot(runs[name].shells).caption) == orange
