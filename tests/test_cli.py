@@ -302,7 +302,7 @@ def test_estimate_prints_a_table(calls, capsys, tmp_path):
     out = capsys.readouterr().out
     assert calls["harness.runner.estimate_run"] == (
         (tmp_path,),
-        {"estimators": ("nade", "nde"), "confidence": 0.95, "pool": None},
+        {"estimators": ("nade", "nde"), "confidence": 0.95},
     )
     row = next(line for line in out.splitlines() if "nade *" in line)
     assert all(text in row for text in ("1.2000e-07", "1.140e-07 to 1.260e-07", "0.050", "1,234.5", "1.20%"))

@@ -210,7 +210,7 @@ class Testing(Section):
 
 
 class PoolSettings(Section):
-    """The pool of cut-ins that shells, surrogate replay and the alarm on SUMO use; built once, in the twin."""
+    """The pool of cut-ins that shells are drawn from; built once, in the twin."""
 
     library: str = Field("ladder-2", description="name of a shipped surrogate library, or a path to your own")
     relative_error: float = Field(

@@ -47,17 +47,6 @@ class Retraced(Stored):
     reason: str | None = None
 
 
-class TableError(Stored):
-    """A challenge table's value beside the same by Monte Carlo."""
-
-    surrogate: str
-    table: str
-    quantity: str
-    table_value: float
-    monte_carlo: float
-    std_error: float
-
-
 class Repeated(Stored):
     """What repeating some tests has shown; `harness.runner.worker.Repeated`."""
 
@@ -97,7 +86,6 @@ class StoredManifest(Stored):
     repeated: Repeated | None = None
     shadow_runs: StoredShadows | None = None
     reported_from: Count | None = None
-    table_errors: list[TableError] | None = None
 
 
 class StoredStatement(Stored):

@@ -49,7 +49,6 @@ from harness.runner.shadow_runs import (
 from harness.runner.shard_pool import ShardPool, executor_of
 from harness.runner.stored_estimates import estimate_run
 from harness.runner.stored_shards import stored_shard
-from harness.runner.table_accuracy import table_errors
 from harness.runner.worker import ShardDone, ShardSpec
 from harness.stopped_by import StoppedBy
 from harness.vocabulary import SAMPLING
@@ -136,7 +135,6 @@ class Run:
                 began=began,
                 workers=self._executor.n_workers,
                 distance_per_test_m=distance_per_test_m(resolved.environment),
-                table_errors=table_errors(resolved, prepared.tables),
             )
             if prepared.shadow_paths is None:
                 self._plan(prepared)

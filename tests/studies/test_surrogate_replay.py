@@ -18,19 +18,19 @@ from harness.campaign.vehicle import AutomatedVehicle, IDMParameters, Reaction
 from harness.episode.loop import Shard
 from harness.episode.trajectory import Followers
 from harness.errors import CampaignError, RunFolderError
-from harness.estimators.alarm import Alarm
 from harness.estimators.block import Block
 from harness.estimators.from_records import block_from_tables
 from harness.importance.build import mixture_weights
 from harness.pool.cut_ins import Pool
-from harness.pool.replay import SurrogateReplay, drivers_crash
 from harness.pool.storage import campaign_pool
 from harness.records.tables import episodes_table
 from harness.resolved import resolve
 from harness.runner.prepare import prepare
 from harness.vehicles.models import driver_records
-from harness.vocabulary import CRASH
+from harness.vocabulary import CRASH, BoolArray
 from harness.worlds.twin import TwinWorld
+from studies.alarm import Alarm, KnownRates
+from studies.surrogate_replay import SurrogateReplay, drivers_crash
 from tests.chains.seed import SEED
 
 SMALL = PoolSettings(relative_error=0.03, cut_ins_per_shell=1500)
@@ -51,17 +51,18 @@ def drive(campaign: Campaign, n: int = N) -> tuple[Shard, pa.Table]:
     return shard, episodes_table(shard, campaign.seed)
 
 
-def replayed(campaign: Campaign, table: pa.Table, pool: Pool) -> Block:
-    surrogates = SurrogateReplay(resolve(campaign), pool)
+def replayed(campaign: Campaign, table: pa.Table, pool: Pool) -> tuple[Block, BoolArray]:
+    """The episodes, and which surrogates would have crashed in them."""
     method = campaign.testing.method
     block = block_from_tables(table, None, method=method, alpha=mixture_weights(campaign))
-    return replace(block, surrogates_crash=surrogates.crashes(table), known_rates=surrogates.known)
+    return block, SurrogateReplay(resolve(campaign), pool).crashes(table)
 
 
-def alarmed(*asked) -> dict[str, Any]:
-    """What the alarm says of episodes, see `replayed`."""
-    alarm = Alarm()
-    alarm.add(replayed(*asked))
+def alarmed(campaign: Campaign, table: pa.Table, pool: Pool, wrong: float = 1.0) -> dict[str, Any]:
+    """What the alarm says of episodes whose weights are all wrong by a factor."""
+    block, crashes = replayed(campaign, table, pool)
+    alarm = Alarm(KnownRates.of(pool))
+    alarm.add(replace(block, log_weight=block.log_weight + np.log(wrong)), crashes)
     return alarm.result()
 
 
@@ -73,11 +74,11 @@ def forced() -> tuple[Campaign, pa.Table, Pool]:
 
 def test_a_surrogate_that_is_the_av_crashes_where_the_av_did(forced):
     one, table, pool = forced
-    block = replayed(one, table, pool)
-    own = block.surrogates_crash[:, pool.names.index("brakes-3-late-700ms")]
+    block, crashes = replayed(one, table, pool)
+    own = crashes[:, pool.names.index("brakes-3-late-700ms")]
     assert block.crash.sum() > 30
     np.testing.assert_array_equal(own, block.crash)
-    assert not np.array_equal(block.surrogates_crash[:, pool.names.index("brakes-3")], block.crash)
+    assert not np.array_equal(crashes[:, pool.names.index("brakes-3")], block.crash)
 
 
 @pytest.mark.parametrize("model", ["r157-cc", "r157-fsm", "need-based"])
@@ -114,13 +115,14 @@ def test_other_draws_after_the_end_do_not_change_what_was_driven(hold_s):
 )
 def test_weighted_crashes_of_surrogates_have_the_rates_of_the_pool(method, settings, n):
     one = campaign(method, **settings)
-    asked = one, drive(one, n)[1], campaign_pool(resolve(one))
-    block, found = replayed(*asked), alarmed(*asked)
-    h, known = block.surrogates_crash * block.weights()[:, None], block.known_rates
-    error = np.sqrt(h.var(axis=0) / n + np.diag(known.covariance))
+    pool = campaign_pool(resolve(one))
+    asked = one, drive(one, n)[1], pool
+    (block, crashes), found = replayed(*asked), alarmed(*asked)
+    h = crashes * block.weights()[:, None]
+    error = np.sqrt(h.var(axis=0) / n + np.diag(pool.mu_covariance))
     many = np.array([entry["n_effective"] for entry in found["surrogates"]]) >= 100.0
     assert np.count_nonzero(many) >= 5
-    assert np.max(np.abs(h.mean(axis=0) - known.mu)[many] / error[many]) < 4.0
+    assert np.max(np.abs(h.mean(axis=0) - pool.mu)[many] / error[many]) < 4.0
     assert not found["raised"]
 
 
@@ -152,10 +154,11 @@ def test_a_few_hundred_tests_notice_a_rate_that_is_far_too_large(forced):
 def test_heavy_cut_ins_that_have_not_occurred_yet_raise_no_alarm():
     """More than half of the rate of fvdm-brakes-4 lies in cut-ins that weigh a thousand times the others."""
     one = campaign("episode_mixture").model_copy(update={"seed": 1})
-    asked = one, drive(one, 400)[1], campaign_pool(resolve(one))
-    found, block = alarmed(*asked), replayed(*asked)
+    pool = campaign_pool(resolve(one))
+    asked = one, drive(one, 400)[1], pool
+    found, (block, crashes) = alarmed(*asked), replayed(*asked)
     missed = next(entry for entry in found["surrogates"] if entry["surrogate"] == "fvdm-brakes-4")
-    h = block.surrogates_crash[:, block.known_rates.names.index("fvdm-brakes-4")] * block.weights()
+    h = crashes[:, pool.names.index("fvdm-brakes-4")] * block.weights()
     assert missed["n_effective"] > 100.0
     assert (missed["mu"] - h.mean()) / (h.std() / np.sqrt(400)) > 10.0  # by its own variance it could not be
     assert not found["raised"]
@@ -164,8 +167,8 @@ def test_heavy_cut_ins_that_have_not_occurred_yet_raise_no_alarm():
 def test_the_pool_knows_how_likely_a_cut_in_is_where_surrogates_crash(forced):
     """Forced cut-ins weigh exactly that, so that their mean squares are known; four standard errors."""
     one, table, pool = forced
-    block = replayed(one, table, pool)
-    h = block.surrogates_crash * block.weights()[:, None]
+    block, crashes = replayed(one, table, pool)
+    h = crashes * block.weights()[:, None]
     distance = h * h - pool.mu * pool.p_cut_in_at_crash
     error = distance.std(axis=0) / np.sqrt(len(h))
     assert np.all(distance.mean(axis=0) < 4.0 * error)  # told with three of the pool's errors on top
@@ -174,11 +177,7 @@ def test_the_pool_knows_how_likely_a_cut_in_is_where_surrogates_crash(forced):
 
 @pytest.mark.parametrize("wrong", [0.7, 1.25])
 def test_weights_that_are_all_wrong_raise_the_alarm(forced, wrong):
-    one, table, pool = forced
-    block = replayed(one, table, pool)
-    alarm = Alarm()
-    alarm.add(replace(block, log_weight=block.log_weight + np.log(wrong)))
-    assert alarm.result()["raised"]
+    assert alarmed(*forced, wrong)["raised"]
 
 
 def test_a_pool_of_another_environment_is_refused(forced):
