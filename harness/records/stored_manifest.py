@@ -137,19 +137,3 @@ class StoredShells(Stored):
         if [len(self.reference_rate), len(self.reference_square)] != [r, r]:
             raise ValueError("references need a rate and a mean square each")
         return self
-
-
-class StoredStop(Stored):
-    """Where one campaign of a comparison stopped by itself."""
-
-    campaign_hash: str
-    stop: dict[str, Any]
-    n_episodes: Count
-    stopped_by: StoppedBy
-
-
-class StoredStops(Stored):
-    """``stops.json`` of a comparison."""
-
-    a: StoredStop | None = None
-    b: StoredStop | None = None

@@ -60,7 +60,6 @@ def run_campaign(
     *,
     workers: int | None = None,
     resume: bool = False,
-    shorten: bool = False,
     progress: Progress | None = None,
 ) -> RunResult:
     """Run a campaign into a folder.
@@ -75,8 +74,6 @@ def run_campaign(
         Worker processes; as many as there are cores by default. Never changes a result.
     resume : bool
         Continue a run that was interrupted, or to a smaller RHW.
-    shorten : bool
-        Whether it may end with fewer tests than the folder holds; the others stay on disk, uncounted.
     progress : Progress, optional
 
     Raises
@@ -88,13 +85,11 @@ def run_campaign(
     resolved = campaign if isinstance(campaign, Resolved) else require_ready(campaign)
     with sole_use(out):
         earlier = require_own_folder(out, resolved, resume=resume)
-        if not shorten:
-            require_no_fewer(out, earlier, resolved.campaign.stop.episodes)
+        require_no_fewer(out, earlier, resolved.campaign.stop.episodes)
         run = Run(resolved, out, earlier, workers, progress or Progress(), began)
         run.run_all()
-        if not shorten:
-            require_no_fewer(out, earlier, run.prefix.n_episodes)
-            run.discard_uncounted()
+        require_no_fewer(out, earlier, run.prefix.n_episodes)
+        run.discard_uncounted()
         return run.finish()
 
 

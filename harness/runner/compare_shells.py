@@ -139,7 +139,7 @@ def require_same_shells(sides: tuple[Resolved, Resolved]) -> None:
             "av.before_cut_in",
             found="controller: a vehicle that acts before the cut-in has cut-ins of its own",
             expected="hold_speed in A and B: pairs need the same cut-ins",
-            mend="Write --set testing.method=forced, which drives each vehicle along the paths of the tests first.",
+            mend="Run both campaigns by themselves and put their intervals side by side, or write hold_speed.",
         )
     if sides[0].campaign.testing.shells.stopping != "sequential":
         raise CampaignError(
