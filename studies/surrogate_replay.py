@@ -16,7 +16,7 @@ from harness.pool.cut_ins import Pool, environment_hash
 from harness.pool.replay import StoredPaths, approach_cut_in, leave_stored, stored_paths
 from harness.records.folder import MEND_SHARD
 from harness.resolved import Resolved
-from harness.traffic.driving import Environment
+from harness.traffic.laws import Environment
 from harness.vocabulary import BV_LV_CONTACT, RUNNING, BoolArray, IntArray
 
 

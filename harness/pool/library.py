@@ -23,8 +23,8 @@ from harness.campaign.vehicle import FVDM, IDM, CarefulCompetent, Constant, Fuzz
 from harness.episode.trajectory import Followers
 from harness.errors import CampaignError
 from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT
-from harness.traffic.driving import Environment
-from harness.vehicles.models import driver_records
+from harness.traffic.laws import Environment
+from harness.vehicles.drivers import driver_records
 from harness.vocabulary import RecordArray
 
 SHIPPED_FOLDER = Path(__file__).parent

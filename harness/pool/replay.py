@@ -23,9 +23,9 @@ from harness.episode.trajectory import (
     walk,
 )
 from harness.maneuvers import CUT_IN
-from harness.traffic.driving import Environment
 from harness.traffic.lateral import onset_of
-from harness.vehicles.reaction import reaction_steps
+from harness.traffic.laws import Environment
+from harness.vehicles.references import reaction_steps
 from harness.vocabulary import (
     CRASH,
     FAILED,

@@ -6,7 +6,7 @@ from harness.campaign.files import SHIPPED_PANEL, load_campaign, load_panel, pan
 from harness.campaign.vehicle import IDM, AutomatedVehicle, IDMParameters
 from harness.cli import main
 from harness.errors import CampaignError
-from harness.vehicles.models import av_records
+from harness.vehicles.drivers import av_records
 from harness.worlds.av_type import recyclable
 
 HEAD = "format: av-panel\nversion: 1\navs:\n"

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from harness.campaign.vehicle import FVDMParameters, IDMParameters
-from harness.importance.immediate import smallest_gaps
+from harness.importance.challenge import smallest_gaps
 from harness.maneuvers import acceleration
+from harness.vehicles.drivers import driver_acceleration, driver_records
 from harness.vehicles.kinematics import CONTACT_M, STEP_S, next_speed
-from harness.vehicles.models import driver_acceleration, driver_records
 from tests.chains.seed import SEED
 from tests.criticality import simulation
 from tests.criticality.kernels import after_cut_in

@@ -10,7 +10,7 @@ from harness.campaign.vehicle import IDMParameters
 from harness.importance import tables as cache
 from harness.importance.build import build_importance
 from harness.importance.tables import Tables, build_tables, table_path, tables_hash
-from harness.vehicles.models import MODEL_FIELDS, driver_records
+from harness.vehicles.drivers import MODEL_FIELDS, driver_records
 from tests.environment.kernels import environment
 
 DRIVER = driver_records([IDMParameters()])

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from harness.maneuvers import ACCELERATIONS_MPS2
-from harness.traffic.driving import t_table
+from harness.traffic.laws import t_table
 from tests.environment import formulas
 from tests.environment.kernels import car_following, environment, free_driving, t_distribution
 

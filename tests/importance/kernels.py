@@ -11,8 +11,7 @@ from harness.compiled import compiled_threads
 from harness.episode.critical_moment import draw_from
 from harness.importance import functions, likelihood
 from harness.maneuvers import acceleration
-from harness.traffic.cut_in import acceptance, cut_in_hazard, opportunity
-from harness.traffic.driving import acceleration_pmf, free_driving
+from harness.traffic.laws import acceleration_pmf, acceptance, cut_in_hazard, free_driving, opportunity
 from harness.vocabulary import State
 
 

@@ -26,7 +26,7 @@ from harness.pool.storage import campaign_pool
 from harness.records.tables import episodes_table
 from harness.resolved import resolve
 from harness.runner.prepare import prepare
-from harness.vehicles.models import driver_records
+from harness.vehicles.drivers import driver_records
 from harness.vocabulary import CRASH, BoolArray
 from harness.worlds.twin import TwinWorld
 from studies.alarm import Alarm, KnownRates

@@ -16,7 +16,7 @@ from harness.records.tables import episodes_table
 from harness.resolved import resolve
 from harness.runner.retrace import Retracing
 from harness.traffic.loading import load_environment
-from harness.vehicles.models import av_records
+from harness.vehicles.drivers import av_records
 from harness.vocabulary import BV_LV_CONTACT, CRASH, STATE_DTYPE, TIMEOUT
 from harness.worlds.twin import TwinWorld
 from studies.surrogate_replay import replay_surrogates
