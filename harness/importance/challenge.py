@@ -1,19 +1,22 @@
 """Challenge: the probability that a surrogate crashes, given state and maneuver.
 
-**Recursive, after the cut-in**: the probability that the surrogate rear-ends BV, by backward induction. BV drives freely and redraws its acceleration every hold period; the surrogate reacts in every step. At redraw times the
-state (v_BV, R2, R2dot) is Markov, so with ``h`` the hold period
+**Recursive, after the cut-in**: the probability that the surrogate rear-ends BV, by backward induction. BV drives
+freely and redraws its acceleration every hold period; the surrogate reacts in every step. At redraw times the state
+(v_BV, R2, R2dot) is Markov, so with ``h`` the hold period
 
     U_0 = 0,   U_{i+1}(s) = Σ_a p(a | v_BV) [1 if the pair collides while a is held, else U_i(s'(s, a))].
 
 Levels of U are stored about one second apart (time remaining in the episode); the challenge of a maneuver,
 C(s, a) = 1 or U(s'), is stored for the longest remaining time.
 
-**Immediate**, as published for NADE: whether the surrogate crashes if BV acts now and then keeps its speed. The answer is yes or no, so what is tabulated is smooth: the smallest gap of the roll-out, which goes on below zero as
-if the vehicles could overlap. Interpolated, it is negative where the surrogate crashes. Staying has challenge 0.
+**Immediate**, as published for NADE: whether the surrogate crashes if BV acts now and then keeps its speed. The
+answer is yes or no, so what is tabulated is smooth: the smallest gap of the roll-out, which goes on below zero as if
+the vehicles could overlap. Interpolated, it is negative where the surrogate crashes. Staying has challenge 0.
 
-**Recursive, before the cut-in**: what *not* cutting in now is worth. The AV keeps its speed, so (v_BV, R2, R2dot) moves with BV's acceleration alone. BV's wish to change
-lanes enters as the factor OL of the current state, held at its present value. What is tabulated by backward induction
-over the hold periods is therefore the expected challenge met per unit of OL,
+**Recursive, before the cut-in**: what *not* cutting in now is worth. The AV keeps its speed, so (v_BV, R2, R2dot)
+moves with BV's acceleration alone. BV's wish to change lanes enters as the factor OL of the current state, held at
+its present value. What is tabulated by backward induction over the hold periods is therefore the expected challenge
+met per unit of OL,
 
     G_t(s) = Σ_a p̄(a | v_BV) { Σ_i Δt accept(R2_i, R2dot_i) C(s_i, cut_in) + G_{t+h}(s'_a) },
 

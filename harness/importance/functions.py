@@ -5,8 +5,9 @@
 A moment is critical if any V_j exceeds the threshold. Before the cut-in the maneuvers are {stay, cut_in}; after it, at
 redraw times, the 31 accelerations.
 
-**The weight of an episode** is p/q_sampled; what is kept is its logarithm. Per importance function j the logarithm L_j = Σ log(q_j/p) over the control steps so far is kept. The probability that a
-step was sampled with, *given the shared history*, is the mixture Σ_j w_j q_j with
+**The weight of an episode** is p/q_sampled; what is kept is its logarithm. Per importance function j the logarithm
+L_j = Σ log(q_j/p) over the control steps so far is kept. The probability that a step was sampled with, *given the
+shared history*, is the mixture Σ_j w_j q_j with
 
 * step mixture: w_j = α_j in every step;
 * episode mixture: the posterior weights w_j ∝ α_j exp(L_j). The drawn component itself is not part of the history.

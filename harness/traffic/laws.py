@@ -1,16 +1,18 @@
 """The laws of traffic: how LV and BV choose accelerations, and the hazard of BV's cut-in.
 
-Accelerations come from free driving, or from car following within the guard that keeps BV off LV. Both are distributions over the 31 accelerations, given as cumulative probabilities P(A ≤ a_k); the tails beyond the
-grid belong to its end points. Sampling inverts the same function that the probabilities are differences of.
+Accelerations come from free driving, or from car following within the guard that keeps BV off LV. Both are
+distributions over the 31 accelerations, given as cumulative probabilities P(A ≤ a_k); the tails beyond the grid
+belong to its end points. Sampling inverts the same function that the probabilities are differences of.
 
 Student's t is a table: cubic Hermite interpolation of scipy's exact values and densities on a grid of 1/32 (absolute
 error below 1e-8, tested), so that a recorded probability *is* the probability that was sampled from.
 
-The probability of BV's cut-in (its lane change) is wish times acceptance, as a hazard per step. Drivers decide about once a second with probability p_1s; a step of 0.1 s has p = 1 - (1 - p_1s)^0.1, so its cumulative
-hazard is -0.1 ln(1 - p_1s). A cut-in time is drawn by one exponential clock: it happens in the first step whose
-accumulated hazard exceeds -ln(1 - U). Given that no cut-in has happened before, this is the Bernoulli(p) draw of the
-step, and the same clock runs unchanged under importance functions and under the forced cut-in. Those that draw a path
-beforehand sum its hazards (`harness.episode.trajectory.weigh_cut_ins`); all others go step by step
+The probability of BV's cut-in (its lane change) is wish times acceptance, as a hazard per step. Drivers decide about
+once a second with probability p_1s; a step of 0.1 s has p = 1 - (1 - p_1s)^0.1, so its cumulative hazard is -0.1 ln(1
+- p_1s). A cut-in time is drawn by one exponential clock: it happens in the first step whose accumulated hazard
+exceeds -ln(1 - U). Given that no cut-in has happened before, this is the Bernoulli(p) draw of the step, and the same
+clock runs unchanged under importance functions and under the forced cut-in. Those that draw a path beforehand sum its
+hazards (`harness.episode.trajectory.weigh_cut_ins`); all others go step by step
 (`harness.episode.critical_moment.choose_lane`).
 """
 

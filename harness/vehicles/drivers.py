@@ -1,6 +1,6 @@
 """Longitudinal driver models that AVs and surrogates share: as kernels read them, and those without a memory.
 
-These are IDM, FVDM, and one that does not look ahead. `references` has those that remember a danger, and `reaction` how
+These are IDM, FVDM, and one that does not look ahead. `references` has those that remember a danger, and how
 a driver lags behind its model: it may react late, change its acceleration slowly, or not look. It keeps its speed until
 it reacts to the cut-in; then its model decides, as fast as its jerk limit allows.
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from harness.campaign.sections import EnvironmentSettings
 from harness.compiled import compiled_threads
-from harness.traffic import cut_in, driving
+from harness.traffic import laws
 from harness.traffic.loading import load_environment
 from harness.vocabulary import State
 
@@ -23,36 +23,36 @@ def environment(level=1.0, hold_s=1.0):
 @compiled_threads
 def _free(speeds, env, u, pmf, drawn):
     for i in range(speeds.size):
-        law = driving.free_driving(speeds[i], env)
-        driving.acceleration_pmf(law, env, pmf[i])
+        law = laws.free_driving(speeds[i], env)
+        laws.acceleration_pmf(law, env, pmf[i])
         for j in range(u.size):
-            drawn[i, j] = driving.draw_acceleration(u[j], law, env)
+            drawn[i, j] = laws.draw_acceleration(u[j], law, env)
 
 
 @compiled_threads
 def _following(states, env, u, pmf, cap, drawn):
     for i in range(states.shape[0]):
         state = State(states[i, 0], states[i, 1], states[i, 2], 0.0, 0.0)
-        law = driving.car_following(state, env)
-        driving.acceleration_pmf(law, env, pmf[i])
+        law = laws.car_following(state, env)
+        laws.acceleration_pmf(law, env, pmf[i])
         cap[i] = law.cap
         for j in range(u.size):
-            drawn[i, j] = driving.draw_acceleration(u[j], law, env)
+            drawn[i, j] = laws.draw_acceleration(u[j], law, env)
 
 
 @compiled_threads
 def _cut_in(states, env, out):
     for i in range(states.shape[0]):
         v, r1, r1dot, r2, r2dot = states[i]
-        out[i, 0] = cut_in.opportunity(State(v, r1, r1dot, r2, r2dot), env)
-        out[i, 1] = cut_in.acceptance(r2, r2dot, env)
-        out[i, 2] = cut_in.cut_in_hazard(out[i, 0], out[i, 1], env)
+        out[i, 0] = laws.opportunity(State(v, r1, r1dot, r2, r2dot), env)
+        out[i, 1] = laws.acceptance(r2, r2dot, env)
+        out[i, 2] = laws.cut_in_hazard(out[i, 0], out[i, 1], env)
 
 
 @compiled_threads
 def _t_cdf(z, table, out):
     for i in range(z.size):
-        out[i] = driving.t_cdf(z[i], table)
+        out[i] = laws.t_cdf(z[i], table)
 
 
 def free_driving(speeds, u=()):

@@ -8,8 +8,8 @@ from scipy import stats
 
 from harness.maneuvers import ACCELERATIONS_MPS2
 from harness.traffic.laws import t_table
-from tests.environment import formulas
-from tests.environment.kernels import car_following, environment, free_driving, t_distribution
+from tests.traffic import formulas
+from tests.traffic.kernels import car_following, environment, free_driving, t_distribution
 
 speeds = st.floats(0.0, 60.0)
 gaps = st.floats(-0.001, 200.0)

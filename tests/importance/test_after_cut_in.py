@@ -9,10 +9,10 @@ import pytest
 
 from harness.importance.grid import AFTER, points_of
 from tests.chains.seed import SEED
-from tests.criticality import simulation
-from tests.criticality.kernels import after_cut_in
-from tests.environment.kernels import free_driving
 from tests.episode.twin_runs import prepared
+from tests.importance import simulation
+from tests.importance.challenge_kernels import after_cut_in
+from tests.traffic.kernels import free_driving
 
 each_surrogate = pytest.mark.parametrize("j", range(3), ids=simulation.SURROGATES)
 POINTS = points_of(AFTER)

@@ -10,7 +10,7 @@ from harness.episode.trajectory import place
 from harness.traffic.initial_state import InitialStates
 from harness.vocabulary import STATE_COLUMNS, State
 from tests.chains.seed import SEED
-from tests.environment.kernels import environment
+from tests.traffic.kernels import environment
 
 N = 400_000
 open_unit = st.floats(1e-9, 1.0 - 1e-9)

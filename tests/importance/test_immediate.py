@@ -13,9 +13,9 @@ from harness.maneuvers import acceleration
 from harness.vehicles.drivers import driver_acceleration, driver_records
 from harness.vehicles.kinematics import CONTACT_M, STEP_S, next_speed
 from tests.chains.seed import SEED
-from tests.criticality import simulation
-from tests.criticality.kernels import after_cut_in
 from tests.episode.twin_runs import SURROGATES, prepared
+from tests.importance import simulation
+from tests.importance.challenge_kernels import after_cut_in
 from tests.kernels import alone
 
 KEEP_SPEED = 20

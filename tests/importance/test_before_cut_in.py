@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from harness.importance.grid import BEFORE, points_of
-from tests.criticality import simulation
-from tests.environment.kernels import cut_in_terms
 from tests.episode.twin_runs import Mean, prepared, run
+from tests.importance import simulation
+from tests.traffic.kernels import cut_in_terms
 
 each_surrogate = pytest.mark.parametrize("j", range(3), ids=simulation.SURROGATES)
 

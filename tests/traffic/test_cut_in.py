@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.environment import formulas
-from tests.environment.kernels import cut_in_terms
+from tests.traffic import formulas
+from tests.traffic.kernels import cut_in_terms
 
 speeds = st.floats(0.0, 60.0)
 gaps = st.floats(-0.001, 200.0)
