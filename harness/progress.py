@@ -19,7 +19,7 @@ LINE_INTERVAL_S = 30.0
 END_SHOWN_FROM_S = 600.0
 _HALF_A_DAY_S = 43_200.0
 _CLOCK_S = 1e-6
-_RECKONED_WITH = ("rhw", "crashes", "heaviest")
+_RECKONED_WITH = ("rhw", "crashes", "one_more_crash")
 
 
 class Progress:
@@ -46,7 +46,7 @@ def episodes_left(
     target_rhw: float | None = None,
     crashes: float | None = None,
     min_crashes: float = 0,
-    heaviest: float = 0.0,
+    one_more_crash: float = 0.0,
 ) -> int:
     """Estimate how many more episodes a campaign needs until it stops.
 
@@ -58,7 +58,7 @@ def episodes_left(
         return max(total - done, 0)
     # No ratio beyond the budget matters, and an infinite one could not be squared.
     ratio = min(rhw / target_rhw, math.sqrt(total))
-    needed = done * max(ratio * ratio, min_crashes / crashes, min(heaviest / target_rhw, total))
+    needed = done * max(ratio * ratio, min_crashes / crashes, min(one_more_crash / target_rhw, total))
     return max(math.ceil(min(needed, total)) - done, 0)
 
 

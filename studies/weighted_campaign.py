@@ -106,4 +106,4 @@ class WeightedCampaign:
             n = look
             if rule.observe(n, watched.result(stop.confidence)):
                 break
-        return self._results(replication, blocks, reached=rule.reached)
+        return self._results(replication, blocks, reached=rule.look.stopped)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -40,6 +40,32 @@ def _kinds(failed_a: bool, failed_b: bool) -> tuple[BoolArray, ...]:
 
 
 MarginVerdict = Literal["proven", "refuted", "open"]
+
+
+@dataclass(frozen=True)
+class MarginDecision:
+    """Whether B's rate is at most 1 + ``margin`` times A's; ``given_the_library`` it is asked of what lies inside."""
+
+    margin: float
+    verdict: MarginVerdict
+    confidence: float
+    given_the_library: bool
+
+    def after(self, pairs: PairCounts) -> MarginDecision:
+        """The same, after more pairs."""
+        return replace(self, verdict=pairs.verdict(self.margin, Level.two_sided(self.confidence)))
+
+    @property
+    def sentence(self) -> str:
+        """The verdict in words."""
+        answer = {
+            "proven": "B is not worse than A by more than",
+            "refuted": "B IS WORSE than A by more than",
+            "open": "It is open whether B is worse than A by more than",
+        }[self.verdict]
+        given = ", given the library" if self.given_the_library else ""
+        looks = f" (decided at {self.confidence:.1%}, which allows for a look after each round)"
+        return f"{answer} {self.margin:.3g} times A's rate{given}{looks}."
 
 
 class Interval(NamedTuple):
@@ -362,18 +388,6 @@ def conditional_paired_statement(found: PairedEstimate) -> str:
     if inside.n_pairs == found.free.n_pairs:
         return f"{text} Nothing was tested outside: whether the assumption holds is not known."
     return f"{text} In {found.free.n_pairs - inside.n_pairs:,} pairs of tests outside neither crashed."
-
-
-def margin_statement(verdict: MarginVerdict, margin: float, level: float, *, conditional: bool) -> str:
-    """Whether B is worse than A by more than a margin."""
-    answer = {
-        "proven": "B is not worse than A by more than",
-        "refuted": "B IS WORSE than A by more than",
-        "open": "It is open whether B is worse than A by more than",
-    }[verdict]
-    given = ", given the library" if conditional else ""
-    looks = f" (decided at {level:.1%}, which allows for a look after each round)"
-    return f"{answer} {margin:.3g} times A's rate{given}{looks}."
 
 
 def _apart(found: Contrast, confidence: float) -> str:

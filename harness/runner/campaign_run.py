@@ -222,9 +222,9 @@ class Run:
         Only what a rule asks for is called ``rhw``: a bar reckons from it when the campaign will stop.
         """
         watched = "half_width" if self._campaign.stop.rhw is None else "rhw"
-        figures: dict[str, int | float] = {"crashes": self.prefix.n_crashes, watched: self.planner.rule.rhw}
+        figures: dict[str, int | float] = {"crashes": self.prefix.n_crashes, watched: self.planner.rule.look.rhw}
         weighted = SAMPLING[self._campaign.testing.method].forces
-        return figures | ({"heaviest": self.planner.rule.heaviest} if weighted else {})
+        return figures | ({"one_more_crash": self.planner.rule.look.one_more_crash} if weighted else {})
 
     def discard_uncounted(self) -> None:
         """Remove shards that an earlier, longer run has left beyond the stop."""
@@ -246,7 +246,7 @@ class Run:
         stopped_by, said = conclusion(self._campaign, rule, prefix.n_episodes, prefix.reported_from)
         if stopped_by == "rhw" and self.planner.remark:
             said += f" {self.planner.remark}"
-        decided = {} if rule.decision is None else {"decision": rule.decision.to_json()}
+        decided = {} if rule.look.decision is None else {"decision": rule.look.decision.to_json()}
         self.leave(stopped_by=stopped_by, ending=said, **decided)
         self._progress.stage("estimates and report", None)
         estimates = estimate_run(self._out)
@@ -255,7 +255,7 @@ class Run:
         from harness.report import write_report  # noqa: PLC0415
 
         report = write_report(self._out)
-        verdict = None if rule.decision is None else rule.decision.verdict
+        verdict = None if rule.look.decision is None else rule.look.decision.verdict
         code = exit_code(self._campaign, stopped_by, verdict)
         return RunResult(self._out, report, estimates, stopped_by, said, code)
 

@@ -92,7 +92,7 @@ def compare_campaigns(
     names = labels or (a.name, b.name)
     both, folders = (sides["a"], sides["b"]), (out / "a", out / "b")
     pairs, rule = compare_shells(both, folders, margin=margin, workers=workers, progress=progress)
-    content = _content(sides, names, shells_content(pairs, rule, margin, names))
+    content = _content(sides, names, shells_content(pairs, rule, names))
     write_json(out / "compare.json", content)
     return Comparison(out, pairs, content, exit_code(rule, precision_asked=a.stop.rhw is not None))
 

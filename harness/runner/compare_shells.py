@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
+from dataclasses import asdict
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -23,11 +24,10 @@ from harness.estimators.pairs import (
     PairedEstimate,
     PairedShells,
     conditional_paired_statement,
-    margin_statement,
     paired_estimate,
     paired_statement,
 )
-from harness.estimators.stopping import PairRule, decision_confidence
+from harness.estimators.stopping import PairRule
 from harness.pool.shells import Draw, acceleration_limit
 from harness.progress import Progress
 from harness.records.folder import sole_use
@@ -183,27 +183,20 @@ def _held_specs(folder: Path, earlier: Mapping[str, Any]) -> Iterator[ShardSpec]
         yield ShardSpec(shard["index"], shard["first_episode"], shard["n_episodes"], tuple(draws))
 
 
-def shells_content(
-    found: PairedEstimate, rule: PairRule, margin: float | None, labels: tuple[str, str]
-) -> dict[str, Any]:
+def shells_content(found: PairedEstimate, rule: PairRule, labels: tuple[str, str]) -> dict[str, Any]:
     """What ``compare.json`` says under shells."""
-    level = decision_confidence(found.a.confidence)
-    free, given = paired_statement(found, *labels), conditional_paired_statement(found)
-    statements = [given, free] if rule.conditional else [free, given]
+    statements = [paired_statement(found, *labels), conditional_paired_statement(found)]
+    if rule.conditional:
+        statements.reverse()
     decided = None
-    if margin is not None and rule.verdict is not None:
-        decided = {
-            "margin": margin,
-            "verdict": rule.verdict,
-            "confidence": level,
-            "given_the_library": rule.conditional,
-        }
-        statements.insert(0, margin_statement(rule.verdict, margin, level, conditional=rule.conditional))
+    if rule.margin is not None:
+        decided = asdict(rule.margin)
+        statements.insert(0, rule.margin.sentence)
     return {**found.to_json(), "margin": decided, "statement": statements[0], "statements": statements}
 
 
 def exit_code(rule: PairRule, *, precision_asked: bool) -> int:
     """5 where B is worse by more than the margin; 4 where the budget was spent before anything was known."""
-    if rule.verdict is not None:
-        return EXIT_OF[rule.verdict]
-    return EXIT_BUDGET_SPENT if precision_asked and not rule.reached else EXIT_DONE
+    if rule.margin is not None:
+        return EXIT_OF[rule.margin.verdict]
+    return EXIT_BUDGET_SPENT if precision_asked and not rule.look.stopped else EXIT_DONE

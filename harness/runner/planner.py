@@ -153,7 +153,7 @@ class ShellPlanner(Planner):
         if self._n_episodes != self._look:
             return False
         enough = self.rule.observe(self.seen)
-        if not (enough and self._plans and self.rule.reached and self.planned is None):
+        if not (enough and self._plans and self.rule.look.stopped and self.planned is None):
             return enough or self.planned is not None
         budget = self._campaign.stop.episodes - self._n_episodes
         stop, left = self._campaign.stop, self._allocation.available - self.drawn

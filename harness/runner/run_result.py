@@ -57,13 +57,13 @@ def conclusion(campaign: Campaign, rule: Rule, n_episodes: int, reported_from: i
     by: StoppedBy
     if 0 < reported_from < n_episodes < campaign.stop.episodes:
         by = "two_phase"
-    elif rule.reached:
-        by = "rhw" if rule.decision is None else "accept"
-    elif rule.decision is not None and rule.decision.is_final:
+    elif rule.look.stopped:
+        by = "rhw" if rule.look.decision is None else "accept"
+    elif rule.look.decision is not None and rule.look.decision.is_final:
         by = "contradicted"
-    elif rule.pool_error_above_target:  # whatever else is spent: more of it would not help
+    elif rule.look.pool_error_above_target:  # whatever else is spent: more of it would not help
         by = "pool_error"
     else:
         by = "episodes" if n_episodes >= campaign.stop.episodes else "pool"
-    asked = campaign.stop.rhw is not None or rule.decision is not None
-    return by, ending(by, n_episodes, rule.waited_for, precision_asked=asked)
+    asked = campaign.stop.rhw is not None or rule.look.decision is not None
+    return by, ending(by, n_episodes, rule.look.unmet, precision_asked=asked)

@@ -62,8 +62,8 @@ def test_two_consecutive_passes_are_needed():
     pattern = [True, False, True, True]
     answers = [rule.observe(n, passing(n, rhw=0.2 if ok else 0.4)) for n, ok in zip(rule.looks, pattern, strict=False)]
     assert answers == [False, False, False, True]
-    assert rule.reached
-    with pytest.raises(ValueError, match="already stopped"):
+    assert rule.look.stopped
+    with pytest.raises(ValueError, match="no look is due"):
         rule.observe(rule.looks[4], passing(rule.looks[4]))
 
 
@@ -71,7 +71,7 @@ def test_too_few_crashes_never_stop():
     rule = StopRule(Stop(episodes=2_000, rhw=0.3, min_crashes=50), "forced", ENDS)
     answers = [rule.observe(n, passing(n, n_crashes=49)) for n in rule.looks]
     assert answers == [False] * (len(rule.looks) - 1) + [True]
-    assert not rule.reached
+    assert not rule.look.stopped
 
 
 @pytest.mark.parametrize(("weight_cap", "stops"), [(59.0, True), (61.0, False), (math.inf, False)])
@@ -79,7 +79,7 @@ def test_one_more_crash_of_the_largest_weight_must_not_matter(weight_cap, stops)
     """At n = 200 and a rate of 1 an RHW of 0.3 allows for a weight of 60."""
     rule = StopRule(Stop(episodes=100_000, rhw=0.3, min_crashes=10), "forced", ENDS)
     rule.observe(rule.looks[0], replace(passing(200), weight_cap=weight_cap))
-    assert rule.heaviest == weight_cap / 200
+    assert rule.look.one_more_crash == weight_cap / 200
     assert rule.observe(rule.looks[1], replace(passing(400), weight_cap=2 * weight_cap)) == stops
 
 
@@ -88,17 +88,17 @@ def test_without_a_precision_the_budget_decides():
     answers = [rule.observe(n, passing(n)) for n in rule.looks]
     assert answers == [False] * (len(rule.looks) - 1) + [True]
     assert rule.looks[-1] == 1_050
-    assert not rule.reached
+    assert not rule.look.stopped
 
 
 def test_looking_elsewhere_is_refused():
     rule = StopRule(Stop(episodes=10_000, rhw=0.3), "nde", ENDS)
-    with pytest.raises(ValueError, match="first 200 episodes"):
+    with pytest.raises(ValueError, match="no look is due"):
         rule.observe(300, passing(300))
-    with pytest.raises(ValueError, match="first 200 episodes"):
+    with pytest.raises(ValueError, match="no look is due"):
         rule.observe(200, passing(400))
     rule.observe(200, passing(200))
-    with pytest.raises(ValueError, match="first 400 episodes"):
+    with pytest.raises(ValueError, match="no look is due"):
         rule.observe(200, passing(200))
 
 
