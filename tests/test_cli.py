@@ -18,7 +18,7 @@ from pyarrow import csv, parquet
 from harness.campaign.files import load_campaign
 from harness.cli import cli, main
 from harness.errors import EXIT_BAD_INPUT, RunFolderError, TooManyFailedError
-from harness.progress import LineProgress
+from harness.progress import ShownProgress
 from harness.vocabulary import EstimatorName
 
 SCENARIOS = Path(__file__).parents[1] / "scenarios"
@@ -143,7 +143,7 @@ def test_run_prints_the_answer_and_where_more_is(calls, capsys, tmp_path):
     assert err == ""
     (campaign, to), options = calls["harness.runner.run_campaign"]
     assert (campaign.seed, to) == (7, folder)
-    assert isinstance(options.pop("progress"), LineProgress)
+    assert isinstance(options.pop("progress"), ShownProgress)
     assert options == {"workers": 2, "resume": True}
 
 
