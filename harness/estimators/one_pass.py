@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -126,6 +126,8 @@ class CampaignFacts:
         When the run ended and which condition decided, in a sentence; None while it goes on.
     decision : dict or None
         What the run has found about the limit that it was asked about; `harness.estimators.stopping.Decision`.
+    no_surrogates : str
+        Why surrogates were not asked about the tests, where they were not.
     """
 
     name: str
@@ -138,6 +140,7 @@ class CampaignFacts:
     repeated: dict[str, Any] | None = None
     ending: str | None = None
     decision: dict[str, Any] | None = None
+    no_surrogates: str = "the blocks do not say what surrogates would have done"
 
 
 def estimate_blocks(
@@ -157,8 +160,14 @@ def estimate_blocks(
     best = done.headline_estimate
     estimates = {done.headline: best, **done.estimates}
     distance_km = None if facts.distance_per_test_m is None else facts.distance_per_test_m / 1000.0
-    retraced = facts.retraced or {"reason": "the run did not retrace its episodes"}
-    statements = {name: _said(found, facts, distance_km) for name, found in estimates.items()}
+    rates = done.diagnostics.alarm.result() or {"reason": facts.no_surrogates}
+    alarm = {
+        "raised": bool(rates.get("raised")),
+        "retraced": facts.retraced or {"reason": "the run did not retrace its episodes"},
+        "surrogate_crash_rates": rates,
+    }
+    cautions = say.alarm_cautions(alarm)
+    statements = {name: _said(found, facts, distance_km, cautions) for name, found in estimates.items()}
     return finite_json(
         {
             "campaign": facts.name,
@@ -171,7 +180,7 @@ def estimate_blocks(
             "distance_per_test_km": distance_km,
             "crash_rate_per_1e6_km": None if distance_km is None else say.per_distance(best, distance_km),
             "estimates": {name: estimate.to_json() for name, estimate in estimates.items()},
-            "diagnostics": {**done.diagnostics.result(facts.importance_names), "alarm": {"retraced": retraced}},
+            "diagnostics": {**done.diagnostics.result(facts.importance_names), "alarm": alarm},
             "convergence": done.convergence,
             "statement": statements[done.headline],
             "statements": statements,
@@ -184,10 +193,12 @@ def estimate_blocks(
     )
 
 
-def _said(found: Estimate | Unavailable, facts: CampaignFacts, distance_km: float | None) -> str:
+def _said(found: Estimate | Unavailable, facts: CampaignFacts, distance_km: float | None, alarm: Sequence[str]) -> str:
     """What an estimator says, led by what it must be warned of and the first reference driver; or why it cannot."""
     if isinstance(found, Unavailable):
         return f"No crash rate from these records: {found.reason.rstrip('.')}."
     answer = say.statement(found, facts.lane_change_level, distance_km)
-    text = say.warned(say.repeated_cautions(facts.repeated), " ".join([*say.reference_statements(found)[:1], answer]))
+    text = say.warned(
+        [*alarm, *say.repeated_cautions(facts.repeated)], " ".join([*say.reference_statements(found)[:1], answer])
+    )
     return text + say.failed_statement(found.details) + say.repeated_statement(facts.repeated)

@@ -208,8 +208,7 @@ class Shells:
             details=asdict(
                 ShellDetails(
                     pool=design.pool,
-                    rhw_from_pool=free.from_pool_relative()[0],
-                    rhw_from_pool_at_least=free.from_pool_relative()[1],
+                    **free.from_pool_relative(),
                     p_cut_in=design.p_cut_in,
                     p_impossible=design.p_impossible,
                     references=() if cautions else compared(design, self._cells, Level.two_sided(confidence)),
@@ -277,8 +276,7 @@ class Shells:
             ci_low=limits.low,
             ci_high=limits.high,
             rhw=limits.rhw,
-            rhw_from_pool=limits.from_pool_relative()[0],
-            rhw_from_pool_at_least=limits.from_pool_relative()[1],
+            **limits.from_pool_relative(),
             n_episodes=int(inside.tests.sum()),
             n_crashes=int(inside.crashes.sum()),
             n_failed=int(inside.failed.sum()),

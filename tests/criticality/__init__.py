@@ -1,0 +1,1 @@
+"""Tests of the challenge tables against direct simulation."""
