@@ -3,7 +3,7 @@
     python -m benchmarks.alarm [REPLICATIONS]
 
 Drives tests in the twin once, asks the surrogates of the pool about them, and draws campaigns from them: their own
-means are then the known rates. Prints the two tables of docs/estimators.md. The normal p-value that the alarm is
+means are then the known rates. Prints the two tables of docs/internals/alarm.md. The normal p-value that the alarm is
 compared with takes its variance from the campaign itself, where that has 100 effective crashes; the smallest of the
 nine surrogates counts, nine times (Bonferroni).
 """
@@ -12,96 +12,109 @@ from __future__ import annotations
 
 import sys
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import ndtr
 
 from harness.campaign.campaign import Campaign
-from harness.estimators.alarm import LEVEL, Alarm
 from harness.estimators.block import Block
 from harness.estimators.from_records import block_from_tables
 from harness.importance.build import mixture_weights
-from harness.pool.replay import SurrogateReplay
 from harness.pool.storage import campaign_pool
 from harness.records.tables import episodes_table
 from harness.resolved import resolve
 from harness.runner.prepare import prepare
-from harness.runner.stored_estimates import MOST_UNASKED
-from harness.strata import KnownRates
-from harness.vocabulary import IntArray, Method
+from harness.vocabulary import BoolArray, FloatArray, IntArray, Method
 from harness.worlds.twin import TwinWorld
+from studies.alarm import LEVEL, Alarm, KnownRates
+from studies.surrogate_replay import SurrogateReplay
 
 SEED = 77
-TESTS = 20_000
+TESTS, MOST = 20_000, 50_000
 SIZES = (400, 1_000, 4_000)
 METHODS: tuple[Method, ...] = ("forced", "episode_mixture")
 WRONG = (0.5, 0.6, 0.7, 0.75, 0.8, 0.85, 0.9, 0.95, 1.05, 1.1, 1.15, 1.2, 1.3, 1.5, 2.0)
 
 
-def asked(method: Method, n: int) -> Block:
+class Asked(NamedTuple):
+    """Tests, which surrogates would have crashed in them (n, D), and the rates that they are told to have."""
+
+    tests: Block
+    crashes: BoolArray
+    known: KnownRates
+
+    @property
+    def h(self) -> FloatArray:
+        """Weighted crashes of surrogates, shape (n, D)."""
+        return np.where(self.crashes, self.tests.weights()[:, None], 0.0)
+
+    def p_value(self, wrong: float = 1.0) -> float:
+        """That of the alarm, where all weights are wrong by a factor."""
+        alarm = Alarm(self.known)
+        alarm.add(replace(self.tests, log_weight=self.tests.log_weight + np.log(wrong)), self.crashes)
+        return float(alarm.result()["p_value"])
+
+    def first(self, n: int) -> Asked:
+        """The first tests."""
+        return Asked(self.tests.take(slice(0, n)), self.crashes[:n], self.known)
+
+
+def asked(method: Method, n: int) -> Asked:
     """Tests of the default AV in the twin, and what surrogates would have done in them."""
     campaign = Campaign.model_validate({"name": "alarm", "seed": SEED, "testing": {"method": method}})
-    ready, surrogates = prepare(resolve(campaign)), SurrogateReplay(resolve(campaign), campaign_pool(resolve(campaign)))
+    ready, pool = prepare(resolve(campaign)), campaign_pool(resolve(campaign))
     table = episodes_table(ready.loop(TwinWorld(256)).run(0, ready.states(0, n)), SEED)
     block = block_from_tables(table, None, method=method, alpha=mixture_weights(campaign))
-    return replace(block, surrogates_crash=surrogates.crashes(table), known_rates=surrogates.known)
+    return Asked(block, SurrogateReplay(resolve(campaign), pool).crashes(table), KnownRates.of(pool))
 
 
-def p_value(block: Block) -> float:
-    """That of the alarm."""
-    alarm = Alarm()
-    alarm.add(block)
-    found = alarm.result()
-    return 1.0 if found is None else float(found["p_value"])
-
-
-def drawn(block: Block, rows: IntArray, known: KnownRates) -> Block:
+def drawn(found: Asked, rows: IntArray, known: KnownRates) -> Asked:
     """Some of the tests, in any order, with other known rates."""
     columns = ("crash", "failed", "cut_in", "bv_lv_contact", "log_weight", "log_q", "n_control_steps", "log_p_cut_in")
-    taken = {name: getattr(block, name)[rows] for name in (*columns, "surrogates_crash")}
-    return replace(block, **taken, known_rates=known)
+    taken = {name: getattr(found.tests, name)[rows] for name in columns}
+    return Asked(replace(found.tests, **taken), found.crashes[rows], known)
 
 
-def by_sample_variance(block: Block) -> float:
+def by_sample_variance(found: Asked) -> float:
     """Normal p-value of the surrogate that differs most."""
-    h = np.where(block.surrogates_crash, block.weights()[:, None], 0.0)
+    h = found.h
     squares, error = (h * h).sum(axis=0), h.std(axis=0) / np.sqrt(len(h))
     many = h.sum(axis=0) ** 2 >= 100.0 * np.maximum(squares, 1e-300)
-    z = (h.mean(axis=0) - block.known_rates.mu)[many] / error[many]
+    z = (h.mean(axis=0) - found.known.mu)[many] / error[many]
     return float(np.min(2.0 * ndtr(-np.abs(z)), initial=1.0)) * h.shape[1]
 
 
-def false_alarms(block: Block, n: int, replications: int) -> str:
+def false_alarms(found: Asked, n: int, replications: int) -> str:
     """Row of the first table."""
-    h = np.where(block.surrogates_crash, block.weights()[:, None], 0.0)
-    exact = replace(block.known_rates, mu=h.mean(axis=0), covariance=np.zeros((h.shape[1], h.shape[1])))
+    h = found.h
+    exact = found.known._replace(mu=h.mean(axis=0), std_error=np.zeros(h.shape[1]))
     raised = np.zeros(2)
     for k in range(replications):
-        rows = np.random.default_rng([SEED, n, k]).integers(0, len(block), n)
-        campaign = drawn(block, rows, exact)
-        raised += [by_sample_variance(campaign) <= LEVEL, p_value(campaign) <= LEVEL]
-    return f"| `{block.method}` | {n:,} | {raised[0] / replications:.1%} | {raised[1] / replications:.1%} |"
+        rows = np.random.default_rng([SEED, n, k]).integers(0, len(h), n)
+        campaign = drawn(found, rows, exact)
+        raised += [by_sample_variance(campaign) <= LEVEL, campaign.p_value() <= LEVEL]
+    return f"| `{found.tests.method}` | {n:,} | {raised[0] / replications:.1%} | {raised[1] / replications:.1%} |"
 
 
-def noticed(block: Block, n: int) -> str:
+def noticed(found: Asked, n: int) -> str:
     """Row of the second table."""
-    tests = block.take(slice(0, n))
-    p = {wrong: p_value(replace(tests, log_weight=tests.log_weight + np.log(wrong))) for wrong in WRONG}
+    p = {wrong: found.first(n).p_value(wrong) for wrong in WRONG}
     small = max((wrong for wrong in WRONG if wrong < 1.0 and p[wrong] <= LEVEL), default=0.0)
     large = min((wrong for wrong in WRONG if wrong > 1.0 and p[wrong] <= LEVEL), default=np.inf)
-    return f"| `{block.method}` | {n:,} | {small:g} | {large:g} |"
+    return f"| `{found.tests.method}` | {n:,} | {small:g} | {large:g} |"
 
 
 def main(replications: int) -> None:
     """Print both tables."""
-    blocks = [asked(method, MOST_UNASKED) for method in METHODS]
+    blocks = [asked(method, MOST) for method in METHODS]
     print("| method | tests | false by the sample's variance | false as reported |\n| --- | --- | --- | --- |")
     for block in blocks:
         for n in SIZES:
-            print(false_alarms(block.take(slice(0, TESTS)), n, replications), flush=True)
+            print(false_alarms(block.first(TESTS), n, replications), flush=True)
     print("\n| method | tests | all weights times, at most | or at least |\n| --- | --- | --- | --- |")
     for block in blocks:
-        for n in (4_000, TESTS, MOST_UNASKED):
+        for n in (4_000, TESTS, MOST):
             print(noticed(block, n), flush=True)
 
 

@@ -53,7 +53,7 @@ def rounds_of(campaign: Campaign, pool: DrawnPool, rng: np.random.Generator) -> 
     rounds, enough = [], False
     while not enough and (added := planner.next_round()).any():
         tests = planner.tally.tests
-        specs = round_specs(tests, added, 0, int(tests.sum()), campaign.run.shard_size)
+        specs = round_specs(tests, added, 0, int(tests.sum()), campaign.run.smallest_shard)
         rounds.append([spec.n_episodes for spec in specs])
         enough = planner.add(campaign_block(pool, added, int(tests.sum()), rng))
     return rounds

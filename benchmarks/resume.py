@@ -3,9 +3,9 @@ until a worker is started for it, and `harness estimate`.
 
     python -m benchmarks.resume runs/resume
 
-makes two folders of 1e6 tests of the forced cut-in (unless they are there: 0.3 GB), one of 200 shards, one of 10,000,
-and measures the commands in processes of their own. Only the first shards are simulated; the others repeat them under
-other indices, which is all the same to whoever reads them. They are gathered before anything is measured.
+makes a folder of 1e6 tests of the forced cut-in in 200 shards (unless it is there: 0.15 GB) and measures the commands
+in processes of their own. Only the first shard is simulated; the others repeat it under other indices, which is all the
+same to whoever reads them.
 """
 
 from __future__ import annotations
@@ -27,19 +27,8 @@ from benchmarks.contenders import SCENARIOS
 from harness.records.folder import COMPRESSION, shard_file, write_json
 
 EPISODES = 1_000_000
-SIMULATED = 5_000
+SHARD = 5_000
 SETTINGS = ("world.engine=twin", "world.cells=64", "stop.rhw=null", "records.traces=none")
-
-
-class Size(NamedTuple):
-    """A run folder, and the seconds that its commands may take."""
-
-    shard_size: int
-    resume_s: float
-    estimate_s: float
-
-
-SIZES = {"200 shards": Size(5_000, 3.0, 6.0), "10,000 shards": Size(100, 5.0, 6.0)}
 
 
 class Cost(NamedTuple):
@@ -60,27 +49,26 @@ def harness(*arguments: str) -> Cost:
     return Cost(time.perf_counter() - started, usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 2**20)
 
 
-def run_words(folder: Path, size: int, episodes: int) -> list[str]:
+def run_words(folder: Path, episodes: int) -> list[str]:
     """`harness run --resume` into a folder, up to so many tests."""
-    settings = (*SETTINGS, f"run.shard_size={size}", f"stop.episodes={episodes}")
+    settings = (*SETTINGS, f"run.shard_size={SHARD}", f"stop.episodes={episodes}")
     command = ["run", str(SCENARIOS / "overtaking_forced.yaml"), "--resume", "--quiet", "--out", str(folder)]
     return [*command, *(word for setting in settings for word in ("--set", setting))]
 
 
-def make_run(folder: Path, size: int) -> None:
-    """Simulate a few shards, and repeat them up to the number of tests."""
-    harness(*run_words(folder, size, SIMULATED))
+def make_run(folder: Path) -> None:
+    """Simulate a shard, and repeat it up to the number of tests."""
+    harness(*run_words(folder, SHARD))
     path = folder / "manifest.json"
     manifest = json.loads(path.read_text(encoding="utf-8"))
-    simulated = [pq.read_table(folder / shard["files"]["episodes"], partitioning=None) for shard in manifest["shards"]]
-    for index in range(len(simulated), EPISODES // size):
-        table = simulated[index % len(simulated)]
-        column = table.schema.get_field_index("episode")
-        episode = pa.array(range(index * size, (index + 1) * size), pa.int64())
+    table = pq.read_table(folder / shard_file("episodes", 0), partitioning=None)
+    column = table.schema.get_field_index("episode")
+    for index in range(1, EPISODES // SHARD):
+        first, file = index * SHARD, shard_file("episodes", index)
+        episode = pa.array(range(first, first + SHARD), pa.int64())
         table = table.set_column(column, table.schema.field(column), episode)
-        file = shard_file("episodes", index)
         pq.write_table(table, folder / file, compression=COMPRESSION)
-        shard = {"index": index, "first_episode": index * size, "n_episodes": size, "files": {"episodes": file}}
+        shard = {"index": index, "first_episode": first, "n_episodes": SHARD, "files": {"episodes": file}}
         manifest["shards"].append(shard)
     write_json(path, {**manifest, "n_episodes": EPISODES, "status": "interrupted"})
 
@@ -99,35 +87,22 @@ def until_worker(*arguments: str) -> float:
     return seconds
 
 
-def measured(folder: Path, size: Size, repetitions: int) -> None:
-    """Print what the commands take."""
-    finished = run_words(folder, size.shard_size, EPISODES)
-    harness(*finished)
-    for name, command, asked_s in (
-        ("resume", finished, size.resume_s),
-        ("estimate", ["estimate", str(folder), "--json"], size.estimate_s),
-    ):
-        for _ in range(repetitions):
-            cost = harness(*command)
-            print(f"  {name}: {cost.wall_s:.1f} s ({cost.cpu_s:.1f} s of CPU); asked <= {asked_s:.0f} s", flush=True)
-    for _ in range(repetitions):
-        wall_s = until_worker(*run_words(folder, size.shard_size, EPISODES + size.shard_size))
-        print(f"  one more shard: {wall_s:.1f} s until a worker starts; asked <= {size.resume_s:.0f} s", flush=True)
-
-
 def main() -> None:
-    """Make the folders that are not there, measure, print."""
+    """Make the folder if it is not there, measure, print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path, help="place of the run folders")
+    parser.add_argument("folder", type=Path, help="the run folder")
     parser.add_argument("--repetitions", type=int, default=3)
-    parser.add_argument("--only", choices=SIZES, help="one of the two")
     options = parser.parse_args()
-    for name in [options.only] if options.only else SIZES:
-        folder, size = options.folder / name.replace(" ", "-").replace(",", ""), SIZES[name]
-        if not (folder / shard_file("episodes", EPISODES // size.shard_size - 1)).exists():
-            make_run(folder, size.shard_size)
-        print(f"{EPISODES:,} tests in {name}")
-        measured(folder, size, options.repetitions)
+    folder: Path = options.folder
+    if not (folder / shard_file("episodes", EPISODES // SHARD - 1)).exists():
+        make_run(folder)
+    for name, command in (("resume", run_words(folder, EPISODES)), ("estimate", ["estimate", str(folder), "--json"])):
+        for _ in range(options.repetitions):
+            cost = harness(*command)
+            print(f"  {name}: {cost.wall_s:.1f} s ({cost.cpu_s:.1f} s of CPU, {cost.gib:.2f} GiB)", flush=True)
+    for _ in range(options.repetitions):
+        wall_s = until_worker(*run_words(folder, EPISODES + SHARD))
+        print(f"  one more shard: {wall_s:.1f} s until a worker starts", flush=True)
 
 
 if __name__ == "__main__":

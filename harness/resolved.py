@@ -8,9 +8,9 @@ from functools import cached_property
 from harness.campaign.campaign import Campaign
 from harness.errors import CampaignError
 from harness.pool.library import Library, load_library
-from harness.traffic.driving import Environment
+from harness.traffic.laws import Environment
 from harness.traffic.loading import load_environment, load_parameters
-from harness.vehicles.models import av_records, surrogate_records
+from harness.vehicles.drivers import av_records, surrogate_records
 from harness.vocabulary import SAMPLING, RecordArray
 
 

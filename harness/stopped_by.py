@@ -20,16 +20,16 @@ MENDS: dict[str, str] = {
 """Why a campaign ended before its precision, and the mend."""
 
 
-def ending(stopped_by: StoppedBy, n_episodes: int, waited_for: tuple[str, ...], *, precision_asked: bool) -> str:
+def ending(stopped_by: StoppedBy, n_episodes: int, unmet: tuple[str, ...], *, precision_asked: bool) -> str:
     """When a campaign ended and what decided it, in a sentence.
 
-    ``waited_for`` are the conditions that were missing when the stop rule last said no; without a ``precision_asked``
+    ``unmet`` are the conditions that were not met when the stop rule last said no; without a ``precision_asked``
     there was only a budget.
     """
     after = f"Stopped after {n_episodes:,} tests"
-    conditions = " and ".join(waited_for)
+    conditions = " and ".join(unmet)
     if stopped_by in ("rhw", "accept"):
-        if not waited_for:
+        if not unmet:
             return f"{after}: every condition was met at the first look."
         return f"{after}: the last condition to be met was {conditions}."
     if stopped_by == "two_phase":

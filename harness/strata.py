@@ -152,26 +152,3 @@ class ShellDesign:
             "references": tuple(Reference(**each) for each in content["references"]),
         }
         return cls(**(plain | arrays | records))
-
-
-@dataclass(frozen=True, eq=False)
-class KnownRates:
-    """Crash rates of surrogates as a pool knows them.
-
-    Attributes
-    ----------
-    pool : str
-        Its key.
-    names : tuple of str, length D
-        Surrogates from careful to careless.
-    mu, covariance : ndarray, shape (D,) and (D, D)
-        Crash rates per test, and the covariance of their errors.
-    p_cut_in_at_crash : ndarray, shape (D,)
-        Mean P(cut-in | path) of the cut-ins on which each crashes, at most.
-    """
-
-    pool: str
-    names: tuple[str, ...]
-    mu: FloatArray
-    covariance: FloatArray
-    p_cut_in_at_crash: FloatArray

@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from harness.cli import main as run_main
-from harness.commands.options import CAMPAIGN, FOLDER, RUN_FOLDER, examples, json_option, quiet_option
+from harness.commands.options import CAMPAIGN, FILE, FOLDER, RUN_FOLDER, examples, json_option, quiet_option
 from harness.console import print_json
 from harness.console_tables import print_table
+from harness.errors import WorldDisagreementError
 
 if TYPE_CHECKING:
     from studies.required_tests import RnotEstimator
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
         "python -m studies validate scenarios/validate/shells_panel.yaml --out runs/shells_panel",
         "python -m studies case scenarios/case_study/study.yaml --out runs/quick --quick",
         "python -m studies rnot runs/nde runs/forced",
+        "python -m studies alarm runs/mixture",
     ),
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )
@@ -29,7 +31,7 @@ def cli() -> None:
     """Studies of the methods behind `harness`, for those who develop or doubt them; run from a checkout.
 
     Exit codes are those of `harness`: 0 done; 2 the file or the call is wrong, or the records do not allow what was
-    asked for; 130 interrupted by Ctrl-C: the same command goes on with what is finished, where it says so.
+    asked for; 3 the alarm is raised; 130 interrupted by Ctrl-C.
     """
 
 
@@ -227,6 +229,55 @@ def study(study_file: Path, folder: Path, *, quick: bool, workers: int | None, q
         print_json({"page": str(done.page), "claims": done.claims, "seconds": done.seconds})
         return
     click.echo(str(done.page))
+
+
+@cli.command(
+    short_help="Do weights, traffic and pool of a run belong together?",
+    epilog=examples(
+        "python -m studies alarm runs/mixture                       # against the campaign's own pool",
+        "python -m studies alarm runs/mixture --pool pool.parquet   # of `harness pool CAMPAIGN --out pool.parquet`",
+    ),
+)
+@click.argument("folder", metavar="RUN", type=RUN_FOLDER)
+@click.option("--pool", "pool_file", type=FILE, help="A pool of the same environment. Default: the campaign's own.")
+@json_option
+@click.pass_context
+def alarm(ctx: click.Context, folder: Path, *, pool_file: Path | None, as_json: bool) -> None:
+    """Put the surrogates of a pool in the AV's place in all tests of RUN, and see if they crash as the pool says.
+
+    The alarm is raised, and the exit code is 3, where they do not, which a sound run shows once in 10,000 times: then a
+    weight, a maneuver on record, the twin or the pool is wrong. With the recursive challenge its tables are compared
+    with Monte Carlo, too; their error costs efficiency and leaves the crash rate unbiased.
+    """
+    from harness.campaign.files import load_campaign  # noqa: PLC0415 - keeps --help fast
+    from harness.progress import shown_progress  # noqa: PLC0415 - keeps --help fast
+    from harness.resolved import resolve  # noqa: PLC0415 - slow to import
+    from studies.alarm import alarm_of_run  # noqa: PLC0415 - slow to import
+    from studies.table_accuracy import table_errors  # noqa: PLC0415 - slow to import
+
+    bar = shown_progress()
+    with bar:
+        found = alarm_of_run(folder, pool_file, bar)
+        tables = list(table_errors(resolve(load_campaign(folder / "campaign.yaml", check_files=False))))
+    if as_json:
+        print_json({**found, "tables": tables})
+    else:
+        _print_columns(f"Weighted crashes of surrogates in {found['n_episodes']:,} tests", found["surrogates"])
+        if tables:
+            _print_columns("Challenge tables against Monte Carlo", tables)
+        verdict = found["no_verdict"] or ("ALARM: weights, maneuvers, twin or pool are wrong" * found["raised"])
+        click.echo(f"{verdict or 'nothing is wrong that these tests could show'} (p-value {found['p_value']:.2g})")
+    if found["raised"]:
+        ctx.exit(WorldDisagreementError.exit_code)
+
+
+def _print_columns(title: str, rows: Sequence[dict[str, Any]]) -> None:
+    """Print mappings of the same keys as a table."""
+    texts = [key for key, value in rows[0].items() if isinstance(value, str)]
+    cells = [[value if isinstance(value, str) else f"{value:.4g}" for value in row.values()] for row in rows]
+    print_table(
+        title, [key.replace("_", " ") for key in rows[0]], cells, texts=[key.replace("_", " ") for key in texts]
+    )
 
 
 def _print_required_tests(content: dict[str, Any]) -> None:

@@ -16,7 +16,7 @@ import pyarrow as pa
 from harness.estimators.estimate import finite_json
 from harness.progress import Progress
 from harness.records.folder import require_place, write_bytes, write_json
-from harness.report.plot_style import BLUE, FULL_WIDTH_IN, GREY, INK, VERMILLION, Plot, new_figure, png
+from harness.report.style import BLUE, FULL_WIDTH_IN, GREY, INK, VERMILLION, Plot, new_figure, png
 from studies.experiment import Experiment
 from studies.judgement import Judgement, Row, corrected, judge
 from studies.subjects import Repeated, Tested, subjects

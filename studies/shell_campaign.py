@@ -148,7 +148,7 @@ class ShellCampaign(_Redrawn):
 
     def _decision_row(self, seen: Shells, name: str, replication: int, rule: RoundRule) -> Row:
         """A decision is a one-sided interval: below the limit, or above."""
-        verdict = "undecided" if rule.decision is None else rule.decision.verdict
+        verdict = "undecided" if rule.look.decision is None else rule.look.decision.verdict
         limit, tally = self.limits[name], seen.tally
         return Row(
             name,
@@ -172,15 +172,16 @@ class ShellCampaign(_Redrawn):
         while not enough and (added := planner.next_round()).any():
             enough = planner.add(campaign_block(drawn, added, int(planner.tally.tests.sum()), rng))
             for name, rule in rules.items():
-                if name not in known and planner.seen.tally.tests.size and rule.observe(planner.seen) and rule.reached:
+                pending = name not in known and planner.seen.tally.tests.size
+                if pending and rule.observe(planner.seen) and rule.look.stopped:
                     known[name] = self._statement_row(planner.seen, name, replication, reached=True)
         estimate = planner.seen.result(self.campaign.stop.confidence)
         outside = int(estimate.details["statements"][0]["n_crashes_outside"])
-        yield estimate_row(FREE, replication, estimate, reached=planner.rule.reached, outside=outside)
+        yield estimate_row(FREE, replication, estimate, reached=planner.rule.look.stopped, outside=outside)
         for name in names:
             yield known.get(name) or self._statement_row(planner.seen, name, replication, reached=False)
         for reference in drawn.design.references:
-            yield from _reference_rows(estimate, reference.name, replication, reached=planner.rule.reached)
+            yield from _reference_rows(estimate, reference.name, replication, reached=planner.rule.look.stopped)
 
     def _statement_row(self, seen: Shells, name: str, replication: int, *, reached: bool) -> Row:
         found = seen.within(name, self.campaign.stop.confidence)
@@ -264,8 +265,8 @@ class PairedCampaign(_Redrawn):
             enough = planner.rule.observe(pairs)
             if early is None:
                 inside.observe(pairs)
-                early = pairs.inside() if inside.reached else None
-        yield self._row(DIFFERENCE, replication, pairs, reached=planner.rule.reached)
+                early = pairs.inside() if inside.look.stopped else None
+        yield self._row(DIFFERENCE, replication, pairs, reached=planner.rule.look.stopped)
         yield self._row(CONDITIONAL_DIFFERENCE, replication, early or pairs.inside(), reached=early is not None)
 
     def _row(self, result: str, replication: int, pairs: PairCounts, *, reached: bool) -> Row:

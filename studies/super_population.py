@@ -27,8 +27,8 @@ from harness.pool.cut_ins import environment_hash
 from harness.pool.library import Library
 from harness.pool.shells import acceleration_limit
 from harness.progress import Progress
-from harness.traffic.driving import Environment
-from harness.vehicles.models import driver_records
+from harness.traffic.laws import Environment
+from harness.vehicles.drivers import driver_records
 from harness.vocabulary import BoolArray, FloatArray, IntArray, RecordArray
 from studies.work import write_table
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from harness.progress import Progress
-from harness.traffic.driving import Environment
+from harness.traffic.laws import Environment
 from harness.vocabulary import FloatArray
 from studies.super_population import Drivers, SuperPopulation, enumerate_paths
 

@@ -96,7 +96,8 @@ class WeightedCampaign:
     def _online(self, replication: int) -> list[Row]:
         campaign = self.campaign
         stop = campaign.stop.model_copy(update={"estimator": self.estimators[0]})
-        rule = StopRule(stop, campaign.testing.method, campaign.run.shard_size, min_crashes=campaign.min_crashes)
+        ends = campaign.run.shard_ends(stop.episodes)
+        rule = StopRule(stop, campaign.testing.method, ends, min_crashes=campaign.min_crashes)
         watched, blocks, n = accumulator(rule.estimator), [], 0
         for look in rule.looks:
             block = self.source(replication * stop.episodes + n, look - n)
@@ -105,4 +106,4 @@ class WeightedCampaign:
             n = look
             if rule.observe(n, watched.result(stop.confidence)):
                 break
-        return self._results(replication, blocks, reached=rule.reached)
+        return self._results(replication, blocks, reached=rule.look.stopped)

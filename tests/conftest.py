@@ -1,9 +1,15 @@
-"""Settings that all tests share: property tests neither hang on the clock nor on chance, nor leave a database behind.
+"""What all tests share: settings, kernels that are compiled once, and runs that are made once.
 
-With ``HARNESS_TEST_SEED`` set, Hypothesis looks elsewhere on every run, as the statistical tests do with that seed.
+Property tests neither hang on the clock nor on chance, nor leave a database behind. With ``HARNESS_TEST_SEED`` set,
+Hypothesis looks elsewhere on every run, as the statistical tests do with that seed.
 """
 
+import fcntl
 import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -18,9 +24,53 @@ settings.register_profile(
 )
 settings.load_profile("harness")
 
+TO_COMPILE = (
+    ("shells-sumo", "shells-acting-twin", "shells-lateral-sumo"),
+    ("nde-sumo", "step-immediate-sumo", "step-recursive-twin", "mixture-twin", "forced-lateral-sumo"),
+)
+"""Golden runs that need all kernels between them, for two processes that compile different ones."""
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """Compile kernels before workers of xdist would, each of them all."""
+    if not getattr(session.config.option, "numprocesses", None):
+        return
+    from harness.compiled import source_hash  # noqa: F401 - sets the variable, and takes a second
+
+    if (mark := Path(os.environ["NUMBA_CACHE_DIR"]) / "compiled-for-tests").exists():
+        return
+    command = [sys.executable, "-m", "tests.golden.record", "--only"]
+    compiling = [subprocess.Popen([*command, *names]) for names in TO_COMPILE]
+    if not any([process.wait() for process in compiling]):  # noqa: C419 - wait for all
+        mark.touch()
+
 
 @pytest.fixture(scope="session")
-def fmu(tmp_path_factory):
+def stored_run(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+    """The folder of a golden campaign, run when it is first asked for, once for all workers. Damage a copy only."""
+    from tests.in_process import run_here
+    from tests.stored_runs import golden
+
+    folder = tmp_path_factory.getbasetemp()
+    folder = (folder.parent if "PYTEST_XDIST_WORKER" in os.environ else folder) / "stored"
+    folder.mkdir(exist_ok=True)
+
+    def of(name: str) -> Path:
+        out, done = folder / name, folder / f"{name}.done"
+        with (folder / f"{name}.lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            if not done.exists():
+                shutil.rmtree(out, ignore_errors=True)
+                run_here(golden(name), out)
+                done.touch()
+        return out
+
+    return of
+
+
+@pytest.fixture(scope="session")
+def fmu(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The IDM of the examples as an FMU."""
     builder = pytest.importorskip("pythonfmu.builder", reason="pythonfmu builds the FMU")
     examples = Path(__file__).parents[1] / "examples"

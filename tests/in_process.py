@@ -14,8 +14,10 @@ from typing import Any
 
 import pytest
 
+from harness import run
+from harness.campaign.campaign import Campaign
 from harness.controllers.black_box import Death
-from harness.runner import executor
+from harness.runner import RunResult, executor
 from harness.runner.worker import ShardDone, ShardRunner, ShardSpec
 
 
@@ -70,3 +72,9 @@ def controllers_here() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("harness.controllers.loading.run_apart", _work_here)
         yield
+
+
+def run_here(campaign: Campaign, out: Path, **options: Any) -> RunResult:
+    """Run a campaign in this process, without its page."""
+    with one_process(), controllers_here(), without_page():
+        return run(campaign, out, workers=1, **options)

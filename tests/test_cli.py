@@ -18,7 +18,7 @@ from pyarrow import csv, parquet
 from harness.campaign.files import load_campaign
 from harness.cli import cli, main
 from harness.errors import EXIT_BAD_INPUT, RunFolderError, TooManyFailedError
-from harness.progress import LineProgress
+from harness.progress import ShownProgress
 from harness.vocabulary import EstimatorName
 
 SCENARIOS = Path(__file__).parents[1] / "scenarios"
@@ -143,7 +143,7 @@ def test_run_prints_the_answer_and_where_more_is(calls, capsys, tmp_path):
     assert err == ""
     (campaign, to), options = calls["harness.runner.run_campaign"]
     assert (campaign.seed, to) == (7, folder)
-    assert isinstance(options.pop("progress"), LineProgress)
+    assert isinstance(options.pop("progress"), ShownProgress)
     assert options == {"workers": 2, "resume": True}
 
 
@@ -302,7 +302,7 @@ def test_estimate_prints_a_table(calls, capsys, tmp_path):
     out = capsys.readouterr().out
     assert calls["harness.runner.estimate_run"] == (
         (tmp_path,),
-        {"estimators": ("nade", "nde"), "confidence": 0.95, "pool": None},
+        {"estimators": ("nade", "nde"), "confidence": 0.95},
     )
     row = next(line for line in out.splitlines() if "nade *" in line)
     assert all(text in row for text in ("1.2000e-07", "1.140e-07 to 1.260e-07", "0.050", "1,234.5", "1.20%"))

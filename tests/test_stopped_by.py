@@ -13,7 +13,7 @@ from tests.estimators.test_stopping import passing
 
 
 def looked_at(looks: list[dict], **stop) -> StopRule:
-    rule = StopRule(Stop(episodes=200 * len(looks), rhw=0.3, **stop), "forced", 200)
+    rule = StopRule(Stop(episodes=200 * len(looks), rhw=0.3, **stop), "forced", range(200, 10_000, 200))
     for n, changes in zip(rule.looks, looks, strict=True):
         if rule.observe(n, replace(passing(n), **changes)):
             break
@@ -25,7 +25,7 @@ WRONG = {"cautions": ("unbounded",)}
 
 
 @pytest.mark.parametrize(
-    ("looks", "reached", "waited_for"),
+    ("looks", "reached", "unmet"),
     [
         ([{}, {}], True, ()),
         ([WIDE, FEW, {}, {}], True, ("stop.min_crashes (50)",)),
@@ -36,9 +36,9 @@ WRONG = {"cautions": ("unbounded",)}
         ([WRONG, WRONG, WRONG], False, ("stop.rhw (0.3)",)),
     ],
 )
-def test_the_rule_remembers_what_was_missing(looks, reached, waited_for):
+def test_the_rule_remembers_what_was_missing(looks, reached, unmet):
     rule = looked_at(looks, min_crashes=50)
-    assert (rule.reached, rule.waited_for) == (reached, waited_for)
+    assert (rule.look.stopped, rule.look.unmet) == (reached, unmet)
 
 
 POOL_SPENT = "all cut-ins that the pool keeps of a shell were tested; raise pool.cut_ins_per_shell and use a new folder"
@@ -46,7 +46,7 @@ BOTH = ("stop.rhw (0.1)", "stop.min_crashes (50)")
 
 
 @pytest.mark.parametrize(
-    ("stopped_by", "waited_for", "sentence"),
+    ("stopped_by", "unmet", "sentence"),
     [
         ("rhw", BOTH[1:], ": the last condition to be met was stop.min_crashes (50)."),
         ("rhw", (), ": every condition was met at the first look."),
@@ -66,6 +66,6 @@ BOTH = ("stop.rhw (0.1)", "stop.min_crashes (50)")
         ("pool", None, f": {POOL_SPENT}."),
     ],
 )
-def test_every_end_has_its_sentence(stopped_by, waited_for, sentence):
-    said = ending(stopped_by, 46_735, waited_for or (), precision_asked=waited_for is not None)
+def test_every_end_has_its_sentence(stopped_by, unmet, sentence):
+    said = ending(stopped_by, 46_735, unmet or (), precision_asked=unmet is not None)
     assert said == "Stopped after 46,735 tests" + sentence

@@ -13,9 +13,9 @@ from typing import Any, Self
 
 from pydantic import Field, model_validator
 
-from harness.campaign.problems import NAME_PATTERN, broken_rule
 from harness.campaign.sections import (
     MOST_SUMO_CELLS,
+    NAME_PATTERN,
     Accept,
     EnvironmentSettings,
     PoolSettings,
@@ -27,11 +27,12 @@ from harness.campaign.sections import (
     Testing,
     Whole,
     World,
+    broken_rule,
     listed,
 )
 from harness.campaign.vehicle import (
     AutomatedVehicle,
-    Surrogate,
+    DriverModel,
     default_surrogates,
 )
 from harness.vocabulary import METHODS, SAMPLING
@@ -45,7 +46,7 @@ class Campaign(Section):
     seed: Whole = Field(1, ge=0, lt=2**63, description="every random number follows from it")
     environment: EnvironmentSettings = EnvironmentSettings()
     av: AutomatedVehicle = AutomatedVehicle()
-    surrogates: dict[SurrogateName, Surrogate] = Field(
+    surrogates: dict[SurrogateName, DriverModel] = Field(
         default_factory=default_surrogates, description="stand-ins for the unknown AV, by name"
     )
     testing: Testing = Testing()
@@ -230,6 +231,6 @@ class Campaign(Section):
             "pool": self.pool.model_dump(exclude=unused) if shells else None,
             "engine": self.world.engine,
             "moments": self.records.moments,
-            "shard_size": self.run.shard_size,
+            "shard_size": self.run.smallest_shard,
         }
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]

@@ -6,22 +6,14 @@ import math
 from collections.abc import Iterable, Sequence
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    ModelWrapValidatorHandler,
-    ValidationError,
-    field_validator,
-    model_validator,
-)
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, field_validator
+from pydantic_core import PydanticCustomError
 
-from harness.campaign.problems import SURROGATE_PATTERN, broken_rule, in_words
 from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT
 from harness.vocabulary import EstimatorName, Method
 
+NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_.-]*$"
+SURROGATE_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_-]*$"
 LARGEST_EXACT_WHOLE_FLOAT = 2.0**53
 
 
@@ -38,24 +30,20 @@ Whole = Annotated[int, BeforeValidator(whole)]
 SurrogateName = Annotated[str, Field(pattern=SURROGATE_PATTERN)]
 
 
+def broken_rule(key: str, *, found: str, expected: str, mend: str) -> PydanticCustomError:
+    """Error for a rule between several values, in the parts of a `harness.errors.HarnessError`.
+
+    ``key`` is the dotted path of the value to blame, seen from the section that states the rule; empty for the section.
+    """
+    parts = {"key": key, "found": found, "expected": expected, "mend": mend}
+    where = "{key}: " if key else ""
+    return PydanticCustomError("broken_rule", where + "found {found}; expected {expected}. {mend}", parts)
+
+
 class Section(BaseModel):
     """A section of the campaign: unknown keys are errors, values never change after loading."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
-
-    @model_validator(mode="wrap")
-    @classmethod
-    def _errors_in_words(cls, data: Any, validate: ModelWrapValidatorHandler[Self]) -> Self:
-        try:
-            return validate(data)
-        except ValidationError as error:
-            raise in_words(error, cls) from None
-
-    def at(self, path: Sequence[str]) -> Any:
-        """Value at a path such as ``("av", "fmu", "file")``; None where a section on the way is left out."""
-        key, *rest = path
-        value = getattr(self, key)
-        return value.at(rest) if rest and value is not None else value
 
     def replaced(self, path: Sequence[str], value: Any) -> Self:
         """A copy with another value at a path such as ``("av", "fmu", "file")``, not validated."""
@@ -222,7 +210,7 @@ class Testing(Section):
 
 
 class PoolSettings(Section):
-    """The pool of cut-ins that shells, surrogate replay and the alarm on SUMO use; built once, in the twin."""
+    """The pool of cut-ins that shells are drawn from; built once, in the twin."""
 
     library: str = Field("ladder-2", description="name of a shipped surrogate library, or a path to your own")
     relative_error: float = Field(
@@ -304,10 +292,35 @@ class RaySettings(Section):
     )
 
 
+USUAL_SHARD, LARGEST_SHARD = 5_000, 1_000_000
+SHARD_SHARE = 32
+
+
 class Run(Section):
     """How the work is spread; nothing here changes a result."""
 
-    shard_size: Whole = Field(5_000, ge=1, le=1_000_000, description="episodes per file and per task")
+    shard_size: Annotated[int, Field(ge=1, le=LARGEST_SHARD), BeforeValidator(whole)] | None = Field(
+        None,
+        description="episodes per file and per task; null: 5,000, and in a long run a 32nd of the episodes before, so "
+        "that it has some 200 files",
+    )
     max_failed_share: Probability = Field(0.01, description="stop with exit code 3 above this share of failures")
     executor: Literal["local", "ray"] = Field("local", description="where workers run: on this machine, or a cluster")
     ray: RaySettings = RaySettings()
+
+    @property
+    def smallest_shard(self) -> int:
+        """Episodes of the first shard."""
+        return self.shard_size or USUAL_SHARD
+
+    def shard_ends(self, n_episodes: int) -> Sequence[int]:
+        """Where the shards of so many episodes end; the last may end beyond them.
+
+        They follow from the index alone, so that a run can be continued.
+        """
+        if self.shard_size is not None:
+            return range(self.shard_size, n_episodes + self.shard_size, self.shard_size)
+        ends = [USUAL_SHARD]
+        while ends[-1] < n_episodes:
+            ends.append(ends[-1] + min(max(USUAL_SHARD, ends[-1] // SHARD_SHARE), LARGEST_SHARD))
+        return ends

@@ -38,7 +38,6 @@ LATERAL = ("lead_steps", "onset_step", "onset_r2_m", "onset_ttc_s", "overlap_ttc
     help="Only this one; may be given several times.",
 )
 @click.option("--confidence", type=click.FloatRange(0, 1, min_open=True, max_open=True), help="Level of intervals.")
-@click.option("--pool", "pool_file", type=FILE, help="Pool of cut-ins for the alarm.")
 @click.option("--write", is_flag=True, help="Replace DIR/estimates.json by the result.")
 @json_option
 @click.pass_context
@@ -48,7 +47,6 @@ def estimate(
     *,
     estimators: Sequence[EstimatorName],
     confidence: float | None,
-    pool_file: Path | None,
     write: bool,
     as_json: bool,
 ) -> None:
@@ -56,13 +54,10 @@ def estimate(
 
     Nothing is simulated in SUMO. An estimator that the records do not allow is shown with the reason; the exit code is
     2 if they allow none of those asked for.
-
-    For the alarm surrogates of a pool of cut-ins take the AV's place, in the twin: those of the run's own pool if it
-    has been built ('harness pool'), in the first 100,000 tests; with --pool those of that one, in all tests.
     """
     from harness.runner import estimate_run  # noqa: PLC0415 - keeps --help fast
 
-    content = estimate_run(folder, estimators=estimators or None, confidence=confidence, pool=pool_file)
+    content = estimate_run(folder, estimators=estimators or None, confidence=confidence)
     if write:
         from harness.records.folder import write_json  # noqa: PLC0415 - keeps --help fast
 

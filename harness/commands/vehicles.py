@@ -83,7 +83,7 @@ def av_check(
     "--margin",
     type=click.FloatRange(min=0.0),
     metavar="R",
-    help="Under shells: run until it is known whether B's crash rate is at most 1 + R times A's.",
+    help="Run until it is known whether B's crash rate is at most 1 + R times A's.",
 )
 @workers_option
 @junit_option
@@ -110,9 +110,8 @@ def compare(
 ) -> None:
     """Drive the AVs of campaigns A and B, which differ in nothing else, in the same traffic; print the difference.
 
-    Under testing.method shells both meet the same cut-ins, round by round, until the half-width of the difference is
-    stop.rhw of the larger rate, or --margin is decided. Under the other methods both run to their own stop rule, then
-    the shorter one as far as the longer; forced is the one to choose there.
+    Both meet the same cut-ins (testing.method: shells), round by round, until the half-width of the difference is
+    stop.rhw of the larger rate, or --margin is decided.
 
     A may be a run folder: its tests are copied and not driven again. Finished parts of an earlier call with the same
     --out are used again, too. The folder receives the run folders a and b, and compare.json.

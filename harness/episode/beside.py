@@ -12,8 +12,7 @@ import math
 from harness.compiled import compiled, compiled_inline
 from harness.episode.cells import Bench
 from harness.vehicles.kinematics import CONTACT_M, gap, next_position, next_speed
-from harness.vehicles.reaction import react
-from harness.vehicles.references import Memory
+from harness.vehicles.references import Memory, react
 from harness.vocabulary import AV, BV
 
 AHEAD_M = 1e-6

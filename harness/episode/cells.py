@@ -15,7 +15,7 @@ from harness.controllers.protocol import BatchObservation
 from harness.episode.trajectory import Trajectory, empty_trajectory, lengths
 from harness.importance.functions import Importance
 from harness.maneuvers import N_ACCELERATIONS
-from harness.traffic.driving import Environment
+from harness.traffic.laws import Environment
 from harness.vehicles.kinematics import gap
 from harness.vocabulary import (
     AV,

@@ -6,11 +6,22 @@ import math
 
 from harness.compiled import compiled_inline
 from harness.episode.cells import Bench
-from harness.importance.functions import challenges_nobody, propose_acceleration, propose_cut_in
-from harness.importance.likelihood import accumulate, forced_ratio
+from harness.importance.functions import (
+    accumulate,
+    challenges_nobody,
+    forced_ratio,
+    propose_acceleration,
+    propose_cut_in,
+)
 from harness.maneuvers import CUT_IN, N_ACCELERATIONS, STAY
-from harness.traffic.cut_in import acceptance, cut_in_hazard, opportunity
-from harness.traffic.driving import acceleration_pmf, draw_acceleration, free_driving
+from harness.traffic.laws import (
+    acceleration_pmf,
+    acceptance,
+    cut_in_hazard,
+    draw_acceleration,
+    free_driving,
+    opportunity,
+)
 from harness.vocabulary import EPISODE_MIXTURE, FORCED, NDE, STEP_MIXTURE, FloatArray, State
 
 

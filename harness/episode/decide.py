@@ -11,7 +11,7 @@ from harness.episode.critical_moment import begin_cut_in, choose_lane, controlle
 from harness.importance.functions import look_ahead
 from harness.maneuvers import acceleration
 from harness.random_stream import BV_DRAWS, BV_FREE_DRAWS, LV_DRAWS, uniform
-from harness.traffic.driving import car_following, draw_acceleration, free_driving
+from harness.traffic.laws import car_following, draw_acceleration, free_driving
 from harness.vocabulary import BV, LV, State
 
 

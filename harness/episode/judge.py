@@ -10,7 +10,7 @@ from harness.compiled import compiled, compiled_inline
 from harness.episode.beside import note_if_ahead
 from harness.episode.cells import Bench, state_of
 from harness.episode.motion import mixed
-from harness.importance.likelihood import log_weight
+from harness.importance.functions import log_weight
 from harness.vehicles.kinematics import CONTACT_M, STEP_S, overlaps
 from harness.vocabulary import (
     AV,

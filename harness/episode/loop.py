@@ -27,11 +27,11 @@ from harness.episode.judge import PASSED_M, PASSED_UNDER_CONTROL_M, fail, judge
 from harness.episode.respond import command, empty_observation, first, observe, respond
 from harness.errors import WorldDisagreementError
 from harness.importance.functions import Importance
-from harness.traffic.driving import Environment
 from harness.traffic.lateral import LateralMotion, in_one_step
+from harness.traffic.laws import Environment
 from harness.unboxed import unboxed
+from harness.vehicles.drivers import driver_records
 from harness.vehicles.kinematics import STEP_S
-from harness.vehicles.models import driver_records
 from harness.vocabulary import AV, CRASH, FAILED, BoolArray, FloatArray, IntArray, RecordArray
 from harness.worlds.protocol import AVLostError, DrivingWorld, World
 

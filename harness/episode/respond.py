@@ -12,8 +12,7 @@ from harness.controllers.protocol import BatchObservation
 from harness.episode.cells import Bench
 from harness.traffic.lateral import lateral_position, perceived_in
 from harness.vehicles.kinematics import STEP_S, gap, next_speed
-from harness.vehicles.reaction import react, reaction_steps
-from harness.vehicles.references import Memory
+from harness.vehicles.references import Memory, react, reaction_steps
 from harness.vocabulary import AV, BV, LV, FloatArray, IntArray, read_only
 
 

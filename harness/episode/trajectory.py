@@ -14,12 +14,19 @@ import numpy as np
 from harness.compiled import compiled_inline, compiled_threads
 from harness.maneuvers import acceleration
 from harness.random_stream import BV_DRAWS, BV_FREE_DRAWS, LV_DRAWS, uniform
-from harness.traffic.cut_in import acceptance, cut_in_hazard, opportunity
-from harness.traffic.driving import Environment, car_following, draw_acceleration, free_driving
 from harness.traffic.lateral import onset_of, perceived_in
+from harness.traffic.laws import (
+    Environment,
+    acceptance,
+    car_following,
+    cut_in_hazard,
+    draw_acceleration,
+    free_driving,
+    opportunity,
+)
+from harness.vehicles.drivers import NEED_BASED_KIND
 from harness.vehicles.kinematics import CONTACT_M, VEHICLE_LENGTH_M, gap, next_position, next_speed, overlaps
-from harness.vehicles.models import NEED_BASED_KIND
-from harness.vehicles.reaction import nothing_yet, react
+from harness.vehicles.references import nothing_yet, react
 from harness.vocabulary import (
     AV,
     BV,

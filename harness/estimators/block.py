@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from harness.strata import KnownRates, ShellDesign
+from harness.strata import ShellDesign
 from harness.vocabulary import SAMPLING, BoolArray, FloatArray, IntArray, Method
 
 MAX_CONTROL_STEPS = 9
@@ -52,8 +52,6 @@ class Block:
         and what is known of the strata.
     ahead : (n,) bool or None
         Whether the vehicle was ever ahead of the boundary that a statement checks; None where none is.
-    surrogates_crash, known_rates : (n, D) bool, KnownRates, or None
-        Which surrogates of a pool would have crashed on the same traffic, and their crash rates; only where asked for.
     """
 
     first_episode: int
@@ -74,15 +72,12 @@ class Block:
     cell_mass: FloatArray | None = None
     shells: ShellDesign | None = None
     ahead: BoolArray | None = None
-    surrogates_crash: BoolArray | None = None
-    known_rates: KnownRates | None = None
 
     def __post_init__(self) -> None:
         n = len(self.crash)
         wide = {
             "log_q": (n, len(self.alpha)),
             "first_ratios": (n, MAX_CONTROL_STEPS, None),
-            "surrogates_crash": (n, None),
             "cell_mass": (n, None),
         }
         for name, array in columns_of(self).items():

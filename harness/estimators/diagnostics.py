@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from harness.estimators.alarm import Alarm
 from harness.estimators.block import Block
 from harness.estimators.weighted import Moments
 from harness.vocabulary import SAMPLING, Method
@@ -32,7 +31,6 @@ class Diagnostics:
     def __init__(self) -> None:
         self.n = self.n_failed = self.n_cut_ins = self.n_contacts = 0
         self.method: Method | None = None
-        self.alarm = Alarm()
         self._weight, self._cut_in, self._contact = Moments(), Moments(), Moments()
         self._ratios: list[Moments] = []
 
@@ -40,7 +38,6 @@ class Diagnostics:
         """Add one block."""
         weights = block.weights()
         self.method = block.method
-        self.alarm.add(block)
         self.n += len(block)
         self.n_failed += int(np.count_nonzero(block.failed))
         self.n_cut_ins += int(np.count_nonzero(block.cut_in))

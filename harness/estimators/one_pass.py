@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -126,8 +126,6 @@ class CampaignFacts:
         When the run ended and which condition decided, in a sentence; None while it goes on.
     decision : dict or None
         What the run has found about the limit that it was asked about; `harness.estimators.stopping.Decision`.
-    no_surrogates : str
-        Why surrogates were not asked about the tests, where they were not.
     """
 
     name: str
@@ -140,7 +138,6 @@ class CampaignFacts:
     repeated: dict[str, Any] | None = None
     ending: str | None = None
     decision: dict[str, Any] | None = None
-    no_surrogates: str = "the blocks do not say what surrogates would have done"
 
 
 def estimate_blocks(
@@ -160,14 +157,8 @@ def estimate_blocks(
     best = done.headline_estimate
     estimates = {done.headline: best, **done.estimates}
     distance_km = None if facts.distance_per_test_m is None else facts.distance_per_test_m / 1000.0
-    rates = done.diagnostics.alarm.result() or {"reason": facts.no_surrogates}
-    alarm = {
-        "raised": bool(rates.get("raised")),
-        "retraced": facts.retraced or {"reason": "the run did not retrace its episodes"},
-        "surrogate_crash_rates": rates,
-    }
-    cautions = say.alarm_cautions(alarm)
-    statements = {name: _said(found, facts, distance_km, cautions) for name, found in estimates.items()}
+    retraced = facts.retraced or {"reason": "the run did not retrace its episodes"}
+    statements = {name: _said(found, facts, distance_km) for name, found in estimates.items()}
     return finite_json(
         {
             "campaign": facts.name,
@@ -180,7 +171,7 @@ def estimate_blocks(
             "distance_per_test_km": distance_km,
             "crash_rate_per_1e6_km": None if distance_km is None else say.per_distance(best, distance_km),
             "estimates": {name: estimate.to_json() for name, estimate in estimates.items()},
-            "diagnostics": {**done.diagnostics.result(facts.importance_names), "alarm": alarm},
+            "diagnostics": {**done.diagnostics.result(facts.importance_names), "alarm": {"retraced": retraced}},
             "convergence": done.convergence,
             "statement": statements[done.headline],
             "statements": statements,
@@ -193,12 +184,10 @@ def estimate_blocks(
     )
 
 
-def _said(found: Estimate | Unavailable, facts: CampaignFacts, distance_km: float | None, alarm: Sequence[str]) -> str:
+def _said(found: Estimate | Unavailable, facts: CampaignFacts, distance_km: float | None) -> str:
     """What an estimator says, led by what it must be warned of and the first reference driver; or why it cannot."""
     if isinstance(found, Unavailable):
         return f"No crash rate from these records: {found.reason.rstrip('.')}."
     answer = say.statement(found, facts.lane_change_level, distance_km)
-    text = say.warned(
-        [*alarm, *say.repeated_cautions(facts.repeated)], " ".join([*say.reference_statements(found)[:1], answer])
-    )
+    text = say.warned(say.repeated_cautions(facts.repeated), " ".join([*say.reference_statements(found)[:1], answer]))
     return text + say.failed_statement(found.details) + say.repeated_statement(facts.repeated)

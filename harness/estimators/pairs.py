@@ -10,16 +10,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from harness.estimators.block import Block
-from harness.estimators.difference import apart_statement, failed_pairs_statement, rates_statement
 from harness.estimators.estimate import Estimate, FailureBounds, finite_json
 from harness.estimators.likelihood import Level, contrast_limit, ratio_limits, spread
 from harness.estimators.shells import Shells
+from harness.estimators.statement import warned
 from harness.estimators.tally import Tally, mean_square
 from harness.strata import ShellDesign
 from harness.vocabulary import BoolArray, FloatArray, IntArray
@@ -40,6 +40,32 @@ def _kinds(failed_a: bool, failed_b: bool) -> tuple[BoolArray, ...]:
 
 
 MarginVerdict = Literal["proven", "refuted", "open"]
+
+
+@dataclass(frozen=True)
+class MarginDecision:
+    """Whether B's rate is at most 1 + ``margin`` times A's; ``given_the_library`` it is asked of what lies inside."""
+
+    margin: float
+    verdict: MarginVerdict
+    confidence: float
+    given_the_library: bool
+
+    def after(self, pairs: PairCounts) -> MarginDecision:
+        """The same, after more pairs."""
+        return replace(self, verdict=pairs.verdict(self.margin, Level.two_sided(self.confidence)))
+
+    @property
+    def sentence(self) -> str:
+        """The verdict in words."""
+        answer = {
+            "proven": "B is not worse than A by more than",
+            "refuted": "B IS WORSE than A by more than",
+            "open": "It is open whether B is worse than A by more than",
+        }[self.verdict]
+        given = ", given the library" if self.given_the_library else ""
+        looks = f" (decided at {self.confidence:.1%}, which allows for a look after each round)"
+        return f"{answer} {self.margin:.3g} times A's rate{given}{looks}."
 
 
 class Interval(NamedTuple):
@@ -364,18 +390,6 @@ def conditional_paired_statement(found: PairedEstimate) -> str:
     return f"{text} In {found.free.n_pairs - inside.n_pairs:,} pairs of tests outside neither crashed."
 
 
-def margin_statement(verdict: MarginVerdict, margin: float, level: float, *, conditional: bool) -> str:
-    """Whether B is worse than A by more than a margin."""
-    answer = {
-        "proven": "B is not worse than A by more than",
-        "refuted": "B IS WORSE than A by more than",
-        "open": "It is open whether B is worse than A by more than",
-    }[verdict]
-    given = ", given the library" if conditional else ""
-    looks = f" (decided at {level:.1%}, which allows for a look after each round)"
-    return f"{answer} {margin:.3g} times A's rate{given}{looks}."
-
-
 def _apart(found: Contrast, confidence: float) -> str:
     differs = found.n_differing > 0
     apart = apart_statement(found.difference, found.ci_low, found.ci_high, confidence, differs=differs)
@@ -393,3 +407,34 @@ def _crashed_outside(found: PairedEstimate) -> Iterator[str]:
     for side, name in enumerate("AB"):
         if n := int(found.pairs.tally(side).crashes[found.pairs.design.library.n_inside :].sum()):
             yield f"{name} has {n:,} times"
+
+
+def rates_statement(a: Estimate, b: Estimate, name_a: str, name_b: str) -> str:
+    """Both rates with their intervals, after what may be wrong about them."""
+    cautions = [f"{name}: {text}" for name, of in (("A", a), ("B", b)) for text in of.cautions]
+    return warned(
+        cautions,
+        f"A ({name_a}) crashes {a.crash_rate:.3g} times per test ({a.ci_low:.3g} to {a.ci_high:.3g}), "
+        f"B ({name_b}) {b.crash_rate:.3g} times ({b.ci_low:.3g} to {b.ci_high:.3g})",
+    )
+
+
+def apart_statement(difference: float, low: float, high: float, confidence: float, *, differs: bool) -> str:
+    """Which of them crashes more often, and by how much."""
+    verdict = "the difference is not distinguishable from 0"
+    if differs and low > 0.0:
+        verdict = "A crashes more often"
+    elif differs and high < 0.0:
+        verdict = "A crashes less often"
+    return f"{verdict}, A - B = {difference:.3g} ({confidence:.0%} interval {low:.3g} to {high:.3g})"
+
+
+def failed_pairs_statement(a: Estimate, b: Estimate) -> str:
+    """How failed tests count; nothing where none has failed."""
+    of_a, of_b = a.details["n_failed"], b.details["n_failed"]
+    if not of_a and not of_b:
+        return ""
+    return (
+        f" Of these tests A FAILED in {of_a:,} and B in {of_b:,}: each limit counts them as crashes or as none, "
+        "whichever takes it farther."
+    )

@@ -208,7 +208,8 @@ class Shells:
             details=asdict(
                 ShellDetails(
                     pool=design.pool,
-                    **free.from_pool_relative(),
+                    rhw_from_pool=free.from_pool_relative()[0],
+                    rhw_from_pool_at_least=free.from_pool_relative()[1],
                     p_cut_in=design.p_cut_in,
                     p_impossible=design.p_impossible,
                     references=() if cautions else compared(design, self._cells, Level.two_sided(confidence)),
@@ -276,7 +277,8 @@ class Shells:
             ci_low=limits.low,
             ci_high=limits.high,
             rhw=limits.rhw,
-            **limits.from_pool_relative(),
+            rhw_from_pool=limits.from_pool_relative()[0],
+            rhw_from_pool_at_least=limits.from_pool_relative()[1],
             n_episodes=int(inside.tests.sum()),
             n_crashes=int(inside.crashes.sum()),
             n_failed=int(inside.failed.sum()),

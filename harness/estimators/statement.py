@@ -169,14 +169,3 @@ def repeated_cautions(repeated: Mapping[str, Any] | None) -> list[str]:
         f"{n_differing:,} of {n:,} tests that were run a second time DIFFERED: this vehicle is not reproducible; its "
         "tests cannot be replayed, and depend on what ran beside and before them"
     ]
-
-
-def alarm_cautions(alarm: Mapping[str, Any]) -> list[str]:
-    """What a raised alarm (``diagnostics.alarm``) says about every estimate of the run; empty without one."""
-    if not alarm["raised"]:
-        return []
-    rates = alarm["surrogate_crash_rates"]
-    return [
-        f"ALARM, replayed surrogates do not crash as often as the pool says (p-value {rates['p_value']:.1e}): weights, "
-        "maneuvers, twin or pool are wrong; see diagnostics.alarm"
-    ]

@@ -1,19 +1,21 @@
-"""When a campaign may stop: a precision asked for beforehand, looked for at places fixed beforehand.
+"""When tests are enough: a precision asked for beforehand, looked for at places fixed beforehand; or a decision.
 
-Looking after every test and stopping at the first narrow interval favours runs that were narrow by luck; and while the
-rare crashes of large weight have not occurred, mean, standard error and largest weight seen are all too small. So looks
-follow from the campaign alone, two in a row must pass, and one more crash of the largest weight that the design allows
-may move the estimate by no more than the half-width asked for: cap/(n·rate) ≤ RHW (docs/estimators.md).
-
-Ratio 1.1: since the half-width shrinks with 1/√n, neighbouring looks differ by 5 % in precision, which is the noise of
-the half-width itself at the default floor of 100 crashes (half of 1/√100); a finer grid mostly repeats the same look.
-With two passes a campaign uses about 20 % more tests than a fixed size would need, with a ratio of 1.25 nearly 50 %.
+Whatever the tests were drawn from, a rule looks at them now and then, leaves what it has found in ``look``, and says
+whether to go on. Looking after every test and stopping at the first narrow interval favours runs that were narrow by
+luck; and while the rare crashes of large weight have not occurred, mean, standard error and largest weight seen are all
+too small. So looks at weighted tests (`StopRule`) follow from the campaign alone, two in a row must pass, and one more
+crash of the largest weight that the design allows may move the estimate by no more than the half-width asked for:
+cap/(n·rate) ≤ RHW. Tests drawn from shells (`RoundRule`) and pairs of tests of two vehicles (`PairRule`) are looked at
+after each round, and once is enough. That limits hold at a fixed number of tests says nothing about the number at which
+a rule stops: that intervals cover there, and how far rates are biased, is measured (docs/estimators.md,
+docs/compare.md).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from bisect import bisect_right
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
@@ -21,32 +23,23 @@ from harness.campaign.campaign import Campaign
 from harness.campaign.sections import Stop
 from harness.estimators.estimate import Estimate
 from harness.estimators.likelihood import Level
-from harness.estimators.pairs import MarginVerdict, PairCounts
+from harness.estimators.pairs import MarginDecision, PairCounts
 from harness.estimators.shells import Shells
-from harness.estimators.tally import RateLimits
 from harness.strata import ASSUMPTION_FREE
 from harness.vocabulary import SAMPLING, EstimatorName, Method
 
 LOOK_RATIO = 1.1
+"""Of neighbouring looks: since the half-width shrinks with 1/√n, they differ by 5 % in precision, which is the noise of
+the half-width itself at the default floor of 100 crashes (half of 1/√100); a finer grid mostly repeats the same look.
+With two passes a campaign uses about 20 % more tests than a fixed size would need, at a ratio of 1.25 nearly 50 %."""
 PASSES_NEEDED = 2
 DEFAULT_MIN_CRASHES = 100
-
-
-def look_grid(n_episodes: int, shard_size: int, ratio: float = LOOK_RATIO) -> tuple[int, ...]:
-    """Numbers of episodes at which a campaign is looked at, ascending.
-
-    The last is `n_episodes`, all others are multiples of ``shard_size``, nearest to a geometric grid of this ratio.
-    """
-    looks: list[int] = []
-    target = float(shard_size)
-    while target < n_episodes:
-        boundary = max(1, math.floor(target / shard_size + 0.5)) * shard_size
-        if boundary < n_episodes and (not looks or boundary > looks[-1]):
-            looks.append(boundary)
-        target *= ratio
-    return (*looks, n_episodes)
-
-
+FIRST_TESTS = "the first tests of each shell (testing.shells.first_tests)"
+POOL_SHARE = 0.5
+"""Share of the squared width from the pool's own error above which more tests hardly narrow an interval."""
+MARGIN_LOOKS = 6
+"""A margin is decided at a level that leaves out so many times less than the campaign's, as it is looked at after each
+round. Measured where B's rate is 1 + margin times A's, by looks from 40 to 3,000 pairs: docs/compare.md."""
 Verdict = Literal["accepted", "rejected", "undecided"]
 
 
@@ -96,41 +89,43 @@ class Decision:
         """The verdict in words."""
         given = "" if self.statement == ASSUMPTION_FREE else f", given statement {self.statement},"
         level, limit = f"{self.confidence:.3g}", f"{self.crash_rate_below:.3g}"
-        if self.contradicted and self.verdict == "undecided":
+        if self.verdict != "undecided":
+            side, word, shown = ("below", "upper", self.high)
+            if self.verdict == "rejected":
+                side, word, shown = ("above", "lower", self.low)
+            return (
+                f"{self.verdict.upper()}: with confidence {level} the crash rate{given} is {side} {limit} per test "
+                f"({word} limit {shown:.3g})."
+            )
+        if self.contradicted:
             return (
                 f"UNDECIDED: whether the crash rate is below {limit} per test is not known: the vehicle does not do "
                 f"what statement {self.statement} assumes. Ask for accept.statement: {ASSUMPTION_FREE}, and use a new "
                 "folder."
             )
-        if self.verdict == "undecided":
-            between = f"it may be {self.low:.3g} as well as {self.high:.3g}"
-            return f"UNDECIDED: whether the crash rate{given} is below {limit} per test is not known; {between}."
-        side, shown = ("below", self.high) if self.verdict == "accepted" else ("above", self.low)
-        word = "upper" if side == "below" else "lower"
-        return (
-            f"{self.verdict.upper()}: with confidence {level} the crash rate{given} is {side} {limit} per test "
-            f"({word} limit {shown:.3g})."
-        )
+        between = f"it may be {self.low:.3g} as well as {self.high:.3g}"
+        return f"UNDECIDED: whether the crash rate{given} is below {limit} per test is not known; {between}."
 
     def to_json(self) -> dict[str, Any]:
         """All of it."""
         return {"verdict": self.verdict, **asdict(self), "sentence": self.sentence}
 
 
-class Rule:
-    """Looks at results, and says why a run ended.
+@dataclass(frozen=True)
+class Look:
+    """What a rule has found at its last look.
 
     Attributes
     ----------
-    reached : bool
-        Whether the asked precision, or decision, was reached; always False when none was asked.
     rhw : float
-        Relative half-width at the last look; infinite where the interval may be wrong.
-    heaviest : float
-        By how much of itself one more crash of the largest weight would have moved the last look's estimate; 0 for
-        limits within shells, which allow for every crash that has not been seen.
-    waited_for : tuple of str
-        Conditions that were missing when a look last failed: what decided, or what is still missing.
+        Relative half-width; infinite where the interval may be wrong.
+    one_more_crash : float
+        By how much of itself one more crash of the largest weight would have moved the estimate; 0 for limits within
+        shells, which allow for every crash that has not been seen.
+    stopped : bool
+        Whether the asked precision, or decision, was reached; always False when none was asked.
+    unmet : tuple of str
+        Conditions that were not met when a look last failed: what decided, or what is still missing.
     pool_error_above_target : bool
         Whether the error of the pool, which no test narrows, is too large for the asked precision.
     decision : Decision or None
@@ -138,21 +133,76 @@ class Rule:
         for.
     """
 
-    def __init__(self, target: float | None, min_crashes: int) -> None:
-        self._target, self._min_crashes = target, min_crashes
-        self.reached = self.pool_error_above_target = False
-        self.rhw, self.heaviest = math.inf, 0.0
-        self.waited_for: tuple[str, ...] = ()
-        self.decision: Decision | None = None
+    rhw: float = math.inf
+    one_more_crash: float = 0.0
+    stopped: bool = False
+    unmet: tuple[str, ...] = ()
+    pool_error_above_target: bool = False
+    decision: Decision | None = None
 
 
-def missing(met: Mapping[str, bool]) -> tuple[str, ...]:
-    """Names of the conditions that are not met."""
-    return tuple(condition for condition, is_met in met.items() if not is_met)
+class Rule:
+    """Looks at results, leaves what it found in ``look``, and says when they are enough.
+
+    ``target`` is the relative half-width that is asked for, None where only the budget ends the tests; ``passes`` is
+    how many looks in a row must find it.
+    """
+
+    def __init__(self, target: float | None, min_crashes: int, *, passes: int = 1) -> None:
+        self._target, self._min_crashes, self._needed = target, min_crashes, passes
+        self._passes = 0
+        self.look = Look()
+
+    def _looked(
+        self,
+        rhw: float,
+        met: Mapping[str, bool],
+        *,
+        one_more_crash: float = 0.0,
+        also: str | None = None,
+        pool: tuple[float, float] = (0.0, 0.0),
+    ) -> bool:
+        """Note a look at a precision; whether to stop.
+
+        Parameters
+        ----------
+        rhw, one_more_crash : float
+            See `Look`.
+        met : mapping
+            Conditions by name, and whether they are met.
+        also : str, optional
+            What these results were waited for besides, if nothing else is unmet.
+        pool : (float, float)
+            Half-widths that the pool's own error would leave by itself, as it was seen, and at least.
+        """
+        unmet = tuple(condition for condition, is_met in met.items() if not is_met)
+        self._passes = 0 if unmet else self._passes + 1
+        stopped = self._passes >= self._needed
+        remembered = unmet or ((also,) if also else self.look.unmet)
+        too_rough = self._target is not None and pool[1] > self._target
+        self.look = Look(rhw, one_more_crash, stopped, remembered, too_rough)
+        return stopped or (too_rough and pool[0] ** 2 >= POOL_SHARE * rhw**2)
+
+
+def look_grid(n_episodes: int, shard_ends: Sequence[int], ratio: float = LOOK_RATIO) -> tuple[int, ...]:
+    """Numbers of episodes at which a campaign is looked at, ascending.
+
+    The last is `n_episodes`, all others are of ``shard_ends``, nearest to a geometric grid of this ratio.
+    """
+    looks: list[int] = []
+    target = float(shard_ends[0])
+    while target < n_episodes:
+        place = bisect_right(shard_ends, target)
+        below, above = shard_ends[max(place - 1, 0)], shard_ends[place]
+        nearest = below if target - below < above - target else above
+        if nearest < n_episodes and (not looks or nearest > looks[-1]):
+            looks.append(nearest)
+        target *= ratio
+    return (*looks, n_episodes)
 
 
 class StopRule(Rule):
-    """Fed with the estimate at each look in turn; says when to stop.
+    """Fed with the estimate of weighted tests at each look in turn.
 
     Parameters
     ----------
@@ -160,7 +210,7 @@ class StopRule(Rule):
         The campaign's ``stop`` section.
     method : str
         ``testing.method``; decides whose interval is watched unless ``stop.estimator`` does.
-    shard_size, ratio
+    shard_ends, ratio
         See `look_grid`.
     min_crashes : int
         Floor on sampled crashes where ``stop.min_crashes`` says nothing.
@@ -177,20 +227,20 @@ class StopRule(Rule):
         self,
         campaign_stop: Stop,
         method: Method,
-        shard_size: int,
+        shard_ends: Sequence[int],
         ratio: float = LOOK_RATIO,
         *,
         min_crashes: int = DEFAULT_MIN_CRASHES,
     ) -> None:
-        super().__init__(campaign_stop.rhw, campaign_stop.min_crashes or min_crashes)
+        super().__init__(campaign_stop.rhw, campaign_stop.min_crashes or min_crashes, passes=PASSES_NEEDED)
         self.estimator: EstimatorName = campaign_stop.estimator or SAMPLING[method].headline
-        self.looks = look_grid(campaign_stop.episodes, shard_size, ratio)
-        self.heaviest = math.inf
-        self._n_seen = self._n_passes = 0
+        self.looks = look_grid(campaign_stop.episodes, shard_ends, ratio)
+        self.look = Look(one_more_crash=math.inf)
+        self._n_looks = 0
 
     def due(self, n: int) -> bool:
         """Whether `observe` wants the estimate of the first ``n`` episodes."""
-        return self._n_seen < len(self.looks) and n == self.looks[self._n_seen]
+        return self._n_looks < len(self.looks) and n == self.looks[self._n_looks]
 
     def observe(self, n: int, estimate: Estimate) -> bool:
         """Whether to stop after the look at `n` episodes, the next of `looks`, with the estimate from exactly these.
@@ -200,69 +250,34 @@ class StopRule(Rule):
         ValueError
             If looks are skipped, repeated or taken elsewhere: the rule is valid only as declared.
         """
-        if self.reached or self._n_seen == len(self.looks):
-            raise ValueError("the campaign has already stopped")
-        if not self.due(n) or estimate.n_episodes != n:
-            raise ValueError(
-                f"expected the estimate of the first {self.looks[self._n_seen]} episodes, "
-                f"got n = {n} with an estimate of {estimate.n_episodes}"
-            )
-        self._n_seen += 1
-        self.rhw = estimate.precision
-        total = n * estimate.crash_rate
-        self.heaviest = estimate.weight_cap / total if total > 0.0 else math.inf
-        last = self._n_seen == len(self.looks)
+        if self.look.stopped or not self.due(n) or estimate.n_episodes != n:
+            raise ValueError(f"no look is due at {n} episodes with an estimate of {estimate.n_episodes}")
+        self._n_looks += 1
+        last, total = self._n_looks == len(self.looks), n * estimate.crash_rate
+        rhw, one_more = estimate.precision, estimate.weight_cap / total if total > 0.0 else math.inf
         if self._target is None:
+            self.look = Look(rhw, one_more)
             return last
-        found = missing(
-            {
-                f"stop.rhw ({self._target:g})": self.rhw <= self._target,
-                f"stop.rhw ({self._target:g}) for one more crash of the largest possible weight": self.heaviest
-                <= self._target,
-                f"stop.min_crashes ({self._min_crashes:,})": estimate.n_crashes >= self._min_crashes,
-            }
-        )
-        self._n_passes = 0 if found else self._n_passes + 1
-        self.reached = self._n_passes >= PASSES_NEEDED
-        self.waited_for = found or self.waited_for
-        if last and self._n_passes and not self.reached:
-            self.waited_for = ("the same at a second look",)
-        return self.reached or last
+        wanted = f"stop.rhw ({self._target:g})"
+        conditions = {
+            wanted: rhw <= self._target,
+            f"{wanted} for one more crash of the largest possible weight": one_more <= self._target,
+            f"stop.min_crashes ({self._min_crashes:,})": estimate.n_crashes >= self._min_crashes,
+        }
+        first_pass_at_last = last and self._passes == 0 and all(conditions.values())
+        also = "the same at a second look" if first_pass_at_last else None
+        return self._looked(rhw, conditions, one_more_crash=one_more, also=also) or last
 
 
-FIRST_TESTS = "the first tests of each shell (testing.shells.first_tests)"
-POOL_SHARE = 0.5
-"""Share of the squared width from the pool's own error above which more tests hardly narrow an interval."""
-LOOKS = 6
-"""A margin is decided at a level that leaves out so many times less than the campaign's, as it is looked at after each
-round. Measured where B's rate is 1 + margin times A's, by looks from 40 to 3,000 pairs: docs/compare.md."""
+class RoundRule(Rule):
+    """Looks at the crash rate from shells after each round, or whether it is below a limit.
 
-
-class _AfterRounds(Rule):
-    """Looks after each round, and is content with one pass.
-
-    ``of_first_tests`` says whether the round brings the tests that every shell gets before anything is decided of it.
+    ``held`` is the number of tests that the run folder holds: before them nothing is given up, whatever precision is
+    asked for now. The precision is ``factor`` times wider than the one that the campaign asks for. ``of_first_tests``
+    says whether the round brings the tests that every shell gets before anything is decided of it.
     """
 
     of_first_tests = False
-
-    def _is_hopeless(self, target: float, pool: float, at_least: float) -> bool:
-        """Whether the pool's own error, as seen and at least, is too large, and nearly all that is left."""
-        self.pool_error_above_target = at_least > target
-        return self.pool_error_above_target and pool**2 >= POOL_SHARE * self.rhw**2
-
-
-class RoundRule(_AfterRounds):
-    """Looks at a crash rate, or whether it is below a limit.
-
-    Parameters
-    ----------
-    campaign : Campaign
-    held : int
-        Tests that the run folder holds: before them nothing is given up, whatever precision is asked for now.
-    factor : float
-        By which the precision is wider than the one that the campaign asks for.
-    """
 
     def __init__(self, campaign: Campaign, held: int = 0, factor: float = 1.0) -> None:
         rhw = campaign.stop.rhw
@@ -272,79 +287,65 @@ class RoundRule(_AfterRounds):
 
     def observe(self, seen: Shells) -> bool:
         """Whether to stop at the end of a round, with all tests so far."""
-        watched, n_crashes = seen.limits_of(self._statement, self._confidence), int(seen.tally.crashes.sum())
-        self.rhw = watched.rhw
+        limits, tally = seen.limits_of(self._statement, self._confidence), seen.tally
         if self._accept is not None:
-            return self._decide(watched, self._accept.crash_rate_below, contradicted=seen.contradicts(self._statement))
+            limit, one_sided = self._accept.crash_rate_below, (1.0 + self._confidence) / 2.0
+            contradicted = seen.contradicts(self._statement)
+            found = Decision(limit, self._statement, one_sided, limits.low, limits.high, contradicted)
+            unmet = (f"accept.crash_rate_below ({limit:g})",)
+            self.look = Look(limits.rhw, stopped=found.verdict != "undecided", unmet=unmet, decision=found)
+            return found.is_final
         if self._target is None:
+            self.look = Look(limits.rhw)
             return False
-        found = missing(
-            {
-                f"stop.rhw ({self._target:g})": self.rhw <= self._target,
-                f"stop.min_crashes ({self._min_crashes:,})": n_crashes >= self._min_crashes,
-            }
-        )
-        if found or self.of_first_tests:
-            self.waited_for = found or (FIRST_TESTS,)
-        if n_crashes < self._min_crashes:
-            return False
-        self.reached = not found
-        pool = watched.from_pool_relative()
-        hopeless = self._is_hopeless(self._target, pool["rhw_from_pool"], pool["rhw_from_pool_at_least"])
-        return self.reached or (hopeless and seen.tally.tests.sum() >= self._held)
-
-    def _decide(self, watched: RateLimits, limit: float, *, contradicted: bool) -> bool:
-        one_sided = (1.0 + self._confidence) / 2.0
-        self.decision = Decision(limit, self._statement, one_sided, watched.low, watched.high, contradicted)
-        self.reached = self.decision.verdict != "undecided"
-        self.waited_for = (f"accept.crash_rate_below ({limit:g})",)
-        return self.decision.is_final
+        enough_crashes = int(tally.crashes.sum()) >= self._min_crashes
+        conditions = {
+            f"stop.rhw ({self._target:g})": limits.rhw <= self._target,
+            f"stop.min_crashes ({self._min_crashes:,})": enough_crashes,
+        }
+        pool = limits.from_pool_relative() if enough_crashes else (0.0, 0.0)
+        also = FIRST_TESTS if self.of_first_tests else None
+        enough = self._looked(limits.rhw, conditions, also=also, pool=pool)
+        return self.look.stopped or (enough and tally.tests.sum() >= self._held)
 
 
 def decision_confidence(confidence: float) -> float:
     """Confidence at which a margin is decided, by looks after every round."""
-    return 1.0 - (1.0 - confidence) / LOOKS
+    return 1.0 - (1.0 - confidence) / MARGIN_LOOKS
 
 
-class PairRule(_AfterRounds):
-    """Looks at the difference, or whether B is worse than A by more than a margin.
+class PairRule(Rule):
+    """Looks at the difference of two vehicles after each round, or whether B is worse than A by more than a margin.
 
-    Attributes
-    ----------
-    rhw : float
-        That of the difference, over the larger rate.
-    verdict : {"proven", "refuted", "open"} or None
-        Whether B's rate is at most 1 + margin times A's; None without a margin.
-    conditional : bool
-        Whether only what lies within the boundary is looked at.
+    ``look.rhw`` is that of the difference, over the larger rate; ``margin`` is what is known about the margin, None
+    where none is asked about; ``conditional`` says whether only what lies within the boundary is looked at.
+    ``of_first_tests`` see `RoundRule`: here nothing stops in such a round.
     """
+
+    of_first_tests = False
 
     def __init__(self, campaign: Campaign, margin: float | None) -> None:
         super().__init__(campaign.stop.rhw, campaign.min_crashes)
-        self._margin, self._confidence = margin, campaign.stop.confidence
-        self._statement = campaign.testing.shells.statement
-        self.conditional = self._statement != ASSUMPTION_FREE
-        self.verdict: MarginVerdict | None = None if margin is None else "open"
+        self._confidence, self._statement = campaign.stop.confidence, campaign.testing.shells.statement
+        self.conditional, level = self._statement != ASSUMPTION_FREE, decision_confidence(self._confidence)
+        self.margin = None if margin is None else MarginDecision(margin, "open", level, self.conditional)
 
     def observe(self, pairs: PairCounts) -> bool:
         """Whether to stop at the end of a round."""
         watched, level = pairs.inside(pairs.design.n_within(self._statement)), Level.two_sided(self._confidence)
-        self.rhw = watched.rhw(level)
-        if self._margin is not None:
-            self.verdict = watched.verdict(self._margin, Level.two_sided(decision_confidence(self._confidence)))
-            self.reached = self.verdict != "open"
-            self.waited_for = (f"--margin ({self._margin:g})",)
-            return self.reached
+        rhw = watched.rhw(level)
+        if self.margin is not None:
+            self.margin = self.margin.after(watched)
+            stopped = self.margin.verdict != "open"
+            self.look = Look(rhw, stopped=stopped, unmet=(f"--margin ({self.margin.margin:g})",))
+            return stopped
         if self._target is None:
+            self.look = Look(rhw)
             return False
-        found = missing(
-            {
-                f"stop.rhw ({self._target:g}, of the difference)": self.rhw <= self._target,
-                f"stop.min_crashes ({self._min_crashes:,})": pairs.n_crashes >= self._min_crashes,
-                FIRST_TESTS: not self.of_first_tests,
-            }
-        )
-        self.waited_for = found or self.waited_for
-        self.reached = not found
+        conditions = {
+            f"stop.rhw ({self._target:g}, of the difference)": rhw <= self._target,
+            f"stop.min_crashes ({self._min_crashes:,})": pairs.n_crashes >= self._min_crashes,
+            FIRST_TESTS: not self.of_first_tests,
+        }
         pool = watched.rhw_from_pool(level)
-        return self.reached or self._is_hopeless(self._target, pool, pool)
+        return self._looked(rhw, conditions, pool=(pool, pool))

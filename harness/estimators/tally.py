@@ -40,10 +40,10 @@ class RateLimits(NamedTuple):
         """Half of the interval's length over the rate; infinite at rate 0."""
         return (self.high - self.low) / 2.0 / self.rate if self.rate > 0.0 else math.inf
 
-    def from_pool_relative(self) -> dict[str, float]:
+    def from_pool_relative(self) -> tuple[float, float]:
         """The pool's part of `rhw`, and what of it more tests of the same pool will not take away; 0 at rate 0."""
         rate = self.rate if self.rate > 0.0 else math.inf
-        return {"rhw_from_pool": self.from_pool / rate, "rhw_from_pool_at_least": self.from_pool_at_least / rate}
+        return self.from_pool / rate, self.from_pool_at_least / rate
 
 
 class Tally(NamedTuple):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from harness.campaign.campaign import Campaign
-from harness.importance.after_cut_in import level_steps
+from harness.importance.challenge import level_steps
 from harness.importance.functions import Importance
 from harness.importance.tables import Tables
 from harness.vehicles.kinematics import CONTACT_M

@@ -18,12 +18,10 @@ import numpy as np
 
 from harness.compiled import cache_root
 from harness.errors import writing
-from harness.importance.after_cut_in import LEVELS, build_after_cut_in
-from harness.importance.before_cut_in import build_before_cut_in
+from harness.importance.challenge import LEVELS, build_after_cut_in, build_before_cut_in, build_immediate
 from harness.importance.grid import AFTER, BEFORE
-from harness.importance.immediate import build_immediate
-from harness.traffic.driving import Environment
-from harness.vehicles.models import MODEL_FIELDS
+from harness.traffic.laws import Environment
+from harness.vehicles.drivers import MODEL_FIELDS
 from harness.vocabulary import Float32Array, RecordArray
 
 _FORMAT = 3

@@ -17,8 +17,8 @@ from harness.episode.trajectory import Followers
 from harness.pool.enumeration import STRIDE, enumerate_cut_ins
 from harness.progress import Progress
 from harness.random_stream import DIAGNOSTIC, INITIAL, uniforms
-from harness.traffic.driving import Environment
 from harness.traffic.initial_state import InitialStates
+from harness.traffic.laws import Environment
 from harness.vocabulary import STATE_COLUMNS, FloatArray, IntArray, RecordArray
 
 PILOT_PATHS = 2048

@@ -13,7 +13,7 @@ from harness.pool.enumeration import write_script
 from harness.pool.library import Library
 from harness.progress import Progress
 from harness.random_stream import DIAGNOSTIC, uniforms
-from harness.traffic.driving import Environment
+from harness.traffic.laws import Environment
 from harness.vocabulary import BoolArray, FloatArray, Int8Array, IntArray
 
 ROUND_PATHS = 1024

@@ -12,7 +12,7 @@ import numpy as np
 
 from harness.pool.aimed_paths import PILOT_PATHS
 from harness.pool.library import Library
-from harness.traffic.driving import Environment
+from harness.traffic.laws import Environment
 from harness.vocabulary import BoolArray, Float32Array, FloatArray, Int8Array, IntArray, RecordArray, UInt64Array
 
 FAR_OFF = 10.0

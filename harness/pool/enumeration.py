@@ -31,9 +31,8 @@ from harness.episode.trajectory import (
 )
 from harness.maneuvers import CUT_IN, acceleration
 from harness.random_stream import LV_DRAWS, uniform
-from harness.traffic.cut_in import cut_in_hazard, opportunity
-from harness.traffic.driving import Environment, draw_acceleration, free_driving
 from harness.traffic.lateral import draw_lead
+from harness.traffic.laws import Environment, cut_in_hazard, draw_acceleration, free_driving, opportunity
 from harness.vehicles.kinematics import CONTACT_M, gap, next_speed
 from harness.vocabulary import LV, BoolArray, FloatArray, Int8Array, IntArray, RecordArray
 

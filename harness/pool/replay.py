@@ -1,9 +1,7 @@
-"""Stored episodes once more, without SUMO: what the twin says about them, and which surrogates would have crashed.
+"""Stored episodes once more, without SUMO: what the twin says about them.
 
 An episode's initial state and maneuvers determine LV's and BV's motion to the last bit, and the AV keeps its speed
-until the cut-in. So the twin can retrace what a world has done, and put any surrogate in the AV's place. Where the AV's
-crash ended the episode early, BV's free driving goes on under p with the episode's own random numbers: the weight of
-the episode is that of its control steps, whatever comes after them.
+until the cut-in. So the twin can retrace what a world has done.
 """
 
 from __future__ import annotations
@@ -17,34 +15,24 @@ from harness.compiled import compiled_inline, compiled_threads
 from harness.episode.trajectory import (
     NO_CRASH,
     WAS_AHEAD,
-    Followers,
     Trajectory,
-    empty_trajectory,
     end_in,
     follow,
     leave,
     state_in,
     walk,
-    who_crashes,
 )
-from harness.errors import CampaignError, RunFolderError
 from harness.maneuvers import CUT_IN
-from harness.pool.cut_ins import Pool, environment_hash
-from harness.records.folder import MEND_SHARD
-from harness.resolved import Resolved
-from harness.strata import KnownRates
-from harness.traffic.driving import Environment
 from harness.traffic.lateral import onset_of
-from harness.vehicles.reaction import reaction_steps
+from harness.traffic.laws import Environment
+from harness.vehicles.references import reaction_steps
 from harness.vocabulary import (
-    BV_LV_CONTACT,
     CRASH,
     FAILED,
     PASSED,
     RUNNING,
     STATE_COLUMNS,
     TIMEOUT,
-    BoolArray,
     FloatArray,
     Int8Array,
     IntArray,
@@ -215,91 +203,3 @@ def retrace(
     """
     for i in range(stored.cut_step.size):
         retrace_episode(i, stored, environment, driver, path, twin)
-
-
-@compiled_threads
-def replay_surrogates(
-    stored: StoredPaths,
-    environment: Environment,
-    followers: Followers,
-    path: Trajectory,
-    crashes: IntArray,
-) -> int:
-    """Which drivers would have crashed in each stored episode of an AV that keeps its speed until the cut-in.
-
-    ``crashes`` (n,) receives one bit per driver, none without a cut-in; ``path`` is room to work in. Returns the row
-    of the first episode whose maneuvers do not fit its steps, or -1.
-    """
-    max_steps = environment.numbers.max_steps
-    for i in range(stored.cut_step.size):
-        crashes[i] = 0
-        cut = stored.cut_step[i]
-        if cut < 0:
-            continue
-        decided, step = approach_cut_in(i, stored, environment, path)
-        if decided == BV_LV_CONTACT and step == cut + 1:
-            continue
-        if decided != RUNNING or not leave_stored(i, max_steps, stored, environment, path):
-            return i
-        crashes[i] = who_crashes(followers, cut, stored.lead[i], environment, path)
-    return -1
-
-
-def drivers_crash(episodes: pa.Table, seed: int, environment: Environment, followers: Followers) -> BoolArray:
-    """Which drivers (D,) would have crashed in the place of the AV, shape (n, D).
-
-    ``episodes`` are consecutive rows of the episodes table, with `PATH_COLUMNS`; ``seed`` is that of the campaign.
-
-    Raises
-    ------
-    RunFolderError
-        An episode's maneuvers do not fit its steps.
-    """
-    stored = stored_paths(episodes, seed)
-    bits = np.zeros(episodes.num_rows, np.int64)
-    wrong = replay_surrogates(stored, environment, followers, empty_trajectory(environment), bits)
-    if wrong >= 0:
-        raise RunFolderError(
-            f"episodes, episode {stored.first + wrong}",
-            found=f"maneuvers that do not lead to a cut-in in step {stored.cut_step[wrong]}",
-            expected="the maneuvers that were driven: they determine the episode",
-            mend=MEND_SHARD,
-        )
-    found: BoolArray = ((bits[:, None] >> np.arange(followers.drivers.size)) & 1).astype(np.bool_)
-    return found
-
-
-class SurrogateReplay:
-    """The surrogates of a pool, in the place of a campaign's AV.
-
-    Raises
-    ------
-    CampaignError
-        The pool is of another environment.
-
-    Attributes
-    ----------
-    known : KnownRates
-    columns : tuple of str
-        What of the episodes table it needs.
-    """
-
-    def __init__(self, resolved: Resolved, pool: Pool) -> None:
-        self._environment, self._seed = resolved.environment, resolved.campaign.seed
-        if pool.environment != (own := environment_hash(self._environment)):
-            raise CampaignError(
-                "pool",
-                found=f"a pool of another environment ({pool.environment})",
-                expected=f"one of the campaign's ({own}): crash rates of surrogates depend on traffic, level of lane "
-                "changing and hold time",
-                mend="Leave the pool out: the right one is built, which takes about 15 s.",
-            )
-        self.known = KnownRates(pool.key, pool.names, pool.mu, pool.mu_covariance, pool.p_cut_in_at_crash)
-        self.columns = (*PATH_COLUMNS, *((LEAD,) if self._environment.lateral.present else ()))
-        names = list(pool.library.surrogates)
-        self._followers = pool.library.followers_in(resolved.environment)
-        self._order = [names.index(name) for name in pool.names]
-
-    def crashes(self, episodes: pa.Table) -> BoolArray:
-        """Which surrogates would have crashed, shape (n, D), in the order of ``known.names``; see `drivers_crash`."""
-        return drivers_crash(episodes, self._seed, self._environment, self._followers)[:, self._order]

@@ -19,7 +19,7 @@ from harness.episode.cells import PrescribedCutIns, PrescribedTraffic
 from harness.pool.cut_ins import Pool
 from harness.pool.library import Library, LibraryDriver, library_records
 from harness.strata import FAILED_SHADOWS, OUTSIDE, Reference, ShellDesign, Statement
-from harness.traffic.driving import Environment
+from harness.traffic.laws import Environment
 from harness.vocabulary import IntArray, RecordArray
 
 _REFERENCES = {

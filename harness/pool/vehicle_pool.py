@@ -35,7 +35,7 @@ from harness.progress import Progress
 from harness.random_stream import DIAGNOSTIC, uniforms
 from harness.records.folder import require_place, write_atomically
 from harness.resolved import Resolved
-from harness.traffic.driving import Environment
+from harness.traffic.laws import Environment
 from harness.vocabulary import STATE_COLUMNS, FloatArray, IntArray, RecordArray, states_from
 
 CANDIDATES = 32_768

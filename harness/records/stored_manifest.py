@@ -47,17 +47,6 @@ class Retraced(Stored):
     reason: str | None = None
 
 
-class TableError(Stored):
-    """A challenge table's value beside the same by Monte Carlo."""
-
-    surrogate: str
-    table: str
-    quantity: str
-    table_value: float
-    monte_carlo: float
-    std_error: float
-
-
 class Repeated(Stored):
     """What repeating some tests has shown; `harness.runner.worker.Repeated`."""
 
@@ -97,8 +86,6 @@ class StoredManifest(Stored):
     repeated: Repeated | None = None
     shadow_runs: StoredShadows | None = None
     reported_from: Count | None = None
-    table_errors: list[TableError] | None = None
-    results: dict[str, list[Count] | None] | None = None
 
 
 class StoredStatement(Stored):
@@ -150,19 +137,3 @@ class StoredShells(Stored):
         if [len(self.reference_rate), len(self.reference_square)] != [r, r]:
             raise ValueError("references need a rate and a mean square each")
         return self
-
-
-class StoredStop(Stored):
-    """Where one campaign of a comparison stopped by itself."""
-
-    campaign_hash: str
-    stop: dict[str, Any]
-    n_episodes: Count
-    stopped_by: StoppedBy
-
-
-class StoredStops(Stored):
-    """``stops.json`` of a comparison."""
-
-    a: StoredStop | None = None
-    b: StoredStop | None = None

@@ -1,52 +1,44 @@
-"""Put the report together: read once, draw, fill the template, write."""
+"""Put the report together: read once, draw, write what is told in rows, fill the template."""
 
 from __future__ import annotations
 
 import re
 from inspect import getmembers, isfunction
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import matplotlib.style
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
+from pydantic import BaseModel
 
+from harness import numbers
+from harness.campaign.campaign import Campaign
+from harness.campaign.files import written_out
+from harness.estimators.shells import ShellDetails, Within
+from harness.numbers import MISSING, count, exponent_of, half_width, number, power_of_ten, share, words
 from harness.records.folder import write_bytes
 from harness.records.reader import table_sizes
-from harness.report import number_format
-from harness.report.answer_plot import answer_plot, rate_exponent
-from harness.report.convergence_plot import convergence_plot
-from harness.report.crash_gallery import GalleryRow, crash_gallery
-from harness.report.cut_in_plot import cut_in_plot
-from harness.report.histogram_plots import crash_time_plot, impact_speed_plot, strata_plot, weight_plot
-from harness.report.plot_style import RC, Plot, inline_svg, png, svg
-from harness.report.run_folder import RunFolder, read_run_folder, typed_folder
-from harness.report.shells_plot import shells_plot
-from harness.report.summary import RunSummary, lateral_facts, summarise
-from harness.report.tables import RateUnit, details, diagnostics, outcome_rows, run_notes, setting_sections, verdict
+from harness.report.crashes import GalleryRow, crash_gallery
+from harness.report.rate_plots import answer_plot, convergence_plot, rate_exponent, shells_plot
+from harness.report.style import RC, Plot, inline_svg, png, svg
+from harness.report.summary import RunFolder, RunSummary, lateral_facts, read_run_folder, summarise
+from harness.report.test_plots import crash_time_plot, cut_in_plot, impact_speed_plot, strata_plot, weight_plot
+from harness.stopped_by import MENDS
+from harness.vocabulary import OUTCOMES
 
 PLOT_NAMES = re.compile(
-    r"(answer|shells|convergence|weights|strata|contrast|cut_ins|impact_speed|crash_time|crash-\d+)\.(png|svg)"
+    r"(answer|shells|convergence|weights|strata|cut_ins|impact_speed|crash_time|crash-\d+)\.(png|svg)"
 )
 
 
-def write_report(folder: Path, *, final: Path | None = None) -> Path:
-    """Write ``report.html`` and ``plots/`` (PNG and SVG) into a run folder.
+def write_report(folder: str | Path) -> Path:
+    """Write ``report.html`` and ``plots/`` (PNG and SVG) into a run folder, and return the page.
 
-    The same folder gives the same bytes if it is reached from the working directory by the same relative path, by which
-    the commands on the page name it; outside the working directory they use its name alone. Plots of an earlier report
-    that this one does not have are removed.
-
-    Parameters
-    ----------
-    folder : Path
-        A finished run, as `harness run` leaves it.
-    final : Path, optional
-        Where it is going to be, which the commands on the page name.
-
-    Returns
-    -------
-    Path
-        The page, self-contained: it can be mailed, archived and opened offline.
+    The page is self-contained: it can be mailed, archived and opened offline. The same folder gives the same bytes if
+    it is reached from the working directory by the same relative path, by which the commands on the page name it;
+    outside the working directory they use its name alone. Plots of an earlier report that this one does not have are
+    removed.
 
     Raises
     ------
@@ -54,13 +46,11 @@ def write_report(folder: Path, *, final: Path | None = None) -> Path:
         If the folder misses a file, or a file is damaged or belongs to another run.
     """
     folder = Path(folder)
-    run = read_run_folder(folder, typed=typed_folder(final or folder))
-    sizes = table_sizes(folder)
-    summary = summarise(run)
+    run = read_run_folder(folder)
+    sizes, summary = table_sizes(folder), summarise(run)
     with matplotlib.style.context(["default", RC]):
         gallery = crash_gallery(run, summary)
         files, figures = _rendered(_plots(run, summary, gallery))
-    style = (Path(__file__).parent / "report.css").read_text(encoding="utf-8")
     environment = Environment(
         loader=PackageLoader("harness.report", "."),
         autoescape=True,
@@ -68,7 +58,7 @@ def write_report(folder: Path, *, final: Path | None = None) -> Path:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters.update(getmembers(number_format, isfunction), verdict=verdict)
+    environment.filters.update(getmembers(numbers, isfunction), verdict=verdict, sentence=sentence)
     page = environment.get_template("report.html.j2").render(
         run=run,
         summary=summary,
@@ -84,7 +74,7 @@ def write_report(folder: Path, *, final: Path | None = None) -> Path:
         details=details(run),
         settings=setting_sections(run.campaign, reproducible=run.manifest.get("reproducible")),
         folder=run.typed,
-        style=Markup(style),  # noqa: S704 - our own file
+        style=Markup((Path(__file__).parent / "report.css").read_text(encoding="utf-8")),  # noqa: S704 - our own file
     )
     _write_plots(folder / "plots", files)
     write_bytes(folder / "report.html", page.encode("utf-8"))
@@ -125,3 +115,138 @@ def _write_plots(folder: Path, files: dict[str, bytes]) -> None:
     for old in folder.iterdir():
         if old.name not in files and PLOT_NAMES.fullmatch(old.name):
             old.unlink()
+
+
+class RateUnit(NamedTuple):
+    """The power of ten in which a table writes its rates."""
+
+    exponent: int
+
+    @property
+    def text(self) -> str:
+        """`` × 10⁻⁷``, to follow the unit in the head of a column."""
+        return f" × {power_of_ten(self.exponent)}" if self.exponent else ""
+
+    def digits(self, rate: float, digits: int) -> str:
+        """A rate with so many significant digits."""
+        return number(rate, digits, exponent=self.exponent)
+
+    def rate(self, rate: float | None) -> str:
+        """A rate, by its own power of ten where this one would show no digit of it or too many."""
+        if not rate or 1e-2 <= rate / 10.0**self.exponent < 1e4:
+            return number(rate, exponent=self.exponent)
+        return number(rate) if exponent_of(rate) or not self.exponent else f"{number(rate)} × 10⁰"
+
+    def ends(self, low: float | None, high: float | None) -> str:
+        """Both ends of an interval, with the decimals that the upper one needs."""
+        if low is None or high is None:
+            return MISSING
+        if not high or 1e-2 <= high / 10.0**self.exponent < 1e4:
+            return " to ".join(number(end, exponent=self.exponent, like=high) for end in (low, high))
+        return f"{self.rate(low)} to {self.rate(high)}"
+
+
+def run_notes(run: RunFolder, summary: RunSummary) -> list[str]:
+    """Return what the reader must know about this run as a whole."""
+    notes = list(run.headline.warnings)
+    n_tests, n_estimated = summary.n_episodes, run.estimates.n_episodes
+    if n_estimated is not None and n_estimated not in (n_tests, n_tests - summary.n_failed):
+        notes.append(
+            f"The estimates cover {count(n_estimated)} tests but the records hold {count(n_tests)}: run "
+            "harness estimate DIR --write."
+        )
+    target, rhw = run.campaign.stop.rhw, run.headline.rhw
+    if run.asked_statement and run.shells is not None:
+        rhw = next(each.rhw for each in run.shells.statements if each.name == run.asked_statement)
+    if target is not None and (rhw is None or rhw > target):
+        reached = "it is not known" if rhw is None else f"it is {half_width(rhw)}"
+        mend = MENDS.get(run.manifest.get("stopped_by") or "")
+        why = f" ({mend})" if mend else ""
+        notes.append(f"The asked relative half-width of {target:g} was not reached: {reached}{why}.")
+    if summary.n_failed:
+        notes.append(
+            f"{count(summary.n_failed)} of {count(n_tests)} tests failed ({share(summary.n_failed / n_tests)}). They "
+            "are kept as rows and listed under Outcomes; a crash rate over the others is biased if failing and "
+            "crashing go together."
+        )
+    return notes
+
+
+def verdict(found: Within) -> str:
+    """What the tests say about the assumption of a statement."""
+    if found.refuted:
+        return "refuted by these tests"
+    if found.n_ahead:
+        return "no longer justified: this vehicle does not keep to it"
+    if found.n_checked:
+        return "kept to in every test" + ("" if found.n_episodes_outside else ", none of them outside")
+    return "no crash seen outside" if found.n_episodes_outside else "not put to the test"
+
+
+def sentence(text: str) -> str:
+    """Write a phrase as a sentence: capital first, full stop last."""
+    text = text.strip()
+    return text[:1].upper() + text[1:] + ("" if text[-1:] in ".!?" else ".")
+
+
+def outcome_rows(summary: RunSummary) -> list[tuple[str, float, float, float]]:
+    """Per outcome: name, tests, share of the tests, how often it happens per naturalistic test."""
+    n = max(summary.n_episodes, 1)
+    counted = zip(OUTCOMES, summary.count.tolist(), summary.weight.tolist(), strict=True)
+    return [(name, tests, tests / n, summary.per_test(weight)) for name, tests, weight in counted]
+
+
+def diagnostics(run: RunFolder) -> list[tuple[str, Any]]:
+    """Return sums of the run as (key, value); of shells without those about weights, which have none to say."""
+    leaves = flat(run.estimates.diagnostics or {})
+    return leaves if run.shells is None else [(path, leaf) for path, leaf in leaves if leaf not in (None, {})]
+
+
+def details(run: RunFolder) -> list[tuple[str, Any]]:
+    """Return what single estimators report about themselves and no other section shows, as (estimator.key, value)."""
+    shown = ShellDetails.__annotations__ if run.shells is not None else ()
+    found = {
+        name: {key: content for key, content in e.details.items() if name != run.estimates.headline or key not in shown}
+        for name, e in run.estimates.estimates.items()
+        if e.details
+    }
+    return flat(found)
+
+
+def flat(content: Any, path: str = "") -> list[tuple[str, Any]]:
+    """Leaves of nested mappings as (dotted path, value), in order; none of an empty one."""
+    if isinstance(content, dict) and (content or not path):
+        return [leaf for key, part in content.items() for leaf in flat(part, f"{path}.{key}" if path else str(key))]
+    return [(path, content)]
+
+
+Settings = list[tuple[str, str, str]]
+"""Of each its path inside the section, its value as text, and what it means."""
+
+
+def setting_sections(campaign: Campaign, *, reproducible: bool | None = None) -> dict[str, Settings]:
+    """Settings by top-level key, as in the file; scalars come first, as ``campaign``, with what the manifest adds."""
+    meanings = dict(_described(campaign, ""))
+    sections: dict[str, Settings] = {"campaign": []}
+    for key, part in written_out(campaign).items():
+        for path, leaf in flat(part, key):
+            title, _, inner = path.partition(".") if isinstance(part, dict) else ("campaign", "", path)
+            sections.setdefault(title, []).append((inner, words(leaf), meanings.get(path, "")))
+    if reproducible is not None:
+        meaning = "whether an episode runs again bit for bit (manifest)"
+        sections["campaign"].append(("reproducible", words(reproducible), meaning))
+    return sections
+
+
+def _described(content: Any, path: str) -> list[tuple[str, str]]:
+    """Follow the validated instances, not the schema, so that the chosen driver model decides what a name means."""
+    found: list[tuple[str, str]] = []
+    if isinstance(content, BaseModel):
+        for name, info in type(content).model_fields.items():
+            inner = f"{path}.{name}" if path else name
+            found.append((inner, info.description or ""))
+            found += _described(getattr(content, name), inner)
+    elif isinstance(content, dict):
+        for name, part in content.items():
+            found += _described(part, f"{path}.{name}")
+    return found

@@ -1,112 +1,264 @@
-"""One pass over all episodes: everything that the plots and tables need, in memory that does not grow with n."""
+"""What the report tells: a run folder's files, read and checked, and one pass over its episodes.
+
+Whatever reads raises a `RunFolderError` that names a file which is missing, damaged, or of another run.
+"""
 
 from __future__ import annotations
 
 import math
+import os
+import shlex
 from collections import Counter
-from dataclasses import dataclass, fields
-from typing import Any, NamedTuple
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
+from pydantic import TypeAdapter, ValidationError
 
-from harness.errors import RunFolderError
-from harness.records.reader import stored_columns
-from harness.report.histograms import Axis, FineHistogram
-from harness.report.run_folder import RunFolder, floats
+from harness.campaign.campaign import Campaign
+from harness.campaign.files import load_campaign
+from harness.errors import CampaignError, RunFolderError
+from harness.estimators.shells import ShellDetails, Within
+from harness.records.folder import MANIFEST, NO_RUN, concatenated, read_json, read_manifest, require_schema
+from harness.records.reader import read_shards, stored_columns
+from harness.records.stored_manifest import Count, Stored, StoredManifest
+from harness.strata import ASSUMPTION_FREE
 from harness.vehicles.kinematics import STEP_S
-from harness.vocabulary import CRASH, FAILED, OUTCOMES, BoolArray, FloatArray, IntArray
+from harness.vocabulary import CRASH, FAILED, OUTCOMES, FloatArray, IntArray
 
+ROWS_TOGETHER = 5_000
+"""Of small shards: each batch costs a millisecond."""
 MOST_CAUSES = 1_000
-CANDIDATES = 50
-"""Crashes kept per ranking: more than are shown, because with a share of traces only some of the worst have one."""
-R2DOT_MPS, R2_M = Axis(-30.0, 20.0, 0.5), Axis(0.0, 150.0, 2.5)
+COLUMNS = (
+    "episode", "component", "log_weight", "n_control_steps", "impact_speed_mps", "crash_time_s", "cut_in_step",
+    "cut_in_r2_m", "cut_in_r2dot_mps",
+)  # fmt: skip
+
+
+class ShownManifest(StoredManifest):
+    """A manifest with what the page shows of every run."""
+
+    created: str
+    versions: dict[str, str]
+    seed: Count
+
+
+class StoredEstimate(Stored):
+    """What the page reads of an estimate, or the reason why there is none."""
+
+    crash_rate: float | None
+    reason: str | None = None
+    ci_low: float | None = None
+    ci_high: float | None = None
+    upper_bound: float | None = None
+    rhw: float | None = None
+    n_episodes: int | None = None
+    n_crashes: int | None = None
+    n_effective: float | None = None
+    largest_weight_share: float | None = None
+    weight_cap: float | None = None
+    method: str | None = None
+    warnings: list[str] = []
+    details: dict[str, Any] = {}
+
+
+class StoredPoint(Stored):
+    """The headline estimate of the first ``n`` tests."""
+
+    n: float
+    crash_rate: float | None
+    ci_low: float | None
+    ci_high: float | None
+    rhw: float | None
+
+
+class StoredEstimates(Stored):
+    """What the page reads of ``estimates.json``."""
+
+    campaign: str
+    campaign_hash: str
+    lane_change_level: float
+    confidence: float
+    headline: str
+    estimates: dict[str, StoredEstimate]
+    statement: str
+    decision: dict[str, Any] | None = None
+    reference_statements: list[str] = []
+    boundary_statements: dict[str, str] = {}
+    n_episodes: int | None = None
+    distance_per_test_km: float | None = None
+    diagnostics: dict[str, Any] | None = None
+    convergence: list[StoredPoint] | None = None
 
 
 @dataclass(frozen=True)
-class Crash:
-    """One crash as its row in ``episodes`` describes it; units as in the schema."""
+class ShownShells(ShellDetails):
+    """What the headline estimate of a shells run says about them."""
 
-    episode: int
-    impact_speed_mps: float
-    crash_time_s: float
-    log_weight: float
-    cut_in_step: float
-    cut_in_r2_m: float
-    cut_in_r2dot_mps: float
-    component: int
+    rate: float
 
     @property
-    def weight(self) -> float:
-        """What this one crash adds to the sum that is the estimate: likelihood ratio, or p_s/n_s in a shell."""
-        return math.exp(self.log_weight)
+    def widest(self) -> Within:
+        """The statement with the widest boundary."""
+        return self.statements[-1]
 
     @property
-    def cut_in_time_s(self) -> float:
-        """Time at the start of the step in which BV cut in."""
-        return STEP_S * self.cut_in_step
+    def has_outside(self) -> bool:
+        """Whether there are cut-ins beyond every boundary."""
+        return self.widest.n_shells < len(self.shells)
+
+    @property
+    def pool_half_width(self) -> float:
+        """What the pool's own error leaves open of the rate."""
+        return self.rhw_from_pool * self.rate
+
+    def narrowest(self, place: int) -> str:
+        """Which boundary a shell is inside of, the narrowest one."""
+        return next((f"inside {each.name}" for each in self.statements if place < each.n_shells), "outside")
+
+    def share_of_uncertainty(self, half_width: float) -> float:
+        """Share in the sum of squared half-widths, which is what makes the interval of the rate."""
+        squares = math.fsum(shell.half_width**2 for shell in self.shells) + self.pool_half_width**2
+        return half_width**2 / squares if squares > 0.0 else math.nan
 
 
-NUMBERS = (*(column.name for column in fields(Crash)), "n_control_steps")
+@dataclass(frozen=True)
+class RunFolder:
+    """A finished run: its campaign, manifest and estimates; ``shells`` is None where tests were drawn otherwise.
+
+    ``typed`` is how commands on the page name it.
+    """
+
+    path: Path
+    campaign: Campaign
+    manifest: dict[str, Any]
+    estimates: StoredEstimates
+    shells: ShownShells | None
+    typed: str
+
+    @property
+    def headline(self) -> StoredEstimate:
+        """The estimate that answers the campaign's question."""
+        return self.estimates.estimates[self.estimates.headline]
+
+    @property
+    def asked_statement(self) -> str | None:
+        """The statement about a boundary that should reach ``stop.rhw``; None for the assumption-free one."""
+        asked = ASSUMPTION_FREE if self.shells is None else self.campaign.testing.shells.statement
+        return None if asked == ASSUMPTION_FREE else asked
+
+    def episodes(self, *columns: str) -> Iterator[pa.RecordBatch]:
+        """Columns of the tests that count, in index order; small shards come together."""
+        counted = int(self.manifest["n_episodes"])
+        together: list[pa.Table] = []
+        for table, _ in read_shards(self.path, episode_columns=list(columns), moment_columns=[]):
+            together.append(table.slice(0, counted))
+            counted -= together[-1].num_rows
+            if sum(part.num_rows for part in together) >= ROWS_TOGETHER:
+                yield from concatenated(together, self.path).to_batches()
+                together = []
+        if together:
+            yield from concatenated(together, self.path).to_batches()
 
 
-class WorstCrashes:
-    """The first `CANDIDATES` crashes by one key, kept while streaming; ties go to the smaller episode index."""
+def typed_folder(folder: Path) -> str:
+    """Return the folder as it is typed in a shell: relative to the working directory, or its bare name.
 
-    def __init__(self, key: str) -> None:
-        self.key = key
-        self.crashes: list[Crash] = []
-
-    def add(self, columns: dict[str, FloatArray], is_crash: BoolArray) -> None:
-        """Offer a batch: ``columns`` by field name, each of shape (m,)."""
-        rows = np.flatnonzero(is_crash & np.isfinite(columns[self.key]))
-        best = rows[np.lexsort((columns["episode"][rows], -columns[self.key][rows]))[:CANDIDATES]]
-        self.crashes += [_crash(columns, int(row)) for row in best]
-        self.crashes.sort(key=lambda crash: (-getattr(crash, self.key), crash.episode))
-        del self.crashes[CANDIDATES:]
+    The bare name stands for a folder that is not below the working directory. An absolute path would say where somebody
+    keeps their files to everybody whom the page is mailed to.
+    """
+    here = Path.cwd()
+    unlinked = Path(os.path.abspath(folder))  # noqa: PTH100 - resolve() would leave by a link what was typed below `here`
+    for path in (unlinked, folder.resolve()):
+        if path.is_relative_to(here):
+            return shlex.quote(path.relative_to(here).as_posix())
+    return shlex.quote(folder.resolve().name)
 
 
-def _crash(columns: dict[str, FloatArray], row: int) -> Crash:
-    values: dict[str, Any] = {column.name: float(columns[column.name][row]) for column in fields(Crash)}
-    return Crash(**{**values, "episode": int(values["episode"]), "component": int(values["component"])})
+def read_run_folder(path: Path) -> RunFolder:
+    """Read campaign, manifest and estimates of a run."""
+    manifest = read_manifest(path)
+    require_schema(manifest, ShownManifest, path / MANIFEST, mend=NO_RUN)
+    estimates = _read_estimates(path, manifest["campaign_hash"])
+    shells = _shells(path, estimates.estimates[estimates.headline])
+    campaign = _read_campaign(path / "campaign.yaml")
+    return RunFolder(path, campaign, manifest, estimates, shells, typed_folder(path))
 
 
+def _read_campaign(path: Path) -> Campaign:
+    try:
+        return load_campaign(path, check_files=False)
+    except CampaignError as error:
+        raise RunFolderError(
+            str(path),
+            found=error.found if error.where == str(path) else f"{error.found} ({error.where})",
+            expected="a campaign with all its sections, as the run has written it",
+            mend="Restore the file, or run the campaign again.",
+        ) from error
+
+
+def _read_estimates(folder: Path, campaign_hash: str) -> StoredEstimates:
+    path, again = folder / "estimates.json", f"Make it again with `harness estimate {folder} --write`."
+    content = read_json(path, mend=again)
+    require_schema(content, StoredEstimates, path, mend=again)
+    estimates = StoredEstimates.model_validate(content)
+    if estimates.campaign_hash != campaign_hash:
+        expected = f"those of campaign {campaign_hash} (manifest.json)"
+        found = f"estimates of campaign {estimates.campaign_hash}"
+        raise RunFolderError(str(path), found=found, expected=expected, mend=again)
+    if estimates.headline not in estimates.estimates:
+        found = f"headline {estimates.headline!r}, which is not among the estimates"
+        raise RunFolderError(str(path), found=found, expected=f"one of {sorted(estimates.estimates)}", mend=again)
+    return estimates
+
+
+def _shells(folder: Path, headline: StoredEstimate) -> ShownShells | None:
+    if "shells" not in headline.details:
+        return None
+    try:
+        return TypeAdapter(ShownShells).validate_python({**headline.details, "rate": headline.crash_rate})
+    except ValidationError as error:
+        wrong = error.errors(include_url=False)[0]
+        raise RunFolderError(
+            str(folder / "estimates.json"),
+            found=f"no complete description of shells ({'.'.join(map(str, wrong['loc']))}: {wrong['msg']})",
+            expected="what `harness estimate` writes for a run with testing.method shells",
+            mend=f"Make it again with `harness estimate {folder} --write`.",
+        ) from error
+
+
+@dataclass(frozen=True, eq=False)
 class RunSummary:
-    """Counts, weight sums and histograms of a run.
+    """Counts and weights of a run's tests, and the columns of those that plots need.
 
-    Weighted sums use the likelihood ratio of each episode: divided by the number of tests they say how often something
-    happens in naturalistic driving. Tests from shells weigh p_s/n_s instead, and their sums need no division:
-    `per_test` knows. Failed episodes are counted but have no weight.
+    A weight is what a test adds to the sum that is the estimate: its likelihood ratio or, of tests from shells,
+    p_s/n_s. Failed tests are counted and have no weight.
 
     Attributes
     ----------
-    log_scales : ndarray, shape (S,), optional
-        For tests that were drawn from shells: added to the recorded log-weight of each, see `_log_scales`.
     count, weight : ndarray, shape (5,)
         Episodes and sum of weights per outcome, in the order of ``OUTCOMES``.
     causes : Counter of str
         Failed episodes per cause.
-    stratum_crash, response_time_s : FineHistogram
-        Of crashes: number of control steps, time from cut-in to crash.
-    cut_in, cut_in_crash : FineHistogram
-        Of all cut-ins and of those that crash: R2dot (rows) and R2.
-    hardest, heaviest, outermost : WorstCrashes
-        By impact speed, by weight, and (of tests from shells) from the most careless shell inwards.
+    rows : dict of ndarray, shape (m,)
+        ``outcome``, ``weight`` and `COLUMNS`, NaN where there is none, of tests that had a cut-in or a weight other
+        than 1: of the others, most in plain naturalistic driving, there is nothing to draw.
+    all_weights_one : bool
+        Whether no maneuver was drawn from an importance function: plain naturalistic driving.
+    from_shells : bool
+        Whether tests were drawn from shells.
     """
 
-    def __init__(self, log_scales: FloatArray | None = None) -> None:
-        self.log_scales = log_scales
-        self.count, self.weight = np.zeros(len(OUTCOMES)), np.zeros(len(OUTCOMES))
-        self.causes: Counter[str] = Counter()
-        self.log_weight_range = (math.inf, -math.inf)
-        self.log10_weight, self.log10_weight_crash = (FineHistogram(Axis(-80.0, 20.0, 0.02)) for _ in range(2))
-        self.stratum_crash = FineHistogram(Axis(-0.5, 600.5, 1.0))
-        self.impact_speed_mps = FineHistogram(Axis(0.0, 80.0, 0.1))
-        self.crash_time_s, self.response_time_s = (FineHistogram(Axis(0.0, 60.0, 0.1)) for _ in range(2))
-        self.cut_in, self.cut_in_crash = (FineHistogram(R2DOT_MPS, R2_M) for _ in range(2))
-        self.hardest, self.heaviest = WorstCrashes("impact_speed_mps"), WorstCrashes("log_weight")
-        self.outermost = WorstCrashes("component")
+    count: FloatArray
+    weight: FloatArray
+    causes: Counter[str]
+    rows: dict[str, FloatArray]
+    all_weights_one: bool
+    from_shells: bool
 
     @property
     def n_episodes(self) -> int:
@@ -124,87 +276,65 @@ class RunSummary:
         return int(self.count[FAILED])
 
     @property
-    def all_weights_one(self) -> bool:
-        """Whether no maneuver was drawn from an importance function: plain naturalistic driving."""
-        return self.log_weight_range == (0.0, 0.0)
-
-    @property
-    def from_shells(self) -> bool:
-        """Whether tests were drawn from shells."""
-        return self.log_scales is not None
+    def crashes(self) -> dict[str, FloatArray]:
+        """`rows` of the crashes alone, and when they were: ``cut_in_s`` and ``response_s`` (s)."""
+        crashes = {name: column[self.rows["outcome"] == CRASH] for name, column in self.rows.items()}
+        cut_in_s = STEP_S * crashes["cut_in_step"]
+        return {**crashes, "cut_in_s": cut_in_s, "response_s": crashes["crash_time_s"] - cut_in_s}
 
     def per_test(self, weight: float) -> float:
         """How often per naturalistic test something happens whose weights add up to ``weight``."""
         return weight if self.from_shells else weight / max(self.n_episodes, 1)
 
-    def add(self, batch: pa.RecordBatch, outcome: IntArray) -> None:
-        """Add a batch whose outcomes are given as indices into ``OUTCOMES``."""
-        columns = {name: floats(batch.column(name)) for name in NUMBERS}
-        if self.log_scales is not None:
-            columns["log_weight"] = columns["log_weight"] + self.log_scales[columns["component"].astype(np.int64)]
-        valid, crash = outcome != FAILED, outcome == CRASH
-        weight = np.where(valid, np.exp(columns["log_weight"]), 0.0)
-        self.count += np.bincount(outcome, minlength=len(OUTCOMES))
-        self.weight += np.bincount(outcome, weights=weight, minlength=len(OUTCOMES))
-        self._add_causes(batch.column("failure"))
-        self._add_weights(columns["log_weight"], weight, valid, crash)
-        for grid, rows in ((self.cut_in, valid), (self.cut_in_crash, crash)):
-            grid.add(weight[rows], columns["cut_in_r2dot_mps"][rows], columns["cut_in_r2_m"][rows])
-        self._add_crashes(columns, weight, crash)
 
-    def _add_causes(self, failure: pa.Array) -> None:
-        for item in failure.drop_null().value_counts():
-            cause = item["values"].as_py()
-            # Causes may hold numbers and so be all different: memory stays bounded, the count per outcome is exact.
-            if cause in self.causes or len(self.causes) < MOST_CAUSES:
-                self.causes[cause] += item["counts"].as_py()
-
-    def _add_weights(self, log_weight: FloatArray, weight: FloatArray, valid: BoolArray, crash: BoolArray) -> None:
-        low, high = self.log_weight_range
-        seen = log_weight[valid]
-        self.log_weight_range = (float(seen.min(initial=low)), float(seen.max(initial=high)))
-        for histogram, rows in ((self.log10_weight, valid), (self.log10_weight_crash, crash)):
-            histogram.add(weight[rows], log_weight[rows] / math.log(10.0))
-
-    def _add_crashes(self, columns: dict[str, FloatArray], weight: FloatArray, crash: BoolArray) -> None:
-        for histogram, values in (
-            (self.stratum_crash, columns["n_control_steps"]),
-            (self.impact_speed_mps, columns["impact_speed_mps"]),
-            (self.crash_time_s, columns["crash_time_s"]),
-            (self.response_time_s, columns["crash_time_s"] - STEP_S * columns["cut_in_step"]),
-        ):
-            histogram.add(weight[crash], values[crash])
-        for ranking in (self.hardest, self.heaviest, self.outermost):
-            ranking.add(columns, crash)
+def floats(column: pa.Array) -> FloatArray:
+    """A column of numbers as an array, NaN where it is null."""
+    return np.asarray(column.cast(pa.float64()).to_numpy(zero_copy_only=False), dtype=np.float64)
 
 
 def summarise(run: RunFolder) -> RunSummary:
-    """Stream over all episodes of a run, in index order; a `RunFolderError` where one has an unknown outcome."""
-    summary = RunSummary(_log_scales(run) if run.campaign.testing.method == "shells" else None)
-    for batch in run.episodes(*NUMBERS, "outcome", "failure"):
-        summary.add(batch, _outcome_index(batch.column("outcome"), run))
-    return summary
+    """One pass over all episodes of a run; a `RunFolderError` where one has an unknown outcome."""
+    count, causes, per_shell = np.zeros(len(OUTCOMES)), Counter[str](), Counter[int]()
+    kept: list[dict[str, FloatArray]] = []
+    for batch in run.episodes(*COLUMNS, "outcome", "failure"):
+        outcome = _outcome_index(batch.column("outcome"), run)
+        count += np.bincount(outcome, minlength=len(OUTCOMES))
+        for item in batch.column("failure").drop_null().value_counts():
+            # Causes may hold numbers and so be all different: memory stays bounded, the count per outcome is exact.
+            if (cause := item["values"].as_py()) in causes or len(causes) < MOST_CAUSES:
+                causes[cause] += item["counts"].as_py()
+        columns = {name: floats(batch.column(name)) for name in COLUMNS} | {"outcome": outcome.astype(np.float64)}
+        if run.shells is not None:
+            shells, tests = np.unique(columns["component"].astype(np.int64), return_counts=True)
+            per_shell.update(dict(zip(shells.tolist(), tests.tolist(), strict=True)))
+        shown = np.isfinite(columns["cut_in_step"]) | (columns["log_weight"] != 0.0)
+        kept.append({name: column[shown] for name, column in columns.items()})
+    rows = {name: np.concatenate([part[name] for part in kept] or [np.zeros(0)]) for name in (*COLUMNS, "outcome")}
+    outcome = rows["outcome"].astype(np.int64)
+    if run.shells is not None:
+        rows["log_weight"] = rows["log_weight"] - _log_tests(per_shell, run)[rows["component"].astype(np.int64)]
+    rows["weight"] = np.where(outcome == FAILED, 0.0, np.exp(rows["log_weight"]))
+    left_out = count - np.bincount(outcome, minlength=len(OUTCOMES))  # those weigh 1 each
+    weight = left_out + np.bincount(outcome, weights=rows["weight"], minlength=len(OUTCOMES))
+    weight[FAILED] = 0.0
+    all_one = not rows["log_weight"][outcome != FAILED].any()
+    return RunSummary(count, weight, causes, rows, all_one, run.shells is not None)
 
 
-def _log_scales(run: RunFolder) -> FloatArray:
-    """Logarithm of 1/n_s per shell, shape (S,): it turns recorded weights p_s into ones that add up to probabilities.
+def _log_tests(per_shell: Counter[int], run: RunFolder) -> FloatArray:
+    """Logarithm of the number of tests n_s per shell, shape (S,).
 
     A record carries log p_s, because it is written before anybody knows how many tests its shell will get. Weights
-    p_s/n_s add up to Σ p_s c_s; weights p_s would count a shell as often as it was tested. A shell without tests has
-    scale 0, and no test to use it.
+    p_s/n_s add up to Σ p_s c_s; weights p_s would count a shell as often as it was tested.
     """
-    tests: Counter[int] = Counter()
-    for batch in run.episodes("component"):
-        for item in batch.column("component").value_counts():
-            tests[item["values"].as_py()] += item["counts"].as_py()
-    if min(tests, default=0) < 0:
+    if min(per_shell, default=0) < 0:
         raise RunFolderError(
             str(run.path / "episodes"),
             found="a test without shell (component -1)",
             expected="the shell that each test was drawn from",
             mend="The records are not those of a run with testing.method shells: run the campaign again.",
         )
-    return -np.log([float(max(tests[shell], 1)) for shell in range(max(tests, default=-1) + 1)])
+    return np.log([float(max(per_shell[shell], 1)) for shell in range(max(per_shell, default=-1) + 1)])
 
 
 def _outcome_index(column: pa.Array, run: RunFolder) -> IntArray:
@@ -220,7 +350,8 @@ def _outcome_index(column: pa.Array, run: RunFolder) -> IntArray:
     return np.asarray(index).astype(np.int64)
 
 
-class LateralFacts(NamedTuple):
+@dataclass(frozen=True)
+class LateralFacts:
     """Of the tests as sampled: 5 %, 50 % and 95 % quantiles of the leads (s) of cut-ins, and crashes by contact."""
 
     n_cut_ins: int

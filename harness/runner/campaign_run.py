@@ -6,16 +6,13 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from functools import cache, partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-import pyarrow as pa
-
 from harness.campaign.campaign import Campaign
-from harness.errors import RunFolderError
 from harness.pool.enumeration import ShadowRuns
 from harness.pool.shells import PrescribedEpisodes
 from harness.pool.vehicle_pool import ShadowPaths
@@ -29,7 +26,6 @@ from harness.records.folder import (
     write_json,
     write_shard,
 )
-from harness.records.gathered import MOST_EPISODES, MOST_SHARDS, gather
 from harness.resolved import Resolved
 from harness.runner.manifest import (
     SMALLEST_FAILED_SAMPLE,
@@ -43,7 +39,7 @@ from harness.runner.manifest import (
 from harness.runner.planner import Planner, planner_of
 from harness.runner.prepare import Prepared, distance_per_test_m, prepare, require_ready, require_same_pool
 from harness.runner.retrace import Retracing
-from harness.runner.run_result import ESTIMATES, RunResult, conclusion, earlier_result, exit_code, results_of
+from harness.runner.run_result import ESTIMATES, RunResult, conclusion, exit_code
 from harness.runner.shadow_runs import (
     as_recorded,
     shadow_file,
@@ -52,8 +48,7 @@ from harness.runner.shadow_runs import (
 )
 from harness.runner.shard_pool import ShardPool, executor_of
 from harness.runner.stored_estimates import estimate_run
-from harness.runner.stored_shards import COLUMNS, GatheredBlocks, stored_shard
-from harness.runner.table_accuracy import table_errors
+from harness.runner.stored_shards import stored_shard
 from harness.runner.worker import ShardDone, ShardSpec
 from harness.stopped_by import StoppedBy
 from harness.vocabulary import SAMPLING
@@ -65,7 +60,6 @@ def run_campaign(
     *,
     workers: int | None = None,
     resume: bool = False,
-    shorten: bool = False,
     progress: Progress | None = None,
 ) -> RunResult:
     """Run a campaign into a folder.
@@ -80,8 +74,6 @@ def run_campaign(
         Worker processes; as many as there are cores by default. Never changes a result.
     resume : bool
         Continue a run that was interrupted, or to a smaller RHW.
-    shorten : bool
-        Whether it may end with fewer tests than the folder holds; the others stay on disk, uncounted.
     progress : Progress, optional
 
     Raises
@@ -93,15 +85,11 @@ def run_campaign(
     resolved = campaign if isinstance(campaign, Resolved) else require_ready(campaign)
     with sole_use(out):
         earlier = require_own_folder(out, resolved, resume=resume)
-        if not shorten:
-            require_no_fewer(out, earlier, resolved.campaign.stop.episodes)
-        if (result := earlier_result(out, resolved, earlier)) is not None:
-            return result
+        require_no_fewer(out, earlier, resolved.campaign.stop.episodes)
         run = Run(resolved, out, earlier, workers, progress or Progress(), began)
         run.run_all()
-        if not shorten:
-            require_no_fewer(out, earlier, run.prefix.n_episodes)
-            run.discard_uncounted()
+        require_no_fewer(out, earlier, run.prefix.n_episodes)
+        run.discard_uncounted()
         return run.finish()
 
 
@@ -133,7 +121,6 @@ class Run:
         self.prescribed: PrescribedEpisodes | None = None
         self._prepared, self._held = prepared, int(earlier["n_episodes"])
         self.prefix = Prefix()
-        self._ungathered: list[dict[str, Any]] = []
         with ExitStack() as refused:
             refused.callback(self._workers.close)
             self._manifest = Manifest(
@@ -143,7 +130,6 @@ class Run:
                 began=began,
                 workers=self._executor.n_workers,
                 distance_per_test_m=distance_per_test_m(resolved.environment),
-                table_errors=table_errors(resolved, prepared.tables),
             )
             if prepared.shadow_paths is None:
                 self._plan(prepared)
@@ -179,7 +165,6 @@ class Run:
             raise
         finally:
             self._workers.close()
-            self._gather()
 
     def _plan(self, prepared: Prepared) -> None:
         """Begin to test what has been prepared."""
@@ -187,14 +172,12 @@ class Run:
             require_same_pool(self._out, prepared)
             write_json(self._out / SHELLS, prepared.prescribed.design.to_json())
         self.prescribed = prepared.prescribed
-        gathers = self.prescribed is None and self._campaign.stop.estimator != "scv"  # which needs moments
-        self._gathered = GatheredBlocks(self._out, self._campaign, same_sources=True) if gathers else None
         self._prepared = prepared
         self.planner: Planner = planner_of(self._campaign, prepared.prescribed, held=self._held)
 
     def _stored(self, spec: ShardSpec) -> ShardDone | None:
         """See `stored_shard`; workers are about to be busy with the first shard that it does not know."""
-        done = stored_shard(self._out, self._prepared, self._retracing, self._gathered, spec)
+        done = stored_shard(self._out, self._prepared, self._retracing, spec)
         if done is None:
             load_report_meanwhile()
         return done
@@ -225,7 +208,6 @@ class Run:
             self._manifest.forget_replaced(done.spec)
             files = write_shard(self._out, done.spec.index, done.parquet)
         self.prefix.add(done, files)
-        self._remember(done)
         self.prefix.require_few_failed(self._campaign, at_least=SMALLEST_FAILED_SAMPLE)
         enough = self.planner.add(done.block)
         self.prefix.reported_from = self.planner.reported_from
@@ -234,32 +216,15 @@ class Run:
         self._manifest.follow(self.prefix)
         return enough
 
-    def _remember(self, done: ShardDone) -> None:
-        """Keep in mind what to gather: consecutive shards, a part's worth of them."""
-        if done.gathered or self._gathered is None:
-            self._gather()
-            return
-        self._ungathered.append({**self.prefix.shards[-1], "n_retraced": done.n_retraced})
-        n_episodes = done.spec.first_episode + done.spec.n_episodes - self._ungathered[0]["first_episode"]
-        if len(self._ungathered) >= MOST_SHARDS or n_episodes >= MOST_EPISODES:
-            self._gather()
-
-    def _gather(self) -> None:
-        """Gather what is in mind. It is a copy: where none can be written, the run goes on."""
-        waiting, self._ungathered = self._ungathered, []
-        if waiting:
-            with suppress(OSError, RunFolderError, pa.ArrowException):
-                gather(self._out, waiting, COLUMNS)
-
     def _figures(self) -> dict[str, int | float]:
         """What a progress bar shows: crashes, and what the stop rule saw at its last look.
 
         Only what a rule asks for is called ``rhw``: a bar reckons from it when the campaign will stop.
         """
         watched = "half_width" if self._campaign.stop.rhw is None else "rhw"
-        figures: dict[str, int | float] = {"crashes": self.prefix.n_crashes, watched: self.planner.rule.rhw}
+        figures: dict[str, int | float] = {"crashes": self.prefix.n_crashes, watched: self.planner.rule.look.rhw}
         weighted = SAMPLING[self._campaign.testing.method].forces
-        return figures | ({"heaviest": self.planner.rule.heaviest} if weighted else {})
+        return figures | ({"one_more_crash": self.planner.rule.look.one_more_crash} if weighted else {})
 
     def discard_uncounted(self) -> None:
         """Remove shards that an earlier, longer run has left beyond the stop."""
@@ -281,7 +246,7 @@ class Run:
         stopped_by, said = conclusion(self._campaign, rule, prefix.n_episodes, prefix.reported_from)
         if stopped_by == "rhw" and self.planner.remark:
             said += f" {self.planner.remark}"
-        decided = {} if rule.decision is None else {"decision": rule.decision.to_json()}
+        decided = {} if rule.look.decision is None else {"decision": rule.look.decision.to_json()}
         self.leave(stopped_by=stopped_by, ending=said, **decided)
         self._progress.stage("estimates and report", None)
         estimates = estimate_run(self._out)
@@ -290,8 +255,7 @@ class Run:
         from harness.report import write_report  # noqa: PLC0415
 
         report = write_report(self._out)
-        self._manifest.write_results(results_of(self._out))
-        verdict = None if rule.decision is None else rule.decision.verdict
+        verdict = None if rule.look.decision is None else rule.look.decision.verdict
         code = exit_code(self._campaign, stopped_by, verdict)
         return RunResult(self._out, report, estimates, stopped_by, said, code)
 

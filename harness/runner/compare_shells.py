@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
+from dataclasses import asdict
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -23,11 +24,10 @@ from harness.estimators.pairs import (
     PairedEstimate,
     PairedShells,
     conditional_paired_statement,
-    margin_statement,
     paired_estimate,
     paired_statement,
 )
-from harness.estimators.stopping import PairRule, decision_confidence
+from harness.estimators.stopping import PairRule
 from harness.pool.shells import Draw, acceleration_limit
 from harness.progress import Progress
 from harness.records.folder import sole_use
@@ -104,7 +104,7 @@ def compare_shells(
             raise ValueError("the campaigns do not draw from shells")
         planner = PairPlanner(campaign, prescribed.design, prescribed.available, margin)
         pairs = PairedShells(prescribed.design)
-        both = [_Side(run, side, pairs, planner.rule, campaign.run.shard_size) for side, run in enumerate(runs)]
+        both = [_Side(run, side, pairs, planner.rule, campaign.run.smallest_shard) for side, run in enumerate(runs)]
         progress.stage("tests of A and B", 2 * campaign.stop.episodes)
         with ExitStack() as working:
             for run in runs:
@@ -139,7 +139,7 @@ def require_same_shells(sides: tuple[Resolved, Resolved]) -> None:
             "av.before_cut_in",
             found="controller: a vehicle that acts before the cut-in has cut-ins of its own",
             expected="hold_speed in A and B: pairs need the same cut-ins",
-            mend="Write --set testing.method=forced, which drives each vehicle along the paths of the tests first.",
+            mend="Run both campaigns by themselves and put their intervals side by side, or write hold_speed.",
         )
     if sides[0].campaign.testing.shells.stopping != "sequential":
         raise CampaignError(
@@ -183,27 +183,20 @@ def _held_specs(folder: Path, earlier: Mapping[str, Any]) -> Iterator[ShardSpec]
         yield ShardSpec(shard["index"], shard["first_episode"], shard["n_episodes"], tuple(draws))
 
 
-def shells_content(
-    found: PairedEstimate, rule: PairRule, margin: float | None, labels: tuple[str, str]
-) -> dict[str, Any]:
+def shells_content(found: PairedEstimate, rule: PairRule, labels: tuple[str, str]) -> dict[str, Any]:
     """What ``compare.json`` says under shells."""
-    level = decision_confidence(found.a.confidence)
-    free, given = paired_statement(found, *labels), conditional_paired_statement(found)
-    statements = [given, free] if rule.conditional else [free, given]
+    statements = [paired_statement(found, *labels), conditional_paired_statement(found)]
+    if rule.conditional:
+        statements.reverse()
     decided = None
-    if margin is not None and rule.verdict is not None:
-        decided = {
-            "margin": margin,
-            "verdict": rule.verdict,
-            "confidence": level,
-            "given_the_library": rule.conditional,
-        }
-        statements.insert(0, margin_statement(rule.verdict, margin, level, conditional=rule.conditional))
+    if rule.margin is not None:
+        decided = asdict(rule.margin)
+        statements.insert(0, rule.margin.sentence)
     return {**found.to_json(), "margin": decided, "statement": statements[0], "statements": statements}
 
 
 def exit_code(rule: PairRule, *, precision_asked: bool) -> int:
     """5 where B is worse by more than the margin; 4 where the budget was spent before anything was known."""
-    if rule.verdict is not None:
-        return EXIT_OF[rule.verdict]
-    return EXIT_BUDGET_SPENT if precision_asked and not rule.reached else EXIT_DONE
+    if rule.margin is not None:
+        return EXIT_OF[rule.margin.verdict]
+    return EXIT_BUDGET_SPENT if precision_asked and not rule.look.stopped else EXIT_DONE

@@ -15,7 +15,6 @@ from harness.campaign.campaign import Campaign
 from harness.campaign.files import dump_campaign
 from harness.errors import RunFolderError, TooManyFailedError
 from harness.records.folder import MANIFEST, read_manifest, require_place, write_json, write_text
-from harness.records.gathered import Fingerprint
 from harness.resolved import Resolved
 from harness.runner.worker import Repeated, ShardDone, ShardSpec
 
@@ -181,7 +180,7 @@ class Manifest:
         if shard["n_episodes"] == spec.n_episodes and not (self._folder / shard["files"]["episodes"]).exists():
             return
         kept = shards[: spec.index]
-        cut = {"status": "interrupted", "stopped_by": None, "ending": None, "results": None}
+        cut = {"status": "interrupted", "stopped_by": None, "ending": None}
         n_kept = sum(shard["n_episodes"] for shard in kept)
         self._earlier = {**self._earlier, **cut, "n_episodes": n_kept, "shards": kept}
         write_json(self._folder / MANIFEST, self._earlier)
@@ -223,12 +222,7 @@ class Manifest:
             "wall_time_s": round(self._written - self._began, 3),
             "n_episodes": prefix.n_episodes,
             "reported_from": prefix.reported_from if prefix.reported_from < prefix.n_episodes else 0,
-            "results": None,
             "shards": prefix.shards,
         }
         write_json(self._folder / MANIFEST, self._last)
         write_text(self._folder / "campaign.yaml", self._campaign)
-
-    def write_results(self, results: dict[str, Fingerprint | None]) -> None:
-        """Record what was made of the tests, as it was last written."""
-        write_json(self._folder / MANIFEST, {**self._last, "results": results})

@@ -100,7 +100,7 @@ def plan_campaign(campaign: Campaign) -> dict[str, Any]:
 
 def _if_slow(test_s: float, campaign: Campaign) -> dict[str, str]:
     """How many workers are fed where a test takes long."""
-    task_s = test_s * campaign.run.shard_size
+    task_s = test_s * campaign.run.smallest_shard
     if test_s < SLOW_TEST_S or campaign.run.shard_size == 1:
         return {}
     said = f"with run.shard_size 1 a task is one test of {test_s:.2g} s, and now up to {task_s:,.0f} s"

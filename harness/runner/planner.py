@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from functools import partial
-from itertools import pairwise
+from itertools import chain, pairwise
 
 import numpy as np
 
@@ -69,8 +69,8 @@ class FixedPlanner(Planner):
 
     def __init__(self, campaign: Campaign) -> None:
         self._campaign = campaign
-        stop, method, size = campaign.stop, campaign.testing.method, campaign.run.shard_size
-        super().__init__(StopRule(stop, method, size, min_crashes=campaign.min_crashes))
+        stop, ends = campaign.stop, campaign.run.shard_ends(campaign.stop.episodes)
+        super().__init__(StopRule(stop, campaign.testing.method, ends, min_crashes=campaign.min_crashes))
         self._sums = accumulator(self.rule.estimator)
         self._n_episodes = 0
 
@@ -89,8 +89,9 @@ class FixedPlanner(Planner):
 
 def known_specs(campaign: Campaign) -> Iterator[ShardSpec]:
     """Shards of a campaign all of whose tests are known beforehand."""
-    size, total = campaign.run.shard_size, campaign.stop.episodes
-    return (ShardSpec(first // size, first, min(size, total - first)) for first in range(0, total, size))
+    total = campaign.stop.episodes
+    edges = enumerate(pairwise(chain((0,), campaign.run.shard_ends(total))))
+    return (ShardSpec(index, first, min(end, total) - first) for index, (first, end) in edges)
 
 
 class ShellPlanner(Planner):
@@ -132,7 +133,7 @@ class ShellPlanner(Planner):
         n_shards = 0
         while (added := self.next_round()).any():
             first = self.reported_from + self._n_episodes
-            specs = round_specs(self.drawn, added, n_shards, first, self._campaign.run.shard_size)
+            specs = round_specs(self.drawn, added, n_shards, first, self._campaign.run.smallest_shard)
             self.drawn = self.drawn + added
             n_shards += len(specs)
             yield iter(specs)
@@ -152,7 +153,7 @@ class ShellPlanner(Planner):
         if self._n_episodes != self._look:
             return False
         enough = self.rule.observe(self.seen)
-        if not (enough and self._plans and self.rule.reached and self.planned is None):
+        if not (enough and self._plans and self.rule.look.stopped and self.planned is None):
             return enough or self.planned is not None
         budget = self._campaign.stop.episodes - self._n_episodes
         stop, left = self._campaign.stop, self._allocation.available - self.drawn

@@ -26,8 +26,8 @@ from harness.records.folder import SHELLS, read_json
 from harness.records.tables import shard_tables
 from harness.resolved import Resolved, resolve
 from harness.runner.retrace import Retracing
-from harness.traffic.driving import Environment
 from harness.traffic.initial_state import InitialStates
+from harness.traffic.laws import Environment
 from harness.vocabulary import PRESCRIBED, RecordArray
 from harness.worlds.av_type import av_type
 from harness.worlds.protocol import World

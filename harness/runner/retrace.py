@@ -1,4 +1,4 @@
-"""The exact alarm: the twin retraces what SUMO has driven, episode by episode, and must arrive at the same bits.
+"""The twin retraces what SUMO has driven, episode by episode, and must arrive at the same bits.
 
 Initial state and maneuvers determine LV's and BV's motion, and the AV keeps its speed until the cut-in. So R2 and R2dot
 at the cut-in, and every end without one, follow from what is on record; for a built-in AV the crash too, with its time

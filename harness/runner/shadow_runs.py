@@ -29,8 +29,8 @@ from harness.pool.vehicle_pool import ShadowPaths
 from harness.random_stream import CUT_IN, uniforms
 from harness.records.folder import COMPRESSION, read_table
 from harness.records.tables import shadow_table
-from harness.traffic.driving import Environment
-from harness.vehicles.models import driver_records
+from harness.traffic.laws import Environment
+from harness.vehicles.drivers import driver_records
 from harness.vocabulary import AV, FAILED, IntArray, RecordArray
 
 SHADOW = "shadow"

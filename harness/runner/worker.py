@@ -71,7 +71,7 @@ class ShardDone:
     """A finished shard: what the stop rule needs of it, how many episodes the twin has retraced, causes of failures.
 
     ``repeated`` is None where no test was run twice; ``parquet`` are its tables as files, or, where they are on disk
-    already, ``files`` their paths by table; ``gathered`` says whether it comes from columns gathered of many shards.
+    already, ``files`` their paths by table.
     """
 
     spec: ShardSpec
@@ -81,7 +81,6 @@ class ShardDone:
     repeated: Repeated | None
     parquet: dict[str, bytes] = field(default_factory=dict)
     files: dict[str, str] = field(default_factory=dict)
-    gathered: bool = False
 
 
 Done = ShardDone | ShadowDone

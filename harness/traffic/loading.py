@@ -19,10 +19,17 @@ from harness.campaign.sections import EnvironmentSettings
 from harness.compiled import compiled_threads
 from harness.errors import CampaignError
 from harness.maneuvers import N_ACCELERATIONS
-from harness.traffic.cut_in import acceptance, opportunity
-from harness.traffic.driving import Environment, acceleration_pmf, build_environment, car_following, free_driving
 from harness.traffic.initial_state import InitialStates
 from harness.traffic.lateral import constant_lead
+from harness.traffic.laws import (
+    Environment,
+    acceleration_pmf,
+    acceptance,
+    build_environment,
+    car_following,
+    free_driving,
+    opportunity,
+)
 from harness.traffic.parameters import SHIPPED_FOLDER, EnvironmentParameters, parameter_record
 from harness.vocabulary import BoolArray, FloatArray, State
 

@@ -8,10 +8,9 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, model_validator
 
-from harness.campaign.problems import broken_rule
-from harness.campaign.sections import Section
+from harness.campaign.sections import broken_rule
 from harness.campaign.vehicle import MAX_CONFIGURED_SPEED_MPS
 from harness.maneuvers import ACCELERATIONS_MPS2
 from harness.traffic.lateral import LateralMotion, constant_lead, in_one_step, log_normal_speed
@@ -27,7 +26,11 @@ LONGEST_LEAD_S = 10.0
 _SPEED = ("speed_median_mps", "speed_log_sd", "longest_lead_s")
 
 
-class Number(Section):
+class _Frozen(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+
+
+class Number(_Frozen):
     """A value and where it comes from (the tags are explained in the shipped file)."""
 
     value: float
@@ -83,7 +86,7 @@ def _whole_steps(number: Number) -> Number:
     return number
 
 
-class Scenario(Section):
+class Scenario(_Frozen):
     """Horizon of a test."""
 
     duration_s: Annotated[Number, _within(1.0, 25.0), AfterValidator(_whole_steps)]
@@ -103,7 +106,7 @@ class Scenario(Section):
         return data
 
 
-class FitRange(Section):
+class FitRange(_Frozen):
     """Where the fits hold; states outside are clamped to it."""
 
     v_min_mps: Speed
@@ -122,7 +125,7 @@ class FitRange(Section):
         return self
 
 
-class InitialState(Section):
+class InitialState(_Frozen):
     """Distribution of (v_BV, R1, R1dot, R2, R2dot)."""
 
     v_location_mps: Coefficient
@@ -157,7 +160,7 @@ class InitialState(Section):
         return self
 
 
-class FreeDriving(Section):
+class FreeDriving(_Frozen):
     """Accelerations of LV, and of BV after its cut-in."""
 
     df: DegreesOfFreedom
@@ -171,7 +174,7 @@ class FreeDriving(Section):
     brake_max_mps2: Acceleration
 
 
-class CarFollowing(Section):
+class CarFollowing(_Frozen):
     """Accelerations of BV behind LV."""
 
     gain_rate_per_s: Gain
@@ -191,7 +194,7 @@ class CarFollowing(Section):
     rate_cap_mps: Speed
 
 
-class Guard(Section):
+class Guard(_Frozen):
     """What keeps BV off LV; part of p."""
 
     lead_braking_mps2: Braking
@@ -200,7 +203,7 @@ class Guard(Section):
     margin_m: Gap
 
 
-class CutIn(Section):
+class CutIn(_Frozen):
     """Hazard of the cut-in."""
 
     intercept: Coefficient
@@ -217,7 +220,7 @@ class CutIn(Section):
     max_probability_1s: Annotated[Number, _within(1e-6, 0.5)]
 
 
-class Lateral(Section):
+class Lateral(_Frozen):
     """How long cut-ins show themselves before BV overlaps: a constant lead, or a log-normal lateral speed."""
 
     distance_m: Annotated[Number, _within(0.1, 5.0)]
@@ -246,7 +249,7 @@ class Lateral(Section):
         return log_normal_speed(self.distance_m.value, median, log_sd, longest)
 
 
-class EnvironmentParameters(Section):
+class EnvironmentParameters(_Frozen):
     """All numbers of the environment."""
 
     format: Literal["ndd-overtaking"]

@@ -8,6 +8,8 @@ former is that of the regulation's annex 4, appendix 3, and the latter that of K
 Times are in steps and need not be whole: in the step in which a delay ends, the acceleration is the mean of what comes
 before and after, by their shares of it. So a driver changes continuously with its delay, and one of a whole number of
 steps is that of the step-wise definition.
+
+`react` is how any driver gets from what its model wants to what it does: late, no faster than its jerk, remembering.
 """
 
 from __future__ import annotations
@@ -16,8 +18,15 @@ import math
 from typing import NamedTuple
 
 from harness.compiled import compiled_inline
+from harness.random_stream import AV_DRAWS, uniform
+from harness.vehicles.drivers import (
+    CAREFUL_COMPETENT_KIND,
+    FUZZY_SAFETY_KIND,
+    SMALLEST_GAP_M,
+    driver_acceleration,
+    idm_acceleration,
+)
 from harness.vehicles.kinematics import STEP_S
-from harness.vehicles.models import SMALLEST_GAP_M, idm_acceleration
 from harness.vocabulary import Record
 
 
@@ -179,3 +188,36 @@ def need_based(
     hardest = driver.min_acceleration_mps2
     wanted = hardest if room <= 0.0 else max(-(closing * closing) / room, hardest)
     return changing(part_after(step, danger, driver.reaction_steps), driver.acceleration_mps2, wanted), danger
+
+
+@compiled_inline
+def reaction_steps(driver: Record, seed: int, episode: int) -> int:
+    """Steps that pass after the cut-in before the driver reacts, its inattention in this episode included."""
+    if driver.inattention_probability > 0.0 and uniform(seed, episode, AV_DRAWS, 0) < driver.inattention_probability:
+        return int(driver.delay_steps + driver.inattention_steps)
+    return int(driver.delay_steps)
+
+
+@compiled_inline
+def nothing_yet(used_up: float) -> Memory:
+    """What a driver remembers before it acts: it has kept its speed, and seen no danger."""
+    return Memory(0.0, math.inf, used_up)
+
+
+@compiled_inline
+def react(driver: Record, memory: Memory, step: int, speed: float, lead_speed: float, gap: float) -> Memory:
+    """What a driver does in a step, as what it will remember of it.
+
+    ``step`` counts from 0, the first one in which it acts.
+    """
+    danger = memory.danger
+    if driver.kind >= 0:
+        wanted = driver_acceleration(driver, speed, lead_speed, gap)
+    elif driver.kind == CAREFUL_COMPETENT_KIND:
+        wanted, danger = careful_competent(driver, memory, step, speed, lead_speed, gap)
+    elif driver.kind == FUZZY_SAFETY_KIND:
+        wanted, danger = fuzzy_safety(driver, memory, step, speed, lead_speed, gap)
+    else:
+        wanted, danger = need_based(driver, memory, step, speed, lead_speed, gap)
+    change = driver.max_jerk_mps3 * STEP_S
+    return Memory(min(max(wanted, memory.acceleration - change), memory.acceleration + change), danger, memory.used_up)

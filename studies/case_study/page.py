@@ -11,12 +11,12 @@ from typing import Any
 import matplotlib.style
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
+from harness import numbers
 from harness.errors import HarnessError
 from harness.estimators.block import MAX_CONTROL_STEPS
 from harness.estimators.diagnostics import CARELESS_MEAN
 from harness.records.folder import write_bytes
-from harness.report import number_format
-from harness.report.plot_style import RC, png
+from harness.report.style import RC, png
 from studies.case_study.context import Made
 from studies.case_study.figures import Verdict, is_settled, verdict
 from studies.case_study.plots import plots_of
@@ -48,7 +48,7 @@ def write_page(study: Study, folder: Path, made: Mapping[str, Made]) -> tuple[Pa
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters.update(shown=shown, number=number_format.number, count=count, cell=cell)
+    environment.filters.update(shown=shown, number=numbers.number, count=count, cell=cell)
     steps = [(name, step, made[name].result) for name, step in study.steps.items()]
     page = environment.get_template("case_study.md.j2").render(
         study=study,
@@ -107,21 +107,21 @@ def shown(found: dict[str, Any]) -> str:
 def _plainly(found: dict[str, Any]) -> str:
     value, low, high = found["value"], found["low"], found["high"]
     if value is None:
-        return "–" if low is None else f"above {number_format.number(low)}"
+        return "–" if low is None else f"above {numbers.number(low)}"
     if low is None and high is None:
-        return number_format.number(value)
+        return numbers.number(value)
     if low == high:
-        return count(value) if float(value).is_integer() else number_format.number(value)
+        return count(value) if float(value).is_integer() else numbers.number(value)
     if value == 0.0:
-        return f"0 (to {number_format.number(high)})"
+        return f"0 (to {numbers.number(high)})"
     if high is None:
-        return f"at least {number_format.number(low)}"
-    return number_format.with_interval(value, 0.0 if low is None else low, high)
+        return f"at least {numbers.number(low)}"
+    return numbers.interval(0.0 if low is None else low, high, value)
 
 
 def count(value: float | None) -> str:
     """A whole number with all its digits up to a million, else three of them."""
-    return number_format.count(value) if value is None or abs(value) < 1e6 else number_format.number(value)
+    return numbers.count(value) if value is None or abs(value) < 1e6 else numbers.number(value)
 
 
 def stratum_rows(result: Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:

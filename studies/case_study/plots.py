@@ -12,7 +12,7 @@ from matplotlib.ticker import MaxNLocator
 
 from harness.estimators.block import MAX_CONTROL_STEPS
 from harness.records.folder import read_table
-from harness.report.plot_style import (
+from harness.report.style import (
     BLUE,
     FULL_WIDTH_IN,
     GREEN,

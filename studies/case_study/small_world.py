@@ -20,13 +20,13 @@ import numpy as np
 from harness.campaign.sections import EnvironmentSettings
 from harness.campaign.vehicle import AutomatedVehicle, default_surrogates
 from harness.estimators.block import MAX_CONTROL_STEPS, Block
+from harness.importance.challenge import roll_out
 from harness.importance.grid import GridPoints
-from harness.importance.immediate import roll_out
 from harness.maneuvers import ACCELERATIONS_MPS2, N_ACCELERATIONS
-from harness.traffic.driving import Environment
+from harness.traffic.laws import Environment
 from harness.traffic.loading import evaluate_laws, load_environment
+from harness.vehicles.drivers import av_records, surrogate_records
 from harness.vehicles.kinematics import CONTACT_M, STEP_S
-from harness.vehicles.models import av_records, surrogate_records
 from harness.vocabulary import BoolArray, FloatArray, IntArray, RecordArray
 
 LV_MPS, BV_MPS, AV_MPS = 3.0, 8.0, 13.0
@@ -208,7 +208,7 @@ def small_world(level: float, *, nodes: int = NODES) -> SmallWorld:
 
 
 def _cut_in(speed: FloatArray, r1: FloatArray, r2: FloatArray, environment: Environment) -> FloatArray:
-    """Probability to cut in within the step, as `harness.traffic.cut_in.cut_in_hazard` gives it."""
+    """Probability to cut in within the step, as `harness.traffic.laws.cut_in_hazard` gives it."""
     n = environment.numbers
     _, chance, accepted = _laws(speed, r1, np.column_stack([r2, speed - AV_MPS]), environment)
     p_1s = np.minimum(chance * accepted, float(n["cut_in__max_probability_1s"]))

@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from bisect import bisect_left
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,11 +15,11 @@ import pytest
 from scipy.special import ndtr
 from scipy.stats import binom, norm
 
-from harness.estimators.alarm import LEVEL, Alarm
 from harness.estimators.block import Block
-from harness.strata import KnownRates
+from harness.vocabulary import BoolArray
+from studies.alarm import LEVEL, Alarm, KnownRates
 from studies.chains.single_choice import SingleChoice
-from tests.estimators.small_blocks import block, fed
+from tests.estimators.small_blocks import block
 
 from .seed import SEED
 
@@ -45,39 +44,43 @@ MEAN_WEIGHT = SURROGATES @ (WORLD.p**2 / (WORLD.alpha @ WORLD.q)) / (SURROGATES 
 ERROR = 0.01
 
 
-def replayed(rng: np.random.Generator, *, corrupt: float = 1.0, n: int = N) -> Block:
+Replayed = tuple[Block, BoolArray, KnownRates]
+
+
+def replayed(rng: np.random.Generator, *, corrupt: float = 1.0, n: int = N) -> Replayed:
     """Tests with surrogates whose rates come from a pool of its own in every replication."""
     maneuver = WORLD.maneuvers(n, rng)
     truth = SURROGATES @ WORLD.p
     pool = truth * (1.0 + ERROR * rng.normal(size=3)) * [corrupt, 1.0, 1.0]
     at_crash = MEAN_WEIGHT * WORLD.alpha[0]  # as if the first were forced cut-ins
-    known = KnownRates("pool", ("careful", "careless", "other"), pool, np.diag((ERROR * truth) ** 2), at_crash)
-    tests = WORLD.block("episode_mixture", maneuver)
-    return replace(tests, surrogates_crash=SURROGATES[:, maneuver].T, known_rates=known)
+    known = KnownRates(("careful", "careless", "other"), pool, ERROR * truth, at_crash)
+    return WORLD.block("episode_mixture", maneuver), SURROGATES[:, maneuver].T, known
 
 
-def told(tests: Block) -> dict[str, Any]:
+def told(tests: Block, crashes: BoolArray, known: KnownRates) -> dict[str, Any]:
     """What the alarm says of some tests."""
-    return fed(Alarm(), [tests]).result()
+    alarm = Alarm(known)
+    alarm.add(tests, crashes)
+    return alarm.result()
 
 
 @pytest.mark.parametrize(("corrupt", "raised"), [(1.0, False), (1.3, True), (0.8, True)])
 def test_a_corrupted_rate_raises_the_alarm(corrupt, raised):
-    assert told(replayed(np.random.default_rng(SEED), corrupt=corrupt, n=20_000))["raised"] == raised
+    assert told(*replayed(np.random.default_rng(SEED), corrupt=corrupt, n=20_000))["raised"] == raised
 
 
 def test_the_alarm_is_rarely_false():
     """At a level of 1e-4, 400 campaigns raise it twice with a probability below 1e-3."""
-    raised = sum(told(replayed(np.random.default_rng([SEED, k])))["raised"] for k in range(REPLICATIONS))
+    raised = sum(told(*replayed(np.random.default_rng([SEED, k])))["raised"] for k in range(REPLICATIONS))
     assert raised < 2
 
 
 def test_blocks_may_be_added_in_any_parts():
-    whole = replayed(np.random.default_rng(SEED), corrupt=2.5)
-    alarm = Alarm()
+    tests, crashes, known = replayed(np.random.default_rng(SEED), corrupt=2.5)
+    alarm = Alarm(known)
     for rows in (slice(0, 1), slice(1, 1_300), slice(1_300, N)):
-        alarm.add(whole.take(rows))
-    found, at_once = alarm.result(), told(whole)
+        alarm.add(tests.take(rows), crashes[rows])
+    found, at_once = alarm.result(), told(tests, crashes, known)
     for one, other in zip([found, *found["surrogates"]], [at_once, *at_once["surrogates"]], strict=True):
         assert one["p_value"] == pytest.approx(other["p_value"], rel=1e-9)
     assert found["p_value"] < 0.1
@@ -85,27 +88,26 @@ def test_blocks_may_be_added_in_any_parts():
 
 def weighted(
     h: list[float], mu: float, *, cap: float | None = None, p_cut_in: float | None = None, error: float = 0.0
-) -> Block:
+) -> Replayed:
     """Tests in which one surrogate, of a rate known with an error, crashes with weights ``h``, 0 for no crash.
 
     They are bounded by a ``cap``, or are those of forced cut-ins with a mean ``p_cut_in`` where it crashes.
     """
     n, crashes = len(h), np.array(h) > 0.0
-    rates = np.array([mu]), np.array([[error**2]]), np.array([1.0 if p_cut_in is None else p_cut_in])
-    return block(
+    rates = np.array([mu]), np.array([error]), np.array([1.0 if p_cut_in is None else p_cut_in])
+    tests = block(
         [False] * n,
         np.log(np.where(crashes, h, 1.0)),
         method="episode_mixture" if p_cut_in is None else "forced",
         log_q=np.zeros((n, 1)),
         alpha=np.zeros(1),
         weight_cap=cap,
-        surrogates_crash=crashes[:, None],
-        known_rates=KnownRates("pool", ("one",), *rates),
     )
+    return tests, crashes[:, None], KnownRates(("one",), *rates)
 
 
 def by_bets(h: list[float], mu: float, cap: float) -> float:
-    return told(weighted(h, mu, cap=cap))["p_value"]
+    return told(*weighted(h, mu, cap=cap))["p_value"]
 
 
 def by_sample_variance(h: list[float], mu: float, cap: float) -> float:
@@ -167,7 +169,7 @@ def with_an_erring_pool(told_error: float, n: int = 1_000, p: float = 0.5, error
 
         def raised(count: int, mu: float = p + error * z) -> bool:
             h = [1.0] * count + [0.0] * (n - count)
-            return bool(told(weighted(h, mu, cap=1.0, error=told_error))["raised"])
+            return bool(told(*weighted(h, mu, cap=1.0, error=told_error))["raised"])
 
         centre = round(n * (p + error * z))
         low = bisect_left(range(centre), True, key=lambda count: not raised(count))
@@ -196,7 +198,7 @@ def paths_missed(n: int, rare: float, times: float, told_share: float = 1.0) -> 
     found = 0.0
     for n_rare, probability in enumerate(binom.pmf(np.arange(n + 1), n, rare)):
         h = [heavy] * n_rare + [light] * (n - n_rare)
-        found += probability * told(weighted(h, mu, p_cut_in=told_share * at_crash))["raised"]
+        found += probability * told(*weighted(h, mu, p_cut_in=told_share * at_crash))["raised"]
     return found
 
 
@@ -215,7 +217,7 @@ def test_too_few_crashes_are_noticed_once_the_heaviest_would_have_occurred(n, ra
     """Not one crash, at μ = 2^-10 and a mean square of 2^-2 μ: the capital of each bet by hand."""
     few = [(1.0 + math.expm1(-(2.0 ** (8 - j))) / 2.0**8) ** -n for j in range(1, 25)]
     many = [(1.0 + 2.0**-j) ** -n for j in range(1, 25)]
-    found = told(weighted([0.0] * n, 2.0**-10, cap=2.0**-2))
+    found = told(*weighted([0.0] * n, 2.0**-10, cap=2.0**-2))
     assert found["p_value"] == pytest.approx(48.0 / math.fsum(many + few), rel=1e-9)
     assert found["raised"] == raised
 
@@ -223,14 +225,14 @@ def test_too_few_crashes_are_noticed_once_the_heaviest_would_have_occurred(n, ra
 def test_too_many_crashes_by_hand():
     many = [((1.0 + 2.0**-j / 0.1) / (1.0 + 2.0**-j)) ** 9 for j in range(1, 25)]
     few = [math.exp(-9.0 * 2.0**-j / 0.1) for j in range(1, 25)]
-    assert told(weighted([1.0] * 9, 0.1))["p_value"] == pytest.approx(48.0 / math.fsum(many + few), rel=1e-9)
+    assert told(*weighted([1.0] * 9, 0.1))["p_value"] == pytest.approx(48.0 / math.fsum(many + few), rel=1e-9)
 
 
 def test_without_a_bound_only_too_many_crashes_are_evidence():
-    none = told(weighted([0.0] * 10_000, 0.1))
+    none = told(*weighted([0.0] * 10_000, 0.1))
     assert none["p_value"] == 1.0
-    assert told(weighted([1.0] * 100, 0.1))["raised"]
+    assert told(*weighted([1.0] * 100, 0.1))["raised"]
 
 
 def test_a_surrogate_without_a_known_rate_is_not_judged():
-    assert told(weighted([1.0] * 100, 0.0, cap=1.0))["p_value"] == 1.0
+    assert told(*weighted([1.0] * 100, 0.0, cap=1.0))["p_value"] == 1.0

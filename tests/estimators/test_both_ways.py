@@ -7,7 +7,6 @@ import pytest
 
 from harness.estimators import one_pass
 from harness.estimators.block import Block, joined
-from harness.estimators.difference import difference_statement, paired_difference
 from harness.estimators.one_pass import ACCUMULATORS
 from studies.chains.named import overtaking
 from studies.chains.sampler import blocks
@@ -83,39 +82,6 @@ def test_no_crash_but_failures_leave_no_small_upper_bound():
         assert estimate.crash_rate == estimate.ci_low == 0.0
         assert estimate.upper_bound > 20 / n
         assert estimate.ci_high > 20 / n
-
-
-def test_a_difference_allows_for_the_worst_of_each_side():
-    """Of 2,000 tests A crashes in 200 and fails in 40, B crashes in 100 and fails in 60 others."""
-    k = np.arange(2_000)
-    a = block((k < 200).tolist(), method="nde", failed=((k >= 1000) & (k < 1040)).tolist(), weight_cap=1.0)
-    b = block((k < 100).tolist(), method="nde", failed=((k >= 1500) & (k < 1560)).tolist(), weight_cap=1.0)
-    none = np.zeros(2_000, np.bool_)
-
-    def between(of_a: Block, of_b: Block):
-        return paired_difference([(replace(of_a, failed=none), replace(of_b, failed=none))], 0.9)
-
-    halves = [slice(0, 900), slice(900, 2_000)]
-    found = paired_difference([(a.take(rows), b.take(rows)) for rows in halves], 0.9)
-    seen = between(a, b)
-    assert (found.difference, found.std_error, found.ratio) == (seen.difference, seen.std_error, seen.ratio)
-    high, low = between(a.failed_as_crashes(), b), between(a, b.failed_as_crashes())
-    assert found.ci_high == pytest.approx(high.ci_high, rel=1e-12)
-    assert found.ci_low == pytest.approx(low.ci_low, rel=1e-12)
-    assert found.ci_low < seen.ci_low < seen.ci_high < found.ci_high
-    assert found.ratio_high == pytest.approx(high.ratio_high, rel=1e-12)
-    assert found.ratio_low == pytest.approx(low.ratio_low, rel=1e-12)
-    assert found.ratio_low < seen.ratio_low < seen.ratio_high < found.ratio_high
-    assert found.a.ci_high > seen.a.ci_high
-    assert "A FAILED in 40 and B in 60" in difference_statement(found, "one", "other")
-
-
-def test_where_only_failed_tests_can_differ_the_ratio_has_the_limits_of_those():
-    k = np.arange(2_000)
-    a, b = (block((k < 200).tolist(), method="nde", failed=(k >= n).tolist(), weight_cap=1.0) for n in (1960, 1940))
-    found = paired_difference([(a, b)], 0.9)
-    assert found.n_differing == 0
-    assert f"A/B = 1 ({found.ratio_low:.3g} to {found.ratio_high:.3g})" in difference_statement(found, "one", "other")
 
 
 def test_required_numbers_of_tests_grow_with_failures():

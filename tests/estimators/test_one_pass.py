@@ -16,7 +16,6 @@ from harness.estimators import (
     estimate_blocks,
     one_pass,
 )
-from harness.estimators.statement import alarm_cautions, warned
 from harness.runner import estimate_run
 from harness.vocabulary import SAMPLING
 from studies.chains.named import overtaking
@@ -69,8 +68,6 @@ def test_a_stored_run_gives_what_blocks_in_memory_give(tmp_path, method, headlin
     if method == "step_mixture":  # q was stored, q/q_sampled is divided again: one rounding in the regression
         memory["estimates"].pop("scv")
         content["estimates"].pop("scv")
-    for found in (content, memory):  # what surrogates would have done is on record in neither, for other reasons
-        assert not found["diagnostics"].pop("alarm")["raised"]
     assert json.loads(json.dumps(content, allow_nan=False)) == memory
 
 
@@ -132,14 +129,6 @@ def test_one_crash_that_could_double_the_rate_leads_the_sentence(n, doubts):
     caution = "WARNING: one more crash of the largest possible weight would add 1.65 times this rate"
     assert content["statement"].startswith(caution) == doubts
     assert ("relative half-width" in content["statement"]) != doubts
-
-
-def test_a_raised_alarm_leads_every_sentence():
-    rates = {"p_value": 1e-9}
-    (caution,) = alarm_cautions({"raised": True, "surrogate_crash_rates": rates})
-    assert warned([caution], "The crash rate is 1.").startswith("WARNING: ALARM, replayed surrogates do not crash")
-    assert "p-value 1.0e-09" in caution
-    assert alarm_cautions({"raised": False, "surrogate_crash_rates": {}}) == []
 
 
 def test_estimators_that_the_records_do_not_allow_are_there_with_the_reason(tmp_path):

@@ -16,10 +16,10 @@ from harness.estimators.pairs import (
     CRASH,
     FAILED,
     NO_CRASH,
+    MarginDecision,
     PairCounts,
     PairedShells,
     conditional_paired_statement,
-    margin_statement,
     no_pairs,
     paired_estimate,
     paired_statement,
@@ -147,7 +147,7 @@ def test_equal_vehicles_are_not_told_apart_and_json_has_no_infinity():
     assert content["ratio_high"] is None
     assert content["only_a"]["ci_low"] == 0.0
     assert "not distinguishable from 0" in paired_statement(found, "x", "y")
-    assert margin_statement("refuted", 0.1, 0.983, conditional=False).startswith("B IS WORSE")
+    assert MarginDecision(0.1, "refuted", 0.983, False).sentence.startswith("B IS WORSE")
 
 
 def test_the_ith_test_of_a_stratum_belongs_to_the_ith_of_the_other_whatever_the_shards():

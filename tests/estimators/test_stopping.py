@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from harness.campaign.sections import Stop
+from harness.campaign.sections import Run, Stop
 from harness.estimators import StopRule, accumulator
 from harness.estimators.stopping import LOOK_RATIO, Decision, look_grid
 from harness.strata import ASSUMPTION_FREE
@@ -19,6 +19,7 @@ from tests.chains.seed import SEED
 from .small_blocks import block
 
 SHARD = 200
+ENDS = range(SHARD, 10**6, SHARD)
 
 
 def passing(n: int, *, rhw: float = 0.01, n_crashes: int = 1_000):
@@ -29,7 +30,7 @@ def passing(n: int, *, rhw: float = 0.01, n_crashes: int = 1_000):
 
 @given(st.integers(1, 10**9), st.integers(1, 10**6))
 def test_looks_are_shard_boundaries_on_a_geometric_grid(n_episodes, shard_size):
-    looks = look_grid(n_episodes, shard_size)
+    looks = look_grid(n_episodes, Run(shard_size=shard_size).shard_ends(n_episodes))
     assert looks[-1] == n_episodes
     assert all(a < b for a, b in itertools.pairwise(looks))
     assert all(look % shard_size == 0 for look in looks[:-1])
@@ -38,60 +39,72 @@ def test_looks_are_shard_boundaries_on_a_geometric_grid(n_episodes, shard_size):
 
 
 def test_looks_thin_out():
-    looks = look_grid(10_000_000, 5_000)
+    looks = look_grid(10_000_000, range(5_000, 10_000_001, 5_000))
     assert looks[:4] == (5_000, 10_000, 15_000, 20_000)
     assert len(looks) < 70
     assert looks[-2] / looks[-3] == pytest.approx(LOOK_RATIO, rel=0.01)
 
 
+def test_long_runs_have_some_200_shards():
+    """The first are of the usual size; one that is given stays."""
+    ends = Run().shard_ends(10_000_000)
+    assert (list(ends[:32]), len(ends)) == ([5_000 * (k + 1) for k in range(32)], 167)
+    assert Run().shard_ends(170_000) == ends[: len(Run().shard_ends(170_000))]
+    assert len(Run().shard_ends(10**8)) < 300
+    assert len(Run(shard_size=10).shard_ends(10**9)) == 10**8
+    looks = look_grid(10_000_000, ends)
+    assert set(looks[:-1]) <= set(ends)
+    assert 40 < len(looks) < 70
+
+
 def test_two_consecutive_passes_are_needed():
-    rule = StopRule(Stop(episodes=100_000, rhw=0.3, min_crashes=10), "forced", SHARD)
+    rule = StopRule(Stop(episodes=100_000, rhw=0.3, min_crashes=10), "forced", ENDS)
     pattern = [True, False, True, True]
     answers = [rule.observe(n, passing(n, rhw=0.2 if ok else 0.4)) for n, ok in zip(rule.looks, pattern, strict=False)]
     assert answers == [False, False, False, True]
-    assert rule.reached
-    with pytest.raises(ValueError, match="already stopped"):
+    assert rule.look.stopped
+    with pytest.raises(ValueError, match="no look is due"):
         rule.observe(rule.looks[4], passing(rule.looks[4]))
 
 
 def test_too_few_crashes_never_stop():
-    rule = StopRule(Stop(episodes=2_000, rhw=0.3, min_crashes=50), "forced", SHARD)
+    rule = StopRule(Stop(episodes=2_000, rhw=0.3, min_crashes=50), "forced", ENDS)
     answers = [rule.observe(n, passing(n, n_crashes=49)) for n in rule.looks]
     assert answers == [False] * (len(rule.looks) - 1) + [True]
-    assert not rule.reached
+    assert not rule.look.stopped
 
 
 @pytest.mark.parametrize(("weight_cap", "stops"), [(59.0, True), (61.0, False), (math.inf, False)])
 def test_one_more_crash_of_the_largest_weight_must_not_matter(weight_cap, stops):
     """At n = 200 and a rate of 1 an RHW of 0.3 allows for a weight of 60."""
-    rule = StopRule(Stop(episodes=100_000, rhw=0.3, min_crashes=10), "forced", 200)
+    rule = StopRule(Stop(episodes=100_000, rhw=0.3, min_crashes=10), "forced", ENDS)
     rule.observe(rule.looks[0], replace(passing(200), weight_cap=weight_cap))
-    assert rule.heaviest == weight_cap / 200
+    assert rule.look.one_more_crash == weight_cap / 200
     assert rule.observe(rule.looks[1], replace(passing(400), weight_cap=2 * weight_cap)) == stops
 
 
 def test_without_a_precision_the_budget_decides():
-    rule = StopRule(Stop(episodes=1_050), "nde", SHARD)
+    rule = StopRule(Stop(episodes=1_050), "nde", ENDS)
     answers = [rule.observe(n, passing(n)) for n in rule.looks]
     assert answers == [False] * (len(rule.looks) - 1) + [True]
     assert rule.looks[-1] == 1_050
-    assert not rule.reached
+    assert not rule.look.stopped
 
 
 def test_looking_elsewhere_is_refused():
-    rule = StopRule(Stop(episodes=10_000, rhw=0.3), "nde", SHARD)
-    with pytest.raises(ValueError, match="first 200 episodes"):
+    rule = StopRule(Stop(episodes=10_000, rhw=0.3), "nde", ENDS)
+    with pytest.raises(ValueError, match="no look is due"):
         rule.observe(300, passing(300))
-    with pytest.raises(ValueError, match="first 200 episodes"):
+    with pytest.raises(ValueError, match="no look is due"):
         rule.observe(200, passing(400))
     rule.observe(200, passing(200))
-    with pytest.raises(ValueError, match="first 400 episodes"):
+    with pytest.raises(ValueError, match="no look is due"):
         rule.observe(200, passing(200))
 
 
 def test_watches_the_methods_own_estimator_unless_told_otherwise():
-    assert StopRule(Stop(), "episode_mixture", SHARD).estimator == "mixture_cv"
-    assert StopRule(Stop(estimator="nade"), "episode_mixture", SHARD).estimator == "nade"
+    assert StopRule(Stop(), "episode_mixture", ENDS).estimator == "mixture_cv"
+    assert StopRule(Stop(estimator="nade"), "episode_mixture", ENDS).estimator == "nade"
 
 
 @pytest.mark.parametrize("method", ["nde", "forced", "episode_mixture"])
@@ -99,7 +112,7 @@ def test_the_same_campaign_stops_at_the_same_test(method):
     """However many tests are ready beyond the prefix, and however often it is run."""
 
     def stopped_at(n_ready: int) -> tuple[int, float]:
-        rule = StopRule(Stop(episodes=40_000, rhw=0.2, min_crashes=30), method, SHARD)
+        rule = StopRule(Stop(episodes=40_000, rhw=0.2, min_crashes=30), method, ENDS)
         state, n = accumulator(rule.estimator), 0
         for part in blocks(frequent_decisive(), method, [SHARD] * n_ready, SEED):
             state.add(part)

@@ -33,7 +33,7 @@ def drawn(rng: np.random.Generator, n: int) -> Block:
 
 
 def stopped(rng: np.random.Generator, *, cap_is_known: bool) -> Estimate:
-    rule, state, n = StopRule(STOP, "forced", SHARD), Nade(), 0
+    rule, state, n = StopRule(STOP, "forced", range(SHARD, STOP.episodes + SHARD, SHARD)), Nade(), 0
     for look in rule.looks:
         state.add(drawn(rng, look - n))
         n = look
@@ -41,7 +41,7 @@ def stopped(rng: np.random.Generator, *, cap_is_known: bool) -> Estimate:
         largest_seen = estimate.largest_weight_share * estimate.crash_rate * n
         if rule.observe(n, estimate if cap_is_known else replace(estimate, weight_cap=largest_seen, cautions=())):
             break
-    assert rule.reached
+    assert rule.look.stopped
     return estimate
 
 

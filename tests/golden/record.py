@@ -2,7 +2,7 @@
 
 Recording again is allowed where a release means to change bits (another law of traffic, another random stream, another
 estimate), and its changelog says so. It is never allowed in a change of structure: there a golden run that differs
-shows a mistake. ``--processes N`` only looks whether workers that are processes give the same.
+shows a mistake.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import hashlib
 import json
 import sys
 import tempfile
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ import pyarrow.parquet as pq
 
 import harness
 from tests.golden.campaigns import BASE, COMPARED, RUNS
-from tests.in_process import controllers_here, one_process, without_page
+from tests.in_process import controllers_here, one_process, run_here, without_page
 
 GOLDEN = Path(__file__).parent / "golden.json"
 TABLES = {"episodes": ["episode"], "moments": ["episode", "step"], "traces": ["episode", "step"], "shadow": ["shadow"]}
@@ -36,32 +37,17 @@ def load(*overrides: str) -> Any:
     return harness.load_campaign(BASE, overrides)
 
 
-def run_here(name: str, out: Path, *more: str, workers: int | None = None, resume: bool = False) -> Path:
-    """Run a golden campaign: in this process, or with ``workers`` that are processes; without its page."""
-    campaign = load(*RUNS[name], *more)
-    with without_page():
-        if workers is not None:
-            harness.run(campaign, out, workers=workers, resume=resume)
-        else:
-            with one_process(), controllers_here():
-                harness.run(campaign, out, workers=1, resume=resume)
-    return out
-
-
-def compare_here(out: Path, workers: int | None = None) -> Path:
-    """Run the golden comparison."""
+def compare(out: Path) -> Path:
+    """Run the golden comparison, in this process."""
     shared, other = COMPARED
-    with without_page():
-        if workers is not None:
-            harness.compare(load(*shared), load(*shared, other), out, workers=workers)
-        else:
-            with one_process(), controllers_here():
-                harness.compare(load(*shared), load(*shared, other), out, workers=1)
+    with one_process(), controllers_here(), without_page():
+        harness.compare(load(*shared), load(*shared, other), out, workers=1)
     return out
 
 
-def column_hash(column: pa.Array) -> str:
+def column_hash(column: pa.Array | pa.ChunkedArray) -> str:
     """Of type and bits; null is not zero, and a dictionary is what it stands for."""
+    column = column.combine_chunks() if isinstance(column, pa.ChunkedArray) else column
     digest = hashlib.sha256(str(column.type).encode())
     _feed(digest, column)
     return digest.hexdigest()[:10]
@@ -87,7 +73,7 @@ def tables_of(folder: Path) -> dict[str, dict[str, Any]]:
         if files := sorted((folder / name).glob("*.parquet")):
             rows = pa.concat_tables([pq.read_table(file, partitioning=None) for file in files]).combine_chunks()
             rows = rows.take(pc.sort_indices(rows.select(keys), [(key, "ascending") for key in keys]))
-            columns = {column: column_hash(rows[column].combine_chunks()) for column in rows.column_names}
+            columns = {column: column_hash(rows[column]) for column in rows.column_names}
             found[name] = {"rows": rows.num_rows, **columns}
     return found
 
@@ -137,24 +123,34 @@ def unlike(found: Any, golden: Any, path: str = "") -> list[str]:
     return [] if same else [f"{path}: {found!r}, was {golden!r}"]
 
 
-def record(workers: int | None = None) -> dict[str, Any]:
-    """All golden runs, as they are now."""
-    with tempfile.TemporaryDirectory() as folder:
-        runs = {name: seen_in(run_here(name, Path(folder) / name, workers=workers)) for name in RUNS}
-        compared = seen_in_comparison(compare_here(Path(folder) / "compared", workers))
-    return json.loads(json.dumps({"runs": runs, "compared": compared}))
+def record(names: Iterable[str], workers: int | None = None) -> dict[str, Any]:
+    """Golden runs as they are now: in this process, or by ``workers`` that are processes."""
+    found = {}
+    for name in names:
+        with tempfile.TemporaryDirectory() as folder, without_page():
+            if workers is None:
+                run_here(load(*RUNS[name]), Path(folder))
+            else:
+                harness.run(load(*RUNS[name]), folder, workers=workers)
+            found[name] = seen_in(Path(folder))
+    return found
 
 
 def main() -> int:
     """Record, or only look."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--processes", type=int, help="look whether so many workers that are processes give the same")
+    parser.add_argument("--processes", type=int, help="record nothing: do so many workers give the same?")
+    parser.add_argument("--only", nargs="+", choices=RUNS, help="record nothing: are these the same?")
     asked = parser.parse_args()
-    if asked.processes:
-        differences = unlike(record(asked.processes), json.loads(GOLDEN.read_text()))
-        sys.stdout.write("\n".join([*differences, "the same bits" if not differences else "other bits", ""]))
+    runs = record(asked.only or RUNS, asked.processes)
+    if asked.only or asked.processes:
+        golden = json.loads(GOLDEN.read_text())["runs"]
+        differences = unlike(json.loads(json.dumps(runs)), {name: golden[name] for name in runs})
+        sys.stdout.writelines(f"{line}\n" for line in differences)
         return bool(differences)
-    GOLDEN.write_text(json.dumps(record(), indent=0) + "\n")
+    with tempfile.TemporaryDirectory() as folder:
+        compared = seen_in_comparison(compare(Path(folder) / "compared"))
+    GOLDEN.write_text(json.dumps({"runs": runs, "compared": compared}, indent=0) + "\n")
     return 0
 
 

@@ -6,24 +6,26 @@ import pytest
 
 from tests.golden import record
 from tests.golden.campaigns import BEGUN, CONTINUED, RUNS
+from tests.in_process import run_here
+from tests.stored_runs import golden
 
 GOLDEN = json.loads(record.GOLDEN.read_text())
 
 
 @pytest.mark.parametrize("name", RUNS)
-def test_a_run_gives_the_same_bits(name, tmp_path):
-    assert record.unlike(record.seen_in(record.run_here(name, tmp_path / "run")), GOLDEN["runs"][name]) == []
+def test_a_run_gives_the_same_bits(name, stored_run):
+    assert record.unlike(record.seen_in(stored_run(name)), GOLDEN["runs"][name]) == []
 
 
 @pytest.mark.parametrize("name", CONTINUED)
 def test_a_run_that_is_continued_ends_the_same(name, tmp_path):
-    record.run_here(name, tmp_path / "run", BEGUN)
-    continued = record.seen_in(record.run_here(name, tmp_path / "run", resume=True))
-    assert record.unlike(continued, GOLDEN["runs"][name]) == []
+    run_here(golden(name, BEGUN), tmp_path / "run")
+    run_here(golden(name), tmp_path / "run", resume=True)
+    assert record.unlike(record.seen_in(tmp_path / "run"), GOLDEN["runs"][name]) == []
 
 
 def test_a_comparison_gives_the_same_bits(tmp_path):
-    found = record.seen_in_comparison(record.compare_here(tmp_path / "compared"))
+    found = record.seen_in_comparison(record.compare(tmp_path / "compared"))
     assert record.unlike(found, GOLDEN["compared"]) == []
 
 

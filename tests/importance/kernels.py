@@ -9,10 +9,9 @@ import numpy as np
 
 from harness.compiled import compiled_threads
 from harness.episode.critical_moment import draw_from
-from harness.importance import functions, likelihood
+from harness.importance import functions
 from harness.maneuvers import acceleration
-from harness.traffic.cut_in import acceptance, cut_in_hazard, opportunity
-from harness.traffic.driving import acceleration_pmf, free_driving
+from harness.traffic.laws import acceleration_pmf, acceptance, cut_in_hazard, free_driving, opportunity
 from harness.vocabulary import State
 
 
@@ -59,14 +58,14 @@ def _draws(u, method, component, alpha, q, out):
 def _accumulate(method, first, alpha, ratios, v, log_ratio, martingale, sampled):
     log_sampled = 0.0
     for t in range(ratios.shape[0]):
-        sampled[t] = likelihood.accumulate(method, first, alpha, ratios[t], v[t], log_sampled, log_ratio, martingale)
+        sampled[t] = functions.accumulate(method, first, alpha, ratios[t], v[t], log_sampled, log_ratio, martingale)
         log_sampled += np.log(sampled[t])
 
 
 @compiled_threads
 def _log_mixtures(alpha, log_ratio, out):
     for i in range(log_ratio.shape[0]):
-        out[i] = likelihood.log_mixture(alpha, log_ratio[i])
+        out[i] = functions.log_mixture(alpha, log_ratio[i])
 
 
 def after_cut_in(states, environment, importance) -> Proposals:

@@ -11,7 +11,7 @@ from harness.campaign.files import load_campaign
 from harness.pool.cut_ins import Pool
 from harness.pool.storage import campaign_pool
 from harness.resolved import resolve
-from harness.traffic.driving import Environment
+from harness.traffic.laws import Environment
 from harness.traffic.loading import load_environment
 
 MIXTURE_FILE = Path(__file__).parents[2] / "scenarios" / "overtaking_mixture.yaml"

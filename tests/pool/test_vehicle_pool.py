@@ -16,11 +16,11 @@ from harness.progress import Progress
 from harness.resolved import resolve
 from harness.runner.prepare import prepare
 from harness.runner.shadow_runs import as_recorded, run_shadows, shadow_specs, without_cut_in
-from harness.vehicles.models import driver_records
+from harness.vehicles.drivers import driver_records
 from harness.vocabulary import CRASH
 from harness.worlds.twin import TwinWorld
-from tests.environment.kernels import cut_in_terms
 from tests.pool.conftest import MIXTURE_FILE, SMALL_POOL
+from tests.traffic.kernels import cut_in_terms
 
 N = 256
 ACTING = "{{controller: 'tests.controllers.early:{}', before_cut_in: controller, limits: {{max_acceleration_mps2: 2}}}}"

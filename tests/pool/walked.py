@@ -12,9 +12,16 @@ from harness.maneuvers import acceleration
 from harness.pool.enumeration import enumerate_cut_ins
 from harness.pool.shells import Draw, PrescribedEpisodes
 from harness.random_stream import BV_DRAWS, LV_DRAWS, uniform
-from harness.traffic.cut_in import acceptance, cut_in_hazard, opportunity
-from harness.traffic.driving import Environment, car_following, draw_acceleration, free_driving
 from harness.traffic.initial_state import InitialStates
+from harness.traffic.laws import (
+    Environment,
+    acceptance,
+    car_following,
+    cut_in_hazard,
+    draw_acceleration,
+    free_driving,
+    opportunity,
+)
 from harness.traffic.loading import load_environment
 from harness.vehicles.kinematics import CONTACT_M, next_position, next_speed
 from harness.vocabulary import State

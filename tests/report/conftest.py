@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from made_run import RECIPES, write_run
 
 from harness.report import write_report
-from harness.report.run_folder import RunFolder, read_run_folder
+from harness.report.summary import RunFolder, read_run_folder
+from tests.report.made_run import RECIPES, write_run
 
 
 class OnDemand(dict):
@@ -44,4 +44,4 @@ def runs(folders: dict[str, Path]) -> dict[str, RunFolder]:
 @pytest.fixture
 def run_folder(folders: dict[str, Path], tmp_path: Path) -> Path:
     """A copy of a full run without report, to be damaged."""
-    return shutil.copytree(folders["full"], tmp_path / "run", ignore=shutil.ignore_patterns("plots", "report.html"))
+    return shutil.copytree(folders["weighted"], tmp_path / "run", ignore=shutil.ignore_patterns("plots", "report.html"))

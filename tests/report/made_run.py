@@ -59,20 +59,16 @@ class RunRecipe:
 
 
 RECIPES = {
-    "full": RunRecipe(n_episodes=3_000, shard_size=1_000),
-    "no_crashes": RunRecipe(crashes=False),
-    "bare": RunRecipe(traces="none", moments=False),
+    "weighted": RunRecipe(n_episodes=3_000, shard_size=1_000),
+    "no_crash": RunRecipe(crashes=False),
     "nde": RunRecipe(method="nde", level=2e6, n_episodes=3_000, target_rhw=None),
-    "nde_no_crashes": RunRecipe(method="nde", traces="none"),
-    "failed": RunRecipe(n_failed=25, traces="none"),
+    "failed": RunRecipe(n_failed=25, traces="none", moments=False),
     "shells": RunRecipe(method="shells", moments=False, traces="none", n_failed=5),
     "shells_refuted": RunRecipe(method="shells", moments=False, outside="crashes"),
-    "shells_no_crashes": RunRecipe(method="shells", moments=False, crashes=False, traces="none"),
     "shells_inside_only": RunRecipe(
         method="shells", moments=False, traces="none", outside="untested", statement="library"
     ),
 }
-SHELLS = [name for name, recipe in RECIPES.items() if recipe.method == "shells"]
 
 
 def write_run(folder: Path, recipe: RunRecipe) -> Path:
@@ -158,8 +154,4 @@ def _manifest(recipe: RunRecipe, shards: list[dict[str, Any]], distance_m: float
         "stopped_by": "episodes",
         "wall_time_s": 71.3,
         "workers": 2,
-        "table_errors": [
-            {"surrogate": "SM-I", "table": "after the cut-in", "quantity": "crash probability", "table_value": 3.21e-5,
-             "monte_carlo": 3.18e-5, "std_error": 2.1e-7},
-        ] if recipe.method == "episode_mixture" else [],
-    }  # fmt: skip
+    }

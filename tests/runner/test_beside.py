@@ -9,7 +9,7 @@ from harness import estimate, replay
 from harness.campaign.vehicle import NeedBasedParameters
 from harness.vehicles.kinematics import CONTACT_M, VEHICLE_LENGTH_M
 from tests.pool.conftest import SMALL_POOL
-from tests.runner.stored_runs import stored_table, unlike_columns
+from tests.stored_runs import stored_table, unlike_columns
 
 SHELLS = (
     "testing.method=shells", "stop.episodes=400", "stop.rhw=null", "stop.min_crashes=null", *SMALL_POOL,

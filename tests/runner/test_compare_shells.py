@@ -13,11 +13,12 @@ from harness.errors import CampaignError, RunFolderError
 from harness.records.reader import read_shards
 from harness.runner import compare_campaigns
 from harness.runner.campaign_run import Run
+from harness.runner.compare import require_comparable
 from harness.runner.worker import ShardRunner
 from tests.in_process import one_process, without_page
 from tests.pool.conftest import SMALL_POOL
 from tests.runner.conftest import MIXTURE_FILE
-from tests.runner.stored_runs import manifest
+from tests.stored_runs import manifest
 
 SHELLS = (
     *("testing.method=shells", "testing.shells.statement=library", "stop.rhw=0.15", "stop.episodes=3000"),
@@ -151,8 +152,8 @@ def test_a_margin_that_the_budget_leaves_open(campaign, tmp_path):
 
 def test_refusals(campaigns, campaign, tmp_path, done):
     forced = campaign("testing.method=forced"), campaign("testing.method=forced", HARDER)
-    with pytest.raises(CampaignError, match="--margin"):
-        compare_campaigns(*forced, tmp_path / "out", margin=0.1)
+    with pytest.raises(CampaignError, match="forced, in a comparison"):
+        compare_campaigns(*forced, tmp_path / "out")
     faster = campaign(*SHELLS, "av.parameters.max_acceleration_mps2=5")
     with pytest.raises(CampaignError, match="hardest acceleration"):
         compare_campaigns(campaigns[0], faster, tmp_path / "out")
@@ -179,3 +180,13 @@ def test_the_command_line_takes_a_run_folder(done, tmp_path, capsys):
     again = json.loads((tmp_path / "out" / "compare.json").read_text())
     assert again["shells"] == done.content["shells"]
     assert main(["compare", str(MIXTURE_FILE), str(MIXTURE_FILE), "--out", str(tmp_path / "x"), "--margin", "0.1"]) == 2
+
+
+@pytest.mark.parametrize(
+    ("override", "where"),
+    [("seed=5", "seed"), ("testing.epsilon=0.2", "testing.epsilon"), ("surrogates={A: {model: idm}}", "surrogates")],
+)
+def test_only_the_vehicle_may_differ(campaign, override, where):
+    with pytest.raises(CampaignError) as caught:
+        require_comparable(campaign(*SHELLS), campaign(*SHELLS, override))
+    assert caught.value.where.startswith(where)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.runner.stored_runs import manifest, shard_files
+from tests.stored_runs import manifest, shard_files
 
 SCENARIO = Path(__file__).parents[2] / "scenarios" / "overtaking_forced.yaml"
 OPTIONS = ("world.engine=twin", "stop.episodes=1000000000", "stop.rhw=null", "run.shard_size=500", "world.cells=16")

@@ -19,8 +19,8 @@ from benchmarks.kills import descendants, started_by
 from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, HarnessError
 from harness.runner.executor import Ended
 from tests.runner.conftest import TWIN
-from tests.runner.stored_runs import manifest, shard_files, unlike_columns
 from tests.runner.test_shadow_runs import FORCED, SHADOWS, SHELLS, of
+from tests.stored_runs import manifest, shard_files, unlike_columns
 
 ray = pytest.importorskip("ray")
 from harness.runner import ray_executor, ray_machine  # noqa: E402 - not without the extra

@@ -11,7 +11,7 @@ from harness.campaign.files import load_campaign
 from harness.errors import CampaignError
 from harness.records.folder import read_manifest
 from harness.runner.replay import replay_episode, suspects
-from tests.runner.stored_runs import copy_of
+from tests.stored_runs import copy_of
 
 FORCED = Path(__file__).parents[2] / "scenarios/overtaking_forced.yaml"
 SMALL = ("world.engine=twin", "stop.rhw=null", "stop.episodes=400", "run.shard_size=100", "records.traces=none")

@@ -16,7 +16,7 @@ from harness.runner.prepare import prepare
 from harness.runner.retrace import Retracing
 from harness.worlds.twin import TwinWorld
 from tests.chains.seed import SEED
-from tests.runner.stored_runs import copy_of, manifest, shard_files, stored_table
+from tests.stored_runs import copy_of, manifest, shard_files, stored_table
 
 N = 600
 AVS = {

@@ -15,13 +15,13 @@ import pytest
 
 from harness.cli import main
 from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, WorldDisagreementError
-from harness.progress import LineProgress
+from harness.progress import ShownProgress
 from harness.runner import campaign_run, executor, shard_pool, worker
 from harness.runner.shard_pool import WorkerLostError
 from harness.runner.worker import ShardSpec
 from tests.runner import bad_workers
 from tests.runner.conftest import MIXTURE_FILE, SMALL, TWIN, sets
-from tests.runner.stored_runs import copy_of, manifest, shard_files, unlike_columns
+from tests.stored_runs import copy_of, manifest, shard_files, unlike_columns
 
 SHARDS_BEFORE_FAILURE = 3
 
@@ -93,12 +93,12 @@ def test_a_clock_that_jumps_back(run_here, campaign, twin_run, tmp_path, monkeyp
     """An hour at every look, in both sessions of a run: nothing but the time of day in a line of progress knows it."""
     hours, stream, out = itertools.count(start=500_000, step=-1), io.StringIO(), tmp_path / "run"
     monkeypatch.setattr("time.time", lambda: 3600.0 * next(hours))
-    with LineProgress(stream=stream, interval_s=0.01) as progress:
+    with ShownProgress(stream=stream, interval_s=0.01) as progress:
         run_here(campaign(*TWIN, "stop.episodes=240"), out, progress=progress)
         run_here(campaign(*TWIN), out, resume=True, progress=progress)
         progress.stage("episodes", 400, done=200)
         progress.advance(100)
-        assert "300 of 400" in progress.line()
+        assert "300 of 400" in next(progress.lines())
     assert unlike_columns(twin_run, out) == []
     assert 0.0 <= manifest(out)["wall_time_s"] < 600.0
     assert " -" not in stream.getvalue()

@@ -10,7 +10,7 @@ from harness.resolved import resolve
 from harness.runner.prepare import prepare
 from harness.worlds.twin import TwinWorld
 from tests.runner.conftest import MIXTURE_FILE, TWIN
-from tests.runner.stored_runs import stored_table, unlike_columns
+from tests.stored_runs import stored_table, unlike_columns
 
 REACTION = "{delay_s: 0.4, max_jerk_mps3: 8, inattention_probability: 0.4, inattention_delay_s: 1.1}"
 AV = f"av={{model: idm, reaction: {REACTION}}}"

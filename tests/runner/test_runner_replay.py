@@ -14,7 +14,8 @@ import pytest
 from harness.cli import main
 from harness.records.schemas import traces_schema
 from harness.runner import replay_episode
-from tests.runner.stored_runs import bits, copy_of, shard_files, stored_table
+from tests.golden.record import column_hash
+from tests.stored_runs import copy_of, shard_files, stored_table
 
 
 def rows_of(table: pa.Table, episode: int) -> pa.Table:
@@ -47,14 +48,14 @@ def test_stored_rows_and_traces_come_out_again(engine, request):
         stored = rows_of(traces, episode)
         if stored.num_rows:
             assert "traces" in result.compared
-            assert all(bits(result.trace[name]) == bits(stored[name]) for name in stored.column_names)
+            assert all(column_hash(result.trace[name]) == column_hash(stored[name]) for name in stored.column_names)
     assert compared == {("episodes",), ("episodes", "traces")}
 
 
 def test_an_episode_run_in_sumo_is_the_same_in_the_twin(sumo_run, twin_run):
     """Two runs of the same seed in either engine: their first 400 rows are equal in every bit but the engine."""
     sumo, twin = (stored_table(folder, "episodes").slice(0, 400) for folder in (sumo_run, twin_run))
-    assert [name for name in sumo.column_names if bits(sumo[name]) != bits(twin[name])] == []
+    assert [name for name in sumo.column_names if column_hash(sumo[name]) != column_hash(twin[name])] == []
 
 
 def tampered(folder, table: str, column: str) -> int:

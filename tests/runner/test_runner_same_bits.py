@@ -14,7 +14,7 @@ import pyarrow.parquet as pq
 
 from harness.progress import Progress
 from tests.runner.conftest import MIXTURE_FILE, SMALL, sets
-from tests.runner.stored_runs import copy_of, manifest, shard_files, stored_table, unlike_columns
+from tests.stored_runs import copy_of, manifest, shard_files, stored_table, unlike_columns
 
 PATIENCE_S = 300.0
 

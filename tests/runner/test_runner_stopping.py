@@ -10,7 +10,7 @@ from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, RunFolderError
 from harness.progress import Progress
 from harness.runner.manifest import Prefix
 from tests.runner.conftest import TWIN
-from tests.runner.stored_runs import copy_of, manifest, shard_files, stored_table, unlike_columns
+from tests.stored_runs import copy_of, manifest, shard_files, stored_table, unlike_columns
 
 LOOSE, TIGHT = "stop.rhw=0.3", "stop.rhw=0.15"
 COMMON = (

@@ -14,7 +14,7 @@ from harness.errors import RunFolderError, TooManyFailedError
 from harness.records.schemas import shadow_schema
 from tests.pool.conftest import SMALL_POOL
 from tests.pool.test_vehicle_pool import ACTING
-from tests.runner.stored_runs import copy_of, manifest, shard_files, stored_table, unlike_columns
+from tests.stored_runs import copy_of, manifest, shard_files, stored_table, unlike_columns
 
 SHELLS = ("testing.method=shells", "stop.rhw=0.5", "stop.episodes=3000", "stop.min_crashes=null", *SMALL_POOL)
 SHADOWS, TWIN = "pool.shadow_paths=120", "world.engine=twin"

@@ -20,7 +20,7 @@ from harness.runner.manifest import Manifest, Prefix
 from harness.runner.planner import round_specs
 from harness.strata import ShellDesign, Statement
 from tests.pool.conftest import SMALL_POOL
-from tests.runner.stored_runs import copy_of, manifest, shard_files, stored_table, unlike_columns
+from tests.stored_runs import copy_of, manifest, shard_files, stored_table, unlike_columns
 
 SHELLS = ("testing.method=shells", "stop.rhw=0.5", "stop.episodes=3000", "stop.min_crashes=null", *SMALL_POOL)
 

@@ -13,7 +13,7 @@ from harness.pool.library import load_library
 from harness.pool.shells import acceleration_limit
 from harness.progress import Progress
 from harness.traffic.loading import load_environment
-from harness.vehicles.models import av_records
+from harness.vehicles.drivers import av_records
 from studies.experiment import Adversary
 from studies.shell_campaign import campaign_block
 from studies.shell_source import Division, equals, leave_out

@@ -8,7 +8,7 @@ import pytest
 from harness.campaign.vehicle import AutomatedVehicle
 from harness.estimators.weighted import Nade
 from harness.progress import Progress
-from harness.vehicles.models import av_records
+from harness.vehicles.drivers import av_records
 from studies.case_study import context, small_case
 from studies.case_study.context import Context
 from studies.case_study.small_world import AV_MPS, HOLD, Proposal, _crashes, small_world

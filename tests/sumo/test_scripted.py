@@ -11,14 +11,15 @@ from harness.episode.trajectory import Followers, empty_trajectory
 from harness.importance.build import build_importance
 from harness.maneuvers import CUT_IN
 from harness.pool.library import load_library
-from harness.pool.replay import replay_surrogates, stored_paths
+from harness.pool.replay import stored_paths
 from harness.records.tables import episodes_table
 from harness.resolved import resolve
 from harness.runner.retrace import Retracing
 from harness.traffic.loading import load_environment
-from harness.vehicles.models import av_records
+from harness.vehicles.drivers import av_records
 from harness.vocabulary import BV_LV_CONTACT, CRASH, STATE_DTYPE, TIMEOUT
 from harness.worlds.twin import TwinWorld
+from studies.surrogate_replay import replay_surrogates
 from tests.episode.test_lateral import BESIDE, NEVER, beside, policy_of
 
 KEEP_SPEED, BRAKE = 20, 0

@@ -1,0 +1,300 @@
+"""The rate drawn: by estimator, as tests came in, and (of shells) where it comes from."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.axes._base import _AxesBase
+
+from harness.numbers import count, exponent_of, interval, number, plain, share
+from harness.report.style import (
+    BLUE,
+    FULL_WIDTH_IN,
+    GREY,
+    MUTED,
+    VERMILLION,
+    Plot,
+    Row,
+    decades,
+    head,
+    interval_bars,
+    new_figure,
+    note,
+    scaled,
+    two_panels,
+)
+from harness.report.summary import ShownShells, StoredEstimates
+from harness.vocabulary import FloatArray
+
+LOG_AXIS_RATIO = 30.0
+POOL = "pool’s own error"
+VISIBLE = 0.005
+"""Smallest share of an axis that a bar must have to show a colour."""
+WEIGHTED = (
+    "Left, the band should narrow around a level line: a rate that still climbs, or drops between jumps, has not "
+    "settled. Right, RHW should fall along the dotted line; each jump upwards is a crash with a large weight, and "
+    "many late jumps mean that the interval cannot be trusted yet."
+)
+IN_ROUNDS = (
+    "Tests come in rounds, first inside the narrowest boundary. A shell without tests counts as free of crashes in "
+    "the estimate (line) and as anything in the interval (band), which is why the band begins wide and one-sided, and "
+    "why the line may jump when a shell is first tested. Right, RHW falls faster than the dotted line while what "
+    "remains is to see no crash outside, and along it where crashes must be counted."
+)
+
+
+def answer_plot(estimates: StoredEstimates, shells: ShownShells | None) -> Plot | None:
+    """Draw the intervals of all estimators that have one, the headline first; None when there is none.
+
+    Of a shells run also those of the statements about a boundary, unless its tests have refuted them.
+    """
+    rows = _intervals(estimates)
+    for each in () if shells is None else shells.statements:
+        if not each.refuted:
+            rows.append(_row(f"given {each.name}", each.crash_rate, each.ci_low, each.ci_high))
+    if not rows:
+        return None
+    figure = new_figure(FULL_WIDTH_IN, 1.15 + 0.34 * len(rows))
+    axes = figure.subplots()
+    on_log = _set_scale(axes, rows)
+    interval_bars(axes, rows)
+    unit = _labelled(axes, axes.get_xlim(), on_log=on_log)
+    axes.set_xlabel(f"crash rate per test{unit} (lane-change level {plain(estimates.lane_change_level)})")
+    if estimates.distance_per_test_km:
+        _add_distance_axis(axes, 1e6 / estimates.distance_per_test_km, on_log=on_log)
+    name, rate, _, *ends, _ = rows[0]
+    alt = f"Crash rate per test by estimator. {name}: {number(rate)}, interval {interval(*ends)}."
+    return Plot("answer", figure, alt, _answer_caption(estimates, rows, on_log=on_log, of_shells=shells is not None))
+
+
+def rate_exponent(estimates: StoredEstimates) -> int:
+    """Power of ten in which the rates of this run are best written."""
+    rows = _intervals(estimates)
+    return exponent_of(rows[0].value or rows[0].high or 0.0) if rows else 0
+
+
+def _intervals(estimates: StoredEstimates) -> list[Row]:
+    found = sorted(estimates.estimates.items(), key=lambda item: item[0] != estimates.headline)
+    return [
+        _row(name, e.crash_rate, e.ci_low, e.ci_high, BLUE if name == estimates.headline else GREY)
+        for name, e in found
+        if e.crash_rate is not None and e.ci_low is not None and e.ci_high is not None
+    ]
+
+
+def _row(name: str, rate: float, low: float, high: float, colour: str = GREY) -> Row:
+    return Row(name, rate, colour, low, high, interval(low, high, rate) if rate > 0.0 else f"0 (to {number(high)})")
+
+
+def _set_scale(axes: Axes, rows: list[Row]) -> bool:
+    """Logarithmic when estimators differ by orders of magnitude, else linear; returns whether logarithmic.
+
+    Lower ends do not decide: one that touches zero would stretch a logarithmic axis without end.
+    """
+    low, high = min(row.low or 0.0 for row in rows), max(row.high or 0.0 for row in rows)
+    rates = [row.value for row in rows if row.value > 0.0]
+    if rates and high / min(rates) > LOG_AXIS_RATIO:
+        axes.set_xscale("log")
+        axes.set_xlim(min(rates) / 5.0, high * 2.0)
+        return True
+    margin = 0.12 * max(high - low, 1e-300)
+    axes.set_xlim(max(low - margin, 0.0), high + margin)
+    return False
+
+
+def _add_distance_axis(axes: Axes, factor: float, *, on_log: bool) -> None:
+    """Second scale on top, per 1e6 km: the same interval in the unit that safety cases use."""
+    top = axes.secondary_xaxis("top", functions=(lambda x: np.multiply(x, factor), lambda x: np.divide(x, factor)))
+    low, high = (factor * end for end in axes.get_xlim())
+    top.set_xlabel(f"crashes per 10⁶ km of such overtaking driving{_labelled(top, (low, high), on_log=on_log)}")
+    top.spines["top"].set_visible(True)
+
+
+def _labelled(axes: _AxesBase, ends: tuple[float, float], *, on_log: bool) -> str:
+    if not on_log:
+        return scaled(axes.xaxis, ends[1])
+    decades(axes.xaxis, *ends)
+    return ""
+
+
+def _answer_caption(estimates: StoredEstimates, rows: list[Row], *, on_log: bool, of_shells: bool) -> str:
+    level = f"{100.0 * estimates.confidence:g} %"
+    text = f"Point and {level} interval of each estimator, from the same tests; the headline ({rows[0].name}) in blue."
+    if on_log:
+        text += " The axis is logarithmic because they differ by orders of magnitude."
+    if rows[0].value == 0.0:
+        return text + " No crash was sampled: the interval reaches from zero to the upper bound."
+    if len(rows) == 1:
+        return text
+    if of_shells:
+        return text + " The others hold for vehicles that keep to what the statement assumes."
+    return text + (
+        " Estimators that use the same tests are not independent: agreement among them is expected, not evidence."
+    )
+
+
+def convergence_plot(
+    estimates: StoredEstimates, target_rhw: float | None, *, of_statement: str | None = None
+) -> Plot | None:
+    """Rate with its band, and RHW with its target, against tests; None without convergence records.
+
+    ``of_statement``: the target is one for a statement of a shells run about a boundary, which convergence does not
+    record.
+    """
+    names = ("n", "crash_rate", "ci_low", "ci_high", "rhw")
+    points = sorted(estimates.convergence or [], key=lambda point: point.n)
+    if len(points) < 2:
+        return None
+    n, rate, low, high, rhw = np.array([[getattr(point, name) for name in names] for point in points], np.float64).T
+    confidence, level = share(estimates.confidence), plain(estimates.lane_change_level)
+    if not np.any(rate > 0.0):
+        return _plot_without_crash(n, high, confidence, level)
+    figure, left, right = two_panels(3.5, ("tests", "tests"), sharex=True)
+    for axes in (left, right):
+        _count_tests(axes, n)
+    left.fill_between(n, low, high, color=BLUE, alpha=0.16, linewidth=0, label=f"{confidence} interval")
+    left.plot(n, rate, color=BLUE, label="estimate")
+    left.axhline(rate[-1], color=MUTED, linewidth=0.9, linestyle=(0, (4, 3)), label="at the end")
+    left.set_ylim(0.0, _rate_limit(rate, high))
+    left.set_ylabel(f"crash rate per test{scaled(left.yaxis, left.get_ylim()[1])} (level {level})")
+    head(left, "Crash rate")
+    _draw_rhw(right, n, rhw, None if of_statement else target_rhw)
+    alt = (
+        f"Left: crash rate against number of tests with its {confidence} band, ending at {number(rate[-1])} after "
+        f"{count(n[-1])} tests. Right: relative half-width against tests, ending at {number(rhw[-1])}."
+    )
+    caption = WEIGHTED if estimates.headline != "shells" else IN_ROUNDS
+    if target_rhw is None:
+        caption += " No RHW was asked for."
+    elif of_statement:
+        caption += f" The RHW that was asked for is that of the statement {of_statement}, not of the rate drawn here."
+    return Plot("convergence", figure, alt, caption)
+
+
+def _plot_without_crash(n: FloatArray, high: FloatArray, confidence: str, level: str) -> Plot:
+    """Draw only the upper end of the interval: without a crash it is all that changes, and RHW is not defined."""
+    figure = new_figure(FULL_WIDTH_IN, 2.9)
+    axes = figure.subplots()
+    _count_tests(axes, n)
+    axes.plot(n, high, color=BLUE)
+    known = high[np.isfinite(high) & (high > 0.0)]
+    if known.size:
+        axes.set_yscale("log")
+        axes.set_ylim(float(known.min()) / 1.6, float(known.max()) * 1.6)
+        decades(axes.yaxis, *axes.get_ylim())
+    axes.set_xlabel("tests")
+    axes.set_ylabel(f"crash rate per test (level {level})")
+    axes.set_title(f"Upper end of the {confidence} interval")
+    alt = f"Upper end of the {confidence} interval against tests, ending at {number(high[-1])}; no crash was sampled."
+    caption = (
+        "No crash was sampled: the estimate stays at zero and only the upper end of its interval falls as tests come "
+        "in. The relative half-width is not defined without a crash."
+    )
+    return Plot("convergence", figure, alt, caption)
+
+
+def _count_tests(axes: Axes, n: FloatArray) -> None:
+    axes.set_xscale("log")
+    axes.set_xlim(n[0], n[-1])
+    decades(axes.xaxis, *axes.get_xlim())
+
+
+def _rate_limit(rate: FloatArray, high: FloatArray) -> float:
+    """Upper end of the rate axis: the last half of the curve fills it, the first wild intervals may leave it."""
+    high = high[np.isfinite(high)]
+    if not high.size:
+        return 1.0
+    settled = float(np.max(high[high.size // 3 :]))
+    return 1.15 * max(min(settled, 3.0 * float(high[-1])), float(np.nanmax(rate[-2:])), 1e-300)
+
+
+def _draw_rhw(axes: Axes, n: FloatArray, rhw: FloatArray, target_rhw: float | None) -> None:
+    axes.set_ylabel("RHW")
+    known = np.isfinite(rhw) & (rhw > 0.0)
+    if not known.any():
+        axes.set_title("Relative half-width (RHW)")
+        axes.text(0.5, 0.5, "not known", transform=axes.transAxes, ha="center", color=MUTED)
+        return
+    n, rhw = n[known], rhw[known]
+    shown = rhw if target_rhw is None else np.append(rhw, target_rhw)
+    axes.set_yscale("log")
+    axes.set_ylim(float(shown.min()) / 1.5, float(shown.max()) * 1.6)
+    decades(axes.yaxis, *axes.get_ylim())
+    axes.plot(n, rhw, color=BLUE, label=f"RHW, {rhw[-1]:.3g} at the end")
+    if target_rhw is not None:
+        axes.axhline(target_rhw, color=VERMILLION, linewidth=1.1, linestyle=(0, (5, 2)), label=f"target {target_rhw:g}")
+    axes.plot(n, rhw[-1] * np.sqrt(n[-1] / n), color=GREY, linewidth=1.0, linestyle=(0, (1, 2)), label="∝ 1/√tests")
+    head(axes, "Relative half-width (RHW)")
+
+
+def shells_plot(found: ShownShells) -> Plot:
+    """Draw contribution with its limits (left) and half-width (right), from careful to careless."""
+    shells, names = found.shells, [*(shell.shell for shell in found.shells), POOL]
+    half_widths = [*(shell.half_width for shell in shells), found.pool_half_width]
+    # An untested shell may hold anything up to its probability: it would flatten all others, and runs out instead.
+    tested = [shell for shell in shells if shell.n_episodes] or list(shells)
+    limit = 1.12 * max(shell.high for shell in tested)
+    widest = 1.12 * max(*(shell.half_width for shell in tested), found.pool_half_width)
+    figure, left, right = two_panels(1.2 + 0.36 * len(names), ("", ""), sharey=True, width_ratios=(3, 2))
+    for axes, end, title, label in (
+        (left, limit, "Where the rate comes from", "contribution to the crash rate"),
+        (right, widest, "Where the uncertainty lies", "half-width"),
+    ):
+        axes.set_xlim(0.0, end)
+        axes.set_title(title)
+        axes.set_xlabel(f"{label}, per test{scaled(axes.xaxis, end)}")
+    rates = [
+        Row(
+            shell.shell if shell.high <= limit else f"{shell.shell}\nnot tested: up to {number(shell.high)}",
+            shell.contribution, BLUE if shell.inside else VERMILLION, shell.low, shell.high,
+        )
+        for shell in shells
+    ]  # fmt: skip
+    interval_bars(left, [*rates, Row(POOL, 0.0, GREY)], filled=True)
+    shares = (share(found.share_of_uncertainty(half_width), least=0.001) for half_width in half_widths)
+    widths = [Row(name, width, GREY, text=text) for name, width, text in zip(names, half_widths, shares, strict=True)]
+    interval_bars(right, widths, filled=True)
+    left.set_yticks(range(len(names)), [*(row.name for row in rates), POOL])  # shared: the right has the names alone
+    for each in found.statements:
+        if (boundary := each.n_shells) < len(shells):
+            for axes in (left, right):
+                axes.axhline(boundary - 0.5, color=MUTED, linewidth=1.0, linestyle=(0, (4, 3)))
+            text, beside = f"outside {each.boundary} ({each.name}) ↓", ("axes fraction", "data")
+            note(left, text, (1.0, boundary - 0.5), (-2, 2), xycoords=beside, ha="right", color=MUTED, fontsize=8)
+    source, open_question = _source(found), _open_question(found, names, half_widths)
+    alt = (
+        f"Bars per shell from {shells[0].shell} to {shells[-1].shell}: contribution to the crash rate with limits, and "
+        f"half-width. {source} {open_question}"
+    )
+    caption = (
+        "From careful (top) to careless. Left: what each shell adds to the crash rate, with its "
+        f"limits{_colours(found, limit)}. {source} Right: probability × half-width of the crash share, with its share "
+        f"of the sum of squares, which is what makes the interval. {open_question}"
+    )
+    return Plot("shells", figure, alt, caption)
+
+
+def _colours(found: ShownShells, limit: float) -> str:
+    """Name the colours that can be seen, none where all bars have one because there is no outside."""
+    seen = {shell.inside for shell in found.shells if shell.contribution > VISIBLE * limit}
+    if not found.has_outside or not seen:
+        return ""
+    if seen == {True, False}:
+        return "; blue inside the widest boundary, orange outside"
+    inside = "; all that can be seen (blue) lies inside the widest boundary"
+    return inside if True in seen else "; all lies outside (orange)"
+
+
+def _source(found: ShownShells) -> str:
+    if found.rate == 0.0:
+        return "No shell contributes: no crash was sampled."
+    most = max(found.shells, key=lambda shell: shell.contribution)
+    return f"Most of the rate comes from {most.shell} ({share(most.contribution / found.rate)})."
+
+
+def _open_question(found: ShownShells, names: list[str], half_widths: list[float]) -> str:
+    widest = max(half_widths)
+    name, most = names[half_widths.index(widest)], share(found.share_of_uncertainty(widest))
+    if name == POOL:
+        return f"Most of what is not known is the pool’s own error ({most}): only a pool of more paths would narrow it."
+    return f"Most of what is not known lies in {name} ({most}): further tests do most there."

@@ -1,0 +1,246 @@
+"""The laws of traffic: how LV and BV choose accelerations, and the hazard of BV's cut-in.
+
+Accelerations come from free driving, or from car following within the guard that keeps BV off LV. Both are
+distributions over the 31 accelerations, given as cumulative probabilities P(A ≤ a_k); the tails beyond the grid
+belong to its end points. Sampling inverts the same function that the probabilities are differences of.
+
+Student's t is a table: cubic Hermite interpolation of scipy's exact values and densities on a grid of 1/32 (absolute
+error below 1e-8, tested), so that a recorded probability *is* the probability that was sampled from.
+
+The probability of BV's cut-in (its lane change) is wish times acceptance, as a hazard per step. Drivers decide about
+once a second with probability p_1s; a step of 0.1 s has p = 1 - (1 - p_1s)^0.1, so its cumulative hazard is -0.1 ln(1
+- p_1s). A cut-in time is drawn by one exponential clock: it happens in the first step whose accumulated hazard
+exceeds -ln(1 - U). Given that no cut-in has happened before, this is the Bernoulli(p) draw of the step, and the same
+clock runs unchanged under importance functions and under the forced cut-in. Those that draw a path beforehand sum its
+hazards (`harness.episode.trajectory.weigh_cut_ins`); all others go step by step
+(`harness.episode.critical_moment.choose_lane`).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from scipy import special
+
+from harness.compiled import compiled_inline
+from harness.maneuvers import ACCELERATIONS_MPS2, N_ACCELERATIONS, acceleration, upper_edge
+from harness.traffic.lateral import LateralMotion
+from harness.vocabulary import FloatArray, Record, State
+
+FREE_DRIVING, CAR_FOLLOWING = 0, 1
+"""Which table of noise a law has."""
+_T_LIMIT = 64.0
+_T_PER_UNIT = 32.0
+
+
+class Environment(NamedTuple):
+    """All that kernels need of the environment.
+
+    ``numbers`` is the parameter record; ``noise_t`` (2, 4097, 2) are the tables of Student's t for free driving and car
+    following; ``brake_cumulative`` (31,) is the cumulative distribution of braking in free driving; ``lateral`` says
+    how long cut-ins show themselves.
+    """
+
+    numbers: Record
+    noise_t: FloatArray
+    brake_cumulative: FloatArray
+    lateral: LateralMotion
+
+
+class AccelerationLaw(NamedTuple):
+    """P(A ≤ a_k) = (1 − b) T((e_k − mean) · inverse_scale) + b B_k for k < ``cap``, else 1; e_k is a bin's upper edge.
+
+    ``mean`` in m/s², ``inverse_scale`` in s²/m; T and B are ``noise_t[noise]`` and ``brake_cumulative`` of the
+    environment, ``brake_share`` is b. Numbers alone: what is compiled without reference counts must not return arrays.
+    """
+
+    noise: int
+    cap: int
+    mean: float
+    inverse_scale: float
+    brake_share: float
+
+
+def build_environment(numbers: Record, lateral: LateralMotion) -> Environment:
+    """Tables of an environment from its parameter record."""
+    braking = np.where(
+        numbers["free_driving__brake_max_mps2"] + 1e-9 >= ACCELERATIONS_MPS2,
+        np.exp(numbers["free_driving__brake_slope_s2pm"] * ACCELERATIONS_MPS2),
+        0.0,
+    )
+    cumulative = np.cumsum(braking) / braking.sum()
+    cumulative[-1] = 1.0
+    noise_t = np.stack([t_table(float(numbers[name])) for name in ("free_driving__df", "car_following__df")])
+    return Environment(numbers, noise_t, cumulative, lateral)
+
+
+def t_table(df: float) -> FloatArray:
+    """Distribution function of Student's t on [-64, 64], and its derivative times the grid step: shape (4097, 2)."""
+    z = np.arange(-_T_LIMIT * _T_PER_UNIT, _T_LIMIT * _T_PER_UNIT + 1) / _T_PER_UNIT
+    peak = special.poch(0.5 * df, 0.5) / np.sqrt(df * np.pi)
+    density = peak * np.exp(-0.5 * (df + 1.0) * np.log1p(z * z / df))
+    return np.column_stack([special.stdtr(df, z), density / _T_PER_UNIT])
+
+
+@compiled_inline
+def t_cdf(z: float, table: FloatArray) -> float:
+    """P(T ≤ z); 0 and 1 outside of the table."""
+    position = (z + _T_LIMIT) * _T_PER_UNIT
+    if not position > 0.0:
+        return 0.0
+    if position >= table.shape[0] - 1:
+        return 1.0
+    i = int(position)
+    s = position - i
+    y0, y1 = table[i, 0], table[i + 1, 0]
+    d0, d1 = table[i, 1], table[i + 1, 1]
+    rise = y1 - y0
+    return float(y0 + s * (d0 + s * ((3.0 * rise - 2.0 * d0 - d1) + s * (d0 + d1 - 2.0 * rise))))
+
+
+@compiled_inline
+def cumulative_probability(k: int, law: AccelerationLaw, environment: Environment) -> float:
+    """P(A ≤ a_k)."""
+    if k >= law.cap:
+        return 1.0
+    noise = t_cdf((upper_edge(k) - law.mean) * law.inverse_scale, environment.noise_t[law.noise])
+    return float((1.0 - law.brake_share) * noise + law.brake_share * environment.brake_cumulative[k])
+
+
+@compiled_inline
+def draw_acceleration(u: float, law: AccelerationLaw, environment: Environment) -> int:
+    """Acceleration index by inversion of a uniform (bisection on the cumulative probabilities)."""
+    low, high = 0, law.cap
+    while low < high:
+        middle = (low + high) // 2
+        if cumulative_probability(middle, law, environment) > u:
+            high = middle
+        else:
+            low = middle + 1
+    return low
+
+
+@compiled_inline
+def acceleration_pmf(law: AccelerationLaw, environment: Environment, out: FloatArray) -> None:
+    """Probabilities of the 31 accelerations, written to ``out`` (31,)."""
+    below = 0.0
+    for k in range(N_ACCELERATIONS):
+        upto = cumulative_probability(k, law, environment)
+        out[k] = max(upto - below, 0.0)
+        below = upto
+
+
+@compiled_inline
+def clamp(x: float, low: float, high: float) -> float:
+    """X limited to [low, high]."""
+    return min(max(x, low), high)
+
+
+@compiled_inline
+def fit_u(speed: float, environment: Environment) -> float:
+    """U = (v - 30)/10 with v clamped to the fit range."""
+    n = environment.numbers
+    v = clamp(speed, n.fit_range__v_min_mps, n.fit_range__v_max_mps)
+    return float((v - n.fit_range__v_centre_mps) / n.fit_range__v_scale_mps)
+
+
+@compiled_inline
+def free_driving(speed: float, environment: Environment) -> AccelerationLaw:
+    """Accelerations of LV, and of BV after its cut-in, at a speed."""
+    n = environment.numbers
+    u = fit_u(speed, environment)
+    log_scale = n.free_driving__log_scale + n.free_driving__log_scale_u * u + n.free_driving__log_scale_uu * (u * u)
+    brake_share = 1.0 / (1.0 + math.exp(-(n.free_driving__brake_logit + n.free_driving__brake_logit_u * u)))
+    mean = n.free_driving__location_mps2
+    return AccelerationLaw(FREE_DRIVING, N_ACCELERATIONS - 1, mean, math.exp(-log_scale), brake_share)
+
+
+@compiled_inline
+def car_following(state: State, environment: Environment) -> AccelerationLaw:
+    """Accelerations of BV behind LV: what the guard forbids is moved to its cap."""
+    n = environment.numbers
+    rate = min(abs(state.r1dot_mps), n.car_following__rate_cap_mps)
+    inverse_scale = math.exp(-(n.car_following__log_scale + n.car_following__log_scale_rate * rate))
+    cap, mean = guard_cap(state, environment), car_following_mean(state, environment)
+    return AccelerationLaw(CAR_FOLLOWING, cap, mean, inverse_scale, 0.0)
+
+
+@compiled_inline
+def car_following_mean(state: State, environment: Environment) -> float:
+    """Mean acceleration (m/s²) of BV behind LV."""
+    n = environment.numbers
+    r1, r1dot = state.r1_m, state.r1dot_mps
+    v = clamp(state.v_bv_mps, n.fit_range__v_min_mps, n.fit_range__v_max_mps)
+    gap = clamp(r1, n.fit_range__r1_min_m, n.fit_range__r1_max_m)
+    median = (
+        n.car_following__median_gap_m + n.car_following__median_gap_v * v + n.car_following__median_gap_vv * (v * v)
+    )
+    mean = n.car_following__gain_rate_per_s * r1dot + n.car_following__gain_gap_per_s2 * (gap - median)
+    if r1dot < 0.0:
+        room = max(r1 - n.car_following__standstill_m, n.car_following__smallest_gap_m)
+        needed = (r1dot * r1dot) / (2.0 * room)
+        if needed > n.car_following__closing_threshold_mps2:
+            mean = -n.car_following__closing_gain * needed
+    if r1 < n.car_following__near_gap_m:
+        mean = min(mean, n.car_following__near_mean_max_mps2)
+    return float(mean)
+
+
+@compiled_inline
+def guard_cap(state: State, environment: Environment) -> int:
+    """Largest acceleration index that the guard allows.
+
+    The largest a with R1 + R1dot h - (a + b_L) h²/2 - max(0, -R1dot + (a + b_L) h)²/(2 b) ≥ margin, or -4 m/s².
+    """
+    n = environment.numbers
+    h = n.guard__horizon_s
+    k = N_ACCELERATIONS - 1
+    while k > 0:
+        closing_acceleration = acceleration(k) + n.guard__lead_braking_mps2
+        gap = state.r1_m + state.r1dot_mps * h - 0.5 * closing_acceleration * (h * h)
+        closing = max(0.0, closing_acceleration * h - state.r1dot_mps)
+        if gap - (closing * closing) / (2.0 * n.guard__own_braking_mps2) >= n.guard__margin_m:
+            break
+        k -= 1
+    return k
+
+
+@compiled_inline
+def opportunity(state: State, environment: Environment) -> float:
+    """OL, the rate per one-second decision at which BV wants to leave its lane, times the campaign's level."""
+    n = environment.numbers
+    u = fit_u(state.v_bv_mps, environment)
+    gap = clamp(state.r1_m, n.fit_range__r1_min_m, n.fit_range__r1_max_m)
+    q = clamp(state.r1dot_mps, -n.cut_in__rate_clamp_mps, n.cut_in__rate_clamp_mps) / n.cut_in__rate_scale_mps
+    exponent = (
+        n.cut_in__intercept
+        + n.cut_in__u * u
+        + n.cut_in__log_gap * math.log(gap + 1.0)
+        + n.cut_in__rate * q
+        + n.cut_in__rate_squared * (q * q)
+        + n.cut_in__u_squared * (u * u)
+    )
+    return float(n.level * math.exp(exponent))
+
+
+@compiled_inline
+def acceptance(r2: float, r2dot: float, environment: Environment) -> float:
+    """Share of wished lane changes carried out in front of an AV that closes from R2 at -R2dot."""
+    n = environment.numbers
+    if r2 <= 0.0:
+        return 0.0
+    accept = 1.0
+    if r2dot < 0.0:
+        ttc = r2 / (-r2dot)
+        accept = 1.0 / (1.0 + math.exp(-(ttc - n.cut_in__accept_ttc_s) / n.cut_in__accept_scale_s))
+    return float(n.cut_in__ignore_share + (1.0 - n.cut_in__ignore_share) * accept)
+
+
+@compiled_inline
+def cut_in_hazard(opportunity_1s: float, accepted: float, environment: Environment) -> float:
+    """Cumulative hazard -ln(1 - p) of one step."""
+    n = environment.numbers
+    p_1s = min(opportunity_1s * accepted, n.cut_in__max_probability_1s)
+    return float(-n.scenario__step_s * math.log1p(-p_1s))

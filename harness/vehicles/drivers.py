@@ -1,0 +1,145 @@
+"""Longitudinal driver models that AVs and surrogates share: as kernels read them, and those without a memory.
+
+These are IDM, FVDM, and one that does not look ahead. `references` has those that remember a danger, and how
+a driver lags behind its model: it may react late, change its acceleration slowly, or not look. It keeps its speed until
+it reacts to the cut-in; then its model decides, as fast as its jerk limit allows.
+
+Only + − × ÷ √ and explicit products are used (and ``math.tanh``, inside compiled code alone), so that every caller gets
+the same bits.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from harness.campaign.vehicle import (
+    FVDM,
+    IDM,
+    AutomatedVehicle,
+    BuiltInParameters,
+    CarefulCompetentParameters,
+    ConstantParameters,
+    FuzzySafetyParameters,
+    FVDMParameters,
+    IDMParameters,
+    NeedBasedParameters,
+    Reaction,
+    Reference,
+    Reflexes,
+)
+from harness.compiled import compiled_inline
+from harness.vocabulary import Record, RecordArray
+
+IDM_KIND, FVDM_KIND, CONSTANT_KIND = 0, 1, 2
+CAREFUL_COMPETENT_KIND, FUZZY_SAFETY_KIND, NEED_BASED_KIND = -1, -2, -3
+"""Below zero: those that remember a danger."""
+SMALLEST_GAP_M = 0.1
+"""Gap below which the models see this gap: they divide by it."""
+
+_COMMON = ("min_acceleration_mps2", "max_acceleration_mps2")
+_IDM = ("acceleration_mps2", "comfortable_deceleration_mps2", "time_headway_s", "minimum_gap_m", "desired_speed_mps")
+_FVDM = ("kappa_per_s", "lambda_per_s", "max_speed_mps", "v1", "v2", "c1_per_m", "c2")
+_REFERENCE = ("used_up_steps", "braking_jerk_mps3", "following_min_acceleration_mps2")
+_CAREFUL_COMPETENT = ("critical_ttc_s", "coasting_mps2")
+_FUZZY_SAFETY = ("comfortable_braking_mps2", "hard_braking_mps2", "leader_braking_mps2", "safe_margin_m")
+_NEED_BASED = ("reaction_steps", "needed_mps2", "standstill_gap_m")
+_REACTION = ("max_jerk_mps3", "inattention_probability", "perceives_lateral_m")
+_STEPS = ("delay_steps", "inattention_steps")
+MODEL_FIELDS = ("kind", *_COMMON, *_IDM, *_FVDM)
+"""What decides a driver's acceleration once it has reacted; the other fields say how it lags behind."""
+DRIVER_DTYPE = np.dtype(
+    [(name, np.int64) for name in ("kind", *_STEPS)]
+    + [(name, np.float64) for name in (*_COMMON, *_IDM, *_FVDM, *_REACTION)]
+    + [(name, np.float64) for name in (*_REFERENCE, *_CAREFUL_COMPETENT, *_FUZZY_SAFETY, *_NEED_BASED)]
+)
+
+
+def driver_records(
+    drivers: Sequence[BuiltInParameters], reactions: Sequence[Reflexes] | None = None, *, see_onset: bool = False
+) -> RecordArray:
+    """Parameters of driver models as kernels read them, shape (number of drivers,); by default all react at once.
+
+    ``see_onset`` says that cut-ins take time: reference drivers then perceive and evaluate them, and none of their
+    delay has been used up before.
+    """
+    kinds: dict[type[BuiltInParameters], int] = {
+        IDMParameters: IDM_KIND,
+        FVDMParameters: FVDM_KIND,
+        ConstantParameters: CONSTANT_KIND,
+        CarefulCompetentParameters: CAREFUL_COMPETENT_KIND,
+        FuzzySafetyParameters: FUZZY_SAFETY_KIND,
+        NeedBasedParameters: NEED_BASED_KIND,
+    }
+    records = np.zeros(len(drivers), dtype=DRIVER_DTYPE)
+    for record, driver, reaction in zip(records, drivers, reactions or [Reflexes()] * len(drivers), strict=True):
+        record["kind"] = kinds[type(driver)]
+        for name in DRIVER_DTYPE.names or ():
+            record[name] = getattr(driver, name, record[name])
+        record["max_jerk_mps3"] = math.inf if reaction.max_jerk_mps3 is None else reaction.max_jerk_mps3
+        record["perceives_lateral_m"] = reaction.perceives_lateral_m
+        record["delay_steps"] = round(reaction.delay_s * 10.0)
+        if see_onset and isinstance(driver, Reference):
+            record["used_up_steps"] = 0.0
+            record["delay_steps"] += driver.evaluation_steps
+        if isinstance(reaction, Reaction):
+            record["inattention_probability"] = reaction.inattention_probability
+            record["inattention_steps"] = round(reaction.inattention_delay_s * 10.0)
+    return records
+
+
+def av_records(av: AutomatedVehicle, *, see_onset: bool = False) -> RecordArray:
+    """Parameters of a built-in AV, shape (1,); of an AV that something else drives, shape (0,)."""
+    if isinstance(av.parameters, BuiltInParameters):
+        return driver_records([av.parameters], [av.reaction], see_onset=see_onset)
+    return driver_records([])
+
+
+def surrogate_records(surrogates: dict[str, IDM | FVDM]) -> RecordArray:
+    """Parameters of the surrogates, in their order, shape (J,)."""
+    return driver_records([model.parameters for model in surrogates.values()])
+
+
+@compiled_inline
+def idm_acceleration(driver: Record, speed: float, lead_speed: float, gap: float) -> float:
+    """Intelligent driver model, before clipping (m/s²).
+
+    a = α [1 − (v/v0)⁴ − (s*/s)²], s* = s0 + max(0, v T + v (v − v_lead)/(2 √(α b))).
+    """
+    braking = 2.0 * math.sqrt(driver.acceleration_mps2 * driver.comfortable_deceleration_mps2)
+    desired = driver.minimum_gap_m + max(0.0, speed * driver.time_headway_s + (speed * (speed - lead_speed)) / braking)
+    ratio = speed / driver.desired_speed_mps
+    squared = ratio * ratio
+    close = desired / gap
+    return float(driver.acceleration_mps2 * (1.0 - squared * squared - close * close))
+
+
+@compiled_inline
+def fvdm_shape(driver: Record, gap: float) -> float:
+    """Tanh(C1 s − C2): the part of the optimal velocity that depends on the gap, increasing in it."""
+    return math.tanh(driver.c1_per_m * gap - driver.c2)
+
+
+@compiled_inline
+def fvdm_acceleration(driver: Record, speed: float, lead_speed: float, shape: float) -> float:
+    """Full velocity difference model, before clipping (m/s²), increasing in ``shape``.
+
+    a = κ (V(s) − v) + λ (v_lead − v), V(s) = v_max [V1 + V2 tanh(C1 s − C2)]/(V1 + V2).
+    """
+    optimal = (driver.max_speed_mps * (driver.v1 + driver.v2 * shape)) / (driver.v1 + driver.v2)
+    return float(driver.kappa_per_s * (optimal - speed) + driver.lambda_per_s * (lead_speed - speed))
+
+
+@compiled_inline
+def driver_acceleration(driver: Record, speed: float, lead_speed: float, gap: float) -> float:
+    """Acceleration (m/s²) of a driver behind a leader at a bumper-to-bumper gap (m), clipped to its limits."""
+    if driver.kind == CONSTANT_KIND:
+        return float(driver.acceleration_mps2)
+    seen = max(gap, SMALLEST_GAP_M)
+    if driver.kind == IDM_KIND:
+        a = idm_acceleration(driver, speed, lead_speed, seen)
+    else:
+        a = fvdm_acceleration(driver, speed, lead_speed, fvdm_shape(driver, seen))
+    return float(min(max(a, driver.min_acceleration_mps2), driver.max_acceleration_mps2))

@@ -1,0 +1,186 @@
+"""The alarm that weights, traffic and pool of a run do not belong together (`python -m studies alarm RUN`).
+
+The stored maneuvers determine LV's and BV's motion, so that any surrogate k of a pool can be put in the AV's place, in
+the twin. f_k says whether it would have crashed, and W f_k has mean μ_k whatever the tests were drawn from and whatever
+the AV is. μ_k is tested by bets (I. Waudby-Smith, A. Ramdas, JRSS B 86, 2024; why nothing is taken from the sample's
+variance: docs/internals/alarm.md): a capital of 1 is multiplied in every test by a factor that has mean 1 if μ_k is
+right. So has the product, which then exceeds 1/p with a probability of p at most, after any number of tests and for any
+weights.
+
+* Too many crashes: (1 + λ W f_k)/(1 + λ μ_k).
+* Too few: exp(-λ W f_k) over its mean, which is at most 1 - (μ_k/c)(1 - exp(-λc)) where W f_k has the mean square cμ_k
+  at most (Jensen's inequality; it makes W. Hoeffding's, JASA 58, 1963, out of a mean square instead of a bound). With
+  forced cut-ins at a share α_0, W is P(cut-in | path)/α_0 at most, and the pool knows its mean where surrogates crash.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.special import logsumexp
+
+from harness.campaign.files import load_campaign
+from harness.errors import HarnessError
+from harness.estimators.block import Block
+from harness.estimators.estimate import finite_json
+from harness.estimators.from_records import EPISODE_COLUMNS, block_from_tables
+from harness.importance.build import mixture_weights
+from harness.pool.cut_ins import Pool
+from harness.pool.replay import LEAD, PATH_COLUMNS
+from harness.pool.storage import campaign_pool, read_pool
+from harness.progress import Progress
+from harness.records.folder import read_manifest
+from harness.records.reader import read_shard
+from harness.resolved import resolve
+from harness.threads import made_ahead
+from harness.vocabulary import BoolArray, FloatArray, Method
+from studies.surrogate_replay import SurrogateReplay
+
+LEVEL = 1e-4
+"""Probability of a false alarm, at most, after any given number of tests."""
+BETS = 2.0 ** -np.arange(1.0, 25.0)
+"""λ μ_k of the bets, whose capitals are averaged. The best λ is within a factor of 1.5 of one of them, which costs a
+tenth of its growth; smaller ones would win nothing below 1e8 tests."""
+_UNBOUNDED = "weights of the step mixture are not bounded: rare large ones may be missing, so that nothing is concluded"
+
+
+class KnownRates(NamedTuple):
+    """Crash rates ``mu`` (D,) of surrogates as a pool knows them, from conservative to aggressive.
+
+    ``std_error`` (D,) is that of ``mu``; ``p_cut_in_at_crash`` (D,) the mean P(cut-in | path) of the cut-ins on which
+    each crashes, at most.
+    """
+
+    names: tuple[str, ...]
+    mu: FloatArray
+    std_error: FloatArray
+    p_cut_in_at_crash: FloatArray
+
+    @classmethod
+    def of(cls, pool: Pool) -> KnownRates:
+        """Those of a pool."""
+        return cls(pool.names, pool.mu, np.sqrt(np.diag(pool.mu_covariance)), pool.p_cut_in_at_crash)
+
+
+class Alarm:
+    """Sums of the surrogates' weighted crashes W f_k, arrays of shape (D,), and of log(1 + λ W f_k), (bets, D)."""
+
+    def __init__(self, known: KnownRates) -> None:
+        self._known, d = known, known.mu.size
+        self._method: Method | None = None
+        self._n = self._n_lost = 0
+        self._hits, self._sum, self._squares = np.zeros((3, d))
+        self._mean_weight, self._won = np.full(d, np.inf), np.zeros((BETS.size, d))
+        # Rates that bets are measured in; infinite where there is none, and then nothing is bet.
+        self._unit = np.where(known.mu > 0.0, known.mu, np.inf)
+
+    def add(self, block: Block, crashes: BoolArray) -> None:
+        """Add one block, and which surrogates would have crashed in its tests (n, D)."""
+        h = np.where(crashes, block.weights()[:, None], 0.0)
+        if not self._n:
+            self._method, self._mean_weight = block.method, _mean_weight(block, self._known)
+        self._n += len(block)
+        self._n_lost += int(np.count_nonzero(block.failed & ~block.cut_in))
+        self._hits += np.count_nonzero(h, axis=0)
+        self._sum += h.sum(axis=0)
+        self._squares += (h * h).sum(axis=0)
+        relative = h / self._unit
+        self._won += [np.log(1.0 + bet * relative).sum(axis=0) for bet in BETS]
+
+    def result(self) -> dict[str, Any]:
+        """Means against known rates, and whether the alarm is raised."""
+        known, mean = self._known, self._sum / self._n
+        effective = np.divide(self._sum**2, self._squares, out=np.zeros_like(mean), where=self._squares > 0.0)
+        log_capital = self._log_capital()
+        p_value = _p_value(float(logsumexp(log_capital)) - math.log(mean.size))
+        no_verdict = _UNBOUNDED if self._method == "step_mixture" else None
+        if no_verdict is None and self._n_lost:
+            lost = "failed tests have no cut-in, and what surrogates would have done in them is not known"
+            no_verdict = f"{self._n_lost} {lost}"
+        columns = {
+            "surrogate": known.names,
+            "n_crashes": self._hits.astype(int).tolist(),
+            "n_effective": effective.tolist(),
+            "mean": mean.tolist(),
+            "mu": known.mu.tolist(),
+            "mu_std_error": known.std_error.tolist(),
+            "p_value": [_p_value(each) for each in log_capital.tolist()],
+        }
+        return {
+            "raised": no_verdict is None and p_value <= LEVEL,
+            "no_verdict": no_verdict,
+            "n_episodes": self._n,
+            "p_value": p_value,
+            "surrogates": [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)],
+        }
+
+    def _log_capital(self) -> FloatArray:
+        """Log of the mean capital of all bets on each surrogate, shape (D,).
+
+        The pool's own error of μ_k is taken as normal. The log of each product then has a normal error too, and half
+        its variance is what that adds to the log of the product's mean.
+        """
+        n, unit, bets = self._n, self._unit, BETS[:, None]
+        error = self._known.std_error / unit
+        heavy = np.maximum(self._mean_weight / unit, 1.0)
+        many, few = bets, np.expm1(-bets * heavy) / heavy  # mean factors are 1 + these, their errors these times μ_k's
+        won = np.stack([self._won, -bets * self._sum / unit])
+        gain = np.stack([np.broadcast_to(many, few.shape), few]) * (self._known.mu > 0.0)
+        price = n * np.log1p(gain) + 0.5 * (n * gain * error / (1.0 + gain)) ** 2
+        found: FloatArray = logsumexp(won - price, axis=(0, 1)) - math.log(2 * BETS.size)
+        return found
+
+
+def _mean_weight(block: Block, known: KnownRates) -> FloatArray:
+    """Mean square of W f_k over its mean, shape (D,), at most; infinite where nothing bounds W."""
+    if block.weight_cap is not None:
+        return np.full(known.mu.shape, block.weight_cap)
+    share = block.forced_share
+    return known.p_cut_in_at_crash / share if share else np.full(known.mu.shape, np.inf)
+
+
+def _p_value(log_capital: float) -> float:
+    """Probability of so much capital, at most (Markov); never 0, which no test can show."""
+    return max(math.exp(-max(log_capital, 0.0)), sys.float_info.min)
+
+
+def alarm_of_run(folder: Path, pool_file: Path | None = None, progress: Progress | None = None) -> dict[str, Any]:
+    """Ask the surrogates of the campaign's pool, or of that in a file, about all tests that a run has on record.
+
+    Raises
+    ------
+    HarnessError
+        The folder is not a run, its records are damaged or do not allow it, or the pool is of another environment.
+    """
+    progress, manifest = progress or Progress(), read_manifest(folder)
+    resolved = resolve(load_campaign(folder / "campaign.yaml", check_files=False))
+    campaign, environment = resolved.campaign, resolved.environment
+    if campaign.testing.method == "shells" or campaign.av.acts_before_cut_in:
+        drawn = campaign.testing.method == "shells"
+        raise HarnessError(
+            str(folder),
+            found="tests drawn from shells" if drawn else "an AV that acted before the cut-in",
+            expected="weighted tests of an AV that keeps its speed until the cut-in: "
+            + ("shells have used the surrogates' outcomes" if drawn else "where it was when BV cut in depends on it"),
+            mend="Choose another run; that SUMO and the twin agree is checked in each by retracing.",
+        )
+    pool = campaign_pool(resolved, progress) if pool_file is None else read_pool(pool_file)
+    surrogates, alarm, alpha = SurrogateReplay(resolved, pool), Alarm(KnownRates.of(pool)), mixture_weights(campaign)
+    columns = [*dict.fromkeys([*EPISODE_COLUMNS, *PATH_COLUMNS, *([LEAD] if environment.lateral.present else ())])]
+
+    def replayed(shard: Mapping[str, Any]) -> tuple[Block, BoolArray]:
+        episodes, _ = read_shard(folder, shard, episode_columns=columns, moment_columns=[])
+        block = block_from_tables(episodes, None, method=campaign.testing.method, alpha=alpha)
+        return block, surrogates.crashes(episodes)
+
+    progress.stage("surrogates in the AV's place", sum(shard["n_episodes"] for shard in manifest["shards"]))
+    for block, crashes in made_ahead(replayed, manifest["shards"]):
+        alarm.add(block, crashes)
+        progress.advance(len(block))
+    content: dict[str, Any] = finite_json({"run": str(folder), "pool": pool.key, **alarm.result()})
+    return content

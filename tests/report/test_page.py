@@ -1,0 +1,152 @@
+"""The page of each kind of run: what it says, that it is self-contained, and that it comes out the same again."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from xml.etree import ElementTree
+
+import matplotlib.pyplot as plt
+import pytest
+
+from harness.report import write_report
+from harness.report.page import run_notes, verdict
+from harness.report.summary import read_run_folder, summarise, typed_folder
+from tests.report.made_run import RECIPES, write_run
+from tests.report.page_text import GOLDEN, KINDS, Page, golden_text
+
+OF_CRASHES = {"cut_ins", "impact_speed", "crash_time"}
+PLOTS = {
+    "weighted": OF_CRASHES | {"weights", "strata"},
+    "no_crash": {"weights", "cut_ins"},
+    "nde": OF_CRASHES,
+    "failed": OF_CRASHES | {"weights", "strata"},
+    "shells": OF_CRASHES | {"shells"},
+    "shells_refuted": OF_CRASHES | {"shells"},
+    "shells_inside_only": OF_CRASHES | {"shells"},
+}
+
+
+def edit(path: Path, **changes) -> dict:
+    """Change top-level keys of a JSON file; returns what it held before."""
+    content = json.loads(path.read_text())
+    path.write_text(json.dumps(content | changes))
+    return content
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_page_says_what_it_always_said(reports, kind):
+    """Where it is meant to say something else: ``python -m tests.report.page_text``, and read the difference."""
+    said, before = golden_text(reports[kind]), (GOLDEN / f"{kind}.txt").read_text(encoding="utf-8")
+    assert said.splitlines() == before.splitlines()
+
+
+@pytest.mark.parametrize("name", RECIPES)
+def test_the_page_is_self_contained_and_has_the_plots_that_make_sense(reports, name):
+    folder, page = reports[name], Page(reports[name])
+    assert "://" not in page.html
+    assert len(page.ids) == len(set(page.ids))
+    for tag, attribute, value in page.attributes:
+        assert tag not in {"script", "link", "iframe"}
+        assert not attribute.startswith("on")
+        assert attribute not in {"href", "xlink:href", "src"} or value.removeprefix("#") in page.ids
+    assert {reference[1:] for reference in re.findall(r"url\(([^)]*)\)", page.html)} <= set(page.ids)
+    stems = {path.stem for path in (folder / "plots").iterdir()}
+    assert {stem for stem in stems if not stem.startswith("crash-")} == {"answer", "convergence"} | PLOTS[name]
+    for stem in stems:
+        assert (folder / "plots" / f"{stem}.png").read_bytes().startswith(b"\x89PNG")
+        ElementTree.parse(folder / "plots" / f"{stem}.svg")
+        assert f"plot-{stem}" in page.ids
+
+
+@pytest.mark.parametrize(
+    ("name", "said", "not_said"),
+    [
+        ("weighted", ["SM-III.parameters.min_acceleration_mps2", "hardest braking a_min [assumed]"], []),
+        ("failed", ["25 of 1,500 tests failed", "the world lost vehicle AV", "--set records.traces=crash"], []),
+        ("no_crash", ["No crash was sampled"], ["harness replay"]),
+        ("nde", ["Every weight is exactly 1", "impact no. 1"], ["weight no."]),
+        ("shells", ["4 more need other records than these: nde, nade, mixture_cv, scv"], ["refuted by these tests"]),
+        ("shells_refuted", ["Statement library: refuted by these tests", "outermost no. 1"], ["Of statement library"]),
+        (
+            "shells_inside_only",
+            ["Statement library: not put to the test", "Of statement library (asked: 0.1)", "still open upwards"],
+            [],
+        ),
+    ],
+)
+def test_each_kind_of_run_has_its_own_words(reports, name, said, not_said):
+    text = Page(reports[name]).words
+    assert [each for each in said if each not in text] == []
+    assert [each for each in not_said if each in text] == []
+
+
+def test_notes_say_what_was_not_reached_and_what_is_stale(run_folder):
+    estimates = edit(run_folder / "estimates.json", n_episodes=2_000)["estimates"]
+    estimates["mixture_cv"]["rhw"] = 0.7
+    edit(run_folder / "estimates.json", estimates=estimates)
+    run = read_run_folder(run_folder)
+    notes = "\n".join(run_notes(run, summarise(run)))
+    assert "asked relative half-width of 0.1 was not reached: it is 0.700 (stop.episodes was spent; raise" in notes
+    assert "cover 2,000 tests but the records hold 3,000" in notes
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"n_checked": 0, "n_episodes_outside": 0}, "not put to the test"),
+        ({"n_checked": 0, "n_episodes_outside": 5}, "no crash seen outside"),
+        ({"n_checked": 9, "n_episodes_outside": 5}, "kept to in every test"),
+        ({"n_checked": 9, "n_episodes_outside": 0}, "kept to in every test, none of them outside"),
+        ({"n_checked": 9, "n_ahead": 1}, "no longer justified: this vehicle does not keep to it"),
+        ({"n_checked": 9, "n_ahead": 1, "refuted": True}, "refuted by these tests"),
+    ],
+)
+def test_the_label_says_what_tests_have_shown(runs, changed, said):
+    assert verdict(replace(runs["shells"].shells.widest, **changed)) == said
+
+
+def test_hostile_texts_are_escaped_and_no_formula(tmp_path):
+    hostile = "<script>alert('x')</script>$\\frac{&"
+    folder = write_run(tmp_path / "run", replace(RECIPES["no_crash"], n_episodes=300))
+    edit(folder / "campaign.yaml", description=hostile)
+    path = folder / "estimates.json"
+    estimates = edit(path, campaign=hostile, statement=hostile, headline=hostile)["estimates"]
+    edit(path, estimates=estimates | {hostile: {**estimates["nade"], "warnings": [hostile]}})
+    write_report(folder)
+    page = Page(folder)
+    assert "<script" not in page.html
+    assert page.words.count(hostile) >= 5
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_a_report_made_again_has_the_same_bytes_whatever_the_plot_settings(reports, tmp_path):
+    """Plots of an earlier report go, other files stay, and no figure leaks."""
+    folder = shutil.copytree(reports["weighted"], tmp_path / "run")
+    before, figures = contents(folder), plt.get_fignums()
+    for name in ("crash-999999999.svg", "my-notes.svg"):
+        (folder / "plots" / name).write_text("left over")
+    with plt.rc_context({"font.size": 30.0, "lines.linewidth": 9.0}):
+        assert write_report(folder) == folder / "report.html"
+        assert plt.rcParams["font.size"] == 30.0
+    assert contents(folder) == before | {"plots/my-notes.svg": b"left over"}
+    assert plt.get_fignums() == figures
+
+
+@pytest.mark.parametrize(
+    ("typed", "shown"), [("runs/a b", "'runs/a b'"), ("runs/../runs/a b/", "'runs/a b'"), ("link", "link")]
+)
+def test_commands_name_the_folder_as_it_is_typed(typed, shown, tmp_path, monkeypatch):
+    (tmp_path / "here/runs/a b").mkdir(parents=True)
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "here/link").symlink_to(tmp_path / "elsewhere")
+    monkeypatch.chdir(tmp_path / "here")
+    assert typed_folder(tmp_path / "here" / typed) == shown
+    assert typed_folder(tmp_path / "elsewhere") == "elsewhere"
+    assert typed_folder(tmp_path / "here") == "."

@@ -1,0 +1,140 @@
+"""The look of all plots, scales of axes, intervals where they are, and names that no line can hide."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import matplotlib.style
+import pytest
+
+import harness.report
+from harness.report.rate_plots import POOL, answer_plot, convergence_plot, shells_plot
+from harness.report.style import CSS_NAMES, INK, RC, Plot, inline_svg, new_figure, svg, tick_label
+from harness.report.summary import StoredEstimates
+from tests.report.made_run import DESIGN
+
+CSS = (Path(harness.report.__file__).parent / "report.css").read_text(encoding="utf-8")
+LIGHT, DARK, PRINT = re.findall(r":root \{(.*?)\n\s*\}", CSS, flags=re.DOTALL)
+
+
+@pytest.mark.parametrize("block", [LIGHT, DARK, PRINT], ids=["light", "dark", "print"])
+def test_every_plot_colour_is_a_css_variable_in_every_scheme(block):
+    defined = dict(re.findall(r"--([\w-]+): (#[0-9a-f]{6});", block))
+    assert set(CSS_NAMES.values()) <= set(defined)
+    if block != DARK:
+        assert [name for colour, name in CSS_NAMES.items() if defined[name] != colour and name != "muted"] == []
+
+
+def luminance(colour: str) -> float:
+    channels = [int(colour[k : k + 2], 16) / 255.0 for k in (1, 3, 5)]
+    linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in channels]
+    return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
+
+
+@pytest.mark.parametrize("block", [LIGHT, DARK], ids=["light", "dark"])
+def test_text_and_lines_have_enough_contrast(block):
+    """WCAG 2: at least 4.5 to 1 for text, 3 to 1 for graphics."""
+    colours = dict(re.findall(r"--([\w-]+): (#[0-9a-f]{6});", block))
+    for background in ("paper", "tint"):
+        for name, least in (("ink", 7.0), ("muted", 4.5), ("blue", 4.5), ("vermillion", 3.0), ("green", 3.0)):
+            high, low = sorted((luminance(colours[name]), luminance(colours[background])), reverse=True)
+            assert (high + 0.05) / (low + 0.05) >= least, (background, name)
+
+
+def test_inline_svg_is_themed_text_without_names_or_namespaces():
+    with matplotlib.style.context(["default", RC]):
+        figure = new_figure(2.0, 1.0)
+        axes = figure.subplots()
+        axes.plot([0.0, 1.0], [0.0, 1.0], "o-", color=INK)
+        axes.set_title("<b>a & b</b> $x$")
+        markup = inline_svg(svg(Plot("tiny", figure, "alt", "caption")))
+    assert markup.startswith("<svg viewBox=")
+    for there in ("var(--ink)", "&lt;b&gt;a &amp; b&lt;/b&gt; $x$", "var(--sans)"):
+        assert there in markup
+    for absent in ("xmlns", '<g id="', "DejaVu"):
+        assert absent not in markup
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(1e-7, "10⁻⁷"), (2e-7, "2·10⁻⁷"), (0.01, "0.01"), (0.5, "0.5"), (1e3, "1000"), (5e4, "5·10⁴"), (1e5, "10⁵")],
+)
+def test_tick_label(value, text):
+    assert tick_label(value) == text
+
+
+def estimates(**rates: tuple[float, float, float] | None) -> StoredEstimates:
+    names = ("crash_rate", "ci_low", "ci_high")
+    return StoredEstimates(
+        campaign="c", campaign_hash="h", lane_change_level=1.0, confidence=0.9, headline=next(iter(rates)),
+        estimates={name: dict(zip(names, rate or (None,) * 3, strict=True)) for name, rate in rates.items()},
+        statement="s", distance_per_test_km=0.3,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("rates", "scale"),
+    [
+        ({"nade": (1.0e-7, 0.9e-7, 1.1e-7)}, "linear"),
+        ({"nade": (1.0e-8, 1.0e-12, 2.0e-8)}, "linear"),
+        ({"nde": (0.0, 0.0, 3.0e-4)}, "linear"),
+        ({"nade": (1.0e-7, 0.9e-7, 1.1e-7), "nde": (0.0, 0.0, 1e-4)}, "log"),
+        ({"nade": (1.0e-7, 0.9e-7, 1.1e-7), "other": (1.0e-4, 0.0, 2e-4)}, "log"),
+    ],
+)
+def test_axis_is_logarithmic_only_where_estimators_differ_by_orders_of_magnitude(rates, scale):
+    plot = answer_plot(estimates(**rates), None)
+    axes = plot.figure.axes[0]
+    plot.figure.draw_without_rendering()
+    assert axes.get_xscale() == scale
+    low, high = axes.get_xlim()
+    for rate, _, end in rates.values():
+        assert end <= high
+        assert rate >= low or rate == 0.0
+
+
+def test_intervals_are_drawn_where_they_are_with_the_headline_first():
+    plot = answer_plot(estimates(cv=(2.0e-7, 1.5e-7, 2.5e-7), nade=(2.1e-7, 1.0e-7, 3.0e-7), scv=None), None)
+    axes = plot.figure.axes[0]
+    assert [label.get_text() for label in axes.get_yticklabels()] == ["cv", "nade"]
+    (first,) = axes.containers[0].lines[2]
+    assert first.get_segments()[0][:, 0] == pytest.approx([1.5e-7, 2.5e-7])
+    assert "2.00 (1.50 to 2.50) × 10⁻⁷" in [text.get_text() for text in axes.texts]
+    assert answer_plot(estimates(scv=None), None) is None
+
+
+@pytest.mark.parametrize(("name", "rows"), [("shells", ["shells", "given library"]), ("shells_refuted", ["shells"])])
+def test_a_refuted_statement_has_no_interval(runs, name, rows):
+    axes = answer_plot(runs[name].estimates, runs[name].shells).figure.axes[0]
+    assert [label.get_text() for label in axes.get_yticklabels()] == rows
+
+
+@pytest.mark.parametrize("name", ["weighted", "shells", "shells_inside_only"])
+def test_legends_lie_outside_the_panels(runs, name):
+    plot = convergence_plot(runs[name].estimates, 0.05)
+    svg(plot)  # lays out
+    for axes in plot.figure.axes:
+        legend = axes.get_legend().get_window_extent()
+        assert legend.y0 >= axes.get_window_extent().y1 - 1.0
+        assert legend.x1 <= plot.figure.bbox.x1
+
+
+def test_the_plot_shows_contributions_and_half_widths(runs):
+    found = runs["shells"].shells
+    rates, widths = shells_plot(found).figure.axes
+    assert [label.get_text() for label in rates.get_yticklabels()] == [*DESIGN.strata, POOL]
+    assert [bar.get_width() for bar in rates.patches] == [*(s.contribution for s in found.shells), 0.0]
+    half_widths = [*(s.half_width for s in found.shells), found.pool_half_width]
+    assert [bar.get_width() for bar in widths.patches] == half_widths
+
+
+def test_a_shell_without_tests_is_said_so_and_runs_out_of_the_plot(runs):
+    rates, widths = shells_plot(runs["shells_inside_only"].shells).figure.axes
+    assert rates.get_yticklabels()[2].get_text() == "outside\nnot tested: up to 3.00 × 10⁻⁵"
+    assert max(rates.get_xlim()[1], widths.get_xlim()[1]) < 1e-6
+
+
+@pytest.mark.parametrize(("name", "orange"), [("shells", False), ("shells_refuted", True)])
+def test_the_caption_names_the_colours_that_are_there(runs, name, orange):
+    assert ("orange" in shells_plot(runs[name].shells).caption) == orange

@@ -1,0 +1,113 @@
+"""Counts, weights, rankings and bins against the same numbers computed from the whole table."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from harness.estimators.tally import Tally, pool_variance
+from harness.report.crashes import crash_gallery, worst_crashes
+from harness.report.summary import read_run_folder, summarise
+from harness.report.test_plots import binned, edges_for, weighted_quantile
+from harness.vocabulary import CRASH, OUTCOMES
+from tests.report.made_run import DESIGN, PATH_MASS, P
+from tests.report.test_page import edit
+
+
+@pytest.fixture(scope="module")
+def table(folders):
+    return pq.read_table(folders["weighted"] / "episodes").to_pandas().sort_values("episode", ignore_index=True)
+
+
+@pytest.fixture(scope="module")
+def summary(runs):
+    return summarise(runs["weighted"])
+
+
+def test_counts_and_weights_by_outcome(summary, table):
+    for k, outcome in enumerate(OUTCOMES):
+        rows = table[table.outcome == outcome]
+        assert summary.count[k] == len(rows)
+        assert summary.weight[k] == pytest.approx(np.exp(rows.log_weight).sum(), rel=1e-12)
+
+
+def test_of_plain_driving_tests_without_a_cut_in_are_counted_and_not_kept(runs):
+    summary = summarise(runs["nde"])
+    assert summary.all_weights_one
+    assert summary.weight.tolist() == summary.count.tolist()
+    assert summary.rows["weight"].size < summary.n_episodes == 3_000
+
+
+@pytest.mark.parametrize(("ranking", "key"), [("impact_speed_mps", "impact_speed_mps"), ("weight", "log_weight")])
+def test_worst_crashes_are_the_worst(summary, table, ranking, key):
+    crash = table[table.outcome == "crash"].sort_values([key, "episode"], ascending=[False, True])
+    kept = [worst.episode for worst in worst_crashes(summary, ranking)]
+    assert kept == crash.episode.head(len(kept)).tolist()
+
+
+@pytest.mark.parametrize(("n_episodes", "n_shards"), [(1_234, 3), (2_000, 2)])
+def test_only_the_prefix_that_counts_and_listed_shards_are_read(run_folder, n_episodes, n_shards):
+    shards = edit(run_folder / "manifest.json")["shards"]
+    edit(run_folder / "manifest.json", n_episodes=n_episodes, shards=shards[:n_shards])
+    assert summarise(read_run_folder(run_folder)).n_episodes == n_episodes
+
+
+def test_gallery_prefers_traced_crashes_where_few_are_traced(run_folder, summary):
+    """With traces of one bad crash only, that one is shown with its diagram, at its true rank."""
+    tenth = worst_crashes(summary, "impact_speed_mps")[9].episode
+    for path in sorted((run_folder / "traces").iterdir()):
+        traces = pq.read_table(path)
+        pq.write_table(traces.filter(np.asarray(traces.column("episode")) == tenth), path)
+    rows = crash_gallery(read_run_folder(run_folder), summary)
+    shown = [(row.crash.episode, row.reason.split(", ")[0]) for row in rows if row.plot]
+    assert shown == [(tenth, "impact no. 10")]
+    assert any(row.plot is None for row in rows)
+
+
+@given(st.lists(st.floats(-3.0, 13.0), min_size=1, max_size=40), st.integers(1, 40))
+def test_bins_hold_every_value_and_are_few(values, most):
+    values = np.array(values)
+    bins = binned(values, np.full(values.size, 0.5), edges_for(values, 0.1, most))
+    assert bins.counts.sum() == values.size
+    assert bins.shares.sum() == pytest.approx(100.0)
+    assert bins.counts.size <= max(most, 2)
+
+
+def test_a_value_on_an_edge_belongs_to_the_upper_bin_in_spite_of_rounding():
+    values = 0.1 * np.arange(10)  # of which 0.3 is a little less than its edge
+    assert binned(values, values, 0.1 * np.arange(11)).counts.tolist() == [1.0] * 10
+
+
+def test_weighted_quantile():
+    values, weights = np.array([9.0, 1.0, 2.0]), np.array([8.0, 1.0, 1.0])
+    assert weighted_quantile(values, weights, 0.5) == 9.0
+    assert weighted_quantile(values, weights, 0.15) == 2.0
+    assert math.isnan(weighted_quantile(values, 0.0 * weights, 0.5))
+
+
+@pytest.mark.parametrize("name", ["shells", "shells_refuted"])
+def test_weights_of_a_shells_run_add_up_to_the_rate(runs, name):
+    """Those that are recorded do not: they ignore how often shells were tested."""
+    run, summary = runs[name], summarise(runs[name])
+    assert summary.per_test(float(summary.weight[CRASH])) == pytest.approx(run.headline.crash_rate, rel=1e-12)
+    assert summary.crashes["weight"].sum() == pytest.approx(run.headline.crash_rate, rel=1e-12)
+    if name == "shells_refuted":
+        assert summary.weight.sum() == pytest.approx(P.sum(), rel=1e-12)
+        outside, worst = run.shells.shells[-1], worst_crashes(summary, "component")[0]
+        assert (worst.component, worst.weight) == (2, pytest.approx(outside.p / outside.n_episodes, rel=1e-12))
+
+
+def test_shares_of_uncertainty_add_up_and_the_rest_is_the_pool(runs):
+    found = runs["shells_refuted"].shells
+    shells = found.shells
+    tests, crashes = (np.array([getattr(s, name) for s in shells]) for name in ("n_episodes", "n_crashes"))
+    tally = Tally(tests, crashes, 0 * crashes, np.outer(crashes, PATH_MASS), np.zeros((3, 3)))
+    variance = pool_variance(P, tally, DESIGN.n_paths)
+    assert found.pool_half_width == pytest.approx(1.6448536 * variance**0.5, rel=1e-6)
+    widths = [*(s.half_width for s in shells), found.pool_half_width]
+    assert sum(map(found.share_of_uncertainty, widths)) == pytest.approx(1.0)

@@ -1,0 +1,73 @@
+"""Run folders for tests: which are there to be shared, how to look at them, and how to damage a copy.
+
+The fixture ``stored_run`` (tests/conftest.py) gives a golden campaign's folder by its name, or one of `MORE`.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+
+from harness.campaign.campaign import Campaign
+from harness.campaign.files import load_campaign
+from tests.golden.campaigns import BASE, RUNS
+from tests.golden.record import TABLES, tables_of
+
+MORE = {"mixture-seven": (*RUNS["mixture-sumo"], "stop.episodes=560")}
+"""Further runs: of seven shards."""
+
+
+def golden(name: str, *more: str) -> Campaign:
+    """A campaign of `RUNS` or `MORE`, with further overrides."""
+    return load_campaign(BASE, [*{**RUNS, **MORE}[name], *more])
+
+
+def sets(*overrides: str) -> list[str]:
+    """Overrides on a command line."""
+    return [word for override in overrides for word in ("--set", override)]
+
+
+def manifest(folder: Path) -> dict[str, Any]:
+    return json.loads((folder / "manifest.json").read_text())
+
+
+def estimates(folder: Path) -> dict[str, Any]:
+    return json.loads((folder / "estimates.json").read_text())
+
+
+def shard_files(folder: Path, table: str = "episodes") -> list[Path]:
+    return sorted((folder / table).glob("shard-*.parquet"))
+
+
+def stored_table(folder: Path, table: str) -> pa.Table:
+    """All rows of a table, sorted; the vehicles of a step keep their order."""
+    rows = pa.concat_tables([pq.read_table(file, partitioning=None) for file in shard_files(folder, table)])
+    return rows.take(pc.sort_indices(rows.select(TABLES[table]), [(key, "ascending") for key in TABLES[table]]))
+
+
+def unlike_columns(a: Path, b: Path) -> list[str]:
+    """Columns in which two runs differ in any bit, as ``table.column``; estimates.json counts as one."""
+    (of_a, of_b), unlike = (tables_of(a), tables_of(b)), []
+    assert {name: list(table) for name, table in of_a.items()} == {name: list(table) for name, table in of_b.items()}
+    for name, table in of_a.items():
+        unlike += [f"{name}.{column}" for column in table if table[column] != of_b[name][column]]
+    if (a / "estimates.json").read_bytes() != (b / "estimates.json").read_bytes():
+        unlike.append("estimates.json")
+    return unlike
+
+
+def copy_of(folder: Path, to: Path) -> Path:
+    """A copy that a test may damage."""
+    return Path(shutil.copytree(folder, to))
+
+
+def truncate(path: Path) -> None:
+    """Cut a file in half, as a crashed machine may leave it."""
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) // 2])

@@ -1,0 +1,196 @@
+"""Surrogates in the place of the AV: the same crashes where they are the AV, and the pool's rates where they are not.
+
+Four standard errors miss with a probability of 6e-5 per surrogate and method.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from harness.campaign.campaign import Campaign
+from harness.campaign.sections import PoolSettings
+from harness.campaign.vehicle import AutomatedVehicle, IDMParameters, Reaction
+from harness.episode.loop import Shard
+from harness.episode.trajectory import Followers
+from harness.errors import CampaignError, RunFolderError
+from harness.estimators.block import Block
+from harness.estimators.from_records import block_from_tables
+from harness.importance.build import mixture_weights
+from harness.pool.cut_ins import Pool
+from harness.pool.storage import campaign_pool
+from harness.records.tables import episodes_table
+from harness.resolved import resolve
+from harness.runner.prepare import prepare
+from harness.vehicles.drivers import driver_records
+from harness.vocabulary import CRASH, BoolArray
+from harness.worlds.twin import TwinWorld
+from studies.alarm import Alarm, KnownRates
+from studies.surrogate_replay import SurrogateReplay, drivers_crash
+from tests.chains.seed import SEED
+
+SMALL = PoolSettings(relative_error=0.03, cut_ins_per_shell=1500)
+N = 10_000
+LATE = AutomatedVehicle(parameters=IDMParameters(min_acceleration_mps2=-3.0), reaction=Reaction(delay_s=0.7))
+
+
+def campaign(method: str, **settings) -> Campaign:
+    plain = Campaign(name="replayed", seed=SEED, pool=SMALL, av=settings.pop("av", AutomatedVehicle()))
+    environment = plain.environment.model_copy(update=settings)
+    testing = plain.testing.model_copy(update={"method": method})
+    return plain.model_copy(update={"environment": environment, "testing": testing})
+
+
+def drive(campaign: Campaign, n: int = N) -> tuple[Shard, pa.Table]:
+    ready = prepare(resolve(campaign))
+    shard = ready.loop(TwinWorld(256)).run(0, ready.states(0, n))
+    return shard, episodes_table(shard, campaign.seed)
+
+
+def replayed(campaign: Campaign, table: pa.Table, pool: Pool) -> tuple[Block, BoolArray]:
+    """The episodes, and which surrogates would have crashed in them."""
+    method = campaign.testing.method
+    block = block_from_tables(table, None, method=method, alpha=mixture_weights(campaign))
+    return block, SurrogateReplay(resolve(campaign), pool).crashes(table)
+
+
+def alarmed(campaign: Campaign, table: pa.Table, pool: Pool, wrong: float = 1.0) -> dict[str, Any]:
+    """What the alarm says of episodes whose weights are all wrong by a factor."""
+    block, crashes = replayed(campaign, table, pool)
+    alarm = Alarm(KnownRates.of(pool))
+    alarm.add(replace(block, log_weight=block.log_weight + np.log(wrong)), crashes)
+    return alarm.result()
+
+
+@pytest.fixture(scope="module")
+def forced() -> tuple[Campaign, pa.Table, Pool]:
+    one = campaign("forced", av=LATE)
+    return one, drive(one)[1], campaign_pool(resolve(one))
+
+
+def test_a_surrogate_that_is_the_av_crashes_where_the_av_did(forced):
+    one, table, pool = forced
+    block, crashes = replayed(one, table, pool)
+    own = crashes[:, pool.names.index("brakes-3-late-700ms")]
+    assert block.crash.sum() > 30
+    np.testing.assert_array_equal(own, block.crash)
+    assert not np.array_equal(crashes[:, pool.names.index("brakes-3")], block.crash)
+
+
+@pytest.mark.parametrize("model", ["r157-cc", "r157-fsm", "need-based"])
+def test_a_driver_that_remembers_is_the_same_as_av_and_as_surrogate(model):
+    one = campaign("forced", av=AutomatedVehicle(model=model))
+    _, table = drive(one, 4_000)
+    crash = np.array(table.column("outcome").cast(pa.string()).to_pylist()) == "crash"
+    environment = resolve(one).environment
+    records = driver_records([AutomatedVehicle(model=name).parameters for name in (model, "idm")])
+    own, idm = drivers_crash(table, one.seed, environment, Followers(records)).T
+    assert crash.sum() > 10
+    np.testing.assert_array_equal(own, crash)
+    assert not np.array_equal(idm, crash)
+
+
+@pytest.mark.parametrize("hold_s", [1.0, 0.1])
+def test_other_draws_after_the_end_do_not_change_what_was_driven(hold_s):
+    """The AV never brakes: its crashes cut the paths short, and careful surrogates need what comes after."""
+    never = AutomatedVehicle(model="constant")
+    one = campaign("forced", av=never, acceleration_hold_s=hold_s)
+    shard, table = drive(one, 400)
+    other = campaign("forced", av=AutomatedVehicle(), acceleration_hold_s=hold_s)
+    _, longer = drive(other, 400)
+    environment = resolve(one).environment
+    followers = resolve(one).library.followers_in(environment)
+    short, long = (drivers_crash(paths, one.seed, environment, followers) for paths in (table, longer))
+    assert np.count_nonzero(shard.results.episode["outcome"] == CRASH) > 100
+    np.testing.assert_array_equal(short, long)
+
+
+@pytest.mark.parametrize(
+    ("method", "settings", "n"),
+    [("nde", {"lane_change_level": 1e5}, 4 * N), ("forced", {}, 2 * N), ("episode_mixture", {}, 2 * N)],
+)
+def test_weighted_crashes_of_surrogates_have_the_rates_of_the_pool(method, settings, n):
+    one = campaign(method, **settings)
+    pool = campaign_pool(resolve(one))
+    asked = one, drive(one, n)[1], pool
+    (block, crashes), found = replayed(*asked), alarmed(*asked)
+    h = crashes * block.weights()[:, None]
+    error = np.sqrt(h.var(axis=0) / n + np.diag(pool.mu_covariance))
+    many = np.array([entry["n_effective"] for entry in found["surrogates"]]) >= 100.0
+    assert np.count_nonzero(many) >= 5
+    assert np.max(np.abs(h.mean(axis=0) - pool.mu)[many] / error[many]) < 4.0
+    assert not found["raised"]
+
+
+def test_the_step_mixture_is_shown_and_not_judged():
+    one = campaign("step_mixture")
+    found = alarmed(one, drive(one)[1], campaign_pool(resolve(one)))
+    assert "not bounded" in found["no_verdict"]
+    for entry in found["surrogates"]:  # of the right size, although no interval can be given
+        assert 0.5 < entry["mean"] / entry["mu"] < 2.0
+
+
+@pytest.mark.parametrize("factor", [0.5, 2.0])
+@pytest.mark.parametrize("name", ["brakes-2-late-1s", "never-brakes", "full-throttle-2"])
+def test_one_corrupted_rate_raises_the_alarm(forced, name, factor):
+    one, table, pool = forced
+    mu = pool.mu.copy()
+    mu[pool.names.index(name)] *= factor
+    for rates, raised in ((pool.mu, False), (mu, True)):
+        assert alarmed(one, table, replace(pool, mu=rates))["raised"] == raised
+
+
+def test_a_few_hundred_tests_notice_a_rate_that_is_far_too_large(forced):
+    one, table, pool = forced
+    for factor, raised in ((1.0, False), (1_000.0, True)):
+        mu = pool.mu * [factor, *[1] * (pool.mu.size - 1)]
+        assert alarmed(one, table.slice(0, 300), replace(pool, mu=mu))["raised"] == raised
+
+
+def test_heavy_cut_ins_that_have_not_occurred_yet_raise_no_alarm():
+    """More than half of the rate of fvdm-brakes-4 lies in cut-ins that weigh a thousand times the others."""
+    one = campaign("episode_mixture").model_copy(update={"seed": 1})
+    pool = campaign_pool(resolve(one))
+    asked = one, drive(one, 400)[1], pool
+    found, (block, crashes) = alarmed(*asked), replayed(*asked)
+    missed = next(entry for entry in found["surrogates"] if entry["surrogate"] == "fvdm-brakes-4")
+    h = crashes[:, pool.names.index("fvdm-brakes-4")] * block.weights()
+    assert missed["n_effective"] > 100.0
+    assert (missed["mu"] - h.mean()) / (h.std() / np.sqrt(400)) > 10.0  # by its own variance it could not be
+    assert not found["raised"]
+
+
+def test_the_pool_knows_how_likely_a_cut_in_is_where_surrogates_crash(forced):
+    """Forced cut-ins weigh exactly that, so that their mean squares are known; four standard errors."""
+    one, table, pool = forced
+    block, crashes = replayed(one, table, pool)
+    h = crashes * block.weights()[:, None]
+    distance = h * h - pool.mu * pool.p_cut_in_at_crash
+    error = distance.std(axis=0) / np.sqrt(len(h))
+    assert np.all(distance.mean(axis=0) < 4.0 * error)  # told with three of the pool's errors on top
+    assert np.all(distance.mean(axis=0) > -4.0 * error - 0.4 * pool.mu * pool.p_cut_in_at_crash)
+
+
+@pytest.mark.parametrize("wrong", [0.7, 1.25])
+def test_weights_that_are_all_wrong_raise_the_alarm(forced, wrong):
+    assert alarmed(*forced, wrong)["raised"]
+
+
+def test_a_pool_of_another_environment_is_refused(forced):
+    _, _, pool = forced
+    with pytest.raises(CampaignError, match="a pool of another environment"):
+        SurrogateReplay(resolve(campaign("forced", lane_change_level=2.0)), pool)
+
+
+def test_maneuvers_that_do_not_fit_are_refused(forced):
+    one, table, pool = forced
+    paths = table.column("bv_maneuvers").to_pylist()
+    paths[7] = [m for m in paths[7] if m != 31]
+    at = table.column_names.index("bv_maneuvers")
+    damaged = table.set_column(at, table.schema.field(at), pa.array(paths, pa.list_(pa.int8())))
+    with pytest.raises(RunFolderError, match="episode 7"):
+        SurrogateReplay(resolve(one), pool).crashes(damaged)

@@ -1,0 +1,108 @@
+"""Initial states against distribution functions by scipy, with the published numbers."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
+
+from harness.episode.trajectory import place
+from harness.traffic.initial_state import InitialStates
+from harness.vocabulary import STATE_COLUMNS, State
+from tests.chains.seed import SEED
+from tests.traffic.kernels import environment
+
+N = 400_000
+open_unit = st.floats(1e-9, 1.0 - 1e-9)
+inside_v = st.floats(20.0, 40.0)
+
+
+@pytest.fixture(scope="module")
+def sampler():
+    return InitialStates(environment().numbers)
+
+
+@pytest.fixture(scope="module")
+def states(sampler):
+    return sampler.draw(SEED, 0, N)
+
+
+def gap_distribution(v):
+    """R1 at a speed: shift + LogNormal, as scipy has it, and its probabilities at 0 and 115 m."""
+    u = (v - 30.0) / 10.0
+    free = stats.lognorm(np.exp(-0.191 + 0.191 * u), 9.66 + 6.43 * u, np.exp(3.282 + 0.311 * u))
+    return free, free.cdf(0.0), free.cdf(115.0)
+
+
+def rate_distribution(v, r1):
+    u, w = (v - 30.0) / 10.0, (r1 - 40.0) / 40.0
+    location = 0.331 - 0.687 * u - 0.219 * w - 0.904 * u * w - 0.230 * u**2
+    return stats.t(4.98, location, np.exp(-0.015 - 0.109 * u + 0.808 * w - 0.327 * w**2))
+
+
+def test_truncations(states):
+    v, r1, r1dot, r2, r2dot = (states[name] for name in STATE_COLUMNS)
+    assert v.min() >= 20.0
+    assert v.max() <= 40.0
+    assert r1.min() >= 0.0
+    assert r1.max() <= 115.0
+    assert ((r2 >= 20.0) & (r2 <= 100.0)).all()
+    assert ((r2dot >= -10.0) & (r2dot <= -5.0)).all()
+    closing = r1dot < 0.0
+    assert (r1[closing] / -r1dot[closing]).min() >= 3.0 - 1e-9
+    assert all(np.isfinite(states[name]).all() for name in STATE_COLUMNS)
+
+
+@pytest.mark.parametrize(
+    ("column", "reference"),
+    [("r2_m", stats.uniform(20.0, 80.0)), ("r2dot_mps", stats.uniform(-10.0, 5.0))],
+    ids=["R2", "R2dot"],
+)
+def test_the_avs_part_is_uniform(states, column, reference):
+    assert stats.kstest(states[column], reference.cdf).pvalue > 1e-4
+
+
+def test_speeds_are_skew_normal(states):
+    free = stats.skewnorm(-2.41, 33.86, 5.174)
+    low, high = free.cdf(20.0), free.cdf(40.0)
+    sample = states["v_bv_mps"][:20_000]
+    assert stats.kstest(sample, lambda v: (free.cdf(v) - low) / (high - low)).pvalue > 1e-4
+
+
+def test_the_axes_are_drawn_independently_of_each_other(states):
+    """R2 and R2dot know nothing of the rest; four standard errors of a correlation."""
+    correlation = np.corrcoef([states[name] for name in STATE_COLUMNS])
+    np.fill_diagonal(correlation, 0.0)
+    assert np.abs(correlation[3:]).max() < 4.0 / np.sqrt(N)
+
+
+@given(inside_v, open_unit)
+def test_gaps_invert_their_distribution(v, probability):
+    found = InitialStates(environment().numbers).given_speed(v, np.array([probability]), np.array([0.5]))["r1_m"][0]
+    free, low, high = gap_distribution(v)
+    assert (free.cdf(found) - low) / (high - low) == pytest.approx(probability, abs=1e-9)
+
+
+@given(inside_v, open_unit, open_unit)
+def test_rates_invert_their_distribution_beyond_three_seconds_to_collision(v, gap_u, probability):
+    state = InitialStates(environment().numbers).given_speed(v, np.array([gap_u]), np.array([probability]))[0]
+    free = rate_distribution(v, state["r1_m"])
+    low = free.cdf(-state["r1_m"] / 3.0)
+    assert (free.cdf(state["r1dot_mps"]) - low) / (1.0 - low) == pytest.approx(probability, abs=1e-9)
+
+
+def test_only_the_rate_is_drawn_anew_where_time_to_collision_is_short(states):
+    """v_BV and R1 keep their laws: as docs/environment.md says, whole states are not discarded."""
+    numbers = environment().numbers.copy()
+    numbers["initial_state__r1dot_min_ttc_s"] = 1e-6  # no truncation
+    free = InitialStates(numbers).draw(SEED, 0, N)
+    for name in ("v_bv_mps", "r1_m", "r2_m", "r2dot_mps"):
+        np.testing.assert_array_equal(free[name], states[name])
+    assert (free["r1dot_mps"] < -free["r1_m"] / 3.0).any()
+    assert not (states["r1dot_mps"] < -states["r1_m"] / 3.0 - 1e-9).any()
+
+
+def test_lv_does_not_start_backwards():
+    x, v = np.zeros(3), np.zeros(3)
+    place(State(20.0, 100.0, -25.0, 50.0, -7.0), x, v)
+    assert v.tolist() == [0.0, 20.0, 27.0]
