@@ -222,12 +222,8 @@ def test_a_manifest_cut_anywhere_is_named_and_nothing_is_touched(stored):
     [
         (lambda folder: folder.rename(folder.parent / "gone"), ("estimate",), "run"),
         (lambda folder: None, ("replay", 400), "from 0 to 239"),
-        (lambda folder: _replace(folder, "campaign.yaml", "seed: 1", "seed: 2"), ("replay", 3), "campaign.yaml"),
-        (
-            lambda folder: _replace(folder, "manifest.json", '"n_episodes": 240', '"n_episodes": 500'),
-            ("estimate",),
-            "240",
-        ),
+        (lambda folder: _replace(folder / "campaign.yaml", "seed: 1", "seed: 2"), ("replay", 3), "campaign.yaml"),
+        (lambda folder: _replace(folder / "manifest.json", 's": 240', 's": 500'), ("estimate",), "240 episodes"),
     ],
     ids=["no folder", "no such test", "another campaign", "fewer tests than counted"],
 )
