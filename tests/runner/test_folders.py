@@ -12,7 +12,7 @@ import pytest
 from harness.cli import main
 from harness.errors import RunFolderError
 from harness.records.folder import read_manifest, require_place, require_schema, sole_use
-from harness.records.stored_manifest import StoredShells, StoredStops
+from harness.records.stored_manifest import StoredShells
 from harness.report.summary import read_run_folder
 from harness.resolved import resolve
 from harness.runner.manifest import require_own_folder
@@ -289,7 +289,7 @@ def test_every_value_of_another_kind_is_refused(stored):
         assert str(path) in str(raised.value), (place, wrong)
         assert len(str(raised.value)) < 1500
         n_refused += 1
-    assert n_refused > 300
+    assert n_refused > 200
 
 
 def test_estimates_of_wrong_types_are_refused(stored):
@@ -302,15 +302,9 @@ def test_estimates_of_wrong_types_are_refused(stored):
                 read_run_folder(stored)
 
 
-STOPS = {"a": {"campaign_hash": "x", "stop": {}, "n_episodes": 3, "stopped_by": "rhw"}}
-WRONG_SHELLS = ({"cell_p": [0.1]}, {"statements": []}, {"reference_rate": []})
-
-
-def test_shells_and_stops_are_checked(stored_run, tmp_path):
+def test_shells_are_checked(stored_run, tmp_path):
     shells = json.loads((stored_run("shells-twin") / "shells.json").read_text())
-    cases = [(StoredShells, shells, wrong) for wrong in (*({key: {}} for key in shells), *WRONG_SHELLS)]
-    cases += [(StoredStops, STOPS, {"a": wrong}) for wrong in (1, [], {}, {**STOPS["a"], "n_episodes": "3"})]
-    for model, content, wrong in cases:
-        require_schema(content, model, tmp_path, mend="")
+    require_schema(shells, StoredShells, tmp_path, mend="")
+    for wrong in (*({key: {}} for key in shells), {"cell_p": [0.1]}, {"statements": []}, {"reference_rate": []}):
         with pytest.raises(RunFolderError):
-            require_schema({**content, **wrong}, model, tmp_path, mend="")
+            require_schema({**shells, **wrong}, StoredShells, tmp_path, mend="")
