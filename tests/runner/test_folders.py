@@ -97,7 +97,9 @@ def test_a_folder_that_cannot_be_made(place, tmp_path, complaint_of, monkeypatch
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").write_text("not a folder")
     assert f"error: {place} found: a place where nothing can be written" in complaint_of(*RUN, place)
-    assert place in complaint_of("compare", BASE, "--against", "av.model=fvdm", "--out", place)
+    assert place in complaint_of(
+        "compare", BASE, "--set", "testing.method=shells", "--against", "av.model=fvdm", "--out", place
+    )
 
 
 def test_a_place_is_tried_without_leaving_anything(tmp_path):
