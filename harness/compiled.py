@@ -65,7 +65,7 @@ os.environ["NUMBA_CACHE_DIR"] = str(cache_root() / f"kernels-{source_hash()}-num
 
 import numba  # noqa: E402  (its settings are read at import)
 from numba import extending  # noqa: E402
-from numba.core import caching  # noqa: E402
+from numba.core import caching, codegen, compiler  # noqa: E402
 
 
 class KernelCacheLocator(caching.UserProvidedCacheLocator):
@@ -97,6 +97,43 @@ _settings.CACHE_LOCATOR_CLASSES = (
     f"{__name__}.{KernelCacheLocator.__name__},{_settings.CACHE_LOCATOR_CLASSES or _OTHERS}"
 )
 
+
+class _NoMachineCode:
+    """In the place of a code generator that is asked to tell machine code where it stands."""
+
+    @staticmethod
+    def set_env(name: str, environment: Any) -> None:
+        """Nothing to be told."""
+
+
+class _PartLibrary(codegen.JITCodeLibrary):
+    """Code of a part, to be linked into kernels, and made fast and turned into machine code only there."""
+
+    codegen: Any = _NoMachineCode
+
+    def _optimize_final_module(self) -> None:
+        pass
+
+    def _finalize_final_module(self) -> None:
+        self._finalize_dynamic_globals()  # type: ignore[no-untyped-call]
+        self._finalized = True
+
+    def get_pointer_to_function(self, name: str) -> int:  # noqa: ARG002
+        """Nowhere, but numba asks for it when the part is complete."""
+        self._ensure_finalized()  # type: ignore[no-untyped-call]
+        return 0
+
+
+class PartCompiler(compiler.Compiler):
+    """Numba's compiler, for parts of kernels."""
+
+    def define_pipelines(self) -> Any:
+        """Numba's own, which add to this library."""
+        state: Any = self.state
+        state.library = _PartLibrary(state.targetctx.codegen(), state.func_id.func_qualname)  # type: ignore[no-untyped-call]
+        return super().define_pipelines()  # type: ignore[no-untyped-call]
+
+
 _SETTINGS: dict[str, Any] = {"cache": True, "fastmath": False, "error_model": "numpy", "no_cfunc_wrapper": True}
 _njit: Any = functools.partial(numba.njit, **_SETTINGS)
 _register: Any = extending.register_jitable
@@ -116,10 +153,11 @@ def compiled(function: _Function) -> _Function:
 def compiled_inline(function: _Function) -> _Function:
     """Let kernels inline a small function; elsewhere it is what it is, a function of Python.
 
-    Kernels find it compiled once for all of them. Nothing is made for calling it from Python, which would take a fourth
-    of the time that a first run compiles.
+    A process compiles it once for all kernels, half of the way: what LLVM does takes most of the time, and is left to
+    the kernels that it becomes part of.
     """
-    result: _Function = _register(forceinline=True, no_cpython_wrapper=True, _nrt=False, **_SETTINGS)(function)
+    settings = {**_SETTINGS, "cache": False, "no_cpython_wrapper": True, "pipeline_class": PartCompiler}
+    result: _Function = _register(forceinline=True, _nrt=False, **settings)(function)
     return result
 
 

@@ -1,12 +1,15 @@
-"""Named tuples that kernels are given as one pointer, because numba has taken them apart before.
+"""Named tuples that kernels are given as one pointer, because they have been taken apart before.
 
-A kernel that is called with named tuples of fifty arrays spends more time on reading Python's objects than on 96 cells.
-Here that is done once: a compiled function stores the tuple, as compiled code sees it, into memory that Python keeps.
-In kernels the fields of an `unboxed` tuple are read like those of the tuple itself.
+A kernel that is called with named tuples of fifty arrays spends more time on reading Python's objects than on 96
+cells. Here that is done once: the tuple is laid out, as compiled code would see it, in memory that Python keeps. In
+kernels the fields of an `unboxed` tuple are read like those of the tuple itself; a tuple within it is a pointer again,
+so that parts of kernels hand on one number each, and are compiled once whoever calls them.
 """
 
 from __future__ import annotations
 
+import struct
+from collections.abc import Iterator
 from typing import Any, TypeVar, cast
 
 import numba
@@ -17,7 +20,7 @@ from numba.core import cgutils, types
 from numba.core.registry import cpu_target
 from numba.core.typing.templates import AttributeTemplate
 
-from harness.compiled import compiled
+import harness.compiled  # noqa: F401  (numba's settings)
 
 _Bundle = TypeVar("_Bundle", bound=tuple[Any, ...])
 _numba: Any = numba
@@ -41,13 +44,28 @@ class _Unboxed:
     __slots__ = ("_bundle", "_memory", "_numba_type_", "address")
 
     def __init__(self, bundle: tuple[Any, ...]) -> None:
-        content = _numba.typeof(bundle)
-        context = cpu_target.target_context
+        content, context = _numba.typeof(bundle), cpu_target.target_context
         self._bundle = bundle
-        self._memory = np.zeros(context.get_abi_sizeof(context.get_value_type(content)), np.uint8)
+        self._memory = np.array(list(_words(bundle)), np.int64)
         self._numba_type_ = _UnboxedType(content)
         self.address: int = self._memory.ctypes.data
-        _write(bundle, self.address)
+        if self._memory.nbytes != context.get_abi_sizeof(context.get_value_type(content)):
+            raise TypeError(f"{type(bundle).__name__} has fields that are not laid out as 8 bytes each")
+
+
+def _words(value: Any) -> Iterator[int]:
+    """A value as numba lays it out: an array is owner, parent, size, item size, address, shape and strides."""
+    if isinstance(value, tuple):
+        for field in value:
+            yield from _words(field)
+    elif isinstance(value, np.ndarray):
+        yield from (0, 0, value.size, value.itemsize, value.ctypes.data, *value.shape, *value.strides)
+    elif isinstance(value, np.void):
+        yield value.__array_interface__["data"][0]
+    elif isinstance(value, float):
+        yield from struct.unpack("q", struct.pack("d", value))
+    else:
+        yield int(value)
 
 
 class _UnboxedType(types.Type):
@@ -80,12 +98,20 @@ class _Fields(AttributeTemplate):
 
     def generic_resolve(self, kind: _UnboxedType, name: str) -> Any:  # type: ignore[override]
         content = kind.content
-        return content.types[content.fields.index(name)] if name in content.fields else None
+        if name not in content.fields:
+            return None
+        field = content.types[content.fields.index(name)]
+        return _UnboxedType(field) if isinstance(field, types.BaseNamedTuple) else field
 
 
 def _read_field(context: Any, builder: Any, kind: _UnboxedType, value: Any, name: str) -> Any:
-    pointer = builder.bitcast(value, context.get_value_type(kind.content).as_pointer())
-    return _load(builder, _cgutils.gep_inbounds(builder, pointer, 0, kind.content.fields.index(name)))
+    content = kind.content
+    place = content.fields.index(name)
+    pointer = builder.bitcast(value, context.get_value_type(content).as_pointer())
+    field = _cgutils.gep_inbounds(builder, pointer, 0, place)
+    if isinstance(content.types[place], types.BaseNamedTuple):
+        return builder.bitcast(field, cgutils.voidptr_t)
+    return _load(builder, field)
 
 
 def _load(builder: Any, pointer: Any) -> Any:
@@ -101,22 +127,7 @@ def _load(builder: Any, pointer: Any) -> Any:
     return value
 
 
-def _store_typed(_context: Any, bundle: Any, _address: Any) -> Any:
-    def generate(context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
-        value, address = arguments
-        builder.store(value, builder.inttoptr(address, value.type.as_pointer()))
-        return context.get_dummy_value()
-
-    return types.void(bundle, types.intp), generate
-
-
 _extending.register_model(_UnboxedType)(_PointerModel)
 _extending.unbox(_UnboxedType)(_unbox)
 _extending.infer_getattr(_Fields)
 _extending.lower_getattr_generic(_UnboxedType)(_read_field)
-_store: Any = _extending.intrinsic(_store_typed)
-
-
-@compiled
-def _write(bundle: tuple[Any, ...], address: int) -> None:
-    _store(bundle, address)

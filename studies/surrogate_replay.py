@@ -17,6 +17,7 @@ from harness.pool.replay import StoredPaths, approach_cut_in, leave_stored, stor
 from harness.records.folder import MEND_SHARD
 from harness.resolved import Resolved
 from harness.traffic.laws import Environment
+from harness.unboxed import unboxed
 from harness.vocabulary import BV_LV_CONTACT, RUNNING, BoolArray, IntArray
 
 
@@ -60,7 +61,8 @@ def drivers_crash(episodes: pa.Table, seed: int, environment: Environment, follo
     """
     stored = stored_paths(episodes, seed)
     bits = np.zeros(episodes.num_rows, np.int64)
-    wrong = replay_surrogates(stored, environment, followers, empty_trajectory(environment), bits)
+    room = empty_trajectory(environment)
+    wrong = replay_surrogates(unboxed(stored), unboxed(environment), unboxed(followers), unboxed(room), bits)
     if wrong >= 0:
         raise RunFolderError(
             f"episodes, episode {stored.first + wrong}",

@@ -7,8 +7,7 @@ import numba
 import numpy as np
 import pytest
 
-from harness import unboxed as module
-from harness.compiled import compiled
+from harness.compiled import compiled, compiled_inline
 from harness.unboxed import unboxed
 
 
@@ -25,12 +24,6 @@ class Bundle(NamedTuple):
     numbers: Any
 
 
-@pytest.fixture(autouse=True)
-def _no_trace_in_the_cache(monkeypatch):
-    """Kept beside harness's own, an entry for this file's types could be read by no process that does not know them."""
-    monkeypatch.setattr(module, "_write", numba.njit(module._write.py_func))
-
-
 def bundle(kind=np.float64):
     fixed = np.arange(12, dtype=kind).reshape(3, 4)
     fixed.flags.writeable = False
@@ -43,6 +36,16 @@ def add_up(b, more):
     for i in range(b.steps):
         b.inner.total[i] += b.factor * b.inner.fixed[i, 1] * (2.0 if b.doubled else 1.0) + more * b.numbers.weight
     return b.numbers.count
+
+
+@compiled_inline
+def total_of(inner):
+    return inner.total.sum()
+
+
+@compiled
+def of_a_tuple_within(b):
+    return total_of(b.inner)
 
 
 @compiled
@@ -60,6 +63,21 @@ def test_kernels_read_every_kind_of_field_and_write_to_the_same_arrays():
     assert plain.inner.total.tolist() == [6.0, 10.0, 14.0]
     plain.numbers["count"] = 9
     assert add_up(for_kernels, 0.0) == 9
+
+
+def test_a_tuple_within_is_handed_on_as_it_is():
+    plain = bundle()
+    plain.inner.total[:] = [1.0, 2.0, 4.0]
+    assert of_a_tuple_within(unboxed(plain)) == 7.0
+
+
+def test_a_layout_of_other_than_8_bytes_is_refused():
+    class Flags(NamedTuple):
+        one: bool
+        other: bool
+
+    with pytest.raises(TypeError, match="Flags"):
+        unboxed(Flags(True, False))
 
 
 def test_it_keeps_alive_what_it_points_to():

@@ -37,6 +37,7 @@ from harness.importance.grid import AFTER, BEFORE, GridPoints, interpolate, loca
 from harness.maneuvers import N_ACCELERATIONS, acceleration
 from harness.traffic.initial_state import InitialStates
 from harness.traffic.laws import Environment, acceleration_pmf, acceptance, car_following, free_driving
+from harness.unboxed import unboxed
 from harness.vehicles.drivers import FVDM_KIND, SMALLEST_GAP_M, driver_acceleration, fvdm_acceleration, fvdm_shape
 from harness.vehicles.kinematics import CONTACT_M, STEP_S, next_speed
 from harness.vocabulary import Float32Array, FloatArray, Record, RecordArray
@@ -127,7 +128,7 @@ def build_after_cut_in(environment: Environment, driver: RecordArray) -> tuple[F
     points, shape = points_of(AFTER), shape_of(AFTER)
     hold = int(environment.numbers["hold_steps"])
     pmf = np.empty((points.speed.size, N_ACCELERATIONS))
-    free_driving_table(points.speed, environment, pmf)
+    free_driving_table(points.speed, unboxed(environment), pmf)
     after = np.empty((*shape, N_ACCELERATIONS, 3), np.float32)
     transitions(driver, hold, points, after)
     value = np.zeros((LEVELS + 1, *shape), np.float32)
@@ -310,7 +311,7 @@ def naturalistic_pmf(environment: Environment) -> FloatArray:
     speeds = points_of(BEFORE).speed
     out = np.empty((speeds.size, N_ACCELERATIONS))
     for i, speed in enumerate(speeds.tolist()):
-        mean_car_following_pmf(sampler.given_speed(speed, gap_u, rate_u), environment, out[i])
+        mean_car_following_pmf(sampler.given_speed(speed, gap_u, rate_u), unboxed(environment), out[i])
     return out
 
 
@@ -322,8 +323,9 @@ def build_before_cut_in(environment: Environment, value: Float32Array) -> Float3
     points, pmf = points_of(BEFORE), naturalistic_pmf(environment)
     hold, steps = int(environment.numbers["hold_steps"]), int(environment.numbers["max_steps"])
     periods = -(-steps // hold)
+    law = unboxed(environment)
     table = np.zeros((periods + 1, *shape_of(BEFORE)), np.float32)
     for period in range(periods - 1, -1, -1):
         later, out = table[period + 1], table[period]
-        backward_period(period * hold, level_steps(hold), environment, value, pmf, points, later, out)
+        backward_period(period * hold, level_steps(hold), law, value, pmf, points, later, out)
     return table

@@ -33,6 +33,7 @@ from harness.maneuvers import CUT_IN, acceleration
 from harness.random_stream import LV_DRAWS, uniform
 from harness.traffic.lateral import draw_lead
 from harness.traffic.laws import Environment, cut_in_hazard, draw_acceleration, free_driving, opportunity
+from harness.unboxed import unboxed
 from harness.vehicles.kinematics import CONTACT_M, gap, next_speed
 from harness.vocabulary import LV, BoolArray, FloatArray, Int8Array, IntArray, RecordArray
 
@@ -117,7 +118,9 @@ def enumerate_cut_ins(
     shape = index.size, int(environment.numbers["max_steps"])
     found = CutInsOnPaths(np.zeros(shape), np.zeros(shape, np.int64), np.zeros(index.size))
     first = np.zeros(index.size, np.int64) if offset is None else offset
-    _enumerate(seed, index, state, environment, followers, runs, stride, first, empty_trajectory(environment), found)
+    room = empty_trajectory(environment)
+    known = unboxed(environment), unboxed(followers), unboxed(runs)
+    _enumerate(seed, index, state, stride, first, *known, unboxed(room), unboxed(found))
     return found
 
 
@@ -126,11 +129,11 @@ def _enumerate(
     seed: int,
     index: IntArray,
     state: RecordArray,
+    stride: int,
+    offset: IntArray,
     environment: Environment,
     followers: Followers,
     runs: ShadowRuns,
-    stride: int,
-    offset: IntArray,
     path: Trajectory,
     found: CutInsOnPaths,
 ) -> None:
@@ -185,7 +188,7 @@ def write_script(
     lv, bv = np.zeros((2, n, room.lv.size), np.int8)
     n_lv, n_bv = np.zeros((2, n), np.int64)
     script = Script(lv, bv, n_lv, n_bv, np.zeros(n if environment.lateral.present else 0, np.int64))
-    _write(seed, index, cut, state, draws_per_cut_in, environment, room, script)
+    _write(seed, index, cut, state, draws_per_cut_in, unboxed(environment), unboxed(room), unboxed(script))
     return script
 
 

@@ -28,6 +28,7 @@ from harness.resolved import Resolved, resolve
 from harness.runner.retrace import Retracing
 from harness.traffic.initial_state import InitialStates
 from harness.traffic.laws import Environment
+from harness.unboxed import unboxed
 from harness.vocabulary import PRESCRIBED, RecordArray
 from harness.worlds.av_type import av_type
 from harness.worlds.protocol import World
@@ -222,4 +223,5 @@ def distance_per_test_m(environment: Environment) -> float:
     Overtakings without cut-in: the others are too few (some 3e-5 at level 1) to matter.
     """
     states = InitialStates(environment.numbers).draw(DISTANCE_SEED, 0, DISTANCE_PATHS)
-    return float(mean_test_distance(DISTANCE_SEED, states, environment, empty_trajectory(environment)))
+    room = empty_trajectory(environment)
+    return float(mean_test_distance(DISTANCE_SEED, states, unboxed(environment), unboxed(room)))

@@ -16,6 +16,7 @@ from harness.episode.trajectory import empty_trajectory
 from harness.errors import WorldDisagreementError
 from harness.pool.replay import Retraced, StoredPaths, retrace, stored_paths
 from harness.resolved import Resolved
+from harness.unboxed import unboxed
 from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import CRASH, FAILED, OUTCOMES, RUNNING, BoolArray, FloatArray, IntArray
 
@@ -49,7 +50,8 @@ class Retracing:
         stored = stored_paths(episodes, self._seed)
         n = int(episodes.num_rows)
         twin = Retraced(np.zeros(n, np.int64), np.zeros(n, np.int64), np.zeros(n), np.zeros(n), np.zeros(n))
-        retrace(stored, self._environment, self._driver, self._room, twin)
+        environment, room = unboxed(self._environment), unboxed(self._room)
+        retrace(unboxed(stored), environment, self._driver, room, unboxed(twin))
         differing = _differences(episodes, stored, twin, self._at_cut_in, self._driver.size > 0)
         for column, (wrong, in_sumo, in_twin) in differing.items():
             if wrong.any():

@@ -31,6 +31,7 @@ from harness.traffic.laws import (
     opportunity,
 )
 from harness.traffic.parameters import SHIPPED_FOLDER, EnvironmentParameters, parameter_record
+from harness.unboxed import unboxed
 from harness.vocabulary import BoolArray, FloatArray, State
 
 PROBABILITIES = np.array([2.0**-53, 1e-6, 1e-3, 0.01, 0.1, 0.5, 0.9, 0.99, 0.999, 1.0 - 1e-6, 1.0 - 2.0**-53])
@@ -94,7 +95,7 @@ def require_sound_laws(environment: Environment, file: str) -> None:
     approaches = np.array(list(product(AV_GAPS_M, RATES_MPS)))
     pmf, scale = np.empty((2, len(states), N_ACCELERATIONS)), np.empty((2, len(states)))
     chance, accepted = np.empty(len(states)), np.empty(len(approaches))
-    evaluate_laws(states, approaches, environment, pmf, scale, chance, accepted)
+    evaluate_laws(states, approaches, unboxed(environment), pmf, scale, chance, accepted)
     for law, section in enumerate(("free_driving", "car_following")):
         where, total = f"{section} ({file})", pmf[law].sum(axis=1)
         limits = "a scale from {:g} to {:g} m/s²".format(*SCALES_MPS2)

@@ -25,6 +25,7 @@ from harness.importance.grid import GridPoints
 from harness.maneuvers import ACCELERATIONS_MPS2, N_ACCELERATIONS
 from harness.traffic.laws import Environment
 from harness.traffic.loading import evaluate_laws, load_environment
+from harness.unboxed import unboxed
 from harness.vehicles.drivers import av_records, surrogate_records
 from harness.vehicles.kinematics import CONTACT_M, STEP_S
 from harness.vocabulary import BoolArray, FloatArray, IntArray, RecordArray
@@ -222,7 +223,9 @@ def _laws(
     n = len(speed)
     pmf, scale, chance = np.empty((2, n, N_ACCELERATIONS)), np.empty((2, n)), np.empty(n)
     accepted = np.empty(len(approaches))
-    evaluate_laws(np.column_stack([speed, r1, LV_MPS - speed]), approaches, environment, pmf, scale, chance, accepted)
+    evaluate_laws(
+        np.column_stack([speed, r1, LV_MPS - speed]), approaches, unboxed(environment), pmf, scale, chance, accepted
+    )
     return pmf[1], chance, accepted
 
 

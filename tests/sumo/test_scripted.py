@@ -16,6 +16,7 @@ from harness.records.tables import episodes_table
 from harness.resolved import resolve
 from harness.runner.retrace import Retracing
 from harness.traffic.loading import load_environment
+from harness.unboxed import unboxed
 from harness.vehicles.drivers import av_records
 from harness.vocabulary import BV_LV_CONTACT, CRASH, STATE_DTYPE, TIMEOUT
 from harness.worlds.twin import TwinWorld
@@ -66,7 +67,7 @@ def test_contact_in_the_step_of_the_cut_in_is_retraced_and_no_surrogate_crashes(
     crashes = np.full(len(STATES), -1, np.int64)
     stored, room = stored_paths(episodes, campaign.seed), empty_trajectory(environment)
     followers = Followers(library.followers_in(environment).drivers)
-    assert replay_surrogates(stored, environment, followers, room, crashes) == -1
+    assert replay_surrogates(*map(unboxed, (stored, environment, followers, room)), crashes) == -1
     everybody = 2 ** len(library.surrogates) - 1
     assert crashes.tolist()[::2] == [0, everybody]
     assert crashes[3] == 0
