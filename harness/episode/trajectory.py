@@ -25,8 +25,8 @@ from harness.traffic.laws import (
     opportunity,
 )
 from harness.vehicles.drivers import NEED_BASED_KIND
-from harness.vehicles.kinematics import CONTACT_M, VEHICLE_LENGTH_M, gap, next_position, next_speed, overlaps
-from harness.vehicles.references import nothing_yet, react
+from harness.vehicles.kinematics import CONTACT_M, STEP_S, VEHICLE_LENGTH_M, gap, next_position, next_speed, overlaps
+from harness.vehicles.references import Memory, nothing_yet, react
 from harness.vocabulary import (
     AV,
     BV,
@@ -42,7 +42,15 @@ from harness.vocabulary import (
 )
 
 AV_START_M = 100.0
-NO_CRASH, WAS_AHEAD = -1, -2
+NO_CRASH, WAS_AHEAD, FOLLOWS = -1, -2, -3
+MOST_FOLLOWERS = 62
+"""Whether they crash are bits of one integer."""
+SAFE_M = 0.01
+"""A gap that no rounding of positions makes a contact."""
+FOLLOWER_DTYPE = np.dtype(
+    [(name, np.int64) for name in ("driver", "encloses", "first", "end")]
+    + [(name, np.float64) for name in ("x", "v", "acceleration", "danger", "used_up")]
+)
 
 
 class Trajectory(NamedTuple):
@@ -51,7 +59,9 @@ class Trajectory(NamedTuple):
     ``x``, ``v`` (3,) are the initial placement. ``lv``, ``bv`` (draws,) are maneuver indices before the cut-in,
     ``x_lv``, ``x_bv``, ``x_av``, ``v_lv``, ``v_bv``, ``v_av`` (steps + 1,) the motion without it, and ``hazard``
     (steps,) that of cutting in.
-    ``free`` (draws,) are BV's maneuvers after the cut-in, ``x_after``, ``v_after`` (steps + 1,) its motion.
+    ``free`` (draws,) are BV's maneuvers after the cut-in, ``x_after``, ``v_after`` (steps + 1,) its motion, and
+    ``slowest`` (steps + 1,) the lowest speed that it will have from there on. ``follower`` (`MOST_FOLLOWERS`,) are
+    those behind it.
     """
 
     x: FloatArray
@@ -68,10 +78,12 @@ class Trajectory(NamedTuple):
     free: Int8Array
     x_after: FloatArray
     v_after: FloatArray
+    slowest: FloatArray
+    follower: RecordArray
 
 
 class Followers(NamedTuple):
-    """Drivers (D,) to be put in the AV's place: at most 62, without inattention.
+    """Drivers (D,) to be put in the AV's place: at most `MOST_FOLLOWERS`, without inattention.
 
     ``envelope`` is the place of the one that crashes wherever another one does: where it does not, nobody else is
     asked; -1 for none.
@@ -93,10 +105,10 @@ def lengths(environment: Environment) -> tuple[int, int, int]:
 def empty_trajectory(environment: Environment) -> Trajectory:
     """Room for a trajectory of an environment."""
     max_steps, _, draws = lengths(environment)
-    shapes = {"x": 3, "v": 3, "lv": draws, "bv": draws, "free": draws, "hazard": max_steps}
-    kinds = dict.fromkeys(("lv", "bv", "free"), np.int8)
+    shapes = {"x": 3, "v": 3, "lv": draws, "bv": draws, "free": draws, "hazard": max_steps, "follower": MOST_FOLLOWERS}
+    kinds = dict.fromkeys(("lv", "bv", "free"), np.dtype(np.int8)) | {"follower": FOLLOWER_DTYPE}
     return Trajectory._make(
-        np.zeros(shapes.get(name, max_steps + 1), kinds.get(name, np.float64)) for name in Trajectory._fields
+        np.zeros(shapes.get(name, max_steps + 1), kinds.get(name, np.dtype(np.float64))) for name in Trajectory._fields
     )
 
 
@@ -215,61 +227,111 @@ def leave(
         x = next_position(x, v, v_after)
         v = v_after
         path.x_after[step + 1], path.v_after[step + 1] = x, v
+    path.slowest[until] = v
+    for step in range(until - 1, cut, -1):
+        path.slowest[step] = min(path.slowest[step + 1], path.v_after[step])
     return draws
 
 
 @compiled_inline
-def follow(
-    driver: Record,
+def take_over(
+    place: int,
+    d: int,
+    drivers: RecordArray,
     late: int,
+    encloses: bool,
     cut: int,
     lead: int,
-    until: int,
-    encloses: bool,
     environment: Environment,
     path: Trajectory,
-) -> tuple[int, float]:
-    """Step after which a driver has run into BV, `NO_CRASH` or `WAS_AHEAD`, and its speed (m/s) at the end.
+) -> None:
+    """Driver ``d`` is to take over from the AV after the step of the onset, as follower ``place``; see `follow`.
 
-    BV shows ``lead`` steps before its cut-in that it will come over. The driver takes over from the AV after the step
-    of the onset, and reacts ``late`` steps after it has perceived it. One that is to enclose others acts from the
-    onset, and also counts as having run into BV where it has passed it before the overlap: a slower one may not have.
+    It reacts ``late`` steps after it has perceived BV. One that ``encloses`` others acts from the onset.
     """
-    onset = onset_of(cut, lead)
-    x, v = path.x_av[onset + 1], path.v_av[onset + 1]
-    if onset == cut and gap(path.x_after[cut + 1], x) < CONTACT_M:
-        return cut + 1, v
+    driver, one, onset = drivers[d], path.follower[place], onset_of(cut, lead)
     perceives_m = 0.0 if encloses else driver.perceives_lateral_m
     perceived, earlier = perceived_in(perceives_m, cut, lead, environment.lateral.distance_m)
-    first, memory = perceived + late, nothing_yet(driver.used_up_steps + earlier)
-    for step in range(onset + 1, until):
-        if step >= first:
-            x_bv, v_bv = path.x_after[step], path.v_after[step]
-            if step <= cut:
-                x_bv, v_bv = path.x_bv[step], path.v_bv[step]
-            memory = react(driver, memory, step - first, v, v_bv, gap(x_bv, x))
-        v_after = next_speed(v, memory.acceleration)
-        x = next_position(x, v, v_after)
-        v = v_after
-        if step >= cut and gap(path.x_after[step + 1], x) < CONTACT_M:
-            return step + 1 if encloses or overlaps(path.x_after[step + 1], x) else WAS_AHEAD, v
-    return NO_CRASH, v
+    memory = nothing_yet(driver.used_up_steps + earlier)
+    one.driver, one.encloses, one.first, one.end = d, encloses, perceived + late, FOLLOWS
+    one.x, one.v = path.x_av[onset + 1], path.v_av[onset + 1]
+    one.acceleration, one.danger, one.used_up = memory.acceleration, memory.danger, memory.used_up
+    if onset == cut and gap(path.x_after[cut + 1], one.x) < CONTACT_M:
+        one.end = cut + 1
+
+
+@compiled_inline
+def follow(n: int, drivers: RecordArray, cut: int, lead: int, until: int, path: Trajectory) -> None:
+    """Drive the first ``n`` followers behind BV, which shows ``lead`` steps before its cut-in that it will come over.
+
+    ``end`` of each receives the step after which it has run into BV, `NO_CRASH` or `WAS_AHEAD`, and ``v`` its speed
+    then. One that encloses others also counts as having run into BV where it has passed it before the overlap: a slower
+    one may not have. Side by side, because each waits for its own last result in every operation of a step.
+    """
+    left = 0
+    for i in range(n):
+        left += path.follower[i].end == FOLLOWS
+    for step in range(onset_of(cut, lead) + 1, until):
+        if left == 0:
+            return
+        x_bv, v_bv, x_next = path.x_after[step], path.v_after[step], path.x_after[step + 1]
+        if step <= cut:
+            x_bv, v_bv = path.x_bv[step], path.v_bv[step]
+        for i in range(n):
+            one = path.follower[i]
+            if one.end != FOLLOWS:
+                continue
+            driver, ahead = drivers[one.driver], gap(x_bv, one.x)
+            if step > cut and never_reaches(driver, one.v, ahead, path.slowest[step], until - step):
+                one.end = NO_CRASH
+                left -= 1
+                continue
+            if step >= one.first:
+                memory = Memory(one.acceleration, one.danger, one.used_up)
+                memory = react(driver, memory, step - one.first, one.v, v_bv, ahead)
+                one.acceleration, one.danger = memory.acceleration, memory.danger
+            v_after = next_speed(one.v, one.acceleration)
+            one.x, one.v = next_position(one.x, one.v, v_after), v_after
+            if step >= cut and gap(x_next, one.x) < CONTACT_M:
+                one.end = step + 1 if one.encloses or overlaps(x_next, one.x) else WAS_AHEAD
+                left -= 1
+    for i in range(n):
+        if path.follower[i].end == FOLLOWS:
+            path.follower[i].end = NO_CRASH
+
+
+@compiled_inline
+def never_reaches(driver: Record, speed: float, ahead: float, slowest: float, steps: int) -> bool:
+    """Whether a driver stays behind even at full throttle from now on; BV is ``ahead`` (m), never below ``slowest``.
+
+    The gap that is left is concave in time, so that its ends decide.
+    """
+    rest = steps * STEP_S
+    left = ahead + (slowest - speed) * rest - 0.5 * max(driver.max_acceleration_mps2, 0.0) * (rest * rest)
+    return ahead > SAFE_M and left > SAFE_M
 
 
 @compiled_inline
 def who_crashes(followers: Followers, cut: int, lead: int, environment: Environment, path: Trajectory) -> int:
     """One bit for each attentive driver that runs into BV; see `follow`."""
     drivers, envelope, until = followers.drivers, followers.envelope, environment.numbers.max_steps
+    found = n = 0
     if envelope >= 0:
-        driver = drivers[envelope]
-        if follow(driver, driver.delay_steps, cut, lead, until, True, environment, path)[0] < 0:
+        late = drivers[envelope].delay_steps
+        take_over(0, envelope, drivers, late, True, cut, lead, environment, path)
+        follow(1, drivers, cut, lead, until, path)
+        if path.follower[0].end < 0:
             return 0
-    found = 0
+        found = 1 << envelope
     for d in range(drivers.size):
-        driver = drivers[d]
-        encloses = is_boundary(driver)
-        if d == envelope or follow(driver, driver.delay_steps, cut, lead, until, encloses, environment, path)[0] >= 0:
-            found |= 1 << d
+        if d != envelope:
+            late, encloses = drivers[d].delay_steps, is_boundary(drivers[d])
+            take_over(n, d, drivers, late, encloses, cut, lead, environment, path)
+            n += 1
+    follow(n, drivers, cut, lead, until, path)
+    for i in range(n):
+        if path.follower[i].end >= 0:
+            found |= 1 << path.follower[i].driver
     return found
 
 

@@ -20,6 +20,7 @@ from harness.episode.trajectory import (
     follow,
     leave,
     state_in,
+    take_over,
     walk,
 )
 from harness.maneuvers import CUT_IN
@@ -182,7 +183,9 @@ def retrace_episode(
         return
     if driver.size > 0:
         late = reaction_steps(driver[0], stored.seed, stored.first + i)
-        crash, speed = follow(driver[0], late, cut, lead, end, False, environment, path)
+        take_over(0, 0, driver, late, False, cut, lead, environment, path)
+        follow(1, driver, cut, lead, end, path)
+        crash, speed = path.follower[0].end, path.follower[0].v
         if crash == WAS_AHEAD:
             twin.outcome[i], twin.n_steps[i] = PASSED, cut + 1
         elif crash != NO_CRASH:
