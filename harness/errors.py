@@ -8,9 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
-from typing import Any
 
 EXIT_DONE = 0
 EXIT_BAD_INPUT = 2
@@ -43,29 +41,17 @@ def writing(path: Path) -> Iterator[None]:
 
 
 class HarnessError(Exception):
-    """Base of all errors that a user can cause and mend.
+    """Base of all errors that a user can cause and mend; its parts are `shortened`, for they may repeat what was given.
 
-    Parameters
-    ----------
-    where : str
-        YAML path (``testing.alpha``), file, or command-line option.
-    found, expected, mend : str
-        What was found, what was expected, and what to do about it. All are `shortened`: they may repeat what was given.
+    ``where`` is a YAML path (``testing.alpha``), a file, or an option of the command line.
     """
 
     exit_code = EXIT_BAD_INPUT
 
-    def __init__(self, where: str, *, found: str, expected: str, mend: str) -> None:
+    def __init__(self, where: str, found: str, expected: str, mend: str) -> None:
         super().__init__(where, found, expected, mend)
-        self.where = shortened(where)
-        self.found = shortened(found)
-        self.expected = shortened(expected)
+        self.where, self.found, self.expected = map(shortened, (where, found, expected))
         self.mend = shortened(mend, LONGEST_ADVICE)
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        # Errors travel from workers to the parent; pickle would call the class with positional arguments.
-        words = {"found": self.found, "expected": self.expected, "mend": self.mend}
-        return partial(type(self), self.where, **words), ()
 
     def __str__(self) -> str:
         return f"{self.where}: found {self.found}; expected {self.expected}. {self.mend}"

@@ -12,8 +12,8 @@ from pydantic_core import PydanticCustomError
 
 from harness.campaign.campaign import Campaign
 from harness.campaign.files import Places, apply_overrides, parse_override
-from harness.campaign.problems import validated
-from harness.campaign.sections import NAME_PATTERN, Positive, Section, Whole, broken_rule
+from harness.campaign.problems import NAME_PATTERN, broken_rule, validated
+from harness.campaign.sections import Positive, Section, Whole
 from harness.campaign.vehicle import AutomatedVehicle, BuiltInParameters
 from harness.campaign.yaml_text import read_yaml
 from harness.errors import CampaignError

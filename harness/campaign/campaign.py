@@ -13,9 +13,9 @@ from typing import Any, Self
 
 from pydantic import Field, model_validator
 
+from harness.campaign.problems import NAME_PATTERN, broken_rule
 from harness.campaign.sections import (
     MOST_SUMO_CELLS,
-    NAME_PATTERN,
     Accept,
     EnvironmentSettings,
     PoolSettings,
@@ -27,12 +27,11 @@ from harness.campaign.sections import (
     Testing,
     Whole,
     World,
-    broken_rule,
     listed,
 )
 from harness.campaign.vehicle import (
     AutomatedVehicle,
-    DriverModel,
+    Surrogate,
     default_surrogates,
 )
 from harness.vocabulary import METHODS, SAMPLING
@@ -46,7 +45,7 @@ class Campaign(Section):
     seed: Whole = Field(1, ge=0, lt=2**63, description="every random number follows from it")
     environment: EnvironmentSettings = EnvironmentSettings()
     av: AutomatedVehicle = AutomatedVehicle()
-    surrogates: dict[SurrogateName, DriverModel] = Field(
+    surrogates: dict[SurrogateName, Surrogate] = Field(
         default_factory=default_surrogates, description="stand-ins for the unknown AV, by name"
     )
     testing: Testing = Testing()

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import difflib
+import json
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,15 +12,26 @@ from typing import Annotated, Any, Literal
 
 import yaml
 from pydantic import Field
+from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
+from pydantic_core import CoreSchema, core_schema
 
 from harness.campaign.campaign import Campaign
-from harness.campaign.problems import describe_found, read_model, validated
-from harness.campaign.sections import NAME_PATTERN, Section
+from harness.campaign.problems import NAME_PATTERN, describe_found, did_you_mean, read_model, validated
+from harness.campaign.sections import Section
 from harness.campaign.vehicle import AV_SOURCES, AutomatedVehicle, default_surrogates
 from harness.campaign.yaml_text import Lines, YamlPath, dotted, parse_value, read_yaml
 from harness.errors import CampaignError
 
-SHIPPED_PARAMETERS = Path(__file__).parent.parent / "traffic"
+SHIPPED_PARAMETERS = Path(__file__).parents[1] / "traffic"
+_CHECKOUT = Path(__file__).parents[2] / "scenarios"
+_INSTALLED = Path(__file__).parents[1] / "scenarios"
+SHIPPED_PANEL = (_INSTALLED if _INSTALLED.exists() else _CHECKOUT) / "av_panel.yaml"
+_FILES = {
+    ("av", "fmu", "file"): "an FMI 2.0 co-simulation FMU",
+    ("pool", "library"): "a surrogate library, or the name of a shipped one",
+    ("environment", "parameters"): "a parameter file, or the name of a shipped one",
+}
+"""Places of a campaign that may name a file, and what that has to be."""
 
 
 def load_campaign(
@@ -42,7 +54,7 @@ def load_campaign(
     Returns
     -------
     Campaign
-        With ``environment.parameters``, when it is a path, and ``av.fmu.file`` absolute.
+        With paths of files that it names absolute.
 
     Raises
     ------
@@ -57,84 +69,67 @@ def load_campaign(
     changes = [*([] if av is None else [av_override(av)]), *map(parse_override, overrides)]
     place = Places(lines, changes)
     campaign = validated(apply_overrides(data, changes), Campaign, str(path), place)
-    for where, (name, expected) in _named_files(campaign).items():
-        file = (Path(path).parent / Path(name).expanduser()).resolve()
-        if check_files and not file.is_file():
-            raise CampaignError(
-                place(where),
-                found=f"{name}, but there is no file {file}",
-                expected=expected,
-                mend="Correct the path; it is relative to the folder of the campaign file.",
-            )
-        campaign = campaign.replaced(where, str(file))
-    campaign = campaign.replaced(("run", "ray", "runtime_env"), _with_absolute_paths(campaign, Path(path).parent))
-    name = campaign.environment.parameters
-    if check_files and not names_a_file(name) and name not in shipped_parameters():
-        shipped = shipped_parameters()
-        close = difflib.get_close_matches(name, shipped, n=1)
-        mend = f"Did you mean '{close[0]}'?" if close else "For a file of your own write its path, such as ./mine.yaml."
-        raise CampaignError(
-            place(("environment", "parameters")),
-            found=f"'{name}', which is not shipped",
-            expected=f"the name of a shipped parameter file: {', '.join(shipped)}; or a path that ends in .yaml",
-            mend=mend,
-        )
-    return campaign
-
-
-def _with_absolute_paths(campaign: Campaign, folder: Path) -> dict[str, Any]:
-    """Ray's environment, in which folders of this machine are relative to the campaign's file; others are URIs."""
-
-    def absolute(value: Any) -> Any:
-        if isinstance(value, list):
-            return [absolute(each) for each in value]
-        if isinstance(value, str) and "://" not in value:
-            return str((folder / Path(value).expanduser()).resolve())
-        return value
-
-    environment = campaign.run.ray.runtime_env
-    return {
-        key: absolute(value) if key in ("working_dir", "py_modules") else value for key, value in environment.items()
+    folder = Path(path).parent
+    for where, expected in _FILES.items():
+        name = campaign.at(where)
+        if name is None or (where[-1] != "file" and not names_a_file(name)):
+            continue
+        file = _absolute(name, folder)
+        if check_files and not Path(file).is_file():
+            mend = "Correct the path; it is relative to the folder of the campaign file."
+            raise CampaignError(place(where), f"{name}, but there is no file {file}", expected, mend)
+        campaign = campaign.replaced(where, file)
+    if check_files:
+        shipped_or_own(campaign.environment.parameters, SHIPPED_PARAMETERS, place(("environment", "parameters")))
+    runtime_env = {
+        key: _absolute(value, folder) if key in ("working_dir", "py_modules") else value
+        for key, value in campaign.run.ray.runtime_env.items()
     }
+    return campaign.replaced(("run", "ray", "runtime_env"), runtime_env)
 
 
-def _named_files(campaign: Campaign) -> dict[tuple[str, ...], tuple[str, str]]:
-    """Files that a campaign names: by their place in it the name and what it has to be."""
-    fmu, library, parameters = campaign.av.fmu, campaign.pool.library, campaign.environment.parameters
-    files: dict[tuple[str, ...], tuple[str, str]] = {}
-    if fmu is not None:
-        files["av", "fmu", "file"] = fmu.file, "an FMI 2.0 co-simulation FMU"
-    if names_a_file(library):
-        files["pool", "library"] = library, "a surrogate library, or the name of a shipped one"
-    if names_a_file(parameters):
-        expected = f"a parameter file, or the name of a shipped one: {', '.join(shipped_parameters())}"
-        files["environment", "parameters"] = parameters, expected
-    return files
+def _absolute(value: Any, folder: Path) -> Any:
+    """A path, or each of a list, that is relative to a folder; URIs, as Ray takes them, stay."""
+    if isinstance(value, list):
+        return [_absolute(each, folder) for each in value]
+    if isinstance(value, str) and "://" not in value:
+        return str((folder / Path(value).expanduser()).resolve())
+    return value
 
 
-def shipped_parameters() -> list[str]:
-    """Names of the environment parameter files that come with the harness."""
-    return sorted(file.stem for file in SHIPPED_PARAMETERS.glob("*.yaml"))
+def names_a_file(name: str) -> bool:
+    """Tell a path to a file of one's own from the name of a shipped one."""
+    return name.endswith((".yaml", ".yml")) or "/" in name
 
 
-def names_a_file(parameters: str) -> bool:
-    """Tell a path to a parameter file from the name of a shipped one."""
-    return parameters.endswith((".yaml", ".yml")) or "/" in parameters
+def shipped_or_own(name: str, folder: Path, where: str) -> Path:
+    """File that a name stands for: one of those shipped in ``folder``, or the user's own.
+
+    Raises
+    ------
+    CampaignError
+        None of that name is shipped; the error names ``where`` it is asked for.
+    """
+    if names_a_file(name):
+        return Path(name)
+    shipped = sorted(file.stem for file in folder.glob("*.yaml"))
+    if name not in shipped:
+        expected = f"a shipped name ({', '.join(shipped)}), or a path that ends in .yaml"
+        mend = did_you_mean(name, shipped) or "For a file of your own write its path, such as ./mine.yaml."
+        raise CampaignError(where, f"'{name}', which is not shipped", expected, mend)
+    return folder / f"{name}.yaml"
+
+
+# -- values given with the command --
 
 
 @dataclass(frozen=True)
 class Override:
-    """One ``--set`` (or ``--av``): where, and the value that replaces what is there."""
+    """One ``--set`` (or ``--av``): where, the value that replaces what is there, and the option as it was typed."""
 
     path: tuple[str, ...]
     value: Any
-    text: str
-    flag: str = "--set"
-
-    @property
-    def option(self) -> str:
-        """The option as it was typed."""
-        return f"{self.flag} {self.text}"
+    option: str
 
 
 def parse_override(text: str) -> Override:
@@ -146,15 +141,10 @@ def parse_override(text: str) -> Override:
         There is no ``=``, an empty part in the path, or no YAML value after the ``=``.
     """
     path, equals, value = text.partition("=")
-    parts = tuple(part.strip() for part in path.split("."))
+    parts, option = tuple(part.strip() for part in path.split(".")), f"--set {text}"
     if not equals or not all(parts):
-        raise CampaignError(
-            f"--set {text}",
-            found="no path and value",
-            expected="section.key=value",
-            mend="For example: --set testing.epsilon=0.2",
-        )
-    return Override(parts, parse_value(value, f"--set {text}"), text)
+        raise CampaignError(option, "no path and value", "section.key=value", "For example: --set testing.epsilon=0.2")
+    return Override(parts, parse_value(value, option), option)
 
 
 def apply_overrides(data: dict[str, Any], overrides: Sequence[Override]) -> dict[str, Any]:
@@ -170,26 +160,17 @@ def apply_overrides(data: dict[str, Any], overrides: Sequence[Override]) -> dict
         if override.path[0] == "surrogates" and len(override.path) > 1 and "surrogates" not in changed:
             # The file leaves the surrogates to their default: changing one must not drop the others.
             changed["surrogates"] = {name: driver.model_dump() for name, driver in default_surrogates().items()}
-        _lay_over(changed, override)
+        section = changed
+        for depth, part in enumerate(override.path[:-1], start=1):
+            inner, where = section.get(part, {}), dotted(override.path[:depth])
+            if not isinstance(inner, dict):
+                mend = f"Set {where} itself, or correct the path."
+                raise CampaignError(override.option, f"{describe_found(inner)} at {where}", "a section with keys", mend)
+            # A copy on the way, because an anchor makes several places share one section.
+            section[part] = dict(inner)
+            section = section[part]
+        section[override.path[-1]] = override.value
     return changed
-
-
-def _lay_over(data: dict[str, Any], override: Override) -> None:
-    section = data
-    for depth, part in enumerate(override.path[:-1], start=1):
-        inner = section.get(part, {})
-        if not isinstance(inner, dict):
-            raise CampaignError(
-                override.option,
-                found=f"{describe_found(inner)} at {dotted(override.path[:depth])}",
-                expected="a section with keys",
-                mend=f"Set {dotted(override.path[:depth])} itself, or correct the path.",
-            )
-        # A copy on the way, because an anchor makes several places share one section.
-        copied = dict(inner)
-        section[part] = copied
-        section = copied
-    section[override.path[-1]] = override.value
 
 
 class Places:
@@ -204,25 +185,24 @@ class Places:
         for override in reversed(self._overrides):
             if tuple(path[: len(override.path)]) == override.path:
                 return override.option
-        inside = [item.option for item in self._overrides if item.path[: len(path)] == tuple(path)]
+        section = tuple(path) if tuple(path) in self._lines.lines else tuple(path[:-1])  # of a key that is missing
+        inside = [item.option for item in self._overrides if item.path[: len(section)] == section]
         place = self._lines.place(path)
-        return f"{place} with {' '.join(inside)}" if inside and path else place
+        return f"{place} with {' '.join(inside)}" if inside and section else place
 
 
-_CHECKOUT = Path(__file__).parents[2] / "scenarios"
-_INSTALLED = Path(__file__).parents[1] / "scenarios"
-SHIPPED_PANEL = (_INSTALLED if _INSTALLED.exists() else _CHECKOUT) / "av_panel.yaml"
-
-VehicleName = Annotated[str, Field(pattern=NAME_PATTERN)]
+# -- a panel of vehicles --
 
 
 class Panel(Section):
-    """Automated vehicles by name."""
+    """Automated vehicles by name: ``av`` sections that experiments, tests and tables share."""
 
     format: Literal["av-panel"]
     version: Literal[1]
     description: str = ""
-    avs: dict[VehicleName, AutomatedVehicle] = Field(min_length=1, description="av sections by name")
+    avs: dict[Annotated[str, Field(pattern=NAME_PATTERN)], AutomatedVehicle] = Field(
+        min_length=1, description="av sections by name"
+    )
 
 
 def load_panel(path: str | Path = SHIPPED_PANEL) -> Panel:
@@ -234,11 +214,11 @@ def load_panel(path: str | Path = SHIPPED_PANEL) -> Panel:
         The file cannot be read or says something wrong; the error names every place.
     """
     panel = read_model(path, Panel)
-    for name, av in panel.avs.items():
-        if av.fmu is not None:
-            file = (Path(path).parent / Path(av.fmu.file).expanduser()).resolve()
-            panel = panel.replaced(("avs",), panel.avs | {name: av.replaced(("fmu", "file"), str(file))})
-    return panel
+    avs = {
+        name: av if av.fmu is None else av.replaced(("fmu", "file"), _absolute(av.fmu.file, Path(path).parent))
+        for name, av in panel.avs.items()
+    }
+    return panel.replaced(("avs",), avs)
 
 
 def panel_av(text: str) -> AutomatedVehicle:
@@ -252,20 +232,18 @@ def panel_av(text: str) -> AutomatedVehicle:
     file, _, name = text.rpartition(":")
     avs = load_panel(file or SHIPPED_PANEL).avs
     if name not in avs:
-        close = difflib.get_close_matches(name, avs, n=1)
-        raise CampaignError(
-            f"--av {text}",
-            found=f"no vehicle '{name}' in {file or 'the shipped panel'}",
-            expected=f"one of {', '.join(avs)}; or PANEL.yaml:NAME for a panel of your own",
-            mend=f"Did you mean '{close[0]}'?" if close else "Name one of them.",
-        )
+        expected = f"one of {', '.join(avs)}; or PANEL.yaml:NAME for a panel of your own"
+        mend = did_you_mean(name, list(avs)) or "Name one of them."
+        raise CampaignError(f"--av {text}", f"no vehicle '{name}' in {file or 'the shipped panel'}", expected, mend)
     return avs[name]
 
 
 def av_override(text: str) -> Override:
     """``--av``: the vehicle's section in place of the campaign's own, with only what the panel writes."""
-    return Override(("av",), panel_av(text).model_dump(exclude_unset=True), text, flag="--av")
+    return Override(("av",), panel_av(text).model_dump(exclude_unset=True), f"--av {text}")
 
+
+# -- campaigns and their schema, written --
 
 _HEADER = """\
 # Campaign {name}, resolved: every value is written out, defaults included.
@@ -276,24 +254,28 @@ _HEADER = """\
 class _Dumper(yaml.SafeDumper):
     """Quotes every text that is not a plain word: other YAML readers see numbers, dates and truth values in many."""
 
-    def ignore_aliases(self, data: Any) -> bool:  # noqa: ARG002 - the library's signature
+    def ignore_aliases(self, _data: Any) -> bool:
         """Write every value out."""
         return True
 
     def represent_text(self, text: str) -> yaml.ScalarNode:
         """Node of a text."""
-        return self.represent_scalar("tag:yaml.org,2002:str", text, style=None if _is_plain_word(text) else '"')
+        plain = re.fullmatch(r"[A-Za-z][A-Za-z0-9_-]*", text) and text.lower() not in _MISREAD
+        node: yaml.ScalarNode = self.represent_scalar("tag:yaml.org,2002:str", text, style=None if plain else '"')
+        return node
 
 
 _Dumper.add_representer(str, _Dumper.represent_text)
+_MISREAD = {"y", "n", "yes", "no", "on", "off", "true", "false", "null"}
 
 
 def dump_campaign(campaign: Campaign) -> str:
     """YAML text of a campaign; `load_campaign` reads an equal campaign from it."""
     parts = [_HEADER.format(name=campaign.name)]
     for key, value in written_out(campaign).items():
-        about = _about(campaign, key)
-        parts.append(f"\n# {about}\n{yaml_text({key: value})}")
+        section = getattr(campaign, key)
+        about = section.__doc__ if isinstance(section, Section) else type(campaign).model_fields[key].description
+        parts.append(f"\n# {(about or key).splitlines()[0]}\n{yaml_text({key: value})}")
     return "".join(parts)
 
 
@@ -304,24 +286,25 @@ def written_out(campaign: Campaign) -> dict[str, Any]:
     return data
 
 
-def _about(campaign: Campaign, key: str) -> str:
-    """Comment above a top-level key: the field's description, or the first line of its section's docstring."""
-    field = type(campaign).model_fields[key]
-    value = getattr(campaign, key)
-    text = (type(value).__doc__ if isinstance(value, Section) else None) or field.description or key
-    return text.splitlines()[0]
-
-
-def yaml_text(data: Any, *, one_line: bool = False) -> str:
+def yaml_text(data: dict[str, Any]) -> str:
     """YAML of plain data, which `harness.campaign.yaml_text` reads back as it is."""
     # Escapes keep every character, control characters included, through any editor; math.inf never folds a line.
-    text: str = yaml.dump(
-        data, Dumper=_Dumper, sort_keys=False, allow_unicode=False, width=math.inf, default_flow_style=one_line
-    )
-    return text.removesuffix("...\n")  # after a value that is no mapping
+    text: str = yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=False, width=math.inf)
+    return text
 
 
-def _is_plain_word(text: str) -> bool:
-    ambiguous = {"y", "n", "yes", "no", "on", "off", "true", "false", "null"}
-    letters = text.replace("_", "").replace("-", "")
-    return letters.isascii() and letters[:1].isalpha() and letters.isalnum() and text.lower() not in ambiguous
+class _Schema(GenerateJsonSchema):
+    """Without titles that repeat the keys; mappings whose names follow a pattern have no others."""
+
+    def field_title_should_be_set(self, _schema: CoreSchema) -> bool:
+        return False
+
+    def dict_schema(self, schema: core_schema.DictSchema) -> JsonSchemaValue:
+        return {"additionalProperties": False, **super().dict_schema(schema)}
+
+
+def schema_text() -> str:
+    """JSON schema (draft 2020-12) of a campaign, committed beside the scenarios and printed by ``harness schema``."""
+    about = {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "harness campaign"}
+    schema = {**about, **Campaign.model_json_schema(schema_generator=_Schema), **about}
+    return json.dumps(schema, indent=2, ensure_ascii=False) + "\n"

@@ -1,36 +1,46 @@
-"""Error messages for unknown keys and wrong values of a file: each place and line, found, expected, how to mend it.
+"""From a pydantic `ValidationError` to one error that names each problem: place and line, found, expected, how to mend.
 
-From a pydantic `ValidationError` to one error that lists every problem; lines are `harness.campaign.yaml_text.Lines`'s.
-
-A problem is a `CampaignError`: where, what was found (`describe_found`), what the JSON schema expects there
-(`describe_expected`), and how to mend it.
+Every section puts the errors of its own keys into words (`in_words`), for it knows what they mean.
 """
 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable, Sequence
+import re
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
-from pydantic_core import ErrorDetails
+from pydantic.fields import FieldInfo
+from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
 
-from harness.campaign.schema import Schema, SchemaView, schema_of
-from harness.campaign.sections import NAME_PATTERN, SURROGATE_PATTERN
-from harness.campaign.yaml_text import YamlPath, dotted, read_yaml
+from harness.campaign.yaml_text import YamlPath, read_yaml
 from harness.errors import CampaignError
 
 Place = Callable[[YamlPath], str]
 """From a path in the data to the words that say where it was written."""
 Model = TypeVar("Model", bound=BaseModel)
 
+NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_.-]*$"
+SURROGATE_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_-]*$"
+_PATTERNS = {
+    pattern: f"a name of letters, digits, {signs}, without spaces, that begins with a letter or digit"
+    for pattern, signs in ((NAME_PATTERN, "_ . and -"), (SURROGATE_PATTERN, "_ and -"))
+}
+_NUMBERS = ("float_type", "finite_number", "int_type", "int_from_float")
+_KINDS = {
+    **dict(zip(_NUMBERS, ("a number", "a number", "a whole number", "a whole number"), strict=True)),
+    "string_type": "text",
+    "bool_type": "true or false",
+    "dict_type": "names, each with its value",
+    "list_type": "a list",
+}
+"""Kinds of values in words, by pydantic's name for the error."""
 _UNITS = {"_mps2": "m/s²", "_mps": "m/s", "_per_s": "1/s", "_per_m": "1/m", "_s": "s", "_m": "m"}
 _LONGEST = 60
-_PATTERNS = {
-    NAME_PATTERN: "a name of letters, digits, _ . and -, without spaces, that begins with a letter or digit",
-    SURROGATE_PATTERN: "a name of letters, digits, _ and -, without spaces, that begins with a letter or digit",
-}
+MOST_SHOWN = 20
+"""Errors of a section that are put into words; a file of another kind has thousands."""
 
 
 class InvalidFileError(CampaignError):
@@ -38,20 +48,29 @@ class InvalidFileError(CampaignError):
 
     def __init__(self, path: str, problems: Sequence[CampaignError]) -> None:
         first, *more = self.problems = tuple(problems)
+        super().__init__(first.where, first.found, first.expected, first.mend)
         if more:
-            super().__init__(path, found=f"{len(self.problems)} problems", expected="none", mend="")
+            super().__init__(path, f"{len(self.problems)} problems", "none", "")
             # Not shortened: each of its lines is short.
             self.mend = "Mend each:\n" + "\n".join(f"  {problem}" for problem in self.problems)
-        else:
-            super().__init__(first.where, found=first.found, expected=first.expected, mend=first.mend)
         self.path = path
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.path, self.problems)
 
 
+def broken_rule(key: str, found: str, expected: str, mend: str) -> PydanticCustomError:
+    """Error of a section in the parts of a `harness.errors.HarnessError`.
+
+    ``key`` is the dotted path of the value to blame, seen from the section; empty for the section itself.
+    """
+    parts = {"key": key, "found": found, "expected": expected, "mend": mend}
+    where = "{key}: " if key else ""
+    return PydanticCustomError("broken_rule", where + "found {found}; expected {expected}. {mend}", parts)
+
+
 def read_model(path: str | Path, model: type[Model]) -> Model:
-    """Read a YAML file into a pydantic model, such as an environment's parameters.
+    """Read a YAML file into a model, such as an environment's parameters.
 
     Raises
     ------
@@ -67,99 +86,109 @@ def validated(data: Any, model: type[Model], path: str, place: Place) -> Model:
     try:
         return model.model_validate(data)
     except ValidationError as error:
-        view = SchemaView(schema_of(model))
-        words = [_words(details, view, data) for details in error.errors(include_url=False)]
-        # A value of several kinds is refused once for each.
-        problems = [
-            CampaignError(place(where), found=found, expected=expected, mend=mend)
-            for where, found, expected, mend in dict.fromkeys(words)
-        ]
-        raise InvalidFileError(path, problems) from None
+        problems: dict[tuple[YamlPath, str], CampaignError] = {}
+        for details in in_words(error, model).errors(include_url=False):
+            parts = details["ctx"]
+            where = (*_path_of(details["loc"], data), *filter(None, parts["key"].split(".")))
+            alike = problems.get((where, parts["found"]))
+            expected = parts["expected"]
+            if (
+                alike is not None and expected not in alike.expected
+            ):  # a value of several kinds is refused once for each
+                expected = f"{alike.expected} or {expected}"
+            mend = parts["mend"] or _where_it_belongs(str(where[-1]), model)
+            problems[where, parts["found"]] = CampaignError(place(where), parts["found"], expected, mend)
+        raise InvalidFileError(path, list(problems.values())) from None
 
 
-_Words = tuple[YamlPath, str, str, str]
-"""Place, found, expected, mend."""
+def in_words(error: ValidationError, section: type[BaseModel]) -> ValidationError:
+    """The error of a section with those of its own keys in words, as of a `broken_rule`."""
+    worded = []
+    for details in error.errors(include_url=False)[:MOST_SHOWN]:
+        parts = details["ctx"] if details["type"] == "broken_rule" else _parts(details, section)
+        worded.append(InitErrorDetails(type=broken_rule(**parts), loc=details["loc"], input=details["input"]))
+    return ValidationError.from_exception_data(section.__name__, worded)
 
 
-def _words(details: ErrorDetails, view: SchemaView, data: Any) -> _Words:
-    path, kind = _path_of(details, data), details["type"]
-    if kind == "broken_rule":
-        parts = details["ctx"]
-        return (*path, *filter(None, parts["key"].split("."))), parts["found"], parts["expected"], parts["mend"]
-    if kind == "extra_forbidden":
-        return _unknown_key(path, view, data)
+def _parts(details: ErrorDetails, section: type[BaseModel]) -> dict[str, str]:
+    """Found, expected and how to mend it, of an error about a key of a section."""
+    kind, loc, value, context = details["type"], details["loc"], details["input"], details.get("ctx", {})
+    field = section.model_fields.get(str(loc[0])) if loc else None
+    key, found = "", describe_found(value)
+    mend = _how_to_mend(value, kind, field)
     if kind == "missing":
-        expected = describe_expected(view.at(path, data), str(path[-1]))
-        return path, "no such key", expected, f"Add '{path[-1]}: …' to this section."
-    if kind in ("union_tag_not_found", "union_tag_invalid"):
-        return _wrong_tag(details, path)
-    if details["loc"][-1:] == ("[key]",):
-        expected = "a name of letters, digits, _ and -, beginning with a letter or digit"
-        return path, f"the name {str(details['input'])[:60]!r}", expected, "Choose another name."
-    schema = view.at(path, data)
-    expected = (
-        describe_expected(schema, dotted(path[-1:])) if schema else details["msg"].removeprefix("Input should be ")
-    )
-    return path, describe_found(details["input"]), expected, _how_to_mend(details["input"], schema)
-
-
-def _path_of(details: ErrorDetails, data: Any) -> tuple[str | int, ...]:
-    """Path in the document for pydantic's ``loc``, which also holds tags of unions and ``[key]`` marks."""
-    path: list[str | int] = []
-    for part in details["loc"]:
-        is_step = part in data if isinstance(data, dict) else isinstance(data, list) and isinstance(part, int)
-        if is_step:
-            path.append(part)
-            data = data[part]
-    return (*path, details["loc"][-1]) if details["type"] == "missing" else tuple(path)
-
-
-def _wrong_tag(details: ErrorDetails, path: YamlPath) -> _Words:
-    key = details["ctx"]["discriminator"].strip("'")
-    expected = f"one of {details['ctx']['expected_tags']}" if "expected_tags" in details["ctx"] else f"a key '{key}'"
-    if details["type"] == "union_tag_not_found":
-        return path, f"no key '{key}'", expected, f"Add '{key}: …'; it decides which other keys follow."
-    return (*path, key), describe_found(details["input"][key]), expected, "Choose one of them."
-
-
-def _unknown_key(path: YamlPath, view: SchemaView, data: Any) -> _Words:
-    key = str(path[-1])
-    known = list(view.at(path[:-1], data).get("properties", {}))
-    expected = f"one of the keys {', '.join(known)}" if known else "no key of this name"
-    elsewhere = list(dict.fromkeys(view.paths_of_key(key)))
-    if close := difflib.get_close_matches(key, known, n=1):
-        mend = f"Did you mean '{close[0]}'?"
-    elif elsewhere:
-        mend = f"'{key}' belongs under {' or '.join(name.rpartition('.')[0] or 'the top level' for name in elsewhere)}."
+        key, found, mend = str(loc[-1]), "no such key", f"Add '{loc[-1]}: …' to this section."
+        expected = (field and field.description) or "a value"
+    elif kind == "extra_forbidden":
+        found, known = f"the unknown key '{str(loc[-1])[:_LONGEST]}'", list(section.model_fields)
+        expected, mend = f"one of the keys {', '.join(known)}", did_you_mean(loc[-1], known)
+    elif kind == "model_type":
+        expected = f"a section with keys such as {', '.join(list(section.model_fields)[:4])}"
+    elif loc[-1] == "[key]":
+        found, expected, mend = f"the name {found}", _PATTERNS[context["pattern"]], "Choose another name."
+    elif kind == "literal_error":
+        words = re.findall("'(.*?)'", context["expected"])
+        expected, mend = f"one of {', '.join(words)}", did_you_mean(value, words) or mend
+    elif kind == "string_pattern_mismatch":
+        examples = " or ".join(map(str, (field and field.examples) or ()))
+        expected = f"text such as {examples}" if examples else _PATTERNS[context["pattern"]]
     else:
-        mend = "Delete it, or correct its name."
-    return path, f"the unknown key '{key}'", expected, mend
+        unit = next((f" ({unit})" for suffix, unit in _UNITS.items() if str(loc[-1]).endswith(suffix)), "")
+        expected = _KINDS.get(kind, details["msg"].removeprefix("Input should be ")) + unit
+        expected += ", or null" if field and len(loc) == 1 and type(None) in get_args(field.annotation) else ""
+    return {"key": key, "found": found, "expected": expected, "mend": mend}
 
 
-def _how_to_mend(value: Any, schema: Schema) -> str:
+def _how_to_mend(value: Any, kind: str, field: FieldInfo | None) -> str:
     if value is None:
         return "Write a value after the colon, or delete the key for its default."
-    wants_number = schema.get("type") in ("number", "integer")
-    if wants_number and isinstance(value, str) and _reads_as_number(value):
+    if kind in _NUMBERS and isinstance(value, str) and re.fullmatch(r"[-+.\d_eE]*\d[-+.\d_eE]*", value):
         return "Remove the quotes."
-    if schema.get("type") == "string" and isinstance(value, bool | int | float):
+    if kind == "string_type" and isinstance(value, bool | int | float):
         return "Put it in quotes if it is meant as text."
-    if isinstance(value, str) and (close := difflib.get_close_matches(value, schema.get("enum", ()), n=1)):
-        return f"Did you mean '{close[0]}'?"
-    about = schema.get("description", "").rstrip(".")
-    return f"Correct it; the key means: {about}." if about else "Correct the value."
+    about = field and field.description
+    return f"Correct it; the key means: {about.rstrip('.')}." if about else "Correct the value."
 
 
-def _reads_as_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
+def did_you_mean(word: object, words: Sequence[str]) -> str:
+    """The closest of some words, as a question; empty if none is close."""
+    return next(
+        (f"Did you mean '{close}'?" for close in difflib.get_close_matches(str(word)[:_LONGEST], words, n=1)), ""
+    )
+
+
+def _path_of(loc: Sequence[str | int], data: Any) -> tuple[str | int, ...]:
+    """Path in the document for pydantic's ``loc``, which also holds members of unions and ``[key]`` marks."""
+    path: list[str | int] = []
+    for part in loc:
+        if part in data if isinstance(data, dict) else isinstance(data, list) and isinstance(part, int):
+            path.append(part)
+            data = data[part]
+    return tuple(path)
+
+
+def _where_it_belongs(key: str, model: type[BaseModel]) -> str:
+    """How to mend an unknown key that resembles none beside it."""
+    places = list(dict.fromkeys(_places_of(key, model, "")))
+    if places:
+        return f"'{key}' belongs under {' or '.join(place or 'the top level' for place in places)}."
+    return "Delete it, or correct its name."
+
+
+def _places_of(key: str, kind: Any, prefix: str) -> Iterator[str]:
+    """Dotted paths of the sections of a type that know a key, names of one's own choice written as ``NAME``."""
+    if not (isinstance(kind, type) and issubclass(kind, BaseModel)):
+        for option in get_args(kind):
+            yield from _places_of(key, option, f"{prefix}.NAME" if get_origin(kind) is dict else prefix)
+        return
+    if key in kind.model_fields:
+        yield prefix
+    for name, field in kind.model_fields.items():
+        yield from _places_of(key, field.annotation, f"{prefix}.{name}".lstrip("."))
 
 
 def describe_found(value: Any) -> str:
-    """Say what ``value`` is, and its kind where the looks deceive: ``the text '0.9'``, ``true (not a number)``."""
+    """Say what ``value`` is, and its kind where the looks deceive: ``the text '0.9'``, ``true (a truth value)``."""
     if value is None:
         return "nothing (null)"
     if isinstance(value, bool):
@@ -170,50 +199,7 @@ def describe_found(value: Any) -> str:
         return f"keys and values ({_short(', '.join(map(str, value)) or 'none')})"
     if isinstance(value, list):
         return f"a list of {len(value)}"
-    return _short(_digits(value))
-
-
-def describe_expected(schema: dict[str, Any], key: str) -> str:
-    """Say what ``schema`` allows, with limits and the unit that the name of ``key`` carries."""
-    words = _describe_kind(schema, key)
-    return f"{words}, or null" if schema.get("nullable") else words
-
-
-def _describe_kind(schema: dict[str, Any], key: str) -> str:
-    kind = schema.get("type")
-    if "const" in schema or "enum" in schema:
-        return "one of " + ", ".join(map(str, schema["enum"])) if "enum" in schema else f"the word '{schema['const']}'"
-    if kind in ("number", "integer"):
-        return _describe_number(schema, key, "a whole number" if kind == "integer" else "a number")
-    if kind == "string":
-        examples = " or ".join(map(str, schema.get("examples", ())))
-        return f"text such as {examples}" if examples else _PATTERNS.get(schema.get("pattern", ""), "text")
-    if "properties" in schema:
-        return "a section with keys such as " + ", ".join(list(schema["properties"])[:4])
-    if "anyOf" in schema:
-        return " or ".join(_describe_kind(option, key) for option in schema["anyOf"])
-    containers = {"array": "a list", "object": "names, each with its value"}
-    return containers.get(str(kind), "a section" if "oneOf" in schema else "another kind of value")
-
-
-def _describe_number(schema: dict[str, Any], key: str, noun: str) -> str:
-    words = {"minimum": "at least", "exclusiveMinimum": "above", "maximum": "at most", "exclusiveMaximum": "below"}
-    limits = [f"{text} {_limit(schema[bound])}" for bound, text in words.items() if bound in schema]
-    if limits and limits[0].startswith("at "):
-        noun += " of"
-    unit = next((name for suffix, name in _UNITS.items() if key.endswith(suffix)), "")
-    return " ".join(filter(None, (noun, " and ".join(limits), f"({unit})" if unit else "")))
-
-
-def _limit(bound: float) -> str:
-    return str(bound) if isinstance(bound, int) and abs(bound) < 10**7 else f"{bound:.12g}"
-
-
-def _digits(value: Any) -> str:
-    try:
-        return str(value)
-    except ValueError:  # Python refuses to print whole numbers of more than 4300 digits
-        return "an enormous whole number"
+    return _short(str(value))
 
 
 def _short(text: str) -> str:

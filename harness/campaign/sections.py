@@ -6,14 +6,22 @@ import math
 from collections.abc import Iterable, Sequence
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, field_validator
-from pydantic_core import PydanticCustomError
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ModelWrapValidatorHandler,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
 
+from harness.campaign.problems import SURROGATE_PATTERN, broken_rule, in_words
 from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT
 from harness.vocabulary import EstimatorName, Method
 
-NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_.-]*$"
-SURROGATE_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_-]*$"
 LARGEST_EXACT_WHOLE_FLOAT = 2.0**53
 
 
@@ -30,20 +38,24 @@ Whole = Annotated[int, BeforeValidator(whole)]
 SurrogateName = Annotated[str, Field(pattern=SURROGATE_PATTERN)]
 
 
-def broken_rule(key: str, *, found: str, expected: str, mend: str) -> PydanticCustomError:
-    """Error for a rule between several values, in the parts of a `harness.errors.HarnessError`.
-
-    ``key`` is the dotted path of the value to blame, seen from the section that states the rule; empty for the section.
-    """
-    parts = {"key": key, "found": found, "expected": expected, "mend": mend}
-    where = "{key}: " if key else ""
-    return PydanticCustomError("broken_rule", where + "found {found}; expected {expected}. {mend}", parts)
-
-
 class Section(BaseModel):
     """A section of the campaign: unknown keys are errors, values never change after loading."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _errors_in_words(cls, data: Any, validate: ModelWrapValidatorHandler[Self]) -> Self:
+        try:
+            return validate(data)
+        except ValidationError as error:
+            raise in_words(error, cls) from None
+
+    def at(self, path: Sequence[str]) -> Any:
+        """Value at a path such as ``("av", "fmu", "file")``; None where a section on the way is left out."""
+        key, *rest = path
+        value = getattr(self, key)
+        return value.at(rest) if rest and value is not None else value
 
     def replaced(self, path: Sequence[str], value: Any) -> Self:
         """A copy with another value at a path such as ``("av", "fmu", "file")``, not validated."""

@@ -6,12 +6,21 @@ import hashlib
 import shlex
 from pathlib import Path
 from string import Formatter
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, get_args
 
-from pydantic import Field, ValidationInfo, field_validator, model_validator
+from pydantic import (
+    ConfigDict,
+    Field,
+    ValidationInfo,
+    ValidatorFunctionWrapHandler,
+    WrapValidator,
+    field_validator,
+    model_validator,
+)
 from pydantic_core import PydanticKnownError
 
-from harness.campaign.sections import Positive, Probability, Section, StepTime, Whole, broken_rule, listed
+from harness.campaign.problems import broken_rule
+from harness.campaign.sections import Positive, Probability, Section, StepTime, Whole, listed
 
 MAX_CONFIGURED_SPEED_MPS = 60.0
 PERCEIVES_LATERAL_M = 0.375
@@ -196,49 +205,6 @@ class NeedBasedParameters(Section):
         return self.acceleration_mps2
 
 
-class IDM(Section):
-    """A vehicle that follows the intelligent driver model."""
-
-    model: Literal["idm"]
-    parameters: IDMParameters = IDMParameters()
-
-
-class FVDM(Section):
-    """A vehicle that follows the full velocity difference model."""
-
-    model: Literal["fvdm"]
-    parameters: FVDMParameters = FVDMParameters()
-
-
-class Constant(Section):
-    """A vehicle that does not look ahead."""
-
-    model: Literal["constant"]
-    parameters: ConstantParameters = ConstantParameters()
-
-
-class CarefulCompetent(Section):
-    """A vehicle driven as by the careful and competent human of UN Regulation No. 157."""
-
-    model: Literal["r157-cc"]
-    parameters: CarefulCompetentParameters = CarefulCompetentParameters()
-
-
-class FuzzySafety(Section):
-    """A vehicle driven by the fuzzy safety model of UN Regulation No. 157."""
-
-    model: Literal["r157-fsm"]
-    parameters: FuzzySafetyParameters = FuzzySafetyParameters()
-
-
-class NeedBased(Section):
-    """A vehicle that brakes with what it needs, a delay after it first needs to."""
-
-    model: Literal["need-based"]
-    parameters: NeedBasedParameters = NeedBasedParameters()
-
-
-DriverModel = Annotated[IDM | FVDM, Field(discriminator="model")]
 BuiltInParameters = (
     IDMParameters
     | FVDMParameters
@@ -247,14 +213,98 @@ BuiltInParameters = (
     | FuzzySafetyParameters
     | NeedBasedParameters
 )
-PARAMETERS: dict[str, type[BuiltInParameters]] = {
-    "idm": IDMParameters,
-    "fvdm": FVDMParameters,
-    "constant": ConstantParameters,
-    "r157-cc": CarefulCompetentParameters,
-    "r157-fsm": FuzzySafetyParameters,
-    "need-based": NeedBasedParameters,
+ModelName = Literal["idm", "fvdm", "constant", "r157-cc", "r157-fsm", "need-based"]
+PARAMETERS: dict[str, type[BuiltInParameters]] = dict(
+    zip(get_args(ModelName), get_args(BuiltInParameters), strict=True)
+)
+AV_SOURCES = ("model", "controller", "sumo", "traci", "fmu")
+READS_NO_PARAMETERS = {
+    "sumo": "Write vType attributes under av.sumo itself.",
+    "traci": "Give them to your program in av.traci.command.",
+    "fmu": "Write them under av.fmu.start_values.",
 }
+"""Sources of an AV beside which parameters would be lost, and where to write them."""
+
+
+def _of_the_model(value: Any, _by_trial: ValidatorFunctionWrapHandler, info: ValidationInfo) -> Any:
+    """Parameters of the model that is named beside them; those of a controller stay as they are.
+
+    Not by trial of a union: a controller's parameters that look like the IDM's would become those.
+    """
+    if "model" not in info.data:
+        # A wrong model is an error of its own; complaints about parameters of a guessed model would only confuse.
+        return IDMParameters()
+    if (model := info.data["model"]) is not None:
+        return PARAMETERS[model].model_validate(value)
+    if not isinstance(value, dict):
+        raise PydanticKnownError("dict_type")
+    return value
+
+
+def _schema_by_model(schema: dict[str, Any]) -> None:
+    """Say in a JSON schema that parameters follow the model, which is the IDM where no source of an AV is named."""
+    properties = schema["properties"]
+    of_model, *_ = properties["model"].get("anyOf", [properties["model"]])
+    by_model = dict(zip(PARAMETERS, properties["parameters"].pop("anyOf"), strict=False))  # and any mapping
+    properties["parameters"]["type"] = "object"
+    schema["allOf"] = [
+        {
+            "if": {"required": ["model"], "properties": {"model": {"const": model}}},
+            "then": {"properties": {"parameters": parameters}},
+        }
+        for model, parameters in by_model.items()
+        if model in of_model["enum"]
+    ]
+    if "controller" in properties:
+        named = [{"required": [name]} for name in AV_SOURCES]
+        none = {"properties": {"parameters": {"maxProperties": 0}}}
+        schema["oneOf"] = [
+            {"not": {"anyOf": named}, "properties": {"parameters": by_model["idm"]}},
+            *(
+                each | none if name in READS_NO_PARAMETERS else each
+                for name, each in zip(AV_SOURCES, named, strict=True)
+            ),
+        ]
+        for name in AV_SOURCES:  # null says "not this one": in a file of its own leaving the key out says it better
+            (source,) = (each for each in properties[name].pop("anyOf") if each.get("type") != "null")
+            properties[name] = source | {key: value for key, value in properties[name].items() if key != "default"}
+
+
+class _Driven(Section):
+    """A section whose parameters follow its model."""
+
+    model_config = ConfigDict(json_schema_extra=_schema_by_model)
+
+
+Parameters = WrapValidator(_of_the_model, json_schema_input_type=BuiltInParameters | dict[str, Any])
+
+
+class Driver(_Driven):
+    """A vehicle that follows a built-in driver model."""
+
+    model: ModelName = Field(description="driver model")
+    parameters: Annotated[BuiltInParameters, Parameters] = Field(
+        default_factory=dict, validate_default=True, description="of the model; defaults where left out"
+    )
+
+
+class Surrogate(Driver):
+    """A stand-in for the unknown AV."""
+
+    model: Literal["idm", "fvdm"] = Field(description="driver model")
+    parameters: Annotated[IDMParameters | FVDMParameters, Parameters] = Field(
+        default_factory=dict, validate_default=True, description="of the model; defaults where left out"
+    )
+
+
+def default_surrogates() -> dict[str, Surrogate]:
+    """Stand-ins of the paper, from careful to careless."""
+    brakes_1, brakes_6 = (FVDMParameters(min_acceleration_mps2=limit) for limit in (-1.0, -6.0))
+    return {
+        "SM-I": Surrogate(model="idm"),
+        "SM-II": Surrogate(model="fvdm", parameters=brakes_1),
+        "SM-III": Surrogate(model="fvdm", parameters=brakes_6),
+    }
 
 
 class Reflexes(Section):
@@ -284,15 +334,6 @@ class Reaction(Reflexes):
     inattention_delay_s: StepTime = Field(
         0.0, ge=0.0, le=10.0, description="how much later it then reacts to the cut-in [assumed]"
     )
-
-
-def default_surrogates() -> dict[str, DriverModel]:
-    """Stand-ins of the paper, from careful to careless."""
-    return {
-        "SM-I": IDM(model="idm"),
-        "SM-II": FVDM(model="fvdm", parameters=FVDMParameters(min_acceleration_mps2=-1.0)),
-        "SM-III": FVDM(model="fvdm", parameters=FVDMParameters(min_acceleration_mps2=-6.0)),
-    }
 
 
 CONTROLLER_PATTERN = r"^([A-Za-z_][A-Za-z0-9_.]*:[A-Za-z_][A-Za-z0-9_]*|[A-Za-z0-9][A-Za-z0-9_.-]*)$"
@@ -358,15 +399,12 @@ _LATER = (
     ("reaction", "perceives_lateral_m", PERCEIVES_LATERAL_M),
     ("parameters", "risk_evaluation_s", RISK_EVALUATION_S),
 )
-AV_SOURCES = ("model", "controller", "sumo", "traci", "fmu")
 
 
-class AutomatedVehicle(Section):
+class AutomatedVehicle(_Driven):
     """The automated vehicle under test: one of model, controller, sumo, traci and fmu."""
 
-    model: Literal["idm", "fvdm", "constant", "r157-cc", "r157-fsm", "need-based"] | None = Field(
-        None, description="built-in driver model; idm when nothing is named"
-    )
+    model: ModelName | None = Field(None, description="built-in driver model; idm when nothing is named")
     controller: str | None = Field(
         None,
         pattern=CONTROLLER_PATTERN,
@@ -378,7 +416,7 @@ class AutomatedVehicle(Section):
     )
     traci: TraciProcess | None = Field(None, description="your program, in any language, as a TraCI client")
     fmu: FmuController | None = Field(None, description="an FMI 2.0 co-simulation FMU")
-    parameters: BuiltInParameters | dict[str, Any] = Field(
+    parameters: Annotated[BuiltInParameters | dict[str, Any], Parameters] = Field(
         default_factory=dict,
         validate_default=True,
         description="parameters of the built-in model (defaults where left out) or of the controller",
@@ -432,19 +470,6 @@ class AutomatedVehicle(Section):
             )
         return {**data, "model": "idm"}
 
-    @field_validator("parameters", mode="plain", json_schema_input_type=dict[str, Any])
-    @classmethod
-    def _parameters_follow_the_model(cls, value: Any, info: ValidationInfo) -> Any:
-        # Not by trial of a union: a controller's parameters that look like the IDM's would become those.
-        if "model" not in info.data:
-            # A wrong model is an error of its own; complaints about parameters of a guessed model would only confuse.
-            return IDMParameters()
-        if (model := info.data["model"]) is not None:
-            return PARAMETERS[model].model_validate(value)
-        if not isinstance(value, dict):
-            raise PydanticKnownError("dict_type")
-        return value
-
     @model_validator(mode="after")
     def _one_source(self) -> Self:
         named = [name for name in AV_SOURCES if getattr(self, name) is not None]
@@ -458,28 +483,12 @@ class AutomatedVehicle(Section):
         return self
 
     @model_validator(mode="after")
-    def _parameters_have_a_reader(self) -> Self:
-        elsewhere = {
-            "sumo": "Write vType attributes under av.sumo itself.",
-            "traci": "Give them to your program in av.traci.command.",
-            "fmu": "Write them under av.fmu.start_values.",
-        }
-        if self.source in elsewhere and self.parameters:
-            raise broken_rule(
-                "parameters",
-                found=f"{listed(dict(self.parameters))}, which nothing reads",
-                expected=f"no parameters beside av.{self.source}",
-                mend=elsewhere[self.source],
-            )
-        return self
-
-    @model_validator(mode="after")
-    def _only_a_built_in_model_is_slowed_down(self) -> Self:
+    def _all_of_it_is_read(self) -> Self:
+        beside = f"beside av.{self.source}"
+        if self.source in READS_NO_PARAMETERS and self.parameters:
+            found = f"{listed(dict(self.parameters))}, which nothing reads"
+            raise broken_rule("parameters", found, f"no parameters {beside}", READS_NO_PARAMETERS[self.source])
         if self.model is None and self.reaction != Reaction():
-            raise broken_rule(
-                "reaction",
-                found=f"a reaction beside av.{self.source}",
-                expected="a reaction only of a built-in model",
-                mend="Your own driver has its own delays: leave av.reaction out.",
-            )
+            mend = "Your own driver has its own delays: leave av.reaction out."
+            raise broken_rule("reaction", f"a reaction {beside}", "a reaction only of a built-in model", mend)
         return self

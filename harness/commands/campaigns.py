@@ -172,7 +172,7 @@ def schema() -> None:
 
     Let the first line of a campaign name the file: '# yaml-language-server: $schema=campaign.schema.json'.
     """
-    from harness.campaign.schema import schema_text  # noqa: PLC0415 - keeps --help fast
+    from harness.campaign.files import schema_text  # noqa: PLC0415 - keeps --help fast
 
     click.echo(schema_text(), nl=False)
 

@@ -2,24 +2,16 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
-from harness.campaign.files import names_a_file
-from harness.campaign.problems import read_model
-from harness.campaign.sections import (
-    Section,
-    ShellSettings,
-    StatementSettings,
-    SurrogateName,
-    broken_rule,
-    checked_statements,
-)
-from harness.campaign.vehicle import FVDM, IDM, CarefulCompetent, Constant, FuzzySafety, NeedBased, Reference, Reflexes
+from harness.campaign.files import shipped_or_own
+from harness.campaign.problems import broken_rule, did_you_mean, read_model
+from harness.campaign.sections import Section, ShellSettings, StatementSettings, SurrogateName, checked_statements
+from harness.campaign.vehicle import Driver, Reference, Reflexes
 from harness.episode.trajectory import Followers
 from harness.errors import CampaignError
 from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT
@@ -32,38 +24,10 @@ MOST_SURROGATES = 60
 """Outcomes of a cut-in are bits of one integer."""
 
 
-class _WithReflexes(Section):
+class LibraryDriver(Driver):
+    """A driver with its reflexes."""
+
     reaction: Reflexes = Reflexes()
-
-
-class LibraryIDM(_WithReflexes, IDM):
-    """An IDM driver with its reflexes."""
-
-
-class LibraryFVDM(_WithReflexes, FVDM):
-    """An FVDM driver with its reflexes."""
-
-
-class LibraryConstant(_WithReflexes, Constant):
-    """A driver that does not react."""
-
-
-class LibraryCarefulCompetent(_WithReflexes, CarefulCompetent):
-    """A careful and competent human driver with its reflexes."""
-
-
-class LibraryFuzzySafety(_WithReflexes, FuzzySafety):
-    """A driver by the fuzzy safety model with its reflexes."""
-
-
-class LibraryNeedBased(_WithReflexes, NeedBased):
-    """A driver that brakes once it needs to, with its reflexes."""
-
-
-LibraryDriver = Annotated[
-    LibraryIDM | LibraryFVDM | LibraryConstant | LibraryCarefulCompetent | LibraryFuzzySafety | LibraryNeedBased,
-    Field(discriminator="model"),
-]
 
 
 def library_records(models: Sequence[LibraryDriver], environment: Environment) -> RecordArray:
@@ -121,10 +85,7 @@ class Library(Section):
     @property
     def envelope_mps2(self) -> float:
         """Acceleration of the envelope (m/s²)."""
-        envelope = self.surrogates[self.envelope]
-        if not isinstance(envelope, LibraryConstant):  # the validator has seen to it
-            raise TypeError(type(envelope).__name__)
-        return envelope.parameters.acceleration_mps2
+        return self.surrogates[self.envelope].parameters.max_acceleration_mps2
 
     @property
     def boundaries(self) -> tuple[str, ...]:
@@ -152,20 +113,15 @@ class Library(Section):
         allowed = [name for name in self.surrogates if name != self.envelope]
         for name, each in found.items():
             if each.boundary not in allowed:
-                where = "boundary" if name == LIBRARY_STATEMENT else f"statements.{name}.boundary"
-                raise CampaignError(
-                    f"testing.shells.{where}",
-                    found=f"'{each.boundary}'",
-                    expected=f"a surrogate of the library other than its envelope: {', '.join(allowed)}",
-                    mend=f"Name one of them, or leave {where.split('.', maxsplit=1)[0]} out for the library's own.",
-                )
+                key = "boundary" if name == LIBRARY_STATEMENT else "statements"
+                where = f"testing.shells.{key}" + (f".{name}.boundary" if key == "statements" else "")
+                expected = f"a surrogate of the library other than its envelope: {', '.join(allowed)}"
+                mend = f"Name one of them, or leave {key} out for the library's own."
+                raise CampaignError(where, f"'{each.boundary}'", expected, mend)
         if shells.statement not in (ASSUMPTION_FREE, *found):
-            raise CampaignError(
-                "testing.shells.statement",
-                found=f"'{shells.statement}'",
-                expected=f"one of {ASSUMPTION_FREE}, {', '.join(found)}",
-                mend="Name one of them, or add it to testing.shells.statements.",
-            )
+            expected = f"one of {ASSUMPTION_FREE}, {', '.join(found)}"
+            mend = "Name one of them, or add it to testing.shells.statements."
+            raise CampaignError("testing.shells.statement", f"'{shells.statement}'", expected, mend)
         return found
 
     @model_validator(mode="after")
@@ -173,60 +129,34 @@ class Library(Section):
         places = {f"statements.{name}.boundary": each.boundary for name, each in self.statements.items()}
         for key, name in {"boundary": self.boundary, "envelope": self.envelope, **places}.items():
             if name not in self.surrogates:
-                close = difflib.get_close_matches(name, self.surrogates, n=1)
-                raise broken_rule(
-                    key,
-                    found=f"'{name}'",
-                    expected=f"one of the surrogates: {', '.join(self.surrogates)}",
-                    mend=f"Did you mean '{close[0]}'?" if close else "Add it to surrogates, or name another.",
-                )
-        for key, name in {"boundary": self.boundary, **places}.items():
-            if name != self.envelope:
-                continue
-            raise broken_rule(
-                key,
-                found=f"'{name}', which is the envelope",
-                expected="a driver that reacts: the envelope crashes nearly always, and assuming less than it says "
-                "nothing",
-                mend="Name the most careless driver that the vehicle can be expected to outdo.",
-            )
-        return self
-
-    @model_validator(mode="after")
-    def _statements_can_be_told_apart(self) -> Self:
+                expected = f"one of the surrogates: {', '.join(self.surrogates)}"
+                mend = did_you_mean(name, list(self.surrogates)) or "Add it to surrogates, or name another."
+                raise broken_rule(key, f"'{name}'", expected, mend)
+            if name == self.envelope and key != "envelope":
+                expected = "a driver that reacts: the envelope crashes nearly always, which says nothing"
+                mend = "Name the most careless driver that the vehicle can be expected to outdo."
+                raise broken_rule(key, f"'{name}', which is the envelope", expected, mend)
         checked_statements(self.statements)
-        return self
-
-    @model_validator(mode="after")
-    def _few_enough(self) -> Self:
         if (n := self.n_drivers) > MOST_SURROGATES:
-            raise broken_rule(
-                "surrogates",
-                found=f"{n} of them, with the references",
-                expected=f"at most {MOST_SURROGATES}",
-                mend="Every shell costs tests: keep those that differ in crash rate by a quarter or more.",
-            )
+            mend = "Every shell costs tests: keep those that differ in crash rate by a quarter or more."
+            raise broken_rule("surrogates", f"{n} of them, with the references", f"at most {MOST_SURROGATES}", mend)
         return self
 
     @model_validator(mode="after")
     def _envelope_encloses(self) -> Self:
-        envelope = self.surrogates[self.envelope]
-        if not isinstance(envelope, LibraryConstant):
-            raise broken_rule(
-                f"surrogates.{self.envelope}.model",
-                found=envelope.model,
-                expected="constant: the envelope is a vehicle at full throttle",
-                mend="Write {model: constant, parameters: {acceleration_mps2: 2.0}}.",
-            )
-        most = envelope.parameters.acceleration_mps2
-        for name, model in (self.surrogates | self.references).items():
-            fastest = model.parameters.max_acceleration_mps2
-            if fastest > most:
+        envelope, most = self.surrogates[self.envelope], self.envelope_mps2
+        place = f"surrogates.{self.envelope}"
+        if envelope.model != "constant":
+            mend = "Write {model: constant, parameters: {acceleration_mps2: 2.0}}."
+            expected = "constant: the envelope is a vehicle at full throttle"
+            raise broken_rule(f"{place}.model", envelope.model, expected, mend)
+        for name, driver in (self.surrogates | self.references).items():
+            if (fastest := driver.parameters.max_acceleration_mps2) > most:
                 raise broken_rule(
-                    f"surrogates.{self.envelope}.parameters.acceleration_mps2",
-                    found=f"{most:g} m/s², less than {name}'s {fastest:g}",
-                    expected="an envelope that accelerates at least as hard as every surrogate",
-                    mend=f"Raise it to {fastest:g}, or limit {name}.",
+                    f"{place}.parameters.acceleration_mps2",
+                    f"{most:g} m/s², less than {name}'s {fastest:g}",
+                    "an envelope that accelerates at least as hard as every surrogate",
+                    f"Raise it to {fastest:g}, or limit {name}.",
                 )
         return self
 
@@ -239,15 +169,4 @@ def load_library(name: str) -> Library:
     CampaignError
         There is none of that name, or the file is wrong; every place is named.
     """
-    if names_a_file(name):
-        return read_model(Path(name), Library)
-    shipped = sorted(file.stem for file in SHIPPED_FOLDER.glob("*.yaml"))
-    if name not in shipped:
-        close = difflib.get_close_matches(name, shipped, n=1)
-        raise CampaignError(
-            "pool.library",
-            found=f"'{name}', which is not shipped",
-            expected=f"the name of a shipped library: {', '.join(shipped)}; or a path that ends in .yaml",
-            mend=f"Did you mean '{close[0]}'?" if close else "For a file of your own write its path: ./mine.yaml.",
-        )
-    return read_model(SHIPPED_FOLDER / f"{name}.yaml", Library)
+    return read_model(shipped_or_own(name, SHIPPED_FOLDER, "pool.library"), Library)

@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, model_validator
+from pydantic import AfterValidator, BaseModel, model_validator
 
-from harness.campaign.sections import broken_rule
+from harness.campaign.problems import broken_rule
+from harness.campaign.sections import Section
 from harness.campaign.vehicle import MAX_CONFIGURED_SPEED_MPS
 from harness.maneuvers import ACCELERATIONS_MPS2
 from harness.traffic.lateral import LateralMotion, constant_lead, in_one_step, log_normal_speed
@@ -26,11 +27,7 @@ LONGEST_LEAD_S = 10.0
 _SPEED = ("speed_median_mps", "speed_log_sd", "longest_lead_s")
 
 
-class _Frozen(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
-
-
-class Number(_Frozen):
+class Number(Section):
     """A value and where it comes from (the tags are explained in the shipped file)."""
 
     value: float
@@ -86,7 +83,7 @@ def _whole_steps(number: Number) -> Number:
     return number
 
 
-class Scenario(_Frozen):
+class Scenario(Section):
     """Horizon of a test."""
 
     duration_s: Annotated[Number, _within(1.0, 25.0), AfterValidator(_whole_steps)]
@@ -106,7 +103,7 @@ class Scenario(_Frozen):
         return data
 
 
-class FitRange(_Frozen):
+class FitRange(Section):
     """Where the fits hold; states outside are clamped to it."""
 
     v_min_mps: Speed
@@ -125,7 +122,7 @@ class FitRange(_Frozen):
         return self
 
 
-class InitialState(_Frozen):
+class InitialState(Section):
     """Distribution of (v_BV, R1, R1dot, R2, R2dot)."""
 
     v_location_mps: Coefficient
@@ -160,7 +157,7 @@ class InitialState(_Frozen):
         return self
 
 
-class FreeDriving(_Frozen):
+class FreeDriving(Section):
     """Accelerations of LV, and of BV after its cut-in."""
 
     df: DegreesOfFreedom
@@ -174,7 +171,7 @@ class FreeDriving(_Frozen):
     brake_max_mps2: Acceleration
 
 
-class CarFollowing(_Frozen):
+class CarFollowing(Section):
     """Accelerations of BV behind LV."""
 
     gain_rate_per_s: Gain
@@ -194,7 +191,7 @@ class CarFollowing(_Frozen):
     rate_cap_mps: Speed
 
 
-class Guard(_Frozen):
+class Guard(Section):
     """What keeps BV off LV; part of p."""
 
     lead_braking_mps2: Braking
@@ -203,7 +200,7 @@ class Guard(_Frozen):
     margin_m: Gap
 
 
-class CutIn(_Frozen):
+class CutIn(Section):
     """Hazard of the cut-in."""
 
     intercept: Coefficient
@@ -220,7 +217,7 @@ class CutIn(_Frozen):
     max_probability_1s: Annotated[Number, _within(1e-6, 0.5)]
 
 
-class Lateral(_Frozen):
+class Lateral(Section):
     """How long cut-ins show themselves before BV overlaps: a constant lead, or a log-normal lateral speed."""
 
     distance_m: Annotated[Number, _within(0.1, 5.0)]
@@ -249,7 +246,7 @@ class Lateral(_Frozen):
         return log_normal_speed(self.distance_m.value, median, log_sd, longest)
 
 
-class EnvironmentParameters(_Frozen):
+class EnvironmentParameters(Section):
     """All numbers of the environment."""
 
     format: Literal["ndd-overtaking"]

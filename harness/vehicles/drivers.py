@@ -11,17 +11,16 @@ the same bits.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from harness.campaign.vehicle import (
-    FVDM,
-    IDM,
     AutomatedVehicle,
     BuiltInParameters,
     CarefulCompetentParameters,
     ConstantParameters,
+    Driver,
     FuzzySafetyParameters,
     FVDMParameters,
     IDMParameters,
@@ -97,7 +96,7 @@ def av_records(av: AutomatedVehicle, *, see_onset: bool = False) -> RecordArray:
     return driver_records([])
 
 
-def surrogate_records(surrogates: dict[str, IDM | FVDM]) -> RecordArray:
+def surrogate_records(surrogates: Mapping[str, Driver]) -> RecordArray:
     """Parameters of the surrogates, in their order, shape (J,)."""
     return driver_records([model.parameters for model in surrogates.values()])
 

@@ -9,8 +9,8 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import Field, model_validator
 
 from harness.campaign.files import Override, Places, apply_overrides
-from harness.campaign.problems import validated
-from harness.campaign.sections import NAME_PATTERN, Positive, Probability, Section, Whole, broken_rule
+from harness.campaign.problems import NAME_PATTERN, broken_rule, validated
+from harness.campaign.sections import Positive, Probability, Section, Whole
 from harness.campaign.yaml_text import read_yaml
 from harness.errors import CampaignError
 
@@ -245,7 +245,7 @@ def load_study(path: Path, *, quick: bool = False) -> Study:
     data, lines = read_yaml(path)
     full = validated(data, Study, str(path), lines.place)
     changes = [
-        Override(("steps", name, key), value, f"steps.{name}.{key}", "quick:")
+        Override(("steps", name, key), value, f"quick: steps.{name}.{key}")
         for name, values in full.quick.items()
         for key, value in values.items()
     ]

@@ -7,7 +7,7 @@ import numpy as np
 
 from harness.campaign.campaign import Campaign
 from harness.campaign.sections import EnvironmentSettings, Records, Testing
-from harness.campaign.vehicle import IDM, AutomatedVehicle, FVDMParameters, IDMParameters
+from harness.campaign.vehicle import AutomatedVehicle, FVDMParameters, IDMParameters, Surrogate
 from harness.episode.loop import Shard
 from harness.resolved import resolve
 from harness.runner.prepare import Prepared, prepare
@@ -26,8 +26,8 @@ DEFAULT_SURROGATES = Campaign(name="default").surrogates
 SURROGATES = {
     "default": DEFAULT_SURROGATES,
     "two": {name: DEFAULT_SURROGATES[name] for name in ("SM-I", "SM-III")},  # immediate tables in half the time
-    "SM-I": {"SM-I": IDM(model="idm")},
-    "brakes with 2 g": {"hard": IDM(model="idm", parameters=IDMParameters(min_acceleration_mps2=-20.0))},
+    "SM-I": {"SM-I": Surrogate(model="idm")},
+    "brakes with 2 g": {"hard": Surrogate(model="idm", parameters=IDMParameters(min_acceleration_mps2=-20.0))},
 }
 
 TWO = "surrogates={SM-I: {model: idm}, SM-III: {model: fvdm, parameters: {min_acceleration_mps2: -6.0}}}"

@@ -329,7 +329,7 @@ def test_the_theorems_hold_on_exact_chains(made):
     [
         (("tests: 6_000", "tests: 0"), "steps.nde.tests"),
         (("tests: 6_000", "test: 6_000"), "'test'"),
-        (("kind: theorems", "kind: theorem"), "steps.theorems.kind"),
+        (("kind: theorems", "kind: theorem"), "does not match any of the expected tags"),
         (("reference: nade", "reference: nobody"), "steps.curves.reference"),
         (("of: nade, sizes", "of: nde, sizes"), "steps.adjusted.of"),
         (("sizes: [700, 1_200", "sizes: [1_200, 700"), "steps.adjusted.sizes"),

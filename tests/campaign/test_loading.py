@@ -1,0 +1,317 @@
+"""Loading a campaign: every mistake is named with YAML path and line, several at once; --set and --av are laid over."""
+
+import pickle
+import re
+import shutil
+
+import pytest
+
+from harness.campaign.campaign import Campaign
+from harness.campaign.files import SHIPPED_PANEL, SHIPPED_PARAMETERS, load_campaign, load_panel, panel_av
+from harness.campaign.problems import InvalidFileError, read_model
+from harness.campaign.vehicle import AutomatedVehicle, IDMParameters, Surrogate
+from harness.cli import main
+from harness.errors import EXIT_BAD_INPUT, CampaignError
+from harness.traffic.parameters import EnvironmentParameters
+
+
+@pytest.fixture
+def load(tmp_path):
+    def load_text(text, *overrides, **options):
+        file = tmp_path / "bad.yaml"
+        file.write_text("name: bad\n" + text)
+        return load_campaign(file, overrides, **options)
+
+    return load_text
+
+
+@pytest.mark.parametrize(
+    ("text", "path", "line", "words"),
+    [
+        ("testin:\n  epsilon: 0.2", "testin", 2, "Did you mean 'testing'?"),
+        ("testing:\n  epsilom: 0.2", "testing.epsilom", 3, "Did you mean 'epsilon'?"),
+        ("epsilon: 0.2", "epsilon", 2, "belongs under testing"),
+        ("zzz: 0.2", "zzz", 2, "Delete it"),
+        ("testing:\n  epsilon: '0.2'", "testing.epsilon", 3, "Remove the quotes"),
+        ("testing:\n  epsilon: true", "testing.epsilon", 3, "truth value"),
+        ("testing:\n  epsilon: .nan", "testing.epsilon", 3, "nan"),
+        ("testing: 5", "testing", 2, "a section with keys such as method"),
+        ("world:", "world", 2, "delete the key for its default"),
+        ("run: [1]", "run", 2, "a list of 1"),
+        ("description: 5", "description", 2, "in quotes"),
+        ("stop:\n  episodes: 1.5", "stop.episodes", 3, "a whole number"),
+        ("stop:\n  episodes: 1e300", "stop.episodes", 3, "1e+300"),
+        ("seed: " + "9" * 4299, "seed", 2, "999…"),
+        ("stop:\n  rhw: true", "stop.rhw", 3, "a number, or null"),
+        ("stop:\n  rhw: 10", "stop.rhw", 3, "less than 10, or null"),
+        ("testing:\n  method: ndee", "testing.method", 3, "Did you mean 'nde'?"),
+        ("av:\n  parameters:\n    desired_speed_mps: 300", "av.parameters.desired_speed_mps", 4, "equal to 60 (m/s)"),
+        ("av:\n  model: fvdm\n  parameters:\n    max_speed_mps: 300", "av.parameters.max_speed_mps", 5, "equal to 60"),
+        ("av:\n  model: fvdm\n  parameters: {time_headway_s: 1}", "av.parameters.time_headway_s", 4, "kappa_per_s"),
+        ("av:\n  parameters: {kappa_per_s: 1}", "av.parameters.kappa_per_s", 3, "surrogates.NAME.parameters"),
+        ("av:\n  parameters: 5", "av.parameters", 3, "a section"),
+        ("av: {model: krauss, parameters: {tau: 1}}", "av.model", 2, "idm, fvdm"),
+        ("surrogates:\n  A: {model: idm, parameters: {v0: 1}}", "surrogates.A.parameters.v0", 3, "time_headway_s"),
+        ("surrogates:\n  A:\n    parameters: {}", "surrogates.A.model", 3, "no such key"),
+        ("surrogates:\n  A:\n    model: constant", "surrogates.A.model", 4, "one of idm, fvdm"),
+        ("surrogates:\n  A: 5", "surrogates.A", 3, "a section"),
+        ("surrogates:\n  a.b: {model: idm}", "surrogates.a.b", 3, "another name"),
+        ("surrogates: {}", "surrogates", 2, "at least one surrogate"),
+        ("testing:\n  alpha: {SM-I: 0.5, SM-II: 0.4, SM-III: 0.2}", "testing.alpha", 3, "sum to 1.1"),
+        ("testing:\n  alpha: {SM-I: 0.5, SM-II: 0.5}", "testing.alpha", 3, "SM-I, SM-II, SM-III"),
+        ("testing:\n  alpha:\n    SM-I: x", "testing.alpha.SM-I", 4, "a number"),
+        ("environment:\n  acceleration_hold_s: 0.25", "environment.acceleration_hold_s", 3, "multiple of the 0.1 s"),
+        ("environment:\n  parameters: gone.yaml", "environment.parameters", 3, "a parameter file"),
+        ("environment:\n  parameters: ndd-overtaking-2", "environment.parameters", 3, "Did you mean"),
+        ("pool: {library: ./gone.yaml}", "pool.library", 2, "a surrogate library"),
+        ("stop:\n  estimator: nde", "stop.estimator", 3, "testing.method nde"),
+        ("stop:\n  estimator: scv\nrecords: {moments: none}", "stop.estimator", 3, "records.moments"),
+        ("stop:\n  estimator: scv\ntesting: {method: forced}", "stop.estimator", 3, "testing.method step_mixture"),
+        ("av:\n  controler: a:B", "av.controler", 3, "Did you mean 'controller'?"),
+        ("av:\n  command: ./a", "av.command", 3, "belongs under av.traci"),
+        ("av:\n  model: idm\n  controller: a:B", "av", 2, "An AV has one driver"),
+        ("av:\n  controller:", "av.controller", 3, "Write a value after 'controller:'"),
+        ("av:\n  controller: my module.py", "av.controller", 3, "text such as my_package.my_module:MyController"),
+        ("av:\n  controller: a:B\n  parameters: [1]", "av.parameters", 4, "names, each with its value"),
+        ("av:\n  sumo:\n    carFollowModel: ACC\n    minGap: true", "av.sumo.minGap", 5, "text or a number"),
+        ("av:\n  sumo: {tau: 1}\n  parameters: {tau: 1}", "av.parameters", 4, "under av.sumo itself"),
+        ("av:\n  sumo: {tau: 1}\n  reaction: {delay_s: 1}", "av.reaction", 4, "leave av.reaction out"),
+        ("av:\n  sumo: {tau: 1}\nworld: {engine: twin}", "world.engine", 4, "Write engine: sumo"),
+        ("av:\n  traci: {command: ''}", "av.traci.command", 3, "starts the program"),
+        ("av:\n  traci: {command: 'x {host}'}", "av.traci.command", 3, "Double a brace"),
+        ("av:\n  traci:\n    command: x\n    restart: 1", "av.traci.restart", 5, "Did you mean 'restarts'?"),
+        ("av:\n  fmu: {file: a.fmu, output: a}", "av.fmu.inputs", 3, "Add 'inputs: …'"),
+        ("av:\n  before_cut_in: controller", "av.before_cut_in", 3, "hold_speed"),
+        ("stop:\n  rhw: 1\n  rhw: 2", "", 4, "the key stop.rhw again, first written on line 3"),
+        ("world: {cells: 257}", "world.cells", 2, "at most 256"),
+        ("testing: {method: step_mixture}\nstop:\n  rhw: 0.3", "stop.rhw", 4, "a fixed number of tests"),
+        ("accept: {crash_rate_below: 0.1}", "accept", 2, "testing.method shells"),
+    ],
+)
+def test_a_mistake_is_named(load, text, path, line, words):
+    with pytest.raises(CampaignError) as caught:
+        load(text)
+    error = caught.value
+    assert error.where.startswith(f"{path} (" if path else "/")
+    assert re.search(rf"bad\.yaml:{line}(:\d+)?\)?$", error.where)
+    assert words in str(error)
+    assert error.exit_code == EXIT_BAD_INPUT
+    assert all((error.found, error.expected, error.mend))
+
+
+def test_all_mistakes_are_named_at_once(load):
+    with pytest.raises(InvalidFileError) as caught:
+        load("stop:\n  rhw: x\ntesting:\n  alpha: {SM-I: 0.9}\n  epsilom: 1\nwordl: {}")
+    where = {problem.where.partition(" ")[0] for problem in caught.value.problems}
+    assert where == {"stop.rhw", "testing.alpha", "testing.epsilom", "wordl"}
+    assert all(place in str(caught.value) for place in where)
+    assert str(pickle.loads(pickle.dumps(caught.value))) == str(caught.value)
+    with pytest.raises(InvalidFileError, match=r"20 problems"):
+        load("".join(f"key_{i}: 1\n" for i in range(1000)))
+
+
+def test_name_is_asked_for_and_explained(tmp_path):
+    for text, words in (("seed: 1", "no such key"), ("name: a b", "a name of letters, digits, _ . and -, without")):
+        (tmp_path / "c.yaml").write_text(text)
+        with pytest.raises(CampaignError, match=rf"^name \(.*c.yaml:1\): .*{words}"):
+            load_campaign(tmp_path / "c.yaml")
+
+
+def test_parameter_files_are_read_with_the_place_of_every_problem(tmp_path):
+    text = (SHIPPED_PARAMETERS / "ndd-overtaking-1.yaml").read_text()
+    text = text.replace("r2_min_m: {value: 20.0,", "r2_min_m: {value: '20',")
+    text = text.replace("r2_max_m: {value: 100.0, source: paper}", "r2_max_m: {value: 100.0, sourse: paper}")
+    (tmp_path / "mine.yaml").write_text(text)
+    line = 1 + next(i for i, row in enumerate(text.splitlines()) if "r2_min_m" in row)
+    with pytest.raises(InvalidFileError, match="Did you mean 'source'") as caught:
+        read_model(tmp_path / "mine.yaml", EnvironmentParameters)
+    assert {problem.where for problem in caught.value.problems} == {
+        f"initial_state.r2_min_m.value ({tmp_path}/mine.yaml:{line})",
+        f"initial_state.r2_max_m.source ({tmp_path}/mine.yaml:{line + 1})",
+        f"initial_state.r2_max_m.sourse ({tmp_path}/mine.yaml:{line + 1})",
+    }
+
+
+def test_values_of_several_kinds(load):
+    campaign = load("testing: {epsilon: 1e-5}\nstop: {episodes: 1e8, rhw: 1}\nav: {model: fvdm, parameters: {c2: 1.6}}")
+    assert (campaign.testing.epsilon, campaign.stop.rhw) == (1e-5, 1.0)
+    assert (campaign.stop.episodes, type(campaign.stop.episodes)) == (100_000_000, int)
+    assert (campaign.av.parameters.c2, campaign.av.parameters.kappa_per_s) == (1.6, 0.85)
+    # These fit the built-in IDM as well; tried as a union they would become its parameters, and be lost.
+    av = load("av: {model: idm, parameters: {}}", "av={controller: 'a:B', parameters: {time_headway_s: 1.5}}").av
+    assert av.parameters == {"time_headway_s": 1.5}
+    assert load("av: {model: idm}", "av.model=null", "av.controller=a:B").av.source == "controller"
+
+
+def test_how_a_number_is_written_does_not_change_the_hash(load):
+    text = "run: {{shard_size: {}}}\nenvironment: {{lane_change_level: {}}}"
+    numbers = (("1000", "10"), ("1e3", "1e1"), ("1000.0", "10.0"))
+    assert len({load(text.format(*pair)).content_hash("parameters") for pair in numbers}) == 1
+
+
+def test_files_are_relative_to_the_campaign(load, tmp_path, monkeypatch):
+    (tmp_path / "deep").mkdir()
+    shutil.copy(SHIPPED_PARAMETERS / "ndd-overtaking-1.yaml", tmp_path / "deep" / "mine.yaml")
+    monkeypatch.chdir("/")
+    ray = "run: {ray: {runtime_env: {working_dir: src, py_modules: [a, 's3://b'], pip: [x]}}}"
+    campaign = load("environment: {parameters: deep/mine.yaml}\n" + ray)
+    assert campaign.environment.parameters == str(tmp_path / "deep/mine.yaml")
+    folders = {"working_dir": f"{tmp_path}/src", "py_modules": [f"{tmp_path}/a", "s3://b"], "pip": ["x"]}
+    assert campaign.run.ray.runtime_env == folders
+    gone = load("environment: {parameters: ./gone.yaml}", check_files=False)
+    assert gone.environment.parameters == str(tmp_path / "gone.yaml")
+
+
+# -- --set --
+
+
+def test_later_overrides_win_and_follow_the_rules_of_the_file(load):
+    campaign = load("stop: {rhw: 0.1}", "stop.rhw=0.2", "stop={rhw: 0.3}", "stop.rhw=4e-1", "description=12:30")
+    assert (campaign.stop.rhw, campaign.description) == (0.4, "12:30")
+    assert load("stop: {rhw: 0.1}", "stop.rhw=null").stop.rhw is None
+
+
+@pytest.mark.parametrize(
+    ("text", "override", "expected"),
+    [
+        ("", "surrogates.SM-II.parameters.min_acceleration_mps2=-2", [-4.0, -2.0, -6.0]),
+        ("surrogates: {A: &a {model: idm}, B: *a}", "surrogates.A.parameters.min_acceleration_mps2=-1", [-1.0, -4.0]),
+    ],
+)
+def test_changing_one_surrogate_keeps_the_others(load, text, override, expected):
+    assert [each.parameters.min_acceleration_mps2 for each in load(text, override).surrogates.values()] == expected
+
+
+@pytest.mark.parametrize(
+    "override",
+    [
+        "testing.epsilom=0.2",
+        "testing.epsilon=no",
+        "testing.epsilon=",
+        "testing.epsilon",
+        "testing.epsilon=[1",
+        "testing..epsilon=1",
+        "=1",
+        "name.first=x",
+        "environment.parameters=gone.yaml",
+        "environment.parameters=gone",
+        "surrogates.A.parameters.x=1",
+        "a={b: 1, b: 2}",
+    ],
+)
+def test_errors_name_the_option(load, override):
+    with pytest.raises(CampaignError) as caught:
+        load("", override)
+    assert f"--set {override}" in caught.value.where
+
+
+def test_rules_between_file_and_option_name_both(load):
+    with pytest.raises(CampaignError) as caught:
+        load("testing:\n  alpha: {SM-I: 0.5, SM-II: 0.4, SM-III: 0.1}", "testing.alpha.SM-I=0.9")
+    assert "bad.yaml:3" in caught.value.where
+    assert "--set testing.alpha.SM-I=0.9" in caught.value.where
+
+
+# -- the panel and --av --
+
+
+@pytest.fixture
+def panel(tmp_path):
+    def write(entries):
+        file = tmp_path / "mine.yaml"
+        file.write_text("format: av-panel\nversion: 1\navs:\n" + entries)
+        return file
+
+    return write
+
+
+def test_the_shipped_panel_has_what_the_design_asks_for():
+    avs = load_panel().avs
+    table_1 = [av.parameters.acceleration_mps2 for name, av in avs.items() if name.startswith("alpha-")]
+    assert table_1 == [0.5 * k for k in range(1, 13)]
+    assert [avs[name].parameters.min_acceleration_mps2 for name in ("brakes-3", "SM-II", "SM-III")] == [
+        -3.0,
+        -1.0,
+        -6.0,
+    ]
+    assert [avs[name].reaction.delay_s for name in ("late-300ms", "late-600ms", "late-1000ms")] == [0.3, 0.6, 1.0]
+    assert [av.sumo["carFollowModel"] for av in avs.values() if av.sumo is not None] == ["ACC", "Krauss"]
+    content = {}
+    for name, av in avs.items():
+        content.setdefault(av.model_dump_json(), []).append(name)
+    assert [names for names in content.values() if len(names) > 1] == [["idm", "alpha-2.0"]]
+
+
+def test_every_number_of_the_shipped_panel_carries_a_tag():
+    lines = SHIPPED_PANEL.read_text().partition("\navs:\n")[2].splitlines()
+    numbers = [line for line in lines if re.match(r"\s*[^#]*\{.*\d", line)]
+    assert len(numbers) >= 25
+    assert [line for line in numbers if not re.search(r"\[(paper|cutin|assumed|SUMO)\]", line)] == []
+
+
+def test_a_vehicle_replaces_the_campaigns_and_overrides_are_laid_over_it(load, panel):
+    text = "av: {model: fvdm, parameters: {kappa_per_s: 0.5}}\nsurrogates: {S: {model: idm}}"
+    by_name = load(text, av="brakes-3")
+    assert (by_name.av, by_name.surrogates) == (panel_av("brakes-3"), {"S": Surrogate(model="idm")})
+    file = panel("  mine: {model: idm, parameters: {time_headway_s: 2}, reaction: {delay_s: 0.2}}\n")
+    mine = load(text, "av.parameters.min_acceleration_mps2=-7", av=f"{file}:mine").av
+    assert mine.parameters == IDMParameters(time_headway_s=2.0, min_acceleration_mps2=-7.0)
+    assert mine.reaction.delay_s == 0.2
+
+
+def test_an_fmu_lies_beside_the_panel(load, panel, tmp_path):
+    (tmp_path / "deep").mkdir()
+    (tmp_path / "deep" / "av.fmu").write_bytes(b"x")
+    file = panel("  box: {fmu: {file: av.fmu, inputs: {speed_mps: v}, output: a}}\n").rename(
+        tmp_path / "deep" / "p.yaml"
+    )
+    assert load("", av=f"{file}:box").av.fmu.file == str(tmp_path / "deep" / "av.fmu")
+
+
+@pytest.mark.parametrize(
+    ("entries", "where", "words"),
+    [
+        ("  a: {model: idm, parameters: {min_acceleration: -3}}", "avs.a.parameters.min_acceleration", "Did you mean"),
+        ("  a: {model: idm}\n  b: {model: fvdm, reaction: {delay_s: 0.25}}", "avs.b.reaction.delay_s", "0.1 s step"),
+        ("  a: {model: idm, controller: 'm:C'}", "avs.a", "one driver"),
+        ("  'a b': {model: idm}", "avs.a b", "another name"),
+        ("  {}", "avs", "at least 1 item"),
+    ],
+)
+def test_a_mistake_in_a_panel_names_its_place(panel, entries, where, words):
+    file = panel(entries)
+    with pytest.raises(CampaignError, match=words) as caught:
+        load_panel(file)
+    assert caught.value.where.startswith(f"{where} ({file}:")
+
+
+def test_a_vehicle_that_is_unknown_or_breaks_a_rule_names_the_option(load, panel):
+    with pytest.raises(CampaignError, match=r"--av late-60ms: found no vehicle .* Did you mean 'late-600ms'"):
+        load("", av="late-60ms")
+    with pytest.raises(CampaignError, match=r"expected one of a; or PANEL"):
+        load("", av=f"{panel('  a: {model: idm}')}:idm")
+    with pytest.raises(CampaignError, match=r"gone\.yaml: found no such file"):
+        load("", av="gone.yaml:idm")
+    with pytest.raises(CampaignError, match=r"^--set world\.engine=twin"):
+        load("", "world.engine=twin", av="sumo-acc")
+    with pytest.raises(CampaignError, match="sumo-acc"):
+        load("", "av.reaction.delay_s=0.1", av="sumo-acc")
+
+
+def test_the_commands_take_a_vehicle(tmp_path, capsys, monkeypatch):
+    file = tmp_path / "c.yaml"
+    file.write_text("name: c\n")
+    assert main(["check", str(file), "--av", "late-300ms"]) == 0
+    assert "delay_s: 0.3" in capsys.readouterr().out
+    seen = []
+    monkeypatch.setattr("harness.runner.compare_campaigns", lambda a, b, *_, **__: seen.extend([a, b]) or 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        main(["compare", str(file), "--out", str(tmp_path / "c"), "--av", "idm", "--against-av", "SM-II", "--quiet"])
+    assert [campaign.av for campaign in seen] == [AutomatedVehicle(), panel_av("SM-II")]
+    assert main(["run", str(file), "--out", str(tmp_path / "r"), "--av", "nobody"]) == 2
+    assert capsys.readouterr().err.startswith("error: --av nobody\n")
+
+
+def test_rules_hold_in_python_too():
+    with pytest.raises(ValueError, match=r"world\.engine: found twin.*Write engine: sumo"):
+        Campaign(name="x", av={"sumo": {"tau": 1.0}}, world={"engine": "twin"})
