@@ -105,6 +105,13 @@ def size(n_bytes: float) -> str:
     return f"{n_bytes:.0f} {unit}" if unit == "B" else f"{number(n_bytes, 2, exponent=0)} {unit}"
 
 
+def leaves(content: Any, path: str = "") -> list[tuple[str, Any]]:
+    """Leaves of nested mappings as (dotted path, value), in order; none of an empty one."""
+    if isinstance(content, dict) and (content or not path):
+        return [leaf for key, part in content.items() for leaf in leaves(part, f"{path}.{key}" if path else str(key))]
+    return [(path, content)]
+
+
 def words(content: Any, digits: int | None = None) -> str:
     """Anything from a YAML or JSON file: numbers with every digit, to be typed again, or rounded to ``digits``."""
     if content is None:

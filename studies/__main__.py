@@ -10,8 +10,7 @@ import click
 
 from harness.cli import main as run_main
 from harness.commands.options import CAMPAIGN, FILE, FOLDER, RUN_FOLDER, examples, json_option, quiet_option
-from harness.console import print_json
-from harness.console_tables import print_table
+from harness.commands.printing import print_json, print_table
 from harness.errors import WorldDisagreementError
 
 if TYPE_CHECKING:
@@ -262,22 +261,13 @@ def alarm(ctx: click.Context, folder: Path, *, pool_file: Path | None, as_json: 
     if as_json:
         print_json({**found, "tables": tables})
     else:
-        _print_columns(f"Weighted crashes of surrogates in {found['n_episodes']:,} tests", found["surrogates"])
+        print_table(f"Weighted crashes of surrogates in {found['n_episodes']:,} tests", found["surrogates"])
         if tables:
-            _print_columns("Challenge tables against Monte Carlo", tables)
+            print_table("Challenge tables against Monte Carlo", tables)
         verdict = found["no_verdict"] or ("ALARM: weights, maneuvers, twin or pool are wrong" * found["raised"])
         click.echo(f"{verdict or 'nothing is wrong that these tests could show'} (p-value {found['p_value']:.2g})")
     if found["raised"]:
         ctx.exit(WorldDisagreementError.exit_code)
-
-
-def _print_columns(title: str, rows: Sequence[dict[str, Any]]) -> None:
-    """Print mappings of the same keys as a table."""
-    texts = [key for key, value in rows[0].items() if isinstance(value, str)]
-    cells = [[value if isinstance(value, str) else f"{value:.4g}" for value in row.values()] for row in rows]
-    print_table(
-        title, [key.replace("_", " ") for key in rows[0]], cells, texts=[key.replace("_", " ") for key in texts]
-    )
 
 
 def _print_required_tests(content: dict[str, Any]) -> None:
@@ -300,7 +290,7 @@ def _print_required_tests(content: dict[str, Any]) -> None:
             ]
         rows.append((row["run"], row["estimator"], f"{row['n_episodes']:,}", *cells))
     title = f"Tests until RHW stays at most {content['rhw']:g} ({level} normal interval)"
-    print_table(title, headings, rows, texts=("run", "estimator", "grid"))
+    print_table(title, [dict(zip(headings, row, strict=True)) for row in rows])
     for row in content["rows"]:
         for remark in [*row.get("remarks", ()), *filter(None, [row.get("reason")])]:
             click.echo(f"{row['run']} {row['estimator']}: {remark}")

@@ -23,8 +23,8 @@ from harness.commands.options import (
     workers_option,
     written_file,
 )
-from harness.console import print_json, print_plan
-from harness.console_tables import print_pool, print_result
+from harness.commands.printing import print_json, print_plan, print_statements, print_table
+from harness.numbers import leaves, words
 
 
 @click.command(
@@ -123,7 +123,9 @@ def run(
     if as_json:
         print_json(result.estimates)
     else:
-        print_result(result)
+        print_statements(result.estimates)
+        for line in (result.ending, result.report, result.folder / "estimates.json"):
+            click.echo(str(line))
     ctx.exit(result.exit_code)
 
 
@@ -159,7 +161,12 @@ def pool(campaign_file: Path, *, out: Path | None, overrides: Sequence[str], as_
     if as_json:
         print_json(found.to_json() | ({} if out is None else {"file": str(out)}))
         return
-    print_pool(found.to_json())
+    content = found.to_json()
+    print_table(f"Pool {content['pool']}: {content['n_paths']:,} paths", content.pop("surrogates"))
+    if references := content.pop("references", ()):
+        print_table("Reference drivers", references)
+    for name, value in leaves(content):
+        click.echo(f"{name.replace('_', ' ')}: {words(value, 4)}")
     if out is not None:
         click.echo(str(out))
 

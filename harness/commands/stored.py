@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from harness.commands.options import FILE, RUN_FOLDER, examples, json_option, written_file
-from harness.console import print_json, write_trace
-from harness.console_tables import print_estimates
+from harness.commands.printing import print_estimates, print_json
 from harness.errors import EXIT_BAD_INPUT, WorldDisagreementError
 from harness.vocabulary import ESTIMATORS
 
@@ -107,7 +106,12 @@ def replay(folder: Path, episode: int, *, out: Path | None, fcd: Path | None, gu
     result = replay_episode(folder, episode, gui=gui, fcd=fcd)
     files = [str(file) for file in (out, fcd) if file is not None]
     if out is not None:
-        write_trace(result.trace, out)
+        from pyarrow import csv, parquet  # noqa: PLC0415 - keeps --help fast
+
+        from harness.records.folder import write_atomically  # noqa: PLC0415 - keeps --help fast
+
+        write = csv.write_csv if out.suffix == ".csv" else parquet.write_table
+        write_atomically(out, lambda unfinished: write(result.trace, unfinished))
     if as_json:
         said = {"episode": episode, "outcome": result.outcome, "bit_equal": result.bit_equal, "files": files}
         print_json({**said, **{name: result.row[name] for name in LATERAL if name in result.row}})

@@ -19,8 +19,8 @@ from harness.commands.options import (
     set_option,
     workers_option,
 )
-from harness.console import print_json
-from harness.console_tables import print_av_check
+from harness.commands.printing import print_json, print_table
+from harness.numbers import leaves
 
 
 @click.command(
@@ -55,7 +55,7 @@ def av_check(
     if as_json:
         print_json(found.to_json())
     else:
-        print_av_check(found)
+        print_table("What the AV is like", [{"what": name, "found": value} for name, value in leaves(found.to_json())])
     ctx.exit(found.exit_code)
 
 

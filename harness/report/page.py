@@ -16,7 +16,7 @@ from harness import numbers
 from harness.campaign.campaign import Campaign
 from harness.campaign.files import written_out
 from harness.estimators.shells import ShellDetails, Within
-from harness.numbers import MISSING, count, exponent_of, half_width, number, power_of_ten, share, words
+from harness.numbers import MISSING, count, exponent_of, half_width, leaves, number, power_of_ten, share, words
 from harness.records.folder import write_bytes
 from harness.records.reader import table_sizes
 from harness.report.crashes import GalleryRow, crash_gallery
@@ -198,8 +198,8 @@ def outcome_rows(summary: RunSummary) -> list[tuple[str, float, float, float]]:
 
 def diagnostics(run: RunFolder) -> list[tuple[str, Any]]:
     """Return sums of the run as (key, value); of shells without those about weights, which have none to say."""
-    leaves = flat(run.estimates.diagnostics or {})
-    return leaves if run.shells is None else [(path, leaf) for path, leaf in leaves if leaf not in (None, {})]
+    found = leaves(run.estimates.diagnostics or {})
+    return found if run.shells is None else [(path, leaf) for path, leaf in found if leaf not in (None, {})]
 
 
 def details(run: RunFolder) -> list[tuple[str, Any]]:
@@ -210,14 +210,7 @@ def details(run: RunFolder) -> list[tuple[str, Any]]:
         for name, e in run.estimates.estimates.items()
         if e.details
     }
-    return flat(found)
-
-
-def flat(content: Any, path: str = "") -> list[tuple[str, Any]]:
-    """Leaves of nested mappings as (dotted path, value), in order; none of an empty one."""
-    if isinstance(content, dict) and (content or not path):
-        return [leaf for key, part in content.items() for leaf in flat(part, f"{path}.{key}" if path else str(key))]
-    return [(path, content)]
+    return leaves(found)
 
 
 Settings = list[tuple[str, str, str]]
@@ -229,7 +222,7 @@ def setting_sections(campaign: Campaign, *, reproducible: bool | None = None) ->
     meanings = dict(_described(campaign, ""))
     sections: dict[str, Settings] = {"campaign": []}
     for key, part in written_out(campaign).items():
-        for path, leaf in flat(part, key):
+        for path, leaf in leaves(part, key):
             title, _, inner = path.partition(".") if isinstance(part, dict) else ("campaign", "", path)
             sections.setdefault(title, []).append((inner, words(leaf), meanings.get(path, "")))
     if reproducible is not None:

@@ -9,7 +9,7 @@ import zipfile
 import pytest
 
 from harness.campaign.files import load_campaign
-from harness.console import system_error
+from harness.commands.printing import system_error
 from harness.controllers import EpisodeStart, Neighbour, Observation
 from harness.controllers.fmu import fmu_maker
 from harness.controllers.loading import build_host, require_controller

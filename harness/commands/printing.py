@@ -1,19 +1,19 @@
-"""What the command line says: complaints on stderr; plain results on stdout, or in a file."""
+"""What the command line says: complaints on stderr; results on stdout, as JSON, sentences and tables."""
 
 from __future__ import annotations
 
 import errno
 import json
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Literal
 
 import click
 
 from harness.errors import HarnessError
+from harness.numbers import half_width, interval, share, words
 
-if TYPE_CHECKING:
-    import pyarrow as pa
+_WIDTH_OF_FILES = 140
 
 
 def show_error(error: HarnessError) -> None:
@@ -97,17 +97,67 @@ def print_plan(plan: dict[str, Any]) -> None:
     """Print what a campaign will cost as YAML comments, so that the whole output stays a campaign file."""
     click.echo("# What it will cost")
     for key, value in plan.items():
-        shown = f"{value:,}" if isinstance(value, int) else f"{value:.4g}" if isinstance(value, float) else value
-        click.echo(f"#   {key.replace('_', ' ')}: {shown}")
+        click.echo(f"#   {key.replace('_', ' ')}: {words(value, 4)}")
 
 
-def write_trace(trace: pa.Table, file: Path) -> None:
-    """Write an episode's trace as Parquet or, when ``file`` ends in ``.csv``, as CSV."""
-    from pyarrow import csv, parquet  # noqa: PLC0415 - keeps --help fast
+def print_table(title: str, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Print mappings of the same keys as a table; numbers to four digits and flush right, and nothing is cut off."""
+    from rich.console import Console  # noqa: PLC0415 - keeps --help fast
+    from rich.table import Table  # noqa: PLC0415 - keeps --help fast
 
-    from harness.records.folder import write_atomically  # noqa: PLC0415 - keeps --help fast
+    table = Table(title=title)
+    for heading, cell in rows[0].items():
+        justify: Literal["left", "right"] = "left" if isinstance(cell, str) else "right"
+        table.add_column(heading.replace("_", " "), justify=justify, overflow="fold")
+    for row in rows:
+        table.add_row(*(words(cell, 4) for cell in row.values()))
+    console = Console()
+    if not console.is_terminal:
+        console.width = _WIDTH_OF_FILES
+    console.print(table)
 
-    if file.suffix == ".csv":
-        write_atomically(file, lambda unfinished: csv.write_csv(trace, unfinished))
-    else:
-        write_atomically(file, lambda unfinished: parquet.write_table(trace, unfinished, compression="zstd"))
+
+def print_estimates(content: dict[str, Any], asked: Sequence[str] = ()) -> None:
+    """Print ``estimates.json`` as a table, with warnings and reasons below and the answer in a sentence last.
+
+    ``asked`` are the estimators to show, all by default. What is said in the end is about them.
+    """
+    shown = {name: entry for name, entry in content["estimates"].items() if not asked or name in asked}
+    rows = [
+        {
+            "estimator": name + (" *" if name == content["headline"] else ""),
+            "crash rate per test": entry["crash_rate"],
+            f"{share(content['confidence'])} interval": interval(entry.get("ci_low"), entry.get("ci_high")),
+            "RHW": half_width(entry.get("rhw")),
+            "effective crashes": entry.get("n_effective"),
+            "largest weight share": share(entry.get("largest_weight_share")),
+        }
+        for name, entry in shown.items()
+    ]
+    print_table(f"{content['campaign']}: {content['n_crashes']:,} crashes in {content['n_episodes']:,} tests", rows)
+    answered = content["headline"] in shown
+    for name, entry in shown.items():
+        # Without the campaign's own estimator the reason is the answer, and comes last.
+        for remark in [*entry.get("warnings", ()), *filter(None, [entry.get("reason") if answered else None])]:
+            click.echo(f"{name}: {remark}")
+    if shells := shown.get("shells", {}).get("details", {}).get("shells"):
+        names = ("shell", "inside", "p", "n_episodes", "n_crashes", "contribution")
+        print_table("Shells, from careful to careless", [{name: shell[name] for name in names} for shell in shells])
+    if answered:
+        print_statements(content)
+        return
+    for name in shown:
+        click.echo(f"{name}: {content['statements'][name]}")
+    if any(entry["crash_rate"] is not None for entry in shown.values()):
+        click.echo(content["scope"])
+
+
+def print_statements(content: dict[str, Any]) -> None:
+    """Print the answer in a sentence, what else is stated under which assumption, and what all this is about."""
+    if decision := content.get("decision"):
+        click.echo(decision["sentence"])
+    click.echo(content["statement"])
+    for name, sentence in content.get("boundary_statements", {}).items():
+        click.echo(f"Statement {name}: {sentence}")
+    for sentence in (*content.get("reference_statements", [])[1:], content["scope"]):
+        click.echo(sentence)
