@@ -23,10 +23,9 @@ from harness.episode.loop import Shard
 from harness.records.folder import encoded, write_shard
 from harness.records.tables import shard_tables
 from harness.resolved import resolve
-from harness.runner.executor import LocalExecutor
 from harness.runner.prepare import Prepared, prepare
-from harness.runner.shard_pool import ShardPool
 from harness.runner.worker import ShardSpec
+from harness.runner.workers import LocalWorkers
 from harness.worlds.cells import sumo_program
 from harness.worlds.protocol import World
 from harness.worlds.shim import shim_library
@@ -207,7 +206,7 @@ class Workers(Contender):
 
     def __init__(self, settings: Campaign, workers: int) -> None:
         self._folder = Path(tempfile.mkdtemp(prefix="harness-benchmark-"))
-        self._pool = ShardPool(settings, LocalExecutor(resolve(settings), self._folder, workers))
+        self._pool = LocalWorkers(resolve(settings), self._folder, workers)
 
     def run(self, first: int, n: int) -> Work:
         # As many shards of 2,500 episodes for every worker.

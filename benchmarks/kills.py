@@ -57,7 +57,10 @@ class Here:
 
     def targets(self, run: subprocess.Popen[bytes]) -> dict[str, list[int]]:
         """What can be killed."""
-        return {"run": [run.pid], "worker": [pid for pid in descendants(run.pid) if started_by(pid, b"spawn_main")]}
+        return {
+            "run": [run.pid],
+            "worker": [pid for pid in descendants(run.pid) if started_by(pid, b"harness.processes")],
+        }
 
     def mend(self) -> None:
         """Nothing is broken for long."""
@@ -82,7 +85,7 @@ class OnMachines(Here):
         everywhere = [pid for machine in machines for pid in machine]
         return {
             "run": [pid for pid in descendants(run.pid) if started_by(pid, b"harness\0run")],
-            "worker": [pid for pid in everywhere if started_by(pid, b"spawn_main")],
+            "worker": [pid for pid in everywhere if started_by(pid, b"harness.processes")],
             "actor": [pid for pid in everywhere if started_by(pid, b"ray::OnMachine")],
             "raylet": [pid for machine in machines[1:] for pid in machine if started_by(pid, b"/raylet/raylet")],
         }

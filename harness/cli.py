@@ -18,7 +18,7 @@ from harness.commands.printing import show_error, show_interrupted, system_error
 from harness.commands.stored import estimate, replay, report
 from harness.commands.vehicles import av_check, compare
 from harness.errors import EXIT_DONE, HarnessError, shortened
-from harness.interruption import Interruption, interruptible
+from harness.processes import Interruption, interruptible
 
 
 @click.group(

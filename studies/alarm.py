@@ -33,11 +33,11 @@ from harness.importance.build import mixture_weights
 from harness.pool.cut_ins import Pool
 from harness.pool.replay import LEAD, PATH_COLUMNS
 from harness.pool.storage import campaign_pool, read_pool
+from harness.processes import made_ahead
 from harness.progress import Progress
 from harness.records.folder import read_manifest
 from harness.records.reader import read_shard
 from harness.resolved import resolve
-from harness.threads import made_ahead
 from harness.vocabulary import BoolArray, FloatArray, Method
 from studies.surrogate_replay import SurrogateReplay
 

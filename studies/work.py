@@ -8,7 +8,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
-from multiprocessing import parent_process
+from multiprocessing import get_context, parent_process
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any
@@ -16,10 +16,9 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from harness.interruption import leave_signals_to_parent
+from harness.processes import leave_signals_to_parent
 from harness.progress import Progress
 from harness.records.folder import read_table, write_atomically
-from harness.spawning import spawn_context
 
 
 def sources_of(*patterns: str) -> str:
@@ -37,7 +36,7 @@ def write_table(path: Path, table: pa.Table) -> None:
 def worker_processes(workers: int | None) -> Iterator[ProcessPoolExecutor]:
     """Worker processes that end at once when the work in the parent is interrupted or fails, or it is killed."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    context = spawn_context()
+    context = get_context("spawn")
     watched, held = context.Pipe(duplex=False)
     with ProcessPoolExecutor(
         workers or os.cpu_count(), mp_context=context, initializer=_end_with_parent, initargs=(watched,)

@@ -16,8 +16,8 @@ import pytest
 
 from harness import run
 from harness.campaign.campaign import Campaign
-from harness.controllers.black_box import Death
-from harness.runner import RunResult, executor
+from harness.controllers.guard import Death
+from harness.runner import RunResult, workers
 from harness.runner.worker import ShardDone, ShardRunner, ShardSpec
 
 
@@ -35,8 +35,8 @@ class WorkerInThisProcess:
     def __init__(self, resolved: Path, folder: Path, black_box: Path) -> None:
         self._runner = ShardRunner(pickle.loads(resolved.read_bytes()), folder)
 
-    def give(self, spec: ShardSpec, doomed: Mapping[int, Death]) -> bool:
-        self._done = self._runner.run(spec, doomed)
+    def give(self, spec: ShardSpec, fatal_episodes: Mapping[int, Death]) -> bool:
+        self._done = self._runner.run(spec, fatal_episodes)
         return True
 
     def answer(self) -> ShardDone:
@@ -49,15 +49,15 @@ class WorkerInThisProcess:
         self._runner.close()
         self._runner._loop._world.close()
 
-    def wait(self) -> None: ...
+    def wait(self, seconds: float) -> None: ...
 
 
 @contextmanager
 def one_process() -> Iterator[None]:
     """Where shards are run, it is here."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(executor, "WorkerProcess", WorkerInThisProcess)
-        patch.setattr(executor.LocalExecutor, "first_to_answer", lambda _, busy: busy[0])
+        patch.setattr(workers, "WorkerProcess", WorkerInThisProcess)
+        patch.setattr(workers.LocalWorkers, "first_to_answer", lambda _, busy: busy[0])
         yield
 
 

@@ -3,7 +3,7 @@ import time
 
 import pytest
 
-from harness.threads import made_ahead, side_by_side
+from harness.processes import made_ahead, side_by_side
 
 
 @pytest.mark.parametrize("worthwhile", [True, False])

@@ -19,15 +19,22 @@ from collections.abc import Callable
 from operator import methodcaller
 from pathlib import Path
 from types import FrameType
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 
 from harness.campaign.vehicle import Limits
-from harness.controllers.black_box import CLOSE, START, BlackBox
+from harness.processes import CLOSE, START, BlackBox
 
 HUNG_EXIT_CODE = 75
 """Exit code of a worker whose controller could not be interrupted."""
+
+
+class Death(NamedTuple):
+    """A call that is known to end the process: its step, or `START`, and the cause for the record."""
+
+    step: int
+    cause: str
 
 
 def require_fault(error: BaseException) -> None:

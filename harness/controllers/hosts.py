@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from harness.controllers.black_box import OF_EPISODE, START, START_BATCH, STEP_BATCH, Death
-from harness.controllers.guard import Guard
+from harness.controllers.guard import Death, Guard
 from harness.controllers.protocol import (
     BatchController,
     BatchObservation,
@@ -20,6 +19,7 @@ from harness.controllers.protocol import (
     Observation,
     VehicleController,
 )
+from harness.processes import OF_EPISODE, START, START_BATCH, STEP_BATCH
 from harness.random_stream import AV_DRAWS
 from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import FloatArray, IntArray, read_only
@@ -58,7 +58,7 @@ class EpisodeRandom(Sequence[np.random.Generator]):
 class VehicleHost:
     """One controller object per cell, made by ``make``.
 
-    ``doomed`` are episodes that are known to kill the process: they fail just before the call that did. It may grow.
+    ``fatal_episodes`` are known to kill the process: they fail just before the call that did. They may become more.
     """
 
     def __init__(
@@ -68,7 +68,7 @@ class VehicleHost:
         seed: int,
         guard: Guard,
         *,
-        doomed: Mapping[int, Death] | None = None,
+        fatal_episodes: Mapping[int, Death] | None = None,
         acts_before_cut_in: bool = False,
     ) -> None:
         self.acts_before_cut_in = acts_before_cut_in
@@ -77,7 +77,7 @@ class VehicleHost:
         self._episodes = [-1] * n_cells
         self._seed = seed
         self._guard = guard
-        self._doomed = {} if doomed is None else doomed
+        self._fatal_episodes = {} if fatal_episodes is None else fatal_episodes
 
     def start(self, cells: IntArray, episodes: IntArray, told: IntArray) -> Failures:
         """Begin episodes, each under the index that its controller is ``told``; returns those that failed at once."""
@@ -122,7 +122,7 @@ class VehicleHost:
         return answer, failures
 
     def _known_death(self, episode: int, step: int) -> str | None:
-        death = self._doomed.get(episode)
+        death = self._fatal_episodes.get(episode)
         return death.cause if death is not None and step >= death.step else None
 
     def _forget(self, k: int) -> None:

@@ -6,22 +6,31 @@ import hashlib
 import importlib
 import sys
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from copy import deepcopy
 from functools import partial
 from importlib.metadata import entry_points
 from inspect import signature
+from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any
+from tempfile import TemporaryDirectory
+from typing import Any, TypeVar
 
 from harness.campaign.campaign import Campaign
 from harness.campaign.vehicle import AutomatedVehicle
-from harness.controllers.apart import AvEndedProcessError, has_foreign_code, run_apart
-from harness.controllers.black_box import CONSTRUCTOR, BlackBox, Death
-from harness.controllers.guard import Guard, cause_of, require_fault
+from harness.controllers.guard import Death, Guard, cause_of, death_cause, require_fault
 from harness.controllers.hosts import BatchHost, ControllerHost, VehicleHost
-from harness.errors import CampaignError
+from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, HarnessError
+from harness.processes import CONSTRUCTOR, BlackBox, Child, first_to_answer, fit_to_travel, last_call
 
 GROUP = "harness.controllers"
+_Answer = TypeVar("_Answer")
+
+
+class AvEndedProcessError(HarnessError):
+    """The AV's controller ended the process that it ran in."""
+
+    exit_code = EXIT_TOO_MANY_FAILED
 
 
 def controller_class(name: str) -> Callable[..., Any]:
@@ -78,7 +87,7 @@ def build_host(
     n_cells: int,
     seed: int,
     black_box: Path | None = None,
-    doomed: Mapping[int, Death] | None = None,
+    fatal_episodes: Mapping[int, Death] | None = None,
 ) -> ControllerHost | None:
     """Host of the AV's controller, or None for an AV that needs none (built in, or driven by SUMO).
 
@@ -87,13 +96,13 @@ def build_host(
     CampaignError
         The controller cannot be found or made, or is of neither kind.
     """
-    early = av.acts_before_cut_in
+    early, guarded = av.acts_before_cut_in, partial(Guard, av.limits, black_box)
     make: Callable[[], Any]
     if av.source == "controller":
         make = _maker(av)
         first = _make_first(make, av, BlackBox(black_box))
         if callable(getattr(first, "step_batch", None)) and callable(getattr(first, "start_batch", None)):
-            return BatchHost(first, seed, Guard(av.limits, black_box), acts_before_cut_in=early)
+            return BatchHost(first, seed, guarded(), acts_before_cut_in=early)
         _require_vehicle_controller(first, str(av.controller))
     elif av.fmu is not None:
         from harness.controllers.fmu import fmu_maker  # noqa: PLC0415 - an extra
@@ -101,7 +110,57 @@ def build_host(
         make = fmu_maker(av.fmu)
     else:
         return None
-    return VehicleHost(make, n_cells, seed, Guard(av.limits, black_box), doomed=doomed, acts_before_cut_in=early)
+    return VehicleHost(
+        make, n_cells, seed, Guard(av.limits, black_box), fatal_episodes=fatal_episodes, acts_before_cut_in=early
+    )
+
+
+def has_foreign_code(campaign: Campaign) -> bool:
+    """Whether the AV is code of the user's that runs inside of the harness's own processes."""
+    return campaign.av.source in ("controller", "fmu")
+
+
+def run_apart(av: AutomatedVehicle, work: Callable[..., _Answer], *arguments: Any) -> _Answer:
+    """``work(*arguments, black_box=…)``, which runs an AV, in a process of its own.
+
+    Raises
+    ------
+    HarnessError
+        Whatever it raises.
+    AvEndedProcessError
+        The controller ended the process; the call it was in is named.
+    """
+    with TemporaryDirectory(prefix="harness-apart-") as folder:
+        black_box = Path(folder) / "black-box"
+        child = Child(_work_and_tell, work, arguments, black_box)
+        try:
+            answer = first_to_answer([child]).receive()
+        finally:
+            exit_code = child.kill()
+        call = last_call(black_box)
+    if answer is None:
+        raise AvEndedProcessError(
+            f"av.{av.source}",
+            found=f"{death_cause(exit_code, av.limits.step_time_s)}, "
+            + ("while it was found" if call is None else f"in {call}"),
+            expected="a controller that returns or raises",
+            mend="Look for os._exit, a crash of compiled code, or a shortage of memory; then check again.",
+        )
+    (result,) = answer
+    if isinstance(result, Exception):
+        raise result
+    return result  # type: ignore[no-any-return]
+
+
+def _work_and_tell(
+    connection: Connection, work: Callable[..., Any], arguments: tuple[Any, ...], black_box: Path
+) -> None:
+    try:
+        answer = work(*arguments, black_box=black_box)
+    except Exception as error:  # noqa: BLE001 - whatever goes wrong here is the parent's to judge
+        answer = fit_to_travel(error)
+    with suppress(OSError):  # the parent was killed: nobody is left to tell
+        connection.send((answer,))
 
 
 def require_controller(campaign: Campaign) -> str | None:

@@ -31,7 +31,7 @@ from numba.extending import get_cython_function_address
 from harness.estimators.block import MAX_CONTROL_STEPS, Block
 from harness.estimators.estimate import Estimate, require_episodes
 from harness.estimators.weighted import FEW_FOR_RESIDUALS, WeightedSums, weighted_estimate
-from harness.threads import side_by_side
+from harness.processes import side_by_side
 from harness.vocabulary import FloatArray, IntArray
 
 WARNING = (

@@ -15,8 +15,8 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from harness.errors import RunFolderError
+from harness.processes import made_ahead
 from harness.records.folder import MEND_SHARD, TABLES, concatenated, damaged, read_manifest, read_table
-from harness.threads import made_ahead
 
 _READERS = 2
 """Threads; each holds a shard."""

@@ -46,10 +46,10 @@ from harness.runner.shadow_runs import (
     shadow_specs,
     stored_shadows,
 )
-from harness.runner.shard_pool import ShardPool, executor_of
 from harness.runner.stored_estimates import estimate_run
 from harness.runner.stored_shards import stored_shard
 from harness.runner.worker import ShardDone, ShardSpec
+from harness.runner.workers import workers_of
 from harness.stopped_by import StoppedBy
 from harness.vocabulary import SAMPLING
 
@@ -115,8 +115,7 @@ class Run:
         for left in out.rglob(".*.part"):  # of an earlier run that was killed
             left.unlink()
         prepared = prepare(resolved, progress)
-        self._executor = executor_of(resolved, out, workers, n_runs=n_runs)
-        self._workers = ShardPool(resolved.campaign, self._executor)
+        self._workers = workers_of(resolved, out, workers, n_runs=n_runs)
         self._retracing = Retracing(resolved)
         self.prescribed: PrescribedEpisodes | None = None
         self._prepared, self._held = prepared, int(earlier["n_episodes"])
@@ -128,7 +127,7 @@ class Run:
                 resolved,
                 earlier,
                 began=began,
-                workers=self._executor.n_workers,
+                workers=self._workers.n_workers,
                 distance_per_test_m=distance_per_test_m(resolved.environment),
             )
             if prepared.shadow_paths is None:
@@ -148,7 +147,7 @@ class Run:
         """Run shadow runs, if there are any to make: rounds of ``most`` tests may begin (None: not known)."""
         if (paths := self._prepared.shadow_paths) is not None:
             self._plan(self._prepared.after(self._run_shadows(paths)))
-        self._progress.stage(f"episodes{self._executor.where}", most, done=self._held)
+        self._progress.stage(f"episodes{self._workers.where}", most, done=self._held)
 
     def run_round(self, specs: Iterator[ShardSpec]) -> bool:
         """Run the shards of a round; True, at once, when the campaign is to stop."""
@@ -185,7 +184,7 @@ class Run:
     def _run_shadows(self, paths: ShadowPaths) -> ShadowRuns:
         """Drive the vehicle along all paths without a cut-in, but for what an earlier run has done of it."""
         environment, n = self._resolved.environment, len(paths)
-        self._progress.stage(f"shadow runs{self._executor.where}", n)
+        self._progress.stage(f"shadow runs{self._workers.where}", n)
         tables, causes = [], Counter[str]()
         for done in self._workers.run(shadow_specs(n), partial(stored_shadows, self._out, paths)):
             if done.parquet:
@@ -234,7 +233,7 @@ class Run:
 
     def leave(self, *, stopped_by: StoppedBy | None = None, ending: str | None = None, **facts: Any) -> None:
         """Write the manifest of what is finished."""
-        if others := self._executor.cpus():  # bits may have come from any of them
+        if others := self._workers.cpus():  # bits may have come from any of them
             self._manifest.note(cpu=", ".join(sorted({cpu_name(), *others})))
         self._manifest.note(**facts)
         retraced = self._retracing.summary(self.prefix.n_retraced)

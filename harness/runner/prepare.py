@@ -9,7 +9,7 @@ from pathlib import Path
 
 from harness.campaign.campaign import Campaign
 from harness.compiled import is_cached
-from harness.controllers.black_box import Death
+from harness.controllers.guard import Death
 from harness.controllers.loading import build_host, require_controller
 from harness.episode.judge import judge
 from harness.episode.loop import MOMENT_LIMITS, NOBODY, EpisodeLoop, Keep, Policy
@@ -86,16 +86,18 @@ class Prepared:
         *,
         traces: str | None = None,
         black_box: Path | None = None,
-        doomed: Mapping[int, Death] | None = None,
+        fatal_episodes: Mapping[int, Death] | None = None,
     ) -> EpisodeLoop:
         """Episode loop in a world, recording what the campaign asks for, or other ``traces``.
 
-        The file ``black_box`` tells in which episode's controller a process died; ``doomed`` are episodes known to kill
-        it, which may grow between two runs.
+        The file ``black_box`` tells in which episode's controller a process died; ``fatal_episodes`` are known to
+        kill it; they may become more between two runs.
         """
         campaign, records = self.campaign, self.campaign.records
         keep = Keep(MOMENT_LIMITS[records.moments], traces or records.traces, records.trace_share)
-        av = build_host(campaign.av, n_cells=world.n_cells, seed=campaign.seed, black_box=black_box, doomed=doomed)
+        av = build_host(
+            campaign.av, n_cells=world.n_cells, seed=campaign.seed, black_box=black_box, fatal_episodes=fatal_episodes
+        )
         return EpisodeLoop(world, self.policy, keep, av)
 
 

@@ -14,11 +14,11 @@ from harness.estimators.block import Block
 from harness.estimators.from_records import EPISODE_COLUMNS, MOMENT_COLUMNS, SHELL_COLUMNS, block_from_tables
 from harness.estimators.one_pass import SPACING
 from harness.importance.build import importance_names, mixture_weights
+from harness.processes import made_ahead
 from harness.records.folder import SHELLS, concatenated, no_episodes, read_json, read_manifest, require_schema
 from harness.records.reader import read_shard
 from harness.records.stored_manifest import StoredShells
 from harness.strata import ShellDesign
-from harness.threads import made_ahead
 from harness.vocabulary import EstimatorName
 
 MOST_GROUPED = 5_000

@@ -18,14 +18,14 @@ from pathlib import Path
 
 import numpy as np
 
-from harness.controllers.apart import fit_to_travel
-from harness.controllers.black_box import Death
+from harness.controllers.guard import Death
 from harness.episode.cells import PrescribedTraffic
 from harness.episode.loop import EpisodeLoop, Shard, hash_of_index
 from harness.estimators.block import Block
 from harness.estimators.from_records import block_from_tables
 from harness.importance.build import mixture_weights
 from harness.pool.shells import Draw
+from harness.processes import fit_to_travel
 from harness.records.folder import encoded
 from harness.records.tables import ShardTables, shard_tables
 from harness.resolved import Resolved
@@ -83,9 +83,9 @@ class ShardDone:
     files: dict[str, str] = field(default_factory=dict)
 
 
-Done = ShardDone | ShadowDone
+ShardResult = ShardDone | ShadowDone
 """What a worker hands back."""
-Spec = ShardSpec | ShadowSpec
+ShardRequest = ShardSpec | ShadowSpec
 
 
 def serve(connection: Connection, resolved: Path, folder: Path, black_box: Path) -> None:
@@ -97,13 +97,13 @@ def serve(connection: Connection, resolved: Path, folder: Path, black_box: Path)
     runner: ShardRunner | None = None
     while True:
         try:
-            spec, doomed = connection.recv()
+            spec, fatal_episodes = connection.recv()
         except (EOFError, OSError):
             break
         try:
             if runner is None:
                 runner = ShardRunner(pickle.loads(resolved.read_bytes()), folder, black_box)  # noqa: S301 - our own
-            answer: Done | Exception = runner.run(spec, doomed)
+            answer: ShardResult | Exception = runner.run(spec, fatal_episodes)
         except Exception as error:  # noqa: BLE001 - whatever goes wrong here is the parent's to judge
             answer = fit_to_travel(error)
         try:
@@ -121,27 +121,27 @@ class ShardRunner:
     """
 
     def __init__(self, resolved: Resolved, folder: Path, black_box: Path | None = None) -> None:
-        self._doomed: dict[int, Death] = {}
+        self._fatal_episodes: dict[int, Death] = {}
         self._folder = folder
         self._prepared = prepare(resolved)
         self._retracing = Retracing(resolved)
         world = build_world(resolved.campaign)
-        self._loop: EpisodeLoop = self._prepared.loop(world, black_box=black_box, doomed=self._doomed)
+        self._loop: EpisodeLoop = self._prepared.loop(world, black_box=black_box, fatal_episodes=self._fatal_episodes)
 
     def close(self) -> None:
         """Release the AV's controllers."""
         self._loop.close()
 
-    def run(self, spec: Spec, doomed: Mapping[int, Death] | None = None) -> Done:
-        """Run a shard; episodes in ``doomed`` fail before the call that ended a process.
+    def run(self, spec: ShardRequest, fatal_episodes: Mapping[int, Death] | None = None) -> ShardResult:
+        """Run a shard; episodes in ``fatal_episodes`` fail before the call that ended a process.
 
         Raises
         ------
         WorldDisagreementError
             The twin retraces an episode differently.
         """
-        self._doomed.clear()  # a shadow run may have the number of a test
-        self._doomed.update(doomed or {})
+        self._fatal_episodes.clear()  # a shadow run may have the number of a test
+        self._fatal_episodes.update(fatal_episodes or {})
         if isinstance(spec, ShadowSpec):
             if self._prepared.shadow_paths is None:
                 raise ValueError("this campaign has no shadow runs")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import signal
 import socket
 import struct
 import subprocess
@@ -20,6 +19,7 @@ from traci.exceptions import FatalTraCIError
 
 from harness.campaign.vehicle import TraciProcess
 from harness.errors import CampaignError, WorldDisagreementError
+from harness.processes import end
 from harness.worlds.cells import sumo_program
 from harness.worlds.protocol import AVLostError
 
@@ -91,11 +91,11 @@ class ConnectedProgram:
         quiet = subprocess.DEVNULL
         with ExitStack() as ending:
             self._server = subprocess.Popen(server, stdout=quiet, stderr=quiet, start_new_session=True)  # noqa: S603
-            ending.callback(_end, self._server)
+            ending.callback(end, self._server)
             self.connection = self._connect()
             ending.callback(self.connection.drop)
             self._program = _start_program(av, self._port, n_cells)
-            ending.callback(_end, self._program)
+            ending.callback(end, self._program)
             self._await_program()
             self._ending = ending.pop_all()
 
@@ -208,13 +208,6 @@ def require_neighbour(own: str, theirs: str) -> None:
             expected="the program that av.traci.command starts, on this machine",
             mend="Close this machine's ports to others, or let the program run here.",
         )
-
-
-def _end(process: subprocess.Popen[bytes]) -> None:
-    """End a process and what it has started: all are in a session of their own."""
-    with suppress(ProcessLookupError):
-        os.killpg(process.pid, signal.SIGKILL)
-    process.wait()
 
 
 def _exit_words(code: int) -> str:

@@ -13,8 +13,9 @@ from harness.cli import main
 from harness.controllers.loading import build_host
 from harness.errors import EXIT_BAD_INPUT, EXIT_DONE, EXIT_TOO_MANY_FAILED
 from harness.resolved import resolve
-from harness.runner import executor, plan_campaign
+from harness.runner import plan_campaign
 from harness.runner.prepare import prepare
+from harness.runner.workers import LocalWorkers
 from harness.worlds.twin import TwinWorld
 from tests.controllers.misbehaving import ChangesItsParameters
 
@@ -182,8 +183,8 @@ def test_a_batch_controllers_fault_is_laid_at_one_cell_or_else_fails_all_that_we
 @pytest.mark.parametrize("where", ["constructor", "step", "step_batch"])
 def test_a_controller_that_always_ends_its_process_is_named_after_a_few_workers(where, tmp_path, capsys, monkeypatch):
     started = []
-    start = executor.start_process
-    monkeypatch.setattr(executor, "start_process", lambda *words: (started.append(words), start(*words))[1])
+    start = LocalWorkers.new_worker
+    monkeypatch.setattr(LocalWorkers, "new_worker", lambda self: (started.append(self), start(self))[1])
     code = _run(tmp_path, _other("EndsTheProcess", f"{{where: {where}}}"), "run.max_failed_share=0.01")
     err = capsys.readouterr().err
     assert "the controller ended the worker process (exit code 7)" in err

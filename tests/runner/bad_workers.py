@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
 
 
 def dying(connection, resolved, folder, black_box) -> None:
@@ -19,3 +23,11 @@ def disobedient(connection, resolved, folder, black_box) -> None:
     connection.recv()
     connection.send(WorldDisagreementError("SUMO, BV3, m", found="0x1p0", expected="0x1p1", mend="Report it."))
     connection.recv()
+
+
+def abandoned(connection, note) -> None:
+    """Starts a program, writes down who they are, and is busy."""
+    helper = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"])
+    Path(note).write_text(f"{os.getpid()} {helper.pid}", encoding="utf-8")
+    Path(note).rename(note + ".done")
+    time.sleep(600)

@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -92,25 +93,21 @@ def test_what_is_ignored_stays_ignored(tmp_path):
 
 
 LAUNCH = """
-import os, signal, sys
-from multiprocessing import resource_tracker, util
-from harness.spawning import spawn_context
+import os, signal, subprocess
+from harness.processes import Child
 
-def work():
-    pass
+class Popen(subprocess.Popen):
+    def __init__(self, *arguments, **options):
+        super().__init__(*arguments, **options)
+        {deed}
 
-def started_and_then(executable, command, handles):
-    start(executable, command, handles)
-    {deed}
-
-if __name__ == "__main__":
-    resource_tracker.ensure_running()
-    start, util.spawnv_passfds = util.spawnv_passfds, started_and_then
-    spawn_context().Process(target=work).start()
+signal.signal(signal.SIGINT, lambda *_: os._exit(0))
+subprocess.Popen = Popen
+Child(print)
 """
 
 
-@pytest.mark.parametrize("deed", ["os.kill(os.getpid(), signal.SIGKILL)", "os.killpg(0, signal.SIGINT); os._exit(0)"])
+@pytest.mark.parametrize("deed", ["os.kill(os.getpid(), signal.SIGKILL)", "os.killpg(0, signal.SIGINT)"])
 def test_a_worker_whose_parent_dies_while_it_starts_is_silent(tmp_path, deed):
     script = tmp_path / "parent.py"
     script.write_text(LAUNCH.format(deed=deed), encoding="utf-8")
@@ -120,30 +117,33 @@ def test_a_worker_whose_parent_dies_while_it_starts_is_silent(tmp_path, deed):
 
 
 ABANDONED = """
-import os, signal, subprocess, sys, time
-from harness.controllers.apart import start_process
+import os, signal, sys, time
+from harness.processes import Child
+from tests.runner.bad_workers import abandoned
 
-def work(note):
-    with open(note, "w") as file:
-        helper = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"])
-        print(os.getpid(), helper.pid, file=file)
-    os.rename(note, note + ".done")
-    time.sleep(600)
-
-if __name__ == "__main__":
-    start_process(work, sys.argv[1])
-    while not os.path.exists(sys.argv[1] + ".done"):
-        time.sleep(0.01)
-    os.kill(os.getpid(), signal.SIGKILL)
+Child(abandoned, sys.argv[1])
+while not os.path.exists(sys.argv[1] + ".done"):
+    time.sleep(0.01)
+os.kill(os.getpid(), signal.SIGKILL)
 """
 
 
 def test_a_busy_worker_does_not_outlive_a_killed_parent_nor_does_what_it_has_started(tmp_path):
     script, note = tmp_path / "parent.py", tmp_path / "pids"
     script.write_text(ABANDONED, encoding="utf-8")
-    process = subprocess.Popen([sys.executable, str(script), str(note)], stderr=subprocess.PIPE, text=True)
+    environment = {**os.environ, "PYTHONPATH": str(SCENARIO.parents[1])}
+    command = [sys.executable, str(script), str(note)]
+    process = subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
     code, complaints = finished(process)  # the pipe ends only when nobody is left that holds it
     assert (code, complaints) == (-signal.SIGKILL, "")
     for pid in map(int, (tmp_path / "pids.done").read_text().split()):
-        state = Path(f"/proc/{pid}/stat")
-        assert not state.exists() or state.read_text().rsplit(")", 1)[1].split()[0] == "Z"
+        wait_until_gone(Path(f"/proc/{pid}/stat"))
+
+
+def wait_until_gone(state: Path) -> None:
+    """A process closes its files a moment before it is gone."""
+    for _ in range(int(PATIENCE_S / POLL_S)):
+        if not state.exists() or state.read_text().rsplit(")", 1)[1].split()[0] == "Z":
+            return
+        time.sleep(POLL_S)
+    raise AssertionError(f"{state} is still there")

@@ -17,13 +17,13 @@ import pytest
 
 from benchmarks.kills import descendants, started_by
 from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, HarnessError
-from harness.runner.executor import Ended
 from tests.runner.conftest import TWIN
 from tests.runner.test_shadow_runs import FORCED, SHADOWS, SHELLS, of
 from tests.stored_runs import manifest, shard_files, unlike_columns
 
 ray = pytest.importorskip("ray")
-from harness.runner import ray_executor, ray_machine  # noqa: E402 - not without the extra
+import harness.runner.ray as on_ray  # noqa: E402 - not without the extra
+from harness.runner.workers import WorkerDeath  # noqa: E402
 
 ROOT = Path(__file__).parents[2]
 ON_RAY = "run.executor=ray"
@@ -51,7 +51,7 @@ def test_a_run_begun_here_goes_on_there_with_the_same_records(run, run_here, cam
     assert unlike_columns(twin_run, tmp_path / "run") == []
     assert manifest(tmp_path / "run")["workers"] == 2  # the cluster's room
     assert manifest(tmp_path / "run")["cpu"] == manifest(twin_run)["cpu"]
-    assert below(b"spawn_main") == []
+    assert below(b"harness.processes") == []
 
 
 def test_shadow_runs_come_to_the_machines(run, campaign, tmp_path):
@@ -78,7 +78,7 @@ def test_killed_actors_and_workers_take_nothing_along(run, campaign, tmp_path):
     struck: list[int] = []
 
     def strike() -> None:
-        for victim, n_done in ((b"ray::OnMachine", 1), (b"spawn_main", 6)):
+        for victim, n_done in ((b"ray::OnMachine", 1), (b"harness.processes", 6)):
             while len(shard_files(tmp_path / "ray")) < n_done:
                 time.sleep(0.02)
             struck.extend(below(victim)[:1])
@@ -93,7 +93,7 @@ def test_killed_actors_and_workers_take_nothing_along(run, campaign, tmp_path):
 
 
 def test_a_shard_that_is_lost_thrice_with_its_machine_is_named(run, campaign, tmp_path, monkeypatch):
-    monkeypatch.setattr(ray_executor.RayWorker, "answer", lambda self: self.kill() or Ended(None, None))
+    monkeypatch.setattr(on_ray.RayWorker, "answer", lambda self: self.kill() or WorkerDeath(None, None))
     with pytest.raises(HarnessError, match="3 worker processes that died, the last with its machine") as lost:
         run(campaign(*TWIN, ON_RAY), tmp_path / "run")
     assert lost.value.exit_code == EXIT_TOO_MANY_FAILED
@@ -139,15 +139,14 @@ def test_an_environment_that_cannot_be_set_up(run, campaign, tmp_path):
 
 
 def test_another_version_on_a_machine_is_refused(run, campaign, tmp_path, monkeypatch):
-    monkeypatch.setattr(ray_machine, "source_hash", lambda: "0123456789abcdef")
+    monkeypatch.setattr(on_ray, "source_hash", lambda: "0123456789abcdef")
     with pytest.raises(HarnessError, match="a machine with sources of its kernels"):
         run(campaign(*TWIN, ON_RAY), tmp_path / "run")
 
 
 def test_without_the_package(run, campaign, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
-    for name in ("ray_executor", "ray_machine"):
-        monkeypatch.delitem(sys.modules, f"harness.runner.{name}")
+    monkeypatch.delitem(sys.modules, "harness.runner.ray")
     with pytest.raises(CampaignError, match=r"pip install 'harness\[ray\]'"):
         run(campaign(*TWIN, ON_RAY), tmp_path / "run")
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import io
 import itertools
-import multiprocessing
 import os
 import pickle
 from collections.abc import Callable
@@ -13,12 +12,13 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.kills import descendants
 from harness.cli import main
 from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, WorldDisagreementError
 from harness.progress import ShownProgress
-from harness.runner import campaign_run, executor, shard_pool, worker
-from harness.runner.shard_pool import WorkerLostError
+from harness.runner import campaign_run, worker, workers
 from harness.runner.worker import ShardSpec
+from harness.runner.workers import WorkerLostError
 from tests.runner import bad_workers
 from tests.runner.conftest import MIXTURE_FILE, SMALL, TWIN, sets
 from tests.stored_runs import copy_of, manifest, shard_files, unlike_columns
@@ -27,8 +27,8 @@ SHARDS_BEFORE_FAILURE = 3
 
 
 def test_a_shard_that_kills_every_worker_ends_the_run_and_is_named(run, campaign, tmp_path, monkeypatch):
-    monkeypatch.setattr(executor, "serve", bad_workers.dying)
-    monkeypatch.setattr(shard_pool, "ATTEMPTS", 2)
+    monkeypatch.setattr(workers, "serve", bad_workers.dying)
+    monkeypatch.setattr(workers, "ATTEMPTS", 2)
     with pytest.raises(
         WorkerLostError, match=r"shard 0 \(from episode 0\): found 2 worker processes that died"
     ) as lost:
@@ -36,15 +36,15 @@ def test_a_shard_that_kills_every_worker_ends_the_run_and_is_named(run, campaign
     assert lost.value.exit_code == EXIT_TOO_MANY_FAILED
     assert "exit code -9" in lost.value.found
     assert manifest(tmp_path)["status"] == "interrupted"
-    assert multiprocessing.active_children() == []
+    assert descendants(os.getpid()) == []
 
 
 def test_a_disagreement_in_a_worker_ends_the_run_and_all_workers(run, campaign, tmp_path, monkeypatch):
-    monkeypatch.setattr(executor, "serve", bad_workers.disobedient)
+    monkeypatch.setattr(workers, "serve", bad_workers.disobedient)
     with pytest.raises(WorldDisagreementError, match="SUMO, BV3, m"):
         run(campaign(*TWIN), tmp_path, workers=2)
     assert manifest(tmp_path)["status"] == "interrupted"
-    assert multiprocessing.active_children() == []
+    assert descendants(os.getpid()) == []
 
 
 def test_a_full_disk_is_said_in_words_and_the_run_can_be_resumed(
@@ -136,7 +136,7 @@ def serve(campaign, tmp_path, monkeypatch):
                 prepare()
                 events.append("prepared")
 
-            def run(self, spec: ShardSpec, doomed: dict) -> object:
+            def run(self, spec: ShardSpec, fatal_episodes: dict) -> object:
                 return run(spec)
 
             def close(self) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import signal
 import subprocess
@@ -13,6 +12,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
+from benchmarks.kills import descendants
 from harness.progress import Progress
 from tests.golden.campaigns import BASE, IN_BOTH_WORLDS
 from tests.in_process import run_here
@@ -75,7 +75,7 @@ class KillOneWorker(Progress):
     def advance(self, n: int = 1) -> None:
         self.calls += 1
         if self.calls == 4:
-            self.killed = [multiprocessing.active_children()[0].pid]
+            self.killed = [descendants(os.getpid())[0]]
             os.kill(self.killed[0], signal.SIGKILL)
 
 

@@ -1,8 +1,8 @@
 """Workers on the machines of a Ray cluster (extra ``harness[ray]``).
 
-On each machine actors stand in for the run (`harness.runner.ray_machine`). Shards come back as encoded Parquet, and are
-written by the run alone. Pools and tables lie once in each machine's part of the object store, and from there in its
-cache.
+On each machine an actor stands in for the run, with a worker process beside it. Shards come back as encoded Parquet,
+and are written by the run alone. Pools and tables lie once in each machine's part of the object store, and from there
+in its cache.
 """
 
 from __future__ import annotations
@@ -12,10 +12,12 @@ import os
 import signal
 import socket
 import sys
-import threading
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib import metadata
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -24,17 +26,18 @@ from ray.exceptions import RayError, RayTaskError, RuntimeEnvSetupError
 from ray.runtime_env import RuntimeEnv
 
 from harness.campaign.sections import RaySettings
-from harness.compiled import cache_root
-from harness.controllers.black_box import Death
+from harness.compiled import cache_root, source_hash
+from harness.controllers.guard import Death
+from harness.controllers.loading import require_controller
 from harness.errors import CampaignError, HarnessError
-from harness.interruption import FROM_USER
+from harness.processes import fit_to_travel, handlers_restored
+from harness.records.folder import write_bytes
 from harness.resolved import Resolved
-from harness.runner.executor import CLOSING_S, Ended
+from harness.runner.manifest import cpu_name
 from harness.runner.prepare import cached_files
-from harness.runner.ray_machine import Files, Machine, OnMachine
 from harness.runner.shadow_runs import SHADOW
-from harness.runner.shard_pool import WorkerLostError
-from harness.runner.worker import Done, ShardSpec, Spec
+from harness.runner.worker import ShardRequest, ShardResult, ShardSpec
+from harness.runner.workers import CLOSING_S, LocalWorkers, WorkerDeath, WorkerLostError, WorkerProcess, Workers
 
 LOCAL = "local"
 """Ray's word for a cluster of this machine alone, which ends with the run."""
@@ -46,62 +49,134 @@ ANSWER_S = 10.0
 STARTS = 3
 """As many workers in a row may be lost before they are ready."""
 
+Files = Mapping[str, ray.ObjectRef]
+"""Content of files in the object store, by their names below some folder."""
+
+
+# -- on another machine --
+
+
+@dataclass(frozen=True)
+class Machine:
+    """What must be equal on all machines, ``made_of``, and what is said of one."""
+
+    made_of: dict[str, str | None]
+    cpu: str
+
+    @classmethod
+    def this(cls, resolved: Resolved, controller_sha256: str | None) -> Machine:
+        """The one that this runs on."""
+        packages = ["harness", *(["libsumo"] if resolved.campaign.world.engine == "sumo" else [])]
+        made_of: dict[str, str | None] = {package: metadata.version(package) for package in packages}
+        made_of["sources of its kernels"] = source_hash()
+        made_of["source of the controller"] = controller_sha256
+        return cls(made_of, cpu_name())
+
+
+class OnMachine:
+    """What an actor is: it runs shards in a worker process beside it, and tells how that ended if it did.
+
+    Whatever goes wrong is handed to the run, which judges it.
+    """
+
+    def __init__(self, resolved: Resolved) -> None:
+        self._resolved = resolved
+        self._folder = TemporaryDirectory(prefix="harness-shadow-runs-")
+        self._workers = LocalWorkers(resolved, Path(self._folder.name), 1)
+        self._worker: WorkerProcess | None = None
+
+    def begin(self, cached: Files) -> Machine | Exception:
+        """Fill the cache, and say what there is."""
+        try:
+            _place(cached, cache_root())
+            return Machine.this(self._resolved, require_controller(self._resolved.campaign))
+        except Exception as error:  # noqa: BLE001 - see the class
+            return fit_to_travel(error)
+
+    def run(
+        self, request: ShardRequest, fatal_episodes: Mapping[int, Death], shadows: Files
+    ) -> ShardResult | WorkerDeath | Exception:
+        """Run a shard; tests may follow from the ``shadows``, files of the run folder."""
+        try:
+            _place(shadows, Path(self._folder.name))
+            worker = self._worker or self._workers.new_worker()
+            worker.give(request, fatal_episodes)  # if it is dead, it has no answer either
+            answer = self._workers.first_to_answer([worker]).answer()
+        except Exception as error:  # noqa: BLE001 - see the class
+            return fit_to_travel(error)
+        self._worker = None if isinstance(answer, WorkerDeath) else worker
+        return answer
+
+    def close(self) -> None:
+        """Let the worker release its controllers."""
+        if self._worker is not None:
+            self._worker.dismiss()
+            self._worker.wait(CLOSING_S)
+        self._workers.close()
+        self._folder.cleanup()
+
+
+def _place(files: Files, folder: Path) -> None:
+    for name, content in files.items():
+        if not (path := folder / name).exists():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_bytes(path, ray.get(content))
+
+
+# -- where the run is --
+
 
 class RayWorker:
     """An actor, seen from the run; ``pending`` is what it is asked for."""
 
-    def __init__(self, actor: Any, pending: ray.ObjectRef[Any], executor: RayExecutor) -> None:
-        self._actor, self.pending, self._executor = actor, pending, executor
+    def __init__(self, actor: Any, pending: ray.ObjectRef[Any], workers: RayWorkers) -> None:
+        self._actor, self.pending, self._workers = actor, pending, workers
 
-    def give(self, spec: Spec, doomed: Mapping[int, Death]) -> bool:
-        """See `harness.runner.executor.Worker`: that it is dead shows in its answer."""
-        self.pending = self._actor.run.remote(spec, dict(doomed), self._executor.shadows(spec))
+    def give(self, request: ShardRequest, fatal_episodes: Mapping[int, Death]) -> bool:
+        """See `harness.runner.workers.Worker`: that it is dead shows in its answer."""
+        self.pending = self._actor.run.remote(request, dict(fatal_episodes), self._workers.shadows(request))
         return True
 
-    def answer(self) -> Done | Ended:
-        """See `harness.runner.executor.Worker`."""
+    def answer(self) -> ShardResult | WorkerDeath:
+        """See `harness.runner.workers.Worker`."""
         answer = self.result()
-        if isinstance(answer, Ended):
-            self._executor.take_back(self)  # its actor lives, and will start another process
+        if isinstance(answer, WorkerDeath):
+            self._workers.ready.append(self)  # its actor lives, and will start another process
         elif answer is None:
             self.kill()  # it may live, where it cannot be reached
-        return answer or Ended(None, None)
+        return answer or WorkerDeath(None, None)
 
     def result(self) -> Any:
         """What it was asked for; None if it is lost."""
         try:
-            found = ray.get(self.pending)
+            result = ray.get(self.pending)
         except (RayTaskError, RuntimeEnvSetupError):
             raise
         except RayError:
             return None
-        if isinstance(found, Exception):
-            raise found
-        return found
+        if isinstance(result, Exception):
+            raise result
+        return result
 
     def kill(self) -> None:
-        """See `harness.runner.executor.Worker`; its process follows it at once."""
+        """See `harness.runner.workers.Worker`; its process follows it at once."""
         ray.kill(self._actor)
 
     def dismiss(self) -> None:
-        """See `harness.runner.executor.Worker`."""
+        """See `harness.runner.workers.Worker`."""
         self.pending = self._actor.close.remote()
 
-    def wait(self) -> None:
-        """See `harness.runner.executor.Worker`."""
-        ray.wait([self.pending], timeout=2.0 * CLOSING_S)
+    def wait(self, seconds: float) -> None:
+        """See `harness.runner.workers.Worker`."""
+        ray.wait([self.pending], timeout=2.0 * seconds)
         self.kill()
 
 
-class RayExecutor:
+class RayWorkers(Workers):
     """Starts an actor for each worker, as far as the cluster has room, and others for those that it loses.
 
-    ``n_runs`` such runs share the machines: their workers take turns.
-
-    Raises
-    ------
-    HarnessError
-        There is no such cluster, or it has no room for one worker.
+    ``n_runs`` such runs share the machines: their workers take turns. Raises a `HarnessError` where there is no such
+    cluster, or no room in it for one worker.
     """
 
     def __init__(self, resolved: Resolved, folder: Path, n_workers: int | None, *, n_runs: int = 1) -> None:
@@ -112,20 +187,18 @@ class RayExecutor:
         if is_ours := not ray.is_initialized():
             _connect(address, environment)
         self._is_ours = is_ours
-        self._here = Machine.this(resolved, resolved.controller_sha256)
-        self._there: set[str] = set()
-        self._starting: list[RayWorker] = []
-        self._ready: list[RayWorker] = []
         try:
-            self.n_workers = n_workers or _room(settings)
+            super().__init__(resolved, n_workers or _room(settings))
         except HarnessError:
-            self.close()
+            self._disconnect()
             raise
         n_machines = sum(node["Alive"] for node in ray.nodes())
         self.where = f" on {n_machines} machine{'s' * (n_machines > 1)} at {address}"
-        self._lost_at_start = 0
-        self._told = False
-        self._since = time.monotonic()
+        self.ready: list[RayWorker] = []
+        self._starting: list[RayWorker] = []
+        self._here = Machine.this(resolved, resolved.controller_sha256)
+        self._cpus: set[str] = set()
+        self._lost_at_start, self._patient_until = 0, time.monotonic() + PATIENCE_S
         self._shadows: Files | None = None
         self._content = ray.put(resolved)
         self._cached = {} if address == LOCAL else _stored(cached_files(resolved), cache_root())
@@ -136,40 +209,36 @@ class RayExecutor:
         )
 
     def cpus(self) -> set[str]:
-        """See `harness.runner.executor.Executor`."""
-        return self._there
+        """See `Workers.cpus`."""
+        return self._cpus
 
-    def shadows(self, spec: Spec) -> Files:
+    def shadows(self, request: ShardRequest) -> Files:
         """Shadow runs that tests follow from: they have all been written before the first test."""
-        if not isinstance(spec, ShardSpec):
+        if not isinstance(request, ShardSpec):
             return {}
         if self._shadows is None:
             self._shadows = _stored(sorted((self._folder / SHADOW).glob("*.parquet")), self._folder)
         return self._shadows
 
-    def new_worker(self, n_there: int) -> RayWorker | None:
-        """See `harness.runner.executor.Executor`."""
-        while n_there + len(self._ready) + len(self._starting) < self.n_workers:
+    def new_worker(self) -> RayWorker | None:
+        """See `Workers.new_worker`."""
+        while len(self._busy) + len(self.ready) + len(self._starting) < self.n_workers:
             actor = self._actor_class.remote(self._content)
             self._starting.append(RayWorker(actor, actor.begin.remote(self._cached), self))
-        return self._ready.pop() if self._ready else None
+        return self.ready.pop() if self.ready else None
 
     def first_to_answer(self, busy: Sequence[RayWorker]) -> RayWorker | None:
-        """See `harness.runner.executor.Executor`."""
-        waited_for = {worker.pending: worker for worker in [*busy, *self._starting]}
-        while not (answered := ray.wait(list(waited_for), num_returns=1, timeout=LOOK_S)[0]):
-            if not busy:
+        """See `Workers.first_to_answer`."""
+        pending = {worker.pending: worker for worker in [*busy, *self._starting]}
+        while not (answered := ray.wait(list(pending), num_returns=1, timeout=LOOK_S)[0]):
+            if not busy and time.monotonic() > self._patient_until:
                 self._tell_of_waiting()
-        worker = waited_for[answered[0]]
+        worker = pending[answered[0]]
         if worker not in self._starting:
             return worker
         self._starting.remove(worker)
         self._admit(worker)
         return None
-
-    def take_back(self, worker: RayWorker) -> None:
-        """Keep a worker for another shard."""
-        self._ready.append(worker)
 
     def _admit(self, worker: RayWorker) -> None:
         """Let a worker in that is ready, if it is one of ours."""
@@ -197,22 +266,26 @@ class RayExecutor:
                     "(working_dir), or install its package on all machines.",
                 )
         self._lost_at_start = 0
-        self._there.add(machine.cpu)
-        self._ready.append(worker)
+        self._cpus.add(machine.cpu)
+        self.ready.append(worker)
 
     def _tell_of_waiting(self) -> None:
-        if not self._told and time.monotonic() - self._since > PATIENCE_S:
-            self._told = True
-            wanted = self._settings.resources
-            sys.stderr.write(  # nothing is wrong yet: machines may come
-                f"waiting for {wanted.cpus:g} CPUs and {wanted.gpus:g} GPUs of one machine; free are "
-                f"{_said(ray.available_resources())} of {_said(ray.cluster_resources())} in all\n"
-            )
+        """Nothing is wrong yet: machines may come."""
+        self._patient_until = float("inf")
+        want, free, have = self._settings.resources, ray.available_resources(), ray.cluster_resources()
+        sys.stderr.write(
+            f"waiting for {want.cpus:g} CPUs and {want.gpus:g} GPUs of one machine; free are {_words(free)} of "
+            f"{_words(have)} in all\n"
+        )
 
     def close(self) -> None:
-        """See `harness.runner.executor.Executor`."""
-        for worker in [*self._starting, *self._ready]:
+        """See `Workers.close`."""
+        super().close()
+        for worker in [*self._starting, *self.ready]:
             worker.kill()
+        self._disconnect()
+
+    def _disconnect(self) -> None:
         if self._is_ours:
             ray.shutdown()
 
@@ -235,14 +308,13 @@ def _wrong_environment(error: Exception) -> CampaignError:
 
 def _connect(address: str, environment: dict[str, Any] | None) -> None:
     """Begin to use a cluster; signals stay the harness's own."""
-    in_main_thread = threading.current_thread() is threading.main_thread()
-    before = {number: signal.getsignal(number) for number in FROM_USER} if in_main_thread else {}
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     ours: dict[str, Any] = {"include_dashboard": False} if address == LOCAL else {}
     ended_by: int | None = None
     try:
-        _require_answer(address)
-        ray.init(address=address, logging_level=logging.ERROR, runtime_env=environment, **ours)
+        with handlers_restored():
+            _require_answer(address)
+            ray.init(address=address, logging_level=logging.ERROR, runtime_env=environment, **ours)
     except SystemExit as error:  # Ray's own answer to SIGTERM, while it connects
         ended_by = int(error.code or 0)
     except (RayError, OSError, RuntimeError, ValueError) as error:
@@ -254,9 +326,6 @@ def _connect(address: str, environment: dict[str, Any] | None) -> None:
             mend="Start it with `ray start --head` and give its address, such as 10.0.0.1:6379, or none for a cluster "
             "of this machine.",
         ) from error
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
     if ended_by is not None:
         signal.raise_signal(ended_by)
 
@@ -276,14 +345,14 @@ def _room(settings: RaySettings) -> int:
     if n == 0:
         raise HarnessError(
             "run.ray.resources",
-            found=f"a cluster of {_said(have)}",
+            found=f"a cluster of {_words(have)}",
             expected=f"room for one worker: {want.cpus:g} CPUs and {want.gpus:g} GPUs on one machine",
             mend="Ask for less, or give --workers if machines are to come later.",
         )
     return n
 
 
-def _said(resources: Mapping[str, float]) -> str:
+def _words(resources: Mapping[str, float]) -> str:
     return f"{resources.get('CPU', 0.0):g} CPUs and {resources.get('GPU', 0.0):g} GPUs"
 
 

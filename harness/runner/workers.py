@@ -1,0 +1,304 @@
+"""Workers that run shards, whose results are handed back in order; what happens to the shard of one that dies.
+
+Here workers are processes of this machine; `harness.runner.ray` makes those of a cluster.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import signal
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import count, islice
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Protocol, TypeVar
+
+from scipy.special import bdtrc
+
+from harness.controllers.guard import Death, death_cause
+from harness.errors import CampaignError, HarnessError, TooManyFailedError
+from harness.processes import OF_EPISODE, Call, Child, first_to_answer, last_call
+from harness.resolved import Resolved
+from harness.runner.worker import ShardRequest, ShardResult, serve
+
+ATTEMPTS = 3
+"""A shard whose worker dies is given to another one, this many times in all."""
+SURELY_TOO_MANY = 1e-4
+"""Probability of so many deaths under the allowed share, below which a controller is refused: with the default share
+its third at the earliest, its seventh if it dies in all of 96 cells, some ten seconds into the run."""
+SENT_FROM_OUTSIDE = (-signal.SIGKILL, -signal.SIGTERM)
+"""Ends that an operator or a shortage of memory brings: a controller is blamed only when its call is hit again."""
+CLOSING_S = 10.0
+"""Time that a worker gets to release its controllers once all is done."""
+
+_Request = TypeVar("_Request", bound=ShardRequest)
+_ShardResult = TypeVar("_ShardResult", bound=ShardResult)
+
+
+class WorkerLostError(HarnessError):
+    """Workers die again and again, on the same shard or before they have one."""
+
+    exit_code = 3
+
+
+@dataclass(frozen=True)
+class WorkerDeath:
+    """What is known of a worker that died on its shard.
+
+    ``exit_code`` is None where it went with its machine; ``call`` is the controller's that it was in, if it was in one.
+    """
+
+    exit_code: int | None
+    call: Call | None
+
+
+class Worker(Protocol):
+    """Runs one shard after another, here or on another machine."""
+
+    def give(self, request: ShardRequest, fatal_episodes: Mapping[int, Death]) -> bool:
+        """Give it a shard to run, with the episodes known to end a process; False if it is dead."""
+        ...
+
+    def answer(self) -> ShardResult | WorkerDeath:
+        """The shard of a worker that has answered, or why it has died: no more care is needed then.
+
+        Raises whatever running the shard has raised.
+        """
+        ...
+
+    def kill(self) -> object:
+        """End it at once, whatever it does."""
+        ...
+
+    def dismiss(self) -> None:
+        """Tell an idle worker that nothing more comes: it releases its controllers."""
+        ...
+
+    def wait(self, seconds: float) -> None:
+        """Give a dismissed worker a little time; then end it."""
+        ...
+
+
+class WorkerProcess(Child):
+    """A process that runs one shard after another, at the end of a pipe of its own."""
+
+    def __init__(self, resolved: Path, folder: Path, black_box: Path) -> None:
+        super().__init__(serve, resolved, folder, black_box)
+        self._black_box = black_box
+
+    def give(self, request: ShardRequest, fatal_episodes: Mapping[int, Death]) -> bool:
+        """See `Worker`."""
+        return self.send((request, dict(fatal_episodes)))
+
+    def answer(self) -> ShardResult | WorkerDeath:
+        """See `Worker`."""
+        answer = self.receive()
+        if answer is None:
+            return WorkerDeath(self.kill(), last_call(self._black_box))
+        if isinstance(answer, BaseException):
+            raise answer
+        return answer  # type: ignore[no-any-return]
+
+    def dismiss(self) -> None:
+        """See `Worker`."""
+        self.connection.close()
+
+
+@dataclass
+class _Job:
+    """A shard that is wanted, with its result once there is one."""
+
+    request: ShardRequest
+    result: ShardResult | None
+    n_deaths: int = 0
+    suspected: Call | None = None
+    fatal_episodes: dict[int, Death] = field(default_factory=dict)
+
+
+class Workers:
+    """``n_workers`` at most; one that dies takes nothing but its unfinished shard along.
+
+    Everything happens in the caller's thread, and no two workers share anything. So there is no lock that a killed one
+    could keep, and no queue that Ctrl-C could leave half filled.
+    """
+
+    where = ""
+    """Said of the workers where their work is shown; empty for this machine."""
+
+    def __init__(self, resolved: Resolved, n_workers: int) -> None:
+        self._campaign, self.n_workers = resolved.campaign, n_workers
+        self._idle: list[Any] = []
+        self._busy: dict[Any, _Job] = {}
+
+    def __enter__(self) -> Workers:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def cpus(self) -> set[str]:
+        """Names of the processors of other machines that have worked: bits are promised for one family."""
+        return set()
+
+    def close(self) -> None:
+        """Stop all workers, finished or not; those that are idle may release their controllers first."""
+        for worker in self._busy:
+            worker.kill()
+        for worker in self._idle:
+            worker.dismiss()
+        for worker in self._idle:
+            worker.wait(CLOSING_S)
+        self._idle, self._busy = [], {}
+
+    def run(
+        self, requests: Iterator[_Request], known: Callable[[_Request], _ShardResult | None]
+    ) -> Iterator[_ShardResult]:
+        """Results in the order of the requests; shards that are ``known`` are not run again.
+
+        Two shards per worker are under way or wait for their turn to be handed back: little is lost at the stop, and
+        little is held in memory. Raises a `WorkerLostError` when workers died `ATTEMPTS` times on the same shard.
+        """
+        wanted: deque[_Job] = deque()
+        waiting: deque[_Job] = deque()
+        while True:
+            for request in islice(requests, 2 * self.n_workers + 1 - len(wanted)):
+                wanted.append(_Job(request, known(request)))
+                if wanted[-1].result is None:
+                    waiting.append(wanted[-1])
+            if not wanted:
+                return
+            self._hand_out(waiting)
+            while wanted[0].result is None:
+                self._collect(waiting)
+                self._hand_out(waiting)
+            yield wanted.popleft().result  # type: ignore[misc]
+
+    def new_worker(self) -> Worker | None:
+        """Another worker beside those that are busy; None as long as none is ready."""
+        raise NotImplementedError
+
+    def first_to_answer(self, busy: Sequence[Any]) -> Worker | None:
+        """Wait until one of the busy workers has answered or died; None when a new one has become ready instead."""
+        raise NotImplementedError
+
+    def _hand_out(self, waiting: deque[_Job]) -> None:
+        """Give waiting shards to idle workers, of which there may be up to as many as were asked for."""
+        while waiting and len(self._busy) < self.n_workers:
+            worker = self._idle.pop() if self._idle else self.new_worker()
+            if worker is None:
+                return
+            if worker.give(waiting[0].request, waiting[0].fatal_episodes):
+                self._busy[worker] = waiting.popleft()
+            else:
+                worker.kill()  # it died while it was idle
+
+    def _collect(self, waiting: deque[_Job]) -> None:
+        """Wait for one worker to finish its shard, or to die on it."""
+        worker = self.first_to_answer(list(self._busy))
+        if worker is None:
+            return
+        job, answer = self._busy[worker], worker.answer()
+        del self._busy[worker]
+        if isinstance(answer, WorkerDeath):
+            waiting.appendleft(job)
+            self._blame(job, answer)
+        else:
+            job.result = answer
+            self._idle.append(worker)
+
+    def _blame(self, job: _Job, death: WorkerDeath) -> None:
+        """Say whose doing the death of a worker was: a test's that is run no more, or nobody's knows."""
+        call = death.call
+        first_time = call != job.suspected
+        job.suspected = call
+        cause = death_cause(death.exit_code, self._campaign.av.limits.step_time_s)
+        own = call is not None and not (death.exit_code in SENT_FROM_OUTSIDE and first_time)  # the controller's own
+        if own and call is not None and call.kind == OF_EPISODE:
+            job.fatal_episodes[call.episode] = Death(call.step, cause)
+            self._require_few_deaths(job)
+            return
+        job.n_deaths += 1
+        if job.n_deaths == ATTEMPTS:
+            raise _lost(job.request, death.exit_code, f"{cause}, in {call}" if own else None)
+
+    def _require_few_deaths(self, job: _Job) -> None:
+        """Each death costs a new process: a controller that dies too often is not run to the end of its shard."""
+        share, fatal = self._campaign.run.max_failed_share, job.fatal_episodes
+        episode, death = next(reversed(fatal.items()))
+        n_begun = max(fatal) - job.request.first_episode + 1
+        if float(bdtrc(len(fatal) - 1, n_begun, share)) < SURELY_TOO_MANY:
+            raise TooManyFailedError(
+                "run.max_failed_share",
+                found=f"{len(fatal)} of the first {n_begun} episodes of shard {job.request.index} ended their worker "
+                f"process, the last of them episode {episode}: {death.cause}",
+                expected=f"a share of at most {share:g}",
+                mend="Mend the controller (`harness av-check` looks at it in seconds), or raise the share to go on.",
+            )
+
+
+def _lost(request: ShardRequest, exit_code: int | None, blamed: str | None) -> WorkerLostError:
+    """What to say of a shard that no worker survives; ``blamed`` is what the controller did, if it did."""
+    how = f"with {'its machine' if exit_code is None else f'exit code {exit_code}'}"
+    mend = "Look for a memory limit (fewer --workers), then continue with --resume."
+    if blamed is not None:
+        how = f"because {blamed}"
+        mend = "Mend the controller: look for os._exit, or a crash of compiled code (`harness av-check`)."
+    return WorkerLostError(
+        f"shard {request.index} (from episode {request.first_episode})",
+        found=f"{ATTEMPTS} worker processes that died, the last {how}",
+        expected="a worker that finishes the shard",
+        mend=mend,
+    )
+
+
+class LocalWorkers(Workers):
+    """Processes of this machine, each started when it is first needed; tests may follow from files in ``folder``."""
+
+    def __init__(self, resolved: Resolved, folder: Path, n_workers: int | None) -> None:
+        super().__init__(resolved, n_workers or os.cpu_count() or 1)
+        self._folder = folder
+        self._own = TemporaryDirectory(prefix="harness-workers-")
+        # As a file: what a pipe cannot hold is waited for until the new process has imported all that it needs.
+        self._resolved = Path(self._own.name) / "resolved"
+        self._resolved.write_bytes(pickle.dumps(resolved))
+        self._numbers = count()
+
+    def new_worker(self) -> WorkerProcess:
+        """See `Workers.new_worker`."""
+        return WorkerProcess(self._resolved, self._folder, Path(self._own.name) / str(next(self._numbers)))
+
+    def first_to_answer(self, busy: Sequence[WorkerProcess]) -> WorkerProcess:
+        """See `Workers.first_to_answer`."""
+        return first_to_answer(busy)
+
+    def close(self) -> None:
+        """See `Workers.close`."""
+        super().close()
+        self._own.cleanup()
+
+
+def workers_of(resolved: Resolved, folder: Path, n_workers: int | None, *, n_runs: int = 1) -> Workers:
+    """Where a campaign's shards are run; ``n_runs`` campaigns share it and take turns.
+
+    Raises
+    ------
+    HarnessError
+        The package, the cluster or room in it is missing.
+    """
+    if resolved.campaign.run.executor == "local":
+        return LocalWorkers(resolved, folder, n_workers)
+    try:
+        from harness.runner.ray import RayWorkers  # noqa: PLC0415 - an extra
+    except ModuleNotFoundError as error:
+        if error.name != "ray":
+            raise
+        raise CampaignError(
+            "run.executor",
+            found="ray, but no package ray",
+            expected="the extra for clusters",
+            mend="Install it here and on all machines of the cluster: pip install 'harness[ray]'.",
+        ) from error
+    return RayWorkers(resolved, folder, n_workers, n_runs=n_runs)
