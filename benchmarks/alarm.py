@@ -18,8 +18,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from harness.campaign.campaign import Campaign
-from harness.estimators.block import Block
-from harness.estimators.from_records import block_from_tables
+from harness.estimators.block import Block, block_from_tables
 from harness.importance.build import mixture_weights
 from harness.pool.storage import campaign_pool
 from harness.records.tables import episodes_table

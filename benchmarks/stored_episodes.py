@@ -20,7 +20,7 @@ from benchmarks.contenders import SCENARIOS, TWIN_CELLS
 from benchmarks.resume import harness
 from harness.campaign.files import load_campaign
 from harness.estimators import Block, one_pass
-from harness.estimators.from_records import EPISODE_COLUMNS, MOMENT_COLUMNS, block_from_tables
+from harness.estimators.block import EPISODE_COLUMNS, MOMENT_COLUMNS, block_from_tables
 from harness.estimators.scv import fill_product_columns, n_columns
 from harness.importance.build import mixture_weights
 from harness.records.reader import read_shards

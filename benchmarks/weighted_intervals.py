@@ -16,12 +16,12 @@ import numpy as np
 
 from harness.campaign.campaign import Campaign
 from harness.campaign.sections import Stop
-from harness.estimators.block import Block
+from harness.estimators.block import Block, Drawn
 from harness.estimators.estimate import Estimate
 from harness.estimators.limits import hall_distances, normal_half_width
 from harness.estimators.stopping import StopRule
 from harness.estimators.weighted import Nade
-from harness.vocabulary import FloatArray, Method
+from harness.vocabulary import CRASH, FloatArray, Method
 from studies.weighted_campaign import twin_episodes
 
 CONFIDENCE = 0.9
@@ -53,10 +53,8 @@ class Population:
 
 def _crashes(weights: FloatArray, cap: float) -> Block:
     n = len(weights)
-    yes, no = np.ones(n, np.bool_), np.zeros(n, np.bool_)
-    return Block(
-        0, "forced", yes, no, yes, no, np.log(weights), np.zeros((n, 0)), np.ones(0), np.zeros(n, int), weight_cap=cap
-    )
+    columns = {"cut_in": np.ones(n, np.bool_)}
+    return Block(0, np.full(n, CRASH, np.int8), np.log(weights), columns, Drawn("forced", weight_cap=cap))
 
 
 def drive(name: str, av: dict[str, object], method: Method, n: int) -> Population:

@@ -26,9 +26,8 @@ from scipy.special import logsumexp
 
 from harness.campaign.files import load_campaign
 from harness.errors import HarnessError
-from harness.estimators.block import Block
+from harness.estimators.block import EPISODE_COLUMNS, Block, block_from_tables
 from harness.estimators.estimate import finite_json
-from harness.estimators.from_records import EPISODE_COLUMNS, block_from_tables
 from harness.importance.build import mixture_weights
 from harness.pool.cut_ins import Pool
 from harness.pool.replay import LEAD, PATH_COLUMNS
@@ -83,7 +82,7 @@ class Alarm:
         """Add one block, and which surrogates would have crashed in its tests (n, D)."""
         h = np.where(crashes, block.weights()[:, None], 0.0)
         if not self._n:
-            self._method, self._mean_weight = block.method, _mean_weight(block, self._known)
+            self._method, self._mean_weight = block.drawn.method, _mean_weight(block, self._known)
         self._n += len(block)
         self._n_lost += int(np.count_nonzero(block.failed & ~block.cut_in))
         self._hits += np.count_nonzero(h, axis=0)
@@ -138,9 +137,9 @@ class Alarm:
 
 def _mean_weight(block: Block, known: KnownRates) -> FloatArray:
     """Mean square of W f_k over its mean, shape (D,), at most; infinite where nothing bounds W."""
-    if block.weight_cap is not None:
-        return np.full(known.mu.shape, block.weight_cap)
-    share = block.forced_share
+    if block.drawn.weight_cap is not None:
+        return np.full(known.mu.shape, block.drawn.weight_cap)
+    share = block.drawn.forced_share
     return known.p_cut_in_at_crash / share if share else np.full(known.mu.shape, np.inf)
 
 

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -26,7 +26,7 @@ import numpy as np
 
 from harness.campaign.files import load_campaign
 from harness.errors import HarnessError
-from harness.estimators.block import Block, columns_of, joined
+from harness.estimators.block import Block, joined
 from harness.estimators.estimate import FailureBounds, finite_json
 from harness.estimators.limits import normal_half_width
 from harness.estimators.scv import Scv
@@ -180,7 +180,7 @@ def scv_rhw_of(tests: Block, procedure: Procedure, shuffle: int) -> FloatArray:
     rhw, state = np.empty(len(grid)), FailureBounds(Scv())
     order = shuffled(procedure.seed, shuffle, tests.crash | tests.failed)
     for at, (start, stop) in enumerate(itertools.pairwise([0, *grid.tolist()])):
-        state.add(rows_of(tests, order[start:stop]))
+        state.add(tests.chosen(order[start:stop]))
         rhw[at] = state.result(procedure.confidence).rhw
     return rhw
 
@@ -199,12 +199,6 @@ def shuffled(seed: int, shuffle: int, placed: BoolArray) -> IntArray:
     order[places] = np.flatnonzero(placed)
     order[order < 0] = generator.permutation(np.flatnonzero(~placed))
     return order
-
-
-def rows_of(tests: Block, rows: IntArray) -> Block:
-    """Block of any rows in any order; numbered anew, for the order is what is asked about."""
-    taken: dict[str, Any] = {name: column[rows] for name, column in columns_of(tests).items()}
-    return replace(tests, first_episode=0, **taken)
 
 
 @dataclass(frozen=True)
@@ -242,7 +236,7 @@ def required_tests_of_runs(
     rows = []
     for folder in folders:
         run = _read(folder, with_ratios="scv" in estimators)
-        plain: RnotEstimator = "nde" if run.sample.method == "nde" else "nade"
+        plain: RnotEstimator = "nde" if run.sample.drawn.method == "nde" else "nade"
         tests = {"n_episodes": run.n_tests, "n_crashes": int(np.count_nonzero(~run.failed))}
         for name in dict.fromkeys(estimators or [plain]):
             told.stage(f"{folder.name} {name}", procedure.n_shuffles)

@@ -17,7 +17,7 @@ import numpy as np
 
 from harness.campaign.campaign import Campaign
 from harness.campaign.sections import Accept
-from harness.estimators.block import Block
+from harness.estimators.block import Block, Drawn
 from harness.estimators.estimate import Estimate
 from harness.estimators.likelihood import Level
 from harness.estimators.pairs import CRASH, NO_CRASH, PairCounts, no_pairs
@@ -25,7 +25,8 @@ from harness.estimators.shells import Shells
 from harness.estimators.stopping import PairRule, RoundRule
 from harness.runner.planner import PairPlanner, ShellPlanner
 from harness.strata import LIBRARY_STATEMENT, ShellDesign
-from harness.vocabulary import FloatArray, IntArray
+from harness.vocabulary import CRASH as CRASHED
+from harness.vocabulary import FAILED, TIMEOUT, FloatArray, IntArray
 from studies.experiment import Fault
 from studies.judgement import Row, estimate_row
 from studies.truths import CONDITIONAL_DIFFERENCE, DIFFERENCE, preventable_by, ratio_to
@@ -219,22 +220,9 @@ def campaign_block(drawn: DrawnPool, added: IntArray, first: int, rng: np.random
     mass = np.zeros((n, tests.size))
     for c in np.flatnonzero(crashes).tolist():
         mass[bad & (cell == c)] = drawn.crashed_paths(c, int(crashes[c]), rng)
-    return Block(
-        first_episode=first,
-        method="shells",
-        crash=bad & ~failed,
-        failed=failed,
-        cut_in=~none,
-        bv_lv_contact=none,
-        log_weight=np.zeros(n),
-        log_q=np.zeros((n, 0)),
-        alpha=np.zeros(0),
-        n_control_steps=np.zeros(n, np.int64),
-        stratum=np.array(drawn.design.cell_stratum)[cell],
-        cell=cell,
-        cell_mass=mass,
-        shells=drawn.design,
-    )
+    columns = {"cut_in": ~none, "stratum": np.array(drawn.design.cell_stratum)[cell], "cell": cell, "cell_mass": mass}
+    outcome = np.select([failed, bad], [FAILED, CRASHED], TIMEOUT).astype(np.int8)
+    return Block(first, outcome, np.zeros(n), columns, Drawn("shells", shells=drawn.design))
 
 
 def _reference_rows(estimate: Estimate, reference: str, replication: int, *, reached: bool) -> Iterator[Row]:

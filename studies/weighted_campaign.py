@@ -11,8 +11,7 @@ import numpy as np
 from harness.campaign.campaign import Campaign
 from harness.episode.loop import EpisodeLoop
 from harness.estimators import StopRule, accumulator
-from harness.estimators.block import Block
-from harness.estimators.from_records import block_from_tables
+from harness.estimators.block import Block, block_from_tables
 from harness.importance.build import mixture_weights
 from harness.records.tables import shard_tables
 from harness.resolved import resolve

@@ -1,4 +1,4 @@
-"""The estimators' only input: a block of consecutive episodes as plain arrays.
+"""The estimators' only input: a block of consecutive episodes as plain arrays; and blocks from the records of a run.
 
 A block is what a shard of records says about weights and outcomes, and nothing else. Exact Markov chains (in the
 tests), the twin and SUMO all end here, so that an estimator cannot tell them apart.
@@ -7,105 +7,59 @@ tests), the twin and SUMO all end here, so that an estimator cannot tell them ap
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
 from numpy.typing import NDArray
 
+from harness.errors import RunFolderError
+from harness.records.folder import MEND_SHARD
 from harness.strata import ShellDesign
-from harness.vocabulary import SAMPLING, BoolArray, FloatArray, IntArray, Method
+from harness.vocabulary import (
+    BV_LV_CONTACT,
+    CRASH,
+    FAILED,
+    OUTCOMES,
+    SAMPLING,
+    BoolArray,
+    FloatArray,
+    Int8Array,
+    IntArray,
+    Method,
+)
 
 MAX_CONTROL_STEPS = 9
 """Control steps that sparse control variates are built from, at most ([paper] section VI-E)."""
+EPISODE_COLUMNS = ("episode", "outcome", "cut_in_step", "n_control_steps", "log_weight", "log_p_cut_in", "log_q")
+SHELL_COLUMNS = ("component", "cell", "cell_mass", "ahead_step")
+MOMENT_COLUMNS = ("episode", "q_sampled", "q")
+Column = NDArray[Any]
 
 
 @dataclass(frozen=True, eq=False)
-class Block:
-    """Consecutive episodes ``first_episode … first_episode + n - 1``, in index order.
+class Drawn:
+    """How all tests of a campaign are drawn.
 
     Attributes
     ----------
     method : str
-        How the episodes were drawn.
-    crash, failed, cut_in, bv_lv_contact : (n,) bool
-        Outcomes. A failed episode is a row like any other and never a crash.
-    log_weight : (n,) float64
-        log p(x_c) - log q_sampled(x_c); exactly 0 without control.
-    log_q : (n, M) float64
-        Per importance function, the sum over control steps of log(q_j/p); -inf where q_j cannot draw the episode.
     alpha : (M,) float64
         Mixture weights of the importance functions.
-    n_control_steps : (n,) int
-        Stratum l of each episode.
-    first_ratios : (n, 9, J) float64 or None
-        q_j(a_t|s_t)/q_alpha(a_t|s_t) of the first nine control steps, 1 beyond the last one; None when the campaign
-        kept no moments.
     weight_cap : float or None
         Bound on Y = 1{crash}·weight that the design guarantees for every episode, seen or not; None if there is none.
-    log_p_cut_in : (n,) float64 or None
-        log P(cut-in | path), where the method draws the path ahead. Bounds Y of that episode alone.
-    stratum, cell, cell_mass, shells : (n,) int, (n,) int, (n, C) float64, ShellDesign, or None
-        Where tests are drawn from shells: stratum and cell of each, its path's probability of a cut-in of each cell,
-        and what is known of the strata.
-    ahead : (n,) bool or None
-        Whether the vehicle was ever ahead of the boundary that a statement checks; None where none is.
+    shells : ShellDesign or None
+        What is known of the strata, where tests are drawn from shells.
     """
 
-    first_episode: int
     method: Method
-    crash: BoolArray
-    failed: BoolArray
-    cut_in: BoolArray
-    bv_lv_contact: BoolArray
-    log_weight: FloatArray
-    log_q: FloatArray
-    alpha: FloatArray
-    n_control_steps: IntArray
-    first_ratios: FloatArray | None = None
+    alpha: FloatArray = field(default_factory=lambda: np.zeros(0))
     weight_cap: float | None = None
-    log_p_cut_in: FloatArray | None = None
-    stratum: IntArray | None = None
-    cell: IntArray | None = None
-    cell_mass: FloatArray | None = None
     shells: ShellDesign | None = None
-    ahead: BoolArray | None = None
-
-    def __post_init__(self) -> None:
-        n = len(self.crash)
-        wide = {
-            "log_q": (n, len(self.alpha)),
-            "first_ratios": (n, MAX_CONTROL_STEPS, None),
-            "cell_mass": (n, None),
-        }
-        for name, array in columns_of(self).items():
-            if not _fits(array.shape, expected := wide.get(name, (n,))):
-                raise ValueError(f"Block.{name} has shape {array.shape}, expected {expected}")
-        if np.any(self.crash & self.failed):
-            raise ValueError("Block: an episode is both crashed and failed")
-        if np.isnan(self.log_weight).any():
-            raise ValueError("Block.log_weight has NaN entries")
-
-    def __len__(self) -> int:
-        return len(self.crash)
-
-    def weights(self) -> FloatArray:
-        """Likelihood ratios p/q_sampled, shape (n,); infinite where they overflow."""
-        with np.errstate(over="ignore"):
-            return np.exp(self.log_weight)
-
-    def weighted_crashes(self) -> FloatArray:
-        """Y = 1{crash}·weight, shape (n,)."""
-        y = np.zeros(len(self))
-        y[self.crash] = np.exp(self.log_weight[self.crash])
-        return y
-
-    def mixture_ratios(self) -> FloatArray:
-        """q_j(x_c)/q_sampled(x_c) over whole episodes, shape (n, M); 0 where q_j cannot draw the episode."""
-        with np.errstate(over="ignore"):
-            return np.exp(self.log_q + self.log_weight[:, None])
 
     @property
     def forced_share(self) -> float:
@@ -115,11 +69,96 @@ class Block:
             return 0.0
         return float(self.alpha[0]) if sampling.mixes else 1.0  # the defensive component is the first
 
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """Consecutive episodes ``first_episode … first_episode + n - 1``, in index order.
+
+    Attributes
+    ----------
+    first_episode : int
+    outcome : (n,) int8
+        Places in `OUTCOMES`. A failed episode is a row like any other and never a crash.
+    log_weight : (n,) float64
+        log p(x_c) - log q_sampled(x_c); exactly 0 without control.
+    columns : mapping of str to array, a row for each episode
+        What else the method records, also as attributes; those that it does not record are left out. ``cut_in`` (n,)
+        bool. ``log_q`` (n, M): per importance function, the sum over control steps of log(q_j/p), -inf where q_j cannot
+        draw the episode. ``n_control_steps`` (n,): stratum l of each episode. ``first_ratios`` (n, 9, J):
+        q_j(a_t|s_t)/q_alpha(a_t|s_t) of the first nine control steps, 1 beyond the last one. ``log_p_cut_in`` (n,):
+        log P(cut-in | path), where the method draws the path ahead; it bounds Y of that episode alone. Of shells
+        ``stratum`` and ``cell`` (n,), ``cell_mass`` (n, C): its path's probability of a cut-in of each cell; and
+        ``ahead`` (n,) bool: whether the vehicle was ever ahead of the boundary that a statement checks.
+    drawn : Drawn
+    """
+
+    first_episode: int
+    outcome: Int8Array
+    log_weight: FloatArray
+    columns: Mapping[str, Column]
+    drawn: Drawn
+
+    def __post_init__(self) -> None:
+        n = len(self.outcome)
+        wide = {
+            "log_q": (n, len(self.drawn.alpha)),
+            "first_ratios": (n, MAX_CONTROL_STEPS, None),
+            "cell_mass": (n, None),
+        }
+        for name, array in {**self.columns, "outcome": self.outcome, "log_weight": self.log_weight}.items():
+            if not _fits(array.shape, expected := wide.get(name, (n,))):
+                raise ValueError(f"Block.{name} has shape {array.shape}, expected {expected}")
+        if np.isnan(self.log_weight).any():
+            raise ValueError("Block.log_weight has NaN entries")
+
+    def __len__(self) -> int:
+        return len(self.outcome)
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_") or name == "columns" or name not in self.columns:
+            raise AttributeError(f"the block has no {name}")
+        return self.columns[name]
+
+    @property
+    def crash(self) -> BoolArray:
+        """Which episodes ended in a crash of the AV, shape (n,)."""
+        return np.asarray(self.outcome == CRASH)
+
+    @property
+    def failed(self) -> BoolArray:
+        """Which episodes failed, shape (n,)."""
+        return np.asarray(self.outcome == FAILED)
+
+    @property
+    def bv_lv_contact(self) -> BoolArray:
+        """Which episodes ended in a contact of BV and LV, shape (n,)."""
+        return np.asarray(self.outcome == BV_LV_CONTACT)
+
+    def weights(self) -> FloatArray:
+        """Likelihood ratios p/q_sampled, shape (n,); infinite where they overflow."""
+        with np.errstate(over="ignore"):
+            return np.exp(self.log_weight)
+
+    def weighted_crashes(self) -> FloatArray:
+        """Y = 1{crash}·weight, shape (n,)."""
+        y, crash = np.zeros(len(self)), self.crash
+        y[crash] = np.exp(self.log_weight[crash])
+        return y
+
+    def mixture_ratios(self) -> FloatArray:
+        """q_j(x_c)/q_sampled(x_c) over whole episodes, shape (n, M); 0 where q_j cannot draw the episode."""
+        with np.errstate(over="ignore"):
+            return np.asarray(np.exp(self.log_q + self.log_weight[:, None]))
+
     def log_path_cap(self) -> float:
         """Log of the largest P(cut-in | path)/share of forced cut-ins, a bound on Y of these paths; inf if unknown."""
-        if self.log_p_cut_in is None or not (share := self.forced_share):
+        if "log_p_cut_in" not in self.columns or not (share := self.drawn.forced_share):
             return math.inf
         return float(np.max(self.log_p_cut_in, initial=-math.inf)) - math.log(share)
+
+    def ending(self, rows: BoolArray, outcome: int) -> Block:
+        """The same episodes, had some of them ended otherwise, each with the weight that it has on record."""
+        return _unchecked(self, outcome=np.where(rows, np.int8(outcome), self.outcome)) if rows.any() else self
 
     def failed_as_crashes(self) -> Block:
         """The same episodes had every failed one crashed, each with the weight that it has on record.
@@ -127,9 +166,7 @@ class Block:
         That is the weight up to the step in which it failed. The step depends on nothing that comes after it, so that
         the mean of these weights is the probability to fail, whatever the episodes were drawn by.
         """
-        if not self.failed.any():
-            return self
-        return _unchecked(self, crash=self.crash | self.failed, failed=np.zeros_like(self.failed))
+        return self.ending(self.failed, CRASH)
 
     def take(self, rows: slice) -> Block:
         """Cut out the block of some consecutive rows, a slice with step 1."""
@@ -138,29 +175,162 @@ class Block:
             raise ValueError("a block holds consecutive episodes: the slice must have step 1")
         if (start, stop) == (0, len(self)):
             return self
-        columns: dict[str, Any] = {name: column[start:stop] for name, column in columns_of(self).items()}
-        return _unchecked(self, first_episode=self.first_episode + start, **columns)
+        return self.chosen(slice(start, stop), self.first_episode + start)
+
+    def chosen(self, rows: slice | IntArray, first_episode: int = 0) -> Block:
+        """Block of any rows, numbered anew."""
+        columns = {name: column[rows] for name, column in self.columns.items()}
+        outcome, log_weight = self.outcome[rows], self.log_weight[rows]
+        return _unchecked(self, first_episode=first_episode, outcome=outcome, log_weight=log_weight, columns=columns)
 
 
 def joined(blocks: Sequence[Block]) -> Block:
     """One block of consecutive ones of the same campaign."""
     if len(blocks) == 1:
         return blocks[0]
-    parts = [columns_of(block) for block in blocks]
-    return _unchecked(blocks[0], **{name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
+    columns = {name: np.concatenate([block.columns[name] for block in blocks]) for name in blocks[0].columns}
+    fields = {name: np.concatenate([vars(block)[name] for block in blocks]) for name in ("outcome", "log_weight")}
+    return _unchecked(blocks[0], columns=columns, **fields)
 
 
-def columns_of(block: Block) -> dict[str, NDArray[Any]]:
-    """All arrays that have a row for each test."""
-    return {name: array for name, array in vars(block).items() if isinstance(array, np.ndarray) and name != "alpha"}
-
-
-def _unchecked(block: Block, **columns: Any) -> Block:
-    """The block with other columns; checking them again takes longer than all the rest."""
+def _unchecked(block: Block, **fields: Any) -> Block:
+    """The block with other content; checking it again takes longer than all the rest."""
     other = copy(block)
-    vars(other).update(columns)
+    vars(other).update(fields)
     return other
 
 
 def _fits(shape: tuple[int, ...], expected: tuple[int | None, ...]) -> bool:
     return len(shape) == len(expected) and all(n in (size, None) for size, n in zip(shape, expected, strict=True))
+
+
+def block_from_tables(
+    episodes: pa.Table,
+    moments: pa.Table | None,
+    *,
+    method: Method,
+    alpha: Sequence[float],
+    shells: ShellDesign | None = None,
+) -> Block:
+    """Block of one shard.
+
+    Parameters
+    ----------
+    episodes : pa.Table
+        Rows of the ``episodes`` table, consecutive and in index order; needs `EPISODE_COLUMNS`.
+    moments : pa.Table or None
+        Control steps of the same episodes, sorted by episode and step; needs `MOMENT_COLUMNS`. Only used for the
+        step mixture.
+    method : str
+        ``testing.method`` of the campaign.
+    alpha : sequence of float
+        Mixture weights in the order of ``log_q``, M of them.
+    shells : ShellDesign, optional
+        Strata of the campaign, if it draws from shells; needs `SHELL_COLUMNS`.
+
+    Raises
+    ------
+    RunFolderError
+        If rows are missing, out of order, or contradict each other.
+    """
+    index = _integers(episodes, "episode")
+    _require_consecutive(index)
+    outcome = _outcomes(episodes)
+    failed, n_control_steps = outcome == FAILED, _integers(episodes, "n_control_steps")
+    columns: dict[str, Column] = {
+        "cut_in": _known(episodes, "cut_in_step"),
+        "log_q": _nested(episodes, "log_q", len(alpha)),
+        "n_control_steps": n_control_steps,
+    }
+    if moments is not None and method == "step_mixture":
+        columns["first_ratios"] = _first_ratios(moments, index, np.where(failed, 0, n_control_steps))
+    if np.all(_known(episodes, "log_p_cut_in") | failed):
+        columns["log_p_cut_in"] = np.asarray(pc.fill_null(episodes.column("log_p_cut_in"), -np.inf).to_numpy())
+    if shells is not None:
+        columns["stratum"], columns["cell"] = _integers(episodes, "component"), _integers(episodes, "cell")
+        columns["cell_mass"] = _nested(episodes, "cell_mass", len(shells.cell_stratum))
+        if shells.checked is not None:
+            columns["ahead"] = _known(episodes, "ahead_step")
+    drawn = Drawn(method, np.asarray(alpha, dtype=np.float64), 1.0 if method == "nde" else None, shells)
+    return Block(int(index[0]), outcome, _log_weights(episodes, failed, int(index[0])), columns, drawn)
+
+
+def _damaged(where: str, found: str, expected: str) -> RunFolderError:
+    return RunFolderError(where, found=found, expected=expected, mend=MEND_SHARD)
+
+
+def _integers(table: pa.Table, name: str) -> IntArray:
+    return np.asarray(table.column(name).to_numpy()).astype(np.int64)
+
+
+def _known(table: pa.Table, name: str) -> BoolArray:
+    return np.asarray(pc.is_valid(table.column(name))).astype(np.bool_)
+
+
+def _outcomes(episodes: pa.Table) -> Int8Array:
+    """How each episode ended, as a place in `OUTCOMES`, shape (n,)."""
+    outcomes = episodes.column("outcome").unify_dictionaries().combine_chunks()
+    place = np.array([OUTCOMES.index(name) for name in outcomes.dictionary.to_pylist()], np.int8)
+    return np.asarray(place[outcomes.indices.to_numpy()])
+
+
+def _nested(table: pa.Table, name: str, width: int) -> FloatArray:
+    """Read a fixed-size list column as an array of shape (rows, width)."""
+    column = table.column(name).combine_chunks()
+    values = np.asarray(column.flatten().to_numpy(zero_copy_only=False), dtype=np.float64)
+    if len(values) != table.num_rows * width:
+        raise RunFolderError(
+            f"column {name}",
+            found=f"{len(values)} numbers in {table.num_rows} rows",
+            expected=f"{width} in each row, one per importance function of the campaign",
+            mend="The records belong to another campaign or are damaged. " + MEND_SHARD,
+        )
+    return values.reshape(table.num_rows, width)
+
+
+def _require_consecutive(index: IntArray) -> None:
+    if len(index) == 0:
+        raise _damaged("episodes", "no rows", "at least one episode per shard")
+    gaps = np.diff(index) != 1
+    if gaps.any():
+        at = int(np.argmax(gaps))
+        raise _damaged(
+            f"episodes, row {at + 1}",
+            f"episode {index[at + 1]} after episode {index[at]}",
+            "every episode once, in index order; a failed one is a row too",
+        )
+
+
+def _log_weights(episodes: pa.Table, failed: BoolArray, first: int) -> FloatArray:
+    """Log weights; that of a failed episode may be unknown and is then 0, the weight of an uncontrolled test."""
+    log_weight = np.array(episodes.column("log_weight").to_numpy(), dtype=np.float64)
+    log_weight[np.isnan(log_weight) & failed] = 0.0
+    wrong = np.isnan(log_weight) | np.isposinf(log_weight)
+    if wrong.any():
+        at = int(np.argmax(wrong))
+        found, expected = f"log_weight {log_weight[at]}", "a number: every weight decides the crash rate"
+        raise _damaged(f"episodes, episode {first + at}", found, expected)
+    return log_weight
+
+
+def _first_ratios(moments: pa.Table, index: IntArray, n_control_steps: IntArray) -> FloatArray:
+    """q_j/q_sampled of the first nine control steps of each episode, shape (n, 9, J); 1 beyond the last one."""
+    row = _integers(moments, "episode") - index[0]
+    if len(row) and (row[0] < 0 or row[-1] >= len(index) or np.any(np.diff(row) < 0)):
+        raise _damaged(
+            "moments",
+            f"rows of episodes {row.min() + index[0]} to {row.max() + index[0]}, or out of order",
+            f"episodes {index[0]} to {index[-1]}, in order",
+        )
+    counts, needed = np.bincount(row, minlength=len(index)), np.minimum(n_control_steps, MAX_CONTROL_STEPS)
+    if (counts < needed).any():
+        at = int(np.argmax(counts < needed))
+        expected = f"{needed[at]} as the episodes table says"
+        raise _damaged(f"moments, episode {index[at]}", f"{counts[at]} control steps", expected)
+    rank = np.arange(len(row)) - (np.cumsum(counts) - counts)[row]
+    n_surrogates = moments.schema.field("q").type.list_size
+    q, q_sampled = _nested(moments, "q", n_surrogates), moments.column("q_sampled").to_numpy()
+    kept = rank < MAX_CONTROL_STEPS
+    ratios = np.ones((len(index), MAX_CONTROL_STEPS, n_surrogates))
+    ratios[row[kept], rank[kept]] = q[kept] / q_sampled[kept, None]
+    return ratios

@@ -37,7 +37,7 @@ class Diagnostics:
     def add(self, block: Block) -> None:
         """Add one block."""
         weights = block.weights()
-        self.method = block.method
+        self.method = block.drawn.method
         self.n += len(block)
         self.n_failed += int(np.count_nonzero(block.failed))
         self.n_cut_ins += int(np.count_nonzero(block.cut_in))
@@ -45,8 +45,8 @@ class Diagnostics:
         self._weight.add(weights)
         self._cut_in.add(weights[block.cut_in])
         self._contact.add(weights[block.bv_lv_contact])
-        if SAMPLING[block.method].mixes:
-            self._ratios = self._ratios or [Moments() for _ in block.alpha]
+        if SAMPLING[block.drawn.method].mixes:
+            self._ratios = self._ratios or [Moments() for _ in block.drawn.alpha]
             for sums, ratios in zip(self._ratios, block.mixture_ratios().T, strict=True):
                 sums.add(ratios)
 

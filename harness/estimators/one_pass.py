@@ -79,7 +79,7 @@ def one_pass(
         if block.first_episode != n:
             raise ValueError(f"expected a block from episode {n} on, got one from {block.first_episode}")
         if own is None:
-            own = SAMPLING[block.method].headline
+            own = SAMPLING[block.drawn.method].headline
             refusals = {name: ACCUMULATORS[name].refusal(block) for name in (own, *names)}
             states = {name: accumulator(name) for name, reason in refusals.items() if reason is None}
         n += len(block)

@@ -219,8 +219,6 @@ class PairedShells:
 
     def add(self, side: int, block: Block) -> None:
         """Tests of A (0) or of B (1), in the order of their draws."""
-        if block.stratum is None or block.cell_mass is None:
-            raise ValueError("the block has no shells")
         ends = np.where(block.failed, FAILED, np.where(block.crash, CRASH, NO_CRASH))
         for s in np.unique(block.stratum).tolist():
             rows = block.stratum == s

@@ -61,13 +61,13 @@ class MixtureCv:
     @classmethod
     def refusal(cls, block: Block) -> str | None:
         """Only the episode mixture has few control variates whose means are known and whose values are bounded."""
-        if block.method == "step_mixture":
+        if block.drawn.method == "step_mixture":
             return (
                 "needs the episode mixture: under the step mixture the products of q_j/q_alpha have mean 1 too, "
                 "but tails too heavy for a regression"
             )
-        if block.method != "episode_mixture":
-            return f"needs the episode mixture; {block.method} draws from a single distribution"
+        if block.drawn.method != "episode_mixture":
+            return f"needs the episode mixture; {block.drawn.method} draws from a single distribution"
         return None
 
     def add(self, block: Block) -> None:
@@ -151,21 +151,19 @@ class Scv:
     @classmethod
     def refusal(cls, block: Block) -> str | None:
         """Needs the step mixture and the ratios of its first control steps."""
-        if block.method != "step_mixture":
-            return f"is defined for the step mixture ([paper] section III-C), these tests were drawn by {block.method}"
-        if block.first_ratios is None:
+        if block.drawn.method != "step_mixture":
+            return f"is defined for the step mixture ([paper] section III-C); these tests are by {block.drawn.method}"
+        if "first_ratios" not in block.columns:
             return "needs the control steps of every episode: set records.moments to first_9 or all"
         return None
 
     def add(self, block: Block) -> None:
         """Hand each episode to its stratum, in index order."""
-        first_ratios = block.first_ratios
-        if first_ratios is None:
-            raise ValueError("scv needs Block.first_ratios in every block")
+        first_ratios, n_control_steps = block.first_ratios, block.n_control_steps
         self.sums.add(block)
         y, n_surrogates = block.weighted_crashes(), first_ratios.shape[2]
-        order = np.argsort(block.n_control_steps, kind="stable")
-        levels, starts = np.unique(block.n_control_steps[order], return_index=True)
+        order = np.argsort(n_control_steps, kind="stable")
+        levels, starts = np.unique(n_control_steps[order], return_index=True)
         parts = list(zip(levels.tolist(), np.split(order, starts[1:]), strict=True))
         for level in levels.tolist():
             self._strata.setdefault(level, Stratum(level))

@@ -48,7 +48,7 @@ MOST_NAMED = 10
 
 @dataclass(frozen=True)
 class Shell:
-    """One shell: its probability per test, what was counted, and limits of the share of cut-ins that crash."""
+    """A row of the table of shells: probability per test, what was counted, limits of the share that crashes."""
 
     shell: str
     inside: bool
@@ -63,12 +63,12 @@ class Shell:
 
     @property
     def low(self) -> float:
-        """Lower limit of the contribution to the crash rate."""
+        """Lower limit of the contribution to the crash rate; ``high`` is the upper one."""
         return self.p * self.crash_share_low
 
     @property
     def high(self) -> float:
-        """Upper limit of the contribution to the crash rate."""
+        """See `low`."""
         return self.p * self.crash_share_high
 
     @property
@@ -79,7 +79,7 @@ class Shell:
 
 @dataclass(frozen=True)
 class Within:
-    """A statement: the rate given that there are no crashes outside its boundary, and what is known about those.
+    """A row of the table of statements: the rate given that there are no crashes outside, and what is known of those.
 
     ``refuted_by`` are the first few tests (episodes) that crashed outside, and ``ahead_in`` those in which the vehicle
     was ahead of the boundary, of the ``n_checked`` that were asked; ``n_ahead`` is their number.
@@ -120,7 +120,7 @@ class ShellDetails:
     rhw_from_pool_at_least: float
     p_cut_in: float
     p_impossible: float
-    references: tuple[Comparison, ...]
+    references: tuple[BesideReference, ...]
     statements: tuple[Within, ...]
     shells: tuple[Shell, ...]
 
@@ -152,31 +152,30 @@ class Shells:
     @classmethod
     def refusal(cls, block: Block) -> str | None:
         """Shells must have been drawn from, and their probabilities be known."""
-        if block.shells is None or block.stratum is None:
-            return f"tests must be drawn from shells (testing.method shells), these were drawn by {block.method}"
+        if block.drawn.shells is None:
+            return f"tests must be drawn from shells (testing.method shells), these were drawn by {block.drawn.method}"
         return None
 
     def add(self, block: Block) -> None:
         """Count one block."""
-        if block.shells is None or block.stratum is None or block.cell is None or block.cell_mass is None:
+        design, crash = block.drawn.shells, block.crash
+        if design is None:
             raise ValueError("the block has no shells")
         if not self._cells.tests.size:
-            self._design = block.shells
-            self._cells = empty_tally(block.shells.cell_p.size)
-        tally = self._cells
-        np.add.at(tally.tests, block.cell, 1)
+            self._design, self._cells = design, empty_tally(design.cell_p.size)
+        tally, cell, stratum = self._cells, block.cell, block.stratum
+        np.add.at(tally.tests, cell, 1)
         for rows, counts, sums in (
-            (block.crash, tally.crashes, tally.crash_mass),
+            (crash, tally.crashes, tally.crash_mass),
             (block.failed, tally.failed, tally.failed_mass),
         ):
-            np.add.at(counts, block.cell[rows], 1)
-            np.add.at(sums, block.cell[rows], block.cell_mass[rows])
-        if block.shells.shadow_runs:
-            crashed = block.crash
-            self._paths.add(block.cell_mass[crashed], block.stratum[crashed], block.shells.p.size)
-        for s in np.unique(block.stratum[block.crash]).tolist():
-            _name(self._crashed.setdefault(s, []), block, block.crash & (block.stratum == s))
-        if block.ahead is not None:
+            np.add.at(counts, cell[rows], 1)
+            np.add.at(sums, cell[rows], block.cell_mass[rows])
+        if design.shadow_runs:
+            self._paths.add(block.cell_mass[crash], stratum[crash], design.p.size)
+        for s in np.unique(stratum[crash]).tolist():
+            _name(self._crashed.setdefault(s, []), block, crash & (stratum == s))
+        if design.checked is not None and "ahead" in block.columns:
             self._n_checked += len(block)
             self._n_ahead += int(block.ahead.sum())
             _name(self._ahead_in, block, block.ahead)
@@ -207,11 +206,10 @@ class Shells:
             cautions=cautions,
             details=asdict(
                 ShellDetails(
-                    pool=design.pool,
-                    rhw_from_pool=free.from_pool_relative()[0],
-                    rhw_from_pool_at_least=free.from_pool_relative()[1],
-                    p_cut_in=design.p_cut_in,
-                    p_impossible=design.p_impossible,
+                    design.pool,
+                    *free.from_pool_relative(),
+                    design.p_cut_in,
+                    design.p_impossible,
                     references=() if cautions else compared(design, self._cells, Level.two_sided(confidence)),
                     statements=tuple(self.within(each.name, confidence) for each in design.statements),
                     shells=self._shells(tally, (1.0 - confidence) / 2.0),
@@ -268,51 +266,42 @@ class Shells:
         level, n_failed_outside = Level.one_sided(confidence, n_outside), int(tally.failed[n:].sum())
         n_crashes_outside = int(outside.crashes.sum()) - n_failed_outside
         crashed = [episode for s, episodes in self._crashed.items() if s >= n for episode in episodes]
+        refuted_by = tuple(sorted(crashed)[:MOST_NAMED])
+        bound = likelihood_limit(design.p[n:], outside.crashes, outside.tests, level, 1.0)
+        n_inside, n_crashes_inside, n_failed_inside = (int(counts.sum()) for counts in inside[:3])
+        asked = given.checked
         return Within(
-            name=given.name,
-            boundary=given.boundary,
-            assumes=given.assumes,
-            n_shells=n,
-            crash_rate=limits.rate,
-            ci_low=limits.low,
-            ci_high=limits.high,
-            rhw=limits.rhw,
-            rhw_from_pool=limits.from_pool_relative()[0],
-            rhw_from_pool_at_least=limits.from_pool_relative()[1],
-            n_episodes=int(inside.tests.sum()),
-            n_crashes=int(inside.crashes.sum()),
-            n_failed=int(inside.failed.sum()),
-            crash_rate_if_failed_had_crashed=float(design.p[:n] @ inside.failed_as_crashes().share),
-            n_episodes_outside=n_outside,
-            n_crashes_outside=n_crashes_outside,
-            n_failed_outside=n_failed_outside,
-            refuted=n_crashes_outside > 0,
-            refuted_by=tuple(sorted(crashed)[:MOST_NAMED]),
-            upper_bound_outside=likelihood_limit(design.p[n:], outside.crashes, outside.tests, level, 1.0),
-            checked=given.checked,
-            n_checked=self._n_checked if given.checked else 0,
-            n_ahead=self._n_ahead if given.checked else 0,
-            ahead_in=tuple(self._ahead_in) if given.checked else (),
+            given.name,
+            given.boundary,
+            given.assumes,
+            n,
+            limits.rate,
+            limits.low,
+            limits.high,
+            limits.rhw,
+            *limits.from_pool_relative(),
+            n_inside,
+            n_crashes_inside,
+            n_failed_inside,
+            float(design.p[:n] @ inside.failed_as_crashes().share),
+            n_outside,
+            n_crashes_outside,
+            n_failed_outside,
+            n_crashes_outside > 0,
+            refuted_by,
+            bound,
+            asked,
+            self._n_checked if asked else 0,
+            self._n_ahead if asked else 0,
+            tuple(self._ahead_in) if asked else (),
         )
 
     def _shells(self, tally: Tally, tail: float) -> tuple[Shell, ...]:
-        p = self._design.p
+        p, inside = self._design.p, np.arange(self._design.p.size) < self._design.n_inside
         low, high = clopper_pearson(tally.crashes, tally.tests, tail, tally.failed)
-        return tuple(
-            Shell(
-                shell=name,
-                inside=s < self._design.n_inside,
-                p=float(p[s]),
-                n_episodes=int(tally.tests[s]),
-                n_crashes=int(tally.crashes[s]),
-                n_failed=int(tally.failed[s]),
-                crash_share=float(tally.share[s]),
-                crash_share_low=float(low[s]),
-                crash_share_high=float(high[s]),
-                contribution=float(p[s] * tally.share[s]),
-            )
-            for s, name in enumerate(self._design.strata)
-        )
+        columns = [inside, p, *tally[:3], tally.share, low, high, p * tally.share]
+        rows = zip(self._design.strata, *(np.asarray(column).tolist() for column in columns), strict=True)
+        return tuple(Shell(*row) for row in rows)
 
     def _warnings(self, tally: Tally) -> list[str]:
         design, found = self._design, []
@@ -343,7 +332,7 @@ def _name(episodes: list[int], block: Block, rows: BoolArray) -> None:
 
 
 @dataclass(frozen=True)
-class Comparison:
+class BesideReference:
     """A vehicle beside a reference driver.
 
     ``crash_rate`` is the reference's, with its standard error. ``ratio`` is the vehicle's crash rate over it, and
@@ -364,7 +353,7 @@ class Comparison:
     preventable_high: float
 
 
-def compared(design: ShellDesign, cells: Tally, level: Level) -> tuple[Comparison, ...]:
+def compared(design: ShellDesign, cells: Tally, level: Level) -> tuple[BesideReference, ...]:
     """The vehicle beside each reference of a design; ``cells`` are its tests by the design's cells."""
     found = []
     for r, reference in enumerate(design.references):
@@ -374,7 +363,7 @@ def compared(design: ShellDesign, cells: Tally, level: Level) -> tuple[Compariso
         preventable = preventable_share(design.cell_p, cells, ~crashes_too, design.n_paths, level)
         error = math.sqrt(max(square - rate * rate, 0.0) / design.n_paths)
         who = reference.name, reference.described, reference.delay_s
-        found.append(Comparison(*who, rate, error, *ratio, *preventable))
+        found.append(BesideReference(*who, rate, error, *ratio, *preventable))
     return tuple(found)
 
 

@@ -135,7 +135,7 @@ class WeightedSums:
         self._largest_y = _larger(self._largest_y, weights)
         self._largest_log_weight = _larger(self._largest_log_weight, block.log_weight)
         self._largest_cut_in_log_weight = _larger(self._largest_cut_in_log_weight, block.log_weight[block.cut_in])
-        self._design_cap = max(self._design_cap, math.inf if block.weight_cap is None else block.weight_cap)
+        self._design_cap = max(self._design_cap, math.inf if (cap := block.drawn.weight_cap) is None else cap)
         self._log_path_cap = max(self._log_path_cap, block.log_path_cap())
 
     def mean(self) -> float:
@@ -292,7 +292,7 @@ class Nade:
     @classmethod
     def refusal(cls, block: Block) -> str | None:
         """Refuses shells: how many tests each gets depends on results, so that no plain mean is meant."""
-        if block.method == "shells":
+        if block.drawn.method == "shells":
             return (
                 "tests were drawn within shells, whose shares must be added by their probabilities (estimator shells)"
             )
@@ -327,8 +327,8 @@ class Nde:
     @classmethod
     def refusal(cls, block: Block) -> str | None:
         """Crash counts mean something only where nothing was controlled."""
-        if block.method != "nde":
-            return f"a share of crashes needs naturalistic tests (method nde), these were drawn by {block.method}"
+        if block.drawn.method != "nde":
+            return f"a share of crashes needs naturalistic tests (method nde), these were drawn by {block.drawn.method}"
         return None
 
     def add(self, block: Block) -> None:

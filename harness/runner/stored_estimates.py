@@ -10,8 +10,7 @@ from typing import Any
 from harness.campaign.files import load_campaign
 from harness.errors import RunFolderError
 from harness.estimators import ESTIMATORS, CampaignFacts, estimate_blocks
-from harness.estimators.block import Block
-from harness.estimators.from_records import EPISODE_COLUMNS, MOMENT_COLUMNS, SHELL_COLUMNS, block_from_tables
+from harness.estimators.block import EPISODE_COLUMNS, MOMENT_COLUMNS, SHELL_COLUMNS, Block, block_from_tables
 from harness.estimators.one_pass import SPACING
 from harness.importance.build import importance_names, mixture_weights
 from harness.processes import made_ahead

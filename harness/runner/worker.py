@@ -21,8 +21,7 @@ import numpy as np
 from harness.controllers.guard import Death
 from harness.episode.cells import PrescribedTraffic
 from harness.episode.loop import EpisodeLoop, Shard, hash_of_index
-from harness.estimators.block import Block
-from harness.estimators.from_records import block_from_tables
+from harness.estimators.block import Block, block_from_tables
 from harness.importance.build import mixture_weights
 from harness.pool.shells import Draw
 from harness.processes import fit_to_travel

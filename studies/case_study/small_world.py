@@ -19,7 +19,7 @@ import numpy as np
 
 from harness.campaign.sections import EnvironmentSettings
 from harness.campaign.vehicle import AutomatedVehicle, default_surrogates
-from harness.estimators.block import MAX_CONTROL_STEPS, Block
+from harness.estimators.block import MAX_CONTROL_STEPS, Block, Drawn
 from harness.importance.challenge import roll_out
 from harness.importance.grid import GridPoints
 from harness.maneuvers import ACCELERATIONS_MPS2, N_ACCELERATIONS
@@ -28,7 +28,7 @@ from harness.traffic.loading import evaluate_laws, load_environment
 from harness.unboxed import unboxed
 from harness.vehicles.drivers import av_records, surrogate_records
 from harness.vehicles.kinematics import CONTACT_M, STEP_S
-from harness.vocabulary import BoolArray, FloatArray, IntArray, RecordArray
+from harness.vocabulary import CRASH, TIMEOUT, BoolArray, FloatArray, IntArray, RecordArray
 
 LV_MPS, BV_MPS, AV_MPS = 3.0, 8.0, 13.0
 R1_M, R2_M = (30.0, 32.0), 5.0
@@ -141,8 +141,9 @@ class SmallWorld:
             if t + 1 < len(self.levels):
                 at[running], alive = self._next(t + 1, at[running], rng)
                 running = running[alive]
-        none, alpha = np.zeros(n, bool), np.full(n_surrogates, 1.0 / n_surrogates)
-        return Block(0, "step_mixture", crash, none, cut_in, none, log_weight, log_q, alpha, steps, ratios)
+        columns = {"cut_in": cut_in, "log_q": log_q, "n_control_steps": steps, "first_ratios": ratios}
+        drawn = Drawn("step_mixture", np.full(n_surrogates, 1.0 / n_surrogates))
+        return Block(0, np.where(crash, CRASH, TIMEOUT).astype(np.int8), log_weight, columns, drawn)
 
     def _next(self, t: int, at: IntArray, rng: np.random.Generator) -> tuple[IntArray, BoolArray]:
         """Situations that follow, and which tests still have one: AV has not passed."""

@@ -7,8 +7,8 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.special import logsumexp
 
-from harness.estimators.block import MAX_CONTROL_STEPS, Block
-from harness.vocabulary import BoolArray, FloatArray, IntArray, Method
+from harness.estimators.block import MAX_CONTROL_STEPS, Block, Drawn
+from harness.vocabulary import CRASH, TIMEOUT, BoolArray, FloatArray, IntArray, Method
 from studies.chains.chain import Chain
 
 DEFENSIVE_SHARE = 0.1
@@ -75,22 +75,16 @@ class Sampler:
             after = np.flatnonzero(self.cut_in & (self.after < self.chain.crashed - 1))
             self._step_before(t, np.flatnonzero(~self.cut_in))
             self._step_after(t, after)
-        log_q, none, cap = self._log_q(), np.zeros(self.n, dtype=bool), self.chain.cut_in_cap
-        return Block(
-            first_episode=first_episode,
-            method=self.method,
-            crash=self.after == self.chain.crashed,
-            failed=none,
-            cut_in=self.cut_in,
-            bv_lv_contact=none,
-            log_weight=self._log_weight(log_q),
-            log_q=log_q,
-            alpha=self.alpha,
-            n_control_steps=self.n_control,
-            first_ratios=self.ratios if self.method == "step_mixture" else None,
-            weight_cap={"nde": 1.0, "forced": cap, "episode_mixture": cap / DEFENSIVE_SHARE}.get(self.method),
-            log_p_cut_in=self.log_p_cut if self.method in ("forced", "episode_mixture") else None,
-        )
+        log_q, cap = self._log_q(), self.chain.cut_in_cap
+        columns = {"cut_in": self.cut_in, "log_q": log_q, "n_control_steps": self.n_control}
+        if self.method == "step_mixture":
+            columns["first_ratios"] = self.ratios
+        if self.method in ("forced", "episode_mixture"):
+            columns["log_p_cut_in"] = self.log_p_cut
+        outcome = np.where(self.after == self.chain.crashed, CRASH, TIMEOUT).astype(np.int8)
+        weight_cap = {"nde": 1.0, "forced": cap, "episode_mixture": cap / DEFENSIVE_SHARE}.get(self.method)
+        drawn = Drawn(self.method, self.alpha, weight_cap)
+        return Block(first_episode, outcome, self._log_weight(log_q), columns, drawn)
 
     def _step_before(self, t: int, rows: IntArray) -> None:
         chain, state = self.chain, self.path[rows, t]

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from harness.estimators.block import Block
-from harness.vocabulary import BoolArray, FloatArray, IntArray, Method
+from harness.estimators.block import Block, Drawn
+from harness.vocabulary import CRASH, TIMEOUT, BoolArray, FloatArray, IntArray, Method
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,20 +40,9 @@ class SingleChoice:
         log_weight = np.log(self.p / (self.alpha @ self.q))[maneuver]
         ratios = np.ones((n, 9, len(self.alpha)))
         ratios[:, 0] = np.exp(log_q + log_weight[:, None])
-        none = np.zeros(n, dtype=bool)
-        return Block(
-            first_episode=0,
-            method=method,
-            crash=self.crash[maneuver],
-            failed=none,
-            cut_in=~none,
-            bv_lv_contact=none,
-            log_weight=log_weight,
-            log_q=log_q,
-            alpha=self.alpha,
-            n_control_steps=np.ones(n, dtype=np.int64),
-            first_ratios=ratios,
-        )
+        columns = {"cut_in": np.ones(n, np.bool_), "log_q": log_q, "n_control_steps": np.ones(n, np.int64)}
+        outcome = np.where(self.crash[maneuver], CRASH, TIMEOUT).astype(np.int8)
+        return Block(0, outcome, log_weight, {**columns, "first_ratios": ratios}, Drawn(method, self.alpha))
 
 
 def with_optimal_function(tilt: float = 1.0) -> SingleChoice:

@@ -86,7 +86,7 @@ def test_forced_weights_are_the_probability_of_a_cut_in_on_the_path():
 def test_defensive_mixture_bounds_every_weighted_crash():
     chain = panel()[2]
     block = draw(chain, "episode_mixture", 50_000, np.random.default_rng(SEED))
-    bound = np.exp(block.log_p_cut_in) / block.alpha[0]
+    bound = np.exp(block.log_p_cut_in) / block.drawn.alpha[0]
     assert np.all(block.weighted_crashes() <= bound * (1.0 + 1e-12))
 
 

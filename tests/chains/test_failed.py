@@ -13,6 +13,7 @@ import pytest
 
 from harness.estimators.block import Block
 from harness.estimators.one_pass import ACCUMULATORS, accumulator
+from harness.vocabulary import FAILED, TIMEOUT
 from studies.chains.named import frequent_decisive
 from studies.chains.sampler import draw
 from studies.chains.shells import ChainShells
@@ -29,7 +30,7 @@ METHODS = {"nde": "nde", "nade": "forced", "mixture_cv": "episode_mixture"}
 
 def with_failures(block: Block, rng: np.random.Generator) -> Block:
     failed = block.crash & (rng.random(len(block)) < FAILING)
-    return replace(block, crash=block.crash & ~failed, failed=failed)
+    return block.ending(failed, FAILED)
 
 
 def require_coverage(drawn, seed: int, name: str, wrong: type) -> None:
@@ -60,7 +61,7 @@ class FailedAsSafe(ACCUMULATORS["shells"]):
     """Mutant: shells that forget that tests failed."""
 
     def add(self, block: Block) -> None:
-        super().add(replace(block, failed=np.zeros_like(block.failed)))
+        super().add(block.ending(block.failed, TIMEOUT))
 
 
 def test_shells_cover_too():

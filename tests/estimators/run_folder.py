@@ -43,7 +43,7 @@ def episodes_table(block: Block) -> pa.Table:
         "cut_in_step": pa.array(np.full(n, 7, dtype=np.int16), mask=~block.cut_in),
         "n_control_steps": pa.array(block.n_control_steps.astype(np.int16)),
         "log_weight": pa.array(block.log_weight),
-        "log_p_cut_in": pa.nulls(n, pa.float64()) if block.log_p_cut_in is None else pa.array(block.log_p_cut_in),
+        "log_p_cut_in": pa.array(block.log_p_cut_in) if "log_p_cut_in" in block.columns else pa.nulls(n, pa.float64()),
         "log_q": pa.FixedSizeListArray.from_arrays(pa.array(block.log_q.ravel()), m) if m else _empty_lists(n),
     }
     schema = episodes_schema(m, 2)
@@ -74,7 +74,7 @@ def write_run(folder: Path, blocks: list[Block], *, with_moments: bool = True, *
     for index, block in enumerate(blocks):
         files = {"episodes": f"episodes/shard-{index:06d}.parquet"}
         tables = {"episodes": episodes_table(block)}
-        if with_moments and block.first_ratios is not None:
+        if with_moments and "first_ratios" in block.columns:
             files["moments"] = f"moments/shard-{index:06d}.parquet"
             tables["moments"] = moments_table(block)
         for name, table in tables.items():
@@ -83,5 +83,5 @@ def write_run(folder: Path, blocks: list[Block], *, with_moments: bool = True, *
         shards.append({"index": index, "first_episode": block.first_episode, "n_episodes": len(block), "files": files})
     content = {"campaign_hash": "c0ffee", "n_episodes": sum(map(len, blocks)), "shards": shards, **manifest}
     (folder / "manifest.json").write_text(json.dumps(content), encoding="utf-8")
-    (folder / "campaign.yaml").write_text(CAMPAIGN.format(method=blocks[0].method), encoding="utf-8")
+    (folder / "campaign.yaml").write_text(CAMPAIGN.format(method=blocks[0].drawn.method), encoding="utf-8")
     return folder

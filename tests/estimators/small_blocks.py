@@ -1,14 +1,13 @@
 """Blocks by hand, for tests that need particular outcomes and weights, and estimators fed with blocks."""
 
 from collections.abc import Iterable
-from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
 
-from harness.estimators.block import Block
+from harness.estimators.block import Block, Drawn
 from harness.strata import ShellDesign, Statement
-from harness.vocabulary import Method
+from harness.vocabulary import CRASH, FAILED, TIMEOUT, Method
 
 State = TypeVar("State")
 SHELLS = ShellDesign(
@@ -26,32 +25,29 @@ def block(
     failed: list[bool] | None = None,
     method: Method = "step_mixture",
     first_episode: int = 0,
-    **settings,
+    alpha: np.ndarray | None = None,
+    weight_cap: float | None = None,
+    **more: np.ndarray,
 ) -> Block:
     """Episodes with the given outcomes; those with a crash have a cut-in."""
-    n = len(crash)
-    usual = {"log_q": np.zeros((n, 2)), "alpha": np.array([0.5, 0.5]), "n_control_steps": np.ones(n, dtype=np.int64)}
+    n, crashed = len(crash), np.array(crash, dtype=bool)
+    outcome = np.select(
+        [np.array([False] * n if failed is None else failed, bool), crashed], [FAILED, CRASH], TIMEOUT
+    ).astype(np.int8)
+    columns = {"cut_in": crashed, "log_q": np.zeros((n, 2)), "n_control_steps": np.ones(n, dtype=np.int64), **more}
+    drawn = Drawn(method, np.full(2, 0.5) if alpha is None else alpha, weight_cap)
     return Block(
-        first_episode=first_episode,
-        method=method,
-        crash=np.array(crash, dtype=bool),
-        failed=np.array(failed if failed is not None else [False] * n, dtype=bool),
-        cut_in=np.array(crash, dtype=bool),
-        bv_lv_contact=np.zeros(n, dtype=bool),
-        log_weight=np.array(log_weight if log_weight is not None else [0.0] * n, dtype=np.float64),
-        **(usual | settings),
+        first_episode, outcome, np.array([0.0] * n if log_weight is None else log_weight, np.float64), columns, drawn
     )
 
 
 def in_shells(strata: list[int], crash: list[bool], failed: list[bool] | None = None, first: int = 0) -> Block:
     """Tests drawn from `SHELLS`."""
-    n = len(strata)
-    stratum = np.array(strata, np.int64)
-    design = {"stratum": stratum, "cell": stratum, "cell_mass": np.tile(SHELLS.p, (n, 1)), "shells": SHELLS}
-    none = {"log_q": np.zeros((n, 0)), "alpha": np.zeros(0)}
-    log_weight = np.log(SHELLS.p)[strata]
-    some = block(crash, log_weight, failed=failed, method="shells", first_episode=first, **design, **none)
-    return replace(some, cut_in=np.ones(n, np.bool_))
+    n, stratum = len(strata), np.array(strata, np.int64)
+    some = block(crash, failed=failed)
+    columns = {"cut_in": np.ones(n, np.bool_), "stratum": stratum, "cell": stratum}
+    columns["cell_mass"] = np.tile(SHELLS.p, (n, 1))
+    return Block(first, some.outcome, np.log(SHELLS.p)[strata], columns, Drawn("shells", shells=SHELLS))
 
 
 def fed(state: State, parts: Iterable[Block]) -> State:

@@ -1,7 +1,5 @@
 """A block refuses what would quietly give a wrong rate."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -19,7 +17,7 @@ def test_take_keeps_indices_right():
     part = some.take(slice(1, 3))
     assert (part.first_episode, len(part), part.first_ratios.shape) == (41, 2, (2, 9, 2))
     np.testing.assert_array_equal(part.crash, [False, True])
-    np.testing.assert_array_equal(part.alpha, some.alpha)
+    assert part.drawn is some.drawn
     with pytest.raises(ValueError, match="step 1"):
         some.take(slice(None, None, 2))
 
@@ -27,13 +25,12 @@ def test_take_keeps_indices_right():
 @pytest.mark.parametrize(
     ("change", "text"),
     [
-        ({"log_weight": np.zeros(3)}, "log_weight has shape"),
+        ({"log_weight": [0.0] * 3}, "log_weight has shape"),
         ({"log_q": np.zeros((2, 5))}, "log_q has shape"),
         ({"first_ratios": np.ones((2, 4, 2))}, "first_ratios has shape"),
-        ({"failed": np.array([True, False])}, "both crashed and failed"),
-        ({"log_weight": np.array([0.0, np.nan])}, "NaN"),
+        ({"log_weight": [0.0, np.nan]}, "NaN"),
     ],
 )
 def test_contradictions_are_refused(change, text):
     with pytest.raises(ValueError, match=text):
-        replace(block([True, False]), **change)
+        block([True, False], **change)

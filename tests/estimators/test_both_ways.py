@@ -8,6 +8,7 @@ import pytest
 from harness.estimators import one_pass
 from harness.estimators.block import Block, joined
 from harness.estimators.one_pass import ACCUMULATORS
+from harness.vocabulary import FAILED, TIMEOUT
 from studies.chains.named import overtaking
 from studies.chains.sampler import blocks
 from studies.required_tests import Procedure, plain_rhw, scv_rhw
@@ -24,7 +25,7 @@ def some_failed(parts: list[Block], share: float = 0.5, *, first: int = 1) -> li
     changed = []
     for k, part in enumerate(parts):
         failed = part.crash & (rng.random(len(part)) < share) & (k >= first)
-        changed.append(replace(part, crash=part.crash & ~failed, failed=failed))
+        changed.append(part.ending(failed, FAILED))
     return changed
 
 
@@ -46,7 +47,7 @@ def drawn(name: str) -> list[Block]:
 def test_lower_ends_without_upper_ends_with_the_failed_tests(name):
     parts = some_failed(drawn(name))
     found = one_pass(parts, (name,)).estimates[name]
-    as_safe = [replace(part, failed=np.zeros_like(part.failed)) for part in parts]
+    as_safe = [part.ending(part.failed, TIMEOUT) for part in parts]
     seen = fed(ACCUMULATORS[name](), as_safe).result(0.9)
     worst = fed(ACCUMULATORS[name](), [part.failed_as_crashes() for part in parts]).result(0.9)
     assert (found.crash_rate, found.std_error, found.ci_low) == (seen.crash_rate, seen.std_error, seen.ci_low)
@@ -92,5 +93,5 @@ def test_required_numbers_of_tests_grow_with_failures():
     with_failed = plain_rhw(weights, len(whole), procedure, failed=whole.failed[counted])
     without = plain_rhw(np.where(whole.failed[counted], 0.0, weights), len(whole), procedure)
     assert np.all(with_failed[:, -1] > 1.5 * without[:, -1])
-    forgotten = replace(whole, failed=np.zeros_like(whole.failed))
+    forgotten = whole.ending(whole.failed, TIMEOUT)
     assert np.all(scv_rhw(whole, procedure)[:, -1] > scv_rhw(forgotten, procedure)[:, -1])

@@ -1,11 +1,10 @@
 """Means of weights and ratios: right where they are known, never more than a diagnostic."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from harness.estimators.diagnostics import Diagnostics
+from harness.vocabulary import BV_LV_CONTACT
 from studies.chains.named import overtaking
 from studies.chains.sampler import blocks
 from tests.chains.seed import SEED
@@ -42,7 +41,7 @@ def test_a_small_mean_weight_of_the_step_mixture_is_explained_not_failed():
 
 def test_contacts_are_weighted_and_failures_counted():
     base = block([False] * 4, [-1.0, 0.0, 0.0, 0.0], failed=[False, True, False, False])
-    result = fed(Diagnostics(), [replace(base, bv_lv_contact=np.array([True, False, False, False]))]).result()
+    result = fed(Diagnostics(), [base.ending(np.array([True, False, False, False]), BV_LV_CONTACT)]).result()
     assert result["bv_lv_contact_share"]["mean"] == pytest.approx(np.exp(-1.0) / 4)
     assert (result["n_failed"], result["n_bv_lv_contacts"]) == (1, 1)
 

@@ -1,13 +1,12 @@
 """Arrow tables into blocks: the same numbers come back, and damaged tables name the place."""
 
-from dataclasses import replace
-
 import numpy as np
 import pyarrow as pa
 import pytest
 
 from harness.errors import RunFolderError
-from harness.estimators.from_records import block_from_tables
+from harness.estimators.block import block_from_tables
+from harness.vocabulary import FAILED
 from studies.chains.named import overtaking
 from studies.chains.sampler import draw
 from tests.chains.seed import SEED
@@ -23,7 +22,7 @@ def drawn(method: str):
 
 def read(block, *, episodes=None, moments=None):
     episodes = episodes_table(block) if episodes is None else episodes
-    return block_from_tables(episodes, moments, method=block.method, alpha=block.alpha)
+    return block_from_tables(episodes, moments, method=block.drawn.method, alpha=block.drawn.alpha)
 
 
 @pytest.mark.parametrize("method", ["nde", "forced", "step_mixture", "episode_mixture"])
@@ -32,14 +31,13 @@ def test_a_block_survives_the_records(method):
     moments = moments_table(block) if method == "step_mixture" else None
     back = read(block, moments=moments)
     assert back.first_episode == 1_000
-    for name in ("crash", "failed", "cut_in", "bv_lv_contact", "log_weight", "log_q", "n_control_steps", "alpha"):
+    assert back.columns.keys() == block.columns.keys()
+    for name in ("outcome", "log_weight", "cut_in", "log_q", "n_control_steps"):
         np.testing.assert_array_equal(getattr(back, name), getattr(block, name))
-    for name in ("first_ratios", "log_p_cut_in"):
-        found, expected = getattr(back, name), getattr(block, name)
-        assert (found is None) == (expected is None)
-        if expected is not None:
-            np.testing.assert_allclose(found, expected, rtol=1e-15)
-    assert back.weight_cap == (1.0 if method == "nde" else None)
+    for name in {"first_ratios", "log_p_cut_in"} & back.columns.keys():
+        np.testing.assert_allclose(back.columns[name], block.columns[name], rtol=1e-15)
+    np.testing.assert_array_equal(back.drawn.alpha, block.drawn.alpha)
+    assert back.drawn.weight_cap == (1.0 if method == "nde" else None)
 
 
 def test_all_control_steps_on_record_are_cut_to_the_first_nine():
@@ -57,7 +55,7 @@ def test_a_failed_episode_may_lack_its_weight_and_its_moments():
     failed = np.zeros(400, dtype=bool)
     failed[np.argmax(~block.crash)] = True
     at = int(np.argmax(failed))
-    table = episodes_table(replace(block, failed=failed))
+    table = episodes_table(block.ending(failed, FAILED))
     weights = block.log_weight.copy()
     weights[at] = np.nan
     column = table.schema.get_field_index("log_weight")

@@ -31,7 +31,7 @@ def test_is_the_intercept_of_least_squares():
     rate, std_error = reference(parts)
     assert estimate.crash_rate == pytest.approx(rate, rel=1e-11)
     assert estimate.std_error == pytest.approx(std_error, rel=1e-9)
-    assert estimate.details["rank"] == len(parts[0].alpha)
+    assert estimate.details["rank"] == len(parts[0].drawn.alpha)
     assert estimate.crash_rate != estimate.details["plain_mean"]
 
 

@@ -55,7 +55,7 @@ def facts(**settings) -> CampaignFacts:
 def test_a_stored_run_gives_what_blocks_in_memory_give(tmp_path, method, headline, importance):
     parts = drawn(method)
     if method != "nde":  # of which records say nothing, as those of real campaigns do not
-        parts = [replace(part, weight_cap=None) for part in parts]
+        parts = [replace(part, drawn=replace(part.drawn, weight_cap=None)) for part in parts]
     folder = write_run(tmp_path, parts, distance_per_test_m=400.0)
     content = estimate_run(folder)
     assert set(content) == KEYS

@@ -146,5 +146,5 @@ def test_columns_stay_within_729(level, surrogates, steps, columns):
 def test_is_refused_without_moments_or_for_other_methods():
     assert "first_9" in (Scv.refusal(block([True])) or "")
     assert "step mixture" in (Scv.refusal(block([True], method="forced")) or "")
-    with pytest.raises(ValueError, match="first_ratios"):
+    with pytest.raises(AttributeError, match="first_ratios"):
         Scv().add(block([True]))

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from harness.estimators import Estimate, one_pass
+from harness.estimators.block import Drawn
 from harness.estimators.likelihood import Level, likelihood_limit
 from harness.estimators.statement import boundary_statements, statement
 from harness.estimators.tally import Tally, combined, pool_variance
@@ -26,12 +27,13 @@ def tally(crashes, tests, failed=(0, 0, 0)) -> Tally:
     return Tally(np.array(tests), k, f, np.outer(k, P), np.outer(f, P))
 
 
-def shells_estimate(*rows: tuple[int, int, int, int], **settings) -> Estimate:
+def shells_estimate(*rows: tuple[int, int, int, int], shells=SHELLS, **columns) -> Estimate:
     """From rows of (stratum, crashes, failed tests, further tests)."""
     strata = np.repeat([stratum for stratum, *_ in rows], [sum(counts) for _, *counts in rows])
     end = np.concatenate([np.repeat(["crash", "failed", "passed"], counts) for _, *counts in rows])
     block = in_shells(strata, end == "crash", end == "failed")
-    return one_pass([replace(block, **settings)], ("shells",)).headline_estimate
+    block = replace(block, columns={**block.columns, **columns}, drawn=Drawn("shells", shells=shells))
+    return one_pass([block], ("shells",)).headline_estimate
 
 
 def within(estimate: Estimate) -> dict:
@@ -217,7 +219,7 @@ def test_one_test_ahead_of_the_boundary_takes_away_the_reason():
 
 
 def test_others_are_refused():
-    other = replace(in_shells([0], [True]), method="nde", shells=None)
+    other = replace(in_shells([0], [True]), drawn=Drawn("nde"))
     assert "testing.method shells" in one_pass([other], ("shells",)).estimates["shells"].reason
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from harness.cli import main
 from harness.errors import RunFolderError
-from harness.estimators.block import columns_of, joined
+from harness.estimators.block import joined
 from harness.runner import estimate_run, stored_estimates
 from harness.runner.stored_estimates import stored_blocks
 from tests.stored_runs import copy_of, stored_table
@@ -51,8 +51,10 @@ def test_shards_are_read_in_groups_without_changing_a_bit(most, sizes, twin_run,
     grouped = list(stored_blocks(twin_run, moments=False))
     assert ([len(block) for block in one_by_one], [len(block) for block in grouped]) == ([80] * 5, sizes)
     whole, again = joined(one_by_one), joined(grouped)
-    assert columns_of(whole).keys() == columns_of(again).keys()
-    assert all(np.array_equal(column, columns_of(again)[name]) for name, column in columns_of(whole).items())
+    assert whole.columns.keys() == again.columns.keys()
+    assert all(np.array_equal(column, again.columns[name]) for name, column in whole.columns.items())
+    np.testing.assert_array_equal(whole.outcome, again.outcome)
+    np.testing.assert_array_equal(whole.log_weight, again.log_weight)
 
 
 def test_shards_with_columns_of_other_types_are_refused(twin_run, tmp_path, monkeypatch):

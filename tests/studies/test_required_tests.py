@@ -23,7 +23,6 @@ from studies.required_tests import (
     plain_rhw,
     required_tests,
     required_tests_of_runs,
-    rows_of,
     scv_rhw,
     shuffled,
 )
@@ -165,14 +164,14 @@ def test_algorithm_1_grown_look_by_look_is_algorithm_1_on_each_prefix():
     for shuffle in range(2):
         order = shuffled(procedure.seed, shuffle, tests.crash)
         for at, n in enumerate(procedure.grid(3_000)):
-            anew = fed(Scv(), [rows_of(tests, order[:n])])
+            anew = fed(Scv(), [tests.chosen(order[:n])])
             assert grown[shuffle, at] == anew.result(procedure.confidence).rhw
 
 
 def test_scv_claims_the_width_of_nade_where_it_has_no_columns_and_less_where_it_has():
     (tests,) = blocks(CHAIN, "step_mixture", [3_000], SEED)
     plain = plain_rhw(tests.weighted_crashes()[tests.crash], 3_000, QUICK)
-    uncontrolled = replace(tests, n_control_steps=np.zeros(3_000, dtype=np.int64))
+    uncontrolled = replace(tests, columns={**tests.columns, "n_control_steps": np.zeros(3_000, np.int64)})
     np.testing.assert_allclose(scv_rhw(uncontrolled, QUICK), plain, rtol=1e-9)
     claimed = scv_rhw(tests, QUICK)
     assert (claimed[:, -1] < plain[:, -1]).all()

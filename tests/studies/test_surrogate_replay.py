@@ -18,8 +18,7 @@ from harness.campaign.vehicle import AutomatedVehicle, IDMParameters, Reaction
 from harness.episode.loop import Shard
 from harness.episode.trajectory import Followers
 from harness.errors import CampaignError, RunFolderError
-from harness.estimators.block import Block
-from harness.estimators.from_records import block_from_tables
+from harness.estimators.block import Block, block_from_tables
 from harness.importance.build import mixture_weights
 from harness.pool.cut_ins import Pool
 from harness.pool.storage import campaign_pool
