@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from harness.campaign.campaign import Campaign
-from harness.errors import CampaignError
+from harness.campaign.combinations import Command, require_combination
 from harness.pool.library import Library, load_library
 from harness.traffic.laws import Environment
 from harness.traffic.loading import load_environment, load_parameters
 from harness.vehicles.drivers import av_records, surrogate_records
-from harness.vocabulary import SAMPLING, RecordArray
+from harness.vocabulary import RecordArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,41 +49,17 @@ class Resolved:
         return load_library(self.campaign.pool.library)
 
 
-def require_lead_is_drawn(campaign: Campaign) -> None:
-    """Refuse (`CampaignError`) what does not know how long a cut-in shows itself before BV overlaps.
-
-    The method's tables are for cut-ins of one step, or nobody could draw the lead.
-    """
-    method, acts = campaign.testing.method, campaign.av.acts_before_cut_in
-    if SAMPLING[method].mixes:
-        raise CampaignError(
-            "testing.method",
-            found=f"{method}, where cut-ins take time (`lateral` of the environment)",
-            expected="shells, forced or nde: the tables of criticality are for cut-ins of one step, and would aim at "
-            "those that an attentive vehicle avoids",
-            mend="Choose shells, or an environment without that section.",
-        )
-    if acts and not SAMPLING[method].shadows:
-        raise CampaignError(
-            "av.before_cut_in",
-            found=f"controller, with testing.method {method}, where cut-ins take time (`lateral` of the environment)",
-            expected="a method that drives the AV along its paths first: only then the onset is known in time",
-            mend="Choose testing.method shells or forced, or hold_speed.",
-        )
-
-
-def resolve(campaign: Campaign, controller_sha256: str | None = None) -> Resolved:
-    """Read what a campaign names.
+def resolve(campaign: Campaign, command: Command = "run", *, controller_sha256: str | None = None) -> Resolved:
+    """Read what a campaign names, and refuse what does not go together (`harness.campaign.combinations`).
 
     Raises
     ------
     CampaignError
-        The environment's parameter file is missing or wrong.
+        The environment's parameter file is missing or wrong, or something of the campaign does not go with the command.
     """
     parameters = load_parameters(campaign.environment)
     environment = load_environment(campaign.environment, parameters)
-    if environment.lateral.present:
-        require_lead_is_drawn(campaign)
+    require_combination(campaign, command, takes_time=environment.lateral.present)
     return Resolved(
         campaign,
         environment,

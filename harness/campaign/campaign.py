@@ -13,9 +13,9 @@ from typing import Any, Self
 
 from pydantic import Field, model_validator
 
+from harness.campaign.combinations import refusal
 from harness.campaign.problems import NAME_PATTERN, broken_rule
 from harness.campaign.sections import (
-    MOST_SUMO_CELLS,
     Accept,
     EnvironmentSettings,
     PoolSettings,
@@ -34,7 +34,7 @@ from harness.campaign.vehicle import (
     Surrogate,
     default_surrogates,
 )
-from harness.vocabulary import METHODS, SAMPLING
+from harness.vocabulary import SAMPLING
 
 
 class Campaign(Section):
@@ -69,122 +69,20 @@ class Campaign(Section):
         return {**content, "testing": {**testing, "shells": {**shells, "statement": asked}}}
 
     @model_validator(mode="after")
-    def _limit_can_be_decided(self) -> Self:
-        if self.accept is None:
-            return self
-        asked, shells = self.accept.statement, self.testing.shells
-        if self.testing.method != "shells":
-            raise broken_rule(
-                "accept",
-                found=f"a limit, with testing.method {self.testing.method}",
-                expected="testing.method shells: how often decisions are wrong is known for its intervals alone",
-                mend="Choose shells, or delete the section and compare the interval with the limit yourself.",
-            )
-        if asked not in (None, shells.statement):
-            raise broken_rule(
-                "accept.statement",
-                found=f"{asked}, and {shells.statement} in testing.shells.statement",
-                expected="the same statement, or one of the two keys alone",
-                mend="Delete one of them.",
-            )
-        if shells.stopping != "sequential":
-            raise broken_rule(
-                "accept",
-                found=f"a limit, with testing.shells.stopping {shells.stopping}",
-                expected="sequential: a decision plans no second phase",
-                mend="Delete testing.shells.stopping.",
-            )
-        return self
-
-    @model_validator(mode="after")
-    def _alpha_matches_surrogates(self) -> Self:
+    def _parts_go_together(self) -> Self:
         alpha = self.testing.alpha
         if alpha is not None and set(alpha) != set(self.surrogates):
-            raise broken_rule(
-                "testing.alpha",
-                found=f"weights for {listed(alpha)}",
-                expected=f"one weight for each surrogate: {listed(self.surrogates)}",
-                mend="Name the surrogates exactly, or leave alpha out for equal weights.",
-            )
+            expected = f"one weight for each surrogate: {listed(self.surrogates)}"
+            mend = "Name the surrogates exactly, or leave alpha out for equal weights."
+            raise broken_rule("testing.alpha", f"weights for {listed(alpha)}", expected, mend)
+        if (parts := refusal(self)) is not None:
+            raise broken_rule(*parts)
         return self
 
-    @model_validator(mode="after")
-    def _av_suits_method_and_world(self) -> Self:
-        method, av, world = self.testing.method, self.av, self.world
-        if av.acts_before_cut_in and SAMPLING[method].holds_speed:
-            raise broken_rule(
-                "av.before_cut_in",
-                found=f"controller, with testing.method {method}",
-                expected="hold_speed: the method draws LV's and BV's path ahead, which needs to know the AV's",
-                mend="Choose hold_speed, or testing.method shells (or forced), which drives the AV along its paths "
-                "first.",
-            )
-        if av.acts_before_cut_in and av.model is not None:
-            raise broken_rule(
-                "av.before_cut_in",
-                found=f"controller, with the built-in model {av.model}",
-                expected="hold_speed: a built-in model has nothing to follow before the cut-in",
-                mend="Delete the key, or bring a controller of your own.",
-            )
-        if world.engine == "twin" and av.source in ("sumo", "traci"):
-            raise broken_rule(
-                "world.engine",
-                found=f"twin, with an AV that SUMO moves (av.{av.source})",
-                expected="sumo",
-                mend="Write engine: sumo.",
-            )
-        if world.engine == "sumo" and world.cells > MOST_SUMO_CELLS:
-            raise broken_rule(
-                "world.cells",
-                found=f"{world.cells}, with engine sumo",
-                expected=f"at most {MOST_SUMO_CELLS}: so many roads has the largest network",
-                mend="Lower it; about 64 is fastest. It never changes a result.",
-            )
-        return self
-
-    @model_validator(mode="after")
-    def _method_has_surrogates_and_bounded_weights(self) -> Self:
-        sampling = SAMPLING[self.testing.method]
-        if not self.surrogates and sampling.mixes:
-            raise broken_rule(
-                "surrogates",
-                found="none",
-                expected=f"at least one surrogate for testing.method {self.testing.method}",
-                mend="Leave surrogates out for the three of the paper, or choose method forced or nde.",
-            )
-        if self.stop.rhw is not None and not sampling.bounded:
-            raise broken_rule(
-                "stop.rhw",
-                found=f"{self.stop.rhw:g}, with testing.method step_mixture",
-                expected="no precision to stop at: nothing bounds the weights of the step mixture, and while the large "
-                "ones are missing its interval looks narrow",
-                mend="Set it to null for a fixed number of tests (stop.episodes), or choose shells, forced or "
-                "episode_mixture.",
-            )
-        return self
-
-    @model_validator(mode="after")
-    def _watched_estimator_is_available(self) -> Self:
-        watched, method = self.stop.estimator, self.testing.method
-        if watched is None:
-            return self
-        allowing = [name for name in METHODS if watched in SAMPLING[name].estimators]
-        available = method in allowing
-        if len(allowing) == 1:
-            need = f"testing.method {allowing[0]}"
-        else:
-            need = f"another testing.method than {listed(name for name in METHODS if name not in allowing)}"
-        if watched == "scv":
-            need += " and records.moments first_9 or all"
-            available = available and self.records.moments != "none"
-        if not available:
-            raise broken_rule(
-                "stop.estimator",
-                found=f"{watched}, which these records will not allow",
-                expected=f"an estimator that can be computed, and {watched} needs {need}",
-                mend="Change one of the two, or leave stop.estimator out for the method's own.",
-            )
-        return self
+    @property
+    def decides_another_statement(self) -> bool:
+        """Whether the limit names another statement than the tests are drawn for."""
+        return self.accept is not None and self.accept.statement not in (None, self.testing.shells.statement)
 
     @property
     def has_shadow_runs(self) -> bool:

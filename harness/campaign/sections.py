@@ -86,10 +86,6 @@ def listed(names: Iterable[str]) -> str:
     return ", ".join(names) or "none"
 
 
-MOST_SUMO_CELLS = 256
-"""Roads of the largest committed network."""
-
-
 class EnvironmentSettings(Section):
     """The naturalistic driving environment."""
 

@@ -16,12 +16,11 @@ from harness.campaign.campaign import Campaign
 from harness.campaign.vehicle import AutomatedVehicle
 from harness.controllers.loading import has_foreign_code, run_apart
 from harness.episode.loop import EpisodeLoop, Shard
-from harness.errors import EXIT_DONE, EXIT_TOO_MANY_FAILED, CampaignError
+from harness.errors import EXIT_DONE, EXIT_TOO_MANY_FAILED
 from harness.estimators.estimate import finite_json
 from harness.resolved import resolve
 from harness.runner.prepare import Prepared, build_world, prepare, require_world
 from harness.runner.worker import Bits, bits_of
-from harness.traffic.loading import load_environment
 from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import AV, CRASH, FAILED, FloatArray
 
@@ -122,12 +121,11 @@ def check_av(campaign: Campaign, n_episodes: int = EPISODES, *, black_box: Path 
     """
     tested = _as_checked(campaign)
     require_world(tested)
-    _require_immediate(tested)
-    prepared = prepare(resolve(tested))
+    prepared = prepare(resolve(tested, "av-check"))
     first, elapsed_s, steps = _timed_run(prepared, n_episodes, black_box)
     again = _run_in_another_order(prepared, n_episodes, black_box)
     idm = tested.model_copy(update={"av": AutomatedVehicle(before_cut_in=tested.av.before_cut_in)})
-    _, idm_s, idm_steps = _timed_run(prepare(resolve(idm)), n_episodes)
+    _, idm_s, idm_steps = _timed_run(prepare(resolve(idm, "av-check")), n_episodes)
     own = tested.av.limits if isinstance(tested.av.parameters, dict) else tested.av.parameters
     limits = own.min_acceleration_mps2, own.max_acceleration_mps2
     return AvCheck(
@@ -141,18 +139,6 @@ def check_av(campaign: Campaign, n_episodes: int = EPISODES, *, black_box: Path 
         behaviour=_behaviour(first, limits, early=tested.av.acts_before_cut_in),
         speed=Speed(1e6 * elapsed_s / steps, n_episodes / elapsed_s, 1e6 * idm_s / idm_steps, n_episodes / idm_s),
     )
-
-
-def _require_immediate(tested: Campaign) -> None:
-    """Refuse a vehicle that acts before the cut-in where those take time: nobody knows the onset of one it leads to."""
-    if tested.av.acts_before_cut_in and load_environment(tested.environment).lateral.present:
-        raise CampaignError(
-            "av.before_cut_in",
-            found="controller, where cut-ins take time (`lateral` of the environment)",
-            expected="hold_speed, or cut-ins of one step: a look at a vehicle makes no shadow runs, without which the "
-            "onset is not known in time",
-            mend="Add --set av.before_cut_in=hold_speed, or --set environment.parameters=ndd-overtaking-1.",
-        )
 
 
 def check_av_apart(campaign: Campaign, n_episodes: int = EPISODES) -> AvCheck:

@@ -77,14 +77,7 @@ def compare_campaigns(
         ``out`` holds other runs.
     """
     require_comparable(a, b)
-    if (method := a.testing.method) != "shells":
-        expected = "shells, under which both vehicles meet the same cut-ins"
-        mend = "Write --set testing.method=shells; or run both by themselves and put their intervals side by side."
-        raise CampaignError("testing.method", found=f"{method}, in a comparison", expected=expected, mend=mend)
-    if a.accept is not None or b.accept is not None:
-        mend = "Write --set accept=null, and --margin if something is to be decided."
-        raise CampaignError("accept", found="a limit of one crash rate", expected="none in a comparison", mend=mend)
-    sides: dict[Side, Resolved] = {"a": require_ready(a), "b": require_ready(b)}
+    sides: dict[Side, Resolved] = {"a": require_ready(a, "compare"), "b": require_ready(b, "compare")}
     if stored is not None:
         _take_over(stored, out / "a", sides["a"])
     for side, of_side in sides.items():  # both, before either is touched

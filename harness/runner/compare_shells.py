@@ -37,7 +37,6 @@ from harness.runner.campaign_run import Run
 from harness.runner.manifest import require_own_folder
 from harness.runner.planner import PairPlanner, Planner, round_specs
 from harness.runner.worker import ShardSpec
-from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT
 from harness.vocabulary import IntArray
 
 PAIRING = "the i-th cut-in that A meets of a shell is the i-th that B meets: same initial state, paths and cut-in"
@@ -133,28 +132,7 @@ def _drive(planner: PairPlanner, pairs: PairedShells, both: list[_Side]) -> Pair
 
 
 def require_same_shells(sides: tuple[Resolved, Resolved]) -> None:
-    """Refuse vehicles that would not have the same cut-ins, or not the same strata of them."""
-    if any(of_side.campaign.has_shadow_runs for of_side in sides):
-        raise CampaignError(
-            "av.before_cut_in",
-            found="controller: a vehicle that acts before the cut-in has cut-ins of its own",
-            expected="hold_speed in A and B: pairs need the same cut-ins",
-            mend="Run both campaigns by themselves and put their intervals side by side, or write hold_speed.",
-        )
-    if sides[0].campaign.testing.shells.stopping != "sequential":
-        raise CampaignError(
-            "testing.shells.stopping",
-            found=sides[0].campaign.testing.shells.stopping,
-            expected="sequential: a comparison plans no second phase",
-            mend="Write --set testing.shells.stopping=sequential.",
-        )
-    if (asked := sides[0].campaign.testing.shells.statement) not in (ASSUMPTION_FREE, LIBRARY_STATEMENT):
-        raise CampaignError(
-            "testing.shells.statement",
-            found=asked,
-            expected=f"{ASSUMPTION_FREE} or {LIBRARY_STATEMENT}: a comparison has these two",
-            mend="Choose one of them.",
-        )
+    """Refuse vehicles that would not have the same strata of cut-ins."""
     limits = [acceleration_limit(of_side.campaign.av) for of_side in sides]
     envelope = sides[0].library.envelope_mps2
     if (limits[0] > envelope) != (limits[1] > envelope):

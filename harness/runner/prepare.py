@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from harness.campaign.campaign import Campaign
+from harness.campaign.combinations import Command
 from harness.compiled import is_cached
 from harness.controllers.guard import Death
 from harness.controllers.loading import build_host, require_controller
@@ -101,8 +102,8 @@ class Prepared:
         return EpisodeLoop(world, self.policy, keep, av)
 
 
-def require_ready(campaign: Campaign) -> Resolved:
-    """Resolve a campaign; refuse what can be known to be wrong before anything is simulated or written.
+def require_ready(campaign: Campaign, command: Command = "run") -> Resolved:
+    """Resolve a campaign for a command; refuse what can be known to be wrong before anything is simulated or written.
 
     Raises
     ------
@@ -118,7 +119,7 @@ def require_ready(campaign: Campaign) -> Resolved:
         av_type(campaign.av.sumo)
     if campaign.av.traci is not None:
         require_private(campaign.av.traci)
-    resolved = resolve(campaign, controller_sha256)
+    resolved = resolve(campaign, command, controller_sha256=controller_sha256)
     if campaign.testing.method == "shells":
         resolved.library.statement_settings(campaign.testing.shells)
     return resolved

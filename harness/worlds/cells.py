@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from harness.campaign.sections import MOST_SUMO_CELLS
+from harness.campaign.combinations import MOST_SUMO_CELLS
 from harness.errors import CampaignError
 from harness.vocabulary import AV, BV, LV, VEHICLES, BoolArray, FloatArray
 
