@@ -16,7 +16,7 @@ import numpy as np
 
 from harness.campaign.campaign import Campaign
 from harness.compiled import source_hash
-from harness.controllers.loading import build_host, require_controller
+from harness.controllers.find import build_host, require_controller
 from harness.episode.cells import PrescribedTraffic
 from harness.episode.loop import EpisodeLoop, Keep, Policy
 from harness.episode.motion import motion_hashes

@@ -16,7 +16,7 @@ import pytest
 
 from harness import run
 from harness.campaign.campaign import Campaign
-from harness.controllers.guard import Death
+from harness.controllers.hosts import Death
 from harness.runner import RunResult, workers
 from harness.runner.worker import ShardDone, ShardRunner, ShardSpec
 
@@ -70,7 +70,7 @@ def _work_here(_: Any, work: Callable[..., Any], *arguments: Any) -> Any:
 def controllers_here() -> Iterator[None]:
     """Where a controller is tried before a run, it is here: for those that are known to end no process."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("harness.controllers.loading.run_apart", _work_here)
+        patch.setattr("harness.controllers.find.run_apart", _work_here)
         yield
 
 

@@ -46,10 +46,8 @@ class Wiring(NamedTuple):
 def fmu_maker(fmu: FmuController) -> Callable[[], VehicleController]:
     """What makes a controller for a cell.
 
-    Raises
-    ------
-    CampaignError
-        fmpy is not installed, the file is no FMI 2.0 co-simulation FMU, or ``av.fmu`` does not fit its variables.
+    A `CampaignError` says that fmpy is not installed, the file is no FMI 2.0 co-simulation FMU, or ``av.fmu`` does not
+    fit its variables.
     """
     fmpy = _fmpy()
     try:
@@ -60,9 +58,9 @@ def fmu_maker(fmu: FmuController) -> Callable[[], VehicleController]:
             raise  # it names the file or the cache: nothing is wrong with the FMU
         raise CampaignError(
             "av.fmu.file",
-            found=f"{fmu.file}, which cannot be read ({' '.join(str(error).split())[:300]})",
-            expected="an FMI 2.0 co-simulation FMU",
-            mend="Export it again, and try 'fmpy validate' on it.",
+            f"{fmu.file}, which cannot be read ({' '.join(str(error).split())[:300]})",
+            "an FMI 2.0 co-simulation FMU",
+            "Export it again, and try 'fmpy validate' on it.",
         ) from error
     _require_co_simulation(fmu.file, description)
     wiring = wire(fmu, description)
@@ -84,9 +82,9 @@ def _fmpy() -> Any:
     except ImportError as error:
         raise CampaignError(
             "av.fmu",
-            found="no package fmpy",
-            expected="the extra for FMUs",
-            mend="Install it: pip install 'harness[fmi]'.",
+            "no package fmpy",
+            "the extra for FMUs",
+            "Install it: pip install 'harness[fmi]'.",
         ) from error
     return fmpy
 
@@ -113,27 +111,21 @@ def _require_co_simulation(file: str, description: Any) -> None:
         kind = "co-simulation" if description.coSimulation is not None else "model exchange"
         raise CampaignError(
             "av.fmu.file",
-            found=f"{file}, for FMI {description.fmiVersion} {kind}",
-            expected="FMI 2.0 co-simulation",
-            mend="Export the model as a co-simulation FMU of that version.",
+            f"{file}, for FMI {description.fmiVersion} {kind}",
+            "FMI 2.0 co-simulation",
+            "Export the model as a co-simulation FMU of that version.",
         )
 
 
 def wire(fmu: FmuController, description: Any) -> Wiring:
-    """Check ``av.fmu`` against the FMU's variables.
-
-    Raises
-    ------
-    CampaignError
-        Naming the key, with the FMU's variables.
-    """
+    """Check ``av.fmu`` against the FMU's variables: a `CampaignError` names the key, and what there is."""
     for name in fmu.inputs:
         if name not in OBSERVATIONS:
             raise CampaignError(
                 f"av.fmu.inputs.{name}",
-                found="no such observation",
-                expected=f"one of {', '.join(OBSERVATIONS)}",
-                mend="The keys are observations, the values the FMU's input variables.",
+                "no such observation",
+                f"one of {', '.join(OBSERVATIONS)}",
+                "The keys are observations, the values the FMU's input variables.",
             )
     inputs = [_reference(f"av.fmu.inputs.{key}", name, description, ("input",)) for key, name in fmu.inputs.items()]
     starts = [_reference("av.fmu.start_values", name, description, ("parameter", "input", "local", "output"))
@@ -150,9 +142,9 @@ def _reference(where: str, name: str, description: Any, causalities: Sequence[st
     listed = ", ".join(f"{each.name} ({each.type} {each.causality})" for each in variables.values())
     raise CampaignError(
         where,
-        found=f"{name}, " + ("no variable of the FMU" if found is None else f"a {found.type} {found.causality}"),
-        expected=f"a Real {' or '.join(causalities)}",
-        mend=f"The FMU has: {listed}.",
+        f"{name}, " + ("no variable of the FMU" if found is None else f"a {found.type} {found.causality}"),
+        f"a Real {' or '.join(causalities)}",
+        f"The FMU has: {listed}.",
     )
 
 

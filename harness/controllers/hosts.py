@@ -1,16 +1,30 @@
 """Hosts: what stands between the episode loop and a user's controller, and turns its faults into failed episodes.
 
 The episode loop calls `start`, `act` and `close`, and knows nothing else of a controller.
+
+Whatever goes wrong in a call, an exception, NaN, an answer too late or outside of av.limits, ends the episode
+(`harness.episode.loop`) with the outcome ``failed``, these words in the column ``failure`` of its row, and the weight
+that it has so far. Its controller is dropped (of a batch only the cells fail), and the run goes on until failed tests
+exceed run.max_failed_share. Rate and lower limit count a failed test as no crash, upper limits as a crash. A call that
+takes too long meets an exception where Python runs, else the end of the process.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+import math
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from operator import methodcaller
+from pathlib import Path
+from types import FrameType
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 
-from harness.controllers.guard import Death, Guard
+from harness.campaign.vehicle import Limits
 from harness.controllers.protocol import (
     BatchController,
     BatchObservation,
@@ -19,13 +33,139 @@ from harness.controllers.protocol import (
     Observation,
     VehicleController,
 )
-from harness.processes import OF_EPISODE, START, START_BATCH, STEP_BATCH
+from harness.processes import CLOSE, OF_EPISODE, START, START_BATCH, STEP_BATCH, BlackBox
 from harness.random_stream import AV_DRAWS
 from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import FloatArray, IntArray, read_only
 
+HUNG_EXIT_CODE = 75
+"""Exit code of a worker whose controller could not be interrupted."""
+
 Failures = dict[int, str]
 """Cell → cause."""
+
+
+class Death(NamedTuple):
+    """A call that is known to end the process: its step, or `START`, and the cause for the record."""
+
+    step: int
+    cause: str
+
+
+def death_cause(exit_code: int | None, seconds: float) -> str:
+    """Cause for the record of an episode whose controller took the worker process along."""
+    if exit_code == HUNG_EXIT_CODE:
+        return f"no answer within {seconds:g} s (av.limits.step_time_s), and the call could not be interrupted"
+    return f"the controller ended the worker process (exit code {exit_code})"
+
+
+def require_fault(error: BaseException) -> None:
+    """Let Ctrl-C pass. Workers and other children ignore it: there even KeyboardInterrupt is the controller's own."""
+    if isinstance(error, KeyboardInterrupt) and signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
+        raise error
+
+
+def cause_of(error: BaseException) -> str:
+    """One line for the record."""
+    return f"{type(error).__name__}: {error}".splitlines()[0][:500]
+
+
+class StepTimeoutError(BaseException):
+    """A controller took longer than ``av.limits.step_time_s``.
+
+    Not an `Exception`, so that ``except Exception`` in the user's code does not swallow it.
+    """
+
+
+class Guard:
+    """Makes the calls of a host's controllers, inside of ``with guard``, and limits the time of each.
+
+    The limit is a signal, and needs the main thread, where workers run controllers. The call under way is noted in the
+    file ``black_box``, if any, so that the parent knows it should the process die; with one, a call that the exception
+    does not end (compiled code, a bare ``except``) ends the process.
+    """
+
+    _current: ClassVar[Guard | None] = None
+
+    def __init__(self, limits: Limits, black_box: Path | None) -> None:
+        self._low, self._high = limits.min_acceleration_mps2, limits.max_acceleration_mps2
+        self._seconds = limits.step_time_s
+        self._black_box = BlackBox(black_box)
+        self._since: float | None = None
+        """When the call under way began, None between calls: the harness itself may take its time."""
+        if black_box is not None:
+            threading.Thread(target=self._watch, name="controller watchdog", daemon=True).start()
+
+    def __enter__(self) -> Self:
+        if Guard._current is not self:  # the handler stays: installing it costs more than a controller's step
+            signal.signal(signal.SIGALRM, self._interrupt)
+            Guard._current = self
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+
+    def call(
+        self,
+        kind: int,
+        function: Callable[..., Any],
+        *arguments: Any,
+        episode: int = 0,
+        step: int = START,
+        check: Callable[[Any], str | None] | None = None,
+    ) -> tuple[Any, str | None]:
+        """What a call returns, and what went wrong; ``check`` looks at an answer under the same protection."""
+        self._black_box.enter(kind, episode, step)
+        self._since = time.monotonic()
+        signal.setitimer(signal.ITIMER_REAL, self._seconds)
+        try:
+            answer = function(*arguments)
+            return answer, self._black_box.misdeed() or (check(answer) if check else None)
+        except BaseException as error:  # noqa: BLE001 - whatever a user's code raises is its episode's end
+            require_fault(error)
+            return None, cause_of(error)
+        finally:
+            self._since = None  # the timer itself is set again by the next call
+            self._black_box.leave()
+
+    def close(self, controllers: Iterable[Any]) -> None:
+        """Close controllers; what they raise is nobody's concern: they have failed before, or the run is over."""
+        for controller in controllers:
+            if controller is not None:
+                self.call(CLOSE, methodcaller("close"), controller)
+
+    def end(self, controllers: Iterable[Any]) -> None:
+        """Close the last controllers, and leave SIGALRM as it is by default."""
+        with self:
+            self.close(controllers)
+        signal.signal(signal.SIGALRM, signal.SIG_DFL)
+        Guard._current = None
+
+    def wrong_answer(self, value: Any) -> str | None:
+        """What is wrong with an acceleration, or None."""
+        if not isinstance(value, int | float | np.floating | np.integer) or isinstance(value, bool):
+            return f"returned {type(value).__name__}, expected an acceleration in m/s2 as a number"
+        if not math.isfinite(value):
+            return f"returned {value}, expected a finite acceleration in m/s2"
+        if not self._low <= value <= self._high:
+            return f"asked for {value:g} m/s2, outside of av.limits ({self._low:g} to {self._high:g})"
+        return None
+
+    def outside(self, values: FloatArray) -> IntArray:
+        """Places of wrong accelerations in an array."""
+        return np.flatnonzero(~((values >= self._low) & (values <= self._high)))  # NaN is neither
+
+    def _interrupt(self, _signal: int, _frame: FrameType | None) -> None:
+        if self._since is not None:
+            raise StepTimeoutError(f"no answer within {self._seconds:g} s (av.limits.step_time_s)")
+
+    def _watch(self) -> None:
+        """End the process when a call outlasts the exception that should have ended it."""
+        while True:
+            time.sleep(0.5)
+            since = self._since
+            if since is not None and time.monotonic() - since > 2.0 * self._seconds + 1.0:
+                os._exit(HUNG_EXIT_CODE)
 
 
 def episode_random(seed: int, episode: int) -> np.random.Generator:
@@ -36,7 +176,7 @@ def episode_random(seed: int, episode: int) -> np.random.Generator:
 class EpisodeRandom(Sequence[np.random.Generator]):
     """`episode_random` of several episodes, made when they are asked for: most controllers want none.
 
-    Each place has a generator of its own: tests of one shadow run, which are told the same index, may begin together.
+    Each place has a generator of its own: tests to which the same index is announced may begin together.
     """
 
     def __init__(self, seed: int, episodes: list[int]) -> None:
@@ -72,18 +212,16 @@ class VehicleHost:
         acts_before_cut_in: bool = False,
     ) -> None:
         self.acts_before_cut_in = acts_before_cut_in
-        self._make = make
+        self._make, self._seed, self._guard = make, seed, guard
         self._controllers: list[VehicleController | None] = [None] * n_cells
         self._episodes = [-1] * n_cells
-        self._seed = seed
-        self._guard = guard
         self._fatal_episodes = {} if fatal_episodes is None else fatal_episodes
 
-    def start(self, cells: IntArray, episodes: IntArray, told: IntArray) -> Failures:
-        """Begin episodes, each under the index that its controller is ``told``; returns those that failed at once."""
+    def start(self, cells: IntArray, episodes: IntArray, announced: IntArray) -> Failures:
+        """Begin episodes, ``announced`` to their controllers under these indices; returns those that failed at once."""
         failures = {}
-        with self._guard.time_limit:
-            for k, episode, index in zip(cells.tolist(), episodes.tolist(), told.tolist(), strict=True):
+        with self._guard:
+            for k, episode, index in np.stack((cells, episodes, announced), axis=1).tolist():
                 self._episodes[k] = episode
                 wrong = self._known_death(episode, START)
                 if wrong is None:
@@ -91,7 +229,7 @@ class VehicleHost:
                     _, wrong = self._guard.call(OF_EPISODE, self._start, k, start, episode=episode)
                 if wrong is not None:
                     failures[k] = f"start: {wrong}"
-                    self._forget(k)
+                    self._drop(k)
         return failures
 
     def _start(self, k: int, start: EpisodeStart) -> None:
@@ -105,7 +243,7 @@ class VehicleHost:
         failures = {}
         rows = zip(*(column.tolist() for column in observation), strict=True)
         call, check = self._guard.call, self._guard.wrong_answer
-        with self._guard.time_limit:
+        with self._guard:
             for i, (k, _, *seen) in enumerate(rows):
                 controller, episode = self._controllers[k], self._episodes[k]
                 if controller is None:
@@ -118,24 +256,22 @@ class VehicleHost:
                     answer[i] = value
                 else:
                     failures[k] = f"step: {wrong}"
-                    self._forget(k)
+                    self._drop(k)
         return answer, failures
 
     def _known_death(self, episode: int, step: int) -> str | None:
         death = self._fatal_episodes.get(episode)
         return death.cause if death is not None and step >= death.step else None
 
-    def _forget(self, k: int) -> None:
+    def _drop(self, k: int) -> None:
         """A controller that failed is not used again: its next episode gets a new one."""
         controller, self._controllers[k] = self._controllers[k], None
-        self._guard.close(controller)
+        self._guard.close([controller])
 
     def close(self) -> None:
         """Release all controllers."""
-        with self._guard.time_limit:
-            for k in range(len(self._controllers)):
-                self._forget(k)
-        self._guard.time_limit.close()
+        self._guard.end(self._controllers)
+        self._controllers[:] = [None] * len(self._controllers)
 
 
 def _step(controller: VehicleController, seen: list[Any]) -> Any:
@@ -153,22 +289,20 @@ class BatchHost:
         self, controller: BatchController, seed: int, guard: Guard, *, acts_before_cut_in: bool = False
     ) -> None:
         self.acts_before_cut_in = acts_before_cut_in
-        self._controller = controller
-        self._seed = seed
-        self._guard = guard
+        self._controller, self._seed, self._guard = controller, seed, guard
 
-    def start(self, cells: IntArray, episodes: IntArray, told: IntArray) -> Failures:  # noqa: ARG002 - see there
+    def start(self, cells: IntArray, _episodes: IntArray, announced: IntArray) -> Failures:
         """As `VehicleHost.start`."""
-        random = EpisodeRandom(self._seed, told.tolist())
-        given = read_only(cells.copy()), read_only(told.copy())
-        with self._guard.time_limit:
-            _, wrong = self._guard.call(START_BATCH, lambda: self._controller.start_batch(*given, random))
+        random = EpisodeRandom(self._seed, announced.tolist())
+        handed = read_only(cells.copy()), read_only(announced.copy())
+        with self._guard:
+            _, wrong = self._guard.call(START_BATCH, lambda: self._controller.start_batch(*handed, random))
         return {} if wrong is None else dict.fromkeys(cells.tolist(), f"start_batch: {wrong}")
 
     def act(self, observation: BatchObservation) -> tuple[FloatArray, Failures]:
         """As `VehicleHost.act`."""
         n, cells = observation.cell.size, observation.cell
-        with self._guard.time_limit:
+        with self._guard:
             answer, wrong = self._guard.call(
                 STEP_BATCH, lambda: np.array(self._controller.step_batch(observation), dtype=np.float64)
             )
@@ -176,17 +310,12 @@ class BatchHost:
             wrong = f"returned an array of shape {answer.shape}, expected ({n},)"
         if wrong is not None:
             return np.zeros(n), dict.fromkeys(cells.tolist(), f"step_batch: {wrong}")
-        low, high = self._guard.limits.min_acceleration_mps2, self._guard.limits.max_acceleration_mps2
-        outside = np.flatnonzero(~((answer >= low) & (answer <= high)))  # NaN is neither
-        return answer, {
-            int(cells[i]): f"step_batch: {self._guard.wrong_answer(float(answer[i]))}" for i in outside.tolist()
-        }
+        outside = self._guard.outside(answer).tolist()
+        return answer, {int(cells[i]): f"step_batch: {self._guard.wrong_answer(float(answer[i]))}" for i in outside}
 
     def close(self) -> None:
         """As `VehicleHost.close`."""
-        with self._guard.time_limit:
-            self._guard.close(self._controller)
-        self._guard.time_limit.close()
+        self._guard.end([self._controller])
 
 
 ControllerHost = VehicleHost | BatchHost

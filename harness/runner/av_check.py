@@ -14,7 +14,7 @@ import numpy as np
 
 from harness.campaign.campaign import Campaign
 from harness.campaign.vehicle import AutomatedVehicle
-from harness.controllers.loading import has_foreign_code, run_apart
+from harness.controllers.find import has_foreign_code, run_apart
 from harness.episode.loop import EpisodeLoop, Shard
 from harness.errors import EXIT_DONE, EXIT_TOO_MANY_FAILED
 from harness.estimators.estimate import finite_json

@@ -13,8 +13,8 @@ import numpy as np
 
 from harness.campaign.campaign import Campaign
 from harness.campaign.sections import Stop
+from harness.controllers.find import AvEndedProcessError, build_host, run_apart
 from harness.controllers.hosts import BatchHost, ControllerHost
-from harness.controllers.loading import AvEndedProcessError, build_host, run_apart
 from harness.controllers.protocol import BatchObservation
 from harness.importance.build import needs_tables
 from harness.pool.shells import acceleration_limit, design_shells

@@ -10,8 +10,8 @@ from pathlib import Path
 from harness.campaign.campaign import Campaign
 from harness.campaign.combinations import Command
 from harness.compiled import is_cached
-from harness.controllers.guard import Death
-from harness.controllers.loading import build_host, require_controller
+from harness.controllers.find import build_host, require_controller
+from harness.controllers.hosts import Death
 from harness.episode.judge import judge
 from harness.episode.loop import MOMENT_LIMITS, NOBODY, EpisodeLoop, Keep, Policy
 from harness.episode.trajectory import empty_trajectory, mean_test_distance

@@ -27,8 +27,8 @@ from ray.runtime_env import RuntimeEnv
 
 from harness.campaign.sections import RaySettings
 from harness.compiled import cache_root, source_hash
-from harness.controllers.guard import Death
-from harness.controllers.loading import require_controller
+from harness.controllers.find import require_controller
+from harness.controllers.hosts import Death
 from harness.errors import CampaignError, HarnessError
 from harness.processes import fit_to_travel, handlers_restored
 from harness.records.folder import write_bytes
@@ -251,18 +251,18 @@ class RayWorkers(Workers):
             if self._lost_at_start == STARTS:
                 raise WorkerLostError(
                     "run.executor",
-                    found=f"{STARTS} workers in a row that were lost while they began",
-                    expected="machines on which the harness starts",
-                    mend="Install the same harness on all of them, and look at Ray's logs there (/tmp/ray).",
+                    f"{STARTS} workers in a row that were lost while they began",
+                    "machines on which the harness starts",
+                    "Install the same harness on all of them, and look at Ray's logs there (/tmp/ray).",
                 )
             return
         for what, here in self._here.made_of.items():
             if (there := machine.made_of.get(what)) != here:
                 raise HarnessError(
                     "run.executor",
-                    found=f"a machine with {what} {there}",
-                    expected=f"{here}, as here: all must run the same code",
-                    mend="Install the same versions everywhere; bring a controller along in run.ray.runtime_env "
+                    f"a machine with {what} {there}",
+                    f"{here}, as here: all must run the same code",
+                    "Install the same versions everywhere; bring a controller along in run.ray.runtime_env "
                     "(working_dir), or install its package on all machines.",
                 )
         self._lost_at_start = 0
@@ -300,9 +300,9 @@ def _runtime_env(settings: RaySettings) -> dict[str, Any] | None:
 def _wrong_environment(error: Exception) -> CampaignError:
     return CampaignError(
         "run.ray.runtime_env",
-        found=f"an environment that Ray cannot set up: {error}",
-        expected="what ray.init takes as runtime_env",
-        mend="Correct it; docs/ray.md has an example.",
+        f"an environment that Ray cannot set up: {error}",
+        "what ray.init takes as runtime_env",
+        "Correct it; docs/ray.md has an example.",
     )
 
 
@@ -320,10 +320,10 @@ def _connect(address: str, environment: dict[str, Any] | None) -> None:
     except (RayError, OSError, RuntimeError, ValueError) as error:
         raise HarnessError(
             "run.ray.address",
-            found=f"{address}: {error}",
-            expected="the address of a Ray cluster whose machines have the same versions of Ray and Python, and "
+            f"{address}: {error}",
+            "the address of a Ray cluster whose machines have the same versions of Ray and Python, and "
             "the same RAY_AUTH_MODE and RAY_AUTH_TOKEN",
-            mend="Start it with `ray start --head` and give its address, such as 10.0.0.1:6379, or none for a cluster "
+            "Start it with `ray start --head` and give its address, such as 10.0.0.1:6379, or none for a cluster "
             "of this machine.",
         ) from error
     if ended_by is not None:
@@ -345,9 +345,9 @@ def _room(settings: RaySettings) -> int:
     if n == 0:
         raise HarnessError(
             "run.ray.resources",
-            found=f"a cluster of {_words(have)}",
-            expected=f"room for one worker: {want.cpus:g} CPUs and {want.gpus:g} GPUs on one machine",
-            mend="Ask for less, or give --workers if machines are to come later.",
+            f"a cluster of {_words(have)}",
+            f"room for one worker: {want.cpus:g} CPUs and {want.gpus:g} GPUs on one machine",
+            "Ask for less, or give --workers if machines are to come later.",
         )
     return n
 

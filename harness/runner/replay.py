@@ -13,7 +13,7 @@ import pyarrow.compute as pc
 
 from harness.campaign.campaign import Campaign
 from harness.campaign.files import load_campaign
-from harness.controllers.loading import has_foreign_code, require_controller, run_apart
+from harness.controllers.find import has_foreign_code, require_controller, run_apart
 from harness.errors import CampaignError, RunFolderError
 from harness.records.folder import no_episodes, read_manifest, read_table
 from harness.records.tables import shard_tables

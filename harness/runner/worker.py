@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from harness.controllers.guard import Death
+from harness.controllers.hosts import Death
 from harness.episode.cells import PrescribedTraffic
 from harness.episode.loop import EpisodeLoop, Shard, hash_of_index
 from harness.estimators.block import Block, block_from_tables

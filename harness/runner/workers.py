@@ -18,7 +18,7 @@ from typing import Any, Protocol, TypeVar
 
 from scipy.special import bdtrc
 
-from harness.controllers.guard import Death, death_cause
+from harness.controllers.hosts import Death, death_cause
 from harness.errors import CampaignError, HarnessError, TooManyFailedError
 from harness.processes import OF_EPISODE, Call, Child, first_to_answer, last_call
 from harness.resolved import Resolved
@@ -232,10 +232,10 @@ class Workers:
         if float(bdtrc(len(fatal) - 1, n_begun, share)) < SURELY_TOO_MANY:
             raise TooManyFailedError(
                 "run.max_failed_share",
-                found=f"{len(fatal)} of the first {n_begun} episodes of shard {job.request.index} ended their worker "
+                f"{len(fatal)} of the first {n_begun} episodes of shard {job.request.index} ended their worker "
                 f"process, the last of them episode {episode}: {death.cause}",
-                expected=f"a share of at most {share:g}",
-                mend="Mend the controller (`harness av-check` looks at it in seconds), or raise the share to go on.",
+                f"a share of at most {share:g}",
+                "Mend the controller (`harness av-check` looks at it in seconds), or raise the share to go on.",
             )
 
 
@@ -248,9 +248,9 @@ def _lost(request: ShardRequest, exit_code: int | None, blamed: str | None) -> W
         mend = "Mend the controller: look for os._exit, or a crash of compiled code (`harness av-check`)."
     return WorkerLostError(
         f"shard {request.index} (from episode {request.first_episode})",
-        found=f"{ATTEMPTS} worker processes that died, the last {how}",
-        expected="a worker that finishes the shard",
-        mend=mend,
+        f"{ATTEMPTS} worker processes that died, the last {how}",
+        "a worker that finishes the shard",
+        mend,
     )
 
 
@@ -297,8 +297,8 @@ def workers_of(resolved: Resolved, folder: Path, n_workers: int | None, *, n_run
             raise
         raise CampaignError(
             "run.executor",
-            found="ray, but no package ray",
-            expected="the extra for clusters",
-            mend="Install it here and on all machines of the cluster: pip install 'harness[ray]'.",
+            "ray, but no package ray",
+            "the extra for clusters",
+            "Install it here and on all machines of the cluster: pip install 'harness[ray]'.",
         ) from error
     return RayWorkers(resolved, folder, n_workers, n_runs=n_runs)

@@ -125,9 +125,9 @@ def refused(sumo: Mapping[str, str | float], message: str) -> CampaignError:
     named = max((name for name in attributes if name.lower() in message.lower()), key=len, default="")
     return CampaignError(
         f"av.sumo.{named}" if named else "av.sumo",
-        found=f"{attributes[named]}, which SUMO refuses" if named else "values which SUMO refuses",
-        expected="a vType that SUMO accepts",
-        mend=f"SUMO says: {message}",
+        f"{attributes[named]}, which SUMO refuses" if named else "values which SUMO refuses",
+        "a vType that SUMO accepts",
+        f"SUMO says: {message}",
     )
 
 

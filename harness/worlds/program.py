@@ -192,9 +192,9 @@ def _start_program(av: TraciProcess, port: int, n_cells: int) -> subprocess.Pope
     except (OSError, ValueError) as error:  # a null character in a word is a ValueError
         raise CampaignError(
             "av.traci.command",
-            found=f"{av.command} ({error})",
-            expected="a program that can be started",
-            mend="Try it in a shell, in the folder in which you start the harness.",
+            f"{av.command} ({error})",
+            "a program that can be started",
+            "Try it in a shell, in the folder in which you start the harness.",
         ) from error
 
 
@@ -204,9 +204,9 @@ def require_neighbour(own: str, theirs: str) -> None:
     if not address.startswith("127.") and own.partition(":")[0] != theirs.partition(":")[0]:
         raise WorldDisagreementError(
             "SUMO's TraCI server",
-            found=f"a client at {address}",
-            expected="the program that av.traci.command starts, on this machine",
-            mend="Close this machine's ports to others, or let the program run here.",
+            f"a client at {address}",
+            "the program that av.traci.command starts, on this machine",
+            "Close this machine's ports to others, or let the program run here.",
         )
 
 

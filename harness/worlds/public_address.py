@@ -36,7 +36,7 @@ def require_private(program: TraciProcess) -> None:
     if public and not program.allow_public:
         raise CampaignError(
             "av.traci",
-            found=f"a machine with the public address {public[0]}, on which SUMO's TraCI server would listen, too",
-            expected="a machine with private addresses only: SUMO cannot be told to listen on this machine alone",
-            mend="Run in a container or behind a firewall that closes all ports, then set av.traci.allow_public: true.",
+            f"a machine with the public address {public[0]}, on which SUMO's TraCI server would listen, too",
+            "a machine with private addresses only: SUMO cannot be told to listen on this machine alone",
+            "Run in a container or behind a firewall that closes all ports, then set av.traci.allow_public: true.",
         )

@@ -63,9 +63,9 @@ class SumoWorld(SumoCells):
         if SumoWorld._open:
             raise CampaignError(
                 "libsumo",
-                found="a simulation that already runs in this process",
-                expected="one at a time",
-                mend="Close the other world first, or use another process.",
+                "a simulation that already runs in this process",
+                "one at a time",
+                "Close the other world first, or use another process.",
             )
         super().__init__(n_cells)
         self._vanilla = vanilla
@@ -193,9 +193,9 @@ class SumoWorld(SumoCells):
 def _disobeyed(where: str, found: float, expected: float) -> WorldDisagreementError:
     return WorldDisagreementError(
         f"SUMO, {where}",
-        found=float(found).hex(),
-        expected=f"{float(expected).hex()}, as commanded",
-        mend="The bits are promised for libsumo 1.28.0; check `pip show libsumo`. Otherwise please report it.",
+        float(found).hex(),
+        f"{float(expected).hex()}, as commanded",
+        "The bits are promised for libsumo 1.28.0; check `pip show libsumo`. Otherwise please report it.",
     )
 
 
@@ -227,7 +227,7 @@ def start_gui(arguments: Sequence[str]) -> Any:
 def _no_window(found: str) -> CampaignError:
     return CampaignError(
         "--gui",
-        found=found,
-        expected="a desktop that sumo-gui can open its window on",
-        mend="Start it from a desktop session (or with ssh -X), or write the motion to a file: --out FILE.csv.",
+        found,
+        "a desktop that sumo-gui can open its window on",
+        "Start it from a desktop session (or with ssh -X), or write the motion to a file: --out FILE.csv.",
     )

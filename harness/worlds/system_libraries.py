@@ -113,10 +113,9 @@ def install(missing: Sequence[SystemLibrary], commands: Sequence[Sequence[str]])
     if done.returncode:
         raise HarnessError(
             shlex.join(commands[-1]),
-            found=f"exit code {done.returncode}: {' | '.join(said)}",
-            expected="the packages installed",
-            mend="See to what it says, or give your administrator the line for this system:\n"
-            f"{_install_lines(missing)}",
+            f"exit code {done.returncode}: {' | '.join(said)}",
+            "the packages installed",
+            f"See to what it says, or give your administrator the line for this system:\n{_install_lines(missing)}",
         )
 
 
@@ -140,9 +139,9 @@ def not_importable(words: str) -> HarnessError:
     """Error for a libsumo that does not load though the known libraries are there, with the loader's own words."""
     return HarnessError(
         "libsumo",
-        found=f"that it cannot be imported: {words}",
-        expected="libsumo 1.28.0 as `pip install` brings it, and the system libraries that it names",
-        mend="Install the package of this system that holds the named file, or libsumo again (`pip install "
+        f"that it cannot be imported: {words}",
+        "libsumo 1.28.0 as `pip install` brings it, and the system libraries that it names",
+        "Install the package of this system that holds the named file, or libsumo again (`pip install "
         "--force-reinstall libsumo==1.28.0`).",
     )
 
@@ -150,9 +149,9 @@ def not_importable(words: str) -> HarnessError:
 def _cannot_load(missing: Sequence[SystemLibrary], advice: str) -> HarnessError:
     return HarnessError(
         "system libraries of SUMO",
-        found=f"no {', '.join(library.soname for library in missing)}",
-        expected="the shared libraries that libsumo needs of the system",
-        mend=f"{advice}, or give your administrator the line for this system:\n{_install_lines(missing)}",
+        f"no {', '.join(library.soname for library in missing)}",
+        "the shared libraries that libsumo needs of the system",
+        f"{advice}, or give your administrator the line for this system:\n{_install_lines(missing)}",
     )
 
 

@@ -175,8 +175,8 @@ class TraciWorld(SumoCells):
 def _meddled(where: str, found: str, expected: str) -> WorldDisagreementError:
     return WorldDisagreementError(
         f"SUMO, {where}",
-        found=found,
-        expected=expected,
-        mend="A TraCI client may only command AVs ('AV0', 'AV1', ...), on their lane, after the cut-in: moving LV or "
+        found,
+        expected,
+        "A TraCI client may only command AVs ('AV0', 'AV1', ...), on their lane, after the cut-in: moving LV or "
         "BV, or changing lanes, would make the likelihood ratios wrong. If yours does not, please report it.",
     )

@@ -94,7 +94,7 @@ def test_the_other_recipes_run(recipe, folder):
 
 
 def test_entry_points_are_found_by_name(folder, tmp_path, monkeypatch):
-    from harness.controllers.loading import controller_class
+    from harness.controllers.find import controller_class
 
     (toml,) = (text for kind, text in BLOCKS if kind == "toml")
     name, target = re.search(r'^([\w-]+) = "(.*)"$', toml, re.MULTILINE).groups()

@@ -10,7 +10,7 @@ import pytest
 
 from harness.campaign.files import load_campaign
 from harness.cli import main
-from harness.controllers.loading import build_host
+from harness.controllers.find import build_host
 from harness.errors import EXIT_BAD_INPUT, EXIT_DONE, EXIT_TOO_MANY_FAILED
 from harness.resolved import resolve
 from harness.runner import plan_campaign

@@ -11,8 +11,8 @@ import pytest
 from harness.campaign.files import load_campaign
 from harness.commands.printing import system_error
 from harness.controllers import EpisodeStart, Neighbour, Observation
+from harness.controllers.find import build_host, require_controller
 from harness.controllers.fmu import fmu_maker
-from harness.controllers.loading import build_host, require_controller
 from harness.errors import CampaignError
 from harness.resolved import resolve
 

@@ -11,8 +11,7 @@ import pytest
 from examples.idm import idm_acceleration
 from harness.campaign.files import load_campaign
 from harness.controllers.protocol import Neighbour, Observation
-from harness.controllers.traci_facade import Traci
-from harness.controllers.traci_style import TraciStyleController
+from harness.controllers.traci_style import Traci, TraciStyleController
 from harness.resolved import resolve
 from harness.runner.prepare import prepare
 from harness.worlds.twin import TwinWorld

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from harness.controllers import EpisodeStart, Neighbour, Observation
-from harness.controllers.traci_facade import Traci, TraCIException
-from harness.controllers.traci_style import StepListenerController, TraciStyleController
+from harness.controllers.traci_style import StepListenerController, Traci, TraCIException, TraciStyleController
 
 
 def seen(time_s=0.0, speed=20.0, *, bv_lane=0, lead_speed=20.0):

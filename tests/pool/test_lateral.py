@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from harness.campaign.files import load_campaign
-from harness.controllers.loading import build_host
+from harness.controllers.find import build_host
 from harness.episode.loop import EpisodeLoop, Keep, Policy
 from harness.importance.build import build_importance
 from harness.pool.library import load_library

@@ -1,4 +1,4 @@
-"""Find the controller that a campaign names, and put the right host around it."""
+"""Find the controller that a campaign names, and put the right host around it; run it in a process of its own."""
 
 from __future__ import annotations
 
@@ -18,8 +18,16 @@ from typing import Any, TypeVar
 
 from harness.campaign.campaign import Campaign
 from harness.campaign.vehicle import AutomatedVehicle
-from harness.controllers.guard import Death, Guard, cause_of, death_cause, require_fault
-from harness.controllers.hosts import BatchHost, ControllerHost, VehicleHost
+from harness.controllers.hosts import (
+    BatchHost,
+    ControllerHost,
+    Death,
+    Guard,
+    VehicleHost,
+    cause_of,
+    death_cause,
+    require_fault,
+)
 from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, HarnessError
 from harness.processes import CONSTRUCTOR, BlackBox, Child, first_to_answer, fit_to_travel, last_call
 
@@ -36,12 +44,8 @@ class AvEndedProcessError(HarnessError):
 def controller_class(name: str) -> Callable[..., Any]:
     """The class that ``package.module:Class``, or an entry point of group ``harness.controllers``, names.
 
-    The folder that the harness was started in is importable, as it is for a script.
-
-    Raises
-    ------
-    CampaignError
-        There is no such module, class or entry point.
+    The folder that the harness was started in is importable, as it is for a script. Where there is no such module,
+    class or entry point, a `CampaignError` says so.
     """
     if ":" not in name:
         return _from_entry_point(name)
@@ -53,17 +57,17 @@ def controller_class(name: str) -> Callable[..., Any]:
     except (Exception, SystemExit) as error:
         raise CampaignError(
             "av.controller",
-            found=f"{name}, whose module cannot be imported ({cause_of(error)})",
-            expected="a Python module that can be imported",
-            mend="Start the harness in the folder that holds it, or install it beside the harness.",
+            f"{name}, whose module cannot be imported ({cause_of(error)})",
+            "a Python module that can be imported",
+            "Start the harness in the folder that holds it, or install it beside the harness.",
         ) from error
     found = getattr(module, class_name, None)
     if not callable(found):
         raise CampaignError(
             "av.controller",
-            found=f"no class {class_name} in {module.__file__}",
-            expected="a controller class (see docs/controllers.md)",
-            mend=f"It has: {', '.join(name for name, value in vars(module).items() if isinstance(value, type))}.",
+            f"no class {class_name} in {getattr(module, '__file__', module_name)}",
+            "a controller class (see docs/controllers.md)",
+            f"It has: {', '.join(name for name, value in vars(module).items() if isinstance(value, type))}.",
         )
     return found  # type: ignore[no-any-return]
 
@@ -73,9 +77,9 @@ def _from_entry_point(name: str) -> Callable[..., Any]:
     if name not in points.names:
         raise CampaignError(
             "av.controller",
-            found=name,
-            expected=f"an entry point of group {GROUP}: {', '.join(sorted(points.names)) or 'none is installed'}",
-            mend="Install the package that brings it, or write 'package.module:Class'.",
+            name,
+            f"an entry point of group {GROUP}: {', '.join(sorted(points.names)) or 'none is installed'}",
+            "Install the package that brings it, or write 'package.module:Class'.",
         )
     found: Callable[..., Any] = points[name].load()
     return found
@@ -110,92 +114,7 @@ def build_host(
         make = fmu_maker(av.fmu)
     else:
         return None
-    return VehicleHost(
-        make, n_cells, seed, Guard(av.limits, black_box), fatal_episodes=fatal_episodes, acts_before_cut_in=early
-    )
-
-
-def has_foreign_code(campaign: Campaign) -> bool:
-    """Whether the AV is code of the user's that runs inside of the harness's own processes."""
-    return campaign.av.source in ("controller", "fmu")
-
-
-def run_apart(av: AutomatedVehicle, work: Callable[..., _Answer], *arguments: Any) -> _Answer:
-    """``work(*arguments, black_box=…)``, which runs an AV, in a process of its own.
-
-    Raises
-    ------
-    HarnessError
-        Whatever it raises.
-    AvEndedProcessError
-        The controller ended the process; the call it was in is named.
-    """
-    with TemporaryDirectory(prefix="harness-apart-") as folder:
-        black_box = Path(folder) / "black-box"
-        child = Child(_work_and_tell, work, arguments, black_box)
-        try:
-            answer = first_to_answer([child]).receive()
-        finally:
-            exit_code = child.kill()
-        call = last_call(black_box)
-    if answer is None:
-        raise AvEndedProcessError(
-            f"av.{av.source}",
-            found=f"{death_cause(exit_code, av.limits.step_time_s)}, "
-            + ("while it was found" if call is None else f"in {call}"),
-            expected="a controller that returns or raises",
-            mend="Look for os._exit, a crash of compiled code, or a shortage of memory; then check again.",
-        )
-    (result,) = answer
-    if isinstance(result, Exception):
-        raise result
-    return result  # type: ignore[no-any-return]
-
-
-def _work_and_tell(
-    connection: Connection, work: Callable[..., Any], arguments: tuple[Any, ...], black_box: Path
-) -> None:
-    try:
-        answer = work(*arguments, black_box=black_box)
-    except Exception as error:  # noqa: BLE001 - whatever goes wrong here is the parent's to judge
-        answer = fit_to_travel(error)
-    with suppress(OSError):  # the parent was killed: nobody is left to tell
-        connection.send((answer,))
-
-
-def require_controller(campaign: Campaign) -> str | None:
-    """Find and make the AV's controller once, before anything is written, in a process of its own.
-
-    Returns
-    -------
-    str or None
-        SHA-256 of the source file of its class; None for an AV without one, or without a source.
-
-    Raises
-    ------
-    CampaignError
-        The controller cannot be found or made, or is of neither kind.
-    """
-    if not has_foreign_code(campaign):
-        return None
-    try:
-        return run_apart(campaign.av, _source_of_made, campaign)
-    except AvEndedProcessError as error:
-        raise CampaignError(
-            error.where, found=error.found, expected="a controller that can be made", mend=error.mend
-        ) from error
-
-
-def _source_of_made(campaign: Campaign, *, black_box: Path | None = None) -> str | None:
-    av = campaign.av
-    host = build_host(av, n_cells=1, seed=0, black_box=black_box)
-    if host is not None:
-        host.close()
-    if av.controller is None:
-        return None
-    module = sys.modules.get(getattr(controller_class(av.controller), "__module__", ""))
-    file = Path(getattr(module, "__file__", None) or "")
-    return hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else None
+    return VehicleHost(make, n_cells, seed, guarded(), fatal_episodes=fatal_episodes, acts_before_cut_in=early)
 
 
 def _maker(av: AutomatedVehicle) -> Callable[[], Any]:
@@ -216,16 +135,15 @@ def _make_first(make: Callable[[], Any], av: AutomatedVehicle, black_box: BlackB
         if not _takes(partial(controller_class(str(av.controller)), **_parameters(av))):
             raise CampaignError(
                 "av.parameters",
-                found=f"parameters that {av.controller} does not take ({cause_of(error)})",
-                expected="keyword arguments of the controller's constructor",
-                mend="Correct av.parameters, or the constructor.",
+                f"parameters that {av.controller} does not take ({cause_of(error)})",
+                "keyword arguments of the controller's constructor",
+                "Correct av.parameters, or the constructor.",
             ) from error
-        given = ", ".join(_parameters(av)) or "none"
         raise CampaignError(
             "av.controller",
-            found=f"{av.controller}, whose constructor raised {cause_of(error)}",
-            expected="a controller that can be made",
-            mend=f"Mend its constructor, or what it needs; av.parameters given to it: {given}.",
+            f"{av.controller}, whose constructor raised {cause_of(error)}",
+            "a controller that can be made",
+            f"Mend its constructor, or what it needs; av.parameters: {', '.join(_parameters(av)) or 'none'}.",
         ) from error
 
 
@@ -262,7 +180,76 @@ def _require_vehicle_controller(made: Any, name: str) -> None:
     if missing:
         raise CampaignError(
             "av.controller",
-            found=f"{name} without {', '.join(missing)}",
-            expected="start, step and close (per vehicle), or start_batch, step_batch and close (arrays)",
-            mend="See docs/controllers.md for both, in ten lines each.",
+            f"{name} without {', '.join(missing)}",
+            "start, step and close (per vehicle), or start_batch, step_batch and close (arrays)",
+            "See docs/controllers.md for both, in ten lines each.",
         )
+
+
+def has_foreign_code(campaign: Campaign) -> bool:
+    """Whether the AV is code of the user's that runs inside of the harness's own processes."""
+    return campaign.av.source in ("controller", "fmu")
+
+
+def run_apart(av: AutomatedVehicle, work: Callable[..., _Answer], *arguments: Any) -> _Answer:
+    """``work(*arguments, black_box=…)``, which runs an AV, in a process of its own.
+
+    Raises whatever that raises, or an `AvEndedProcessError` if the controller ended the process, naming the call.
+    """
+    with TemporaryDirectory(prefix="harness-apart-") as folder:
+        black_box = Path(folder) / "black-box"
+        child = Child(_work_and_tell, work, arguments, black_box)
+        try:
+            answer = first_to_answer([child]).receive()
+        finally:
+            exit_code = child.kill()
+        call = last_call(black_box)
+    if answer is None:
+        when = "while it was found" if call is None else f"in {call}"
+        raise AvEndedProcessError(
+            f"av.{av.source}",
+            f"{death_cause(exit_code, av.limits.step_time_s)}, {when}",
+            "a controller that returns or raises",
+            "Look for os._exit, a crash of compiled code, or a shortage of memory; then check again.",
+        )
+    (result,) = answer
+    if isinstance(result, Exception):
+        raise result
+    return result  # type: ignore[no-any-return]
+
+
+def _work_and_tell(
+    connection: Connection, work: Callable[..., Any], arguments: tuple[Any, ...], black_box: Path
+) -> None:
+    try:
+        answer = work(*arguments, black_box=black_box)
+    except Exception as error:  # noqa: BLE001 - whatever goes wrong here is the parent's to judge
+        answer = fit_to_travel(error)
+    with suppress(OSError):  # the parent was killed: nobody is left to tell
+        connection.send((answer,))
+
+
+def require_controller(campaign: Campaign) -> str | None:
+    """Find and make the AV's controller once, before anything is written, in a process of its own.
+
+    Returns the SHA-256 of the source file of its class; None for an AV without one, or without a source. Raises a
+    `CampaignError` if it cannot be found or made, or is of neither kind.
+    """
+    if not has_foreign_code(campaign):
+        return None
+    try:
+        return run_apart(campaign.av, _source_of_made, campaign)
+    except AvEndedProcessError as error:
+        raise CampaignError(error.where, error.found, "a controller that can be made", error.mend) from error
+
+
+def _source_of_made(campaign: Campaign, *, black_box: Path | None = None) -> str | None:
+    av = campaign.av
+    host = build_host(av, n_cells=1, seed=0, black_box=black_box)
+    if host is not None:
+        host.close()
+    if av.controller is None:
+        return None
+    module = sys.modules.get(getattr(controller_class(av.controller), "__module__", ""))
+    file = Path(getattr(module, "__file__", None) or "")
+    return hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else None
