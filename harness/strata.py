@@ -5,11 +5,12 @@ The pool makes both; estimators and the planner of a campaign use them, and need
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Annotated
 
 import numpy as np
+from pydantic import AfterValidator, FiniteFloat, PlainSerializer, PlainValidator, TypeAdapter
 
 from harness.vocabulary import FloatArray
 
@@ -19,7 +20,15 @@ ASSUMPTION_FREE, LIBRARY_STATEMENT = "assumption_free", "library"
 """Names of the statement that has no boundary, and of the one whose boundary is the library's own."""
 FAILED_SHADOWS = "failed shadow runs"
 """Name of a stratum that cannot be tested: cut-ins on paths on which the vehicle failed before one could come."""
-_ARRAYS = ("cell_p", "reference_rate", "reference_square")
+
+
+_FLOATS = TypeAdapter(list[FiniteFloat])
+Numbers = Annotated[
+    FloatArray,
+    PlainValidator(lambda content: np.array(_FLOATS.validate_python(content, strict=True))),
+    PlainSerializer(lambda array: array.tolist()),
+]
+"""An array that a JSON file holds as a list of numbers."""
 
 
 @dataclass(frozen=True)
@@ -90,15 +99,15 @@ class ShellDesign:
     pool: str
     strata: tuple[str, ...]
     cell_stratum: tuple[int, ...]
-    cell_p: FloatArray
+    cell_p: Numbers
     n_paths: int
     statements: tuple[Statement, ...]
     p_cut_in: float
     p_impossible: float
     cell_references: tuple[int, ...] = ()
     references: tuple[Reference, ...] = ()
-    reference_rate: FloatArray = field(default_factory=lambda: np.zeros(0))
-    reference_square: FloatArray = field(default_factory=lambda: np.zeros(0))
+    reference_rate: Numbers = field(default_factory=lambda: np.zeros(0))
+    reference_square: Numbers = field(default_factory=lambda: np.zeros(0))
     available: tuple[int, ...] = ()
     shadow_runs: bool = False
 
@@ -138,17 +147,16 @@ class ShellDesign:
         joined: FloatArray = np.eye(len(self.strata))[list(self.cell_stratum)]
         return joined
 
-    def to_json(self) -> dict[str, Any]:
-        """Plain content for a file."""
-        return {name: x.tolist() if isinstance(x, np.ndarray) else x for name, x in asdict(self).items()}
 
-    @classmethod
-    def from_json(cls, content: dict[str, Any]) -> ShellDesign:
-        """Back from `to_json`."""
-        arrays = {name: np.array(content[name], dtype=np.float64) for name in _ARRAYS}
-        plain: dict[str, Any] = {name: tuple(x) if isinstance(x, list) else x for name, x in content.items()}
-        records = {
-            "statements": tuple(Statement(**each) for each in content["statements"]),
-            "references": tuple(Reference(**each) for each in content["references"]),
-        }
-        return cls(**(plain | arrays | records))
+def _of_one_size(design: ShellDesign) -> ShellDesign:
+    n, r, strata = len(design.cell_stratum), len(design.references), set(range(len(design.strata)))
+    if not design.cell_p.size == len(design.cell_references) == n or set(design.cell_stratum) != strata:
+        raise ValueError("cells need a stratum, a probability and references each, and strata a cell")
+    if not design.reference_rate.size == design.reference_square.size == r or not design.statements:
+        raise ValueError("references need a rate and a mean square each, and there is a statement")
+    return design
+
+
+StoredDesign = Annotated[ShellDesign, AfterValidator(_of_one_size)]
+"""``shells.json`` of a run."""
+STORED_DESIGN = TypeAdapter(StoredDesign)

@@ -14,16 +14,18 @@ import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
-from pydantic import BaseModel, ValidationError
+from pydantic import TypeAdapter, ValidationError
 
 from harness.errors import RunFolderError, shortened, writing
-from harness.records.stored_manifest import StoredManifest
+from harness.records.manifest import StoredManifest
 from harness.records.tables import ShardTables
+
+T = TypeVar("T")
 
 MANIFEST = "manifest.json"
 SHELLS = "shells.json"
@@ -230,8 +232,7 @@ def read_manifest(folder: Path, *, mend: str = NO_RUN) -> dict[str, Any]:
     if not path.exists():
         expected = "a run folder, which holds a manifest.json"
         raise RunFolderError(str(path), found="no such file: this is no run folder", expected=expected, mend=mend)
-    content = read_json(path, mend=mend)
-    require_schema(content, StoredManifest, path, mend=mend)
+    content = read_as(StoredManifest, path, mend=mend).model_dump(exclude_unset=True)
     if kind := next((kind for kind in ("part", "plan") if content.get(kind)), None):
         version = (content.get("versions") or {}).get("harness", "that made it")
         again = f"Bring the parts together with version {version}, or run the campaign.yaml again into a new folder."
@@ -239,31 +240,18 @@ def read_manifest(folder: Path, *, mend: str = NO_RUN) -> dict[str, Any]:
     return content
 
 
-def require_schema(content: dict[str, Any], model: type[BaseModel], path: Path, *, mend: str) -> None:
-    """Refuse the content of a JSON file that is not what a run writes, by the first value that is wrong."""
+def read_as(kind: type[T], path: Path, *, mend: str) -> T:
+    """Read a JSON file of a run as a type; one that no run has written is refused by the first value that is wrong."""
     try:
-        model.model_validate(content)
-    except ValidationError as error:
-        wrong = error.errors(include_url=False)
-        where = ".".join(map(str, wrong[0]["loc"]))
-        more = f", and {len(wrong) - 1} more that do not fit" if len(wrong) > 1 else ""
-        missing = wrong[0]["type"] == "missing"
-        raise RunFolderError(
-            str(path),
-            found=f"no key {where}{more}" if missing else f"{where} {shortened(repr(wrong[0]['input']), 60)}{more}",
-            expected=f"what a run has written: {wrong[0]['msg'][:1].lower()}{wrong[0]['msg'][1:]}",
-            mend=mend,
-        ) from None
-
-
-def read_json(path: Path, *, mend: str) -> dict[str, Any]:
-    """Read a JSON object of a run."""
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        return TypeAdapter(kind).validate_json(path.read_bytes(), strict=True)
     except FileNotFoundError:
         raise RunFolderError(str(path), found="no such file", expected="a JSON file of a run", mend=mend) from None
-    except (OSError, ValueError, RecursionError) as error:
+    except OSError as error:
         raise RunFolderError(str(path), found=str(error), expected="a JSON file of a run", mend=mend) from error
-    if not isinstance(content, dict):
-        raise RunFolderError(str(path), found=type(content).__name__, expected="a JSON object", mend=mend)
-    return content
+    except ValidationError as error:
+        first, *others = error.errors(include_url=False)
+        where = ".".join(map(str, first["loc"])) or "content"
+        more = f", and {len(others)} more that do not fit" if others else ""
+        found = f"no key {where}" if first["type"] == "missing" else f"{where} {shortened(repr(first['input']), 60)}"
+        expected = f"what a run has written: {first['msg'][:1].lower()}{first['msg'][1:]}"
+        raise RunFolderError(str(path), found=found + more, expected=expected, mend=mend) from None

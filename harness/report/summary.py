@@ -23,9 +23,9 @@ from harness.campaign.campaign import Campaign
 from harness.campaign.files import load_campaign
 from harness.errors import CampaignError, RunFolderError
 from harness.estimators.shells import ShellDetails, Within
-from harness.records.folder import MANIFEST, NO_RUN, concatenated, read_json, read_manifest, require_schema
+from harness.records.folder import MANIFEST, NO_RUN, concatenated, read_as, read_manifest
+from harness.records.manifest import Count, Stored, StoredManifest
 from harness.records.reader import read_shards, stored_columns
-from harness.records.stored_manifest import Count, Stored, StoredManifest
 from harness.strata import ASSUMPTION_FREE
 from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import CRASH, FAILED, OUTCOMES, FloatArray, IntArray
@@ -182,7 +182,7 @@ def typed_folder(folder: Path) -> str:
 def read_run_folder(path: Path) -> RunFolder:
     """Read campaign, manifest and estimates of a run."""
     manifest = read_manifest(path)
-    require_schema(manifest, ShownManifest, path / MANIFEST, mend=NO_RUN)
+    read_as(ShownManifest, path / MANIFEST, mend=NO_RUN)
     estimates = _read_estimates(path, manifest["campaign_hash"])
     shells = _shells(path, estimates.estimates[estimates.headline])
     campaign = _read_campaign(path / "campaign.yaml")
@@ -203,9 +203,7 @@ def _read_campaign(path: Path) -> Campaign:
 
 def _read_estimates(folder: Path, campaign_hash: str) -> StoredEstimates:
     path, again = folder / "estimates.json", f"Make it again with `harness estimate {folder} --write`."
-    content = read_json(path, mend=again)
-    require_schema(content, StoredEstimates, path, mend=again)
-    estimates = StoredEstimates.model_validate(content)
+    estimates = read_as(StoredEstimates, path, mend=again)
     if estimates.campaign_hash != campaign_hash:
         expected = f"those of campaign {campaign_hash} (manifest.json)"
         found = f"estimates of campaign {estimates.campaign_hash}"

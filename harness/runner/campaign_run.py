@@ -51,6 +51,7 @@ from harness.runner.stored_shards import stored_shard
 from harness.runner.worker import ShardDone, ShardSpec
 from harness.runner.workers import workers_of
 from harness.stopped_by import StoppedBy
+from harness.strata import STORED_DESIGN
 from harness.vocabulary import SAMPLING
 
 
@@ -169,7 +170,7 @@ class Run:
         """Begin to test what has been prepared."""
         if prepared.prescribed is not None:
             require_same_pool(self._out, prepared)
-            write_json(self._out / SHELLS, prepared.prescribed.design.to_json())
+            write_json(self._out / SHELLS, STORED_DESIGN.dump_python(prepared.prescribed.design, mode="json"))
         self.prescribed = prepared.prescribed
         self._prepared = prepared
         self.planner: Planner = planner_of(self._campaign, prepared.prescribed, held=self._held)

@@ -23,7 +23,7 @@ from harness.pool.shells import PrescribedEpisodes, checked_boundary
 from harness.pool.storage import campaign_pool, campaign_pool_key, pool_path
 from harness.pool.vehicle_pool import ShadowPaths, campaign_shadow_paths, shadow_paths_file, vehicle_pool
 from harness.progress import Progress
-from harness.records.folder import SHELLS, read_json
+from harness.records.folder import SHELLS, read_as
 from harness.records.tables import shard_tables
 from harness.resolved import Resolved, resolve
 from harness.runner.retrace import Retracing
@@ -181,7 +181,7 @@ def require_same_pool(folder: Path, prepared: Prepared) -> None:
     path = folder / SHELLS
     if prepared.prescribed is None or not path.exists():
         return
-    found = read_json(path, mend="Run the campaign into a new folder.").get("pool")
+    found = read_as(dict[str, object], path, mend="Run the campaign into a new folder.").get("pool")
     if found != prepared.prescribed.design.pool:
         raise RunFolderError(
             str(path),

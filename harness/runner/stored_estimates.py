@@ -14,10 +14,9 @@ from harness.estimators.block import EPISODE_COLUMNS, MOMENT_COLUMNS, SHELL_COLU
 from harness.estimators.one_pass import SPACING
 from harness.importance.build import importance_names, mixture_weights
 from harness.processes import made_ahead
-from harness.records.folder import SHELLS, concatenated, no_episodes, read_json, read_manifest, require_schema
+from harness.records.folder import SHELLS, concatenated, no_episodes, read_as, read_manifest
 from harness.records.reader import read_shard
-from harness.records.stored_manifest import StoredShells
-from harness.strata import ShellDesign
+from harness.strata import ShellDesign, StoredDesign
 from harness.vocabulary import EstimatorName
 
 MOST_GROUPED = 5_000
@@ -138,7 +137,7 @@ def _groups(shards: _Shards) -> Iterator[_Shards]:
 
 def read_shells(folder: Path) -> ShellDesign:
     """Strata of a shells campaign; a `RunFolderError` where the file is missing, damaged, or of a too early version."""
-    content = read_json(folder / SHELLS, mend=_FINISH)
+    content = read_as(dict[str, Any], folder / SHELLS, mend=_FINISH)
     if "n_inside" in content and "statements" not in content:
         version = read_manifest(folder).get("versions", {}).get("harness", "that made it")
         raise RunFolderError(
@@ -147,8 +146,7 @@ def read_shells(folder: Path) -> ShellDesign:
             expected="a run of this version: its tests say what those rest on",
             mend=f"Run the campaign again into a new folder, or estimate this one with version {version}.",
         )
-    require_schema(content, StoredShells, folder / SHELLS, mend=_FINISH)
-    return ShellDesign.from_json(content)
+    return read_as(StoredDesign, folder / SHELLS, mend=_FINISH)
 
 
 def _incomplete(folder: Path, found: str, expected: str) -> RunFolderError:

@@ -20,7 +20,7 @@ from harness.campaign.files import load_campaign
 from harness.compiled import WORLD_SOURCES, source_hash
 from harness.estimators.estimate import finite_json
 from harness.progress import Progress
-from harness.records.folder import read_json, sole_use, write_json
+from harness.records.folder import read_as, sole_use, write_json
 from harness.resolved import resolve
 from harness.traffic.loading import load_parameters
 from studies.case_study.context import Context, Made
@@ -95,7 +95,7 @@ def run_study(
                 write_json(place / RESULT, finite_json({"kind": step.kind, **_MAKERS[step.kind](step, context)}))
                 seconds[name] = time.monotonic() - began
             shutil.rmtree(context.parts, ignore_errors=True)  # what they were kept for is there
-            result = read_json(place / RESULT, mend="Delete the folder of this step; it is made again.")
+            result = read_as(dict[str, Any], place / RESULT, mend="Delete the folder of this step; it is made again.")
             made[name] = Made(place, result)
             told(name, seconds[name])
         return StudyResult(*write_page(study, folder, made), seconds)

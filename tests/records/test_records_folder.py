@@ -17,7 +17,7 @@ import pytest
 from harness.errors import RunFolderError
 from harness.records.folder import (
     encoded,
-    read_json,
+    read_as,
     read_manifest,
     read_table,
     shard_file,
@@ -103,7 +103,7 @@ def test_json_is_strict(tmp_path):
         write_json(tmp_path / "file.json", {"rhw": float("inf")})
     assert files_below(tmp_path) == set()
     write_json(tmp_path / "file.json", {"rate": 0.1, "σ": [1, None]})
-    assert read_json(tmp_path / "file.json", mend="") == {"rate": 0.1, "σ": [1, None]}
+    assert read_as(dict, tmp_path / "file.json", mend="") == {"rate": 0.1, "σ": [1, None]}
 
 
 @pytest.mark.parametrize("damage", [lambda content: content[:-30], lambda content: b"", lambda content: content[::-1]])

@@ -22,7 +22,7 @@ from harness.records.tables import shard_tables
 from harness.resolved import resolve
 from harness.runner.prepare import prepare
 from harness.runner.stored_estimates import stored_blocks
-from harness.strata import ShellDesign, Statement
+from harness.strata import STORED_DESIGN, ShellDesign, Statement
 from harness.vocabulary import CRASH, FAILED, TIMEOUT
 from harness.worlds.twin import TwinWorld
 
@@ -97,7 +97,7 @@ def write_run(folder: Path, recipe: RunRecipe) -> Path:
         distance_m += float(e["av_distance_m"].sum()) / recipe.n_episodes
     (folder / "campaign.yaml").write_text(campaign.model_dump_json())
     (folder / "manifest.json").write_text(json.dumps(_manifest(recipe, shards, distance_m)))
-    (folder / "shells.json").write_text(json.dumps(DESIGN.to_json()))
+    (folder / "shells.json").write_bytes(STORED_DESIGN.dump_json(DESIGN))
     facts = CampaignFacts("made", HASH, recipe.level, 0.9, distance_m, importance_names(campaign))
     (folder / "estimates.json").write_text(json.dumps(estimate_blocks(stored_blocks(folder, moments=False), facts)))
     return folder

@@ -11,11 +11,11 @@ import pytest
 
 from harness.cli import main
 from harness.errors import RunFolderError
-from harness.records.folder import read_manifest, require_place, require_schema, sole_use
-from harness.records.stored_manifest import StoredShells
+from harness.records.folder import read_as, read_manifest, require_place, sole_use, write_json
 from harness.report.summary import read_run_folder
 from harness.resolved import resolve
 from harness.runner.manifest import require_own_folder
+from harness.strata import StoredDesign
 from tests.golden.campaigns import BASE, RUNS
 from tests.in_process import run_here
 from tests.stored_runs import copy_of, golden, manifest, sets, shard_files, truncate, unlike_columns
@@ -306,7 +306,8 @@ def test_estimates_of_wrong_types_are_refused(stored):
 
 def test_shells_are_checked(stored_run, tmp_path):
     shells = json.loads((stored_run("shells-twin") / "shells.json").read_text())
-    require_schema(shells, StoredShells, tmp_path, mend="")
+    read_as(StoredDesign, stored_run("shells-twin") / "shells.json", mend="")
     for wrong in (*({key: {}} for key in shells), {"cell_p": [0.1]}, {"statements": []}, {"reference_rate": []}):
+        write_json(tmp_path / "shells.json", {**shells, **wrong})
         with pytest.raises(RunFolderError):
-            require_schema({**shells, **wrong}, StoredShells, tmp_path, mend="")
+            read_as(StoredDesign, tmp_path / "shells.json", mend="")

@@ -1,4 +1,4 @@
-"""What the JSON files of a run may hold; ``manifest.json`` comes checked from `harness.records.folder.read_manifest`.
+"""What ``manifest.json`` of a run may hold; it comes checked from `harness.records.folder.read_manifest`.
 
 A key that is not named here is let through: later versions add some. One that is missing, as in older folders, is no
 error, but for the three without which nothing can be read.
@@ -6,9 +6,9 @@ error, but for the three without which nothing can be read.
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Self
+from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field
 
 from harness.stopped_by import StoppedBy
 
@@ -86,54 +86,3 @@ class StoredManifest(Stored):
     repeated: Repeated | None = None
     shadow_runs: StoredShadows | None = None
     reported_from: Count | None = None
-
-
-class StoredStatement(Stored):
-    """A statement of ``shells.json``."""
-
-    model_config = ConfigDict(extra="forbid")
-    name: str
-    boundary: str
-    assumes: str
-    n_inside: Count
-    checked: bool
-
-
-class StoredReference(Stored):
-    """A reference driver of ``shells.json``."""
-
-    model_config = ConfigDict(extra="forbid")
-    name: str
-    described: str
-    delay_s: float | None
-
-
-class StoredShells(Stored):
-    """``shells.json``: the strata of a shells campaign, see `harness.strata.ShellDesign`."""
-
-    model_config = ConfigDict(extra="forbid")
-    pool: str
-    strata: list[str]
-    cell_stratum: list[Count]
-    cell_p: list[float]
-    cell_references: list[Count]
-    references: list[StoredReference]
-    reference_rate: list[float]
-    reference_square: list[float]
-    n_paths: Count
-    statements: list[StoredStatement] = Field(min_length=1)
-    p_cut_in: float
-    p_impossible: float
-    available: list[Count]
-    shadow_runs: bool = False
-
-    @model_validator(mode="after")
-    def _of_one_size(self) -> Self:
-        n, r = len(self.cell_stratum), len(self.references)
-        if [len(self.cell_p), len(self.cell_references)] != [n, n] or set(self.cell_stratum) != set(
-            range(len(self.strata))
-        ):
-            raise ValueError("cells need a stratum, a probability and references each, and strata a cell")
-        if [len(self.reference_rate), len(self.reference_square)] != [r, r]:
-            raise ValueError("references need a rate and a mean square each")
-        return self
