@@ -105,7 +105,7 @@ class WithParts(Recorded):
     def __init__(self, settings: Campaign, world: Callable[[Campaign], World]) -> None:
         super().__init__(settings, world)
         self._seconds: dict[str, float] = {}
-        for kernel in ("refill", "decide", "respond", "command", "judge"):
+        for kernel in ("decide", "judge"):
             self._time(loop, kernel, "policy")
         self._time(self.world, "place", "refill")
         self._time(self.world, "_contacts", "collisions")

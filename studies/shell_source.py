@@ -243,6 +243,7 @@ def _template(
             n_lv=none,
             n_bv=none,
             crashes=np.zeros((0, d + r), np.bool_),
+            lead=none,
             path_mass=np.zeros((0, kind[0].size), np.float32),
             motion=np.zeros(int(shadow_runs), np.uint64),
         ),

@@ -20,7 +20,7 @@ import pyarrow.parquet as pq
 
 from harness.campaign.vehicle import AutomatedVehicle, BuiltInParameters, Reflexes
 from harness.compiled import WORLD_SOURCES, cache_root, source_hash
-from harness.episode.trajectory import Followers
+from harness.episode.path import Followers
 from harness.errors import CampaignError
 from harness.pool.aimed_paths import PILOT_PATHS, Enumerator
 from harness.pool.cut_ins import environment_hash

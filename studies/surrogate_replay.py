@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow as pa
 
 from harness.compiled import compiled_threads
-from harness.episode.trajectory import Followers, Trajectory, empty_trajectory, who_crashes
+from harness.episode.path import Followers, Trajectory, empty_trajectory, who_crashes
 from harness.errors import CampaignError, RunFolderError
 from harness.pool.cut_ins import Pool, environment_hash
 from harness.pool.replay import StoredPaths, approach_cut_in, leave_stored, stored_paths

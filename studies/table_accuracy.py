@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from harness.episode.loop import MOMENT_LIMITS, EpisodeLoop, Keep, Policy, Shard
+from harness.episode.loop import MOMENT_LIMITS, Drawing, EpisodeLoop, RecordPolicy, Shard
 from harness.importance.build import build_importance
 from harness.importance.tables import Tables
 from harness.resolved import Resolved
@@ -55,9 +55,9 @@ def _run_surrogate(j: int, resolved: Resolved, tables: Tables) -> Shard:
     campaign, environment = resolved.campaign, resolved.environment
     testing = campaign.testing.model_copy(update={"method": "episode_mixture", "criticality_threshold": 0.0})
     importance = build_importance(campaign.model_copy(update={"testing": testing}), tables)
-    policy = Policy(SEED, environment, importance, resolved.surrogates[j : j + 1])
+    policy = Drawing(SEED, environment, importance, resolved.surrogates[j : j + 1])
     states = InitialStates(environment.numbers).draw(SEED, 0, EPISODES)
-    return EpisodeLoop(TwinWorld(_CELLS), policy, Keep(MOMENT_LIMITS["all"], "none", 0.0)).run(0, states)
+    return EpisodeLoop(TwinWorld(_CELLS), policy, RecordPolicy(MOMENT_LIMITS["all"], "none", 0.0)).run(0, states)
 
 
 def _predictions(j: int, shard: Shard) -> tuple[FloatArray, FloatArray]:

@@ -18,8 +18,8 @@ from harness.campaign.campaign import Campaign
 from harness.compiled import source_hash
 from harness.controllers.find import build_host, require_controller
 from harness.episode.cells import PrescribedTraffic
-from harness.episode.loop import EpisodeLoop, Keep, Policy
-from harness.episode.motion import motion_hashes
+from harness.episode.judge import motion_hashes
+from harness.episode.loop import Drawing, EpisodeLoop, RecordPolicy
 from harness.errors import HarnessError
 from harness.importance.build import build_importance
 from harness.pool.cut_ins import onset_steps
@@ -116,9 +116,9 @@ def _loop(resolved: Resolved) -> EpisodeLoop:
     """The vehicle in the twin, on prescribed traffic, with all of its motion kept."""
     campaign, environment = resolved.campaign, resolved.environment
     prescribed = build_importance(campaign, None)._replace(method=PRESCRIBED)
-    policy = Policy(campaign.seed, environment, prescribed, resolved.av)
+    policy = Drawing(campaign.seed, environment, prescribed, resolved.av)
     host = build_host(campaign.av, n_cells=CELLS, seed=campaign.seed)
-    return EpisodeLoop(TwinWorld(CELLS), policy, Keep(0, "none", 0.0), host)
+    return EpisodeLoop(TwinWorld(CELLS), policy, RecordPolicy(0, "none", 0.0), host)
 
 
 def _crashes(

@@ -12,7 +12,7 @@ import numpy as np
 
 from harness.compiled import compiled_inline
 from harness.controllers.protocol import BatchObservation
-from harness.episode.trajectory import Trajectory, empty_trajectory, lengths
+from harness.episode.path import Trajectory, empty_trajectory, lengths
 from harness.importance.functions import Importance
 from harness.maneuvers import N_ACCELERATIONS
 from harness.traffic.laws import Environment
@@ -36,11 +36,11 @@ CELL_DTYPE = np.dtype(
     [
         ("row", _i8),  # row of the shard, -1: idle
         ("episode", _i8),  # index in the campaign
-        ("told", _i8),  # index that the AV is told, and that its random stream follows from
-        ("motion", np.uint64),  # hash of the AV's motion, through the step of the onset
+        ("announced_index", _i8),  # index that the AV is told, and that its random stream follows from
+        ("motion_hash", np.uint64),  # hash of the AV's motion, through the step of the onset
         ("step", _i8),  # t, in steps
         ("cut_step", _i8),  # -1 before the cut-in
-        ("planned", _i8),  # step in which BV will cut in, where cut-ins take time; -1: it will not
+        ("planned", _i8),  # step in which BV will cut in, if that is known before; else -1
         ("lead", _i8),  # steps from the onset of its lateral motion to overlap
         ("onset_step", _i8),  # from the step after it on the AV may act; -1: nobody knows of an onset yet
         ("component", _i8),  # episode mixture: importance function drawn; shells: the shell; else -1
@@ -64,10 +64,10 @@ CELL_DTYPE = np.dtype(
         ("onset_r2dot", _f8),
         ("av_start", _f8),
         ("danger", _f8),  # what a built-in AV remembers beside its acceleration
-        ("beside_x", _f8),  # of the boundary beside the AV: position, speed, and what it remembers
-        ("beside_v", _f8),
-        ("beside_acceleration", _f8),
-        ("beside_danger", _f8),
+        ("boundary_x", _f8),  # of the boundary beside the AV: position, speed, and what it remembers
+        ("boundary_v", _f8),
+        ("boundary_acceleration", _f8),
+        ("boundary_danger", _f8),
         ("ahead_step", _i8),  # first step after which the AV was ahead of it, -1: never
     ]
 )
@@ -213,11 +213,12 @@ class PrescribedTraffic(NamedTuple):
     """Episodes whose traffic is prescribed: what LV and BV do in each row of a shard; no rows if it is drawn.
 
     ``lv``, ``bv`` (rows, draws) int8 are maneuver indices as an episode records them, 31 in ``bv`` being the cut-in in
-    step ``cut_step`` (rows,), which is -1 for a run without a cut-in. ``stratum`` (rows,) is the shell and
+    step ``cut_step`` (rows,), which is -1 for a run without a cut-in, and in which BV begins to move sideways ``lead``
+    (rows,) steps earlier. ``stratum`` (rows,) is the shell and
     ``log_weight`` (rows,) its log probability.
-    ``told`` (rows,) are the indices that AVs are told, ``motion`` (rows,) hashes of what they must have done when the
-    step of the onset is over: those of their shadow runs. Both are empty where an AV keeps its speed until then.
-    ``lead`` (rows,) is how many steps before its cut-in BV begins to move sideways; empty where cut-ins are one step.
+    ``announced_index`` (rows,) are the indices that AVs are told, ``motion_hash`` (rows,) of what they must have done
+    when the step of the onset is over: those of their baseline runs. Both are empty where an AV keeps its speed until
+    then.
     """
 
     lv: Int8Array
@@ -225,8 +226,8 @@ class PrescribedTraffic(NamedTuple):
     cut_step: IntArray
     stratum: IntArray
     log_weight: FloatArray
-    told: IntArray
-    motion: UInt64Array
+    announced_index: IntArray
+    motion_hash: UInt64Array
     lead: IntArray
 
 
@@ -276,14 +277,15 @@ def empty_scratch(environment: Environment, importance: Importance) -> Scratch:
     )
 
 
-class Bench(NamedTuple):
-    """The test bench as kernels see it: all that the episodes of a shard are run with, and written to.
+class KernelState(NamedTuple):
+    """All that the episodes of a shard are run with, and written to.
 
     ``first_episode`` is the campaign index of row 0, ``states`` (rows,) are initial states. ``x``, ``v`` (K, 3) are the
     world's positions (m) and speeds (m/s) of LV, BV, AV. ``driver`` is (1,) for a built-in AV, else (0,). ``passed_m``
-    is the R2 at which the AV has passed. ``observation`` is what a controller outside of the kernels sees, and
-    ``acts_before_cut_in`` whether it acts from the start; else from the step after the onset. ``boundary`` is (1,)
-    where the AV is compared with a driver beside it, else (0,).
+    is the R2 at which the AV has passed. ``asks_controller`` says whether one outside of the kernels decides for the
+    AV: ``observation`` is what it sees, ``acts_before_cut_in`` whether from the start; else from the step after the
+    onset. ``boundary`` is (1,)
+    where the AV is compared with a driver beside it, else (0,). What may be so or not is 0 or 1.
     """
 
     seed: int
@@ -299,14 +301,15 @@ class Bench(NamedTuple):
     importance: Importance
     driver: RecordArray
     passed_m: float
-    keep_traces: bool
+    keep_traces: int
+    asks_controller: int
     observation: BatchObservation
-    acts_before_cut_in: bool
+    acts_before_cut_in: int
     boundary: RecordArray
 
 
 @compiled_inline
-def state_of(k: int, bench: Bench) -> State:
+def state_of(k: int, kernel: KernelState) -> State:
     """State of cell ``k`` from the world's positions and speeds."""
-    x, v = bench.x, bench.v
+    x, v = kernel.x, kernel.v
     return State(v[k, BV], gap(x[k, LV], x[k, BV]), v[k, LV] - v[k, BV], gap(x[k, BV], x[k, AV]), v[k, BV] - v[k, AV])

@@ -1,131 +1,449 @@
-"""What LV and BV do in the coming step: accelerations drawn at their hold clocks, the cut-in in every step.
+"""What LV and BV do: where a test begins, what is drawn for it, and their maneuvers in every step.
 
-Where the traffic is prescribed they repeat it.
+Accelerations are drawn at hold clocks, the cut-in in every step, by importance functions where a moment is critical;
+where the traffic is prescribed they repeat it.
 """
 
 from __future__ import annotations
 
+import math
+
 from harness.compiled import compiled, compiled_inline
-from harness.episode.cells import Bench, state_of
-from harness.episode.critical_moment import begin_cut_in, choose_lane, controlled_draw
-from harness.importance.functions import look_ahead
-from harness.maneuvers import acceleration
+from harness.episode.cells import KernelState, state_of
+from harness.episode.drive import command, drive_av
+from harness.episode.path import place, state_in, walk, weigh_cut_ins
+from harness.importance.functions import (
+    accumulate,
+    challenges_nobody,
+    forced_ratio,
+    look_ahead,
+    propose_acceleration,
+    propose_cut_in,
+)
+from harness.maneuvers import CUT_IN, N_ACCELERATIONS, STAY, acceleration
 from harness.random_stream import BV_DRAWS, BV_FREE_DRAWS, LV_DRAWS, uniform
-from harness.traffic.laws import car_following, draw_acceleration, free_driving
-from harness.vocabulary import BV, LV, State
+from harness.random_stream import CUT_IN as CUT_IN_STREAM
+from harness.traffic.lateral import draw_lead, onset_of
+from harness.traffic.laws import (
+    acceleration_pmf,
+    acceptance,
+    car_following,
+    cut_in_hazard,
+    draw_acceleration,
+    free_driving,
+    opportunity,
+)
+from harness.vocabulary import (
+    AV,
+    BV,
+    EPISODE_MIXTURE,
+    FORCED,
+    LV,
+    NDE,
+    PRESCRIBED,
+    STEP_MIXTURE,
+    FloatArray,
+    State,
+)
 
 
 @compiled
-def decide(bench: Bench) -> int:
-    """Maneuvers of LV and BV in every running cell; returns how many control steps the shard has recorded so far."""
-    cells = bench.cells
+def decide(kernel: KernelState, given: int) -> int:
+    """Begin episodes in idle cells (`refill`); maneuvers of LV and BV, and of the AV if it is built in, in every cell.
+
+    Returns how many episodes have begun.
+    """
+    cells, begun = kernel.cells, refill(kernel, given)
     for k in range(cells.cell.size):
         cell = cells.cell[k]
         cells.cut_in[k] = 0
         if cell.row < 0:
             continue
-        if bench.traffic.cut_step.size > 0:
-            repeat_traffic(k, state_of(k, bench), bench)
+        if kernel.traffic.cut_step.size > 0:
+            repeat_traffic(k, state_of(k, kernel), kernel)
         else:
-            draw_maneuvers(k, state_of(k, bench), bench)
+            draw_maneuvers(k, state_of(k, kernel), kernel)
         cells.acceleration[k, LV] = acceleration(cell.lv_maneuver)
         cells.acceleration[k, BV] = acceleration(cell.bv_maneuver)
-    return int(bench.results.moment_count[0])
+    if not kernel.asks_controller:
+        if kernel.driver.size > 0:
+            drive_av(kernel)
+        command(kernel)
+    return begun
 
 
 @compiled_inline
-def draw_maneuvers(k: int, state: State, bench: Bench) -> None:
+def draw_maneuvers(k: int, state: State, kernel: KernelState) -> None:
     """Redraw where a hold period begins; before the cut-in, stay or cut in."""
-    hold_steps = bench.environment.numbers.hold_steps
-    cell = bench.cells.cell[k]
+    hold_steps = kernel.environment.numbers.hold_steps
+    cell = kernel.cells.cell[k]
     redraw = cell.step % hold_steps == 0
     if redraw:
-        u = uniform(bench.seed, cell.episode, LV_DRAWS, cell.n_lv)
-        take_lv(k, draw_acceleration(u, free_driving(bench.v[k, LV], bench.environment), bench.environment), bench)
+        u = uniform(kernel.seed, cell.episode, LV_DRAWS, cell.n_lv)
+        take_lv(k, draw_acceleration(u, free_driving(kernel.v[k, LV], kernel.environment), kernel.environment), kernel)
     if cell.cut_step < 0:
         if redraw:
-            redraw_following(k, state, bench)
-        if bench.environment.lateral.cumulative.size > 0:
-            note_onset(k, state, bench)
-            if cell.step == cell.planned:  # it was decided before anybody could see it
-                begin_cut_in(k, state, bench)
-        else:
-            choose_lane(k, state, bench)
+            redraw_following(k, state, kernel)
+        if not may_show(kernel):
+            choose_lane(k, state, kernel)
+            return
+        note_onset(k, state, kernel)
+        if cell.step == cell.planned:  # it was decided before anybody could see it
+            begin_cut_in(k, state, kernel)
     elif (cell.step - cell.cut_step - 1) % hold_steps == 0:
-        redraw_free(k, state, bench)
+        redraw_free(k, state, kernel)
 
 
 @compiled_inline
-def redraw_following(k: int, state: State, bench: Bench) -> None:
+def redraw_following(k: int, state: State, kernel: KernelState) -> None:
     """BV's acceleration behind LV, and what cutting in or staying would be worth during the coming hold period."""
-    cells = bench.cells
+    cells = kernel.cells
     cell = cells.cell[k]
-    u = uniform(bench.seed, cell.episode, BV_DRAWS, cell.n_bv)
-    take_bv(k, draw_acceleration(u, car_following(state, bench.environment), bench.environment), bench)
+    u = uniform(kernel.seed, cell.episode, BV_DRAWS, cell.n_bv)
+    take_bv(k, draw_acceleration(u, car_following(state, kernel.environment), kernel.environment), kernel)
     cell.n_bv += 1
-    if bench.importance.n_surrogates > 0:
+    if kernel.importance.n_surrogates > 0:
         look_ahead(
             state,
             acceleration(cell.bv_maneuver),
             cell.step,
-            bench.environment,
-            bench.importance,
+            kernel.environment,
+            kernel.importance,
             cells.cut_challenge[k],
             cells.stay_challenge[k],
         )
 
 
 @compiled_inline
-def redraw_free(k: int, state: State, bench: Bench) -> None:
+def redraw_free(k: int, state: State, kernel: KernelState) -> None:
     """BV's acceleration for the coming hold period after its cut-in."""
-    cell = bench.cells.cell[k]
-    u = uniform(bench.seed, cell.episode, BV_FREE_DRAWS, cell.n_bv_free)
+    cell = kernel.cells.cell[k]
+    u = uniform(kernel.seed, cell.episode, BV_FREE_DRAWS, cell.n_bv_free)
     cell.n_bv_free += 1
-    if bench.importance.n_surrogates > 0:
-        take_bv(k, controlled_draw(k, u, state, bench), bench)
+    if kernel.importance.n_surrogates > 0:
+        take_bv(k, controlled_draw(k, u, state, kernel), kernel)
     else:
-        take_bv(k, draw_acceleration(u, free_driving(state.v_bv_mps, bench.environment), bench.environment), bench)
+        take_bv(k, draw_acceleration(u, free_driving(state.v_bv_mps, kernel.environment), kernel.environment), kernel)
 
 
 @compiled_inline
-def repeat_traffic(k: int, state: State, bench: Bench) -> None:
+def repeat_traffic(k: int, state: State, kernel: KernelState) -> None:
     """LV and BV repeat a path of the pool, cut-in included."""
-    traffic, hold_steps = bench.traffic, bench.environment.numbers.hold_steps
-    cell = bench.cells.cell[k]
+    traffic, hold_steps = kernel.traffic, kernel.environment.numbers.hold_steps
+    cell = kernel.cells.cell[k]
     redraw = cell.step % hold_steps == 0
     if redraw:
-        take_lv(k, traffic.lv[cell.row, cell.n_lv], bench)
+        take_lv(k, traffic.lv[cell.row, cell.n_lv], kernel)
     since = cell.step - cell.cut_step - 1
     if (cell.cut_step < 0 and redraw) or (cell.cut_step >= 0 and since % hold_steps == 0):
-        take_bv(k, traffic.bv[cell.row, cell.n_path], bench)
-    if bench.traffic.lead.size > 0:
-        note_onset(k, state, bench)
+        take_bv(k, traffic.bv[cell.row, cell.n_path], kernel)
+    note_onset(k, state, kernel)
     if cell.step == traffic.cut_step[cell.row]:
-        begin_cut_in(k, state, bench)
+        begin_cut_in(k, state, kernel)
         cell.n_control += 1
 
 
 @compiled_inline
-def note_onset(k: int, state: State, bench: Bench) -> None:
+def note_onset(k: int, state: State, kernel: KernelState) -> None:
     """Keep the state in which BV begins to move sideways."""
-    cell = bench.cells.cell[k]
+    cell = kernel.cells.cell[k]
     if cell.step == cell.onset_step:
         cell.onset_r2, cell.onset_r2dot = state.r2_m, state.r2dot_mps
 
 
 @compiled_inline
-def take_lv(k: int, maneuver: int, bench: Bench) -> None:
+def take_lv(k: int, maneuver: int, kernel: KernelState) -> None:
     """LV holds a maneuver from now on."""
-    cell = bench.cells.cell[k]
+    cell = kernel.cells.cell[k]
     cell.lv_maneuver = maneuver
-    bench.cells.lv_path[k, cell.n_lv] = maneuver
+    kernel.cells.lv_path[k, cell.n_lv] = maneuver
     cell.n_lv += 1
 
 
 @compiled_inline
-def take_bv(k: int, maneuver: int, bench: Bench) -> None:
+def take_bv(k: int, maneuver: int, kernel: KernelState) -> None:
     """BV holds a maneuver from now on."""
-    cell = bench.cells.cell[k]
+    cell = kernel.cells.cell[k]
     cell.bv_maneuver = maneuver
-    bench.cells.bv_path[k, cell.n_path] = maneuver
+    kernel.cells.bv_path[k, cell.n_path] = maneuver
     cell.n_path += 1
+
+
+COMPONENT_DRAW, CUT_IN_DRAW = 0, 1
+"""Indices within the cut-in stream."""
+
+
+@compiled_inline
+def may_show(kernel: KernelState) -> bool:
+    """Whether cut-ins can be seen before they happen, so that they have to be drawn when the test begins."""
+    return bool(kernel.environment.lateral.cumulative.size > 1)
+
+
+@compiled_inline
+def refill(kernel: KernelState, given: int) -> int:
+    """Give every idle cell the next episode of the shard, of which ``given`` rows have been given before.
+
+    The world's ``x`` and ``v`` receive their placement, ``cells.placed`` their cells; returns how many there are.
+    """
+    n = 0
+    for k in range(kernel.cells.cell.size):
+        if given + n == kernel.states.size:
+            break
+        if kernel.cells.cell[k].row < 0:
+            place(kernel.states[given + n], kernel.x[k], kernel.v[k])
+            begin_cell(k, given + n, kernel)
+            kernel.cells.placed[n] = k
+            n += 1
+    return n
+
+
+@compiled_inline
+def begin_cell(k: int, row: int, kernel: KernelState) -> None:
+    """Reset cell ``k`` for the episode of a row."""
+    cells, method = kernel.cells, kernel.importance.method
+    seed, episode = kernel.seed, kernel.first_episode + row
+    cell = cells.cell[k]
+    cell.row, cell.episode, cell.step, cell.cut_step, cell.component = row, episode, 0, -1, -1
+    cell.planned, cell.lead, cell.onset_step = -1, 0, -1
+    cell.announced_index = kernel.traffic.announced_index[row] if kernel.traffic.announced_index.size > 0 else episode
+    cell.motion_hash = 0
+    cell.lv_maneuver = cell.bv_maneuver = cell.n_lv = cell.n_bv = cell.n_bv_free = cell.n_path = cell.n_control = 0
+    cell.clock = cell.hazard = cell.log_sampled = 0.0
+    cell.hazard_total = cell.log_p_cut_in = math.nan
+    cell.min_ttc = cell.danger = math.inf
+    cell.cut_r2 = cell.cut_r2dot = cell.onset_r2 = cell.onset_r2dot = math.nan
+    cell.av_start = kernel.x[k, AV]
+    cell.ahead_step = -1
+    cells.acceleration[k, AV] = 0.0
+    cells.log_ratio[k, :] = 0.0
+    cells.martingale[k, :] = 0.0
+    if method == PRESCRIBED:
+        log_weight = kernel.traffic.log_weight[row]
+        cell.component, cell.log_sampled = kernel.traffic.stratum[row], -log_weight
+        if kernel.importance.first == 1:  # a forced cut-in whose path has been walked by the AV itself
+            cell.log_p_cut_in, cells.log_ratio[k, 0] = log_weight, -log_weight
+        if kernel.traffic.cut_step[row] >= 0:
+            plan_cut_in(k, kernel.traffic.cut_step[row], kernel.traffic.lead[row], kernel)
+        return
+    forced = method == FORCED
+    if method == EPISODE_MIXTURE:
+        cell.component = draw_component(uniform(seed, episode, CUT_IN_STREAM, COMPONENT_DRAW), kernel.importance.alpha)
+        forced = cell.component == 0
+    u = uniform(seed, episode, CUT_IN_STREAM, CUT_IN_DRAW)
+    cell.target = -math.log1p(-u)
+    environment, path = kernel.environment, kernel.scratch.path
+    if method in (FORCED, EPISODE_MIXTURE) or may_show(kernel):
+        max_steps = environment.numbers.max_steps
+        steps = walk(kernel.states[row], seed, episode, 0, max_steps, True, environment, path)
+        hazard_total = weigh_cut_ins(steps, environment, path)
+        if method in (FORCED, EPISODE_MIXTURE):
+            cell.hazard_total = hazard_total
+            p_cut_in = -math.expm1(-cell.hazard_total)
+            cell.log_p_cut_in = math.log(p_cut_in)
+            if forced:
+                cell.target = min(-math.log1p(-u * p_cut_in), cell.hazard_total)
+        if may_show(kernel):
+            look_for_cut_in(k, steps, kernel)
+
+
+@compiled_inline
+def look_for_cut_in(k: int, steps: int, kernel: KernelState) -> None:
+    """Plan the cut-in that the cell's clock leads to on a path that has been walked, if there is one."""
+    cell, hazard = kernel.cells.cell[k], kernel.scratch.path.hazard
+    for step in range(steps):
+        cell.clock += hazard[step]
+        cut = cell.clock >= cell.target
+        if kernel.importance.method == FORCED:
+            state = state_in(step, kernel.scratch.path)
+            record_ratios(k, step, state, cut, -math.expm1(-hazard[step]), hazard[step], False, kernel)
+        if cut:
+            lead = draw_lead(step, kernel.seed, cell.episode, kernel.environment.lateral)
+            plan_cut_in(k, step, lead, kernel)
+            return
+
+
+@compiled_inline
+def plan_cut_in(k: int, cut: int, lead: int, kernel: KernelState) -> None:
+    """BV will cut in in a step, and show it some steps earlier."""
+    cell = kernel.cells.cell[k]
+    cell.planned, cell.lead, cell.onset_step = cut, lead, onset_of(cut, lead)
+
+
+@compiled_inline
+def draw_component(u: float, alpha: FloatArray) -> int:
+    """Index of the importance function that this episode follows."""
+    total = 0.0
+    for j in range(alpha.size - 1):
+        total += alpha[j]
+        if u < total:
+            return j
+    return alpha.size - 1
+
+
+@compiled_inline
+def choose_lane(k: int, state: State, kernel: KernelState) -> None:
+    """Stay or cut in."""
+    cells, scratch, environment, importance = kernel.cells, kernel.scratch, kernel.environment, kernel.importance
+    cell, method = cells.cell[k], importance.method
+    wish = opportunity(state, environment)
+    hazard = cut_in_hazard(wish, acceptance(state.r2_m, state.r2dot_mps, environment), environment)
+    p = -math.expm1(-hazard) if method != NDE else 0.0  # only the likelihood ratios ask for it
+    critical = False
+    if importance.n_surrogates > 0:
+        i = cell.step % environment.numbers.hold_steps
+        cut_challenge, stay_challenge = cells.cut_challenge[k, i], cells.stay_challenge[k, i]
+        critical = propose_cut_in(p, wish, cut_challenge, stay_challenge, importance, scratch.q, scratch.challenge)
+    cell.clock += sampling_hazard(hazard, critical, method, cell.component, importance.alpha, scratch.q)
+    cut = cell.clock >= cell.target
+    record_ratios(k, cell.step, state, cut, p, hazard, critical, kernel)
+    if cut:
+        begin_cut_in(k, state, kernel)
+
+
+@compiled_inline
+def record_ratios(
+    k: int, step: int, state: State, cut: bool, p: float, hazard: float, critical: bool, kernel: KernelState
+) -> None:
+    """Likelihood ratios of having stayed or cut in, and the moment if it was one of control."""
+    cell, scratch, importance = kernel.cells.cell[k], kernel.scratch, kernel.importance
+    sampled = 1.0
+    if critical or importance.first == 1:
+        sampled = update_ratios(k, cut, p, hazard, critical, kernel)
+    cell.hazard += hazard
+    if critical or (importance.method == FORCED and cut):
+        cell.n_control += 1
+        exposure = p if cut else 1.0 - p
+        for j in range(importance.n_surrogates):
+            scratch.q[j] = scratch.q[j] if cut else 1.0 - scratch.q[j]
+        record_moment(k, step, state, CUT_IN if cut else STAY, exposure, exposure * sampled, kernel)
+
+
+@compiled_inline
+def begin_cut_in(k: int, state: State, kernel: KernelState) -> None:
+    """BV moves to the right lane in this step."""
+    cell = kernel.cells.cell[k]
+    cell.cut_step = cell.step
+    if cell.onset_step < 0:
+        cell.planned, cell.onset_step = cell.step, cell.step
+    cell.cut_r2, cell.cut_r2dot = state.r2_m, state.r2dot_mps
+    kernel.cells.cut_in[k] = 1
+    kernel.cells.bv_path[k, cell.n_path] = CUT_IN
+    cell.n_path += 1
+
+
+@compiled_inline
+def sampling_hazard(
+    hazard: float, critical: bool, method: int, component: int, alpha: FloatArray, q: FloatArray
+) -> float:
+    """Hazard that the sampler's clock advances by; ``q`` (J,) is q_j(cut_in)."""
+    if not critical:
+        return hazard
+    if method == STEP_MIXTURE:
+        mixed = 0.0
+        for j in range(q.size):
+            mixed += alpha[j] * q[j]
+        return -math.log1p(-min(mixed, 1.0))
+    if method == EPISODE_MIXTURE and component > 0:
+        return -math.log1p(-min(q[component - 1], 1.0))
+    return hazard
+
+
+@compiled_inline
+def update_ratios(k: int, cut: bool, p: float, hazard: float, critical: bool, kernel: KernelState) -> float:
+    """Accumulate the likelihood ratios of staying or cutting in; returns q_α/p of the step."""
+    scratch, importance = kernel.scratch, kernel.importance
+    cell = kernel.cells.cell[k]
+    if importance.first == 1:
+        scratch.ratio[0] = forced_ratio(cell.hazard, cell.hazard + hazard, cell.hazard_total, cut)
+    for j in range(importance.n_surrogates):
+        q = scratch.q[j]
+        scratch.ratio[importance.first + j] = (q / p if cut else (1.0 - q) / (1.0 - p)) if critical else 1.0
+        scratch.challenge[j] = scratch.challenge[j] if critical else 0.0
+    return accumulate_ratios(k, kernel)
+
+
+@compiled_inline
+def controlled_draw(k: int, u: float, state: State, kernel: KernelState) -> int:
+    """Acceleration index at a redraw time after the cut-in, which may be critical."""
+    scratch, environment, importance = kernel.scratch, kernel.environment, kernel.importance
+    cell, p, q = kernel.cells.cell[k], scratch.p, scratch.q_acceleration
+    law = free_driving(state.v_bv_mps, environment)
+    if challenges_nobody(state, importance):
+        return draw_acceleration(u, law, environment)
+    acceleration_pmf(law, environment, p)
+    if not propose_acceleration(state, p, importance, q, scratch.challenge):
+        return draw_acceleration(u, law, environment)
+    if importance.method == STEP_MIXTURE or cell.component > 0:
+        maneuver = draw_from(u, importance.method, cell.component, importance.alpha, q)
+    else:
+        maneuver = draw_acceleration(u, law, environment)
+    if importance.first == 1:
+        scratch.ratio[0] = 1.0
+    for j in range(importance.n_surrogates):
+        scratch.q[j] = q[j, maneuver]
+        scratch.ratio[importance.first + j] = q[j, maneuver] / p[maneuver]
+    sampled = accumulate_ratios(k, kernel)
+    cell.n_control += 1
+    record_moment(k, cell.step, state, maneuver, p[maneuver], p[maneuver] * sampled, kernel)
+    return maneuver
+
+
+@compiled_inline
+def draw_from(u: float, method: int, component: int, alpha: FloatArray, q: FloatArray) -> int:
+    """Acceleration index from the step mixture, or from the episode's component, by inversion; ``q`` (J, 31)."""
+    total = 0.0
+    last = 0
+    for m in range(N_ACCELERATIONS):
+        if method == STEP_MIXTURE:
+            probability = 0.0
+            for j in range(q.shape[0]):
+                probability += alpha[j] * q[j, m]
+        else:
+            probability = q[component - 1, m]
+        if probability > 0.0:
+            last = m
+            total += probability
+            if u < total:
+                return m
+    return last
+
+
+@compiled_inline
+def accumulate_ratios(k: int, kernel: KernelState) -> float:
+    """Take ``scratch.ratio`` and ``scratch.challenge`` of a step into the likelihood ratios; returns its q_α/p."""
+    cells, scratch, importance = kernel.cells, kernel.scratch, kernel.importance
+    cell = cells.cell[k]
+    sampled = accumulate(
+        importance.method,
+        importance.first,
+        importance.alpha,
+        scratch.ratio,
+        scratch.challenge,
+        cell.log_sampled,
+        cells.log_ratio[k],
+        cells.martingale[k],
+    )
+    if importance.method == STEP_MIXTURE:
+        cell.log_sampled += math.log(sampled)
+    return sampled
+
+
+@compiled_inline
+def record_moment(
+    k: int, step: int, state: State, maneuver: int, p: float, q_sampled: float, kernel: KernelState
+) -> None:
+    """Keep a control step, if the campaign keeps that many of an episode."""
+    results, scratch = kernel.results, kernel.scratch
+    cell = kernel.cells.cell[k]
+    if cell.n_control > results.moment_limit:
+        return
+    i = results.moment_count[0]
+    moment = results.moment[i]
+    moment.row, moment.step, moment.maneuver = cell.row, step, maneuver
+    moment.v_bv_mps, moment.r1_m, moment.r1dot_mps = state.v_bv_mps, state.r1_m, state.r1dot_mps
+    moment.r2_m, moment.r2dot_mps = state.r2_m, state.r2dot_mps
+    moment.p, moment.q_sampled = p, q_sampled
+    for j in range(scratch.q.size):
+        results.moment_q[i, j] = scratch.q[j]
+        results.moment_v[i, j] = scratch.challenge[j]
+    results.moment_count[0] = i + 1

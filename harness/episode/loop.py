@@ -1,4 +1,4 @@
-"""Run a range of episodes in a world: refill → decide → respond → command → step → judge, until all have ended."""
+"""Run a range of episodes in a world: decide → ask the controller → command → step → judge, until all have ended."""
 
 from __future__ import annotations
 
@@ -9,10 +9,8 @@ from typing import NamedTuple
 import numpy as np
 
 from harness.controllers.hosts import ControllerHost
-from harness.episode.begin import refill
-from harness.episode.beside import drive_beside
 from harness.episode.cells import (
-    Bench,
+    KernelState,
     PrescribedCutIns,
     PrescribedTraffic,
     Results,
@@ -23,8 +21,8 @@ from harness.episode.cells import (
     with_more_room,
 )
 from harness.episode.decide import decide
+from harness.episode.drive import command, empty_observation, first, observe
 from harness.episode.judge import PASSED_M, PASSED_UNDER_CONTROL_M, fail, judge
-from harness.episode.respond import command, empty_observation, first, observe, respond
 from harness.errors import WorldDisagreementError
 from harness.importance.functions import Importance
 from harness.traffic.lateral import LateralMotion, in_one_step
@@ -46,7 +44,7 @@ CONTROL_STEPS = 16
 """Of an episode, for which a shard has room at first; more is made where they are more."""
 
 
-class Policy(NamedTuple):
+class Drawing(NamedTuple):
     """What decides the motion of LV, BV and AV; ``boundary`` is (1,) if the AV is compared with a driver, else (0,)."""
 
     seed: int
@@ -56,7 +54,7 @@ class Policy(NamedTuple):
     boundary: RecordArray = NOBODY
 
 
-class Keep(NamedTuple):
+class RecordPolicy(NamedTuple):
     """What is recorded: at most ``moments`` control steps per episode, and the motion of the ``traces`` episodes."""
 
     moments: int
@@ -113,7 +111,7 @@ def traced_by_index(seed: int, episodes: IntArray, share: float) -> BoolArray:
 class EpisodeLoop:
     """K idle cells of a world, fed with episodes of one campaign; ``av`` is a controller outside of the kernels."""
 
-    def __init__(self, world: World, policy: Policy, keep: Keep, av: ControllerHost | None = None) -> None:
+    def __init__(self, world: World, policy: Drawing, keep: RecordPolicy, av: ControllerHost | None = None) -> None:
         environment, importance = policy.environment, policy.importance
         self._world = world
         self._policy = policy
@@ -135,24 +133,22 @@ class EpisodeLoop:
             The world did something else than it was told.
         """
         shard = self._empty_shard(first_episode, states, traffic or drawn_traffic())
-        bench = self._bench(shard)
+        kernel = self._kernel_state(shard)
         given = ended = 0
         while True:
-            placed = refill(bench, given)
-            recorded = decide(bench)
-            ended += self._respond(bench, shard, placed)
+            placed = decide(kernel, given)
+            if self._av is not None:
+                ended += self._ask(self._av, kernel, shard, placed)
+                command(kernel)
             if ended == states.size:
                 return shard
-            command(bench)
-            if self._policy.boundary.size:
-                drive_beside(bench)
-            ended += self._step_and_judge(bench, shard, placed)
+            ended += self._step_and_judge(kernel, shard, placed)
             given += placed
-            if recorded > shard.results.moment.size - self._world.n_cells:
+            if shard.results.moment_count[0] > shard.results.moment.size - self._world.n_cells:
                 shard.results = with_more_room(shard.results, 2 * shard.results.moment.size)
-                bench = self._bench(shard)
+                kernel = self._kernel_state(shard)
 
-    def beside(self, world: World | None = None, keep: Keep | None = None) -> EpisodeLoop:
+    def beside(self, world: World | None = None, keep: RecordPolicy | None = None) -> EpisodeLoop:
         """Another loop with the same AV and policy, in a world of no more cells, or with other records."""
         return EpisodeLoop(world or self._world, self._policy, keep or self._keep, self._av)
 
@@ -171,12 +167,12 @@ class EpisodeLoop:
         traced = traced_by_index(policy.seed, first_episode + np.arange(states.size), keep.trace_share)
         return Shard(first_episode, states, results, traced, traffic, lateral=policy.environment.lateral)
 
-    def _bench(self, shard: Shard) -> Bench:
+    def _kernel_state(self, shard: Shard) -> KernelState:
         """All that kernels need for a shard, in the form that they need it in."""
         policy, controlled = self._policy, self._av or self._driving
         early = controlled is not None and controlled.acts_before_cut_in
         return unboxed(
-            Bench(
+            KernelState(
                 seed=policy.seed,
                 first_episode=shard.first_episode,
                 states=shard.states,
@@ -190,43 +186,40 @@ class EpisodeLoop:
                 importance=policy.importance,
                 driver=policy.driver,
                 passed_m=PASSED_UNDER_CONTROL_M if early else PASSED_M,
-                keep_traces=self._keep.any_trace,
+                keep_traces=int(self._keep.any_trace),
+                asks_controller=int(self._av is not None),
                 observation=self._observation,
-                acts_before_cut_in=early,
+                acts_before_cut_in=int(early),
                 boundary=policy.boundary,
             )
         )
 
-    def _respond(self, bench: Bench, shard: Shard, placed: int) -> int:
-        """What the AVs do, the user's controller or a built-in one; returns how many controllers failed."""
-        if self._av is None:
-            if self._policy.driver.size:
-                respond(bench)
-            return 0
+    def _ask(self, av: ControllerHost, kernel: KernelState, shard: Shard, placed: int) -> int:
+        """Let the user's controllers drive the AVs; returns how many failed."""
         cells, failures = self._cells, dict[int, str]()
         if placed:
             refilled = cells.placed[:placed]
             begun = cells.cell[refilled]
-            failures.update(self._av.start(refilled, begun["episode"], begun["told"]))
-        if n := observe(bench):
+            failures.update(av.start(refilled, begun["episode"], begun["announced_index"]))
+        if n := observe(kernel):
             acting = self._observation.cell[:n]
-            cells.acceleration[acting, AV], failed = self._av.act(first(self._observation, n))
+            cells.acceleration[acting, AV], failed = av.act(first(self._observation, n))
             failures = {**failed, **failures}
-        return self._fail(failures, bench, shard)
+        return self._fail(failures, kernel, shard)
 
-    def _step_and_judge(self, bench: Bench, shard: Shard, placed: int) -> int:
+    def _step_and_judge(self, kernel: KernelState, shard: Shard, placed: int) -> int:
         """Let the world take the step, and end what is over; returns how many episodes that are."""
         cells, world = self._cells, self._world
         try:
             if placed:
                 refilled = cells.placed[:placed]
                 if self._driving is not None:
-                    self._driving.announce(refilled, cells.cell["told"][refilled])
+                    self._driving.announce(refilled, cells.cell["announced_index"][refilled])
                 world.place(refilled, world.x, world.v)
             contact = world.step(cells.speed, cells.cut_in)
         except AVLostError as lost:
-            return self._lose(str(lost), bench, shard)
-        ended = judge(bench, contact)
+            return self._lose(str(lost), kernel, shard)
+        ended = judge(kernel, contact)
         if ended < 0:
             raise _disagreement(cells.cell[-1 - ended], bool(contact[-1 - ended]))
         if ended:
@@ -235,18 +228,18 @@ class EpisodeLoop:
             shard.failures.update((row, STRAYED) for _, row in self._ended(ended) if outcome[row] == FAILED)
         return ended
 
-    def _lose(self, cause: str, bench: Bench, shard: Shard) -> int:
+    def _lose(self, cause: str, kernel: KernelState, shard: Shard) -> int:
         """Fail all running episodes and begin again; returns their number."""
         running = np.flatnonzero(self._cells.cell["row"] >= 0)
-        lost = self._fail(dict.fromkeys(running.tolist(), cause), bench, shard)
+        lost = self._fail(dict.fromkeys(running.tolist(), cause), kernel, shard)
         if self._driving is not None:
             self._driving.restart()
         return lost
 
-    def _fail(self, failures: Mapping[int, str], bench: Bench, shard: Shard) -> int:
+    def _fail(self, failures: Mapping[int, str], kernel: KernelState, shard: Shard) -> int:
         """End episodes whose controller failed (cell → cause), and go on; returns their number."""
         if failures:
-            fail(bench, np.array(sorted(failures), np.int64))
+            fail(kernel, np.array(sorted(failures), np.int64))
             for k, row in self._ended(len(failures)):
                 shard.failures[row] = failures[k]
             self._keep_traces(len(failures), shard)

@@ -13,8 +13,8 @@ shared history*, is the mixture Σ_j w_j q_j with
 * episode mixture: the posterior weights w_j ∝ α_j exp(L_j). The drawn component itself is not part of the history.
 
 Hence log q_sampled/p accumulates to Σ log Σ_j α_j q_j/p (step), or to log Σ_j α_j exp(L_j) (episode). Forced cut-ins
-and shells know it at the beginning of the episode (`harness.episode.begin`): P(cut-in | path), and the shell's p_s.
-Each control step adds its ratios (`harness.episode.critical_moment.update_ratios`), and the end of the episode asks for
+and shells know it at the beginning of the episode (`harness.episode.decide`): P(cut-in | path), and the shell's p_s.
+Each control step adds its ratios (`harness.episode.decide.update_ratios`), and the end of the episode asks for
 `log_weight`, which is the record's (`harness.episode.judge.end_episode`).
 """
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from harness.episode.trajectory import Followers
+from harness.episode.path import Followers
 from harness.pool.enumeration import STRIDE, enumerate_cut_ins
 from harness.progress import Progress
 from harness.random_stream import DIAGNOSTIC, INITIAL, uniforms

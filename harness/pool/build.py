@@ -142,7 +142,7 @@ def pool_of(
         *script[:-1],
         crashes,
         by_path[path].astype(np.float32),
-        lead=script.lead,
+        script.lead,
     )
     return Pool(
         key=key,

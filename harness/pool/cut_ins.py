@@ -21,8 +21,9 @@ own, which few paths meet: paths aimed there would be lost for all others."""
 
 
 def onset_steps(step: IntArray, lead: IntArray) -> IntArray:
-    """Steps of the onset of cut-ins in given steps (n,); ``lead`` (n,) is empty where they are the same."""
-    return np.maximum(step - lead, 0) if lead.size else step
+    """Steps of the onset of cut-ins in given steps (n,), with a ``lead`` (n,)."""
+    onset: IntArray = np.maximum(step - lead, 0)
+    return onset
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +36,7 @@ class CutIns:
     surrogates crash, in the pool's order, and which references. ``path_mass`` (n, C) float32: the path's probability of
     a cut-in of each cell. ``motion`` (n,) are hashes of what the AV did through the step of the cut-in,
     in the pool of a vehicle that acts before it, or of its onset; else empty. ``lead`` (n,) is how many steps earlier
-    that is; empty where cut-ins are one step.
+    that is: 0 where cut-ins are one step.
     """
 
     path: IntArray
@@ -48,8 +49,8 @@ class CutIns:
     n_bv: IntArray
     crashes: BoolArray
     path_mass: Float32Array
+    lead: IntArray
     motion: UInt64Array = field(default_factory=lambda: np.zeros(0, np.uint64))
-    lead: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
 
     @property
     def onset(self) -> IntArray:
@@ -140,7 +141,7 @@ class Pool:
             "p_cut_in_std_error": self.p_cut_in_se,
             "boundary": self.library.boundary,
             "envelope": self.library.envelope,
-            "delays_after_cut_in_s": {} if self.cut_ins.lead.size else self.library.delays_after_cut_in_s,
+            "delays_after_cut_in_s": {} if self.cut_ins.lead.any() else self.library.delays_after_cut_in_s,
             "surrogates": [dict(zip(keys, row, strict=True)) for row in surrogates],
             "no_surrogate_crashes": p[-1],
             "references": [dict(zip(keys[:-1], row, strict=True)) for row in references],

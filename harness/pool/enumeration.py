@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from harness.compiled import compiled_inline, compiled_threads
-from harness.episode.trajectory import (
+from harness.episode.path import (
     Followers,
     Trajectory,
     empty_trajectory,
@@ -91,7 +91,7 @@ class Script(NamedTuple):
     """Maneuvers of LV and BV on paths (n,), as an episode records them.
 
     ``lv``, ``bv`` (n, draws), 31 marking the cut-in; ``n_lv``, ``n_bv`` (n,) how many there are. ``lead`` (n,) is how
-    many steps earlier BV begins to move sideways; (0,) where cut-ins are one step.
+    many steps earlier BV begins to move sideways.
     """
 
     lv: Int8Array
@@ -187,7 +187,7 @@ def write_script(
     room, n = empty_trajectory(environment), index.size
     lv, bv = np.zeros((2, n, room.lv.size), np.int8)
     n_lv, n_bv = np.zeros((2, n), np.int64)
-    script = Script(lv, bv, n_lv, n_bv, np.zeros(n if environment.lateral.present else 0, np.int64))
+    script = Script(lv, bv, n_lv, n_bv, np.zeros(n, np.int64))
     _write(seed, index, cut, state, draws_per_cut_in, unboxed(environment), unboxed(room), unboxed(script))
     return script
 
@@ -218,8 +218,7 @@ def _write(
         for m in range(drawn):
             bv[i, before + 1 + m] = path.free[m]
         script.n_bv[i] += 1 + drawn
-        if script.lead.size > 0:
-            script.lead[i] = draw_lead(cut[i], seed, index[i], environment.lateral)
+        script.lead[i] = draw_lead(cut[i], seed, index[i], environment.lateral)
         script.n_lv[i] = (n.max_steps - 1) // n.hold_steps + 1
         v = path.v[LV]
         for step in range(n.max_steps):

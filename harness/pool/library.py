@@ -12,7 +12,7 @@ from harness.campaign.files import shipped_or_own
 from harness.campaign.problems import broken_rule, did_you_mean, read_model
 from harness.campaign.sections import Section, ShellSettings, StatementSettings, SurrogateName, checked_statements
 from harness.campaign.vehicle import Driver, Reference, Reflexes
-from harness.episode.trajectory import Followers
+from harness.episode.path import Followers
 from harness.errors import CampaignError
 from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT
 from harness.traffic.laws import Environment

@@ -12,7 +12,7 @@ import numpy as np
 import pyarrow as pa
 
 from harness.compiled import compiled_inline, compiled_threads
-from harness.episode.trajectory import (
+from harness.episode.path import (
     NO_CRASH,
     WAS_AHEAD,
     Trajectory,

@@ -77,7 +77,7 @@ def design_shells(pool: Pool, *, shells: ShellSettings | None = None, limit_mps2
         cell_p=p,
         cell_references=tuple(pool.cell_references[first].tolist()),
         references=tuple(
-            _reference(*each, takes_time=pool.cut_ins.lead.size > 0) for each in pool.library.references.items()
+            _reference(*each, takes_time=bool(pool.cut_ins.lead.any())) for each in pool.library.references.items()
         ),
         reference_rate=pool.reference_rate,
         reference_square=pool.reference_square,
@@ -216,9 +216,9 @@ class PrescribedEpisodes:
             cut_step=c.step[rows],
             stratum=stratum.astype(np.int64),
             log_weight=np.log(self.design.p[stratum]),
-            told=c.row[rows] if acts else np.zeros(0, np.int64),
-            motion=c.motion[rows] if acts else c.motion,
-            lead=c.lead[rows] if c.lead.size else c.lead,
+            announced_index=c.row[rows] if acts else np.zeros(0, np.int64),
+            motion_hash=c.motion[rows] if acts else c.motion,
+            lead=c.lead[rows],
         )
         return c.state[rows], traffic
 

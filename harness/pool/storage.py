@@ -23,7 +23,7 @@ from harness.records.tables import prefixes, rows
 from harness.resolved import Resolved
 from harness.vocabulary import STATE_COLUMNS, IntArray, states_from
 
-_FORMAT = 5
+_FORMAT = 6
 """Raise it when the meaning of a pool changes."""
 _MADE_BY = ("aimed_paths.py", "build.py", "cut_ins.py")
 """Code that decides what is in a pool, beside the kernels."""
@@ -160,9 +160,8 @@ def _table(pool: Pool) -> pa.Table:
         ),
         "lv_maneuvers": (prefixes(c.lv, c.n_lv), "LV's draws, one per hold period"),
         "bv_maneuvers": (prefixes(c.bv, c.n_bv), "BV's draws; 31 marks the cut-in"),
+        "lead_steps": (pa.array(c.lead.astype(np.int16)), "steps from the onset of lateral motion to overlap"),
     }
-    if c.lead.size:
-        columns["lead_steps"] = pa.array(c.lead.astype(np.int16)), "steps from the onset of lateral motion to overlap"
     schema = pa.schema(
         [pa.field(name, array.type, nullable=False, metadata={"doc": doc}) for name, (array, doc) in columns.items()]
     )
@@ -202,7 +201,7 @@ def _pool(table: pa.Table, facts: dict[str, Any]) -> Pool:
         n_bv=n_bv,
         crashes=matrix("crashes"),
         path_mass=matrix("path_mass"),
-        lead=whole("lead_steps") if "lead_steps" in table.column_names else np.zeros(0, np.int64),
+        lead=whole("lead_steps"),
     )
     known: dict[str, Any] = {
         name: np.array(value) if isinstance(value, list) else value for name, value in facts.items()

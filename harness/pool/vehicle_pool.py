@@ -23,7 +23,7 @@ import pyarrow.parquet as pq
 
 from harness.campaign.sections import PoolSettings
 from harness.compiled import cache_root
-from harness.episode.motion import motion_hashes
+from harness.episode.judge import motion_hashes
 from harness.errors import HarnessError
 from harness.pool.aimed_paths import PILOT_PATHS, EnumeratedPaths, contributions
 from harness.pool.build import POOL_SEED, ROUND_PATHS, careful_first, pool_of, take_aim

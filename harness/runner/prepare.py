@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -13,8 +14,8 @@ from harness.compiled import is_cached
 from harness.controllers.find import build_host, require_controller
 from harness.controllers.hosts import Death
 from harness.episode.judge import judge
-from harness.episode.loop import MOMENT_LIMITS, NOBODY, EpisodeLoop, Keep, Policy
-from harness.episode.trajectory import empty_trajectory, mean_test_distance
+from harness.episode.loop import MOMENT_LIMITS, NOBODY, Drawing, EpisodeLoop, RecordPolicy
+from harness.episode.path import empty_trajectory, mean_test_distance
 from harness.errors import RunFolderError
 from harness.importance.build import build_importance, needs_tables
 from harness.importance.tables import Tables, build_tables, table_path
@@ -49,7 +50,7 @@ class Prepared:
     """
 
     resolved: Resolved
-    policy: Policy
+    policy: Drawing
     initial_states: InitialStates
     tables: Tables | None
     prescribed: PrescribedEpisodes | None = None
@@ -95,7 +96,7 @@ class Prepared:
         kill it; they may become more between two runs.
         """
         campaign, records = self.campaign, self.campaign.records
-        keep = Keep(MOMENT_LIMITS[records.moments], traces or records.traces, records.trace_share)
+        keep = RecordPolicy(MOMENT_LIMITS[records.moments], traces or records.traces, records.trace_share)
         av = build_host(
             campaign.av, n_cells=world.n_cells, seed=campaign.seed, black_box=black_box, fatal_episodes=fatal_episodes
         )
@@ -137,13 +138,17 @@ def prepare(resolved: Resolved, progress: Progress | None = None) -> Prepared:
     with ThreadPoolExecutor(1) as thread:
         building = thread.submit(_built, resolved, progress or Progress())
         if not is_cached(judge):
-            compile_kernels(resolved)
+            gc.disable()  # a compiler makes many small objects, and next to no garbage
+            try:
+                compile_kernels(resolved)
+            finally:
+                gc.enable()
         tables, prescribed, shadow_paths = building.result()
     importance = build_importance(campaign, tables)
     if campaign.has_shadow_runs:  # what happens then is prescribed, cut-in included
         importance = importance._replace(method=PRESCRIBED)
     boundary = NOBODY if prescribed is None else checked_boundary(resolved.library, prescribed.design, environment)
-    policy = Policy(campaign.seed, environment, importance, resolved.av, boundary)
+    policy = Drawing(campaign.seed, environment, importance, resolved.av, boundary)
     return Prepared(resolved, policy, InitialStates(environment.numbers), tables, prescribed, shadow_paths)
 
 
@@ -202,9 +207,9 @@ def compile_kernels(resolved: Resolved) -> None:
     campaign, environment = resolved.campaign, resolved.environment
     naturalistic = campaign.model_copy(update={"testing": campaign.testing.model_copy(update={"method": "nde"})})
     importance = build_importance(naturalistic, None)
-    policy = Policy(campaign.seed, environment, importance, resolved.av, boundary=resolved.surrogates[:1])
+    policy = Drawing(campaign.seed, environment, importance, resolved.av, boundary=resolved.surrogates[:1])
     states = InitialStates(environment.numbers).draw(0, 0, 1)
-    shard = EpisodeLoop(TwinWorld(1), policy, Keep(0, "none", 0.0)).run(0, states)
+    shard = EpisodeLoop(TwinWorld(1), policy, RecordPolicy(0, "none", 0.0)).run(0, states)
     Retracing(resolved).check(shard_tables(shard, campaign.seed, keep_traces=False).episodes)
     distance_per_test_m(environment)
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from harness.episode.trajectory import empty_trajectory
+from harness.episode.path import empty_trajectory
 from harness.errors import WorldDisagreementError
 from harness.pool.replay import Retraced, StoredPaths, retrace, stored_paths
 from harness.resolved import Resolved

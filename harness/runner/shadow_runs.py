@@ -16,11 +16,11 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from harness.episode.begin import CUT_IN_DRAW
 from harness.episode.cells import PrescribedTraffic, drawn_traffic
-from harness.episode.loop import EpisodeLoop, Keep, Shard
-from harness.episode.motion import motion_hashes
-from harness.episode.trajectory import Followers
+from harness.episode.decide import CUT_IN_DRAW
+from harness.episode.judge import motion_hashes
+from harness.episode.loop import EpisodeLoop, RecordPolicy, Shard
+from harness.episode.path import Followers
 from harness.errors import RunFolderError
 from harness.pool.cut_ins import onset_steps
 from harness.pool.enumeration import ShadowRuns, enumerate_cut_ins, write_script
@@ -37,7 +37,7 @@ SHADOW = "shadow"
 """Folder of the shadow runs within a run folder."""
 SHARD_RUNS = 50
 """Shadow runs of one file and one task: half a second of a slow controller."""
-ALL_MOTION = Keep(0, "all", 0.0)
+ALL_MOTION = RecordPolicy(0, "all", 0.0)
 AT_ONCE = 1000
 """Shadow runs whose motion is held in memory at once: some 15 MB."""
 _MEND = "Delete this file and run again with --resume: the same shadow runs are made anew."

@@ -29,23 +29,20 @@ _ROUNDING = 1e-9
 
 
 class LateralMotion(NamedTuple):
-    """``distance_m`` from first lateral motion to overlap, and P(lead ≤ k steps), ``cumulative`` (k + 1,).
-
-    ``cumulative`` is empty where cut-ins are one step.
-    """
+    """``distance_m`` from first lateral motion to overlap, and P(lead ≤ k steps), ``cumulative`` (k + 1,)."""
 
     distance_m: float
     cumulative: FloatArray
 
     @property
     def present(self) -> bool:
-        """Whether cut-ins take time here, if only none."""
-        return self.cumulative.size > 0
+        """Whether cut-ins may take time here."""
+        return self.cumulative.size > 1
 
 
 def in_one_step() -> LateralMotion:
     """The paper's cut-in."""
-    return LateralMotion(DISTANCE_M, np.zeros(0))
+    return constant_lead(0.0)
 
 
 def constant_lead(lead_s: float, distance_m: float = DISTANCE_M) -> LateralMotion:
@@ -67,7 +64,7 @@ def log_normal_speed(distance_m: float, median_mps: float, log_sd: float, longes
 def draw_lead(cut: int, seed: int, episode: int, lateral: LateralMotion) -> int:
     """Lead (steps) of the cut-in that overlaps after a step."""
     last = lateral.cumulative.size - 1
-    if last <= 0:
+    if last == 0:
         return 0
     u = uniform(seed, episode, LATERAL, cut)
     lead = 0

@@ -11,7 +11,7 @@ from harness.campaign.campaign import Campaign
 from harness.campaign.sections import EnvironmentSettings
 from harness.campaign.vehicle import AutomatedVehicle, ConstantParameters, Reaction
 from harness.episode.cells import PrescribedTraffic, drawn_traffic
-from harness.episode.loop import EpisodeLoop, Keep, Policy
+from harness.episode.loop import Drawing, EpisodeLoop, RecordPolicy
 from harness.importance.build import build_importance
 from harness.maneuvers import CUT_IN
 from harness.records.tables import episodes_table
@@ -93,7 +93,7 @@ def test_control_steps_of_forced_cut_ins_are_those_of_before():
     ready = [prepare(resolve(campaign("forced", lead_s))) for lead_s in (None, 0.0, 1.0)]
     kept = []
     for each in ready:
-        loop = EpisodeLoop(TwinWorld(64), each.policy, Keep(9, "none", 0.0))
+        loop = EpisodeLoop(TwinWorld(64), each.policy, RecordPolicy(9, "none", 0.0))
         results = loop.run(0, each.states(0, 200)).results
         moment = results.moment[: results.moment_count[0]]
         kept.append(moment[np.argsort(moment["row"])])
@@ -171,16 +171,16 @@ def beside(lead: int, cut: int, r2_m: list[float], closing_mps: float = 0.0) -> 
     return states, traffic._replace(lead=np.full(n, lead))
 
 
-def policy_of(av: AutomatedVehicle, lead_s: float) -> Policy:
+def policy_of(av: AutomatedVehicle, lead_s: float) -> Drawing:
     one = campaign("shells", lead_s, av)
     resolved = resolve(one)
-    return Policy(1, resolved.environment, build_importance(one, None), resolved.av)
+    return Drawing(1, resolved.environment, build_importance(one, None), resolved.av)
 
 
 @pytest.mark.parametrize(("r2_m", "outcome"), BESIDE)
 def test_in_the_first_state_of_overlap_touching_is_a_crash_and_being_ahead_is_having_passed(r2_m, outcome):
     states, traffic = beside(0, 0, [r2_m])
-    shard = EpisodeLoop(TwinWorld(1), policy_of(NEVER, 0.0), Keep(0, "none", 0.0)).run(0, states, traffic)
+    shard = EpisodeLoop(TwinWorld(1), policy_of(NEVER, 0.0), RecordPolicy(0, "none", 0.0)).run(0, states, traffic)
     episode = shard.results.episode[0]
     if outcome is None:
         assert episode["n_steps"] > 1
@@ -197,7 +197,7 @@ def test_a_vehicle_that_accelerates_and_passes_is_ahead_at_the_overlap():
     shorter = [(4.0, 40, PASSED), (2.0, 20, CRASH)]
     for lead_s, lead, expected in shorter:
         states, traffic = beside(lead, lead, [2.0], closing_mps=1.0)
-        loop = EpisodeLoop(TwinWorld(1), policy_of(fast, lead_s), Keep(0, "all", 0.0))
+        loop = EpisodeLoop(TwinWorld(1), policy_of(fast, lead_s), RecordPolicy(0, "all", 0.0))
         shard = loop.run(0, states, traffic)
         episode, trace = shard.results.episode[0], shard.traces[0]
         assert (episode["outcome"], episode["n_steps"]) == (expected, lead + 1)

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from harness.compiled import compiled_threads
-from harness.episode.critical_moment import draw_from
+from harness.episode.decide import draw_from
 from harness.importance import functions
 from harness.maneuvers import acceleration
 from harness.traffic.laws import acceleration_pmf, acceptance, cut_in_hazard, free_driving, opportunity

@@ -7,7 +7,7 @@ import pytest
 
 from harness.campaign.files import load_campaign
 from harness.controllers.find import build_host
-from harness.episode.loop import EpisodeLoop, Keep, Policy
+from harness.episode.loop import Drawing, EpisodeLoop, RecordPolicy
 from harness.importance.build import build_importance
 from harness.pool.library import load_library
 from harness.pool.shells import PrescribedEpisodes
@@ -77,7 +77,7 @@ def test_leads_are_kept_with_the_pool(lateral_pool, pool, tmp_path):
     write_pool(tmp_path / "pool.parquet", lateral_pool)
     assert np.array_equal(read_pool(tmp_path / "pool.parquet").cut_ins.lead, lateral_pool.cut_ins.lead)
     write_pool(tmp_path / "paper.parquet", pool)
-    assert read_pool(tmp_path / "paper.parquet").cut_ins.lead.size == 0
+    assert not read_pool(tmp_path / "paper.parquet").cut_ins.lead.any()
 
 
 def test_a_vehicle_that_acts_before_has_a_pool_of_its_own_that_its_tests_follow():
@@ -86,8 +86,8 @@ def test_a_vehicle_that_acts_before_has_a_pool_of_its_own_that_its_tests_follow(
     resolved = resolve(acts)
     environment, library = resolved.environment, resolved.library
     paths = walk_candidates(environment, library, acts.pool, "test", candidates=1024).draw(60)
-    policy = Policy(1, environment, build_importance(acts, None)._replace(method=PRESCRIBED), resolved.av)
-    loop = EpisodeLoop(TwinWorld(32), policy, Keep(0, "none", 0.0), build_host(acts.av, n_cells=32, seed=1))
+    policy = Drawing(1, environment, build_importance(acts, None)._replace(method=PRESCRIBED), resolved.av)
+    loop = EpisodeLoop(TwinWorld(32), policy, RecordPolicy(0, "none", 0.0), build_host(acts.av, n_cells=32, seed=1))
     motion = without_cut_in(loop, paths.seed, 0, paths.index, paths.state, environment)
     pool = vehicle_pool(resolved, paths, recorded(motion, environment))
     rows = np.unique(np.linspace(0, len(pool.cut_ins.path) - 1, 800).astype(np.int64))

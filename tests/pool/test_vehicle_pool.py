@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from harness.campaign.files import load_campaign
-from harness.episode.motion import motion_hashes
-from harness.episode.trajectory import Followers
+from harness.episode.judge import motion_hashes
+from harness.episode.path import Followers
 from harness.errors import HarnessError
 from harness.pool.aimed_paths import Enumerator
 from harness.pool.enumeration import ShadowRuns, enumerate_cut_ins

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from harness.compiled import compiled_threads
-from harness.episode.loop import EpisodeLoop, Keep, Policy
-from harness.episode.trajectory import Followers
+from harness.episode.loop import Drawing, EpisodeLoop, RecordPolicy
+from harness.episode.path import Followers
 from harness.importance.build import build_importance
 from harness.maneuvers import acceleration
 from harness.pool.enumeration import enumerate_cut_ins
@@ -47,8 +47,8 @@ def driven(campaign, pool, library, name: str):
     driver = library.followers_in(environment).drivers[place][None].copy()
     if name == library.envelope:  # it acts from the onset
         driver["perceives_lateral_m"] = 0.0
-    policy = Policy(1, environment, build_importance(campaign, None), driver)
-    shard = EpisodeLoop(TwinWorld(16), policy, Keep(0, "none", 0.0)).run(0, states, traffic)
+    policy = Drawing(1, environment, build_importance(campaign, None), driver)
+    shard = EpisodeLoop(TwinWorld(16), policy, RecordPolicy(0, "none", 0.0)).run(0, states, traffic)
     return cut_ins.row, shard.results.episode, np.log(prescribed.design.p[traffic.stratum])
 
 

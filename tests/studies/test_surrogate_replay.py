@@ -16,7 +16,7 @@ from harness.campaign.campaign import Campaign
 from harness.campaign.sections import PoolSettings
 from harness.campaign.vehicle import AutomatedVehicle, IDMParameters, Reaction
 from harness.episode.loop import Shard
-from harness.episode.trajectory import Followers
+from harness.episode.path import Followers
 from harness.errors import CampaignError, RunFolderError
 from harness.estimators.block import Block, block_from_tables
 from harness.importance.build import mixture_weights

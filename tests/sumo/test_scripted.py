@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from harness.episode.cells import PrescribedTraffic, drawn_traffic
-from harness.episode.loop import EpisodeLoop, Keep, Policy, Shard
-from harness.episode.trajectory import Followers, empty_trajectory
+from harness.episode.loop import Drawing, EpisodeLoop, RecordPolicy, Shard
+from harness.episode.path import Followers, empty_trajectory
 from harness.importance.build import build_importance
 from harness.maneuvers import CUT_IN
 from harness.pool.library import load_library
@@ -42,15 +42,15 @@ def cut_in_at_once() -> PrescribedTraffic:
     lv, bv = np.full((n, 22), KEEP_SPEED, np.int8), np.full((n, 22), KEEP_SPEED, np.int8)
     bv[:, 1] = CUT_IN
     zeros = np.zeros(n, np.int64)
-    return drawn_traffic()._replace(lv=lv, bv=bv, cut_step=zeros, stratum=zeros, log_weight=np.zeros(n))
+    return drawn_traffic()._replace(lv=lv, bv=bv, cut_step=zeros, stratum=zeros, log_weight=np.zeros(n), lead=zeros)
 
 
 def run(world, smoke) -> Shard:
     campaign = smoke("testing.method=shells")
-    policy = Policy(
+    policy = Drawing(
         1, load_environment(campaign.environment), build_importance(campaign, None), av_records(campaign.av)
     )
-    return EpisodeLoop(world, policy, Keep(0, "all", 0.0)).run(0, STATES, cut_in_at_once())
+    return EpisodeLoop(world, policy, RecordPolicy(0, "all", 0.0)).run(0, STATES, cut_in_at_once())
 
 
 def test_the_twin_judges_cut_ins_beside_lv(smoke):
@@ -87,7 +87,7 @@ def test_sumo_flags_vehicles_beside_each_other_by_the_rule_of_the_first_overlap(
     states, traffic = beside(0, 0, [r2_m for r2_m, _ in BESIDE])
     episode = {}
     for name, world in (("twin", TwinWorld(4)), ("sumo", open_world(4))):
-        loop = EpisodeLoop(world, policy_of(NEVER, 0.0), Keep(0, "none", 0.0))
+        loop = EpisodeLoop(world, policy_of(NEVER, 0.0), RecordPolicy(0, "none", 0.0))
         episode[name] = loop.run(0, states, traffic).results.episode
     assert episode["sumo"].tobytes() == episode["twin"].tobytes()
     for row, (_, outcome) in zip(episode["sumo"], BESIDE, strict=True):

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import traci
 
-from harness.episode.loop import EpisodeLoop, Keep, Shard
+from harness.episode.loop import EpisodeLoop, RecordPolicy, Shard
 from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, WorldDisagreementError
 from harness.resolved import resolve
 from harness.runner.prepare import prepare
@@ -166,7 +166,7 @@ class NervousTwin(TwinWorld):
 
 def run_in(world, campaign) -> Shard:
     prepared = prepare(resolve(campaign))
-    return EpisodeLoop(world, prepared.policy, Keep(0, "none", 0.0)).run(500, prepared.states(500, 60))
+    return EpisodeLoop(world, prepared.policy, RecordPolicy(0, "none", 0.0)).run(500, prepared.states(500, 60))
 
 
 def test_a_crash_that_the_world_does_not_flag_stops_the_run_and_names_the_episode(smoke):

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from harness.episode.trajectory import place
+from harness.episode.path import place
 from harness.traffic.initial_state import InitialStates
 from harness.vocabulary import STATE_COLUMNS, State
 from tests.chains.seed import SEED

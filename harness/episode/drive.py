@@ -1,0 +1,136 @@
+"""What AVs do in the coming step, or see if a controller is to say it; the speeds commanded; and the boundary driver.
+
+That is the one that a statement says the AV is never ahead of, driven beside it from its cut-in on.
+It starts with the AV: same place, same speed, one step after the onset of the cut-in, when neither could act yet. As
+long as the AV is not ahead of it, the AV runs into nothing that it does not run into. Where it has run into BV itself,
+or passed it before the overlap, there is nothing left to be compared.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from harness.compiled import compiled, compiled_inline
+from harness.controllers.protocol import BatchObservation
+from harness.episode.cells import KernelState
+from harness.traffic.lateral import lateral_position, perceived_in
+from harness.vehicles.kinematics import CONTACT_M, STEP_S, gap, next_position, next_speed
+from harness.vehicles.references import Memory, react, reaction_steps
+from harness.vocabulary import AV, BV, LV, FloatArray, IntArray, read_only
+
+
+@compiled_inline
+def drive_av(kernel: KernelState) -> None:
+    """Acceleration of a built-in AV wherever it is cut in on; it acts from the step after the onset at most."""
+    x, v, cells, driver = kernel.x, kernel.v, kernel.cells, kernel.driver
+    perceives_m, distance_m = driver[0].perceives_lateral_m, kernel.environment.lateral.distance_m
+    for k in range(cells.cell.size):
+        cell = cells.cell[k]
+        if cell.row < 0 or cell.onset_step < 0 or cell.step <= cell.onset_step:
+            continue
+        first, earlier = perceived_in(perceives_m, cell.planned, cell.lead, distance_m)
+        step = cell.step - first - reaction_steps(driver[0], kernel.seed, cell.episode)
+        if step >= 0:
+            memory = Memory(cells.acceleration[k, AV], cell.danger, driver[0].used_up_steps + earlier)
+            memory = react(driver[0], memory, step, v[k, AV], v[k, BV], gap(x[k, BV], x[k, AV]))
+            cells.acceleration[k, AV], cell.danger = memory.acceleration, memory.danger
+
+
+@compiled
+def observe(kernel: KernelState) -> int:
+    """Write what the AVs that are to act see to ``kernel.observation``; returns their number."""
+    x, v, cells, out = kernel.x, kernel.v, kernel.cells, kernel.observation
+    distance_m = kernel.environment.lateral.distance_m
+    n = 0
+    for k in range(cells.cell.size):
+        cell = cells.cell[k]
+        followed, comes = 0 <= cell.cut_step < cell.step, 0 <= cell.onset_step < cell.step
+        if cell.row < 0 or not (comes or kernel.acts_before_cut_in):
+            continue
+        out.cell[n], out.episode[n], out.time_s[n] = k, cell.announced_index, cell.step * STEP_S
+        out.position_m[n], out.speed_mps[n] = x[k, AV], v[k, AV]
+        out.acceleration_mps2[n] = cells.acceleration[k, AV]
+        out.gap_m[n] = gap(x[k, BV], x[k, AV]) if followed else math.inf
+        out.lead_speed_mps[n] = v[k, BV] if followed else math.nan
+        out.bv_position_m[n], out.bv_speed_mps[n] = x[k, BV], v[k, BV]
+        out.bv_lane[n] = 0 if followed else 1
+        out.lv_position_m[n], out.lv_speed_mps[n] = x[k, LV], v[k, LV]
+        out.bv_lateral_m[n] = lateral_position(cell.step, cell.planned, cell.lead, distance_m) if comes else 0.0
+        out.bv_lateral_speed_mps[n] = distance_m / (cell.lead * STEP_S) if comes and not followed else 0.0
+        out.bv_overlaps[n] = 1 if followed else 0
+        n += 1
+    return n
+
+
+def empty_observation(n_cells: int) -> BatchObservation:
+    """Room for the observations of K cells: rows of one array of whole numbers and of one of floats."""
+    return _rows(np.zeros((4, n_cells), np.int64), np.zeros((12, n_cells)))
+
+
+def first(observation: BatchObservation, n: int) -> BatchObservation:
+    """The first ``n`` entries of every array, as copies that a controller may keep, and that nobody can write into."""
+    whole: Any = observation.cell.base
+    real: Any = observation.time_s.base
+    return _rows(read_only(whole[:, :n].copy()), read_only(real[:, :n].copy()))
+
+
+def _rows(whole: IntArray, real: FloatArray) -> BatchObservation:
+    cell, episode, bv_lane, bv_overlaps = whole
+    return BatchObservation._make([cell, episode, *real[:8], bv_lane, *real[8:], bv_overlaps])
+
+
+@compiled
+def command(kernel: KernelState) -> None:
+    """Turn accelerations into the speeds at the end of the step; idle cells stand still. Drive the boundary, too."""
+    if kernel.boundary.size > 0:
+        boundary_driver(kernel)
+    x, v, cells = kernel.x, kernel.v, kernel.cells
+    for k in range(cells.cell.size):
+        running = cells.cell[k].row >= 0
+        for vehicle in range(3):
+            a = cells.acceleration[k, vehicle]
+            cells.speed[k, vehicle] = next_speed(v[k, vehicle], a) if running else 0.0
+            if kernel.keep_traces and running:
+                here = cells.trace[k, cells.cell[k].step, vehicle]
+                here[0], here[1], here[2] = x[k, vehicle], v[k, vehicle], a
+
+
+AHEAD_M = 1e-6
+"""What counts as ahead: more than a rounding of positions."""
+
+
+@compiled_inline
+def boundary_driver(kernel: KernelState) -> None:
+    """Before a step: the boundary's position at its end, infinite once it has run into BV."""
+    x, v, driver = kernel.x, kernel.v, kernel.boundary[0]
+    for k in range(kernel.cells.cell.size):
+        cell = kernel.cells.cell[k]
+        since = cell.step - cell.onset_step - 1
+        if cell.row < 0 or cell.onset_step < 0 or since < 0:
+            continue
+        if since == 0:
+            cell.boundary_x, cell.boundary_v = x[k, AV], v[k, AV]
+            cell.boundary_acceleration, cell.boundary_danger = 0.0, math.inf
+        ahead = gap(x[k, BV], cell.boundary_x)
+        if ahead < CONTACT_M and cell.step > cell.planned:
+            cell.boundary_x = math.inf
+        if cell.boundary_x == math.inf:
+            continue
+        if since >= driver.delay_steps:
+            memory = Memory(cell.boundary_acceleration, cell.boundary_danger, driver.used_up_steps)
+            memory = react(driver, memory, since - driver.delay_steps, cell.boundary_v, v[k, BV], ahead)
+            cell.boundary_acceleration, cell.boundary_danger = memory.acceleration, memory.danger
+        after = next_speed(cell.boundary_v, cell.boundary_acceleration)
+        cell.boundary_x, cell.boundary_v = next_position(cell.boundary_x, cell.boundary_v, after), after
+
+
+@compiled_inline
+def note_if_ahead(k: int, kernel: KernelState) -> None:
+    """After a step: whether it was the first at whose end the AV is ahead of the boundary."""
+    cell = kernel.cells.cell[k]
+    followed = 0 <= cell.onset_step < cell.step - 1
+    if followed and cell.ahead_step < 0 and kernel.x[k, AV] > cell.boundary_x + AHEAD_M:
+        cell.ahead_step = cell.step
