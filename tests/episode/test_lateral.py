@@ -140,7 +140,7 @@ def test_a_longer_lead_never_crashes_a_vehicle_that_brakes_more_for_it_and_helps
     assert crashes[0] > crashes[1] > crashes[2]
 
 
-@pytest.mark.parametrize("lead_s", [0.0, 0.8, None])
+@pytest.mark.parametrize("lead_s", [0.1, 0.8, None])
 @pytest.mark.parametrize(
     "av",
     [IDM, AutomatedVehicle(model="r157-cc"), AutomatedVehicle(model="constant", parameters={"acceleration_mps2": 2.0})],
@@ -180,7 +180,7 @@ def policy_of(av: AutomatedVehicle, lead_s: float) -> Drawing:
 @pytest.mark.parametrize(("r2_m", "outcome"), BESIDE)
 def test_in_the_first_state_of_overlap_touching_is_a_crash_and_being_ahead_is_having_passed(r2_m, outcome):
     states, traffic = beside(0, 0, [r2_m])
-    shard = EpisodeLoop(TwinWorld(1), policy_of(NEVER, 0.0), RecordPolicy(0, "none", 0.0)).run(0, states, traffic)
+    shard = EpisodeLoop(TwinWorld(1), policy_of(NEVER, 1.0), RecordPolicy(0, "none", 0.0)).run(0, states, traffic)
     episode = shard.results.episode[0]
     if outcome is None:
         assert episode["n_steps"] > 1

@@ -100,7 +100,7 @@ def test_a_vehicle_that_acts_before_has_a_pool_of_its_own_that_its_tests_follow(
     enclosed = pool.cut_ins.crashes[rows, pool.names.index(library.envelope)]
     assert 50 < crashed.sum() < rows.size - 50
     assert np.all(enclosed[crashed])
-    other = traffic._replace(motion=traffic.motion + np.uint64(1))
+    other = traffic._replace(motion_hash=traffic.motion_hash + np.uint64(1))
     assert len(loop.run(10**6, states[:40], other._replace(**_first(other, 40))).failures) == 40
 
 
