@@ -106,9 +106,15 @@ def test_what_says_nothing_of_leads_has_the_hashes_of_before():
     assert resolve(reference).content_hash == "8e61b44d997bf0d0"
 
 
+def test_a_lead_of_zero_is_the_environment_without_one():
+    smoke, other = (load_campaign("scenarios/smoke.yaml", sets) for sets in ((), ["environment.cut_in_lead_s=0"]))
+    assert environment_hash(load_environment(other.environment)) == environment_hash(
+        load_environment(smoke.environment)
+    )
+
+
 @pytest.mark.parametrize(
-    "override",
-    ["environment.parameters=ndd-overtaking-1-lateral", "environment.cut_in_lead_s=0", "environment.cut_in_lead_s=0.5"],
+    "override", ["environment.parameters=ndd-overtaking-1-lateral", "environment.cut_in_lead_s=0.5"]
 )
 def test_what_says_something_has_others(override):
     smoke, other = load_campaign("scenarios/smoke.yaml"), load_campaign("scenarios/smoke.yaml", [override])
