@@ -8,15 +8,13 @@ from __future__ import annotations
 
 import math
 from copy import deepcopy
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 import numpy as np
+from pydantic_core import from_json, to_json
 
 from harness.estimators.block import Block
-
-WIDEST_RHW = 10.0
-"""Relative half-widths above are not given as a number: next to nothing is known, and the digits would mean nothing."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +71,7 @@ class Estimate:
 
     def to_json(self) -> dict[str, Any]:
         """Plain JSON content; infinite and undefined numbers become null, as does an RHW that says nothing."""
-        return finite_json({**asdict(self), "rhw": self.precision})
+        return finite_json(replace(self, rhw=self.precision))
 
 
 @dataclass(frozen=True)
@@ -87,17 +85,10 @@ class Unavailable:
         return {"crash_rate": None, "reason": self.reason}
 
 
-def finite_json(content: dict[str, Any]) -> dict[str, Any]:
-    """Copy of nested content with tuples as lists and non-finite numbers as null, which JSON cannot write."""
-    return {key: _finite(value) for key, value in content.items()}
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, dict):
-        return finite_json(value)
-    if isinstance(value, list | tuple):
-        return [_finite(entry) for entry in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+def finite_json(content: Any) -> dict[str, Any]:
+    """JSON content of a dataclass or mapping: tuples as lists, non-finite numbers, which JSON cannot write, as null."""
+    plain: dict[str, Any] = from_json(to_json(content, inf_nan_mode="null"))
+    return plain
 
 
 class Accumulator(Protocol):

@@ -9,7 +9,6 @@ round, whichever takes it farther.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal, NamedTuple
 
@@ -19,7 +18,6 @@ from harness.estimators.block import Block
 from harness.estimators.estimate import Estimate, FailureBounds, finite_json
 from harness.estimators.likelihood import Level, contrast_limit, ratio_limits, spread
 from harness.estimators.shells import Shells
-from harness.estimators.statement import warned
 from harness.estimators.tally import Tally, mean_square
 from harness.strata import ShellDesign
 from harness.vocabulary import BoolArray, FloatArray, IntArray
@@ -357,82 +355,3 @@ def _shells(pairs: PairCounts) -> list[dict[str, Any]]:
         }
         for s, row in enumerate(pairs.outcomes())
     ]
-
-
-def paired_statement(found: PairedEstimate, name_a: str, name_b: str) -> str:
-    """Without an assumption: both rates, what lies between them, and where only one of the two crashes."""
-    free = found.free
-    return (
-        f"{rates_statement(found.a, found.b, name_a, name_b)}: {_apart(free, found.a.confidence)}, from "
-        f"{free.n_pairs:,} pairs of tests. Alone, where the other one does not, "
-        f"A crashes {_alone(free.only_a)} times per test, B {_alone(free.only_b)}."
-        f"{failed_pairs_statement(found.a, found.b)}"
-    )
-
-
-def conditional_paired_statement(found: PairedEstimate) -> str:
-    """If both crash only where the boundary surrogate or a more careful one does."""
-    boundary, inside = found.pairs.design.library.boundary, found.conditional
-    if found.refuted:
-        who = " and ".join(_crashed_outside(found))
-        return (
-            f"{who} crashed where the surrogate {boundary} does not crash: nothing can be said under the assumption "
-            f"that they crash only where {boundary} does."
-        )
-    text = (
-        f"If A and B crash only where the surrogate {boundary} or a more careful one crashes: "
-        f"{_apart(inside, found.a.confidence)}, from {inside.n_pairs:,} pairs of tests."
-    )
-    if inside.n_pairs == found.free.n_pairs:
-        return f"{text} Nothing was tested outside: whether the assumption holds is not known."
-    return f"{text} In {found.free.n_pairs - inside.n_pairs:,} pairs of tests outside neither crashed."
-
-
-def _apart(found: Contrast, confidence: float) -> str:
-    differs = found.n_differing > 0
-    apart = apart_statement(found.difference, found.ci_low, found.ci_high, confidence, differs=differs)
-    if not math.isfinite(found.ratio):
-        return apart
-    high = f"{found.ratio_high:.3g}" if math.isfinite(found.ratio_high) else "no limit"
-    return f"{apart}, A/B = {found.ratio:.3g} ({found.ratio_low:.3g} to {high})"
-
-
-def _alone(found: Interval) -> str:
-    return f"{found.value:.3g} ({found.ci_low:.3g} to {found.ci_high:.3g})"
-
-
-def _crashed_outside(found: PairedEstimate) -> Iterator[str]:
-    for side, name in enumerate("AB"):
-        if n := int(found.pairs.tally(side).crashes[found.pairs.design.library.n_inside :].sum()):
-            yield f"{name} has {n:,} times"
-
-
-def rates_statement(a: Estimate, b: Estimate, name_a: str, name_b: str) -> str:
-    """Both rates with their intervals, after what may be wrong about them."""
-    cautions = [f"{name}: {text}" for name, of in (("A", a), ("B", b)) for text in of.cautions]
-    return warned(
-        cautions,
-        f"A ({name_a}) crashes {a.crash_rate:.3g} times per test ({a.ci_low:.3g} to {a.ci_high:.3g}), "
-        f"B ({name_b}) {b.crash_rate:.3g} times ({b.ci_low:.3g} to {b.ci_high:.3g})",
-    )
-
-
-def apart_statement(difference: float, low: float, high: float, confidence: float, *, differs: bool) -> str:
-    """Which of them crashes more often, and by how much."""
-    verdict = "the difference is not distinguishable from 0"
-    if differs and low > 0.0:
-        verdict = "A crashes more often"
-    elif differs and high < 0.0:
-        verdict = "A crashes less often"
-    return f"{verdict}, A - B = {difference:.3g} ({confidence:.0%} interval {low:.3g} to {high:.3g})"
-
-
-def failed_pairs_statement(a: Estimate, b: Estimate) -> str:
-    """How failed tests count; nothing where none has failed."""
-    of_a, of_b = a.details["n_failed"], b.details["n_failed"]
-    if not of_a and not of_b:
-        return ""
-    return (
-        f" Of these tests A FAILED in {of_a:,} and B in {of_b:,}: each limit counts them as crashes or as none, "
-        "whichever takes it farther."
-    )

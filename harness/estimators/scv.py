@@ -151,8 +151,8 @@ class Scv:
     @classmethod
     def refusal(cls, block: Block) -> str | None:
         """Needs the step mixture and the ratios of its first control steps."""
-        if block.drawn.method != "step_mixture":
-            return f"is defined for the step mixture ([paper] section III-C); these tests are by {block.drawn.method}"
+        if (method := block.drawn.method) != "step_mixture":
+            return f"is defined for the step mixture ([paper] section III-C), these tests were drawn by {method}"
         if "first_ratios" not in block.columns:
             return "needs the control steps of every episode: set records.moments to first_9 or all"
         return None

@@ -6,12 +6,14 @@ error, but for the three without which nothing can be read.
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from harness.stopped_by import StoppedBy
-
+StoppedBy = Literal["rhw", "accept", "contradicted", "two_phase", "episodes", "pool", "pool_error"]
+"""The asked precision, a decision about the limit, a vehicle that does not do what the deciding statement assumes, the
+number of tests planned for a precision, the budget, the last cut-in that the pool holds of a shell that needs more, or
+the pool's own error, which alone is wider than that."""
 Count = Annotated[int, Field(ge=0, lt=2**63)]
 ShardPath = Annotated[str, Field(pattern=r"^[a-z]+/[A-Za-z0-9_-]+\.parquet$")]
 

@@ -15,6 +15,7 @@ from pydantic import BaseModel
 from harness import numbers
 from harness.campaign.campaign import Campaign
 from harness.campaign.files import written_out
+from harness.estimators.answer import MENDS
 from harness.estimators.shells import ShellDetails, Within
 from harness.numbers import MISSING, count, exponent_of, half_width, leaves, number, power_of_ten, share, words
 from harness.records.folder import write_bytes
@@ -24,7 +25,6 @@ from harness.report.rate_plots import answer_plot, convergence_plot, rate_expone
 from harness.report.style import RC, Plot, inline_svg, png, svg
 from harness.report.summary import RunFolder, RunSummary, lateral_facts, read_run_folder, summarise
 from harness.report.test_plots import crash_time_plot, cut_in_plot, impact_speed_plot, strata_plot, weight_plot
-from harness.stopped_by import MENDS
 from harness.vocabulary import OUTCOMES
 
 PLOT_NAMES = re.compile(

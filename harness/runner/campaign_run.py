@@ -26,6 +26,7 @@ from harness.records.folder import (
     write_json,
     write_shard,
 )
+from harness.records.manifest import StoppedBy
 from harness.resolved import Resolved
 from harness.runner.manifest import (
     SMALLEST_FAILED_SAMPLE,
@@ -50,7 +51,6 @@ from harness.runner.stored_estimates import estimate_run
 from harness.runner.stored_shards import stored_shard
 from harness.runner.worker import ShardDone, ShardSpec
 from harness.runner.workers import workers_of
-from harness.stopped_by import StoppedBy
 from harness.strata import STORED_DESIGN
 from harness.vocabulary import SAMPLING
 

@@ -17,16 +17,9 @@ from typing import Any
 import numpy as np
 
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED, CampaignError
+from harness.estimators.answer import conditional_paired_statement, paired_statement
 from harness.estimators.block import Block
-from harness.estimators.pairs import (
-    MarginVerdict,
-    PairCounts,
-    PairedEstimate,
-    PairedShells,
-    conditional_paired_statement,
-    paired_estimate,
-    paired_statement,
-)
+from harness.estimators.pairs import MarginVerdict, PairCounts, PairedEstimate, PairedShells, paired_estimate
 from harness.estimators.stopping import PairRule
 from harness.pool.shells import Draw, acceleration_limit
 from harness.progress import Progress

@@ -9,8 +9,9 @@ from typing import Any
 
 from harness.campaign.campaign import Campaign
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED
+from harness.estimators.answer import ending
 from harness.estimators.stopping import Rule, Verdict
-from harness.stopped_by import StoppedBy, ending
+from harness.records.manifest import StoppedBy
 
 EXIT_OF: Mapping[Verdict, int] = {"accepted": EXIT_DONE, "rejected": EXIT_REFUTED, "undecided": EXIT_BUDGET_SPENT}
 ESTIMATES, REPORT = "estimates.json", "report.html"
@@ -28,7 +29,7 @@ class RunResult:
     estimates : dict
         Content of ``estimates.json``.
     stopped_by : {"rhw", "accept", "contradicted", "two_phase", "episodes", "pool", "pool_error"}
-        See `harness.stopped_by`.
+        See `harness.records.manifest.StoppedBy`.
     ending : str
         When it ended and which condition decided, in a sentence.
     exit_code : int

@@ -9,8 +9,8 @@ from typing import Any, Literal
 import numpy as np
 from scipy.stats import t as student
 
-from harness.estimators.diagnostics import CARELESS_MEAN
 from harness.estimators.limits import normal_half_width
+from harness.estimators.one_pass import CARELESS_MEAN
 from harness.vocabulary import Method
 
 Verdict = Literal["reproduced", "not reproduced", "cannot be told", "ours to choose"]

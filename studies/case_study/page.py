@@ -14,7 +14,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from harness import numbers
 from harness.errors import HarnessError
 from harness.estimators.block import MAX_CONTROL_STEPS
-from harness.estimators.diagnostics import CARELESS_MEAN
+from harness.estimators.one_pass import CARELESS_MEAN
 from harness.records.folder import write_bytes
 from harness.report.style import RC, png
 from studies.case_study.context import Made

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from harness.estimators.diagnostics import Diagnostics
+from harness.estimators.one_pass import Diagnostics
 from harness.vocabulary import BV_LV_CONTACT
 from studies.chains.named import overtaking
 from studies.chains.sampler import blocks

@@ -9,6 +9,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from harness.estimators.answer import conditional_paired_statement, paired_statement
 from harness.estimators.likelihood import Level
 from harness.estimators.pairs import (
     A_CRASHES,
@@ -19,10 +20,8 @@ from harness.estimators.pairs import (
     MarginDecision,
     PairCounts,
     PairedShells,
-    conditional_paired_statement,
     no_pairs,
     paired_estimate,
-    paired_statement,
 )
 from harness.strata import ShellDesign, Statement
 from tests.estimators.small_blocks import SHELLS, in_shells

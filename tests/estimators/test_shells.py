@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from harness.estimators import Estimate, one_pass
+from harness.estimators.answer import boundary_statements, statement
 from harness.estimators.block import Drawn
 from harness.estimators.likelihood import Level, likelihood_limit
-from harness.estimators.statement import boundary_statements, statement
 from harness.estimators.tally import Tally, combined, pool_variance
 from harness.strata import Statement
 

@@ -15,7 +15,7 @@ import numpy as np
 from harness.campaign.campaign import Campaign
 from harness.episode.cells import PrescribedCutIns
 from harness.episode.loop import Shard
-from harness.estimators.one_pass import CampaignFacts, estimate_blocks
+from harness.estimators.answer import CampaignFacts, estimate_blocks
 from harness.importance.build import importance_names
 from harness.records.folder import encoded, write_shard
 from harness.records.tables import shard_tables

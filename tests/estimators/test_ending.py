@@ -8,7 +8,7 @@ import pytest
 
 from harness.campaign.sections import Stop
 from harness.estimators import StopRule
-from harness.stopped_by import ending
+from harness.estimators.answer import ending
 from tests.estimators.test_stopping import passing
 
 

@@ -1,0 +1,372 @@
+"""What a run answers: ``estimates.json``, and the sentences that are functions of estimates, decisions and pairs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from harness.estimators.block import Block
+from harness.estimators.estimate import Estimate, Unavailable, finite_json
+from harness.estimators.one_pass import one_pass
+from harness.estimators.pairs import Contrast, Interval, PairedEstimate
+from harness.numbers import WIDEST_RHW
+from harness.records.manifest import StoppedBy
+from harness.vocabulary import ESTIMATORS, EstimatorName
+
+_PER_KM = 1e6
+REPLAY = "harness replay FOLDER"
+"""Command that replays a test, without its number; FOLDER stands for the run's."""
+SCOPE = "The interval is about sampling error in this environment, not about how well the environment matches the road."
+MENDS: dict[str, str] = {
+    "episodes": "stop.episodes was spent; raise it and go on with --resume",
+    "pool": "all cut-ins that the pool keeps of a shell were tested; raise pool.cut_ins_per_shell and use a new folder",
+    "contradicted": "the vehicle does not do what the statement assumes; ask for accept.statement: assumption_free and "
+    "use a new folder",
+    "pool_error": "the pool's own error alone is wider; lower pool.relative_error (or raise pool.shadow_paths, of a "
+    "vehicle that acts before the cut-in) and use a new folder",
+}
+"""Why a campaign ended before its precision, and the mend."""
+
+
+@dataclass(frozen=True)
+class CampaignFacts:
+    """What estimates must say about the campaign that they belong to.
+
+    Attributes
+    ----------
+    distance_per_test_m : float or None
+        Mean distance that the AV drives in a naturalistic test; None if unknown, and then nothing is said per km.
+    importance_names : tuple of str
+        Names of the importance functions, in order.
+    retraced : dict
+        What the run says about the twin retracing its episodes.
+    repeated : dict
+        What the run says about tests that it ran twice.
+    ending : str or None
+        When the run ended and which condition decided, in a sentence; None while it goes on.
+    decision : dict or None
+        What the run has found about the limit that it was asked about; `harness.estimators.stopping.Decision`.
+    """
+
+    name: str
+    content_hash: str
+    lane_change_level: float
+    confidence: float = 0.9
+    distance_per_test_m: float | None = None
+    importance_names: tuple[str, ...] = ()
+    retraced: dict[str, Any] | None = None
+    repeated: dict[str, Any] | None = None
+    ending: str | None = None
+    decision: dict[str, Any] | None = None
+
+
+def estimate_blocks(
+    blocks: Iterable[Block], facts: CampaignFacts, *, estimators: Collection[EstimatorName] | None = None
+) -> dict[str, Any]:
+    """Estimates of blocks that cover a campaign's episodes, as JSON content.
+
+    Parameters
+    ----------
+    blocks : iterable of Block
+        Contiguous and in index order.
+    facts : CampaignFacts
+    estimators : collection of str, optional
+        Which to report beside the method's own; all by default.
+    """
+    done = one_pass(blocks, estimators or ESTIMATORS, confidence=facts.confidence)
+    best = done.headline_estimate
+    estimates = {done.headline: best, **done.estimates}
+    distance_km = None if facts.distance_per_test_m is None else facts.distance_per_test_m / 1000.0
+    retraced = facts.retraced or {"reason": "the run did not retrace its episodes"}
+    statements = {name: _said(found, facts, distance_km) for name, found in estimates.items()}
+    return finite_json(
+        {
+            "campaign": facts.name,
+            "campaign_hash": facts.content_hash,
+            "lane_change_level": facts.lane_change_level,
+            "confidence": facts.confidence,
+            "n_episodes": best.n_episodes,
+            "n_crashes": best.n_crashes,
+            "headline": done.headline,
+            "distance_per_test_km": distance_km,
+            "crash_rate_per_1e6_km": None if distance_km is None else per_distance(best, distance_km),
+            "estimates": {name: estimate.to_json() for name, estimate in estimates.items()},
+            "diagnostics": {**done.diagnostics.result(facts.importance_names), "alarm": {"retraced": retraced}},
+            "convergence": done.convergence,
+            "statement": statements[done.headline],
+            "statements": statements,
+            "reference_statements": reference_statements(best),
+            "boundary_statements": boundary_statements(best),
+            "scope": SCOPE,
+            "ending": facts.ending,
+            "decision": facts.decision,
+        }
+    )
+
+
+def _said(found: Estimate | Unavailable, facts: CampaignFacts, distance_km: float | None) -> str:
+    """What an estimator says, led by what it must be warned of and the first reference driver; or why it cannot."""
+    if isinstance(found, Unavailable):
+        return f"No crash rate from these records: {found.reason.rstrip('.')}."
+    answer = statement(found, facts.lane_change_level, distance_km)
+    text = warned(repeated_cautions(facts.repeated), " ".join([*reference_statements(found)[:1], answer]))
+    return text + failed_statement(found.details) + repeated_statement(facts.repeated)
+
+
+def warned(cautions: Iterable[str], text: str) -> str:
+    """The text, with what may be wrong about it first."""
+    return " ".join([*(f"WARNING: {caution.rstrip('.')}." for caution in cautions), text])
+
+
+def per_distance(estimate: Estimate, distance_per_test_km: float) -> dict[str, float]:
+    """Crash rate and interval per 1e6 km of such overtaking driving."""
+    scale = _PER_KM / distance_per_test_km
+    return {
+        "rate": estimate.crash_rate * scale,
+        "ci_low": estimate.ci_low * scale,
+        "ci_high": estimate.ci_high * scale,
+    }
+
+
+def statement(estimate: Estimate, lane_change_level: float, distance_per_test_km: float | None) -> str:
+    """Why the interval may be wrong, if it may; then rate, interval, number of tests and level, in words."""
+    tests = (
+        f"{estimate.n_episodes:,} overtaking tests at lane-change level {lane_change_level:g} "
+        f"({estimate.n_crashes:,} sampled crashes)"
+    )
+    level, per_km = f"{estimate.confidence:.0%}", ""
+    if estimate.n_crashes == 0:
+        upper = estimate.upper_bound
+        if distance_per_test_km:
+            per_km = f", or {upper * _PER_KM / distance_per_test_km:.3g} per 1e6 km of such driving"
+        text = f"No crash was sampled in {tests}: with {level} confidence the rate is below {upper:.3g} per test"
+    else:
+        if distance_per_test_km:
+            scaled = per_distance(estimate, distance_per_test_km)
+            per_km = (
+                f"; that is {scaled['rate']:.3g} crashes per 1e6 km of such overtaking driving "
+                f"({scaled['ci_low']:.3g} to {scaled['ci_high']:.3g})"
+            )
+        text = (
+            f"The crash rate is {estimate.crash_rate:.3g} per test ({level} interval {estimate.ci_low:.3g} to "
+            f"{estimate.ci_high:.3g}{_width(estimate)}), estimated from {tests}"
+        )
+    return warned(estimate.cautions, f"{text}{per_km}.")
+
+
+def _width(estimate: Estimate) -> str:
+    if estimate.cautions:
+        return ""
+    if estimate.rhw > WIDEST_RHW:
+        return ", still open upwards: far wider than the rate"
+    return f", relative half-width {estimate.rhw:.1%}"
+
+
+def failed_statement(found: Mapping[str, Any]) -> str:
+    """What failed tests (``details``) would change, as a sentence to follow the answer; empty without any."""
+    if not found["n_failed"]:
+        return ""
+    return (
+        f" Of these tests {found['n_failed']:,} FAILED: they count as no crash in the rate and as crashes in the upper "
+        f"limit. Had they all crashed, the rate would be {found['crash_rate_if_failed_had_crashed']:.3g}."
+    )
+
+
+def reference_statements(estimate: Estimate) -> list[str]:
+    """How the vehicle compares with each reference driver, a sentence each; none unless drawn from shells."""
+    references, level = estimate.details.get("references", ()), f"{estimate.confidence:.0%}"
+    return [_beside(found, level) for found in references if found["crash_rate"] > 0.0]
+
+
+def _beside(found: Mapping[str, Any], level: str) -> str:
+    who = f"{found['described']} ({found['reference']})"
+    if found["ratio"] == 0.0:
+        return (
+            f"In the same traffic this vehicle crashes less than {found['ratio_high']:.3g} times as often as {who} "
+            f"would (upper end of the {level} interval): no crash was sampled."
+        )
+    low, high = found["preventable_low"], found["preventable_high"]
+    return (
+        f"This vehicle crashes {found['ratio']:.2f} times as often as {who} would in the same traffic ({level} "
+        f"interval {found['ratio_low']:.2f} to {found['ratio_high']:.2f}); {_percent(found['preventable'])} of its "
+        f"crashes such a driver would have avoided ({_percent(low)} to {_percent(high)})."
+    )
+
+
+def _percent(share: float) -> str:
+    """A share to two figures at least: whether it is 0.1 or 0 % may matter."""
+    return f"{100.0 * share:.2g} %" if share < 0.1 else f"{100.0 * share:.0f} %"
+
+
+def boundary_statements(estimate: Estimate) -> dict[str, str]:
+    """What holds for vehicles that crash only within a boundary, by statement; none unless drawn from shells."""
+    details, level = estimate.details, f"{estimate.confidence:.0%}"
+    return {found["name"]: _within(found, len(details["shells"]), level) for found in details.get("statements", ())}
+
+
+def _within(found: Mapping[str, Any], n_shells: int, level: str) -> str:
+    if found["refuted"]:
+        return (
+            f"REFUTED: it is not so that this vehicle {found['assumes']}. It crashed in "
+            f"{found['n_crashes_outside']:,} of {found['n_episodes_outside']:,} tests beyond {found['boundary']}, "
+            f"first in {_replayed(found['refuted_by'])}."
+        )
+    if math.isinf(found["rhw_from_pool"]):
+        return "Under an assumption about where it crashes nothing more can be said: its crashes lie on too few paths."
+    text = (
+        f"If this vehicle {found['assumes']}, its crash rate is {found['crash_rate']:.3g} per test ({level} interval "
+        f"{found['ci_low']:.3g} to {found['ci_high']:.3g}), estimated from {found['n_episodes']:,} tests "
+        f"({found['n_crashes']:,} sampled crashes).{failed_statement(found)}"
+    )
+    return f"{text} {_outside(found, n_shells, level)}{_ahead(found)}"
+
+
+def _outside(found: Mapping[str, Any], n_shells: int, level: str) -> str:
+    if found["n_shells"] == n_shells:
+        return "Nothing lies outside."
+    if not found["n_episodes_outside"]:
+        return "Nothing was tested outside: whether the assumption holds is not known."
+    failed = found["n_failed_outside"]
+    counted = f", but {failed:,} of them FAILED and are counted as crashes here" if failed else ""
+    return (
+        f"There was no crash in {found['n_episodes_outside']:,} tests outside{counted}: with {level} confidence "
+        f"fewer than {found['upper_bound_outside']:.3g} crashes per test lie there."
+    )
+
+
+def _ahead(found: Mapping[str, Any]) -> str:
+    """What each test says about the assumption, where it was asked."""
+    if not found["n_checked"]:
+        return ""
+    if not found["n_ahead"]:
+        return f" In none of {found['n_checked']:,} tests was it ahead of such a vehicle: each keeps to the assumption."
+    return (
+        f" In {found['n_ahead']:,} of {found['n_checked']:,} tests it was AHEAD of such a vehicle, first in "
+        f"{_replayed(found['ahead_in'])}: it does not do what is assumed, and nothing but the lack of crashes outside "
+        "speaks for the statement."
+    )
+
+
+def _replayed(episodes: Sequence[int]) -> str:
+    """The first of some tests, and how to see it."""
+    return f"episode {episodes[0]} (`{REPLAY} {episodes[0]}`)"
+
+
+def repeated_statement(repeated: Mapping[str, Any] | None) -> str:
+    """That repeated tests came out alike, as a sentence to follow the answer; empty where none did."""
+    if repeated is None or not repeated["n_episodes"] or repeated["differing"]:
+        return ""
+    return f" {repeated['n_episodes']:,} of these tests were run a second time: same bits."
+
+
+def repeated_cautions(repeated: Mapping[str, Any] | None) -> list[str]:
+    """That repeated tests came out otherwise, which is to be said first; empty where none did."""
+    if repeated is None or not repeated["differing"]:
+        return []
+    n, n_differing = repeated["n_episodes"], len(repeated["differing"])
+    return [
+        f"{n_differing:,} of {n:,} tests that were run a second time DIFFERED: this vehicle is not reproducible; its "
+        "tests cannot be replayed, and depend on what ran beside and before them"
+    ]
+
+
+def ending(stopped_by: StoppedBy, n_episodes: int, unmet: tuple[str, ...], *, precision_asked: bool) -> str:
+    """When a campaign ended and what decided it, in a sentence.
+
+    ``unmet`` are the conditions that were not met when the stop rule last said no; without a ``precision_asked`` there
+    was only a budget.
+    """
+    after = f"Stopped after {n_episodes:,} tests"
+    conditions = " and ".join(unmet)
+    if stopped_by in ("rhw", "accept"):
+        if not unmet:
+            return f"{after}: every condition was met at the first look."
+        return f"{after}: the last condition to be met was {conditions}."
+    if stopped_by == "two_phase":
+        return f"{after}: as many as the first phase had planned, which are reported without it."
+    if precision_asked:
+        return f"{after} without {conditions}: {MENDS[stopped_by]}."
+    if stopped_by == "episodes":
+        return f"{after}: stop.episodes was all that was asked for."
+    return f"{after}: {MENDS[stopped_by]}."
+
+
+def paired_statement(found: PairedEstimate, name_a: str, name_b: str) -> str:
+    """Without an assumption: both rates, what lies between them, and where only one of the two crashes."""
+    free = found.free
+    return (
+        f"{rates_statement(found.a, found.b, name_a, name_b)}: {_apart(free, found.a.confidence)}, from "
+        f"{free.n_pairs:,} pairs of tests. Alone, where the other one does not, "
+        f"A crashes {_alone(free.only_a)} times per test, B {_alone(free.only_b)}."
+        f"{failed_pairs_statement(found.a, found.b)}"
+    )
+
+
+def conditional_paired_statement(found: PairedEstimate) -> str:
+    """If both crash only where the boundary surrogate or a more careful one does."""
+    boundary, inside = found.pairs.design.library.boundary, found.conditional
+    if found.refuted:
+        who = " and ".join(_crashed_outside(found))
+        return (
+            f"{who} crashed where the surrogate {boundary} does not crash: nothing can be said under the assumption "
+            f"that they crash only where {boundary} does."
+        )
+    text = (
+        f"If A and B crash only where the surrogate {boundary} or a more careful one crashes: "
+        f"{_apart(inside, found.a.confidence)}, from {inside.n_pairs:,} pairs of tests."
+    )
+    if inside.n_pairs == found.free.n_pairs:
+        return f"{text} Nothing was tested outside: whether the assumption holds is not known."
+    return f"{text} In {found.free.n_pairs - inside.n_pairs:,} pairs of tests outside neither crashed."
+
+
+def _apart(found: Contrast, confidence: float) -> str:
+    differs = found.n_differing > 0
+    apart = apart_statement(found.difference, found.ci_low, found.ci_high, confidence, differs=differs)
+    if not math.isfinite(found.ratio):
+        return apart
+    high = f"{found.ratio_high:.3g}" if math.isfinite(found.ratio_high) else "no limit"
+    return f"{apart}, A/B = {found.ratio:.3g} ({found.ratio_low:.3g} to {high})"
+
+
+def _alone(found: Interval) -> str:
+    return f"{found.value:.3g} ({found.ci_low:.3g} to {found.ci_high:.3g})"
+
+
+def _crashed_outside(found: PairedEstimate) -> Iterator[str]:
+    for side, name in enumerate("AB"):
+        if n := int(found.pairs.tally(side).crashes[found.pairs.design.library.n_inside :].sum()):
+            yield f"{name} has {n:,} times"
+
+
+def rates_statement(a: Estimate, b: Estimate, name_a: str, name_b: str) -> str:
+    """Both rates with their intervals, after what may be wrong about them."""
+    cautions = [f"{name}: {text}" for name, of in (("A", a), ("B", b)) for text in of.cautions]
+    return warned(
+        cautions,
+        f"A ({name_a}) crashes {a.crash_rate:.3g} times per test ({a.ci_low:.3g} to {a.ci_high:.3g}), "
+        f"B ({name_b}) {b.crash_rate:.3g} times ({b.ci_low:.3g} to {b.ci_high:.3g})",
+    )
+
+
+def apart_statement(difference: float, low: float, high: float, confidence: float, *, differs: bool) -> str:
+    """Which of them crashes more often, and by how much."""
+    verdict = "the difference is not distinguishable from 0"
+    if differs and low > 0.0:
+        verdict = "A crashes more often"
+    elif differs and high < 0.0:
+        verdict = "A crashes less often"
+    return f"{verdict}, A - B = {difference:.3g} ({confidence:.0%} interval {low:.3g} to {high:.3g})"
+
+
+def failed_pairs_statement(a: Estimate, b: Estimate) -> str:
+    """How failed tests count; nothing where none has failed."""
+    of_a, of_b = a.details["n_failed"], b.details["n_failed"]
+    if not of_a and not of_b:
+        return ""
+    return (
+        f" Of these tests A FAILED in {of_a:,} and B in {of_b:,}: each limit counts them as crashes or as none, "
+        "whichever takes it farther."
+    )
