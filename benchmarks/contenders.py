@@ -21,7 +21,7 @@ from harness.campaign.files import load_campaign
 from harness.episode import loop
 from harness.episode.loop import Shard
 from harness.records.folder import encoded, write_shard
-from harness.records.tables import shard_tables
+from harness.records.schemas import shard_tables
 from harness.resolved import resolve
 from harness.runner.prepare import Prepared, prepare
 from harness.runner.worker import ShardSpec

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from harness.campaign.campaign import Campaign
     from harness.progress import Progress
-    from harness.records.frames import StoredRun
+    from harness.records.reader import StoredRun
     from harness.runner import AvCheck, Comparison, ReplayResult, RunResult
     from harness.vocabulary import EstimatorName
 
@@ -97,8 +97,8 @@ def estimate(
 
 
 def read(folder: str | Path) -> StoredRun:
-    """Tables of a stored run as pandas frames, with units and weights (see `harness.records.frames`)."""
-    from harness.records.frames import StoredRun  # noqa: PLC0415
+    """Tables of a stored run as pandas frames, with units and weights (see `harness.records.reader`)."""
+    from harness.records.reader import StoredRun  # noqa: PLC0415
 
     return StoredRun(Path(folder))
 

@@ -13,7 +13,7 @@ from harness.episode.loop import EpisodeLoop
 from harness.estimators import StopRule, accumulator
 from harness.estimators.block import Block, block_from_tables
 from harness.importance.build import mixture_weights
-from harness.records.tables import shard_tables
+from harness.records.schemas import shard_tables
 from harness.resolved import resolve
 from harness.runner.prepare import Prepared, prepare
 from harness.vocabulary import EstimatorName, Method

@@ -19,7 +19,7 @@ from harness.pool.cut_ins import CutIns, Pool, environment_hash
 from harness.pool.library import Library
 from harness.progress import Progress
 from harness.records.folder import require_place, write_atomically
-from harness.records.tables import prefixes, rows
+from harness.records.schemas import prefixes, rows
 from harness.resolved import Resolved
 from harness.vocabulary import STATE_COLUMNS, IntArray, states_from
 

@@ -23,7 +23,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from harness.errors import RunFolderError, shortened, writing
 from harness.records.manifest import StoredManifest
-from harness.records.tables import ShardTables
+from harness.records.schemas import ShardTables
 
 T = TypeVar("T")
 

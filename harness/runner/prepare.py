@@ -25,7 +25,7 @@ from harness.pool.storage import campaign_pool, campaign_pool_key, pool_path
 from harness.pool.vehicle_pool import ShadowPaths, campaign_shadow_paths, shadow_paths_file, vehicle_pool
 from harness.progress import Progress
 from harness.records.folder import SHELLS, read_as
-from harness.records.tables import shard_tables
+from harness.records.schemas import shard_tables
 from harness.resolved import Resolved, resolve
 from harness.runner.retrace import Retracing
 from harness.traffic.initial_state import InitialStates

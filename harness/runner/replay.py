@@ -16,7 +16,7 @@ from harness.campaign.files import load_campaign
 from harness.controllers.find import has_foreign_code, require_controller, run_apart
 from harness.errors import CampaignError, RunFolderError
 from harness.records.folder import no_episodes, read_manifest, read_table
-from harness.records.tables import shard_tables
+from harness.records.schemas import shard_tables
 from harness.resolved import Resolved, resolve
 from harness.runner.manifest import cpu_name, versions
 from harness.runner.prepare import build_world, prepare, require_same_pool, require_world

@@ -28,7 +28,7 @@ from harness.pool.storage import padded
 from harness.pool.vehicle_pool import ShadowPaths
 from harness.random_stream import CUT_IN, uniforms
 from harness.records.folder import COMPRESSION, read_table
-from harness.records.tables import shadow_table
+from harness.records.schemas import shadow_table
 from harness.traffic.laws import Environment
 from harness.vehicles.drivers import driver_records
 from harness.vocabulary import AV, FAILED, IntArray, RecordArray

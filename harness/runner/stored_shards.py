@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from harness.records.folder import read_table, shard_files
-from harness.records.tables import ShardTables
+from harness.records.schemas import ShardTables
 from harness.runner.prepare import Prepared
 from harness.runner.retrace import Retracing
 from harness.runner.worker import ShardDone, ShardSpec, finished

@@ -26,7 +26,7 @@ from harness.importance.build import mixture_weights
 from harness.pool.shells import Draw
 from harness.processes import fit_to_travel
 from harness.records.folder import encoded
-from harness.records.tables import ShardTables, shard_tables
+from harness.records.schemas import ShardTables, shard_tables
 from harness.resolved import Resolved
 from harness.runner.prepare import Prepared, build_world, prepare
 from harness.runner.retrace import Retracing

@@ -14,7 +14,7 @@ from harness.episode.cells import PrescribedTraffic, drawn_traffic
 from harness.episode.loop import Drawing, EpisodeLoop, RecordPolicy
 from harness.importance.build import build_importance
 from harness.maneuvers import CUT_IN
-from harness.records.tables import episodes_table
+from harness.records.schemas import episodes_table
 from harness.resolved import resolve
 from harness.runner.prepare import prepare
 from harness.runner.retrace import Retracing

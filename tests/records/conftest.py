@@ -11,7 +11,7 @@ import pytest
 from harness.campaign.campaign import Campaign
 from harness.campaign.files import load_campaign
 from harness.episode.loop import Shard
-from harness.records.tables import ShardTables, shard_tables
+from harness.records.schemas import ShardTables, shard_tables
 from harness.resolved import resolve
 from harness.runner.prepare import prepare
 from harness.worlds.twin import TwinWorld

@@ -18,7 +18,7 @@ from harness.episode.loop import Shard
 from harness.estimators.answer import CampaignFacts, estimate_blocks
 from harness.importance.build import importance_names
 from harness.records.folder import encoded, write_shard
-from harness.records.tables import shard_tables
+from harness.records.schemas import shard_tables
 from harness.resolved import resolve
 from harness.runner.prepare import prepare
 from harness.runner.stored_estimates import stored_blocks

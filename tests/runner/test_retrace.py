@@ -10,7 +10,7 @@ import pytest
 from harness.campaign.campaign import Campaign
 from harness.campaign.vehicle import AutomatedVehicle, IDMParameters, Reaction
 from harness.errors import WorldDisagreementError
-from harness.records.tables import episodes_table
+from harness.records.schemas import episodes_table
 from harness.resolved import resolve
 from harness.runner.prepare import prepare
 from harness.runner.retrace import Retracing

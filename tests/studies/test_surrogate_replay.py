@@ -22,7 +22,7 @@ from harness.estimators.block import Block, block_from_tables
 from harness.importance.build import mixture_weights
 from harness.pool.cut_ins import Pool
 from harness.pool.storage import campaign_pool
-from harness.records.tables import episodes_table
+from harness.records.schemas import episodes_table
 from harness.resolved import resolve
 from harness.runner.prepare import prepare
 from harness.vehicles.drivers import driver_records

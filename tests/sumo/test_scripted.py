@@ -12,7 +12,7 @@ from harness.importance.build import build_importance
 from harness.maneuvers import CUT_IN
 from harness.pool.library import load_library
 from harness.pool.replay import stored_paths
-from harness.records.tables import episodes_table
+from harness.records.schemas import episodes_table
 from harness.resolved import resolve
 from harness.runner.retrace import Retracing
 from harness.traffic.loading import load_environment
