@@ -41,27 +41,31 @@ def unboxed(bundle: _Bundle) -> _Bundle:
 class _Unboxed:
     """Keeps a bundle and its native form; numba asks for ``_numba_type_``, and its unboxing below for ``address``."""
 
-    __slots__ = ("_bundle", "_memory", "_numba_type_", "address")
+    __slots__ = ("_bundle", "_memory", "_numba_type_", "_records", "address")
 
     def __init__(self, bundle: tuple[Any, ...]) -> None:
         content, context = _numba.typeof(bundle), cpu_target.target_context
-        self._bundle = bundle
-        self._memory = np.array(list(_words(bundle)), np.int64)
+        self._bundle, self._records = bundle, list[np.ndarray]()
+        self._memory = np.array(list(_words(bundle, self._records)), np.int64)
         self._numba_type_ = _UnboxedType(content)
         self.address: int = self._memory.ctypes.data
         if self._memory.nbytes != context.get_abi_sizeof(context.get_value_type(content)):
             raise TypeError(f"{type(bundle).__name__} has fields that are not laid out as 8 bytes each")
 
 
-def _words(value: Any) -> Iterator[int]:
-    """A value as numba lays it out: an array is owner, parent, size, item size, address, shape and strides."""
+def _words(value: Any, records: list[np.ndarray]) -> Iterator[int]:
+    """A value as numba lays it out: an array is owner, parent, size, item size, address, shape and strides.
+
+    A record by itself does not say where it is: a copy joins ``records``, for the caller to keep.
+    """
     if isinstance(value, tuple):
         for field in value:
-            yield from _words(field)
+            yield from _words(field, records)
     elif isinstance(value, np.ndarray):
         yield from (0, 0, value.size, value.itemsize, value.ctypes.data, *value.shape, *value.strides)
     elif isinstance(value, np.void):
-        yield value.__array_interface__["data"][0]
+        records.append(np.array(value))
+        yield records[-1].ctypes.data
     elif isinstance(value, float):
         yield from struct.unpack("q", struct.pack("d", value))
     else:

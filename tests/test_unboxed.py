@@ -1,6 +1,7 @@
 """Named tuples that kernels are given as one pointer: what compiled code reads is the tuple's own."""
 
 import gc
+import pickle
 from typing import Any, NamedTuple
 
 import numba
@@ -61,8 +62,16 @@ def test_kernels_read_every_kind_of_field_and_write_to_the_same_arrays():
     plain.inner.total[:] = 0.0
     assert add_up(for_kernels, 2.0) == 7
     assert plain.inner.total.tolist() == [6.0, 10.0, 14.0]
-    plain.numbers["count"] = 9
-    assert add_up(for_kernels, 0.0) == 9
+
+
+def test_a_record_that_owns_its_memory_is_read_as_well():
+    """As one does that another process has sent: what numpy says of its address is that of a copy, gone at once."""
+    sent = pickle.loads(pickle.dumps(bundle()))
+    assert sent.numbers.flags.owndata
+    for_kernels = unboxed(sent)
+    others = [np.full(2, -1) for _ in range(1000)]
+    assert add_up(for_kernels, 0.0) == 7
+    assert len(others) == 1000
 
 
 def test_a_tuple_within_is_handed_on_as_it_is():
