@@ -12,11 +12,10 @@ from collections.abc import Sequence
 
 import click
 
-from harness.commands.campaigns import check, pool, run, schema, setup
+from harness.commands.campaigns import av_check, check, compare, pool, run, schema, setup
 from harness.commands.options import examples
 from harness.commands.printing import show_error, show_interrupted, system_error, usage_error
 from harness.commands.stored import estimate, replay, report
-from harness.commands.vehicles import av_check, compare
 from harness.errors import EXIT_DONE, HarnessError, shortened
 from harness.processes import Interruption, interruptible
 

@@ -26,12 +26,10 @@ def written_file(*suffixes: str) -> Callable[[click.Context, click.Parameter, Pa
         if value is None:
             return None
         if suffixes and value.suffix not in suffixes:
-            raise HarnessError(
-                f"{parameter.opts[0]} {value}",
-                found=f"a name that ends in '{value.suffix}'" if value.suffix else "a name without a suffix",
-                expected=f"a name that ends in {' or '.join(suffixes)}",
-                mend=f"Write {parameter.opts[0]} {value.with_suffix(suffixes[0])}.",
-            )
+            option, endings = parameter.opts[0], " or ".join(suffixes)
+            found = f"a name that ends in '{value.suffix}'" if value.suffix else "a name without a suffix"
+            mend = f"Write {option} {value.with_suffix(suffixes[0])}."
+            raise HarnessError(f"{option} {value}", found, f"a name that ends in {endings}", mend)
         from harness.records.folder import require_place  # noqa: PLC0415 - keeps --help fast
 
         require_place(value.parent)
