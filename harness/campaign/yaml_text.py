@@ -121,9 +121,11 @@ def _load(text: str, name: str) -> tuple[Any, dict[tuple[str | int, ...], int]]:
     except MarkedYAMLError as error:
         # In the parser's words: what it was at, and since which line, then the problem.
         mark, since = error.problem_mark or error.context_mark, error.context_mark
-        context = error.context and error.context + (f" (line {since.line + 1})" if since else "")
+        context = f"{error.context} (line {since.line + 1})" if since else None
         found = ": ".join(filter(None, [context, error.problem])).removeprefix("found ")
         where = name if mark is None else f"{name}:{mark.line + 1}:{mark.column + 1}"
+        if error.context and not since:  # the path of a key, of `_checked_lines`
+            where = f"{error.context} ({where})"
         mend = str(error.note or "Check indentation, quotes and brackets just before it.")
     except ReaderError as error:
         before = text[: error.position].split("\n")
@@ -176,8 +178,8 @@ def _checked_lines(root: Node) -> dict[tuple[str | int, ...], int]:
                 raise ComposerError(None, None, found, key.start_mark, "Quote the key if it is meant as text.")
             at = (*path, key.value)
             if at in lines:
-                found = f"the key {dotted(at)} again, first written on line {lines[at]}"
-                raise ComposerError(None, None, found, key.start_mark, "Delete one of the two.")
+                found = f"the key {key.value!r} again, first written on line {lines[at]}"
+                raise ComposerError(dotted(at), None, found, key.start_mark, "Delete one of the two.")
             lines[at] = key.start_mark.line + 1
             waiting.append((at, value))
     return lines

@@ -82,7 +82,7 @@ def load(tmp_path):
         ("av:\n  traci:\n    command: x\n    restart: 1", "av.traci.restart", 5, "Did you mean 'restarts'?"),
         ("av:\n  fmu: {file: a.fmu, output: a}", "av.fmu.inputs", 3, "Add 'inputs: …'"),
         ("av:\n  before_cut_in: controller", "av.before_cut_in", 3, "hold_speed"),
-        ("stop:\n  rhw: 1\n  rhw: 2", "", 4, "the key stop.rhw again, first written on line 3"),
+        ("stop:\n  rhw: 1\n  rhw: 2", "stop.rhw", 4, "again, first written on line 3"),
         ("world: {cells: 257}", "world.cells", 2, "at most 256"),
         ("testing: {method: step_mixture}\nstop:\n  rhw: 0.3", "stop.rhw", 4, "a fixed number of tests"),
         ("accept: {crash_rate_below: 0.1}", "accept", 2, "testing.method shells"),
@@ -92,8 +92,8 @@ def test_a_mistake_is_named(load, text, path, line, words):
     with pytest.raises(CampaignError) as caught:
         load(text)
     error = caught.value
-    assert error.where.startswith(f"{path} (" if path else "/")
-    assert re.search(rf"bad\.yaml:{line}(:\d+)?\)?$", error.where)
+    assert error.where.startswith(f"{path} (")
+    assert re.search(rf"bad\.yaml:{line}(:\d+)?\)$", error.where)
     assert words in str(error)
     assert error.exit_code == EXIT_BAD_INPUT
     assert all((error.found, error.expected, error.mend))

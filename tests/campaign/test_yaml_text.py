@@ -66,8 +66,8 @@ def test_lines_fall_back_to_the_nearest_ancestor(read):
 @pytest.mark.parametrize(
     ("text", "line", "words"),
     [
-        ("a: 1\nb:\n  c: 1\n  c: 2\n", "4:3", "b.c again, first written on line 3"),
-        ("a: {b: 1,\n b: 1}", 2, "a.b again"),
+        ("a: 1\nb:\n  c: 1\n  c: 2\n", "4:3", "b.c ("),
+        ("a: {b: 1,\n b: 1}", 2, "again, first"),
         ("- 1\n", 1, "list"),
         ("\n5\n", 2, "single value"),
         ("a: 1\n\tb: 2", "2:1", "character '\\t'"),
