@@ -7,18 +7,14 @@ import os
 import pickle
 import resource
 import signal
-import stat
 from pathlib import Path
 
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 
 from harness.errors import RunFolderError
 from harness.records.folder import (
     encoded,
     read_as,
-    read_manifest,
     read_table,
     shard_file,
     write_atomically,
@@ -45,21 +41,6 @@ def test_a_write_that_fails_leaves_nothing_but_the_old_file(tmp_path):
         assert files_below(tmp_path) == old
         write_atomically(path, lambda temporary: temporary.write_text("old"))
     assert path.read_text() == "old"
-
-
-def test_a_file_that_is_written_is_never_seen_in_part(tmp_path):
-    """So a process that is killed in the middle leaves none of that name."""
-    path = tmp_path / "file"
-
-    def write(temporary: Path) -> None:
-        assert temporary.parent == path.parent, "or putting it in place would not be atomic"
-        temporary.write_text("half")
-        assert not path.exists()
-        temporary.write_text("whole")
-
-    write_atomically(path, write)
-    assert path.read_text() == "whole"
-    assert stat.S_IMODE(path.stat().st_mode) == 0o644
 
 
 def test_a_real_limit_on_file_size_leaves_nothing(tmp_path, record):
@@ -114,21 +95,6 @@ def test_a_damaged_table_is_named(damage, tmp_path, record):
         read_table(path)
     assert raised.value.where == str(path)
     assert "--resume" in raised.value.mend
-
-
-def test_a_table_without_a_column_that_is_needed_is_named(tmp_path):
-    path = tmp_path / "shard-000000.parquet"
-    pq.write_table(pa.table({"episode": [1]}), path)
-    with pytest.raises(RunFolderError) as raised:
-        read_table(path, ["episode", "log_weight"])
-    assert raised.value.where == str(path)
-
-
-def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(RunFolderError, match="shard-000007"):
-        read_table(tmp_path / "shard-000007.parquet")
-    with pytest.raises(RunFolderError, match=r"manifest\.json"):
-        read_manifest(tmp_path)
 
 
 def test_shards_are_read_in_the_manifests_order_and_no_others(tmp_path, record):
