@@ -34,20 +34,9 @@ MENDS: dict[str, str] = {
 class CampaignFacts:
     """What estimates must say about the campaign that they belong to.
 
-    Attributes
-    ----------
-    distance_per_test_m : float or None
-        Mean distance that the AV drives in a naturalistic test; None if unknown, and then nothing is said per km.
-    importance_names : tuple of str
-        Names of the importance functions, in order.
-    retraced : dict
-        What the run says about the twin retracing its episodes.
-    repeated : dict
-        What the run says about tests that it ran twice.
-    ending : str or None
-        When the run ended and which condition decided, in a sentence; None while it goes on.
-    decision : dict or None
-        What the run has found about the limit that it was asked about; `harness.estimators.stopping.Decision`.
+    Nothing is said per km where ``distance_per_test_m``, the mean distance that the AV drives in a naturalistic test,
+    is not known. ``importance_names`` are in the order of the importance functions; the rest is what the manifest says
+    of the twin retracing episodes, of tests that ran twice, and of why the run ended.
     """
 
     name: str
@@ -67,13 +56,7 @@ def estimate_blocks(
 ) -> dict[str, Any]:
     """Estimates of blocks that cover a campaign's episodes, as JSON content.
 
-    Parameters
-    ----------
-    blocks : iterable of Block
-        Contiguous and in index order.
-    facts : CampaignFacts
-    estimators : collection of str, optional
-        Which to report beside the method's own; all by default.
+    Blocks are contiguous and in index order; ``estimators`` are reported beside the method's own, all by default.
     """
     done = one_pass(blocks, estimators or ESTIMATORS, confidence=facts.confidence)
     best = done.headline_estimate

@@ -212,26 +212,18 @@ def block_from_tables(
     alpha: Sequence[float],
     shells: ShellDesign | None = None,
 ) -> Block:
-    """Block of one shard.
+    """Block of one shard; rows that are missing, out of order, or contradict each other are a `RunFolderError`.
 
     Parameters
     ----------
     episodes : pa.Table
         Rows of the ``episodes`` table, consecutive and in index order; needs `EPISODE_COLUMNS`.
     moments : pa.Table or None
-        Control steps of the same episodes, sorted by episode and step; needs `MOMENT_COLUMNS`. Only used for the
-        step mixture.
-    method : str
-        ``testing.method`` of the campaign.
+        Control steps of the same episodes, sorted by episode and step; needs `MOMENT_COLUMNS`, for the step mixture.
     alpha : sequence of float
         Mixture weights in the order of ``log_q``, M of them.
     shells : ShellDesign, optional
         Strata of the campaign, if it draws from shells; needs `SHELL_COLUMNS`.
-
-    Raises
-    ------
-    RunFolderError
-        If rows are missing, out of order, or contradict each other.
     """
     index = _integers(episodes, "episode")
     _require_consecutive(index)

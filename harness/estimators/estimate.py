@@ -115,16 +115,9 @@ def require_episodes(n: int) -> None:
 
 
 class FailureBounds:
-    """An estimator that is fed twice from the first failed test on.
+    """An estimator that is fed twice from the first failed test on: failed tests as no crash, and as crashes.
 
-    Parameters
-    ----------
-    seen : Accumulator
-        Takes failed tests as no crash; empty, unless the others are given.
-    worst : Accumulator, optional
-        The same tests with failed ones as crashes.
-    n_failed : int
-        How many of them have failed.
+    ``seen`` is empty, unless ``worst`` and the number of failed tests are given, too.
     """
 
     def __init__(self, seen: Accumulator, worst: Accumulator | None = None, n_failed: int = 0) -> None:

@@ -87,29 +87,17 @@ class WeightedSum(NamedTuple):
 def likelihood_limit(
     weights: FloatArray, crashes: Counts, tests: IntArray, level: Level, side: float, variance: float = 0.0
 ) -> float:
-    """One limit of Σ w_s θ_s, θ_s being the share of tests that crash.
-
-    ``weights`` (known factors, negative for what is subtracted), ``crashes`` and ``tests`` have shape (S,); the rest
-    see `contrast_limit`.
-    """
+    """One limit of Σ w_s θ_s, θ_s being the share of tests that crash; arrays (S,), the rest see `contrast_limit`."""
     outcomes = np.column_stack([crashes, tests - crashes])
     return contrast_limit(np.outer(weights, CRASH), outcomes, level, side, variance)
 
 
 def contrast_limit(weights: FloatArray, counts: Counts, level: Level, side: float, variance: float = 0.0) -> float:
-    """One limit of Σ w_sj θ_sj, θ_sj being the share of a stratum's tests with an outcome.
+    """One limit, upper (``side`` +1) or lower (-1), of Σ w_sj θ_sj.
 
-    Parameters
-    ----------
-    weights : ndarray, shape (S, J)
-        Known factors of all outcomes; 0 for one that does not count.
-    counts : ndarray of int64, shape (S, J)
-        How often each was seen; a stratum without a test may have any shares.
-    level : Level
-    side : float
-        +1 for the upper limit, -1 for the lower one.
-    variance : float
-        Of a further error, normal and independent of the tests, of the sum itself (the pool's).
+    ``weights`` (S, J) are known factors of all outcomes, 0 for one that does not count, and ``counts`` (S, J) how often
+    each was seen; a stratum without a test may have any shares. ``variance`` is that of a further error of the sum
+    itself (the pool's), normal and independent of the tests.
     """
     return float(outermost(WeightedSum.of(weights, counts, side, variance), level)[0])
 
@@ -117,19 +105,9 @@ def contrast_limit(weights: FloatArray, counts: Counts, level: Level, side: floa
 def spread(weights: FloatArray, lower: Counts, upper: Counts, level: Level, size: int, most: IntArray) -> IntArray:
     """Divide further tests among strata, shape (S,), so that they narrow the interval of Σ w_sj θ_sj most.
 
-    Portions are given one after the other. With shares and threshold as they are one more test of a stratum moves
-    a limit by KL(c_s ‖ θ_s)/ν, by the envelope theorem; a stratum without a test comes first.
-
-    Parameters
-    ----------
-    weights : ndarray, shape (S, J)
-    lower, upper : ndarray, shape (S, J)
-        Counts of outcomes that either limit is from: they differ by what failed tests may have been.
-    level : Level
-    size : int
-        How many tests.
-    most : ndarray of int64, shape (S,)
-        How many there are of each stratum.
+    Portions of ``size`` tests are given one after the other, at most so many (S,) of each stratum. With shares and
+    threshold as they are one more test of a stratum moves a limit by KL(c_s ‖ θ_s)/ν, by the envelope theorem; one
+    without a test comes first. The counts (S, J) that either limit is from differ by what failed tests may have been.
     """
     given = np.zeros_like(most)
     below, above = WeightedSum.of(weights, lower, -1.0), WeightedSum.of(weights, upper, 1.0)
@@ -147,16 +125,8 @@ def ratio_limits(
     """Limits of x = Σ a_sj θ_sj / Σ b_sj θ_sj: the ratios x for which Σ (a - x b)θ may be 0.
 
     Both limits of that contrast fall as x grows, so that the set is an interval: from 0 where the sum above may be
-    nothing, to infinity where the one below may.
-
-    Parameters
-    ----------
-    above, below : ndarray, shape (S, J)
-        Factors of the outcomes in both sums, none negative.
-    counts : ndarray of int64, shape (S, J)
-    level : Level
-    variance : callable
-        Of the further error of the contrast at a ratio, see `contrast_limit`.
+    nothing, to infinity where the one below may. Factors ``above`` and ``below`` (S, J) are not negative; ``variance``
+    is that of the further error of the contrast at a ratio.
     """
 
     def limit(side: float, x: float) -> float:

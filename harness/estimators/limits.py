@@ -17,14 +17,7 @@ def clopper_pearson(
 ) -> tuple[FloatArray, FloatArray]:
     """Exact limits of binomial shares, leaving out the probability ``tail`` at each end; [0, 1] without a test.
 
-    Parameters
-    ----------
-    crashes, tests, failed : int or ndarray of int, shape (S,)
-        ``failed`` tests may have been crashes: only the upper limit counts them.
-
-    Returns
-    -------
-    low, high : ndarray, of the counts' shape
+    Counts and limits have shape (S,); ``failed`` tests may have been crashes: only the upper limit counts them.
     """
     k, n = np.asarray(crashes, dtype=np.float64), np.asarray(tests, dtype=np.float64)
     worst = k + np.asarray(failed)
@@ -42,14 +35,8 @@ def hall_distances(std_error: float, third_moment: float, tail: float) -> tuple[
     """Distances of Hall's lower and upper limit from an estimate whose error is skewed.
 
     His transformation (P. Hall, On the removal of skewness by transformation, JRSS B 54, 1992) makes the studentised
-    mean T nearly normal by g(T) = T + κT²/3 + κ²T³/27 + κ/6, which moves both limits towards the skew.
-
-    Parameters
-    ----------
-    std_error, third_moment : float
-        Of the estimate; its error's third central moment over std_error³ is the skewness κ.
-    tail : float
-        Probability to be left out on each side, below 1/2.
+    mean T nearly normal by g(T) = T + κT²/3 + κ²T³/27 + κ/6, which moves both limits towards the skew κ, the third
+    central moment of the estimate's error over std_error³. ``tail`` is left out on each side.
     """
     z = -float(ndtri(tail))
     if third_moment == 0.0 or not 0.0 < std_error < math.inf:
@@ -85,13 +72,7 @@ def capped_mean_upper(mean: float, cap: float, n: int, confidence: float) -> flo
     It inverts Hoeffding's inequality in its relative-entropy form (W. Hoeffding, Probability inequalities for sums of
     bounded random variables, JASA 58, 1963, Theorem 1): P(mean ≤ x) ≤ exp(-n·KL(x/cap, μ/cap)) for x ≤ μ. For a mean
     of 0 it *is* the Clopper-Pearson bound times the cap; with crashes it uses their weights and not only their number.
-
-    Parameters
-    ----------
-    mean : float
-        Observed mean, in [0, cap].
-    cap : float
-        Largest possible value; infinite if unknown, and then only the trivial bound 1 is left.
+    With an unknown, infinite cap only the trivial bound 1 is left.
     """
     if not math.isfinite(cap):
         return 1.0

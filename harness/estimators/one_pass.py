@@ -94,14 +94,8 @@ def accumulator(name: EstimatorName) -> FailureBounds:
 class PassResult:
     """What one pass over a campaign's blocks gives.
 
-    Attributes
-    ----------
-    estimates : dict
-        Per asked estimator an `Estimate`, or `Unavailable` with the reason.
-    headline, headline_estimate : str, Estimate
-        The method's own estimator, asked for or not.
-    convergence : list of dict
-        The headline estimate on growing prefixes, for plots: block boundaries at least 1 % apart.
+    ``headline`` is the method's own estimator, asked for or not; ``convergence`` its estimate on growing prefixes, for
+    plots: block boundaries at least 1 % apart.
     """
 
     estimates: dict[EstimatorName, Estimate | Unavailable]
@@ -116,19 +110,7 @@ def one_pass(
 ) -> PassResult:
     """Feed every block to every estimator that can use it.
 
-    Parameters
-    ----------
-    blocks : iterable of Block
-        Contiguous and in index order, from episode 0.
-    names : collection of str
-        Estimators asked for.
-    confidence : float
-        Level of all intervals.
-
-    Raises
-    ------
-    ValueError
-        If there is no episode, or a block does not follow the one before.
+    Blocks are contiguous and in index order, from episode 0; a gap, or no episode at all, is a `ValueError`.
     """
     own: EstimatorName | None = None
     states: dict[EstimatorName, FailureBounds] = {}

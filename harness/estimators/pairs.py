@@ -317,13 +317,7 @@ class PairedEstimate:
 
 
 def paired_estimate(pairs: PairCounts, confidence: float) -> PairedEstimate:
-    """Everything that pairs of tests say, at one level of confidence.
-
-    Raises
-    ------
-    ValueError
-        There is no pair.
-    """
+    """Everything that pairs of tests, at least one, say at one level of confidence."""
     level, n_inside = Level.two_sided(confidence), pairs.design.library.n_inside
     return PairedEstimate(
         a=_own(pairs, 0, confidence),

@@ -116,18 +116,10 @@ class MixtureCv:
 
 
 def _regression(factor: FloatArray, n: int) -> tuple[FloatArray, int, float]:
-    """Least squares of Y on [1, H], of the smallest norm where columns depend on each other.
+    """Least squares of Y on [1, H] from their factor (k, k), of the smallest norm where columns depend on each other.
 
-    Parameters
-    ----------
-    factor : (k, k) float64
-        Upper triangular factor of [1, H, Y].
-    n : int
-        Rows behind the factor; it scales the tolerance for the rank (Σ_j alpha_j h_j = 0 always costs one).
-
-    Returns
-    -------
-    Intercept and β, shape (1 + M,); rank of [1, H]; variance of the intercept from that of the residuals.
+    Gives intercept and β, (1 + M,), the rank of [1, H], and the variance of the intercept from that of the residuals.
+    ``n`` rows scale the tolerance for the rank (Σ_j alpha_j h_j = 0 always costs one).
     """
     design, target = factor[:-1, :-1], factor[:-1, -1]
     left, singular, right = np.linalg.svd(design)
@@ -317,16 +309,9 @@ def n_columns(n_control_steps: int, n_surrogates: int) -> int:
 
 
 def fill_product_columns(first_ratios: FloatArray, n_control_steps: int, out: FloatArray) -> None:
-    """Write the columns of episodes of one stratum, not yet centred; the last step's j runs fastest.
+    """Write the columns of m episodes of one stratum, not yet centred; the last step's j runs fastest.
 
-    Parameters
-    ----------
-    first_ratios : (m, 9, J) float64
-        q_j/q_alpha per control step.
-    n_control_steps : int
-        Stratum l of all m episodes.
-    out : (m, d) float64
-        In Fortran order, d = `n_columns`.
+    ``first_ratios`` (m, 9, J) are q_j/q_alpha per control step, ``out`` (m, `n_columns`) is in Fortran order.
     """
     n_rows, _, n_surrogates = first_ratios.shape
     if out.shape[1] == 0:
@@ -362,19 +347,9 @@ def empty_factor(n_columns: int) -> FloatArray:
 
 
 def fold_rows(factor: FloatArray, rows: FloatArray) -> None:
-    """Make `factor` that of the matrix behind it with more rows below.
+    """Make ``factor`` (k, k), upper triangular, that of the matrix behind it with more ``rows`` (m, k) below.
 
-    Parameters
-    ----------
-    factor : (k, k) float64
-        Upper triangular, in Fortran order; receives the new factor. The signs of its rows are arbitrary.
-    rows : (m, k) float64
-        In Fortran order; destroyed.
-
-    Raises
-    ------
-    ValueError
-        If an array is not in Fortran order, or their widths differ.
+    Both are in Fortran order, else `ValueError`; the rows are destroyed. The signs of the factor's rows are arbitrary.
     """
     m, k = rows.shape
     if not (factor.flags.f_contiguous and rows.flags.f_contiguous and factor.shape == (k, k)):

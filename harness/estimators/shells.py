@@ -268,32 +268,33 @@ class Shells:
         crashed = [episode for s, episodes in self._crashed.items() if s >= n for episode in episodes]
         refuted_by = tuple(sorted(crashed)[:MOST_NAMED])
         bound = likelihood_limit(design.p[n:], outside.crashes, outside.tests, level, 1.0)
-        n_inside, n_crashes_inside, n_failed_inside = (int(counts.sum()) for counts in inside[:3])
-        asked = given.checked
+        n_tests, n_crashes, n_failed = (int(counts.sum()) for counts in inside[:3])
+        from_pool, at_least = limits.from_pool_relative()
         return Within(
-            given.name,
-            given.boundary,
-            given.assumes,
-            n,
-            limits.rate,
-            limits.low,
-            limits.high,
-            limits.rhw,
-            *limits.from_pool_relative(),
-            n_inside,
-            n_crashes_inside,
-            n_failed_inside,
-            float(design.p[:n] @ inside.failed_as_crashes().share),
-            n_outside,
-            n_crashes_outside,
-            n_failed_outside,
-            n_crashes_outside > 0,
-            refuted_by,
-            bound,
-            asked,
-            self._n_checked if asked else 0,
-            self._n_ahead if asked else 0,
-            tuple(self._ahead_in) if asked else (),
+            name=given.name,
+            boundary=given.boundary,
+            assumes=given.assumes,
+            n_shells=n,
+            crash_rate=limits.rate,
+            ci_low=limits.low,
+            ci_high=limits.high,
+            rhw=limits.rhw,
+            rhw_from_pool=from_pool,
+            rhw_from_pool_at_least=at_least,
+            n_episodes=n_tests,
+            n_crashes=n_crashes,
+            n_failed=n_failed,
+            crash_rate_if_failed_had_crashed=float(design.p[:n] @ inside.failed_as_crashes().share),
+            n_episodes_outside=n_outside,
+            n_crashes_outside=n_crashes_outside,
+            n_failed_outside=n_failed_outside,
+            refuted=n_crashes_outside > 0,
+            refuted_by=refuted_by,
+            upper_bound_outside=bound,
+            checked=given.checked,
+            n_checked=self._n_checked if given.checked else 0,
+            n_ahead=self._n_ahead if given.checked else 0,
+            ahead_in=tuple(self._ahead_in) if given.checked else (),
         )
 
     def _shells(self, tally: Tally, tail: float) -> tuple[Shell, ...]:
@@ -392,14 +393,8 @@ def rate_ratio_limits(
 ) -> tuple[float, float]:
     """Limits of Σ p_s θ_s over the crash rate of a reference.
 
-    Parameters
-    ----------
-    p : ndarray, shape (S,)
-        Probabilities of the strata, from ``n_paths`` paths.
-    with_reference : ndarray, shape (S,)
-        Over the crashed tests of each stratum, the sum of their paths' probability that the reference crashes.
-    moments : (float, float)
-        Crash rate of the reference, and mean square of a path's probability that it crashes.
+    Of that ``moments`` has the rate and the mean square of a path's probability of a crash; ``with_reference`` (S,) is,
+    over the crashed tests of each stratum, the sum of their paths' probability that the reference crashes.
     """
     rate, square = moments
     own, of_paths = float(p @ tally.share), pool_variance(p, tally, n_paths)
@@ -417,15 +412,7 @@ def rate_ratio_limits(
 def preventable_share(
     p: FloatArray, cells: Tally, prevented: BoolArray, n_paths: int, level: Level
 ) -> tuple[float, float, float]:
-    """Share of Σ p_c θ_c that lies in some cells, with its limits; NaN without a crash.
-
-    Parameters
-    ----------
-    p : ndarray, shape (C,)
-        Probabilities of the cells, from ``n_paths`` paths.
-    cells : Tally
-    prevented : ndarray of bool, shape (C,)
-    """
+    """Share of Σ p_c θ_c that lies in the ``prevented`` ones of all cells (C,), with limits; NaN without a crash."""
     contributions = p * cells.share
     total = float(contributions.sum())
     share = float(contributions[prevented].sum()) / total if total > 0.0 else math.nan

@@ -162,18 +162,10 @@ class Rule:
         also: str | None = None,
         pool: tuple[float, float] = (0.0, 0.0),
     ) -> bool:
-        """Note a look at a precision; whether to stop.
+        """Note a look at a precision, with conditions by name, and whether they are ``met``; say whether to stop.
 
-        Parameters
-        ----------
-        rhw, one_more_crash : float
-            See `Look`.
-        met : mapping
-            Conditions by name, and whether they are met.
-        also : str, optional
-            What these results were waited for besides, if nothing else is unmet.
-        pool : (float, float)
-            Half-widths that the pool's own error would leave by itself, as it was seen, and at least.
+        ``also`` is what was waited for besides, if nothing is unmet; ``pool`` has the half-widths that the pool's own
+        error would leave by itself, as it was seen, and at least.
         """
         unmet = tuple(condition for condition, is_met in met.items() if not is_met)
         self._passes = 0 if unmet else self._passes + 1
@@ -204,23 +196,8 @@ def look_grid(n_episodes: int, shard_ends: Sequence[int], ratio: float = LOOK_RA
 class StopRule(Rule):
     """Fed with the estimate of weighted tests at each look in turn.
 
-    Parameters
-    ----------
-    campaign_stop : Stop
-        The campaign's ``stop`` section.
-    method : str
-        ``testing.method``; decides whose interval is watched unless ``stop.estimator`` does.
-    shard_ends, ratio
-        See `look_grid`.
-    min_crashes : int
-        Floor on sampled crashes where ``stop.min_crashes`` says nothing.
-
-    Attributes
-    ----------
-    estimator : str
-        Whose estimate `observe` wants.
-    looks : tuple of int
-        Numbers of episodes at which it wants it.
+    ``estimator`` is whose estimate `observe` wants, the method's own unless ``stop.estimator`` says another, ``looks``
+    at which numbers of episodes. ``min_crashes`` is the floor where ``stop.min_crashes`` says nothing.
     """
 
     def __init__(
@@ -245,10 +222,7 @@ class StopRule(Rule):
     def observe(self, n: int, estimate: Estimate) -> bool:
         """Whether to stop after the look at `n` episodes, the next of `looks`, with the estimate from exactly these.
 
-        Raises
-        ------
-        ValueError
-            If looks are skipped, repeated or taken elsewhere: the rule is valid only as declared.
+        Looks skipped, repeated or taken elsewhere are a `ValueError`: the rule is valid only as declared.
         """
         if self.look.stopped or not self.due(n) or estimate.n_episodes != n:
             raise ValueError(f"no look is due at {n} episodes with an estimate of {estimate.n_episodes}")

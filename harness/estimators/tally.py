@@ -110,14 +110,8 @@ def empty_tally(n_strata: int) -> Tally:
 def pool_variance(p: FloatArray, tally: Tally, n_paths: int, factor: FloatArray | float = 1.0) -> float:
     """Variance of Σ p_s c_s that comes from the pool's finite number of paths, wherever the vehicle crashes.
 
-    It is (Σ E[x_s x_t] - μ²)/n, see `mean_square`. A stratum in which no crash was seen adds nothing.
-
-    Parameters
-    ----------
-    p : ndarray, shape (S,)
-        Probabilities of the strata.
-    factor : ndarray, shape (S,)
-        By which crashes of each stratum are fewer than seen.
+    It is (Σ E[x_s x_t] - μ²)/n, see `mean_square`. A stratum in which no crash was seen adds nothing. ``factor`` (S,)
+    says by how much crashes of each stratum are fewer than seen.
     """
     scale = p / tally.at_least_one * factor
     rate = float(scale @ tally.crashes)

@@ -231,14 +231,8 @@ def weighted_estimate(
 
     The bound is the interval's own, one-sided, where crashes are many enough for it, else Hoeffding's for the mean of
     capped Y, which holds at every n and is in ``details`` in any case. Without a crash moments say nothing; the
-    interval is then [0, two-sided Hoeffding bound].
-
-    Parameters
-    ----------
-    third_moment : float or None
-        Third central moment of the error of ``rate``; None for a plain normal interval.
-    method, details, warnings, cautions
-        The estimator's own; see `Estimate`.
+    interval is then [0, two-sided Hoeffding bound]. ``third_moment`` is that of the error of ``rate``; None for a plain
+    normal interval.
     """
     cap, origin = sums.cap()
     hoeffding = capped_mean_upper(sums.mean(), cap, sums.n, confidence)
