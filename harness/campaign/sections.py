@@ -67,12 +67,8 @@ def _whole_steps(seconds: float) -> float:
     """Refuse a time that is not a multiple of the 0.1 s step."""
     steps = seconds * 10.0
     if abs(steps - round(steps)) >= 1e-9:
-        raise broken_rule(
-            "",
-            found=f"{seconds:g} s",
-            expected="a multiple of the 0.1 s step",
-            mend=f"The nearest one is {round(steps) / 10.0:g}.",
-        )
+        mend = f"The nearest one is {round(steps) / 10.0:g}."
+        raise broken_rule("", f"{seconds:g} s", "a multiple of the 0.1 s step", mend)
     return seconds
 
 
@@ -148,12 +144,9 @@ class ShellSettings(Section):
     @classmethod
     def _is_not_called_conditional(cls, statement: str) -> str:
         if statement == "conditional":
-            raise broken_rule(
-                "",
-                found="conditional, of which there are several now",
-                expected=f"{ASSUMPTION_FREE}, or the name of a statement",
-                mend=f"The former one is called {LIBRARY_STATEMENT}.",
-            )
+            expected = f"{ASSUMPTION_FREE}, or the name of a statement"
+            mend = f"The former one is called {LIBRARY_STATEMENT}."
+            raise broken_rule("", "conditional, of which there are several now", expected, mend)
         return statement
 
     @field_validator("statements")
@@ -165,19 +158,13 @@ class ShellSettings(Section):
 def checked_statements(statements: dict[str, StatementSettings]) -> dict[str, StatementSettings]:
     """The statements, if they can stand beside the library's own one, and in one test."""
     if taken := {ASSUMPTION_FREE, LIBRARY_STATEMENT} & set(statements):
-        raise broken_rule(
-            "",
-            found=f"a statement named {min(taken)}",
-            expected=f"another name: {ASSUMPTION_FREE} and {LIBRARY_STATEMENT} are there always",
-            mend="Rename it; the boundary of the statement library is the key boundary.",
-        )
+        expected = f"another name: {ASSUMPTION_FREE} and {LIBRARY_STATEMENT} are there always"
+        mend = "Rename it; the boundary of the statement library is the key boundary."
+        raise broken_rule("", f"a statement named {min(taken)}", expected, mend)
     if len(checked := [name for name, each in statements.items() if each.checked]) > 1:
-        raise broken_rule(
-            "",
-            found=f"{len(checked)} statements that are checked in each test: {listed(checked)}",
-            expected="one at most",
-            mend="Leave checked out of the others: a crash beyond their boundary refutes them.",
-        )
+        found = f"{len(checked)} statements that are checked in each test: {listed(checked)}"
+        mend = "Leave checked out of the others: a crash beyond their boundary refutes them."
+        raise broken_rule("", found, "one at most", mend)
     return statements
 
 
@@ -208,12 +195,8 @@ class Testing(Section):
     def _alpha_sums_to_one(cls, alpha: dict[str, float] | None) -> dict[str, float] | None:
         total = 1.0 if alpha is None else math.fsum(alpha.values())
         if abs(total - 1.0) > 1e-9:
-            raise broken_rule(
-                "",
-                found=f"weights that sum to {total:.12g}",
-                expected="weights that sum to 1",
-                mend="Change them, or leave alpha out for equal weights.",
-            )
+            mend = "Change them, or leave alpha out for equal weights."
+            raise broken_rule("", f"weights that sum to {total:.12g}", "weights that sum to 1", mend)
         return alpha
 
 

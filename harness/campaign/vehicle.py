@@ -167,12 +167,9 @@ class FuzzySafetyParameters(Reference):
     @model_validator(mode="after")
     def _hard_is_harder(self) -> Self:
         if self.hard_braking_mps2 < self.comfortable_braking_mps2:
-            raise broken_rule(
-                "hard_braking_mps2",
-                found=f"{self.hard_braking_mps2:g}, below comfortable_braking_mps2 {self.comfortable_braking_mps2:g}",
-                expected="at least as much: it brakes the harder the greater the danger",
-                mend="Exchange them, or make them equal.",
-            )
+            found = f"{self.hard_braking_mps2:g}, below comfortable_braking_mps2 {self.comfortable_braking_mps2:g}"
+            expected = "at least as much: it brakes the harder the greater the danger"
+            raise broken_rule("hard_braking_mps2", found, expected, "Exchange them, or make them equal.")
         return self
 
 
@@ -371,12 +368,9 @@ class TraciProcess(Section):
         except ValueError as error:
             problem = str(error)
         if problem is not None:
-            raise broken_rule(
-                "",
-                found=f"{problem[:60]}, in {command[:200]!r}",
-                expected="a program and its arguments, with {port} and {cells} as they stand the only things in braces",
-                mend="Double a brace that is meant as itself: {{ and }}.",
-            )
+            expected = "a program and its arguments, with {port} and {cells} as they stand the only things in braces"
+            mend = "Double a brace that is meant as itself: {{ and }}."
+            raise broken_rule("", f"{problem[:60]}, in {command[:200]!r}", expected, mend)
         return command
 
     def words(self, port: int, cells: int) -> list[str]:
@@ -462,24 +456,16 @@ class AutomatedVehicle(_Driven):
         if not isinstance(data, dict) or any(data.get(name) is not None for name in AV_SOURCES):
             return data
         if forgotten := [name for name in AV_SOURCES if name in data]:
-            raise broken_rule(
-                forgotten[0],
-                found="nothing (null)",
-                expected=f"one of {', '.join(AV_SOURCES)}, with a value",
-                mend=f"Write a value after '{forgotten[0]}:', or delete the key for the built-in idm.",
-            )
+            mend = f"Write a value after '{forgotten[0]}:', or delete the key for the built-in idm."
+            raise broken_rule(forgotten[0], "nothing (null)", f"one of {', '.join(AV_SOURCES)}, with a value", mend)
         return {**data, "model": "idm"}
 
     @model_validator(mode="after")
     def _one_source(self) -> Self:
         named = [name for name in AV_SOURCES if getattr(self, name) is not None]
         if len(named) > 1:
-            raise broken_rule(
-                "",
-                found=" and ".join(named),
-                expected=f"one of {', '.join(AV_SOURCES)}",
-                mend="An AV has one driver: delete the others, or set them to null.",
-            )
+            mend = "An AV has one driver: delete the others, or set them to null."
+            raise broken_rule("", " and ".join(named), f"one of {', '.join(AV_SOURCES)}", mend)
         return self
 
     @model_validator(mode="after")

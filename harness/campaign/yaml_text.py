@@ -67,16 +67,11 @@ def read_yaml(path: str | Path) -> tuple[dict[str, Any], Lines]:
     name = str(path)
     data, lines = _load(_read_text(Path(path)), name)
     if not lines:
-        raise CampaignError(
-            name, found="an empty file", expected="YAML keys and values", mend="Is it the right file, fully written?"
-        )
+        raise CampaignError(name, "an empty file", "YAML keys and values", "Is it the right file, fully written?")
     if not isinstance(data, dict):
-        raise CampaignError(
-            f"{name}:{lines[()]}",
-            found=f"a {'list' if isinstance(data, list) else 'single value'} at the top level",
-            expected="keys and values",
-            mend="Write 'key: value' lines, without a dash before the first one.",
-        )
+        found = f"a {'list' if isinstance(data, list) else 'single value'} at the top level"
+        mend = "Write 'key: value' lines, without a dash before the first one."
+        raise CampaignError(f"{name}:{lines[()]}", found, "keys and values", mend)
     return data, Lines(name, lines)
 
 
@@ -85,10 +80,10 @@ def parse_value(text: str, where: str) -> Any:
     try:
         data, lines = _load(text, where)
     except CampaignError as error:
-        raise CampaignError(where, found=error.found, expected=error.expected, mend=error.mend) from None
+        raise CampaignError(where, error.found, error.expected, error.mend) from None
     if not lines:
         mend = "Write null if you mean none, '\"\"' for no text."
-        raise CampaignError(where, found="no value after '='", expected="a value", mend=mend)
+        raise CampaignError(where, "no value after '='", "a value", mend)
     return data
 
 
@@ -107,7 +102,7 @@ def _read_text(path: Path) -> str:
         found, mend = f"bytes that are not UTF-8 (at byte {error.start})", "Save the file as UTF-8 text."
     except (OSError, ValueError) as error:
         found, mend = f"a file that cannot be read ({error})", "Check its name and permissions."
-    raise CampaignError(str(path), found=found, expected="a readable YAML file in UTF-8", mend=mend)
+    raise CampaignError(str(path), found, "a readable YAML file in UTF-8", mend)
 
 
 def _load(text: str, name: str) -> tuple[Any, dict[tuple[str | int, ...], int]]:
@@ -134,7 +129,7 @@ def _load(text: str, name: str) -> tuple[Any, dict[tuple[str | int, ...], int]]:
         found, mend = "values nested too deeply", "Close the brackets that were left open."
     except (ValueError, OverflowError) as error:  # a number or an escape that is out of all bounds
         found = str(error).splitlines()[0]
-    raise CampaignError(where, found=found, expected="plain YAML 1.2", mend=mend)
+    raise CampaignError(where, found, "plain YAML 1.2", mend)
 
 
 class StrictLoader(SafeLoader):

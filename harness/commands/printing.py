@@ -46,27 +46,19 @@ def system_error(error: OSError) -> HarnessError | None:
     """Translate an error of the operating system that a user can mend; None for any other."""
     where = str(error.filename or f"disk of the output folder, or of the cache {_cache_folder()}")
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return HarnessError(
-            where,
-            found="no space left",
-            expected="room for what is written there",
-            mend="Nothing finished is lost: free some space, then give the same command again (`run` with --resume).",
-        )
+        mend = "Nothing finished is lost: free some space, then give the same command again (`run` with --resume)."
+        return HarnessError(where, "no space left", "room for what is written there", mend)
     if error.errno in (errno.EFBIG, errno.EIO):
         return HarnessError(
             where,
-            found=f"a file that could not be written or read on ({error.strerror})",
-            expected="a sound disk, and no limit on the size of files (`ulimit -f`)",
-            mend="Nothing finished is lost: lift the limit or choose another disk, then give the same command again "
+            f"a file that could not be written or read on ({error.strerror})",
+            "a sound disk, and no limit on the size of files (`ulimit -f`)",
+            "Nothing finished is lost: lift the limit or choose another disk, then give the same command again "
             "(`run` with --resume).",
         )
     if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
-        return HarnessError(
-            where,
-            found=f"no permission ({error.strerror})",
-            expected="a place that may be read and written",
-            mend="Change its permissions, or choose another place.",
-        )
+        mend = "Change its permissions, or choose another place."
+        return HarnessError(where, f"no permission ({error.strerror})", "a place that may be read and written", mend)
     return None
 
 
@@ -80,12 +72,8 @@ def _cache_folder() -> str:
 def usage_error(error: click.UsageError, context: click.Context) -> HarnessError:
     """Put what click says of a wrong call into the words of all errors."""
     usage = " ".join(context.get_usage().removeprefix("Usage: ").split())
-    return HarnessError(
-        context.command_path,
-        found=error.format_message().rstrip("."),
-        expected=f"a call of the form: {usage}",
-        mend=f"See `{context.command_path} --help`.",
-    )
+    mend = f"See `{context.command_path} --help`."
+    return HarnessError(context.command_path, error.format_message().rstrip("."), f"a call of the form: {usage}", mend)
 
 
 def print_json(content: Any) -> None:

@@ -123,12 +123,8 @@ def replay(folder: Path, episode: int, *, out: Path | None, fcd: Path | None, gu
         for file in files:
             click.echo(file)
     if result.bit_equal is False:
-        raise WorldDisagreementError(
-            f"episode {episode} of {folder}",
-            found="a replay that differs from the stored trace",
-            expected="the same bits",
-            mend=str(result.suspects),
-        )
+        found = "a replay that differs from the stored trace"
+        raise WorldDisagreementError(f"episode {episode} of {folder}", found, "the same bits", str(result.suspects))
 
 
 def _onset(row: dict[str, Any]) -> str:

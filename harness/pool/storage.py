@@ -98,12 +98,9 @@ def read_pool(path: Path) -> Pool:
             table = file.read()
         return _pool(table, sound_facts(table))
     except (OSError, pa.ArrowException, KeyError, TypeError, ValueError) as error:
-        raise RunFolderError(
-            str(path),
-            found=f"a file that is not a whole pool ({str(error).splitlines()[0] if str(error) else error!r})",
-            expected="a pool that `harness pool` has written",
-            mend="Delete it: it is built again when it is needed.",
-        ) from error
+        found = f"a file that is not a whole pool ({str(error).splitlines()[0] if str(error) else error!r})"
+        mend = "Delete it: it is built again when it is needed."
+        raise RunFolderError(str(path), found, "a pool that `harness pool` has written", mend) from error
 
 
 def stamped(table: pa.Table, facts: dict[str, Any]) -> pa.Table:

@@ -187,9 +187,9 @@ def vehicle_pool(resolved: Resolved, paths: ShadowPaths, runs: ShadowRuns) -> Po
         failed = f" ({n:,} of them failed)" if (n := int(runs.failed.sum())) else ""
         raise HarnessError(
             "shadow runs",
-            found=f"no cut-in on {len(paths):,} paths{failed} after which even the most careless surrogate would crash",
-            expected="some: the crash rate is estimated from them",
-            mend="Raise pool.shadow_paths, or use testing.method forced; look at whether the vehicle moves at all "
+            f"no cut-in on {len(paths):,} paths{failed} after which even the most careless surrogate would crash",
+            "some: the crash rate is estimated from them",
+            "Raise pool.shadow_paths, or use testing.method forced; look at whether the vehicle moves at all "
             "(`harness av-check`).",
         )
     mass = found.probability * paths.weight[:, None]

@@ -152,12 +152,8 @@ def _require(sound: BoolArray, where: str, found: str, values: tuple[FloatArray,
     """Refuse a law that is not sound (n,) everywhere; ``found`` formats the ``values`` (n,) where it first fails."""
     if not sound.all():
         first = int(np.argmin(sound))
-        raise CampaignError(
-            where,
-            found=found.format(*(value[first] for value in values)),
-            expected=expected,
-            mend="The numbers are allowed one by one, but not together: correct those of this law.",
-        )
+        mend = "The numbers are allowed one by one, but not together: correct those of this law."
+        raise CampaignError(where, found.format(*(value[first] for value in values)), expected, mend)
 
 
 @compiled_threads

@@ -41,7 +41,7 @@ def _within(low: float, high: float) -> AfterValidator:
     def checked(number: Number) -> Number:
         if not low <= number.value <= high:
             expected = f"a number from {low:g} to {high:g}"
-            raise broken_rule("value", found=f"{number.value:g}", expected=expected, mend="Correct the value.")
+            raise broken_rule("value", f"{number.value:g}", expected, "Correct the value.")
         return number
 
     return AfterValidator(checked)
@@ -67,19 +67,15 @@ DegreesOfFreedom = Annotated[Number, _within(2.0, 1000.0)]  # below 2 more than 
 def _require_order(numbers: BaseModel, low: str, high: str, *, equal: bool) -> None:
     least, most = getattr(numbers, low).value, getattr(numbers, high).value
     if least > most or (least == most and not equal):
-        raise broken_rule(
-            low,
-            found=f"{least:g}, with {high} {most:g}",
-            expected=f"a number {'of at most' if equal else 'below'} {high}",
-            mend="Change places, or correct one of them.",
-        )
+        expected = f"a number {'of at most' if equal else 'below'} {high}"
+        raise broken_rule(low, f"{least:g}, with {high} {most:g}", expected, "Change places, or correct one of them.")
 
 
 def _whole_steps(number: Number) -> Number:
     steps = number.value / STEP_S
     if abs(steps - round(steps)) >= 1e-9:
         expected, mend = f"a multiple of the {STEP_S:g} s step", f"The nearest one is {round(steps) * STEP_S:g}."
-        raise broken_rule("value", found=f"{number.value:g}", expected=expected, mend=mend)
+        raise broken_rule("value", f"{number.value:g}", expected, mend)
     return number
 
 
@@ -94,12 +90,8 @@ class Scenario(Section):
     def _nothing_that_is_fixed(cls, data: Any) -> Any:
         for name in FIXED if isinstance(data, dict) else ():
             if name in data:
-                raise broken_rule(
-                    name,
-                    found="a key that would change nothing",
-                    expected=f"no such key: motion is computed for {name} {FIXED[name]:g}",
-                    mend="Delete the line.",
-                )
+                expected = f"no such key: motion is computed for {name} {FIXED[name]:g}"
+                raise broken_rule(name, "a key that would change nothing", expected, "Delete the line.")
         return data
 
 
@@ -230,12 +222,8 @@ class Lateral(Section):
     def _one_of_both(self) -> Self:
         named = tuple(name for name in ("lead_s", *_SPEED) if getattr(self, name) is not None)
         if named not in (("lead_s",), _SPEED):
-            raise broken_rule(
-                "",
-                found=", ".join(named) or "neither",
-                expected=f"lead_s alone, or {', '.join(_SPEED)}",
-                mend="A lead is constant, or follows from a lateral speed and is cut off at the longest.",
-            )
+            mend = "A lead is constant, or follows from a lateral speed and is cut off at the longest."
+            raise broken_rule("", ", ".join(named) or "neither", f"lead_s alone, or {', '.join(_SPEED)}", mend)
         return self
 
     def motion(self) -> LateralMotion:
@@ -266,12 +254,9 @@ class EnvironmentParameters(Section):
         slowest = self.fit_range.v_min_mps.value - self.initial_state.r2dot_max_mps.value
         fastest = self.fit_range.v_max_mps.value - self.initial_state.r2dot_min_mps.value
         if slowest < 0.0 or fastest > MAX_CONFIGURED_SPEED_MPS:
-            raise broken_rule(
-                "initial_state",
-                found=f"speeds of the AV (v_BV - R2dot) from {slowest:g} to {fastest:g} m/s",
-                expected=f"speeds from 0 to {MAX_CONFIGURED_SPEED_MPS:g} m/s",
-                mend="Narrow r2dot_min_mps and r2dot_max_mps, or v_min_mps and v_max_mps of fit_range.",
-            )
+            found = f"speeds of the AV (v_BV - R2dot) from {slowest:g} to {fastest:g} m/s"
+            mend = "Narrow r2dot_min_mps and r2dot_max_mps, or v_min_mps and v_max_mps of fit_range."
+            raise broken_rule("initial_state", found, f"speeds from 0 to {MAX_CONFIGURED_SPEED_MPS:g} m/s", mend)
         return self
 
     def values(self) -> dict[str, float]:
