@@ -18,13 +18,13 @@ import numpy as np
 from benchmarks.one_at_a_time import OverTraci, in_libsumo
 from harness.campaign.campaign import Campaign
 from harness.campaign.files import load_campaign
+from harness.drawing import ShardRequest, Source
 from harness.episode import loop
 from harness.episode.loop import Shard
 from harness.records.folder import encoded, write_shard
 from harness.records.schemas import shard_tables
 from harness.resolved import resolve
-from harness.runner.prepare import Prepared, prepare
-from harness.runner.worker import ShardSpec
+from harness.runner.resolve import prepare
 from harness.runner.workers import LocalWorkers
 from harness.worlds.cells import sumo_program
 from harness.worlds.protocol import World
@@ -76,7 +76,7 @@ class Recorded(Contender):
     """Episodes of a campaign in some world, written to disk as the runner writes them."""
 
     def __init__(self, settings: Campaign, world: Callable[[Campaign], World]) -> None:
-        self.prepared: Prepared = prepare(resolve(settings))
+        self.prepared: Source = prepare(resolve(settings))
         self.world = world(settings)
         self.loop = self.prepared.loop(self.world)
         self.folder = Path(tempfile.mkdtemp(prefix="harness-benchmark-"))
@@ -211,7 +211,7 @@ class Workers(Contender):
     def run(self, first: int, n: int) -> Work:
         # As many shards of 2,500 episodes for every worker.
         n_shards = max(2, n // SHARD)
-        specs = [ShardSpec(i, first + i * SHARD, SHARD) for i in range(n_shards)]
+        specs = [ShardRequest(i, first + i * SHARD, SHARD) for i in range(n_shards)]
         for done in self._pool.run(iter(specs), lambda _: None):
             write_shard(self._folder, done.spec.index, done.parquet)
         return Work(n_shards * SHARD, 0)

@@ -19,7 +19,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from harness.campaign.files import load_campaign
 from harness.resolved import resolve
-from harness.runner.prepare import build_world, prepare
+from harness.runner.resolve import build_world, prepare
 from harness.worlds.sumo import SumoWorld
 
 ROOT = Path(__file__).parents[1]

@@ -22,10 +22,10 @@ from benchmarks.contenders import SCENARIOS
 from benchmarks.shells_rare_hole import IDM
 from harness.campaign.campaign import Campaign
 from harness.campaign.files import load_campaign
+from harness.drawing.shells import ShellRounds, round_requests
 from harness.pool.shells import design_shells
 from harness.pool.storage import campaign_pool
 from harness.resolved import resolve
-from harness.runner.planner import ShellPlanner, round_specs
 from harness.vocabulary import FloatArray
 from studies.shell_campaign import DrawnPool, campaign_block
 
@@ -49,13 +49,13 @@ def drawn_pool(campaign: Campaign) -> DrawnPool:
 def rounds_of(campaign: Campaign, pool: DrawnPool, rng: np.random.Generator) -> list[list[int]]:
     """Tests of each shard of each round until the stop rule is content."""
     available = np.full(pool.design.p.size, campaign.pool.cut_ins_per_shell, np.int64)
-    planner = ShellPlanner(campaign, pool.design, available)
+    planner = ShellRounds(campaign, pool.design, available)
     rounds, enough = [], False
     while not enough and (added := planner.next_round()).any():
         tests = planner.tally.tests
-        specs = round_specs(tests, added, 0, int(tests.sum()), campaign.run.smallest_shard)
+        specs = round_requests(tests, added, 0, int(tests.sum()), campaign.run.smallest_shard)
         rounds.append([spec.n_episodes for spec in specs])
-        enough = planner.add(campaign_block(pool, added, int(tests.sum()), rng))
+        enough = planner.enough(campaign_block(pool, added, int(tests.sum()), rng))
     return rounds
 
 

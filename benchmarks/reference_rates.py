@@ -23,8 +23,9 @@ import numpy as np
 
 from harness.campaign.campaign import Campaign
 from harness.campaign.files import load_campaign
+from harness.drawing import Source
 from harness.resolved import resolve
-from harness.runner.prepare import Prepared, prepare
+from harness.runner.resolve import prepare
 from harness.vocabulary import BV_LV_CONTACT, CRASH
 from harness.worlds.twin import TwinWorld
 
@@ -33,7 +34,7 @@ CHUNK = 50_000
 
 
 @cache
-def _prepared(path: str, overrides: tuple[str, ...]) -> Prepared:
+def _prepared(path: str, overrides: tuple[str, ...]) -> Source:
     return prepare(resolve(_campaign(path, overrides)))
 
 

@@ -17,13 +17,13 @@ import numpy as np
 
 from harness.campaign.campaign import Campaign
 from harness.campaign.sections import Accept
+from harness.drawing.shells import PairRounds, ShellRounds
 from harness.estimators.block import Block, Drawn
 from harness.estimators.estimate import Estimate
 from harness.estimators.likelihood import Level
 from harness.estimators.pairs import CRASH, NO_CRASH, PairCounts, no_pairs
 from harness.estimators.shells import Shells
 from harness.estimators.stopping import PairRule, RoundRule
-from harness.runner.planner import PairPlanner, ShellPlanner
 from harness.strata import LIBRARY_STATEMENT, ShellDesign
 from harness.vocabulary import CRASH as CRASHED
 from harness.vocabulary import FAILED, TIMEOUT, FloatArray, IntArray
@@ -128,12 +128,12 @@ class ShellCampaign(_Redrawn):
     def rows(self, replication: int) -> Iterator[Row]:
         """See `_Redrawn`."""
         rng, (drawn,), available = self._begin(replication)
-        planner = ShellPlanner(self.campaign, drawn.design, available)
+        planner = ShellRounds(self.campaign, drawn.design, available)
         rounds = self._decide if self.limits else self._replicate
         return rounds(replication, rng, drawn, planner)
 
     def _decide(
-        self, replication: int, rng: np.random.Generator, drawn: DrawnPool, planner: ShellPlanner
+        self, replication: int, rng: np.random.Generator, drawn: DrawnPool, planner: ShellRounds
     ) -> Iterator[Row]:
         """All limits from the same tests: what is tested next does not depend on any."""
         pending = {
@@ -141,7 +141,7 @@ class ShellCampaign(_Redrawn):
             for name, limit in self.limits.items()
         }
         while pending and (added := planner.next_round()).any():
-            planner.add(campaign_block(drawn, added, int(planner.tally.tests.sum()), rng))
+            planner.enough(campaign_block(drawn, added, int(planner.tally.tests.sum()), rng))
             for name in [name for name, rule in pending.items() if rule.observe(planner.seen)]:
                 yield self._decision_row(planner.seen, name, replication, pending.pop(name))
         for name, rule in pending.items():
@@ -164,14 +164,14 @@ class ShellCampaign(_Redrawn):
         )
 
     def _replicate(
-        self, replication: int, rng: np.random.Generator, drawn: DrawnPool, planner: ShellPlanner
+        self, replication: int, rng: np.random.Generator, drawn: DrawnPool, planner: ShellRounds
     ) -> Iterator[Row]:
         names = [each.name for each in drawn.design.statements]
         rules = {name: RoundRule(self.campaign.replaced(_STATEMENT, name)) for name in names}
         known: dict[str, Row] = {}
         enough = False
         while not enough and (added := planner.next_round()).any():
-            enough = planner.add(campaign_block(drawn, added, int(planner.tally.tests.sum()), rng))
+            enough = planner.enough(campaign_block(drawn, added, int(planner.tally.tests.sum()), rng))
             for name, rule in rules.items():
                 pending = name not in known and planner.seen.tally.tests.size
                 if pending and rule.observe(planner.seen) and rule.look.stopped:
@@ -245,7 +245,7 @@ class PairedCampaign(_Redrawn):
     def rows(self, replication: int) -> Iterator[Row]:
         """See `_Redrawn`."""
         rng, drawn, available = self._begin(replication)
-        planner = PairPlanner(self.campaign, drawn[0].design, available, None)
+        planner = PairRounds(self.campaign, drawn[0].design, available, None)
         pairs, early = no_pairs(drawn[0].design), None
         inside, enough = PairRule(self.campaign.replaced(_STATEMENT, LIBRARY_STATEMENT), None), False
         while not enough and (added := planner.next_round(pairs)).any():

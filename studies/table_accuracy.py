@@ -17,7 +17,7 @@ from harness.episode.loop import MOMENT_LIMITS, Drawing, EpisodeLoop, RecordPoli
 from harness.importance.build import build_importance
 from harness.importance.tables import Tables
 from harness.resolved import Resolved
-from harness.runner.prepare import prepare
+from harness.runner.resolve import prepare
 from harness.traffic.initial_state import InitialStates
 from harness.vocabulary import CRASH, FloatArray
 from harness.worlds.twin import TwinWorld

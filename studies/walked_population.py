@@ -17,6 +17,7 @@ import numpy as np
 from harness.campaign.campaign import Campaign
 from harness.compiled import source_hash
 from harness.controllers.find import build_host, require_controller
+from harness.drawing.baseline import recorded, without_cut_in
 from harness.episode.cells import PrescribedTraffic
 from harness.episode.judge import motion_hashes
 from harness.episode.loop import Drawing, EpisodeLoop, RecordPolicy
@@ -27,7 +28,6 @@ from harness.pool.enumeration import STRIDE, ShadowRuns, enumerate_cut_ins, writ
 from harness.pool.vehicle_pool import CANDIDATES, ShadowPaths, walk_candidates
 from harness.progress import Progress
 from harness.resolved import Resolved, resolve
-from harness.runner.shadow_runs import recorded, without_cut_in
 from harness.vocabulary import CRASH, PRESCRIBED, BoolArray, IntArray
 from harness.worlds.twin import TwinWorld
 from studies.super_population import SuperPopulation, cached, joined, population_key

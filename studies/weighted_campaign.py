@@ -9,13 +9,14 @@ from functools import cache, partial
 import numpy as np
 
 from harness.campaign.campaign import Campaign
+from harness.drawing import Source
 from harness.episode.loop import EpisodeLoop
 from harness.estimators import StopRule, accumulator
 from harness.estimators.block import Block, block_from_tables
 from harness.importance.build import mixture_weights
 from harness.records.schemas import shard_tables
 from harness.resolved import resolve
-from harness.runner.prepare import Prepared, prepare
+from harness.runner.resolve import prepare
 from harness.vocabulary import EstimatorName, Method
 from harness.worlds.twin import TwinWorld
 from studies.chains.chain import Chain
@@ -55,7 +56,7 @@ def _twin_block(campaign: Campaign, first: int, n: int) -> Block:
 
 
 @cache
-def prepared_twin(campaign_json: str) -> tuple[Prepared, EpisodeLoop]:
+def prepared_twin(campaign_json: str) -> tuple[Source, EpisodeLoop]:
     """A campaign in the twin; prepared when a process asks for it first, and once only."""
     prepared = prepare(resolve(Campaign.model_validate_json(campaign_json)))
     return prepared, prepared.loop(TwinWorld(CELLS))

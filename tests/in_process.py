@@ -17,8 +17,9 @@ import pytest
 from harness import run
 from harness.campaign.campaign import Campaign
 from harness.controllers.hosts import Death
+from harness.drawing import ShardRequest
 from harness.runner import RunResult, workers
-from harness.runner.worker import ShardDone, ShardRunner, ShardSpec
+from harness.runner.worker import ShardResult, ShardRunner
 
 
 @contextmanager
@@ -35,11 +36,11 @@ class WorkerInThisProcess:
     def __init__(self, resolved: Path, folder: Path, black_box: Path) -> None:
         self._runner = ShardRunner(pickle.loads(resolved.read_bytes()), folder)
 
-    def give(self, spec: ShardSpec, fatal_episodes: Mapping[int, Death]) -> bool:
+    def give(self, spec: ShardRequest, fatal_episodes: Mapping[int, Death]) -> bool:
         self._done = self._runner.run(spec, fatal_episodes)
         return True
 
-    def answer(self) -> ShardDone:
+    def answer(self) -> ShardResult:
         return self._done
 
     def kill(self) -> None:

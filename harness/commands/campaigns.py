@@ -155,7 +155,7 @@ def av_check(
     controller is wrong.
     """
     campaign = loaded(campaign_file, overrides, av)
-    from harness.runner.av_check import check_av_apart  # noqa: PLC0415 - slow to import: only once the campaign is right
+    from harness.runner.look import check_av_apart  # noqa: PLC0415 - slow to import: only once the campaign is right
 
     found = check_av_apart(campaign, episodes)
     if as_json:

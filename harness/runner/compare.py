@@ -1,27 +1,45 @@
-"""Compare two AVs on common random numbers: the same episodes with each, and the interval of the difference."""
+"""Compare two AVs on the same cut-ins drawn from shells: both are driven round by round, to where they differ.
+
+The i-th cut-in of a stratum is the same for both, as it follows from the campaign's seed and the pool. What either
+folder holds already, from an earlier call or because it is the copy of a stored run, is not driven again.
+"""
 
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass
+from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Literal
+from typing import Any
+
+import numpy as np
 
 from harness.campaign.campaign import Campaign
-from harness.errors import CampaignError, RunFolderError
-from harness.estimators.pairs import PairedEstimate
+from harness.drawing import ShardRequest
+from harness.drawing.shells import PairRounds, Shells, round_requests
+from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED, CampaignError, RunFolderError
+from harness.estimators.answer import conditional_paired_statement, paired_statement
+from harness.estimators.pairs import MarginVerdict, PairCounts, PairedEstimate, PairedShells, paired_estimate
+from harness.estimators.stopping import PairRule
+from harness.pool.shells import Draw, acceleration_limit
 from harness.progress import Progress
-from harness.records.folder import read_manifest, require_place, write_json
+from harness.records.folder import read_manifest, require_place, sole_use, write_json
+from harness.records.reader import read_shards
 from harness.resolved import Resolved
-from harness.runner.compare_shells import PAIRING, compare_shells, exit_code, shells_content
-from harness.runner.manifest import require_own_folder
-from harness.runner.prepare import require_ready
+from harness.runner.resolve import require_ready
+from harness.runner.resume import require_own_folder
+from harness.runner.run import Run, finish
+from harness.vocabulary import IntArray
 
-Side = Literal["a", "b"]
-SIDES: tuple[Side, Side] = ("a", "b")
+SIDES = ("a", "b")
 MAY_DIFFER = frozenset({"av", "name", "description"})
+PAIRING = "the i-th cut-in that A meets of a shell is the i-th that B meets: same initial state, paths and cut-in"
+EXIT_OF: Mapping[MarginVerdict, int] = {"proven": EXIT_DONE, "refuted": EXIT_REFUTED, "open": EXIT_BUDGET_SPENT}
+
+Both = tuple[Resolved, Resolved]
 
 
 @dataclass(frozen=True)
@@ -49,10 +67,9 @@ def compare_campaigns(
     stored: Path | None = None,
     margin: float | None = None,
 ) -> Comparison:
-    """Run two campaigns that differ in the AV over the same episodes, and estimate the difference.
+    """Drive two vehicles on the same cut-ins until the difference, or the margin, is known well enough.
 
-    One rule looks at the difference (`harness.runner.compare_shells`). What an earlier call has finished in ``out`` is
-    used again.
+    What an earlier call has finished in ``out`` is used again.
 
     Parameters
     ----------
@@ -72,64 +89,129 @@ def compare_campaigns(
     Raises
     ------
     CampaignError
-        The campaigns differ in something else, or do not draw from shells.
+        The campaigns differ in something else, or do not draw from the same shells.
     RunFolderError
         ``out`` holds other runs.
     """
     require_comparable(a, b)
-    sides: dict[Side, Resolved] = {"a": require_ready(a, "compare"), "b": require_ready(b, "compare")}
+    sides = require_ready(a, "compare"), require_ready(b, "compare")
+    folders = out / "a", out / "b"
     if stored is not None:
-        _take_over(stored, out / "a", sides["a"])
-    for side, of_side in sides.items():  # both, before either is touched
-        require_own_folder(out / side, of_side, resume=True)
-    names = labels or (a.name, b.name)
-    both, folders = (sides["a"], sides["b"]), (out / "a", out / "b")
-    pairs, rule = compare_shells(both, folders, margin=margin, workers=workers, progress=progress)
-    content = _content(sides, names, shells_content(pairs, rule, names))
-    write_json(out / "compare.json", content)
-    return Comparison(out, pairs, content, exit_code(rule, precision_asked=a.stop.rhw is not None))
-
-
-def require_comparable(a: Campaign, b: Campaign) -> None:
-    """Refuse campaigns that differ in more than the vehicle, by a `CampaignError` that names every key that differs."""
-    keys = set(MAY_DIFFER)
-    apart = list(_differing("", a.model_dump(exclude=keys), b.model_dump(exclude=keys)))
-    if not apart:
-        return
-    where, of_a, of_b = apart[0]
-    more = f"; also {', '.join(key for key, _, _ in apart[1:])}" if len(apart) > 1 else ""
-    raise CampaignError(
-        where,
-        found=f"{of_a} in A and {of_b} in B{more}",
-        expected=f"campaigns that differ in {', '.join(sorted(keys))} only: pairs of episodes need equal settings",
-        mend=f"Make them equal, e.g. with --set {where}=…, which holds for both.",
-    )
-
-
-def _differing(prefix: str, a: Any, b: Any) -> Iterator[tuple[str, Any, Any]]:
-    if isinstance(a, dict) and isinstance(b, dict):
-        for key in dict.fromkeys([*a, *b]):
-            yield from _differing(f"{prefix}.{key}" if prefix else str(key), a.get(key), b.get(key))
-        if a == b and list(a) != list(b):
-            yield prefix, f"the order {', '.join(a)}", f"{', '.join(b)}"
-    elif a != b:
-        yield prefix, a, b
-
-
-def _content(of_sides: dict[Side, Resolved], labels: tuple[str, str], answer: dict[str, Any]) -> dict[str, Any]:
-    campaign = of_sides["a"].campaign
-    sides = {
-        side: {"label": label, "campaign_hash": of_sides[side].content_hash}
-        for side, label in zip(SIDES, labels, strict=True)
-    }
-    return {
+        _take_over(stored, folders[0], sides[0])
+    for side, folder in zip(sides, folders, strict=True):  # both, before either is touched
+        require_own_folder(folder, side, resume=True)
+    require_same_shells(sides)
+    found, rule = _compared(sides, folders, margin, workers, progress or Progress())
+    labels = labels or (a.name, b.name)
+    content = {
         "format": 1,
-        "method": campaign.testing.method,
-        "seed": campaign.seed,
+        "method": a.testing.method,
+        "seed": a.seed,
         "pairing": PAIRING,
-        "campaigns": sides,
-        **answer,
+        "campaigns": {
+            name: {"label": label, "campaign_hash": side.content_hash}
+            for name, label, side in zip(SIDES, labels, sides, strict=True)
+        },
+        **_answer(found, rule, labels),
     }
+    write_json(out / "compare.json", content)
+    missed = a.stop.rhw is not None and not rule.look.stopped
+    code = (EXIT_BUDGET_SPENT if missed else EXIT_DONE) if rule.margin is None else EXIT_OF[rule.margin.verdict]
+    return Comparison(out, found, content, code)
+
+
+def _compared(
+    sides: Both, folders: tuple[Path, Path], margin: float | None, workers: int | None, progress: Progress
+) -> tuple[PairedEstimate, PairRule]:
+    campaign = sides[0].campaign
+    with ExitStack() as held, ExitStack() as working:
+        runs, stored = [], []
+        for resolved, folder in zip(sides, folders, strict=True):
+            held.enter_context(sole_use(folder))
+            earlier = require_own_folder(folder, resolved, resume=True)
+            stored.append(list(_stored_requests(folder, earlier)))
+            runs.append(working.enter_context(Run(resolved, folder, earlier, workers, progress, n_runs=2).under_way()))
+        source = runs[0].source  # the other's is the same: one environment and one library make one pool
+        if not isinstance(source, Shells):
+            raise TypeError("the campaigns do not draw from shells")
+        design, available = source.prescribed.design, source.prescribed.available
+        rounds, pairs = PairRounds(campaign, design, available, margin), PairedShells(design)
+        both = [_Side(run, side, pairs, rounds.rule) for side, run in enumerate(runs)]
+        progress.stage("tests of A and B", 2 * campaign.stop.episodes)
+        for side, requests in zip(both, stored, strict=True):
+            side.run(iter(requests))
+        counts = _drive(rounds, pairs, both)
+        working.close()
+        for run in runs:
+            run.discard_uncounted()
+            finish(run, rounds.rule)
+    return paired_estimate(counts, campaign.stop.confidence), rounds.rule
+
+
+@dataclass(frozen=True)
+class _Side:
+    """One vehicle's run, and where its tests go."""
+
+    into: Run
+    side: int
+    pairs: PairedShells
+    rule: PairRule
+
+    def run(self, requests: Iterator[ShardRequest]) -> None:
+        """Test what is asked for."""
+        for shard in self.into.results(requests):
+            self.pairs.add(self.side, shard.block)
+            self.into.follow(self.rule, shard)
+
+    def drive(self, n_pairs: IntArray) -> None:
+        """Test what is missing of the first cut-ins of each stratum."""
+        tested, prefix = self.pairs.tests(self.side), self.into.prefix
+        missing = np.maximum(n_pairs - tested, 0)
+        if missing.any():
+            size = self.into.campaign.run.smallest_shard
+            self.run(iter(round_requests(tested, missing, len(prefix.shards), prefix.n_episodes, size)))
+
+
+def _drive(rounds: PairRounds, pairs: PairedShells, both: list[_Side]) -> PairCounts:
+    """Rounds of pairs until the rule is content; the pairs that it has seen."""
+    n_pairs = np.zeros_like(pairs.tests(0))
+    counts = pairs.first(n_pairs)
+    while (added := rounds.next_round(counts)).any():
+        n_pairs = n_pairs + added
+        for side in both:
+            side.drive(n_pairs)
+        counts = pairs.first(n_pairs)
+        if rounds.rule.observe(counts):
+            break
+    return counts
+
+
+def _stored_requests(folder: Path, earlier: Mapping[str, Any]) -> Iterator[ShardRequest]:
+    """Shards that a folder holds, as they were asked for."""
+    if not earlier["shards"]:
+        return
+    taken: dict[int, int] = {}
+    tables = read_shards(folder, episode_columns=["component"], moment_columns=[])
+    for shard, (episodes, _) in zip(earlier["shards"], tables, strict=True):
+        stratum = episodes.column("component").to_numpy()
+        edges = [0, *(np.flatnonzero(np.diff(stratum)) + 1).tolist(), stratum.size]
+        draws = []
+        for first, end in pairwise(edges):
+            s, n = int(stratum[first]), end - first
+            draws.append(Draw(s, taken.get(s, 0), n))
+            taken[s] = taken.get(s, 0) + n
+        yield ShardRequest(shard["index"], shard["first_episode"], shard["n_episodes"], tuple(draws))
+
+
+def _answer(found: PairedEstimate, rule: PairRule, labels: tuple[str, str]) -> dict[str, Any]:
+    """What ``compare.json`` says of the difference."""
+    statements = [paired_statement(found, *labels), conditional_paired_statement(found)]
+    if rule.conditional:
+        statements.reverse()
+    if rule.margin is not None:
+        statements.insert(0, rule.margin.sentence)
+    decided = None if rule.margin is None else asdict(rule.margin)
+    return {**found.to_json(), "margin": decided, "statement": statements[0], "statements": statements}
 
 
 def _take_over(stored: Path, folder: Path, resolved: Resolved) -> None:
@@ -151,3 +233,40 @@ def _take_over(stored: Path, folder: Path, resolved: Resolved) -> None:
         if folder.exists():
             folder.rmdir()
         copy.replace(folder)
+
+
+def require_comparable(a: Campaign, b: Campaign) -> None:
+    """Refuse campaigns that differ in more than the vehicle, by a `CampaignError` that names every key that differs."""
+    keys = set(MAY_DIFFER)
+    if apart := list(_differing("", a.model_dump(exclude=keys), b.model_dump(exclude=keys))):
+        where, of_a, of_b = apart[0]
+        more = f"; also {', '.join(key for key, _, _ in apart[1:])}" if len(apart) > 1 else ""
+        raise CampaignError(
+            where,
+            found=f"{of_a} in A and {of_b} in B{more}",
+            expected=f"campaigns that differ in {', '.join(sorted(keys))} only: pairs of episodes need equal settings",
+            mend=f"Make them equal, e.g. with --set {where}=…, which holds for both.",
+        )
+
+
+def _differing(prefix: str, a: Any, b: Any) -> Iterator[tuple[str, Any, Any]]:
+    if isinstance(a, dict) and isinstance(b, dict):
+        for key in dict.fromkeys([*a, *b]):
+            yield from _differing(f"{prefix}.{key}" if prefix else str(key), a.get(key), b.get(key))
+        if a == b and list(a) != list(b):
+            yield prefix, f"the order {', '.join(a)}", f"{', '.join(b)}"
+    elif a != b:
+        yield prefix, a, b
+
+
+def require_same_shells(sides: Both) -> None:
+    """Refuse vehicles that would not have the same strata of cut-ins."""
+    limits = [acceleration_limit(of_side.campaign.av) for of_side in sides]
+    envelope = sides[0].library.envelope_mps2
+    if (limits[0] > envelope) != (limits[1] > envelope):
+        raise CampaignError(
+            "av",
+            found=f"a hardest acceleration of {limits[0]:g} m/s² in A and {limits[1]:g} m/s² in B",
+            expected=f"both up to {envelope:g} m/s², the envelope of the surrogate library, or both above",
+            mend=f"Limit both (av.limits.max_acceleration_mps2: {envelope:g}), or neither.",
+        )

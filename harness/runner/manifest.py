@@ -13,10 +13,11 @@ from typing import Any
 
 from harness.campaign.campaign import Campaign
 from harness.campaign.files import dump_campaign
-from harness.errors import RunFolderError, TooManyFailedError
-from harness.records.folder import MANIFEST, read_manifest, require_place, write_json, write_text
+from harness.drawing import ShardRequest
+from harness.errors import TooManyFailedError
+from harness.records.folder import MANIFEST, write_json, write_text
 from harness.resolved import Resolved
-from harness.runner.worker import Repeated, ShardDone, ShardSpec
+from harness.runner.worker import Repeated, ShardResult
 
 INTERVAL_S = 5.0
 SMALLEST_FAILED_SAMPLE = 200
@@ -44,56 +45,6 @@ def cpu_name() -> str:
     return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.machine())
 
 
-def require_own_folder(folder: Path, resolved: Resolved, *, resume: bool) -> dict[str, Any]:
-    """Refuse a folder that holds something else; return the manifest of a run to be continued, or one without shards.
-
-    Raises
-    ------
-    RunFolderError
-        The folder cannot be written to, holds another campaign, this one without ``--resume`` or with another
-        controller (one file may not mix two versions of it), only a part of a run, or files that are no run.
-    """
-
-    def refusal(found: str, expected: str, mend: str) -> RunFolderError:
-        return RunFolderError(str(folder), found=found, expected=expected, mend=mend)
-
-    require_place(folder)
-    if not folder.exists() or not any(folder.iterdir()):
-        return {"n_episodes": 0, "shards": []}
-    elsewhere = "Choose another folder with --out."
-    if not (folder / MANIFEST).exists():
-        expected = "a new or empty folder, or one that a run has left"
-        raise refusal("a folder with other files", expected, elsewhere)
-    manifest = read_manifest(folder, mend=elsewhere)
-    if manifest["campaign_hash"] != resolved.content_hash:
-        raise refusal(
-            f"another campaign ({manifest.get('name')}, {manifest['campaign_hash']})",
-            f"a folder for this one ({resolved.content_hash})",
-            "Choose another folder with --out, or run the campaign.yaml that it holds.",
-        )
-    if not resume:
-        mend = "Continue it with --resume, or choose another folder with --out."
-        raise refusal("this campaign, already begun", "a new or empty folder", mend)
-    if manifest.get("controller_sha256") != resolved.controller_sha256:
-        raise refusal(
-            "tests of this campaign whose controller's source file has been changed since",
-            "the same controller for all tests of a run",
-            "Restore the file, or test the new controller in another folder with --out.",
-        )
-    return manifest
-
-
-def require_no_fewer(folder: Path, earlier: dict[str, Any], n_episodes: int) -> None:
-    """Refuse (`RunFolderError`) to throw away finished tests, which the stop rule asked for now would not keep."""
-    if n_episodes < (held := earlier["n_episodes"]):
-        raise RunFolderError(
-            str(folder),
-            found=f"{held:,} finished tests, of which the campaign as it is asked for now would keep {n_episodes:,}",
-            expected="a stop rule (stop.rhw, stop.episodes) that needs at least the tests that are there",
-            mend="Repeat the --set options of the earlier run or ask for more; `harness estimate` reads what is there.",
-        )
-
-
 class Prefix:
     """Finished shards in order, from the first on, as the manifest lists them, and what is counted over them."""
 
@@ -103,13 +54,18 @@ class Prefix:
         self.repeated: Repeated | None = None
         self._causes: Counter[str] = Counter()
 
-    def add(self, done: ShardDone, files: dict[str, str]) -> None:
+    def add(self, done: ShardResult, files: dict[str, str]) -> None:
         """Append a shard that is on disk."""
-        spec = done.spec
+        request = done.request
         self.shards.append(
-            {"index": spec.index, "first_episode": spec.first_episode, "n_episodes": spec.n_episodes, "files": files}
+            {
+                "index": request.index,
+                "first_episode": request.first_episode,
+                "n_episodes": request.n_episodes,
+                "files": files,
+            }
         )
-        self.n_episodes += spec.n_episodes
+        self.n_episodes += request.n_episodes
         self.n_retraced += done.n_retraced
         self.n_crashes += int(done.block.crash.sum())
         self.n_failed += int(done.block.failed.sum())
@@ -168,18 +124,18 @@ class Manifest:
         self._last: dict[str, Any] = {}
         self.write(Prefix(), "running")  # first: --resume knows a folder by its manifest
 
-    def forget_replaced(self, spec: ShardSpec) -> None:
+    def forget_replaced(self, request: ShardRequest) -> None:
         """Cut what an earlier run has left before the shard that this one is about to take the place of, if it does.
 
         One of the same size whose file is missing is only made anew.
         """
         shards = self._earlier["shards"]
-        if spec.index >= len(shards):
+        if request.index >= len(shards):
             return
-        shard = shards[spec.index]
-        if shard["n_episodes"] == spec.n_episodes and not (self._folder / shard["files"]["episodes"]).exists():
+        shard = shards[request.index]
+        if shard["n_episodes"] == request.n_episodes and not (self._folder / shard["files"]["episodes"]).exists():
             return
-        kept = shards[: spec.index]
+        kept = shards[: request.index]
         cut = {"status": "interrupted", "stopped_by": None, "ending": None}
         n_kept = sum(shard["n_episodes"] for shard in kept)
         self._earlier = {**self._earlier, **cut, "n_episodes": n_kept, "shards": kept}

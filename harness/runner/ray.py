@@ -29,14 +29,15 @@ from harness.campaign.sections import RaySettings
 from harness.compiled import cache_root, source_hash
 from harness.controllers.find import require_controller
 from harness.controllers.hosts import Death
+from harness.drawing import ShardRequest
+from harness.drawing.baseline import SHADOW
 from harness.errors import CampaignError, HarnessError
 from harness.processes import fit_to_travel, handlers_restored
 from harness.records.folder import write_bytes
 from harness.resolved import Resolved
 from harness.runner.manifest import cpu_name
-from harness.runner.prepare import cached_files
-from harness.runner.shadow_runs import SHADOW
-from harness.runner.worker import ShardRequest, ShardResult, ShardSpec
+from harness.runner.resolve import cached_files
+from harness.runner.worker import Request, Result
 from harness.runner.workers import CLOSING_S, LocalWorkers, WorkerDeath, WorkerLostError, WorkerProcess, Workers
 
 LOCAL = "local"
@@ -94,8 +95,8 @@ class OnMachine:
             return fit_to_travel(error)
 
     def run(
-        self, request: ShardRequest, fatal_episodes: Mapping[int, Death], shadows: Files
-    ) -> ShardResult | WorkerDeath | Exception:
+        self, request: Request, fatal_episodes: Mapping[int, Death], shadows: Files
+    ) -> Result | WorkerDeath | Exception:
         """Run a shard; tests may follow from the ``shadows``, files of the run folder."""
         try:
             _place(shadows, Path(self._folder.name))
@@ -132,12 +133,12 @@ class RayWorker:
     def __init__(self, actor: Any, pending: ray.ObjectRef[Any], workers: RayWorkers) -> None:
         self._actor, self.pending, self._workers = actor, pending, workers
 
-    def give(self, request: ShardRequest, fatal_episodes: Mapping[int, Death]) -> bool:
+    def give(self, request: Request, fatal_episodes: Mapping[int, Death]) -> bool:
         """See `harness.runner.workers.Worker`: that it is dead shows in its answer."""
         self.pending = self._actor.run.remote(request, dict(fatal_episodes), self._workers.shadows(request))
         return True
 
-    def answer(self) -> ShardResult | WorkerDeath:
+    def answer(self) -> Result | WorkerDeath:
         """See `harness.runner.workers.Worker`."""
         answer = self.result()
         if isinstance(answer, WorkerDeath):
@@ -212,9 +213,9 @@ class RayWorkers(Workers):
         """See `Workers.cpus`."""
         return self._cpus
 
-    def shadows(self, request: ShardRequest) -> Files:
+    def shadows(self, request: Request) -> Files:
         """Shadow runs that tests follow from: they have all been written before the first test."""
-        if not isinstance(request, ShardSpec):
+        if not isinstance(request, ShardRequest):
             return {}
         if self._shadows is None:
             self._shadows = _stored(sorted((self._folder / SHADOW).glob("*.parquet")), self._folder)

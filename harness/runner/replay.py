@@ -7,21 +7,20 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
 from harness.campaign.campaign import Campaign
 from harness.campaign.files import load_campaign
 from harness.controllers.find import has_foreign_code, require_controller, run_apart
+from harness.drawing.baseline import read_baseline
 from harness.errors import CampaignError, RunFolderError
 from harness.records.folder import no_episodes, read_manifest, read_table
 from harness.records.schemas import shard_tables
 from harness.resolved import Resolved, resolve
 from harness.runner.manifest import cpu_name, versions
-from harness.runner.prepare import build_world, prepare, require_same_pool, require_world
-from harness.runner.shadow_runs import read_shadows
-from harness.runner.worker import run_drawn
+from harness.runner.resolve import build_world, prepare, require_world
+from harness.runner.resume import require_same_pool
 from harness.worlds.protocol import World
 from harness.worlds.system_libraries import require_libraries
 
@@ -102,19 +101,13 @@ def _replay(
     black_box: Path | None = None,
 ) -> dict[str, pa.Table]:
     """Row and trace of the episode, run again."""
-    prepared = prepare(resolved)
-    if prepared.shadow_paths is not None:
-        prepared = prepared.after(read_shadows(folder, prepared.shadow_paths, resolved.environment))
-    require_same_pool(folder, prepared)
+    source = prepare(resolved)
+    if source.baseline_paths is not None:
+        source.begin_after(read_baseline(folder, source.baseline_paths, resolved.environment))
+    require_same_pool(folder, source)
     world = _world(resolved.campaign, gui=gui, fcd=fcd)
     try:
-        loop = prepared.loop(world, traces="all", black_box=black_box)
-        if prepared.prescribed is None:
-            shard = run_drawn(loop, prepared, episode, 1)
-        else:
-            row, stratum = (np.asarray(stored[name]).astype(np.int64) for name in ("pool_cut_in", "component"))
-            shard = loop.run(episode, *prepared.prescribed.of_rows(row, stratum))
-            shard.cut_ins = prepared.prescribed.cut_ins(row)
+        shard = source.run_again(source.loop(world, traces="all", black_box=black_box), episode, stored)
     finally:
         world.close()
     tables = shard_tables(shard, resolved.campaign.seed, keep_traces=True)

@@ -19,18 +19,17 @@ from pathlib import Path
 import numpy as np
 
 from harness.controllers.hosts import Death
+from harness.drawing import ShardRequest, Source
+from harness.drawing.baseline import BaselineRequest, BaselineResult, read_baseline, run_baseline
 from harness.episode.cells import PrescribedTraffic
 from harness.episode.loop import EpisodeLoop, Shard, hash_of_index
-from harness.estimators.block import Block, block_from_tables
-from harness.importance.build import mixture_weights
-from harness.pool.shells import Draw
+from harness.estimators.block import Block
 from harness.processes import fit_to_travel
 from harness.records.folder import encoded
 from harness.records.schemas import ShardTables, shard_tables
 from harness.resolved import Resolved
-from harness.runner.prepare import Prepared, build_world, prepare
+from harness.runner.resolve import build_world, prepare
 from harness.runner.retrace import Retracing
-from harness.runner.shadow_runs import ShadowDone, ShadowSpec, forced_traffic, read_shadows, run_shadows
 from harness.vocabulary import FAILED
 from harness.worlds.twin import TwinWorld
 
@@ -48,16 +47,6 @@ Bits = tuple[bytes, bytes, str | None]
 
 
 @dataclass(frozen=True)
-class ShardSpec:
-    """A fixed range of episodes; ``draws`` says which cut-ins they are, where they are prescribed."""
-
-    index: int
-    first_episode: int
-    n_episodes: int
-    draws: tuple[Draw, ...] = ()
-
-
-@dataclass(frozen=True)
 class Repeated:
     """How many tests were run once more, and which of them (campaign indices) came out otherwise."""
 
@@ -66,14 +55,14 @@ class Repeated:
 
 
 @dataclass(frozen=True)
-class ShardDone:
+class ShardResult:
     """A finished shard: what the stop rule needs of it, how many episodes the twin has retraced, causes of failures.
 
     ``repeated`` is None where no test was run twice; ``parquet`` are its tables as files, or, where they are on disk
     already, ``files`` their paths by table.
     """
 
-    spec: ShardSpec
+    request: ShardRequest
     block: Block
     n_retraced: int
     failures: Counter[str]
@@ -82,27 +71,27 @@ class ShardDone:
     files: dict[str, str] = field(default_factory=dict)
 
 
-ShardResult = ShardDone | ShadowDone
-"""What a worker hands back."""
-ShardRequest = ShardSpec | ShadowSpec
+Request = ShardRequest | BaselineRequest
+Result = ShardResult | BaselineResult
+"""What a worker is asked for, and what it hands back."""
 
 
 def serve(connection: Connection, resolved: Path, folder: Path, black_box: Path) -> None:
     """Prepare with the first shard, run shards until the parent is gone or has no more.
 
-    The file ``resolved`` holds the campaign. In the run's ``folder`` stand the shadow runs that tests follow from, once
-    there are some.
+    The file ``resolved`` holds the campaign. In the run's ``folder`` stand the baseline runs that tests
+    follow from, once there are some.
     """
     runner: ShardRunner | None = None
     while True:
         try:
-            spec, fatal_episodes = connection.recv()
+            request, fatal_episodes = connection.recv()
         except (EOFError, OSError):
             break
         try:
             if runner is None:
                 runner = ShardRunner(pickle.loads(resolved.read_bytes()), folder, black_box)  # noqa: S301 - our own
-            answer: ShardResult | Exception = runner.run(spec, fatal_episodes)
+            answer: Result | Exception = runner.run(request, fatal_episodes)
         except Exception as error:  # noqa: BLE001 - whatever goes wrong here is the parent's to judge
             answer = fit_to_travel(error)
         try:
@@ -122,16 +111,17 @@ class ShardRunner:
     def __init__(self, resolved: Resolved, folder: Path, black_box: Path | None = None) -> None:
         self._fatal_episodes: dict[int, Death] = {}
         self._folder = folder
-        self._prepared = prepare(resolved)
+        self._source = prepare(resolved)
         self._retracing = Retracing(resolved)
+        self._begun = False
         world = build_world(resolved.campaign)
-        self._loop: EpisodeLoop = self._prepared.loop(world, black_box=black_box, fatal_episodes=self._fatal_episodes)
+        self._loop: EpisodeLoop = self._source.loop(world, black_box=black_box, fatal_episodes=self._fatal_episodes)
 
     def close(self) -> None:
         """Release the AV's controllers."""
         self._loop.close()
 
-    def run(self, spec: ShardRequest, fatal_episodes: Mapping[int, Death] | None = None) -> ShardResult:
+    def run(self, request: Request, fatal_episodes: Mapping[int, Death] | None = None) -> Result:
         """Run a shard; episodes in ``fatal_episodes`` fail before the call that ended a process.
 
         Raises
@@ -139,38 +129,31 @@ class ShardRunner:
         WorldDisagreementError
             The twin retraces an episode differently.
         """
-        self._fatal_episodes.clear()  # a shadow run may have the number of a test
+        self._fatal_episodes.clear()  # a baseline run may have the number of a test
         self._fatal_episodes.update(fatal_episodes or {})
-        if isinstance(spec, ShadowSpec):
-            if self._prepared.shadow_paths is None:
-                raise ValueError("this campaign has no shadow runs")
-            return run_shadows(self._loop, self._prepared.shadow_paths, self._prepared.policy.environment, spec)
-        return self._tests(spec)
+        source, paths = self._source, self._source.baseline_paths
+        if isinstance(request, ShardRequest):
+            if paths is not None and not self._begun:
+                self._begun = True
+                source.begin_after(read_baseline(self._folder, paths, source.resolved.environment))
+            return self._tests(request)
+        if paths is None:
+            raise ValueError("this campaign has no baseline runs")
+        return run_baseline(self._loop, paths, source.resolved.environment, request)
 
-    def _tests(self, spec: ShardSpec) -> ShardDone:
-        if (paths := self._prepared.shadow_paths) is not None and self._prepared.prescribed is None:
-            self._prepared = self._prepared.after(read_shadows(self._folder, paths, self._prepared.policy.environment))
-        campaign, shard = self._prepared.campaign, self._run(spec)
+    def _tests(self, request: ShardRequest) -> ShardResult:
+        campaign, shard = self._source.campaign, self._source.run(self._loop, request)
         keep_traces = campaign.records.traces != "none" or campaign.records.trace_share > 0.0
         tables = shard_tables(shard, campaign.seed, keep_traces=keep_traces)
         # A vehicle must show that it does the same again: built-in models do, and outside programs need not.
-        if spec.index == 0 and campaign.av.model is None and campaign.av.traci is None:
+        if request.index == 0 and campaign.av.model is None and campaign.av.traci is None:
             metadata = {**(tables.episodes.schema.metadata or {}), REPEATED: json.dumps(asdict(self._repeat(shard)))}
             tables = tables._replace(episodes=tables.episodes.replace_schema_metadata(metadata))
-        return replace(finished(self._prepared, self._retracing, spec, tables), parquet=encoded(tables))
-
-    def _run(self, spec: ShardSpec) -> Shard:
-        prescribed, first = self._prepared.prescribed, spec.first_episode
-        if prescribed is None:
-            return run_drawn(self._loop, self._prepared, first, spec.n_episodes)
-        states, traffic, cut_ins = prescribed.episodes(spec.draws)
-        shard = self._loop.run(first, states, traffic)
-        shard.cut_ins = cut_ins
-        return shard
+        return replace(finished(self._source, self._retracing, request, tables), parquet=encoded(tables))
 
     def _repeat(self, shard: Shard) -> Repeated:
         """Run some tests again, alone and after all the others."""
-        campaign = self._prepared.campaign
+        campaign = self._source.campaign
         # The twin does one episode at little cost; an AV that SUMO moves has to be moved by SUMO again.
         alone = self._loop if campaign.av.sumo is not None else self._loop.beside(TwinWorld(1))
         rows = _rows_to_repeat(shard, campaign.seed, acts_early=campaign.av.acts_before_cut_in)
@@ -183,26 +166,12 @@ class ShardRunner:
         return Repeated(len(rows), tuple(sorted(differing)))
 
 
-def run_drawn(loop: EpisodeLoop, prepared: Prepared, first: int, n: int) -> Shard:
-    """Run consecutive episodes that follow from their index alone."""
-    states, policy = prepared.states(first, n), prepared.policy
-    if not prepared.campaign.has_shadow_runs:
-        return loop.run(first, states)
-    return loop.run(first, states, forced_traffic(loop, policy.seed, first, states, policy.environment))
-
-
-def finished(prepared: Prepared, retracing: Retracing, spec: ShardSpec, tables: ShardTables) -> ShardDone:
+def finished(source: Source, retracing: Retracing, request: ShardRequest, tables: ShardTables) -> ShardResult:
     """What is to be known of a shard's tables, after the twin has retraced them."""
-    n_retraced, campaign = retracing.check(tables.episodes), prepared.campaign
-    block = block_from_tables(
-        tables.episodes,
-        tables.moments if campaign.stop.estimator == "scv" else None,
-        method=campaign.testing.method,
-        alpha=mixture_weights(campaign),
-        shells=None if prepared.prescribed is None else prepared.prescribed.design,
-    )
+    n_retraced = retracing.check(tables.episodes)
+    block = source.block(tables.episodes, tables.moments if source.campaign.stop.estimator == "scv" else None)
     failures = Counter(tables.episodes.column("failure").drop_null().to_pylist())
-    return ShardDone(spec, block, n_retraced, failures, repeated_of(tables.episodes.schema.metadata))
+    return ShardResult(request, block, n_retraced, failures, repeated_of(tables.episodes.schema.metadata))
 
 
 def _rows_to_repeat(shard: Shard, seed: int, *, acts_early: bool) -> list[int]:

@@ -22,7 +22,7 @@ from harness.controllers.hosts import Death, death_cause
 from harness.errors import CampaignError, HarnessError, TooManyFailedError
 from harness.processes import OF_EPISODE, Call, Child, first_to_answer, last_call
 from harness.resolved import Resolved
-from harness.runner.worker import ShardRequest, ShardResult, serve
+from harness.runner.worker import Request, Result, serve
 
 ATTEMPTS = 3
 """A shard whose worker dies is given to another one, this many times in all."""
@@ -34,8 +34,8 @@ SENT_FROM_OUTSIDE = (-signal.SIGKILL, -signal.SIGTERM)
 CLOSING_S = 10.0
 """Time that a worker gets to release its controllers once all is done."""
 
-_Request = TypeVar("_Request", bound=ShardRequest)
-_ShardResult = TypeVar("_ShardResult", bound=ShardResult)
+_Request = TypeVar("_Request", bound=Request)
+_Result = TypeVar("_Result", bound=Result)
 
 
 class WorkerLostError(HarnessError):
@@ -58,11 +58,11 @@ class WorkerDeath:
 class Worker(Protocol):
     """Runs one shard after another, here or on another machine."""
 
-    def give(self, request: ShardRequest, fatal_episodes: Mapping[int, Death]) -> bool:
+    def give(self, request: Request, fatal_episodes: Mapping[int, Death]) -> bool:
         """Give it a shard to run, with the episodes known to end a process; False if it is dead."""
         ...
 
-    def answer(self) -> ShardResult | WorkerDeath:
+    def answer(self) -> Result | WorkerDeath:
         """The shard of a worker that has answered, or why it has died: no more care is needed then.
 
         Raises whatever running the shard has raised.
@@ -89,11 +89,11 @@ class WorkerProcess(Child):
         super().__init__(serve, resolved, folder, black_box)
         self._black_box = black_box
 
-    def give(self, request: ShardRequest, fatal_episodes: Mapping[int, Death]) -> bool:
+    def give(self, request: Request, fatal_episodes: Mapping[int, Death]) -> bool:
         """See `Worker`."""
         return self.send((request, dict(fatal_episodes)))
 
-    def answer(self) -> ShardResult | WorkerDeath:
+    def answer(self) -> Result | WorkerDeath:
         """See `Worker`."""
         answer = self.receive()
         if answer is None:
@@ -111,8 +111,8 @@ class WorkerProcess(Child):
 class _Job:
     """A shard that is wanted, with its result once there is one."""
 
-    request: ShardRequest
-    result: ShardResult | None
+    request: Request
+    result: Result | None
     n_deaths: int = 0
     suspected: Call | None = None
     fatal_episodes: dict[int, Death] = field(default_factory=dict)
@@ -153,9 +153,7 @@ class Workers:
             worker.wait(CLOSING_S)
         self._idle, self._busy = [], {}
 
-    def run(
-        self, requests: Iterator[_Request], known: Callable[[_Request], _ShardResult | None]
-    ) -> Iterator[_ShardResult]:
+    def run(self, requests: Iterator[_Request], known: Callable[[_Request], _Result | None]) -> Iterator[_Result]:
         """Results in the order of the requests; shards that are ``known`` are not run again.
 
         Two shards per worker are under way or wait for their turn to be handed back: little is lost at the stop, and
@@ -239,7 +237,7 @@ class Workers:
             )
 
 
-def _lost(request: ShardRequest, exit_code: int | None, blamed: str | None) -> WorkerLostError:
+def _lost(request: Request, exit_code: int | None, blamed: str | None) -> WorkerLostError:
     """What to say of a shard that no worker survives; ``blamed`` is what the controller did, if it did."""
     how = f"with {'its machine' if exit_code is None else f'exit code {exit_code}'}"
     mend = "Look for a memory limit (fewer --workers), then continue with --resume."

@@ -16,7 +16,7 @@ from harness.estimators.limits import normal_half_width
 from harness.estimators.scv import Scv, StratumFit
 from harness.estimators.weighted import Nade
 from harness.records.folder import write_bytes
-from harness.runner.stored_estimates import stored_blocks
+from harness.runner.estimate import stored_blocks
 from harness.vocabulary import Method
 from studies.case_study.context import Context
 from studies.case_study.figures import exactly, figure, marked, tests_for, weights_are_in

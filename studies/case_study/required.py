@@ -9,7 +9,7 @@ import numpy as np
 import pyarrow as pa
 
 from harness.estimators.block import Block, joined
-from harness.runner.stored_estimates import stored_blocks
+from harness.runner.estimate import stored_blocks
 from harness.vocabulary import FloatArray, IntArray
 from studies.case_study.context import Context, Made
 from studies.case_study.control_variates import cut_at

@@ -16,8 +16,8 @@ from harness.estimators.limits import clopper_pearson, normal_half_width
 from harness.records.folder import read_table
 from harness.resolved import resolve
 from harness.runner import RunResult, run_campaign
-from harness.runner.prepare import prepare
-from harness.runner.stored_estimates import stored_blocks
+from harness.runner.estimate import stored_blocks
+from harness.runner.resolve import prepare
 from harness.vocabulary import CRASH, FAILED, BoolArray, FloatArray, IntArray, Method
 from studies.case_study.context import Context, Made
 from studies.case_study.figures import exactly, figure, is_settled, marked, tests_for, weights_are_in

@@ -14,7 +14,7 @@ from harness.controllers.find import build_host
 from harness.errors import EXIT_BAD_INPUT, EXIT_DONE, EXIT_TOO_MANY_FAILED
 from harness.resolved import resolve
 from harness.runner import plan_campaign
-from harness.runner.prepare import prepare
+from harness.runner.resolve import prepare
 from harness.runner.workers import LocalWorkers
 from harness.worlds.twin import TwinWorld
 from tests.controllers.misbehaving import ChangesItsParameters
@@ -252,7 +252,7 @@ def test_check_survives_a_controller_that_does_not(tmp_path, capsys):
 
 
 def test_check_says_how_a_slow_controller_keeps_many_workers_busy(tmp_path, monkeypatch):
-    monkeypatch.setattr("harness.runner.plan.seconds_per_test", lambda _: 12.0)
+    monkeypatch.setattr("harness.runner.look.seconds_per_test", lambda _: 12.0)
     (tmp_path / "c.yaml").write_text(SMALL)
     settings = [f"av={_other('Prints')}", "run.shard_size=100"]
     plan = plan_campaign(load_campaign(tmp_path / "c.yaml", settings))

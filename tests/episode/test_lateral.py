@@ -16,7 +16,7 @@ from harness.importance.build import build_importance
 from harness.maneuvers import CUT_IN
 from harness.records.schemas import episodes_table
 from harness.resolved import resolve
-from harness.runner.prepare import prepare
+from harness.runner.resolve import prepare
 from harness.runner.retrace import Retracing
 from harness.vocabulary import AV, BV, CRASH, PASSED, STATE_DTYPE
 from harness.worlds.twin import TwinWorld

@@ -8,9 +8,10 @@ import numpy as np
 from harness.campaign.campaign import Campaign
 from harness.campaign.sections import EnvironmentSettings, Records, Testing
 from harness.campaign.vehicle import AutomatedVehicle, FVDMParameters, IDMParameters, Surrogate
+from harness.drawing import Source
 from harness.episode.loop import Shard
 from harness.resolved import resolve
-from harness.runner.prepare import Prepared, prepare
+from harness.runner.resolve import prepare
 from harness.vocabulary import CRASH
 from harness.worlds.twin import TwinWorld
 from tests.chains.seed import SEED
@@ -58,12 +59,12 @@ def campaign(
     )
 
 
-def prepared(method: str, challenge: str = "recursive", **settings) -> Prepared:
+def prepared(method: str, challenge: str = "recursive", **settings) -> Source:
     return _prepared(method, challenge, tuple(sorted(settings.items())))
 
 
 @cache
-def _prepared(method, challenge, settings) -> Prepared:
+def _prepared(method, challenge, settings) -> Source:
     return prepare(resolve(campaign(method, challenge, **dict(settings))))
 
 
@@ -89,7 +90,7 @@ class Mean:
 class Run:
     """Episodes 0 … n − 1 of a campaign, and what tests ask of them."""
 
-    prepared: Prepared
+    prepared: Source
     shard: Shard
 
     @cached_property

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from harness.campaign.files import load_campaign
+from harness.drawing.baseline import as_recorded, baseline_requests, run_baseline, without_cut_in
 from harness.episode.judge import motion_hashes
 from harness.episode.path import Followers
 from harness.errors import HarnessError
@@ -14,8 +15,7 @@ from harness.pool.enumeration import ShadowRuns, enumerate_cut_ins
 from harness.pool.vehicle_pool import CANDIDATES, EVENLY, chances, vehicle_pool
 from harness.progress import Progress
 from harness.resolved import resolve
-from harness.runner.prepare import prepare
-from harness.runner.shadow_runs import as_recorded, run_shadows, shadow_specs, without_cut_in
+from harness.runner.resolve import prepare
 from harness.vehicles.drivers import driver_records
 from harness.vocabulary import CRASH
 from harness.worlds.twin import TwinWorld
@@ -37,9 +37,12 @@ def prepared_after(campaign):
     ready = prepare(resolve(campaign))
     loop = ready.loop(TwinWorld(32))
     environment = ready.policy.environment
-    specs = shadow_specs(len(ready.shadow_paths))
-    runs = as_recorded([run_shadows(loop, ready.shadow_paths, environment, spec).table for spec in specs], environment)
-    return ready.after(runs), loop, runs
+    specs = baseline_requests(len(ready.baseline_paths))
+    runs = as_recorded(
+        [run_baseline(loop, ready.baseline_paths, environment, spec).table for spec in specs], environment
+    )
+    ready.begin_after(runs)
+    return ready, loop, runs
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +72,7 @@ def test_a_vehicle_that_holds_its_speed_has_the_cut_ins_of_one_that_holds(enviro
 def test_probabilities_are_those_of_the_states_that_were_driven(speeds):
     """Against the hazard at the states of a trace, worked out one by one."""
     ready, loop, runs = speeds
-    paths, environment = ready.shadow_paths, ready.policy.environment
+    paths, environment = ready.baseline_paths, ready.policy.environment
     rows = slice(0, 10)
     shard = without_cut_in(loop, paths.seed, 0, paths.index[rows], paths.state[rows], environment)
     some = ShadowRuns._make(values[rows] for values in runs)
@@ -89,7 +92,7 @@ def test_probabilities_are_those_of_the_states_that_were_driven(speeds):
 def test_a_vehicle_that_is_a_surrogate_from_the_cut_in_on_crashes_where_that_one_does(speeds):
     """The loop drives what the pool has worked out: script, motion and hash agree, and every outcome."""
     ready, _, _ = speeds
-    pool = vehicle_pool(ready.resolved, ready.shadow_paths, speeds[2])
+    pool = vehicle_pool(ready.resolved, ready.baseline_paths, speeds[2])
     brakes = "av.parameters={min_acceleration_mps2: -3.0}"
     loop = prepare(resolve(acting("Speeds", brakes))).loop(TwinWorld(64))
     rows = np.unique(np.linspace(0, len(pool.cut_ins.path) - 1, 1500).astype(np.int64))
@@ -129,7 +132,7 @@ def test_weights_of_the_chosen_paths_keep_every_mean():
 def test_shells_of_a_holder_on_few_chosen_paths_are_those_of_the_large_pool(campaign, pool):
     """Each within four standard errors (false alarm for 9 numbers below 1e-3), which are 13 % at most, mostly 3 %."""
     ready, _, runs = prepared_after(acting("HoldsBatch", "pool.shadow_paths=1000"))
-    own = vehicle_pool(ready.resolved, ready.shadow_paths, runs)
+    own = vehicle_pool(ready.resolved, ready.baseline_paths, runs)
     order = [own.names.index(name) for name in pool.names]
     error = np.sqrt(np.diag(own.mu_covariance)[order] + np.diag(pool.mu_covariance))
     assert np.all(error < 0.13 * pool.mu)
@@ -153,4 +156,4 @@ def test_a_vehicle_that_never_moves_is_refused(speeds):
     ready, _, runs = speeds
     parked = runs._replace(n_steps=np.zeros_like(runs.n_steps), failed=np.ones_like(runs.failed))
     with pytest.raises(HarnessError, match="no cut-in on 120 paths"):
-        vehicle_pool(ready.resolved, ready.shadow_paths, parked)
+        vehicle_pool(ready.resolved, ready.baseline_paths, parked)

@@ -7,7 +7,7 @@ import pytest
 
 from harness.campaign.files import load_campaign
 from harness.cli import main
-from harness.runner.av_check import check_av
+from harness.runner.look import check_av
 
 MIXTURE_FILE = str(Path(__file__).parents[2] / "scenarios/overtaking_mixture.yaml")
 CONTROLLERS = '''

@@ -12,8 +12,8 @@ from harness.cli import main
 from harness.errors import CampaignError, RunFolderError
 from harness.records.reader import read_shards
 from harness.runner import compare_campaigns
-from harness.runner.campaign_run import Run
 from harness.runner.compare import require_comparable
+from harness.runner.run import Run
 from harness.runner.worker import ShardRunner
 from tests.in_process import one_process, without_page
 from tests.pool.conftest import SMALL_POOL
@@ -116,15 +116,15 @@ def test_a_stored_run_of_a_is_taken_over(done, campaigns, run_here, campaign, tm
 
 
 def test_an_interrupted_comparison_goes_on(done, campaigns, tmp_path, monkeypatch, driven):
-    run_round, calls = Run.run_round, []
+    results, calls = Run.results, []
 
     def interrupted(self, specs):
         calls.append(1)
         if len(calls) == 8:
             raise KeyboardInterrupt
-        return run_round(self, specs)
+        return results(self, specs)
 
-    monkeypatch.setattr(Run, "run_round", interrupted)
+    monkeypatch.setattr(Run, "results", interrupted)
     with pytest.raises(KeyboardInterrupt):
         compare_campaigns(*campaigns, tmp_path, workers=1)
     assert manifest(tmp_path / "a")["status"] == manifest(tmp_path / "b")["status"] == "interrupted"

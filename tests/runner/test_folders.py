@@ -14,7 +14,7 @@ from harness.errors import RunFolderError
 from harness.records.folder import read_as, read_manifest, require_place, sole_use, write_json
 from harness.report.summary import read_run_folder
 from harness.resolved import resolve
-from harness.runner.manifest import require_own_folder
+from harness.runner.resume import require_own_folder
 from harness.strata import StoredDesign
 from tests.golden.campaigns import BASE, RUNS
 from tests.in_process import run_here

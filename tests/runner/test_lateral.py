@@ -11,7 +11,7 @@ from harness import replay
 from harness.errors import CampaignError
 from harness.report import write_report
 from harness.runner import plan_campaign
-from harness.runner.av_check import check_av
+from harness.runner.look import check_av
 from studies.alarm import alarm_of_run
 from tests.pool.conftest import SMALL_POOL
 from tests.pool.test_vehicle_pool import ACTING

@@ -12,7 +12,7 @@ from harness.campaign.vehicle import AutomatedVehicle, IDMParameters, Reaction
 from harness.errors import WorldDisagreementError
 from harness.records.schemas import episodes_table
 from harness.resolved import resolve
-from harness.runner.prepare import prepare
+from harness.runner.resolve import prepare
 from harness.runner.retrace import Retracing
 from harness.worlds.twin import TwinWorld
 from tests.chains.seed import SEED

@@ -14,10 +14,11 @@ import pytest
 
 from benchmarks.kills import descendants
 from harness.cli import main
+from harness.drawing import ShardRequest
 from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, WorldDisagreementError
 from harness.progress import ShownProgress
-from harness.runner import campaign_run, worker, workers
-from harness.runner.worker import ShardSpec
+from harness.runner import run as running
+from harness.runner import worker, workers
 from harness.runner.workers import WorkerLostError
 from tests.runner import bad_workers
 from tests.runner.conftest import MIXTURE_FILE, SMALL, TWIN, sets
@@ -81,7 +82,7 @@ def test_a_disk_that_is_full_at_the_very_end(run_here, campaign, twin_run, tmp_p
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "estimates.json")
 
     with monkeypatch.context() as patch:
-        patch.setattr(campaign_run, "write_json", full)
+        patch.setattr(running, "write_json", full)
         with pytest.raises(OSError, match="No space left"):
             run_here(campaign(*TWIN), out, resume=True)
     assert not (out / "estimates.json").exists()
@@ -111,10 +112,10 @@ class Pipe:
     """A connection whose other end sends shards and then is closed."""
 
     def __init__(self, n_shards: int) -> None:
-        self._specs = [ShardSpec(i, 10 * i, 10) for i in range(n_shards)]
+        self._specs = [ShardRequest(i, 10 * i, 10) for i in range(n_shards)]
         self.sent: list[object] = []
 
-    def recv(self) -> tuple[ShardSpec, dict]:
+    def recv(self) -> tuple[ShardRequest, dict]:
         if not self._specs:
             raise EOFError
         return self._specs.pop(0), {}
@@ -128,7 +129,9 @@ class Pipe:
 def serve(campaign, tmp_path, monkeypatch):
     """Serve shards with stand-ins for preparing and running one; returns what was noted."""
 
-    def served(pipe: Pipe, run: Callable[[ShardSpec], object], prepare: Callable[[], None] = lambda: None) -> list[str]:
+    def served(
+        pipe: Pipe, run: Callable[[ShardRequest], object], prepare: Callable[[], None] = lambda: None
+    ) -> list[str]:
         events = []
 
         class Runner:
@@ -136,7 +139,7 @@ def serve(campaign, tmp_path, monkeypatch):
                 prepare()
                 events.append("prepared")
 
-            def run(self, spec: ShardSpec, fatal_episodes: dict) -> object:
+            def run(self, spec: ShardRequest, fatal_episodes: dict) -> object:
                 return run(spec)
 
             def close(self) -> None:
@@ -151,7 +154,7 @@ def serve(campaign, tmp_path, monkeypatch):
     return served
 
 
-def index_of(spec: ShardSpec) -> int:
+def index_of(spec: ShardRequest) -> int:
     return spec.index
 
 
@@ -191,7 +194,7 @@ def test_a_defect_reaches_the_parent_with_the_workers_traceback(serve):
 
 
 def test_an_error_that_cannot_be_pickled_reaches_the_parent_in_words(serve):
-    def run(_: ShardSpec) -> None:
+    def run(_: ShardRequest) -> None:
         error = ValueError("of a strange kind")
         error.handle = lambda: None
         raise error

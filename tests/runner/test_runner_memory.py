@@ -21,12 +21,13 @@ def resident_mb() -> float:
 
 def run_shards(connection, folder: Path) -> None:
     """Work like a worker process, and say after every shard how much memory that takes."""
+    from harness.drawing import ShardRequest
     from harness.resolved import resolve
-    from harness.runner.worker import ShardRunner, ShardSpec
+    from harness.runner.worker import ShardRunner
 
     runner = ShardRunner(resolve(load_campaign(MIXTURE_FILE)), folder)
     for index in range(EPISODES // SHARD):
-        runner.run(ShardSpec(index, index * SHARD, SHARD))
+        runner.run(ShardRequest(index, index * SHARD, SHARD))
         for path in folder.rglob("*.parquet"):
             path.unlink()
         connection.send(resident_mb())

@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 
 from harness import estimate, replay
+from harness.drawing.allocation import GROWTH, Allocation, first_tests
+from harness.drawing.shells import round_requests
 from harness.errors import CampaignError, RunFolderError
 from harness.estimators.likelihood import Level
 from harness.estimators.tally import Tally, combined
-from harness.runner.allocation import GROWTH, Allocation, first_tests
 from harness.runner.manifest import Manifest, Prefix
-from harness.runner.planner import round_specs
 from harness.strata import ShellDesign, Statement
 from tests.pool.conftest import SMALL_POOL
 from tests.stored_runs import copy_of, manifest, shard_files, stored_table, unlike_columns
@@ -324,7 +324,7 @@ def test_first_tests_that_are_enough_are_what_decided(campaign, run_here, tmp_pa
 
 
 def test_a_round_is_divided_into_shards_without_gap():
-    specs = round_specs(np.array([12, 12, 100]), np.array([70, 0, 300]), 5, 124, 100)
+    specs = round_requests(np.array([12, 12, 100]), np.array([70, 0, 300]), 5, 124, 100)
     assert [spec.index for spec in specs] == list(range(5, 5 + len(specs)))
     assert specs[0].first_episode == 124
     assert sum(spec.n_episodes for spec in specs) == 370

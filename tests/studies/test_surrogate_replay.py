@@ -24,7 +24,7 @@ from harness.pool.cut_ins import Pool
 from harness.pool.storage import campaign_pool
 from harness.records.schemas import episodes_table
 from harness.resolved import resolve
-from harness.runner.prepare import prepare
+from harness.runner.resolve import prepare
 from harness.vehicles.drivers import driver_records
 from harness.vocabulary import CRASH, BoolArray
 from harness.worlds.twin import TwinWorld

@@ -28,7 +28,7 @@ def load(command, more=""):
 )
 def test_a_machine_with_a_public_address_is_refused_unless_it_is_allowed(addresses, more, refused, monkeypatch):
     monkeypatch.setattr(public_address, "own_addresses", lambda: addresses)
-    monkeypatch.setattr("harness.runner.plan.seconds_per_test", lambda _: 0.1)
+    monkeypatch.setattr("harness.runner.look.seconds_per_test", lambda _: 0.1)
     if not refused:
         plan_campaign(load(COMMAND, more))
         return

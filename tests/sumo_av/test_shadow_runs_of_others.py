@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from harness.campaign.files import load_campaign
+from harness.drawing.baseline import as_recorded, baseline_requests, run_baseline
 from harness.resolved import resolve
-from harness.runner.prepare import build_world, prepare
-from harness.runner.shadow_runs import as_recorded, run_shadows, shadow_specs
+from harness.runner.resolve import build_world, prepare
 from harness.worlds.sumo_driven import FreshWorld, SumoAvWorld
 from tests.controllers.test_same_bits import ROOT, fmu_av
 from tests.pool.conftest import MIXTURE_FILE, SMALL_POOL
@@ -38,12 +38,12 @@ def driven_in(world, campaign):
     ready = prepare(resolve(campaign))
     loop, environment = ready.loop(world), ready.policy.environment
     try:
-        specs = list(shadow_specs(len(ready.shadow_paths)))
-        done = [run_shadows(loop, ready.shadow_paths, environment, spec) for spec in specs]
+        specs = list(baseline_requests(len(ready.baseline_paths)))
+        done = [run_baseline(loop, ready.baseline_paths, environment, spec) for spec in specs]
         runs = as_recorded([part.table for part in done], environment)
-        after = ready.after(runs)
-        rows = np.linspace(0, after.prescribed.available.sum() - 1, SHOWN).astype(np.int64)
-        shard = loop.run(1000, *after.prescribed.of_rows(rows, np.zeros(SHOWN, np.int64)))
+        ready.begin_after(runs)
+        rows = np.linspace(0, ready.prescribed.available.sum() - 1, SHOWN).astype(np.int64)
+        shard = loop.run(1000, *ready.prescribed.of_rows(rows, np.zeros(SHOWN, np.int64)))
     finally:
         loop.close()
         world.close()

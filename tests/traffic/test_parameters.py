@@ -14,7 +14,7 @@ from harness.campaign.sections import EnvironmentSettings
 from harness.campaign.yaml_text import read_yaml
 from harness.errors import CampaignError
 from harness.resolved import resolve
-from harness.runner.prepare import prepare
+from harness.runner.resolve import prepare
 from harness.traffic.loading import load_environment, load_parameters, parameter_file, require_sound_laws
 from harness.traffic.parameters import EnvironmentParameters
 from harness.vocabulary import STATE_COLUMNS

@@ -1,12 +1,14 @@
-"""Look at an AV before a campaign is spent on it: deterministic, finite, within limits, what it does, and how fast."""
+"""Look before anything is spent on a campaign: what the AV does, how fast it is, and what tests cost."""
 
 from __future__ import annotations
 
+import os
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -14,15 +16,19 @@ import numpy as np
 
 from harness.campaign.campaign import Campaign
 from harness.campaign.vehicle import AutomatedVehicle
-from harness.controllers.find import has_foreign_code, run_apart
-from harness.episode.loop import EpisodeLoop, Shard
+from harness.controllers.find import AvEndedProcessError, build_host, has_foreign_code, run_apart
+from harness.drawing import ShardRequest, Source, source_of
+from harness.episode.loop import EpisodeLoop, RecordPolicy, Shard
 from harness.errors import EXIT_DONE, EXIT_TOO_MANY_FAILED
 from harness.estimators.estimate import finite_json
+from harness.importance.build import needs_tables
 from harness.resolved import resolve
-from harness.runner.prepare import Prepared, build_world, prepare, require_world
+from harness.runner.resolve import build_world, prepare, require_ready, require_world
 from harness.runner.worker import Bits, bits_of
 from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import AV, CRASH, FAILED, FloatArray
+from harness.worlds.protocol import AVLostError
+from harness.worlds.shim import shim_library
 
 EPISODES = 48
 CELLS, OTHER_CELLS = 16, 5
@@ -121,9 +127,9 @@ def check_av(campaign: Campaign, n_episodes: int = EPISODES, *, black_box: Path 
     """
     tested = _as_checked(campaign)
     require_world(tested)
-    prepared = prepare(resolve(tested, "av-check"))
-    first, elapsed_s, steps = _timed_run(prepared, n_episodes, black_box)
-    again = _run_in_another_order(prepared, n_episodes, black_box)
+    source = prepare(resolve(tested, "av-check"))
+    first, elapsed_s, steps = _timed_run(source, n_episodes, black_box)
+    again = _run_in_another_order(source, n_episodes, black_box)
     idm = tested.model_copy(update={"av": AutomatedVehicle(before_cut_in=tested.av.before_cut_in)})
     _, idm_s, idm_steps = _timed_run(prepare(resolve(idm, "av-check")), n_episodes)
     own = tested.av.limits if isinstance(tested.av.parameters, dict) else tested.av.parameters
@@ -165,9 +171,9 @@ def _as_checked(campaign: Campaign) -> Campaign:
 
 
 @contextmanager
-def _opened(prepared: Prepared, black_box: Path | None, n_cells: int | None = None) -> Iterator[EpisodeLoop]:
-    world = build_world(prepared.campaign, n_cells)
-    loop = prepared.loop(world, black_box=black_box)
+def _opened(source: Source, black_box: Path | None, n_cells: int | None = None) -> Iterator[EpisodeLoop]:
+    world = build_world(source.campaign, n_cells)
+    loop = source.loop(world, black_box=black_box)
     try:
         yield loop
     finally:
@@ -175,11 +181,11 @@ def _opened(prepared: Prepared, black_box: Path | None, n_cells: int | None = No
         world.close()
 
 
-def _timed_run(prepared: Prepared, n_episodes: int, black_box: Path | None = None) -> tuple[Shard, float, int]:
+def _timed_run(source: Source, n_episodes: int, black_box: Path | None = None) -> tuple[Shard, float, int]:
     """First run of the episodes; the time is the shortest of several, which other processes disturb least."""
-    with _opened(prepared, black_box) as loop:
-        loop.run(0, prepared.states(0, min(WARM_UP_EPISODES, n_episodes)))  # compiles
-        states = prepared.states(0, n_episodes)
+    with _opened(source, black_box) as loop:
+        loop.run(0, source.states(0, min(WARM_UP_EPISODES, n_episodes)))  # compiles
+        states = source.states(0, n_episodes)
         began = time.perf_counter()
         shard, elapsed_s = loop.run(0, states), time.perf_counter() - began
         until = began + SHORTEST_TIMING_S
@@ -189,13 +195,13 @@ def _timed_run(prepared: Prepared, n_episodes: int, black_box: Path | None = Non
     return shard, elapsed_s, max(1, int(shard.results.episode["n_steps"].sum()))
 
 
-def _run_in_another_order(prepared: Prepared, n_episodes: int, black_box: Path | None) -> dict[int, Bits]:
+def _run_in_another_order(source: Source, n_episodes: int, black_box: Path | None) -> dict[int, Bits]:
     """What every episode leaves when it is run in another cell, the second half first."""
     half = n_episodes // 2
     found: dict[int, Bits] = {}
-    with _opened(prepared, black_box, OTHER_CELLS) as loop:
+    with _opened(source, black_box, OTHER_CELLS) as loop:
         for begin, end in ((half, n_episodes), (0, half)):
-            shard = loop.run(begin, prepared.states(begin, end - begin))
+            shard = loop.run(begin, source.states(begin, end - begin))
             found.update({begin + row: bits_of(shard, row) for row in range(end - begin)})
     return found
 
@@ -233,3 +239,146 @@ def _reaction_s(a: FloatArray) -> float:
     """Time (s) from the onset of the cut-in to the step that brakes; infinite if none does."""
     braking = np.flatnonzero(a < BRAKING_MPS2)
     return float(braking[0]) * STEP_S if braking.size else np.inf
+
+
+# -- what a campaign costs --
+
+KB_PER_EPISODE = 0.2
+KB_PER_MOMENT = 0.1
+MOMENTS_PER_EPISODE = {"all": 70, "first_9": 9, "none": 0}
+MEASURED_S = 1.0
+SLOW_TEST_S = 0.1
+"""Time of a test from which on handing tests out one by one costs less than workers that wait (docs/performance.md)."""
+STEPS, STEPS_WITH_CUT_IN = 89, 185
+"""Mean steps of a test without and with a cut-in, of the default IDM in 5,000 tests of `nde` and of `forced`."""
+STEPS_ACTED = 162
+"""Of the latter, those after the cut-in."""
+
+
+def plan_campaign(campaign: Campaign) -> dict[str, Any]:
+    """Cost of a campaign that runs to its budget of episodes.
+
+    Returns
+    -------
+    dict
+        ``episodes``, ``episodes_per_second_estimate`` (all cores), ``seconds_estimate``, ``tables`` (in words) and
+        ``disk_mb``; of an AV that is not built in ``av_ms_per_test``, measured, or in words why there is none. Where
+        cut-ins take time, ``within_reach_of_`` each statement: which rates it can tell, in words.
+
+    Raises
+    ------
+    CampaignError
+        A run would refuse the campaign before it starts.
+    """
+    resolved, source = require_ready(campaign), source_of(campaign)
+    engine = "sumo with shim" if campaign.world.engine == "sumo" and shim_library() else campaign.world.engine
+    per_core: float = source.episodes_per_s[engine]
+    of_av: dict[str, float | str] = {}
+    if campaign.av.model is None:
+        measured = seconds_per_test(campaign)
+        of_av["av_ms_per_test"] = measured if isinstance(measured, str) else _rounded(1e3 * measured)
+        if isinstance(measured, float):
+            moved_by_sumo = campaign.av.source in ("sumo", "traci")
+            per_core = 1.0 / (measured + (0.0 if moved_by_sumo else 1.0 / per_core))
+            of_av |= _if_slow(measured, campaign)
+    rate = _rounded(per_core * (os.cpu_count() or 1))
+    moments = MOMENTS_PER_EPISODE[campaign.records.moments] if needs_tables(campaign) else 0
+    episodes = campaign.stop.episodes
+    return {
+        "episodes": episodes,
+        "episodes_per_second_estimate": rate,
+        "seconds_estimate": round(episodes / rate),
+        "tables": source.building(resolved),
+        "disk_mb": round(episodes * (KB_PER_EPISODE + KB_PER_MOMENT * moments) / 1000.0, 1),
+        **of_av,
+        **source.reach(resolved),
+    }
+
+
+def _if_slow(test_s: float, campaign: Campaign) -> dict[str, str]:
+    """How many workers are fed where a test takes long."""
+    if test_s < SLOW_TEST_S or campaign.run.smallest_shard == 1:
+        return {}
+    task_s = test_s * campaign.run.smallest_shard
+    said = f"with run.shard_size 1 a task is one test of {test_s:.2g} s, and now up to {task_s:,.0f} s"
+    if source_of(campaign).tests_in_rounds:
+        said += "; testing.shells.smallest_round feeds so many workers from the first round on"
+    return {"slow_av": said}
+
+
+def _rounded(value: float) -> float:
+    """Two digits: more are not known."""
+    return float(f"{value:.2g}")
+
+
+def seconds_per_test(campaign: Campaign) -> float | str:
+    """Time (s) that the campaign's AV adds to a test on one core, the world's included where SUMO moves the AV.
+
+    In words why, where there is none.
+    """
+    try:
+        return run_apart(campaign.av, _measure, campaign)
+    except AvEndedProcessError as error:
+        return f"not known: {error.found}"
+
+
+class _TimeIsUpError(Exception):
+    """Enough has been measured, or the AV has failed, which is the message."""
+
+
+class _Clock:
+    """Time spent in calls, and for how many vehicles; it ends the loop that makes them."""
+
+    def __init__(self) -> None:
+        self.spent_s, self.n_steps, self._until = 0.0, 0, time.perf_counter() + MEASURED_S
+
+    def watch(self, owner: object, name: str, n_vehicles: Callable[[Any], int], failures: Callable[[Any], Any]) -> None:
+        """Measure a method of an object; what it answers says which vehicles have failed, and why."""
+        call = getattr(owner, name)
+
+        def measured(*arguments: Any, **options: Any) -> Any:
+            began = time.perf_counter()
+            answer = call(*arguments, **options)
+            now = time.perf_counter()
+            self.spent_s, self.n_steps = self.spent_s + now - began, self.n_steps + n_vehicles(arguments[0])
+            for cause in failures(answer).values():
+                raise _TimeIsUpError(cause)
+            if now > self._until and self.n_steps:
+                raise _TimeIsUpError
+            return answer
+
+        setattr(owner, name, measured)
+
+
+def _measure(campaign: Campaign, *, black_box: Path | None = None) -> float | str:
+    """Forced cut-ins in the loop itself until the clock ends it."""
+    testing = campaign.testing.model_copy(update={"method": "forced"})
+    records = campaign.records.model_copy(update={"moments": "none"})
+    source = prepare(resolve(campaign.model_copy(update={"testing": testing, "records": records})))
+    clock = _Clock()
+    try:
+        world = build_world(campaign)
+    except AVLostError as error:
+        return f"not known: {error}"
+    host = build_host(campaign.av, n_cells=world.n_cells, seed=campaign.seed, black_box=black_box)
+    loop = EpisodeLoop(world, source.policy, RecordPolicy(0, "none", 0.0), host)
+    try:
+        if host is not None:
+            clock.watch(host, "start", lambda _: 0, dict)
+            clock.watch(host, "act", lambda seen: len(seen[0]), lambda answer: answer[1])
+        else:
+            clock.watch(world, "step", lambda _: world.n_cells, lambda _: {})
+        for k in count():
+            source.run(loop, ShardRequest(0, k * world.n_cells, world.n_cells))
+    except (AVLostError, _TimeIsUpError) as error:
+        if error.args:
+            return f"not known: {error}"
+    finally:
+        loop.close()
+        world.close()
+    rare = source_of(campaign).cut_ins_are_rare
+    if host is None:
+        n_steps = STEPS if rare else STEPS_WITH_CUT_IN
+    else:
+        n_steps = STEPS_ACTED if not rare else STEPS * host.acts_before_cut_in
+    return n_steps * clock.spent_s / clock.n_steps

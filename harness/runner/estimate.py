@@ -8,15 +8,16 @@ from pathlib import Path
 from typing import Any
 
 from harness.campaign.files import load_campaign
+from harness.drawing import source_of
+from harness.drawing.protocol import block_of
 from harness.errors import RunFolderError
 from harness.estimators import ESTIMATORS, CampaignFacts, estimate_blocks
-from harness.estimators.block import EPISODE_COLUMNS, MOMENT_COLUMNS, SHELL_COLUMNS, Block, block_from_tables
+from harness.estimators.block import Block
 from harness.estimators.one_pass import SPACING
-from harness.importance.build import importance_names, mixture_weights
+from harness.importance.build import importance_names
 from harness.processes import made_ahead
-from harness.records.folder import SHELLS, concatenated, no_episodes, read_as, read_manifest
+from harness.records.folder import concatenated, no_episodes, read_manifest
 from harness.records.reader import read_shard
-from harness.strata import ShellDesign, StoredDesign
 from harness.vocabulary import EstimatorName
 
 MOST_GROUPED = 5_000
@@ -93,17 +94,16 @@ def stored_blocks(folder: Path, *, moments: bool) -> Iterator[Block]:
     n_counted, reported_from = int(manifest["n_episodes"]), int(manifest.get("reported_from") or 0)
     if n_counted == 0:
         raise no_episodes(folder)
-    method, alpha = campaign.testing.method, mixture_weights(campaign)
-    shells = read_shells(folder) if method == "shells" else None
-    needed = [*EPISODE_COLUMNS, *(SHELL_COLUMNS if shells else ())]
-    ratios = list(MOMENT_COLUMNS) if moments and method == "step_mixture" else []
+    source = source_of(campaign)
+    design, needed = source.stored_design(folder), list(source.columns)
+    ratios = list(source.moment_columns) if moments else []
 
     def read(group: _Shards) -> Block:
         stored = [read_shard(folder, shard, episode_columns=needed, moment_columns=ratios) for shard in group]
         episodes = concatenated([table for table, _ in stored], folder)
         kept = [table for _, table in stored if table is not None]
         steps = concatenated(kept, folder) if kept else None
-        return block_from_tables(episodes, steps, method=method, alpha=alpha, shells=shells)
+        return block_of(campaign, episodes, steps, design)
 
     n = 0
     for block in made_ahead(read, _groups(manifest["shards"])):
@@ -133,20 +133,6 @@ def _groups(shards: _Shards) -> Iterator[_Shards]:
             group, begin = [], n
     if group:
         yield group
-
-
-def read_shells(folder: Path) -> ShellDesign:
-    """Strata of a shells campaign; a `RunFolderError` where the file is missing, damaged, or of a too early version."""
-    content = read_as(dict[str, Any], folder / SHELLS, mend=_FINISH)
-    if "n_inside" in content and "statements" not in content:
-        version = read_manifest(folder).get("versions", {}).get("harness", "that made it")
-        raise RunFolderError(
-            str(folder / SHELLS),
-            found="shells of an earlier version, without statements and reference drivers",
-            expected="a run of this version: its tests say what those rest on",
-            mend=f"Run the campaign again into a new folder, or estimate this one with version {version}.",
-        )
-    return read_as(StoredDesign, folder / SHELLS, mend=_FINISH)
 
 
 def _incomplete(folder: Path, found: str, expected: str) -> RunFolderError:

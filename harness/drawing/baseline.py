@@ -1,0 +1,146 @@
+"""Baseline runs: a vehicle that acts before the cut-in is driven along each path without one, to know where it is.
+
+A test repeats the path with a cut-in, and tells the vehicle the index of the baseline run, so that both see the same
+random stream. What the vehicle did through the step of the cut-in must be the same to the last bit, or the test fails.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+
+from harness.episode.cells import drawn_traffic
+from harness.episode.loop import EpisodeLoop, RecordPolicy, Shard
+from harness.errors import RunFolderError
+from harness.pool.enumeration import ShadowRuns, write_script
+from harness.pool.storage import padded
+from harness.pool.vehicle_pool import ShadowPaths
+from harness.records.folder import COMPRESSION, read_table
+from harness.records.schemas import shadow_table
+from harness.traffic.laws import Environment
+from harness.vocabulary import AV, FAILED, IntArray, RecordArray
+
+SHADOW = "shadow"
+"""Folder of the baseline runs within a run folder; it keeps its first name."""
+SHARD_RUNS = 50
+"""Baseline runs of one file and one task: half a second of a slow controller."""
+ALL_MOTION = RecordPolicy(0, "all", 0.0)
+_MEND = "Delete this file and run again with --resume: the same baseline runs are made anew."
+
+
+@dataclass(frozen=True)
+class BaselineRequest:
+    """A fixed range of baseline runs."""
+
+    index: int
+    first_episode: int
+    n_episodes: int
+
+
+@dataclass(frozen=True)
+class BaselineResult:
+    """A finished range: its table, as a file where it is not on disk yet, and the causes of failures."""
+
+    request: BaselineRequest
+    table: pa.Table
+    parquet: bytes
+    failures: Counter[str]
+
+
+def baseline_requests(n: int) -> Iterator[BaselineRequest]:
+    """All baseline runs of a campaign, in order."""
+    return (BaselineRequest(i, first, min(SHARD_RUNS, n - first)) for i, first in enumerate(range(0, n, SHARD_RUNS)))
+
+
+def baseline_file(folder: Path, request: BaselineRequest) -> Path:
+    """Where a range of baseline runs is kept."""
+    return folder / SHADOW / f"shard-{request.index:06d}.parquet"
+
+
+def run_baseline(
+    loop: EpisodeLoop, paths: ShadowPaths, environment: Environment, request: BaselineRequest
+) -> BaselineResult:
+    """Drive the loop's vehicle along a range of paths."""
+    rows = slice(request.first_episode, request.first_episode + request.n_episodes)
+    shard = without_cut_in(loop, paths.seed, request.first_episode, paths.index[rows], paths.state[rows], environment)
+    table = shadow_table(shard, paths.index[rows], paths.weight[rows])
+    sink = pa.BufferOutputStream()
+    pq.write_table(table, sink, compression=COMPRESSION)
+    return BaselineResult(request, table, sink.getvalue().to_pybytes(), _causes(table))
+
+
+def stored_baseline(folder: Path, paths: ShadowPaths, request: BaselineRequest) -> BaselineResult | None:
+    """A range that an earlier run has finished, or None; a `RunFolderError` if it is damaged, or of other paths."""
+    file = baseline_file(folder, request)
+    if not file.exists():
+        return None
+    table = _read(file)
+    rows = slice(request.first_episode, request.first_episode + request.n_episodes)
+    if not np.array_equal(table.column("path").to_numpy(), paths.index[rows]):
+        raise RunFolderError(
+            str(file),
+            found="baseline runs on other paths",
+            expected="those of this campaign and this version of the harness",
+            mend="Use a new folder, or the version that the run was begun with (manifest.json).",
+        )
+    return BaselineResult(request, table, b"", _causes(table))
+
+
+def _read(file: Path) -> pa.Table:
+    try:
+        return read_table(file)
+    except RunFolderError as error:
+        raise RunFolderError(error.where, found=error.found, expected=error.expected, mend=_MEND) from error
+
+
+def _causes(table: pa.Table) -> Counter[str]:
+    return Counter(table.column("failure").drop_null().to_pylist())
+
+
+def read_baseline(folder: Path, paths: ShadowPaths, environment: Environment) -> ShadowRuns:
+    """All baseline runs of a run folder; a `RunFolderError` if some are missing or damaged."""
+    found = [stored_baseline(folder, paths, request) for request in baseline_requests(len(paths))]
+    if any(done is None for done in found):
+        raise RunFolderError(
+            str(folder / SHADOW),
+            found=f"baseline runs of {sum(done is not None for done in found)} of {len(found)} files",
+            expected="those of all paths: they say how probable each test is",
+            mend="Let `harness run` go on with --resume.",
+        )
+    return as_recorded([done.table for done in found if done is not None], environment)
+
+
+def as_recorded(tables: list[pa.Table], environment: Environment) -> ShadowRuns:
+    """Consecutive baseline runs as arrays."""
+    table = pa.concat_tables(tables, promote_options="none")
+    width = int(environment.numbers["max_steps"]) + 1
+    n_steps = table.column("n_steps").to_numpy().astype(np.int64)
+    failed = np.asarray(pc.equal(table.column("outcome").cast(pa.string()), "failed"))
+    motion = (padded(table.column(name), width)[0] for name in ("av_position_m", "av_speed_mps"))
+    return ShadowRuns(n_steps, failed, *motion)
+
+
+def without_cut_in(
+    loop: EpisodeLoop, seed: int, first: int, index: IntArray, state: RecordArray, environment: Environment
+) -> Shard:
+    """Drive the loop's vehicle along paths (n,) on which nobody cuts in; the first is its episode ``first``."""
+    none = np.full(len(index), -1, np.int64)
+    lv, bv, *_ = write_script(seed, index, none, state, environment)
+    traffic = drawn_traffic()._replace(lv=lv, bv=bv, cut_step=none, stratum=none, log_weight=np.zeros(len(index)))
+    return loop.beside(keep=ALL_MOTION).run(first, state, traffic)
+
+
+def recorded(shard: Shard, environment: Environment) -> ShadowRuns:
+    """Baseline runs as they come from the loop."""
+    episode, width = shard.results.episode, int(environment.numbers["max_steps"]) + 1
+    x, v = np.zeros((2, episode.size, width))
+    for row, trace in shard.traces.items():
+        x[row, : len(trace)], v[row, : len(trace)] = trace[:, AV, 0], trace[:, AV, 1]
+    return ShadowRuns(episode["n_steps"].astype(np.int64), episode["outcome"] == FAILED, x, v)

@@ -1,0 +1,224 @@
+"""The one shape that all ways of drawing tests have: what episodes need, rounds of tests, and when they are enough.
+
+A way of drawing is a class, one per file of this package, named after ``testing.method``. What holds for the way itself
+stands on the class and is asked before anything is built; an instance holds what the tests of one campaign are drawn
+from. The runner knows no more of a method than this.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from itertools import chain, pairwise
+from pathlib import Path
+from typing import ClassVar
+
+import pyarrow as pa
+
+from harness.campaign.campaign import Campaign
+from harness.controllers.find import build_host
+from harness.controllers.hosts import Death
+from harness.episode.loop import MOMENT_LIMITS, NOBODY, Drawing, EpisodeLoop, RecordPolicy, Shard
+from harness.estimators import StopRule, accumulator
+from harness.estimators.block import EPISODE_COLUMNS, Block, block_from_tables
+from harness.estimators.stopping import Rule
+from harness.importance.build import build_importance, mixture_weights
+from harness.importance.tables import Tables, build_tables, table_path
+from harness.pool.enumeration import ShadowRuns
+from harness.pool.shells import Draw
+from harness.pool.vehicle_pool import ShadowPaths
+from harness.progress import Progress
+from harness.resolved import Resolved
+from harness.strata import ShellDesign
+from harness.traffic.initial_state import InitialStates
+from harness.vocabulary import RecordArray
+from harness.worlds.protocol import World
+
+
+@dataclass(frozen=True)
+class ShardRequest:
+    """A fixed range of episodes; ``draws`` says which cut-ins they are, where they are prescribed."""
+
+    index: int
+    first_episode: int
+    n_episodes: int
+    draws: tuple[Draw, ...] = ()
+
+
+class Rounds:
+    """Requests in rounds; the next round is asked for when all of the last one have been added.
+
+    ``rule`` says why it is enough, ``reported_from`` is the first test of those that the answer is from (0 where all
+    are), ``remark`` what the ending is to say besides; mostly nothing.
+    """
+
+    rule: Rule
+    reported_from = 0
+    remark = ""
+
+    def __iter__(self) -> Iterator[Iterator[ShardRequest]]:
+        """Requests of each round."""
+        raise NotImplementedError
+
+    def enough(self, block: Block) -> bool:
+        """Add the tests of the next shard; True when the campaign is to stop."""
+        raise NotImplementedError
+
+
+class KnownRounds(Rounds):
+    """All tests are known beforehand, in one round; a stop rule looks at the end of some of their shards."""
+
+    def __init__(self, campaign: Campaign) -> None:
+        self._total, self._confidence = campaign.stop.episodes, campaign.stop.confidence
+        self._ends = campaign.run.shard_ends(self._total)
+        self.rule = self._rule = StopRule(
+            campaign.stop, campaign.testing.method, self._ends, min_crashes=campaign.min_crashes
+        )
+        self._sums, self._n_episodes = accumulator(self._rule.estimator), 0
+
+    def __iter__(self) -> Iterator[Iterator[ShardRequest]]:
+        """See `Rounds`."""
+        edges = enumerate(pairwise(chain((0,), self._ends)))
+        yield (ShardRequest(index, first, min(end, self._total) - first) for index, (first, end) in edges)
+
+    def enough(self, block: Block) -> bool:
+        """See `Rounds`."""
+        self._sums.add(block)
+        self._n_episodes += len(block)
+        if not self._rule.due(self._n_episodes):
+            return False
+        return self._rule.observe(self._n_episodes, self._sums.result(self._confidence))
+
+
+class Source:
+    """What the tests of a campaign are drawn from, built or read from the cache; tests are independent by default.
+
+    Attributes
+    ----------
+    resolved : Resolved
+    policy : Drawing
+        What the episode loop needs to know.
+    tables : Tables or None
+        Challenges, where importance functions of surrogates are mixed.
+    design : ShellDesign or None
+        Strata, of those that have some.
+    baseline_paths : ShadowPaths or None
+        Paths along which the vehicle has to be driven without a cut-in before tests can be drawn; see `begin_after`.
+    """
+
+    episodes_per_s: ClassVar[Mapping[str, int]]
+    """On one core of a 2020s server by engine, recording included: orders of magnitude; `benchmarks/` tells yours."""
+    columns: ClassVar[tuple[str, ...]] = EPISODE_COLUMNS
+    """Of the episodes table, that estimates need."""
+    moment_columns: ClassVar[tuple[str, ...]] = ()
+    """Of the table of control steps, that one of its estimators needs."""
+    uses_tables: ClassVar = False
+    cut_ins_are_rare: ClassVar = False
+    tests_in_rounds: ClassVar = False
+
+    def __init__(self, resolved: Resolved, progress: Progress) -> None:
+        self.resolved, self.campaign = resolved, resolved.campaign
+        self.tables = self._built_tables(progress)
+        importance = build_importance(self.campaign, self.tables)
+        self.policy = Drawing(self.campaign.seed, resolved.environment, importance, resolved.av, NOBODY)
+        self.initial_states = InitialStates(resolved.environment.numbers)
+        self.design: ShellDesign | None = None
+        self.baseline_paths: ShadowPaths | None = None
+
+    def _built_tables(self, progress: Progress) -> Tables | None:
+        if not self.uses_tables:
+            return None
+        drivers = self.resolved.surrogates
+        progress.stage("criticality tables", len(drivers))
+        return build_tables(self.resolved.environment, drivers, self.campaign.testing.challenge, progress.advance)
+
+    @classmethod
+    def require(cls, resolved: Resolved) -> None:
+        """Refuse (`CampaignError`) what can be known to be wrong before anything is built."""
+
+    @classmethod
+    def cached_files(cls, resolved: Resolved) -> list[Path]:
+        """What building leaves in the cache, or has found there: with these another machine builds nothing."""
+        if not cls.uses_tables:
+            return []
+        return [table_path(resolved.environment, resolved.surrogates, resolved.campaign.testing.challenge)]
+
+    @classmethod
+    def building(cls, resolved: Resolved) -> str:
+        """What is to be built, and how long that takes, in words."""
+        files = cls.cached_files(resolved)
+        if not files or all(file.is_file() for file in files):
+            return "cached" if files else "none needed"
+        per_driver_s = 5 if resolved.campaign.environment.acceleration_hold_s >= 0.5 else 40
+        return f"to build (about {per_driver_s * len(resolved.campaign.surrogates)} s of one core)"
+
+    @classmethod
+    def reach(cls, resolved: Resolved) -> dict[str, str]:  # noqa: ARG003 - nothing is known of it
+        """Which rates the statements of a campaign can tell, in words, by key; nothing where that is no question."""
+        return {}
+
+    @classmethod
+    def stored_design(cls, folder: Path) -> ShellDesign | None:  # noqa: ARG003 - there is none
+        """Strata of a stored run."""
+        return None
+
+    def begin_after(self, runs: ShadowRuns) -> None:  # noqa: ARG002 - there are none
+        """Draw tests by what the vehicle did in its baseline runs, along `baseline_paths`.
+
+        Raises
+        ------
+        HarnessError
+            Nothing on these paths can be tested.
+        """
+        raise ValueError("this campaign has no baseline runs")
+
+    def states(self, first_episode: int, n_episodes: int) -> RecordArray:
+        """Initial states of consecutive episodes, shape (n_episodes,)."""
+        return self.initial_states.draw(self.campaign.seed, first_episode, n_episodes)
+
+    def loop(
+        self,
+        world: World,
+        *,
+        traces: str | None = None,
+        black_box: Path | None = None,
+        fatal_episodes: Mapping[int, Death] | None = None,
+    ) -> EpisodeLoop:
+        """Episode loop in a world, recording what the campaign asks for, or other ``traces``.
+
+        The file ``black_box`` tells in which episode's controller a process died; ``fatal_episodes`` are known to kill
+        it, and may grow between two runs.
+        """
+        campaign, records = self.campaign, self.campaign.records
+        keep = RecordPolicy(MOMENT_LIMITS[records.moments], traces or records.traces, records.trace_share)
+        av = build_host(
+            campaign.av, n_cells=world.n_cells, seed=campaign.seed, black_box=black_box, fatal_episodes=fatal_episodes
+        )
+        return EpisodeLoop(world, self.policy, keep, av)
+
+    def rounds(self, held: int = 0) -> Rounds:  # noqa: ARG002 - only rounds that give up ask for it
+        """Rounds of tests, for a folder that holds so many already."""
+        return KnownRounds(self.campaign)
+
+    def run(self, loop: EpisodeLoop, request: ShardRequest) -> Shard:
+        """Run the tests of a shard."""
+        return loop.run(request.first_episode, self.states(request.first_episode, request.n_episodes))
+
+    def run_again(self, loop: EpisodeLoop, episode: int, stored: pa.Table) -> Shard:  # noqa: ARG002 - the index says all
+        """Run an episode that is ``stored`` as one row."""
+        return self.run(loop, ShardRequest(0, episode, 1))
+
+    def is_shard(self, request: ShardRequest, episodes: pa.Table) -> bool:
+        """Whether stored episodes are those that are asked for, and not the last shard of a smaller budget."""
+        return bool(episodes.num_rows == request.n_episodes)
+
+    def block(self, episodes: pa.Table, moments: pa.Table | None) -> Block:
+        """What estimators read of a shard."""
+        return block_of(self.campaign, episodes, moments, self.design)
+
+
+def block_of(campaign: Campaign, episodes: pa.Table, moments: pa.Table | None, design: ShellDesign | None) -> Block:
+    """What estimators read of the tables of a campaign's shard."""
+    return block_from_tables(
+        episodes, moments, method=campaign.testing.method, alpha=mixture_weights(campaign), shells=design
+    )

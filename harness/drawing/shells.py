@@ -1,0 +1,299 @@
+"""Cut-ins of the pool, drawn within shells, in rounds: each decides what the next one tests.
+
+A round is run to its end before the next begins, whatever the number of workers, and the result is looked at. Rounds
+grow geometrically, to where they narrow the interval most (`harness.drawing.allocation`). That depends on counts alone,
+not on the stop rule or on time: a run can be continued to a smaller RHW. First the strata inside the narrowest boundary
+are tested until what is stated about them is roughly known; then those inside the next one, and at last all.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+
+from harness.campaign.campaign import Campaign
+from harness.campaign.sections import Stop
+from harness.drawing.allocation import CONFIDENCE, Allocation
+from harness.drawing.protocol import Rounds, ShardRequest, Source
+from harness.episode.loop import EpisodeLoop, Shard
+from harness.errors import RunFolderError
+from harness.estimators import Shells as SeenShells
+from harness.estimators.block import EPISODE_COLUMNS, SHELL_COLUMNS, Block
+from harness.estimators.likelihood import Level
+from harness.estimators.pairs import PairCounts
+from harness.estimators.stopping import PairRule, RoundRule
+from harness.estimators.tally import Tally, empty_tally
+from harness.pool.cut_ins import Pool
+from harness.pool.enumeration import ShadowRuns
+from harness.pool.shells import Draw, PrescribedEpisodes, acceleration_limit, checked_boundary, design_shells
+from harness.pool.storage import cached_pool, campaign_pool, campaign_pool_key, pool_path
+from harness.pool.vehicle_pool import campaign_shadow_paths, shadow_paths_file, vehicle_pool
+from harness.progress import Progress
+from harness.records.folder import SHELLS, read_as, read_manifest
+from harness.resolved import Resolved
+from harness.strata import ASSUMPTION_FREE, ShellDesign, StoredDesign
+from harness.vocabulary import IntArray
+
+MOST_SHARDS_PER_ROUND = 16
+SMALLEST_SHARD = 64
+BIASED_RHW = 0.5
+"""Precision from which on stopping at the first interval biases the rate noticeably."""
+TOO_WIDE = (
+    f"A relative half-width above {BIASED_RHW:g} is reached by chance: stopping at the first such interval makes rates "
+    "too high on the mean. Ask for a smaller stop.rhw, or for testing.shells.stopping: two_phase."
+)
+FIRST_PHASE = 1.7
+"""Precision of the first of two phases over that of the second (measured: docs/estimators.md)."""
+
+
+_FINISH = "Run `harness run` with --resume, which makes missing shards."
+POOL_S = "about 15 s"
+OVER_BOUND = 1.6
+"""Tests that a rate takes, over the lower bound (measured: medians of the panel, 1.5 to 1.75)."""
+USUAL_RHW = 0.3
+
+
+class Shells(Source):
+    """Tests of strata of the pool's cut-ins; a vehicle that acts before the cut-in makes the pool itself."""
+
+    episodes_per_s = {"sumo": 1700, "sumo with shim": 2700, "twin": 30000}
+    columns = (*EPISODE_COLUMNS, *SHELL_COLUMNS)
+    tests_in_rounds = True
+
+    def __init__(self, resolved: Resolved, progress: Progress) -> None:
+        super().__init__(resolved, progress)
+        if self.campaign.has_shadow_runs:
+            self.baseline_paths = campaign_shadow_paths(resolved, progress)
+        else:
+            self._draw_from(campaign_pool(resolved, progress))
+
+    def _draw_from(self, pool: Pool) -> None:
+        self.prescribed = PrescribedEpisodes(self.campaign, pool)
+        self.design = self.prescribed.design
+        boundary = checked_boundary(self.resolved.library, self.design, self.resolved.environment)
+        self.policy = self.policy._replace(boundary=boundary)
+
+    @classmethod
+    def require(cls, resolved: Resolved) -> None:
+        """See `Source`: the library knows what is stated."""
+        resolved.library.statement_settings(resolved.campaign.testing.shells)
+
+    @classmethod
+    def cached_files(cls, resolved: Resolved) -> list[Path]:
+        """See `Source`."""
+        own = resolved.campaign.has_shadow_runs
+        return [shadow_paths_file(resolved) if own else pool_path(campaign_pool_key(resolved))]
+
+    @classmethod
+    def building(cls, resolved: Resolved) -> str:
+        """See `Source`."""
+        what, make = "pool of cut-ins", "build"
+        if resolved.campaign.has_shadow_runs:
+            what, make = f"paths of {resolved.campaign.pool.shadow_paths:,} baseline runs", "choose"
+        cached = all(file.is_file() for file in cls.cached_files(resolved))
+        return f"{what}: " + ("cached" if cached else f"to {make} ({POOL_S} on two cores)")
+
+    @classmethod
+    def reach(cls, resolved: Resolved) -> dict[str, str]:
+        """See `Source`: where cut-ins take time the rates of attentive vehicles are tiny."""
+        campaign = resolved.campaign
+        if not resolved.environment.lateral.present or campaign.has_shadow_runs:
+            return {}
+        if (pool := cached_pool(resolved)) is None:
+            return {"within_reach": "known once the pool is built (harness pool)"}
+        design = design_shells(pool, shells=campaign.testing.shells, limit_mps2=acceleration_limit(campaign.av))
+        p = {ASSUMPTION_FREE: float(design.p.sum())}
+        p |= {each.name: float(design.p[: each.n_inside].sum()) for each in design.statements}
+        return {f"within_reach_of_{name}": within_reach(at_stake, campaign.stop) for name, at_stake in p.items()}
+
+    @classmethod
+    def stored_design(cls, folder: Path) -> ShellDesign:
+        """Strata of a stored run; a `RunFolderError` where they are missing, damaged, or of a too early version."""
+        content = read_as(dict[str, object], folder / SHELLS, mend=_FINISH)
+        if "n_inside" in content and "statements" not in content:
+            version = read_manifest(folder).get("versions", {}).get("harness", "that made it")
+            raise RunFolderError(
+                str(folder / SHELLS),
+                found="shells of an earlier version, without statements and reference drivers",
+                expected="a run of this version: its tests say what those rest on",
+                mend=f"Run the campaign again into a new folder, or estimate this one with version {version}.",
+            )
+        return read_as(StoredDesign, folder / SHELLS, mend=_FINISH)
+
+    def begin_after(self, runs: ShadowRuns) -> None:
+        """See `Source`."""
+        if self.baseline_paths is None:
+            raise ValueError("this campaign has no baseline runs")
+        self._draw_from(vehicle_pool(self.resolved, self.baseline_paths, runs))
+
+    def rounds(self, held: int = 0) -> ShellRounds:
+        """See `Source`."""
+        return ShellRounds(self.campaign, self.prescribed.design, self.prescribed.available, held)
+
+    def run(self, loop: EpisodeLoop, request: ShardRequest) -> Shard:
+        """See `Source`."""
+        states, traffic, cut_ins = self.prescribed.episodes(request.draws)
+        shard = loop.run(request.first_episode, states, traffic)
+        shard.cut_ins = cut_ins
+        return shard
+
+    def run_again(self, loop: EpisodeLoop, episode: int, stored: pa.Table) -> Shard:
+        """See `Source`."""
+        row, stratum = (np.asarray(stored[name]).astype(np.int64) for name in ("pool_cut_in", "component"))
+        shard = loop.run(episode, *self.prescribed.of_rows(row, stratum))
+        shard.cut_ins = self.prescribed.cut_ins(row)
+        return shard
+
+    def is_shard(self, request: ShardRequest, episodes: pa.Table) -> bool:
+        """See `Source`: nor of the last round of a smaller budget."""
+        cut_ins, wanted = episodes.column("pool_cut_in"), self.prescribed.rows(request.draws)[0]
+        return super().is_shard(request, episodes) and not cut_ins.null_count and np.array_equal(cut_ins, wanted)
+
+
+def within_reach(p: float, stop: Stop) -> str:
+    """What can be said of a rate where cut-ins of probability ``p`` have to be shown not to crash.
+
+    A rate to within ± r of itself needs some 1.6 ln(1/α) p/(2 r μ) tests: without an assumption p is that of all that
+    the envelope reaches, inside a boundary that of its shells. (Lower bound ln(1/α) p/(2 r μ); the panel of
+    docs/shells-validation.md took 1.5 to 1.75 times that.) Where cut-ins take time, the rate of an attentive vehicle
+    falls by orders of magnitude, and that number of tests grows as its inverse; what remains is the upper limit
+    ln(1/α) p/n.
+    """
+    rhw, n, nats = stop.rhw or USUAL_RHW, stop.episodes, math.log(1.0 / (1.0 - stop.confidence))
+    smallest, limit = OVER_BOUND * nats * p / (2.0 * rhw * n), nats * p / n
+    return (
+        f"a rate to within ±{100.0 * rhw:.0f} % from some {smallest:.1e} per test on, with {n:,} tests; of a vehicle "
+        f"that crashes less an upper limit, {limit:.1e} without a crash"
+    )
+
+
+class ShellRounds(Rounds):
+    """Fed with finished tests of shells in order; says what is tested next, and when it is enough.
+
+    In two phases the tests up to a wider precision only plan the number of the others, which alone are reported: that
+    number does not depend on their results.
+
+    ``available``, shape (S,), are the most tests of each stratum, ``held`` see `RoundRule`; ``seen`` are the tests of
+    this phase, ``drawn`` those of both, (S,); ``reported_from`` is the first test of the second phase, ``planned`` its
+    tests, (S,), once they are.
+    """
+
+    rule: RoundRule
+
+    def __init__(self, campaign: Campaign, design: ShellDesign, available: IntArray, held: int = 0) -> None:
+        shells = campaign.testing.shells
+        self._plans = shells.stopping == "two_phase" and campaign.stop.rhw is not None
+        self.rule = RoundRule(campaign, held, FIRST_PHASE if self._plans else 1.0)
+        wide = campaign.stop.rhw is not None and campaign.stop.rhw > BIASED_RHW and not self._plans
+        self.remark = TOO_WIDE if wide else ""
+        self._campaign = campaign
+        self._allocation = Allocation.of(shells, design, available)
+        self.drawn = np.zeros(design.p.size, np.int64)
+        self.planned: IntArray | None = None
+        self._begin_phase()
+
+    def _begin_phase(self) -> None:
+        self.seen = SeenShells()
+        self._n_episodes = self._look = 0
+
+    @property
+    def tally(self) -> Tally:
+        """What the tests of each stratum have come to so far."""
+        return self.seen.tally if self._n_episodes else empty_tally(self.drawn.size)
+
+    def __iter__(self) -> Iterator[Iterator[ShardRequest]]:
+        """See `Rounds`."""
+        n_shards = 0
+        while (added := self.next_round()).any():
+            first = self.reported_from + self._n_episodes
+            requests = round_requests(self.drawn, added, n_shards, first, self._campaign.run.smallest_shard)
+            self.drawn = self.drawn + added
+            n_shards += len(requests)
+            yield iter(requests)
+
+    def next_round(self) -> IntArray:
+        """Tests to add per stratum, shape (S,); all 0 when no stratum or no budget is left."""
+        tally, budget = self.tally, self._campaign.stop.episodes - self.reported_from - self._n_episodes
+        added = self._allocation.next_round(tally, budget) if self.planned is None else self.planned - tally.tests
+        self.rule.of_first_tests = self._allocation.is_first(tally.tests, added)
+        self._look = self._n_episodes + int(added.sum())
+        return added
+
+    def enough(self, block: Block) -> bool:
+        """See `Rounds`."""
+        self.seen.add(block)
+        self._n_episodes += len(block)
+        if self._n_episodes != self._look:
+            return False
+        enough = self.rule.observe(self.seen)
+        if not (enough and self._plans and self.rule.look.stopped and self.planned is None):
+            return enough or self.planned is not None
+        budget = self._campaign.stop.episodes - self._n_episodes
+        stop, left = self._campaign.stop, self._allocation.available - self.drawn
+        rhw = stop.rhw or math.inf
+        self.planned = self._allocation.second_phase(self.tally, left, budget, rhw, stop.confidence)
+        self.rule, self.reported_from = RoundRule(self._campaign), self._n_episodes
+        self._begin_phase()
+        return False
+
+
+class PairRounds:
+    """Says which pairs of tests of two vehicles are driven next, from counts alone.
+
+    Rounds are those of one vehicle, with pairs in place of tests; within a round pairs go to where the likelihood ratio
+    says that one more narrows the interval of the difference most. The campaigns are equal but for the vehicle;
+    ``available``, shape (S,), are the most pairs of each stratum, for ``margin`` see `PairRule`.
+    """
+
+    def __init__(self, campaign: Campaign, design: ShellDesign, available: IntArray, margin: float | None) -> None:
+        self.rule, self._budget = PairRule(campaign, margin), campaign.stop.episodes
+        self._allocation = Allocation.of(campaign.testing.shells, design, available)
+        self._level = Level.two_sided(CONFIDENCE)
+
+    def next_round(self, pairs: PairCounts) -> IntArray:
+        """Pairs to add per stratum, shape (S,); all 0 when no stratum or no budget is left."""
+        added = self._allocation.next_round(
+            _differing(pairs),
+            self._budget - int(pairs.tests.sum()),
+            inner_rhw=lambda n: pairs.inside(n).rhw(self._level),
+            given_by=partial(pairs.spread, self._level),
+        )
+        self.rule.of_first_tests = self._allocation.is_first(pairs.tests, added)
+        return added
+
+
+def _differing(pairs: PairCounts) -> Tally:
+    """Pairs of which one vehicle has crashed and the other has not, in the crashes' place."""
+    differing = pairs.outcomes()[:, 1:3].sum(1)
+    may_differ = np.maximum(pairs.tally(0).failed, pairs.tally(1).failed)
+    no_mass = np.zeros((differing.size, differing.size))
+    return Tally(pairs.tests, differing, np.minimum(may_differ, pairs.tests - differing), no_mass, no_mass)
+
+
+def round_requests(
+    tests: IntArray, added: IntArray, index: int, first_episode: int, shard_size: int
+) -> list[ShardRequest]:
+    """Divide a round into shards, each a range of the round's tests in the order of strata.
+
+    ``tests`` and ``added``, shape (S,), are draws taken so far and those of the round; ``index`` and ``first_episode``
+    are the first shard's, ``shard_size`` the most episodes of one.
+    """
+    total = int(added.sum())
+    n_shards = max(-(-total // shard_size), min(MOST_SHARDS_PER_ROUND, total // SMALLEST_SHARD), 1)
+    edges = np.linspace(0, total, n_shards + 1).round().astype(np.int64).tolist()
+    ends = np.cumsum(added).tolist()
+    requests = []
+    for k, (low, high) in enumerate(pairwise(edges)):
+        draws = []
+        for s, (taken, begin, end) in enumerate(zip(tests.tolist(), [0, *ends], ends, strict=False)):
+            first, last = max(low, begin), min(high, end)
+            if first < last:
+                draws.append(Draw(s, taken + first - begin, last - first))
+        requests.append(ShardRequest(index + k, first_episode + low, high - low, tuple(draws)))
+    return requests

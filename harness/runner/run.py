@@ -1,0 +1,301 @@
+"""Run a campaign: rounds of tests, shards in order through the stop rule, then estimates and report."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from functools import cache, partial
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from harness.campaign.campaign import Campaign
+from harness.drawing import Rounds, ShardRequest
+from harness.drawing.baseline import as_recorded, baseline_file, baseline_requests, stored_baseline
+from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED
+from harness.estimators.answer import ending as ending_sentence
+from harness.estimators.stopping import Rule, Verdict
+from harness.pool.vehicle_pool import ShadowPaths
+from harness.progress import Progress
+from harness.records.folder import SHELLS, TABLES, shards_on_disk, sole_use, write_bytes, write_json, write_shard
+from harness.records.manifest import StoppedBy
+from harness.resolved import Resolved
+from harness.runner.estimate import estimate_run
+from harness.runner.manifest import SMALLEST_FAILED_SAMPLE, Manifest, Prefix, cpu_name, require_few_failed
+from harness.runner.resolve import distance_per_test_m, prepare, require_ready
+from harness.runner.resume import require_no_fewer, require_own_folder, require_same_pool, stored_shard
+from harness.runner.retrace import Retracing
+from harness.runner.worker import ShardResult
+from harness.runner.workers import workers_of
+from harness.strata import STORED_DESIGN
+from harness.vocabulary import SAMPLING
+
+EXIT_OF: Mapping[Verdict, int] = {"accepted": EXIT_DONE, "rejected": EXIT_REFUTED, "undecided": EXIT_BUDGET_SPENT}
+ESTIMATES = "estimates.json"
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """What a finished campaign left.
+
+    Attributes
+    ----------
+    folder : Path
+    report : Path
+        The page ``report.html``.
+    estimates : dict
+        Content of ``estimates.json``.
+    stopped_by : {"rhw", "accept", "contradicted", "two_phase", "episodes", "pool", "pool_error"}
+        See `harness.records.manifest.StoppedBy`.
+    ending : str
+        When it ended and which condition decided, in a sentence.
+    exit_code : int
+        0, or 4 when the budget or the pool was spent before the asked precision or decision, or 5 where the crash rate
+        is above the limit that was to be kept.
+    """
+
+    folder: Path
+    report: Path
+    estimates: dict[str, Any]
+    stopped_by: StoppedBy
+    ending: str
+    exit_code: int
+
+
+def run_campaign(
+    campaign: Campaign | Resolved,
+    out: Path,
+    *,
+    workers: int | None = None,
+    resume: bool = False,
+    progress: Progress | None = None,
+) -> RunResult:
+    """Run a campaign into a folder.
+
+    Parameters
+    ----------
+    campaign : Campaign or Resolved
+        The latter from `require_ready`.
+    out : Path
+        New, empty, or (with ``resume``) the folder of this campaign.
+    workers : int, optional
+        Worker processes; as many as there are cores by default. Never changes a result.
+    resume : bool
+        Continue a run that was interrupted, or to a smaller RHW.
+    progress : Progress, optional
+
+    Raises
+    ------
+    HarnessError
+        The campaign, the folder or the AV is at fault; nothing that was finished is lost.
+    """
+    resolved = campaign if isinstance(campaign, Resolved) else require_ready(campaign)
+    with sole_use(out):
+        earlier = require_own_folder(out, resolved, resume=resume)
+        require_no_fewer(out, earlier, resolved.campaign.stop.episodes)
+        with Run(resolved, out, earlier, workers, progress or Progress()).under_way() as run:
+            run.make_ready()
+            rounds = run.source.rounds(run.held)
+            run_rounds(run, rounds)
+        require_no_fewer(out, earlier, run.prefix.n_episodes)
+        run.discard_uncounted()
+        return finish(run, rounds.rule, rounds.remark)
+
+
+def run_rounds(run: Run, rounds: Rounds) -> None:
+    """Run rounds of tests until there are enough."""
+    for requests in rounds:
+        for shard in run.results(requests):
+            enough = rounds.enough(shard.block)
+            run.prefix.reported_from = rounds.reported_from
+            run.follow(rounds.rule, shard)
+            if enough:
+                return
+
+
+class Run:
+    """A campaign on its way into a folder, in which nobody but this process writes.
+
+    Attributes
+    ----------
+    source : Source
+        What its tests are drawn from.
+    prefix : Prefix
+        What is finished.
+    held : int
+        Tests that the folder held before.
+    """
+
+    def __init__(
+        self,
+        resolved: Resolved,
+        out: Path,
+        earlier: dict[str, Any],
+        n_workers: int | None,
+        progress: Progress,
+        *,
+        n_runs: int = 1,
+    ) -> None:
+        self.resolved, self.campaign, self.out, self._progress = resolved, resolved.campaign, out, progress
+        began = time.monotonic()
+        for left in out.rglob(".*.part"):  # of an earlier run that was killed
+            left.unlink()
+        self.source = prepare(resolved, progress)
+        self.prefix, self.held = Prefix(), int(earlier["n_episodes"])
+        self._retracing = Retracing(resolved)
+        self._workers = workers_of(resolved, out, n_workers, n_runs=n_runs)
+        with ExitStack() as refused:
+            refused.callback(self._workers.close)
+            distance_m = distance_per_test_m(resolved.environment)
+            self.manifest = Manifest(
+                out, resolved, earlier, began=began, workers=self._workers.n_workers, distance_per_test_m=distance_m
+            )
+            require_same_pool(out, self.source)
+            self._write_design()
+            refused.pop_all()
+
+    @contextmanager
+    def under_way(self) -> Iterator[Run]:
+        """Tests are run within this: the manifest follows, so that an interrupted run can be read, and workers end."""
+        try:
+            yield self
+            self.prefix.require_few_failed(self.campaign)
+        except BaseException:
+            self.manifest.write(self.prefix, "interrupted")
+            raise
+        finally:
+            self._workers.close()
+
+    def make_ready(self) -> None:
+        """Make baseline runs, if tests follow from some, and say how many tests there will be at most."""
+        if (paths := self.source.baseline_paths) is not None:
+            self._make_baseline(paths)
+            require_same_pool(self.out, self.source)
+            self._write_design()
+        # Until a decision nobody knows how many.
+        most = self.campaign.stop.episodes if self.campaign.accept is None else None
+        self._progress.stage(f"episodes{self._workers.where}", most, done=self.held)
+
+    def results(self, requests: Iterator[ShardRequest]) -> Iterator[ShardResult]:
+        """Finished shards in order, each in the folder and counted."""
+        for shard in self._workers.run(requests, self._known):
+            self._add(shard)
+            yield shard
+
+    def follow(self, rule: Rule, shard: ShardResult) -> None:
+        """Show how far it is, and let the manifest follow.
+
+        Only what a rule asks for is called ``rhw``: a bar reckons from it when the campaign will stop.
+        """
+        self._progress.advance(min(max(self.prefix.n_episodes - self.held, 0), shard.request.n_episodes))
+        watched = "half_width" if self.campaign.stop.rhw is None else "rhw"
+        one_more = {"one_more_crash": rule.look.one_more_crash} if SAMPLING[self.campaign.testing.method].forces else {}
+        self._progress.status(crashes=self.prefix.n_crashes, **{watched: rule.look.rhw}, **one_more)
+        self.manifest.follow(self.prefix)
+
+    def _known(self, request: ShardRequest) -> ShardResult | None:
+        """See `stored_shard`; workers are about to be busy with the first shard that it does not know."""
+        shard = stored_shard(self.out, self.source, self._retracing, request)
+        if shard is None:
+            load_report_meanwhile()
+        return shard
+
+    def _add(self, shard: ShardResult) -> None:
+        """Write a shard that is not there yet, and count it."""
+        files = shard.files
+        if shard.parquet:
+            self.manifest.forget_replaced(shard.request)
+            files = write_shard(self.out, shard.request.index, shard.parquet)
+        self.prefix.add(shard, files)
+        self.prefix.require_few_failed(self.campaign, at_least=SMALLEST_FAILED_SAMPLE)
+
+    def _make_baseline(self, paths: ShadowPaths) -> None:
+        """Drive the vehicle along all paths without a cut-in, but for what an earlier run has done of it."""
+        environment, n = self.resolved.environment, len(paths)
+        self._progress.stage(f"baseline runs{self._workers.where}", n)
+        tables, causes = [], Counter[str]()
+        for result in self._workers.run(baseline_requests(n), partial(stored_baseline, self.out, paths)):
+            if result.parquet:
+                write_bytes(baseline_file(self.out, result.request), result.parquet)
+            tables.append(result.table)
+            causes += result.failures
+            self._progress.advance(result.request.n_episodes)
+            self.manifest.note(shadow_runs={"n_runs": sum(map(len, tables)), "n_failed": causes.total()})
+            self.manifest.follow(self.prefix)
+        most, where = self.campaign.run.max_failed_share, "the run folder's shadow/ tables"
+        require_few_failed(causes.total(), n, causes, most, "baseline runs", where)
+        runs = as_recorded(tables, environment)
+        self.manifest.note(distance_per_test_m=runs.mean_distance_m(paths.weight))
+        self.source.begin_after(runs)
+
+    def _write_design(self) -> None:
+        """RecordPolicy the strata: without them nothing can be estimated."""
+        if self.source.design is not None:
+            write_json(self.out / SHELLS, STORED_DESIGN.dump_python(self.source.design, mode="json"))
+
+    def discard_uncounted(self) -> None:
+        """Remove shards that an earlier, longer run has left beyond the stop."""
+        counted = {self.out / file for shard in self.prefix.shards for file in shard["files"].values()}
+        for path in {path for table in TABLES for path in shards_on_disk(self.out, table)} - counted:
+            path.unlink()
+
+    def close_manifest(self, stopped_by: StoppedBy, ending: str, **facts: Any) -> None:
+        """Write the manifest of what is finished."""
+        if others := self._workers.cpus():  # bits may have come from any of them
+            self.manifest.note(cpu=", ".join(sorted({cpu_name(), *others})))
+        self.manifest.note(**facts)
+        retraced = self._retracing.summary(self.prefix.n_retraced)
+        self.manifest.write(self.prefix, "done", stopped_by=stopped_by, ending=ending, retraced=retraced)
+        self._progress.stage("estimates and report", None)
+
+
+def finish(run: Run, rule: Rule, remark: str = "") -> RunResult:
+    """Write manifest, estimates and report of a run whose rule has seen enough."""
+    stopped_by, said = conclusion(run.campaign, rule, run.prefix.n_episodes, run.prefix.reported_from)
+    if stopped_by == "rhw" and remark:
+        said += f" {remark}"
+    decided = {} if rule.look.decision is None else {"decision": rule.look.decision.to_json()}
+    run.close_manifest(stopped_by, said, **decided)
+    estimates = estimate_run(run.out)
+    write_json(run.out / ESTIMATES, estimates)
+    # No worker loads matplotlib, and it has been loaded here while workers were busy.
+    from harness.report import write_report  # noqa: PLC0415
+
+    verdict = None if rule.look.decision is None else rule.look.decision.verdict
+    code = exit_code(run.campaign, stopped_by, verdict)
+    return RunResult(run.out, write_report(run.out), estimates, stopped_by, said, code)
+
+
+def exit_code(campaign: Campaign, stopped_by: StoppedBy, verdict: Verdict | None) -> int:
+    """See `RunResult`."""
+    if verdict is not None:
+        return EXIT_OF[verdict]
+    missed = campaign.stop.rhw is not None and stopped_by not in ("rhw", "two_phase")
+    return EXIT_BUDGET_SPENT if missed else EXIT_DONE
+
+
+def conclusion(campaign: Campaign, rule: Rule, n_episodes: int, reported_from: int) -> tuple[StoppedBy, str]:
+    """Why a campaign ended after so many tests; those from ``reported_from`` on are reported. In a sentence."""
+    by: StoppedBy
+    if 0 < reported_from < n_episodes < campaign.stop.episodes:
+        by = "two_phase"
+    elif rule.look.stopped:
+        by = "rhw" if rule.look.decision is None else "accept"
+    elif rule.look.decision is not None and rule.look.decision.is_final:
+        by = "contradicted"
+    elif rule.look.pool_error_above_target:  # whatever else is spent: more of it would not help
+        by = "pool_error"
+    else:
+        by = "episodes" if n_episodes >= campaign.stop.episodes else "pool"
+    asked = campaign.stop.rhw is not None or rule.look.decision is not None
+    return by, ending_sentence(by, n_episodes, rule.look.unmet, precision_asked=asked)
+
+
+@cache
+def load_report_meanwhile() -> None:
+    """Load matplotlib beside busy workers, once: no earlier, because it would slow down what makes them wait."""
+    threading.Thread(target=import_module, args=("harness.report",), daemon=True).start()
