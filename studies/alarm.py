@@ -163,10 +163,10 @@ def alarm_of_run(folder: Path, pool_file: Path | None = None, progress: Progress
         drawn = campaign.testing.method == "shells"
         raise HarnessError(
             str(folder),
-            found="tests drawn from shells" if drawn else "an AV that acted before the cut-in",
-            expected="weighted tests of an AV that keeps its speed until the cut-in: "
+            "tests drawn from shells" if drawn else "an AV that acted before the cut-in",
+            "weighted tests of an AV that keeps its speed until the cut-in: "
             + ("shells have used the surrogates' outcomes" if drawn else "where it was when BV cut in depends on it"),
-            mend="Choose another run; that SUMO and the twin agree is checked in each by retracing.",
+            "Choose another run; that SUMO and the twin agree is checked in each by retracing.",
         )
     pool = campaign_pool(resolved, progress) if pool_file is None else read_pool(pool_file)
     surrogates, alarm, alpha = SurrogateReplay(resolved, pool), Alarm(KnownRates.of(pool)), mixture_weights(campaign)

@@ -149,37 +149,37 @@ class Experiment(Section):
         if bool(self.avs) == bool(self.chains):
             yield broken_rule(
                 "avs",
-                found="both avs and chains" if self.avs else "neither avs nor chains",
-                expected="one of the two",
-                mend="Name vehicles under avs for overtaking in the twin, or exact chains under chains.",
+                "both avs and chains" if self.avs else "neither avs nor chains",
+                "one of the two",
+                "Name vehicles under avs for overtaking in the twin, or exact chains under chains.",
             )
         for name in self.chains:
             if name not in CHAINS:
                 expected = f"some of {', '.join(CHAINS)}"
-                yield broken_rule("chains", found=f"'{name}'", expected=expected, mend="Choose one of them.")
+                yield broken_rule("chains", f"'{name}'", expected, "Choose one of them.")
         method = self.campaign.testing.method
         if self.adversaries and method != "shells":
             expected = "method shells: their crashes are drawn within shells"
-            yield broken_rule("adversaries", found=f"adversaries for {method}", expected=expected, mend="Delete them.")
+            yield broken_rule("adversaries", f"adversaries for {method}", expected, "Delete them.")
         for name, made in self.adversaries.items():
             where, others = f"adversaries.{name}", ", ".join(self.avs)
             if made.of not in self.avs:
                 expected = f"one of avs: {others}"
-                yield broken_rule(f"{where}.of", found=f"'{made.of}'", expected=expected, mend="Name one of them.")
+                yield broken_rule(f"{where}.of", f"'{made.of}'", expected, "Name one of them.")
             if name in self.avs:
-                yield broken_rule(where, found="a name that avs has, too", expected="another", mend="Rename it.")
+                yield broken_rule(where, "a name that avs has, too", "another", "Rename it.")
         if self.pairs and method != "shells":
             expected = "method shells: it compares on drawn cut-ins"
-            yield broken_rule("pairs", found=f"pairs for {method}", expected=expected, mend="Delete them.")
+            yield broken_rule("pairs", f"pairs for {method}", expected, "Delete them.")
         known = [*self.holding, *(name for name, made in self.adversaries.items() if made.of in self.holding)]
         for name, pair in self.pairs.items():
             for side, asked in (("a", pair.a), ("b", pair.b)):
                 if asked not in known:
                     yield broken_rule(
                         f"pairs.{name}.{side}",
-                        found=f"'{asked}'",
-                        expected=f"a vehicle that holds its speed before the cut-in: {', '.join(known)}",
-                        mend="Name one of them; `harness compare` takes no others under shells.",
+                        f"'{asked}'",
+                        f"a vehicle that holds its speed before the cut-in: {', '.join(known)}",
+                        "Name one of them; `harness compare` takes no others under shells.",
                     )
 
     def _about_vehicles(self) -> Iterator[PydanticCustomError]:
@@ -187,26 +187,26 @@ class Experiment(Section):
         if self.campaign.world.engine != "twin":
             yield broken_rule(
                 "campaign.world.engine",
-                found=self.campaign.world.engine,
-                expected="twin: thousands of replications are not affordable in SUMO, whose records the twin's equal",
-                mend="Leave the key out.",
+                self.campaign.world.engine,
+                "twin: thousands of replications are not affordable in SUMO, whose records the twin's equal",
+                "Leave the key out.",
             )
         for name, av in self.avs.items():
             built_in, acts = isinstance(av.parameters, BuiltInParameters), av.acts_before_cut_in
             if not (built_in or (av.source in ("controller", "fmu") and acts)):
                 yield broken_rule(
                     f"avs.{name}",
-                    found=f"an AV that av.{av.source} drives" + ("" if acts else " from the cut-in on"),
-                    expected="a built-in model (idm, fvdm, constant), or a controller with before_cut_in controller: "
+                    f"an AV that av.{av.source} drives" + ("" if acts else " from the cut-in on"),
+                    "a built-in model (idm, fvdm, constant), or a controller with before_cut_in controller: "
                     "replications run in the twin",
-                    mend="Leave it out here, and test it in SUMO with `harness run`.",
+                    "Leave it out here, and test it in SUMO with `harness run`.",
                 )
             if acts and (built_in or self.campaign.testing.method != "shells"):
                 yield broken_rule(
                     f"avs.{name}.before_cut_in",
-                    found=av.before_cut_in,
-                    expected="hold_speed, but for a controller with testing.method shells, which walks paths first",
-                    mend="Leave the key out.",
+                    av.before_cut_in,
+                    "hold_speed, but for a controller with testing.method shells, which walks paths first",
+                    "Leave the key out.",
                 )
 
     def _about_the_method(self) -> Iterator[PydanticCustomError]:
@@ -216,16 +216,16 @@ class Experiment(Section):
         if wrong := set(self.results).difference(judged):
             expected = f"for testing.method {method}: {', '.join(sorted(judged))}"
             mend = "Change one of the two."
-            yield broken_rule("estimators", found=", ".join(sorted(wrong)), expected=expected, mend=mend)
+            yield broken_rule("estimators", ", ".join(sorted(wrong)), expected, mend)
         if self.limits and (method != "shells" or self.pairs):
             yield broken_rule(
                 "limits",
-                found="comparisons of two vehicles" if self.pairs else f"testing.method {method}",
-                expected="campaigns of single vehicles by testing.method shells, which alone decide",
-                mend="Delete the key.",
+                "comparisons of two vehicles" if self.pairs else f"testing.method {method}",
+                "campaigns of single vehicles by testing.method shells, which alone decide",
+                "Delete the key.",
             )
         if self.fault is not None and method != "shells":
-            yield broken_rule("fault", found=f"a wrong shell for {method}", expected="method shells", mend="Delete it.")
+            yield broken_rule("fault", f"a wrong shell for {method}", "method shells", "Delete it.")
 
 
 def load_experiment(path: Path, overrides: Sequence[str] = ()) -> Experiment:
@@ -244,10 +244,7 @@ def load_experiment(path: Path, overrides: Sequence[str] = ()) -> Experiment:
         return experiment
     file = (path.parent / library).resolve()
     if not file.is_file():
-        raise CampaignError(
-            f"{path}: campaign.pool.library",
-            found=f"{library}, but there is no file {file}",
-            expected="a surrogate library, or the name of a shipped one",
-            mend="Correct the path; it is relative to the folder of the experiment.",
-        )
+        expected = "a surrogate library, or the name of a shipped one"
+        mend = "Correct the path; it is relative to the folder of the experiment."
+        raise CampaignError(f"{path}: campaign.pool.library", f"{library}, but there is no file {file}", expected, mend)
     return experiment.replaced(("campaign", "pool", "library"), str(file))

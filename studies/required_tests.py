@@ -254,12 +254,10 @@ def required_tests_of_runs(
 def _read(folder: Path, *, with_ratios: bool) -> _Run:
     method = load_campaign(folder / "campaign.yaml", check_files=False).testing.method
     if method == "shells":
-        raise HarnessError(
-            str(folder),
-            found="tests drawn from shells, of which each has its own probability",
-            expected="tests that can change places: drawn by nde, forced, step_mixture or episode_mixture",
-            mend="For shells the number of tests is what the run itself needed: see docs/shells.md.",
-        )
+        found = "tests drawn from shells, of which each has its own probability"
+        expected = "tests that can change places: drawn by nde, forced, step_mixture or episode_mixture"
+        mend = "For shells the number of tests is what the run itself needed: see docs/shells.md."
+        raise HarnessError(str(folder), found, expected, mend)
     weights, failed, kept, sample, n = [], [], [], None, 0
     for block in stored_blocks(folder, moments=with_ratios):
         sample = sample or block
@@ -270,7 +268,7 @@ def _read(folder: Path, *, with_ratios: bool) -> _Run:
         if with_ratios and Scv.refusal(block) is None:
             kept.append(block)
     if sample is None:
-        raise HarnessError(str(folder), found="no tests on record", expected="a run", mend="Run the campaign first.")
+        raise HarnessError(str(folder), "no tests on record", "a run", "Run the campaign first.")
     return _Run(n, np.concatenate(weights), np.concatenate(failed), sample, joined(kept) if kept else None)
 
 

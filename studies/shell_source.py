@@ -194,12 +194,9 @@ def leave_out(library: Library, names: set[str], careful_first: tuple[str, ...])
         candidates = [*reversed(careful_first[:place]), *careful_first[place + 1 :]]
         left = [name for name in candidates if name not in names and name != library.envelope]
         if not left:
-            raise CampaignError(
-                "campaign.pool.library",
-                found=f"no surrogate but the envelope, without the vehicle's equals ({', '.join(sorted(names))})",
-                expected="one that can be the boundary",
-                mend="Add a surrogate to the library, or leave this vehicle out of the experiment.",
-            )
+            found = f"no surrogate but the envelope, without the vehicle's equals ({', '.join(sorted(names))})"
+            mend = "Add a surrogate to the library, or leave this vehicle out of the experiment."
+            raise CampaignError("campaign.pool.library", found, "one that can be the boundary", mend)
         library = library.model_copy(update={"boundary": left[0]})
     return library.without(names)
 

@@ -109,12 +109,9 @@ class Drivers:
             parameters += [cast(BuiltInParameters, av.parameters)] * len(shares)
             reactions += reflexes
         if len(parameters) > MOST_DRIVERS:
-            raise CampaignError(
-                "avs",
-                found=f"{len(parameters)} drivers with the library's {len(models)}",
-                expected=f"at most {MOST_DRIVERS}",
-                mend="Divide the experiment; an inattentive vehicle counts as two.",
-            )
+            found = f"{len(parameters)} drivers with the library's {len(models)}"
+            mend = "Divide the experiment; an inattentive vehicle counts as two."
+            raise CampaignError("avs", found, f"at most {MOST_DRIVERS}", mend)
         enclosed = all(acceleration_limit(av) <= library.envelope_mps2 for av in avs.values())
         envelope = list(library.surrogates).index(library.envelope) if enclosed else NO_ENVELOPE
         records = driver_records(parameters, reactions, see_onset=see_onset)

@@ -66,9 +66,9 @@ def drivers_crash(episodes: pa.Table, seed: int, environment: Environment, follo
     if wrong >= 0:
         raise RunFolderError(
             f"episodes, episode {stored.first + wrong}",
-            found=f"maneuvers that do not lead to a cut-in in step {stored.cut_step[wrong]}",
-            expected="the maneuvers that were driven: they determine the episode",
-            mend=MEND_SHARD,
+            f"maneuvers that do not lead to a cut-in in step {stored.cut_step[wrong]}",
+            "the maneuvers that were driven: they determine the episode",
+            MEND_SHARD,
         )
     found: BoolArray = ((bits[:, None] >> np.arange(followers.drivers.size)) & 1).astype(np.bool_)
     return found
@@ -82,10 +82,10 @@ class SurrogateReplay:
         if pool.environment != (own := environment_hash(self._environment)):
             raise CampaignError(
                 "pool",
-                found=f"a pool of another environment ({pool.environment})",
-                expected=f"one of the campaign's ({own}): crash rates of surrogates depend on traffic, level of lane "
+                f"a pool of another environment ({pool.environment})",
+                f"one of the campaign's ({own}): crash rates of surrogates depend on traffic, level of lane "
                 "changing and hold time",
-                mend="Leave the pool out: the right one is built, which takes about 15 s.",
+                "Leave the pool out: the right one is built, which takes about 15 s.",
             )
         names = list(pool.library.surrogates)
         self._followers = pool.library.followers_in(self._environment)

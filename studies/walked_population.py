@@ -142,9 +142,7 @@ def _crashes(
 
 def _require_none_failed(resolved: Resolved, n_failed: int, n: int, what: str) -> None:
     if n_failed:
-        raise HarnessError(
-            f"avs: {resolved.campaign.av.controller or resolved.campaign.av.fmu}",
-            found=f"{n_failed:,} of {n:,} {what} failed",
-            expected="none: what a vehicle would have done is not known, and so neither is its crash rate",
-            mend="Mend the vehicle (`harness av-check` looks at it in seconds), or leave it out of the experiment.",
-        )
+        where = f"avs: {resolved.campaign.av.controller or resolved.campaign.av.fmu}"
+        expected = "none: what a vehicle would have done is not known, and so neither is its crash rate"
+        mend = "Mend the vehicle (`harness av-check` looks at it in seconds), or leave it out of the experiment."
+        raise HarnessError(where, f"{n_failed:,} of {n:,} {what} failed", expected, mend)

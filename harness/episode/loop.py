@@ -263,9 +263,7 @@ class EpisodeLoop:
 
 def _disagreement(cell: np.void, contact: bool) -> WorldDisagreementError:
     """SUMO's own collision flag and the crash criterion must name the same cells."""
-    return WorldDisagreementError(
-        f"episode {cell['episode']}, step {cell['step']}",
-        found="a collision that the positions do not show" if contact else "no collision where the positions show one",
-        expected="a collision exactly when bumpers overlap by more than 1 mm",
-        mend="Please report this episode: its campaign.yaml and index reproduce it.",
-    )
+    found = "a collision that the positions do not show" if contact else "no collision where the positions show one"
+    expected = "a collision exactly when bumpers overlap by more than 1 mm"
+    mend = "Please report this episode: its campaign.yaml and index reproduce it."
+    return WorldDisagreementError(f"episode {cell['episode']}, step {cell['step']}", found, expected, mend)

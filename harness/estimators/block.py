@@ -248,7 +248,7 @@ def block_from_tables(
 
 
 def _damaged(where: str, found: str, expected: str) -> RunFolderError:
-    return RunFolderError(where, found=found, expected=expected, mend=MEND_SHARD)
+    return RunFolderError(where, found, expected, MEND_SHARD)
 
 
 def _integers(table: pa.Table, name: str) -> IntArray:
@@ -271,12 +271,9 @@ def _nested(table: pa.Table, name: str, width: int) -> FloatArray:
     column = table.column(name).combine_chunks()
     values = np.asarray(column.flatten().to_numpy(zero_copy_only=False), dtype=np.float64)
     if len(values) != table.num_rows * width:
-        raise RunFolderError(
-            f"column {name}",
-            found=f"{len(values)} numbers in {table.num_rows} rows",
-            expected=f"{width} in each row, one per importance function of the campaign",
-            mend="The records belong to another campaign or are damaged. " + MEND_SHARD,
-        )
+        expected = f"{width} in each row, one per importance function of the campaign"
+        mend = "The records belong to another campaign or are damaged. " + MEND_SHARD
+        raise RunFolderError(f"column {name}", f"{len(values)} numbers in {table.num_rows} rows", expected, mend)
     return values.reshape(table.num_rows, width)
 
 

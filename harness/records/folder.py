@@ -83,12 +83,8 @@ def require_place(folder: Path, *, mend: str = "Choose another place, or change 
         with _made(folder):
             tempfile.TemporaryFile(dir=folder).close()
     except OSError as error:
-        raise RunFolderError(
-            str(folder),
-            found=f"a place where nothing can be written ({error.strerror})",
-            expected="a folder, or a place where one can be made",
-            mend=mend,
-        ) from error
+        found = f"a place where nothing can be written ({error.strerror})"
+        raise RunFolderError(str(folder), found, "a folder, or a place where one can be made", mend) from error
 
 
 @contextmanager
@@ -121,12 +117,9 @@ def _lock(handle: int, folder: Path) -> None:
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
-        raise RunFolderError(
-            str(folder),
-            found="a folder into which another process is running a campaign",
-            expected="a folder for this process alone",
-            mend="Wait for the other one, or end it, or choose another folder with --out.",
-        ) from None
+        found = "a folder into which another process is running a campaign"
+        mend = "Wait for the other one, or end it, or choose another folder with --out."
+        raise RunFolderError(str(folder), found, "a folder for this process alone", mend) from None
     except OSError:
         pass  # some network file systems cannot lock a folder
 
@@ -196,31 +189,23 @@ def concatenated(tables: Sequence[pa.Table], folder: Path) -> pa.Table:
         mixed = [f"{name} as {' and '.join(sorted(found))}" for name, found in types.items() if len(found) > 1]
         raise RunFolderError(
             str(folder),
-            found=f"shards of different types: {'; '.join(mixed) or error}",
-            expected="records that one version of the harness has written",
-            mend="Run the campaign again into a new folder.",
+            f"shards of different types: {'; '.join(mixed) or error}",
+            "records that one version of the harness has written",
+            "Run the campaign again into a new folder.",
         ) from error
 
 
 def damaged(path: Path, error: Exception) -> RunFolderError:
     """What to say of a Parquet file of a run that cannot be read."""
     missing = isinstance(error, FileNotFoundError)
-    return RunFolderError(
-        str(path),
-        found="no such file" if missing else f"a file that cannot be read ({str(error).splitlines()[0]})",
-        expected="a complete Parquet file of this run",
-        mend=MEND_SHARD,
-    )
+    found = "no such file" if missing else f"a file that cannot be read ({str(error).splitlines()[0]})"
+    return RunFolderError(str(path), found, "a complete Parquet file of this run", MEND_SHARD)
 
 
 def no_episodes(folder: Path) -> RunFolderError:
     """What to say of a run that was ended before its first shard was finished."""
-    return RunFolderError(
-        str(folder),
-        found="a run that has not finished an episode yet",
-        expected="episodes on record",
-        mend="Let `harness run` go on with --resume.",
-    )
+    found = "a run that has not finished an episode yet"
+    return RunFolderError(str(folder), found, "episodes on record", "Let `harness run` go on with --resume.")
 
 
 def read_manifest(folder: Path, *, mend: str = NO_RUN) -> dict[str, Any]:
@@ -231,12 +216,12 @@ def read_manifest(folder: Path, *, mend: str = NO_RUN) -> dict[str, Any]:
     path = folder / MANIFEST
     if not path.exists():
         expected = "a run folder, which holds a manifest.json"
-        raise RunFolderError(str(path), found="no such file: this is no run folder", expected=expected, mend=mend)
+        raise RunFolderError(str(path), "no such file: this is no run folder", expected, mend)
     content = read_as(StoredManifest, path, mend=mend).model_dump(exclude_unset=True)
     if kind := next((kind for kind in ("part", "plan") if content.get(kind)), None):
         version = (content.get("versions") or {}).get("harness", "that made it")
         again = f"Bring the parts together with version {version}, or run the campaign.yaml again into a new folder."
-        raise RunFolderError(str(folder), found=f"a {kind} of a run", expected="a whole run", mend=again)
+        raise RunFolderError(str(folder), f"a {kind} of a run", "a whole run", again)
     return content
 
 
@@ -245,13 +230,13 @@ def read_as(kind: type[T], path: Path, *, mend: str) -> T:
     try:
         return TypeAdapter(kind).validate_json(path.read_bytes(), strict=True)
     except FileNotFoundError:
-        raise RunFolderError(str(path), found="no such file", expected="a JSON file of a run", mend=mend) from None
+        raise RunFolderError(str(path), "no such file", "a JSON file of a run", mend) from None
     except OSError as error:
-        raise RunFolderError(str(path), found=str(error), expected="a JSON file of a run", mend=mend) from error
+        raise RunFolderError(str(path), str(error), "a JSON file of a run", mend) from error
     except ValidationError as error:
         first, *others = error.errors(include_url=False)
         where = ".".join(map(str, first["loc"])) or "content"
         more = f", and {len(others)} more that do not fit" if others else ""
         found = f"no key {where}" if first["type"] == "missing" else f"{where} {shortened(repr(first['input']), 60)}"
         expected = f"what a run has written: {first['msg'][:1].lower()}{first['msg'][1:]}"
-        raise RunFolderError(str(path), found=found + more, expected=expected, mend=mend) from None
+        raise RunFolderError(str(path), found + more, expected, mend) from None

@@ -62,12 +62,8 @@ def read_shard(
     files = shard["files"]
     episodes = read_table(folder / files["episodes"], episode_columns)
     if episodes.num_rows != shard["n_episodes"]:
-        raise RunFolderError(
-            str(folder / files["episodes"]),
-            found=f"{episodes.num_rows} rows",
-            expected=f"{shard['n_episodes']} rows (manifest.json)",
-            mend=MEND_SHARD,
-        )
+        expected = f"{shard['n_episodes']} rows (manifest.json)"
+        raise RunFolderError(str(folder / files["episodes"]), f"{episodes.num_rows} rows", expected, MEND_SHARD)
     moments = None
     if "moments" in files and moment_columns != []:
         moments = read_table(folder / files["moments"], moment_columns)
@@ -147,12 +143,8 @@ class StoredRun:
             raise no_episodes(self.folder)
         asked = None if columns is None else set(columns) - {_WEIGHT.name}
         if unknown := sorted((asked or set()) - kept):
-            raise RunFolderError(
-                str(self.folder),
-                found=f"no column {unknown[0]!r} in episodes",
-                expected=f"one of {', '.join(sorted(kept))}",
-                mend="Correct its name.",
-            )
+            found = f"no column {unknown[0]!r} in episodes"
+            raise RunFolderError(str(self.folder), found, f"one of {', '.join(sorted(kept))}", "Correct its name.")
         needed = None if asked is None else sorted(asked | {"log_weight", "component"})
         shards = read_shards(self.folder, episode_columns=needed, moment_columns=[])
         table = concatenated([episodes for episodes, _ in shards], self.folder)
@@ -176,12 +168,8 @@ class StoredRun:
         shards = read_manifest(self.folder)["shards"]
         tables = [read_table(self.folder / shard["files"][name]) for shard in shards if shard["files"].get(name)]
         if not tables:
-            raise RunFolderError(
-                str(self.folder),
-                found=f"no {name}",
-                expected=f"a run whose campaign kept {name}",
-                mend=f"Run it into another folder with --set records.{name}=all.",
-            )
+            mend = f"Run it into another folder with --set records.{name}=all."
+            raise RunFolderError(str(self.folder), f"no {name}", f"a run whose campaign kept {name}", mend)
         table = concatenated(tables, self.folder)
         return _described(table.to_pandas(), table.schema)
 

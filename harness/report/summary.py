@@ -193,12 +193,9 @@ def _read_campaign(path: Path) -> Campaign:
     try:
         return load_campaign(path, check_files=False)
     except CampaignError as error:
-        raise RunFolderError(
-            str(path),
-            found=error.found if error.where == str(path) else f"{error.found} ({error.where})",
-            expected="a campaign with all its sections, as the run has written it",
-            mend="Restore the file, or run the campaign again.",
-        ) from error
+        found = error.found if error.where == str(path) else f"{error.found} ({error.where})"
+        expected = "a campaign with all its sections, as the run has written it"
+        raise RunFolderError(str(path), found, expected, "Restore the file, or run the campaign again.") from error
 
 
 def _read_estimates(folder: Path, campaign_hash: str) -> StoredEstimates:
@@ -207,10 +204,10 @@ def _read_estimates(folder: Path, campaign_hash: str) -> StoredEstimates:
     if estimates.campaign_hash != campaign_hash:
         expected = f"those of campaign {campaign_hash} (manifest.json)"
         found = f"estimates of campaign {estimates.campaign_hash}"
-        raise RunFolderError(str(path), found=found, expected=expected, mend=again)
+        raise RunFolderError(str(path), found, expected, again)
     if estimates.headline not in estimates.estimates:
         found = f"headline {estimates.headline!r}, which is not among the estimates"
-        raise RunFolderError(str(path), found=found, expected=f"one of {sorted(estimates.estimates)}", mend=again)
+        raise RunFolderError(str(path), found, f"one of {sorted(estimates.estimates)}", again)
     return estimates
 
 
@@ -221,12 +218,10 @@ def _shells(folder: Path, headline: StoredEstimate) -> ShownShells | None:
         return TypeAdapter(ShownShells).validate_python({**headline.details, "rate": headline.crash_rate})
     except ValidationError as error:
         wrong = error.errors(include_url=False)[0]
-        raise RunFolderError(
-            str(folder / "estimates.json"),
-            found=f"no complete description of shells ({'.'.join(map(str, wrong['loc']))}: {wrong['msg']})",
-            expected="what `harness estimate` writes for a run with testing.method shells",
-            mend=f"Make it again with `harness estimate {folder} --write`.",
-        ) from error
+        found = f"no complete description of shells ({'.'.join(map(str, wrong['loc']))}: {wrong['msg']})"
+        expected = "what `harness estimate` writes for a run with testing.method shells"
+        mend = f"Make it again with `harness estimate {folder} --write`."
+        raise RunFolderError(str(folder / "estimates.json"), found, expected, mend) from error
 
 
 @dataclass(frozen=True, eq=False)
@@ -326,12 +321,9 @@ def _log_tests(per_shell: Counter[int], run: RunFolder) -> FloatArray:
     p_s/n_s add up to Σ p_s c_s; weights p_s would count a shell as often as it was tested.
     """
     if min(per_shell, default=0) < 0:
-        raise RunFolderError(
-            str(run.path / "episodes"),
-            found="a test without shell (component -1)",
-            expected="the shell that each test was drawn from",
-            mend="The records are not those of a run with testing.method shells: run the campaign again.",
-        )
+        expected = "the shell that each test was drawn from"
+        mend = "The records are not those of a run with testing.method shells: run the campaign again."
+        raise RunFolderError(str(run.path / "episodes"), "a test without shell (component -1)", expected, mend)
     return np.log([float(max(per_shell[shell], 1)) for shell in range(max(per_shell, default=-1) + 1)])
 
 
@@ -339,12 +331,9 @@ def _outcome_index(column: pa.Array, run: RunFolder) -> IntArray:
     index = pc.index_in(column.cast(pa.string()), pa.array(OUTCOMES), skip_nulls=True)
     if index.null_count:
         unknown = column.filter(pc.is_null(index))[0].as_py()
-        raise RunFolderError(
-            str(run.path / "episodes"),
-            found="an episode without outcome" if unknown is None else f"the outcome {unknown!r}",
-            expected=f"one of {', '.join(OUTCOMES)}",
-            mend="The records are from another version of the harness: use that version, or run again.",
-        )
+        found = "an episode without outcome" if unknown is None else f"the outcome {unknown!r}"
+        mend = "The records are from another version of the harness: use that version, or run again."
+        raise RunFolderError(str(run.path / "episodes"), found, f"one of {', '.join(OUTCOMES)}", mend)
     return np.asarray(index).astype(np.int64)
 
 

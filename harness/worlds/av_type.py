@@ -132,4 +132,4 @@ def refused(sumo: Mapping[str, str | float], message: str) -> CampaignError:
 
 
 def _wrong(name: str, found: str | float, expected: str, mend: str) -> CampaignError:
-    return CampaignError(f"av.sumo.{name}", found=str(found), expected=expected, mend=mend)
+    return CampaignError(f"av.sumo.{name}", str(found), expected, mend)

@@ -118,9 +118,7 @@ def committed_file(name: str) -> Path:
     """A file of ``sumo_networks/``, from the installed package or from the checkout."""
     path = (_INSTALLED if _INSTALLED.exists() else _CHECKOUT) / name
     if not path.exists():
-        raise CampaignError(
-            str(path), found="no file", expected="the committed network", mend="Reinstall the harness from a checkout."
-        )
+        raise CampaignError(str(path), "no file", "the committed network", "Reinstall the harness from a checkout.")
     return path
 
 

@@ -223,7 +223,5 @@ def _free_port() -> int:
 def _server_program() -> Path:
     program = sumo_program("sumo")
     if program is None:
-        raise CampaignError(
-            "av.traci", found="no SUMO server", expected="the extra 'sumo'", mend="pip install 'harness[sumo]'."
-        )
+        raise CampaignError("av.traci", "no SUMO server", "the extra 'sumo'", "pip install 'harness[sumo]'.")
     return program

@@ -211,9 +211,7 @@ def start_gui(arguments: Sequence[str]) -> Any:
 
     program = sumo_program("sumo-gui")
     if program is None:
-        raise CampaignError(
-            "--gui", found="no sumo-gui", expected="the extra 'sumo'", mend="Install it: pip install 'harness[sumo]'."
-        )
+        raise CampaignError("--gui", "no sumo-gui", "the extra 'sumo'", "Install it: pip install 'harness[sumo]'.")
     display = os.environ.get("DISPLAY")
     if sys.platform.startswith("linux") and not display:
         raise _no_window("no screen (the environment variable DISPLAY is not set)")

@@ -80,12 +80,9 @@ def asked(path: str, made: Mapping[str, Made]) -> dict[str, Any]:
     name, _, key = path.partition(".")
     figures = made[name].result["figures"]
     if key not in figures:
-        raise HarnessError(
-            path,
-            found=f"no figure '{key}' of the step {name}",
-            expected=f"one of {', '.join(figures) or 'none'}",
-            mend="Correct the name in the study; what is finished is kept.",
-        )
+        expected = f"one of {', '.join(figures) or 'none'}"
+        mend = "Correct the name in the study; what is finished is kept."
+        raise HarnessError(path, f"no figure '{key}' of the step {name}", expected, mend)
     found: dict[str, Any] = figures[key]
     return found
 

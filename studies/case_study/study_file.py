@@ -54,9 +54,7 @@ class ControlVariates(Section):
     @model_validator(mode="after")
     def _rises(self) -> Self:
         if self.sizes[0] < 2 or any(a >= b for a, b in pairwise(self.sizes)):
-            raise broken_rule(
-                "sizes", found=f"{self.sizes}", expected="rising numbers from 2 on", mend="Put them in order."
-            )
+            raise broken_rule("sizes", f"{self.sizes}", "rising numbers from 2 on", "Put them in order.")
         return self
 
 
@@ -104,7 +102,7 @@ class Variants(Section):
     def _has_any(self) -> Self:
         if not (self.avs or self.settings or self.each_of):
             found, expected = "no variant", "some under avs, settings or each_of"
-            raise broken_rule("avs", found=found, expected=expected, mend="Name some.")
+            raise broken_rule("avs", found, expected, "Name some.")
         return self
 
 
@@ -183,20 +181,14 @@ class Study(Section):
         for name, step in self.steps.items():
             for key, wanted in inputs_of(step):
                 if wanted not in before:
-                    raise broken_rule(
-                        f"steps.{name}.{key}",
-                        found=f"'{wanted}'",
-                        expected=f"one of the steps above it: {', '.join(before) or 'there is none'}",
-                        mend="Name one of them, or move that step up.",
-                    )
+                    expected = f"one of the steps above it: {', '.join(before) or 'there is none'}"
+                    mend = "Name one of them, or move that step up."
+                    raise broken_rule(f"steps.{name}.{key}", f"'{wanted}'", expected, mend)
                 kind, kinds = self.steps[wanted].kind, _READS[key, step.kind]
                 if kind not in kinds:
-                    raise broken_rule(
-                        f"steps.{name}.{key}",
-                        found=f"'{wanted}', a step of kind {kind}",
-                        expected=f"one of kind {' or '.join(kinds)}",
-                        mend="Name such a step.",
-                    )
+                    found = f"'{wanted}', a step of kind {kind}"
+                    expected = f"one of kind {' or '.join(kinds)}"
+                    raise broken_rule(f"steps.{name}.{key}", found, expected, "Name such a step.")
             before.append(name)
         return self
 
@@ -208,7 +200,7 @@ class Study(Section):
         for key, path in asked:
             if (name := path.partition(".")[0]) not in self.steps:
                 expected = f"one of the steps {', '.join(self.steps)}"
-                raise broken_rule(key, found=f"the step '{name}'", expected=expected, mend="Name one of them.")
+                raise broken_rule(key, f"the step '{name}'", expected, "Name one of them.")
         return self
 
 
@@ -264,11 +256,8 @@ def _placed(step: Step, path: Path, name: str) -> Step:
             continue
         file = (path.parent / named).resolve()
         if not file.is_file():
-            raise CampaignError(
-                f"{path}: steps.{name}.{key}",
-                found=f"{named}, but there is no file {file}",
-                expected=f"a file with {'an experiment' if key == 'experiment' else 'a campaign'}",
-                mend="Correct the path; it is relative to the folder of the study.",
-            )
+            expected = f"a file with {'an experiment' if key == 'experiment' else 'a campaign'}"
+            mend = "Correct the path; it is relative to the folder of the study."
+            raise CampaignError(f"{path}: steps.{name}.{key}", f"{named}, but there is no file {file}", expected, mend)
         step = step.model_copy(update={key: str(file)})
     return step

@@ -58,12 +58,8 @@ def campaign_of(step: TwinTests | Run) -> Campaign:
     bare = (*IN_THE_TWIN, "records.moments=none") if isinstance(step, TwinTests) else ()
     campaign = load_campaign(step.campaign, [*step.set, *bare])
     if isinstance(step, TwinTests) and campaign.testing.method == "shells":
-        raise HarnessError(
-            step.campaign,
-            found="testing.method shells",
-            expected="nde, forced, step_mixture or episode_mixture for a step of kind twin_tests",
-            mend="Make it a step of kind run.",
-        )
+        expected = "nde, forced, step_mixture or episode_mixture for a step of kind twin_tests"
+        raise HarnessError(step.campaign, "testing.method shells", expected, "Make it a step of kind run.")
     return campaign
 
 
@@ -164,12 +160,9 @@ def read_tests(made: Made) -> Tests:
         They were drawn from shells, each with a probability of its own.
     """
     if "n" not in made.result:
-        raise HarnessError(
-            str(made.folder),
-            found="tests drawn from shells, of which each has its own probability",
-            expected="tests that can be averaged: drawn by nde, forced, step_mixture or episode_mixture",
-            mend="Name another step.",
-        )
+        found = "tests drawn from shells, of which each has its own probability"
+        expected = "tests that can be averaged: drawn by nde, forced, step_mixture or episode_mixture"
+        raise HarnessError(str(made.folder), found, expected, "Name another step.")
     return _tests(made.result["n"], read_table(made.folder / CRASHES))
 
 
