@@ -9,8 +9,8 @@ import matplotlib.style
 import pytest
 
 import harness.report
-from harness.report.rate_plots import POOL, answer_plot, convergence_plot, shells_plot
-from harness.report.style import CSS_NAMES, INK, RC, Plot, inline_svg, new_figure, svg, tick_label
+from harness.report.rate_plots import POOL, answer_plot, shells_plot
+from harness.report.style import CSS_NAMES, INK, RC, Plot, inline_svg, new_figure, svg
 from harness.report.summary import StoredEstimates
 from tests.report.made_run import DESIGN
 
@@ -56,14 +56,6 @@ def test_inline_svg_is_themed_text_without_names_or_namespaces():
         assert absent not in markup
 
 
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [(1e-7, "10⁻⁷"), (2e-7, "2·10⁻⁷"), (0.01, "0.01"), (0.5, "0.5"), (1e3, "1000"), (5e4, "5·10⁴"), (1e5, "10⁵")],
-)
-def test_tick_label(value, text):
-    assert tick_label(value) == text
-
-
 def estimates(**rates: tuple[float, float, float] | None) -> StoredEstimates:
     names = ("crash_rate", "ci_low", "ci_high")
     return StoredEstimates(
@@ -104,37 +96,21 @@ def test_intervals_are_drawn_where_they_are_with_the_headline_first():
     assert answer_plot(estimates(scv=None), None) is None
 
 
-@pytest.mark.parametrize(("name", "rows"), [("shells", ["shells", "given library"]), ("shells_refuted", ["shells"])])
-def test_a_refuted_statement_has_no_interval(runs, name, rows):
-    axes = answer_plot(runs[name].estimates, runs[name].shells).figure.axes[0]
-    assert [label.get_text() for label in axes.get_yticklabels()] == rows
-
-
-@pytest.mark.parametrize("name", ["weighted", "shells", "shells_inside_only"])
-def test_legends_lie_outside_the_panels(runs, name):
-    plot = convergence_plot(runs[name].estimates, 0.05)
-    svg(plot)  # lays out
-    for axes in plot.figure.axes:
-        legend = axes.get_legend().get_window_extent()
-        assert legend.y0 >= axes.get_window_extent().y1 - 1.0
-        assert legend.x1 <= plot.figure.bbox.x1
-
-
 def test_the_plot_shows_contributions_and_half_widths(runs):
+    """The latter are what is not known, that of the pool included; a refuted statement has no interval."""
     found = runs["shells"].shells
     rates, widths = shells_plot(found).figure.axes
     assert [label.get_text() for label in rates.get_yticklabels()] == [*DESIGN.strata, POOL]
     assert [bar.get_width() for bar in rates.patches] == [*(s.contribution for s in found.shells), 0.0]
     half_widths = [*(s.half_width for s in found.shells), found.pool_half_width]
     assert [bar.get_width() for bar in widths.patches] == half_widths
+    assert sum(map(found.share_of_uncertainty, half_widths)) == pytest.approx(1.0)
+    for name, rows in (("shells", ["shells", "given library"]), ("shells_refuted", ["shells"])):
+        axes = answer_plot(runs[name].estimates, runs[name].shells).figure.axes[0]
+        assert [label.get_text() for label in axes.get_yticklabels()] == rows
 
 
 def test_a_shell_without_tests_is_said_so_and_runs_out_of_the_plot(runs):
     rates, widths = shells_plot(runs["shells_inside_only"].shells).figure.axes
     assert rates.get_yticklabels()[2].get_text() == "outside\nnot tested: up to 3.00 × 10⁻⁵"
     assert max(rates.get_xlim()[1], widths.get_xlim()[1]) < 1e-6
-
-
-@pytest.mark.parametrize(("name", "orange"), [("shells", False), ("shells_refuted", True)])
-def test_the_caption_names_the_colours_that_are_there(runs, name, orange):
-    assert ("orange" in shells_plot(runs[name].shells).caption) == orange

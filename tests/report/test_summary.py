@@ -10,12 +10,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from harness.estimators.tally import Tally, pool_variance
 from harness.report.crashes import crash_gallery, worst_crashes
 from harness.report.summary import read_run_folder, summarise
 from harness.report.test_plots import binned, edges_for, weighted_quantile
 from harness.vocabulary import CRASH, OUTCOMES
-from tests.report.made_run import DESIGN, PATH_MASS, P
+from tests.report.made_run import P
 from tests.report.test_page import edit
 
 
@@ -78,12 +77,9 @@ def test_bins_hold_every_value_and_are_few(values, most):
     assert bins.counts.size <= max(most, 2)
 
 
-def test_a_value_on_an_edge_belongs_to_the_upper_bin_in_spite_of_rounding():
-    values = 0.1 * np.arange(10)  # of which 0.3 is a little less than its edge
-    assert binned(values, values, 0.1 * np.arange(11)).counts.tolist() == [1.0] * 10
-
-
-def test_weighted_quantile():
+def test_values_on_an_edge_and_weighted_quantiles():
+    tenths = 0.1 * np.arange(10)  # of which 0.3 is a little less than its edge
+    assert binned(tenths, tenths, 0.1 * np.arange(11)).counts.tolist() == [1.0] * 10
     values, weights = np.array([9.0, 1.0, 2.0]), np.array([8.0, 1.0, 1.0])
     assert weighted_quantile(values, weights, 0.5) == 9.0
     assert weighted_quantile(values, weights, 0.15) == 2.0
@@ -100,14 +96,3 @@ def test_weights_of_a_shells_run_add_up_to_the_rate(runs, name):
         assert summary.weight.sum() == pytest.approx(P.sum(), rel=1e-12)
         outside, worst = run.shells.shells[-1], worst_crashes(summary, "component")[0]
         assert (worst.component, worst.weight) == (2, pytest.approx(outside.p / outside.n_episodes, rel=1e-12))
-
-
-def test_shares_of_uncertainty_add_up_and_the_rest_is_the_pool(runs):
-    found = runs["shells_refuted"].shells
-    shells = found.shells
-    tests, crashes = (np.array([getattr(s, name) for s in shells]) for name in ("n_episodes", "n_crashes"))
-    tally = Tally(tests, crashes, 0 * crashes, np.outer(crashes, PATH_MASS), np.zeros((3, 3)))
-    variance = pool_variance(P, tally, DESIGN.n_paths)
-    assert found.pool_half_width == pytest.approx(1.6448536 * variance**0.5, rel=1e-6)
-    widths = [*(s.half_width for s in shells), found.pool_half_width]
-    assert sum(map(found.share_of_uncertainty, widths)) == pytest.approx(1.0)
