@@ -84,12 +84,9 @@ def stored_baseline(folder: Path, paths: ShadowPaths, request: BaselineRequest) 
     table = _read(file)
     rows = slice(request.first_episode, request.first_episode + request.n_episodes)
     if not np.array_equal(table.column("path").to_numpy(), paths.index[rows]):
-        raise RunFolderError(
-            str(file),
-            found="baseline runs on other paths",
-            expected="those of this campaign and this version of the harness",
-            mend="Use a new folder, or the version that the run was begun with (manifest.json).",
-        )
+        expected = "those of this campaign and this version of the harness"
+        mend = "Use a new folder, or the version that the run was begun with (manifest.json)."
+        raise RunFolderError(str(file), "baseline runs on other paths", expected, mend)
     return BaselineResult(request, table, b"", _causes(table))
 
 
@@ -97,7 +94,7 @@ def _read(file: Path) -> pa.Table:
     try:
         return read_table(file)
     except RunFolderError as error:
-        raise RunFolderError(error.where, found=error.found, expected=error.expected, mend=_MEND) from error
+        raise RunFolderError(error.where, error.found, error.expected, _MEND) from error
 
 
 def _causes(table: pa.Table) -> Counter[str]:
@@ -110,9 +107,9 @@ def read_baseline(folder: Path, paths: ShadowPaths, environment: Environment) ->
     if any(done is None for done in found):
         raise RunFolderError(
             str(folder / SHADOW),
-            found=f"baseline runs of {sum(done is not None for done in found)} of {len(found)} files",
-            expected="those of all paths: they say how probable each test is",
-            mend="Let `harness run` go on with --resume.",
+            f"baseline runs of {sum(done is not None for done in found)} of {len(found)} files",
+            "those of all paths: they say how probable each test is",
+            "Let `harness run` go on with --resume.",
         )
     return as_recorded([done.table for done in found if done is not None], environment)
 

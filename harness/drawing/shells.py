@@ -118,12 +118,10 @@ class Shells(Source):
         content = read_as(dict[str, object], folder / SHELLS, mend=_FINISH)
         if "n_inside" in content and "statements" not in content:
             version = read_manifest(folder).get("versions", {}).get("harness", "that made it")
-            raise RunFolderError(
-                str(folder / SHELLS),
-                found="shells of an earlier version, without statements and reference drivers",
-                expected="a run of this version: its tests say what those rest on",
-                mend=f"Run the campaign again into a new folder, or estimate this one with version {version}.",
-            )
+            found = "shells of an earlier version, without statements and reference drivers"
+            expected = "a run of this version: its tests say what those rest on"
+            mend = f"Run the campaign again into a new folder, or estimate this one with version {version}."
+            raise RunFolderError(str(folder / SHELLS), found, expected, mend)
         return read_as(StoredDesign, folder / SHELLS, mend=_FINISH)
 
     def begin_after(self, runs: ShadowRuns) -> None:

@@ -179,3 +179,8 @@ def _described(frame: pd.DataFrame, schema: pa.Schema) -> pd.DataFrame:
     for key in ("unit", "doc"):
         frame.attrs[key] = {name: schema.field(name).metadata[key.encode()].decode() for name in frame.columns}
     return frame
+
+
+def read(folder: str | Path) -> StoredRun:
+    """Tables of a stored run as pandas frames, with units and weights."""
+    return StoredRun(Path(folder))

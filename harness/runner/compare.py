@@ -59,12 +59,12 @@ class Comparison:
 def compare_campaigns(
     a: Campaign,
     b: Campaign,
-    out: Path,
+    out: str | Path,
     *,
     workers: int | None = None,
     progress: Progress | None = None,
     labels: tuple[str, str] | None = None,
-    stored: Path | None = None,
+    stored: str | Path | None = None,
     margin: float | None = None,
 ) -> Comparison:
     """Drive two vehicles on the same cut-ins until the difference, or the margin, is known well enough.
@@ -75,13 +75,13 @@ def compare_campaigns(
     ----------
     a, b : Campaign
         Equal but for ``av``, ``name`` and ``description``.
-    out : Path
+    out : str or Path
         Folder; ``out/a`` and ``out/b`` become run folders.
     workers, progress
         See `harness.runner.run_campaign`.
     labels : (str, str), optional
         Names for the answer; the campaigns' own by default.
-    stored : Path, optional
+    stored : str or Path, optional
         Run folder of A, whose tests are not driven again; it is copied to ``out/a``.
     margin : float, optional
         Decide whether B's rate is at most 1 + margin times A's.
@@ -95,9 +95,10 @@ def compare_campaigns(
     """
     require_comparable(a, b)
     sides = require_ready(a, "compare"), require_ready(b, "compare")
+    out = Path(out)
     folders = out / "a", out / "b"
     if stored is not None:
-        _take_over(stored, folders[0], sides[0])
+        _take_over(Path(stored), folders[0], sides[0])
     for side, folder in zip(sides, folders, strict=True):  # both, before either is touched
         require_own_folder(folder, side, resume=True)
     require_same_shells(sides)
@@ -220,12 +221,9 @@ def _take_over(stored: Path, folder: Path, resolved: Resolved) -> None:
         return
     manifest = read_manifest(stored)
     if manifest["campaign_hash"] != resolved.content_hash:
-        raise RunFolderError(
-            str(stored),
-            found=f"a run of campaign {manifest['campaign_hash']}",
-            expected=f"one of A as it is to be compared ({resolved.content_hash})",
-            mend="Leave out --set and --av where they change more than the stop rule, or name A's campaign file.",
-        )
+        expected = f"one of A as it is to be compared ({resolved.content_hash})"
+        mend = "Leave out --set and --av where they change more than the stop rule, or name A's campaign file."
+        raise RunFolderError(str(stored), f"a run of campaign {manifest['campaign_hash']}", expected, mend)
     require_place(folder.parent)
     folder.parent.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory(dir=folder.parent, prefix=".", suffix=".part") as unfinished:
@@ -241,12 +239,9 @@ def require_comparable(a: Campaign, b: Campaign) -> None:
     if apart := list(_differing("", a.model_dump(exclude=keys), b.model_dump(exclude=keys))):
         where, of_a, of_b = apart[0]
         more = f"; also {', '.join(key for key, _, _ in apart[1:])}" if len(apart) > 1 else ""
-        raise CampaignError(
-            where,
-            found=f"{of_a} in A and {of_b} in B{more}",
-            expected=f"campaigns that differ in {', '.join(sorted(keys))} only: pairs of episodes need equal settings",
-            mend=f"Make them equal, e.g. with --set {where}=…, which holds for both.",
-        )
+        expected = f"campaigns that differ in {', '.join(sorted(keys))} only: pairs of episodes need equal settings"
+        mend = f"Make them equal, e.g. with --set {where}=…, which holds for both."
+        raise CampaignError(where, f"{of_a} in A and {of_b} in B{more}", expected, mend)
 
 
 def _differing(prefix: str, a: Any, b: Any) -> Iterator[tuple[str, Any, Any]]:
@@ -264,9 +259,7 @@ def require_same_shells(sides: Both) -> None:
     limits = [acceleration_limit(of_side.campaign.av) for of_side in sides]
     envelope = sides[0].library.envelope_mps2
     if (limits[0] > envelope) != (limits[1] > envelope):
-        raise CampaignError(
-            "av",
-            found=f"a hardest acceleration of {limits[0]:g} m/s² in A and {limits[1]:g} m/s² in B",
-            expected=f"both up to {envelope:g} m/s², the envelope of the surrogate library, or both above",
-            mend=f"Limit both (av.limits.max_acceleration_mps2: {envelope:g}), or neither.",
-        )
+        found = f"a hardest acceleration of {limits[0]:g} m/s² in A and {limits[1]:g} m/s² in B"
+        expected = f"both up to {envelope:g} m/s², the envelope of the surrogate library, or both above"
+        mend = f"Limit both (av.limits.max_acceleration_mps2: {envelope:g}), or neither."
+        raise CampaignError("av", found, expected, mend)

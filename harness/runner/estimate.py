@@ -28,7 +28,7 @@ _Shards = Sequence[Mapping[str, Any]]
 
 
 def estimate_run(
-    folder: Path,
+    folder: str | Path,
     *,
     estimators: Sequence[EstimatorName] | None = None,
     confidence: float | None = None,
@@ -37,7 +37,7 @@ def estimate_run(
 
     Parameters
     ----------
-    folder : Path
+    folder : str or Path
         Run folder with ``manifest.json``, ``campaign.yaml`` and shards.
     estimators : sequence of str, optional
         Which to report beside the method's own; all by default.
@@ -136,4 +136,4 @@ def _groups(shards: _Shards) -> Iterator[_Shards]:
 
 
 def _incomplete(folder: Path, found: str, expected: str) -> RunFolderError:
-    return RunFolderError(str(folder), found=found, expected=expected, mend=_FINISH)
+    return RunFolderError(str(folder), found, expected, _FINISH)

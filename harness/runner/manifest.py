@@ -86,9 +86,9 @@ def require_few_failed(
         cause = "".join(f", {n_such} of them with: {why}" for why, n_such in causes.most_common(1))
         raise TooManyFailedError(
             "run.max_failed_share",
-            found=f"{n_failed} of {n} {what} failed{cause}",
-            expected=f"a share of at most {most:g}",
-            mend="Mend the AV (`harness av-check` looks at it in seconds), or raise the share to go on. All causes "
+            f"{n_failed} of {n} {what} failed{cause}",
+            f"a share of at most {most:g}",
+            "Mend the AV (`harness av-check` looks at it in seconds), or raise the share to go on. All causes "
             f"are in the column 'failure' of {where}.",
         )
 

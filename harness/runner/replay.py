@@ -43,18 +43,20 @@ class ReplayResult:
     suspects: str | None = None
 
 
-def replay_episode(folder: Path, episode: int, *, gui: bool = False, fcd: Path | None = None) -> ReplayResult:
+def replay_episode(
+    folder: str | Path, episode: int, *, gui: bool = False, fcd: str | Path | None = None
+) -> ReplayResult:
     """Replay an episode of a run; a user's own code in a process of its own.
 
     Parameters
     ----------
-    folder : Path
+    folder : str or Path
         Run folder.
     episode : int
         Index in the campaign.
     gui : bool
         Show it in sumo-gui (extra ``harness[sumo]``).
-    fcd : Path, optional
+    fcd : str or Path, optional
         Write SUMO's floating-car data to this file.
 
     Raises
@@ -66,18 +68,16 @@ def replay_episode(folder: Path, episode: int, *, gui: bool = False, fcd: Path |
     HarnessError
         SUMO's system libraries are missing.
     """
+    folder, fcd = Path(folder), None if fcd is None else Path(fcd)
     manifest = read_manifest(folder)
     _require_reproducible(manifest)
     stored = _stored(folder, manifest, episode)
     campaign = load_campaign(folder / "campaign.yaml")
     resolved = resolve(campaign)
     if resolved.content_hash != manifest["campaign_hash"]:
-        raise CampaignError(
-            str(folder / "campaign.yaml"),
-            found=f"campaign {resolved.content_hash}",
-            expected=f"campaign {manifest['campaign_hash']}, which made the records",
-            mend="Restore campaign.yaml and the environment parameter file that it names.",
-        )
+        expected = f"campaign {manifest['campaign_hash']}, which made the records"
+        mend = "Restore campaign.yaml and the environment parameter file that it names."
+        raise CampaignError(str(folder / "campaign.yaml"), f"campaign {resolved.content_hash}", expected, mend)
     if gui or fcd is not None:
         require_libraries()
     else:
@@ -138,18 +138,15 @@ def _require_reproducible(manifest: dict[str, Any]) -> None:
     if repeated:
         raise CampaignError(
             "av",
-            found=f"a run that is not reproducible: {len(repeated['differing'])} of {repeated['n_episodes']} tests "
+            f"a run that is not reproducible: {len(repeated['differing'])} of {repeated['n_episodes']} tests "
             "that it repeated itself came out otherwise",
-            expected="an AV that does the same again, given the same observations and the same random stream",
-            mend="Draw only from the generator handed over in start, and keep nothing across episodes (`harness "
+            "an AV that does the same again, given the same observations and the same random stream",
+            "Draw only from the generator handed over in start, and keep nothing across episodes (`harness "
             "av-check` tells whether that is so). The traces that the run has kept are what happened.",
         )
-    raise CampaignError(
-        "av.traci",
-        found="a run that is not reproducible: a program outside of the harness drove the AV",
-        expected="an AV that does the same again: model, controller, sumo or fmu",
-        mend="Look at the traces that the run has kept (records.traces: crash), or let the program write a log.",
-    )
+    found = "a run that is not reproducible: a program outside of the harness drove the AV"
+    mend = "Look at the traces that the run has kept (records.traces: crash), or let the program write a log."
+    raise CampaignError("av.traci", found, "an AV that does the same again: model, controller, sumo or fmu", mend)
 
 
 def _world(campaign: Campaign, *, gui: bool, fcd: Path | None) -> World:
@@ -169,12 +166,8 @@ def _stored(folder: Path, manifest: dict[str, Any], episode: int) -> dict[str, p
             return {name: table.filter(pc.equal(table["episode"], episode)) for name, table in tables.items()}
     if not manifest["n_episodes"]:
         raise no_episodes(folder)
-    raise RunFolderError(
-        str(folder),
-        found=f"no episode {episode}",
-        expected=f"an index from 0 to {manifest['n_episodes'] - 1}",
-        mend="The report and the episodes table list the episodes of interest.",
-    )
+    mend = "The report and the episodes table list the episodes of interest."
+    raise RunFolderError(str(folder), f"no episode {episode}", f"an index from 0 to {manifest['n_episodes'] - 1}", mend)
 
 
 def _equal(again: pa.Table, stored: pa.Table) -> bool:

@@ -38,7 +38,7 @@ def require_own_folder(folder: Path, resolved: Resolved, *, resume: bool) -> dic
     """
 
     def refusal(found: str, expected: str, mend: str) -> RunFolderError:
-        return RunFolderError(str(folder), found=found, expected=expected, mend=mend)
+        return RunFolderError(str(folder), found, expected, mend)
 
     require_place(folder)
     if not folder.exists() or not any(folder.iterdir()):
@@ -69,12 +69,10 @@ def require_own_folder(folder: Path, resolved: Resolved, *, resume: bool) -> dic
 def require_no_fewer(folder: Path, earlier: dict[str, Any], n_episodes: int) -> None:
     """Refuse (`RunFolderError`) to throw away finished tests, which the stop rule asked for now would not keep."""
     if n_episodes < (held := earlier["n_episodes"]):
-        raise RunFolderError(
-            str(folder),
-            found=f"{held:,} finished tests, of which the campaign as it is asked for now would keep {n_episodes:,}",
-            expected="a stop rule (stop.rhw, stop.episodes) that needs at least the tests that are there",
-            mend="Repeat the --set options of the earlier run or ask for more; `harness estimate` reads what is there.",
-        )
+        found = f"{held:,} finished tests, of which the campaign as it is asked for now would keep {n_episodes:,}"
+        expected = "a stop rule (stop.rhw, stop.episodes) that needs at least the tests that are there"
+        mend = "Repeat the --set options of the earlier run or ask for more; `harness estimate` reads what is there."
+        raise RunFolderError(str(folder), found, expected, mend)
 
 
 def require_same_pool(folder: Path, source: Source) -> None:
@@ -88,12 +86,9 @@ def require_same_pool(folder: Path, source: Source) -> None:
     if (
         found := read_as(dict[str, object], path, mend="Run the campaign into a new folder.").get("pool")
     ) != design.pool:
-        raise RunFolderError(
-            str(path),
-            found=f"cut-ins of pool {found}",
-            expected=f"those of pool {design.pool}, which this campaign now has",
-            mend="Restore the surrogate library, or the version of the harness (manifest.json), or use a new folder.",
-        )
+        expected = f"those of pool {design.pool}, which this campaign now has"
+        mend = "Restore the surrogate library, or the version of the harness (manifest.json), or use a new folder."
+        raise RunFolderError(str(path), f"cut-ins of pool {found}", expected, mend)
 
 
 def stored_shard(folder: Path, source: Source, retracing: Retracing, request: ShardRequest) -> ShardResult | None:

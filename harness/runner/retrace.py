@@ -56,12 +56,10 @@ class Retracing:
         for column, (wrong, in_sumo, in_twin) in differing.items():
             if wrong.any():
                 row = int(np.argmax(wrong))
-                raise WorldDisagreementError(
-                    f"episode {stored.first + row}, {column}",
-                    found=f"{in_sumo[row]} in SUMO",
-                    expected=f"{in_twin[row]}, to the last bit: the twin retraced its maneuvers",
-                    mend="Please report this episode: its campaign.yaml and index reproduce it.",
-                )
+                where = f"episode {stored.first + row}, {column}"
+                expected = f"{in_twin[row]}, to the last bit: the twin retraced its maneuvers"
+                mend = "Please report this episode: its campaign.yaml and index reproduce it."
+                raise WorldDisagreementError(where, f"{in_sumo[row]} in SUMO", expected, mend)
         return n
 
     def summary(self, n: int) -> dict[str, Any]:

@@ -68,7 +68,7 @@ class RunResult:
 
 def run_campaign(
     campaign: Campaign | Resolved,
-    out: Path,
+    out: str | Path,
     *,
     workers: int | None = None,
     resume: bool = False,
@@ -80,7 +80,7 @@ def run_campaign(
     ----------
     campaign : Campaign or Resolved
         The latter from `require_ready`.
-    out : Path
+    out : str or Path
         New, empty, or (with ``resume``) the folder of this campaign.
     workers : int, optional
         Worker processes; as many as there are cores by default. Never changes a result.
@@ -93,7 +93,7 @@ def run_campaign(
     HarnessError
         The campaign, the folder or the AV is at fault; nothing that was finished is lost.
     """
-    resolved = campaign if isinstance(campaign, Resolved) else require_ready(campaign)
+    resolved, out = campaign if isinstance(campaign, Resolved) else require_ready(campaign), Path(out)
     with sole_use(out):
         earlier = require_own_folder(out, resolved, resume=resume)
         require_no_fewer(out, earlier, resolved.campaign.stop.episodes)
