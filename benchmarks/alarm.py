@@ -26,8 +26,7 @@ from harness.resolved import resolve
 from harness.runner.resolve import prepare
 from harness.vocabulary import BoolArray, FloatArray, IntArray, Method
 from harness.worlds.twin import TwinWorld
-from studies.alarm import LEVEL, Alarm, KnownRates
-from studies.surrogate_replay import SurrogateReplay
+from studies.alarm import LEVEL, Alarm, KnownRates, SurrogateReplay
 
 SEED = 77
 TESTS, MOST = 20_000, 50_000

@@ -27,7 +27,7 @@ from harness.pool.shells import design_shells
 from harness.pool.storage import campaign_pool
 from harness.resolved import resolve
 from harness.vocabulary import FloatArray
-from studies.shell_campaign import DrawnPool, campaign_block
+from studies.replication.shells import DrawnPool, campaign_block
 
 WORKERS = (8, 64, 512)
 TEST_S = (0.01, 1.0, 20.0)

@@ -15,7 +15,7 @@ from harness.estimators.block import Block
 from harness.estimators.estimate import Estimate
 from harness.estimators.scv import Scv
 from harness.estimators.weighted import Nade
-from studies.chains.named import frequent_decisive, rare_decisive
+from studies.chains.chain import frequent_decisive, rare_decisive
 from studies.chains.sampler import draw
 
 SETTINGS = [(frequent_decisive, 2_000), (frequent_decisive, 20_000), (rare_decisive, 2_000), (rare_decisive, 20_000)]

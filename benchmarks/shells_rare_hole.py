@@ -19,7 +19,7 @@ from harness.campaign.files import load_campaign
 from harness.pool.shells import design_shells
 from harness.pool.storage import campaign_pool
 from harness.resolved import resolve
-from studies.shell_campaign import FREE, DrawnPool, ShellCampaign
+from studies.replication.shells import FREE, DrawnPool, ShellCampaign
 
 IDM = {"brakes-8": 1.0, "brakes-5": 1.0, "brakes-3": 0.362}
 """Crash shares of the default IDM inside: in the run of docs/limits.md 1,086 of 3,000 tests crashed in brakes-3."""

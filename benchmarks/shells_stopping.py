@@ -15,9 +15,9 @@ from pathlib import Path
 from benchmarks.contenders import SCENARIOS
 from harness.campaign.campaign import Campaign
 from harness.campaign.sections import Stop
-from studies.experiment import Experiment, load_experiment
-from studies.run import validate
-from studies.shell_campaign import FREE
+from studies.replication.experiment import Experiment, load_experiment
+from studies.replication.run import validate
+from studies.replication.shells import FREE
 
 BUDGET = 1_000_000
 

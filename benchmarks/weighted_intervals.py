@@ -22,7 +22,7 @@ from harness.estimators.limits import hall_distances, normal_half_width
 from harness.estimators.stopping import StopRule
 from harness.estimators.weighted import Nade
 from harness.vocabulary import CRASH, FloatArray, Method
-from studies.weighted_campaign import twin_episodes
+from studies.replication.weighted import twin_episodes
 
 CONFIDENCE = 0.9
 SEED = 77

@@ -12,17 +12,22 @@ from harness.cli import main as run_main
 from harness.commands.options import CAMPAIGN, FILE, FOLDER, RUN_FOLDER, examples, json_option, quiet_option
 from harness.commands.printing import print_json, print_table
 from harness.errors import WorldDisagreementError
+from harness.progress import shown_progress
 
 if TYPE_CHECKING:
-    from studies.required_tests import RnotEstimator
+    from studies.rnot import RnotEstimator
+
+_ME = "python -m studies"
+_out_option = click.option("--out", "folder", type=FOLDER, required=True, help="Folder of the results; may be new.")
+_workers_option = click.option("--workers", type=click.IntRange(min=1), help="Processes. Default: one per core.")
 
 
 @click.group(
     epilog=examples(
-        "python -m studies validate scenarios/validate/shells_panel.yaml --out runs/shells_panel",
-        "python -m studies case scenarios/case_study/study.yaml --out runs/quick --quick",
-        "python -m studies rnot runs/nde runs/forced",
-        "python -m studies alarm runs/mixture",
+        f"{_ME} validate scenarios/validate/shells_panel.yaml --out runs/shells_panel",
+        f"{_ME} case scenarios/case_study/study.yaml --out runs/quick --quick",
+        f"{_ME} rnot runs/nde runs/forced",
+        f"{_ME} alarm runs/mixture",
     ),
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )
@@ -51,23 +56,17 @@ def cli() -> None:
     )
     + "\n\n"
     + examples(
-        "python -m studies validate scenarios/validate/shells_panel.yaml --out runs/shells_panel",
-        "python -m studies validate scenarios/validate/shells_panel.yaml --set campaign.stop.confidence=0.99 --out x",
-        "python -m studies validate scenarios/validate/shells_acting.yaml --out runs/acting   # walks paths first",
-        "python -m studies validate scenarios/validate/shells_pairs.yaml --out runs/pairs     # of `compare`",
+        f"{_ME} validate scenarios/validate/shells_panel.yaml --out runs/shells_panel",
+        f"{_ME} validate scenarios/validate/shells_panel.yaml --set campaign.stop.confidence=0.99 --out x",
+        f"{_ME} validate scenarios/validate/shells_acting.yaml --out runs/acting   # walks paths first",
+        f"{_ME} validate scenarios/validate/shells_pairs.yaml --out runs/pairs     # of `compare`",
     ),
 )
 @click.argument("experiment_file", metavar="EXPERIMENT", type=CAMPAIGN)
-@click.option("--out", "folder", type=FOLDER, required=True, help="Folder of the results; made if it is not there.")
+@_out_option
 @click.option("--replications", type=click.IntRange(min=2), help="Instead of the experiment's own number.")
-@click.option(
-    "--set",
-    "overrides",
-    multiple=True,
-    metavar="KEY=VALUE",
-    help="Instead of what the file says, e.g. campaign.stop.confidence=0.99; may be repeated.",
-)
-@click.option("--workers", type=click.IntRange(min=1), help="Processes. Default: one per core.")
+@click.option("--set", "overrides", multiple=True, metavar="KEY=VALUE", help="Instead of what the file says.")
+@_workers_option
 @quiet_option
 @json_option
 def validate(
@@ -89,59 +88,81 @@ def validate(
     Printed is a line per vehicle and result, with the columns below. The folder receives results.json,
     replications.parquet (one row each) and coverage.png.
     """
-    from studies.experiment import load_experiment  # noqa: PLC0415 - keeps --help fast
+    from studies.replication.experiment import load_experiment  # noqa: PLC0415 - keeps --help fast
 
     experiment = load_experiment(experiment_file, overrides)
     if replications is not None:
         experiment = experiment.model_copy(update={"replications": replications})
-    from harness.progress import shown_progress  # noqa: PLC0415 - keeps --help fast
-    from studies.run import RESULTS, table_lines  # noqa: PLC0415 - slow to import: once the file is right
-    from studies.run import validate as repeat  # noqa: PLC0415
+    from studies.replication.run import RESULTS, table_lines  # noqa: PLC0415 - slow to import: once the file is right
+    from studies.replication.run import validate as repeat  # noqa: PLC0415
 
     bar = shown_progress(quiet=quiet)
     with bar:
         judgements = repeat(experiment, folder, workers=workers, progress=bar)
     if as_json:
         print_json([one.to_json() for one in judgements])
-        return
-    for line in table_lines(judgements):
-        click.echo(line)
-    click.echo(str(folder / RESULTS))
+    else:
+        click.echo("\n".join([*table_lines(judgements), str(folder / RESULTS)]))
+
+
+@cli.command(
+    name="case",
+    short_help="Reproduce a paper's case study, and answer its claims.",
+    epilog=examples(
+        f"{_ME} case scenarios/case_study/study.yaml --out runs/quick --quick   # minutes: tiny sizes",
+        f"{_ME} case scenarios/case_study/study.yaml --out runs/case_study      # an hour on two cores",
+    ),
+)
+@click.argument("study_file", metavar="STUDY", type=CAMPAIGN)
+@_out_option
+@click.option("--quick", is_flag=True, help="The sizes of the file's own section quick, too small for conclusions.")
+@_workers_option
+@quiet_option
+@json_option
+def study(study_file: Path, folder: Path, *, quick: bool, workers: int | None, quiet: bool, as_json: bool) -> None:
+    """Make the steps of STUDY that are not in the folder yet, and the page that puts them beside the paper's numbers.
+
+    Each step has a folder of its own under steps/, named after all that it depends on: a second run makes nothing
+    again, a killed one goes on, and a change in the file makes only what it concerns. The folder receives
+    case_study.md, claims.json (the verdicts) and plots/.
+    """
+    from studies.case_study.study import load_study  # noqa: PLC0415 - keeps --help fast
+
+    asked = load_study(study_file, quick=quick)
+    from studies.case_study.steps import run_study  # noqa: PLC0415 - slow to import: once the file is right
+
+    def told(name: str, seconds: float | None) -> None:
+        if not (as_json or quiet):
+            click.echo(f"{name}: " + ("there already" if seconds is None else f"{seconds:.1f} s"))
+
+    bar = shown_progress(quiet=quiet)
+    with bar:
+        done = run_study(asked, folder, workers=workers, progress=bar, told=told)
+    if as_json:
+        print_json({"page": str(done.page), "claims": done.claims, "seconds": done.seconds})
+    else:
+        click.echo(str(done.page))
+
+
+_SHARE = click.FloatRange(0, 1, min_open=True, max_open=True)
 
 
 @cli.command(
     short_help="How many tests the paper's procedure would ask for (RNoT, AAR).",
     epilog=examples(
-        "python -m studies rnot runs/nde runs/forced        # and the acceleration of the second over the first",
-        "python -m studies rnot runs/nade --rhw 0.1 --total 5000   # another threshold, and end of the grid",
-        "python -m studies rnot runs/nade -e nade -e scv --total 2000 --ratio 1.25   # takes minutes",
+        f"{_ME} rnot runs/nde runs/forced        # and the acceleration of the second over the first",
+        f"{_ME} rnot runs/nade --rhw 0.1 --total 5000   # another threshold, and end of the grid",
+        f"{_ME} rnot runs/nade -e nade -e scv --total 2000 --ratio 1.25   # takes minutes",
     ),
+    context_settings={"show_default": True},
 )
 @click.argument("folders", metavar="RUN...", type=RUN_FOLDER, nargs=-1, required=True)
-@click.option(
-    "--rhw",
-    type=click.FloatRange(0, min_open=True),
-    default=0.3,
-    show_default=True,
-    help="Relative half-width to reach.",
-)
-@click.option(
-    "--confidence",
-    type=click.FloatRange(0, 1, min_open=True, max_open=True),
-    default=0.9,
-    show_default=True,
-    help="Level of the normal interval.",
-)
-@click.option("--shuffles", type=click.IntRange(min=1), default=200, show_default=True, help="Orderings of the tests.")
-@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Seed of the orderings.")
-@click.option("--first", type=click.IntRange(min=2), default=10, show_default=True, help="First look of the grid.")
-@click.option(
-    "--ratio",
-    type=click.FloatRange(1, min_open=True),
-    default=1.05,
-    show_default=True,
-    help="From one look to the next.",
-)
+@click.option("--rhw", type=click.FloatRange(0, min_open=True), default=0.3, help="Relative half-width to reach.")
+@click.option("--confidence", type=_SHARE, default=0.9, help="Level of the normal interval.")
+@click.option("--shuffles", "n_shuffles", type=click.IntRange(min=1), default=200, help="Orderings of the tests.")
+@click.option("--seed", type=click.IntRange(min=0), default=1, help="Seed of the orderings.")
+@click.option("--first", type=click.IntRange(min=2), default=10, help="First look of the grid.")
+@click.option("--ratio", type=click.FloatRange(1, min_open=True), default=1.05, help="From one look to the next.")
 @click.option("--total", type=click.IntRange(min=2), help="Last look. Default, and at most: all tests on record.")
 @click.option(
     "--estimator",
@@ -152,19 +173,7 @@ def validate(
     help="Whose RHW; may be given several times. Default: nde for naturalistic runs, else nade.",
 )
 @json_option
-def rnot(
-    folders: Sequence[Path],
-    *,
-    rhw: float,
-    confidence: float,
-    shuffles: int,
-    seed: int,
-    first: int,
-    ratio: float,
-    total: int | None,
-    estimators: Sequence[RnotEstimator],
-    as_json: bool,
-) -> None:
+def rnot(folders: Sequence[Path], *, estimators: Sequence[RnotEstimator], as_json: bool, **asked: Any) -> None:
     """Count the tests that each RUN needed, the way the paper counts them; nothing is simulated.
 
     The tests of a run are shuffled. The required number of tests (RNoT) of a shuffle is the first look at which the
@@ -177,64 +186,28 @@ def rnot(
     'scv' is computed only when asked for. It solves its regressions anew at each look of each shuffle, which takes
     minutes: a larger --ratio and a smaller --total make it quicker. Its RHW rests on a variance that is too small.
     """
-    from harness.progress import shown_progress  # noqa: PLC0415 - keeps --help fast
-    from studies.required_tests import Procedure, required_tests_of_runs  # noqa: PLC0415 - keeps --help fast
+    from studies.rnot import Procedure, required_tests_of_runs, table_row  # noqa: PLC0415 - keeps --help fast
 
-    procedure = Procedure(rhw, confidence, shuffles, seed, first, ratio, total)
     bar = shown_progress()
     with bar:
-        content = required_tests_of_runs(folders, procedure, estimators=estimators, progress=bar)
+        content = required_tests_of_runs(folders, Procedure(**asked), estimators=estimators, progress=bar)
     if as_json:
         print_json(content)
-    else:
-        _print_required_tests(content)
-
-
-@cli.command(
-    name="case",
-    short_help="Reproduce a paper's case study, and answer its claims.",
-    epilog=examples(
-        "python -m studies case scenarios/case_study/study.yaml --out runs/quick --quick   # minutes: tiny sizes",
-        "python -m studies case scenarios/case_study/study.yaml --out runs/case_study      # an hour on two cores",
-    ),
-)
-@click.argument("study_file", metavar="STUDY", type=CAMPAIGN)
-@click.option("--out", "folder", type=FOLDER, required=True, help="Folder of the results; made if it is not there.")
-@click.option("--quick", is_flag=True, help="The sizes of the file's own section quick, too small for conclusions.")
-@click.option("--workers", type=click.IntRange(min=1), help="Processes. Default: one per core.")
-@quiet_option
-@json_option
-def study(study_file: Path, folder: Path, *, quick: bool, workers: int | None, quiet: bool, as_json: bool) -> None:
-    """Make the steps of STUDY that are not in the folder yet, and the page that puts them beside the paper's numbers.
-
-    Each step has a folder of its own under steps/, named after all that it depends on: a second run makes nothing
-    again, a killed one goes on, and a change in the file makes only what it concerns. The folder receives
-    case_study.md, claims.json (the verdicts) and plots/.
-    """
-    from studies.case_study.study_file import load_study  # noqa: PLC0415 - keeps --help fast
-
-    asked = load_study(study_file, quick=quick)
-    from harness.progress import shown_progress  # noqa: PLC0415 - keeps --help fast
-    from studies.case_study.steps import run_study  # noqa: PLC0415 - slow to import: once the file is right
-
-    def told(name: str, seconds: float | None) -> None:
-        if not (as_json or quiet):
-            click.echo(f"{name}: " + ("there already" if seconds is None else f"{seconds:.1f} s"))
-
-    bar = shown_progress(quiet=quiet)
-    with bar:
-        done = run_study(asked, folder, workers=workers, progress=bar, told=told)
-    if as_json:
-        print_json({"page": str(done.page), "claims": done.claims, "seconds": done.seconds})
         return
-    click.echo(str(done.page))
+    print_table(
+        f"Tests until RHW stays at most {content['rhw']:g} ({content['confidence']:.0%} normal interval)",
+        [table_row(row) for row in content["rows"]],
+    )
+    for row in content["rows"]:
+        for remark in [*row.get("remarks", ()), *filter(None, [row.get("reason")])]:
+            click.echo(f"{row['run']} {row['estimator']}: {remark}")
 
 
 @cli.command(
     short_help="Do weights, traffic and pool of a run belong together?",
     epilog=examples(
-        "python -m studies alarm runs/mixture                       # against the campaign's own pool",
-        "python -m studies alarm runs/mixture --pool pool.parquet   # of `harness pool CAMPAIGN --out pool.parquet`",
+        f"{_ME} alarm runs/mixture                       # against the campaign's own pool",
+        f"{_ME} alarm runs/mixture --pool pool.parquet   # of `harness pool CAMPAIGN --out pool.parquet`",
     ),
 )
 @click.argument("folder", metavar="RUN", type=RUN_FOLDER)
@@ -248,57 +221,26 @@ def alarm(ctx: click.Context, folder: Path, *, pool_file: Path | None, as_json: 
     weight, a maneuver on record, the twin or the pool is wrong. With the recursive challenge its tables are compared
     with Monte Carlo, too; their error costs efficiency and leaves the crash rate unbiased.
     """
-    from harness.campaign.files import load_campaign  # noqa: PLC0415 - keeps --help fast
-    from harness.progress import shown_progress  # noqa: PLC0415 - keeps --help fast
-    from harness.resolved import resolve  # noqa: PLC0415 - slow to import
     from studies.alarm import alarm_of_run  # noqa: PLC0415 - slow to import
-    from studies.table_accuracy import table_errors  # noqa: PLC0415 - slow to import
 
     bar = shown_progress()
     with bar:
         found = alarm_of_run(folder, pool_file, bar)
-        tables = list(table_errors(resolve(load_campaign(folder / "campaign.yaml", check_files=False))))
     if as_json:
-        print_json({**found, "tables": tables})
+        print_json(found)
     else:
         print_table(f"Weighted crashes of surrogates in {found['n_episodes']:,} tests", found["surrogates"])
-        if tables:
-            print_table("Challenge tables against Monte Carlo", tables)
+        if found["tables"]:
+            print_table("Challenge tables against Monte Carlo", found["tables"])
         verdict = found["no_verdict"] or ("ALARM: weights, maneuvers, twin or pool are wrong" * found["raised"])
         click.echo(f"{verdict or 'nothing is wrong that these tests could show'} (p-value {found['p_value']:.2g})")
     if found["raised"]:
         ctx.exit(WorldDisagreementError.exit_code)
 
 
-def _print_required_tests(content: dict[str, Any]) -> None:
-    """Print required numbers of tests as a table, with what limits each of them below."""
-    level, n_shuffles = f"{content['confidence']:.0%}", f"{content['n_shuffles']:,}"
-    headings = ("run", "estimator", "tests on record", "grid", "shuffles", "mean RNoT", "5-95 %", "never", "AAR")
-    rows = []
-    for row in content["rows"]:
-        cells = ["-"] * 6
-        if row["mean"] is not None:
-            limit = "≥ " if row["mean_is_lower_limit"] else ""
-            aar = {"equal": "", "at least": "≥ ", "at most": "≤ "}.get(row["aar_is"])
-            cells = [
-                row["grid"],
-                n_shuffles,
-                f"{limit}{row['mean']:,.0f}",
-                f"{row['low_5']:,} to {row['high_95']:,}",
-                f"{row['never_reached']:,}",
-                "-" if aar is None else f"{aar}{row['aar']:.3g}",
-            ]
-        rows.append((row["run"], row["estimator"], f"{row['n_episodes']:,}", *cells))
-    title = f"Tests until RHW stays at most {content['rhw']:g} ({level} normal interval)"
-    print_table(title, [dict(zip(headings, row, strict=True)) for row in rows])
-    for row in content["rows"]:
-        for remark in [*row.get("remarks", ()), *filter(None, [row.get("reason")])]:
-            click.echo(f"{row['run']} {row['estimator']}: {remark}")
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
-    return run_main(arguments, cli, "python -m studies")
+    return run_main(arguments, cli, _ME)
 
 
 if __name__ == "__main__":

@@ -1,11 +1,11 @@
 """The alarm that weights, traffic and pool of a run do not belong together (`python -m studies alarm RUN`).
 
 The stored maneuvers determine LV's and BV's motion, so that any surrogate k of a pool can be put in the AV's place, in
-the twin. f_k says whether it would have crashed, and W f_k has mean μ_k whatever the tests were drawn from and whatever
-the AV is. μ_k is tested by bets (I. Waudby-Smith, A. Ramdas, JRSS B 86, 2024; why nothing is taken from the sample's
-variance: docs/internals/alarm.md): a capital of 1 is multiplied in every test by a factor that has mean 1 if μ_k is
-right. So has the product, which then exceeds 1/p with a probability of p at most, after any number of tests and for any
-weights.
+the twin; where the AV's crash ended an episode early, BV goes on under p with the episode's own random numbers. f_k
+says whether it would have crashed, and W f_k has mean μ_k whatever the tests were drawn from and whatever the AV is.
+μ_k is tested by bets (I. Waudby-Smith, A. Ramdas, JRSS B 86, 2024; why nothing is taken from the sample's variance:
+docs/internals/alarm.md): a capital of 1 is multiplied in every test by a factor that has mean 1 if μ_k is right. So has
+the product, which then exceeds 1/p with a probability of p at most, after any number of tests and for any weights.
 
 * Too many crashes: (1 + λ W f_k)/(1 + λ μ_k).
 * Too few: exp(-λ W f_k) over its mean, which is at most 1 - (μ_k/c)(1 - exp(-λc)) where W f_k has the mean square cμ_k
@@ -17,28 +17,109 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import pyarrow as pa
 from scipy.special import logsumexp
 
 from harness.campaign.files import load_campaign
-from harness.errors import HarnessError
+from harness.compiled import compiled_threads
+from harness.episode.loop import MOMENT_LIMITS, Drawing, EpisodeLoop, RecordPolicy, Shard
+from harness.episode.path import Followers, Trajectory, empty_trajectory, who_crashes
+from harness.errors import CampaignError, HarnessError, RunFolderError
 from harness.estimators.block import EPISODE_COLUMNS, Block, block_from_tables
 from harness.estimators.estimate import finite_json
-from harness.importance.build import mixture_weights
-from harness.pool.cut_ins import Pool
-from harness.pool.replay import LEAD, PATH_COLUMNS
+from harness.importance.build import build_importance, mixture_weights
+from harness.importance.tables import Tables
+from harness.pool.cut_ins import Pool, environment_hash
+from harness.pool.replay import LEAD, PATH_COLUMNS, StoredPaths, approach_cut_in, leave_stored, stored_paths
 from harness.pool.storage import campaign_pool, read_pool
 from harness.processes import made_ahead
 from harness.progress import Progress
-from harness.records.folder import read_manifest
+from harness.records.folder import MEND_SHARD, read_manifest
 from harness.records.reader import read_shard
-from harness.resolved import resolve
-from harness.vocabulary import BoolArray, FloatArray, Method
-from studies.surrogate_replay import SurrogateReplay
+from harness.resolved import Resolved, resolve
+from harness.runner.resolve import prepare
+from harness.traffic.initial_state import InitialStates
+from harness.traffic.laws import Environment
+from harness.unboxed import unboxed
+from harness.vocabulary import BV_LV_CONTACT, CRASH, RUNNING, BoolArray, FloatArray, IntArray, Method
+from harness.worlds.twin import TwinWorld
+
+
+@compiled_threads
+def replay_surrogates(
+    stored: StoredPaths, environment: Environment, followers: Followers, path: Trajectory, crashes: IntArray
+) -> int:
+    """Which drivers would have crashed in each stored episode of an AV that keeps its speed until the cut-in.
+
+    ``crashes`` (n,) receives one bit per driver, none without a cut-in; ``path`` is room to work in. Returns the row
+    of the first episode whose maneuvers do not fit its steps, or -1.
+    """
+    max_steps = environment.numbers.max_steps
+    for i in range(stored.cut_step.size):
+        crashes[i] = 0
+        cut = stored.cut_step[i]
+        if cut < 0:
+            continue
+        decided, step = approach_cut_in(i, stored, environment, path)
+        if decided == BV_LV_CONTACT and step == cut + 1:
+            continue
+        if decided != RUNNING or not leave_stored(i, max_steps, stored, environment, path):
+            return i
+        crashes[i] = who_crashes(followers, cut, stored.lead[i], environment, path)
+    return -1
+
+
+def drivers_crash(episodes: pa.Table, seed: int, environment: Environment, followers: Followers) -> BoolArray:
+    """Which drivers (D,) would have crashed in the place of the AV, shape (n, D).
+
+    ``episodes`` are consecutive rows of the episodes table, with `PATH_COLUMNS`; ``seed`` is that of the campaign.
+
+    Raises
+    ------
+    RunFolderError
+        An episode's maneuvers do not fit its steps.
+    """
+    stored = stored_paths(episodes, seed)
+    bits = np.zeros(episodes.num_rows, np.int64)
+    room = empty_trajectory(environment)
+    wrong = replay_surrogates(unboxed(stored), unboxed(environment), unboxed(followers), unboxed(room), bits)
+    if wrong >= 0:
+        raise RunFolderError(
+            f"episodes, episode {stored.first + wrong}",
+            f"maneuvers that do not lead to a cut-in in step {stored.cut_step[wrong]}",
+            "the maneuvers that were driven: they determine the episode",
+            MEND_SHARD,
+        )
+    found: BoolArray = ((bits[:, None] >> np.arange(followers.drivers.size)) & 1).astype(np.bool_)
+    return found
+
+
+class SurrogateReplay:
+    """The surrogates of a pool in the place of a campaign's AV; a pool of another environment is a `CampaignError`."""
+
+    def __init__(self, resolved: Resolved, pool: Pool) -> None:
+        self._environment, self._seed = resolved.environment, resolved.campaign.seed
+        if pool.environment != (own := environment_hash(self._environment)):
+            raise CampaignError(
+                "pool",
+                f"a pool of another environment ({pool.environment})",
+                f"one of the campaign's ({own}): crash rates of surrogates depend on traffic, level of lane "
+                "changing and hold time",
+                "Leave the pool out: the right one is built, which takes about 15 s.",
+            )
+        names = list(pool.library.surrogates)
+        self._followers = pool.library.followers_in(self._environment)
+        self._order = [names.index(name) for name in pool.names]
+
+    def crashes(self, episodes: pa.Table) -> BoolArray:
+        """Which surrogates would have crashed in consecutive episodes, shape (n, D), in the order of the pool."""
+        return drivers_crash(episodes, self._seed, self._environment, self._followers)[:, self._order]
+
 
 LEVEL = 1e-4
 """Probability of a false alarm, at most, after any given number of tests."""
@@ -181,5 +262,65 @@ def alarm_of_run(folder: Path, pool_file: Path | None = None, progress: Progress
     for block, crashes in made_ahead(replayed, manifest["shards"]):
         alarm.add(block, crashes)
         progress.advance(len(block))
-    content: dict[str, Any] = finite_json({"run": str(folder), "pool": pool.key, **alarm.result()})
+    tables = list(table_errors(resolved))
+    content: dict[str, Any] = finite_json({"run": str(folder), "pool": pool.key, **alarm.result(), "tables": tables})
     return content
+
+
+EPISODES = 6_000
+SEED = 40_001
+_CELLS = 512
+QUANTITIES = {"before the cut-in": "mean of V_j(s_0)", "after the cut-in": "mean of W V_j(s) at BV's first redraw"}
+
+
+def table_errors(resolved: Resolved) -> Iterator[dict[str, Any]]:
+    """How far the tables of the recursive challenge are from Monte Carlo, by surrogate and table.
+
+    A surrogate is run in the AV's place in the twin. If its tables were exact, the mean of V_j(s_0) before any
+    maneuver, and the mean of W V_j(s) at the first redraw after the cut-in, would both equal its crash rate. Nothing is
+    told of campaigns without tables, nor of the immediate challenge, which is a yes or no by definition.
+    """
+    tables = prepare(resolved).tables
+    if tables is None or resolved.campaign.testing.challenge == "immediate":
+        return
+    for j, surrogate in enumerate(resolved.campaign.surrogates):
+        shard = _run_surrogate(j, resolved, tables)
+        y = np.where(shard.results.episode["outcome"] == CRASH, np.exp(shard.results.episode["log_weight"]), 0.0)
+        for (table, quantity), predicted in zip(QUANTITIES.items(), _predictions(j, shard), strict=True):
+            yield {
+                "surrogate": surrogate,
+                "table": table,
+                "quantity": quantity,
+                "table_value": float(predicted.mean()),
+                "monte_carlo": float(y.mean()),
+                "std_error": float((predicted - y).std(ddof=1)) / math.sqrt(y.size),
+            }
+
+
+def _run_surrogate(j: int, resolved: Resolved, tables: Tables) -> Shard:
+    """Episodes of the campaign's mixture with surrogate ``j`` as the AV, every control step kept."""
+    campaign, environment = resolved.campaign, resolved.environment
+    testing = campaign.testing.model_copy(update={"method": "episode_mixture", "criticality_threshold": 0.0})
+    importance = build_importance(campaign.model_copy(update={"testing": testing}), tables)
+    policy = Drawing(SEED, environment, importance, resolved.surrogates[j : j + 1])
+    states = InitialStates(environment.numbers).draw(SEED, 0, EPISODES)
+    return EpisodeLoop(TwinWorld(_CELLS), policy, RecordPolicy(MOMENT_LIMITS["all"], "none", 0.0)).run(0, states)
+
+
+def _predictions(j: int, shard: Shard) -> tuple[FloatArray, FloatArray]:
+    """Per episode V_j(s_0), and W V_j(s) at the first control step after the cut-in (0 without one)."""
+    used = int(shard.results.moment_count[0])
+    moment, v = shard.results.moment[:used], shard.results.moment_v[:used, j]
+    order = np.lexsort((moment["step"], moment["row"]))
+    moment, v = moment[order], v[order]
+    log_step = np.log(moment["p"]) - np.log(moment["q_sampled"])
+    first = np.searchsorted(moment["row"], moment["row"])
+    total = np.concatenate([[0.0], np.cumsum(log_step)])
+    weight_before = np.exp(total[:-1] - total[first])
+    before, after = np.zeros((2, len(shard.results.episode)))
+    at_start = moment["step"] == 0
+    before[moment["row"][at_start]] = v[at_start]
+    cut_in = shard.results.episode["cut_in_step"][moment["row"]]
+    at_redraw = (cut_in >= 0) & (moment["step"] == cut_in + 1)
+    after[moment["row"][at_redraw]] = (weight_before * v)[at_redraw]
+    return before, after

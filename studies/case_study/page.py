@@ -17,10 +17,9 @@ from harness.estimators.block import MAX_CONTROL_STEPS
 from harness.estimators.one_pass import CARELESS_MEAN
 from harness.records.folder import write_bytes
 from harness.report.style import RC, png
-from studies.case_study.context import Made
 from studies.case_study.figures import Verdict, is_settled, verdict
 from studies.case_study.plots import plots_of
-from studies.case_study.study_file import Study
+from studies.case_study.study import Made, Study
 
 UNSETTLED = "†"
 PAGE, CLAIMS = "case_study.md", "claims.json"

@@ -29,10 +29,9 @@ from harness.report.style import (
     scaled,
     tick_label,
 )
-from studies.case_study.context import Made
+from studies.case_study.counted import CURVES
 from studies.case_study.figures import is_settled
-from studies.case_study.required import CURVES
-from studies.case_study.study_file import Convergence, Line, Study
+from studies.case_study.study import Convergence, Line, Made, Study
 
 _COLOURS = (INK, BLUE, VERMILLION, GREEN)
 

@@ -18,22 +18,14 @@ from harness.resolved import resolve
 from harness.runner.resolve import prepare
 from harness.runner.run import run_campaign
 from harness.vocabulary import EstimatorName
-from studies.case_study.context import Context
-from studies.case_study.control_variates import Claims
-from studies.case_study.figures import (
-    figure,
-    marked,
-    mean_of,
-    ratio_of_means,
-    ratio_of_variances,
-    tests_for,
-)
-from studies.case_study.study_file import Replications, Variants
+from studies.case_study.counted import Claims
+from studies.case_study.figures import figure, marked, mean_of, ratio_of_means, ratio_of_variances, tests_for
+from studies.case_study.study import Context, Replications, Variants
 from studies.case_study.tested import AT_ONCE, IN_THE_TWIN, figures_of_shells
-from studies.experiment import load_experiment
-from studies.run import REPLICATIONS, validate
-from studies.weighted_campaign import prepared_twin, twin_episodes
-from studies.work import write_table
+from studies.replication.experiment import load_experiment
+from studies.replication.run import REPLICATIONS, validate
+from studies.replication.weighted import prepared_twin, twin_episodes
+from studies.replication.work import write_table
 
 
 def replicate(step: Replications, context: Context) -> dict[str, Any]:
@@ -115,10 +107,7 @@ def test_variants(step: Variants, context: Context) -> dict[str, Any]:
     write_table(context.folder / "variants.parquet", pa.Table.from_pylist(rows))
     gains = {row["variant"]: row["gain_claimed"] for row in rows}
     mean = mean_of((gain["value"] for gain in gains.values()), context.confidence)
-    return {
-        "variants": rows,
-        "figures": {**gains, "mean": marked(mean, settled=all(row["settled"] for row in rows))},
-    }
+    return {"variants": rows, "figures": {**gains, "mean": marked(mean, settled=all(row["settled"] for row in rows))}}
 
 
 def claims_in_twin(n: int, replications: int, rhw: float, confidence: float, campaign_json: str) -> pa.Table:

@@ -1,7 +1,18 @@
-"""Where the published method works: the 2022 conference version's smaller case, with its exact answers."""
+"""The smaller case of the 2022 conference version as a finite tree, on which everything is known exactly.
+
+LV keeps 3 m/s, BV follows it from 8 m/s, AV keeps 13 m/s on the other lane, 5 m behind BV; only R1 is random at the
+start. BV draws an acceleration each second and may cut in in each step; AV has passed it within two seconds. After the
+cut-in BV keeps its speed, so that whether the vehicle, or a surrogate, crashes is certain. R1's distribution is that of
+the nodes and weights of Gauss and Legendre: all that follows from it is smooth in R1.
+
+What the conference version does not say (drivers, probabilities) is that of this project: its environment, whose fits
+end at 20 m/s and are held constant below, and its default vehicle and surrogates.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cache, partial
 from itertools import product
 from typing import Any, NamedTuple
@@ -9,12 +20,235 @@ from typing import Any, NamedTuple
 import numpy as np
 import pyarrow as pa
 
-from studies.case_study.context import Context
-from studies.case_study.control_variates import Claims
+from harness.campaign.sections import EnvironmentSettings
+from harness.campaign.vehicle import AutomatedVehicle, default_surrogates
+from harness.estimators.block import MAX_CONTROL_STEPS, Block, Drawn
+from harness.importance.challenge import roll_out
+from harness.importance.grid import GridPoints
+from harness.maneuvers import ACCELERATIONS_MPS2, N_ACCELERATIONS
+from harness.traffic.laws import Environment
+from harness.traffic.loading import evaluate_laws, load_environment
+from harness.unboxed import unboxed
+from harness.vehicles.drivers import av_records, surrogate_records
+from harness.vehicles.kinematics import CONTACT_M, STEP_S
+from harness.vocabulary import CRASH, TIMEOUT, BoolArray, FloatArray, IntArray, RecordArray
+from studies.case_study.counted import Claims
 from studies.case_study.figures import exactly, figure, marked, mean_of, tests_for
-from studies.case_study.small_world import SmallWorld, small_world
-from studies.case_study.study_file import SmallCase
-from studies.work import write_table
+from studies.case_study.study import Context, SmallCase
+from studies.replication.work import write_table
+
+LV_MPS, BV_MPS, AV_MPS = 3.0, 8.0, 13.0
+R1_M, R2_M = (30.0, 32.0), 5.0
+STEPS, HOLD = 100, 10
+NODES = 8
+
+
+class Level(NamedTuple):
+    """Situations of one step, m of them, in which BV has its acceleration and may cut in.
+
+    ``p`` is the probability to cut in here, ``crash`` whether the vehicle under test would crash then, ``surrogates``
+    (m, J) which surrogates would. ``parent`` is the situation of the step before that staying in lane led here from,
+    ``share`` (m,) with which probability (of the first step: with which it begins).
+    """
+
+    p: FloatArray
+    crash: FloatArray
+    surrogates: FloatArray
+    parent: IntArray
+    share: FloatArray
+
+
+class Proposal(NamedTuple):
+    """Per situation: q_j(cut_in) (m, J), and whether it is critical (m,)."""
+
+    q: FloatArray
+    critical: BoolArray
+
+
+@dataclass(frozen=True, eq=False)
+class SmallWorld:
+    """The tree; surrogates as published are the default."""
+
+    levels: Sequence[Level]
+
+    def value(self, crash: Sequence[FloatArray]) -> list[FloatArray]:
+        """Probability of a crash from each situation on, by backward induction; ``crash``: after a cut-in there."""
+        values: list[FloatArray] = [np.zeros(len(level.p)) for level in self.levels]
+        later = np.zeros(len(self.levels[-1].p))
+        for t in range(len(self.levels) - 1, -1, -1):
+            level = self.levels[t]
+            values[t] = level.p * crash[t] + (1.0 - level.p) * later
+            if t:
+                later = self._to_parents(t, values[t])
+        return values
+
+    def _to_parents(self, t: int, value: FloatArray) -> FloatArray:
+        """Expectation over what follows each situation of the step before."""
+        level = self.levels[t]
+        return np.bincount(level.parent, level.share * value, len(self.levels[t - 1].p)).astype(np.float64)
+
+    @property
+    def crash_rate(self) -> float:
+        """μ."""
+        return float(self.levels[0].share @ self.value([level.crash for level in self.levels])[0])
+
+    def proposals(self, epsilon: float, *, recursive: bool, threshold: float = 0.0) -> list[Proposal]:
+        """Importance functions; a later cut-in counts only for the recursive challenge.
+
+        A situation is critical where V_j of any surrogate is above the threshold; elsewhere all draw from p.
+        """
+        n_surrogates = self.levels[0].surrogates.shape[1]
+        found = [
+            Proposal(np.repeat(level.p[:, None], n_surrogates, 1), np.zeros(len(level.p), bool))
+            for level in self.levels
+        ]
+        of_surrogates = [self.value([level.surrogates[:, j] for level in self.levels]) for j in range(n_surrogates)]
+        for t, level in enumerate(self.levels):
+            now = level.p[:, None] * level.surrogates
+            v = np.stack([values[t] for values in of_surrogates], axis=1) if recursive else now
+            aimed = np.divide(now, v, out=found[t].q.copy(), where=v > 0.0)
+            found[t].critical[:] = np.any(v > threshold, axis=1)
+            controlled = found[t].critical[:, None] & (v > 0.0)
+            found[t].q[:] = np.where(controlled, epsilon * level.p[:, None] + (1.0 - epsilon) * aimed, found[t].q)
+        return found
+
+    def relvar(self, proposals: Sequence[Proposal]) -> float:
+        """Var(Y)/μ² of a test under the step mixture with equal weights, by backward induction of E[Y² | situation]."""
+        later = np.zeros(len(self.levels[-1].p))
+        for t in range(len(self.levels) - 1, -1, -1):
+            level, q = self.levels[t], proposals[t].q.mean(axis=1)
+            cutting = np.divide(level.p**2, q, out=np.zeros_like(q), where=q > 0.0) * level.crash
+            square = cutting + np.divide((1.0 - level.p) ** 2, 1.0 - q, out=np.zeros_like(q), where=q < 1.0) * later
+            if t:
+                later = self._to_parents(t, square)
+        return float(self.levels[0].share @ square) / self.crash_rate**2 - 1.0
+
+    def draw(self, proposals: Sequence[Proposal], n: int, rng: np.random.Generator) -> Block:
+        """Tests under the step mixture, as the estimators see those of any world."""
+        n_surrogates = self.levels[0].surrogates.shape[1]
+        at = rng.choice(len(self.levels[0].p), n, p=self.levels[0].share / self.levels[0].share.sum())
+        log_weight, steps, ratios = np.zeros(n), np.zeros(n, np.int64), np.ones((n, MAX_CONTROL_STEPS, n_surrogates))
+        crash, cut_in, running = np.zeros(n, bool), np.zeros(n, bool), np.arange(n)
+        log_q = np.zeros((n, n_surrogates))
+        for t, (level, proposal) in enumerate(zip(self.levels, proposals, strict=True)):
+            here = at[running]
+            p, q = level.p[here], proposal.q[here]
+            cut = rng.random(len(here)) < q.mean(axis=1)
+            chosen_p, chosen_q = np.where(cut, p, 1.0 - p), np.where(cut[:, None], q, 1.0 - q)
+            sampled = chosen_q.mean(axis=1)
+            log_weight[running] += np.log(chosen_p / sampled)
+            log_q[running] += np.log(chosen_q / chosen_p[:, None])
+            critical = proposal.critical[here]
+            kept = critical & (steps[running] < MAX_CONTROL_STEPS)
+            ratios[running[kept], steps[running[kept]]] = (chosen_q / sampled[:, None])[kept]
+            steps[running] += critical
+            crash[running[cut]] = level.crash[here[cut]] > 0.0
+            cut_in[running[cut]] = True
+            running = running[~cut]
+            if t + 1 < len(self.levels):
+                at[running], alive = self._next(t + 1, at[running], rng)
+                running = running[alive]
+        columns = {"cut_in": cut_in, "log_q": log_q, "n_control_steps": steps, "first_ratios": ratios}
+        drawn = Drawn("step_mixture", np.full(n_surrogates, 1.0 / n_surrogates))
+        return Block(0, np.where(crash, CRASH, TIMEOUT).astype(np.int8), log_weight, columns, drawn)
+
+    def _next(self, t: int, at: IntArray, rng: np.random.Generator) -> tuple[IntArray, BoolArray]:
+        """Situations that follow, and which tests still have one: AV has not passed."""
+        level, n_before = self.levels[t], len(self.levels[t - 1].p)
+        order = np.argsort(level.parent, kind="stable")
+        total = np.concatenate([[0.0], np.cumsum(level.share[order])])
+        first = np.searchsorted(level.parent[order], np.arange(n_before + 1))
+        start, stop = total[first[at]], total[first[at + 1]]
+        u = start + rng.random(len(at))
+        place = np.minimum(np.searchsorted(total, u, side="right") - 1, len(order) - 1)
+        alive = u < stop
+        return np.where(alive, order[place], 0), alive
+
+
+class _Situations(NamedTuple):
+    """What is told apart in a step: v_BV, R1, R2, BV's acceleration; where it comes from, how likely."""
+
+    speed: FloatArray
+    r1: FloatArray
+    r2: FloatArray
+    acceleration: FloatArray
+    parent: IntArray
+    share: FloatArray
+
+    def moved(self) -> tuple[_Situations, IntArray]:
+        """All of them after a step without cut-in, each the parent of itself, and which of them AV has not passed."""
+        after = np.maximum(self.speed + self.acceleration * STEP_S, 0.0)
+        r1 = self.r1 + (LV_MPS - 0.5 * (self.speed + after)) * STEP_S
+        r2 = self.r2 + (0.5 * (self.speed + after) - AV_MPS) * STEP_S
+        parent = np.arange(len(after))
+        whole = _Situations(after, r1, r2, self.acceleration, parent, np.ones(len(after)))
+        return whole, np.flatnonzero(r2 > 0.0)
+
+    def drawn(self, environment: Environment) -> _Situations:
+        """Each once for every acceleration that BV may draw."""
+        pmf, _, _ = _laws(self.speed, self.r1, np.zeros((0, 2)), environment)
+        row, maneuver = np.nonzero(pmf)
+        every = self.taken(row)
+        return every._replace(acceleration=ACCELERATIONS_MPS2[maneuver], share=every.share * pmf[row, maneuver])
+
+    def taken(self, rows: IntArray) -> _Situations:
+        """Some of them."""
+        return _Situations._make(column[rows] for column in self)
+
+
+def small_world(level: float, *, nodes: int = NODES) -> SmallWorld:
+    """The tree at a level of lane changing."""
+    environment = load_environment(EnvironmentSettings(lane_change_level=level))
+    records = surrogate_records(default_surrogates())
+    drivers = [av_records(AutomatedVehicle()), *np.split(records, len(records))]
+    x, weight = np.polynomial.legendre.leggauss(nodes)
+    r1, ones = R1_M[0] + (x + 1.0) / 2.0 * (R1_M[1] - R1_M[0]), np.ones(nodes)
+    here = _Situations(ones * BV_MPS, r1, ones * R2_M, ones, np.arange(nodes), weight / 2.0).drawn(environment)
+    levels: list[Level] = []
+    while len(here.share) and len(levels) < STEPS:
+        after, on = here.moved()
+        crash = _crashes(drivers, after.speed, after.r2, STEPS - 1 - len(levels))
+        p = _cut_in(here.speed, here.r1, here.r2, environment)
+        levels.append(Level(p, crash[:, 0], crash[:, 1:], here.parent, here.share))
+        here = after.taken(on)
+        if len(levels) % HOLD == 0 and len(on):
+            here = here.drawn(environment)
+    return SmallWorld(levels)
+
+
+def _cut_in(speed: FloatArray, r1: FloatArray, r2: FloatArray, environment: Environment) -> FloatArray:
+    """Probability to cut in within the step, as `harness.traffic.laws.cut_in_hazard` gives it."""
+    n = environment.numbers
+    _, chance, accepted = _laws(speed, r1, np.column_stack([r2, speed - AV_MPS]), environment)
+    p_1s = np.minimum(chance * accepted, float(n["cut_in__max_probability_1s"]))
+    return np.asarray(-np.expm1(float(n["scenario__step_s"]) * np.log1p(-p_1s)))
+
+
+def _laws(
+    speed: FloatArray, r1: FloatArray, approaches: FloatArray, environment: Environment
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """BV's distribution over accelerations behind LV (m, 31), its wish to change lanes (m,), and acceptance."""
+    n = len(speed)
+    pmf, scale, chance = np.empty((2, n, N_ACCELERATIONS)), np.empty((2, n)), np.empty(n)
+    accepted = np.empty(len(approaches))
+    evaluate_laws(
+        np.column_stack([speed, r1, LV_MPS - speed]), approaches, unboxed(environment), pmf, scale, chance, accepted
+    )
+    return pmf[1], chance, accepted
+
+
+def _crashes(drivers: Sequence[RecordArray], speed: FloatArray, r2: FloatArray, steps: int) -> FloatArray:
+    """Who runs into BV, which keeps its speed, in so many steps after that of the cut-in: (m, drivers)."""
+    states, back = np.unique(np.column_stack([speed, r2]), axis=0, return_inverse=True)
+    found = np.zeros((len(states), len(drivers)))
+    for row, (v, gap) in enumerate(states):
+        points = GridPoints(np.array([v]), np.array([gap]), np.array([v - AV_MPS]))
+        for k, driver in enumerate(drivers):
+            smallest = np.empty((2, 1, 1, 1), np.float32)
+            roll_out(driver, 0, max(steps, 1), points, smallest, np.empty((1, 1, 1, N_ACCELERATIONS), np.float32))
+            found[row, k] = gap < CONTACT_M or (steps > 0 and smallest[1, 0, 0, 0] < CONTACT_M)
+    return found[back.ravel()]
+
 
 _world = cache(small_world)
 TRUE_WITHIN = 2.0

@@ -23,23 +23,22 @@ from harness.progress import Progress
 from harness.records.folder import read_as, sole_use, write_json
 from harness.resolved import resolve
 from harness.traffic.loading import load_parameters
-from studies.case_study.context import Context, Made
-from studies.case_study.control_variates import compare_control_variates
+from studies.case_study.counted import compare_control_variates, count_required_tests, draw_convergence
 from studies.case_study.page import write_page
 from studies.case_study.repeated import replicate, test_variants, variants_of
-from studies.case_study.required import count_required_tests, draw_convergence
 from studies.case_study.small_case import answer_small_case
-from studies.case_study.study_file import FILES, Step, Study, inputs_of
+from studies.case_study.study import FILES, Context, Made, Step, Study, inputs_of
 from studies.case_study.tested import keep_run, test_in_twin
 from studies.case_study.theorems import check_theorems
-from studies.experiment import load_experiment
-from studies.work import sources_of
+from studies.replication.experiment import load_experiment
+from studies.replication.work import sources_of
 
 RESULT = "result.json"
 _SHARED = (
-    "*.py",
+    "rnot.py",
     "chains/*.py",
-    *(f"case_study/{name}.py" for name in ("control_variates", "figures", "small_world", "tested")),
+    "replication/*.py",
+    *(f"case_study/{name}.py" for name in ("counted", "figures", "small_case", "tested")),
 )
 """What makers have from other files than their own."""
 _MAKERS: dict[str, Callable[[Any, Context], dict[str, Any]]] = {

@@ -19,11 +19,10 @@ from harness.runner import RunResult, run_campaign
 from harness.runner.estimate import stored_blocks
 from harness.runner.resolve import prepare
 from harness.vocabulary import CRASH, FAILED, BoolArray, FloatArray, IntArray, Method
-from studies.case_study.context import Context, Made
 from studies.case_study.figures import exactly, figure, is_settled, marked, tests_for, weights_are_in
-from studies.case_study.study_file import Run, TwinTests
-from studies.weighted_campaign import prepared_twin
-from studies.work import write_table
+from studies.case_study.study import Context, Made, Run, TwinTests
+from studies.replication.weighted import prepared_twin
+from studies.replication.work import write_table
 
 PART, AT_ONCE = 500_000, 50_000
 """Tests of a file that a killed step goes on from, and of a call of the twin."""

@@ -16,13 +16,11 @@ import pyarrow as pa
 
 from harness.estimators.scv import MixtureCv, Scv
 from harness.vocabulary import FloatArray
-from studies.case_study.context import Context
 from studies.case_study.figures import exactly
-from studies.case_study.study_file import Theorems
-from studies.chains.chain import Chain, Episodes, enumerate_episodes
-from studies.chains.named import overtaking, rare_decisive
-from studies.chains.single_choice import with_optimal_function
-from studies.work import write_table
+from studies.case_study.study import Context, Theorems
+from studies.chains.chain import Chain, Episodes, enumerate_episodes, overtaking, rare_decisive
+from studies.chains.sampler import with_optimal_function
+from studies.replication.work import write_table
 
 
 def small_chains() -> list[Chain]:

@@ -15,7 +15,7 @@ from harness.strata import LIBRARY_STATEMENT, OUTSIDE, ShellDesign, Statement
 from harness.vocabulary import FloatArray, IntArray
 from studies.chains.chain import Chain
 from studies.chains.sampler import approach_paths
-from studies.shell_campaign import DrawnPool
+from studies.replication.shells import DrawnPool
 
 
 class ChainShells:
@@ -47,7 +47,7 @@ class ChainShells:
         return total
 
     def draw(self, rng: np.random.Generator) -> list[DrawnPool]:
-        """A new pool; see `studies.shell_campaign.Draw`."""
+        """A new pool; see `studies.replication.shells.Draw`."""
         chain, names = self._chain, self._names
         path = approach_paths(chain, self._pool_paths, rng)
         hazard = chain.hazard[path]

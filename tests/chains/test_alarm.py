@@ -18,7 +18,7 @@ from scipy.stats import binom, norm
 from harness.estimators.block import Block
 from harness.vocabulary import BoolArray
 from studies.alarm import LEVEL, Alarm, KnownRates
-from studies.chains.single_choice import SingleChoice
+from studies.chains.sampler import SingleChoice
 from tests.estimators.small_blocks import block
 
 from .seed import SEED

@@ -7,8 +7,7 @@ import pytest
 from scipy.stats import binomtest
 
 from studies.case_study.theorems import small_chains
-from studies.chains.chain import enumerate_episodes
-from studies.chains.named import frequent_decisive, overtaking, panel
+from studies.chains.chain import enumerate_episodes, frequent_decisive, overtaking, panel
 from studies.chains.sampler import draw, mixture_weights
 
 from .seed import SEED

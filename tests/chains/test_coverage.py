@@ -13,9 +13,8 @@ from scipy.stats import binomtest
 from harness.estimators.block import Block
 from harness.estimators.scv import MixtureCv, Scv
 from harness.estimators.weighted import Nade
-from studies.chains.named import frequent_decisive, rare_decisive
-from studies.chains.sampler import draw
-from studies.chains.single_choice import with_optimal_function
+from studies.chains.chain import frequent_decisive, rare_decisive
+from studies.chains.sampler import draw, with_optimal_function
 
 from .coverage import replicate
 

@@ -14,10 +14,10 @@ import pytest
 from harness.estimators.block import Block
 from harness.estimators.one_pass import ACCUMULATORS, accumulator
 from harness.vocabulary import FAILED, TIMEOUT
-from studies.chains.named import frequent_decisive
+from studies.chains.chain import frequent_decisive
 from studies.chains.sampler import draw
 from studies.chains.shells import ChainShells
-from studies.shell_campaign import DrawnPool, campaign_block
+from studies.replication.shells import DrawnPool, campaign_block
 
 from .coverage import replicate
 

@@ -13,7 +13,7 @@ from scipy.stats import binomtest
 
 from harness.estimators import Estimate, one_pass
 from harness.estimators.weighted import Nade
-from studies.chains.named import frequent_decisive, panel, rare_decisive
+from studies.chains.chain import frequent_decisive, panel, rare_decisive
 from studies.chains.sampler import Sampler, blocks
 from tests.estimators.small_blocks import fed
 

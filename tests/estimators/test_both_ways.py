@@ -9,9 +9,9 @@ from harness.estimators import one_pass
 from harness.estimators.block import Block, joined
 from harness.estimators.one_pass import ACCUMULATORS
 from harness.vocabulary import FAILED, TIMEOUT
-from studies.chains.named import overtaking
+from studies.chains.chain import overtaking
 from studies.chains.sampler import blocks
-from studies.required_tests import Procedure, plain_rhw, scv_rhw
+from studies.rnot import Procedure, plain_rhw, scv_rhw
 from tests.chains.seed import SEED
 from tests.estimators.small_blocks import block, fed, in_shells
 

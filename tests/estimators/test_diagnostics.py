@@ -5,7 +5,7 @@ import pytest
 
 from harness.estimators.one_pass import Diagnostics
 from harness.vocabulary import BV_LV_CONTACT
-from studies.chains.named import overtaking
+from studies.chains.chain import overtaking
 from studies.chains.sampler import blocks
 from tests.chains.seed import SEED
 

@@ -7,7 +7,7 @@ import pytest
 from harness.errors import RunFolderError
 from harness.estimators.block import block_from_tables
 from harness.vocabulary import FAILED
-from studies.chains.named import overtaking
+from studies.chains.chain import overtaking
 from studies.chains.sampler import draw
 from tests.chains.seed import SEED
 

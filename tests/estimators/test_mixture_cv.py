@@ -5,7 +5,7 @@ import pytest
 
 from harness.estimators.limits import normal_half_width, skewed_distances
 from harness.estimators.scv import MixtureCv
-from studies.chains.named import panel
+from studies.chains.chain import panel
 from studies.chains.sampler import blocks, draw
 from tests.chains.seed import SEED
 

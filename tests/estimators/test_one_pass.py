@@ -18,7 +18,7 @@ from harness.estimators import (
 )
 from harness.runner import estimate_run
 from harness.vocabulary import SAMPLING
-from studies.chains.named import overtaking
+from studies.chains.chain import overtaking
 from studies.chains.sampler import blocks
 from tests.chains.seed import SEED
 

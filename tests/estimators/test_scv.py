@@ -8,7 +8,7 @@ import pytest
 from harness.estimators.block import Block
 from harness.estimators.scv import CHUNK_ROWS, Scv, Stratum, fill_product_columns, n_columns, steps_used
 from harness.estimators.weighted import Nade
-from studies.chains.named import frequent_decisive, overtaking, panel
+from studies.chains.chain import frequent_decisive, overtaking, panel
 from studies.chains.sampler import blocks
 from tests.chains.seed import SEED
 

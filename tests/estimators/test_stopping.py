@@ -12,7 +12,7 @@ from harness.campaign.sections import Run, Stop
 from harness.estimators import StopRule, accumulator
 from harness.estimators.stopping import LOOK_RATIO, Decision, look_grid
 from harness.strata import ASSUMPTION_FREE
-from studies.chains.named import frequent_decisive
+from studies.chains.chain import frequent_decisive
 from studies.chains.sampler import blocks
 from tests.chains.seed import SEED
 

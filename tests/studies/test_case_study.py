@@ -13,11 +13,11 @@ import pytest
 
 from harness.numbers import number
 from harness.progress import Progress
-from studies import run as studies_run
 from studies.__main__ import main
-from studies.case_study import context, required, tested
-from studies.case_study.context import Context, Made
-from studies.case_study.control_variates import Claims
+from studies.case_study import counted as required
+from studies.case_study import study as context
+from studies.case_study import tested
+from studies.case_study.counted import Claims
 from studies.case_study.figures import (
     exactly,
     figure,
@@ -31,8 +31,9 @@ from studies.case_study.figures import (
 from studies.case_study.page import asked, count, shown
 from studies.case_study.repeated import replicate
 from studies.case_study.steps import run_study, step_keys
-from studies.case_study.study_file import Replications, load_study
-from studies.required_tests import RequiredTests
+from studies.case_study.study import Context, Made, Replications, load_study
+from studies.replication import run as studies_run
+from studies.rnot import RequiredTests
 from tests.pool.conftest import SMALL_POOL
 
 from .here import Here, Interrupting

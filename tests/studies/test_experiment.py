@@ -9,7 +9,7 @@ import pytest
 from harness.campaign.files import load_panel
 from harness.errors import CampaignError
 from studies.__main__ import main
-from studies.experiment import load_experiment
+from studies.replication.experiment import load_experiment
 
 FOLDER = Path(__file__).parents[2] / "scenarios" / "validate"
 HEAD = "format: validation-experiment\nversion: 1\nname: x\n"
@@ -52,7 +52,6 @@ def test_shipped_experiments_are_right(file):
         ("avs: {a: {}}\nchains: [rare]\n" + SHELLS, "avs", "both"),
         ("chains: [unheard-of]\n" + SHELLS, "chains", "unheard-of"),
         ("chains: [rare]\nestimators: [scv]\n" + SHELLS, "estimators", "scv"),
-        ("chains: [rare]\nfault: {factor: 2.0}\ncampaign: {testing: {method: forced}}\n", "fault", "forced"),
         ("chains: [rare]\ncampaign: {world: {engine: sumo}}\n", "campaign.world.engine", "sumo"),
         ("chains: [rare]\ncampaign: {world: twin}\n", "campaign.world", "twin"),
         ("chains: [rare]\ncampaign: {pool: {library: ./none.yaml}}\n", "campaign.pool.library", "no file"),

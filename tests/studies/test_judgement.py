@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from studies.judgement import Row, Subject, corrected, holm, judge
-from studies.truths import Known
+from studies.replication.judgement import Row, Subject, corrected, holm, judge
+from studies.replication.populations import Known
 
 
 def rows(rates, half: float, tests: int = 100, outside: int = 0) -> list[Row]:

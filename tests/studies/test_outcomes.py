@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from studies.chains.named import replayed
+from studies.chains.chain import replayed
 from studies.chains.shells import ChainShells, joint_outcomes
 
 

@@ -9,8 +9,8 @@ import pytest
 
 from harness.campaign.files import load_campaign
 from harness.strata import ShellDesign, Statement
-from studies.shell_campaign import DrawnPool, PairedCampaign
-from studies.truths import CONDITIONAL_DIFFERENCE, DIFFERENCE
+from studies.replication.populations import CONDITIONAL_DIFFERENCE, DIFFERENCE
+from studies.replication.shells import DrawnPool, PairedCampaign
 
 SMOKE = Path(__file__).parents[2] / "scenarios/smoke.yaml"
 P = np.array([1e-7, 2e-7, 3e-6])

@@ -19,12 +19,12 @@ import pytest
 
 from harness.campaign.campaign import Campaign
 from harness.vocabulary import SAMPLING
-from studies import run
 from studies.__main__ import main
-from studies.experiment import load_experiment
-from studies.judgement import Row, Subject, judge
-from studies.weighted_campaign import WeightedCampaign, twin_episodes
-from studies.work import worker_processes
+from studies.replication import run
+from studies.replication.experiment import load_experiment
+from studies.replication.judgement import Row, Subject, judge
+from studies.replication.weighted import WeightedCampaign, twin_episodes
+from studies.replication.work import worker_processes
 
 from .here import Here
 
@@ -118,7 +118,7 @@ def test_weighted_methods_run_in_the_twin(tmp_path, capsys, monkeypatch):
 
 PARENT = """
 import os, time
-from studies.work import worker_processes
+from studies.replication.work import worker_processes
 
 if __name__ == "__main__":
     with worker_processes(1) as executor:

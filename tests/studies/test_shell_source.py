@@ -14,11 +14,9 @@ from harness.pool.shells import acceleration_limit
 from harness.progress import Progress
 from harness.traffic.loading import load_environment
 from harness.vehicles.drivers import av_records
-from studies.experiment import Adversary
-from studies.shell_campaign import campaign_block
-from studies.shell_source import Division, equals, leave_out
-from studies.super_population import NO_ENVELOPE, Drivers, enumerate_paths
-from studies.truths import RATE, Truths
+from studies.replication.experiment import Adversary
+from studies.replication.populations import NO_ENVELOPE, RATE, Drivers, Truths, enumerate_paths
+from studies.replication.shells import Division, campaign_block, equals, leave_out
 
 PATHS = 1024
 ENVIRONMENT = load_environment(EnvironmentSettings())

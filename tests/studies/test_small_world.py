@@ -9,10 +9,10 @@ from harness.campaign.vehicle import AutomatedVehicle
 from harness.estimators.weighted import Nade
 from harness.progress import Progress
 from harness.vehicles.drivers import av_records
-from studies.case_study import context, small_case
-from studies.case_study.context import Context
-from studies.case_study.small_world import AV_MPS, HOLD, Proposal, _crashes, small_world
-from studies.case_study.study_file import SmallCase
+from studies.case_study import small_case
+from studies.case_study import study as context
+from studies.case_study.small_case import AV_MPS, HOLD, Proposal, _crashes, small_world
+from studies.case_study.study import Context, SmallCase
 from tests.chains.seed import SEED
 from tests.estimators.small_blocks import fed
 

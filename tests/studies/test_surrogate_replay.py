@@ -28,8 +28,7 @@ from harness.runner.resolve import prepare
 from harness.vehicles.drivers import driver_records
 from harness.vocabulary import CRASH, BoolArray
 from harness.worlds.twin import TwinWorld
-from studies.alarm import Alarm, KnownRates
-from studies.surrogate_replay import SurrogateReplay, drivers_crash
+from studies.alarm import Alarm, KnownRates, SurrogateReplay, drivers_crash
 from tests.chains.seed import SEED
 
 SMALL = PoolSettings(relative_error=0.03, cut_ins_per_shell=1500)

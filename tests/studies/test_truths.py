@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from studies.super_population import SuperPopulation, cached
-from studies.truths import (
+from studies.replication.populations import (
     DIFFERENCE,
     RATE,
+    SuperPopulation,
+    cached,
     of_pair,
     of_vehicle,
     preventable_by,

@@ -9,13 +9,18 @@ from harness.campaign.campaign import Campaign
 from harness.errors import HarnessError
 from harness.pool.library import load_library
 from harness.progress import Progress
-from studies.experiment import Fault
-from studies.judgement import Subject, judge
-from studies.shell_campaign import FREE, ShellCampaign
-from studies.shell_source import Division
-from studies.super_population import reference_drivers
-from studies.truths import RATE, of_vehicle, preventable_by, ratio_to
-from studies.walked_population import chooser, walk_paths
+from studies.replication.judgement import Subject, judge
+from studies.replication.populations import (
+    RATE,
+    chooser,
+    of_vehicle,
+    preventable_by,
+    ratio_to,
+    reference_drivers,
+    walk_paths,
+)
+from studies.replication.shells import FREE, Division, ShellCampaign
+from tests.chains.coverage import wrong_shell
 
 from .here import Here
 
@@ -76,10 +81,10 @@ def test_a_vehicle_without_a_known_truth_is_refused(walk, name):
         walk(campaign(f"tests.controllers.early:{name}", **({"noise_mps2": 0.5} if name == "FreshNoise" else {})), 64)
 
 
-def repeated(population, crashing, fault=None, paths=200):
+def repeated(population, crashing, wrong=(0, 1.0), paths=200):
     division = Division(LIBRARY, population, [crashing], paths, limit_mps2=2.0, shadow_runs=True)
     source = division.of_vehicle(crashing)
-    rows = ShellCampaign(campaign("examples.acting:Speeds"), source.draw, 3, fault).run(range(FEW))
+    rows = ShellCampaign(campaign("examples.acting:Speeds"), wrong_shell(source.draw, *wrong), 3).run(range(FEW))
     known = of_vehicle(population, crashing, reference_drivers(LIBRARY))
     subject = Subject("speeds", known[RATE], known)
     names = dict.fromkeys(row.result for row in rows)
@@ -97,7 +102,7 @@ def test_redrawn_pools_cover_and_wrong_ones_are_found(speeds):
         assert right[name].p_value > 0.01
         assert right[name].refused <= 0.15  # 200 paths, of which 40 are to count
     heaviest = int(np.argmax(np.bincount(drawn.design.cell_stratum, drawn.crash_mass.sum(0))))
-    _, wrong = repeated(speeds, crashing, Fault(shell=heaviest, factor=3.0))
+    _, wrong = repeated(speeds, crashing, (heaviest, 3.0))
     assert wrong[FREE].p_value < 1e-6
     assert wrong[ratio_to("r157-cc")].p_value < 1e-6
 

@@ -20,7 +20,7 @@ from harness.unboxed import unboxed
 from harness.vehicles.drivers import av_records
 from harness.vocabulary import BV_LV_CONTACT, CRASH, STATE_DTYPE, TIMEOUT
 from harness.worlds.twin import TwinWorld
-from studies.surrogate_replay import replay_surrogates
+from studies.alarm import replay_surrogates
 from tests.episode.test_lateral import BESIDE, NEVER, beside, policy_of
 
 KEEP_SPEED, BRAKE = 20, 0

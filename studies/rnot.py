@@ -17,7 +17,7 @@ in shards, and not by the estimator, so that two estimators of one run see the s
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -238,15 +238,38 @@ def required_tests_of_runs(
         run = _read(folder, with_ratios="scv" in estimators)
         plain: RnotEstimator = "nde" if run.sample.drawn.method == "nde" else "nade"
         tests = {"n_episodes": run.n_tests, "n_crashes": int(np.count_nonzero(~run.failed))}
+        grid = procedure.grid(run.n_tests)
         for name in dict.fromkeys(estimators or [plain]):
             told.stage(f"{folder.name} {name}", procedure.n_shuffles)
             row = {"run": str(folder), "estimator": name, **tests}
             if reason := _REFUSAL[name](run.sample):
                 rows.append({**row, "mean": None, "reason": reason})
                 continue
-            found = _found(run, name, procedure, told)
+            if name == "scv":
+                assert run.whole is not None
+                rhw = scv_rhw(run.whole, procedure, lambda: told.advance(1))
+            else:
+                rhw = plain_rhw(run.weights, run.n_tests, procedure, lambda: told.advance(1), run.failed)
+            found = required_tests(rhw, grid, procedure.rhw)
             reference = reference or found
-            rows.append(row | _row(run, name, found, reference, procedure))
+            aar, side = acceleration(reference, found)
+            rows.append(
+                row
+                | {
+                    "grid": f"{grid[0]:,} to {grid[-1]:,} by {procedure.ratio - 1.0:.3g} n ({len(grid)} looks)",
+                    "grid_points": len(grid),
+                    "total": int(grid[-1]),
+                    "mean": found.mean,
+                    "mean_is_lower_limit": found.is_lower_limit,
+                    "low_5": found.quantile(0.05),
+                    "high_95": found.quantile(0.95),
+                    "never_reached": int(np.count_nonzero(found.never_reached)),
+                    "never_above": int(np.count_nonzero(found.never_above)),
+                    "aar": None if side == "unknown" else aar,
+                    "aar_is": side,
+                    "remarks": list(_remarks(run, name, found, int(grid[-1]), procedure)),
+                }
+            )
     content: dict[str, Any] = finite_json({**asdict(procedure), "rows": rows})
     return content
 
@@ -272,59 +295,38 @@ def _read(folder: Path, *, with_ratios: bool) -> _Run:
     return _Run(n, np.concatenate(weights), np.concatenate(failed), sample, joined(kept) if kept else None)
 
 
-def _found(run: _Run, name: RnotEstimator, procedure: Procedure, progress: Progress) -> RequiredTests:
-    def done() -> None:
-        progress.advance(1)
-
+def _remarks(run: _Run, name: str, found: RequiredTests, total: int, procedure: Procedure) -> Iterator[str]:
+    """What limits a required number of tests."""
+    many, above = (np.count_nonzero(each) for each in (found.never_reached, found.never_above))
+    of_shuffles = f"of {procedure.n_shuffles} shuffles are"
     if name == "scv":
-        assert run.whole is not None
-        rhw = scv_rhw(run.whole, procedure, done)
-    else:
-        rhw = plain_rhw(run.weights, run.n_tests, procedure, done, run.failed)
-    return required_tests(rhw, procedure.grid(run.n_tests), procedure.rhw)
-
-
-def _row(
-    run: _Run, name: RnotEstimator, found: RequiredTests, reference: RequiredTests, procedure: Procedure
-) -> dict[str, Any]:
-    grid = procedure.grid(run.n_tests)
-    ratio, side = acceleration(reference, found)
-    return {
-        "grid": f"{grid[0]:,} to {grid[-1]:,} by {procedure.ratio - 1.0:.3g} n ({len(grid)} looks)",
-        "grid_points": len(grid),
-        "total": int(grid[-1]),
-        "mean": found.mean,
-        "mean_is_lower_limit": found.is_lower_limit,
-        "low_5": found.quantile(0.05),
-        "high_95": found.quantile(0.95),
-        "never_reached": int(np.count_nonzero(found.never_reached)),
-        "never_above": int(np.count_nonzero(found.never_above)),
-        "aar": None if side == "unknown" else ratio,
-        "aar_is": side,
-        "remarks": _remarks(run, name, found, int(grid[-1]), procedure),
-    }
-
-
-def _remarks(run: _Run, name: RnotEstimator, found: RequiredTests, total: int, procedure: Procedure) -> list[str]:
-    remarks, n_shuffles = [SCV_REMARK] if name == "scv" else [], procedure.n_shuffles
+        yield SCV_REMARK
     if run.failed.any():
-        remarks.append(
-            f"{np.count_nonzero(run.failed)} tests failed: the lower limit counts them as no crash, the upper one "
-            "as crashes"
-        )
+        n_failed = np.count_nonzero(run.failed)
+        yield f"{n_failed} tests failed: the lower limit counts them as no crash, the upper one as crashes"
     if found.is_lower_limit:
-        remarks.append(
-            f"{np.count_nonzero(found.never_reached)} of {n_shuffles} shuffles are above RHW {procedure.rhw:g} at "
-            f"{total:,} tests and count as {total:,}: the mean is a lower limit"
-        )
-    if found.never_above.any():
-        remarks.append(
-            f"{np.count_nonzero(found.never_above)} of {n_shuffles} shuffles are nowhere above RHW {procedure.rhw:g}: "
-            "each counts with the n of its largest RHW, as in the paper"
-        )
-    if not found.is_lower_limit and found.quantile(0.95) > run.n_tests / 2:
-        remarks.append(
+        at = f"{many} {of_shuffles} above RHW {procedure.rhw:g} at {total:,} tests"
+        yield f"{at} and count as {total:,}: the mean is a lower limit"
+    elif found.quantile(0.95) > run.n_tests / 2:
+        yield (
             f"above half of the {run.n_tests:,} tests on record shuffles of the same tests hardly differ: ask a longer "
             "run for a mean and a range to rely on"
         )
-    return remarks
+    if above:
+        nowhere = f"{above} {of_shuffles} nowhere above RHW {procedure.rhw:g}"
+        yield f"{nowhere}: each counts with the n of its largest RHW, as in the paper"
+
+
+def table_row(row: Mapping[str, Any]) -> dict[str, str]:
+    """What a terminal shows of a row."""
+    shown = {"run": row["run"], "estimator": row["estimator"], "tests on record": f"{row['n_episodes']:,}"}
+    if row["mean"] is None:
+        return shown | dict.fromkeys(("grid", "mean RNoT", "5-95 %", "never", "AAR"), "-")
+    aar = {"equal": "", "at least": "≥ ", "at most": "≤ "}.get(row["aar_is"])
+    return shown | {
+        "grid": row["grid"],
+        "mean RNoT": f"{'≥ ' if row['mean_is_lower_limit'] else ''}{row['mean']:,.0f}",
+        "5-95 %": f"{row['low_5']:,} to {row['high_95']:,}",
+        "never": f"{row['never_reached']:,}",
+        "AAR": "-" if aar is None else f"{aar}{row['aar']:.3g}",
+    }

@@ -23,7 +23,7 @@ from harness.records.folder import read_table, write_atomically
 
 def sources_of(*patterns: str) -> str:
     """Hash of sources of these studies."""
-    files = sorted(path for pattern in patterns for path in Path(__file__).parent.glob(pattern))
+    files = sorted(path for pattern in patterns for path in Path(__file__).parents[1].glob(pattern))
     return hashlib.sha256(b"".join(path.name.encode() + path.read_bytes() for path in files)).hexdigest()[:16]
 
 

@@ -17,7 +17,7 @@ from scipy.stats import binomtest
 from harness.estimators.estimate import Estimate, finite_json
 from harness.estimators.limits import clopper_pearson, normal_half_width
 from harness.vocabulary import FloatArray
-from studies.truths import Known
+from studies.replication.populations import Known
 
 COVERAGE_CONFIDENCE = 0.95
 SIGNIFICANCE = 0.05
@@ -94,11 +94,11 @@ class Subject:
 class Judgement:
     """One method on one vehicle; `python -m studies validate --help` says what is printed of it.
 
-    Bias and relative variances are over the ``scale`` of the truth (`studies.truths.Known`). The assumption is
-    not met by a statement about vehicles that do not crash outside, and one that does; coverage is not judged then, and
-    has no p-values. Tests for the wanted RHW, 0.3, follow from the true variance at this number of tests, if it was
-    fixed. ``reached`` is the share of replications that reached the precision asked for. Those refused count as
-    covered; where they have no value either, nothing else takes notice of them.
+    Bias and relative variances are over the ``scale`` of the truth (`Known`). The assumption is not met by a statement
+    about vehicles that do not crash outside, and one that does; coverage is not judged then, and has no p-values. Tests
+    for the wanted RHW, 0.3, follow from the true variance at this number of tests, if it was fixed. ``reached`` is the
+    share of replications that reached the precision asked for. Those refused count as covered; where they have no value
+    either, nothing else takes notice of them.
     """
 
     subject: str

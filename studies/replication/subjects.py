@@ -15,16 +15,36 @@ from harness.progress import Progress
 from harness.strata import LIBRARY_STATEMENT
 from harness.traffic.loading import load_environment
 from harness.vocabulary import FloatArray
-from studies.chains.named import CHAINS
+from studies.chains.chain import CHAINS
 from studies.chains.shells import ChainShells
-from studies.experiment import Experiment
-from studies.judgement import Subject
-from studies.shell_campaign import Draw, PairedCampaign, ShellCampaign, limit_at, result_of
-from studies.shell_source import Division, OvertakingShells
-from studies.super_population import Drivers, Mixed, SuperPopulation, enumerate_paths, reference_drivers
-from studies.truths import CONDITIONAL_DIFFERENCE, RATE, Known, Truths, of_pair, of_vehicle
-from studies.walked_population import Choose, chooser, walk_paths
-from studies.weighted_campaign import WeightedCampaign, chain_episodes, twin_episodes
+from studies.replication.experiment import Experiment
+from studies.replication.judgement import Subject
+from studies.replication.populations import (
+    CONDITIONAL_DIFFERENCE,
+    RATE,
+    Choose,
+    Drivers,
+    Known,
+    Mixed,
+    SuperPopulation,
+    Truths,
+    chooser,
+    enumerate_paths,
+    of_pair,
+    of_vehicle,
+    reference_drivers,
+    walk_paths,
+)
+from studies.replication.shells import (
+    Division,
+    Draw,
+    OvertakingShells,
+    PairedCampaign,
+    ShellCampaign,
+    limit_at,
+    result_of,
+)
+from studies.replication.weighted import WeightedCampaign, chain_episodes, twin_episodes
 
 Repeated = ShellCampaign | PairedCampaign | WeightedCampaign
 """A campaign that can be repeated, in any process."""
@@ -73,7 +93,7 @@ def _chains(experiment: Experiment) -> Iterator[Tested]:
 
 def _of_shells(experiment: Experiment, campaign: Campaign, draw: Draw, seed: int, subject: Subject) -> Tested:
     limits = {limit_at(factor): factor * subject.crash_rate.value for factor in experiment.limits}
-    return subject, ShellCampaign(campaign, draw, seed, experiment.fault, limits)
+    return subject, ShellCampaign(campaign, draw, seed, limits)
 
 
 def _vehicle(
@@ -150,7 +170,7 @@ class _Shells:
             facts = {CONDITIONAL_DIFFERENCE: beyond}, source.cells.left_out, source.cells.template.library.boundary
             subject = Subject(name, Known(scale, 0.0, scale), dict(known), *facts)
             campaign, seed = experiment.subject(base[0]), experiment.seed_of(place)
-            yield subject, PairedCampaign(campaign, source.draw, seed, experiment.fault)
+            yield subject, PairedCampaign(campaign, source.draw, seed)
 
     def _division(self, *crashing: FloatArray, limit_mps2: float) -> Division:
         library, paths = self.library, self.experiment.super_population.pool_paths

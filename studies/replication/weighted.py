@@ -21,7 +21,7 @@ from harness.vocabulary import EstimatorName, Method
 from harness.worlds.twin import TwinWorld
 from studies.chains.chain import Chain
 from studies.chains.sampler import draw
-from studies.judgement import Row, estimate_row
+from studies.replication.judgement import Row, estimate_row
 
 CELLS = 1024
 CHUNK = 20_000

@@ -17,10 +17,10 @@ from harness.estimators.estimate import finite_json
 from harness.progress import Progress
 from harness.records.folder import require_place, write_bytes, write_json
 from harness.report.style import BLUE, FULL_WIDTH_IN, GREY, INK, VERMILLION, Plot, new_figure, png
-from studies.experiment import Experiment
-from studies.judgement import Judgement, Row, corrected, judge
-from studies.subjects import Repeated, Tested, subjects
-from studies.work import kept_parts, worker_processes, write_table
+from studies.replication.experiment import Experiment
+from studies.replication.judgement import Judgement, Row, corrected, judge
+from studies.replication.subjects import Repeated, Tested, subjects
+from studies.replication.work import kept_parts, worker_processes, write_table
 
 TASKS_PER_SUBJECT = 8
 RESULTS, REPLICATIONS, PLOT = "results.json", "replications.parquet", "coverage.png"

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, NamedTuple, Self
 
+import pyarrow as pa
 from pydantic import Field, model_validator
 
 from harness.campaign.files import Override, Places, apply_overrides
@@ -13,6 +16,8 @@ from harness.campaign.problems import NAME_PATTERN, broken_rule, validated
 from harness.campaign.sections import Positive, Probability, Section, Whole
 from harness.campaign.yaml_text import read_yaml
 from harness.errors import CampaignError
+from harness.progress import Progress
+from studies.replication.work import kept_parts, worker_processes
 
 StepName = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
 Overrides = list[str]
@@ -261,3 +266,44 @@ def _placed(step: Step, path: Path, name: str) -> Step:
             raise CampaignError(f"{path}: steps.{name}.{key}", f"{named}, but there is no file {file}", expected, mend)
         step = step.model_copy(update={key: str(file)})
     return step
+
+
+class Made(NamedTuple):
+    """A finished step: its folder, and the content of its ``result.json``."""
+
+    folder: Path
+    result: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Context:
+    """Where and how a step is made.
+
+    The folder is the step's own: what it finds there it has left itself when it was killed. Required numbers of tests
+    are for ``rhw`` at a ``confidence``; ``made`` are the steps made before, by name. Without ``workers`` there is one
+    for each core.
+    """
+
+    folder: Path
+    rhw: float
+    confidence: float
+    made: Mapping[str, Made]
+    workers: int | None
+    progress: Progress
+
+    @property
+    def name(self) -> str:
+        """The step's, which its folder's begins with."""
+        return self.folder.name.rpartition("-")[0]
+
+    @property
+    def parts(self) -> Path:
+        """Where what is finished is kept until the step is."""
+        return self.folder / "parts"
+
+    def by_workers(
+        self, jobs: Sequence[Any], make: Callable[[Any], pa.Table], size: Callable[[Any], int] = lambda _job: 1
+    ) -> list[pa.Table]:
+        """Tables of all jobs, made by worker processes; see `kept_parts`."""
+        with worker_processes(self.workers) as executor:
+            return kept_parts(self.parts, self.name, jobs, make, self.progress, run=executor.map, size=size)

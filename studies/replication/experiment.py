@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
-from pydantic_core import PydanticCustomError
 
 from harness.campaign.campaign import Campaign
 from harness.campaign.files import Places, apply_overrides, parse_override
@@ -18,8 +17,10 @@ from harness.campaign.vehicle import AutomatedVehicle, BuiltInParameters
 from harness.campaign.yaml_text import read_yaml
 from harness.errors import CampaignError
 from harness.vocabulary import SAMPLING, EstimatorName
-from studies.chains.named import CHAINS
+from studies.chains.chain import CHAINS
 
+_Wrong = tuple[str, str, str, str]
+"""Where it is, what was found, what was expected, how to mend it."""
 AvName = Annotated[str, Field(pattern=NAME_PATTERN)]
 
 
@@ -32,13 +33,6 @@ class SuperPopulation(Section):
     paths: Whole = Field(65_536, ge=1024, le=1 << 22, description="paths that pools are drawn from, with replacement")
     reference_paths: Whole = Field(65_536, ge=1024, le=1 << 22, description="independent paths that the truth is from")
     pool_paths: Whole = Field(16_384, ge=256, le=1 << 20, description="paths of each pool; smoke.yaml has 32,768")
-
-
-class Fault(Section):
-    """A mistake made on purpose, to show that the experiment notices."""
-
-    shell: Whole = Field(0, ge=0, description="stratum whose probability is wrong, from the most careful on")
-    factor: float = Field(gt=0.0, description="wrong probability over the right one")
 
 
 class Adversary(Section):
@@ -97,7 +91,6 @@ class Experiment(Section):
         description="judge decisions instead of intervals: limits of `accept`, as multiples of each one's crash rate",
     )
     super_population: SuperPopulation = SuperPopulation()
-    fault: Fault | None = None
 
     @property
     def results(self) -> tuple[EstimatorName, ...]:
@@ -140,92 +133,66 @@ class Experiment(Section):
 
     @model_validator(mode="after")
     def _can_be_repeated(self) -> Self:
-        for broken in chain(self._about_subjects(), self._about_vehicles(), self._about_the_method()):
-            raise broken
+        for key, found, expected, mend in chain(self._wrong_subjects(), self._wrong_vehicles(), self._wrong_results()):
+            raise broken_rule(key, found, expected, mend)
         return self
 
-    def _about_subjects(self) -> Iterator[PydanticCustomError]:
-        """What is wrong with subjects, and those made of others."""
+    def _wrong_subjects(self) -> Iterator[_Wrong]:
+        """Subjects, and those made of others."""
         if bool(self.avs) == bool(self.chains):
-            yield broken_rule(
-                "avs",
-                "both avs and chains" if self.avs else "neither avs nor chains",
-                "one of the two",
-                "Name vehicles under avs for overtaking in the twin, or exact chains under chains.",
-            )
-        for name in self.chains:
-            if name not in CHAINS:
-                expected = f"some of {', '.join(CHAINS)}"
-                yield broken_rule("chains", f"'{name}'", expected, "Choose one of them.")
-        method = self.campaign.testing.method
-        if self.adversaries and method != "shells":
-            expected = "method shells: their crashes are drawn within shells"
-            yield broken_rule("adversaries", f"adversaries for {method}", expected, "Delete them.")
+            mend = "Name vehicles under avs for overtaking in the twin, or exact chains under chains."
+            yield "avs", "both avs and chains" if self.avs else "neither avs nor chains", "one of the two", mend
+        for name in set(self.chains) - set(CHAINS):
+            yield "chains", f"'{name}'", f"some of {', '.join(CHAINS)}", "Choose one of them."
         for name, made in self.adversaries.items():
-            where, others = f"adversaries.{name}", ", ".join(self.avs)
             if made.of not in self.avs:
-                expected = f"one of avs: {others}"
-                yield broken_rule(f"{where}.of", f"'{made.of}'", expected, "Name one of them.")
+                expected = f"one of avs: {', '.join(self.avs)}"
+                yield f"adversaries.{name}.of", f"'{made.of}'", expected, "Name one of them."
             if name in self.avs:
-                yield broken_rule(where, "a name that avs has, too", "another", "Rename it.")
-        if self.pairs and method != "shells":
-            expected = "method shells: it compares on drawn cut-ins"
-            yield broken_rule("pairs", f"pairs for {method}", expected, "Delete them.")
+                yield f"adversaries.{name}", "a name that avs has, too", "another", "Rename it."
         known = [*self.holding, *(name for name, made in self.adversaries.items() if made.of in self.holding)]
         for name, pair in self.pairs.items():
             for side, asked in (("a", pair.a), ("b", pair.b)):
                 if asked not in known:
-                    yield broken_rule(
-                        f"pairs.{name}.{side}",
-                        f"'{asked}'",
-                        f"a vehicle that holds its speed before the cut-in: {', '.join(known)}",
-                        "Name one of them; `harness compare` takes no others under shells.",
-                    )
+                    expected = f"a vehicle that holds its speed before the cut-in: {', '.join(known)}"
+                    mend = "Name one of them; `harness compare` takes no others under shells."
+                    yield f"pairs.{name}.{side}", f"'{asked}'", expected, mend
 
-    def _about_vehicles(self) -> Iterator[PydanticCustomError]:
+    def _wrong_vehicles(self) -> Iterator[_Wrong]:
         """What has no twin."""
-        if self.campaign.world.engine != "twin":
-            yield broken_rule(
-                "campaign.world.engine",
-                self.campaign.world.engine,
-                "twin: thousands of replications are not affordable in SUMO, whose records the twin's equal",
-                "Leave the key out.",
-            )
+        engine, shells = self.campaign.world.engine, self.campaign.testing.method == "shells"
+        if engine != "twin":
+            expected = "twin: thousands of replications are not affordable in SUMO, whose records the twin's equal"
+            yield "campaign.world.engine", engine, expected, "Leave the key out."
         for name, av in self.avs.items():
             built_in, acts = isinstance(av.parameters, BuiltInParameters), av.acts_before_cut_in
             if not (built_in or (av.source in ("controller", "fmu") and acts)):
-                yield broken_rule(
+                yield (
                     f"avs.{name}",
                     f"an AV that av.{av.source} drives" + ("" if acts else " from the cut-in on"),
                     "a built-in model (idm, fvdm, constant), or a controller with before_cut_in controller: "
                     "replications run in the twin",
                     "Leave it out here, and test it in SUMO with `harness run`.",
                 )
-            if acts and (built_in or self.campaign.testing.method != "shells"):
-                yield broken_rule(
-                    f"avs.{name}.before_cut_in",
-                    av.before_cut_in,
-                    "hold_speed, but for a controller with testing.method shells, which walks paths first",
-                    "Leave the key out.",
-                )
+            if acts and (built_in or not shells):
+                expected = "hold_speed, but for a controller with testing.method shells, which walks paths first"
+                yield f"avs.{name}.before_cut_in", av.before_cut_in, expected, "Leave the key out."
 
-    def _about_the_method(self) -> Iterator[PydanticCustomError]:
+    def _wrong_results(self) -> Iterator[_Wrong]:
         """What the method does not allow."""
         method = self.campaign.testing.method
-        judged = SAMPLING[method].estimators
-        if wrong := set(self.results).difference(judged):
+        if wrong := set(self.results).difference(judged := SAMPLING[method].estimators):
             expected = f"for testing.method {method}: {', '.join(sorted(judged))}"
-            mend = "Change one of the two."
-            yield broken_rule("estimators", ", ".join(sorted(wrong)), expected, mend)
-        if self.limits and (method != "shells" or self.pairs):
-            yield broken_rule(
-                "limits",
-                "comparisons of two vehicles" if self.pairs else f"testing.method {method}",
-                "campaigns of single vehicles by testing.method shells, which alone decide",
-                "Delete the key.",
-            )
-        if self.fault is not None and method != "shells":
-            yield broken_rule("fault", f"a wrong shell for {method}", "method shells", "Delete it.")
+            yield "estimators", ", ".join(sorted(wrong)), expected, "Change one of the two."
+        for key, why in {
+            "adversaries": "their crashes are drawn within shells",
+            "pairs": "it compares on drawn cut-ins",
+            "limits": "it alone decides",
+        }.items():
+            if getattr(self, key) and method != "shells":
+                yield key, f"{key} for {method}", f"method shells: {why}", "Delete them."
+        if self.limits and self.pairs:
+            yield "limits", "comparisons of two vehicles", "campaigns of single vehicles", "Delete the key."
 
 
 def load_experiment(path: Path, overrides: Sequence[str] = ()) -> Experiment:
@@ -244,7 +211,10 @@ def load_experiment(path: Path, overrides: Sequence[str] = ()) -> Experiment:
         return experiment
     file = (path.parent / library).resolve()
     if not file.is_file():
-        expected = "a surrogate library, or the name of a shipped one"
-        mend = "Correct the path; it is relative to the folder of the experiment."
-        raise CampaignError(f"{path}: campaign.pool.library", f"{library}, but there is no file {file}", expected, mend)
+        raise CampaignError(
+            f"{path}: campaign.pool.library",
+            f"{library}, but there is no file {file}",
+            "a surrogate library, or the name of a shipped one",
+            "Correct the path; it is relative to the folder of the experiment.",
+        )
     return experiment.replaced(("campaign", "pool", "library"), str(file))

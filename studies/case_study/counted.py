@@ -1,0 +1,268 @@
+"""What a run claims as it grows: NADE with and without control variates, convergence, the paper's RNoT and AAR."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Iterator, Sequence
+from itertools import pairwise, takewhile
+from typing import Any, NamedTuple
+
+import numpy as np
+import pyarrow as pa
+
+from harness.estimators.block import MAX_CONTROL_STEPS, Block, joined
+from harness.estimators.estimate import FailureBounds
+from harness.estimators.limits import normal_half_width
+from harness.estimators.scv import Scv, StratumFit
+from harness.estimators.weighted import Nade
+from harness.records.folder import write_bytes
+from harness.runner.estimate import stored_blocks
+from harness.vocabulary import FloatArray, IntArray, Method
+from studies.case_study.figures import (
+    exactly,
+    figure,
+    marked,
+    mean_of,
+    ratio,
+    ratio_of_means,
+    tests_for,
+    weights_are_in,
+)
+from studies.case_study.study import Context, ControlVariates, Convergence, Made, RequiredNumbers
+from studies.case_study.tested import Tests, read_tests, settled
+from studies.replication.work import kept_parts, write_table
+from studies.rnot import (
+    Procedure,
+    RequiredTests,
+    acceleration,
+    plain_rhw,
+    required_tests,
+    scv_rhw_of,
+    total_and_half_width,
+)
+
+
+class Claims:
+    """Both estimators, fed with the same blocks; SCV only where it is defined and wanted."""
+
+    def __init__(self, *, with_scv: bool = True) -> None:
+        self.nade, self.scv = FailureBounds(Nade()), Scv()
+        self._scv, self._with_scv = FailureBounds(self.scv), with_scv
+        self._n, self._weight = 0, 0.0
+        self._method: Method = "nde"
+
+    def add(self, block: Block) -> None:
+        """Add tests."""
+        self._method = block.drawn.method
+        self._with_scv = self._with_scv and Scv.refusal(block) is None
+        self._n += len(block)
+        self._weight += float(block.weights().sum())
+        self.nade.add(block)
+        if self._with_scv:
+            self._scv.add(block)
+
+    def row(self, rhw: float, confidence: float) -> dict[str, Any]:
+        """Figures of what is claimed so far; ``settled`` says whether it means anything."""
+        nade, z = self.nade.result(confidence), normal_half_width(1.0, confidence)
+        scv = self._scv.result(confidence) if self._with_scv else None
+        mean_weight = self._weight / self._n
+        settled = weights_are_in(self._method, mean_weight)
+        row: dict[str, Any] = {
+            "n": self._n,
+            "n_crashes": nade.n_crashes,
+            "mean_weight": mean_weight,
+            "settled": settled,
+            "largest_weight_share": nade.largest_weight_share,
+        }
+        for name, found in (("nade", nade), ("scv", scv)):
+            rate, half = (0.0, 0.0) if found is None else (found.crash_rate, z * found.std_error)
+            said = figure(rate, max(rate - half, 0.0), rate + half) if rate > 0.0 else figure(None)
+            row[f"{name}_rate"] = marked(said, settled=settled)
+            row[f"{name}_rhw"] = half / rate if rate > 0.0 else None
+            row[f"{name}_tests"] = tests_for(self._n * (half / z / rate) ** 2, rhw, confidence) if rate > 0.0 else None
+        beside = scv if scv is not None and scv.std_error > 0.0 < nade.crash_rate else None
+        row["gain_claimed"] = None if beside is None else (nade.std_error / beside.std_error) ** 2
+        row["difference"] = None if beside is None else abs(beside.crash_rate / nade.crash_rate - 1.0)
+        return row
+
+
+def compare_control_variates(step: ControlVariates, context: Context) -> dict[str, Any]:
+    """Both estimates at every size, in one pass that goes on from the last size; the strata after the last one."""
+    run = context.made[step.of]
+    sizes = [size for size in step.sizes if size <= run.result["n"]]
+    begun = context.parts / "state.pickle"
+    # Written by this very step: its folder is named after the code whose objects these are.
+    claims, rows = pickle.loads(begun.read_bytes()) if begun.is_file() else (Claims(), [])  # noqa: S301
+    done = rows[-1]["n"] if rows else 0
+    context.progress.stage(context.name, sizes[-1] if sizes else 0, done=done)
+    for block in cut_at(stored_blocks(run.folder / "run", moments=True), sizes):
+        n = block.first_episode + len(block)
+        if n <= done:
+            continue
+        if block.first_episode >= max(sizes, default=0):
+            break
+        claims.add(block)
+        context.progress.advance(len(block))
+        if n in sizes:
+            rows.append(claims.row(context.rhw, context.confidence))
+            begun.parent.mkdir(exist_ok=True)
+            write_bytes(begun, pickle.dumps((claims, rows)))
+    fits = claims.scv.fits()
+    beyond = [fit for level, fit in fits if level > MAX_CONTROL_STEPS]
+    strata = [{"control_steps": level, **_together([fit])} for level, fit in fits]
+    write_table(context.folder / "sizes.parquet", pa.Table.from_pylist(rows))
+    write_table(context.folder / "strata.parquet", pa.Table.from_pylist(strata))
+    return {
+        "sizes": rows,
+        "left_out": [size for size in step.sizes if size > run.result["n"]],
+        "strata": strata,
+        "beyond": _together(beyond),
+        "all": _together([fit for _, fit in fits]),
+        "figures": _figures(rows, fits),
+    }
+
+
+def cut_at(blocks: Iterator[Block], sizes: list[int]) -> Iterator[Block]:
+    """The same tests in blocks that end where a size is reached, too."""
+    for block in blocks:
+        first, stop = block.first_episode, block.first_episode + len(block)
+        cuts = [0, *(size - first for size in sizes if first < size < stop), len(block)]
+        for start, end in pairwise(cuts):
+            yield block.take(slice(start, end))
+
+
+def _together(fits: Sequence[StratumFit]) -> dict[str, Any]:
+    """One stratum, or several: their tests and results together, the most columns, the largest rank."""
+    n = sum(fit.n for fit in fits)
+    mean = sum(fit.n * fit.intercept for fit in fits) / max(n, 1)
+    between = sum(fit.n * (fit.intercept - mean) ** 2 for fit in fits)
+    spread = {
+        name: float(np.sqrt((sum(each) + between) / max(n, 1)))
+        for name, each in {
+            "sd_before": [fit.total_squares for fit in fits],
+            "sd_after": [fit.residual_squares for fit in fits],
+        }.items()
+    }
+    return {
+        "n": n,
+        "columns": max((fit.n_columns for fit in fits), default=0),
+        "rank": max((fit.rank for fit in fits), default=0),
+        **spread,
+    }
+
+
+def _figures(rows: list[dict[str, Any]], fits: list[tuple[int, StratumFit]]) -> dict[str, Any]:
+    if not rows:
+        return {}
+    last, most = rows[-1], max(((fit.n, level) for level, fit in fits if level > 0), default=(0, None))[1]
+    gain = last["gain_claimed"]
+    return {
+        "claimed_gain": marked(figure(None) if gain is None else exactly(gain), settled=last["settled"]),
+        "difference": figure(last["difference"]),
+        "most_frequent_stratum": figure(None) if most is None else exactly(most),
+    }
+
+
+CURVES = "curves.parquet"
+
+
+def draw_convergence(step: Convergence, context: Context) -> dict[str, Any]:
+    """Curves as Parquet; how many tests each needed in the order in which it was tested; rates over the reference's."""
+    procedure = Procedure(context.rhw, context.confidence)
+    tables, figures = list[pa.Table](), dict[str, Any]()
+    reference = context.made[step.reference].result["figures"]["crash_rate"]
+    for name in step.of:
+        tests = read_tests(context.made[name])
+        n, rate, half = curve(tests, procedure)
+        tables.append(pa.table({"step": [name] * len(n), "n": n, "crash_rate": rate, "half_width": half}))
+        rhw = np.divide(half, rate, out=np.full(len(n), np.inf), where=rate > 0.0)
+        required = required_tests(rhw[None, :], n, procedure.rhw)
+        found = {
+            "settled": figure(None, tests.n) if required.is_lower_limit else exactly(required.n[0]),
+            "rhw": exactly(rhw[-1]) if np.isfinite(rhw[-1]) else figure(None),
+            "over_reference": ratio(context.made[name].result["figures"]["crash_rate"], reference),
+        }
+        is_in = settled(context.made[name])
+        figures |= {f"{name}.{key}": marked(each, settled=is_in) for key, each in found.items()}
+    write_table(context.folder / CURVES, pa.concat_tables(tables))
+    return {"figures": figures}
+
+
+def curve(tests: Tests, procedure: Procedure) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Numbers of tests (g,), and after each the mean of Y and the half-width of its normal interval."""
+    n = procedure.grid(tests.n)
+    total, half = total_and_half_width(tests.y, np.searchsorted(tests.episode, n), n, procedure.z)
+    return n, total / n, half / n
+
+
+class _Found(NamedTuple):
+    """RNoT of every shuffle of some tests, and whether their weights have come in."""
+
+    rnot: RequiredTests
+    tests: int
+    settled: bool
+
+    def figure(self, confidence: float) -> dict[str, Any]:
+        """Mean over shuffles with its interval; a lower limit where some needed more tests than there were."""
+        mean = mean_of(self.rnot.n.tolist(), confidence)
+        if self.rnot.is_lower_limit:
+            mean = figure(None if self.rnot.never_reached.all() else mean["value"], mean["low"] or mean["value"])
+        return marked(mean, settled=self.settled)
+
+    def over(self, other: _Found, confidence: float) -> dict[str, Any]:
+        """AAR of the other one: ratio of the means, open where one of them is a lower limit."""
+        found = ratio_of_means(self.rnot.n.tolist(), other.rnot.n.tolist(), confidence)
+        side = acceleration(self.rnot, other.rnot)[1]
+        if side == "at least":
+            found = figure(found["value"], found["low"] or found["value"])
+        elif side == "at most":
+            found = figure(found["value"], None, found["high"] or found["value"])
+        return marked(figure(None) if side == "unknown" else found, settled=self.settled and other.settled)
+
+
+def count_required_tests(step: RequiredNumbers, context: Context) -> dict[str, Any]:
+    """RNoT of every step that is named, and of SCV beside NADE on the same shuffles of the same tests."""
+    asked = context.rhw, context.confidence
+    found = {name: _plain(context.made[name], Procedure(*asked, step.shuffles), context) for name in step.of}
+    pairs = {f"{step.of[0]}_over_{name}": (step.of[0], name) for name in step.of[1:]}
+    if step.scv is not None:
+        made, fewer = context.made[step.scv], Procedure(*asked, step.scv_shuffles, ratio=step.scv_ratio)
+        found["nade_beside_scv"] = _plain(made, fewer, context, first=step.scv_tests)
+        found["scv"] = _scv(made, fewer, context, first=step.scv_tests)
+        pairs["nade_over_scv"] = "nade_beside_scv", "scv"
+    for name, each in found.items():
+        columns = {"shuffle": np.arange(len(each.rnot.n)), "tests": each.rnot.n}
+        write_table(context.folder / f"{name}.parquet", pa.table({**columns, "never_reached": each.rnot.never_reached}))
+    figures = {name: each.figure(context.confidence) for name, each in found.items()}
+    ratios = {name: found[a].over(found[b], context.confidence) for name, (a, b) in pairs.items()}
+    return {
+        "never_reached": {name: int(np.count_nonzero(each.rnot.never_reached)) for name, each in found.items()},
+        "shuffles": {name: len(each.rnot.n) for name, each in found.items()},
+        "tests": {name: each.tests for name, each in found.items()},
+        "figures": figures | ratios,
+    }
+
+
+def _plain(made: Made, procedure: Procedure, context: Context, *, first: int | None = None) -> _Found:
+    """Of the mean of Y, on all tests of a step or its first ones."""
+    tests = read_tests(made)
+    n = min(tests.n, first or tests.n)
+    kept = tests.episode < n
+    context.progress.stage(f"shuffles of {made.folder.name.rpartition('-')[0]}", procedure.n_shuffles)
+    rhw = plain_rhw(tests.weight[kept], n, procedure, lambda: context.progress.advance(1), tests.failed[kept])
+    return _Found(required_tests(rhw, procedure.grid(n), procedure.rhw), n, settled(made))
+
+
+def _scv(made: Made, procedure: Procedure, context: Context, *, first: int) -> _Found:
+    """Of what SCV claims, a part for each shuffle; the tests are read only if any is missing."""
+    n, tests = min(made.result["n"], first), list[Block]()
+
+    def rhw_of(shuffle: int) -> pa.Table:
+        if not tests:
+            blocks = cut_at(stored_blocks(made.folder / "run", moments=True), [n])
+            tests.append(joined(list(takewhile(lambda block: block.first_episode < n, blocks))))
+        return pa.table({"rhw": scv_rhw_of(tests[0], procedure, shuffle)})
+
+    tables = kept_parts(context.parts, "scv", range(procedure.n_shuffles), rhw_of, context.progress)
+    rhw = np.array([table.column("rhw").to_numpy() for table in tables])
+    return _Found(required_tests(rhw, procedure.grid(n), procedure.rhw), n, settled(made))

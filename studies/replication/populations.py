@@ -1,0 +1,438 @@
+"""Large populations of enumerated paths: every cut-in, its probability, which drivers crash on it; and so the truth.
+
+Enumerating a pool takes seconds, thousands of pools hours. So many paths are enumerated once, and the pools of the
+replications are drawn from them with replacement, path by path, as real pools are drawn from all paths. The truth is
+from other paths, that no pool of the experiment has: crash rates, their ratios and differences are means over paths, or
+ratios of two of them, so that each has a standard error.
+
+A vehicle that acts before the cut-in has a population of paths that it has walked. They are chosen as for a campaign's
+shadow runs, only many more of them, and every `STRIDE`-th of their cut-ins is asked. Surrogates and references take
+over from the vehicle as in its pool, and the vehicle itself drives each of these cut-ins as a test of the campaign
+would: told the index of its shadow run, and held to the hash of what it did there.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import cast
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from harness.campaign.campaign import Campaign
+from harness.campaign.vehicle import AutomatedVehicle, BuiltInParameters, Reflexes
+from harness.compiled import WORLD_SOURCES, cache_root, source_hash
+from harness.controllers.find import build_host, require_controller
+from harness.drawing.baseline import recorded, without_cut_in
+from harness.episode.cells import PrescribedTraffic
+from harness.episode.judge import motion_hashes
+from harness.episode.loop import Drawing, EpisodeLoop, RecordPolicy
+from harness.episode.path import Followers
+from harness.errors import CampaignError, HarnessError
+from harness.importance.build import build_importance
+from harness.pool.aimed_paths import PILOT_PATHS, Enumerator
+from harness.pool.cut_ins import environment_hash, onset_steps
+from harness.pool.enumeration import STRIDE, ShadowRuns, enumerate_cut_ins, write_script
+from harness.pool.library import Library
+from harness.pool.shells import acceleration_limit
+from harness.pool.vehicle_pool import CANDIDATES, ShadowPaths, walk_candidates
+from harness.progress import Progress
+from harness.resolved import Resolved, resolve
+from harness.traffic.laws import Environment
+from harness.vehicles.drivers import driver_records
+from harness.vocabulary import CRASH, PRESCRIBED, BoolArray, FloatArray, IntArray, RecordArray
+from harness.worlds.twin import TwinWorld
+from studies.replication.work import sources_of, write_table
+
+MOST_DRIVERS = 62
+NO_ENVELOPE = -1
+CHUNK_PATHS = 2048
+_FORMAT = 1
+_COLUMNS = ("path", "mass", "bits")
+
+
+@dataclass(frozen=True, eq=False)
+class SuperPopulation:
+    """Cut-ins of n paths on which at least one driver crashes.
+
+    ``cut_in`` (n,) is the weighted probability of a cut-in, by path; ``path`` and ``mass`` (m,) are the path of each
+    cut-in, ascending, and its weighted probability; ``bits`` (m,) have one bit per driver that crashes.
+    """
+
+    cut_in: FloatArray
+    path: IntArray
+    mass: FloatArray
+    bits: IntArray
+
+    @property
+    def n_paths(self) -> int:
+        """Number of paths."""
+        return self.cut_in.size
+
+    def crashes(self, driver: int) -> BoolArray:
+        """On which cut-ins a driver crashes, shape (m,)."""
+        return np.asarray((self.bits >> driver) & 1 == 1)
+
+    def by_path(self, mass: FloatArray) -> FloatArray:
+        """Sum of a mass of cut-ins (m,) over each path, shape (n,)."""
+        return np.asarray(np.bincount(self.path, mass, minlength=self.cut_in.size), np.float64)
+
+
+@dataclass(frozen=True)
+class Mixed:
+    """A vehicle as drivers of the enumeration, each with the share of episodes in which it is that one."""
+
+    drivers: tuple[int, ...]
+    shares: tuple[float, ...]
+
+    def crash_mass(self, population: SuperPopulation) -> FloatArray:
+        """Probability that a cut-in happens and the vehicle crashes on it, shape (m,)."""
+        crashing = np.zeros(population.mass.size)
+        for driver, share in zip(self.drivers, self.shares, strict=True):
+            crashing += share * population.crashes(driver)
+        return crashing * population.mass
+
+
+@dataclass(frozen=True, eq=False)
+class Drivers:
+    """All drivers of an enumeration (D,), which are asked about the same cut-ins.
+
+    The ``envelope`` crashes wherever another one does; -1 if there is none. Vehicles and reference drivers are by name.
+    """
+
+    records: RecordArray
+    envelope: int
+    vehicles: dict[str, Mixed]
+    references: dict[str, int]
+
+    @classmethod
+    def of(cls, library: Library, avs: Mapping[str, AutomatedVehicle], *, see_onset: bool = False) -> Drivers:
+        """The library's, references last, in the order of its file, and then vehicles with built-in models.
+
+        The envelope is the library's, unless a vehicle accelerates harder; ``see_onset`` is that of `driver_records`.
+        """
+        models = [*library.surrogates.values(), *library.references.values()]
+        parameters: list[BuiltInParameters] = [model.parameters for model in models]
+        reactions: list[Reflexes] = [model.reaction for model in models]
+        vehicles = {}
+        for name, av in avs.items():
+            reflexes, shares = zip(*_reactions(av), strict=True)
+            vehicles[name] = Mixed(tuple(range(len(parameters), len(parameters) + len(shares))), shares)
+            parameters += [cast(BuiltInParameters, av.parameters)] * len(shares)
+            reactions += reflexes
+        if len(parameters) > MOST_DRIVERS:
+            raise CampaignError(
+                "avs",
+                f"{len(parameters)} drivers with the library's {len(models)}",
+                f"at most {MOST_DRIVERS}",
+                "Divide the experiment; an inattentive vehicle counts as two.",
+            )
+        enclosed = all(acceleration_limit(av) <= library.envelope_mps2 for av in avs.values())
+        envelope = list(library.surrogates).index(library.envelope) if enclosed else NO_ENVELOPE
+        records = driver_records(parameters, reactions, see_onset=see_onset)
+        return cls(records, envelope, vehicles, reference_drivers(library))
+
+    def only(self, names: set[str]) -> Drivers:
+        """The envelope, the references and the drivers of some vehicles."""
+        vehicles = {name: one for name, one in self.vehicles.items() if name in names}
+        enclosed = self.envelope != NO_ENVELOPE
+        kept = [self.envelope] * enclosed + [*self.references.values()]
+        kept += [d for one in vehicles.values() for d in one.drivers]
+        renumbered = {name: Mixed(tuple(map(kept.index, one.drivers)), one.shares) for name, one in vehicles.items()}
+        references = {name: kept.index(driver) for name, driver in self.references.items()}
+        return Drivers(self.records[kept], 0 if enclosed else NO_ENVELOPE, renumbered, references)
+
+
+def reference_drivers(library: Library) -> dict[str, int]:
+    """The library's reference drivers by name, as places among all its drivers."""
+    return {name: len(library.surrogates) + r for r, name in enumerate(library.references)}
+
+
+def _reactions(av: AutomatedVehicle) -> list[tuple[Reflexes, float]]:
+    """The reflexes that a vehicle can have in an episode, and how probable each is."""
+    own = av.reaction
+    reflexes = Reflexes(**own.model_dump(include=set(Reflexes.model_fields)))
+    if own.inattention_probability == 0.0 or own.inattention_delay_s == 0.0:
+        return [(reflexes, 1.0)]
+    late = reflexes.model_copy(update={"delay_s": own.delay_s + own.inattention_delay_s})
+    return [(reflexes, 1.0 - own.inattention_probability), (late, own.inattention_probability)]
+
+
+def enumerate_paths(
+    environment: Environment, drivers: Drivers, seed: int, n_paths: int, progress: Progress
+) -> SuperPopulation:
+    """Enumerate paths that are aimed at the drivers' crashes, or read them from the cache."""
+    asked = environment, Followers(drivers.records, drivers.envelope), seed
+
+    def enumerated() -> SuperPopulation:
+        pilot = Enumerator(*asked)
+        progress.stage(f"super-population of seed {seed}", n_paths + PILOT_PATHS)
+        rates = pilot.run(0, PILOT_PATHS, progress).rates(drivers.records.size)
+        return _compressed(pilot.aimed(rates), n_paths, progress)
+
+    return cached(population_key(environment, drivers.records.tolist(), drivers.envelope, seed, n_paths), enumerated)
+
+
+def cached(key: str, make: Callable[[], SuperPopulation]) -> SuperPopulation:
+    """A population of a key, read from the cache or made and kept there."""
+    file = cache_root() / "super_populations" / f"{key}.parquet"
+    with suppress(OSError, pa.ArrowException, KeyError, TypeError, ValueError):  # a damaged one is made anew
+        table = pq.read_table(file, partitioning=None)
+        cut_in = np.frombuffer(table.schema.metadata[b"cut_in"], np.float64)
+        return SuperPopulation(cut_in, *(np.asarray(table.column(name)) for name in _COLUMNS))
+    population = make()
+    table = pa.table({name: getattr(population, name) for name in _COLUMNS})
+    write_table(file, table.replace_schema_metadata({b"cut_in": population.cut_in.tobytes()}))
+    return population
+
+
+def _compressed(aimed: Enumerator, n_paths: int, progress: Progress) -> SuperPopulation:
+    """Enumerate chunk by chunk, and keep the cut-ins with crashes of each."""
+    parts = []
+    for first in range(0, n_paths, CHUNK_PATHS):
+        paths = aimed.run(PILOT_PATHS + first, min(CHUNK_PATHS, n_paths - first), progress)
+        mass, bits = paths.mass, paths.crashes
+        row, step = np.nonzero((bits != 0) & (mass > 0.0))
+        parts.append(SuperPopulation(mass.sum(1), first + row.astype(np.int64), mass[row, step], bits[row, step]))
+    return joined(parts)
+
+
+def joined(parts: Sequence[SuperPopulation]) -> SuperPopulation:
+    """All in one; each part knows the numbers that its paths have in the whole."""
+    columns = ("cut_in", *_COLUMNS)
+    return SuperPopulation(*(np.concatenate([getattr(part, name) for part in parts]) for name in columns))
+
+
+def population_key(environment: Environment, *content_of: object) -> str:
+    """Hash of all that a population depends on: plain content, an environment, and code."""
+    content = [_FORMAT, source_hash(WORLD_SOURCES), environment_hash(environment), *content_of]
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:24]
+
+
+LARGEST_ERROR = 0.005
+"""Standard error of a crash rate, over the rate, that a truth should have at most."""
+MORE_PATHS = 3
+RATE, DIFFERENCE, CONDITIONAL_DIFFERENCE = "rate", "difference", "difference, conditional"
+
+
+def ratio_to(reference: str) -> str:
+    """Name of the ratio of a vehicle's crash rate to a reference driver's."""
+    return f"ratio to {reference}"
+
+
+def preventable_by(reference: str) -> str:
+    """Name of the share of a vehicle's crashes that a reference driver would have avoided."""
+    return f"preventable by {reference}"
+
+
+@dataclass(frozen=True)
+class Known:
+    """A true value, its standard error, and what deviations from it are to be seen beside.
+
+    That is the value itself, but 1 for a share, and the larger of the two rates for a difference: both may be 0.
+    """
+
+    value: float
+    std_error: float
+    scale: float
+
+    @property
+    def relative_error(self) -> float:
+        """Standard error over the scale; infinite at scale 0."""
+        return self.std_error / self.scale if self.scale > 0.0 else float("inf")
+
+
+def mean_of(by_path: FloatArray, scale: float | None = None) -> Known:
+    """Mean of a number that each path has (n,)."""
+    mean = float(by_path.mean())
+    return Known(mean, float(by_path.std() / np.sqrt(by_path.size)), mean if scale is None else scale)
+
+
+def ratio_of(above: FloatArray, below: FloatArray, scale: float | None = None) -> Known:
+    """Ratio of the means of two numbers that each path has (n,), with the error of the delta method."""
+    mean = float(below.mean())
+    ratio = float(above.mean()) / mean if mean > 0.0 else float("nan")
+    error = float((above - ratio * below).std() / np.sqrt(below.size)) / mean if mean > 0.0 else float("nan")
+    return Known(ratio, error, ratio if scale is None else scale)
+
+
+def of_vehicle(population: SuperPopulation, crashing: FloatArray, references: Mapping[str, int]) -> dict[str, Known]:
+    """Everything about a vehicle by its mass of crashes (m,), beside reference drivers."""
+    own = population.by_path(crashing)
+    found = {RATE: mean_of(own)}
+    for name, driver in references.items():
+        crashes_too = population.crashes(driver)
+        found[ratio_to(name)] = ratio_of(own, population.by_path(population.mass * crashes_too))
+        found[preventable_by(name)] = ratio_of(population.by_path(crashing * ~crashes_too), own, 1.0)
+    return found
+
+
+def of_pair(population: SuperPopulation, a: FloatArray, b: FloatArray) -> dict[str, Known]:
+    """How much more often one vehicle crashes than another, by their masses of crashes (m,); both statements' truth."""
+    by_path = population.by_path(a - b)
+    difference = mean_of(by_path, max(float(x.sum()) for x in (a, b)) / population.n_paths)
+    return {DIFFERENCE: difference, CONDITIONAL_DIFFERENCE: difference}
+
+
+class Truths:
+    """Paths that vehicles' truths are from: aimed at all drivers, and again at some that these leave imprecise.
+
+    Those mostly crash in quite other places than the rest. They are enumerated again with more paths, aimed at them
+    alone, and at vehicles that they are to be seen ``beside``.
+    """
+
+    def __init__(
+        self,
+        environment: Environment,
+        drivers: Drivers,
+        seed: int,
+        n_paths: int,
+        progress: Progress,
+        beside: Mapping[str, set[str]] | None = None,
+    ) -> None:
+        population = enumerate_paths(environment, drivers, seed, n_paths, progress)
+        self._enumerated = [(drivers, population)]
+        imprecise = {name for name in drivers.vehicles if self.vehicle(name)[RATE].relative_error > LARGEST_ERROR}
+        if imprecise:
+            again = drivers.only(imprecise.union(*((beside or {}).get(name, set()) for name in imprecise)))
+            population = enumerate_paths(environment, again, seed + 1, MORE_PATHS * n_paths, progress)
+            self._enumerated.insert(0, (again, population))
+
+    def vehicle(self, name: str) -> dict[str, Known]:
+        """Everything about one vehicle."""
+        drivers, population, (crashing,) = self._where(name)
+        return of_vehicle(population, crashing, drivers.references)
+
+    def pair(self, a: str, b: str) -> dict[str, Known]:
+        """Everything about two vehicles."""
+        _, population, crashing = self._where(a, b)
+        return of_pair(population, *crashing)
+
+    def _where(self, *names: str) -> tuple[Drivers, SuperPopulation, list[FloatArray]]:
+        """The most precise paths that have all of them, and their masses of crashes."""
+        drivers, population = next(found for found in self._enumerated if set(names) <= set(found[0].vehicles))
+        return drivers, population, [drivers.vehicles[name].crash_mass(population) for name in names]
+
+
+CELLS = 1024
+WALKED_CHUNK = 1024
+"""Paths that one task walks: some 15 MB of motion."""
+
+
+_SOURCES = ("pool/vehicle_pool.py", "controllers/hosts.py")
+"""Files beside those of the world that decide what a vehicle meets, and is told."""
+Choose = Callable[[int, int], ShadowPaths]
+"""Chooses paths from a seed, so many of them; all vehicles of an experiment walk the same."""
+
+
+def chooser(campaign: Campaign, progress: Progress, candidates: int = CANDIDATES) -> Choose:
+    """Chooses paths in the traffic of a campaign, out of so many, or of as many as are asked for."""
+    resolved = resolve(campaign)
+
+    @cache
+    def choose(seed: int, n_paths: int) -> ShadowPaths:
+        settings = campaign.pool.model_copy(update={"seed": seed})
+        where, most = (resolved.environment, resolved.library), max(n_paths, candidates)
+        return walk_candidates(*where, settings, "walked", progress, most).draw(n_paths)
+
+    return choose
+
+
+def walk_paths(
+    campaign: Campaign, choose: Choose, seed: int, n_paths: int, executor: Executor, progress: Progress
+) -> SuperPopulation:
+    """Let the campaign's vehicle walk so many paths, or read what it did from the cache.
+
+    Raises
+    ------
+    HarnessError
+        The vehicle failed, or did something else in a test than in its shadow run.
+    """
+    code = require_controller(campaign), source_hash(_SOURCES), sources_of("replication/populations.py")
+    resolved = resolve(campaign)
+    drivers = resolved.library.followers_in(resolved.environment).drivers.tolist()
+    asked = drivers, campaign.av.identity(), *code, campaign.seed, seed, n_paths
+
+    def walked() -> SuperPopulation:
+        paths = choose(seed, n_paths)
+        progress.stage(f"walked paths of seed {seed}", n_paths)
+        parts = []
+        for part in executor.map(_walk, *zip(*_tasks(campaign, paths), strict=True)):
+            parts.append(part)
+            progress.advance(part.n_paths)
+        return joined(parts)
+
+    return cached(population_key(resolved.environment, "walked", STRIDE, *asked), walked)
+
+
+def _tasks(campaign: Campaign, paths: ShadowPaths) -> Iterator[tuple[str, int, ShadowPaths]]:
+    """Ranges of the paths, each with the number of its first one."""
+    content = campaign.model_dump_json()
+    for first in range(0, len(paths), WALKED_CHUNK):
+        rows = slice(first, first + WALKED_CHUNK)
+        chunk = replace(paths, index=paths.index[rows], state=paths.state[rows], weight=paths.weight[rows])
+        yield content, first, chunk
+
+
+def _walk(campaign_json: str, first: int, paths: ShadowPaths) -> SuperPopulation:
+    """Walk a range of paths, and drive their cut-ins."""
+    resolved = resolve(Campaign.model_validate_json(campaign_json))
+    environment, library = resolved.environment, resolved.library
+    loop = _loop(resolved)
+    runs = recorded(without_cut_in(loop, paths.seed, first, paths.index, paths.state, environment), environment)
+    _require_none_failed(resolved, int(runs.failed.sum()), len(paths), "shadow runs")
+    offset = np.random.default_rng([paths.seed, first]).integers(0, STRIDE, len(paths))
+    where = paths.seed, paths.index, paths.state, environment, library.followers_in(environment)
+    probability, bits, _ = enumerate_cut_ins(*where, runs, STRIDE, offset)
+    mass = probability * paths.weight[:, None]
+    row, step = np.nonzero(mass > 0.0)
+    crashes = _crashes(resolved, loop, first, paths, runs, row, step)
+    of_cut_ins = bits[row, step] | (crashes.astype(np.int64) << library.n_drivers)  # the vehicle comes after these
+    somebody = of_cut_ins != 0
+    row, step = row[somebody], step[somebody]
+    return SuperPopulation(mass.sum(1), first + row, mass[row, step], of_cut_ins[somebody])
+
+
+def _loop(resolved: Resolved) -> EpisodeLoop:
+    """The vehicle in the twin, on prescribed traffic, with all of its motion kept."""
+    campaign, environment = resolved.campaign, resolved.environment
+    prescribed = build_importance(campaign, None)._replace(method=PRESCRIBED)
+    policy = Drawing(campaign.seed, environment, prescribed, resolved.av)
+    host = build_host(campaign.av, n_cells=CELLS, seed=campaign.seed)
+    return EpisodeLoop(TwinWorld(CELLS), policy, RecordPolicy(0, "none", 0.0), host)
+
+
+def _crashes(
+    resolved: Resolved,
+    loop: EpisodeLoop,
+    first: int,
+    paths: ShadowPaths,
+    runs: ShadowRuns,
+    row: IntArray,
+    step: IntArray,
+) -> BoolArray:
+    """Drive the vehicle on cut-ins of paths in given rows and steps (n,): whether it crashed on each."""
+    lv, bv, _, _, lead = write_script(paths.seed, paths.index[row], step, paths.state[row], resolved.environment)
+    motion = motion_hashes(runs.x_m, runs.v_mps)[row, onset_steps(step, lead)]
+    nowhere, weightless = np.full(row.size, -1), np.zeros(row.size)
+    traffic = PrescribedTraffic(lv, bv, step, nowhere, weightless, first + row, motion, lead)
+    outcome = loop.run(0, paths.state[row], traffic)
+    _require_none_failed(resolved, len(outcome.failures), row.size, "tests")
+    return np.asarray(outcome.results.episode["outcome"] == CRASH)
+
+
+def _require_none_failed(resolved: Resolved, n_failed: int, n: int, what: str) -> None:
+    if n_failed:
+        raise HarnessError(
+            f"avs: {resolved.campaign.av.controller or resolved.campaign.av.fmu}",
+            f"{n_failed:,} of {n:,} {what} failed",
+            "none: what a vehicle would have done is not known, and so neither is its crash rate",
+            "Mend the vehicle (`harness av-check` looks at it in seconds), or leave it out of the experiment.",
+        )

@@ -1,0 +1,495 @@
+"""Shells campaigns and comparisons on pools drawn anew: allocation, rounds, rules and estimator are those of real ones.
+
+Given the pool, the tests of a stratum are independent draws, so that the world is replaced by a few random numbers per
+stratum and round: how many tests fall into each of its cells, and how many of those crash; of two vehicles, how many
+pairs end in which way. A real campaign draws from a systematic sample of the pool's cut-ins without replacement, which
+scatters no more than that.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+
+from harness.campaign.campaign import Campaign
+from harness.campaign.sections import Accept, ShellSettings
+from harness.drawing.shells import PairRounds, ShellRounds
+from harness.errors import CampaignError
+from harness.estimators.block import Block, Drawn
+from harness.estimators.estimate import Estimate
+from harness.estimators.likelihood import Level
+from harness.estimators.pairs import CRASH, NO_CRASH, PairCounts, no_pairs
+from harness.estimators.shells import Shells
+from harness.estimators.stopping import PairRule, RoundRule
+from harness.pool.cut_ins import CutIns, Pool, shells_of
+from harness.pool.library import Library
+from harness.pool.shells import cells_in_strata, design_shells, outermost, shells_in_strata
+from harness.strata import LIBRARY_STATEMENT, ShellDesign
+from harness.vocabulary import CRASH as CRASHED
+from harness.vocabulary import FAILED, TIMEOUT, BoolArray, FloatArray, IntArray
+from studies.replication.experiment import Adversary
+from studies.replication.judgement import Row, estimate_row
+from studies.replication.populations import (
+    CONDITIONAL_DIFFERENCE,
+    DIFFERENCE,
+    SuperPopulation,
+    preventable_by,
+    ratio_to,
+    reference_drivers,
+)
+
+FREE = "shells"
+EQUAL_RATE = 0.02
+"""A surrogate whose crash rate is this close to the vehicle's counts as its equal."""
+_CRASHING = ((CRASH, CRASH), (CRASH, NO_CRASH), (NO_CRASH, CRASH))
+"""How A and B end: both crash, only A, only B."""
+_STATEMENT = ("testing", "shells", "statement")
+
+
+def limit_at(factor: float) -> str:
+    """Name of the decision about a limit, a multiple of the crash rate."""
+    return f"limit {factor:g} x rate"
+
+
+def result_of(statement: str) -> str:
+    """Name of a statement's rows among results."""
+    return f"{FREE}, {statement}"
+
+
+@dataclass(frozen=True, eq=False)
+class DrawnPool:
+    """A pool, and what a vehicle does on its paths.
+
+    ``mass`` and ``crash_mass`` (n, C) are each path's probability of a cut-in of each cell of the design, and of a
+    crash in it; ``failing`` is the share of crashes that end as failed tests.
+    """
+
+    design: ShellDesign
+    mass: FloatArray
+    crash_mass: FloatArray
+    failing: float = 0.0
+
+    @cached_property
+    def share(self) -> FloatArray:
+        """Share of crashes in each cell, shape (C,)."""
+        p, crash_p = self.mass.sum(0), self.crash_mass.sum(0)
+        share = np.divide(crash_p, p, out=np.zeros_like(p), where=p > 0.0)
+        return np.asarray(np.clip(share, 0.0, 1.0))  # rounding may leave the unit interval
+
+    @cached_property
+    def _cumulative(self) -> FloatArray:
+        return np.cumsum(self.crash_mass, axis=0)
+
+    def tests_of_cells(self, added: IntArray, rng: np.random.Generator) -> IntArray:
+        """How many of so many tests of each stratum (S,) are of each cell, shape (C,)."""
+        if added.size == self.mass.shape[1]:
+            return added
+        within = (self.design.joined * self.mass.sum(0)[:, None]).T
+        p = within / np.maximum(within.sum(1, keepdims=True), np.finfo(np.float64).tiny)
+        found: IntArray = rng.multinomial(added, p).sum(0)
+        return found
+
+    def crashed_paths(self, cell: int, n: int, rng: np.random.Generator) -> FloatArray:
+        """Mass (n, C) of the paths of n crashed tests of a cell."""
+        cumulative = self._cumulative[:, cell]
+        paths: FloatArray = self.mass[np.searchsorted(cumulative, rng.random(n) * cumulative[-1], side="right")]
+        return paths
+
+
+Draw = Callable[[np.random.Generator], Sequence[DrawnPool]]
+"""Draws a new pool: with the crashes of a vehicle, or without references where both of two crash, only A, only B."""
+
+
+@dataclass(frozen=True, eq=False)
+class ShellCampaign:
+    """A shells campaign to replicate, each time on a new pool; its stop rule, statement and first tests are used.
+
+    Judged are all statements and the comparisons with reference drivers. With ``limits``, by name, it is repeated until
+    all of these are decided, as by ``accept``, and they are judged instead.
+    """
+
+    campaign: Campaign
+    draw: Draw
+    seed: int
+    limits: Mapping[str, float] = field(default_factory=dict)
+
+    def run(self, replications: range) -> list[Row]:
+        """Rows of all results for each replication."""
+        rounds = self._decide if self.limits else self._replicate
+        return [row for replication in replications for row in rounds(replication)]
+
+    def _rounds(self, replication: int) -> tuple[ShellRounds, ShellDesign, Callable[[], bool | None]]:
+        """The planner, the design, and what runs a round: whether it was enough, None where nothing is left."""
+        rng = np.random.default_rng([self.seed, replication])
+        (drawn,) = self.draw(rng)
+        planner = ShellRounds(self.campaign, drawn.design, _most_tests(self.campaign, drawn))
+
+        def run_round() -> bool | None:
+            if not (added := planner.next_round()).any():
+                return None
+            return planner.enough(campaign_block(drawn, added, int(planner.tally.tests.sum()), rng))
+
+        return planner, drawn.design, run_round
+
+    def _decide(self, replication: int) -> Iterator[Row]:
+        """All limits from the same tests: what is tested next does not depend on any."""
+        planner, _, run_round = self._rounds(replication)
+        pending = {
+            name: RoundRule(self.campaign.model_copy(update={"accept": Accept(crash_rate_below=limit)}))
+            for name, limit in self.limits.items()
+        }
+        while pending and run_round() is not None:
+            for name in [name for name, rule in pending.items() if rule.observe(planner.seen)]:
+                yield self._decision_row(planner.seen, name, replication, pending.pop(name))
+        for name, rule in pending.items():
+            yield self._decision_row(planner.seen, name, replication, rule)
+
+    def _decision_row(self, seen: Shells, name: str, replication: int, rule: RoundRule) -> Row:
+        """A decision is a one-sided interval: below the limit, or above."""
+        verdict = "undecided" if rule.look.decision is None else rule.look.decision.verdict
+        limit, tally = self.limits[name], seen.tally
+        rate = seen.limits_of(self.campaign.testing.shells.statement, self.campaign.stop.confidence).rate
+        low, high = limit if verdict == "rejected" else 0.0, limit if verdict == "accepted" else math.inf
+        counts = int(tally.tests.sum()), int(tally.crashes.sum())
+        return Row(name, replication, *counts, rate, seen.std_error(), low, high, reached=verdict != "undecided")
+
+    def _replicate(self, replication: int) -> Iterator[Row]:
+        planner, design, run_round = self._rounds(replication)
+        names = [each.name for each in design.statements]
+        rules = {name: RoundRule(self.campaign.replaced(_STATEMENT, name)) for name in names}
+        known: dict[str, Row] = {}
+        while (enough := run_round()) is not None:
+            for name, rule in rules.items():
+                pending = name not in known and planner.seen.tally.tests.size
+                if pending and rule.observe(planner.seen) and rule.look.stopped:
+                    known[name] = self._statement_row(planner.seen, name, replication, reached=True)
+            if enough:
+                break
+        estimate, reached = planner.seen.result(self.campaign.stop.confidence), planner.rule.look.stopped
+        outside = int(estimate.details["statements"][0]["n_crashes_outside"])
+        yield estimate_row(FREE, replication, estimate, reached=reached, outside=outside)
+        for name in names:
+            yield known.get(name) or self._statement_row(planner.seen, name, replication, reached=False)
+        for reference in design.references:
+            yield from _reference_rows(estimate, reference.name, replication, reached=reached)
+
+    def _statement_row(self, seen: Shells, name: str, replication: int, *, reached: bool) -> Row:
+        found = seen.within(name, self.campaign.stop.confidence)
+        error, refused = seen.std_error(found.n_shells), math.isinf(found.rhw_from_pool)
+        numbers = found.n_episodes, found.n_crashes, found.crash_rate, error, found.ci_low, found.ci_high
+        return Row(result_of(name), replication, *numbers, reached, found.n_crashes_outside, refused)
+
+
+def _most_tests(campaign: Campaign, drawn: DrawnPool) -> IntArray:
+    """The most tests of each stratum, shape (S,)."""
+    return np.full(drawn.design.p.size, campaign.pool.cut_ins_per_shell, np.int64)
+
+
+def campaign_block(drawn: DrawnPool, added: IntArray, first: int, rng: np.random.Generator) -> Block:
+    """What the records of a round become: within a cell the crashes come first, which no estimator can see."""
+    tests = drawn.tests_of_cells(added, rng)
+    cell, crashes = np.repeat(np.arange(tests.size), tests), rng.binomial(tests, drawn.share)
+    n = cell.size
+    rank = np.arange(n) - np.repeat(np.cumsum(tests) - tests, tests)
+    none, bad = np.zeros(n, np.bool_), rank < crashes[cell]
+    failed = bad & (rank < rng.binomial(crashes, drawn.failing)[cell]) if drawn.failing else none
+    mass = np.zeros((n, tests.size))
+    for c in np.flatnonzero(crashes).tolist():
+        mass[bad & (cell == c)] = drawn.crashed_paths(c, int(crashes[c]), rng)
+    columns = {"cut_in": ~none, "stratum": np.array(drawn.design.cell_stratum)[cell], "cell": cell, "cell_mass": mass}
+    outcome = np.select([failed, bad], [FAILED, CRASHED], TIMEOUT).astype(np.int8)
+    return Block(first, outcome, np.zeros(n), columns, Drawn("shells", shells=drawn.design))
+
+
+def _reference_rows(estimate: Estimate, reference: str, replication: int, *, reached: bool) -> Iterator[Row]:
+    """Ratio to a reference driver, and the share of crashes that it would have avoided; open where nothing is said."""
+    found = next((each for each in estimate.details["references"] if each["reference"] == reference), None)
+    z = Level.two_sided(estimate.confidence).z
+    for name, key, widest in (
+        (ratio_to(reference), "ratio", (math.nan, 0.0, math.inf)),
+        (preventable_by(reference), "preventable", (math.nan, 0.0, 1.0)),
+    ):
+        value, low, high = widest if found is None else (found[key], found[f"{key}_low"], found[f"{key}_high"])
+        counts, error = (estimate.n_episodes, estimate.n_crashes), (high - low) / 2.0 / z
+        yield Row(name, replication, *counts, value, error, low, high, reached, refused=found is None)
+
+
+@dataclass(frozen=True, eq=False)
+class PairedCampaign:
+    """A comparison of two vehicles to replicate, by both statements; ``campaign`` is that of either vehicle."""
+
+    campaign: Campaign
+    draw: Draw
+    seed: int
+
+    def run(self, replications: range) -> list[Row]:
+        """Rows of both results for each replication."""
+        return [row for replication in replications for row in self._replicate(replication)]
+
+    def _replicate(self, replication: int) -> Iterator[Row]:
+        rng = np.random.default_rng([self.seed, replication])
+        drawn = self.draw(rng)
+        planner = PairRounds(self.campaign, drawn[0].design, _most_tests(self.campaign, drawn[0]), None)
+        pairs, early = no_pairs(drawn[0].design), None
+        inside, enough = PairRule(self.campaign.replaced(_STATEMENT, LIBRARY_STATEMENT), None), False
+        while not enough and (added := planner.next_round(pairs)).any():
+            pairs = _with_round(pairs, drawn, added, rng)
+            enough = planner.rule.observe(pairs)
+            if early is None:
+                inside.observe(pairs)
+                early = pairs.inside() if inside.look.stopped else None
+        yield self._row(DIFFERENCE, replication, pairs, reached=planner.rule.look.stopped)
+        yield self._row(CONDITIONAL_DIFFERENCE, replication, early or pairs.inside(), reached=early is not None)
+
+    def _row(self, result: str, replication: int, pairs: PairCounts, *, reached: bool) -> Row:
+        level = Level.two_sided(self.campaign.stop.confidence)
+        found, beyond = pairs.difference(level), pairs.ends[pairs.design.library.n_inside :]
+        counts = int(pairs.tests.sum()), pairs.n_differing
+        numbers = found.value, found.half_width / level.z, found.ci_low, found.ci_high
+        outside = int(beyond.sum() - beyond[:, NO_CRASH, NO_CRASH].sum())
+        return Row(result, replication, *counts, *numbers, reached, outside)
+
+
+def _with_round(pairs: PairCounts, drawn: Sequence[DrawnPool], added: IntArray, rng: np.random.Generator) -> PairCounts:
+    """The pairs after a round of so many more of each stratum (S,), by a multinomial of each."""
+    share = np.column_stack([pool.share for pool in drawn])
+    share = np.column_stack([share, np.maximum(1.0 - share.sum(1), 0.0)])
+    counts = rng.multinomial(added, share / share.sum(1, keepdims=True))
+    ends, mass = pairs.ends.copy(), pairs.mass.copy()
+    ends[:, NO_CRASH, NO_CRASH] += counts[:, -1]
+    for kind, pool, of_kind in zip(_CRASHING, drawn, counts.T[:-1], strict=True):
+        ends[:, *kind] += of_kind
+        mass[:, *kind] += [pool.crashed_paths(s, k, rng).sum(0) for s, k in enumerate(of_kind.tolist())]
+    return PairCounts(pairs.design, ends, mass)
+
+
+@dataclass(frozen=True, eq=False)
+class DrawnCells:
+    """Cells of a super-population's paths, of which pools are drawn.
+
+    The ``template`` is a pool without cut-ins, whose probabilities each draw replaces; ``left_out`` are surrogates that
+    are equals of a vehicle, ``limit_mps2`` is the hardest acceleration of the vehicles, and ``mass`` (n, C) the
+    probability of a cut-in of each cell, by path of the super-population.
+    """
+
+    template: Pool
+    left_out: tuple[str, ...]
+    limit_mps2: float
+    mass: FloatArray
+
+    def draw(self, rng: np.random.Generator, masses: Sequence[FloatArray]) -> tuple[ShellDesign, list[FloatArray]]:
+        """The design of a new pool, and for ``masses`` (n, C) what they are on its paths, by the design's cells."""
+        rows = rng.integers(0, len(self.mass), self.template.n_paths)
+        drawn = self.mass[rows]
+        by_reference = drawn @ self._crash_of_references
+        pool = replace(
+            self.template,
+            cell_p=drawn.mean(0),
+            p_cut_in=float(drawn.sum(1).mean()),
+            reference_rate=by_reference.mean(0),
+            reference_square=(by_reference * by_reference).mean(0),
+        )
+        design = design_shells(pool, limit_mps2=self.limit_mps2)
+        groups = shells_in_strata(pool, outermost(pool, ShellSettings()), self.limit_mps2)
+        cells = cells_in_strata(pool, groups)
+        tested = np.flatnonzero(cells >= 0)
+        joined = np.zeros((tested.size, design.cell_p.size))
+        joined[np.arange(tested.size), cells[tested]] = 1.0
+        found = [of[rows][:, tested] @ joined if of is not self.mass else drawn[:, tested] @ joined for of in masses]
+        return design, found
+
+    @property
+    def _crash_of_references(self) -> FloatArray:
+        """1 where a reference crashes on a cell's cut-ins, shape (C, R)."""
+        references = np.arange(len(self.template.library.references))
+        return np.asarray((self.template.cell_references[:, None] >> references) & 1, np.float64)
+
+    def crashes_outside(self, crashing: FloatArray) -> dict[str, float]:
+        """Share of a crash mass by cell (n, C) that lies beyond the boundary of each statement; 0 of no crash."""
+        by_cell, names = crashing.sum(0), self.template.names
+        total = by_cell.sum() or 1.0
+        places = {
+            name: names.index(each.boundary)
+            for name, each in self.template.library.statement_settings(ShellSettings()).items()
+        }
+        return {name: float(by_cell[self.template.cell_shell > place].sum() / total) for name, place in places.items()}
+
+
+@dataclass(frozen=True, eq=False)
+class OvertakingShells:
+    """Pools of a vehicle, or of two.
+
+    ``crashing`` are the parts (n, C) of ``cells.mass`` on which the vehicle crashes, or both of two, only A, only B.
+    ``failing`` is the share of crashes that end as failed tests.
+    """
+
+    cells: DrawnCells
+    crashing: tuple[FloatArray, ...]
+    failing: float = 0.0
+
+    def draw(self, rng: np.random.Generator) -> list[DrawnPool]:
+        """A new pool; see `Draw`."""
+        design, (mass, *crashing) = self.cells.draw(rng, [self.cells.mass, *self.crashing])
+        return [DrawnPool(design, mass, each, self.failing) for each in crashing]
+
+
+class Division:
+    """Cut-ins of a super-population, divided into ``cells`` by a library without the equals of some vehicles."""
+
+    def __init__(
+        self,
+        library: Library,
+        population: SuperPopulation,
+        crashing: Sequence[FloatArray],
+        pool_paths: int,
+        *,
+        limit_mps2: float,
+        shadow_runs: bool = False,
+    ) -> None:
+        """Leave out the equals of vehicles that crash on these masses of cut-ins, (m,) each."""
+        bit = {name: driver for driver, name in enumerate(library.surrogates)}
+        rate = {name: float(population.mass[population.crashes(driver)].sum()) for name, driver in bit.items()}
+        careful_first = tuple(sorted(bit, key=rate.__getitem__))
+        alike = set().union(*(equals(library, population, of_vehicle) for of_vehicle in crashing))
+        reduced = leave_out(library, alike, careful_first)
+        names = tuple(name for name in careful_first if name in reduced.surrogates)
+        self._population = population
+        self._shell = shells_of(population.bits, np.array([bit[name] for name in names])).astype(np.int64)
+        references = list(reference_drivers(library).values())
+        crash_too = sum(
+            (population.crashes(driver).astype(np.int64) << r for r, driver in enumerate(references)),
+            start=np.zeros(population.bits.size, np.int64),
+        )
+        nobody = len(names) << len(references)
+        kind = np.append((self._shell << len(references)) | crash_too, nobody)
+        kinds, cell = np.unique(kind, return_inverse=True)
+        self._cell, self._n_cells = cell[:-1], kinds.size
+        mass = self.by_cell(population.mass)
+        mass[:, cell[-1]] += np.maximum(population.cut_in - mass.sum(1), 0.0)
+        divided = kinds >> len(references), kinds & ((1 << len(references)) - 1)
+        template = _template(reduced, names, divided, mass, pool_paths, shadow_runs=shadow_runs)
+        left_out = tuple(name for name in careful_first if name not in reduced.surrogates)
+        self.cells = DrawnCells(template, left_out, limit_mps2, mass)
+
+    def by_cell(self, mass: FloatArray) -> FloatArray:
+        """A mass of cut-ins (m,) by path and cell, (n, C)."""
+        place = self._population.path * self._n_cells + self._cell
+        summed = np.bincount(place, mass, minlength=self._population.n_paths * self._n_cells)
+        return np.asarray(summed, np.float64).reshape(-1, self._n_cells)
+
+    def of_vehicle(self, crashing: FloatArray, failing: float = 0.0) -> OvertakingShells:
+        """Pools of a vehicle that crashes on this mass of cut-ins (m,)."""
+        return OvertakingShells(self.cells, (self.by_cell(crashing),), failing)
+
+    def of_pair(self, a: FloatArray, b: FloatArray) -> OvertakingShells:
+        """Pools of two vehicles that crash on these masses of cut-ins (m,).
+
+        Where either crashes on a share of a cut-in's episodes, by inattention or by what an adversary is made of, the
+        two do so independently.
+        """
+        mass = self._population.mass
+        both = a * np.divide(b, mass, out=np.zeros_like(mass), where=mass > 0.0)
+        only_a, only_b = (np.maximum(one - both, 0.0) for one in (a, b))
+        return OvertakingShells(self.cells, (self.by_cell(both), self.by_cell(only_a), self.by_cell(only_b)))
+
+    def as_adversary(self, made: Adversary, crashing: FloatArray) -> FloatArray:
+        """The mass of crashes (m,) of an adversary made of a vehicle."""
+        boundary, population = outermost(self.cells.template, ShellSettings()), self._population
+        inside: BoolArray = self._shell <= boundary
+        if made.crashes != "everywhere":
+            weight = population.by_path(crashing * inside)
+            order = np.argsort(-weight if made.crashes == "on_heaviest_paths" else weight, kind="stable")
+            kept = np.zeros(weight.size, np.bool_)
+            kept[order] = np.cumsum(weight[order]) <= made.share * weight.sum()
+            crashing = crashing * kept[population.path]
+        # Cut-ins on which nobody crashes are no part of a hole either: they are not tested.
+        tested = ~inside & (self._shell < len(self.cells.template.names))
+        return np.where(tested, np.maximum(crashing, made.hole * population.mass), crashing)
+
+
+def equals(library: Library, population: SuperPopulation, crashing: FloatArray) -> set[str]:
+    """Surrogates that crash on the same cut-ins as a vehicle (its mass of them, shape (m,)), or nearly as often."""
+    rate = crashing.sum()
+    found = set()
+    for driver, name in enumerate(library.surrogates):
+        mass = population.mass * population.crashes(driver)
+        if abs(mass.sum() - rate) <= EQUAL_RATE * rate or np.array_equal(mass, crashing):
+            found.add(name)
+    return found
+
+
+def leave_out(library: Library, names: set[str], careful_first: tuple[str, ...]) -> Library:
+    """The library without a vehicle's equals; the envelope stays, and another surrogate takes over as boundary.
+
+    That is the next more careful one that is left, or the next more careless one if none is; ``careful_first`` are all
+    surrogates.
+
+    Raises
+    ------
+    CampaignError
+        No surrogate is left but the envelope.
+    """
+    names = names - {library.envelope}
+    if library.boundary in names:
+        place = careful_first.index(library.boundary)
+        candidates = [*reversed(careful_first[:place]), *careful_first[place + 1 :]]
+        left = [name for name in candidates if name not in names and name != library.envelope]
+        if not left:
+            raise CampaignError(
+                "campaign.pool.library",
+                f"no surrogate but the envelope, without the vehicle's equals ({', '.join(sorted(names))})",
+                "one that can be the boundary",
+                "Add a surrogate to the library, or leave this vehicle out of the experiment.",
+            )
+        library = library.model_copy(update={"boundary": left[0]})
+    return library.without(names)
+
+
+def _template(
+    library: Library,
+    names: tuple[str, ...],
+    kind: tuple[IntArray, IntArray],
+    mass: FloatArray,
+    n_paths: int,
+    *,
+    shadow_runs: bool,
+) -> Pool:
+    """Pool without cut-ins; ``kind`` are shell and references of each cell, ``mass`` is (n, C)."""
+    d, r = len(names), len(library.references)
+    none: IntArray = np.zeros(0, np.int64)
+    no_draws = np.zeros((0, 0), np.int8)
+    return Pool(
+        key="drawn",
+        environment="drawn",
+        library=library,
+        names=names,
+        n_paths=n_paths,
+        p_cut_in=float(mass.sum(1).mean()),
+        p_cut_in_se=0.0,
+        mu=np.zeros(d),
+        mu_covariance=np.zeros((d, d)),
+        p_cut_in_at_crash=np.ones(d),
+        cell_shell=kind[0],
+        cell_references=kind[1],
+        cell_p=mass.mean(0),
+        reference_rate=np.zeros(r),
+        reference_square=np.zeros(r),
+        cut_ins=CutIns(
+            path=none,
+            step=none,
+            cell=none,
+            state=np.zeros((0, 5)),
+            lv=no_draws,
+            bv=no_draws,
+            n_lv=none,
+            n_bv=none,
+            crashes=np.zeros((0, d + r), np.bool_),
+            path_mass=np.zeros((0, kind[0].size), np.float32),
+            motion=np.zeros(int(shadow_runs), np.uint64),
+            lead=none,
+        ),
+    )
