@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 
 from harness.campaign.sections import EnvironmentSettings, PoolSettings
-from harness.pool.aimed_paths import PILOT_PATHS
 from harness.pool.build import take_aim
 from harness.pool.library import load_library
+from harness.pool.walk import PILOT_PATHS
 from harness.progress import Progress
 from harness.traffic.loading import load_environment
 

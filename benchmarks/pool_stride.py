@@ -12,8 +12,8 @@ from __future__ import annotations
 import time
 
 from harness import load_campaign
-from harness.pool.aimed_paths import PILOT_PATHS, Enumerator
 from harness.pool.library import load_library
+from harness.pool.walk import PILOT_PATHS, Enumerator
 from harness.progress import Progress
 from harness.traffic.loading import load_environment
 

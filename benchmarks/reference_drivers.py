@@ -11,8 +11,8 @@ from __future__ import annotations
 import numpy as np
 
 from harness import load_campaign
-from harness.pool.aimed_paths import PILOT_PATHS, EnumeratedPaths, Enumerator
 from harness.pool.library import Library
+from harness.pool.walk import PILOT_PATHS, EnumeratedPaths, Enumerator
 from harness.progress import Progress
 from harness.traffic.loading import load_environment
 from harness.vocabulary import BoolArray

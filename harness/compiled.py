@@ -35,7 +35,7 @@ WORLD_SOURCES = (
     "controllers/protocol.py",
     "importance/*.py",
     "episode/*.py",
-    "pool/enumeration.py",
+    "pool/walk.py",
     "worlds/twin.py",
 )
 """All files that decide what happens in a test; pools and tables are made again when one changes."""

@@ -19,9 +19,9 @@ import pyarrow.parquet as pq
 from harness.episode.cells import drawn_traffic
 from harness.episode.loop import EpisodeLoop, RecordPolicy, Shard
 from harness.errors import RunFolderError
-from harness.pool.enumeration import ShadowRuns, write_script
 from harness.pool.storage import padded
 from harness.pool.vehicle_pool import ShadowPaths
+from harness.pool.walk import ShadowRuns, write_script
 from harness.records.folder import COMPRESSION, read_table
 from harness.records.schemas import shadow_table
 from harness.traffic.laws import Environment

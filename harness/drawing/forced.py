@@ -12,7 +12,7 @@ from harness.episode.judge import motion_hashes
 from harness.episode.loop import EpisodeLoop, Shard
 from harness.episode.path import Followers
 from harness.pool.cut_ins import onset_steps
-from harness.pool.enumeration import enumerate_cut_ins, write_script
+from harness.pool.walk import enumerate_cut_ins, write_script
 from harness.progress import Progress
 from harness.random_stream import CUT_IN, uniforms
 from harness.resolved import Resolved

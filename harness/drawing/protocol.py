@@ -24,9 +24,9 @@ from harness.estimators.block import EPISODE_COLUMNS, Block, block_from_tables
 from harness.estimators.stopping import Rule
 from harness.importance.build import build_importance, mixture_weights
 from harness.importance.tables import Tables, build_tables, table_path
-from harness.pool.enumeration import ShadowRuns
 from harness.pool.shells import Draw
 from harness.pool.vehicle_pool import ShadowPaths
+from harness.pool.walk import ShadowRuns
 from harness.progress import Progress
 from harness.resolved import Resolved
 from harness.strata import ShellDesign

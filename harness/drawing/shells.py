@@ -30,10 +30,10 @@ from harness.estimators.pairs import PairCounts
 from harness.estimators.stopping import PairRule, RoundRule
 from harness.estimators.tally import Tally, empty_tally
 from harness.pool.cut_ins import Pool
-from harness.pool.enumeration import ShadowRuns
 from harness.pool.shells import Draw, PrescribedEpisodes, acceleration_limit, checked_boundary, design_shells
 from harness.pool.storage import cached_pool, campaign_pool, campaign_pool_key, pool_path
 from harness.pool.vehicle_pool import campaign_shadow_paths, shadow_paths_file, vehicle_pool
+from harness.pool.walk import ShadowRuns
 from harness.progress import Progress
 from harness.records.folder import SHELLS, read_as, read_manifest
 from harness.resolved import Resolved

@@ -7,10 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from harness.campaign.sections import PoolSettings
-from harness.pool.aimed_paths import PILOT_PATHS, EnumeratedPaths, Enumerator, joined
 from harness.pool.cut_ins import FAR_OFF, CutIns, Pool, environment_hash, shells_of
-from harness.pool.enumeration import write_script
 from harness.pool.library import Library
+from harness.pool.walk import PILOT_PATHS, EnumeratedPaths, Enumerator, joined, write_script
 from harness.progress import Progress
 from harness.random_stream import DIAGNOSTIC, uniforms
 from harness.traffic.laws import Environment

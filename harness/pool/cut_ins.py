@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from harness.pool.aimed_paths import PILOT_PATHS
 from harness.pool.library import Library
+from harness.pool.walk import PILOT_PATHS
 from harness.traffic.laws import Environment
 from harness.vocabulary import BoolArray, Float32Array, FloatArray, Int8Array, IntArray, RecordArray, UInt64Array
 

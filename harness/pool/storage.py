@@ -25,7 +25,7 @@ from harness.vocabulary import STATE_COLUMNS, IntArray, states_from
 
 _FORMAT = 6
 """Raise it when the meaning of a pool changes."""
-_MADE_BY = ("aimed_paths.py", "build.py", "cut_ins.py")
+_MADE_BY = ("build.py", "cut_ins.py")
 """Code that decides what is in a pool, beside the kernels."""
 _METADATA, _DIGEST = b"harness_pool", b"harness_pool_sha256"
 

@@ -25,12 +25,11 @@ from harness.campaign.sections import PoolSettings
 from harness.compiled import cache_root
 from harness.episode.judge import motion_hashes
 from harness.errors import HarnessError
-from harness.pool.aimed_paths import PILOT_PATHS, EnumeratedPaths, contributions
 from harness.pool.build import POOL_SEED, ROUND_PATHS, careful_first, pool_of, take_aim
 from harness.pool.cut_ins import Pool
-from harness.pool.enumeration import ShadowRuns, enumerate_cut_ins
 from harness.pool.library import Library
 from harness.pool.storage import campaign_pool_key, sound_facts, stamped
+from harness.pool.walk import PILOT_PATHS, EnumeratedPaths, ShadowRuns, contributions, enumerate_cut_ins
 from harness.progress import Progress
 from harness.random_stream import DIAGNOSTIC, uniforms
 from harness.records.folder import require_place, write_atomically

@@ -15,10 +15,10 @@ from harness.episode.judge import judge
 from harness.episode.loop import Drawing, EpisodeLoop, RecordPolicy
 from harness.episode.path import empty_trajectory, mean_test_distance
 from harness.importance.build import build_importance
+from harness.pool.replay import Retracing
 from harness.progress import Progress
 from harness.records.schemas import shard_tables
 from harness.resolved import Resolved, resolve
-from harness.runner.retrace import Retracing
 from harness.traffic.initial_state import InitialStates
 from harness.traffic.laws import Environment
 from harness.unboxed import unboxed

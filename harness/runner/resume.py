@@ -12,6 +12,7 @@ from typing import Any
 
 from harness.drawing import ShardRequest, Source
 from harness.errors import RunFolderError
+from harness.pool.replay import Retracing
 from harness.records.folder import (
     MANIFEST,
     SHELLS,
@@ -23,7 +24,6 @@ from harness.records.folder import (
 )
 from harness.records.schemas import ShardTables
 from harness.resolved import Resolved
-from harness.runner.retrace import Retracing
 from harness.runner.worker import ShardResult, finished
 
 

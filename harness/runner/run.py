@@ -19,6 +19,7 @@ from harness.drawing.baseline import as_recorded, baseline_file, baseline_reques
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED
 from harness.estimators.answer import ending as ending_sentence
 from harness.estimators.stopping import Rule, Verdict
+from harness.pool.replay import Retracing
 from harness.pool.vehicle_pool import ShadowPaths
 from harness.progress import Progress
 from harness.records.folder import SHELLS, TABLES, shards_on_disk, sole_use, write_bytes, write_json, write_shard
@@ -28,7 +29,6 @@ from harness.runner.estimate import estimate_run
 from harness.runner.manifest import SMALLEST_FAILED_SAMPLE, Manifest, Prefix, cpu_name, require_few_failed
 from harness.runner.resolve import distance_per_test_m, prepare, require_ready
 from harness.runner.resume import require_no_fewer, require_own_folder, require_same_pool, stored_shard
-from harness.runner.retrace import Retracing
 from harness.runner.worker import ShardResult
 from harness.runner.workers import workers_of
 from harness.strata import STORED_DESIGN

@@ -24,12 +24,12 @@ from harness.drawing.baseline import BaselineRequest, BaselineResult, read_basel
 from harness.episode.cells import PrescribedTraffic
 from harness.episode.loop import EpisodeLoop, Shard, hash_of_index
 from harness.estimators.block import Block
+from harness.pool.replay import Retracing
 from harness.processes import fit_to_travel
 from harness.records.folder import encoded
 from harness.records.schemas import ShardTables, shard_tables
 from harness.resolved import Resolved
 from harness.runner.resolve import build_world, prepare
-from harness.runner.retrace import Retracing
 from harness.vocabulary import FAILED
 from harness.worlds.twin import TwinWorld
 

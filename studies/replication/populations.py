@@ -37,12 +37,11 @@ from harness.episode.loop import Drawing, EpisodeLoop, RecordPolicy
 from harness.episode.path import Followers
 from harness.errors import CampaignError, HarnessError
 from harness.importance.build import build_importance
-from harness.pool.aimed_paths import PILOT_PATHS, Enumerator
 from harness.pool.cut_ins import environment_hash, onset_steps
-from harness.pool.enumeration import STRIDE, ShadowRuns, enumerate_cut_ins, write_script
 from harness.pool.library import Library
 from harness.pool.shells import acceleration_limit
 from harness.pool.vehicle_pool import CANDIDATES, ShadowPaths, walk_candidates
+from harness.pool.walk import PILOT_PATHS, STRIDE, Enumerator, ShadowRuns, enumerate_cut_ins, write_script
 from harness.progress import Progress
 from harness.resolved import Resolved, resolve
 from harness.traffic.laws import Environment

@@ -14,10 +14,10 @@ from harness.episode.cells import PrescribedTraffic, drawn_traffic
 from harness.episode.loop import Drawing, EpisodeLoop, RecordPolicy
 from harness.importance.build import build_importance
 from harness.maneuvers import CUT_IN
+from harness.pool.replay import Retracing
 from harness.records.schemas import episodes_table
 from harness.resolved import resolve
 from harness.runner.resolve import prepare
-from harness.runner.retrace import Retracing
 from harness.vocabulary import AV, BV, CRASH, PASSED, STATE_DTYPE
 from harness.worlds.twin import TwinWorld
 from tests.chains.seed import SEED

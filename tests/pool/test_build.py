@@ -10,7 +10,6 @@ import pytest
 
 from harness.campaign.files import load_campaign
 from harness.errors import RunFolderError
-from harness.pool.aimed_paths import NATURALISTIC_SHARE, aimed_points, fit_proposal
 from harness.pool.cut_ins import FAR_OFF
 from harness.pool.shells import Draw, PrescribedEpisodes
 from harness.pool.storage import (
@@ -21,6 +20,7 @@ from harness.pool.storage import (
     read_pool,
     write_pool,
 )
+from harness.pool.walk import NATURALISTIC_SHARE, aimed_points, fit_proposal
 from harness.resolved import resolve
 from tests.chains.seed import SEED
 from tests.pool.conftest import MIXTURE_FILE, SMALL_POOL

@@ -7,10 +7,9 @@ import pytest
 from scipy.stats import chisquare
 
 from harness.campaign.sections import PoolSettings
-from harness.pool.aimed_paths import Enumerator
-from harness.pool.enumeration import STRIDE
 from harness.pool.library import load_library
 from harness.pool.shells import design_shells
+from harness.pool.walk import STRIDE, Enumerator
 from harness.progress import Progress
 from harness.traffic.initial_state import InitialStates
 from harness.vocabulary import CRASH

@@ -10,9 +10,8 @@ from harness.drawing.baseline import as_recorded, baseline_requests, run_baselin
 from harness.episode.judge import motion_hashes
 from harness.episode.path import Followers
 from harness.errors import HarnessError
-from harness.pool.aimed_paths import Enumerator
-from harness.pool.enumeration import ShadowRuns, enumerate_cut_ins
 from harness.pool.vehicle_pool import CANDIDATES, EVENLY, chances, vehicle_pool
+from harness.pool.walk import Enumerator, ShadowRuns, enumerate_cut_ins
 from harness.progress import Progress
 from harness.resolved import resolve
 from harness.runner.resolve import prepare

@@ -9,8 +9,8 @@ from harness.episode.loop import Drawing, EpisodeLoop, RecordPolicy
 from harness.episode.path import Followers
 from harness.importance.build import build_importance
 from harness.maneuvers import acceleration
-from harness.pool.enumeration import enumerate_cut_ins
 from harness.pool.shells import Draw, PrescribedEpisodes
+from harness.pool.walk import enumerate_cut_ins
 from harness.random_stream import BV_DRAWS, LV_DRAWS, uniform
 from harness.traffic.initial_state import InitialStates
 from harness.traffic.laws import (

@@ -10,10 +10,10 @@ import pytest
 from harness.campaign.campaign import Campaign
 from harness.campaign.vehicle import AutomatedVehicle, IDMParameters, Reaction
 from harness.errors import WorldDisagreementError
+from harness.pool.replay import Retracing
 from harness.records.schemas import episodes_table
 from harness.resolved import resolve
 from harness.runner.resolve import prepare
-from harness.runner.retrace import Retracing
 from harness.worlds.twin import TwinWorld
 from tests.chains.seed import SEED
 from tests.stored_runs import copy_of, manifest, shard_files, stored_table

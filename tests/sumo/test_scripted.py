@@ -11,10 +11,9 @@ from harness.episode.path import Followers, empty_trajectory
 from harness.importance.build import build_importance
 from harness.maneuvers import CUT_IN
 from harness.pool.library import load_library
-from harness.pool.replay import stored_paths
+from harness.pool.replay import Retracing, stored_paths
 from harness.records.schemas import episodes_table
 from harness.resolved import resolve
-from harness.runner.retrace import Retracing
 from harness.traffic.loading import load_environment
 from harness.unboxed import unboxed
 from harness.vehicles.drivers import av_records
