@@ -389,7 +389,7 @@ def pages() -> Iterator[Path]:
 
 MADE_BY = (
     "\n\nMade by `python -m studies case scenarios/case_study/study.yaml --out runs/case_study` "
-    "([how](validation.md#the-papers-case-study)).\n\n"
+    "([how](internals/validation.md#the-papers-case-study)).\n\n"
 )
 
 

@@ -159,8 +159,8 @@ def within_reach(p: float, stop: Stop) -> str:
 
     A rate to within ± r of itself needs some 1.6 ln(1/α) p/(2 r μ) tests: without an assumption p is that of all that
     the envelope reaches, inside a boundary that of its shells. (Lower bound ln(1/α) p/(2 r μ); the panel of
-    docs/shells-validation.md took 1.5 to 1.75 times that.) Where cut-ins take time, the rate of an attentive vehicle
-    falls by orders of magnitude, and that number of tests grows as its inverse; what remains is the upper limit
+    docs/internals/shells-validation.md took 1.5 to 1.75 times that.) Where cut-ins take time, the rate of an attentive
+    vehicle falls by orders of magnitude, and that number of tests grows as its inverse; what remains is the upper limit
     ln(1/α) p/n.
     """
     rhw, n, nats = stop.rhw or USUAL_RHW, stop.episodes, math.log(1.0 / (1.0 - stop.confidence))
