@@ -41,10 +41,7 @@ class Resolved:
     def library(self) -> Library:
         """The surrogates of pools; read when they are first asked for, as most campaigns never do.
 
-        Raises
-        ------
-        CampaignError
-            The library's file is missing or wrong.
+        Raises `CampaignError`: the library's file is missing or wrong.
         """
         return load_library(self.campaign.pool.library)
 
@@ -52,10 +49,8 @@ class Resolved:
 def resolve(campaign: Campaign, command: Command = "run", *, controller_sha256: str | None = None) -> Resolved:
     """Read what a campaign names, and refuse what does not go together (`harness.campaign.combinations`).
 
-    Raises
-    ------
-    CampaignError
-        The environment's parameter file is missing or wrong, or something of the campaign does not go with the command.
+    Raises `CampaignError`: the environment's parameter file is missing or wrong, or something of the campaign does not
+    go with the command.
     """
     parameters = load_parameters(campaign.environment)
     environment = load_environment(campaign.environment, parameters)

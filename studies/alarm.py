@@ -79,10 +79,7 @@ def drivers_crash(episodes: pa.Table, seed: int, environment: Environment, follo
 
     ``episodes`` are consecutive rows of the episodes table, with `PATH_COLUMNS`; ``seed`` is that of the campaign.
 
-    Raises
-    ------
-    RunFolderError
-        An episode's maneuvers do not fit its steps.
+    Raises `RunFolderError`: an episode's maneuvers do not fit its steps.
     """
     stored = stored_paths(episodes, seed)
     bits = np.zeros(episodes.num_rows, np.int64)
@@ -232,10 +229,8 @@ def _p_value(log_capital: float) -> float:
 def alarm_of_run(folder: Path, pool_file: Path | None = None, progress: Progress | None = None) -> dict[str, Any]:
     """Ask the surrogates of the campaign's pool, or of that in a file, about all tests that a run has on record.
 
-    Raises
-    ------
-    HarnessError
-        The folder is not a run, its records are damaged or do not allow it, or the pool is of another environment.
+    Raises `HarnessError`: the folder is not a run, its records are damaged or do not allow it, or the pool is of
+    another environment.
     """
     progress, manifest = progress or Progress(), read_manifest(folder)
     resolved = resolve(load_campaign(folder / "campaign.yaml", check_files=False))

@@ -226,10 +226,8 @@ def required_tests_of_runs(
 
     The default estimator is the plain one of each run: ``nde`` for naturalistic tests, ``nade`` for weighted ones.
 
-    Raises
-    ------
-    HarnessError
-        If a folder is not a run, its records are damaged or incomplete, or its tests were drawn from shells.
+    Raises `HarnessError`: if a folder is not a run, its records are damaged or incomplete, or its tests were drawn from
+    shells.
     """
     told = progress or Progress()
     reference: RequiredTests | None = None

@@ -56,10 +56,7 @@ def load_campaign(
     Campaign
         With paths of files that it names absolute.
 
-    Raises
-    ------
-    CampaignError
-        The file cannot be read, is not YAML, or says something wrong; the error names every place.
+    Raises `CampaignError`: the file cannot be read, is not YAML, or says something wrong; the error names every place.
 
     Examples
     --------
@@ -105,10 +102,7 @@ def names_a_file(name: str) -> bool:
 def shipped_or_own(name: str, folder: Path, where: str) -> Path:
     """File that a name stands for: one of those shipped in ``folder``, or the user's own.
 
-    Raises
-    ------
-    CampaignError
-        None of that name is shipped; the error names ``where`` it is asked for.
+    Raises `CampaignError`: none of that name is shipped; the error names ``where`` it is asked for.
     """
     if names_a_file(name):
         return Path(name)
@@ -135,10 +129,7 @@ class Override:
 def parse_override(text: str) -> Override:
     """Read ``testing.epsilon=0.2``; the value is read by the same rules as in a campaign file.
 
-    Raises
-    ------
-    CampaignError
-        There is no ``=``, an empty part in the path, or no YAML value after the ``=``.
+    Raises `CampaignError`: there is no ``=``, an empty part in the path, or no YAML value after the ``=``.
     """
     path, equals, value = text.partition("=")
     parts, option = tuple(part.strip() for part in path.split(".")), f"--set {text}"
@@ -150,10 +141,7 @@ def parse_override(text: str) -> Override:
 def apply_overrides(data: dict[str, Any], overrides: Sequence[Override]) -> dict[str, Any]:
     """Lay each override over ``data``, later ones over earlier ones; ``data`` itself stays as it is.
 
-    Raises
-    ------
-    CampaignError
-        The path leads through something that is not a section.
+    Raises `CampaignError`: the path leads through something that is not a section.
     """
     changed = dict(data)
     for override in overrides:
@@ -208,10 +196,7 @@ class Panel(Section):
 def load_panel(path: str | Path = SHIPPED_PANEL) -> Panel:
     """Read a panel; an FMU's file, relative to the panel's folder, becomes absolute.
 
-    Raises
-    ------
-    CampaignError
-        The file cannot be read or says something wrong; the error names every place.
+    Raises `CampaignError`: the file cannot be read or says something wrong; the error names every place.
     """
     panel = read_model(path, Panel)
     avs = {
@@ -224,10 +209,7 @@ def load_panel(path: str | Path = SHIPPED_PANEL) -> Panel:
 def panel_av(text: str) -> AutomatedVehicle:
     """The vehicle that ``PANEL.yaml:NAME`` names, or a bare ``NAME`` in the shipped panel.
 
-    Raises
-    ------
-    CampaignError
-        There is no such panel, or no such vehicle in it.
+    Raises `CampaignError`: there is no such panel, or no such vehicle in it.
     """
     file, _, name = text.rpartition(":")
     avs = load_panel(file or SHIPPED_PANEL).avs

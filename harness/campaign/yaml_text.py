@@ -59,10 +59,8 @@ class Lines:
 def read_yaml(path: str | Path) -> tuple[dict[str, Any], Lines]:
     """Read a UTF-8 file with one YAML 1.2 document whose top level is a mapping: its plain data, and their lines.
 
-    Raises
-    ------
-    CampaignError
-        The file is missing, a folder, not UTF-8, empty, not a mapping, not YAML, or says a key twice.
+    Raises `CampaignError`: the file is missing, a folder, not UTF-8, empty, not a mapping, not YAML, or says a key
+    twice.
     """
     name = str(path)
     data, lines = _load(_read_text(Path(path)), name)

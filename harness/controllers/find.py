@@ -95,10 +95,7 @@ def build_host(
 ) -> ControllerHost | None:
     """Host of the AV's controller, or None for an AV that needs none (built in, or driven by SUMO).
 
-    Raises
-    ------
-    CampaignError
-        The controller cannot be found or made, or is of neither kind.
+    Raises `CampaignError`: the controller cannot be found or made, or is of neither kind.
     """
     early, guarded = av.acts_before_cut_in, partial(Guard, av.limits, black_box)
     make: Callable[[], Any]

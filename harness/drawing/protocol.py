@@ -165,10 +165,7 @@ class Source:
     def begin_after(self, runs: ShadowRuns) -> None:  # noqa: ARG002 - there are none
         """Draw tests by what the vehicle did in its baseline runs, along `baseline_paths`.
 
-        Raises
-        ------
-        HarnessError
-            Nothing on these paths can be tested.
+        Raises `HarnessError`: nothing on these paths can be tested.
         """
         raise ValueError("this campaign has no baseline runs")
 

@@ -127,10 +127,7 @@ class EpisodeLoop:
 
         ``traffic`` is what LV and BV do, where it is not drawn.
 
-        Raises
-        ------
-        WorldDisagreementError
-            The world did something else than it was told.
+        Raises `WorldDisagreementError`: the world did something else than it was told.
         """
         shard = self._empty_shard(first_episode, states, traffic or drawn_traffic())
         kernel = self._kernel_state(shard)

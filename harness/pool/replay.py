@@ -235,10 +235,7 @@ class Retracing:
     def check(self, episodes: pa.Table) -> int:
         """Retrace the rows of an episodes table; returns how many, all of them equal.
 
-        Raises
-        ------
-        WorldDisagreementError
-            The twin arrives at something else; the first such episode is named.
+        Raises `WorldDisagreementError`: the twin arrives at something else; the first such episode is named.
         """
         if self._reason is not None:
             return 0

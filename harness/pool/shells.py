@@ -58,10 +58,7 @@ def outermost(pool: Pool, shells: ShellSettings) -> int:
 def design_shells(pool: Pool, *, shells: ShellSettings | None = None, limit_mps2: float) -> ShellDesign:
     """Strata of a campaign; see `acceleration_limit`.
 
-    Raises
-    ------
-    CampaignError
-        The library knows no such boundary or statement.
+    Raises `CampaignError`: the library knows no such boundary or statement.
     """
     shells = shells or ShellSettings()
     groups = shells_in_strata(pool, outermost(pool, shells), limit_mps2)

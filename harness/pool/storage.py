@@ -54,10 +54,7 @@ def pool_path(key: str) -> Path:
 def campaign_pool(resolved: Resolved, progress: Progress | None = None) -> Pool:
     """The pool of a campaign's environment and library, from the cache or built and cached.
 
-    Raises
-    ------
-    RunFolderError
-        The pool could not be kept.
+    Raises `RunFolderError`: the pool could not be kept.
     """
     key = campaign_pool_key(resolved)
     if (cached := cached_pool(resolved)) is not None:
@@ -88,10 +85,7 @@ def write_pool(path: Path, pool: Pool) -> None:
 def read_pool(path: Path) -> Pool:
     """Read a pool.
 
-    Raises
-    ------
-    RunFolderError
-        The file is missing, damaged, or not a pool.
+    Raises `RunFolderError`: the file is missing, damaged, or not a pool.
     """
     try:
         with pq.ParquetFile(path) as file:  # read_table would import, for 0.3 s, what reads folders
@@ -112,10 +106,7 @@ def stamped(table: pa.Table, facts: dict[str, Any]) -> pa.Table:
 def sound_facts(table: pa.Table) -> dict[str, Any]:
     """The facts of a `stamped` table.
 
-    Raises
-    ------
-    KeyError, TypeError, ValueError
-        It is none of this version, or its content has changed.
+    Raises `KeyError`, `TypeError` or `ValueError`: it is none of this version, or its content has changed.
     """
     metadata = table.schema.metadata or {}
     facts: dict[str, Any] = json.loads(metadata[_METADATA])

@@ -137,10 +137,7 @@ def shadow_paths_file(resolved: Resolved) -> Path:
 def campaign_shadow_paths(resolved: Resolved, progress: Progress | None = None) -> ShadowPaths:
     """The paths that a campaign's vehicle is to walk, of candidates from the cache, or walked and cached.
 
-    Raises
-    ------
-    RunFolderError
-        The candidates could not be kept.
+    Raises `RunFolderError`: the candidates could not be kept.
     """
     key, path, settings = _candidates_key(resolved), shadow_paths_file(resolved), resolved.campaign.pool
     if (candidates := _cached(path, key)) is None:
@@ -174,10 +171,7 @@ def _cached(path: Path, key: str) -> Candidates | None:
 def vehicle_pool(resolved: Resolved, paths: ShadowPaths, runs: ShadowRuns) -> Pool:
     """Pool of the vehicle that was driven along the paths.
 
-    Raises
-    ------
-    HarnessError
-        No cut-in was found on which even the envelope crashes.
+    Raises `HarnessError`: no cut-in was found on which even the envelope crashes.
     """
     environment, library = resolved.environment, resolved.library
     followers = library.followers_in(environment)

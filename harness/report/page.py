@@ -40,10 +40,7 @@ def write_report(folder: str | Path) -> Path:
     outside the working directory they use its name alone. Plots of an earlier report that this one does not have are
     removed.
 
-    Raises
-    ------
-    RunFolderError
-        If the folder misses a file, or a file is damaged or belongs to another run.
+    Raises `RunFolderError`: if the folder misses a file, or a file is damaged or belongs to another run.
     """
     folder = Path(folder)
     run = read_run_folder(folder)

@@ -86,12 +86,8 @@ def compare_campaigns(
     margin : float, optional
         Decide whether B's rate is at most 1 + margin times A's.
 
-    Raises
-    ------
-    CampaignError
-        The campaigns differ in something else, or do not draw from the same shells.
-    RunFolderError
-        ``out`` holds other runs.
+    Raises `CampaignError`: the campaigns differ in something else, or do not draw from the same shells. Raises
+    `RunFolderError`: ``out`` holds other runs.
     """
     require_comparable(a, b)
     sides = require_ready(a, "compare"), require_ready(b, "compare")

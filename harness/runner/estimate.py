@@ -49,10 +49,7 @@ def estimate_run(
     dict
         Content of ``estimates.json``.
 
-    Raises
-    ------
-    HarnessError
-        If the folder is not a run, its records are damaged or incomplete.
+    Raises `HarnessError`: if the folder is not a run, its records are damaged or incomplete.
     """
     folder = Path(folder)
     manifest = read_manifest(folder)
@@ -84,10 +81,7 @@ def stored_blocks(folder: Path, *, moments: bool) -> Iterator[Block]:
     moments : bool
         Whether to read the ratios of control steps, which `scv` needs, where there are any on record.
 
-    Raises
-    ------
-    HarnessError
-        If the folder is not a run, or its records are damaged or incomplete.
+    Raises `HarnessError`: if the folder is not a run, or its records are damaged or incomplete.
     """
     campaign = load_campaign(folder / "campaign.yaml", check_files=False)
     manifest = read_manifest(folder)

@@ -120,10 +120,7 @@ def check_av(campaign: Campaign, n_episodes: int = EPISODES, *, black_box: Path 
     black_box : Path, optional
         File that tells in which call of the controller the process died.
 
-    Raises
-    ------
-    HarnessError
-        The campaign is wrong, or the AV cannot be found, made or started.
+    Raises `HarnessError`: the campaign is wrong, or the AV cannot be found, made or started.
     """
     tested = _as_checked(campaign)
     require_world(tested)
@@ -265,10 +262,7 @@ def plan_campaign(campaign: Campaign) -> dict[str, Any]:
         ``disk_mb``; of an AV that is not built in ``av_ms_per_test``, measured, or in words why there is none. Where
         cut-ins take time, ``within_reach_of_`` each statement: which rates it can tell, in words.
 
-    Raises
-    ------
-    CampaignError
-        A run would refuse the campaign before it starts.
+    Raises `CampaignError`: a run would refuse the campaign before it starts.
     """
     resolved, source = require_ready(campaign), source_of(campaign)
     engine = "sumo with shim" if campaign.world.engine == "sumo" and shim_library() else campaign.world.engine

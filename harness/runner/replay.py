@@ -59,14 +59,9 @@ def replay_episode(
     fcd : str or Path, optional
         Write SUMO's floating-car data to this file.
 
-    Raises
-    ------
-    RunFolderError
-        The folder is no run, or has no such episode.
-    CampaignError
-        The environment's parameter file has changed since, or the AV is not reproducible.
-    HarnessError
-        SUMO's system libraries are missing.
+    Raises `RunFolderError`: the folder is no run, or has no such episode. Raises `CampaignError`: the environment's
+    parameter file has changed since, or the AV is not reproducible. Raises `HarnessError`: SUMO's system libraries are
+    missing.
     """
     folder, fcd = Path(folder), None if fcd is None else Path(fcd)
     manifest = read_manifest(folder)

@@ -35,13 +35,9 @@ DISTANCE_PATHS = 20_000
 def require_ready(campaign: Campaign, command: Command = "run") -> Resolved:
     """Resolve a campaign for a command; refuse what can be known to be wrong before anything is simulated or written.
 
-    Raises
-    ------
-    CampaignError
-        The AV's controller cannot be found or made, SUMO knows no such attribute of it, strangers could drive it, the
-        environment's parameters are wrong, or the surrogate library is wrong or lacks the boundary.
-    HarnessError
-        SUMO's system libraries are missing.
+    Raises `CampaignError`: the AV's controller cannot be found or made, SUMO knows no such attribute of it, strangers
+    could drive it, the environment's parameters are wrong, or the surrogate library is wrong or lacks the boundary.
+    Raises `HarnessError`: SUMO's system libraries are missing.
     """
     require_world(campaign)
     controller_sha256 = require_controller(campaign)

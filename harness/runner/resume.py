@@ -30,11 +30,8 @@ from harness.runner.worker import ShardResult, finished
 def require_own_folder(folder: Path, resolved: Resolved, *, resume: bool) -> dict[str, Any]:
     """Refuse a folder that holds something else; return the manifest of a run to be continued, or one without shards.
 
-    Raises
-    ------
-    RunFolderError
-        The folder cannot be written to, holds another campaign, this one without ``--resume`` or with another
-        controller (one file may not mix two versions of it), only a part of a run, or files that are no run.
+    Raises `RunFolderError`: the folder cannot be written to, holds another campaign, this one without ``--resume`` or
+    with another controller (one file may not mix two versions of it), only a part of a run, or files that are no run.
     """
 
     def refusal(found: str, expected: str, mend: str) -> RunFolderError:
@@ -97,12 +94,8 @@ def stored_shard(folder: Path, source: Source, retracing: Retracing, request: Sh
     It is taken over if its episodes are on disk, and its moments where the campaign keeps some, with as many rows as
     are wanted and, of shells, the cut-ins that are to be drawn now. The twin retraces it.
 
-    Raises
-    ------
-    RunFolderError
-        One of its files is damaged.
-    WorldDisagreementError
-        The twin retraces an episode differently.
+    Raises `RunFolderError`: one of its files is damaged. Raises `WorldDisagreementError`: the twin retraces an episode
+    differently.
     """
     files = shard_files(folder, request.index)
     needed = {"episodes"} | ({"moments"} if source.campaign.records.moments != "none" else set())

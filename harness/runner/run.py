@@ -88,10 +88,7 @@ def run_campaign(
         Continue a run that was interrupted, or to a smaller RHW.
     progress : Progress, optional
 
-    Raises
-    ------
-    HarnessError
-        The campaign, the folder or the AV is at fault; nothing that was finished is lost.
+    Raises `HarnessError`: the campaign, the folder or the AV is at fault; nothing that was finished is lost.
     """
     resolved, out = campaign if isinstance(campaign, Resolved) else require_ready(campaign), Path(out)
     with sole_use(out):

@@ -124,10 +124,7 @@ class ShardRunner:
     def run(self, request: Request, fatal_episodes: Mapping[int, Death] | None = None) -> Result:
         """Run a shard; episodes in ``fatal_episodes`` fail before the call that ended a process.
 
-        Raises
-        ------
-        WorldDisagreementError
-            The twin retraces an episode differently.
+        Raises `WorldDisagreementError`: the twin retraces an episode differently.
         """
         self._fatal_episodes.clear()  # a baseline run may have the number of a test
         self._fatal_episodes.update(fatal_episodes or {})

@@ -281,10 +281,7 @@ class LocalWorkers(Workers):
 def workers_of(resolved: Resolved, folder: Path, n_workers: int | None, *, n_runs: int = 1) -> Workers:
     """Where a campaign's shards are run; ``n_runs`` campaigns share it and take turns.
 
-    Raises
-    ------
-    HarnessError
-        The package, the cluster or room in it is missing.
+    Raises `HarnessError`: the package, the cluster or room in it is missing.
     """
     if resolved.campaign.run.executor == "local":
         return LocalWorkers(resolved, folder, n_workers)

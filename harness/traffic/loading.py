@@ -56,10 +56,7 @@ def parameter_file(name: str) -> Path:
 def load_parameters(settings: EnvironmentSettings) -> EnvironmentParameters:
     """The numbers that a campaign's environment names.
 
-    Raises
-    ------
-    CampaignError
-        The file is missing or wrong, every place being named, or its laws give no probabilities.
+    Raises `CampaignError`: the file is missing or wrong, every place being named, or its laws give no probabilities.
     """
     file = parameter_file(settings.parameters)
     parameters = read_model(file, EnvironmentParameters)
@@ -81,10 +78,7 @@ def load_environment(settings: EnvironmentSettings, parameters: EnvironmentParam
 def require_sound_laws(environment: Environment, file: str) -> None:
     """Refuse an environment whose laws give something else than probabilities and finite states.
 
-    Raises
-    ------
-    CampaignError
-        Names the law and the parameter ``file``, and the state in which it fails.
+    Raises `CampaignError`: names the law and the parameter ``file``, and the state in which it fails.
     """
     n = environment.numbers
     speeds = np.linspace(n["fit_range__v_min_mps"], n["fit_range__v_max_mps"], 9)

@@ -75,10 +75,8 @@ _RECYCLABLE_ONLY_AS: dict[str, float] = {"sigma": 0.0, "speedDev": 0.0, "actionS
 def av_type(sumo: Mapping[str, str | float]) -> dict[str, str | float]:
     """All vType attributes of an AV, defaults filled in.
 
-    Raises
-    ------
-    CampaignError
-        An attribute or model that SUMO does not have, or a length that the crash criterion does not know.
+    Raises `CampaignError`: an attribute or model that SUMO does not have, or a length that the crash criterion does not
+    know.
     """
     for name, value in sumo.items():
         if name not in ATTRIBUTES:

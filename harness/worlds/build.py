@@ -18,10 +18,7 @@ def build_sumo_world(
 
     An AV whose SUMO model keeps hidden state gets one cell in any case; ``gui`` and ``options``: see `SumoWorld`.
 
-    Raises
-    ------
-    CampaignError
-        SUMO refuses the AV's attributes.
+    Raises `CampaignError`: SUMO refuses the AV's attributes.
     """
     cells = n_cells or campaign.world.cells
     av = campaign.av

@@ -74,12 +74,8 @@ class ConnectedProgram:
 
     A step may take ``step_time_s`` (``av.limits.step_time_s``).
 
-    Raises
-    ------
-    AVLostError
-        The program ended, or did not connect in time.
-    CampaignError
-        SUMO or the program cannot be started at all.
+    Raises `AVLostError`: the program ended, or did not connect in time. Raises `CampaignError`: SUMO or the program
+    cannot be started at all.
     """
 
     def __init__(self, av: TraciProcess, n_cells: int, sumo_arguments: Sequence[str], step_time_s: float) -> None:
@@ -122,10 +118,7 @@ class ConnectedProgram:
     def answer(self, ask: Callable[[], _Answer], seconds: float | None = None) -> _Answer:
         """What SUMO answers to the harness, which may mean to wait for the program.
 
-        Raises
-        ------
-        AVLostError
-            No answer in time (default: that of a step), the program has ended, or is not connected.
+        Raises `AVLostError`: no answer in time (default: that of a step), the program has ended, or is not connected.
         """
         limit = seconds or self._step_time_s
         began = time.monotonic()

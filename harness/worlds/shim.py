@@ -80,10 +80,7 @@ class Shim:
     def find_vehicles(self) -> None:
         """Look the vehicles up again: those of an earlier simulation in this process are gone.
 
-        Raises
-        ------
-        RuntimeError
-            There is no such vehicle.
+        Raises `RuntimeError`: there is no such vehicle.
         """
         if self._library.shim_find_vehicles(self._handle):
             raise self._error()
@@ -96,10 +93,7 @@ class Shim:
         bool
             Whether every position and speed is that of ``x`` and ``v``, in every bit.
 
-        Raises
-        ------
-        RuntimeError
-            SUMO raised an error, or a vehicle has left the road.
+        Raises `RuntimeError`: SUMO raised an error, or a vehicle has left the road.
         """
         if wanted is not self._wanted:
             self._wanted, self._wanted_address = wanted, wanted.ctypes.data

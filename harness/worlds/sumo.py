@@ -48,10 +48,7 @@ class SumoWorld(SumoCells):
     options : sequence of str
         Further SUMO options, for instance ``--fcd-output``.
 
-    Raises
-    ------
-    CampaignError
-        A simulation already runs in this process: libsumo holds only one.
+    Raises `CampaignError`: a simulation already runs in this process: libsumo holds only one.
     """
 
     _open: ClassVar[bool] = False
@@ -202,10 +199,7 @@ def _disobeyed(where: str, found: float, expected: float) -> WorldDisagreementEr
 def start_gui(arguments: Sequence[str]) -> Any:
     """Start sumo-gui and connect to it; returns traci, which has libsumo's functions.
 
-    Raises
-    ------
-    CampaignError
-        It is not installed, or has no screen to open its window on.
+    Raises `CampaignError`: it is not installed, or has no screen to open its window on.
     """
     import traci  # noqa: PLC0415 - comes with libsumo, wanted only here
 

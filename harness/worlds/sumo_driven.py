@@ -41,10 +41,7 @@ class SumoAvWorld(SumoWorld):
     options
         Those of `SumoWorld`.
 
-    Raises
-    ------
-    CampaignError
-        SUMO does not know, or refuses, an attribute.
+    Raises `CampaignError`: SUMO does not know, or refuses, an attribute.
     """
 
     def __init__(

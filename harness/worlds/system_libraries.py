@@ -77,10 +77,7 @@ def require_libraries() -> None:
 def install_commands(missing: Sequence[SystemLibrary]) -> list[list[str]]:
     """Commands that install the packages of missing libraries here; all but the last prepare the last.
 
-    Raises
-    ------
-    HarnessError
-        No package manager that is known, or neither root nor sudo.
+    Raises `HarnessError`: no package manager that is known, or neither root nor sudo.
     """
     manager = next((name for name, commands in _INSTALL.items() if shutil.which(commands[0][0])), None)
     if manager is None:
@@ -98,10 +95,7 @@ def install_commands(missing: Sequence[SystemLibrary]) -> list[list[str]]:
 def install(missing: Sequence[SystemLibrary], commands: Sequence[Sequence[str]]) -> None:
     """Run the commands of `install_commands`, silently unless the last fails.
 
-    Raises
-    ------
-    HarnessError
-        The packages could not be installed; it repeats what the package manager complained about.
+    Raises `HarnessError`: the packages could not be installed; it repeats what the package manager complained about.
     """
     said: list[str] = []
     for command in commands:

@@ -54,10 +54,7 @@ class TraciWorld(SumoCells):
     def announce(self, cells: IntArray, episodes: IntArray) -> None:  # noqa: ARG002 - the program is not told
         """See `harness.worlds.protocol.DrivingWorld`; SUMO and the program are started with the first episodes.
 
-        Raises
-        ------
-        AVLostError
-            The program does not connect, or has been started as often as the campaign allows.
+        Raises `AVLostError`: the program does not connect, or has been started as often as the campaign allows.
         """
         if self._given_up:
             raise AVLostError(self._given_up)
@@ -97,12 +94,8 @@ class TraciWorld(SumoCells):
     def step(self, speed: FloatArray, cut_in: Int8Array) -> BoolArray:
         """See `harness.worlds.protocol.World`; speeds of released AVs are ignored.
 
-        Raises
-        ------
-        AVLostError
-            The program did not take part in this step.
-        WorldDisagreementError
-            A vehicle that the harness commands is not where it should be.
+        Raises `AVLostError`: the program did not take part in this step. Raises `WorldDisagreementError`: a vehicle
+        that the harness commands is not where it should be.
         """
         program = self._running()
         api = program.connection

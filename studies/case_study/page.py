@@ -30,10 +30,7 @@ def write_page(study: Study, folder: Path, made: Mapping[str, Made]) -> tuple[Pa
 
     Returned are the page, and the content of ``claims.json``.
 
-    Raises
-    ------
-    HarnessError
-        A claim or the picture asks for a figure that its step does not have.
+    Raises `HarnessError`: a claim or the picture asks for a figure that its step does not have.
     """
     claims = [_answered(claim.model_dump(), made, conclusive=study.conclusive) for claim in study.claims]
     with matplotlib.style.context(["default", RC]):
@@ -71,10 +68,7 @@ def write_page(study: Study, folder: Path, made: Mapping[str, Made]) -> tuple[Pa
 def asked(path: str, made: Mapping[str, Made]) -> dict[str, Any]:
     """The figure of a step.
 
-    Raises
-    ------
-    HarnessError
-        The step has no such figure.
+    Raises `HarnessError`: the step has no such figure.
     """
     name, _, key = path.partition(".")
     figures = made[name].result["figures"]

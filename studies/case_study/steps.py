@@ -75,10 +75,8 @@ def run_study(
     Worker processes, one per core by default, change no result. ``told`` receives each step's name and seconds when it
     is finished, None for one that was there before.
 
-    Raises
-    ------
-    HarnessError
-        A file that a step names is wrong, which shows before any step is made; or the folder cannot be used.
+    Raises `HarnessError`: a file that a step names is wrong, which shows before any step is made; or the folder cannot
+    be used.
     """
     keys = step_keys(study)
     made: dict[str, Made] = {}

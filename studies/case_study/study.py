@@ -234,10 +234,7 @@ def load_study(path: Path, *, quick: bool = False) -> Study:
 
     Both forms are validated whichever is asked for, so that a file is right or wrong whatever is made of it.
 
-    Raises
-    ------
-    CampaignError
-        The file cannot be read or says something wrong; the error names every place.
+    Raises `CampaignError`: the file cannot be read or says something wrong; the error names every place.
     """
     data, lines = read_yaml(path)
     full = validated(data, Study, str(path), lines.place)

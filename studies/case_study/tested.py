@@ -49,10 +49,7 @@ class Tests(NamedTuple):
 def campaign_of(step: TwinTests | Run) -> Campaign:
     """The campaign that a step tests.
 
-    Raises
-    ------
-    HarnessError
-        It is wrong, or draws from shells where crashes alone are to be kept.
+    Raises `HarnessError`: it is wrong, or draws from shells where crashes alone are to be kept.
     """
     bare = (*IN_THE_TWIN, "records.moments=none") if isinstance(step, TwinTests) else ()
     campaign = load_campaign(step.campaign, [*step.set, *bare])
@@ -153,10 +150,7 @@ def _tests(n: int, table: pa.Table) -> Tests:
 def read_tests(made: Made) -> Tests:
     """Tests of a finished step.
 
-    Raises
-    ------
-    HarnessError
-        They were drawn from shells, each with a probability of its own.
+    Raises `HarnessError`: they were drawn from shells, each with a probability of its own.
     """
     if "n" not in made.result:
         found = "tests drawn from shells, of which each has its own probability"

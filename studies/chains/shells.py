@@ -75,10 +75,8 @@ def joint_outcomes(chain: Chain) -> FloatArray:
     The cut-in is in step t from state g; the third axis has one bit per surrogate that crashes, the last says whether
     the vehicle does.
 
-    Raises
-    ------
-    ValueError
-        The BV's maneuvers after the cut-in depend on the vehicle, so that surrogates cannot meet the same ones.
+    Raises `ValueError`: the BV's maneuvers after the cut-in depend on the vehicle, so that surrogates cannot meet the
+    same ones.
     """
     if not np.allclose(chain.exposure, chain.exposure[0], rtol=0.0, atol=0.0):
         raise ValueError(f"chain {chain.name!r}: maneuvers depend on the danger that the vehicle is in")

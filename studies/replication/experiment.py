@@ -198,10 +198,7 @@ class Experiment(Section):
 def load_experiment(path: Path, overrides: Sequence[str] = ()) -> Experiment:
     """Read an experiment, with ``section.key=value`` laid over what the file says.
 
-    Raises
-    ------
-    CampaignError
-        The file cannot be read or says something wrong; the error names every place.
+    Raises `CampaignError`: the file cannot be read or says something wrong; the error names every place.
     """
     data, lines = read_yaml(path)
     changes = [parse_override(text) for text in overrides]

@@ -349,10 +349,7 @@ def walk_paths(
 ) -> SuperPopulation:
     """Let the campaign's vehicle walk so many paths, or read what it did from the cache.
 
-    Raises
-    ------
-    HarnessError
-        The vehicle failed, or did something else in a test than in its shadow run.
+    Raises `HarnessError`: the vehicle failed, or did something else in a test than in its shadow run.
     """
     code = require_controller(campaign), source_hash(_SOURCES), sources_of("replication/populations.py")
     resolved = resolve(campaign)

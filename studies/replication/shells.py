@@ -428,10 +428,7 @@ def leave_out(library: Library, names: set[str], careful_first: tuple[str, ...])
     That is the next more careful one that is left, or the next more careless one if none is; ``careful_first`` are all
     surrogates.
 
-    Raises
-    ------
-    CampaignError
-        No surrogate is left but the envelope.
+    Raises `CampaignError`: no surrogate is left but the envelope.
     """
     names = names - {library.envelope}
     if library.boundary in names:
