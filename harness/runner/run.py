@@ -230,7 +230,7 @@ class Run:
         self.source.begin_after(runs)
 
     def _write_design(self) -> None:
-        """RecordPolicy the strata: without them nothing can be estimated."""
+        """Keep the strata: without them nothing can be estimated."""
         if self.source.design is not None:
             write_json(self.out / SHELLS, STORED_DESIGN.dump_python(self.source.design, mode="json"))
 
