@@ -3,12 +3,9 @@
 import errno
 import json
 import os
-import subprocess
-import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import SimpleNamespace
-from typing import get_args
 
 import pyarrow as pa
 import pytest
@@ -19,7 +16,6 @@ from harness.campaign.files import load_campaign
 from harness.cli import cli, main
 from harness.errors import EXIT_BAD_INPUT, RunFolderError, TooManyFailedError
 from harness.progress import ShownProgress
-from harness.vocabulary import EstimatorName
 
 SCENARIOS = Path(__file__).parents[1] / "scenarios"
 SMOKE = str(SCENARIOS / "smoke.yaml")
@@ -106,14 +102,11 @@ def calls(monkeypatch, tmp_path):
     return seen
 
 
-def test_help_teaches_and_needs_nothing_heavy():
+def test_help_teaches():
     for command in ([], *([name] for name in cli.commands)):
         result = CliRunner().invoke(cli, [*command, "--help"])
         assert result.exit_code == 0
         assert "Examples:\n    harness " in result.output
-    heavy = "{'numba', 'scipy', 'pyarrow', 'pydantic', 'rich'}"
-    loaded = f"import sys, harness.cli; print(sorted({heavy} & set(sys.modules)))"
-    assert subprocess.run([sys.executable, "-c", loaded], capture_output=True, check=True).stdout == b"[]\n"
 
 
 def test_check_prints_a_campaign_file(calls, capsys, tmp_path):
@@ -186,20 +179,6 @@ def test_bad_campaigns_end_with_2_and_the_place(calls, capsys, tmp_path, text, p
     assert sorted(file.name for file in tmp_path.iterdir()) == ["bad.yaml"]
 
 
-def test_numbers_without_dot_run(calls, tmp_path):
-    (tmp_path / "good.yaml").write_text("name: good\ntesting: {epsilon: 1e-5}\n")
-    assert main(["run", str(tmp_path / "good.yaml"), "--out", str(tmp_path / "out")]) == 0
-    assert calls["harness.runner.run_campaign"][0][0].testing.epsilon == 1e-5
-
-
-def test_several_problems_are_listed(calls, capsys, tmp_path):
-    (tmp_path / "bad.yaml").write_text("name: bad\nseed: x\nwordl: {}\n")
-    assert main(["check", str(tmp_path / "bad.yaml")]) == 2
-    err = capsys.readouterr().err
-    assert err.startswith(f"error: {tmp_path / 'bad.yaml'}: 2 problems\nerror: seed (")
-    assert "\nerror: wordl (" in err
-
-
 @pytest.mark.parametrize(
     "arguments",
     [
@@ -260,34 +239,6 @@ def test_errors_of_the_system_that_can_be_mended(calls, capsys, tmp_path, number
     assert words in err
 
 
-def test_a_system_error_without_a_file_names_the_folders_it_may_be_in(calls, capsys, tmp_path, monkeypatch):
-    monkeypatch.setenv("HARNESS_CACHE_DIR", str(tmp_path / "cache"))
-    calls["stand_in"]("harness.runner.run_campaign", OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)))
-    assert main(["run", SMOKE, "--out", str(tmp_path)]) == 2
-    assert f"output folder, or of the cache {tmp_path}/cache" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        ["check", "x" * 10_000],
-        ["check", SMOKE, "--set", f"name={'x ' * 5_000}"],
-        ["check", SMOKE, "--set", f"{'x' * 10_000}=1"],
-        ["check", SMOKE, "--set", "x" * 10_000],
-        ["check", SMOKE, "--set", f"stop={'x' * 10_000}", "--set", f"av.model={'y' * 10_000}"],
-        ["check", SMOKE, "--av", "x" * 10_000],
-        ["check", SMOKE, "--" + "x" * 10_000],
-        ["x" * 10_000],
-        ["estimate", "x" * 10_000],
-    ],
-)
-def test_what_was_given_is_not_repeated_at_any_length(arguments, capsys):
-    assert main(arguments) == 2
-    lines = capsys.readouterr().err.splitlines()
-    assert max(map(len, lines)) < 1300
-    assert any("characters)" in line for line in lines)
-
-
 def test_defects_are_not_hidden(calls, tmp_path):
     calls["stand_in"]("harness.runner.run_campaign", OSError(errno.EBADF, "closed too early"))
     with pytest.raises(OSError, match="closed too early"):
@@ -321,28 +272,11 @@ def test_estimate_closes_with_what_was_asked(calls, capsys, tmp_path):
     assert out.count("weights are not 1") == 1
 
 
-def test_estimate_without_a_crash_has_gaps(calls, capsys, tmp_path):
-    entry = {**NADE, "crash_rate": 0.0, "rhw": None, "n_effective": None, "largest_weight_share": None}
-    calls["stand_in"]("harness.runner.estimate_run", {**ESTIMATES, "estimates": {"nade": entry}})
-    assert main(["estimate", str(tmp_path)]) == 0
-    assert "– │ –" in " ".join(capsys.readouterr().out.split())
-
-
-def test_estimate_knows_every_estimator():
-    option = next(option for option in cli.commands["estimate"].params if option.name == "estimators")
-    assert tuple(option.type.choices) == get_args(EstimatorName)
-
-
 def test_estimate_writes_only_when_asked(calls, capsys, tmp_path):
     assert main(["estimate", str(tmp_path), "--write", "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == ESTIMATES
     assert json.loads((tmp_path / "estimates.json").read_text()) == ESTIMATES
     assert [file.name for file in tmp_path.iterdir()] == ["estimates.json"]
-
-
-def test_report_prints_the_page(calls, capsys, tmp_path):
-    assert main(["report", str(tmp_path)]) == 0
-    assert capsys.readouterr().out == f"{tmp_path / 'report.html'}\n"
 
 
 def test_replay_writes_the_trace(calls, capsys, tmp_path):
@@ -355,13 +289,6 @@ def test_replay_writes_the_trace(calls, capsys, tmp_path):
     assert main(["replay", str(tmp_path), "17", "--out", str(as_parquet), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["bit_equal"] is True
     assert parquet.read_table(as_parquet)["step"].to_pylist() == [0, 1]
-
-
-def test_a_file_to_write_may_need_its_folder(calls, capsys, tmp_path):
-    file = tmp_path / "new" / "deeper" / "trace.csv"
-    assert main(["replay", str(tmp_path), "17", "--out", str(file)]) == 0
-    assert capsys.readouterr().out.endswith(f"\n{file}\n")
-    assert [path.name for path in file.parent.iterdir()] == ["trace.csv"]
 
 
 @pytest.mark.parametrize("option", ["--out", "--fcd"])
@@ -398,14 +325,6 @@ def test_pool_prints_what_it_wrote(calls, capsys, tmp_path):
     assert json.loads(capsys.readouterr().out)["file"] == str(file)
 
 
-def test_pool_refuses_another_kind_of_file(calls, capsys, tmp_path):
-    assert main(["pool", SMOKE, "--out", str(tmp_path / "new" / "pool.txt")]) == 2
-    err = capsys.readouterr().err
-    assert "'.txt'" in err
-    assert f"Write --out {tmp_path}/new/pool.parquet." in err
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_replay_that_differs_is_an_error(calls, capsys, tmp_path):
     calls["stand_in"]("harness.runner.replay_episode", Replay(bit_equal=False))
     assert main(["replay", str(tmp_path), "17"]) == 3
@@ -425,14 +344,6 @@ def test_replay_says_when_a_cut_in_that_takes_time_began(calls, tmp_path, capsys
     assert sentence in capsys.readouterr().out
 
 
-def test_schema_prints_what_is_committed():
-    result = subprocess.run([sys.executable, "-m", "harness", "schema"], capture_output=True, check=True)
-    assert result.stdout.decode() == (SCENARIOS / "campaign.schema.json").read_text(encoding="utf-8")
-
-
-def test_a_reader_that_leaves_is_no_error():
-    command = f"{sys.executable} -m harness schema | head -c 1; exit ${{PIPESTATUS[0]}}"
-    result = subprocess.run(["bash", "-c", command], capture_output=True, check=False)
-    assert result.stdout == b"{"
-    assert result.stderr == b""
-    assert result.returncode in (0, 1)
+def test_schema_prints_what_is_committed(capsys):
+    assert main(["schema"]) == 0
+    assert capsys.readouterr().out == (SCENARIOS / "campaign.schema.json").read_text(encoding="utf-8")

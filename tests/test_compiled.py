@@ -112,12 +112,6 @@ def of_another_process(lines: str, **environment: str) -> subprocess.CompletedPr
     return subprocess.run(command, env=variables, capture_output=True, text=True, check=False)
 
 
-def test_it_is_the_cache_also_where_numba_was_imported_before():
-    say = "import numba; from harness import random_stream; print(random_stream._fill_uniforms._cache.cache_path)"
-    said = of_another_process(say).stdout.strip()
-    assert said == str(Path(os.environ["NUMBA_CACHE_DIR"]) / "harness")
-
-
 def test_numba_with_a_vector_library_is_refused():
     refused = of_another_process("import numba; numba.config.USING_SVML = True; import harness.compiled")
     assert refused.returncode != 0

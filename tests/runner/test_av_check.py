@@ -151,9 +151,3 @@ def test_a_controller_that_ends_the_process_is_told(check, tmp_path, capfd):
         "error: av.controller\n  found:    the controller ended the worker process (exit code 1), in "
     )
     assert "of step" in err
-
-
-def test_the_command_line_runs_a_controller_in_a_process_of_its_own(check, capfd):
-    arguments = ["--set", "av={}", "--set", "av.controller=checked_controllers:Undefined", "--episodes", "6"]
-    assert main(["av-check", MIXTURE_FILE, *arguments]) == 3
-    assert "nan" in capfd.readouterr().out

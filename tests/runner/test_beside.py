@@ -83,7 +83,3 @@ def test_the_boundary_itself_is_never_ahead_in_sumo_or_twin(campaign, run_here, 
     tests = stored_table(sumo.folder, "episodes")
     assert tests.column("ahead_step").null_count == tests.num_rows
     assert tests.column("outcome").to_pylist().count("crash") > 100
-
-
-def test_other_methods_have_no_such_column(twin_run):
-    assert "ahead_step" not in stored_table(twin_run, "episodes").column_names

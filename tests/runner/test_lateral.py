@@ -9,7 +9,6 @@ import pytest
 
 from harness import replay
 from harness.errors import CampaignError
-from harness.report import write_report
 from harness.runner import plan_campaign
 from harness.runner.look import check_av
 from studies.alarm import alarm_of_run
@@ -56,11 +55,6 @@ def test_records_say_when_it_began_and_how_it_ended(lateral_run):
     assert (traces[traces.vehicle != "BV"].lateral_m == 0.0).all()
 
 
-def test_without_a_lead_records_have_no_column_more(twin_run):
-    assert not set(COLUMNS) & set(stored_table(twin_run, "episodes").column_names)
-    assert "lateral_m" not in stored_table(twin_run, "traces").column_names
-
-
 def test_a_test_is_replayed_bit_for_bit(lateral_run):
     episodes = stored_table(lateral_run.folder, "episodes").to_pylist()
     crashed = next(row["episode"] for row in episodes if row["outcome"] == "crash")
@@ -69,13 +63,6 @@ def test_a_test_is_replayed_bit_for_bit(lateral_run):
     assert "traces" in again.compared
     assert again.row["onset_step"] is not None
     assert "lateral_m" in again.trace.column_names
-
-
-def test_the_page_shows_the_onset(lateral_run):
-    page = write_report(lateral_run.folder).read_text(encoding="utf-8")
-    assert "by a lane change that takes time" in page
-    assert "0.5 s before" in page
-    assert "onset" in page
 
 
 @pytest.mark.usefixtures("lateral_run")  # it builds the pool

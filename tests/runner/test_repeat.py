@@ -59,17 +59,6 @@ def test_a_vehicle_that_does_not_is_found_out_for_any_number_of_workers_and_afte
     assert (longer["repeated"], longer["reproducible"], longer["n_episodes"]) == (one["repeated"], False, 500)
 
 
-def test_a_built_in_vehicle_need_not_show_anything(twin_run):
-    manifest = read_manifest(twin_run)
-    assert (manifest["repeated"], manifest["reproducible"]) == (None, True)
-    assert "repeated" not in statement(twin_run)
-
-
-def test_a_short_run_repeats_two(run_av):
-    folder = run_av(GOOD, "stop.episodes=12")
-    assert read_manifest(folder)["repeated"]["n_episodes"] == 2
-
-
 def test_a_replay_that_differs_names_what_it_knows(run_av):
     folder = run_av(GOOD, "stop.episodes=100")
     manifest = read_manifest(folder)

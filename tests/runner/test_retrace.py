@@ -16,7 +16,8 @@ from harness.resolved import resolve
 from harness.runner.resolve import prepare
 from harness.worlds.twin import TwinWorld
 from tests.chains.seed import SEED
-from tests.stored_runs import copy_of, manifest, shard_files, stored_table
+from tests.in_process import run_here
+from tests.stored_runs import copy_of, golden, manifest, shard_files, stored_table
 
 N = 600
 AVS = {
@@ -120,11 +121,7 @@ def test_a_run_in_sumo_says_that_all_is_equal(sumo_run):
     assert {"cut_in_r2_m", "impact_speed_mps"} <= set(said["compared"])
 
 
-def test_a_run_in_the_twin_says_why_nothing_was(twin_run):
-    assert "twin itself" in manifest(twin_run)["retraced"]["reason"]
-
-
-def test_a_stored_shard_is_retraced_when_a_run_goes_on(campaign, sumo_run, run, tmp_path):
+def test_a_stored_shard_is_retraced_when_a_run_goes_on(sumo_run, tmp_path):
     folder = copy_of(sumo_run, tmp_path / "run")
     path = shard_files(folder)[0]
     table = pq.read_table(path, partitioning=None)
@@ -134,4 +131,4 @@ def test_a_stored_shard_is_retraced_when_a_run_goes_on(campaign, sumo_run, run, 
     at = table.column_names.index("cut_in_r2_m")
     pq.write_table(table.set_column(at, table.schema.field(at), pa.array(values, pa.float64())), path)
     with pytest.raises(WorldDisagreementError, match=f"episode {row}"):
-        run(campaign("world.cells=8"), folder, workers=1, resume=True)
+        run_here(golden("mixture-seven"), folder, resume=True)

@@ -53,23 +53,6 @@ def test_it_reaches_the_precision_and_keeps_the_shadow_runs(early_run):
     assert json.loads((folder / "shells.json").read_text())["n_paths"] == 120
 
 
-def test_the_twin_gives_the_same_bits_for_two_workers_and_other_cells(early_run, campaign, run, tmp_path):
-    twin = run(campaign(*SHELLS, SHADOWS, f"av={of('Speeds')}", TWIN, "world.cells=64"), tmp_path / "run", workers=2)
-    assert _unlike(early_run.folder, twin.folder) == []
-
-
-def _unlike(one, other) -> list[str]:
-    """Columns of the episodes that differ; the pool's key names the engine, so that files of JSON differ."""
-    names = [name for name in unlike_columns(one, other) if not name.endswith(".json")]
-    same = [a.read_bytes() == b.read_bytes() for a, b in zip(files_of(one), files_of(other), strict=True)]
-    return names + ["shadow"] * (not all(same))
-
-
-def test_an_array_controller_gives_the_same_bits(early_run, campaign, run_here, tmp_path):
-    batch = run_here(campaign(*SHELLS, SHADOWS, f"av={of('SpeedsBatch')}", TWIN), tmp_path / "run")
-    assert _unlike(early_run.folder, batch.folder) == []
-
-
 def test_a_test_is_replayed_bit_for_bit(early_run):
     again = replay(early_run.folder, 5)
     assert again.bit_equal

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import io
 import json
-from collections import Counter
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +11,7 @@ import pytest
 from harness import estimate, replay
 from harness.drawing.allocation import GROWTH, Allocation, first_tests
 from harness.drawing.shells import round_requests
-from harness.errors import CampaignError, RunFolderError
+from harness.errors import RunFolderError
 from harness.estimators.likelihood import Level
 from harness.estimators.tally import Tally, combined
 from harness.runner.manifest import Manifest, Prefix
@@ -47,16 +44,6 @@ def test_it_reaches_the_precision_and_says_both_things(shells_run):
     assert not any(each["refuted"] for each in estimate["details"]["statements"])
 
 
-def test_the_twin_gives_the_same_bits(shells_run, campaign, run_here, tmp_path):
-    twin = run_here(campaign(*SHELLS, "world.engine=twin"), tmp_path / "run")
-    assert [name for name in unlike_columns(shells_run.folder, twin.folder) if name != "estimates.json"] == []
-
-
-def test_two_workers_and_other_cells(shells_run, campaign, run, tmp_path):
-    other = run(campaign(*SHELLS, "world.cells=64"), tmp_path / "run", workers=2)
-    assert unlike_columns(shells_run.folder, other.folder) == []
-
-
 def test_continued_to_a_narrower_interval(shells_run, campaign, run_here, tmp_path):
     """Twin: a rougher run, continued; shards are taken over, and the end is that of a run in one go."""
     twin = "world.engine=twin"
@@ -67,20 +54,6 @@ def test_continued_to_a_narrower_interval(shells_run, campaign, run_here, tmp_pa
     assert len(begun) < len(shard_files(out))
     assert all((out / "episodes" / name).read_bytes() == content for name, content in begun.items())
     assert [name for name in unlike_columns(shells_run.folder, out) if name != "estimates.json"] == []
-
-
-def test_what_a_campaign_names_is_read_once(campaign, run_here, tmp_path, monkeypatch):
-    """Also by the worker, which is this process here and is handed what has been read."""
-    opened, really_open = [], io.open
-
-    def noted(file, *arguments, **options):
-        opened.append(Path(str(file)).name)
-        return really_open(file, *arguments, **options)
-
-    monkeypatch.setattr(io, "open", noted)  # what pathlib opens files by
-    run_here(campaign(*SHELLS, "world.engine=twin", "stop.episodes=150"), tmp_path / "run")
-    named = Counter(name for name in opened if name in ("ndd-overtaking-1.yaml", "ladder-2.yaml"))
-    assert named == {"ndd-overtaking-1.yaml": 1, "ladder-2.yaml": 1}
 
 
 def test_a_pool_that_is_used_up_ends_the_run(campaign, run_here, tmp_path):
@@ -181,21 +154,6 @@ def test_a_careless_vehicle_is_found_out(campaign, run_here, tmp_path):
     assert f"`harness replay FOLDER {first}`" in refuted
     assert replay(tmp_path / "run", first).row["outcome"] == "crash"
     assert result.estimates["estimates"]["shells"]["crash_rate"] == pytest.approx(2.4e-5, rel=0.5)
-
-
-def test_rows_say_which_cut_in_they_were(shells_run):
-    episodes = stored_table(shells_run.folder, "episodes")
-    assert episodes.column("pool_cut_in").null_count == 0
-    strata = len(json.loads((shells_run.folder / "shells.json").read_text())["strata"])
-    assert set(episodes.column("component").to_pylist()) == set(range(strata))
-    weights = np.unique(np.round(episodes.column("log_weight").to_numpy(), 12))
-    assert weights.size == strata
-
-
-def test_an_unknown_boundary_is_refused(campaign, run_here, tmp_path):
-    with pytest.raises(CampaignError, match="a surrogate of the library"):
-        run_here(campaign(*SHELLS, "testing.shells.boundary=brakes-4"), tmp_path / "run")
-    assert not (tmp_path / "run").exists()
 
 
 def test_a_run_without_its_shells_is_named(shells_run, tmp_path):
