@@ -26,10 +26,9 @@ from harness.records.schemas import shard_tables
 from harness.resolved import resolve
 from harness.runner.resolve import prepare
 from harness.runner.workers import LocalWorkers
-from harness.worlds.cells import sumo_program
 from harness.worlds.protocol import World
 from harness.worlds.shim import shim_library
-from harness.worlds.sumo import SumoWorld
+from harness.worlds.sumo import SumoWorld, sumo_program
 from harness.worlds.twin import TwinWorld
 
 SCENARIOS = Path(__file__).parents[1] / "scenarios"

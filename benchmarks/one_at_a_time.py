@@ -19,7 +19,7 @@ import traci
 from sumolib.miscutils import getFreeSocketPort
 
 from harness.vocabulary import AV, BV, VEHICLES, BoolArray, FloatArray, Int8Array, IntArray
-from harness.worlds.cells import EXACT_OPTIONS, committed_file, network_file
+from harness.worlds.sumo import EXACT_OPTIONS, committed_file, network_file
 
 LEFT, RIGHT = 1, 0
 

@@ -23,10 +23,11 @@ from harness.errors import EXIT_DONE, EXIT_TOO_MANY_FAILED
 from harness.estimators.estimate import finite_json
 from harness.importance.build import needs_tables
 from harness.resolved import resolve
-from harness.runner.resolve import build_world, prepare, require_ready, require_world
+from harness.runner.resolve import prepare, require_ready, require_world
 from harness.runner.worker import Bits, bits_of
 from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import AV, CRASH, FAILED, FloatArray
+from harness.worlds import build_world
 from harness.worlds.protocol import AVLostError
 from harness.worlds.shim import shim_library
 

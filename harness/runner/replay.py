@@ -19,8 +19,9 @@ from harness.records.folder import no_episodes, read_manifest, read_table
 from harness.records.schemas import shard_tables
 from harness.resolved import Resolved, resolve
 from harness.runner.manifest import cpu_name, versions
-from harness.runner.resolve import build_world, prepare, require_world
+from harness.runner.resolve import prepare, require_world
 from harness.runner.resume import require_same_pool
+from harness.worlds import build_world
 from harness.worlds.protocol import World
 from harness.worlds.system_libraries import require_libraries
 
@@ -145,12 +146,8 @@ def _require_reproducible(manifest: dict[str, Any]) -> None:
 
 
 def _world(campaign: Campaign, *, gui: bool, fcd: Path | None) -> World:
-    if not gui and fcd is None:
-        return build_world(campaign, n_cells=1)
-    from harness.worlds.build import build_sumo_world  # noqa: PLC0415 - libsumo takes half a second to import
-
     options = () if fcd is None else ("--fcd-output", str(fcd), "--precision", "9")
-    return build_sumo_world(campaign, 1, gui=gui, options=options)
+    return build_world(campaign, 1, in_sumo=gui or fcd is not None, gui=gui, options=options)
 
 
 def _stored(folder: Path, manifest: dict[str, Any], episode: int) -> dict[str, pa.Table]:

@@ -22,9 +22,7 @@ from harness.resolved import Resolved, resolve
 from harness.traffic.initial_state import InitialStates
 from harness.traffic.laws import Environment
 from harness.unboxed import unboxed
-from harness.worlds.av_type import av_type
-from harness.worlds.protocol import World
-from harness.worlds.public_address import require_private
+from harness.worlds.sumo_driven import av_type
 from harness.worlds.system_libraries import require_libraries
 
 DISTANCE_SEED = 20_000
@@ -44,6 +42,8 @@ def require_ready(campaign: Campaign, command: Command = "run") -> Resolved:
     if campaign.av.sumo is not None:
         av_type(campaign.av.sumo)
     if campaign.av.traci is not None:
+        from harness.worlds.program import require_private  # noqa: PLC0415 - imports traci
+
         require_private(campaign.av.traci)
     resolved = resolve(campaign, command, controller_sha256=controller_sha256)
     source_of(campaign).require(resolved)
@@ -90,17 +90,6 @@ def compile_kernels(resolved: Resolved) -> None:
     shard = EpisodeLoop(TwinWorld(1), policy, RecordPolicy(0, "none", 0.0)).run(0, states)
     Retracing(resolved).check(shard_tables(shard, campaign.seed, keep_traces=False).episodes)
     distance_per_test_m(environment)
-
-
-def build_world(campaign: Campaign, n_cells: int | None = None) -> World:
-    """The world that a campaign names, with its number of cells or another."""
-    if campaign.world.engine == "twin":
-        from harness.worlds.twin import TwinWorld  # noqa: PLC0415 - a run needs one of the two worlds
-
-        return TwinWorld(n_cells or campaign.world.cells)
-    from harness.worlds.build import build_sumo_world  # noqa: PLC0415 - libsumo takes half a second to import
-
-    return build_sumo_world(campaign, n_cells)
 
 
 def distance_per_test_m(environment: Environment) -> float:

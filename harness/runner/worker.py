@@ -29,8 +29,9 @@ from harness.processes import fit_to_travel
 from harness.records.folder import encoded
 from harness.records.schemas import ShardTables, shard_tables
 from harness.resolved import Resolved
-from harness.runner.resolve import build_world, prepare
+from harness.runner.resolve import prepare
 from harness.vocabulary import FAILED
+from harness.worlds import build_world
 from harness.worlds.twin import TwinWorld
 
 REPEATED = b"harness.repeated"

@@ -118,7 +118,7 @@ def test_the_twin_needs_none(bare_machine, capsys):
 
 
 def test_a_libsumo_that_does_not_load_for_another_reason_is_told_too():
-    code = "import sys; sys.modules['libsumo'] = None; import harness.worlds.build"
+    code = "import sys; sys.modules['libsumo'] = None; from harness.worlds.sumo import SumoWorld; SumoWorld(1)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert "HarnessError: libsumo: found that it cannot be imported" in done.stderr
 

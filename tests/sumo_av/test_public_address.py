@@ -7,7 +7,7 @@ import pytest
 from harness.campaign.files import load_campaign
 from harness.errors import CampaignError, WorldDisagreementError
 from harness.runner import plan_campaign
-from harness.worlds import program, public_address
+from harness.worlds import program
 from tests.sumo_av.running import EXAMPLE, ROOT
 
 FORCED = ROOT / "scenarios/overtaking_forced.yaml"
@@ -27,7 +27,7 @@ def load(command, more=""):
     ],
 )
 def test_a_machine_with_a_public_address_is_refused_unless_it_is_allowed(addresses, more, refused, monkeypatch):
-    monkeypatch.setattr(public_address, "own_addresses", lambda: addresses)
+    monkeypatch.setattr(program, "own_addresses", lambda: addresses)
     monkeypatch.setattr("harness.runner.look.seconds_per_test", lambda _: 0.1)
     if not refused:
         plan_campaign(load(COMMAND, more))
@@ -38,7 +38,7 @@ def test_a_machine_with_a_public_address_is_refused_unless_it_is_allowed(address
 
 
 def test_this_machines_own_addresses_are_found():
-    assert "127.0.0.1" in public_address.own_addresses()
+    assert "127.0.0.1" in program.own_addresses()
 
 
 def test_permission_to_be_public_is_no_other_vehicle():

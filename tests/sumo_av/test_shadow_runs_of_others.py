@@ -8,7 +8,8 @@ import pytest
 from harness.campaign.files import load_campaign
 from harness.drawing.baseline import as_recorded, baseline_requests, run_baseline
 from harness.resolved import resolve
-from harness.runner.resolve import build_world, prepare
+from harness.runner.resolve import prepare
+from harness.worlds import build_world
 from harness.worlds.sumo_driven import FreshWorld, SumoAvWorld
 from tests.controllers.test_same_bits import ROOT, fmu_av
 from tests.pool.conftest import MIXTURE_FILE, SMALL_POOL

@@ -3,9 +3,8 @@ import pytest
 
 from harness.errors import CampaignError
 from harness.vocabulary import AV, BV, CRASH, LV
-from harness.worlds import sumo_av_world
-from harness.worlds.av_type import DEFAULTS, recyclable
-from harness.worlds.sumo_driven import FreshWorld, SumoAvWorld
+from harness.worlds import sumo_driven
+from harness.worlds.sumo_driven import DEFAULTS, FreshWorld, SumoAvWorld, recyclable
 from tests.sumo_av.running import ROOT, bits, run, run_idm, run_in, sumo_av
 
 
@@ -49,7 +48,7 @@ def test_other_models_do_not_and_get_a_seeded_simulation_per_episode(attributes)
 
 
 def test_random_numbers_differ_between_episodes_and_campaigns():
-    seeds = {sumo_av_world.sumo_seed(seed, episode) for seed in (1, 2) for episode in range(50)}
+    seeds = {sumo_driven.sumo_seed(seed, episode) for seed in (1, 2) for episode in range(50)}
     assert len(seeds) == 100
 
 
@@ -93,7 +92,7 @@ def test_collision_flag_and_formula_agree_for_an_av_that_keeps_a_gap_but_hardly_
 def test_the_speed_mode_of_a_released_av_does_not_matter_as_nothing_is_commanded(monkeypatch):
     av = sumo_av(carFollowModel="Krauss")
     (default,) = driven(av, [(0, 16)])
-    monkeypatch.setattr(sumo_av_world, "SUMO_DECIDES", sumo_av_world.OBEY)
+    monkeypatch.setattr(sumo_driven, "SUMO_DECIDES", sumo_driven.OBEY)
     (obeying,) = driven(av, [(0, 16)])
     assert [bits(default, row) for row in range(16)] == [bits(obeying, row) for row in range(16)]
 

@@ -7,7 +7,7 @@ from harness.errors import CampaignError, TooManyFailedError, WorldDisagreementE
 from harness.runner.replay import replay_episode
 from harness.runner.run import run_campaign
 from harness.vocabulary import AV, FAILED
-from harness.worlds.traci_driven import TraciWorld
+from harness.worlds.program import TraciWorld
 from tests.sumo_av.misbehaving_client import FAULT_STEP
 from tests.sumo_av.running import EXAMPLE, MISBEHAVING, bits, campaign, program, run, run_idm, run_in
 
