@@ -12,12 +12,9 @@ import pyarrow.parquet as pq
 import pytest
 
 from harness.numbers import number
-from harness.progress import Progress
 from studies.__main__ import main
-from studies.case_study import counted as required
 from studies.case_study import study as context
 from studies.case_study import tested
-from studies.case_study.counted import Claims
 from studies.case_study.figures import (
     exactly,
     figure,
@@ -26,15 +23,10 @@ from studies.case_study.figures import (
     ratio_of_means,
     ratio_of_variances,
     verdict,
-    weights_are_in,
 )
-from studies.case_study.page import asked, count, shown
-from studies.case_study.repeated import replicate
+from studies.case_study.page import count, shown
 from studies.case_study.steps import run_study, step_keys
-from studies.case_study.study import Context, Made, Replications, load_study
-from studies.replication import run as studies_run
-from studies.rnot import RequiredTests
-from tests.pool.conftest import SMALL_POOL
+from studies.case_study.study import Made, load_study
 
 from .here import Here, Interrupting
 
@@ -161,58 +153,6 @@ def test_a_run_without_its_result_goes_on_from_its_shards(study, made, tmp_path)
     assert json.loads((place / "result.json").read_text()) == made["nade"].result
 
 
-def resumed(study, made, tmp_path, step, progress):
-    """The study with everything made but one step, which is interrupted; then its folder."""
-    file, folder = study
-    again = tmp_path / "out"
-    shutil.copytree(folder, again)
-    place = again / "steps" / made[step].folder.name
-    shutil.rmtree(place)
-    with pytest.raises(KeyboardInterrupt):
-        run_study(load_study(file), again, workers=1, progress=progress)
-    assert any((place / "parts").iterdir())
-    return load_study(file), again, place
-
-
-def test_a_killed_pass_over_the_control_variates_goes_on_from_its_last_size(study, made, tmp_path, monkeypatch):
-    asked_for, again, place = resumed(study, made, tmp_path, "adjusted", Interrupting("adjusted", 3))
-    seen, really = [], Claims.add
-    monkeypatch.setattr(Claims, "add", lambda self, block: seen.append(block.first_episode) or really(self, block))
-    run_study(asked_for, again, workers=1)
-    assert seen == [700, 1_000]
-    assert json.loads((place / "result.json").read_text()) == made["adjusted"].result
-    assert not (place / "parts").exists()
-
-
-def test_killed_shuffles_of_scv_go_on_from_the_last_one(study, made, tmp_path, monkeypatch):
-    asked_for, again, place = resumed(study, made, tmp_path, "required", Interrupting("scv", 1))
-    seen, really = [], required.scv_rhw_of
-    monkeypatch.setattr(required, "scv_rhw_of", lambda *args: seen.append(args[-1]) or really(*args))
-    run_study(asked_for, again, workers=1)
-    assert seen == [1]
-    assert json.loads((place / "result.json").read_text()) == made["required"].result
-
-
-def test_killed_replications_go_on_from_the_last_ones(tmp_path, monkeypatch):
-    text = "format: validation-experiment\nversion: 1\nname: x\nreplications: 4\nchains: [good surrogates]\n"
-    (tmp_path / "x.yaml").write_text(text + "campaign: {testing: {method: step_mixture}, stop: {episodes: 300}}\n")
-    step = Replications(kind="replications", experiment=str(tmp_path / "x.yaml"))
-    whole, killed = (tmp_path / name for name in ("whole", "killed"))
-    monkeypatch.setattr(studies_run, "worker_processes", lambda workers: Here())
-    seen, really = [], studies_run.replications_of
-    monkeypatch.setattr(studies_run, "replications_of", lambda *args: seen.append(args[1]) or really(*args))
-    results = []
-    for folder, progress in ((whole, Progress()), (killed, Interrupting("replications", 2)), (killed, Progress())):
-        folder.mkdir(exist_ok=True)
-        try:
-            results.append(replicate(step, Context(folder, 0.3, 0.9, {}, 1, progress)))
-        except KeyboardInterrupt:
-            assert seen[4:] == [range(1), range(1, 2)]
-            seen.clear()
-    assert seen == [range(2, 3), range(3, 4)]
-    assert results[0] == results[1]
-
-
 def numbers_of(content) -> set[str]:
     """Every number of a result, in all the forms that the page may write it in."""
     if isinstance(content, dict):
@@ -287,34 +227,6 @@ def test_variants_are_tested_on_the_same_traffic(made):
     assert mean == pytest.approx(np.mean([one for one in gains if one is not None]))
 
 
-def test_variants_are_tested_with_shells_too(tmp_path, monkeypatch):
-    """One run of shells beside plain simulation: two rates of the same vehicle on the same traffic."""
-    monkeypatch.setattr(context, "worker_processes", lambda workers: Here())
-    file = tmp_path / "study.yaml"
-    file.write_text(f"""
-format: case-study
-version: 1
-name: shells
-title: Shells
-steps:
-  table:
-    kind: variants
-    title: Table
-    campaign: {SCENARIOS}/overtaking_forced.yaml
-    tests: 4_000
-    avs: [alpha-0.5]
-    shells: {SCENARIOS}/smoke.yaml
-    shells_set: [stop.rhw=0.3, testing.shells.first_tests=null, {", ".join(SMALL_POOL)}]
-    reported: {{alpha-0.5: 11.52}}
-""")
-    done = run_study(load_study(file), tmp_path / "out", workers=1)
-    (row,) = json.loads(next((tmp_path / "out" / "steps").glob("*/result.json")).read_text())["variants"]
-    assert row["shells_rate"]["low"] < row["nade_rate"]["value"] < row["shells_rate"]["high"]
-    assert 100 < row["shells_tests"]["value"] < 20_000
-    assert f"{shown(row['shells_rate'])} | {shown(row['shells_tests'])} |" in done.page.read_text()
-    assert "| 11.52 |" in done.page.read_text()
-
-
 def test_the_theorems_hold_on_exact_chains(made):
     figures = made["theorems"].result["figures"]
     assert figures["largest_bias"]["value"] < 1e-10
@@ -351,12 +263,6 @@ def test_a_wrong_file_is_refused_before_anything_is_made(tmp_path, capsys, wrong
     assert main(["case", str(file), "--out", str(tmp_path / "out")]) == 2
     assert said in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
-
-
-def test_a_figure_that_is_not_there_is_named_with_those_that_are(made):
-    with pytest.raises(Exception, match=r"largest_bias") as error:
-        asked("theorems.smallest_bias", made)
-    assert error.value.exit_code == 2
 
 
 def test_the_shipped_study_is_right_and_its_claims_ask_for_what_there_is():
@@ -413,30 +319,6 @@ def test_ratios_of_paired_repetitions():
     rates = [1.0, 2.0, 4.0]
     assert ratio_of_variances(rates, rates, 0.9) == exactly(1.0)
     assert ratio_of_variances(rates, [1.0, 1.0, 1.0], 0.9) == figure(None)
-
-
-def test_shuffles_are_judged_by_their_mean_or_not_at_all():
-    """Ten shuffles from 8 to 12 have the mean 10 ± 1; one alone is no interval."""
-    n = np.array([8, 12] * 5)
-    none = np.zeros(10, bool)
-    found = required._Found(RequiredTests(n, none, none), 100, settled=True)
-    low, high = found.figure(0.9)["low"], found.figure(0.9)["high"]
-    assert 8.0 < low < 9.0
-    assert low + high == pytest.approx(20.0)
-    assert found.over(found, 0.9) == exactly(1.0)
-    one = required._Found(RequiredTests(n[:1], none[:1], none[:1]), 100, settled=True)
-    assert verdict(8.0, one.figure(0.9), within=2.0, tolerance=None, at_most=False) == "cannot be told"
-    unsettled = found._replace(settled=False)
-    assert verdict(10.0, found.over(unsettled, 0.9), within=99.0, tolerance=None, at_most=False) == "cannot be told"
-    limit = required._Found(RequiredTests(n, np.arange(10) > 8, none), 12, settled=True)
-    assert limit.figure(0.9)["high"] is None
-    assert limit.over(found, 0.9)["high"] is None
-
-
-def test_weights_that_have_not_come_in_leave_the_rate_open():
-    assert not weights_are_in("step_mixture", 0.03)
-    assert weights_are_in("step_mixture", 0.9)
-    assert weights_are_in("forced", 3e-5)  # their expectation is the probability of a cut-in
 
 
 def test_relative_variance_of_known_weights():

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 
-from harness.campaign.files import load_panel
 from harness.errors import CampaignError
 from studies.__main__ import main
 from studies.replication.experiment import load_experiment
@@ -69,9 +68,3 @@ def test_the_command_refuses_before_anything_is_written(tmp_path, capsys):
     assert main(["validate", str(file), "--out", str(tmp_path / "out")]) == 2
     assert "avs.krauss" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
-
-
-def test_the_panel_experiment_has_every_vehicle_of_the_panel_that_has_a_twin():
-    """Table I's twelve differ in alpha only, which changes no crash: idm stands for them."""
-    panel = {name: av for name, av in load_panel().avs.items() if av.sumo is None and not name.startswith("alpha-")}
-    assert load_experiment(FOLDER / "shells_panel.yaml").avs == panel

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -51,10 +50,6 @@ def test_a_dip_below_the_threshold_does_not_count():
     assert first_below(np.array([rhw]), GRID, 0.3).tolist() == [20]
 
 
-def test_at_the_threshold_is_low_enough():
-    assert read(0.9, 0.3, 0.3, 0.3, 0.3).n.tolist() == [20]
-
-
 def test_where_nothing_is_above_the_n_of_the_largest_counts():
     found = read(0.1, 0.15, 0.25, 0.2, 0.1)
     assert (found.n.tolist(), found.never_above.tolist(), found.is_lower_limit) == ([30], [True], False)
@@ -69,13 +64,6 @@ def test_above_at_the_total_counts_as_the_total_and_is_told(last):
     assert found.is_lower_limit
     settled_at_the_last_look = read(0.9, 0.9, 0.9, 0.9, 0.3)
     assert (settled_at_the_last_look.n.tolist(), settled_at_the_last_look.is_lower_limit) == ([50], False)
-
-
-def test_mean_and_quantiles_are_over_shuffles():
-    rhw = np.where(np.array([[20], [30], [30], [50]]) > GRID, 0.9, 0.1)
-    found = required_tests(rhw, GRID, 0.3)
-    assert found.n.tolist() == [20, 30, 30, 50]
-    assert (found.mean, found.quantile(0.05), found.quantile(0.5), found.quantile(0.95)) == (32.5, 20, 30, 50)
 
 
 def test_the_acceleration_says_on_which_side_of_the_truth_it_is():
@@ -144,19 +132,6 @@ def test_the_width_on_a_prefix_is_that_of_its_mean_and_sample_variance():
         assert sorted(shuffled(procedure.seed, shuffle, tests.crash)) == list(range(800))
 
 
-def test_places_of_crashes_are_uniform():
-    """Each of 5 tests, 2 crashed, must come first in a fifth of 5,000 shuffles: within 5 standard deviations (1e-5)."""
-    crash = np.array([True, False, False, True, False])
-    first = np.bincount([shuffled(1, shuffle, crash)[0] for shuffle in range(5_000)], minlength=5)
-    assert np.abs(first - 1_000).max() < 5 * np.sqrt(5_000 * 0.2 * 0.8)
-
-
-def test_without_a_crash_the_threshold_is_never_reached():
-    found = required_tests(plain_rhw(np.empty(0), 500, QUICK), QUICK.grid(500), 0.3)
-    assert found.never_reached.all()
-    assert found.mean == 500
-
-
 def test_algorithm_1_grown_look_by_look_is_algorithm_1_on_each_prefix():
     (tests,) = blocks(CHAIN, "step_mixture", [3_000], SEED)
     procedure = replace(QUICK, ratio=3.0, n_shuffles=2)
@@ -203,36 +178,6 @@ def test_a_stored_run_gives_what_its_blocks_give(tmp_path):
     assert other["rows"] != content["rows"]
 
 
-def test_rows_do_not_depend_on_what_else_is_asked_and_shards_do_not_matter(tmp_path):
-    one = write_run(tmp_path / "one", drawn("step_mixture", [1_500]))
-    whole = drawn("step_mixture", [1_500])[0]
-    cut = [whole.take(slice(a, b)) for a, b in pairwise([0, 100, 700, 1_500])]
-    three = write_run(tmp_path / "three", cut)
-    rows = required_tests_of_runs([one, three], QUICK, estimators=["nade", "scv"])["rows"]
-    assert {**rows[0], "run": None} == {**rows[2], "run": None}
-    assert rows[1]["mean"] == rows[3]["mean"]
-    (alone,) = required_tests_of_runs([three], QUICK, estimators=["scv"])["rows"]
-    assert {**alone, "aar": None} == {**rows[3], "aar": None}
-
-
-@pytest.mark.parametrize(
-    ("method", "plain"),
-    [("nde", "nde"), ("forced", "nade"), ("step_mixture", "nade"), ("episode_mixture", "nade")],
-)
-def test_the_plain_estimator_is_the_default_of_every_method(tmp_path, method, plain):
-    content = required_tests_of_runs([write_run(tmp_path, drawn(method))], QUICK)
-    assert [row["estimator"] for row in content["rows"]] == [plain]
-    assert content["rows"][0]["mean"] > 0
-
-
-def test_what_the_records_do_not_allow_has_a_reason_and_is_no_reference(tmp_path):
-    folder = write_run(tmp_path, drawn("step_mixture"), with_moments=False)
-    refused, plain = required_tests_of_runs([folder], QUICK, estimators=["scv", "nade"])["rows"]
-    assert refused["mean"] is None
-    assert "records.moments" in refused["reason"]
-    assert plain["aar"] == 1.0
-
-
 def test_two_runs_that_never_settle_have_no_acceleration(tmp_path):
     parts = [block([True] + [False] * 99, method="nde", alpha=np.empty(0), log_q=np.empty((100, 0)))]
     folders = [write_run(tmp_path / name, parts) for name in ("a", "b")]
@@ -244,13 +189,6 @@ def test_two_runs_that_never_settle_have_no_acceleration(tmp_path):
         assert "the mean is a lower limit" in row["remarks"][0]
 
 
-def test_a_record_that_is_too_short_is_told(tmp_path):
-    folder = write_run(tmp_path, drawn("step_mixture"))
-    (row,) = required_tests_of_runs([folder], replace(QUICK, rhw=0.35))["rows"]
-    assert row["high_95"] > 750
-    assert "ask a longer run" in row["remarks"][-1]
-
-
 OPTIONS = ["--rhw", "0.6", "--shuffles", "5", "--seed", "3", "--ratio", "1.3"]
 
 
@@ -259,22 +197,6 @@ def test_the_command_prints_what_python_gives(tmp_path, capsys):
     assert main(["rnot", str(folder), *OPTIONS, "-e", "nade", "-e", "scv", "--json"]) == 0
     content = json.loads(capsys.readouterr().out)
     assert content == required_tests_of_runs([folder], QUICK, estimators=["nade", "scv"])
-
-
-def test_the_table_says_what_limits_its_numbers(tmp_path, capsys, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    for name, method in (("mixture", "step_mixture"), ("forced", "forced")):
-        write_run(tmp_path / name, drawn(method))
-    assert main(["rnot", "mixture", "forced", *OPTIONS, "--total", "40", "-e", "nade", "-e", "scv"]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    rows = [[cell.strip() for cell in line.strip("│").split("│")] for line in lines if line.startswith("│")]
-    runs = [("mixture", "nade"), ("mixture", "scv"), ("forced", "nade"), ("forced", "scv")]
-    assert [(row[0], row[1]) for row in rows] == runs
-    assert rows[0][2:5] == ["1,500", "10 to 40 by 0.3 n (7 looks)", "≥ 40"]
-    assert rows[3][3:] == ["-"] * 5
-    assert f"mixture scv: {SCV_REMARK}" in lines
-    assert any(line.startswith("mixture nade: ") and line.endswith("the mean is a lower limit") for line in lines)
-    assert any(line.startswith("forced scv: ") and "step mixture" in line for line in lines)
 
 
 def test_the_command_refuses_shells_in_plain_words(tmp_path, capsys):

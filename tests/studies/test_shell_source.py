@@ -13,9 +13,8 @@ from harness.pool.library import load_library
 from harness.pool.shells import acceleration_limit
 from harness.progress import Progress
 from harness.traffic.loading import load_environment
-from harness.vehicles.drivers import av_records
 from studies.replication.experiment import Adversary
-from studies.replication.populations import NO_ENVELOPE, RATE, Drivers, Truths, enumerate_paths
+from studies.replication.populations import RATE, Drivers, Truths, enumerate_paths
 from studies.replication.shells import Division, campaign_block, equals, leave_out
 
 PATHS = 1024
@@ -67,22 +66,10 @@ def test_imprecise_truths_are_enumerated_again_and_agree():
     assert wild.value == pytest.approx(2.43e-5, abs=4.0 * wild.std_error)
 
 
-def test_the_cache_gives_the_same_back(drivers, population):
-    again = enumerated(drivers)
-    for name in ("cut_in", "path", "mass", "bits"):
-        np.testing.assert_array_equal(getattr(again, name), getattr(population, name))
-
-
 def test_an_inattentive_vehicle_is_two_drivers_mixed(drivers, population):
     mixed, early, late = (drivers.vehicles[name].crash_mass(population) for name in ("late", "own", "attentive-late"))
     np.testing.assert_allclose(mixed, 0.75 * early + 0.25 * late, rtol=1e-12)
     assert late.sum() > 1.5 * early.sum()
-
-
-def test_a_vehicle_keeps_all_its_reflexes():
-    reaction = {"delay_s": 0.3, "max_jerk_mps3": 7.0, "perceives_lateral_m": 2.0}
-    av = AutomatedVehicle.model_validate({"model": "idm", "reaction": reaction})
-    assert Drivers.of(LIBRARY, {"late": av}).records[-1:].tobytes() == av_records(av).tobytes()
 
 
 def test_equals_are_found_and_left_out(drivers, population):
@@ -116,11 +103,6 @@ def test_drawn_pools_scatter_around_the_population(drivers, population):
     assert abs(rates.mean() - exact) < 4.0 * rates.std() / np.sqrt(len(rates))
     assert all(each.design.strata[-1] == "outside" for each in drawn)
     assert all(each.design.statements[-1].boundary == LIBRARY.boundary for each in drawn)
-
-
-def test_a_vehicle_that_accelerates_harder_has_no_envelope(drivers):
-    assert drivers.envelope >= 0
-    assert drivers_of("faster").envelope == NO_ENVELOPE
 
 
 @pytest.mark.slow

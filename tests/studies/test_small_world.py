@@ -11,7 +11,7 @@ from harness.progress import Progress
 from harness.vehicles.drivers import av_records
 from studies.case_study import small_case
 from studies.case_study import study as context
-from studies.case_study.small_case import AV_MPS, HOLD, Proposal, _crashes, small_world
+from studies.case_study.small_case import AV_MPS, Proposal, _crashes, small_world
 from studies.case_study.study import Context, SmallCase
 from tests.chains.seed import SEED
 from tests.estimators.small_blocks import fed
@@ -34,18 +34,6 @@ def test_backward_induction_is_the_sum_over_all_paths(world):
     assert total == pytest.approx(world.crash_rate, rel=1e-12)
 
 
-def test_situations_that_follow_are_certain_or_spread_by_a_distribution(world):
-    for t, level in enumerate(world.levels[1:], 1):
-        total = np.bincount(level.parent, level.share)[np.unique(level.parent)]
-        np.testing.assert_allclose(total, 1.0, rtol=1e-12)
-        assert (level.share == 1.0).all() or t % HOLD == 0
-    assert world.levels[0].share.sum() == pytest.approx(1.0, rel=1e-12)
-
-
-def test_more_nodes_change_nothing(world):
-    assert small_world(1e4, nodes=12).crash_rate == pytest.approx(world.crash_rate, rel=1e-8)
-
-
 def test_without_control_the_relative_variance_is_that_of_a_share(world):
     plain = [Proposal(np.repeat(level.p[:, None], 3, 1), np.zeros(len(level.p), bool)) for level in world.levels]
     assert world.relvar(plain) == pytest.approx(1.0 / world.crash_rate - 1.0, rel=1e-12)
@@ -64,19 +52,6 @@ def test_drawn_tests_meet_rate_and_variance(world, recursive, epsilon):
     weights = block.weights()
     assert abs(weights.mean() - 1.0) < 4.0 * weights.std() / np.sqrt(len(block))
     assert abs(block.crash.mean() - world.crash_rate) > 4.0 * found.std_error
-
-
-def test_nothing_is_controlled_below_the_threshold(world):
-    """One above any criticality leaves plain simulation; in between, only situations above it are drawn otherwise."""
-    for proposal, level in zip(world.proposals(0.1, recursive=True, threshold=0.99), world.levels, strict=True):
-        assert not proposal.critical.any()
-        np.testing.assert_array_equal(proposal.q, np.repeat(level.p[:, None], 3, 1))
-    some = world.proposals(0.1, recursive=True, threshold=2e-3)
-    every = world.proposals(0.1, recursive=True)
-    assert 0 < sum(x.critical.sum() for x in some) < sum(x.critical.sum() for x in every)
-    for a, b in zip(some, every, strict=True):
-        np.testing.assert_array_equal(a.q[a.critical], b.q[a.critical])
-    assert world.relvar(some) > world.relvar(every)
 
 
 def test_the_case_is_answered(world, tmp_path, monkeypatch):
