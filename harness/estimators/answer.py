@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from harness.estimators.block import Block
-from harness.estimators.estimate import Estimate, Unavailable, finite_json
+from harness.estimators.estimate import Estimate, Estimates, Unavailable, finite_json
 from harness.estimators.one_pass import one_pass
 from harness.estimators.pairs import Contrast, Interval, PairedEstimate
 from harness.numbers import WIDEST_RHW
@@ -63,29 +63,31 @@ def estimate_blocks(
     estimates = {done.headline: best, **done.estimates}
     distance_km = None if facts.distance_per_test_m is None else facts.distance_per_test_m / 1000.0
     retraced = facts.retraced or {"reason": "the run did not retrace its episodes"}
-    statements = {name: _said(found, facts, distance_km) for name, found in estimates.items()}
+    statements: dict[str, str] = {name: _said(found, facts, distance_km) for name, found in estimates.items()}
     return finite_json(
-        {
-            "campaign": facts.name,
-            "campaign_hash": facts.content_hash,
-            "lane_change_level": facts.lane_change_level,
-            "confidence": facts.confidence,
-            "n_episodes": best.n_episodes,
-            "n_crashes": best.n_crashes,
-            "headline": done.headline,
-            "distance_per_test_km": distance_km,
-            "crash_rate_per_1e6_km": None if distance_km is None else per_distance(best, distance_km),
-            "estimates": {name: estimate.to_json() for name, estimate in estimates.items()},
-            "diagnostics": {**done.diagnostics.result(facts.importance_names), "alarm": {"retraced": retraced}},
-            "convergence": done.convergence,
-            "statement": statements[done.headline],
-            "statements": statements,
-            "reference_statements": reference_statements(best),
-            "boundary_statements": boundary_statements(best),
-            "scope": SCOPE,
-            "ending": facts.ending,
-            "decision": facts.decision,
-        }
+        Estimates(
+            campaign=facts.name,
+            campaign_hash=facts.content_hash,
+            lane_change_level=facts.lane_change_level,
+            confidence=facts.confidence,
+            n_episodes=best.n_episodes,
+            n_crashes=best.n_crashes,
+            headline=done.headline,
+            distance_per_test_km=distance_km,
+            crash_rate_per_1e6_km=None if distance_km is None else per_distance(best, distance_km),
+            estimates={
+                name: found.shown if isinstance(found, Estimate) else found for name, found in estimates.items()
+            },
+            diagnostics={**done.diagnostics.result(facts.importance_names), "alarm": {"retraced": retraced}},
+            convergence=tuple(done.convergence),
+            statement=statements[done.headline],
+            statements=statements,
+            reference_statements=tuple(reference_statements(best)),
+            boundary_statements=boundary_statements(best),
+            scope=SCOPE,
+            ending=facts.ending,
+            decision=facts.decision,
+        )
     )
 
 

@@ -9,12 +9,17 @@ from __future__ import annotations
 import math
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol
+from typing import Annotated, Any, Protocol
 
 import numpy as np
+from pydantic import BeforeValidator
 from pydantic_core import from_json, to_json
+from typing_extensions import TypedDict
 
 from harness.estimators.block import Block
+
+Number = Annotated[float, BeforeValidator(lambda value: math.nan if value is None else value)]
+"""What JSON has as null, because it was infinite or not defined, is read as NaN: not known."""
 
 
 @dataclass(frozen=True)
@@ -48,18 +53,18 @@ class Estimate:
     """
 
     crash_rate: float
-    std_error: float
-    ci_low: float
-    ci_high: float
-    upper_bound: float
+    std_error: Number
+    ci_low: Number
+    ci_high: Number
+    upper_bound: Number
     confidence: float
-    rhw: float
+    rhw: Number
     n_episodes: int
     n_crashes: int
-    n_effective: float
-    largest_weight_share: float
+    n_effective: Number
+    largest_weight_share: Number
     method: str
-    weight_cap: float = math.inf
+    weight_cap: Number = math.inf
     warnings: tuple[str, ...] = ()
     cautions: tuple[str, ...] = ()
     details: dict[str, Any] = field(default_factory=dict)
@@ -69,9 +74,10 @@ class Estimate:
         """`rhw` as far as it says how precise the rate is: infinite where the interval may be wrong."""
         return math.inf if self.cautions else self.rhw
 
-    def to_json(self) -> dict[str, Any]:
-        """Plain JSON content; infinite and undefined numbers become null, as does an RHW that says nothing."""
-        return finite_json(replace(self, rhw=self.precision))
+    @property
+    def shown(self) -> Estimate:
+        """What is written of it: without an RHW that says nothing."""
+        return replace(self, rhw=self.precision)
 
 
 @dataclass(frozen=True)
@@ -79,10 +85,48 @@ class Unavailable:
     """An estimator that these records do not allow: what is missing, and what would provide it."""
 
     reason: str
+    crash_rate: None = None
 
-    def to_json(self) -> dict[str, Any]:
-        """Plain JSON content: no value, and why."""
-        return {"crash_rate": None, "reason": self.reason}
+    @property
+    def shown(self) -> Unavailable:
+        """See `Estimate.shown`."""
+        return self
+
+
+class Point(TypedDict):
+    """The headline estimate of the first ``n`` tests."""
+
+    n: int
+    crash_rate: Number
+    ci_low: Number
+    ci_high: Number
+    rhw: Number
+    n_crashes: int
+
+
+@dataclass(frozen=True)
+class Estimates:
+    """Content of ``estimates.json``, as `harness.estimators.answer` writes it and the page reads it."""
+
+    campaign: str
+    campaign_hash: str
+    lane_change_level: float
+    confidence: float
+    n_episodes: int
+    n_crashes: int
+    headline: str
+    distance_per_test_km: float | None
+    crash_rate_per_1e6_km: dict[str, Number] | None
+    estimates: dict[str, Estimate | Unavailable]
+    diagnostics: dict[str, Any]
+    convergence: tuple[Point, ...]
+    statement: str
+    statements: dict[str, str]
+    reference_statements: tuple[str, ...]
+    boundary_statements: dict[str, str]
+    scope: str
+    ending: str | None = None
+    decision: dict[str, Any] | None = None
 
 
 def finite_json(content: Any) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from harness.estimators.block import Block
-from harness.estimators.estimate import Accumulator, Estimate, FailureBounds, Unavailable, require_episodes
+from harness.estimators.estimate import Accumulator, Estimate, FailureBounds, Point, Unavailable, require_episodes
 from harness.estimators.scv import MixtureCv, Scv
 from harness.estimators.shells import Shells
 from harness.estimators.weighted import Moments, Nade, Nde
@@ -102,7 +102,7 @@ class PassResult:
     headline: EstimatorName
     headline_estimate: Estimate
     diagnostics: Diagnostics
-    convergence: list[dict[str, Any]]
+    convergence: list[Point]
 
 
 def one_pass(
@@ -115,7 +115,7 @@ def one_pass(
     own: EstimatorName | None = None
     states: dict[EstimatorName, FailureBounds] = {}
     refusals: dict[EstimatorName, str | None] = {}
-    diagnostics, convergence, n = Diagnostics(), list[dict[str, Any]](), 0
+    diagnostics, convergence, n = Diagnostics(), list[Point](), 0
     for block in blocks:
         if block.first_episode != n:
             raise ValueError(f"expected a block from episode {n} on, got one from {block.first_episode}")
@@ -138,7 +138,7 @@ def one_pass(
     return PassResult(estimates, own, results[own], diagnostics, convergence)
 
 
-def _point(estimate: Estimate) -> dict[str, Any]:
+def _point(estimate: Estimate) -> Point:
     return {
         "n": estimate.n_episodes,
         "crash_rate": estimate.crash_rate,

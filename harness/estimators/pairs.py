@@ -301,8 +301,8 @@ class PairedEstimate:
     def to_json(self) -> dict[str, Any]:
         """Content of ``compare.json``, as far as it comes from counts."""
         return {
-            "a": self.a.to_json(),
-            "b": self.b.to_json(),
+            "a": finite_json(self.a.shown),
+            "b": finite_json(self.b.shown),
             **self.free.to_json(),
             "confidence": self.a.confidence,
             "conditional": {

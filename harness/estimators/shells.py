@@ -26,7 +26,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from harness.estimators.block import Block
-from harness.estimators.estimate import Estimate, require_episodes
+from harness.estimators.estimate import Estimate, Number, require_episodes
 from harness.estimators.likelihood import CRASH, Level, likelihood_limit, ratio_limits
 from harness.estimators.limits import clopper_pearson
 from harness.estimators.tally import (
@@ -92,7 +92,7 @@ class Within:
     crash_rate: float
     ci_low: float
     ci_high: float
-    rhw: float | None
+    rhw: Number
     rhw_from_pool: float
     rhw_from_pool_at_least: float
     n_episodes: int

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from inspect import getmembers, isfunction
 from pathlib import Path
@@ -16,6 +17,7 @@ from harness import numbers
 from harness.campaign.campaign import Campaign
 from harness.campaign.files import written_out
 from harness.estimators.answer import MENDS
+from harness.estimators.estimate import Estimate
 from harness.estimators.shells import ShellDetails, Within
 from harness.numbers import MISSING, count, exponent_of, half_width, leaves, number, power_of_ten, share, words
 from harness.records.folder import write_bytes
@@ -147,7 +149,7 @@ def run_notes(run: RunFolder, summary: RunSummary) -> list[str]:
     """Return what the reader must know about this run as a whole."""
     notes = list(run.headline.warnings)
     n_tests, n_estimated = summary.n_episodes, run.estimates.n_episodes
-    if n_estimated is not None and n_estimated not in (n_tests, n_tests - summary.n_failed):
+    if n_estimated not in (n_tests, n_tests - summary.n_failed):
         notes.append(
             f"The estimates cover {count(n_estimated)} tests but the records hold {count(n_tests)}: run "
             "harness estimate DIR --write."
@@ -155,8 +157,8 @@ def run_notes(run: RunFolder, summary: RunSummary) -> list[str]:
     target, rhw = run.campaign.stop.rhw, run.headline.rhw
     if run.asked_statement and run.shells is not None:
         rhw = next(each.rhw for each in run.shells.statements if each.name == run.asked_statement)
-    if target is not None and (rhw is None or rhw > target):
-        reached = "it is not known" if rhw is None else f"it is {half_width(rhw)}"
+    if target is not None and not rhw <= target:
+        reached = "it is not known" if math.isnan(rhw) else f"it is {half_width(rhw)}"
         mend = MENDS.get(run.manifest.get("stopped_by") or "")
         why = f" ({mend})" if mend else ""
         notes.append(f"The asked relative half-width of {target:g} was not reached: {reached}{why}.")
@@ -195,7 +197,7 @@ def outcome_rows(summary: RunSummary) -> list[tuple[str, float, float, float]]:
 
 def diagnostics(run: RunFolder) -> list[tuple[str, Any]]:
     """Return sums of the run as (key, value); of shells without those about weights, which have none to say."""
-    found = leaves(run.estimates.diagnostics or {})
+    found = leaves(run.estimates.diagnostics)
     return found if run.shells is None else [(path, leaf) for path, leaf in found if leaf not in (None, {})]
 
 
@@ -205,7 +207,7 @@ def details(run: RunFolder) -> list[tuple[str, Any]]:
     found = {
         name: {key: content for key, content in e.details.items() if name != run.estimates.headline or key not in shown}
         for name, e in run.estimates.estimates.items()
-        if e.details
+        if isinstance(e, Estimate)
     }
     return leaves(found)
 

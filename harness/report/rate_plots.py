@@ -6,6 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.axes._base import _AxesBase
 
+from harness.estimators.estimate import Estimate, Estimates
 from harness.numbers import count, exponent_of, interval, number, plain, share
 from harness.report.style import (
     BLUE,
@@ -23,7 +24,7 @@ from harness.report.style import (
     scaled,
     two_panels,
 )
-from harness.report.summary import ShownShells, StoredEstimates
+from harness.report.summary import ShownShells
 from harness.vocabulary import FloatArray
 
 LOG_AXIS_RATIO = 30.0
@@ -43,7 +44,7 @@ IN_ROUNDS = (
 )
 
 
-def answer_plot(estimates: StoredEstimates, shells: ShownShells | None) -> Plot | None:
+def answer_plot(estimates: Estimates, shells: ShownShells | None) -> Plot | None:
     """Draw the intervals of all estimators that have one, the headline first; None when there is none.
 
     Of a shells run also those of the statements about a boundary, unless its tests have refuted them.
@@ -67,18 +68,18 @@ def answer_plot(estimates: StoredEstimates, shells: ShownShells | None) -> Plot 
     return Plot("answer", figure, alt, _answer_caption(estimates, rows, on_log=on_log, of_shells=shells is not None))
 
 
-def rate_exponent(estimates: StoredEstimates) -> int:
+def rate_exponent(estimates: Estimates) -> int:
     """Power of ten in which the rates of this run are best written."""
     rows = _intervals(estimates)
     return exponent_of(rows[0].value or rows[0].high or 0.0) if rows else 0
 
 
-def _intervals(estimates: StoredEstimates) -> list[Row]:
+def _intervals(estimates: Estimates) -> list[Row]:
     found = sorted(estimates.estimates.items(), key=lambda item: item[0] != estimates.headline)
     return [
         _row(name, e.crash_rate, e.ci_low, e.ci_high, BLUE if name == estimates.headline else GREY)
         for name, e in found
-        if e.crash_rate is not None and e.ci_low is not None and e.ci_high is not None
+        if isinstance(e, Estimate) and e.ci_low <= e.ci_high
     ]
 
 
@@ -117,7 +118,7 @@ def _labelled(axes: _AxesBase, ends: tuple[float, float], *, on_log: bool) -> st
     return ""
 
 
-def _answer_caption(estimates: StoredEstimates, rows: list[Row], *, on_log: bool, of_shells: bool) -> str:
+def _answer_caption(estimates: Estimates, rows: list[Row], *, on_log: bool, of_shells: bool) -> str:
     level = f"{100.0 * estimates.confidence:g} %"
     text = f"Point and {level} interval of each estimator, from the same tests; the headline ({rows[0].name}) in blue."
     if on_log:
@@ -133,19 +134,17 @@ def _answer_caption(estimates: StoredEstimates, rows: list[Row], *, on_log: bool
     )
 
 
-def convergence_plot(
-    estimates: StoredEstimates, target_rhw: float | None, *, of_statement: str | None = None
-) -> Plot | None:
+def convergence_plot(estimates: Estimates, target_rhw: float | None, *, of_statement: str | None = None) -> Plot | None:
     """Rate with its band, and RHW with its target, against tests; None without convergence records.
 
     ``of_statement``: the target is one for a statement of a shells run about a boundary, which convergence does not
     record.
     """
-    names = ("n", "crash_rate", "ci_low", "ci_high", "rhw")
-    points = sorted(estimates.convergence or [], key=lambda point: point.n)
+    points = sorted(estimates.convergence, key=lambda point: point["n"])
     if len(points) < 2:
         return None
-    n, rate, low, high, rhw = np.array([[getattr(point, name) for name in names] for point in points], np.float64).T
+    columns = [(each["n"], each["crash_rate"], each["ci_low"], each["ci_high"], each["rhw"]) for each in points]
+    n, rate, low, high, rhw = np.array(columns, np.float64).T
     confidence, level = share(estimates.confidence), plain(estimates.lane_change_level)
     if not np.any(rate > 0.0):
         return _plot_without_crash(n, high, confidence, level)

@@ -22,9 +22,10 @@ from pydantic import TypeAdapter, ValidationError
 from harness.campaign.campaign import Campaign
 from harness.campaign.files import load_campaign
 from harness.errors import CampaignError, RunFolderError
+from harness.estimators.estimate import Estimate, Estimates, Unavailable
 from harness.estimators.shells import ShellDetails, Within
 from harness.records.folder import MANIFEST, NO_RUN, concatenated, read_as, read_manifest
-from harness.records.manifest import Count, Stored, StoredManifest
+from harness.records.manifest import Count, StoredManifest
 from harness.records.reader import read_shards, stored_columns
 from harness.strata import ASSUMPTION_FREE
 from harness.vehicles.kinematics import STEP_S
@@ -45,54 +46,6 @@ class ShownManifest(StoredManifest):
     created: str
     versions: dict[str, str]
     seed: Count
-
-
-class StoredEstimate(Stored):
-    """What the page reads of an estimate, or the reason why there is none."""
-
-    crash_rate: float | None
-    reason: str | None = None
-    ci_low: float | None = None
-    ci_high: float | None = None
-    upper_bound: float | None = None
-    rhw: float | None = None
-    n_episodes: int | None = None
-    n_crashes: int | None = None
-    n_effective: float | None = None
-    largest_weight_share: float | None = None
-    weight_cap: float | None = None
-    method: str | None = None
-    warnings: list[str] = []
-    details: dict[str, Any] = {}
-
-
-class StoredPoint(Stored):
-    """The headline estimate of the first ``n`` tests."""
-
-    n: float
-    crash_rate: float | None
-    ci_low: float | None
-    ci_high: float | None
-    rhw: float | None
-
-
-class StoredEstimates(Stored):
-    """What the page reads of ``estimates.json``."""
-
-    campaign: str
-    campaign_hash: str
-    lane_change_level: float
-    confidence: float
-    headline: str
-    estimates: dict[str, StoredEstimate]
-    statement: str
-    decision: dict[str, Any] | None = None
-    reference_statements: list[str] = []
-    boundary_statements: dict[str, str] = {}
-    n_episodes: int | None = None
-    distance_per_test_km: float | None = None
-    diagnostics: dict[str, Any] | None = None
-    convergence: list[StoredPoint] | None = None
 
 
 @dataclass(frozen=True)
@@ -136,14 +89,16 @@ class RunFolder:
     path: Path
     campaign: Campaign
     manifest: dict[str, Any]
-    estimates: StoredEstimates
+    estimates: Estimates
     shells: ShownShells | None
     typed: str
 
     @property
-    def headline(self) -> StoredEstimate:
+    def headline(self) -> Estimate:
         """The estimate that answers the campaign's question."""
-        return self.estimates.estimates[self.estimates.headline]
+        found = self.estimates.estimates[self.estimates.headline]
+        assert isinstance(found, Estimate)  # of a folder that has been read
+        return found
 
     @property
     def asked_statement(self) -> str | None:
@@ -198,21 +153,21 @@ def _read_campaign(path: Path) -> Campaign:
         raise RunFolderError(str(path), found, expected, "Restore the file, or run the campaign again.") from error
 
 
-def _read_estimates(folder: Path, campaign_hash: str) -> StoredEstimates:
+def _read_estimates(folder: Path, campaign_hash: str) -> Estimates:
     path, again = folder / "estimates.json", f"Make it again with `harness estimate {folder} --write`."
-    estimates = read_as(StoredEstimates, path, mend=again)
+    estimates = read_as(Estimates, path, mend=again)
     if estimates.campaign_hash != campaign_hash:
         expected = f"those of campaign {campaign_hash} (manifest.json)"
         found = f"estimates of campaign {estimates.campaign_hash}"
         raise RunFolderError(str(path), found, expected, again)
-    if estimates.headline not in estimates.estimates:
-        found = f"headline {estimates.headline!r}, which is not among the estimates"
+    if not isinstance(estimates.estimates.get(estimates.headline), Estimate):
+        found = f"headline {estimates.headline!r}, of which there is no estimate"
         raise RunFolderError(str(path), found, f"one of {sorted(estimates.estimates)}", again)
     return estimates
 
 
-def _shells(folder: Path, headline: StoredEstimate) -> ShownShells | None:
-    if "shells" not in headline.details:
+def _shells(folder: Path, headline: Estimate | Unavailable) -> ShownShells | None:
+    if isinstance(headline, Unavailable) or "shells" not in headline.details:
         return None
     try:
         return TypeAdapter(ShownShells).validate_python({**headline.details, "rate": headline.crash_rate})

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from pydantic import TypeAdapter
 
 from harness.errors import HarnessError, RunFolderError
 from harness.estimators import (
@@ -16,6 +17,7 @@ from harness.estimators import (
     estimate_blocks,
     one_pass,
 )
+from harness.estimators.estimate import Estimates, finite_json
 from harness.runner import estimate_run
 from harness.vocabulary import SAMPLING
 from studies.chains.chain import overtaking
@@ -182,7 +184,7 @@ def test_each_estimator_gets_what_it_would_get_alone(method):
         reason = alone.seen.refusal(parts[0])
         if reason is not None:
             assert estimate == Unavailable(reason)
-            assert estimate.to_json() == {"crash_rate": None, "reason": reason}
+            assert finite_json(estimate.shown) == {"crash_rate": None, "reason": reason}
             continue
         for part in parts:
             alone.add(part)
@@ -217,3 +219,16 @@ def test_a_gap_is_refused():
         one_pass([second])
     with pytest.raises(ValueError, match="at least one episode"):
         one_pass([])
+
+
+OF_ONE = """crash_rate std_error ci_low ci_high upper_bound confidence rhw n_episodes n_crashes n_effective
+largest_weight_share weight_cap method warnings cautions details"""
+
+
+@pytest.mark.parametrize("method", ["nde", "step_mixture", "episode_mixture"])
+def test_the_file_keeps_its_keys_and_is_read_as_what_wrote_it(method):
+    content = estimate_blocks(drawn(method), facts())
+    assert content.keys() == KEYS
+    assert content["estimates"][content["headline"]].keys() == set(OF_ONE.split())
+    assert content["convergence"][0].keys() == {"n", "crash_rate", "ci_low", "ci_high", "rhw", "n_crashes"}
+    assert finite_json(TypeAdapter(Estimates).validate_json(json.dumps(content), strict=True)) == content

@@ -9,9 +9,9 @@ import matplotlib.style
 import pytest
 
 import harness.report
+from harness.estimators.estimate import Estimate, Estimates, Unavailable
 from harness.report.rate_plots import POOL, answer_plot, shells_plot
 from harness.report.style import CSS_NAMES, INK, RC, Plot, inline_svg, new_figure, svg
-from harness.report.summary import StoredEstimates
 from tests.report.made_run import DESIGN
 
 CSS = (Path(harness.report.__file__).parent / "report.css").read_text(encoding="utf-8")
@@ -56,13 +56,13 @@ def test_inline_svg_is_themed_text_without_names_or_namespaces():
         assert absent not in markup
 
 
-def estimates(**rates: tuple[float, float, float] | None) -> StoredEstimates:
-    names = ("crash_rate", "ci_low", "ci_high")
-    return StoredEstimates(
-        campaign="c", campaign_hash="h", lane_change_level=1.0, confidence=0.9, headline=next(iter(rates)),
-        estimates={name: dict(zip(names, rate or (None,) * 3, strict=True)) for name, rate in rates.items()},
-        statement="s", distance_per_test_km=0.3,
-    )  # fmt: skip
+def estimates(**rates: tuple[float, float, float] | None) -> Estimates:
+    rest = 1.0, 0.9, 0.1, 9, 9, 9.0, 0.1, "m"
+    found = {
+        name: Unavailable("why") if rate is None else Estimate(rate[0], 0.0, *rate[1:], *rest)
+        for name, rate in rates.items()
+    }
+    return Estimates("c", "h", 1.0, 0.9, 9, 9, next(iter(rates)), 0.3, None, found, {}, (), "s", {}, (), {}, "")
 
 
 @pytest.mark.parametrize(
