@@ -16,7 +16,7 @@ from typing import Any
 from harness.campaign.campaign import Campaign
 from harness.drawing import Rounds, ShardRequest
 from harness.drawing.baseline import as_recorded, baseline_file, baseline_requests, stored_baseline
-from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED
+from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED, CampaignError
 from harness.estimators.answer import ending as ending_sentence
 from harness.estimators.stopping import Rule, Verdict
 from harness.pool.replay import Retracing
@@ -30,7 +30,7 @@ from harness.runner.manifest import SMALLEST_FAILED_SAMPLE, Manifest, Prefix, cp
 from harness.runner.resolve import distance_per_test_m, prepare, require_ready
 from harness.runner.resume import require_no_fewer, require_own_folder, require_same_pool, stored_shard
 from harness.runner.worker import ShardResult
-from harness.runner.workers import workers_of
+from harness.runner.workers import LocalWorkers, Workers
 from harness.strata import STORED_DESIGN
 from harness.vocabulary import SAMPLING
 
@@ -296,3 +296,24 @@ def conclusion(campaign: Campaign, rule: Rule, n_episodes: int, reported_from: i
 def load_report_meanwhile() -> None:
     """Load matplotlib beside busy workers, once: no earlier, because it would slow down what makes them wait."""
     threading.Thread(target=import_module, args=("harness.report",), daemon=True).start()
+
+
+def workers_of(resolved: Resolved, folder: Path, n_workers: int | None, *, n_runs: int = 1) -> Workers:
+    """Where a campaign's shards are run; ``n_runs`` campaigns share it and take turns.
+
+    Raises `HarnessError`: the package, the cluster or room in it is missing.
+    """
+    if resolved.campaign.run.executor == "local":
+        return LocalWorkers(resolved, folder, n_workers)
+    try:
+        from harness.runner.ray import RayWorkers  # noqa: PLC0415 - an extra
+    except ModuleNotFoundError as error:
+        if error.name != "ray":
+            raise
+        raise CampaignError(
+            "run.executor",
+            "ray, but no package ray",
+            "the extra for clusters",
+            "Install it here and on all machines of the cluster: pip install 'harness[ray]'.",
+        ) from error
+    return RayWorkers(resolved, folder, n_workers, n_runs=n_runs)

@@ -19,7 +19,7 @@ from typing import Any, Protocol, TypeVar
 from scipy.special import bdtrc
 
 from harness.controllers.hosts import Death, death_cause
-from harness.errors import CampaignError, HarnessError, TooManyFailedError
+from harness.errors import HarnessError, TooManyFailedError
 from harness.processes import OF_EPISODE, Call, Child, first_to_answer, last_call
 from harness.resolved import Resolved
 from harness.runner.worker import Request, Result, serve
@@ -276,24 +276,3 @@ class LocalWorkers(Workers):
         """See `Workers.close`."""
         super().close()
         self._own.cleanup()
-
-
-def workers_of(resolved: Resolved, folder: Path, n_workers: int | None, *, n_runs: int = 1) -> Workers:
-    """Where a campaign's shards are run; ``n_runs`` campaigns share it and take turns.
-
-    Raises `HarnessError`: the package, the cluster or room in it is missing.
-    """
-    if resolved.campaign.run.executor == "local":
-        return LocalWorkers(resolved, folder, n_workers)
-    try:
-        from harness.runner.ray import RayWorkers  # noqa: PLC0415 - an extra
-    except ModuleNotFoundError as error:
-        if error.name != "ray":
-            raise
-        raise CampaignError(
-            "run.executor",
-            "ray, but no package ray",
-            "the extra for clusters",
-            "Install it here and on all machines of the cluster: pip install 'harness[ray]'.",
-        ) from error
-    return RayWorkers(resolved, folder, n_workers, n_runs=n_runs)
