@@ -7,7 +7,6 @@ command, and is known whether its cut-ins take time (`lateral` of the environmen
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 from harness.errors import CampaignError
@@ -22,17 +21,11 @@ MOST_SUMO_CELLS = 256
 """Roads of the largest committed network."""
 
 
-@dataclass(frozen=True)
-class Use:
+class Use(NamedTuple):
     """What a campaign is for (no command while it is read), and whether its cut-ins are known to take time."""
 
     command: Command | None = None
     takes_time: bool = False
-
-    @property
-    def compares(self) -> bool:
-        """Whether the campaign is one side of a comparison."""
-        return self.command == "compare"
 
 
 WHILE_READ = Use()
@@ -40,10 +33,6 @@ WHILE_READ = Use()
 
 def _sampling(campaign: Campaign) -> Sampling:
     return SAMPLING[campaign.testing.method]
-
-
-def _acts(campaign: Campaign) -> bool:
-    return campaign.av.acts_before_cut_in
 
 
 class Combination(NamedTuple):
@@ -56,6 +45,7 @@ class Combination(NamedTuple):
     mend: str
 
 
+_COMPARED = ASSUMPTION_FREE, LIBRARY_STATEMENT
 _TAKES_TIME = "where cut-ins take time (`lateral` of the environment)"
 
 REFUSED = (
@@ -84,14 +74,14 @@ REFUSED = (
     # -- vehicles that act before the cut-in --
     Combination(
         "av.before_cut_in",
-        lambda c, _: _acts(c) and _sampling(c).holds_speed,
+        lambda c, _: c.av.acts_before_cut_in and _sampling(c).holds_speed,
         "controller, with testing.method {testing.method}",
         "hold_speed: the method draws LV's and BV's path ahead, which needs to know the AV's",
         "Choose hold_speed, or testing.method shells (or forced), which drives the AV along its paths first.",
     ),
     Combination(
         "av.before_cut_in",
-        lambda c, _: _acts(c) and c.av.model is not None,
+        lambda c, _: c.av.acts_before_cut_in and c.av.model is not None,
         "controller, with the built-in model {av.model}",
         "hold_speed: a built-in model has nothing to follow before the cut-in",
         "Delete the key, or bring a controller of your own.",
@@ -144,7 +134,7 @@ REFUSED = (
     # -- cut-ins that take time --
     Combination(
         "av.before_cut_in",
-        lambda c, use: use.takes_time and _acts(c) and use.command == "av-check",
+        lambda c, use: use.takes_time and c.av.acts_before_cut_in and use.command == "av-check",
         "controller, " + _TAKES_TIME,
         "hold_speed, or cut-ins of one step: a look at a vehicle makes no shadow runs, without which the onset is not "
         "known in time",
@@ -160,7 +150,7 @@ REFUSED = (
     ),
     Combination(
         "av.before_cut_in",
-        lambda c, use: use.takes_time and _acts(c) and not _sampling(c).shadows,
+        lambda c, use: use.takes_time and c.av.acts_before_cut_in and not _sampling(c).shadows,
         "controller, with testing.method {testing.method}, " + _TAKES_TIME,
         "a method that drives the AV along its paths first: only then the onset is known in time",
         "Choose testing.method shells or forced, or hold_speed.",
@@ -168,37 +158,39 @@ REFUSED = (
     # -- comparisons --
     Combination(
         "testing.method",
-        lambda c, use: use.compares and c.testing.method != "shells",
+        lambda c, use: use.command == "compare" and c.testing.method != "shells",
         "{testing.method}, in a comparison",
         "shells, under which both vehicles meet the same cut-ins",
         "Write --set testing.method=shells; or run both by themselves and put their intervals side by side.",
     ),
     Combination(
         "accept",
-        lambda c, use: use.compares and c.accept is not None,
+        lambda c, use: use.command == "compare" and c.accept is not None,
         "a limit of one crash rate",
         "none in a comparison",
         "Write --set accept=null, and --margin if something is to be decided.",
     ),
     Combination(
         "av.before_cut_in",
-        lambda c, use: use.compares and c.has_shadow_runs,
+        lambda c, use: use.command == "compare" and c.has_shadow_runs,
         "controller: a vehicle that acts before the cut-in has cut-ins of its own",
         "hold_speed in A and B: pairs need the same cut-ins",
         "Run both campaigns by themselves and put their intervals side by side, or write hold_speed.",
     ),
     Combination(
         "testing.shells.stopping",
-        lambda c, use: use.compares and c.testing.shells.stopping != "sequential",
+        lambda c, use: use.command == "compare" and c.testing.shells.stopping != "sequential",
         "{testing.shells.stopping}",
         "sequential: a comparison plans no second phase",
         "Write --set testing.shells.stopping=sequential.",
     ),
     Combination(
         "testing.shells.statement",
-        lambda c, use: use.compares and c.testing.shells.statement not in (ASSUMPTION_FREE, LIBRARY_STATEMENT),
+        lambda c, use: (
+            use.command == "compare" and c.testing.shells.statement not in (ASSUMPTION_FREE, LIBRARY_STATEMENT)
+        ),
         "{testing.shells.statement}",
-        f"{ASSUMPTION_FREE} or {LIBRARY_STATEMENT}: a comparison has these two",
+        f"{' or '.join(_COMPARED)}: a comparison has these two",
         "Choose one of them.",
     ),
 )

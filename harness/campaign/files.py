@@ -37,30 +37,24 @@ _FILES = {
 def load_campaign(
     path: str | Path, overrides: Sequence[str] = (), *, av: str | None = None, check_files: bool = True
 ) -> Campaign:
-    """Read, override and validate a campaign.
+    """Read, override and validate a campaign; paths of files that it names become absolute.
 
     Parameters
     ----------
     path : str or Path
         Campaign file.
     overrides : sequence of str
-        ``section.key=value`` each, as after ``--set``.
+        ``section.key=value`` each, as after ``--set``: ``["stop.rhw=0.3", "av.parameters.min_acceleration_mps2=-6"]``.
     av : str, optional
         Vehicle that replaces the campaign's, as after ``--av``: ``PANEL.yaml:NAME``, or ``NAME`` in the shipped panel.
         Overrides are laid over it.
     check_files : bool
         Whether files that the campaign names must exist; False to look at a run whose environment file is gone.
 
-    Returns
-    -------
-    Campaign
-        With paths of files that it names absolute.
-
-    Raises `CampaignError`: the file cannot be read, is not YAML, or says something wrong; the error names every place.
-
-    Examples
-    --------
-    >>> load_campaign("scenarios/smoke.yaml", ["stop.rhw=0.3", "av.parameters.min_acceleration_mps2=-6"])
+    Raises
+    ------
+    CampaignError
+        The file cannot be read, is not YAML, or says something wrong; the error names every place.
     """
     data, lines = read_yaml(path)
     changes = [*([] if av is None else [av_override(av)]), *map(parse_override, overrides)]
@@ -100,10 +94,7 @@ def names_a_file(name: str) -> bool:
 
 
 def shipped_or_own(name: str, folder: Path, where: str) -> Path:
-    """File that a name stands for: one of those shipped in ``folder``, or the user's own.
-
-    Raises `CampaignError`: none of that name is shipped; the error names ``where`` it is asked for.
-    """
+    """File that a name stands for: one of those shipped in ``folder`` (or `CampaignError`), or the user's own."""
     if names_a_file(name):
         return Path(name)
     shipped = sorted(file.stem for file in folder.glob("*.yaml"))
@@ -127,10 +118,7 @@ class Override:
 
 
 def parse_override(text: str) -> Override:
-    """Read ``testing.epsilon=0.2``; the value is read by the same rules as in a campaign file.
-
-    Raises `CampaignError`: there is no ``=``, an empty part in the path, or no YAML value after the ``=``.
-    """
+    """Read ``testing.epsilon=0.2`` (else `CampaignError`), the value by the same rules as in a campaign file."""
     path, equals, value = text.partition("=")
     parts, option = tuple(part.strip() for part in path.split(".")), f"--set {text}"
     if not equals or not all(parts):
@@ -141,7 +129,7 @@ def parse_override(text: str) -> Override:
 def apply_overrides(data: dict[str, Any], overrides: Sequence[Override]) -> dict[str, Any]:
     """Lay each override over ``data``, later ones over earlier ones; ``data`` itself stays as it is.
 
-    Raises `CampaignError`: the path leads through something that is not a section.
+    A path that leads through something that is not a section is a `CampaignError`.
     """
     changed = dict(data)
     for override in overrides:
@@ -194,10 +182,7 @@ class Panel(Section):
 
 
 def load_panel(path: str | Path = SHIPPED_PANEL) -> Panel:
-    """Read a panel; an FMU's file, relative to the panel's folder, becomes absolute.
-
-    Raises `CampaignError`: the file cannot be read or says something wrong; the error names every place.
-    """
+    """Read a panel, or name all that is wrong with it (`CampaignError`); paths of FMUs become absolute."""
     panel = read_model(path, Panel)
     avs = {
         name: av if av.fmu is None else av.replaced(("fmu", "file"), _absolute(av.fmu.file, Path(path).parent))
@@ -207,10 +192,7 @@ def load_panel(path: str | Path = SHIPPED_PANEL) -> Panel:
 
 
 def panel_av(text: str) -> AutomatedVehicle:
-    """The vehicle that ``PANEL.yaml:NAME`` names, or a bare ``NAME`` in the shipped panel.
-
-    Raises `CampaignError`: there is no such panel, or no such vehicle in it.
-    """
+    """The vehicle that ``PANEL.yaml:NAME`` names, or a bare ``NAME`` in the shipped panel; else a `CampaignError`."""
     file, _, name = text.rpartition(":")
     avs = load_panel(file or SHIPPED_PANEL).avs
     if name not in avs:

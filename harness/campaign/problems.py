@@ -70,10 +70,7 @@ def broken_rule(key: str, found: str, expected: str, mend: str) -> PydanticCusto
 
 
 def read_model(path: str | Path, model: type[Model]) -> Model:
-    """Read a YAML file into a model, such as an environment's parameters.
-
-    Raises `CampaignError`: as `read_yaml`; or the content does not fit ``model``, with every problem's path and line.
-    """
+    """Read a YAML file into a model, or name the path and line of every problem (`CampaignError`)."""
     data, lines = read_yaml(path)
     return validated(data, model, str(path), lines.place)
 

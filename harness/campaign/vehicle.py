@@ -27,16 +27,28 @@ PERCEIVES_LATERAL_M = 0.375
 RISK_EVALUATION_S = 0.4
 
 
-class IDMParameters(Section):
+Strength = Annotated[float, Field(gt=0.0, le=20.0)]
+Braking = Annotated[float, Field(ge=-20.0, le=0.0)]
+Gap = Annotated[float, Field(ge=0.0, le=50.0)]
+Delay = Annotated[float, Field(ge=0.0, le=10.0)]
+Speed = Annotated[float, Field(gt=0.0, le=MAX_CONFIGURED_SPEED_MPS)]
+
+
+class Following(Section):
+    """How an intelligent driver model follows; defaults are SM-I's (environment.md: [cutin] except where said)."""
+
+    acceleration_mps2: Strength = Field(2.0, description="maximum acceleration, the alpha of Table I [cutin]")
+    comfortable_deceleration_mps2: Strength = Field(3.0, description="b [cutin]")
+    time_headway_s: Delay = Field(1.0, description="T [cutin]")
+    minimum_gap_m: Gap = Field(2.0, description="s0 [cutin]")
+    desired_speed_mps: Speed = Field(40.0, description="v0 [assumed]")
+    max_acceleration_mps2: Strength = Field(2.0, description="upper clip [paper]")
+
+
+class IDMParameters(Following):
     """Intelligent driver model; defaults are SM-I's (environment.md: [cutin] except where said)."""
 
-    acceleration_mps2: Positive = Field(2.0, le=20.0, description="maximum acceleration, the alpha of Table I [cutin]")
-    comfortable_deceleration_mps2: Positive = Field(3.0, le=20.0, description="b [cutin]")
-    time_headway_s: float = Field(1.0, ge=0.0, le=10.0, description="T [cutin]")
-    minimum_gap_m: float = Field(2.0, ge=0.0, le=50.0, description="s0 [cutin]")
-    desired_speed_mps: Positive = Field(40.0, le=MAX_CONFIGURED_SPEED_MPS, description="v0 [assumed]")
-    min_acceleration_mps2: float = Field(-4.0, ge=-20.0, le=0.0, description="hardest braking a_min [assumed]")
-    max_acceleration_mps2: Positive = Field(2.0, le=20.0, description="upper clip [paper]")
+    min_acceleration_mps2: Braking = Field(-4.0, description="hardest braking a_min [assumed]")
 
 
 class FVDMParameters(Section):
@@ -44,13 +56,13 @@ class FVDMParameters(Section):
 
     kappa_per_s: Positive = Field(0.85, le=20.0, description="sensitivity to the optimal velocity [cutin]")
     lambda_per_s: float = Field(0.5, ge=0.0, le=20.0, description="sensitivity to the speed difference [assumed]")
-    max_speed_mps: Positive = Field(40.0, le=MAX_CONFIGURED_SPEED_MPS, description="v_max [assumed]")
+    max_speed_mps: Speed = Field(40.0, description="v_max [assumed]")
     v1: Positive = Field(6.75, le=1000.0, description="V1 of the optimal velocity function [cutin]")
     v2: Positive = Field(7.91, le=1000.0, description="V2 of the optimal velocity function [cutin]")
     c1_per_m: Positive = Field(0.13, le=100.0, description="C1 of the optimal velocity function [cutin]")
     c2: float = Field(1.57, ge=-1000.0, le=1000.0, description="C2 of the optimal velocity function [cutin]")
-    min_acceleration_mps2: float = Field(-1.0, ge=-20.0, le=0.0, description="hardest braking a_min [paper: -1, -6]")
-    max_acceleration_mps2: Positive = Field(2.0, le=20.0, description="upper clip [paper]")
+    min_acceleration_mps2: Braking = Field(-1.0, description="hardest braking a_min [paper: -1, -6]")
+    max_acceleration_mps2: Strength = Field(2.0, description="upper clip [paper]")
 
 
 class ConstantParameters(Section):
@@ -69,7 +81,7 @@ class ConstantParameters(Section):
         return self.acceleration_mps2
 
 
-class Reference(Section):
+class Reference(Following):
     """What the reference drivers of UN Regulation No. 157 share: when they react, and how they follow.
 
     The regulation's cut-in takes time: BV moves sideways, and the driver has seen and evaluated the risk when their
@@ -97,31 +109,18 @@ class Reference(Section):
         le=5.0,
         description="how long it evaluates what it has perceived, where cut-ins take time [JRC-FSM: 0.4 s]",
     )
-    min_acceleration_mps2: float = Field(
-        -7.59294, ge=-20.0, le=0.0, description="hardest braking, 0.774 g [JRC-FSM: CC_max_deceleration]"
+    min_acceleration_mps2: Braking = Field(
+        -7.59294, description="hardest braking, 0.774 g [JRC-FSM: CC_max_deceleration]"
     )
     braking_jerk_mps3: Positive = Field(
         12.65, le=1000.0, description="how fast it comes to brake harder, 0.774 g in 0.6 s [JRC-FSM: CC_min_jerk]"
     )
-    acceleration_mps2: Positive = Field(2.0, le=20.0, description="alpha of the IDM by which it follows [cutin]")
-    comfortable_deceleration_mps2: Positive = Field(3.0, le=20.0, description="b of that IDM [cutin]")
-    time_headway_s: float = Field(1.0, ge=0.0, le=10.0, description="T of that IDM [cutin]")
-    minimum_gap_m: float = Field(2.0, ge=0.0, le=50.0, description="s0 of that IDM [cutin]")
-    desired_speed_mps: Positive = Field(40.0, le=MAX_CONFIGURED_SPEED_MPS, description="v0 of that IDM [assumed]")
-    following_min_acceleration_mps2: float = Field(
-        -4.0, ge=-20.0, le=0.0, description="hardest braking of that IDM [assumed]"
-    )
-    max_acceleration_mps2: Positive = Field(2.0, le=20.0, description="upper clip of that IDM [paper]")
+    following_min_acceleration_mps2: Braking = Field(-4.0, description="hardest braking of that IDM [assumed]")
 
     @property
     def reaction_steps(self) -> float:
         """Its reaction time, in steps."""
         return 10.0 * self.reaction_time_s
-
-    @property
-    def evaluation_steps(self) -> int:
-        """How long it evaluates what it has perceived, in steps."""
-        return round(10.0 * self.risk_evaluation_s)
 
     @property
     def used_up_steps(self) -> float:
@@ -137,8 +136,8 @@ class Reference(Section):
 class CarefulCompetentParameters(Reference):
     """The careful and competent human driver of UN Regulation No. 157."""
 
-    critical_ttc_s: Positive = Field(
-        2.0, le=20.0, description="time to collision below which it brakes [JRC-FSM: CC_critical_ttc]"
+    critical_ttc_s: Strength = Field(
+        2.0, description="time to collision below which it brakes [JRC-FSM: CC_critical_ttc]"
     )
     coasting_mps2: float = Field(
         0.4, ge=0.0, le=5.0, description="deceleration off the accelerator, until it brakes [JRC-FSM]"
@@ -148,17 +147,13 @@ class CarefulCompetentParameters(Reference):
 class FuzzySafetyParameters(Reference):
     """The fuzzy safety model of the Joint Research Centre, a performance model of UN Regulation No. 157."""
 
-    comfortable_braking_mps2: Positive = Field(
-        4.0, le=20.0, description="b_min: braking in anticipation, and the least in danger [JRC-FSM: FSM_br_min]"
+    comfortable_braking_mps2: Strength = Field(
+        4.0, description="b_min: braking in anticipation, and the least in danger [JRC-FSM: FSM_br_min]"
     )
-    hard_braking_mps2: Positive = Field(
-        6.0, le=20.0, description="b_max: braking in the greatest danger [JRC-FSM: FSM_br_max]"
-    )
-    leader_braking_mps2: Positive = Field(
-        7.0, le=20.0, description="how hard the vehicle ahead may brake [JRC-FSM: FSM_bl]"
-    )
-    standstill_gap_m: float = Field(
-        2.0, ge=0.0, le=50.0, description="part of the gap that anticipation does not count [JRC-FSM: FSM_margin_dist]"
+    hard_braking_mps2: Strength = Field(6.0, description="b_max: braking in the greatest danger [JRC-FSM: FSM_br_max]")
+    leader_braking_mps2: Strength = Field(7.0, description="how hard the vehicle ahead may brake [JRC-FSM: FSM_bl]")
+    standstill_gap_m: Gap = Field(
+        2.0, description="part of the gap that anticipation does not count [JRC-FSM: FSM_margin_dist]"
     )
     safe_margin_m: Positive = Field(
         2.0, le=50.0, description="gap beyond the safe one that is felt as safe [JRC-FSM: FSM_margin_safe_dist]"
@@ -176,15 +171,15 @@ class FuzzySafetyParameters(Reference):
 class NeedBasedParameters(Section):
     """A vehicle that accelerates until it needs to brake, and a delay later brakes with what it needs."""
 
-    acceleration_mps2: Positive = Field(1.0, le=20.0, description="until it needs to brake [assumed]")
-    deceleration_mps2: Positive = Field(
-        3.0, le=20.0, description="hardest braking, from the delay after the first need on [assumed]"
+    acceleration_mps2: Strength = Field(1.0, description="until it needs to brake [assumed]")
+    deceleration_mps2: Strength = Field(
+        3.0, description="hardest braking, from the delay after the first need on [assumed]"
     )
-    reaction_time_s: float = Field(0.5, ge=0.0, le=10.0, description="between the first need and the brakes [assumed]")
-    needed_mps2: Positive = Field(
-        1.0, le=20.0, description="it needs to brake where no less than this prevents a collision [assumed]"
+    reaction_time_s: Delay = Field(0.5, description="between the first need and the brakes [assumed]")
+    needed_mps2: Strength = Field(
+        1.0, description="it needs to brake where no less than this prevents a collision [assumed]"
     )
-    standstill_gap_m: float = Field(2.0, ge=0.0, le=50.0, description="gap that is to remain [assumed]")
+    standstill_gap_m: Gap = Field(2.0, description="gap that is to remain [assumed]")
 
     @property
     def reaction_steps(self) -> float:
@@ -253,15 +248,11 @@ def _schema_by_model(schema: dict[str, Any]) -> None:
         if model in of_model["enum"]
     ]
     if "controller" in properties:
-        named = [{"required": [name]} for name in AV_SOURCES]
-        none = {"properties": {"parameters": {"maxProperties": 0}}}
-        schema["oneOf"] = [
-            {"not": {"anyOf": named}, "properties": {"parameters": by_model["idm"]}},
-            *(
-                each | none if name in READS_NO_PARAMETERS else each
-                for name, each in zip(AV_SOURCES, named, strict=True)
-            ),
-        ]
+        named: list[dict[str, Any]] = [{"required": [name]} for name in AV_SOURCES]
+        schema["oneOf"] = [{"not": {"anyOf": named}, "properties": {"parameters": by_model["idm"]}}]
+        for name in AV_SOURCES:
+            none = {"properties": {"parameters": {"maxProperties": 0}}} if name in READS_NO_PARAMETERS else {}
+            schema["oneOf"].append({"required": [name], **none})
         for name in AV_SOURCES:  # null says "not this one": in a file of its own leaving the key out says it better
             (source,) = (each for each in properties[name].pop("anyOf") if each.get("type") != "null")
             properties[name] = source | {key: value for key, value in properties[name].items() if key != "default"}

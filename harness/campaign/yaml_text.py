@@ -59,8 +59,7 @@ class Lines:
 def read_yaml(path: str | Path) -> tuple[dict[str, Any], Lines]:
     """Read a UTF-8 file with one YAML 1.2 document whose top level is a mapping: its plain data, and their lines.
 
-    Raises `CampaignError`: the file is missing, a folder, not UTF-8, empty, not a mapping, not YAML, or says a key
-    twice.
+    Any other file, and one that says a key twice, is a `CampaignError`.
     """
     name = str(path)
     data, lines = _load(_read_text(Path(path)), name)

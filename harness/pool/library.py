@@ -101,8 +101,10 @@ class Library(Section):
     def statement_settings(self, shells: ShellSettings) -> dict[str, StatementSettings]:
         """The statements of a campaign, its own or the library's, by name.
 
-        Raises `CampaignError`: a boundary is no surrogate that reacts, or the statement that is asked for is none of
-        them.
+        Raises
+        ------
+        CampaignError
+            A boundary is no surrogate that reacts, or the statement that is asked for is none of them.
         """
         own = shells.boundary or self.boundary
         assumes = self.assumes if own == self.boundary else ""
@@ -160,8 +162,5 @@ class Library(Section):
 
 
 def load_library(name: str) -> Library:
-    """Read a shipped library by name, or a file by its path.
-
-    Raises `CampaignError`: there is none of that name, or the file is wrong; every place is named.
-    """
+    """Read a shipped library by name, or a file by its path; a `CampaignError` names every place that is wrong."""
     return read_model(shipped_or_own(name, SHIPPED_FOLDER, "pool.library"), Library)

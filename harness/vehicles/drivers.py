@@ -82,7 +82,7 @@ def driver_records(
         record["delay_steps"] = round(reaction.delay_s * 10.0)
         if see_onset and isinstance(driver, Reference):
             record["used_up_steps"] = 0.0
-            record["delay_steps"] += driver.evaluation_steps
+            record["delay_steps"] += round(10.0 * driver.risk_evaluation_s)
         if isinstance(reaction, Reaction):
             record["inattention_probability"] = reaction.inattention_probability
             record["inattention_steps"] = round(reaction.inattention_delay_s * 10.0)
