@@ -13,7 +13,7 @@ from typing import Any, Self
 
 from pydantic import Field, model_validator
 
-from harness.campaign.combinations import refusal
+from harness.campaign.combinations import Parts, refusal
 from harness.campaign.problems import NAME_PATTERN, broken_rule
 from harness.campaign.sections import (
     Accept,
@@ -75,14 +75,15 @@ class Campaign(Section):
             expected = f"one weight for each surrogate: {listed(self.surrogates)}"
             mend = "Name the surrogates exactly, or leave alpha out for equal weights."
             raise broken_rule("testing.alpha", f"weights for {listed(alpha)}", expected, mend)
-        if (parts := refusal(self)) is not None:
-            raise broken_rule(*parts)
+        if (words := refusal(self.parts)) is not None:
+            raise broken_rule(*words)
         return self
 
     @property
-    def decides_another_statement(self) -> bool:
-        """Whether the limit names another statement than the tests are drawn for."""
-        return self.accept is not None and self.accept.statement not in (None, self.testing.shells.statement)
+    def parts(self) -> Parts:
+        """What `harness.campaign.combinations` asks of it."""
+        sections = self.av, self.surrogates, self.testing, self.world, self.records, self.stop, self.accept
+        return Parts(*sections, has_shadow_runs=self.has_shadow_runs)
 
     @property
     def has_shadow_runs(self) -> bool:

@@ -7,18 +7,30 @@ command, and is known whether its cut-ins take time (`lateral` of the environmen
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
+from harness.campaign.sections import Accept, Records, Stop, Testing, World
+from harness.campaign.vehicle import AutomatedVehicle, Surrogate
 from harness.errors import CampaignError
 from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT
 from harness.vocabulary import METHODS, SAMPLING, Sampling
 
-if TYPE_CHECKING:
-    from harness.campaign.campaign import Campaign
-
 Command = Literal["run", "compare", "av-check"]
 MOST_SUMO_CELLS = 256
 """Roads of the largest committed network."""
+
+
+class Parts(NamedTuple):
+    """What is asked of a campaign: its sections, and what follows from several of them."""
+
+    av: AutomatedVehicle
+    surrogates: dict[str, Surrogate]
+    testing: Testing
+    world: World
+    records: Records
+    stop: Stop
+    accept: Accept | None
+    has_shadow_runs: bool
 
 
 class Use(NamedTuple):
@@ -31,15 +43,15 @@ class Use(NamedTuple):
 WHILE_READ = Use()
 
 
-def _sampling(campaign: Campaign) -> Sampling:
-    return SAMPLING[campaign.testing.method]
+def _sampling(parts: Parts) -> Sampling:
+    return SAMPLING[parts.testing.method]
 
 
 class Combination(NamedTuple):
     """What is refused: where to put the blame, when, and the words, with values of the campaign in braces."""
 
     where: str
-    is_asked: Callable[[Campaign, Use], bool]
+    is_asked: Callable[[Parts, Use], bool]
     found: str
     expected: str
     mend: str
@@ -59,7 +71,7 @@ REFUSED = (
     ),
     Combination(
         "accept.statement",
-        lambda c, _: c.decides_another_statement,
+        lambda c, _: c.accept is not None and c.accept.statement not in (None, c.testing.shells.statement),
         "{accept.statement}, and {testing.shells.statement} in testing.shells.statement",
         "the same statement, or one of the two keys alone",
         "Delete one of them.",
@@ -197,18 +209,18 @@ REFUSED = (
 """All that is refused, in the order in which it is told."""
 
 
-def refusal(campaign: Campaign, use: Use = WHILE_READ) -> tuple[str, str, str, str] | None:
+def refusal(parts: Parts, use: Use = WHILE_READ) -> tuple[str, str, str, str] | None:
     """Where, found, expected and mend of the first combination that is refused; None if the campaign may go on."""
-    allowing = (name for name in METHODS if campaign.stop.estimator in SAMPLING[name].estimators)
-    values = {**dict(campaign), "allowing": " or ".join(allowing)}
+    allowing = (name for name in METHODS if parts.stop.estimator in SAMPLING[name].estimators)
+    values = {**parts._asdict(), "allowing": " or ".join(allowing)}
     for row in REFUSED:
         # A command may change a campaign that has been read: what it was allowed with then is not asked again.
-        if row.is_asked(campaign, use) and not (use != WHILE_READ and row.is_asked(campaign, WHILE_READ)):
+        if row.is_asked(parts, use) and not (use != WHILE_READ and row.is_asked(parts, WHILE_READ)):
             return row.where, row.found.format(**values), row.expected.format(**values), row.mend
     return None
 
 
-def require_combination(campaign: Campaign, command: Command, *, takes_time: bool) -> None:
+def require_combination(parts: Parts, command: Command, *, takes_time: bool) -> None:
     """Refuse (`CampaignError`) a campaign that does not go with the command that it is for, or with its cut-ins."""
-    if (parts := refusal(campaign, Use(command, takes_time))) is not None:
-        raise CampaignError(*parts)
+    if (words := refusal(parts, Use(command, takes_time))) is not None:
+        raise CampaignError(*words)

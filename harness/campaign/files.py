@@ -51,10 +51,7 @@ def load_campaign(
     check_files : bool
         Whether files that the campaign names must exist; False to look at a run whose environment file is gone.
 
-    Raises
-    ------
-    CampaignError
-        The file cannot be read, is not YAML, or says something wrong; the error names every place.
+    Raises `CampaignError`: the file cannot be read, is not YAML, or says something wrong; the error names every place.
     """
     data, lines = read_yaml(path)
     changes = [*([] if av is None else [av_override(av)]), *map(parse_override, overrides)]

@@ -101,10 +101,8 @@ class Library(Section):
     def statement_settings(self, shells: ShellSettings) -> dict[str, StatementSettings]:
         """The statements of a campaign, its own or the library's, by name.
 
-        Raises
-        ------
-        CampaignError
-            A boundary is no surrogate that reacts, or the statement that is asked for is none of them.
+        Raises `CampaignError`: a boundary is no surrogate that reacts, or the statement that is asked for is none of
+        them.
         """
         own = shells.boundary or self.boundary
         assumes = self.assumes if own == self.boundary else ""
