@@ -148,8 +148,8 @@ REFUSED = (
         "av.before_cut_in",
         lambda c, use: use.takes_time and c.av.acts_before_cut_in and use.command == "av-check",
         "controller, " + _TAKES_TIME,
-        "hold_speed, or cut-ins of one step: a look at a vehicle makes no shadow runs, without which the onset is not "
-        "known in time",
+        "hold_speed, or cut-ins of one step: a look at a vehicle makes no baseline runs, without which nobody knows "
+        "the onset in time",
         "Add --set av.before_cut_in=hold_speed, or --set environment.parameters=ndd-overtaking-1.",
     ),
     Combination(

@@ -214,7 +214,7 @@ class RayWorkers(Workers):
         return self._cpus
 
     def shadows(self, request: Request) -> Files:
-        """Shadow runs that tests follow from: they have all been written before the first test."""
+        """Baseline runs that tests follow from: they have all been written before the first test."""
         if not isinstance(request, ShardRequest):
             return {}
         if self._shadows is None:

@@ -90,7 +90,7 @@ def test_av_check_looks_at_a_vehicle_from_the_onset_on_and_refuses_one_that_acts
     with_lead, without = (check_av(campaign("world.engine=twin", *lead), 48) for lead in ((LEAD,), ()))
     assert with_lead.exit_code == 0
     assert with_lead.behaviour.n_crashes <= without.behaviour.n_crashes
-    with pytest.raises(CampaignError, match="shadow runs"):
+    with pytest.raises(CampaignError, match="baseline runs"):
         check_av(campaign(LEAD, "testing.method=forced", f"av={ACTING.format('Speeds')}"), 4)
 
 

@@ -94,7 +94,7 @@ def test_a_vehicle_with_noise_of_its_own_is_refused_and_one_with_the_given_noise
 def test_shadow_runs_that_fail_count_against_the_vehicle(campaign, run_here, tmp_path):
     """Three in 120 fail: refused at one per cent; with five they are a part of the upper limit that no test takes."""
     breaks = (*SHELLS, SHADOWS, TWIN, f"av={of('Breaks')}")
-    with pytest.raises(TooManyFailedError, match="3 of 120 shadow runs failed, 3 of them with: step: RuntimeError"):
+    with pytest.raises(TooManyFailedError, match="3 of 120 baseline runs failed, 3 of them with: step: RuntimeError"):
         run_here(campaign(*breaks), tmp_path / "run")
     assert manifest(tmp_path / "run")["status"] == "interrupted"
     loose = campaign(*breaks, "run.max_failed_share=0.05", "stop.rhw=9")
@@ -159,7 +159,7 @@ def test_shadow_runs_that_are_gone_or_damaged_are_named(early_run, campaign, run
     with pytest.raises(RunFolderError, match=r"shard-000000\.parquet.*Delete this file"):
         replay(folder, 5)
     files_of(folder)[0].unlink()
-    with pytest.raises(RunFolderError, match="shadow runs of 2 of 3 files"):
+    with pytest.raises(RunFolderError, match="baseline runs of 2 of 3 files"):
         replay(folder, 5)
     assert estimate(folder)["n_episodes"] == early_run.estimates["n_episodes"]  # needs no path
 
