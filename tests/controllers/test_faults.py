@@ -248,7 +248,7 @@ def test_check_survives_a_controller_that_does_not(tmp_path, capsys):
     (tmp_path / "c.yaml").write_text(SMALL)
     av = f"av={_other('EndsTheProcess', '{where: step}')}"
     assert main(["check", str(tmp_path / "c.yaml"), "--json", "--set", av]) == EXIT_DONE
-    assert "in the call of step 0 of episode 0" in json.loads(capsys.readouterr().out)["plan"]["av_ms_per_test"]
+    assert "in the call of step" in json.loads(capsys.readouterr().out)["plan"]["av_ms_per_test"]
 
 
 def test_check_says_how_a_slow_controller_keeps_many_workers_busy(tmp_path, monkeypatch):
