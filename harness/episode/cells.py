@@ -58,11 +58,7 @@ CELL_DTYPE = np.dtype(
         ("log_p_cut_in", _f8),
         ("log_sampled", _f8),  # step mixture: sum of log q_alpha/p; shells: -log p_s
         ("min_ttc", _f8),
-        ("cut_r2", _f8),
-        ("cut_r2dot", _f8),
-        ("onset_r2", _f8),
-        ("onset_r2dot", _f8),
-        ("av_start", _f8),
+        *((name, _f8) for name in ("cut_r2", "cut_r2dot", "onset_r2", "onset_r2dot", "av_start")),
         ("danger", _f8),  # what a built-in AV remembers beside its acceleration
         ("boundary_x", _f8),  # of the boundary beside the AV: position, speed, and what it remembers
         ("boundary_v", _f8),
@@ -72,40 +68,18 @@ CELL_DTYPE = np.dtype(
     ]
 )
 
+_STEPS = ("n_steps", "cut_in_step", "lead_steps", "onset_step", "n_control_steps", "n_lv", "n_bv", "ahead_step")
+_AT_CUT_IN = ("cut_in_r2_m", "cut_in_r2dot_mps", "onset_r2_m", "onset_r2dot_mps")
+_AT_END = ("crash_time_s", "impact_speed_mps", "min_ttc_s", "av_distance_m", "log_weight", "log_p_cut_in")
 EPISODE_DTYPE = np.dtype(
-    [
-        ("outcome", np.int8),
-        ("n_steps", np.int16),
-        ("cut_in_step", np.int16),
-        ("cut_in_r2_m", _f8),
-        ("cut_in_r2dot_mps", _f8),
-        ("lead_steps", np.int16),
-        ("onset_step", np.int16),
-        ("onset_r2_m", _f8),
-        ("onset_r2dot_mps", _f8),
-        ("crash_time_s", _f8),
-        ("impact_speed_mps", _f8),
-        ("min_ttc_s", _f8),
-        ("av_distance_m", _f8),
-        ("n_control_steps", np.int16),
-        ("component", np.int8),
-        ("log_weight", _f8),
-        ("log_p_cut_in", _f8),
-        ("n_lv", np.int16),
-        ("n_bv", np.int16),
-        ("ahead_step", np.int16),
-    ]
+    [(name, np.int8) for name in ("outcome", "component")]
+    + [(name, np.int16) for name in _STEPS]
+    + [(name, _f8) for name in (*_AT_CUT_IN, *_AT_END)]
 )
 
 MOMENT_DTYPE = np.dtype(
-    [
-        ("row", _i8),
-        ("step", np.int16),
-        ("maneuver", np.int8),
-        *((name, _f8) for name in STATE_COLUMNS),
-        ("p", _f8),
-        ("q_sampled", _f8),
-    ]
+    [("row", _i8), ("step", np.int16), ("maneuver", np.int8)]
+    + [(name, _f8) for name in (*STATE_COLUMNS, "p", "q_sampled")]
 )
 
 
@@ -139,24 +113,16 @@ class Cells(NamedTuple):
 def idle_cells(n_cells: int, environment: Environment, importance: Importance, *, keep_traces: bool) -> Cells:
     """K cells without an episode."""
     max_steps, hold_steps, draws = lengths(environment)
-    cell = np.zeros(n_cells, CELL_DTYPE)
+    cell, n_surrogates = np.zeros(n_cells, CELL_DTYPE), importance.n_surrogates
     cell["row"] = -1
-    return Cells(
-        cell=cell,
-        log_ratio=np.zeros((n_cells, importance.alpha.size)),
-        martingale=np.zeros((n_cells, importance.n_surrogates)),
-        cut_challenge=np.zeros((n_cells, hold_steps, importance.n_surrogates)),
-        stay_challenge=np.zeros((n_cells, hold_steps, importance.n_surrogates)),
-        lv_path=np.zeros((n_cells, draws), np.int8),
-        bv_path=np.zeros((n_cells, draws), np.int8),
-        acceleration=np.zeros((n_cells, 3)),
-        speed=np.zeros((n_cells, 3)),
-        cut_in=np.zeros(n_cells, np.int8),
-        trace=np.full((n_cells, max_steps + 1 if keep_traces else 1, 3, 3), np.nan),
-        placed=np.zeros(n_cells, np.int64),
-        ended=np.zeros(n_cells, np.int64),
-        ended_row=np.zeros(n_cells, np.int64),
-    )
+    log_ratio, martingale = np.zeros((n_cells, importance.alpha.size)), np.zeros((n_cells, n_surrogates))
+    cutting, staying = np.zeros((2, n_cells, hold_steps, n_surrogates))
+    lv_path, bv_path = np.zeros((2, n_cells, draws), np.int8)
+    acceleration, speed = np.zeros((2, n_cells, 3))
+    trace = np.full((n_cells, max_steps + 1 if keep_traces else 1, 3, 3), np.nan)
+    placed, ended, ended_row = np.zeros((3, n_cells), np.int64)
+    drawn = cell, log_ratio, martingale, cutting, staying, lv_path, bv_path
+    return Cells(*drawn, acceleration, speed, np.zeros(n_cells, np.int8), trace, placed, ended, ended_row)
 
 
 class Results(NamedTuple):
@@ -183,18 +149,11 @@ def empty_results(
 ) -> Results:
     """Buffers for a shard of ``n_episodes`` with room for ``capacity`` control steps."""
     draws, n_surrogates = lengths(environment)[2], importance.n_surrogates
-    return Results(
-        episode=np.zeros(n_episodes, EPISODE_DTYPE),
-        log_q=np.zeros((n_episodes, importance.alpha.size)),
-        martingale=np.zeros((n_episodes, n_surrogates)),
-        lv_path=np.zeros((n_episodes, draws), np.int8),
-        bv_path=np.zeros((n_episodes, draws), np.int8),
-        moment=np.zeros(capacity, MOMENT_DTYPE),
-        moment_q=np.zeros((capacity, n_surrogates)),
-        moment_v=np.zeros((capacity, n_surrogates)),
-        moment_count=np.zeros(1, np.int64),
-        moment_limit=moment_limit,
-    )
+    episode, log_q = np.zeros(n_episodes, EPISODE_DTYPE), np.zeros((n_episodes, importance.alpha.size))
+    lv_path, bv_path = np.zeros((2, n_episodes, draws), np.int8)
+    tests = episode, log_q, np.zeros((n_episodes, n_surrogates)), lv_path, bv_path
+    q, v = np.zeros((2, capacity, n_surrogates))
+    return Results(*tests, np.zeros(capacity, MOMENT_DTYPE), q, v, np.zeros(1, np.int64), moment_limit)
 
 
 def with_more_room(results: Results, capacity: int) -> Results:
