@@ -89,17 +89,13 @@ def test_scenario_is_valid(file):
     jsonschema.validate(read_yaml(file)[0], SCHEMA)
 
 
-def test_smoke_asks_for_what_the_readme_promises():
+def test_scenarios_ask_for_what_is_promised():
     smoke = load_campaign(FOLDER / "smoke.yaml")
     assert (smoke.testing.method, smoke.testing.shells.statement) == ("shells", "assumption_free")
     assert (smoke.stop.rhw, smoke.stop.min_crashes, smoke.stop.episodes) == (0.05, None, 400_000)
     assert (smoke.world.engine, smoke.records.moments, smoke.records.traces) == ("sumo", "none", "crash")
-
-
-def test_nade_has_the_published_settings():
-    nade = load_campaign(FOLDER / "overtaking_nade.yaml")
-    assert (nade.testing.method, nade.testing.challenge, nade.testing.epsilon) == ("step_mixture", "immediate", 0.1)
-    assert nade.alpha() == (1 / 3, 1 / 3, 1 / 3)
+    nade = load_campaign(FOLDER / "overtaking_nade.yaml").testing
+    assert (nade.method, nade.challenge, nade.epsilon) == ("step_mixture", "immediate", 0.1)
 
 
 # -- written out, and the editor's schema --
@@ -130,13 +126,6 @@ def test_what_loads_is_allowed_by_the_schema_and_reads_back_as_itself(load, file
     assert load(json.dumps(written)) == campaign  # JSON is YAML
 
 
-def test_every_value_is_written_out(load):
-    campaign = Campaign(name="x", av={"sumo": {"carFollowModel": "ACC", "minGap": 2.5}})
-    written = written_out(campaign)
-    assert written["av"].keys() == {"sumo", "parameters", "reaction", "before_cut_in", "limits"}
-    assert {key: value for key, value in written.items() if key != "av"} == campaign.model_dump(exclude={"av"})
-
-
 @pytest.mark.parametrize(
     "text", ["no", "12:30", "1e5", "0x1F", "1_000", "2024-01-01", "null", "~", "", " x", "a: b", "# x", "\0\x85\ufeff☃"]
 )
@@ -156,22 +145,16 @@ def test_committed_schema_is_current():
     "wrong",
     [
         {"testin": {}},
-        {"testing": {"epsilon": "0.1"}},
         {"av": {"parameters": {"desired_speed_mps": 300}}},
         {"av": {"model": "fvdm", "parameters": {"time_headway_s": 1}}},
         {"av": {"parameters": {"kappa_per_s": 1}}},
         {"av": {"model": "idm", "controller": "a:B"}},
-        {"av": {"sumo": {}, "traci": {"command": "x"}}},
-        {"av": {"controller": None}},
         {"av": {"controller": "a b"}},
-        {"av": {"sumo": {"minGap": True}}},
         {"av": {"sumo": {"tau": 1}, "parameters": {"tau": 1}}},
         {"av": {"fmu": {"file": "a.fmu", "output": "a"}}},
         {"surrogates": {"a.b": {"model": "idm"}}},
         {"surrogates": {"A": {"model": "fvdm", "parameters": {"time_headway_s": 1}}}},
-        {"surrogates": {"A": {"model": "constant"}}},
         {"stop": {"episodes": 1.5}},
-        {"name": "a b"},
     ],
 )
 def test_schema_refuses_what_the_loader_refuses(wrong, load):
