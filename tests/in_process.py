@@ -5,11 +5,18 @@ Whoever moves what is patched here mends it here: no other file of the tests kno
 
 from __future__ import annotations
 
+import os
 import pickle
+import subprocess
+import sys
 import tempfile
+import traceback
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -79,3 +86,37 @@ def run_here(campaign: Campaign, out: Path, **options: Any) -> RunResult:
     """Run a campaign in this process, without its page."""
     with one_process(), controllers_here(), without_page():
         return run(campaign, out, workers=1, **options)
+
+
+class ForkedPython(subprocess.Popen):
+    """Instead of a fresh Python for a worker, a copy of this one: its imports take seconds, and are done here."""
+
+    def _execute_child(self, args: Any, executable: Any, preexec_fn: Any, close_fds: Any, *rest: Any) -> None:
+        if not (isinstance(args, list) and args[:2] == [sys.executable, "-c"] and "harness.processes" in args[2]):
+            super()._execute_child(args, executable, preexec_fn, close_fds, *rest)
+            return
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # threads of xdist are nothing to a worker
+            self.pid = os.fork()
+        if self.pid == 0:
+            try:
+                os.setsid()
+                kept = sorted({0, 1, 2, *rest[0]})
+                for before, after in pairwise([*kept, os.sysconf("SC_OPEN_MAX")]):
+                    os.closerange(before + 1, after)
+                exec(args[2], {"__name__": "__worker__"})
+                os._exit(0)
+            except SystemExit as error:
+                os._exit(error.code if isinstance(error.code, int) else 1)
+            except BaseException:  # noqa: BLE001 - nothing of pytest may go on in a copy
+                traceback.print_exc()
+                os._exit(1)
+        self._child_created = True
+
+
+@contextmanager
+def forked_workers() -> Iterator[None]:
+    """Workers that are processes of their own begin at once."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("harness.processes.subprocess", SimpleNamespace(**{**vars(subprocess), "Popen": ForkedPython}))
+        yield
