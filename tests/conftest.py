@@ -9,7 +9,7 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -44,6 +44,15 @@ def pytest_sessionstart(session: pytest.Session) -> None:
     compiling = [subprocess.Popen([*command, *names]) for names in TO_COMPILE]
     if not any([process.wait() for process in compiling]):  # noqa: C419 - wait for all
         mark.touch()
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _workers_begin_at_once() -> Iterator[None]:
+    """Only tests that start a program by themselves pay for a fresh Python."""
+    from tests.in_process import forked_workers
+
+    with forked_workers():
+        yield
 
 
 @pytest.fixture(scope="session")

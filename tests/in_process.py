@@ -101,6 +101,7 @@ class ForkedPython(subprocess.Popen):
         if self.pid == 0:
             try:
                 os.setsid()
+                sys.stdout, sys.stderr = (open(fd, "w", buffering=1, closefd=False) for fd in (1, 2))  # noqa: SIM115
                 kept = sorted({0, 1, 2, *rest[0]})
                 for before, after in pairwise([*kept, os.sysconf("SC_OPEN_MAX")]):
                     os.closerange(before + 1, after)

@@ -11,7 +11,7 @@ import pytest
 from harness.campaign.campaign import Campaign
 from harness.campaign.files import load_campaign
 from harness.runner import RunResult, run_campaign
-from tests.in_process import forked_workers, one_process, without_page
+from tests.in_process import one_process, without_page
 
 MIXTURE_FILE = Path(__file__).parents[2] / "scenarios" / "overtaking_mixture.yaml"
 SMALL = ("stop.episodes=1600", "stop.rhw=null", "run.shard_size=80", "records.trace_share=0.05")
@@ -31,8 +31,8 @@ def campaign() -> Callable[..., Campaign]:
 
 @pytest.fixture(scope="session")
 def run() -> Callable[..., RunResult]:
-    """`run_campaign` without the page; its workers are processes, and copies of this one."""
-    return forked_workers()(without_page()(run_campaign))
+    """`run_campaign` without the page."""
+    return without_page()(run_campaign)
 
 
 @pytest.fixture(scope="session")
