@@ -142,19 +142,17 @@ def judge(subject: Subject, result: str, rows: Sequence[Row], confidence: float)
     ``confidence`` is the nominal coverage.
     """
     columns = {field.name: np.array([getattr(row, field.name) for row in rows]) for field in fields(Row)}
-    tests, reached = columns["n_tests"], columns["reached"]
-    known, n = subject.truth(result), len(rows)
+    tests, reached, known, n = columns["n_tests"], columns["reached"], subject.truth(result), len(rows)
     truth, scale = known.value, known.scale
-    said = np.isfinite(columns["crash_rate"])
+    has_value = np.isfinite(columns["crash_rate"])
     with np.errstate(divide="ignore", invalid="ignore"):  # of what never crashes nothing relative is known
-        errors, claimed = (columns["crash_rate"][said] - truth) / scale, columns["std_error"][said] / scale
+        errors = (columns["crash_rate"][has_value] - truth) / scale
+        claimed = columns["std_error"][has_value] / scale
     covered = int(np.count_nonzero((columns["ci_low"] <= truth) & (truth <= columns["ci_high"])))
     low, high = map(float, clopper_pearson(covered, n, (1.0 - COVERAGE_CONFIDENCE) / 2.0))
-    met = subject.meets_assumption_of(result)
     tests_5, median, tests_95 = (float(q) for q in np.quantile(tests, [0.05, 0.5, 0.95]))
-    relvar = _mean(errors**2)
-    fixed = not reached.any() and bool(np.all(tests == tests[0]))
-    z = normal_half_width(1.0, confidence)
+    fixed, relvar = not reached.any() and bool(np.all(tests == tests[0])), _mean(errors**2)
+    met, z = subject.meets_assumption_of(result), normal_half_width(1.0, confidence)
     return Judgement(
         subject=subject.name,
         result=result,
