@@ -45,24 +45,6 @@ def test_too_narrow_intervals_are_noticed_and_too_wide_ones_are_not_blamed():
     assert wide.coverage > 0.99
 
 
-def test_a_conditional_statement_is_not_judged_where_it_does_not_hold():
-    of = rows([0.5] * 10, 0.1, outside=1)
-    found = judge(Subject.exact("a", 1.0, crashes_outside={"x": 0.4}), "x", of, 0.9)
-    (found,) = corrected([found])
-    assert found.p_value is None
-    assert not found.too_low
-    assert found.alarm == 1.0
-    held = judge(Subject.exact("a", 1.0, crashes_outside={"x": 1e-4}), "x", of, 0.9)
-    assert held.p_value < 1e-6
-
-
-def test_the_number_of_tests_is_described_by_its_quantiles():
-    of = [Row("x", k, k, 1, 1.0, 0.1, 0.9, 1.1, True) for k in range(1, 102)]
-    found = judge(Subject.exact("a", 1.0), "x", of, 0.9)
-    assert (found.tests_5, found.tests_median, found.tests_95) == (6.0, 51.0, 96.0)
-    assert found.tests_for_wanted_rhw is None
-
-
 def test_a_difference_of_nothing_is_judged_relative_to_the_rates():
     subject = Subject("equal", Known(2.0, 0.0, 2.0), {"x": Known(0.0, 0.0, 2.0)})
     errors = np.random.default_rng(2).normal(0.0, 0.2, 2000)

@@ -17,13 +17,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from harness.campaign.campaign import Campaign
-from harness.vocabulary import SAMPLING
 from studies.__main__ import main
 from studies.replication import run
 from studies.replication.experiment import load_experiment
 from studies.replication.judgement import Row, Subject, judge
-from studies.replication.weighted import WeightedCampaign, twin_episodes
 from studies.replication.work import worker_processes
 
 from .here import Here
@@ -93,16 +90,6 @@ def test_what_never_crashes_has_results_too(tmp_path):
     content = json.loads((tmp_path / "results.json").read_text())
     assert content["largest_relative_error_of_truth"] is None
     assert [(one["bias"], one["coverage"]) for one in content["judgements"]] == [(None, 1.0)]
-
-
-@pytest.mark.parametrize("method", ["nde", "forced", "step_mixture", "episode_mixture"])
-def test_every_result_that_may_be_asked_for_is_given(method):
-    """At a level of lane changing at which crashes are frequent."""
-    settings = {"environment": {"lane_change_level": 1e3}, "testing": {"method": method}, "stop": {"episodes": 300}}
-    campaign = Campaign.model_validate({"name": "x", "world": {"engine": "twin"}, **settings})
-    estimators = sorted(SAMPLING[method].estimators)
-    rows = WeightedCampaign(campaign, twin_episodes(campaign, 5, estimators), estimators).run(range(2))
-    assert [row.result for row in rows] == [*estimators, *estimators]
 
 
 def test_weighted_methods_run_in_the_twin(tmp_path, capsys, monkeypatch):

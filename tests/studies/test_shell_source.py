@@ -7,7 +7,6 @@ import pytest
 
 from harness.campaign.sections import EnvironmentSettings, PoolSettings
 from harness.campaign.vehicle import AutomatedVehicle
-from harness.errors import CampaignError
 from harness.pool.build import build_pool
 from harness.pool.library import load_library
 from harness.pool.shells import acceleration_limit
@@ -15,7 +14,7 @@ from harness.progress import Progress
 from harness.traffic.loading import load_environment
 from studies.replication.experiment import Adversary
 from studies.replication.populations import RATE, Drivers, Truths, enumerate_paths
-from studies.replication.shells import Division, campaign_block, equals, leave_out
+from studies.replication.shells import Division, campaign_block, equals
 
 PATHS = 1024
 ENVIRONMENT = load_environment(EnvironmentSettings())
@@ -66,12 +65,6 @@ def test_imprecise_truths_are_enumerated_again_and_agree():
     assert wild.value == pytest.approx(2.43e-5, abs=4.0 * wild.std_error)
 
 
-def test_an_inattentive_vehicle_is_two_drivers_mixed(drivers, population):
-    mixed, early, late = (drivers.vehicles[name].crash_mass(population) for name in ("late", "own", "attentive-late"))
-    np.testing.assert_allclose(mixed, 0.75 * early + 0.25 * late, rtol=1e-12)
-    assert late.sum() > 1.5 * early.sum()
-
-
 def test_equals_are_found_and_left_out(drivers, population):
     vehicle = drivers.vehicles["equal"].crash_mass(population)
     assert equals(LIBRARY, population, vehicle) == {"brakes-3"}
@@ -80,17 +73,6 @@ def test_equals_are_found_and_left_out(drivers, population):
     assert "brakes-3" not in source.cells.template.names
     assert equals(LIBRARY, population, drivers.vehicles["own"].crash_mass(population)) == set()
     assert equals(LIBRARY, population, np.zeros_like(vehicle)) == set()  # one that never crashes is nobody's equal
-
-
-def test_the_envelope_stays_and_another_surrogate_becomes_the_boundary():
-    careful_first = tuple(LIBRARY.surrogates)
-    reduced = leave_out(LIBRARY, {"brakes-2-late-1s", "full-throttle-2"}, careful_first)
-    assert reduced.boundary == "brakes-3-late-700ms"
-    assert reduced.envelope == "full-throttle-2"
-    alone = leave_out(LIBRARY, set(careful_first[:6]), careful_first)
-    assert alone.boundary == "never-brakes"
-    with pytest.raises(CampaignError, match="no surrogate but the envelope"):
-        leave_out(LIBRARY, set(careful_first), careful_first)
 
 
 def test_drawn_pools_scatter_around_the_population(drivers, population):
@@ -154,17 +136,6 @@ def test_an_adversary_with_a_hole_crashes_outside_in_that_share(drivers, populat
     before = source.cells.crashes_outside(source.crashing[0])
     after = made.cells.crashes_outside(made.crashing[0])
     assert all(after[name] > share for name, share in before.items())
-
-
-def test_failed_crashes_are_counted_as_failed(drivers, population):
-    _, made = adversary_of(drivers, population, failing=0.5)
-    rng = np.random.default_rng(8)
-    (drawn,) = made.draw(rng)
-    block = campaign_block(drawn, np.full(drawn.design.p.size, 400), 0, rng)
-    assert not np.any(block.crash & block.failed)
-    bad = block.crash | block.failed
-    assert block.failed[bad].mean() == pytest.approx(0.5, abs=4.5 * 0.5 / np.sqrt(bad.sum()))
-    assert np.all(block.cell_mass[bad].sum(1) > 0.0)
 
 
 def test_cells_divide_strata_by_what_references_do():

@@ -11,7 +11,7 @@ from harness.progress import Progress
 from harness.vehicles.drivers import av_records
 from studies.case_study import small_case
 from studies.case_study import study as context
-from studies.case_study.small_case import AV_MPS, Proposal, _crashes, small_world
+from studies.case_study.small_case import AV_MPS, _crashes, small_world
 from studies.case_study.study import Context, SmallCase
 from tests.chains.seed import SEED
 from tests.estimators.small_blocks import fed
@@ -32,12 +32,6 @@ def test_backward_induction_is_the_sum_over_all_paths(world):
             reach = (reach * (1.0 - world.levels[t - 1].p))[level.parent] * level.share
         total += float(reach @ (level.p * level.crash))
     assert total == pytest.approx(world.crash_rate, rel=1e-12)
-
-
-def test_without_control_the_relative_variance_is_that_of_a_share(world):
-    plain = [Proposal(np.repeat(level.p[:, None], 3, 1), np.zeros(len(level.p), bool)) for level in world.levels]
-    assert world.relvar(plain) == pytest.approx(1.0 / world.crash_rate - 1.0, rel=1e-12)
-    assert world.draw(plain, 100, np.random.default_rng(1)).log_weight == pytest.approx(0.0, abs=1e-12)
 
 
 @pytest.mark.parametrize(("recursive", "epsilon"), [(True, 0.1), (False, 0.9)])
@@ -73,16 +67,6 @@ def test_the_case_is_answered(world, tmp_path, monkeypatch):
     assert small_case._holds(56.0, 57.0)
     assert not small_case._holds(82.7, 25_929.0)
     assert not small_case._holds(None, 57.0)
-
-
-def test_ratios_on_record_multiply_to_the_weight_of_each_function(world):
-    """Up to nine control steps: Π q_j/q_alpha is what log_q and log_weight say of q_j and p."""
-    block = world.draw(world.proposals(0.5, recursive=True), 3_000, np.random.default_rng(SEED))
-    short = block.n_control_steps <= 9
-    assert short.any()
-    products = block.first_ratios.prod(axis=1)[short]
-    controlled = np.exp(block.log_q + block.log_weight[:, None])[short]
-    np.testing.assert_allclose(products, controlled, rtol=1e-9)
 
 
 def test_who_crashes_is_what_a_plain_roll_out_says():
