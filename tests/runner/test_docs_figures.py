@@ -1,8 +1,7 @@
-"""The weights of `harness.read` give the rate of every method, as docs/records.md has it; docs/limits.md too."""
+"""The weights of `harness.read` give the rate of every method, as docs/records.md has it."""
 
 from __future__ import annotations
 
-import json
 import re
 from pathlib import Path
 
@@ -10,7 +9,6 @@ import numpy as np
 import pytest
 
 import harness
-from benchmarks.limits import limits
 from tests.runner.test_shells_runs import SHELLS
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -40,13 +38,3 @@ def test_the_weights_give_the_rate_of_every_method(method, campaign, run_here, t
     assert (plain == pytest.approx(rate, rel=1e-9)) == (method != "shells")
     exec(LINES.replace("runs/hard-braking", str(result.folder)), {})
     assert float(capsys.readouterr().out.split()[-1]) == pytest.approx(rate, rel=1e-9)
-
-
-def test_the_figures_of_the_limits_come_out_of_another_run(campaign, run_here, tmp_path):
-    """A small pool and few tests: within six standard errors, and five per cent for the pool, of what is printed."""
-    found = limits(run_here(campaign(*SHELLS, *TWIN, "seed=5"), tmp_path / "run").folder)
-    printed = json.loads((DOCS / "validation" / "limits.json").read_text())
-    assert found["of_the_tests"] == printed["of_the_tests"]
-    assert found["of_the_rate"].keys() == printed["of_the_rate"].keys()
-    for name, (share, error) in found["of_the_rate"].items():
-        assert share == pytest.approx(printed["of_the_rate"][name][0], abs=6.0 * (error or 0.03) + 0.05), name
