@@ -1,4 +1,4 @@
-"""Arrow tables into blocks: the same numbers come back, and damaged tables name the place."""
+"""Blocks, and Arrow tables into them: the same numbers come back, and damaged tables name the place."""
 
 import numpy as np
 import pyarrow as pa
@@ -12,6 +12,7 @@ from studies.chains.sampler import draw
 from tests.chains.seed import SEED
 
 from .run_folder import episodes_table, moments_table
+from .small_blocks import block as made
 
 CHAIN = overtaking("ten steps", skill=0.5, surrogates=[0.5, 0.2], level=0.02, horizon=11)
 
@@ -23,6 +24,17 @@ def drawn(method: str):
 def read(block, *, episodes=None, moments=None):
     episodes = episodes_table(block) if episodes is None else episodes
     return block_from_tables(episodes, moments, method=block.drawn.method, alpha=block.drawn.alpha)
+
+
+def without(table: pa.Table, row: int) -> pa.Table:
+    return pa.concat_tables([table.slice(0, row), table.slice(row + 1)])
+
+
+def without_weight(episodes: pa.Table, row: int) -> pa.Table:
+    weights = episodes["log_weight"].to_numpy().copy()
+    weights[row] = np.nan
+    column = episodes.schema.get_field_index("log_weight")
+    return episodes.set_column(column, episodes.schema.field(column), pa.array(weights))
 
 
 @pytest.mark.parametrize("method", ["nde", "forced", "step_mixture", "episode_mixture"])
@@ -55,49 +67,27 @@ def test_a_failed_episode_may_lack_its_weight_and_its_moments():
     failed = np.zeros(400, dtype=bool)
     failed[np.argmax(~block.crash)] = True
     at = int(np.argmax(failed))
-    table = episodes_table(block.ending(failed, FAILED))
-    weights = block.log_weight.copy()
-    weights[at] = np.nan
-    column = table.schema.get_field_index("log_weight")
-    table = table.set_column(column, table.schema.field(column), pa.array(weights))
     moments = moments_table(block)
     moments = moments.filter(pa.array(moments["episode"].to_numpy() != 1_000 + at))
-    back = read(block, episodes=table, moments=moments)
+    back = read(block, episodes=without_weight(episodes_table(block.ending(failed, FAILED)), at), moments=moments)
     assert back.failed[at]
     assert back.log_weight[at] == 0.0
     assert np.all(back.first_ratios[at] == 1.0)
 
 
-def damaged(change: str):
-    block = drawn("step_mixture")
-    episodes, moments = episodes_table(block), moments_table(block)
-    if change == "gap":
-        episodes = pa.concat_tables([episodes.slice(0, 10), episodes.slice(11)])
-    elif change == "empty":
-        episodes = episodes.slice(0, 0)
-    elif change == "weight":
-        nan = pa.array(np.where(np.arange(400) == 5, np.nan, block.log_weight))
-        column = episodes.schema.get_field_index("log_weight")
-        episodes = episodes.set_column(column, episodes.schema.field(column), nan)
-    elif change == "moments":
-        moments = moments.slice(0, moments.num_rows - 1)
-    elif change == "order":
-        moments = moments.take(pa.array(np.arange(moments.num_rows)[::-1]))
-    return episodes, moments, block
-
-
 @pytest.mark.parametrize(
-    ("change", "text"),
+    ("damage", "text"),
     [
-        ("gap", "row 10: found episode 1011 after episode 1009"),
-        ("empty", "no rows"),
-        ("weight", "episode 1005: found log_weight nan"),
-        ("moments", "moments, episode 1399: found"),
-        ("order", "in order"),
+        (lambda episodes, moments: (without(episodes, 10), moments), "row 10: found episode 1011 after episode 1009"),
+        (lambda episodes, moments: (episodes.slice(0, 0), moments), "no rows"),
+        (lambda episodes, moments: (without_weight(episodes, 5), moments), "episode 1005: found log_weight nan"),
+        (lambda episodes, moments: (episodes, moments.slice(0, len(moments) - 1)), "moments, episode 1399: found"),
+        (lambda episodes, moments: (episodes, moments.take(pa.array(range(len(moments))[::-1]))), "in order"),
     ],
 )
-def test_damaged_tables_name_the_place(change, text):
-    episodes, moments, block = damaged(change)
+def test_damaged_tables_name_the_place(damage, text):
+    block = drawn("step_mixture")
+    episodes, moments = damage(episodes_table(block), moments_table(block))
     with pytest.raises(RunFolderError, match=text):
         read(block, episodes=episodes, moments=moments)
 
@@ -106,3 +96,25 @@ def test_records_of_another_campaign_are_refused():
     block = drawn("step_mixture")
     with pytest.raises(RunFolderError, match="column log_q"):
         block_from_tables(episodes_table(block), None, method="step_mixture", alpha=[0.2, 0.3, 0.5])
+
+
+def test_weighted_crashes_and_ratios():
+    some = made([True, False], [-1.0, -2.0], log_q=np.array([[1.0, -np.inf], [2.0, 0.0]]))
+    np.testing.assert_allclose(some.weighted_crashes(), [np.exp(-1.0), 0.0])
+    np.testing.assert_allclose(some.mixture_ratios(), [[1.0, 0.0], [1.0, np.exp(-2.0)]])
+
+
+def test_take_keeps_indices_right():
+    some = made([True, False, True], first_episode=40, first_ratios=np.ones((3, 9, 2)))
+    part = some.take(slice(1, 3))
+    assert (part.first_episode, part.crash.tolist(), part.first_ratios.shape) == (41, [False, True], (2, 9, 2))
+    with pytest.raises(ValueError, match="step 1"):
+        some.take(slice(None, None, 2))
+
+
+@pytest.mark.parametrize(
+    ("change", "text"), [({"log_q": np.zeros((2, 5))}, "log_q has shape"), ({"log_weight": [0.0, np.nan]}, "NaN")]
+)
+def test_contradictions_are_refused(change, text):
+    with pytest.raises(ValueError, match=text):
+        made([True, False], **change)

@@ -58,16 +58,3 @@ def test_control_that_never_acted_leaves_the_plain_mean():
 def test_fewer_tests_than_columns_claim_no_precision():
     one = draw(CHAIN, "episode_mixture", 1, np.random.default_rng(SEED))
     assert fed(MixtureCv(), [one]).result(0.9).std_error == np.inf
-
-
-def test_a_component_that_cannot_draw_an_episode_counts_minus_one():
-    part = draw(CHAIN, "episode_mixture", 500, np.random.default_rng(SEED))
-    assert np.all(part.mixture_ratios()[~part.cut_in, 0] == 0.0)
-    assert np.isfinite(fed(MixtureCv(), [part]).result(0.9).crash_rate)
-
-
-@pytest.mark.parametrize("method", ["nde", "forced", "step_mixture"])
-def test_other_methods_are_refused_with_the_reason(method):
-    reason = MixtureCv.refusal(block([True], method=method))
-    assert reason is not None
-    assert "episode mixture" in reason

@@ -69,30 +69,19 @@ def test_the_cap_comes_from_the_design_then_from_the_paths_then_from_weights():
         assert unknown.sums.cap()[1] in unknown.result(0.9).method
 
 
-def test_a_weight_above_the_designs_cap_is_an_alarm():
-    estimate = nade(block([True] * 60, [0.0] * 60, method="forced", weight_cap=1e-3)).result(0.9)
-    assert any("contradict the campaign" in warning for warning in estimate.warnings)
-
-
-def test_what_a_user_must_be_told():
-    estimate = nade(block([True] * 60, [0.0] + [-9.0] * 59)).result(0.9)
-    text = " ".join(estimate.warnings)
-    assert "effective sample size" in text
-    assert "one crash carries" in text
-    assert "weights of these tests are unbounded" in estimate.cautions[0]
-    assert estimate.warnings[0] == estimate.cautions[0]
-    assert (estimate.precision, finite_json(estimate.shown)["rhw"]) == (math.inf, None)
-    assert "crashes were sampled" not in text
-    assert "only 3 crashes" in " ".join(nade(block([True] * 3)).result(0.9).warnings)
-    assert not nade(block([True] * 60, method="nde", weight_cap=1.0)).result(0.9).warnings
-
-
-def test_nde_is_for_naturalistic_tests_only():
-    assert Nde.refusal(block([True], method="nde")) is None
-    assert "step_mixture" in (Nde.refusal(block([True])) or "")
-
-
-def test_nothing_gives_no_estimate():
-    for state in (Nade(), Nde()):
-        with pytest.raises(ValueError, match="at least one episode"):
-            state.result(0.9)
+@pytest.mark.parametrize(
+    ("weights", "cap", "told"),
+    [
+        ([0.0] + [-9.0] * 59, None, ["effective sample size", "one crash carries", "weights of these tests are unbou"]),
+        ([0.0] * 60, 1e-3, ["contradict the campaign"]),
+        ([0.0] * 3, 1.0, ["only 3 crashes"]),
+        ([0.0] * 60, 1.0, []),
+    ],
+)
+def test_what_a_user_must_be_told(weights, cap, told):
+    method = "step_mixture" if cap is None else "forced"
+    estimate = nade(block([True] * len(weights), weights, method=method, weight_cap=cap)).result(0.9)
+    assert all(any(part in warning for warning in estimate.warnings) for part in told)
+    assert bool(estimate.warnings) == bool(told)
+    assert list(estimate.warnings[: len(estimate.cautions)]) == list(estimate.cautions)
+    assert (estimate.precision == math.inf) == (cap != 1.0)

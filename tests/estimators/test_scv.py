@@ -6,7 +6,16 @@ import numpy as np
 import pytest
 
 from harness.estimators.block import Block
-from harness.estimators.scv import CHUNK_ROWS, Scv, Stratum, fill_product_columns, n_columns, steps_used
+from harness.estimators.scv import (
+    CHUNK_ROWS,
+    Scv,
+    Stratum,
+    empty_factor,
+    fill_product_columns,
+    fold_rows,
+    n_columns,
+    steps_used,
+)
 from harness.estimators.weighted import Nade
 from studies.chains.chain import frequent_decisive, overtaking, panel
 from studies.chains.sampler import blocks
@@ -37,7 +46,7 @@ def algorithm_1(parts: list[Block]) -> tuple[float, float, dict[int, tuple[int, 
         z.append(y[rows] - centred @ coefficients[1:])
         rank = int(np.linalg.matrix_rank(centred)) if products else 0
         strata[int(level)] = (int(rows.sum()), len(products), rank)
-    return estimate, float(np.var(np.concatenate(z), ddof=1)), strata
+    return estimate, float(np.var(np.concatenate(z), ddof=1)) if n > 1 else 0.0, strata
 
 
 @pytest.mark.parametrize("chain", [SMALL, frequent_decisive(), panel()[1]], ids=["small", "decisive", "two surrogates"])
@@ -105,7 +114,7 @@ def test_columns_that_never_vary_explain_nothing():
     assert fit.residual_squares == pytest.approx(np.sum((y - y.mean()) ** 2), rel=1e-12)
 
 
-@pytest.mark.parametrize("n", [2, 31, 33, 34, 35, 100])
+@pytest.mark.parametrize("n", [1, 2, 31, 33, 34, 35, 100])
 def test_a_factor_of_few_rows_fits_as_the_square_one_does(n):
     rng = np.random.default_rng(n)
     ratios, y = rng.uniform(0.5, 1.5, size=(n, 9, 3)), rng.exponential(size=n)
@@ -117,14 +126,6 @@ def test_a_factor_of_few_rows_fits_as_the_square_one_does(n):
     assert (fit.n, fit.n_columns, fit.rank) == strata[5]
     assert fit.intercept == pytest.approx(np.mean(y), rel=1e-12)
     assert fit.residual_squares == pytest.approx(var_z * (n - 1), rel=1e-8, abs=1e-15)
-
-
-def test_one_episode_is_its_own_mean_with_nothing_left():
-    stratum = Stratum(5)
-    stratum.add(np.full((1, 9, 3), 1.2), np.array([0.25]))
-    fit = stratum.fit()
-    assert (fit.n, fit.n_columns, fit.rank, fit.residual_squares) == (1, 32, 0, 0.0)
-    assert fit.intercept == pytest.approx(0.25, rel=1e-12)
 
 
 def test_columns_are_products_in_the_order_of_vec():
@@ -143,8 +144,18 @@ def test_columns_stay_within_729(level, surrogates, steps, columns):
     assert n_columns(level, surrogates) == columns
 
 
-def test_is_refused_without_moments_or_for_other_methods():
-    assert "first_9" in (Scv.refusal(block([True])) or "")
-    assert "step mixture" in (Scv.refusal(block([True], method="forced")) or "")
-    with pytest.raises(AttributeError, match="first_ratios"):
-        Scv().add(block([True]))
+@pytest.mark.parametrize("k", [1, 5, 33, 100])
+def test_rows_folded_in_blocks_have_the_factor_of_the_whole_matrix(k):
+    matrix = np.random.default_rng(k).normal(size=(300, k)) * np.logspace(0, 6, k)
+    factor = empty_factor(k)
+    for rows in np.split(matrix, [1, 40, 40, 170]):
+        fold_rows(factor, np.array(rows, order="F"))
+    expected = np.linalg.qr(matrix, mode="r")
+    np.testing.assert_allclose(np.abs(factor), np.abs(expected), rtol=0, atol=1e-12 * np.abs(expected).max())
+    assert np.array_equal(factor, np.triu(factor))
+
+
+@pytest.mark.parametrize(("k", "order"), [(3, "C"), (4, "F")])
+def test_arrays_that_would_be_misread_are_refused(k, order):
+    with pytest.raises(ValueError, match="Fortran"):
+        fold_rows(empty_factor(k), np.ones((4, 3), order=order))

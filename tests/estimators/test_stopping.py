@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from harness.campaign.sections import Run, Stop
 from harness.estimators import StopRule, accumulator
+from harness.estimators.answer import ending
 from harness.estimators.stopping import LOOK_RATIO, Decision, look_grid
 from harness.strata import ASSUMPTION_FREE
 from studies.chains.chain import frequent_decisive
@@ -38,13 +39,6 @@ def test_looks_are_shard_boundaries_on_a_geometric_grid(n_episodes, shard_size):
         assert b <= a * LOOK_RATIO + 2 * shard_size
 
 
-def test_looks_thin_out():
-    looks = look_grid(10_000_000, range(5_000, 10_000_001, 5_000))
-    assert looks[:4] == (5_000, 10_000, 15_000, 20_000)
-    assert len(looks) < 70
-    assert looks[-2] / looks[-3] == pytest.approx(LOOK_RATIO, rel=0.01)
-
-
 def test_long_runs_have_some_200_shards():
     """The first are of the usual size; one that is given stays."""
     ends = Run().shard_ends(10_000_000)
@@ -52,26 +46,10 @@ def test_long_runs_have_some_200_shards():
     assert Run().shard_ends(170_000) == ends[: len(Run().shard_ends(170_000))]
     assert len(Run().shard_ends(10**8)) < 300
     assert len(Run(shard_size=10).shard_ends(10**9)) == 10**8
-    looks = look_grid(10_000_000, ends)
-    assert set(looks[:-1]) <= set(ends)
-    assert 40 < len(looks) < 70
-
-
-def test_two_consecutive_passes_are_needed():
-    rule = StopRule(Stop(episodes=100_000, rhw=0.3, min_crashes=10), "forced", ENDS)
-    pattern = [True, False, True, True]
-    answers = [rule.observe(n, passing(n, rhw=0.2 if ok else 0.4)) for n, ok in zip(rule.looks, pattern, strict=False)]
-    assert answers == [False, False, False, True]
-    assert rule.look.stopped
-    with pytest.raises(ValueError, match="no look is due"):
-        rule.observe(rule.looks[4], passing(rule.looks[4]))
-
-
-def test_too_few_crashes_never_stop():
-    rule = StopRule(Stop(episodes=2_000, rhw=0.3, min_crashes=50), "forced", ENDS)
-    answers = [rule.observe(n, passing(n, n_crashes=49)) for n in rule.looks]
-    assert answers == [False] * (len(rule.looks) - 1) + [True]
-    assert not rule.look.stopped
+    for shards in (ends, range(5_000, 10_000_001, 5_000)):
+        looks = look_grid(10_000_000, shards)
+        assert set(looks[:-1]) <= set(shards)
+        assert 40 < len(looks) < 70
 
 
 @pytest.mark.parametrize(("weight_cap", "stops"), [(59.0, True), (61.0, False), (math.inf, False)])
@@ -89,17 +67,6 @@ def test_without_a_precision_the_budget_decides():
     assert answers == [False] * (len(rule.looks) - 1) + [True]
     assert rule.looks[-1] == 1_050
     assert not rule.look.stopped
-
-
-def test_looking_elsewhere_is_refused():
-    rule = StopRule(Stop(episodes=10_000, rhw=0.3), "nde", ENDS)
-    with pytest.raises(ValueError, match="no look is due"):
-        rule.observe(300, passing(300))
-    with pytest.raises(ValueError, match="no look is due"):
-        rule.observe(200, passing(400))
-    rule.observe(200, passing(200))
-    with pytest.raises(ValueError, match="no look is due"):
-        rule.observe(200, passing(200))
 
 
 def test_watches_the_methods_own_estimator_unless_told_otherwise():
@@ -126,46 +93,80 @@ def test_the_same_campaign_stops_at_the_same_test(method):
     assert first[0] % SHARD == 0
 
 
+def test_looking_elsewhere_is_refused():
+    rule = StopRule(Stop(episodes=10_000, rhw=0.3, min_crashes=10), "nde", ENDS)
+
+    def refused(n: int, of: int) -> None:
+        with pytest.raises(ValueError, match="no look is due"):
+            rule.observe(n, passing(of))
+
+    refused(300, 300)
+    refused(200, 400)
+    rule.observe(200, passing(200))
+    refused(200, 200)
+    assert rule.observe(400, passing(400))
+    refused(rule.looks[2], rule.looks[2])
+
+
+FEW, WIDE, HEAVY = {"n_crashes": 5}, {"rhw": 0.4}, {"weight_cap": 1e9}
+WRONG = {"cautions": ("unbounded",)}
+
+
+@pytest.mark.parametrize(
+    ("looks", "reached", "unmet"),
+    [
+        ([{}, {}], True, ()),
+        ([WIDE, FEW, {}, {}], True, ("stop.min_crashes (50)",)),
+        ([FEW, WIDE, {}, {}], True, ("stop.rhw (0.3)",)),
+        ([WIDE, {}, WIDE, {}, {}], True, ("stop.rhw (0.3)",)),
+        ([HEAVY, {}, {}], True, ("stop.rhw (0.3) for one more crash of the largest possible weight",)),
+        ([FEW, FEW, FEW], False, ("stop.min_crashes (50)",)),
+        ([WIDE | FEW, WIDE | FEW], False, ("stop.rhw (0.3)", "stop.min_crashes (50)")),
+        ([WIDE, {}], False, ("the same at a second look",)),
+        ([WRONG, WRONG, WRONG], False, ("stop.rhw (0.3)",)),
+    ],
+)
+def test_two_looks_in_turn_must_pass_and_what_was_missing_is_remembered(looks, reached, unmet):
+    rule = StopRule(Stop(episodes=SHARD * len(looks), rhw=0.3, min_crashes=50), "forced", ENDS)
+    ended = [rule.observe(n, replace(passing(n), **of)) for n, of in zip(rule.looks, looks, strict=True)]
+    assert ended == [False] * (len(looks) - 1) + [True]
+    assert (rule.look.stopped, rule.look.unmet) == (reached, unmet)
+
+
+BOTH = ("stop.rhw (0.1)", "stop.min_crashes (50)")
+
+
+@pytest.mark.parametrize(
+    ("stopped_by", "unmet", "said"),
+    [
+        ("rhw", BOTH[1:], ": the last condition to be met was stop.min_crashes (50)."),
+        ("rhw", (), ": every condition was met at the first look."),
+        ("episodes", None, ": stop.episodes was all that was asked for."),
+        ("episodes", BOTH, " without stop.rhw (0.1) and stop.min_crashes (50): stop.episodes was spent; "),
+        ("pool_error", BOTH[:1], " without stop.rhw (0.1): the pool's own error alone is wider; "),
+        ("pool", None, ": all cut-ins that the pool keeps of a shell were tested; "),
+    ],
+)
+def test_every_end_has_its_sentence(stopped_by, unmet, said):
+    text = ending(stopped_by, 46_735, unmet or (), precision_asked=unmet is not None)
+    assert text.startswith("Stopped after 46,735 tests" + said)
+
+
 RATES = st.floats(1e-9, 1e-3)
 
 
-@given(limit=RATES, one=RATES, other=RATES)
-def test_a_verdict_says_that_the_whole_interval_is_on_one_side(limit, one, other):
+@given(limit=RATES, one=RATES, other=RATES, contradicted=st.booleans())
+def test_a_verdict_says_that_the_whole_interval_is_on_one_side(limit, one, other, contradicted):
+    """A statement that tests contradict accepts nothing and still rejects."""
     low, high = sorted((one, other))
-    verdict = Decision(limit, ASSUMPTION_FREE, 0.95, low, high).verdict
-    assert (verdict == "undecided") == (low <= limit <= high)
-    assert (verdict == "accepted") == (high < limit)
+    found = Decision(limit, "library", 0.95, low, high, contradicted=contradicted)
+    assert (found.verdict == "rejected") == (low > limit)
+    assert (found.verdict == "accepted") == (high < limit and not contradicted)
+    assert found.is_final == (not low <= limit <= high)
+    assert ("does not do what statement library assumes" in found.sentence) == (contradicted and low <= limit)
 
 
-@pytest.mark.parametrize(
-    ("interval", "sentence"),
-    [
-        (
-            (1e-7, 1.9e-7),
-            "ACCEPTED: with confidence 0.95 the crash rate is below 2e-07 per test (upper limit 1.9e-07).",
-        ),
-        ((3e-7, 4e-7), "REJECTED: with confidence 0.95 the crash rate is above 2e-07 per test (lower limit 3e-07)."),
-        (
-            (1e-7, 4e-7),
-            "UNDECIDED: whether the crash rate is below 2e-07 per test is not known; it may be 1e-07 as well as 4e-07.",
-        ),
-    ],
-)
-def test_it_is_said_in_a_sentence(interval, sentence):
-    assert Decision(2e-7, ASSUMPTION_FREE, 0.95, *interval).sentence == sentence
-
-
-def test_what_a_statement_decides_says_so():
-    found = Decision(2e-7, "library", 0.95, 0.0, 1e-7)
-    assert "the crash rate, given statement library, is below" in found.sentence
-    assert found.to_json()["verdict"] == "accepted"
-
-
-@pytest.mark.parametrize(
-    ("interval", "verdict", "final"),
-    [((1e-8, 1e-7), "undecided", True), ((1e-7, 3e-7), "undecided", False), ((3e-7, 4e-7), "rejected", True)],
-)
-def test_a_statement_that_tests_contradict_accepts_nothing_and_still_rejects(interval, verdict, final):
-    found = Decision(2e-7, "need-based", 0.95, *interval, contradicted=True)
-    assert (found.verdict, found.is_final) == (verdict, final)
-    assert ("does not do what statement need-based assumes" in found.sentence) == (verdict == "undecided")
+def test_it_is_said_in_a_sentence():
+    said = "ACCEPTED: with confidence 0.95 the crash rate{} is below 2e-07 per test (upper limit 1.9e-07)."
+    for statement, given_what in ((ASSUMPTION_FREE, ""), ("library", ", given statement library,")):
+        assert Decision(2e-7, statement, 0.95, 1e-7, 1.9e-7).sentence == said.format(given_what)
