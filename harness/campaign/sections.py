@@ -130,8 +130,8 @@ class ShellSettings(Section):
         description="sequential: stop at the first interval that is narrow enough, which biases a rate that is only "
         "roughly known; two_phase: first tests plan how many more there are, and these alone are reported",
     )
-    first_tests: Whole | None = Field(
-        None, ge=1, le=10_000, description="tests of each shell before any is preferred; by its probability"
+    first_tests: Annotated[int, Field(ge=1, le=10_000), BeforeValidator(whole)] | None = Field(
+        None, description="tests of each shell before any is preferred; by its probability"
     )
     smallest_round: Whole = Field(
         1,
@@ -250,8 +250,8 @@ class Stop(Section):
     )
     confidence: float = Field(0.9, gt=0.0, lt=1.0, description="level of every interval")
     estimator: EstimatorName | None = Field(None, description="whose RHW is watched; default: the method's own")
-    min_crashes: Whole | None = Field(
-        None, ge=1, description="sampled crashes needed before RHW may stop the campaign; 100, with shells 1"
+    min_crashes: Annotated[int, Field(ge=1), BeforeValidator(whole)] | None = Field(
+        None, description="sampled crashes needed before RHW may stop the campaign; 100, with shells 1"
     )
 
 
