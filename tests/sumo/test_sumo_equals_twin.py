@@ -59,15 +59,8 @@ def hopeless_starts() -> np.ndarray:
     return np.array(rows, STATE_DTYPE)
 
 
-METHODS = (
-    MIXTURE,
-    "forced_without_shim",
-    "forced_drawn_in_every_step",
-    "published",
-    "bv_into_lv",
-    "vanilla",
-    "vanilla_bv_into_lv",
-)
+METHODS = (MIXTURE, "forced_without_shim", "forced_drawn_in_every_step", "published", "bv_into_lv")
+VANILLA = ("vanilla", "vanilla_bv_into_lv")
 SMALL = ("five_in_64_cells", "five_in_64_cells_without_shim", "late_under_step_mixture")
 
 
@@ -90,7 +83,7 @@ def jobs(smoke) -> dict[str, Job]:
     small = (Job(smoke(forced), 5, 64), Job(smoke(forced), 5, 64, shim=False), Job(late, 60, 16))
     of_avs = {name: Job(smoke(forced, f"av={av}"), EPISODES, 32) for name, av in AVS.items()}
     of_avs |= {name: Job(smoke(forced, *of), 2 * EPISODES, 32) for name, of in LATERAL.items()}
-    return {**dict(zip((*METHODS, *SMALL), (*of_methods, *small), strict=True)), **of_avs}
+    return {**dict(zip((*METHODS, *VANILLA, *SMALL), (*of_methods, *small), strict=True)), **of_avs}
 
 
 @pytest.fixture(scope="module")
@@ -104,14 +97,14 @@ def twins(jobs) -> dict[str, Shard]:
     return {name: run_episodes(job, TwinWorld(48)) for name, job in jobs.items()}
 
 
-@pytest.mark.parametrize("name", [*METHODS, *SMALL, *AVS, *LATERAL])
+@pytest.mark.parametrize("name", [*METHODS, *VANILLA, *SMALL, *AVS, *LATERAL])
 def test_sumo_and_twin_agree_in_every_bit(name, recordings, twins):
     assert differences(motions_seen(recordings[name]), motions_computed(twins[name])) == {}
     assert np.array_equal(recordings[name]["outcome"], twins[name].results.episode["outcome"])
 
 
-def test_the_episodes_compared_are_many_and_of_every_kind(jobs, twins):
-    exact = np.concatenate([twins[name].results.episode for name in METHODS if not jobs[name].vanilla])
+def test_the_episodes_compared_are_many_and_of_every_kind(twins):
+    exact = np.concatenate([twins[name].results.episode for name in METHODS])
     crashed, cut_in = exact["outcome"] == CRASH, exact["cut_in_step"] >= 0
     assert exact.size >= 1_000
     assert crashed.sum() >= 200
@@ -122,6 +115,9 @@ def test_the_episodes_compared_are_many_and_of_every_kind(jobs, twins):
     assert vanilla.size >= 200
     assert (vanilla["outcome"] == CRASH).sum() >= 50
     assert ((vanilla["cut_in_step"] >= 0) & (vanilla["outcome"] != CRASH)).sum() >= 50
+    speeds = [trace[..., 1] for name in ("mixture", "vanilla") for trace in twins[name].traces.values()]
+    assert any(((v[1:] == 0.0) & (v[:-1] > 0.0)).any() for v in speeds), "somebody brakes to a standstill"
+    assert any(((v[1:] > 0.0) & (v[:-1] == 0.0)).any() for v in speeds), "somebody drives off"
 
 
 def test_among_cut_ins_that_take_time_are_side_contacts_and_vehicles_that_have_passed(twins):
@@ -131,12 +127,6 @@ def test_among_cut_ins_that_take_time_are_side_contacts_and_vehicles_that_have_p
     assert ((episode["outcome"] == CRASH) & at_overlap).sum() >= 5
     seen = twins["seen"].results.episode
     assert np.unique(seen["lead_steps"]).size >= 20
-
-
-def test_vehicles_that_brake_to_a_standstill_and_drive_off_are_among_them(twins):
-    speeds = [trace[..., 1] for name in ("mixture", "vanilla") for trace in twins[name].traces.values()]
-    assert sum(int(((v[1:] == 0.0) & (v[:-1] > 0.0)).sum()) for v in speeds) >= 1
-    assert sum(int(((v[1:] > 0.0) & (v[:-1] == 0.0)).sum()) for v in speeds) >= 1
 
 
 @pytest.mark.parametrize(("vehicle", "toward"), [(LV, 0.0), (BV, 0.0), (BV, 100.0), (AV, 100.0)])

@@ -12,45 +12,42 @@ from harness.vocabulary import AV, BV, LV, VEHICLES
 CELLS, ROUNDS, SEED = 64, 40, 20_261_121
 
 
+def log_uniform(random: np.random.Generator, low: float, high: float, shape: int | tuple[int, int]) -> np.ndarray:
+    return np.exp(random.uniform(np.log(low), np.log(high), shape))
+
+
 def random_positions(random: np.random.Generator) -> np.ndarray:
     """Positions (CELLS, 3) at which nobody touches anybody; near the road's start floats are fine enough to differ."""
     x = np.empty((CELLS, 3))
-    x[:, AV] = np.exp(random.uniform(np.log(0.1), np.log(3000.0), CELLS))
-    x[:, BV] = np.exp(random.uniform(np.log(0.1), np.log(2000.0), CELLS))
+    x[:, AV] = log_uniform(random, 0.1, 3000.0, CELLS)
+    x[:, BV] = log_uniform(random, 0.1, 2000.0, CELLS)
     x[:, LV] = x[:, BV] + random.uniform(100.0, 1500.0, CELLS)
     return x
 
 
-def any_change(random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    return random.uniform(0.0, 45.0, (CELLS, 3)), random.uniform(0.0, 45.0, (CELLS, 3))
+def driven(random: np.random.Generator, before: np.ndarray) -> np.ndarray:
+    return np.maximum(before + random.integers(-100, 51, before.shape) / 5.0 * STEP_S, 0.0)
 
 
-def driving(random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    speed = random.uniform(0.0, 45.0, (CELLS, 3))
-    acceleration = random.integers(-100, 51, (CELLS, 3)) / 5.0
-    return speed, np.maximum(speed + acceleration * STEP_S, 0.0)
-
-
-def braking_to_a_stop(random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    return random.uniform(0.0, 2.0, (CELLS, 3)), np.zeros((CELLS, 3))
-
-
-def stopping_from_any_speed(random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    return np.exp(random.uniform(np.log(1e-12), np.log(45.0), (CELLS, 3))), np.zeros((CELLS, 3))
-
-
-def driving_off(random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    return np.zeros((CELLS, 3)), random.uniform(0.0, 2.0, (CELLS, 3))
+SHAPE = CELLS, 3
+SPEEDS = {
+    "any change": lambda random: (random.uniform(0.0, 45.0, SHAPE), random.uniform(0.0, 45.0, SHAPE)),
+    "driving": lambda random: (before := random.uniform(0.0, 45.0, SHAPE), driven(random, before)),
+    "braking to a stop": lambda random: (random.uniform(0.0, 2.0, SHAPE), np.zeros(SHAPE)),
+    "stopping from any speed": lambda random: (log_uniform(random, 1e-12, 45.0, SHAPE), np.zeros(SHAPE)),
+    "driving off": lambda random: (np.zeros(SHAPE), random.uniform(0.0, 2.0, SHAPE)),
+}
+"""Speeds before and after a step."""
 
 
 @pytest.mark.parametrize("vanilla", [False, True])
-@pytest.mark.parametrize("speeds", [any_change, driving, braking_to_a_stop, stopping_from_any_speed, driving_off])
+@pytest.mark.parametrize("speeds", SPEEDS)
 def test_a_step_of_sumo_is_the_formula_in_every_bit(speeds, vanilla, open_world):
     random = np.random.default_rng(SEED)
     world = open_world(CELLS, vanilla=vanilla)
     everywhere, nobody = np.arange(CELLS), np.zeros(CELLS, np.int8)
     for _ in range(ROUNDS):
-        x, (before, after) = random_positions(random), speeds(random)
+        x, (before, after) = random_positions(random), SPEEDS[speeds](random)
         world.place(everywhere, x, before)
         world.step(after, nobody)
         for k in range(CELLS):

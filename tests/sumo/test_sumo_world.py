@@ -10,13 +10,13 @@ from pathlib import Path
 import libsumo
 import numpy as np
 import pytest
-import traci
 
 from harness.episode.loop import EpisodeLoop, RecordPolicy, Shard
 from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, WorldDisagreementError
 from harness.resolved import resolve
 from harness.runner.resolve import prepare
 from harness.vocabulary import AV, BV, CRASH, LV
+from harness.worlds.shim import shim_library
 from harness.worlds.twin import TwinWorld
 
 X, V = (np.tile(values, (8, 1)) for values in ([300.0, 200.0, 100.0], [30.0, 28.0, 35.0]))
@@ -57,30 +57,17 @@ def test_closing_a_world_twice_leaves_the_next_one_alone(open_world, driving):
     second = driving(2)
     first.close()
     drive(second)
-    with pytest.raises(CampaignError, match="already runs"):
-        open_world(2)
 
 
-def test_without_its_extra_the_gui_is_refused_in_words(open_world, monkeypatch):
+def test_without_its_extra_or_a_screen_the_gui_is_refused_in_words(open_world, monkeypatch):
     monkeypatch.setitem(sys.modules, "sumo", None)
-    with pytest.raises(CampaignError, match=r"--gui: found no sumo-gui; expected the extra 'sumo'"):
+    with pytest.raises(CampaignError, match=r"found no sumo-gui; expected the extra"):
         open_world(1, gui=True)
-    assert open_world(1).n_cells == 1
-
-
-def test_without_a_screen_the_gui_is_refused_in_words(monkeypatch, open_world):
     monkeypatch.setattr("harness.worlds.sumo.sumo_program", Path)
     monkeypatch.delenv("DISPLAY", raising=False)
     with pytest.raises(CampaignError, match="DISPLAY is not set"):
         open_world(1, gui=True)
-
-    def ends_at_once(_):
-        raise traci.FatalTraCIError("Could not connect.")
-
-    monkeypatch.setenv("DISPLAY", ":99")
-    monkeypatch.setattr(traci, "start", ends_at_once)
-    with pytest.raises(CampaignError, match="DISPLAY is :99"):
-        open_world(1, gui=True)
+    assert open_world(1).n_cells == 1
 
 
 # -- a world that disobeys --
@@ -96,18 +83,21 @@ def test_a_vehicle_one_unit_in_the_last_place_off_is_noticed_at_once(victim, shi
     with pytest.raises(WorldDisagreementError, match=f"{victim}, m: found ") as raised:
         drive(world)
     assert raised.value.exit_code == EXIT_TOO_MANY_FAILED
+    assert str(pickle.loads(pickle.dumps(raised.value))) == str(raised.value)  # as a worker sends it
     found, expected = raised.value.found, raised.value.expected.split(",")[0]
     assert float.fromhex(found) == np.nextafter(float.fromhex(expected), np.inf)
 
 
-@pytest.mark.parametrize("shim", [True, False])
+@pytest.mark.parametrize(("shim", "steps"), [(True, 1), (False, 10)])
 @pytest.mark.parametrize("victim", ["LV1", "BV0", "AV2"])
-def test_a_speed_one_unit_in_the_last_place_off_is_noticed_within_ten_steps(victim, shim, driving):
-    """So small a difference does not show in a position of some 100 m; the speed itself is asked for now and then."""
+def test_a_speed_one_unit_in_the_last_place_off_is_noticed_within_ten_steps(victim, shim, steps, driving):
+    """It does not show in a position of some 100 m: the shim compares speeds always, Python asks now and then."""
+    if shim and shim_library() is None:
+        pytest.skip("no compiled shim")
     world = driving(3, shim=shim)
     libsumo.vehicle.setSpeed(victim, np.nextafter(libsumo.vehicle.getSpeed(victim), 0.0))
     with pytest.raises(WorldDisagreementError, match=f"{victim}, m"):
-        drive(world, steps=10)
+        drive(world, steps=steps)
 
 
 def test_a_speed_that_was_not_set_at_placement_is_noticed(driving, monkeypatch):
@@ -137,31 +127,20 @@ def test_a_lane_change_that_does_not_happen_is_noticed(driving, monkeypatch):
         world.step(V[:4], np.array([0, 0, 1, 0], np.int8))
 
 
-def test_a_disagreement_survives_the_way_from_a_worker_to_its_parent():
-    error = WorldDisagreementError("SUMO, BV3, m", found="0x1p0", expected="0x1p1", mend="Report it.")
-    again = pickle.loads(pickle.dumps(error))
-    assert type(again) is WorldDisagreementError
-    assert str(again) == str(error)
-
-
 # -- the collision flag and the formula --
 
 
-class BlindTwin(TwinWorld):
-    """Never flags a collision."""
+class LyingTwin(TwinWorld):
+    """Flags no collision, or one in cell 3 at its 20th step, when nobody touches anybody."""
 
-    def step(self, speed, cut_in):
-        return super().step(speed, cut_in) & False
-
-
-class NervousTwin(TwinWorld):
-    """Flags a collision in cell 3 at its 20th step, when nobody touches anybody."""
-
-    steps = 0
+    def __init__(self, n_cells, *, nervous):
+        super().__init__(n_cells)
+        self.steps, self.nervous = 0, nervous
 
     def step(self, speed, cut_in):
         self.steps += 1
-        return super().step(speed, cut_in) | ((self.steps == 20) & (np.arange(self.n_cells) == 3))
+        flag = super().step(speed, cut_in)
+        return flag | ((self.steps == 20) & (np.arange(self.n_cells) == 3)) if self.nervous else flag & False
 
 
 def run_in(world, campaign) -> Shard:
@@ -169,19 +148,14 @@ def run_in(world, campaign) -> Shard:
     return EpisodeLoop(world, prepared.policy, RecordPolicy(0, "none", 0.0)).run(500, prepared.states(500, 60))
 
 
-def test_a_crash_that_the_world_does_not_flag_stops_the_run_and_names_the_episode(smoke):
+def test_a_flag_that_the_positions_do_not_show_or_lack_stops_the_run_and_names_the_episode(smoke):
     run = run_in(TwinWorld(16), smoke()).results.episode
     crashes = {f"episode {500 + row}, step {run['n_steps'][row]}" for row in np.flatnonzero(run["outcome"] == CRASH)}
     with pytest.raises(WorldDisagreementError, match="found no collision where the positions show one") as raised:
-        run_in(BlindTwin(16), smoke())
+        run_in(LyingTwin(16, nervous=False), smoke())
     assert raised.value.where in crashes
-
-
-def test_a_flag_without_a_crash_stops_the_run_and_names_the_episode(smoke):
-    with pytest.raises(
-        WorldDisagreementError, match="episode 503, step 20: found a collision that the positions do not show"
-    ):
-        run_in(NervousTwin(16), smoke())
+    with pytest.raises(WorldDisagreementError, match="episode 503, step 20: found a collision that the positions do"):
+        run_in(LyingTwin(16, nervous=True), smoke())
 
 
 # -- cells are used again --

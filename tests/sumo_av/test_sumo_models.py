@@ -4,7 +4,7 @@ import pytest
 from harness.errors import CampaignError
 from harness.vocabulary import AV, BV, CRASH, LV
 from harness.worlds import sumo_driven
-from harness.worlds.sumo_driven import DEFAULTS, FreshWorld, SumoAvWorld, recyclable
+from harness.worlds.sumo_driven import DEFAULTS, SumoAvWorld, recyclable
 from tests.sumo_av.running import ROOT, bits, run, run_idm, run_in, sumo_av
 
 
@@ -31,11 +31,7 @@ def test_recyclable_models_move_after_many_episodes_as_in_a_fresh_simulation(mod
 
 @pytest.mark.parametrize(
     "attributes",
-    [
-        {"carFollowModel": "Krauss", "sigma": 0.5},
-        {"carFollowModel": "EIDM"},
-        {"carFollowModel": "Wiedemann"},
-    ],
+    [{"carFollowModel": "Krauss", "sigma": 0.5}, {"carFollowModel": "EIDM"}, {"carFollowModel": "Wiedemann"}],
     ids=lambda attributes: "-".join(map(str, attributes.values())),
 )
 def test_other_models_do_not_and_get_a_seeded_simulation_per_episode(attributes):
@@ -70,17 +66,11 @@ def test_lv_and_bv_move_as_with_any_other_av_and_the_av_holds_its_speed_until_th
         cut = shard.results.episode["cut_in_step"][row]
         assert np.array_equal(mine[: cut + 2, AV, :2], theirs[: cut + 2, AV, :2])
         assert (mine[: cut + 2, AV, 1] == mine[0, AV, 1]).all()
-        responded += mine[min(cut + 3, len(mine) - 1), AV, 1] != mine[0, AV, 1]
-    assert responded > 12
-
-
-def test_speeds_of_the_av_explain_its_positions_and_recorded_accelerations():
-    shard = run(sumo_av(carFollowModel="IDM"), 0, 8)
-    for trace in shard.traces.values():
-        x, v, a = trace[:, AV].T
+        x, v, a = mine[:, AV].T
         assert np.allclose(np.diff(x), 0.05 * (v[1:] + v[:-1]), atol=1e-9)
         assert np.allclose(np.diff(v), 0.1 * a[:-1], atol=1e-12)
-        assert np.abs(a[:-1]).max() > 0.5
+        responded += mine[min(cut + 3, len(mine) - 1), AV, 1] != mine[0, AV, 1]
+    assert responded > 12
 
 
 def test_collision_flag_and_formula_agree_for_an_av_that_keeps_a_gap_but_hardly_brakes():
@@ -89,31 +79,20 @@ def test_collision_flag_and_formula_agree_for_an_av_that_keeps_a_gap_but_hardly_
     assert (shard.results.episode["outcome"] == CRASH).sum() >= 5
 
 
-def test_the_speed_mode_of_a_released_av_does_not_matter_as_nothing_is_commanded(monkeypatch):
-    av = sumo_av(carFollowModel="Krauss")
-    (default,) = driven(av, [(0, 16)])
-    monkeypatch.setattr(sumo_driven, "SUMO_DECIDES", sumo_driven.OBEY)
-    (obeying,) = driven(av, [(0, 16)])
-    assert [bits(default, row) for row in range(16)] == [bits(obeying, row) for row in range(16)]
-
-
-def test_python_and_shim_move_alike():
+def test_neither_the_shim_nor_the_speed_mode_of_a_released_av_matters(monkeypatch):
+    """Nothing is commanded then."""
     av = sumo_av(carFollowModel="CACC")
-    (without,), (with_shim,) = driven(av, [(0, 12)], shim=False), driven(av, [(0, 12)])
-    assert [bits(without, row) for row in range(12)] == [bits(with_shim, row) for row in range(12)]
-
-
-def test_an_av_that_acts_from_the_start_changes_its_speed_before_the_cut_in():
-    (shard,) = driven(sumo_av(carFollowModel="IDM"), [(0, 12)], acts_before_cut_in=True)
-    assert all(trace[1, AV, 1] != trace[0, AV, 1] for trace in shard.traces.values())
+    (with_shim,), (without,) = driven(av, [(0, 12)]), driven(av, [(0, 12)], shim=False)
+    monkeypatch.setattr(sumo_driven, "SUMO_DECIDES", sumo_driven.OBEY)
+    (obeying,) = driven(av, [(0, 12)])
+    for row in range(12):
+        assert bits(with_shim, row) == bits(without, row) == bits(obeying, row)
 
 
 @pytest.mark.parametrize(
     ("attributes", "where", "words"),
     [
         ({"tao": 1.0}, "av.sumo.tao", "Did you mean 'tau'"),
-        ({"carFollowModel": "Kraus"}, "av.sumo.carFollowModel", "Did you mean 'Krauss'"),
-        ({"accel": -1.0}, "av.sumo.accel", "Must be greater than 0"),
         ({"tau": "short"}, "av.sumo.tau", "Cannot be parsed"),
         ({"sigma": 2.0, "carFollowModel": "Krauss"}, "av.sumo.sigma", "Only values between"),
         ({"length": 4.0}, "av.sumo.length", "Delete"),
@@ -127,20 +106,13 @@ def test_wrong_attributes_are_named_with_what_sumo_says(attributes, where, words
     assert caught.value.exit_code == 2
     assert words in str(caught.value)
     assert "Error" not in capfd.readouterr().err
-
-
-def test_a_world_can_be_opened_after_sumo_has_refused_a_type():
-    with pytest.raises(CampaignError):
-        SumoAvWorld(1, {"accel": -1.0})
-    SumoAvWorld(1, {}).close()
-    FreshWorld({"carFollowModel": "EIDM"}, 1).close()
+    SumoAvWorld(1, {}).close()  # as if SUMO had not been asked
 
 
 def test_documented_defaults_are_the_real_ones():
     text = (ROOT / "docs" / "sumo-av.md").read_text(encoding="utf-8")
     for name, value in DEFAULTS.items():
-        shown = value if isinstance(value, str) else f"{value:g}"
-        assert f"| `{name}` | {shown} |" in text
+        assert f"| `{name}` | {value if isinstance(value, str) else format(value, 'g')} |" in text
 
 
 @pytest.mark.parametrize(("overtakes", "speed_mps"), [(1.0, 40.0), (0.0, 26.0)])

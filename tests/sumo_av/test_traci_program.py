@@ -18,10 +18,12 @@ def assert_same_motion(shard, expected, rows):
         assert shard.traces[row][:, :, :2].tobytes() == expected.traces[row][:, :, :2].tobytes()
 
 
-def test_the_example_client_drives_like_the_built_in_idm_in_every_bit():
-    shard, expected = run(program(EXAMPLE), 0, 24, cells=8), run_idm(0, 24)
+@pytest.mark.parametrize("n", [24, 3])
+def test_the_example_client_drives_like_the_built_in_idm_in_every_bit(n):
+    """Also where some of its eight cells never get an episode and stay parked."""
+    shard, expected = run(program(EXAMPLE), 0, n, cells=8), run_idm(0, n)
     assert not shard.failures
-    assert_same_motion(shard, expected, range(24))
+    assert_same_motion(shard, expected, range(n))
 
 
 def test_commands_to_an_av_that_must_hold_its_speed_are_overruled():
@@ -41,11 +43,6 @@ def test_with_before_cut_in_controller_the_program_drives_from_the_start():
         world.close()
     assert not shard.failures
     assert shard.traces[0][3, AV, 1] < shard.traces[0][0, AV, 1] - 1.0
-
-
-def test_cells_that_never_get_an_episode_stay_parked():
-    shard, expected = run(program(EXAMPLE), 0, 3, cells=8), run_idm(0, 3)
-    assert_same_motion(shard, expected, range(3))
 
 
 def test_connecting_late_is_no_fault():
