@@ -16,7 +16,7 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from operator import methodcaller
 from pathlib import Path
 from types import FrameType
@@ -173,28 +173,6 @@ def episode_random(seed: int, episode: int) -> np.random.Generator:
     return np.random.Generator(np.random.Philox(key=seed, counter=[0, episode, AV_DRAWS, 0]))
 
 
-class EpisodeRandom(Sequence[np.random.Generator]):
-    """`episode_random` of several episodes, made when they are asked for: most controllers want none.
-
-    Each place has a generator of its own: tests to which the same index is announced may begin together.
-    """
-
-    def __init__(self, seed: int, episodes: list[int]) -> None:
-        self._seed, self._episodes = seed, episodes
-        self._made: dict[int, np.random.Generator] = {}
-
-    def __len__(self) -> int:
-        return len(self._episodes)
-
-    def __getitem__(self, i: Any) -> Any:
-        if isinstance(i, slice):
-            return [self[j] for j in range(len(self))[i]]
-        place = range(len(self))[i]
-        if place not in self._made:
-            self._made[place] = episode_random(self._seed, self._episodes[place])
-        return self._made[place]
-
-
 class VehicleHost:
     """One controller object per cell, made by ``make``.
 
@@ -293,7 +271,7 @@ class BatchHost:
 
     def start(self, cells: IntArray, _episodes: IntArray, announced: IntArray) -> Failures:
         """As `VehicleHost.start`."""
-        random = EpisodeRandom(self._seed, announced.tolist())
+        random = [episode_random(self._seed, index) for index in announced.tolist()]
         handed = read_only(cells.copy()), read_only(announced.copy())
         with self._guard:
             _, wrong = self._guard.call(START_BATCH, lambda: self._controller.start_batch(*handed, random))

@@ -133,12 +133,6 @@ class Workers:
         self._idle: list[Any] = []
         self._busy: dict[Any, _Job] = {}
 
-    def __enter__(self) -> Workers:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
     def cpus(self) -> set[str]:
         """Names of the processors of other machines that have worked: bits are promised for one family."""
         return set()

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from harness.campaign.files import load_campaign
-from harness.controllers.hosts import EpisodeRandom
+from harness.controllers.hosts import BatchHost, Guard
 from harness.errors import CampaignError
 from harness.resolved import resolve
 from harness.runner.resolve import prepare
@@ -65,11 +65,19 @@ def test_a_method_that_draws_the_path_ahead_refuses_it():
         load("episode_mixture")
 
 
-def test_tests_of_one_shadow_run_that_begin_together_have_streams_of_their_own():
+def test_tests_of_one_baseline_run_that_begin_together_have_streams_of_their_own():
     """Both are told the same index: the second was given the rest of the first one's numbers, and its test failed."""
-    random = EpisodeRandom(7, [3, 5, 3])
-    first, other, second = (stream.uniform(size=4) for stream in random)
-    np.testing.assert_array_equal(first, second)
-    assert not np.any(first == other)
-    assert random[0] is random[-3]
-    assert [stream is random[i] for i, stream in zip((1, 2), random[1:], strict=True)] == [True, True]
+    seen = []
+
+    class Draws:
+        def start_batch(self, cells, episodes, random):
+            seen.extend(stream.uniform(size=4) for stream in random)
+
+        def step_batch(self, observation): ...
+        def close(self): ...
+
+    host = BatchHost(Draws(), 7, Guard(load("nde").av.limits, None))
+    assert host.start(np.arange(3), np.arange(3), np.array([3, 5, 3])) == {}
+    host.close()
+    np.testing.assert_array_equal(seen[0], seen[2])
+    assert not np.any(seen[0] == seen[1])
