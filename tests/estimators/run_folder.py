@@ -26,32 +26,21 @@ stop:
 """
 
 
-def outcome(block: Block) -> np.ndarray:
-    names = np.full(len(block), "timeout", dtype=object)
-    names[block.crash], names[block.failed], names[block.bv_lv_contact] = "crash", "failed", "bv_lv_contact"
-    return names
-
-
 def episodes_table(block: Block) -> pa.Table:
     """The rows of an ``episodes`` shard; columns that estimates do not read are left out."""
     n, m = block.log_q.shape
     index = block.first_episode + np.arange(n)
-    codes = np.array([OUTCOMES.index(name) for name in outcome(block)], dtype=np.int8)
     columns = {
         "episode": pa.array(index),
-        "outcome": pa.DictionaryArray.from_arrays(pa.array(codes), pa.array(OUTCOMES)),
+        "outcome": pa.DictionaryArray.from_arrays(pa.array(block.outcome), pa.array(OUTCOMES)),
         "cut_in_step": pa.array(np.full(n, 7, dtype=np.int16), mask=~block.cut_in),
         "n_control_steps": pa.array(block.n_control_steps.astype(np.int16)),
         "log_weight": pa.array(block.log_weight),
         "log_p_cut_in": pa.array(block.log_p_cut_in) if "log_p_cut_in" in block.columns else pa.nulls(n, pa.float64()),
-        "log_q": pa.FixedSizeListArray.from_arrays(pa.array(block.log_q.ravel()), m) if m else _empty_lists(n),
+        "log_q": pa.array(block.log_q.tolist(), pa.list_(pa.float64(), m)),
     }
     schema = episodes_schema(m, 2)
     return pa.table(columns, schema=pa.schema([schema.field(name) for name in columns]))
-
-
-def _empty_lists(n: int) -> pa.Array:
-    return pa.array([[]] * n, pa.list_(pa.float64(), 0))
 
 
 def moments_table(block: Block) -> pa.Table:

@@ -13,7 +13,7 @@ from scipy.special import betaincinv, xlogy
 
 from harness.estimators.likelihood import Level, contrast_limit, likelihood_limit, ratio_limits, spread
 
-from .enumerated import coverage
+from .exact import coverage, covering, tilted
 
 MANY = 1e6
 """A quantile so large that the threshold for few crashes always holds."""
@@ -29,18 +29,9 @@ def both(weights, counts, level, variance=0.0):
 
 
 def closed_form(weights, crashes, tests, threshold, side):
-    """Limit of binomial strata by the two roots of a quadratic, without cancellation only in the middle."""
-    c = crashes / tests
-
-    def at(nu):
-        a = nu * weights / tests
-        root = np.sqrt((1 - a) ** 2 + 4 * a * c)
-        theta = np.where(a <= 1, 2 * c / (1 - a + root), (a - 1 + root) / (2 * np.where(a > 1, a, 1)))
-        cost = xlogy(c, c) - xlogy(c, theta) + xlogy(1 - c, 1 - c) - xlogy(1 - c, 1 - theta)
-        return weights @ theta, (tests * cost).sum() - threshold
-
-    nu = brentq(lambda nu: at(nu)[1], 0.0, side * 1e4, xtol=1e-14, rtol=1e-15)
-    return at(nu)[0]
+    """Limit of binomial strata."""
+    far = brentq(lambda nu: tilted(nu * weights / tests, crashes, tests)[1] - threshold, 0.0, side * 1e4, xtol=1e-14)
+    return weights @ tilted(far * weights / tests, crashes, tests)[0]
 
 
 def test_two_outcomes_are_a_binomial_stratum_to_nine_digits():
@@ -143,16 +134,6 @@ def test_a_ratio_is_open_where_a_vehicle_has_not_crashed():
     assert low < 1.0 < high
 
 
-def covering(truth, limits):
-    """Whether limits of counts hold the truth, up to rounding."""
-
-    def covers(counts):
-        low, high = limits(counts)
-        return low - 1e-9 <= truth <= high + 1e-9
-
-    return covers
-
-
 def difference(share, p):
     return sum(w * (a - b) for w, (a, b) in zip(p, share, strict=True))
 
@@ -239,12 +220,9 @@ def binomial(weights, crashes, tests, level, variance=0.0):
     return tuple(likelihood_limit(w, k, n, level, side, variance) for side in (-1.0, 1.0))
 
 
-def test_shares_end_at_0_and_1():
+def test_shares_end_at_0_and_1_and_without_a_crash_the_one_sided_bound_is_the_exact_one():
     assert binomial([1.0], [0], [20], LEVEL)[0] == pytest.approx(0.0, abs=1e-12)
     assert binomial([1.0], [20], [20], LEVEL)[1] == pytest.approx(1.0, abs=1e-12)
-
-
-def test_without_a_crash_the_one_sided_bound_is_the_exact_one():
     bound = likelihood_limit(np.ones(1), np.zeros(1, int), np.array([50]), Level.one_sided(0.95, 50), 1.0)
     assert bound == pytest.approx(betaincinv(1, 50, 0.95), rel=1e-9)
 
@@ -273,6 +251,7 @@ RARE = [
     ((1.3 / 40, 1.7 / 40), (40, 40), (1.0, 1.0)),
     ((0.12, 0.004), (30, 400), (1.0, 12.0)),
     ((0.9, 0.02), (20, 60), (1.0, 2.0)),
+    *((share, (12, 12, 30), (1.0, 3.0, 200.0)) for share in ((1.0, 0.3, 0.0), (0.6, 0.1, 0.002), (0.9, 0.5, 0.1))),
 ]
 
 
@@ -282,6 +261,12 @@ def test_limits_cover_where_few_crashes_decide(confidence, share, tests, weights
     level, truth = Level.two_sided(confidence), float(np.dot(weights, share))
     covers = covering(truth, lambda counts: binomial(weights, counts[:, 0], tests, level))
     assert coverage([(each,) for each in share], tests, covers) >= confidence
+
+
+def test_without_the_empty_stratum_they_do_not():
+    """The sibling that must fail: a stratum that was tested without a crash is left out of the limits."""
+    covers = covering(5.9, lambda k: binomial([1.0, 3.0, 0.0], (12, k[0, 0], 0), (12, 12, 30), Level.two_sided(0.9)))
+    assert coverage([(0.3,)], [12], covers) < 0.5
 
 
 def test_eight_strata_with_few_crashes_each_at_99_percent():

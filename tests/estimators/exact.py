@@ -1,4 +1,4 @@
-"""Coverage of limits from counts, by summing over all outcomes of small campaigns."""
+"""What limits from counts are held against: coverage summed over all outcomes, nearest shares in closed form."""
 
 import math
 from collections.abc import Callable, Iterator, Sequence
@@ -25,3 +25,22 @@ def coverage(shares: Sequence[Sequence[float]], tests: Sequence[int], covers: Ca
         if chance > 1e-8:
             covered += chance * bool(covers(np.array([counts for _, counts in drawn])))
     return covered
+
+
+def covering(truth: float, limits: Callable[[np.ndarray], tuple[float, float]]) -> Callable[[np.ndarray], bool]:
+    """Whether limits of counts hold the truth, up to rounding."""
+
+    def covers(counts: np.ndarray) -> bool:
+        low, high = limits(counts)
+        return low - 1e-9 <= truth <= high + 1e-9
+
+    return covers
+
+
+def tilted(a: np.ndarray, crashes: np.ndarray, tests: np.ndarray) -> tuple[np.ndarray, float]:
+    """Shares nearest to those seen, tilted by ``a`` per test, as roots of a quadratic; and Σ n KL of them."""
+    c = crashes / tests
+    root = np.sqrt((1 - a) ** 2 + 4 * a * c)
+    shares = np.where(a <= 1, 2 * c / (1 - a + root), (a - 1 + root) / (2 * np.where(a > 1, a, 1)))
+    cost = xlogy(c, c) - xlogy(c, shares) + xlogy(1 - c, 1 - c) - xlogy(1 - c, 1 - shares)
+    return shares, float((tests * cost).sum())
