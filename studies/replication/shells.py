@@ -281,41 +281,11 @@ class DrawnCells:
     limit_mps2: float
     mass: FloatArray
 
-    def draw(self, rng: np.random.Generator, masses: Sequence[FloatArray]) -> tuple[ShellDesign, list[FloatArray]]:
-        """The design of a new pool, and for ``masses`` (n, C) what they are on its paths, by the design's cells."""
-        rows = rng.integers(0, len(self.mass), self.template.n_paths)
-        drawn = self.mass[rows]
-        by_reference = drawn @ self._crash_of_references
-        pool = replace(
-            self.template,
-            cell_p=drawn.mean(0),
-            p_cut_in=float(drawn.sum(1).mean()),
-            reference_rate=by_reference.mean(0),
-            reference_square=(by_reference * by_reference).mean(0),
-        )
-        design = design_shells(pool, limit_mps2=self.limit_mps2)
-        groups = shells_in_strata(pool, outermost(pool, ShellSettings()), self.limit_mps2)
-        cells = cells_in_strata(pool, groups)
-        tested = np.flatnonzero(cells >= 0)
-        joined = np.zeros((tested.size, design.cell_p.size))
-        joined[np.arange(tested.size), cells[tested]] = 1.0
-        found = [of[rows][:, tested] @ joined if of is not self.mass else drawn[:, tested] @ joined for of in masses]
-        return design, found
-
-    @property
-    def _crash_of_references(self) -> FloatArray:
-        """1 where a reference crashes on a cell's cut-ins, shape (C, R)."""
-        references = np.arange(len(self.template.library.references))
-        return np.asarray((self.template.cell_references[:, None] >> references) & 1, np.float64)
-
     def crashes_outside(self, crashing: FloatArray) -> dict[str, float]:
         """Share of a crash mass by cell (n, C) that lies beyond the boundary of each statement; 0 of no crash."""
         by_cell, names = crashing.sum(0), self.template.names
-        total = by_cell.sum() or 1.0
-        places = {
-            name: names.index(each.boundary)
-            for name, each in self.template.library.statement_settings(ShellSettings()).items()
-        }
+        total, statements = by_cell.sum() or 1.0, self.template.library.statement_settings(ShellSettings())
+        places = {name: names.index(each.boundary) for name, each in statements.items()}
         return {name: float(by_cell[self.template.cell_shell > place].sum() / total) for name, place in places.items()}
 
 
@@ -332,9 +302,26 @@ class OvertakingShells:
     failing: float = 0.0
 
     def draw(self, rng: np.random.Generator) -> list[DrawnPool]:
-        """A new pool; see `Draw`."""
-        design, (mass, *crashing) = self.cells.draw(rng, [self.cells.mass, *self.crashing])
-        return [DrawnPool(design, mass, each, self.failing) for each in crashing]
+        """A new pool: its design, and what vehicles do on its paths by the design's cells; see `Draw`."""
+        of, limit = self.cells.template, self.cells.limit_mps2
+        rows = rng.integers(0, len(self.cells.mass), of.n_paths)
+        drawn = self.cells.mass[rows]
+        references = np.arange(len(of.library.references))
+        by_reference = drawn @ np.asarray((of.cell_references[:, None] >> references) & 1, np.float64)
+        pool = replace(
+            of,
+            cell_p=drawn.mean(0),
+            p_cut_in=float(drawn.sum(1).mean()),
+            reference_rate=by_reference.mean(0),
+            reference_square=(by_reference * by_reference).mean(0),
+        )
+        design = design_shells(pool, limit_mps2=limit)
+        cells = cells_in_strata(pool, shells_in_strata(pool, outermost(pool, ShellSettings()), limit))
+        tested = np.flatnonzero(cells >= 0)
+        joined = np.zeros((tested.size, design.cell_p.size))
+        joined[np.arange(tested.size), cells[tested]] = 1.0
+        mass = drawn[:, tested] @ joined
+        return [DrawnPool(design, mass, each[rows][:, tested] @ joined, self.failing) for each in self.crashing]
 
 
 class Division:
@@ -414,12 +401,12 @@ class Division:
 def equals(library: Library, population: SuperPopulation, crashing: FloatArray) -> set[str]:
     """Surrogates that crash on the same cut-ins as a vehicle (its mass of them, shape (m,)), or nearly as often."""
     rate = crashing.sum()
-    found = set()
-    for driver, name in enumerate(library.surrogates):
-        mass = population.mass * population.crashes(driver)
-        if abs(mass.sum() - rate) <= EQUAL_RATE * rate or np.array_equal(mass, crashing):
-            found.add(name)
-    return found
+    masses = {name: population.mass * population.crashes(d) for d, name in enumerate(library.surrogates)}
+    return {
+        name
+        for name, mass in masses.items()
+        if abs(mass.sum() - rate) <= EQUAL_RATE * rate or np.array_equal(mass, crashing)
+    }
 
 
 def leave_out(library: Library, names: set[str], careful_first: tuple[str, ...]) -> Library:
@@ -436,12 +423,9 @@ def leave_out(library: Library, names: set[str], careful_first: tuple[str, ...])
         candidates = [*reversed(careful_first[:place]), *careful_first[place + 1 :]]
         left = [name for name in candidates if name not in names and name != library.envelope]
         if not left:
-            raise CampaignError(
-                "campaign.pool.library",
-                f"no surrogate but the envelope, without the vehicle's equals ({', '.join(sorted(names))})",
-                "one that can be the boundary",
-                "Add a surrogate to the library, or leave this vehicle out of the experiment.",
-            )
+            found = f"no surrogate but the envelope, without the vehicle's equals ({', '.join(sorted(names))})"
+            mend = "Add a surrogate to the library, or leave this vehicle out of the experiment."
+            raise CampaignError("campaign.pool.library", found, "one that can be the boundary", mend)
         library = library.model_copy(update={"boundary": left[0]})
     return library.without(names)
 

@@ -70,7 +70,10 @@ def subjects(experiment: Experiment, executor: Executor, progress: Progress) -> 
             shells = _Shells(experiment, library, drivers, truths, pools)
             yield from shells.pairs() if experiment.pairs else shells.single()
         else:
-            yield from _weighted(experiment, truths)
+            for name in experiment.holding:
+                tested, place = experiment.subject(name), list(experiment.avs).index(name)
+                episodes = twin_episodes(tested, experiment.seed_of(place), experiment.results)
+                yield Subject(name, truths.vehicle(name)[RATE]), WeightedCampaign(tested, episodes, experiment.results)
     if experiment.acting and not experiment.pairs:
         choose = chooser(campaign, progress)
         for name in experiment.acting:
@@ -113,14 +116,6 @@ def _vehicle(
 def _exactly(known: Mapping[str, Known]) -> dict[str, Known]:
     """What a population says about itself."""
     return {name: replace(each, std_error=0.0) for name, each in known.items()}
-
-
-def _weighted(experiment: Experiment, truths: Truths) -> Iterator[Tested]:
-    """Vehicles tested by a method that gives crashes weights."""
-    for name in experiment.holding:
-        tested, seed = experiment.subject(name), experiment.seed_of(list(experiment.avs).index(name))
-        episodes = twin_episodes(tested, seed, experiment.results)
-        yield Subject(name, truths.vehicle(name)[RATE]), WeightedCampaign(tested, episodes, experiment.results)
 
 
 @dataclass(frozen=True, eq=False)
