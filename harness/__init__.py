@@ -18,12 +18,12 @@ if TYPE_CHECKING:
     from harness.campaign.files import load_campaign
     from harness.errors import HarnessError
     from harness.records.reader import read
-    from harness.report import write_report
-    from harness.runner import check_av as av_check
-    from harness.runner import compare_campaigns as compare
-    from harness.runner import estimate_run as estimate
-    from harness.runner import replay_episode as replay
-    from harness.runner import run_campaign as run
+    from harness.report.page import write_report
+    from harness.runner.compare import compare_campaigns as compare
+    from harness.runner.estimate import estimate_run as estimate
+    from harness.runner.look import check_av as av_check
+    from harness.runner.replay import replay_episode as replay
+    from harness.runner.run import run_campaign as run
 
 __all__ = [
     "HarnessError",
@@ -39,14 +39,14 @@ __all__ = [
 
 _PLACES = {
     "HarnessError": ("harness.errors", "HarnessError"),
-    "av_check": ("harness.runner", "check_av"),
-    "compare": ("harness.runner", "compare_campaigns"),
-    "estimate": ("harness.runner", "estimate_run"),
+    "av_check": ("harness.runner.look", "check_av"),
+    "compare": ("harness.runner.compare", "compare_campaigns"),
+    "estimate": ("harness.runner.estimate", "estimate_run"),
     "load_campaign": ("harness.campaign.files", "load_campaign"),
     "read": ("harness.records.reader", "read"),
-    "replay": ("harness.runner", "replay_episode"),
-    "run": ("harness.runner", "run_campaign"),
-    "write_report": ("harness.report", "write_report"),  # not "report": the package of that name takes that place
+    "replay": ("harness.runner.replay", "replay_episode"),
+    "run": ("harness.runner.run", "run_campaign"),
+    "write_report": ("harness.report.page", "write_report"),  # not "report": the package of that name takes that place
 }
 """Where each name is; imported when it is asked for, so that ``import harness`` and ``harness --help`` are quick."""
 

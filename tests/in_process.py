@@ -25,7 +25,8 @@ from harness import run
 from harness.campaign.campaign import Campaign
 from harness.controllers.hosts import Death
 from harness.drawing import ShardRequest
-from harness.runner import RunResult, workers
+from harness.runner import workers
+from harness.runner.run import RunResult
 from harness.runner.worker import ShardResult, ShardRunner
 
 
@@ -33,7 +34,7 @@ from harness.runner.worker import ShardResult, ShardRunner
 def without_page() -> Iterator[None]:
     """It takes longer than small campaigns; test_api.py looks at it."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("harness.report.write_report", lambda folder, **_: folder / "report.html")
+        patch.setattr("harness.report.page.write_report", lambda folder, **_: folder / "report.html")
         yield
 
 

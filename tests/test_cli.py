@@ -93,11 +93,13 @@ def calls(monkeypatch, tmp_path):
 
         monkeypatch.setattr(target, called, raising=False)
 
-    stand_in("harness.runner.plan_campaign", {"episodes": 400_000, "tables": "to build (about 20 s)", "disk_mb": 12.5})
-    stand_in("harness.runner.run_campaign", lambda _, folder: Result(folder, folder / "report.html"))
-    stand_in("harness.report.write_report", lambda folder: folder / "report.html")
-    stand_in("harness.runner.estimate_run", ESTIMATES)
-    stand_in("harness.runner.replay_episode", Replay(bit_equal=True))
+    stand_in(
+        "harness.runner.look.plan_campaign", {"episodes": 400_000, "tables": "to build (about 20 s)", "disk_mb": 12.5}
+    )
+    stand_in("harness.runner.run.run_campaign", lambda _, folder: Result(folder, folder / "report.html"))
+    stand_in("harness.report.page.write_report", lambda folder: folder / "report.html")
+    stand_in("harness.runner.estimate.estimate_run", ESTIMATES)
+    stand_in("harness.runner.replay.replay_episode", Replay(bit_equal=True))
     seen["stand_in"] = stand_in
     return seen
 
@@ -134,7 +136,7 @@ def test_run_prints_the_answer_and_where_more_is(calls, capsys, tmp_path):
         str(folder / "estimates.json"),
     ]
     assert err == ""
-    (campaign, to), options = calls["harness.runner.run_campaign"]
+    (campaign, to), options = calls["harness.runner.run.run_campaign"]
     assert (campaign.seed, to) == (7, folder)
     assert isinstance(options.pop("progress"), ShownProgress)
     assert options == {"workers": 2, "resume": True}
@@ -142,7 +144,7 @@ def test_run_prints_the_answer_and_where_more_is(calls, capsys, tmp_path):
 
 def test_run_as_json_and_with_the_budget_spent(calls, capsys, tmp_path):
     calls["stand_in"](
-        "harness.runner.run_campaign", lambda _, folder: Result(folder, folder / "report.html", exit_code=4)
+        "harness.runner.run.run_campaign", lambda _, folder: Result(folder, folder / "report.html", exit_code=4)
     )
     assert main(["run", SMOKE, "--out", str(tmp_path / "out"), "--json"]) == 4
     assert json.loads(capsys.readouterr().out) == ESTIMATES
@@ -155,7 +157,7 @@ def test_wrong_campaign_leaves_nothing_behind(calls, capsys, tmp_path):
     assert err.splitlines()[0] == "error: --set testing.epsilom=1"
     assert [line.split()[0] for line in err.splitlines()[1:]] == ["found:", "expected:", "mend:"]
     assert "Did you mean 'epsilon'?" in err
-    assert "harness.runner.run_campaign" not in calls
+    assert "harness.runner.run.run_campaign" not in calls
     assert not (tmp_path / "out").exists()
 
 
@@ -207,17 +209,17 @@ def test_wrong_calls_end_with_2(calls, capsys, arguments):
 @pytest.mark.parametrize("kind", [RunFolderError, TooManyFailedError])
 def test_errors_of_the_work_keep_their_exit_code(calls, capsys, tmp_path, kind):
     error = kind("episodes/0.parquet", found="half a file", expected="a whole one", mend="Delete it.")
-    calls["stand_in"]("harness.runner.run_campaign", error)
+    calls["stand_in"]("harness.runner.run.run_campaign", error)
     assert main(["run", SMOKE, "--out", str(tmp_path)]) == kind.exit_code
     expected = "error: episodes/0.parquet\n  found:    half a file\n  expected: a whole one\n  mend:     Delete it.\n"
     assert capsys.readouterr().err == expected
 
 
 def test_interrupt_says_how_to_go_on(calls, capsys, tmp_path):
-    calls["stand_in"]("harness.runner.run_campaign", KeyboardInterrupt())
+    calls["stand_in"]("harness.runner.run.run_campaign", KeyboardInterrupt())
     assert main(["run", SMOKE, "--out", str(tmp_path)]) == 130
     assert "--resume" in capsys.readouterr().err
-    calls["stand_in"]("harness.runner.estimate_run", KeyboardInterrupt())
+    calls["stand_in"]("harness.runner.estimate.estimate_run", KeyboardInterrupt())
     assert main(["estimate", str(tmp_path)]) == 130
     assert "--resume" not in capsys.readouterr().err
 
@@ -232,7 +234,7 @@ def test_interrupt_says_how_to_go_on(calls, capsys, tmp_path):
     ],
 )
 def test_errors_of_the_system_that_can_be_mended(calls, capsys, tmp_path, number, words):
-    calls["stand_in"]("harness.runner.run_campaign", OSError(number, os.strerror(number), "episodes/0.parquet"))
+    calls["stand_in"]("harness.runner.run.run_campaign", OSError(number, os.strerror(number), "episodes/0.parquet"))
     assert main(["run", SMOKE, "--out", str(tmp_path)]) == 2
     err = capsys.readouterr().err
     assert "error: episodes/0.parquet" in err
@@ -240,10 +242,10 @@ def test_errors_of_the_system_that_can_be_mended(calls, capsys, tmp_path, number
 
 
 def test_defects_are_not_hidden(calls, tmp_path):
-    calls["stand_in"]("harness.runner.run_campaign", OSError(errno.EBADF, "closed too early"))
+    calls["stand_in"]("harness.runner.run.run_campaign", OSError(errno.EBADF, "closed too early"))
     with pytest.raises(OSError, match="closed too early"):
         main(["run", SMOKE, "--out", str(tmp_path)])
-    calls["stand_in"]("harness.runner.run_campaign", ZeroDivisionError())
+    calls["stand_in"]("harness.runner.run.run_campaign", ZeroDivisionError())
     with pytest.raises(ZeroDivisionError):
         main(["run", SMOKE, "--out", str(tmp_path)])
 
@@ -251,7 +253,7 @@ def test_defects_are_not_hidden(calls, tmp_path):
 def test_estimate_prints_a_table(calls, capsys, tmp_path):
     assert main(["estimate", str(tmp_path), "-e", "nade", "-e", "nde", "--confidence", "0.95"]) == 0
     out = capsys.readouterr().out
-    assert calls["harness.runner.estimate_run"] == (
+    assert calls["harness.runner.estimate.estimate_run"] == (
         (tmp_path,),
         {"estimators": ("nade", "nde"), "confidence": 0.95},
     )
@@ -284,7 +286,7 @@ def test_replay_writes_the_trace(calls, capsys, tmp_path):
     assert main(["replay", str(tmp_path), "17", "--out", str(as_csv), "--fcd", "fcd.xml"]) == 0
     out = capsys.readouterr().out
     assert out.splitlines() == ["episode 17: crash; bit for bit as stored", str(as_csv), "fcd.xml"]
-    assert calls["harness.runner.replay_episode"] == ((tmp_path, 17), {"gui": False, "fcd": Path("fcd.xml")})
+    assert calls["harness.runner.replay.replay_episode"] == ((tmp_path, 17), {"gui": False, "fcd": Path("fcd.xml")})
     assert csv.read_csv(as_csv)["vehicle"].to_pylist() == ["LV", "BV"]
     assert main(["replay", str(tmp_path), "17", "--out", str(as_parquet), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["bit_equal"] is True
@@ -296,7 +298,7 @@ def test_a_file_that_cannot_be_written_is_refused_first(calls, capsys, tmp_path,
     (tmp_path / "file").write_text("not a folder")
     assert main(["replay", str(tmp_path), "17", option, str(tmp_path / "file" / "x.csv")]) == 2
     assert "nothing can be written" in capsys.readouterr().err
-    assert "harness.runner.replay_episode" not in calls
+    assert "harness.runner.replay.replay_episode" not in calls
 
 
 POOL = {
@@ -326,19 +328,19 @@ def test_pool_prints_what_it_wrote(calls, capsys, tmp_path):
 
 
 def test_replay_that_differs_is_an_error(calls, capsys, tmp_path):
-    calls["stand_in"]("harness.runner.replay_episode", Replay(bit_equal=False))
+    calls["stand_in"]("harness.runner.replay.replay_episode", Replay(bit_equal=False))
     assert main(["replay", str(tmp_path), "17"]) == 3
     out, err = capsys.readouterr()
     assert out == "episode 17: crash; NOT as stored\n"
     assert "mend:     The controller's source file has been changed" in err
-    calls["stand_in"]("harness.runner.replay_episode", Replay(bit_equal=None))
+    calls["stand_in"]("harness.runner.replay.replay_episode", Replay(bit_equal=None))
     assert main(["replay", str(tmp_path), "17"]) == 0
     assert "no stored trace" in capsys.readouterr().out
 
 
 def test_replay_says_when_a_cut_in_that_takes_time_began(calls, tmp_path, capsys):
     row = {"onset_step": 41, "cut_in_step": 53, "onset_r2_m": 7.25, "contact": "side"}
-    calls["stand_in"]("harness.runner.replay_episode", Replay(bit_equal=True, row=row))
+    calls["stand_in"]("harness.runner.replay.replay_episode", Replay(bit_equal=True, row=row))
     assert main(["replay", str(tmp_path), "17"]) == 0
     sentence = "BV comes over from 4.2 s on, 7.2 m ahead of the AV, and overlaps at 5.4 s; side contact"
     assert sentence in capsys.readouterr().out

@@ -45,7 +45,7 @@ def check(campaign_file: Path, overrides: Sequence[str], av: str | None, *, as_j
     """
     campaign = loaded(campaign_file, overrides, av)
     from harness.campaign.files import dump_campaign  # noqa: PLC0415 - keeps --help fast
-    from harness.runner import plan_campaign  # noqa: PLC0415 - slow to import: only once the campaign is right
+    from harness.runner.look import plan_campaign  # noqa: PLC0415 - slow to import: only once the campaign is right
 
     plan = plan_campaign(campaign)
     if as_json:
@@ -111,7 +111,7 @@ def run(
     where = [] if executor is None else [f"run.executor={executor}"]
     campaign = loaded(campaign_file, [*overrides, *limit, *where], av)
     from harness.progress import shown_progress  # noqa: PLC0415 - keeps --help fast
-    from harness.runner import run_campaign  # noqa: PLC0415 - slow to import: only once the campaign is right
+    from harness.runner.run import run_campaign  # noqa: PLC0415 - slow to import: only once the campaign is right
 
     with shown_progress(campaign.stop.rhw, campaign.min_crashes, quiet=quiet) as bar:
         result = run_campaign(campaign, folder, workers=workers, resume=resume, progress=bar)
@@ -232,7 +232,7 @@ def compare(
     if stored is not None:  # how far it was run before says nothing about now
         a = a.model_copy(update={"stop": b.stop})
     from harness.progress import shown_progress  # noqa: PLC0415 - keeps --help fast
-    from harness.runner import compare_campaigns  # noqa: PLC0415 - slow to import: only once the campaigns are right
+    from harness.runner.compare import compare_campaigns  # noqa: PLC0415 - slow to import: only once the campaigns are right
 
     label_b = ", ".join([b.name, *filter(None, [against_av]), *against]) if file_b is None else b.name
     labels = a.name, label_b

@@ -14,7 +14,6 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-import pyarrow.parquet as pq
 
 from harness.episode.cells import drawn_traffic
 from harness.episode.loop import EpisodeLoop, RecordPolicy, Shard
@@ -22,7 +21,7 @@ from harness.errors import RunFolderError
 from harness.pool.storage import padded
 from harness.pool.vehicle_pool import ShadowPaths
 from harness.pool.walk import ShadowRuns, write_script
-from harness.records.folder import COMPRESSION, read_table
+from harness.records.folder import parquet, read_table
 from harness.records.schemas import shadow_table
 from harness.traffic.laws import Environment
 from harness.vocabulary import AV, FAILED, IntArray, RecordArray
@@ -71,9 +70,7 @@ def run_baseline(
     rows = slice(request.first_episode, request.first_episode + request.n_episodes)
     shard = without_cut_in(loop, paths.seed, request.first_episode, paths.index[rows], paths.state[rows], environment)
     table = shadow_table(shard, paths.index[rows], paths.weight[rows])
-    sink = pa.BufferOutputStream()
-    pq.write_table(table, sink, compression=COMPRESSION)
-    return BaselineResult(request, table, sink.getvalue().to_pybytes(), _causes(table))
+    return BaselineResult(request, table, parquet(table), _causes(table))
 
 
 def stored_baseline(folder: Path, paths: ShadowPaths, request: BaselineRequest) -> BaselineResult | None:

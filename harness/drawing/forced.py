@@ -38,7 +38,6 @@ class Forced(Source):
             self.policy = self.policy._replace(importance=self.policy.importance._replace(method=PRESCRIBED))
 
     def run(self, loop: EpisodeLoop, request: ShardRequest) -> Shard:
-        """See `Source`."""
         if not self.campaign.has_shadow_runs:
             return super().run(loop, request)
         first, states = request.first_episode, self.states(request.first_episode, request.n_episodes)

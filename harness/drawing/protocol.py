@@ -19,9 +19,9 @@ from harness.campaign.campaign import Campaign
 from harness.controllers.find import build_host
 from harness.controllers.hosts import Death
 from harness.episode.loop import MOMENT_LIMITS, NOBODY, Drawing, EpisodeLoop, RecordPolicy, Shard
-from harness.estimators import StopRule, accumulator
 from harness.estimators.block import EPISODE_COLUMNS, Block, block_from_tables
-from harness.estimators.stopping import Rule
+from harness.estimators.one_pass import accumulator
+from harness.estimators.stopping import Rule, StopRule
 from harness.importance.build import build_importance, mixture_weights
 from harness.importance.tables import Tables, build_tables, table_path
 from harness.pool.shells import Draw
@@ -77,12 +77,10 @@ class KnownRounds(Rounds):
         self._sums, self._n_episodes = accumulator(self._rule.estimator), 0
 
     def __iter__(self) -> Iterator[Iterator[ShardRequest]]:
-        """See `Rounds`."""
         edges = enumerate(pairwise(chain((0,), self._ends)))
         yield (ShardRequest(index, first, min(end, self._total) - first) for index, (first, end) in edges)
 
     def enough(self, block: Block) -> bool:
-        """See `Rounds`."""
         self._sums.add(block)
         self._n_episodes += len(block)
         if not self._rule.due(self._n_episodes):

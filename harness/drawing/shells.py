@@ -23,10 +23,10 @@ from harness.drawing.allocation import CONFIDENCE, Allocation
 from harness.drawing.protocol import Rounds, ShardRequest, Source
 from harness.episode.loop import EpisodeLoop, Shard
 from harness.errors import RunFolderError
-from harness.estimators import Shells as SeenShells
 from harness.estimators.block import EPISODE_COLUMNS, SHELL_COLUMNS, Block
 from harness.estimators.likelihood import Level
 from harness.estimators.pairs import PairCounts
+from harness.estimators.shells import Shells as SeenShells
 from harness.estimators.stopping import PairRule, RoundRule
 from harness.estimators.tally import Tally, empty_tally
 from harness.pool.cut_ins import Pool
@@ -86,13 +86,11 @@ class Shells(Source):
 
     @classmethod
     def cached_files(cls, resolved: Resolved) -> list[Path]:
-        """See `Source`."""
         own = resolved.campaign.has_shadow_runs
         return [shadow_paths_file(resolved) if own else pool_path(campaign_pool_key(resolved))]
 
     @classmethod
     def building(cls, resolved: Resolved) -> str:
-        """See `Source`."""
         what, make = "pool of cut-ins", "build"
         if resolved.campaign.has_shadow_runs:
             what, make = f"paths of {resolved.campaign.pool.shadow_paths:,} baseline runs", "choose"
@@ -125,24 +123,20 @@ class Shells(Source):
         return read_as(StoredDesign, folder / SHELLS, mend=_FINISH)
 
     def begin_after(self, runs: ShadowRuns) -> None:
-        """See `Source`."""
         if self.baseline_paths is None:
             raise ValueError("this campaign has no baseline runs")
         self._draw_from(vehicle_pool(self.resolved, self.baseline_paths, runs))
 
     def rounds(self, held: int = 0) -> ShellRounds:
-        """See `Source`."""
         return ShellRounds(self.campaign, self.prescribed.design, self.prescribed.available, held)
 
     def run(self, loop: EpisodeLoop, request: ShardRequest) -> Shard:
-        """See `Source`."""
         states, traffic, cut_ins = self.prescribed.episodes(request.draws)
         shard = loop.run(request.first_episode, states, traffic)
         shard.cut_ins = cut_ins
         return shard
 
     def run_again(self, loop: EpisodeLoop, episode: int, stored: pa.Table) -> Shard:
-        """See `Source`."""
         row, stratum = (np.asarray(stored[name]).astype(np.int64) for name in ("pool_cut_in", "component"))
         shard = loop.run(episode, *self.prescribed.of_rows(row, stratum))
         shard.cut_ins = self.prescribed.cut_ins(row)
@@ -206,7 +200,6 @@ class ShellRounds(Rounds):
         return self.seen.tally if self._n_episodes else empty_tally(self.drawn.size)
 
     def __iter__(self) -> Iterator[Iterator[ShardRequest]]:
-        """See `Rounds`."""
         n_shards = 0
         while (added := self.next_round()).any():
             first = self.reported_from + self._n_episodes
@@ -224,7 +217,6 @@ class ShellRounds(Rounds):
         return added
 
     def enough(self, block: Block) -> bool:
-        """See `Rounds`."""
         self.seen.add(block)
         self._n_episodes += len(block)
         if self._n_episodes != self._look:

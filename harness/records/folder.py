@@ -141,10 +141,11 @@ def write_json(path: Path, content: Any) -> None:
 
 def encoded(tables: ShardTables) -> dict[str, bytes]:
     """A shard's tables as Parquet files, by name: what a worker hands back."""
-    return {name: _parquet(table) for name, table in tables._asdict().items() if table is not None}
+    return {name: parquet(table) for name, table in tables._asdict().items() if table is not None}
 
 
-def _parquet(table: pa.Table) -> bytes:
+def parquet(table: pa.Table) -> bytes:
+    """A table as the content of a file."""
     sink = pa.BufferOutputStream()
     pq.write_table(table, sink, compression=COMPRESSION)
     content: bytes = sink.getvalue().to_pybytes()

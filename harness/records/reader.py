@@ -82,9 +82,9 @@ def read_traces(folder: Path, episodes: Collection[int], columns: list[str]) -> 
     return concatenated(found, folder) if found else None
 
 
-def stored_columns(folder: Path, manifest: Mapping[str, Any] | None = None) -> set[str]:
-    """Columns of the episodes table of a run; none if it has no shard. A ``manifest`` at hand spares reading it."""
-    shards = (manifest or read_manifest(folder))["shards"]
+def stored_columns(folder: Path) -> set[str]:
+    """Columns of the episodes table of a run; none if it has no shard."""
+    shards = read_manifest(folder)["shards"]
     return set(footer(folder / shards[0]["files"]["episodes"]).schema.to_arrow_schema().names) if shards else set()
 
 

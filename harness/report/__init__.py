@@ -3,7 +3,3 @@
 The page is made from a finished run folder alone, so it can be made again at any time and on any machine. ``summary``
 reads, ``rate_plots``, ``test_plots`` and ``crashes`` draw (in one ``style``), ``page`` puts all together.
 """
-
-from harness.report.page import write_report
-
-__all__ = ["write_report"]

@@ -78,7 +78,7 @@ def compare_campaigns(
     out : str or Path
         Folder; ``out/a`` and ``out/b`` become run folders.
     workers, progress
-        See `harness.runner.run_campaign`.
+        See `harness.runner.run.run_campaign`.
     labels : (str, str), optional
         Names for the answer; the campaigns' own by default.
     stored : str or Path, optional

@@ -11,14 +11,14 @@ from harness.campaign.files import load_campaign
 from harness.drawing import source_of
 from harness.drawing.protocol import block_of
 from harness.errors import RunFolderError
-from harness.estimators import ESTIMATORS, CampaignFacts, estimate_blocks
+from harness.estimators.answer import CampaignFacts, estimate_blocks
 from harness.estimators.block import Block
 from harness.estimators.one_pass import SPACING
 from harness.importance.build import importance_names
 from harness.processes import made_ahead
 from harness.records.folder import concatenated, no_episodes, read_manifest
 from harness.records.reader import read_shard
-from harness.vocabulary import EstimatorName
+from harness.vocabulary import ESTIMATORS, EstimatorName
 
 MOST_GROUPED = 5_000
 """Tests of small shards that are read as one."""

@@ -260,7 +260,7 @@ def finish(run: Run, rule: Rule, remark: str = "") -> RunResult:
     estimates = estimate_run(run.out)
     write_json(run.out / ESTIMATES, estimates)
     # No worker loads matplotlib, and it has been loaded here while workers were busy.
-    from harness.report import write_report  # noqa: PLC0415
+    from harness.report.page import write_report  # noqa: PLC0415
 
     verdict = None if rule.look.decision is None else rule.look.decision.verdict
     code = exit_code(run.campaign, stopped_by, verdict)

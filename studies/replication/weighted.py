@@ -11,8 +11,9 @@ import numpy as np
 from harness.campaign.campaign import Campaign
 from harness.drawing import Source
 from harness.episode.loop import EpisodeLoop
-from harness.estimators import StopRule, accumulator
 from harness.estimators.block import Block, block_from_tables
+from harness.estimators.one_pass import accumulator
+from harness.estimators.stopping import StopRule
 from harness.importance.build import mixture_weights
 from harness.records.schemas import shard_tables
 from harness.resolved import resolve

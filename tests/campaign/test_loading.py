@@ -288,7 +288,7 @@ def test_the_commands_take_a_vehicle(tmp_path, capsys, monkeypatch):
     assert main(["check", str(file), "--av", "late-300ms"]) == 0
     assert "delay_s: 0.3" in capsys.readouterr().out
     seen = []
-    monkeypatch.setattr("harness.runner.compare_campaigns", lambda a, b, *_, **__: seen.extend([a, b]) or 1 / 0)
+    monkeypatch.setattr("harness.runner.compare.compare_campaigns", lambda a, b, *_, **__: seen.extend([a, b]) or 1 / 0)
     with pytest.raises(ZeroDivisionError):
         main(["compare", str(file), "--out", str(tmp_path / "c"), "--av", "idm", "--against-av", "SM-II", "--quiet"])
     assert [campaign.av for campaign in seen] == [AutomatedVehicle(), panel_av("SM-II")]

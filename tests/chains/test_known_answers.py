@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from scipy.stats import binomtest
 
-from harness.estimators import Estimate, one_pass
+from harness.estimators.estimate import Estimate
+from harness.estimators.one_pass import one_pass
 from harness.estimators.weighted import Nade
 from studies.chains.chain import frequent_decisive, panel, rare_decisive
 from studies.chains.sampler import Sampler, blocks

@@ -5,9 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from harness.estimators import one_pass
 from harness.estimators.block import Block, joined
-from harness.estimators.one_pass import ACCUMULATORS
+from harness.estimators.one_pass import ACCUMULATORS, one_pass
 from harness.vocabulary import FAILED, TIMEOUT
 from studies.chains.chain import overtaking
 from studies.chains.sampler import blocks

@@ -8,18 +8,11 @@ import pytest
 from pydantic import TypeAdapter
 
 from harness.errors import RunFolderError
-from harness.estimators import (
-    ESTIMATORS,
-    CampaignFacts,
-    Estimate,
-    Unavailable,
-    accumulator,
-    estimate_blocks,
-    one_pass,
-)
-from harness.estimators.estimate import Estimates, finite_json
-from harness.runner import estimate_run
-from harness.vocabulary import SAMPLING
+from harness.estimators.answer import CampaignFacts, estimate_blocks
+from harness.estimators.estimate import Estimate, Estimates, Unavailable, finite_json
+from harness.estimators.one_pass import accumulator, one_pass
+from harness.runner.estimate import estimate_run
+from harness.vocabulary import ESTIMATORS, SAMPLING
 from studies.chains.chain import overtaking
 from studies.chains.sampler import blocks
 from tests.chains.seed import SEED

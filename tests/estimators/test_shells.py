@@ -6,11 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from harness.estimators import Estimate, one_pass
 from harness.estimators.answer import boundary_statements, statement
 from harness.estimators.block import Drawn
-from harness.estimators.estimate import finite_json
+from harness.estimators.estimate import Estimate, finite_json
 from harness.estimators.likelihood import Level, likelihood_limit
+from harness.estimators.one_pass import one_pass
 from harness.estimators.tally import Tally, combined, pool_variance
 from harness.strata import Statement
 

@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from harness.campaign.sections import Run, Stop
-from harness.estimators import StopRule, accumulator
 from harness.estimators.answer import ending
-from harness.estimators.stopping import LOOK_RATIO, Decision, look_grid
+from harness.estimators.one_pass import accumulator
+from harness.estimators.stopping import LOOK_RATIO, Decision, StopRule, look_grid
 from harness.strata import ASSUMPTION_FREE
 from studies.chains.chain import frequent_decisive
 from studies.chains.sampler import blocks

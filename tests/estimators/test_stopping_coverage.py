@@ -10,8 +10,9 @@ import numpy as np
 from scipy.stats import binomtest
 
 from harness.campaign.sections import Stop
-from harness.estimators import Estimate, StopRule
 from harness.estimators.block import Block
+from harness.estimators.estimate import Estimate
+from harness.estimators.stopping import StopRule
 from harness.estimators.weighted import Nade
 
 from .small_blocks import block

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from harness.report import write_report
+from harness.report.page import write_report
 from harness.report.summary import RunFolder, read_run_folder
 from tests.report.made_run import RECIPES, write_run
 

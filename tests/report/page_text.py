@@ -7,7 +7,7 @@ import tempfile
 from html.parser import HTMLParser
 from pathlib import Path
 
-from harness.report import write_report
+from harness.report.page import write_report
 from tests.report.made_run import RECIPES, write_run
 
 GOLDEN = Path(__file__).parent / "golden"

@@ -11,7 +11,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from harness.errors import RunFolderError
-from harness.report import write_report
+from harness.report.page import write_report
 
 SHARDS = [f"{table}/shard-000001.parquet" for table in ("episodes", "moments", "traces")]
 FILES = ["manifest.json", "estimates.json", "campaign.yaml"]

@@ -12,8 +12,7 @@ from xml.etree import ElementTree
 import matplotlib.pyplot as plt
 import pytest
 
-from harness.report import write_report
-from harness.report.page import run_notes, verdict
+from harness.report.page import run_notes, verdict, write_report
 from harness.report.summary import read_run_folder, summarise, typed_folder
 from tests.report.made_run import RECIPES, write_run
 from tests.report.page_text import GOLDEN, KINDS, Page, golden_text

@@ -10,7 +10,7 @@ import pytest
 
 from harness.campaign.campaign import Campaign
 from harness.campaign.files import load_campaign
-from harness.runner import RunResult, run_campaign
+from harness.runner.run import RunResult, run_campaign
 from tests.in_process import one_process, without_page
 
 MIXTURE_FILE = Path(__file__).parents[2] / "scenarios" / "overtaking_mixture.yaml"

@@ -11,8 +11,7 @@ import pytest
 from harness.cli import main
 from harness.errors import CampaignError, RunFolderError
 from harness.records.reader import read_shards
-from harness.runner import compare_campaigns
-from harness.runner.compare import require_comparable
+from harness.runner.compare import compare_campaigns, require_comparable
 from harness.runner.run import Run
 from harness.runner.worker import ShardRunner
 from tests.in_process import one_process, without_page

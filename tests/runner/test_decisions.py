@@ -6,7 +6,7 @@ import pytest
 
 from harness import estimate
 from harness.errors import CampaignError
-from harness.report import write_report
+from harness.report.page import write_report
 from tests.runner.test_shells_runs import SHELLS
 
 

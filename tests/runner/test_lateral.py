@@ -9,8 +9,7 @@ import pytest
 
 from harness import replay
 from harness.errors import CampaignError
-from harness.runner import plan_campaign
-from harness.runner.look import check_av
+from harness.runner.look import check_av, plan_campaign
 from studies.alarm import alarm_of_run
 from tests.pool.conftest import SMALL_POOL
 from tests.pool.test_vehicle_pool import ACTING

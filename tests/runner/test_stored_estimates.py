@@ -12,8 +12,8 @@ import pytest
 from harness.cli import main
 from harness.errors import RunFolderError
 from harness.estimators.block import joined
-from harness.runner import estimate, estimate_run
-from harness.runner.estimate import stored_blocks
+from harness.runner import estimate
+from harness.runner.estimate import estimate_run, stored_blocks
 from tests.stored_runs import copy_of, stored_table
 
 

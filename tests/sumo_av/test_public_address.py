@@ -6,7 +6,7 @@ import pytest
 
 from harness.campaign.files import load_campaign
 from harness.errors import CampaignError, WorldDisagreementError
-from harness.runner import plan_campaign
+from harness.runner.look import plan_campaign
 from harness.worlds import program
 from tests.sumo_av.running import EXAMPLE, ROOT
 
