@@ -18,16 +18,9 @@ from harness.vocabulary import RecordArray
 class Resolved:
     """A campaign and the content of the files that it names.
 
-    Attributes
-    ----------
-    av : structured ndarray, shape (1,)
-        Record of a built-in AV; shape (0,) of any other.
-    surrogates : structured ndarray, shape (J,)
-        Records of the drivers that challenges are computed for.
-    content_hash : str
-        Of all that changes an episode's bits, the environment's numbers included.
-    controller_sha256 : str or None
-        Hash of the source of the AV's controller; None where there is none, or nobody has looked.
+    ``av`` (1,) is the record of a built-in AV, (0,) of any other; ``surrogates`` (J,) are the drivers that challenges
+    are computed for. ``content_hash`` is of all that changes an episode's bits, the environment's numbers included;
+    ``controller_sha256`` of the source of the AV's controller, None where there is none, or nobody has looked.
     """
 
     campaign: Campaign

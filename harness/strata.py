@@ -33,18 +33,10 @@ Numbers = Annotated[
 
 @dataclass(frozen=True)
 class Statement:
-    """What is said about vehicles that crash only inside a boundary.
+    """What is said about vehicles that crash only inside a boundary, the most careless surrogate there.
 
-    Attributes
-    ----------
-    name, boundary : str
-        Its name, and the most careless surrogate inside.
-    assumes : str
-        What it assumes, as the end of a sentence that begins with "If this vehicle".
-    n_inside : int
-        Strata up to the boundary.
-    checked : bool
-        Whether each test shows that the assumption holds in it: that the vehicle is never ahead of the boundary.
+    ``assumes`` is the end of a sentence that begins with "If this vehicle"; ``n_inside`` strata lie inside; ``checked``
+    says whether each test shows that the assumption holds in it: that the vehicle is never ahead of the boundary.
     """
 
     name: str
@@ -144,8 +136,7 @@ class ShellDesign:
     @cached_property
     def joined(self) -> FloatArray:
         """1 where a cell belongs to a stratum, shape (C, S)."""
-        joined: FloatArray = np.eye(len(self.strata))[list(self.cell_stratum)]
-        return joined
+        return np.asarray(np.eye(len(self.strata))[list(self.cell_stratum)])
 
 
 def _of_one_size(design: ShellDesign) -> ShellDesign:

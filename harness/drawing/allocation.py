@@ -90,16 +90,9 @@ class Allocation:
     ) -> IntArray:
         """Tests to add per stratum, at most ``budget``; all 0 when no stratum or no budget is left.
 
-        Failed tests widen the limits that are to be narrowed: they may have been crashes.
-
-        Parameters
-        ----------
-        tally : Tally
-        budget : int
-        inner_rhw : callable, optional
-            Gives the relative half-width from so many first strata; by default that of a crash rate.
-        given_by : callable, optional
-            Gives so many tests to strata with so much room (S,) each; by default to where a crash rate is narrowed.
+        Failed tests widen the limits that are to be narrowed: they may have been crashes. ``inner_rhw`` gives the
+        relative half-width from so many first strata, by default that of a crash rate; ``given_by`` gives so many tests
+        to strata with so much room (S,) each, by default to where a crash rate is narrowed.
         """
         tests = tally.tests
         if self._used_up(tally):

@@ -91,17 +91,9 @@ class KnownRounds(Rounds):
 class Source:
     """What the tests of a campaign are drawn from, built or read from the cache; tests are independent by default.
 
-    Attributes
-    ----------
-    resolved : Resolved
-    policy : Drawing
-        What the episode loop needs to know.
-    tables : Tables or None
-        Challenges, where importance functions of surrogates are mixed.
-    design : ShellDesign or None
-        Strata, of those that have some.
-    baseline_paths : ShadowPaths or None
-        Paths along which the vehicle has to be driven without a cut-in before tests can be drawn; see `begin_after`.
+    ``policy`` is what the episode loop needs to know, ``tables`` are challenges where surrogates' importance functions
+    are mixed, and ``design`` has the strata of those that have some. Along ``baseline_paths`` the vehicle has to be
+    driven without a cut-in before tests can be drawn; see `begin_after`.
     """
 
     episodes_per_s: ClassVar[Mapping[str, int]]

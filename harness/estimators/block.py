@@ -45,15 +45,9 @@ Column = NDArray[Any]
 class Drawn:
     """How all tests of a campaign are drawn.
 
-    Attributes
-    ----------
-    method : str
-    alpha : (M,) float64
-        Mixture weights of the importance functions.
-    weight_cap : float or None
-        Bound on Y = 1{crash}·weight that the design guarantees for every episode, seen or not; None if there is none.
-    shells : ShellDesign or None
-        What is known of the strata, where tests are drawn from shells.
+    ``alpha`` (M,) are mixture weights of the importance functions; ``weight_cap`` is the bound on Y = 1{crash}·weight
+    that the design guarantees for every episode, seen or not, None if there is none; ``shells`` is what is known of the
+    strata, where tests are drawn from some.
     """
 
     method: Method

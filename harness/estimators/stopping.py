@@ -50,19 +50,10 @@ class Decision:
     Looks inflate errors, and limits by the likelihood ratio are wider than a level needs where crashes are few. What is
     left is measured: decisions are wrong in at most 1 % where 5 % are allowed (docs/gate.md).
 
-    Attributes
-    ----------
-    crash_rate_below : float
-        The limit, per test.
-    statement : str
-        Which statement decides.
-    confidence : float
-        That the crash rate lies on the side which is said: an interval leaves out half as much there as at both sides.
-    low, high : float
-        The interval.
-    contradicted : bool
-        Whether a test has shown that the vehicle does not do what the statement assumes. Its upper limit then says
-        nothing, while what crashed, crashed.
+    ``statement`` is the one that decides about the limit ``crash_rate_below``, per test, by the interval from ``low``
+    to ``high``. ``confidence`` is that the crash rate lies on the side which is said: an interval leaves out half as
+    much there as at both sides. ``contradicted`` says whether a test has shown that the vehicle does not do what the
+    statement assumes: its upper limit then says nothing, while what crashed, crashed.
     """
 
     crash_rate_below: float
@@ -113,32 +104,20 @@ class Decision:
 
 @dataclass(frozen=True)
 class Look:
-    """What a rule has found at its last look.
-
-    Attributes
-    ----------
-    rhw : float
-        Relative half-width; infinite where the interval may be wrong.
-    one_more_crash : float
-        By how much of itself one more crash of the largest weight would have moved the estimate; 0 for limits within
-        shells, which allow for every crash that has not been seen.
-    stopped : bool
-        Whether the asked precision, or decision, was reached; always False when none was asked.
-    unmet : tuple of str
-        Conditions that were not met when a look last failed: what decided, or what is still missing.
-    pool_error_above_target : bool
-        Whether the error of the pool, which no test narrows, is too large for the asked precision.
-    decision : Decision or None
-        What is known about the limit that the campaign asks about, if it does; that, not a precision, is then waited
-        for.
-    """
+    """What a rule has found at its last look; a relative half-width is infinite where the interval may be wrong."""
 
     rhw: float = math.inf
     one_more_crash: float = 0.0
+    """By how much of itself one more crash of the largest weight would have moved the estimate; 0 for limits within
+    shells, which allow for every crash that has not been seen."""
     stopped: bool = False
+    """Whether the asked precision, or decision, was reached; always False when none was asked."""
     unmet: tuple[str, ...] = ()
+    """Conditions that were not met when a look last failed: what decided, or what is still missing."""
     pool_error_above_target: bool = False
+    """Whether the error of the pool, which no test narrows, is too large for the asked precision."""
     decision: Decision | None = None
+    """What is known about the limit that the campaign asks about, if it does; then that is waited for."""
 
 
 class Rule:

@@ -69,22 +69,10 @@ def compare_campaigns(
 ) -> Comparison:
     """Drive two vehicles on the same cut-ins until the difference, or the margin, is known well enough.
 
-    What an earlier call has finished in ``out`` is used again.
-
-    Parameters
-    ----------
-    a, b : Campaign
-        Equal but for ``av``, ``name`` and ``description``.
-    out : str or Path
-        Folder; ``out/a`` and ``out/b`` become run folders.
-    workers, progress
-        See `harness.runner.run.run_campaign`.
-    labels : (str, str), optional
-        Names for the answer; the campaigns' own by default.
-    stored : str or Path, optional
-        Run folder of A, whose tests are not driven again; it is copied to ``out/a``.
-    margin : float, optional
-        Decide whether B's rate is at most 1 + margin times A's.
+    The campaigns are equal but for ``av``, ``name`` and ``description``; ``labels`` name them in the answer, by default
+    as they do themselves. ``out/a`` and ``out/b`` become run folders; what an earlier call has finished there is used
+    again. ``stored`` is a run folder of A, whose tests are not driven again: it is copied to ``out/a``. A ``margin``
+    asks whether B's rate is at most 1 + margin times A's. ``workers`` and ``progress`` are those of `run_campaign`.
 
     Raises `CampaignError`: the campaigns differ in something else, or do not draw from the same shells. Raises
     `RunFolderError`: ``out`` holds other runs.

@@ -33,21 +33,10 @@ def estimate_run(
     estimators: Sequence[EstimatorName] | None = None,
     confidence: float | None = None,
 ) -> dict[str, Any]:
-    """Estimate a stored run from its records.
+    """Estimate a stored run from its records; returns the content of ``estimates.json``.
 
-    Parameters
-    ----------
-    folder : str or Path
-        Run folder with ``manifest.json``, ``campaign.yaml`` and shards.
-    estimators : sequence of str, optional
-        Which to report beside the method's own; all by default.
-    confidence : float, optional
-        Level of the intervals; the campaign's by default.
-
-    Returns
-    -------
-    dict
-        Content of ``estimates.json``.
+    ``estimators`` are reported beside the method's own, all by default; ``confidence`` is the level of the intervals,
+    by default the campaign's.
 
     Raises `HarnessError`: if the folder is not a run, its records are damaged or incomplete.
     """
@@ -74,12 +63,7 @@ def estimate_run(
 def stored_blocks(folder: Path, *, moments: bool) -> Iterator[Block]:
     """Blocks of the tests that are reported, in index order from 0; a gap or too few of them is an error.
 
-    Parameters
-    ----------
-    folder : Path
-        Run folder.
-    moments : bool
-        Whether to read the ratios of control steps, which `scv` needs, where there are any on record.
+    With ``moments`` ratios of control steps are read, which `scv` needs, where there are any on record.
 
     Raises `HarnessError`: if the folder is not a run, or its records are damaged or incomplete.
     """

@@ -102,8 +102,7 @@ class AvCheck:
         """Plain JSON content; undefined numbers become null."""
         content = {**asdict(self), "deterministic": not self.differing, "exit_code": self.exit_code}
         content["speed"]["ratio"] = self.speed.ratio
-        cleaned: dict[str, Any] = finite_json(content)
-        return cleaned
+        return finite_json(content)
 
 
 def check_av(campaign: Campaign, n_episodes: int = EPISODES, *, black_box: Path | None = None) -> AvCheck:
@@ -112,14 +111,8 @@ def check_av(campaign: Campaign, n_episodes: int = EPISODES, *, black_box: Path 
     The second run has other cells, begins in the middle, and follows episodes of its own: a controller that remembers
     an earlier episode, shares state between instances or draws from a global stream gives other bits there.
 
-    Parameters
-    ----------
-    campaign : Campaign
-        Its method, engine and records are replaced by what the check needs; its AV and seed are not.
-    n_episodes : int
-        At least 2.
-    black_box : Path, optional
-        File that tells in which call of the controller the process died.
+    The campaign's method, engine and records are replaced by what the check needs; its AV and seed are not.
+    ``n_episodes`` is at least 2; the file ``black_box`` tells in which call of the controller the process died.
 
     Raises `HarnessError`: the campaign is wrong, or the AV cannot be found, made or started.
     """
@@ -256,12 +249,9 @@ STEPS_ACTED = 162
 def plan_campaign(campaign: Campaign) -> dict[str, Any]:
     """Cost of a campaign that runs to its budget of episodes.
 
-    Returns
-    -------
-    dict
-        ``episodes``, ``episodes_per_second_estimate`` (all cores), ``seconds_estimate``, ``tables`` (in words) and
-        ``disk_mb``; of an AV that is not built in ``av_ms_per_test``, measured, or in words why there is none. Where
-        cut-ins take time, ``within_reach_of_`` each statement: which rates it can tell, in words.
+    That is ``episodes``, ``episodes_per_second_estimate`` (all cores), ``seconds_estimate``, ``tables`` (in words) and
+    ``disk_mb``; of an AV that is not built in ``av_ms_per_test``, measured, or in words why there is none. Where
+    cut-ins take time, ``within_reach_of_`` each statement: which rates it can tell, in words.
 
     Raises `CampaignError`: a run would refuse the campaign before it starts.
     """

@@ -49,16 +49,8 @@ def replay_episode(
 ) -> ReplayResult:
     """Replay an episode of a run; a user's own code in a process of its own.
 
-    Parameters
-    ----------
-    folder : str or Path
-        Run folder.
-    episode : int
-        Index in the campaign.
-    gui : bool
-        Show it in sumo-gui (extra ``harness[sumo]``).
-    fcd : str or Path, optional
-        Write SUMO's floating-car data to this file.
+    ``episode`` is its index in the campaign. With ``gui`` it is shown in sumo-gui (extra ``harness[sumo]``); ``fcd`` is
+    a file for SUMO's floating-car data.
 
     Raises `RunFolderError`: the folder is no run, or has no such episode. Raises `CampaignError`: the environment's
     parameter file has changed since, or the AV is not reproducible. Raises `HarnessError`: SUMO's system libraries are

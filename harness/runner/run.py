@@ -40,22 +40,11 @@ ESTIMATES = "estimates.json"
 
 @dataclass(frozen=True)
 class RunResult:
-    """What a finished campaign left.
+    """What a finished campaign left in its folder, ``estimates.json`` and the page ``report.html`` among it.
 
-    Attributes
-    ----------
-    folder : Path
-    report : Path
-        The page ``report.html``.
-    estimates : dict
-        Content of ``estimates.json``.
-    stopped_by : {"rhw", "accept", "contradicted", "two_phase", "episodes", "pool", "pool_error"}
-        See `harness.records.manifest.StoppedBy`.
-    ending : str
-        When it ended and which condition decided, in a sentence.
-    exit_code : int
-        0, or 4 when the budget or the pool was spent before the asked precision or decision, or 5 where the crash rate
-        is above the limit that was to be kept.
+    ``stopped_by`` is explained at `harness.records.manifest.StoppedBy`; ``ending`` says in a sentence when it ended and
+    which condition decided. The exit code is 0, or 4 when the budget or the pool was spent before the asked precision
+    or decision, or 5 where the crash rate is above the limit that was to be kept.
     """
 
     folder: Path
@@ -74,19 +63,10 @@ def run_campaign(
     resume: bool = False,
     progress: Progress | None = None,
 ) -> RunResult:
-    """Run a campaign into a folder.
+    """Run a campaign (if it has been through `require_ready`, as that returned it) into a folder.
 
-    Parameters
-    ----------
-    campaign : Campaign or Resolved
-        The latter from `require_ready`.
-    out : str or Path
-        New, empty, or (with ``resume``) the folder of this campaign.
-    workers : int, optional
-        Worker processes; as many as there are cores by default. Never changes a result.
-    resume : bool
-        Continue a run that was interrupted, or to a smaller RHW.
-    progress : Progress, optional
+    That is new or empty or, with ``resume``, holds a run of this campaign that was interrupted, or is to go on to a
+    smaller RHW. The number of ``workers``, by default as many as there are cores, never changes a result.
 
     Raises `HarnessError`: the campaign, the folder or the AV is at fault; nothing that was finished is lost.
     """
@@ -117,14 +97,8 @@ def run_rounds(run: Run, rounds: Rounds) -> None:
 class Run:
     """A campaign on its way into a folder, in which nobody but this process writes.
 
-    Attributes
-    ----------
-    source : Source
-        What its tests are drawn from.
-    prefix : Prefix
-        What is finished.
-    held : int
-        Tests that the folder held before.
+    ``source`` is what its tests are drawn from, ``prefix`` what is finished, ``held`` how many tests the folder held
+    before.
     """
 
     def __init__(
