@@ -78,20 +78,13 @@ def stored_baseline(folder: Path, paths: ShadowPaths, request: BaselineRequest) 
     file = baseline_file(folder, request)
     if not file.exists():
         return None
-    table = _read(file)
+    table = read_table(file, mend=_MEND)
     rows = slice(request.first_episode, request.first_episode + request.n_episodes)
     if not np.array_equal(table.column("path").to_numpy(), paths.index[rows]):
         expected = "those of this campaign and this version of the harness"
         mend = "Use a new folder, or the version that the run was begun with (manifest.json)."
         raise RunFolderError(str(file), "baseline runs on other paths", expected, mend)
     return BaselineResult(request, table, b"", _causes(table))
-
-
-def _read(file: Path) -> pa.Table:
-    try:
-        return read_table(file)
-    except RunFolderError as error:
-        raise RunFolderError(error.where, error.found, error.expected, _MEND) from error
 
 
 def _causes(table: pa.Table) -> Counter[str]:

@@ -308,12 +308,17 @@ def conditional_paired_statement(found: PairedEstimate) -> str:
 
 
 def _apart(found: Contrast, confidence: float) -> str:
-    differs = found.n_differing > 0
-    apart = apart_statement(found.difference, found.ci_low, found.ci_high, confidence, differs=differs)
+    """Which of them crashes more often, and by how much."""
+    low, high, verdict = found.ci_low, found.ci_high, "the difference is not distinguishable from 0"
+    if found.n_differing and low > 0.0:
+        verdict = "A crashes more often"
+    elif found.n_differing and high < 0.0:
+        verdict = "A crashes less often"
+    apart = f"{verdict}, A - B = {found.difference:.3g} ({confidence:.0%} interval {low:.3g} to {high:.3g})"
     if not math.isfinite(found.ratio):
         return apart
-    high = f"{found.ratio_high:.3g}" if math.isfinite(found.ratio_high) else "no limit"
-    return f"{apart}, A/B = {found.ratio:.3g} ({found.ratio_low:.3g} to {high})"
+    most = f"{found.ratio_high:.3g}" if math.isfinite(found.ratio_high) else "no limit"
+    return f"{apart}, A/B = {found.ratio:.3g} ({found.ratio_low:.3g} to {most})"
 
 
 def _alone(found: Interval) -> str:
@@ -334,16 +339,6 @@ def rates_statement(a: Estimate, b: Estimate, name_a: str, name_b: str) -> str:
         f"A ({name_a}) crashes {a.crash_rate:.3g} times per test ({a.ci_low:.3g} to {a.ci_high:.3g}), "
         f"B ({name_b}) {b.crash_rate:.3g} times ({b.ci_low:.3g} to {b.ci_high:.3g})",
     )
-
-
-def apart_statement(difference: float, low: float, high: float, confidence: float, *, differs: bool) -> str:
-    """Which of them crashes more often, and by how much."""
-    verdict = "the difference is not distinguishable from 0"
-    if differs and low > 0.0:
-        verdict = "A crashes more often"
-    elif differs and high < 0.0:
-        verdict = "A crashes less often"
-    return f"{verdict}, A - B = {difference:.3g} ({confidence:.0%} interval {low:.3g} to {high:.3g})"
 
 
 def failed_pairs_statement(a: Estimate, b: Estimate) -> str:

@@ -87,11 +87,6 @@ class Unavailable:
     reason: str
     crash_rate: None = None
 
-    @property
-    def shown(self) -> Unavailable:
-        """See `Estimate.shown`."""
-        return self
-
 
 class Point(TypedDict):
     """The headline estimate of the first ``n`` tests."""

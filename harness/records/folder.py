@@ -165,7 +165,9 @@ def write_shard(folder: Path, index: int, shard: Mapping[str, bytes]) -> dict[st
     return shard_files(folder, index)
 
 
-def read_table(path: Path, columns: list[str] | None = None, rows: pc.Expression | None = None) -> pa.Table:
+def read_table(
+    path: Path, columns: list[str] | None = None, rows: pc.Expression | None = None, *, mend: str = MEND_SHARD
+) -> pa.Table:
     """Read one Parquet file of a run; row groups that cannot hold one of the asked ``rows`` are skipped."""
     try:
         if rows is not None:
@@ -173,9 +175,9 @@ def read_table(path: Path, columns: list[str] | None = None, rows: pc.Expression
         with pq.ParquetFile(path) as file:  # a millisecond faster than read_table, which matters with many shards
             table = file.read(columns, use_threads=file.metadata.num_rows > ROWS_FOR_THREADS)
     except (OSError, pa.ArrowException, KeyError) as error:
-        raise damaged(path, error) from error
+        raise damaged(path, error, mend) from error
     if missing := sorted(set(columns or ()).difference(table.column_names)):
-        raise damaged(path, pa.ArrowInvalid(f"no column {missing[0]!r}"))
+        raise damaged(path, pa.ArrowInvalid(f"no column {missing[0]!r}"), mend)
     return table
 
 
@@ -196,11 +198,11 @@ def concatenated(tables: Sequence[pa.Table], folder: Path) -> pa.Table:
         ) from error
 
 
-def damaged(path: Path, error: Exception) -> RunFolderError:
+def damaged(path: Path, error: Exception, mend: str = MEND_SHARD) -> RunFolderError:
     """What to say of a Parquet file of a run that cannot be read."""
     missing = isinstance(error, FileNotFoundError)
     found = "no such file" if missing else f"a file that cannot be read ({str(error).splitlines()[0]})"
-    return RunFolderError(str(path), found, "a complete Parquet file of this run", MEND_SHARD)
+    return RunFolderError(str(path), found, "a complete Parquet file of this run", mend)
 
 
 def no_episodes(folder: Path) -> RunFolderError:

@@ -269,7 +269,7 @@ def conclusion(campaign: Campaign, rule: Rule, n_episodes: int, reported_from: i
 @cache
 def load_report_meanwhile() -> None:
     """Load matplotlib beside busy workers, once: no earlier, because it would slow down what makes them wait."""
-    threading.Thread(target=import_module, args=("harness.report",), daemon=True).start()
+    threading.Thread(target=import_module, args=("harness.report.page",), daemon=True).start()
 
 
 def workers_of(resolved: Resolved, folder: Path, n_workers: int | None, *, n_runs: int = 1) -> Workers:
