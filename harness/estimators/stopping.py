@@ -262,11 +262,6 @@ class RoundRule(Rule):
         return self.look.stopped or (enough and tally.tests.sum() >= self._held)
 
 
-def decision_confidence(confidence: float) -> float:
-    """Confidence at which a margin is decided, by looks after every round."""
-    return 1.0 - (1.0 - confidence) / MARGIN_LOOKS
-
-
 class PairRule(Rule):
     """Looks at the difference of two vehicles after each round, or whether B is worse than A by more than a margin.
 
@@ -280,7 +275,7 @@ class PairRule(Rule):
     def __init__(self, campaign: Campaign, margin: float | None) -> None:
         super().__init__(campaign.stop.rhw, campaign.min_crashes)
         self._confidence, self._statement = campaign.stop.confidence, campaign.testing.shells.statement
-        self.conditional, level = self._statement != ASSUMPTION_FREE, decision_confidence(self._confidence)
+        self.conditional, level = self._statement != ASSUMPTION_FREE, 1.0 - (1.0 - self._confidence) / MARGIN_LOOKS
         self.margin = None if margin is None else MarginDecision(margin, "open", level, self.conditional)
 
     def observe(self, pairs: PairCounts) -> bool:

@@ -13,15 +13,7 @@ from typing import Any
 from harness.drawing import ShardRequest, Source
 from harness.errors import RunFolderError
 from harness.pool.replay import Retracing
-from harness.records.folder import (
-    MANIFEST,
-    SHELLS,
-    read_as,
-    read_manifest,
-    read_table,
-    require_place,
-    shard_files,
-)
+from harness.records.folder import MANIFEST, SHELLS, read_as, read_manifest, read_table, require_place, shard_files
 from harness.records.schemas import ShardTables
 from harness.resolved import Resolved
 from harness.runner.worker import ShardResult, finished
@@ -80,9 +72,8 @@ def require_same_pool(folder: Path, source: Source) -> None:
     path, design = folder / SHELLS, source.design
     if design is None or not path.exists():
         return
-    if (
-        found := read_as(dict[str, object], path, mend="Run the campaign into a new folder.").get("pool")
-    ) != design.pool:
+    found = read_as(dict[str, object], path, mend="Run the campaign into a new folder.").get("pool")
+    if found != design.pool:
         expected = f"those of pool {design.pool}, which this campaign now has"
         mend = "Restore the surrogate library, or the version of the harness (manifest.json), or use a new folder."
         raise RunFolderError(str(path), f"cut-ins of pool {found}", expected, mend)
