@@ -212,7 +212,7 @@ class Workers(Contender):
         n_shards = max(2, n // SHARD)
         specs = [ShardRequest(i, first + i * SHARD, SHARD) for i in range(n_shards)]
         for done in self._pool.run(iter(specs), lambda _: None):
-            write_shard(self._folder, done.spec.index, done.parquet)
+            write_shard(self._folder, done.request.index, done.parquet)
         return Work(n_shards * SHARD, 0)
 
     def rows(self, n: int) -> None:  # starts the workers; their rows are on disk
