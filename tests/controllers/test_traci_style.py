@@ -1,10 +1,12 @@
 """The facade answers as TraCI 1.28 does (numbers below were read from a SUMO), and commands only the AV."""
 
+from operator import attrgetter
+
 import numpy as np
 import pytest
 
 from harness.controllers import EpisodeStart, Neighbour, Observation
-from harness.controllers.traci_style import StepListenerController, Traci, TraCIException, TraciStyleController
+from harness.controllers.traci_style import StepListenerController, Traci, TraciStyleController
 
 
 def seen(time_s=0.0, speed=20.0, *, bv_lane=0, lead_speed=20.0):
@@ -60,72 +62,53 @@ def test_accelerations_of_traffic_are_differences_of_speeds(traci):
     assert traci.vehicle.getAcceleration("LV") == 0.0
 
 
-def test_slow_down_is_linear_as_in_sumo(traci):
-    traci.vehicle.slowDown("AV", 18.0, 0.5)
-    assert drive(traci, 6, 20.0) == [19.6, 19.2, 18.8, 18.4, 18.0, 18.0]
-
-
-def test_slow_down_over_a_part_of_a_step_ends_on_the_speed(traci):
-    traci.vehicle.slowDown("AV", 15.0, 0.25)
-    assert drive(traci, 4, 20.0) == [18.0, 16.0, 15.0, 15.0]
-
-
-def test_set_acceleration_lasts_for_its_duration(traci):
-    traci.vehicle.setAcceleration("AV", -2.0, 0.3)
-    assert drive(traci, 5, 20.0) == [19.8, 19.6, 19.4, 19.4, 19.4]
-    traci.vehicle.setAcceleration("AV", -2.0, 0.25)
-    assert drive(traci, 4, 19.4) == [19.2, 19.0, 18.9, 18.9]
-
-
-def test_set_speed_holds_until_released(traci):
-    traci.vehicle.setSpeed("AV", 19.0)
-    assert drive(traci, 3, 20.0) == [19.0, 19.0, 19.0]
-    traci.vehicle.setSpeed("AV", -1)
-    assert drive(traci, 2, 19.0) == [19.0, 19.0]
-
-
-def test_decel_bounds_what_set_speed_leads_to(traci):
-    traci.vehicle.setDecel("AV", 4.5)
-    traci.vehicle.setSpeed("AV", 0.0)
-    assert drive(traci, 3, 20.0) == [19.55, 19.1, 18.65]
-
-
-@pytest.mark.parametrize("vehicle", ["LV", "BV"])
 @pytest.mark.parametrize(
-    ("name", "arguments"),
-    [("setSpeed", (3.0,)), ("setAcceleration", (1.0, 1.0)), ("slowDown", (1.0, 1.0)), ("setDecel", (1.0,))],
+    ("commands", "speeds"),
+    [
+        ([("slowDown", 18.0, 0.5)], [19.6, 19.2, 18.8, 18.4, 18.0, 18.0]),
+        ([("slowDown", 15.0, 0.25)], [18.0, 16.0, 15.0, 15.0]),
+        ([("setAcceleration", -2.0, 0.3)], [19.8, 19.6, 19.4, 19.4]),
+        ([("setAcceleration", -2.0, 0.25)], [19.8, 19.6, 19.5, 19.5]),
+        ([("setSpeed", 19.0)], [19.0, 19.0, 19.0]),
+        ([("setDecel", 4.5), ("setSpeed", 0.0)], [19.55, 19.1, 18.65]),
+    ],
 )
-def test_commands_for_traffic_are_refused_with_the_reason(traci, vehicle, name, arguments):
-    with pytest.raises(TraCIException, match=f"{name}.*{vehicle}.*invalidate the likelihood ratios"):
-        getattr(traci.vehicle, name)(vehicle, *arguments)
+def test_commands_lead_to_the_speeds_of_sumo(traci, commands, speeds):
+    for name, *arguments in commands:
+        getattr(traci.vehicle, name)("AV", *arguments)
+    assert drive(traci, len(speeds), 20.0) == speeds
+    traci.vehicle.setSpeed("AV", -1)  # releases it
+    assert drive(traci, 2, speeds[-1]) == [speeds[-1]] * 2
+
+
+MOVES = ("moveTo", "moveToXY", "changeLane", "remove", "add", "setRoute", "rerouteTraveltime")
+ENDS = ("simulationStep", "load", "close", "start", "switch")
+COMMANDS = {"setSpeed": (3.0,), "setAcceleration": (1.0, 1.0), "slowDown": (1.0, 1.0), "setDecel": (1.0,)}
+RATIOS = "invalidate the likelihood ratios"
+REFUSED = [
+    *(
+        (f"{name}.*{of}.*{RATIOS}", f"vehicle.{name}", of, *rest)
+        for name, rest in COMMANDS.items()
+        for of in ("LV", "BV")
+    ),
+    *((RATIOS, f"vehicle.{name}", "AV", 1, 2) for name in MOVES),
+    *(("the harness itself starts, steps and ends", name) for name in ENDS),
+    ("as under speed mode 32", "vehicle.setSpeedMode", "AV", 31),
+    ("stays on its lane", "vehicle.setLaneChangeMode", "AV", 0),
+    *(("'AV7' is not known", f"vehicle.{name}", "AV7") for name in ("getSpeed", "getLeader", "getLaneIndex")),
+    ("'AV7' is not known", "vehicle.setSpeed", "AV7", 1.0),
+    ("", "vehicle.slowDown", "AV", -1.0, 1.0),
+    ("", "vehicle.slowDown", "AV", 1.0, -1.0),
+    ("", "vehicle.setAcceleration", "AV", 1.0, -1.0),
+    ("", "vehicle.setAcceleration", "AV", float("nan"), 1.0),
+]
+
+
+@pytest.mark.parametrize(("reason", "name", "arguments"), [(reason, name, rest) for reason, name, *rest in REFUSED])
+def test_what_is_not_the_avs_or_not_possible_is_refused(traci, reason, name, arguments):
+    with pytest.raises(traci.exceptions.TraCIException, match=reason or None):
+        attrgetter(name)(traci)(*arguments)
     assert traci.vehicle.next_acceleration() == 0.0
-
-
-@pytest.mark.parametrize("name", ["moveTo", "moveToXY", "changeLane", "remove", "add", "setRoute", "rerouteTraveltime"])
-def test_what_would_move_traffic_is_refused(traci, name):
-    with pytest.raises(TraCIException, match="invalidate the likelihood ratios"):
-        getattr(traci.vehicle, name)("AV", 1, 2)
-
-
-def test_what_would_step_or_end_the_simulation_is_refused(traci):
-    for name in ("simulationStep", "load", "close", "start", "switch"):
-        with pytest.raises(TraCIException, match="the harness itself starts, steps and ends"):
-            getattr(traci, name)()
-
-
-def test_modes_are_refused_because_they_have_no_effect(traci):
-    with pytest.raises(TraCIException, match="as under speed mode 32"):
-        traci.vehicle.setSpeedMode("AV", 31)
-    with pytest.raises(TraCIException, match="stays on its lane"):
-        traci.vehicle.setLaneChangeMode("AV", 0)
-
-
-def test_another_cell_and_unknown_vehicles_are_not_there(traci):
-    for name in ("getSpeed", "getLeader", "getLaneIndex"):
-        with pytest.raises(TraCIException, match="'AV7' is not known"):
-            getattr(traci.vehicle, name)("AV7")
-    with pytest.raises(TraCIException, match="'AV7' is not known"):
-        traci.vehicle.setSpeed("AV7", 1.0)
 
 
 def test_an_unknown_name_lists_what_there_is(traci):

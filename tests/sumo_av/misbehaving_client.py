@@ -15,8 +15,32 @@ import idm_client
 FAULT_STEP = 60
 
 
+def slows_lv(traci):
+    traci.vehicle.setSpeedMode("LV1", 0)
+    traci.vehicle.slowDown("LV1", 0.0, 2.0)
+    traci.vehicle.setPreviousSpeed("LV1", 1.0)
+
+
+def changes_lane(traci):
+    for k in range(4):
+        traci.vehicle.setActionStepLength(f"AV{k}", 0.1, True)
+        traci.vehicle.changeLane(f"AV{k}", 1, 0.0)
+
+
+FAULTS = {
+    "exits": lambda traci: sys.exit(7),
+    "is_killed": lambda traci: os.kill(os.getpid(), signal.SIGKILL),
+    "hangs": lambda traci: time.sleep(600),
+    "closes": lambda traci: (traci.close(), time.sleep(600)),
+    "drops": lambda traci: (traci._socket.close(), time.sleep(600)),
+    "moves_bv": lambda traci: traci.vehicle.moveTo("BV1", "cell1_1", 500.0),
+    "slows_lv": slows_lv,
+    "changes_lane": changes_lane,
+}
+
+
 class Faulty:
-    """A connection that does something wrong at step `FAULT_STEP`."""
+    """A connection that does something wrong at step `FAULT_STEP`, or pushes a held AV in every one."""
 
     def __init__(self, connection, fault):
         self._connection, self._fault, self._step = connection, fault, 0
@@ -26,44 +50,11 @@ class Faulty:
 
     def simulationStep(self):  # noqa: N802 - TraCI's name
         self._step += 1
-        if self._step == FAULT_STEP:
-            getattr(self, self._fault)()
+        if self._step == FAULT_STEP and self._fault in FAULTS:
+            FAULTS[self._fault](self._connection)
         if self._fault == "pushes_held_avs" and self._step > 1:
             self._connection.vehicle.setSpeed("AV0", 3.0)
         return self._connection.simulationStep()
-
-    def exits(self):
-        sys.exit(7)
-
-    def is_killed(self):
-        os.kill(os.getpid(), signal.SIGKILL)
-
-    def hangs(self):
-        time.sleep(600)
-
-    def closes(self):
-        self._connection.close()
-        time.sleep(600)
-
-    def drops(self):
-        self._connection._socket.close()
-        time.sleep(600)
-
-    def moves_bv(self):
-        self._connection.vehicle.moveTo("BV1", "cell1_1", 500.0)
-
-    def slows_lv(self):
-        self._connection.vehicle.setSpeedMode("LV1", 0)
-        self._connection.vehicle.slowDown("LV1", 0.0, 2.0)
-        self._connection.vehicle.setPreviousSpeed("LV1", 1.0)
-
-    def changes_lane(self):
-        for k in range(4):
-            self._connection.vehicle.setActionStepLength(f"AV{k}", 0.1, True)
-            self._connection.vehicle.changeLane(f"AV{k}", 1, 0.0)
-
-    def pushes_held_avs(self):
-        pass
 
 
 def main():
