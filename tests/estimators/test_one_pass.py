@@ -10,15 +10,15 @@ from pydantic import TypeAdapter
 from harness.errors import RunFolderError
 from harness.estimators.answer import CampaignFacts, estimate_blocks
 from harness.estimators.estimate import Estimate, Estimates, Unavailable, finite_json
-from harness.estimators.one_pass import accumulator, one_pass
+from harness.estimators.one_pass import Diagnostics, accumulator, one_pass
 from harness.runner.estimate import estimate_run
-from harness.vocabulary import ESTIMATORS, SAMPLING
+from harness.vocabulary import BV_LV_CONTACT, ESTIMATORS, SAMPLING
 from studies.chains.chain import overtaking
 from studies.chains.sampler import blocks
 from tests.chains.seed import SEED
 
 from .run_folder import write_run
-from .small_blocks import block
+from .small_blocks import block, fed
 
 CHAIN = overtaking("two surrogates", skill=0.5, surrogates=[0.5, 0.2], level=0.02, horizon=6)
 SIZES = [600, 600, 300]
@@ -155,9 +155,7 @@ def test_each_estimator_gets_what_it_would_get_alone(method):
             assert estimate == Unavailable(reason)
             assert finite_json(estimate) == {"crash_rate": None, "reason": reason}
             continue
-        for part in parts:
-            alone.add(part)
-        assert estimate == alone.result(0.9)
+        assert estimate == fed(alone, parts).result(0.9)
     assert set(together) == set(ESTIMATORS)
     assert isinstance(together[SAMPLING[method].headline], Estimate)
 
@@ -187,3 +185,40 @@ def test_a_gap_is_refused(kept, text):
     parts = list(blocks(SHORT, "nde", [10] * 3, SEED))
     with pytest.raises(ValueError, match=text):
         one_pass([parts[k] for k in kept])
+
+
+def test_means_are_those_of_numpy():
+    parts = list(blocks(SHORT, "episode_mixture", [3_000, 2_000], SEED))
+    result = fed(Diagnostics(), parts).result(("forced", "one", "two"))
+    weights = np.concatenate([part.weights() for part in parts])
+    cut_in = np.concatenate([part.cut_in for part in parts])
+    ratios = np.concatenate([part.mixture_ratios() for part in parts])
+    for found, values in (
+        (result["mean_weight"], weights),
+        (result["mean_weight_cut_in"], weights * cut_in),
+        (result["mean_ratio"]["forced"], ratios[:, 0]),
+        (result["mean_ratio"]["two"], ratios[:, 2]),
+    ):
+        assert found["mean"] == pytest.approx(values.mean(), rel=1e-12)
+        assert found["std_error"] == pytest.approx(values.std(ddof=1) / np.sqrt(5_000), rel=1e-9)
+    assert result["n_cut_ins"] == cut_in.sum()
+
+
+def test_a_small_mean_weight_of_the_step_mixture_is_explained_not_failed():
+    careless = fed(Diagnostics(), [block([False] * 10, [-5.0] * 10)]).result()
+    assert "still missing" in careless["heavy_tail"]
+    assert "never tests" in careless["note"]
+    assert "heavy_tail" not in fed(Diagnostics(), [block([False] * 10)]).result()
+    assert "heavy_tail" not in fed(Diagnostics(), [block([False] * 10, [-5.0] * 10, method="forced")]).result()
+
+
+def test_contacts_are_weighted_and_failures_counted():
+    base = block([False] * 4, [-1.0, 0.0, 0.0, 0.0], failed=[False, True, False, False])
+    result = fed(Diagnostics(), [base.ending(np.array([True, False, False, False]), BV_LV_CONTACT)]).result()
+    assert result["bv_lv_contact_share"]["mean"] == pytest.approx(np.exp(-1.0) / 4)
+    assert (result["n_failed"], result["n_bv_lv_contacts"]) == (1, 1)
+
+
+def test_weights_that_overflow_do_not_stop_the_estimate():
+    result = fed(Diagnostics(), [block([False, False], [800.0, 0.0])]).result()
+    assert result["mean_weight"]["mean"] == np.inf

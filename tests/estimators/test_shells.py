@@ -1,6 +1,7 @@
-"""Shells: limits of the weighted sum; counts that merge; statements that say what they rest on."""
+"""Shells: limits of the weighted sum, statements that say what they rest on, and how many paths crashes lie on."""
 
 import json
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +12,7 @@ from harness.estimators.block import Drawn
 from harness.estimators.estimate import Estimate, finite_json
 from harness.estimators.likelihood import Level, likelihood_limit
 from harness.estimators.one_pass import one_pass
-from harness.estimators.tally import Tally, combined, pool_variance
+from harness.estimators.tally import FEWEST_PATHS, CrashPaths, Tally, combined, pool_variance
 from harness.strata import Statement
 
 from .small_blocks import SHELLS, in_shells
@@ -188,29 +189,62 @@ def test_a_crash_outside_refutes_the_assumption():
 TWO = (Statement("library", "careful", "keeps to careful", 1), Statement("need", "careless", "brakes", 2, checked=True))
 
 
-def test_each_statement_has_its_own_inside_and_its_own_refutation():
+@pytest.mark.parametrize("ahead_in", [(), (7, 250)])
+def test_each_statement_has_its_own_inside_and_its_own_refutation(ahead_in):
     """One set of tests: a crash beyond the narrow boundary alone leaves the wide statement as it is."""
-    design = replace(SHELLS, statements=TWO)
-    estimate = shells_estimate((0, 8, 0, 2), (1, 3, 0, 17), (2, 0, 0, 400), shells=design, ahead=np.zeros(430, bool))
+    ahead, rows = np.isin(np.arange(430), ahead_in), ((0, 8, 0, 2), (1, 3, 0, 17), (2, 0, 0, 400))
+    estimate = shells_estimate(*rows, shells=replace(SHELLS, statements=TWO), ahead=ahead)
     library, need = estimate.details["statements"]
     assert (library["n_episodes"], library["n_episodes_outside"], library["refuted"]) == (10, 420, True)
     assert library["refuted_by"] == (10, 11, 12)
     assert (need["n_episodes"], need["n_episodes_outside"], need["refuted"]) == (30, 400, False)
+    assert (need["n_checked"], need["n_ahead"], need["ahead_in"]) == (430, len(ahead_in), ahead_in)
     assert library["crash_rate"] == pytest.approx(0.8e-4)
     assert need["crash_rate"] == pytest.approx(estimate.crash_rate)
     alone = combined(P[:2], tally((8, 3, 0), (10, 20, 400)).part(slice(0, 2)), SHELLS.n_paths, LEVEL)
     assert (need["ci_low"], need["ci_high"]) == pytest.approx((alone.low, alone.high), rel=1e-9)
-    assert "In none of 430 tests was it ahead" in boundary_statements(estimate)["need"]
+    said = "In 2 of 430 tests it was AHEAD of" if ahead_in else "In none of 430 tests was it ahead"
+    assert said in boundary_statements(estimate)["need"]
     assert "ahead" not in boundary_statements(estimate)["library"]
+    assert any("was ahead of careless in 2 of 430" in warning for warning in estimate.warnings) == bool(ahead_in)
 
 
-def test_one_test_ahead_of_the_boundary_takes_away_the_reason():
-    ahead = np.zeros(430, bool)
-    ahead[[7, 250]] = True
-    counts = (0, 8, 0, 2), (1, 3, 0, 17), (2, 0, 0, 400)
-    estimate = shells_estimate(*counts, shells=replace(SHELLS, statements=TWO), ahead=ahead)
-    need = estimate.details["statements"][1]
-    assert (need["n_checked"], need["n_ahead"], need["ahead_in"], need["refuted"]) == (430, 2, (7, 250), False)
-    text = boundary_statements(estimate)["need"]
-    assert "In 2 of 430 tests it was AHEAD of such a vehicle, first in episode 7 (`harness replay FOLDER 7`)" in text
-    assert any("was ahead of careless in 2 of 430 tests" in warning for warning in estimate.warnings)
+def counted(paths, strata, n_strata=2):
+    """Crashed tests of paths that are known by one number each."""
+    found = CrashPaths()
+    found.add(np.asarray(paths, np.float64)[:, None], np.asarray(strata, np.int64), n_strata)
+    return found
+
+
+def test_pairs_of_one_path_are_counted_by_weight():
+    """Paths 1, 1, 1 and 2 in stratum 0, 2 and 3 in stratum 1: by hand."""
+    found = counted([1, 1, 1, 2, 2, 3], [0, 0, 0, 0, 1, 1])
+    w = [1.0] * 4 + [0.5] * 2
+    total = sum(w) ** 2 - sum(x * x for x in w)
+    same = 2 * (3 * 1.0 * 1.0) + 2 * (1.0 * 0.5)
+    assert found.number(np.array([1.0, 0.5])) == pytest.approx(total / same)
+    assert found.number(np.array([1.0, 0.0])) == pytest.approx(12 / 6)
+
+
+def test_one_or_two_pairs_say_nothing():
+    assert counted([1, 1, 2, 2, 3], [0] * 5).number(np.ones(2)) == math.inf
+    assert counted([1, 1, 1, 2], [0] * 4).number(np.ones(2)) == 2.0
+    assert CrashPaths().number(np.ones(2)) == math.inf
+    assert counted([1, 1, 1], [0] * 3).number(np.zeros(2)) == math.inf
+
+
+@pytest.mark.parametrize("n_paths", [8, 25, 150, 500])
+def test_it_is_the_number_of_equal_paths_and_the_guard_tells_few_from_many(n_paths):
+    """Eighty crashes; the guard decides wrongly in 1,000 draws never."""
+    rng = np.random.default_rng(n_paths)
+    numbers = np.array([counted(rng.integers(n_paths, size=80), [0] * 80).number(np.ones(2)) for _ in range(1000)])
+    assert np.mean(1.0 / numbers) == pytest.approx(1.0 / n_paths, rel=0.05)
+    assert np.all((numbers < FEWEST_PATHS) == (n_paths < FEWEST_PATHS))
+
+
+def test_unequal_paths_count_as_far_as_they_carry():
+    """G = 4, 1, 1, 1, 1: (8)^2/20 = 3.2 paths."""
+    rng = np.random.default_rng(5)
+    share = np.array([4, 1, 1, 1, 1]) / 8
+    pairs = [1.0 / counted(rng.choice(5, size=60, p=share), [0] * 60).number(np.ones(2)) for _ in range(400)]
+    assert np.mean(pairs) == pytest.approx(20 / 64, rel=0.03)
