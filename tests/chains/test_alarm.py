@@ -222,7 +222,17 @@ def test_too_few_crashes_are_noticed_once_the_heaviest_would_have_occurred(n, ra
     assert found["raised"] == raised
 
 
+def test_too_many_crashes_by_hand():
+    many = [((1.0 + 2.0**-j / 0.1) / (1.0 + 2.0**-j)) ** 9 for j in range(1, 25)]
+    few = [math.exp(-9.0 * 2.0**-j / 0.1) for j in range(1, 25)]
+    assert told(*weighted([1.0] * 9, 0.1))["p_value"] == pytest.approx(48.0 / math.fsum(many + few), rel=1e-9)
+
+
 def test_without_a_bound_only_too_many_crashes_are_evidence():
     none = told(*weighted([0.0] * 10_000, 0.1))
     assert none["p_value"] == 1.0
     assert told(*weighted([1.0] * 100, 0.1))["raised"]
+
+
+def test_a_surrogate_without_a_known_rate_is_not_judged():
+    assert told(*weighted([1.0] * 100, 0.0, cap=1.0))["p_value"] == 1.0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.stats import binomtest
 
 from studies.case_study.theorems import small_chains
 from studies.chains.chain import enumerate_episodes, frequent_decisive, overtaking, panel
@@ -15,6 +16,12 @@ from .seed import SEED
 def small() -> list:
     immediate = {"surrogates": [0.6, 0.3], "challenge": "immediate"}
     return [*small_chains(), overtaking("immediate", skill=0.6, level=0.05, horizon=4, **immediate)]
+
+
+def test_crash_rates_span_the_rare_range():
+    rates = [chain.crash_rate for chain in panel()]
+    assert max(rates) > 1e-3
+    assert min(rates) < 1e-8
 
 
 @pytest.mark.parametrize("chain", small(), ids=lambda c: c.name)
@@ -50,6 +57,29 @@ def test_importance_functions_sum_to_one_and_have_mean_ratio_one(chain):
     np.testing.assert_allclose(maneuver.sum(axis=-1), 1.0, rtol=1e-12)
     np.testing.assert_allclose((maneuver * (chain.exposure / maneuver)).sum(axis=-1), 1.0, rtol=1e-12)
     assert np.all((chain.proposals.cut >= 0.0) & (chain.proposals.cut <= 1.0))
+
+
+def test_plain_sampling_gives_the_induced_crash_rate():
+    chain = frequent_decisive()
+    block = draw(chain, "nde", 200_000, np.random.default_rng(SEED))
+    assert binomtest(int(block.crash.sum()), 200_000, chain.crash_rate).pvalue > 1e-4
+    assert binomtest(int(block.cut_in.sum()), 200_000, chain.cut_in_rate).pvalue > 1e-4
+
+
+@pytest.mark.parametrize("method", ["nde", "step_mixture"])
+def test_without_control_the_log_weight_is_exactly_zero(method):
+    block = draw(panel()[3], method, 20_000, np.random.default_rng(SEED))
+    free = block.n_control_steps == 0
+    assert np.all(block.log_weight[free] == 0.0)
+    assert np.all(block.log_q[free] == 0.0)
+
+
+def test_forced_weights_are_the_probability_of_a_cut_in_on_the_path():
+    chain = panel()[1]
+    block = draw(chain, "forced", 5_000, np.random.default_rng(SEED))
+    assert block.cut_in.all()
+    assert np.all(block.log_weight == block.log_p_cut_in)
+    assert block.weighted_crashes().max() <= chain.cut_in_cap
 
 
 def test_defensive_mixture_bounds_every_weighted_crash():
