@@ -21,6 +21,7 @@ from typing import Any
 
 import pytest
 
+from benchmarks.kills import descendants, started_by
 from harness import run
 from harness.campaign.campaign import Campaign
 from harness.controllers.hosts import Death
@@ -122,3 +123,8 @@ def forked_workers() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("harness.processes.subprocess", SimpleNamespace(**{**vars(subprocess), "Popen": ForkedPython}))
         yield
+
+
+def workers_alive() -> list[int]:
+    """Processes below this one, but for Python's own watcher of shared memory, which other tests may have started."""
+    return [pid for pid in descendants(os.getpid()) if not started_by(pid, b"resource_tracker")]

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.kills import descendants
 from harness.cli import main
 from harness.drawing import ShardRequest
 from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, WorldDisagreementError
@@ -20,6 +19,7 @@ from harness.progress import ShownProgress
 from harness.runner import run as running
 from harness.runner import worker, workers
 from harness.runner.workers import WorkerLostError
+from tests.in_process import workers_alive
 from tests.runner import bad_workers
 from tests.runner.conftest import MIXTURE_FILE, SMALL, TWIN, sets
 from tests.stored_runs import copy_of, manifest, shard_files, unlike_columns
@@ -37,7 +37,7 @@ def test_a_shard_that_kills_every_worker_ends_the_run_and_is_named(run, campaign
     assert lost.value.exit_code == EXIT_TOO_MANY_FAILED
     assert "exit code -9" in lost.value.found
     assert manifest(tmp_path)["status"] == "interrupted"
-    assert descendants(os.getpid()) == []
+    assert workers_alive() == []
 
 
 def test_a_disagreement_in_a_worker_ends_the_run_and_all_workers(run, campaign, tmp_path, monkeypatch):
@@ -45,7 +45,7 @@ def test_a_disagreement_in_a_worker_ends_the_run_and_all_workers(run, campaign, 
     with pytest.raises(WorldDisagreementError, match="SUMO, BV3, m"):
         run(campaign(*TWIN), tmp_path, workers=2)
     assert manifest(tmp_path)["status"] == "interrupted"
-    assert descendants(os.getpid()) == []
+    assert workers_alive() == []
 
 
 def test_a_full_disk_is_said_in_words_and_the_run_can_be_resumed(

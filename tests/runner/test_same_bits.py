@@ -12,10 +12,9 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from benchmarks.kills import descendants
 from harness.progress import Progress
 from tests.golden.campaigns import BASE, IN_BOTH_WORLDS
-from tests.in_process import run_here
+from tests.in_process import run_here, workers_alive
 from tests.stored_runs import MORE, copy_of, golden, manifest, sets, shard_files, stored_table, unlike_columns
 
 PATIENCE_S = 300.0
@@ -75,7 +74,7 @@ class KillOneWorker(Progress):
     def advance(self, n: int = 1) -> None:
         self.calls += 1
         if self.calls == 4:
-            self.killed = [descendants(os.getpid())[0]]
+            self.killed = [workers_alive()[0]]
             os.kill(self.killed[0], signal.SIGKILL)
 
 
