@@ -189,3 +189,10 @@ def test_imports_lead_where_they_should(folder, imported):
     wrong = re.compile(rf"^\s*(?:from|import) {imported}\b", re.MULTILINE)
     files = (ROOT / folder).rglob("*.py")
     assert [file for file in files if wrong.search(file.read_text(encoding="utf-8"))] == []
+
+
+def test_the_wheel_has_every_folder_of_the_package():
+    folders = {
+        path.parent.relative_to(ROOT).as_posix().replace("/", ".") for path in ROOT.glob("harness/**/__init__.py")
+    }
+    assert folders == set(PROJECT["tool"]["setuptools"]["packages"]) - {"harness.scenarios", "harness.sumo_networks"}
