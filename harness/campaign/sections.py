@@ -283,8 +283,8 @@ class RaySettings(Section):
     )
 
 
-USUAL_SHARD, LARGEST_SHARD = 5_000, 1_000_000
-SHARD_SHARE = 32
+USUAL_SHARD, LARGEST_SHARD = 5_000, 2_000_000
+SHARD_SHARE, LONG_RUN = 32, 2_500_000
 
 
 class Run(Section):
@@ -292,8 +292,8 @@ class Run(Section):
 
     shard_size: Annotated[int, Field(ge=1, le=LARGEST_SHARD), BeforeValidator(whole)] | None = Field(
         None,
-        description="episodes per file and per task; null: 5,000, and in a long run a 32nd of the episodes before, so "
-        "that it has some 200 files",
+        description="episodes per file and per task; null: 5,000, and in a long run a 32nd of the episodes before, "
+        "from 2.5 million on a 16th, so that a run of 100 million has 200 files",
     )
     max_failed_share: Probability = Field(0.01, description="stop with exit code 3 above this share of failures")
     executor: Literal["local", "ray"] = Field("local", description="where workers run: on this machine, or a cluster")
@@ -313,5 +313,6 @@ class Run(Section):
             return range(self.shard_size, n_episodes + self.shard_size, self.shard_size)
         ends = [USUAL_SHARD]
         while ends[-1] < n_episodes:
-            ends.append(ends[-1] + min(max(USUAL_SHARD, ends[-1] // SHARD_SHARE), LARGEST_SHARD))
+            share = SHARD_SHARE if ends[-1] < LONG_RUN else SHARD_SHARE // 2
+            ends.append(ends[-1] + min(max(USUAL_SHARD, ends[-1] // share), LARGEST_SHARD))
         return ends
