@@ -18,14 +18,14 @@ import numpy as np
 from benchmarks.one_at_a_time import OverTraci, in_libsumo
 from harness.campaign.campaign import Campaign
 from harness.campaign.files import load_campaign
-from harness.drawing import ShardRequest, Source
 from harness.episode import loop
 from harness.episode.loop import Shard
 from harness.records.folder import encoded, write_shard
 from harness.records.schemas import shard_tables
 from harness.resolved import resolve
-from harness.runner.resolve import prepare
+from harness.runner.prepare import prepare
 from harness.runner.workers import LocalWorkers
+from harness.sampling import ShardRequest, Source
 from harness.worlds.protocol import World
 from harness.worlds.shim import shim_library
 from harness.worlds.sumo import SumoWorld, sumo_program

@@ -20,10 +20,10 @@ if TYPE_CHECKING:
     from harness.records.reader import read
     from harness.report.page import write_report
     from harness.runner.compare import compare_campaigns as compare
-    from harness.runner.estimate import estimate_run as estimate
     from harness.runner.look import check_av as av_check
-    from harness.runner.replay import replay_episode as replay
     from harness.runner.run import run_campaign as run
+    from harness.runner.stored import estimate_run as estimate
+    from harness.runner.stored import replay_episode as replay
 
 __all__ = [
     "HarnessError",
@@ -41,10 +41,10 @@ _PLACES = {
     "HarnessError": ("harness.errors", "HarnessError"),
     "av_check": ("harness.runner.look", "check_av"),
     "compare": ("harness.runner.compare", "compare_campaigns"),
-    "estimate": ("harness.runner.estimate", "estimate_run"),
+    "estimate": ("harness.runner.stored", "estimate_run"),
     "load_campaign": ("harness.campaign.files", "load_campaign"),
     "read": ("harness.records.reader", "read"),
-    "replay": ("harness.runner.replay", "replay_episode"),
+    "replay": ("harness.runner.stored", "replay_episode"),
     "run": ("harness.runner.run", "run_campaign"),
     "write_report": ("harness.report.page", "write_report"),  # not "report": the package of that name takes that place
 }

@@ -80,6 +80,8 @@ class Sampling:
         Whether an AV that does not is driven along each path without a cut-in first.
     bounded : bool
         Whether something bounds the weights; else no precision can be promised.
+    strata : bool
+        Whether tests are cut-ins of the pool, counted within strata of known probability.
     """
 
     estimators: tuple[EstimatorName, ...]
@@ -88,6 +90,7 @@ class Sampling:
     holds_speed: bool = False
     shadows: bool = False
     bounded: bool = True
+    strata: bool = False
 
     @property
     def headline(self) -> EstimatorName:
@@ -100,7 +103,7 @@ SAMPLING: dict[Method, Sampling] = {
     "forced": Sampling(("nade",), forces=True, shadows=True),
     "step_mixture": Sampling(("nade", "scv"), mixes=True, bounded=False),
     "episode_mixture": Sampling(("mixture_cv", "nade"), mixes=True, forces=True, holds_speed=True),
-    "shells": Sampling(("shells",), shadows=True),
+    "shells": Sampling(("shells",), shadows=True, strata=True),
 }
 
 OUTCOMES = ("crash", "passed", "timeout", "bv_lv_contact", "failed")

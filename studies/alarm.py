@@ -42,7 +42,7 @@ from harness.progress import Progress
 from harness.records.folder import MEND_SHARD, read_manifest
 from harness.records.reader import read_shard
 from harness.resolved import Resolved, resolve
-from harness.runner.resolve import prepare
+from harness.runner.prepare import prepare
 from harness.traffic.initial_state import InitialStates
 from harness.traffic.laws import Environment
 from harness.unboxed import unboxed

@@ -32,7 +32,7 @@ from harness.estimators.limits import normal_half_width
 from harness.estimators.scv import Scv
 from harness.estimators.weighted import Nade, Nde
 from harness.progress import Progress
-from harness.runner.estimate import stored_blocks
+from harness.runner.stored import stored_blocks
 from harness.vocabulary import BoolArray, FloatArray, IntArray
 
 RnotEstimator = Literal["nde", "nade", "scv"]

@@ -25,10 +25,10 @@ from benchmarks.kills import descendants, started_by
 from harness import run
 from harness.campaign.campaign import Campaign
 from harness.controllers.hosts import Death
-from harness.drawing import ShardRequest
 from harness.runner import workers
 from harness.runner.run import RunResult
-from harness.runner.worker import ShardResult, ShardRunner
+from harness.runner.workers import ShardResult, ShardRunner
+from harness.sampling import ShardRequest
 
 
 @contextmanager

@@ -98,8 +98,8 @@ def calls(monkeypatch, tmp_path):
     )
     stand_in("harness.runner.run.run_campaign", lambda _, folder: Result(folder, folder / "report.html"))
     stand_in("harness.report.page.write_report", lambda folder: folder / "report.html")
-    stand_in("harness.runner.estimate.estimate_run", ESTIMATES)
-    stand_in("harness.runner.replay.replay_episode", Replay(bit_equal=True))
+    stand_in("harness.runner.stored.estimate_run", ESTIMATES)
+    stand_in("harness.runner.stored.replay_episode", Replay(bit_equal=True))
     seen["stand_in"] = stand_in
     return seen
 
@@ -219,7 +219,7 @@ def test_interrupt_says_how_to_go_on(calls, capsys, tmp_path):
     calls["stand_in"]("harness.runner.run.run_campaign", KeyboardInterrupt())
     assert main(["run", SMOKE, "--out", str(tmp_path)]) == 130
     assert "--resume" in capsys.readouterr().err
-    calls["stand_in"]("harness.runner.estimate.estimate_run", KeyboardInterrupt())
+    calls["stand_in"]("harness.runner.stored.estimate_run", KeyboardInterrupt())
     assert main(["estimate", str(tmp_path)]) == 130
     assert "--resume" not in capsys.readouterr().err
 
@@ -253,7 +253,7 @@ def test_defects_are_not_hidden(calls, tmp_path):
 def test_estimate_prints_a_table(calls, capsys, tmp_path):
     assert main(["estimate", str(tmp_path), "-e", "nade", "-e", "nde", "--confidence", "0.95"]) == 0
     out = capsys.readouterr().out
-    assert calls["harness.runner.estimate.estimate_run"] == (
+    assert calls["harness.runner.stored.estimate_run"] == (
         (tmp_path,),
         {"estimators": ("nade", "nde"), "confidence": 0.95},
     )
@@ -286,7 +286,7 @@ def test_replay_writes_the_trace(calls, capsys, tmp_path):
     assert main(["replay", str(tmp_path), "17", "--out", str(as_csv), "--fcd", "fcd.xml"]) == 0
     out = capsys.readouterr().out
     assert out.splitlines() == ["episode 17: crash; bit for bit as stored", str(as_csv), "fcd.xml"]
-    assert calls["harness.runner.replay.replay_episode"] == ((tmp_path, 17), {"gui": False, "fcd": Path("fcd.xml")})
+    assert calls["harness.runner.stored.replay_episode"] == ((tmp_path, 17), {"gui": False, "fcd": Path("fcd.xml")})
     assert csv.read_csv(as_csv)["vehicle"].to_pylist() == ["LV", "BV"]
     assert main(["replay", str(tmp_path), "17", "--out", str(as_parquet), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["bit_equal"] is True
@@ -298,7 +298,7 @@ def test_a_file_that_cannot_be_written_is_refused_first(calls, capsys, tmp_path,
     (tmp_path / "file").write_text("not a folder")
     assert main(["replay", str(tmp_path), "17", option, str(tmp_path / "file" / "x.csv")]) == 2
     assert "nothing can be written" in capsys.readouterr().err
-    assert "harness.runner.replay.replay_episode" not in calls
+    assert "harness.runner.stored.replay_episode" not in calls
 
 
 POOL = {
@@ -328,19 +328,19 @@ def test_pool_prints_what_it_wrote(calls, capsys, tmp_path):
 
 
 def test_replay_that_differs_is_an_error(calls, capsys, tmp_path):
-    calls["stand_in"]("harness.runner.replay.replay_episode", Replay(bit_equal=False))
+    calls["stand_in"]("harness.runner.stored.replay_episode", Replay(bit_equal=False))
     assert main(["replay", str(tmp_path), "17"]) == 3
     out, err = capsys.readouterr()
     assert out == "episode 17: crash; NOT as stored\n"
     assert "mend:     The controller's source file has been changed" in err
-    calls["stand_in"]("harness.runner.replay.replay_episode", Replay(bit_equal=None))
+    calls["stand_in"]("harness.runner.stored.replay_episode", Replay(bit_equal=None))
     assert main(["replay", str(tmp_path), "17"]) == 0
     assert "no stored trace" in capsys.readouterr().out
 
 
 def test_replay_says_when_a_cut_in_that_takes_time_began(calls, tmp_path, capsys):
     row = {"onset_step": 41, "cut_in_step": 53, "onset_r2_m": 7.25, "contact": "side"}
-    calls["stand_in"]("harness.runner.replay.replay_episode", Replay(bit_equal=True, row=row))
+    calls["stand_in"]("harness.runner.stored.replay_episode", Replay(bit_equal=True, row=row))
     assert main(["replay", str(tmp_path), "17"]) == 0
     sentence = "BV comes over from 4.2 s on, 7.2 m ahead of the AV, and overlaps at 5.4 s; side contact"
     assert sentence in capsys.readouterr().out

@@ -9,11 +9,17 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
+import re
 from typing import Any, Self
 
+import yaml
 from pydantic import Field, model_validator
+from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
+from pydantic_core import CoreSchema, core_schema
 
 from harness.campaign.combinations import Parts, refusal
+from harness.campaign.drivers import Surrogate, default_surrogates
 from harness.campaign.problems import NAME_PATTERN, broken_rule
 from harness.campaign.sections import (
     Accept,
@@ -29,12 +35,8 @@ from harness.campaign.sections import (
     World,
     listed,
 )
-from harness.campaign.vehicle import (
-    AutomatedVehicle,
-    Surrogate,
-    default_surrogates,
-)
-from harness.vocabulary import SAMPLING
+from harness.campaign.vehicle import AV_SOURCES, AutomatedVehicle
+from harness.vocabulary import SAMPLING, Sampling
 
 
 class Campaign(Section):
@@ -86,16 +88,21 @@ class Campaign(Section):
         return Parts(*sections, has_shadow_runs=self.has_shadow_runs)
 
     @property
+    def sampling(self) -> Sampling:
+        """What is to be known of its method, ``testing.method``."""
+        return SAMPLING[self.testing.method]
+
+    @property
     def has_shadow_runs(self) -> bool:
         """Whether the AV is first driven along its paths without a cut-in."""
-        return self.av.acts_before_cut_in and SAMPLING[self.testing.method].shadows
+        return self.av.acts_before_cut_in and self.sampling.shadows
 
     @property
     def min_crashes(self) -> int:
         """Sampled crashes needed before RHW may stop the campaign; limits within shells are exact, without a floor."""
         if self.stop.min_crashes is not None:
             return self.stop.min_crashes
-        return 1 if self.testing.method == "shells" else 100
+        return 1 if self.sampling.strata else 100
 
     def alpha(self) -> tuple[float, ...]:
         """Mixture weights of the surrogates, in their order, summing to 1."""
@@ -109,7 +116,7 @@ class Campaign(Section):
         Cells, workers, stop rule, trace policy and names are left out, so that a campaign can be continued to a
         smaller RHW or with other resources.
         """
-        shells = self.testing.method == "shells"
+        shells = self.sampling.strata
         planned = shells and self.testing.shells.stopping == "two_phase"
         environment, testing = self.environment.model_dump(exclude={"parameters"}), self.testing.model_dump()
         # What came later changes no hash of before where it is left as it is.
@@ -132,3 +139,70 @@ class Campaign(Section):
             "shard_size": self.run.smallest_shard,
         }
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
+
+
+# -- campaigns and their schema, written --
+
+_HEADER = """\
+# Campaign {name}, resolved: every value is written out, defaults included.
+# Lists of allowed keys and values: harness schema. Run it again: harness run THIS_FILE --out DIR
+"""
+
+
+class _Dumper(yaml.SafeDumper):
+    """Quotes every text that is not a plain word: other YAML readers see numbers, dates and truth values in many."""
+
+    def ignore_aliases(self, _data: Any) -> bool:
+        """Write every value out."""
+        return True
+
+    def represent_text(self, text: str) -> yaml.ScalarNode:
+        """Node of a text."""
+        plain = re.fullmatch(r"[A-Za-z][A-Za-z0-9_-]*", text) and text.lower() not in _MISREAD
+        node: yaml.ScalarNode = self.represent_scalar("tag:yaml.org,2002:str", text, style=None if plain else '"')
+        return node
+
+
+_Dumper.add_representer(str, _Dumper.represent_text)
+_MISREAD = {"y", "n", "yes", "no", "on", "off", "true", "false", "null"}
+
+
+def dump_campaign(campaign: Campaign) -> str:
+    """YAML text of a campaign; `harness.campaign.files.load_campaign` reads an equal campaign from it."""
+    parts = [_HEADER.format(name=campaign.name)]
+    for key, value in written_out(campaign).items():
+        section = getattr(campaign, key)
+        about = section.__doc__ if isinstance(section, Section) else type(campaign).model_fields[key].description
+        parts.append(f"\n# {(about or key).splitlines()[0]}\n{yaml_text({key: value})}")
+    return "".join(parts)
+
+
+def written_out(campaign: Campaign) -> dict[str, Any]:
+    """Plain data of a campaign with every default, but of the sources of an AV only the one that drives it."""
+    data = campaign.model_dump()
+    data["av"] = {key: value for key, value in data["av"].items() if key not in AV_SOURCES or value is not None}
+    return data
+
+
+def yaml_text(data: dict[str, Any]) -> str:
+    """YAML of plain data, which `harness.campaign.files` reads back as it is."""
+    # Escapes keep every character, control characters included, through any editor; math.inf never folds a line.
+    text: str = yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=False, width=math.inf)
+    return text
+
+
+class _Schema(GenerateJsonSchema):
+    """Without titles that repeat the keys; mappings whose names follow a pattern have no others."""
+
+    def field_title_should_be_set(self, _schema: CoreSchema) -> bool:
+        return False
+
+    def dict_schema(self, schema: core_schema.DictSchema) -> JsonSchemaValue:
+        return {"additionalProperties": False, **super().dict_schema(schema)}
+
+
+def schema_text() -> str:
+    """JSON schema (draft 2020-12) of a campaign, committed beside the scenarios and printed by ``harness schema``."""
+    about = {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "harness campaign"}
+    schema = {**about, **Campaign.model_json_schema(schema_generator=_Schema), **about}
+    return json.dumps(schema, indent=2, ensure_ascii=False) + "\n"

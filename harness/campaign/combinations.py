@@ -9,8 +9,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Literal, NamedTuple
 
+from harness.campaign.drivers import Surrogate
 from harness.campaign.sections import Accept, Records, Stop, Testing, World
-from harness.campaign.vehicle import AutomatedVehicle, Surrogate
+from harness.campaign.vehicle import AutomatedVehicle
 from harness.errors import CampaignError
 from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT
 from harness.vocabulary import METHODS, SAMPLING, Sampling
@@ -64,7 +65,7 @@ REFUSED = (
     # -- limits --
     Combination(
         "accept",
-        lambda c, _: c.accept is not None and c.testing.method != "shells",
+        lambda c, _: c.accept is not None and not _sampling(c).strata,
         "a limit, with testing.method {testing.method}",
         "testing.method shells: how often decisions are wrong is known for its intervals alone",
         "Choose shells, or delete the section and compare the interval with the limit yourself.",
@@ -170,7 +171,7 @@ REFUSED = (
     # -- comparisons --
     Combination(
         "testing.method",
-        lambda c, use: use.command == "compare" and c.testing.method != "shells",
+        lambda c, use: use.command == "compare" and not _sampling(c).strata,
         "{testing.method}, in a comparison",
         "shells, under which both vehicles meet the same cut-ins",
         "Write --set testing.method=shells; or run both by themselves and put their intervals side by side.",

@@ -8,16 +8,15 @@ from __future__ import annotations
 import difflib
 import re
 from collections.abc import Callable, Iterator, Sequence
-from pathlib import Path
 from typing import Any, TypeVar, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
 
-from harness.campaign.yaml_text import YamlPath, read_yaml
 from harness.errors import CampaignError
 
+YamlPath = Sequence[str | int]
 Place = Callable[[YamlPath], str]
 """From a path in the data to the words that say where it was written."""
 Model = TypeVar("Model", bound=BaseModel)
@@ -67,12 +66,6 @@ def broken_rule(key: str, found: str, expected: str, mend: str) -> PydanticCusto
     parts = {"key": key, "found": found, "expected": expected, "mend": mend}
     where = "{key}: " if key else ""
     return PydanticCustomError("broken_rule", where + "found {found}; expected {expected}. {mend}", parts)
-
-
-def read_model(path: str | Path, model: type[Model]) -> Model:
-    """Read a YAML file into a model, or name the path and line of every problem (`CampaignError`)."""
-    data, lines = read_yaml(path)
-    return validated(data, model, str(path), lines.place)
 
 
 def validated(data: Any, model: type[Model], path: str, place: Place) -> Model:

@@ -1,4 +1,4 @@
-"""The automated vehicle under test, and the built-in driver models that stand in for it."""
+"""The automated vehicle under test: who drives it, and what it may ask for."""
 
 from __future__ import annotations
 
@@ -6,209 +6,22 @@ import hashlib
 import shlex
 from pathlib import Path
 from string import Formatter
-from typing import Annotated, Any, Literal, Self, get_args
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import (
-    ConfigDict,
-    Field,
-    ValidationInfo,
-    ValidatorFunctionWrapHandler,
-    WrapValidator,
-    field_validator,
-    model_validator,
+from pydantic import ConfigDict, Field, field_validator, model_validator
+
+from harness.campaign.drivers import (
+    PERCEIVES_LATERAL_M,
+    RISK_EVALUATION_S,
+    BuiltInParameters,
+    ModelName,
+    Parameters,
+    Reaction,
+    schema_by_model,
 )
-from pydantic_core import PydanticKnownError
-
 from harness.campaign.problems import broken_rule
-from harness.campaign.sections import Positive, Probability, Section, StepTime, Whole, listed
+from harness.campaign.sections import Positive, Section, Whole, listed
 
-MAX_CONFIGURED_SPEED_MPS = 60.0
-PERCEIVES_LATERAL_M = 0.375
-RISK_EVALUATION_S = 0.4
-
-
-Strength = Annotated[float, Field(gt=0.0, le=20.0)]
-Braking = Annotated[float, Field(ge=-20.0, le=0.0)]
-Gap = Annotated[float, Field(ge=0.0, le=50.0)]
-Delay = Annotated[float, Field(ge=0.0, le=10.0)]
-Speed = Annotated[float, Field(gt=0.0, le=MAX_CONFIGURED_SPEED_MPS)]
-
-
-class Following(Section):
-    """How an intelligent driver model follows; defaults are SM-I's (environment.md: [cutin] except where said)."""
-
-    acceleration_mps2: Strength = Field(2.0, description="maximum acceleration, the alpha of Table I [cutin]")
-    comfortable_deceleration_mps2: Strength = Field(3.0, description="b [cutin]")
-    time_headway_s: Delay = Field(1.0, description="T [cutin]")
-    minimum_gap_m: Gap = Field(2.0, description="s0 [cutin]")
-    desired_speed_mps: Speed = Field(40.0, description="v0 [assumed]")
-    max_acceleration_mps2: Strength = Field(2.0, description="upper clip [paper]")
-
-
-class IDMParameters(Following):
-    """Intelligent driver model; defaults are SM-I's (environment.md: [cutin] except where said)."""
-
-    min_acceleration_mps2: Braking = Field(-4.0, description="hardest braking a_min [assumed]")
-
-
-class FVDMParameters(Section):
-    """Full velocity difference model; defaults from the co-author's code ([cutin]) except where said."""
-
-    kappa_per_s: Positive = Field(0.85, le=20.0, description="sensitivity to the optimal velocity [cutin]")
-    lambda_per_s: float = Field(0.5, ge=0.0, le=20.0, description="sensitivity to the speed difference [assumed]")
-    max_speed_mps: Speed = Field(40.0, description="v_max [assumed]")
-    v1: Positive = Field(6.75, le=1000.0, description="V1 of the optimal velocity function [cutin]")
-    v2: Positive = Field(7.91, le=1000.0, description="V2 of the optimal velocity function [cutin]")
-    c1_per_m: Positive = Field(0.13, le=100.0, description="C1 of the optimal velocity function [cutin]")
-    c2: float = Field(1.57, ge=-1000.0, le=1000.0, description="C2 of the optimal velocity function [cutin]")
-    min_acceleration_mps2: Braking = Field(-1.0, description="hardest braking a_min [paper: -1, -6]")
-    max_acceleration_mps2: Strength = Field(2.0, description="upper clip [paper]")
-
-
-class ConstantParameters(Section):
-    """A vehicle that accelerates in the same way whatever happens before it: 0 never brakes."""
-
-    acceleration_mps2: float = Field(0.0, ge=-20.0, le=20.0, description="its acceleration [assumed]")
-
-    @property
-    def min_acceleration_mps2(self) -> float:
-        """Its only acceleration (m/s²)."""
-        return self.acceleration_mps2
-
-    @property
-    def max_acceleration_mps2(self) -> float:
-        """Its only acceleration (m/s²)."""
-        return self.acceleration_mps2
-
-
-class Reference(Following):
-    """What the reference drivers of UN Regulation No. 157 share: when they react, and how they follow.
-
-    The regulation's cut-in takes time: BV moves sideways, and the driver has seen and evaluated the risk when their
-    sides are still ``evaluated_at_m`` apart. Where ours is a step, after which they overlap, the driver has used up
-    ``evaluated_at_m / lateral_speed_mps`` of its delay by then. Where cut-ins take time it sees them, evaluates them
-    for ``risk_evaluation_s``, and nothing stands in for that.
-    """
-
-    reaction_time_s: float = Field(
-        0.75, ge=0.0, le=5.0, description="from the evaluated risk to the brakes [JRC-FSM: CC_rt, FSM_rt]"
-    )
-    lateral_speed_mps: Positive = Field(
-        1.8, le=10.0, description="at which BV is taken to have come over [JRC-FSM: 0.72 m in 0.4 s]"
-    )
-    evaluated_at_m: float = Field(
-        0.505,
-        ge=0.0,
-        le=5.0,
-        description="distance of their sides when the risk has been evaluated: 1.6 of two vehicles of 1.9 in lanes of "
-        "3.5, less 0.375 of wandering, less 0.72 in which it is evaluated [JRC-FSM: CC_calc_dist_to_react]",
-    )
-    risk_evaluation_s: StepTime = Field(
-        RISK_EVALUATION_S,
-        ge=0.0,
-        le=5.0,
-        description="how long it evaluates what it has perceived, where cut-ins take time [JRC-FSM: 0.4 s]",
-    )
-    min_acceleration_mps2: Braking = Field(
-        -7.59294, description="hardest braking, 0.774 g [JRC-FSM: CC_max_deceleration]"
-    )
-    braking_jerk_mps3: Positive = Field(
-        12.65, le=1000.0, description="how fast it comes to brake harder, 0.774 g in 0.6 s [JRC-FSM: CC_min_jerk]"
-    )
-    following_min_acceleration_mps2: Braking = Field(-4.0, description="hardest braking of that IDM [assumed]")
-
-    @property
-    def reaction_steps(self) -> float:
-        """Its reaction time, in steps."""
-        return 10.0 * self.reaction_time_s
-
-    @property
-    def used_up_steps(self) -> float:
-        """How much of its reaction time has passed by the cut-in, if that is the danger; in steps."""
-        return 10.0 * self.evaluated_at_m / self.lateral_speed_mps
-
-    @property
-    def delay_after_cut_in_s(self) -> float:
-        """How long after the cut-in it begins to brake (s); not before it, however slowly BV comes over."""
-        return max(0.0, self.reaction_steps - self.used_up_steps) / 10.0
-
-
-class CarefulCompetentParameters(Reference):
-    """The careful and competent human driver of UN Regulation No. 157."""
-
-    critical_ttc_s: Strength = Field(
-        2.0, description="time to collision below which it brakes [JRC-FSM: CC_critical_ttc]"
-    )
-    coasting_mps2: float = Field(
-        0.4, ge=0.0, le=5.0, description="deceleration off the accelerator, until it brakes [JRC-FSM]"
-    )
-
-
-class FuzzySafetyParameters(Reference):
-    """The fuzzy safety model of the Joint Research Centre, a performance model of UN Regulation No. 157."""
-
-    comfortable_braking_mps2: Strength = Field(
-        4.0, description="b_min: braking in anticipation, and the least in danger [JRC-FSM: FSM_br_min]"
-    )
-    hard_braking_mps2: Strength = Field(6.0, description="b_max: braking in the greatest danger [JRC-FSM: FSM_br_max]")
-    leader_braking_mps2: Strength = Field(7.0, description="how hard the vehicle ahead may brake [JRC-FSM: FSM_bl]")
-    standstill_gap_m: Gap = Field(
-        2.0, description="part of the gap that anticipation does not count [JRC-FSM: FSM_margin_dist]"
-    )
-    safe_margin_m: Positive = Field(
-        2.0, le=50.0, description="gap beyond the safe one that is felt as safe [JRC-FSM: FSM_margin_safe_dist]"
-    )
-
-    @model_validator(mode="after")
-    def _hard_is_harder(self) -> Self:
-        if self.hard_braking_mps2 < self.comfortable_braking_mps2:
-            found = f"{self.hard_braking_mps2:g}, below comfortable_braking_mps2 {self.comfortable_braking_mps2:g}"
-            expected = "at least as much: it brakes the harder the greater the danger"
-            raise broken_rule("hard_braking_mps2", found, expected, "Exchange them, or make them equal.")
-        return self
-
-
-class NeedBasedParameters(Section):
-    """A vehicle that accelerates until it needs to brake, and a delay later brakes with what it needs."""
-
-    acceleration_mps2: Strength = Field(1.0, description="until it needs to brake [assumed]")
-    deceleration_mps2: Strength = Field(
-        3.0, description="hardest braking, from the delay after the first need on [assumed]"
-    )
-    reaction_time_s: Delay = Field(0.5, description="between the first need and the brakes [assumed]")
-    needed_mps2: Strength = Field(
-        1.0, description="it needs to brake where no less than this prevents a collision [assumed]"
-    )
-    standstill_gap_m: Gap = Field(2.0, description="gap that is to remain [assumed]")
-
-    @property
-    def reaction_steps(self) -> float:
-        """Its reaction time, in steps."""
-        return 10.0 * self.reaction_time_s
-
-    @property
-    def min_acceleration_mps2(self) -> float:
-        """Its braking (m/s²)."""
-        return -self.deceleration_mps2
-
-    @property
-    def max_acceleration_mps2(self) -> float:
-        """Its acceleration (m/s²)."""
-        return self.acceleration_mps2
-
-
-BuiltInParameters = (
-    IDMParameters
-    | FVDMParameters
-    | ConstantParameters
-    | CarefulCompetentParameters
-    | FuzzySafetyParameters
-    | NeedBasedParameters
-)
-ModelName = Literal["idm", "fvdm", "constant", "r157-cc", "r157-fsm", "need-based"]
-PARAMETERS: dict[str, type[BuiltInParameters]] = dict(
-    zip(get_args(ModelName), get_args(BuiltInParameters), strict=True)
-)
 AV_SOURCES = ("model", "controller", "sumo", "traci", "fmu")
 READS_NO_PARAMETERS = {
     "sumo": "Write vType attributes under av.sumo itself.",
@@ -216,114 +29,6 @@ READS_NO_PARAMETERS = {
     "fmu": "Write them under av.fmu.start_values.",
 }
 """Sources of an AV beside which parameters would be lost, and where to write them."""
-
-
-def _of_the_model(value: Any, _by_trial: ValidatorFunctionWrapHandler, info: ValidationInfo) -> Any:
-    """Parameters of the model that is named beside them; those of a controller stay as they are.
-
-    Not by trial of a union: a controller's parameters that look like the IDM's would become those.
-    """
-    if "model" not in info.data:
-        # A wrong model is an error of its own; complaints about parameters of a guessed model would only confuse.
-        return IDMParameters()
-    if (model := info.data["model"]) is not None:
-        return PARAMETERS[model].model_validate(value)
-    if not isinstance(value, dict):
-        raise PydanticKnownError("dict_type")
-    return value
-
-
-def _schema_by_model(schema: dict[str, Any]) -> None:
-    """Say in a JSON schema that parameters follow the model, which is the IDM where no source of an AV is named."""
-    properties = schema["properties"]
-    of_model, *_ = properties["model"].get("anyOf", [properties["model"]])
-    by_model = dict(zip(PARAMETERS, properties["parameters"].pop("anyOf"), strict=False))  # and any mapping
-    properties["parameters"]["type"] = "object"
-    schema["allOf"] = [
-        {
-            "if": {"required": ["model"], "properties": {"model": {"const": model}}},
-            "then": {"properties": {"parameters": parameters}},
-        }
-        for model, parameters in by_model.items()
-        if model in of_model["enum"]
-    ]
-    if "controller" in properties:
-        named: list[dict[str, Any]] = [{"required": [name]} for name in AV_SOURCES]
-        schema["oneOf"] = [{"not": {"anyOf": named}, "properties": {"parameters": by_model["idm"]}}]
-        for name in AV_SOURCES:
-            none = {"properties": {"parameters": {"maxProperties": 0}}} if name in READS_NO_PARAMETERS else {}
-            schema["oneOf"].append({"required": [name], **none})
-        for name in AV_SOURCES:  # null says "not this one": in a file of its own leaving the key out says it better
-            (source,) = (each for each in properties[name].pop("anyOf") if each.get("type") != "null")
-            properties[name] = source | {key: value for key, value in properties[name].items() if key != "default"}
-
-
-class _Driven(Section):
-    """A section whose parameters follow its model."""
-
-    model_config = ConfigDict(json_schema_extra=_schema_by_model)
-
-
-Parameters = WrapValidator(_of_the_model, json_schema_input_type=BuiltInParameters | dict[str, Any])
-
-
-class Driver(_Driven):
-    """A vehicle that follows a built-in driver model."""
-
-    model: ModelName = Field(description="driver model")
-    parameters: Annotated[BuiltInParameters, Parameters] = Field(
-        default_factory=dict, validate_default=True, description="of the model; defaults where left out"
-    )
-
-
-class Surrogate(Driver):
-    """A stand-in for the unknown AV."""
-
-    model: Literal["idm", "fvdm"] = Field(description="driver model")
-    parameters: Annotated[IDMParameters | FVDMParameters, Parameters] = Field(
-        default_factory=dict, validate_default=True, description="of the model; defaults where left out"
-    )
-
-
-def default_surrogates() -> dict[str, Surrogate]:
-    """Stand-ins of the paper, from careful to careless."""
-    brakes_1, brakes_6 = (FVDMParameters(min_acceleration_mps2=limit) for limit in (-1.0, -6.0))
-    return {
-        "SM-I": Surrogate(model="idm"),
-        "SM-II": Surrogate(model="fvdm", parameters=brakes_1),
-        "SM-III": Surrogate(model="fvdm", parameters=brakes_6),
-    }
-
-
-class Reflexes(Section):
-    """How a driver lags behind its model: surrogates may be late and smooth, but not random."""
-
-    delay_s: StepTime = Field(
-        0.0, ge=0.0, le=10.0, description="time after the cut-in during which it keeps its speed [assumed]"
-    )
-    max_jerk_mps3: Annotated[float, Field(ge=0.1, le=1000.0)] | None = Field(
-        None, description="fastest change of its acceleration; unlimited when left out [assumed]"
-    )
-    perceives_lateral_m: float = Field(
-        PERCEIVES_LATERAL_M,
-        ge=0.0,
-        le=10.0,
-        description="how far a vehicle has to have come over before the driver sees that it cuts in: 0 acts from the "
-        "onset, the way to overlap or more only from there; where cut-ins take time [JRC-FSM: 0.375 of wandering]",
-    )
-
-
-class Reaction(Reflexes):
-    """How a built-in AV lags behind its model, now and then by inattention."""
-
-    inattention_probability: Probability = Field(
-        0.0, description="share of episodes in which it reacts later still [assumed]"
-    )
-    inattention_delay_s: StepTime = Field(
-        0.0, ge=0.0, le=10.0, description="how much later it then reacts to the cut-in [assumed]"
-    )
-
-
 CONTROLLER_PATTERN = r"^([A-Za-z_][A-Za-z0-9_.]*:[A-Za-z_][A-Za-z0-9_]*|[A-Za-z0-9][A-Za-z0-9_.-]*)$"
 
 
@@ -386,8 +91,23 @@ _LATER = (
 )
 
 
-class AutomatedVehicle(_Driven):
+def _schema_of_sources(schema: dict[str, Any]) -> None:
+    """Say in a JSON schema that parameters follow the source of the AV, which is the IDM where none is named."""
+    properties, by_model = schema["properties"], schema_by_model(schema)
+    named: list[dict[str, Any]] = [{"required": [name]} for name in AV_SOURCES]
+    schema["oneOf"] = [{"not": {"anyOf": named}, "properties": {"parameters": by_model["idm"]}}]
+    for name in AV_SOURCES:
+        none = {"properties": {"parameters": {"maxProperties": 0}}} if name in READS_NO_PARAMETERS else {}
+        schema["oneOf"].append({"required": [name], **none})
+    for name in AV_SOURCES:  # null says "not this one": in a file of its own leaving the key out says it better
+        (source,) = (each for each in properties[name].pop("anyOf") if each.get("type") != "null")
+        properties[name] = source | {key: value for key, value in properties[name].items() if key != "default"}
+
+
+class AutomatedVehicle(Section):
     """The automated vehicle under test: one of model, controller, sumo, traci and fmu."""
+
+    model_config = ConfigDict(json_schema_extra=_schema_of_sources)
 
     model: ModelName | None = Field(None, description="built-in driver model; idm when nothing is named")
     controller: str | None = Field(

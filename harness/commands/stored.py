@@ -54,7 +54,7 @@ def estimate(
     Nothing is simulated in SUMO. An estimator that the records do not allow is shown with the reason; the exit code is
     2 if they allow none of those asked for.
     """
-    from harness.runner.estimate import estimate_run  # noqa: PLC0415 - keeps --help fast
+    from harness.runner.stored import estimate_run  # noqa: PLC0415 - keeps --help fast
 
     content = estimate_run(folder, estimators=estimators or None, confidence=confidence)
     if write:
@@ -101,7 +101,7 @@ def replay(folder: Path, episode: int, *, out: Path | None, fcd: Path | None, gu
 
     Where the run has stored the episode's trace, the replay is compared with it; a difference ends with exit code 3.
     """
-    from harness.runner.replay import replay_episode  # noqa: PLC0415 - keeps --help fast
+    from harness.runner.stored import replay_episode  # noqa: PLC0415 - keeps --help fast
 
     result = replay_episode(folder, episode, gui=gui, fcd=fcd)
     files = [str(file) for file in (out, fcd) if file is not None]

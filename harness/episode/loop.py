@@ -145,9 +145,11 @@ class EpisodeLoop:
                 shard.results = with_more_room(shard.results, 2 * shard.results.moment.size)
                 kernel = self._kernel_state(shard)
 
-    def beside(self, world: World | None = None, keep: RecordPolicy | None = None) -> EpisodeLoop:
-        """Another loop with the same AV and policy, in a world of no more cells, or with other records."""
-        return EpisodeLoop(world or self._world, self._policy, keep or self._keep, self._av)
+    def beside(
+        self, world: World | None = None, keep: RecordPolicy | None = None, drawing: Drawing | None = None
+    ) -> EpisodeLoop:
+        """Another loop with the same AV, in a world of no more cells, with other records, or another drawing."""
+        return EpisodeLoop(world or self._world, drawing or self._policy, keep or self._keep, self._av)
 
     def close(self) -> None:
         """Release what the AV's controllers hold; the loop runs no more."""

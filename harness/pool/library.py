@@ -8,10 +8,10 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
-from harness.campaign.files import shipped_or_own
-from harness.campaign.problems import broken_rule, did_you_mean, read_model
+from harness.campaign.drivers import Driver, Reference, Reflexes
+from harness.campaign.files import read_model, shipped_or_own
+from harness.campaign.problems import broken_rule, did_you_mean
 from harness.campaign.sections import Section, ShellSettings, StatementSettings, SurrogateName, checked_statements
-from harness.campaign.vehicle import Driver, Reference, Reflexes
 from harness.episode.path import Followers
 from harness.errors import CampaignError
 from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT

@@ -12,9 +12,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from harness.campaign.campaign import Campaign
+from harness.campaign.drivers import BuiltInParameters
+from harness.campaign.drivers import Reference as ReferenceParameters
 from harness.campaign.sections import ShellSettings, StatementSettings
-from harness.campaign.vehicle import AutomatedVehicle, BuiltInParameters
-from harness.campaign.vehicle import Reference as ReferenceParameters
+from harness.campaign.vehicle import AutomatedVehicle
 from harness.episode.cells import PrescribedCutIns, PrescribedTraffic
 from harness.pool.cut_ins import Pool
 from harness.pool.library import Library, LibraryDriver, library_records

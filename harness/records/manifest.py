@@ -50,7 +50,7 @@ class Retraced(Stored):
 
 
 class Repeated(Stored):
-    """What repeating some tests has shown; `harness.runner.worker.Repeated`."""
+    """What repeating some tests has shown; `harness.runner.repeat.Repeated`."""
 
     n_episodes: Count
     differing: list[Count]

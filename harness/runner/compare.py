@@ -18,8 +18,6 @@ from typing import Any
 import numpy as np
 
 from harness.campaign.campaign import Campaign
-from harness.drawing import ShardRequest
-from harness.drawing.shells import PairRounds, Shells, round_requests
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED, CampaignError, RunFolderError
 from harness.estimators.answer import conditional_paired_statement, paired_statement
 from harness.estimators.pairs import MarginVerdict, PairCounts, PairedEstimate, PairedShells, paired_estimate
@@ -29,9 +27,11 @@ from harness.progress import Progress
 from harness.records.folder import read_manifest, require_place, sole_use, write_json
 from harness.records.reader import read_shards
 from harness.resolved import Resolved
-from harness.runner.resolve import require_ready
+from harness.runner.prepare import require_ready
 from harness.runner.resume import require_own_folder
 from harness.runner.run import Run, finish
+from harness.sampling import ShardRequest
+from harness.sampling.shells import PairRounds, Shells, round_requests
 from harness.vocabulary import IntArray
 
 SIDES = ("a", "b")

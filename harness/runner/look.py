@@ -17,14 +17,13 @@ import numpy as np
 from harness.campaign.campaign import Campaign
 from harness.campaign.vehicle import AutomatedVehicle
 from harness.controllers.find import AvEndedProcessError, build_host, has_foreign_code, run_apart
-from harness.drawing import ShardRequest, Source, source_of
 from harness.episode.loop import EpisodeLoop, RecordPolicy, Shard
 from harness.errors import EXIT_DONE, EXIT_TOO_MANY_FAILED
 from harness.estimators.estimate import finite_json
-from harness.importance.build import needs_tables
 from harness.resolved import resolve
-from harness.runner.resolve import prepare, require_ready, require_world
-from harness.runner.worker import Bits, bits_of
+from harness.runner.prepare import prepare, require_ready, require_world
+from harness.runner.repeat import Bits, bits_of
+from harness.sampling import ShardRequest, Source, source_of
 from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import AV, CRASH, FAILED, FloatArray
 from harness.worlds import build_world
@@ -267,7 +266,7 @@ def plan_campaign(campaign: Campaign) -> dict[str, Any]:
             per_core = 1.0 / (measured + (0.0 if moved_by_sumo else 1.0 / per_core))
             of_av |= _if_slow(measured, campaign)
     rate = _rounded(per_core * (os.cpu_count() or 1))
-    moments = MOMENTS_PER_EPISODE[campaign.records.moments] if needs_tables(campaign) else 0
+    moments = MOMENTS_PER_EPISODE[campaign.records.moments] if campaign.sampling.mixes else 0
     episodes = campaign.stop.episodes
     return {
         "episodes": episodes,
@@ -286,7 +285,7 @@ def _if_slow(test_s: float, campaign: Campaign) -> dict[str, str]:
         return {}
     task_s = test_s * campaign.run.smallest_shard
     said = f"with run.shard_size 1 a task is one test of {test_s:.2g} s, and now up to {task_s:,.0f} s"
-    if source_of(campaign).tests_in_rounds:
+    if campaign.sampling.strata:
         said += "; testing.shells.smallest_round feeds so many workers from the first round on"
     return {"slow_av": said}
 

@@ -29,16 +29,24 @@ from harness.campaign.sections import RaySettings
 from harness.compiled import cache_root, source_hash
 from harness.controllers.find import require_controller
 from harness.controllers.hosts import Death
-from harness.drawing import ShardRequest
-from harness.drawing.baseline import SHADOW
 from harness.errors import CampaignError, HarnessError
 from harness.processes import fit_to_travel, handlers_restored
 from harness.records.folder import write_bytes
 from harness.resolved import Resolved
-from harness.runner.manifest import cpu_name
-from harness.runner.resolve import cached_files
-from harness.runner.worker import Request, Result
-from harness.runner.workers import CLOSING_S, LocalWorkers, WorkerDeath, WorkerLostError, WorkerProcess, Workers
+from harness.runner.prepare import cached_files
+from harness.runner.resume import cpu_name
+from harness.runner.workers import (
+    CLOSING_S,
+    LocalWorkers,
+    Request,
+    Result,
+    WorkerDeath,
+    WorkerLostError,
+    WorkerProcess,
+    Workers,
+)
+from harness.sampling import ShardRequest
+from harness.sampling.baseline import SHADOW
 
 LOCAL = "local"
 """Ray's word for a cluster of this machine alone, which ends with the run."""

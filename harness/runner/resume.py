@@ -1,22 +1,203 @@
-"""What ``--resume`` takes over, and which folders it refuses.
+"""What a run folder holds of a run: the manifest that tells of it, and what ``--resume`` takes over.
 
 A shard whose file of episodes is there is complete: `harness.records.folder.write_shard` writes that last. Baseline
-runs are taken over in `harness.drawing.baseline`.
+runs are taken over in `harness.sampling.baseline`.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+import platform
+import time
+from collections import Counter
+from dataclasses import asdict, replace
+from datetime import UTC, datetime
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from harness.drawing import ShardRequest, Source
-from harness.errors import RunFolderError
+from harness.campaign.campaign import Campaign, dump_campaign
+from harness.errors import RunFolderError, TooManyFailedError
 from harness.pool.replay import Retracing
-from harness.records.folder import MANIFEST, SHELLS, read_as, read_manifest, read_table, require_place, shard_files
+from harness.records.folder import (
+    MANIFEST,
+    SHELLS,
+    read_as,
+    read_manifest,
+    read_table,
+    require_place,
+    shard_files,
+    write_json,
+    write_text,
+)
 from harness.records.schemas import ShardTables
 from harness.resolved import Resolved
-from harness.runner.worker import ShardResult, finished
+from harness.runner.repeat import Repeated
+from harness.runner.workers import ShardResult, finished
+from harness.sampling import ShardRequest, Source
+
+INTERVAL_S = 5.0
+SMALLEST_FAILED_SAMPLE = 200
+"""Episodes before the share of failures can end a campaign."""
+_PACKAGES = ("harness", "libsumo", "numba", "llvmlite", "numpy", "scipy", "pyarrow")
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python and of the packages that results depend on."""
+    found = {"python": platform.python_version()}
+    for package in _PACKAGES:
+        try:
+            found[package] = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            found[package] = "not installed"
+    return found
+
+
+def cpu_name() -> str:
+    """Model name of the processor: bits are promised for one CPU family."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return platform.processor() or platform.machine()
+    return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.machine())
+
+
+class Prefix:
+    """Finished shards in order, from the first on, as the manifest lists them, and what is counted over them."""
+
+    def __init__(self) -> None:
+        self.shards: list[dict[str, Any]] = []
+        self.n_episodes = self.n_crashes = self.n_failed = self.n_retraced = self.reported_from = 0
+        self.repeated: Repeated | None = None
+        self._causes: Counter[str] = Counter()
+
+    def add(self, done: ShardResult, files: dict[str, str]) -> None:
+        """Append a shard that is on disk."""
+        request = done.request
+        self.shards.append(
+            {
+                "index": request.index,
+                "first_episode": request.first_episode,
+                "n_episodes": request.n_episodes,
+                "files": files,
+            }
+        )
+        self.n_episodes += request.n_episodes
+        self.n_retraced += done.n_retraced
+        self.n_crashes += int(done.block.crash.sum())
+        self.n_failed += int(done.block.failed.sum())
+        self._causes += done.failures
+        self.repeated = self.repeated or done.repeated
+
+    def require_few_failed(self, campaign: Campaign, *, at_least: int = 0) -> None:
+        """Refuse an answer from tests of which too many failed, once there are ``at_least`` so many."""
+        if self.n_episodes >= at_least:
+            require_few_failed(self.n_failed, self.n_episodes, self._causes, campaign.run.max_failed_share)
+
+
+def require_few_failed(
+    n_failed: int, n: int, causes: Counter[str], most: float, what: str = "episodes", where: str = "the episodes table"
+) -> None:
+    """Refuse (`TooManyFailedError`) an answer where more than the share ``most`` of tests, or ``what`` else, failed."""
+    if n_failed > most * n:
+        cause = "".join(f", {n_such} of them with: {why}" for why, n_such in causes.most_common(1))
+        raise TooManyFailedError(
+            "run.max_failed_share",
+            f"{n_failed} of {n} {what} failed{cause}",
+            f"a share of at most {most:g}",
+            "Mend the AV (`harness av-check` looks at it in seconds), or raise the share to go on. All causes "
+            f"are in the column 'failure' of {where}.",
+        )
+
+
+class Manifest:
+    """Keeps ``manifest.json`` and ``campaign.yaml`` of a run folder true.
+
+    ``earlier`` is what `require_own_folder` found, ``began`` `time.monotonic` at the run's beginning; ``facts`` are
+    more keys.
+    """
+
+    def __init__(
+        self, folder: Path, resolved: Resolved, earlier: dict[str, Any], *, began: float, **facts: Any
+    ) -> None:
+        campaign = resolved.campaign
+        self._folder, self._earlier = folder, earlier
+        self._campaign = dump_campaign(campaign)
+        self._reproducible = campaign.av.reproducible
+        self._began = began - float(earlier.get("wall_time_s") or 0.0)
+        self._content: dict[str, Any] = {
+            "format": 1,
+            "name": campaign.name,
+            "campaign_hash": resolved.content_hash,
+            "created": earlier.get("created") or datetime.now(UTC).isoformat(timespec="seconds"),
+            "seed": campaign.seed,
+            "engine": campaign.world.engine,
+            "versions": versions(),
+            "cpu": cpu_name(),
+            "controller_sha256": resolved.controller_sha256,
+            **facts,
+        }
+        self._written = began
+        self._last: dict[str, Any] = {}
+        self.write(Prefix(), "running")  # first: --resume knows a folder by its manifest
+
+    def forget_replaced(self, request: ShardRequest) -> None:
+        """Cut what an earlier run has left before the shard that this one is about to take the place of, if it does.
+
+        One of the same size whose file is missing is only made anew.
+        """
+        shards = self._earlier["shards"]
+        if request.index >= len(shards):
+            return
+        shard = shards[request.index]
+        if shard["n_episodes"] == request.n_episodes and not (self._folder / shard["files"]["episodes"]).exists():
+            return
+        kept = shards[: request.index]
+        cut = {"status": "interrupted", "stopped_by": None, "ending": None}
+        n_kept = sum(shard["n_episodes"] for shard in kept)
+        self._earlier = {**self._earlier, **cut, "n_episodes": n_kept, "shards": kept}
+        write_json(self._folder / MANIFEST, self._earlier)
+
+    def note(self, **facts: Any) -> None:
+        """More keys, from the next time on that it is written."""
+        self._content.update(facts)
+
+    def follow(self, prefix: Prefix) -> None:
+        """Write it every few seconds, so that a run which goes on can be read."""
+        if time.monotonic() - self._written > INTERVAL_S:
+            self.write(prefix, "running")
+
+    def write(
+        self,
+        prefix: Prefix,
+        status: str,
+        *,
+        stopped_by: str | None = None,
+        ending: str | None = None,
+        retraced: dict[str, Any] | None = None,
+    ) -> None:
+        """Record the contiguous prefix of finished shards.
+
+        While a run goes on and has not come as far as an earlier one, what that one has left stays true.
+        """
+        self._written = time.monotonic()
+        if status != "done" and prefix.n_episodes < self._earlier["n_episodes"]:
+            return
+        repeated = prefix.repeated
+        self._last = {
+            **self._content,
+            "status": status,
+            "stopped_by": stopped_by,
+            "ending": ending,
+            "retraced": retraced,
+            "reproducible": self._reproducible and not (repeated and repeated.differing),
+            "repeated": None if repeated is None else asdict(repeated),
+            "wall_time_s": round(self._written - self._began, 3),
+            "n_episodes": prefix.n_episodes,
+            "reported_from": prefix.reported_from if prefix.reported_from < prefix.n_episodes else 0,
+            "shards": prefix.shards,
+        }
+        write_json(self._folder / MANIFEST, self._last)
+        write_text(self._folder / "campaign.yaml", self._campaign)
 
 
 def require_own_folder(folder: Path, resolved: Resolved, *, resume: bool) -> dict[str, Any]:

@@ -14,8 +14,6 @@ from pathlib import Path
 from typing import Any
 
 from harness.campaign.campaign import Campaign
-from harness.drawing import Rounds, ShardRequest
-from harness.drawing.baseline import as_recorded, baseline_file, baseline_requests, stored_baseline
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED, CampaignError
 from harness.estimators.answer import ending as ending_sentence
 from harness.estimators.stopping import Rule, Verdict
@@ -25,14 +23,23 @@ from harness.progress import Progress
 from harness.records.folder import SHELLS, TABLES, shards_on_disk, sole_use, write_bytes, write_json, write_shard
 from harness.records.manifest import StoppedBy
 from harness.resolved import Resolved
-from harness.runner.estimate import estimate_run
-from harness.runner.manifest import SMALLEST_FAILED_SAMPLE, Manifest, Prefix, cpu_name, require_few_failed
-from harness.runner.resolve import distance_per_test_m, prepare, require_ready
-from harness.runner.resume import require_no_fewer, require_own_folder, require_same_pool, stored_shard
-from harness.runner.worker import ShardResult
-from harness.runner.workers import LocalWorkers, Workers
+from harness.runner.prepare import distance_per_test_m, prepare, require_ready
+from harness.runner.resume import (
+    SMALLEST_FAILED_SAMPLE,
+    Manifest,
+    Prefix,
+    cpu_name,
+    require_few_failed,
+    require_no_fewer,
+    require_own_folder,
+    require_same_pool,
+    stored_shard,
+)
+from harness.runner.stored import estimate_run
+from harness.runner.workers import LocalWorkers, ShardResult, Workers
+from harness.sampling import Rounds, ShardRequest
+from harness.sampling.baseline import as_recorded, baseline_file, baseline_requests, stored_baseline
 from harness.strata import STORED_DESIGN
-from harness.vocabulary import SAMPLING
 
 EXIT_OF: Mapping[Verdict, int] = {"accepted": EXIT_DONE, "rejected": EXIT_REFUTED, "undecided": EXIT_BUDGET_SPENT}
 ESTIMATES = "estimates.json"
@@ -164,7 +171,7 @@ class Run:
         """
         self._progress.advance(min(max(self.prefix.n_episodes - self.held, 0), shard.request.n_episodes))
         watched = "half_width" if self.campaign.stop.rhw is None else "rhw"
-        one_more = {"one_more_crash": rule.look.one_more_crash} if SAMPLING[self.campaign.testing.method].forces else {}
+        one_more = {"one_more_crash": rule.look.one_more_crash} if self.campaign.sampling.forces else {}
         self._progress.status(crashes=self.prefix.n_crashes, **{watched: rule.look.rhw}, **one_more)
         self.manifest.follow(self.prefix)
 

@@ -8,10 +8,11 @@ from __future__ import annotations
 import os
 import pickle
 import signal
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import count, islice
+from multiprocessing.connection import Connection
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Protocol, TypeVar
@@ -19,10 +20,19 @@ from typing import Any, Protocol, TypeVar
 from scipy.special import bdtrc
 
 from harness.controllers.hosts import Death, death_cause
+from harness.episode.loop import EpisodeLoop
 from harness.errors import HarnessError, TooManyFailedError
-from harness.processes import OF_EPISODE, Call, Child, first_to_answer, last_call
+from harness.estimators.block import Block
+from harness.pool.replay import Retracing
+from harness.processes import OF_EPISODE, Call, Child, first_to_answer, fit_to_travel, last_call
+from harness.records.folder import encoded
+from harness.records.schemas import ShardTables, shard_tables
 from harness.resolved import Resolved
-from harness.runner.worker import Request, Result, serve
+from harness.runner.prepare import prepare
+from harness.runner.repeat import Repeated, repeat, repeated_of, with_repeated
+from harness.sampling import ShardRequest, Source
+from harness.sampling.baseline import BaselineRequest, BaselineResult, read_baseline, run_baseline
+from harness.worlds import build_world
 
 ATTEMPTS = 3
 """A shard whose worker dies is given to another one, this many times in all."""
@@ -34,8 +44,110 @@ SENT_FROM_OUTSIDE = (-signal.SIGKILL, -signal.SIGTERM)
 CLOSING_S = 10.0
 """Time that a worker gets to release its controllers once all is done."""
 
+
+@dataclass(frozen=True)
+class ShardResult:
+    """A finished shard: what the stop rule needs of it, how many episodes the twin has retraced, causes of failures.
+
+    ``repeated`` is None where no test was run twice; ``parquet`` are its tables as files, or, where they are on disk
+    already, ``files`` their paths by table.
+    """
+
+    request: ShardRequest
+    block: Block
+    n_retraced: int
+    failures: Counter[str]
+    repeated: Repeated | None
+    parquet: dict[str, bytes] = field(default_factory=dict)
+    files: dict[str, str] = field(default_factory=dict)
+
+
+Request = ShardRequest | BaselineRequest
+Result = ShardResult | BaselineResult
+"""What a worker is asked for, and what it hands back."""
 _Request = TypeVar("_Request", bound=Request)
 _Result = TypeVar("_Result", bound=Result)
+
+
+def serve(connection: Connection, resolved: Path, folder: Path, black_box: Path) -> None:
+    """Prepare with the first shard, run shards until the parent is gone or has no more.
+
+    The file ``resolved`` holds the campaign. In the run's ``folder`` stand the baseline runs that tests
+    follow from, once there are some.
+    """
+    runner: ShardRunner | None = None
+    while True:
+        try:
+            request, fatal_episodes = connection.recv()
+        except (EOFError, OSError):
+            break
+        try:
+            if runner is None:
+                runner = ShardRunner(pickle.loads(resolved.read_bytes()), folder, black_box)  # noqa: S301 - our own
+            answer: Result | Exception = runner.run(request, fatal_episodes)
+        except Exception as error:  # noqa: BLE001 - whatever goes wrong here is the parent's to judge
+            answer = fit_to_travel(error)
+        try:
+            connection.send(answer)
+        except OSError:  # the parent was killed: nobody is left to tell
+            break
+    if runner is not None:
+        runner.close()
+
+
+class ShardRunner:
+    """Runs shards of one campaign in one world. It writes nothing: the process that runs the campaign does.
+
+    The file ``black_box`` tells that process in which call of a controller this one died.
+    """
+
+    def __init__(self, resolved: Resolved, folder: Path, black_box: Path | None = None) -> None:
+        self._fatal_episodes: dict[int, Death] = {}
+        self._folder = folder
+        self._source = prepare(resolved)
+        self._retracing = Retracing(resolved)
+        self._begun = False
+        world = build_world(resolved.campaign)
+        self._loop: EpisodeLoop = self._source.loop(world, black_box=black_box, fatal_episodes=self._fatal_episodes)
+
+    def close(self) -> None:
+        """Release the AV's controllers."""
+        self._loop.close()
+
+    def run(self, request: Request, fatal_episodes: Mapping[int, Death] | None = None) -> Result:
+        """Run a shard; episodes in ``fatal_episodes`` fail before the call that ended a process.
+
+        Raises `WorldDisagreementError`: the twin retraces an episode differently.
+        """
+        self._fatal_episodes.clear()  # a baseline run may have the number of a test
+        self._fatal_episodes.update(fatal_episodes or {})
+        source, paths = self._source, self._source.baseline_paths
+        if isinstance(request, ShardRequest):
+            if paths is not None and not self._begun:
+                self._begun = True
+                source.begin_after(read_baseline(self._folder, paths, source.resolved.environment))
+                self._loop = self._loop.beside(drawing=source.policy)
+            return self._tests(request)
+        if paths is None:
+            raise ValueError("this campaign has no baseline runs")
+        return run_baseline(self._loop, paths, source.resolved.environment, request)
+
+    def _tests(self, request: ShardRequest) -> ShardResult:
+        campaign, shard = self._source.campaign, self._source.run(self._loop, request)
+        keep_traces = campaign.records.traces != "none" or campaign.records.trace_share > 0.0
+        tables = shard_tables(shard, campaign.seed, keep_traces=keep_traces)
+        # A vehicle must show that it does the same again: built-in models do, and outside programs need not.
+        if request.index == 0 and campaign.av.model is None and campaign.av.traci is None:
+            tables = tables._replace(episodes=with_repeated(tables.episodes, repeat(self._loop, campaign, shard)))
+        return replace(finished(self._source, self._retracing, request, tables), parquet=encoded(tables))
+
+
+def finished(source: Source, retracing: Retracing, request: ShardRequest, tables: ShardTables) -> ShardResult:
+    """What is to be known of a shard's tables, after the twin has retraced them."""
+    n_retraced = retracing.check(tables.episodes)
+    block = source.block(tables.episodes, tables.moments if source.campaign.stop.estimator == "scv" else None)
+    failures = Counter(tables.episodes.column("failure").drop_null().to_pylist())
+    return ShardResult(request, block, n_retraced, failures, repeated_of(tables.episodes))
 
 
 class WorkerLostError(HarnessError):

@@ -13,8 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from harness.campaign.files import names_a_file
-from harness.campaign.problems import read_model
+from harness.campaign.files import names_a_file, read_model
 from harness.campaign.sections import EnvironmentSettings
 from harness.compiled import compiled_threads
 from harness.errors import CampaignError

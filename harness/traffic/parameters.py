@@ -10,9 +10,9 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import AfterValidator, BaseModel, model_validator
 
+from harness.campaign.drivers import MAX_CONFIGURED_SPEED_MPS
 from harness.campaign.problems import broken_rule
 from harness.campaign.sections import Section
-from harness.campaign.vehicle import MAX_CONFIGURED_SPEED_MPS
 from harness.maneuvers import ACCELERATIONS_MPS2
 from harness.traffic.lateral import LateralMotion, constant_lead, in_one_step, log_normal_speed
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M

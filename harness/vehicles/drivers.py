@@ -15,8 +15,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from harness.campaign.vehicle import (
-    AutomatedVehicle,
+from harness.campaign.drivers import (
     BuiltInParameters,
     CarefulCompetentParameters,
     ConstantParameters,
@@ -29,6 +28,7 @@ from harness.campaign.vehicle import (
     Reference,
     Reflexes,
 )
+from harness.campaign.vehicle import AutomatedVehicle
 from harness.compiled import compiled_inline
 from harness.vocabulary import Record, RecordArray
 

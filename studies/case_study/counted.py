@@ -16,7 +16,7 @@ from harness.estimators.limits import normal_half_width
 from harness.estimators.scv import Scv, StratumFit
 from harness.estimators.weighted import Nade
 from harness.records.folder import write_bytes
-from harness.runner.estimate import stored_blocks
+from harness.runner.stored import stored_blocks
 from harness.vocabulary import FloatArray, IntArray, Method
 from studies.case_study.figures import (
     exactly,

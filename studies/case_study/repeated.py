@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 from harness.campaign.campaign import Campaign
 from harness.campaign.files import load_campaign
 from harness.resolved import resolve
-from harness.runner.resolve import prepare
+from harness.runner.prepare import prepare
 from harness.runner.run import run_campaign
 from harness.vocabulary import EstimatorName
 from studies.case_study.counted import Claims

@@ -20,8 +20,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import pyarrow as pa
 
+from harness.campaign.drivers import default_surrogates
 from harness.campaign.sections import EnvironmentSettings
-from harness.campaign.vehicle import AutomatedVehicle, default_surrogates
+from harness.campaign.vehicle import AutomatedVehicle
 from harness.estimators.block import MAX_CONTROL_STEPS, Block, Drawn
 from harness.importance.challenge import roll_out
 from harness.importance.grid import GridPoints

@@ -11,10 +11,9 @@ from typing import Annotated, Any, Literal, NamedTuple, Self
 import pyarrow as pa
 from pydantic import Field, model_validator
 
-from harness.campaign.files import Override, Places, apply_overrides
+from harness.campaign.files import Override, Places, apply_overrides, read_yaml
 from harness.campaign.problems import NAME_PATTERN, broken_rule, validated
 from harness.campaign.sections import Positive, Probability, Section, Whole
-from harness.campaign.yaml_text import read_yaml
 from harness.errors import CampaignError
 from harness.progress import Progress
 from studies.replication.work import kept_parts, worker_processes

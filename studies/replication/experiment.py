@@ -10,11 +10,11 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import Field, field_validator, model_validator
 
 from harness.campaign.campaign import Campaign
-from harness.campaign.files import Places, apply_overrides, parse_override
+from harness.campaign.drivers import BuiltInParameters
+from harness.campaign.files import Places, apply_overrides, parse_override, read_yaml
 from harness.campaign.problems import NAME_PATTERN, broken_rule, validated
 from harness.campaign.sections import Positive, Section, Whole
-from harness.campaign.vehicle import AutomatedVehicle, BuiltInParameters
-from harness.campaign.yaml_text import read_yaml
+from harness.campaign.vehicle import AutomatedVehicle
 from harness.errors import CampaignError
 from harness.vocabulary import SAMPLING, EstimatorName
 from studies.chains.chain import CHAINS

@@ -27,10 +27,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from harness.campaign.campaign import Campaign
-from harness.campaign.vehicle import AutomatedVehicle, BuiltInParameters, Reflexes
+from harness.campaign.drivers import BuiltInParameters, Reflexes
+from harness.campaign.vehicle import AutomatedVehicle
 from harness.compiled import WORLD_SOURCES, cache_root, source_hash
 from harness.controllers.find import build_host, require_controller
-from harness.drawing.baseline import recorded, without_cut_in
 from harness.episode.cells import PrescribedTraffic
 from harness.episode.judge import motion_hashes
 from harness.episode.loop import Drawing, EpisodeLoop, RecordPolicy
@@ -44,6 +44,7 @@ from harness.pool.vehicle_pool import CANDIDATES, ShadowPaths, walk_candidates
 from harness.pool.walk import PILOT_PATHS, STRIDE, Enumerator, ShadowRuns, enumerate_cut_ins, write_script
 from harness.progress import Progress
 from harness.resolved import Resolved, resolve
+from harness.sampling.baseline import recorded, without_cut_in
 from harness.traffic.laws import Environment
 from harness.vehicles.drivers import driver_records
 from harness.vocabulary import CRASH, PRESCRIBED, BoolArray, FloatArray, IntArray, RecordArray

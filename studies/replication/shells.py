@@ -17,7 +17,6 @@ import numpy as np
 
 from harness.campaign.campaign import Campaign
 from harness.campaign.sections import Accept, ShellSettings
-from harness.drawing.shells import PairRounds, ShellRounds
 from harness.errors import CampaignError
 from harness.estimators.block import Block, Drawn
 from harness.estimators.estimate import Estimate
@@ -28,6 +27,7 @@ from harness.estimators.stopping import PairRule, RoundRule
 from harness.pool.cut_ins import CutIns, Pool, shells_of
 from harness.pool.library import Library
 from harness.pool.shells import cells_in_strata, design_shells, outermost, shells_in_strata
+from harness.sampling.shells import PairRounds, ShellRounds
 from harness.strata import LIBRARY_STATEMENT, ShellDesign
 from harness.vocabulary import CRASH as CRASHED
 from harness.vocabulary import FAILED, TIMEOUT, BoolArray, FloatArray, IntArray

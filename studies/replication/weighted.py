@@ -9,7 +9,6 @@ from functools import cache, partial
 import numpy as np
 
 from harness.campaign.campaign import Campaign
-from harness.drawing import Source
 from harness.episode.loop import EpisodeLoop
 from harness.estimators.block import Block, block_from_tables
 from harness.estimators.one_pass import accumulator
@@ -17,7 +16,8 @@ from harness.estimators.stopping import StopRule
 from harness.importance.build import mixture_weights
 from harness.records.schemas import shard_tables
 from harness.resolved import resolve
-from harness.runner.resolve import prepare
+from harness.runner.prepare import prepare
+from harness.sampling import Source
 from harness.vocabulary import EstimatorName, Method
 from harness.worlds.twin import TwinWorld
 from studies.chains.chain import Chain

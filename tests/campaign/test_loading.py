@@ -7,9 +7,10 @@ import shutil
 import pytest
 
 from harness.campaign.campaign import Campaign
-from harness.campaign.files import SHIPPED_PANEL, SHIPPED_PARAMETERS, load_campaign, load_panel, panel_av
-from harness.campaign.problems import InvalidFileError, read_model
-from harness.campaign.vehicle import AutomatedVehicle, IDMParameters, Surrogate
+from harness.campaign.drivers import IDMParameters, Surrogate
+from harness.campaign.files import SHIPPED_PANEL, SHIPPED_PARAMETERS, load_campaign, load_panel, panel_av, read_model
+from harness.campaign.problems import InvalidFileError
+from harness.campaign.vehicle import AutomatedVehicle
 from harness.cli import main
 from harness.errors import EXIT_BAD_INPUT, CampaignError
 from harness.traffic.parameters import EnvironmentParameters

@@ -2,7 +2,7 @@
 
 import pytest
 
-from harness.campaign.yaml_text import parse_value, read_yaml
+from harness.campaign.files import parse_value, read_yaml
 from harness.errors import CampaignError
 
 

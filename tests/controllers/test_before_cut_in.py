@@ -7,7 +7,7 @@ from harness.campaign.files import load_campaign
 from harness.controllers.hosts import BatchHost, Guard
 from harness.errors import CampaignError
 from harness.resolved import resolve
-from harness.runner.resolve import prepare
+from harness.runner.prepare import prepare
 from harness.vocabulary import PASSED
 from harness.worlds.twin import TwinWorld
 from tests.controllers.test_same_bits import ROOT

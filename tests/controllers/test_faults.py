@@ -14,7 +14,7 @@ from harness.controllers.find import build_host
 from harness.errors import EXIT_BAD_INPUT, EXIT_DONE, EXIT_TOO_MANY_FAILED
 from harness.resolved import resolve
 from harness.runner.look import plan_campaign
-from harness.runner.resolve import prepare
+from harness.runner.prepare import prepare
 from harness.runner.workers import LocalWorkers
 from harness.worlds.twin import TwinWorld
 from tests.controllers.misbehaving import ChangesItsParameters

@@ -14,7 +14,7 @@ from harness.campaign.files import load_campaign
 from harness.controllers.protocol import Neighbour, Observation
 from harness.controllers.traci_style import Traci, TraciStyleController
 from harness.resolved import resolve
-from harness.runner.resolve import prepare
+from harness.runner.prepare import prepare
 from harness.worlds.twin import TwinWorld
 
 N = 400

@@ -7,7 +7,7 @@ import pytest
 
 from harness.campaign.files import load_campaign
 from harness.resolved import resolve
-from harness.runner.resolve import prepare
+from harness.runner.prepare import prepare
 from harness.worlds.twin import TwinWorld
 
 ROOT = Path(__file__).parents[2]

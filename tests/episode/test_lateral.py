@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from harness.campaign.campaign import Campaign
+from harness.campaign.drivers import ConstantParameters, Reaction
 from harness.campaign.sections import EnvironmentSettings
-from harness.campaign.vehicle import AutomatedVehicle, ConstantParameters, Reaction
+from harness.campaign.vehicle import AutomatedVehicle
 from harness.episode.cells import PrescribedTraffic, drawn_traffic
 from harness.episode.loop import Drawing, EpisodeLoop, RecordPolicy
 from harness.importance.build import build_importance
@@ -17,7 +18,7 @@ from harness.maneuvers import CUT_IN
 from harness.pool.replay import Retracing
 from harness.records.schemas import episodes_table
 from harness.resolved import resolve
-from harness.runner.resolve import prepare
+from harness.runner.prepare import prepare
 from harness.vocabulary import AV, BV, CRASH, PASSED, STATE_DTYPE
 from harness.worlds.twin import TwinWorld
 from tests.chains.seed import SEED

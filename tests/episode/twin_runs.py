@@ -6,12 +6,13 @@ from functools import cache, cached_property
 import numpy as np
 
 from harness.campaign.campaign import Campaign
+from harness.campaign.drivers import FVDMParameters, IDMParameters, Surrogate
 from harness.campaign.sections import EnvironmentSettings, Records, Testing
-from harness.campaign.vehicle import AutomatedVehicle, FVDMParameters, IDMParameters, Surrogate
-from harness.drawing import Source
+from harness.campaign.vehicle import AutomatedVehicle
 from harness.episode.loop import Shard
 from harness.resolved import resolve
-from harness.runner.resolve import prepare
+from harness.runner.prepare import prepare
+from harness.sampling import Source
 from harness.vocabulary import CRASH
 from harness.worlds.twin import TwinWorld
 from tests.chains.seed import SEED

@@ -11,7 +11,7 @@ from harness.errors import RunFolderError
 from harness.estimators.answer import CampaignFacts, estimate_blocks
 from harness.estimators.estimate import Estimate, Estimates, Unavailable, finite_json
 from harness.estimators.one_pass import Diagnostics, accumulator, one_pass
-from harness.runner.estimate import estimate_run
+from harness.runner.stored import estimate_run
 from harness.vocabulary import BV_LV_CONTACT, ESTIMATORS, SAMPLING
 from studies.chains.chain import overtaking
 from studies.chains.sampler import blocks

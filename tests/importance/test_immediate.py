@@ -7,7 +7,7 @@ which hardly brakes, may catch up a second time, where its smallest gap jumps: i
 import numpy as np
 import pytest
 
-from harness.campaign.vehicle import FVDMParameters, IDMParameters
+from harness.campaign.drivers import FVDMParameters, IDMParameters
 from harness.importance.challenge import smallest_gaps
 from harness.maneuvers import acceleration
 from harness.vehicles.drivers import driver_acceleration, driver_records

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from harness.campaign.drivers import IDMParameters
 from harness.campaign.files import load_campaign
-from harness.campaign.vehicle import IDMParameters
 from harness.importance import tables as cache
 from harness.importance.build import build_importance
 from harness.importance.tables import Tables, build_tables, table_path, tables_hash

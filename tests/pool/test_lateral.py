@@ -7,7 +7,6 @@ import pytest
 
 from harness.campaign.files import load_campaign
 from harness.controllers.find import build_host
-from harness.drawing.baseline import recorded, without_cut_in
 from harness.episode.loop import Drawing, EpisodeLoop, RecordPolicy
 from harness.importance.build import build_importance
 from harness.pool.library import load_library
@@ -15,6 +14,7 @@ from harness.pool.shells import PrescribedEpisodes
 from harness.pool.storage import campaign_pool, read_pool, write_pool
 from harness.pool.vehicle_pool import vehicle_pool, walk_candidates
 from harness.resolved import resolve
+from harness.sampling.baseline import recorded, without_cut_in
 from harness.traffic.loading import load_environment
 from harness.vocabulary import CRASH, PASSED, PRESCRIBED
 from harness.worlds.twin import TwinWorld

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from harness.campaign.files import load_campaign
-from harness.drawing.baseline import as_recorded, baseline_requests, run_baseline, without_cut_in
 from harness.episode.judge import motion_hashes
 from harness.episode.path import Followers
 from harness.errors import HarnessError
@@ -14,7 +13,8 @@ from harness.pool.vehicle_pool import CANDIDATES, EVENLY, chances, vehicle_pool
 from harness.pool.walk import Enumerator, ShadowRuns, enumerate_cut_ins
 from harness.progress import Progress
 from harness.resolved import resolve
-from harness.runner.resolve import prepare
+from harness.runner.prepare import prepare
+from harness.sampling.baseline import as_recorded, baseline_requests, run_baseline, without_cut_in
 from harness.vehicles.drivers import driver_records
 from harness.vocabulary import CRASH
 from harness.worlds.twin import TwinWorld

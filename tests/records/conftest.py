@@ -13,7 +13,7 @@ from harness.campaign.files import load_campaign
 from harness.episode.loop import Shard
 from harness.records.schemas import ShardTables, shard_tables
 from harness.resolved import resolve
-from harness.runner.resolve import prepare
+from harness.runner.prepare import prepare
 from harness.worlds.twin import TwinWorld
 
 MIXTURE_FILE = Path(__file__).parents[2] / "scenarios" / "overtaking_mixture.yaml"

@@ -20,8 +20,8 @@ from harness.importance.build import importance_names
 from harness.records.folder import encoded, write_shard
 from harness.records.schemas import shard_tables
 from harness.resolved import resolve
-from harness.runner.estimate import stored_blocks
-from harness.runner.resolve import prepare
+from harness.runner.prepare import prepare
+from harness.runner.stored import stored_blocks
 from harness.strata import STORED_DESIGN, ShellDesign, Statement
 from harness.vocabulary import CRASH, FAILED, TIMEOUT
 from harness.worlds.twin import TwinWorld

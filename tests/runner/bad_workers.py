@@ -1,4 +1,4 @@
-"""Worker processes that fail; put in the place of `harness.runner.worker.serve`."""
+"""Worker processes that fail; put in the place of `harness.runner.workers.serve`."""
 
 from __future__ import annotations
 

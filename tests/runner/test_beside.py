@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from harness import estimate, replay
-from harness.campaign.vehicle import NeedBasedParameters
+from harness.campaign.drivers import NeedBasedParameters
 from harness.vehicles.kinematics import CONTACT_M, VEHICLE_LENGTH_M
 from tests.pool.conftest import SMALL_POOL
 from tests.stored_runs import stored_table, unlike_columns

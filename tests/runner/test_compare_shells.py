@@ -13,7 +13,7 @@ from harness.errors import CampaignError, RunFolderError
 from harness.records.reader import read_shards
 from harness.runner.compare import compare_campaigns, require_comparable
 from harness.runner.run import Run
-from harness.runner.worker import ShardRunner
+from harness.runner.workers import ShardRunner
 from tests.in_process import one_process, without_page
 from tests.pool.conftest import SMALL_POOL
 from tests.runner.conftest import MIXTURE_FILE

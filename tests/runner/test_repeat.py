@@ -10,7 +10,7 @@ import pytest
 from harness.campaign.files import load_campaign
 from harness.errors import CampaignError
 from harness.records.folder import read_manifest
-from harness.runner.replay import replay_episode, suspects
+from harness.runner.stored import replay_episode, suspects
 from tests.stored_runs import copy_of
 
 FORCED = Path(__file__).parents[2] / "scenarios/overtaking_forced.yaml"

@@ -8,12 +8,13 @@ import pyarrow.parquet as pq
 import pytest
 
 from harness.campaign.campaign import Campaign
-from harness.campaign.vehicle import AutomatedVehicle, IDMParameters, Reaction
+from harness.campaign.drivers import IDMParameters, Reaction
+from harness.campaign.vehicle import AutomatedVehicle
 from harness.errors import WorldDisagreementError
 from harness.pool.replay import Retracing
 from harness.records.schemas import episodes_table
 from harness.resolved import resolve
-from harness.runner.resolve import prepare
+from harness.runner.prepare import prepare
 from harness.worlds.twin import TwinWorld
 from tests.chains.seed import SEED
 from tests.in_process import run_here

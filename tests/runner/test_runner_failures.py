@@ -13,12 +13,12 @@ from pathlib import Path
 import pytest
 
 from harness.cli import main
-from harness.drawing import ShardRequest
 from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, WorldDisagreementError
 from harness.progress import ShownProgress
 from harness.runner import run as running
-from harness.runner import worker, workers
+from harness.runner import workers
 from harness.runner.workers import WorkerLostError
+from harness.sampling import ShardRequest
 from tests.in_process import workers_alive
 from tests.runner import bad_workers
 from tests.runner.conftest import MIXTURE_FILE, SMALL, TWIN, sets
@@ -145,10 +145,10 @@ def serve(campaign, tmp_path, monkeypatch):
             def close(self) -> None:
                 events.append("closed")
 
-        monkeypatch.setattr(worker, "ShardRunner", Runner)
+        monkeypatch.setattr(workers, "ShardRunner", Runner)
         resolved = tmp_path / "resolved"
         resolved.write_bytes(pickle.dumps(campaign()))
-        worker.serve(pipe, resolved, tmp_path, tmp_path / "black-box")
+        workers.serve(pipe, resolved, tmp_path, tmp_path / "black-box")
         return events
 
     return served

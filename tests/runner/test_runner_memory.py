@@ -21,9 +21,9 @@ def resident_mb() -> float:
 
 def run_shards(connection, folder: Path) -> None:
     """Work like a worker process, and say after every shard how much memory that takes."""
-    from harness.drawing import ShardRequest
     from harness.resolved import resolve
-    from harness.runner.worker import ShardRunner
+    from harness.runner.workers import ShardRunner
+    from harness.sampling import ShardRequest
 
     runner = ShardRunner(resolve(load_campaign(MIXTURE_FILE)), folder)
     for index in range(EPISODES // SHARD):

@@ -11,7 +11,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from harness.cli import main
-from harness.runner.replay import replay_episode
+from harness.runner.stored import replay_episode
 from tests.golden.record import column_hash
 from tests.stored_runs import copy_of, shard_files, stored_table
 

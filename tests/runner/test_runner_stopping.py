@@ -8,7 +8,7 @@ import pytest
 
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, RunFolderError
 from harness.progress import Progress
-from harness.runner.manifest import Prefix
+from harness.runner.resume import Prefix
 from tests.runner.conftest import TWIN
 from tests.stored_runs import copy_of, manifest, shard_files, stored_table, unlike_columns
 

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from harness import estimate, replay
-from harness.drawing.allocation import GROWTH, Allocation, first_tests
-from harness.drawing.shells import round_requests
 from harness.errors import RunFolderError
 from harness.estimators.likelihood import Level
 from harness.estimators.tally import Tally, combined
-from harness.runner.manifest import Manifest, Prefix
+from harness.runner.resume import Manifest, Prefix
+from harness.sampling.allocation import GROWTH, Allocation, first_tests
+from harness.sampling.shells import round_requests
 from harness.strata import ShellDesign, Statement
 from tests.pool.conftest import SMALL_POOL
 from tests.stored_runs import copy_of, manifest, shard_files, stored_table, unlike_columns

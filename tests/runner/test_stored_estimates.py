@@ -12,8 +12,8 @@ import pytest
 from harness.cli import main
 from harness.errors import RunFolderError
 from harness.estimators.block import joined
-from harness.runner import estimate
-from harness.runner.estimate import estimate_run, stored_blocks
+from harness.runner import stored
+from harness.runner.stored import estimate_run, stored_blocks
 from tests.stored_runs import copy_of, stored_table
 
 
@@ -46,8 +46,8 @@ def test_rate_and_counts_can_be_had_from_the_table_alone(sumo_run):
 def test_shards_are_read_in_groups_without_changing_a_bit(most, sizes, twin_run, monkeypatch):
     """Five shards of 80 tests, as one block of several tables."""
     one_by_one = list(stored_blocks(twin_run, moments=False))
-    monkeypatch.setattr(estimate, "SPACING", 100.0)
-    monkeypatch.setattr(estimate, "MOST_GROUPED", most)
+    monkeypatch.setattr(stored, "SPACING", 100.0)
+    monkeypatch.setattr(stored, "MOST_GROUPED", most)
     grouped = list(stored_blocks(twin_run, moments=False))
     assert ([len(block) for block in one_by_one], [len(block) for block in grouped]) == ([80] * 5, sizes)
     whole, again = joined(one_by_one), joined(grouped)
@@ -63,6 +63,6 @@ def test_shards_with_columns_of_other_types_are_refused(twin_run, tmp_path, monk
     table = pq.read_table(path)
     column = table.schema.get_field_index("cut_in_step")
     pq.write_table(table.set_column(column, "cut_in_step", table.column(column).cast("float64")), path)
-    monkeypatch.setattr(estimate, "SPACING", 100.0)
+    monkeypatch.setattr(stored, "SPACING", 100.0)
     with pytest.raises(RunFolderError, match="cut_in_step as double and int16"):
         list(stored_blocks(folder, moments=False))

@@ -13,8 +13,9 @@ import pyarrow as pa
 import pytest
 
 from harness.campaign.campaign import Campaign
+from harness.campaign.drivers import IDMParameters, Reaction
 from harness.campaign.sections import PoolSettings
-from harness.campaign.vehicle import AutomatedVehicle, IDMParameters, Reaction
+from harness.campaign.vehicle import AutomatedVehicle
 from harness.episode.loop import Shard
 from harness.episode.path import Followers
 from harness.errors import RunFolderError
@@ -24,7 +25,7 @@ from harness.pool.cut_ins import Pool
 from harness.pool.storage import campaign_pool
 from harness.records.schemas import episodes_table
 from harness.resolved import resolve
-from harness.runner.resolve import prepare
+from harness.runner.prepare import prepare
 from harness.vehicles.drivers import driver_records
 from harness.vocabulary import CRASH, BoolArray
 from harness.worlds.twin import TwinWorld

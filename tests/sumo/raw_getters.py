@@ -16,7 +16,7 @@ import numpy as np
 from harness.campaign.campaign import Campaign
 from harness.episode.loop import Shard
 from harness.resolved import resolve
-from harness.runner.resolve import prepare
+from harness.runner.prepare import prepare
 from harness.vocabulary import BV_LV_CONTACT, CRASH, VEHICLES
 
 

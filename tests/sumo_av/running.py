@@ -11,7 +11,7 @@ from harness.campaign.sections import Records, Run, Stop, Testing, World
 from harness.campaign.vehicle import AutomatedVehicle, Limits, TraciProcess
 from harness.episode.loop import Shard
 from harness.resolved import resolve
-from harness.runner.resolve import prepare
+from harness.runner.prepare import prepare
 from harness.worlds import build_world
 from harness.worlds.twin import TwinWorld
 

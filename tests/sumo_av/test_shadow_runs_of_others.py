@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from harness.campaign.files import load_campaign
-from harness.drawing.baseline import as_recorded, baseline_requests, run_baseline
 from harness.resolved import resolve
-from harness.runner.resolve import prepare
+from harness.runner.prepare import prepare
+from harness.sampling.baseline import as_recorded, baseline_requests, run_baseline
 from harness.worlds import build_world
 from harness.worlds.sumo_driven import FreshWorld, SumoAvWorld
 from tests.controllers.test_same_bits import ROOT, fmu_av

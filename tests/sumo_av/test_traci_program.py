@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from harness.errors import CampaignError, TooManyFailedError, WorldDisagreementError
-from harness.runner.replay import replay_episode
 from harness.runner.run import run_campaign
+from harness.runner.stored import replay_episode
 from harness.vocabulary import AV, FAILED
 from harness.worlds.program import TraciWorld
 from tests.sumo_av.misbehaving_client import FAULT_STEP

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 import yaml
 
-from harness.campaign.files import load_campaign
-from harness.campaign.problems import read_model
+from harness.campaign.files import load_campaign, read_model
 from harness.campaign.sections import EnvironmentSettings
 from harness.errors import CampaignError
 from harness.pool.cut_ins import environment_hash

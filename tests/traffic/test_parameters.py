@@ -10,11 +10,11 @@ import pytest
 from pydantic import ValidationError
 
 from harness.campaign.campaign import Campaign
+from harness.campaign.files import read_yaml
 from harness.campaign.sections import EnvironmentSettings
-from harness.campaign.yaml_text import read_yaml
 from harness.errors import CampaignError
 from harness.resolved import resolve
-from harness.runner.resolve import prepare
+from harness.runner.prepare import prepare
 from harness.traffic.loading import load_environment, load_parameters, parameter_file, require_sound_laws
 from harness.traffic.parameters import EnvironmentParameters
 from harness.vocabulary import STATE_COLUMNS

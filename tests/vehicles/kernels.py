@@ -4,7 +4,7 @@ Import this module as ``tests.…`` everywhere: numba's cache remembers the name
 
 import numpy as np
 
-from harness.campaign.vehicle import IDMParameters
+from harness.campaign.drivers import IDMParameters
 from harness.compiled import compiled_threads
 from harness.vehicles import drivers, kinematics, references
 

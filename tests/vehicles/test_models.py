@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from harness.campaign.vehicle import FVDMParameters, IDMParameters
+from harness.campaign.drivers import FVDMParameters, IDMParameters
 from tests.vehicles.kernels import accelerations
 
 speeds = st.floats(0.0, 60.0)

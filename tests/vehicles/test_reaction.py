@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import binomtest
 
-from harness.campaign.vehicle import (
+from harness.campaign.drivers import (
     CarefulCompetentParameters,
     ConstantParameters,
     FuzzySafetyParameters,

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from harness.campaign.vehicle import (
+from harness.campaign.drivers import (
     CarefulCompetentParameters,
     FuzzySafetyParameters,
     IDMParameters,

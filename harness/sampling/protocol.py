@@ -102,9 +102,7 @@ class Source:
     """Of the episodes table, that estimates need."""
     moment_columns: ClassVar[tuple[str, ...]] = ()
     """Of the table of control steps, that one of its estimators needs."""
-    uses_tables: ClassVar = False
     cut_ins_are_rare: ClassVar = False
-    tests_in_rounds: ClassVar = False
 
     def __init__(self, resolved: Resolved, progress: Progress) -> None:
         self.resolved, self.campaign = resolved, resolved.campaign
@@ -116,7 +114,7 @@ class Source:
         self.baseline_paths: ShadowPaths | None = None
 
     def _built_tables(self, progress: Progress) -> Tables | None:
-        if not self.uses_tables:
+        if not self.campaign.sampling.mixes:
             return None
         drivers = self.resolved.surrogates
         progress.stage("criticality tables", len(drivers))
@@ -129,7 +127,7 @@ class Source:
     @classmethod
     def cached_files(cls, resolved: Resolved) -> list[Path]:
         """What building leaves in the cache, or has found there: with these another machine builds nothing."""
-        if not cls.uses_tables:
+        if not resolved.campaign.sampling.mixes:
             return []
         return [table_path(resolved.environment, resolved.surrogates, resolved.campaign.testing.challenge)]
 

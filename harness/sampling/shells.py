@@ -1,9 +1,9 @@
 """Cut-ins of the pool, drawn within shells, in rounds: each decides what the next one tests.
 
 A round is run to its end before the next begins, whatever the number of workers, and the result is looked at. Rounds
-grow geometrically, to where they narrow the interval most (`harness.drawing.allocation`). That depends on counts alone,
-not on the stop rule or on time: a run can be continued to a smaller RHW. First the strata inside the narrowest boundary
-are tested until what is stated about them is roughly known; then those inside the next one, and at last all.
+grow geometrically, to where they narrow the interval most (`harness.sampling.allocation`). That depends on counts
+alone, not on the stop rule or on time: a run can be continued to a smaller RHW. First the strata inside the narrowest
+boundary are tested until what is stated about them is roughly known; then those of the next one, and at last all.
 """
 
 from __future__ import annotations
@@ -19,8 +19,6 @@ import pyarrow as pa
 
 from harness.campaign.campaign import Campaign
 from harness.campaign.sections import Stop
-from harness.drawing.allocation import CONFIDENCE, Allocation
-from harness.drawing.protocol import Rounds, ShardRequest, Source
 from harness.episode.loop import EpisodeLoop, Shard
 from harness.errors import RunFolderError
 from harness.estimators.block import EPISODE_COLUMNS, SHELL_COLUMNS, Block
@@ -37,6 +35,8 @@ from harness.pool.walk import ShadowRuns
 from harness.progress import Progress
 from harness.records.folder import SHELLS, read_as, read_manifest
 from harness.resolved import Resolved
+from harness.sampling.allocation import CONFIDENCE, Allocation
+from harness.sampling.protocol import Rounds, ShardRequest, Source
 from harness.strata import ASSUMPTION_FREE, ShellDesign, StoredDesign
 from harness.vocabulary import IntArray
 
@@ -64,7 +64,6 @@ class Shells(Source):
 
     episodes_per_s = {"sumo": 1700, "sumo with shim": 2700, "twin": 30000}
     columns = (*EPISODE_COLUMNS, *SHELL_COLUMNS)
-    tests_in_rounds = True
 
     def __init__(self, resolved: Resolved, progress: Progress) -> None:
         super().__init__(resolved, progress)

@@ -10,7 +10,6 @@ from harness.campaign.campaign import Campaign
 from harness.campaign.combinations import Command
 from harness.compiled import is_cached
 from harness.controllers.find import require_controller
-from harness.drawing import Source, source_of
 from harness.episode.judge import judge
 from harness.episode.loop import Drawing, EpisodeLoop, RecordPolicy
 from harness.episode.path import empty_trajectory, mean_test_distance
@@ -19,6 +18,7 @@ from harness.pool.replay import Retracing
 from harness.progress import Progress
 from harness.records.schemas import shard_tables
 from harness.resolved import Resolved, resolve
+from harness.sampling import Source, source_of
 from harness.traffic.initial_state import InitialStates
 from harness.traffic.laws import Environment
 from harness.unboxed import unboxed

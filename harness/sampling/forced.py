@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from harness.drawing.baseline import recorded, without_cut_in
-from harness.drawing.protocol import ShardRequest, Source
 from harness.episode.cells import PrescribedTraffic
 from harness.episode.decide import CUT_IN_DRAW
 from harness.episode.judge import motion_hashes
@@ -16,6 +14,8 @@ from harness.pool.walk import enumerate_cut_ins, write_script
 from harness.progress import Progress
 from harness.random_stream import CUT_IN, uniforms
 from harness.resolved import Resolved
+from harness.sampling.baseline import recorded, without_cut_in
+from harness.sampling.protocol import ShardRequest, Source
 from harness.traffic.laws import Environment
 from harness.vehicles.drivers import driver_records
 from harness.vocabulary import PRESCRIBED, RecordArray
