@@ -9,6 +9,8 @@ stays ignored: SIGHUP under ``nohup``, SIGINT in the background of a script.
 
 from __future__ import annotations
 
+import gc
+import math
 import mmap
 import os
 import pickle
@@ -24,8 +26,10 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from functools import cache
+from importlib import import_module
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection, wait
+from multiprocessing.reduction import recv_handle, send_handle
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
@@ -38,6 +42,7 @@ if TYPE_CHECKING:
 FROM_USER = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 LOOK_S = 0.5
 """Time between two looks at a process whose pipe is silent: a copy that a controller made of it keeps the pipe open."""
+_POLL_S, _FORK_ATTEMPTS = 0.005, 3
 _LEFT_TO_US = (signal.SIG_DFL, signal.default_int_handler)
 
 _Item = TypeVar("_Item")
@@ -107,22 +112,15 @@ def leave_signals_to_parent() -> None:
 class Child:
     """A process that calls ``target(connection, *arguments)``, at the other end of a pipe.
 
-    It is a fresh Python, which finds modules where this one does and runs no script again. It prints to stderr:
-    stdout is for the harness's results.
+    It is a fresh Python, which finds modules where this one does and runs no script again, or a copy that a
+    ``server`` makes of itself. It prints to stderr: stdout is for the harness's results.
     """
 
-    def __init__(self, target: Callable[..., None], *arguments: Any) -> None:
+    def __init__(self, target: Callable[..., None], *arguments: Any, server: ForkServer | None = None) -> None:
         work = pickle.dumps((target, arguments))
         self.connection, theirs = Pipe()
-        code = f"import sys; sys.path[:] = {sys.path!r}; from harness.processes import _begin; "
         with theirs:  # or its death would not end the pipe
-            self._process = subprocess.Popen(  # noqa: S603 - our own words
-                [sys.executable, "-c", f"{code}_begin({theirs.fileno()}, {os.getpid()})"],
-                stdin=subprocess.DEVNULL,
-                env={"OPENBLAS_NUM_THREADS": "1", **os.environ},
-                pass_fds=[theirs.fileno()],
-                start_new_session=True,
-            )
+            self._process = _fresh_python(theirs) if server is None else server.fork(theirs)
         with suppress(OSError):  # it has died already
             self.connection.send_bytes(work)
 
@@ -170,7 +168,140 @@ def first_to_answer(children: Sequence[_Child]) -> _Child:
             return found[0]
 
 
-def end(process: subprocess.Popen[bytes]) -> int:
+def _fresh_python(connection: Connection) -> subprocess.Popen[bytes]:
+    code = f"import sys; sys.path[:] = {sys.path!r}; from harness.processes import _begin; "
+    return subprocess.Popen(  # noqa: S603 - our own words
+        [sys.executable, "-c", f"{code}_begin({connection.fileno()}, {os.getpid()})"],
+        stdin=subprocess.DEVNULL,
+        env={"OPENBLAS_NUM_THREADS": "1", **os.environ},
+        pass_fds=[connection.fileno()],
+        start_new_session=True,
+    )
+
+
+class ForkServer:
+    """A process that imports modules once and then copies itself: a child begins at once, and shares their memory.
+
+    It has one thread and runs nobody's code, so that a copy lacks nothing. Its children end with it, as it does with
+    its parent. It starts when it is first needed, and again if it was killed.
+    """
+
+    def __init__(self, *modules: str) -> None:
+        self._modules, self._child = modules, None  # type: tuple[str, ...], Child | None
+
+    def start(self) -> Child:
+        """Let it import what it needs, beside the caller."""
+        if self._child is None or not self._child.is_alive():
+            self._child = Child(_serve_forks, self._modules)
+        return self._child
+
+    def fork(self, connection: Connection) -> Forked:
+        """A copy that does the work which it receives; an `OSError` where there can be none."""
+        for _ in range(_FORK_ATTEMPTS):
+            child = self.start()
+            with suppress(EOFError, OSError):  # it has been killed
+                child.connection.send(None)
+                send_handle(child.connection, connection.fileno(), 0)
+                answer = child.connection.recv()
+                break
+        else:
+            answer = ChildProcessError("the process that starts workers was killed again and again")
+        if isinstance(answer, OSError):
+            raise answer
+        return Forked(child, answer)
+
+    def close(self) -> None:
+        """End it, once its children have ended."""
+        if self._child is not None:
+            self._child.kill()
+            self._child = None
+
+
+class Forked:
+    """A copy of a `ForkServer`, with as much of `subprocess.Popen` as is needed."""
+
+    def __init__(self, server: Child, pid: int) -> None:
+        self._server, self.pid = server, pid
+        self._exit_code: int | None = None
+
+    def poll(self) -> int | None:
+        """Its exit code; None while it runs."""
+        if self._exit_code is None:
+            try:
+                self._server.connection.send(self.pid)
+                self._exit_code = self._server.connection.recv()
+            except (EOFError, OSError):
+                self._exit_code = -signal.SIGKILL  # its server has been killed, and it ends with that
+        return self._exit_code
+
+    def wait(self, timeout: float = math.inf) -> int:
+        """Its exit code, once it has ended; `subprocess.TimeoutExpired` if it does not."""
+        until = time.monotonic() + timeout
+        while (code := self.poll()) is None:
+            if time.monotonic() > until:
+                raise subprocess.TimeoutExpired("a worker", timeout)
+            time.sleep(_POLL_S)
+        return code
+
+
+def _serve_forks(connection: Connection, modules: Sequence[str]) -> None:
+    """Tell the exit code of a child, or make one: the copy leaves this function to do its own work."""
+    for name in modules:
+        with suppress(ImportError):  # who needs it will say so
+            import_module(name)
+    gc.freeze()  # what is never looked through is never copied
+    server = os.getpid()
+    while True:
+        try:
+            pid = connection.recv()
+            if pid is not None:
+                ended, status = os.waitpid(pid, os.WNOHANG)
+                connection.send(os.waitstatus_to_exitcode(status) if ended else None)
+                continue
+            descriptor = recv_handle(connection)
+        except (EOFError, OSError):  # the parent is gone
+            return
+        try:
+            is_copy = os.fork() == 0
+        except OSError as error:
+            connection.send(error)
+            is_copy = False
+        if is_copy:
+            os.setsid()
+            with connection:  # only now, as a leader of its own session, can it be ended with all that it starts
+                connection.send(os.getpid())
+            _begin(descriptor, server)
+            return
+        os.close(descriptor)
+
+
+_ahead: list[ForkServer] = []
+
+
+@contextmanager
+def imports_ahead(*modules: str) -> Iterator[None]:
+    """Let the next `fork_server` import its modules already, beside this process."""
+    _ahead.append(ForkServer(*modules))
+    try:
+        _ahead[-1].start()
+        yield
+    finally:
+        for server in _ahead:  # nobody has asked for it
+            server.close()
+        _ahead.clear()
+
+
+def fork_server(*modules: str) -> ForkServer:
+    """One for these modules: that of `imports_ahead`, or one that starts when it is needed."""
+    return _ahead.pop() if _ahead else ForkServer(*modules)
+
+
+def worker_modules(engine: str) -> tuple[str, ...]:
+    """What takes long to import, of all that runs shards in a world; pandas is loaded by pyarrow."""
+    return "harness.runner.workers", "pandas", *(("libsumo",) if engine == "sumo" else ())
+
+
+def end(process: subprocess.Popen[bytes] | Forked) -> int:
     """End a process that leads a session, with everything that it has started; returns its exit code."""
     with suppress(ProcessLookupError, PermissionError):  # there is nobody left
         os.killpg(process.pid, signal.SIGKILL)
@@ -180,7 +311,6 @@ def end(process: subprocess.Popen[bytes]) -> int:
 def _begin(descriptor: int, parent: int) -> None:
     """Do what this process has been started for."""
     leave_signals_to_parent()
-    threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
     with suppress(OSError):  # stderr may be closed
         os.dup2(2, 1)
     connection = Connection(descriptor)
@@ -189,6 +319,8 @@ def _begin(descriptor: int, parent: int) -> None:
     except (EOFError, OSError):  # the parent has been killed before it could say what to do
         raise SystemExit(1) from None
     target, arguments = pickle.loads(work)  # noqa: S301 - our own bytes
+    if target is not _serve_forks:  # which has no threads, and waits for its parent all the time
+        threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
     target(connection, *arguments)
 
 

@@ -25,6 +25,7 @@ from benchmarks.kills import descendants, started_by
 from harness import run
 from harness.campaign.campaign import Campaign
 from harness.controllers.hosts import Death
+from harness.processes import ForkServer
 from harness.runner import workers
 from harness.runner.run import RunResult
 from harness.runner.workers import ShardResult, ShardRunner
@@ -42,7 +43,7 @@ def without_page() -> Iterator[None]:
 class WorkerInThisProcess:
     """Stands in for `WorkerProcess` where the tests are not about processes: spares starting one."""
 
-    def __init__(self, resolved: Path, folder: Path, black_box: Path) -> None:
+    def __init__(self, server: ForkServer, resolved: Path, folder: Path, black_box: Path) -> None:
         self._runner = ShardRunner(pickle.loads(resolved.read_bytes()), folder)
 
     def give(self, spec: ShardRequest, fatal_episodes: Mapping[int, Death]) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
 
 import click
@@ -110,11 +111,15 @@ def run(
     limit = [] if accept is None else [f"accept.crash_rate_below={accept!r}"]
     where = [] if executor is None else [f"run.executor={executor}"]
     campaign = loaded(campaign_file, [*overrides, *limit, *where], av)
+    from harness.processes import imports_ahead, worker_modules  # noqa: PLC0415 - keeps --help fast
     from harness.progress import shown_progress  # noqa: PLC0415 - keeps --help fast
-    from harness.runner.run import run_campaign  # noqa: PLC0415 - slow to import: only once the campaign is right
 
-    with shown_progress(campaign.stop.rhw, campaign.min_crashes, quiet=quiet) as bar:
-        result = run_campaign(campaign, folder, workers=workers, resume=resume, progress=bar)
+    is_local = campaign.run.executor == "local"
+    with imports_ahead(*worker_modules(campaign.world.engine)) if is_local else nullcontext():
+        from harness.runner.run import run_campaign  # noqa: PLC0415 - slow to import: only once the campaign is right
+
+        with shown_progress(campaign.stop.rhw, campaign.min_crashes, quiet=quiet) as bar:
+            result = run_campaign(campaign, folder, workers=workers, resume=resume, progress=bar)
     if junit is not None:
         from harness.report.junit import statement_cases, write_junit  # noqa: PLC0415 - keeps --help fast
 

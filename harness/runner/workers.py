@@ -24,7 +24,17 @@ from harness.episode.loop import EpisodeLoop
 from harness.errors import HarnessError, TooManyFailedError
 from harness.estimators.block import Block
 from harness.pool.replay import Retracing
-from harness.processes import OF_EPISODE, Call, Child, first_to_answer, fit_to_travel, last_call
+from harness.processes import (
+    OF_EPISODE,
+    Call,
+    Child,
+    ForkServer,
+    first_to_answer,
+    fit_to_travel,
+    fork_server,
+    last_call,
+    worker_modules,
+)
 from harness.records.folder import encoded
 from harness.records.schemas import ShardTables, shard_tables
 from harness.resolved import Resolved
@@ -197,8 +207,8 @@ class Worker(Protocol):
 class WorkerProcess(Child):
     """A process that runs one shard after another, at the end of a pipe of its own."""
 
-    def __init__(self, resolved: Path, folder: Path, black_box: Path) -> None:
-        super().__init__(serve, resolved, folder, black_box)
+    def __init__(self, server: ForkServer, resolved: Path, folder: Path, black_box: Path) -> None:
+        super().__init__(serve, resolved, folder, black_box, server=server)
         self._black_box = black_box
 
     def give(self, request: Request, fatal_episodes: Mapping[int, Death]) -> bool:
@@ -369,10 +379,12 @@ class LocalWorkers(Workers):
         self._resolved = Path(self._own.name) / "resolved"
         self._resolved.write_bytes(pickle.dumps(resolved))
         self._numbers = count()
+        self._server = fork_server(*worker_modules(resolved.campaign.world.engine))
 
     def new_worker(self) -> WorkerProcess:
         """See `Workers.new_worker`."""
-        return WorkerProcess(self._resolved, self._folder, Path(self._own.name) / str(next(self._numbers)))
+        black_box = Path(self._own.name) / str(next(self._numbers))
+        return WorkerProcess(self._server, self._resolved, self._folder, black_box)
 
     def first_to_answer(self, busy: Sequence[WorkerProcess]) -> WorkerProcess:
         """See `Workers.first_to_answer`."""
@@ -381,4 +393,5 @@ class LocalWorkers(Workers):
     def close(self) -> None:
         """See `Workers.close`."""
         super().close()
+        self._server.close()
         self._own.cleanup()

@@ -25,6 +25,12 @@ def disobedient(connection, resolved, folder, black_box) -> None:
     connection.recv()
 
 
+def waiting(connection) -> None:
+    """Tells how many threads its parent has, and waits for a word."""
+    connection.send(len([*Path(f"/proc/{os.getppid()}/task").iterdir()]))
+    connection.recv()
+
+
 def abandoned(connection, note) -> None:
     """Starts a program, writes down who they are, and is busy."""
     helper = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"])

@@ -7,6 +7,8 @@ import sys
 import time
 from pathlib import Path
 
+from harness.processes import Child, ForkServer
+from tests.runner import bad_workers
 from tests.stored_runs import manifest, shard_files
 
 SCENARIO = Path(__file__).parents[2] / "scenarios" / "overtaking_forced.yaml"
@@ -111,6 +113,23 @@ def test_a_busy_worker_does_not_outlive_a_killed_parent_nor_does_what_it_has_sta
     assert (code, complaints) == (-signal.SIGKILL, "")
     for pid in map(int, (tmp_path / "pids.done").read_text().split()):
         wait_until_gone(Path(f"/proc/{pid}/stat"))
+
+
+def test_copies_of_a_fork_server_are_whole_and_end_with_it():
+    """It has one thread at the fork, and is started again when it was killed."""
+    server = ForkServer("harness.runner.workers", "libsumo")
+    first, second = (Child(bad_workers.waiting, server=server) for _ in range(2))
+    assert [first.connection.recv(), second.connection.recv()] == [1, 1]
+    assert first.send("end")
+    first.wait(PATIENCE_S)
+    assert (first.is_alive(), second.is_alive()) == (False, True)
+    os.killpg(server.start()._process.pid, signal.SIGKILL)
+    wait_until_gone(Path(f"/proc/{second._process.pid}/stat"))
+    assert (second.receive(), second.kill()) == (None, -signal.SIGKILL)
+    third = Child(bad_workers.waiting, server=server)
+    assert third.connection.recv() == 1
+    assert third.kill() == -signal.SIGKILL
+    server.close()
 
 
 def wait_until_gone(state: Path) -> None:
