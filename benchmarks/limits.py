@@ -22,7 +22,7 @@ from scipy import special
 
 import harness
 from harness.campaign.files import load_campaign
-from harness.traffic.initial_state import InitialStates
+from harness.traffic.laws import InitialStates
 from harness.traffic.loading import load_environment
 
 FAST_MPS = 40.0

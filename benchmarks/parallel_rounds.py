@@ -22,8 +22,8 @@ from benchmarks.contenders import SCENARIOS
 from benchmarks.shells_rare_hole import IDM
 from harness.campaign.campaign import Campaign
 from harness.campaign.files import load_campaign
+from harness.pool.build import campaign_pool
 from harness.pool.shells import design_shells
-from harness.pool.storage import campaign_pool
 from harness.resolved import resolve
 from harness.sampling.shells import ShellRounds, round_requests
 from harness.vocabulary import FloatArray

@@ -16,8 +16,8 @@ import numpy as np
 
 from benchmarks.contenders import SCENARIOS
 from harness.campaign.files import load_campaign
+from harness.pool.build import campaign_pool
 from harness.pool.shells import design_shells
-from harness.pool.storage import campaign_pool
 from harness.resolved import resolve
 from studies.replication.shells import FREE, DrawnPool, ShellCampaign
 

@@ -27,7 +27,7 @@ from pydantic.fields import FieldInfo
 
 from harness.campaign.campaign import Campaign
 from harness.campaign.sections import EnvironmentSettings
-from harness.records.schemas import episodes_schema, moments_schema, shadow_schema, traces_schema
+from harness.records.schemas import baseline_schema, episodes_schema, moments_schema, traces_schema
 from harness.traffic.loading import load_parameters
 
 FOLDER = Path(__file__).parent
@@ -37,7 +37,7 @@ SCHEMAS = {
     "episodes": episodes_schema(4, 3, 2, takes_time=True),
     "moments": moments_schema(3),
     "traces": traces_schema(takes_time=True),
-    "shadow": shadow_schema(),
+    "shadow": baseline_schema(),
 }
 RESULTS = {
     "level_1": ("nde_1", "forced_1", "step_recursive_1", "episode_recursive_1"),

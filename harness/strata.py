@@ -18,7 +18,7 @@ OUTSIDE = "outside"
 """Name of the stratum of everything beyond the boundary."""
 ASSUMPTION_FREE, LIBRARY_STATEMENT = "assumption_free", "library"
 """Names of the statement that has no boundary, and of the one whose boundary is the library's own."""
-FAILED_SHADOWS = "failed shadow runs"
+FAILED_BASELINE = "failed shadow runs"
 """Name of a stratum that cannot be tested: cut-ins on paths on which the vehicle failed before one could come."""
 
 

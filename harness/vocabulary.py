@@ -70,13 +70,13 @@ class Sampling:
     estimators : tuple of str
         Those that its records allow, the first being the method's own, which answers the campaign's question; `scv`
         needs control steps on record besides.
-    mixes : bool
-        Whether it mixes importance functions of the surrogates, and so needs some, and their challenge tables.
+    mixes_steps, mixes_episodes : bool
+        Whether it mixes importance functions of the surrogates, in every critical step or one per episode.
     forces : bool
         Whether forced cut-ins are among what it draws from.
     holds_speed : bool
         Whether the AV must hold its speed until the cut-in, because what is drawn before the episode depends on it.
-    shadows : bool
+    baseline_runs : bool
         Whether an AV that does not is driven along each path without a cut-in first.
     bounded : bool
         Whether something bounds the weights; else no precision can be promised.
@@ -85,10 +85,11 @@ class Sampling:
     """
 
     estimators: tuple[EstimatorName, ...]
-    mixes: bool = False
+    mixes_steps: bool = False
+    mixes_episodes: bool = False
     forces: bool = False
     holds_speed: bool = False
-    shadows: bool = False
+    baseline_runs: bool = False
     bounded: bool = True
     strata: bool = False
 
@@ -97,13 +98,18 @@ class Sampling:
         """The method's own estimator."""
         return self.estimators[0]
 
+    @property
+    def mixes(self) -> bool:
+        """Whether it needs surrogates, and their challenge tables."""
+        return self.mixes_steps or self.mixes_episodes
+
 
 SAMPLING: dict[Method, Sampling] = {
     "nde": Sampling(("nde", "nade")),
-    "forced": Sampling(("nade",), forces=True, shadows=True),
-    "step_mixture": Sampling(("nade", "scv"), mixes=True, bounded=False),
-    "episode_mixture": Sampling(("mixture_cv", "nade"), mixes=True, forces=True, holds_speed=True),
-    "shells": Sampling(("shells",), shadows=True, strata=True),
+    "forced": Sampling(("nade",), forces=True, baseline_runs=True),
+    "step_mixture": Sampling(("nade", "scv"), mixes_steps=True, bounded=False),
+    "episode_mixture": Sampling(("mixture_cv", "nade"), mixes_episodes=True, forces=True, holds_speed=True),
+    "shells": Sampling(("shells",), baseline_runs=True, strata=True),
 }
 
 OUTCOMES = ("crash", "passed", "timeout", "bv_lv_contact", "failed")
@@ -113,5 +119,7 @@ RUNNING = -1
 VEHICLES = ("LV", "BV", "AV")
 LV, BV, AV = range(len(VEHICLES))
 
-NDE, FORCED, STEP_MIXTURE, EPISODE_MIXTURE, PRESCRIBED = range(len(METHODS))
-"""Methods as kernels know them; PRESCRIBED is shells, and any method where shadow runs prescribe the traffic."""
+N_ACCELERATIONS, CUT_IN, STAY = 31, 31, 32
+"""Maneuvers of BV: accelerations 0 … 30, and then, before a cut-in, changing lanes or not."""
+ACCELERATIONS_MPS2 = (np.arange(N_ACCELERATIONS) - 20) / 5.0
+"""-4 … 2 m/s² in steps of 0.2 [paper]; written as a quotient so that every value is the nearest double."""

@@ -26,26 +26,24 @@ import pyarrow as pa
 from scipy.special import logsumexp
 
 from harness.campaign.files import load_campaign
-from harness.compiled import compiled_threads
+from harness.compiled import compiled_threads, unboxed
 from harness.episode.loop import MOMENT_LIMITS, Drawing, EpisodeLoop, RecordPolicy, Shard
 from harness.episode.path import Followers, Trajectory, empty_trajectory, who_crashes
 from harness.errors import CampaignError, HarnessError, RunFolderError
 from harness.estimators.block import EPISODE_COLUMNS, Block, block_from_tables
 from harness.estimators.estimate import finite_json
-from harness.importance.build import build_importance, mixture_weights
+from harness.importance.functions import build_importance, mixture_weights
 from harness.importance.tables import Tables
-from harness.pool.cut_ins import Pool, environment_hash
+from harness.pool.build import campaign_pool
+from harness.pool.cut_ins import Pool, environment_hash, read_pool
 from harness.pool.replay import LEAD, PATH_COLUMNS, StoredPaths, approach_cut_in, leave_stored, stored_paths
-from harness.pool.storage import campaign_pool, read_pool
 from harness.processes import made_ahead
 from harness.progress import Progress
 from harness.records.folder import MEND_SHARD, read_manifest
 from harness.records.reader import read_shard
 from harness.resolved import Resolved, resolve
 from harness.runner.prepare import prepare
-from harness.traffic.initial_state import InitialStates
-from harness.traffic.laws import Environment
-from harness.unboxed import unboxed
+from harness.traffic.laws import Environment, InitialStates
 from harness.vocabulary import BV_LV_CONTACT, CRASH, RUNNING, BoolArray, FloatArray, IntArray, Method
 from harness.worlds.twin import TwinWorld
 

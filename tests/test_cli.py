@@ -315,14 +315,14 @@ POOL = {
 
 
 def test_pool_prints_what_it_wrote(calls, capsys, tmp_path):
-    calls["stand_in"]("harness.pool.storage.campaign_pool", SimpleNamespace(to_json=lambda: POOL))
-    calls["stand_in"]("harness.pool.storage.write_pool", None)
+    calls["stand_in"]("harness.pool.build.campaign_pool", SimpleNamespace(to_json=lambda: POOL))
+    calls["stand_in"]("harness.pool.cut_ins.write_pool", None)
     file = tmp_path / "pool.parquet"
     assert main(["pool", SMOKE, "--out", str(file)]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert "delays after cut in s.a: 0.4690" in lines
     assert lines[-1] == str(file)
-    assert calls["harness.pool.storage.write_pool"][0][0] == file
+    assert calls["harness.pool.cut_ins.write_pool"][0][0] == file
     assert main(["pool", SMOKE, "--out", str(file), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["file"] == str(file)
 

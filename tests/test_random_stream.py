@@ -1,7 +1,6 @@
 """Random numbers by counter against numpy's Philox, word by word."""
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -58,18 +57,3 @@ def test_a_row_is_what_numpys_generator_draws(seed, episode, stream, count):
     generator = np.random.Generator(np.random.Philox(key=seed, counter=before))
     # numpy carries its counter into the episode's word after 2**64 blocks: never within a row.
     np.testing.assert_array_equal(uniforms(seed, episode, 1, stream, count)[0], generator.random(count))
-
-
-@given(st.permutations(range(24)))
-def test_order_of_asking_leaves_no_trace(order):
-    np.testing.assert_array_equal(at(3, 5, 1, order), uniforms(3, 5, 1, 1, 24)[0, order])
-
-
-def test_rows_belong_to_episodes_whatever_the_range():
-    whole = uniforms(9, 0, 50, 2, 7)
-    np.testing.assert_array_equal(whole[13:31], uniforms(9, 13, 18, 2, 7))
-
-
-@pytest.mark.parametrize("other", [(8, 0, 2), (9, 1, 2), (9, 0, 3), (2, 0, 9), (9, 2, 0)])
-def test_seed_episode_and_stream_are_told_apart(other):
-    assert not np.isin(uniforms(9, 0, 1, 2, 64), uniforms(other[0], other[1], 1, other[2], 64)).any()

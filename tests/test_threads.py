@@ -1,5 +1,4 @@
 import threading
-import time
 
 import pytest
 
@@ -9,10 +8,6 @@ from harness.processes import made_ahead, side_by_side
 @pytest.mark.parametrize("worthwhile", [True, False])
 def test_results_come_in_the_order_of_the_items(worthwhile):
     assert side_by_side(lambda i: i * i, range(100), worthwhile=worthwhile) == [i * i for i in range(100)]
-
-
-@pytest.mark.parametrize("worthwhile", [True, False])
-def test_an_error_of_one_item_is_raised(worthwhile):
     with pytest.raises(ZeroDivisionError):
         side_by_side(lambda i: 1 // i, [1, 0, 1], worthwhile=worthwhile)
 
@@ -33,18 +28,6 @@ def test_the_next_item_is_made_while_the_present_one_is_in_use():
 
     for item in made_ahead(make, [1, 2], 1):
         assert item == 2 or second_made.wait(10)
-
-
-def test_one_thread_makes_one_item_at_a_time():
-    at_work = threading.Lock()
-
-    def make(i):
-        assert at_work.acquire(blocking=False)
-        time.sleep(1e-4)
-        at_work.release()
-        return i
-
-    assert list(made_ahead(make, range(50), 1)) == list(range(50))
 
 
 def test_an_error_while_reading_is_raised_where_the_item_is_used():

@@ -85,7 +85,7 @@ class Campaign(Section):
     def parts(self) -> Parts:
         """What `harness.campaign.combinations` asks of it."""
         sections = self.av, self.surrogates, self.testing, self.world, self.records, self.stop, self.accept
-        return Parts(*sections, has_shadow_runs=self.has_shadow_runs)
+        return Parts(*sections, has_baseline_runs=self.has_baseline_runs)
 
     @property
     def sampling(self) -> Sampling:
@@ -93,9 +93,9 @@ class Campaign(Section):
         return SAMPLING[self.testing.method]
 
     @property
-    def has_shadow_runs(self) -> bool:
+    def has_baseline_runs(self) -> bool:
         """Whether the AV is first driven along its paths without a cut-in."""
-        return self.av.acts_before_cut_in and self.sampling.shadows
+        return self.av.acts_before_cut_in and self.sampling.baseline_runs
 
     @property
     def min_crashes(self) -> int:

@@ -31,7 +31,7 @@ class Parts(NamedTuple):
     records: Records
     stop: Stop
     accept: Accept | None
-    has_shadow_runs: bool
+    has_baseline_runs: bool
 
 
 class Use(NamedTuple):
@@ -163,7 +163,7 @@ REFUSED = (
     ),
     Combination(
         "av.before_cut_in",
-        lambda c, use: use.takes_time and c.av.acts_before_cut_in and not _sampling(c).shadows,
+        lambda c, use: use.takes_time and c.av.acts_before_cut_in and not _sampling(c).baseline_runs,
         "controller, with testing.method {testing.method}, " + _TAKES_TIME,
         "a method that drives the AV along its paths first: only then the onset is known in time",
         "Choose testing.method shells or forced, or hold_speed.",
@@ -185,7 +185,7 @@ REFUSED = (
     ),
     Combination(
         "av.before_cut_in",
-        lambda c, use: use.command == "compare" and c.has_shadow_runs,
+        lambda c, use: use.command == "compare" and c.has_baseline_runs,
         "controller: a vehicle that acts before the cut-in has cut-ins of its own",
         "hold_speed in A and B: pairs need the same cut-ins",
         "Run both campaigns by themselves and put their intervals side by side, or write hold_speed.",

@@ -278,7 +278,8 @@ def pool(campaign_file: Path, *, out: Path | None, overrides: Sequence[str], as_
     the first in this order that a surrogate crashes on. A pool is built once and kept; `harness run` builds it, too.
     """
     campaign = loaded(campaign_file, overrides)
-    from harness.pool.storage import campaign_pool, write_pool  # noqa: PLC0415 - slow to import
+    from harness.pool.build import campaign_pool  # noqa: PLC0415 - slow to import
+    from harness.pool.cut_ins import write_pool  # noqa: PLC0415 - slow to import
     from harness.progress import shown_progress  # noqa: PLC0415 - keeps --help fast
     from harness.resolved import resolve  # noqa: PLC0415 - slow to import
 

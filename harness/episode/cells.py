@@ -14,13 +14,13 @@ from harness.compiled import compiled_inline
 from harness.controllers.protocol import BatchObservation
 from harness.episode.path import Trajectory, empty_trajectory, lengths
 from harness.importance.functions import Importance
-from harness.maneuvers import N_ACCELERATIONS
 from harness.traffic.laws import Environment
 from harness.vehicles.kinematics import gap
 from harness.vocabulary import (
     AV,
     BV,
     LV,
+    N_ACCELERATIONS,
     STATE_COLUMNS,
     FloatArray,
     Int8Array,
@@ -56,7 +56,7 @@ CELL_DTYPE = np.dtype(
         ("hazard", _f8),  # hazard accumulated under p
         ("hazard_total", _f8),  # hazard of the whole path without cut-in (methods that draw the path ahead)
         ("log_p_cut_in", _f8),
-        ("log_sampled", _f8),  # step mixture: sum of log q_alpha/p; shells: -log p_s
+        ("log_sampled", _f8),  # log q_sampled/p so far, of all but the episode mixture: see likelihood_ratio
         ("min_ttc", _f8),
         *((name, _f8) for name in ("cut_r2", "cut_r2dot", "onset_r2", "onset_r2dot", "av_start")),
         ("danger", _f8),  # what a built-in AV remembers beside its acceleration

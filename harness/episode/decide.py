@@ -1,7 +1,7 @@
 """What LV and BV do: where a test begins, what is drawn for it, and their maneuvers in every step.
 
 Accelerations are drawn at hold clocks, the cut-in in every step, by importance functions where a moment is critical;
-where the traffic is prescribed they repeat it.
+where the traffic is prescribed they repeat it. What that is worth: `harness.episode.likelihood_ratio`.
 """
 
 from __future__ import annotations
@@ -11,20 +11,14 @@ import math
 from harness.compiled import compiled, compiled_inline
 from harness.episode.cells import KernelState, state_of
 from harness.episode.drive import command, drive_av
+from harness.episode.likelihood_ratio import record_acceleration, record_lane
 from harness.episode.path import place, state_in, walk, weigh_cut_ins
-from harness.importance.functions import (
-    accumulate,
-    challenges_nobody,
-    forced_ratio,
-    look_ahead,
-    propose_acceleration,
-    propose_cut_in,
-)
-from harness.maneuvers import CUT_IN, N_ACCELERATIONS, STAY, acceleration
+from harness.importance.functions import challenges_nobody, look_ahead, propose_acceleration, propose_cut_in
 from harness.random_stream import BV_DRAWS, BV_FREE_DRAWS, LV_DRAWS, uniform
 from harness.random_stream import CUT_IN as CUT_IN_STREAM
 from harness.traffic.lateral import draw_lead, onset_of
 from harness.traffic.laws import (
+    acceleration,
     acceleration_pmf,
     acceptance,
     car_following,
@@ -33,18 +27,7 @@ from harness.traffic.laws import (
     free_driving,
     opportunity,
 )
-from harness.vocabulary import (
-    AV,
-    BV,
-    EPISODE_MIXTURE,
-    FORCED,
-    LV,
-    NDE,
-    PRESCRIBED,
-    STEP_MIXTURE,
-    FloatArray,
-    State,
-)
+from harness.vocabulary import AV, BV, CUT_IN, LV, N_ACCELERATIONS, FloatArray, State
 
 
 @compiled
@@ -200,8 +183,7 @@ def refill(kernel: KernelState, given: int) -> int:
 @compiled_inline
 def begin_cell(k: int, row: int, kernel: KernelState) -> None:
     """Reset cell ``k`` for the episode of a row."""
-    cells, method = kernel.cells, kernel.importance.method
-    seed, episode = kernel.seed, kernel.first_episode + row
+    cells, episode = kernel.cells, kernel.first_episode + row
     cell = cells.cell[k]
     cell.row, cell.episode, cell.step, cell.cut_step, cell.component = row, episode, 0, -1, -1
     cell.planned, cell.lead, cell.onset_step = -1, 0, -1
@@ -217,33 +199,47 @@ def begin_cell(k: int, row: int, kernel: KernelState) -> None:
     cells.acceleration[k, AV] = 0.0
     cells.log_ratio[k, :] = 0.0
     cells.martingale[k, :] = 0.0
-    if method == PRESCRIBED:
-        log_weight = kernel.traffic.log_weight[row]
-        cell.component, cell.log_sampled = kernel.traffic.stratum[row], -log_weight
-        if kernel.importance.first == 1:  # a forced cut-in whose path has been walked by the AV itself
-            cell.log_p_cut_in, cells.log_ratio[k, 0] = log_weight, -log_weight
-        if kernel.traffic.cut_step[row] >= 0:
-            plan_cut_in(k, kernel.traffic.cut_step[row], kernel.traffic.lead[row], kernel)
-        return
-    forced = method == FORCED
-    if method == EPISODE_MIXTURE:
-        cell.component = draw_component(uniform(seed, episode, CUT_IN_STREAM, COMPONENT_DRAW), kernel.importance.alpha)
+    if kernel.traffic.cut_step.size > 0:
+        begin_prescribed(k, row, kernel)
+    else:
+        begin_drawn(k, row, kernel)
+
+
+@compiled_inline
+def begin_prescribed(k: int, row: int, kernel: KernelState) -> None:
+    """What is known of a test whose traffic is prescribed."""
+    cell, traffic = kernel.cells.cell[k], kernel.traffic
+    cell.component, cell.log_sampled = traffic.stratum[row], -traffic.log_weight[row]
+    if kernel.importance.n_forced == 1:  # a forced cut-in whose path has been walked by the AV itself
+        cell.log_p_cut_in, kernel.cells.log_ratio[k, 0] = traffic.log_weight[row], -traffic.log_weight[row]
+    if traffic.cut_step[row] >= 0:
+        plan_cut_in(k, traffic.cut_step[row], traffic.lead[row], kernel)
+
+
+@compiled_inline
+def begin_drawn(k: int, row: int, kernel: KernelState) -> None:
+    """Draw when BV will cut in, on the clock of hazards; a forced cut-in, or one that shows itself, on its path."""
+    cell, environment, importance = kernel.cells.cell[k], kernel.environment, kernel.importance
+    forced = importance.n_forced == 1
+    if importance.mixes_episodes:
+        u = uniform(kernel.seed, cell.episode, CUT_IN_STREAM, COMPONENT_DRAW)
+        cell.component = draw_component(u, importance.alpha)
         forced = cell.component == 0
-    u = uniform(seed, episode, CUT_IN_STREAM, CUT_IN_DRAW)
+    u = uniform(kernel.seed, cell.episode, CUT_IN_STREAM, CUT_IN_DRAW)
     cell.target = -math.log1p(-u)
-    environment, path = kernel.environment, kernel.scratch.path
-    if method in (FORCED, EPISODE_MIXTURE) or may_show(kernel):
-        max_steps = environment.numbers.max_steps
-        steps = walk(kernel.states[row], seed, episode, 0, max_steps, True, environment, path)
-        hazard_total = weigh_cut_ins(steps, environment, path)
-        if method in (FORCED, EPISODE_MIXTURE):
-            cell.hazard_total = hazard_total
-            p_cut_in = -math.expm1(-cell.hazard_total)
-            cell.log_p_cut_in = math.log(p_cut_in)
-            if forced:
-                cell.target = min(-math.log1p(-u * p_cut_in), cell.hazard_total)
-        if may_show(kernel):
-            look_for_cut_in(k, steps, kernel)
+    if importance.n_forced == 0 and not may_show(kernel):
+        return
+    path, max_steps = kernel.scratch.path, environment.numbers.max_steps
+    steps = walk(kernel.states[row], kernel.seed, cell.episode, 0, max_steps, True, environment, path)
+    hazard_total = weigh_cut_ins(steps, environment, path)
+    if importance.n_forced == 1:
+        p_cut_in = -math.expm1(-hazard_total)
+        cell.hazard_total, cell.log_p_cut_in = hazard_total, math.log(p_cut_in)
+        if forced:
+            cell.log_sampled = -cell.log_p_cut_in
+            cell.target = min(-math.log1p(-u * p_cut_in), hazard_total)
+    if may_show(kernel):
+        look_for_cut_in(k, steps, kernel)
 
 
 @compiled_inline
@@ -253,9 +249,9 @@ def look_for_cut_in(k: int, steps: int, kernel: KernelState) -> None:
     for step in range(steps):
         cell.clock += hazard[step]
         cut = cell.clock >= cell.target
-        if kernel.importance.method == FORCED:
+        if kernel.importance.n_forced == 1:
             state = state_in(step, kernel.scratch.path)
-            record_ratios(k, step, state, cut, -math.expm1(-hazard[step]), hazard[step], False, kernel)
+            record_lane(k, step, state, cut, -math.expm1(-hazard[step]), hazard[step], False, kernel)
         if cut:
             lead = draw_lead(step, kernel.seed, cell.episode, kernel.environment.lateral)
             plan_cut_in(k, step, lead, kernel)
@@ -284,38 +280,24 @@ def draw_component(u: float, alpha: FloatArray) -> int:
 def choose_lane(k: int, state: State, kernel: KernelState) -> None:
     """Stay or cut in."""
     cells, scratch, environment, importance = kernel.cells, kernel.scratch, kernel.environment, kernel.importance
-    cell, method = cells.cell[k], importance.method
+    cell = cells.cell[k]
     wish = opportunity(state, environment)
     hazard = cut_in_hazard(wish, acceptance(state.r2_m, state.r2dot_mps, environment), environment)
-    p = -math.expm1(-hazard) if method != NDE else 0.0  # only the likelihood ratios ask for it
+    p = -math.expm1(-hazard) if importance.alpha.size > 0 else 0.0  # only the likelihood ratios ask for it
     critical = False
     if importance.n_surrogates > 0:
         i = cell.step % environment.numbers.hold_steps
         cut_challenge, stay_challenge = cells.cut_challenge[k, i], cells.stay_challenge[k, i]
         critical = propose_cut_in(p, wish, cut_challenge, stay_challenge, importance, scratch.q, scratch.challenge)
-    cell.clock += sampling_hazard(hazard, critical, method, cell.component, importance.alpha, scratch.q)
+    if critical and (importance.mixes_steps or cell.component > 0):
+        q = sampled_probability(cell.component, importance.alpha, scratch.q)
+        cell.clock += -math.log1p(-min(q, 1.0))
+    else:
+        cell.clock += hazard
     cut = cell.clock >= cell.target
-    record_ratios(k, cell.step, state, cut, p, hazard, critical, kernel)
+    record_lane(k, cell.step, state, cut, p, hazard, critical, kernel)
     if cut:
         begin_cut_in(k, state, kernel)
-
-
-@compiled_inline
-def record_ratios(
-    k: int, step: int, state: State, cut: bool, p: float, hazard: float, critical: bool, kernel: KernelState
-) -> None:
-    """Likelihood ratios of having stayed or cut in, and the moment if it was one of control."""
-    cell, scratch, importance = kernel.cells.cell[k], kernel.scratch, kernel.importance
-    sampled = 1.0
-    if critical or importance.first == 1:
-        sampled = update_ratios(k, cut, p, hazard, critical, kernel)
-    cell.hazard += hazard
-    if critical or (importance.method == FORCED and cut):
-        cell.n_control += 1
-        exposure = p if cut else 1.0 - p
-        for j in range(importance.n_surrogates):
-            scratch.q[j] = scratch.q[j] if cut else 1.0 - scratch.q[j]
-        record_moment(k, step, state, CUT_IN if cut else STAY, exposure, exposure * sampled, kernel)
 
 
 @compiled_inline
@@ -332,34 +314,14 @@ def begin_cut_in(k: int, state: State, kernel: KernelState) -> None:
 
 
 @compiled_inline
-def sampling_hazard(
-    hazard: float, critical: bool, method: int, component: int, alpha: FloatArray, q: FloatArray
-) -> float:
-    """Hazard that the sampler's clock advances by; ``q`` (J,) is q_j(cut_in)."""
-    if not critical:
-        return hazard
-    if method == STEP_MIXTURE:
-        mixed = 0.0
-        for j in range(q.size):
-            mixed += alpha[j] * q[j]
-        return -math.log1p(-min(mixed, 1.0))
-    if method == EPISODE_MIXTURE and component > 0:
-        return -math.log1p(-min(q[component - 1], 1.0))
-    return hazard
-
-
-@compiled_inline
-def update_ratios(k: int, cut: bool, p: float, hazard: float, critical: bool, kernel: KernelState) -> float:
-    """Accumulate the likelihood ratios of staying or cutting in; returns q_α/p of the step."""
-    scratch, importance = kernel.scratch, kernel.importance
-    cell = kernel.cells.cell[k]
-    if importance.first == 1:
-        scratch.ratio[0] = forced_ratio(cell.hazard, cell.hazard + hazard, cell.hazard_total, cut)
-    for j in range(importance.n_surrogates):
-        q = scratch.q[j]
-        scratch.ratio[importance.first + j] = (q / p if cut else (1.0 - q) / (1.0 - p)) if critical else 1.0
-        scratch.challenge[j] = scratch.challenge[j] if critical else 0.0
-    return accumulate_ratios(k, kernel)
+def sampled_probability(component: int, alpha: FloatArray, q: FloatArray) -> float:
+    """Probability of a maneuver under the episode's importance function, or the step mixture of all, ``q`` (J,)."""
+    if component > 0:
+        return float(q[component - 1])
+    mixed = 0.0
+    for j in range(q.size):
+        mixed += alpha[j] * q[j]
+    return mixed
 
 
 @compiled_inline
@@ -373,77 +335,24 @@ def controlled_draw(k: int, u: float, state: State, kernel: KernelState) -> int:
     acceleration_pmf(law, environment, p)
     if not propose_acceleration(state, p, importance, q, scratch.challenge):
         return draw_acceleration(u, law, environment)
-    if importance.method == STEP_MIXTURE or cell.component > 0:
-        maneuver = draw_from(u, importance.method, cell.component, importance.alpha, q)
+    if importance.mixes_steps or cell.component > 0:
+        maneuver = draw_from(u, cell.component, importance.alpha, q)
     else:
         maneuver = draw_acceleration(u, law, environment)
-    if importance.first == 1:
-        scratch.ratio[0] = 1.0
-    for j in range(importance.n_surrogates):
-        scratch.q[j] = q[j, maneuver]
-        scratch.ratio[importance.first + j] = q[j, maneuver] / p[maneuver]
-    sampled = accumulate_ratios(k, kernel)
-    cell.n_control += 1
-    record_moment(k, cell.step, state, maneuver, p[maneuver], p[maneuver] * sampled, kernel)
+    record_acceleration(k, state, maneuver, kernel)
     return maneuver
 
 
 @compiled_inline
-def draw_from(u: float, method: int, component: int, alpha: FloatArray, q: FloatArray) -> int:
-    """Acceleration index from the step mixture, or from the episode's component, by inversion; ``q`` (J, 31)."""
+def draw_from(u: float, component: int, alpha: FloatArray, q: FloatArray) -> int:
+    """Acceleration index by inversion of `sampled_probability`; ``q`` (J, 31)."""
     total = 0.0
     last = 0
     for m in range(N_ACCELERATIONS):
-        if method == STEP_MIXTURE:
-            probability = 0.0
-            for j in range(q.shape[0]):
-                probability += alpha[j] * q[j, m]
-        else:
-            probability = q[component - 1, m]
+        probability = sampled_probability(component, alpha, q[:, m])
         if probability > 0.0:
             last = m
             total += probability
             if u < total:
                 return m
     return last
-
-
-@compiled_inline
-def accumulate_ratios(k: int, kernel: KernelState) -> float:
-    """Take ``scratch.ratio`` and ``scratch.challenge`` of a step into the likelihood ratios; returns its q_α/p."""
-    cells, scratch, importance = kernel.cells, kernel.scratch, kernel.importance
-    cell = cells.cell[k]
-    sampled = accumulate(
-        importance.method,
-        importance.first,
-        importance.alpha,
-        scratch.ratio,
-        scratch.challenge,
-        cell.log_sampled,
-        cells.log_ratio[k],
-        cells.martingale[k],
-    )
-    if importance.method == STEP_MIXTURE:
-        cell.log_sampled += math.log(sampled)
-    return sampled
-
-
-@compiled_inline
-def record_moment(
-    k: int, step: int, state: State, maneuver: int, p: float, q_sampled: float, kernel: KernelState
-) -> None:
-    """Keep a control step, if the campaign keeps that many of an episode."""
-    results, scratch = kernel.results, kernel.scratch
-    cell = kernel.cells.cell[k]
-    if cell.n_control > results.moment_limit:
-        return
-    i = results.moment_count[0]
-    moment = results.moment[i]
-    moment.row, moment.step, moment.maneuver = cell.row, step, maneuver
-    moment.v_bv_mps, moment.r1_m, moment.r1dot_mps = state.v_bv_mps, state.r1_m, state.r1dot_mps
-    moment.r2_m, moment.r2dot_mps = state.r2_m, state.r2dot_mps
-    moment.p, moment.q_sampled = p, q_sampled
-    for j in range(scratch.q.size):
-        results.moment_q[i, j] = scratch.q[j]
-        results.moment_v[i, j] = scratch.challenge[j]
-    results.moment_count[0] = i + 1

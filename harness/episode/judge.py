@@ -9,7 +9,7 @@ import numpy as np
 from harness.compiled import compiled, compiled_inline
 from harness.episode.cells import KernelState, state_of
 from harness.episode.drive import note_if_ahead
-from harness.importance.functions import log_weight
+from harness.episode.likelihood_ratio import log_weight
 from harness.vehicles.kinematics import CONTACT_M, STEP_S, overlaps
 from harness.vocabulary import (
     AV,
@@ -113,8 +113,7 @@ def end_episode(k: int, outcome: int, n: int, kernel: KernelState) -> None:
     row.impact_speed_mps = v[k, AV] - v[k, BV] if outcome == CRASH else math.nan
     row.av_distance_m = kernel.x[k, AV] - cell.av_start
     row.n_control_steps, row.component = cell.n_control, cell.component
-    method, alpha = kernel.importance.method, kernel.importance.alpha
-    row.log_weight = log_weight(method, alpha, cells.log_ratio[k], cell.log_sampled, cell.log_p_cut_in)
+    row.log_weight = log_weight(kernel.importance, cells.log_ratio[k], cell.log_sampled)
     row.log_p_cut_in = cell.log_p_cut_in
     row.n_lv, row.n_bv = cell.n_lv, cell.n_path
     row.ahead_step = cell.ahead_step

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from harness.compiled import unboxed
 from harness.controllers.hosts import ControllerHost
 from harness.episode.cells import (
     KernelState,
@@ -27,7 +28,6 @@ from harness.errors import WorldDisagreementError
 from harness.importance.functions import Importance
 from harness.traffic.lateral import LateralMotion, in_one_step
 from harness.traffic.laws import Environment
-from harness.unboxed import unboxed
 from harness.vehicles.drivers import driver_records
 from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import AV, CRASH, FAILED, BoolArray, FloatArray, IntArray, RecordArray
@@ -36,7 +36,7 @@ from harness.worlds.protocol import AVLostError, DrivingWorld, World
 NOBODY = driver_records([])
 MOMENT_LIMITS = {"all": 32767, "first_9": 9, "none": 0}
 STRAYED = (
-    "the vehicle did something else than in its shadow run, given the same traffic and the same random stream: it "
+    "the vehicle did something else than in its baseline run, given the same traffic and the same random stream: it "
     "draws random numbers of its own, remembers earlier episodes, or depends on time"
 )
 """Cause of a test that failed because its weight would have been wrong."""

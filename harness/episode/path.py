@@ -12,11 +12,11 @@ from typing import NamedTuple
 import numpy as np
 
 from harness.compiled import compiled_inline, compiled_threads
-from harness.maneuvers import acceleration
 from harness.random_stream import BV_DRAWS, BV_FREE_DRAWS, LV_DRAWS, uniform
 from harness.traffic.lateral import onset_of, perceived_in
 from harness.traffic.laws import (
     Environment,
+    acceleration,
     acceptance,
     car_following,
     cut_in_hazard,

@@ -32,15 +32,20 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
-from harness.compiled import compiled_inline, compiled_threads
+from harness.compiled import compiled_inline, compiled_threads, unboxed
 from harness.importance.grid import AFTER, BEFORE, GridPoints, interpolate, locate, points_of, shape_of, state_at
-from harness.maneuvers import N_ACCELERATIONS, acceleration
-from harness.traffic.initial_state import InitialStates
-from harness.traffic.laws import Environment, acceleration_pmf, acceptance, car_following, free_driving
-from harness.unboxed import unboxed
+from harness.traffic.laws import (
+    Environment,
+    InitialStates,
+    acceleration,
+    acceleration_pmf,
+    acceptance,
+    car_following,
+    free_driving,
+)
 from harness.vehicles.drivers import FVDM_KIND, SMALLEST_GAP_M, driver_acceleration, fvdm_acceleration, fvdm_shape
 from harness.vehicles.kinematics import CONTACT_M, STEP_S, next_speed
-from harness.vocabulary import Float32Array, FloatArray, Record, RecordArray
+from harness.vocabulary import N_ACCELERATIONS, Float32Array, FloatArray, Record, RecordArray
 
 LEVELS = 12
 """Seconds of remaining time that are told apart; later crashes are counted in the last level."""

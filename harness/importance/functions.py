@@ -5,17 +5,7 @@
 A moment is critical if any V_j exceeds the threshold. Before the cut-in the maneuvers are {stay, cut_in}; after it, at
 redraw times, the 31 accelerations.
 
-**The weight of an episode** is p/q_sampled; what is kept is its logarithm. Per importance function j the logarithm
-L_j = Σ log(q_j/p) over the control steps so far is kept. The probability that a step was sampled with, *given the
-shared history*, is the mixture Σ_j w_j q_j with
-
-* step mixture: w_j = α_j in every step;
-* episode mixture: the posterior weights w_j ∝ α_j exp(L_j). The drawn component itself is not part of the history.
-
-Hence log q_sampled/p accumulates to Σ log Σ_j α_j q_j/p (step), or to log Σ_j α_j exp(L_j) (episode). Forced cut-ins
-and shells know it at the beginning of the episode (`harness.episode.decide`): P(cut-in | path), and the shell's p_s.
-Each control step adds its ratios (`harness.episode.decide.update_ratios`), and the end of the episode asks for
-`log_weight`, which is the record's (`harness.episode.judge.end_episode`).
+What a test that is sampled with them is worth: `harness.episode.likelihood_ratio`.
 """
 
 from __future__ import annotations
@@ -23,31 +13,36 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+import numpy as np
+
+from harness.campaign.campaign import Campaign
 from harness.compiled import compiled_inline
-from harness.importance.challenge import level_of
+from harness.importance.challenge import level_of, level_steps
 from harness.importance.grid import AFTER, BEFORE, interpolate, interpolate_maneuvers, locate
-from harness.maneuvers import N_ACCELERATIONS
+from harness.importance.tables import Tables
 from harness.traffic.laws import Environment, acceptance
 from harness.vehicles.kinematics import CONTACT_M, STEP_S, next_speed
-from harness.vocabulary import EPISODE_MIXTURE, FORCED, BoolArray, Float32Array, FloatArray, State
+from harness.vocabulary import N_ACCELERATIONS, SAMPLING, BoolArray, Float32Array, FloatArray, State, read_only
 
 
 class Importance(NamedTuple):
     """All that kernels need to sample critical moments.
 
-    ``method`` is one of `harness.vocabulary.METHODS`; ``recursive`` says which challenge; ``n_surrogates`` is 0 where
-    nobody is asked; ``first`` is the index of the first surrogate among the importance functions: 1 when the forced
-    cut-in is component 0. ``steps_per_level`` lie between two levels of ``value``.
+    What may be so or not is 0 or 1. ``recursive`` says which challenge; ``mixes_steps`` and ``mixes_episodes`` whether
+    importance functions are mixed in every critical step, or one is drawn per episode. ``n_surrogates`` is 0 where
+    nobody is asked; ``n_forced`` is 1 where the forced cut-in is importance function 0: surrogates follow after it.
+    ``steps_per_level`` lie between two levels of ``value``.
     ``alpha`` (M,) are the mixture weights. ``value`` (J, levels + 1, v, R2, R2dot), ``maneuvers`` (J, v, R2, R2dot, 31)
     and ``before`` (J, redraw times + 1, v, R2, R2dot) are the challenge tables (see `harness.importance.tables`).
     ``harmless`` (J, v - 1, R2 - 1, R2dot - 1) marks the grid cells after the cut-in in which no acceleration challenges
     a surrogate: most of what is driven lies there, and nothing needs to be interpolated.
     """
 
-    method: int
-    recursive: bool
+    recursive: int
+    mixes_steps: int
+    mixes_episodes: int
     n_surrogates: int
-    first: int
+    n_forced: int
     steps_per_level: int
     epsilon: float
     threshold: float
@@ -58,8 +53,69 @@ class Importance(NamedTuple):
     harmless: BoolArray
 
 
+_ROUNDING_M = 1e-9
+"""More than interpolation between gaps of up to a kilometre can lose."""
+
+
+def needs_tables(campaign: Campaign) -> bool:
+    """Whether the campaign's method looks at surrogates at all."""
+    return SAMPLING[campaign.testing.method].mixes
+
+
+def importance_names(campaign: Campaign) -> tuple[str, ...]:
+    """Names of the importance functions, in the order of ``log_q``."""
+    defensive = ("forced",) if SAMPLING[campaign.testing.method].forces else ()
+    return defensive + (tuple(campaign.surrogates) if needs_tables(campaign) else ())
+
+
+def mixture_weights(campaign: Campaign) -> tuple[float, ...]:
+    """Weights α of the importance functions, in the order of `importance_names`."""
+    alpha = tuple(campaign.alpha()) if needs_tables(campaign) else ()
+    if not SAMPLING[campaign.testing.method].forces:
+        return alpha
+    share = campaign.testing.defensive_share if alpha else 1.0
+    return (share, *((1.0 - share) * weight for weight in alpha))
+
+
+def build_importance(campaign: Campaign, tables: Tables | None) -> Importance:
+    """Importance functions of a campaign; ``nde`` and ``forced`` need no challenge tables."""
+    testing, sampling = campaign.testing, SAMPLING[campaign.testing.method]
+    recursive = testing.challenge == "recursive"
+    none = _none(5), _none(5), _none(5), np.zeros((0, 1, 1, 1), np.bool_)
+    return Importance(
+        int(recursive),
+        int(sampling.mixes_steps),
+        int(sampling.mixes_episodes),
+        len(campaign.surrogates) if sampling.mixes else 0,
+        int(sampling.forces),
+        level_steps(round(campaign.environment.acceleration_hold_s * 10)),
+        testing.epsilon,
+        testing.criticality_threshold,
+        np.array(mixture_weights(campaign), dtype=np.float64),
+        *(none if tables is None else (*tables, harmless_cells(tables.maneuvers, recursive=recursive))),
+    )
+
+
+def harmless_cells(maneuvers: Float32Array, *, recursive: bool) -> BoolArray:
+    """Grid cells in which every acceleration has challenge 0, wherever in the cell it is interpolated.
+
+    ``maneuvers`` (J, v, R2, R2dot, 31) are probabilities (recursive) or smallest gaps in metres (immediate); the result
+    has shape (J, v - 1, R2 - 1, R2dot - 1).
+    """
+    cells: BoolArray = maneuvers.max(-1) == 0.0 if recursive else maneuvers.min(-1) > CONTACT_M + _ROUNDING_M
+    for axis in (1, 2, 3):
+        n = cells.shape[axis]
+        cells = cells.take(range(n - 1), axis) & cells.take(range(1, n), axis)
+    return cells
+
+
+def _none(dimensions: int) -> Float32Array:
+    """No table; read-only like those that are mapped, for kernels to be compiled once."""
+    return read_only(np.zeros((0,) + (1,) * (dimensions - 1), np.float32))
+
+
 @compiled_inline
-def as_challenge(tabulated: float, recursive: bool) -> float:
+def as_challenge(tabulated: float, recursive: int) -> float:
     """Challenge from a table entry: a probability (recursive), or a smallest gap in metres (immediate)."""
     if recursive:
         return tabulated
@@ -180,75 +236,3 @@ def propose_acceleration(state: State, p: FloatArray, importance: Importance, q:
                 importance.epsilon * p[m] + (1.0 - importance.epsilon) * (q[j, m] / total) if total > 0.0 else p[m]
             )
     return critical
-
-
-@compiled_inline
-def log_weight(method: int, alpha: FloatArray, log_ratio: FloatArray, log_sampled: float, log_p_cut_in: float) -> float:
-    """Log p(x_c) − log q_sampled(x_c) of a finished episode; exactly 0 without control.
-
-    ``alpha``, ``log_ratio`` (M,) are weights and L_j of the importance functions; ``log_sampled`` is Σ log q_α/p of the
-    step mixture, or −log p_s of the shell; ``log_p_cut_in`` is the path's, log P(cut-in | path).
-    """
-    if method == FORCED:
-        return log_p_cut_in
-    if method == EPISODE_MIXTURE:
-        return -log_mixture(alpha, log_ratio)
-    return -log_sampled
-
-
-@compiled_inline
-def log_mixture(alpha: FloatArray, log_ratio: FloatArray) -> float:
-    """Log Σ_j α_j exp(L_j); ``alpha`` and ``log_ratio`` have shape (M,)."""
-    largest = -math.inf
-    for j in range(alpha.size):
-        largest = max(largest, log_ratio[j])
-    if largest == -math.inf:
-        return -math.inf
-    total = 0.0
-    for j in range(alpha.size):
-        total += alpha[j] * math.exp(log_ratio[j] - largest)
-    return largest + math.log(total)
-
-
-@compiled_inline
-def accumulate(
-    method: int,
-    first: int,
-    alpha: FloatArray,
-    ratio: FloatArray,
-    v: FloatArray,
-    log_sampled: float,
-    log_ratio: FloatArray,
-    martingale: FloatArray,
-) -> float:
-    """Take the maneuver of one step into an episode's likelihood ratios; returns q_α/p, given the shared history.
-
-    ``ratio`` (M,) is q_j/p of the maneuver, surrogates from index ``first`` on; ``v`` (J,) is V_j(s), 0 where the
-    moment is not critical; ``log_sampled`` is the step mixture's Σ log q_α/p of the steps before. ``log_ratio`` (M,)
-    is updated, ``martingale`` (J,) increased by W_{t−1} V_j (q_{j,t}/q_{α,t} − 1).
-    """
-    before = log_mixture(alpha, log_ratio) if method == EPISODE_MIXTURE else log_sampled
-    sampled = 0.0
-    for j in range(ratio.size):
-        weight = alpha[j] * math.exp(log_ratio[j] - before) if method == EPISODE_MIXTURE else alpha[j]
-        sampled += weight * ratio[j]
-        log_ratio[j] += math.log(ratio[j])
-    weight_before = math.exp(-before)
-    for j in range(v.size):
-        if v[j] > 0.0:
-            martingale[j] += weight_before * v[j] * (ratio[first + j] / sampled - 1.0)
-    return sampled
-
-
-@compiled_inline
-def forced_ratio(before: float, after: float, total: float, cut: bool) -> float:
-    """q/p of a step under the forced cut-in: P(the step | a cut-in will come)/P(the step).
-
-    ``before`` and ``after`` are the hazards accumulated until and including the step, ``total`` that of the path.
-    """
-    coming = -math.expm1(before - total)
-    if coming <= 0.0:  # nothing was left of the path's hazard: the ratio so far is 0 and stays it
-        return 1.0
-    if cut:
-        return 1.0 / coming
-    return -math.expm1(min(after - total, 0.0)) / coming

@@ -1,30 +1,91 @@
-"""Build a pool: pilot run, aimed paths until crash rates are known well enough, shells, and cut-ins to keep."""
+"""Pools of campaigns, from the cache or built: a pilot run, and aimed paths until crash rates are known well enough."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import hashlib
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
 from harness.campaign.sections import PoolSettings
-from harness.pool.cut_ins import FAR_OFF, CutIns, Pool, environment_hash, shells_of
+from harness.compiled import WORLD_SOURCES, cache_root, source_hash
+from harness.errors import RunFolderError
+from harness.pool.cut_ins import FORMAT, CutIns, Pool, environment_hash, read_pool, write_pool
 from harness.pool.library import Library
+from harness.pool.shells import cells_of, conservative_first, shells_of
 from harness.pool.walk import PILOT_PATHS, EnumeratedPaths, Enumerator, joined, write_script
 from harness.progress import Progress
 from harness.random_stream import DIAGNOSTIC, uniforms
+from harness.records.folder import require_place
+from harness.resolved import Resolved
 from harness.traffic.laws import Environment
 from harness.vocabulary import BoolArray, FloatArray, Int8Array, IntArray
 
 ROUND_PATHS = 1024
 MOST_PATHS = 1 << 20
-CARELESS_SHARE = 0.2
+AGGRESSIVE_SHARE = 0.2
 """How much the surrogates beyond the boundary count in aiming, and those far off: less has to be known there."""
-CARELESS_ERROR = 4.0
+AGGRESSIVE_ERROR = 4.0
 """Their relative error may be this many times the target."""
+FAR_OFF = 10.0
+"""A surrogate whose rate varies this much more from path to path than the boundary's (relvar) crashes in traffic of its
+own, which few paths meet: paths aimed there would be lost for all others."""
 POOL_SEED = 0x706F6F6C
 """Keeps a pool's random numbers apart from those of a campaign with the same seed."""
 KEEP_DRAW = 1
 """Draw of a shell within the diagnostic stream."""
+
+
+_MADE_BY = ("build.py", "cut_ins.py", "shells.py")
+"""Code that decides what is in a pool, beside the kernels."""
+
+
+def campaign_pool_key(resolved: Resolved) -> str:
+    """Hash of all that a pool depends on: environment, level of lane changing, library, settings, and code."""
+    library = resolved.library
+    content = [
+        FORMAT,
+        source_hash(WORLD_SOURCES),
+        *(hashlib.sha256((Path(__file__).parent / name).read_bytes()).hexdigest() for name in _MADE_BY),
+        environment_hash(resolved.environment),
+        {name: model.model_dump() for name, model in library.surrogates.items()},
+        [(name, model.model_dump()) for name, model in library.references.items()],
+        [sorted(library.boundaries), library.boundary, library.envelope],
+        resolved.campaign.pool.model_dump(exclude={"library", "shadow_paths"}),
+    ]
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:24]
+
+
+def pool_path(key: str) -> Path:
+    """Where a pool is cached."""
+    return cache_root() / "pools" / f"{key}.parquet"
+
+
+def campaign_pool(resolved: Resolved, progress: Progress | None = None) -> Pool:
+    """The pool of a campaign's environment and library, from the cache or built and cached.
+
+    Raises `RunFolderError`: the pool could not be kept.
+    """
+    key = campaign_pool_key(resolved)
+    if (cached := cached_pool(resolved)) is not None:
+        return cached
+    require_place(pool_path(key).parent, mend="Change its permissions, or name another place in HARNESS_CACHE_DIR.")
+    pool = build_pool(resolved.environment, resolved.library, resolved.campaign.pool, key, progress)
+    write_pool(pool_path(key), pool)
+    return pool
+
+
+def cached_pool(resolved: Resolved) -> Pool | None:
+    """The pool of a campaign; None if none has been built on this machine, or its file is damaged or another's."""
+    key = campaign_pool_key(resolved)
+    try:
+        pool = read_pool(pool_path(key)) if pool_path(key).is_file() else None
+    except RunFolderError:
+        return None
+    # The key does not hold the words of statements: they are those of today.
+    return replace(pool, library=resolved.library) if pool is not None and pool.key == key else None
 
 
 def build_pool(
@@ -34,7 +95,7 @@ def build_pool(
     progress = progress or Progress()
     aim = take_aim(environment, library, settings, progress)
     paths = _until_known(aim, settings, progress)
-    order = careful_first(paths.rates(len(library.surrogates)))
+    order = conservative_first(paths.rates(len(library.surrogates)))
     return pool_of(paths, settings.seed ^ POOL_SEED, order, environment, library, settings, key)
 
 
@@ -44,12 +105,12 @@ class Aim:
 
     enumerator: Enumerator
     pilot: FloatArray
-    careful: BoolArray
+    conservative: BoolArray
 
     @property
     def share(self) -> FloatArray:
         """How much each column counts in aiming, shape (D + 1,)."""
-        return np.where(self.careful, 1.0, CARELESS_SHARE)
+        return np.where(self.conservative, 1.0, AGGRESSIVE_SHARE)
 
 
 def take_aim(environment: Environment, library: Library, settings: PoolSettings, progress: Progress) -> Aim:
@@ -58,32 +119,26 @@ def take_aim(environment: Environment, library: Library, settings: PoolSettings,
     pilot = Enumerator(environment, library.followers_in(environment), settings.seed ^ POOL_SEED)
     progress.stage("pool: pilot", PILOT_PATHS)
     rates = pilot.run(0, PILOT_PATHS, progress).rates(len(names))
-    aim = Aim(pilot, rates, _careful(rates, names.index(library.boundary)))
-    return Aim(pilot.aimed(rates, aim.share), rates, aim.careful)
+    aim = Aim(pilot, rates, _conservative(rates, names.index(library.boundary)))
+    return Aim(pilot.aimed(rates, aim.share), rates, aim.conservative)
 
 
-def careful_first(rates: FloatArray) -> IntArray:
-    """Surrogates from careful to careless by the rates (n, D + 1) of paths, as places in the library, shape (D,)."""
-    order: IntArray = np.argsort(rates[:, :-1].mean(0), kind="stable")
-    return order
-
-
-def _careful(rates: FloatArray, boundary: int) -> BoolArray:
+def _conservative(rates: FloatArray, boundary: int) -> BoolArray:
     """Which columns (surrogates, and the cut-in) are to be known well, shape (D + 1,) bool.
 
-    Those that are no more careless than the boundary, and crash in the traffic that it crashes in.
+    Those that are no more aggressive than the boundary, and crash in the traffic that it crashes in.
     """
     mean = rates.mean(0)
     seen = mean > 0.0  # one that no path has met yet is met by few
     relvar = np.where(seen, rates.var(0) / np.where(seen, mean, 1.0) ** 2, np.inf)
-    careful: BoolArray = (mean <= mean[boundary]) & (relvar <= FAR_OFF * relvar[boundary])
-    return careful
+    conservative: BoolArray = (mean <= mean[boundary]) & (relvar <= FAR_OFF * relvar[boundary])
+    return conservative
 
 
 def _until_known(aim: Aim, settings: PoolSettings, progress: Progress) -> EnumeratedPaths:
     """Enumerate paths until the relative errors are small enough; what is left of them is part of every interval."""
-    pilot, careful = aim.pilot, aim.careful
-    wanted = settings.relative_error * np.where(careful, 1.0, CARELESS_ERROR)
+    pilot, conservative = aim.pilot, aim.conservative
+    wanted = settings.relative_error * np.where(conservative, 1.0, AGGRESSIVE_ERROR)
     progress.stage("pool of cut-ins", _paths_needed(pilot, wanted))
     rounds: list[EnumeratedPaths] = []
     rates = np.zeros((0, pilot.shape[1]))
@@ -93,7 +148,7 @@ def _until_known(aim: Aim, settings: PoolSettings, progress: Progress) -> Enumer
         mean = rates.mean(0)
         known = mean > 0.0
         error = rates.std(0)[known] / np.sqrt(len(rates)) / mean[known]
-        progress.status(error=f"{error[careful[known]].max(initial=0.0):.2%}")
+        progress.status(error=f"{error[conservative[known]].max(initial=0.0):.2%}")
         if np.all(error <= wanted[known]):
             break
     return joined(rounds)
@@ -126,8 +181,7 @@ def pool_of(
     n = len(rates)
     ordered = rates[:, order]
     shell, references = shells_of(paths.crashes, order), paths.crashes >> n_surrogates
-    kinds, by_path, cell = _cells(mass, (shell.astype(np.int64) << n_references) | references)
-    cell_references = kinds & ((1 << n_references) - 1)
+    cell, cell_shell, cell_references, by_path = cells_of(mass, shell, references, n_references)
     by_reference = by_path @ ((cell_references[:, None] >> np.arange(n_references)) & 1)
     path, step = _keep(mass, shell, n_surrogates + 1, settings)
     script = write_script(seed, paths.index[path], step, paths.state[path], environment)
@@ -154,7 +208,7 @@ def pool_of(
         mu=ordered.mean(0),
         mu_covariance=np.atleast_2d(np.cov(ordered.T, bias=True)) / n,
         p_cut_in_at_crash=_p_cut_in_at_crash(ordered, rates[:, -1] / paths.weight),
-        cell_shell=kinds >> n_references,
+        cell_shell=cell_shell,
         cell_references=cell_references,
         cell_p=by_path.mean(0),
         reference_rate=by_reference.mean(0),
@@ -169,18 +223,6 @@ def _p_cut_in_at_crash(rates: FloatArray, p_cut_in: FloatArray) -> FloatArray:
     at_most = both.mean(0) + 3.0 * both.std(0) / np.sqrt(len(rates))
     found: FloatArray = np.divide(at_most, mean, out=np.ones_like(mean), where=mean > 0.0)
     return found
-
-
-def _cells(mass: FloatArray, kind: IntArray) -> tuple[IntArray, FloatArray, IntArray]:
-    """Cells of cut-ins with ``mass`` (n, steps) of some ``kind`` (n, steps).
-
-    Returns the kind of each cell (C,), the mass of each path in it (n, C), and the cell of each cut-in (n, steps).
-    """
-    kinds = np.unique(kind[mass > 0.0])
-    cell = np.minimum(np.searchsorted(kinds, kind), kinds.size - 1)  # without mass it may be of no kind
-    flat = np.arange(len(mass))[:, None] * kinds.size + cell
-    by_path: FloatArray = np.bincount(flat.ravel(), mass.ravel(), minlength=len(mass) * kinds.size).astype(np.float64)
-    return kinds, by_path.reshape(len(mass), kinds.size), cell
 
 
 def _keep(mass: FloatArray, shell: Int8Array, n_shells: int, settings: PoolSettings) -> tuple[IntArray, IntArray]:

@@ -1,23 +1,42 @@
-"""What a pool is: shells with their probabilities, surrogates with their crash rates, and cut-ins to test with."""
+"""What a pool is: cells with their probabilities, surrogates with their crash rates, and cut-ins to test with.
+
+On disk it is one Parquet file of cut-ins, with all that is known of cells and surrogates in its metadata.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 
+from harness.errors import RunFolderError
 from harness.pool.library import Library
 from harness.pool.walk import PILOT_PATHS
+from harness.records.folder import write_atomically
+from harness.records.schemas import prefixes, rows
 from harness.traffic.laws import Environment
-from harness.vocabulary import BoolArray, Float32Array, FloatArray, Int8Array, IntArray, RecordArray, UInt64Array
+from harness.vocabulary import (
+    STATE_COLUMNS,
+    BoolArray,
+    Float32Array,
+    FloatArray,
+    Int8Array,
+    IntArray,
+    RecordArray,
+    UInt64Array,
+    states_from,
+)
 
-FAR_OFF = 10.0
-"""A surrogate whose rate varies this much more from path to path than the boundary's (relvar) crashes in traffic of its
-own, which few paths meet: paths aimed there would be lost for all others."""
+FORMAT = 6
+"""Raise it when the meaning of a pool changes."""
+_METADATA, _DIGEST = b"harness_pool", b"harness_pool_sha256"
 
 
 def onset_steps(step: IntArray, lead: IntArray) -> IntArray:
@@ -59,7 +78,7 @@ class CutIns:
 
     @property
     def row(self) -> IntArray:
-        """Which row of the pool's paths each is of, shape (n,): in the pool of a vehicle its shadow run."""
+        """Which row of the pool's paths each is of, shape (n,): in the pool of a vehicle its baseline run."""
         rows: IntArray = self.path - PILOT_PATHS
         return rows
 
@@ -89,7 +108,7 @@ class Pool:
     reference_rate, reference_square : ndarray, shape (R,)
         Crash rates of the references, and mean squares of a path's probability that they crash.
     p_unknown : float
-        Probability of cut-ins about which nothing is known, at most: of shadow runs that failed.
+        Probability of cut-ins about which nothing is known, at most: of baseline runs that failed.
     """
 
     key: str
@@ -156,13 +175,123 @@ def environment_hash(environment: Environment) -> str:
     return hashlib.sha256(json.dumps(numbers, sort_keys=True).encode()).hexdigest()[:24]
 
 
-def shells_of(crashes: IntArray, order: IntArray) -> Int8Array:
-    """Shell of cut-ins: the place in the order of the first surrogate that crashes, D if none does.
+def write_pool(path: Path, pool: Pool) -> None:
+    """Write a pool atomically."""
+    table = _table(pool)
+    write_atomically(path, lambda temporary: pq.write_table(table, temporary, compression="zstd"))
 
-    ``crashes``, of any shape, has one bit per surrogate; ``order`` (D,) are the bits from the most careful surrogate to
-    the most careless.
+
+def read_pool(path: Path) -> Pool:
+    """Read a pool.
+
+    Raises `RunFolderError`: the file is missing, damaged, or not a pool.
     """
-    shell = np.full(crashes.shape, len(order), np.int8)
-    for place in reversed(range(len(order))):
-        shell[(crashes >> order[place]) & 1 == 1] = place
-    return shell
+    try:
+        with pq.ParquetFile(path) as file:  # read_table would import, for 0.3 s, what reads folders
+            table = file.read()
+        return _pool(table, sound_facts(table))
+    except (OSError, pa.ArrowException, KeyError, TypeError, ValueError) as error:
+        found = f"a file that is not a whole pool ({str(error).splitlines()[0] if str(error) else error!r})"
+        mend = "Delete it: it is built again when it is needed."
+        raise RunFolderError(str(path), found, "a pool that `harness pool` has written", mend) from error
+
+
+def stamped(table: pa.Table, facts: dict[str, Any]) -> pa.Table:
+    """The table with facts, and a hash of both: Parquet notices a truncated file, but hardly any flipped bit."""
+    known = json.dumps({"format": FORMAT, **facts}).encode()
+    return table.replace_schema_metadata({_METADATA: known, _DIGEST: _digest(table, known)})
+
+
+def sound_facts(table: pa.Table) -> dict[str, Any]:
+    """The facts of a `stamped` table.
+
+    Raises `KeyError`, `TypeError` or `ValueError`: it is none of this version, or its content has changed.
+    """
+    metadata = table.schema.metadata or {}
+    facts: dict[str, Any] = json.loads(metadata[_METADATA])
+    if facts["format"] != FORMAT:
+        raise ValueError(f"a pool of format {facts['format']}, this version reads {FORMAT}")
+    if metadata[_DIGEST].decode() != _digest(table, metadata[_METADATA]):
+        raise ValueError("its content has changed since it was written")
+    return facts
+
+
+def _digest(table: pa.Table, facts: bytes) -> str:
+    digest = hashlib.sha256(facts)
+    for column in table.columns:
+        array = column.combine_chunks()
+        if isinstance(array, pa.ListArray):
+            digest.update(np.asarray(array.value_lengths()).tobytes())
+        values = array.flatten() if isinstance(array, pa.ListArray | pa.FixedSizeListArray) else array
+        digest.update(values.to_numpy(zero_copy_only=False).tobytes())
+    return digest.hexdigest()
+
+
+def _table(pool: Pool) -> pa.Table:
+    c = pool.cut_ins
+    probability = pool.shell_p / np.maximum(np.bincount(pool.shell, minlength=pool.shell_p.size), 1)
+    columns: dict[str, tuple[pa.Array, str]] = {
+        "path": (pa.array(c.path), "index of the path in the pool"),
+        **{name: (pa.array(np.ascontiguousarray(c.state[name])), "initial state") for name in STATE_COLUMNS},
+        "cut_in_step": (pa.array(c.step.astype(np.int16)), "step (0.1 s) in which BV cuts in"),
+        "probability": (pa.array(probability[pool.shell]), "P under the NDE that it stands for"),
+        "shell": (pa.array(pool.shell.astype(np.int8)), "first surrogate that crashes; the last shell: none does"),
+        "cell": (pa.array(c.cell.astype(np.int16)), "shell and references that crash, as the metadata lists cells"),
+        "crashes": (
+            rows(c.crashes),
+            "which surrogates crash, in the order of the metadata's names, and which references",
+        ),
+        "path_mass": (
+            rows(c.path_mass),
+            "P of a cut-in of each cell on the same path, times naturalistic over proposal density of the path",
+        ),
+        "lv_maneuvers": (prefixes(c.lv, c.n_lv), "LV's draws, one per hold period"),
+        "bv_maneuvers": (prefixes(c.bv, c.n_bv), "BV's draws; 31 marks the cut-in"),
+        "lead_steps": (pa.array(c.lead.astype(np.int16)), "steps from the onset of lateral motion to overlap"),
+    }
+    schema = pa.schema(
+        [pa.field(name, array.type, nullable=False, metadata={"doc": doc}) for name, (array, doc) in columns.items()]
+    )
+    known = {each.name: getattr(pool, each.name) for each in fields(pool) if each.name not in ("library", "cut_ins")}
+    plain = {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in known.items()}
+    table = pa.table([array for array, _ in columns.values()], schema=schema)
+    return stamped(table, {"library": pool.library.model_dump(), **plain})
+
+
+def padded(column: pa.ChunkedArray, width: int) -> tuple[np.ndarray, IntArray]:
+    """Lists (n,) as rows of zeros beyond their lengths, shape (n, width), and their lengths (n,)."""
+    lists = column.combine_chunks()
+    lengths, flat = np.asarray(lists.value_lengths()).astype(np.int64), np.asarray(lists.flatten())
+    values = np.zeros((len(lists), width), flat.dtype)
+    values[np.arange(width) < lengths[:, None]] = flat
+    return values, lengths
+
+
+def _pool(table: pa.Table, facts: dict[str, Any]) -> Pool:
+    def whole(name: str) -> IntArray:
+        return np.asarray(table.column(name)).astype(np.int64)
+
+    def matrix(name: str) -> np.ndarray:
+        values = table.column(name).combine_chunks().flatten().to_numpy(zero_copy_only=False)
+        return np.asarray(values).reshape(table.num_rows, -1)
+
+    width = int(np.asarray(table.column("bv_maneuvers").combine_chunks().value_lengths()).max(initial=0))
+    (lv, n_lv), (bv, n_bv) = (padded(table.column(name), width) for name in ("lv_maneuvers", "bv_maneuvers"))
+    cut_ins = CutIns(
+        path=whole("path"),
+        step=whole("cut_in_step"),
+        cell=whole("cell"),
+        state=states_from(np.asarray(table.column(name)) for name in STATE_COLUMNS),
+        lv=lv,
+        bv=bv,
+        n_lv=n_lv,
+        n_bv=n_bv,
+        crashes=matrix("crashes"),
+        path_mass=matrix("path_mass"),
+        lead=whole("lead_steps"),
+    )
+    known: dict[str, Any] = {
+        name: np.array(value) if isinstance(value, list) else value for name, value in facts.items()
+    }
+    known |= {"library": Library.model_validate(facts["library"]), "names": tuple(facts["names"]), "cut_ins": cut_ins}
+    return Pool(**{field.name: known[field.name] for field in fields(Pool)})

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pyarrow as pa
 
-from harness.compiled import compiled_inline, compiled_threads
+from harness.compiled import compiled_inline, compiled_threads, unboxed
 from harness.episode.path import (
     NO_CRASH,
     WAS_AHEAD,
@@ -26,15 +26,14 @@ from harness.episode.path import (
     walk,
 )
 from harness.errors import WorldDisagreementError
-from harness.maneuvers import CUT_IN
 from harness.resolved import Resolved
 from harness.traffic.lateral import onset_of
 from harness.traffic.laws import Environment
-from harness.unboxed import unboxed
 from harness.vehicles.kinematics import STEP_S
 from harness.vehicles.references import reaction_steps
 from harness.vocabulary import (
     CRASH,
+    CUT_IN,
     FAILED,
     OUTCOMES,
     PASSED,

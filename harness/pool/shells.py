@@ -1,4 +1,7 @@
-"""Shells as strata of a test campaign: which cut-ins belong together, their probability, and the tests drawn from them.
+"""What a shell is, and shells as strata of a campaign: which cut-ins belong together, and the tests drawn from them.
+
+Surrogates are in an order, the most conservative first, by their crash rates. A cut-in belongs to the shell of the
+first of them that crashes on it, or to the last shell if none does. Cells divide shells by which references crash.
 
 Shells up to the boundary are strata of their own. All beyond it is one stratum, *outside*: what a careful vehicle is
 tested for there is that nothing happens, and dividing a stratum without crashes only costs tests. A shell on which not
@@ -19,15 +22,45 @@ from harness.campaign.vehicle import AutomatedVehicle
 from harness.episode.cells import PrescribedCutIns, PrescribedTraffic
 from harness.pool.cut_ins import Pool
 from harness.pool.library import Library, LibraryDriver, library_records
-from harness.strata import FAILED_SHADOWS, OUTSIDE, Reference, ShellDesign, Statement
+from harness.strata import FAILED_BASELINE, OUTSIDE, Reference, ShellDesign, Statement
 from harness.traffic.laws import Environment
-from harness.vocabulary import IntArray, RecordArray
+from harness.vocabulary import FloatArray, Int8Array, IntArray, RecordArray
 
-_REFERENCES = {
-    "r157-cc": "a careful and competent driver",
-    "r157-fsm": "a driver by the fuzzy safety model",
-}
+_REFERENCES = {"r157-cc": "a careful and competent driver", "r157-fsm": "a driver by the fuzzy safety model"}
 """Drivers of UN Regulation No. 157 in plain words."""
+
+
+def conservative_first(rates: FloatArray) -> IntArray:
+    """Order of the surrogates by the rates (n, D + 1) of paths, as places in the library, shape (D,)."""
+    order: IntArray = np.argsort(rates[:, :-1].mean(0), kind="stable")
+    return order
+
+
+def shells_of(crashes: IntArray, order: IntArray) -> Int8Array:
+    """Shell of cut-ins: the place in the order of the first surrogate that crashes, D if none does.
+
+    ``crashes``, of any shape, has one bit per surrogate; ``order`` (D,) are the bits as `conservative_first` puts them.
+    """
+    shell = np.full(crashes.shape, len(order), np.int8)
+    for place in reversed(range(len(order))):
+        shell[(crashes >> order[place]) & 1 == 1] = place
+    return shell
+
+
+def cells_of(
+    mass: FloatArray, shell: Int8Array, references: IntArray, n_references: int
+) -> tuple[IntArray, IntArray, IntArray, FloatArray]:
+    """Cells of cut-ins with ``mass``, of a ``shell``, on which ``references`` crash (one bit each): all (n, steps).
+
+    Returns the cell of each cut-in (n, steps), shell and references of each cell (C,), and each path's mass in it
+    (n, C).
+    """
+    kind = (shell.astype(np.int64) << n_references) | references
+    kinds = np.unique(kind[mass > 0.0])
+    cell = np.minimum(np.searchsorted(kinds, kind), kinds.size - 1)  # without mass it may be of no kind
+    flat = np.arange(len(mass))[:, None] * kinds.size + cell
+    by_path: FloatArray = np.bincount(flat.ravel(), mass.ravel(), minlength=len(mass) * kinds.size).astype(np.float64)
+    return cell, kinds >> n_references, kinds & ((1 << n_references) - 1), by_path.reshape(len(mass), kinds.size)
 
 
 def acceleration_limit(av: AutomatedVehicle) -> float:
@@ -85,14 +118,14 @@ def design_shells(pool: Pool, *, shells: ShellSettings | None = None, limit_mps2
         p_impossible=pool.p_cut_in - float(p.sum()),
         shadow_runs=pool.cut_ins.motion.size > 0,
     )
-    return design if pool.p_unknown == 0.0 else _with_failed_shadows(design, pool.p_unknown)
+    return design if pool.p_unknown == 0.0 else _with_failed_baseline(design, pool.p_unknown)
 
 
-def _with_failed_shadows(design: ShellDesign, p: float) -> ShellDesign:
+def _with_failed_baseline(design: ShellDesign, p: float) -> ShellDesign:
     """One more stratum, of probability ``p`` at most: as it has no test, it may crash as often as it happens."""
     return replace(
         design,
-        strata=(*design.strata, FAILED_SHADOWS),
+        strata=(*design.strata, FAILED_BASELINE),
         cell_stratum=(*design.cell_stratum, len(design.strata)),
         cell_p=np.append(design.cell_p, p),
         cell_references=(*design.cell_references, 0),

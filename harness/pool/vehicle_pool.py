@@ -5,7 +5,7 @@ the vehicle has moved. Candidates are aimed paths of the pool, walked in the twi
 paths are drawn from them with replacement, by how much they contribute to the surrogates' crash rates, with a share
 that is drawn evenly and bounds every weight.
 
-Along each path the vehicle is then driven once without a cut-in, its *shadow run*. Where it was says how probable a
+Along each path the vehicle is then driven once without a cut-in, its *baseline run*. Where it was says how probable a
 cut-in was in each step. Surrogates take over from it after the step of the cut-in, in which it still does what it did.
 So shells, their probabilities and their moments are those of this vehicle; allocation and estimates stay what they are.
 """
@@ -25,11 +25,11 @@ from harness.campaign.sections import PoolSettings
 from harness.compiled import cache_root
 from harness.episode.judge import motion_hashes
 from harness.errors import HarnessError
-from harness.pool.build import POOL_SEED, ROUND_PATHS, careful_first, pool_of, take_aim
-from harness.pool.cut_ins import Pool
+from harness.pool.build import POOL_SEED, ROUND_PATHS, campaign_pool_key, pool_of, take_aim
+from harness.pool.cut_ins import Pool, sound_facts, stamped
 from harness.pool.library import Library
-from harness.pool.storage import campaign_pool_key, sound_facts, stamped
-from harness.pool.walk import PILOT_PATHS, EnumeratedPaths, ShadowRuns, contributions, enumerate_cut_ins
+from harness.pool.shells import conservative_first
+from harness.pool.walk import PILOT_PATHS, BaselineRuns, EnumeratedPaths, contributions, enumerate_cut_ins
 from harness.progress import Progress
 from harness.random_stream import DIAGNOSTIC, uniforms
 from harness.records.folder import require_place, write_atomically
@@ -38,20 +38,21 @@ from harness.traffic.laws import Environment
 from harness.vocabulary import STATE_COLUMNS, FloatArray, IntArray, RecordArray, states_from
 
 CANDIDATES = 32_768
-"""Paths of an AV that holds its speed to choose from: they cost milliseconds each, and save two of three shadow runs.
+"""Paths of an AV that holds its speed to choose from: they cost milliseconds each, and save two of three
+baseline runs.
 
-Their own error (standard error 0.4 % of the careful surrogates' rates, against 2 % of 500 shadow runs; measured in the
-default traffic) is in no interval.
+Their own error (standard error 0.4 % of the conservative surrogates' rates, against 2 % of 500 baseline runs; measured
+in the default traffic) is in no interval.
 """
 EVENLY = 0.1
 """Share of the choice that does not look at surrogates: no path counts for more than ten times its even weight."""
 CHOICE_DRAW = 2
-"""Draw of a shadow run within the diagnostic stream."""
+"""Draw of a baseline run within the diagnostic stream."""
 _COLUMNS = ("index", "weight", "chance")
 
 
 @dataclass(frozen=True, eq=False)
-class ShadowPaths:
+class BaselinePaths:
     """Independent draws of paths; some may be the same path, for runs with random streams of their own.
 
     Attributes
@@ -78,18 +79,18 @@ class ShadowPaths:
 
 
 @dataclass(frozen=True, eq=False)
-class Candidates(ShadowPaths):
+class Candidates(BaselinePaths):
     """Paths to choose from, each with its ``chance`` (n,) in every draw, and the ``weight`` that it has if drawn."""
 
     chance: FloatArray
 
-    def draw(self, n: int) -> ShadowPaths:
+    def draw(self, n: int) -> BaselinePaths:
         """So many of them, with replacement."""
         u = uniforms(self.seed, 0, n, DIAGNOSTIC, CHOICE_DRAW + 1)[:, CHOICE_DRAW]
         cumulative = np.cumsum(self.chance)
         chosen = np.minimum(np.searchsorted(cumulative, u * cumulative[-1], side="right"), len(self) - 1)
         arrays = (values[chosen] for values in (self.index, self.state, self.weight))
-        return ShadowPaths(self.key, self.seed, self.order, *arrays)
+        return BaselinePaths(self.key, self.seed, self.order, *arrays)
 
 
 def walk_candidates(
@@ -103,14 +104,14 @@ def walk_candidates(
     """Walk so many paths beside an AV that holds its speed."""
     progress = progress or Progress()
     aim = take_aim(environment, library, settings, progress)
-    progress.stage("paths for shadow runs", candidates)
+    progress.stage("paths for baseline runs", candidates)
     n_surrogates = len(library.surrogates)
     rounds = range(PILOT_PATHS, PILOT_PATHS + candidates, ROUND_PATHS)
     parts = (aim.enumerator.run(first, ROUND_PATHS, progress) for first in rounds)
     columns = [(part.index, part.state, part.weight, part.rates(n_surrogates)) for part in parts]
     index, state, weight, rates = (np.concatenate(column) for column in zip(*columns, strict=True))
     chance = chances(rates, aim.share)
-    order = careful_first(rates)
+    order = conservative_first(rates)
     return Candidates(key, settings.seed ^ POOL_SEED, order, index, state, weight / (candidates * chance), chance)
 
 
@@ -129,17 +130,17 @@ def _candidates_key(resolved: Resolved) -> str:
     return hashlib.sha256(json.dumps([campaign_pool_key(resolved), own]).encode()).hexdigest()[:24]
 
 
-def shadow_paths_file(resolved: Resolved) -> Path:
+def baseline_paths_file(resolved: Resolved) -> Path:
     """Where the candidates of a campaign's paths are cached."""
     return cache_root() / "pools" / f"shadow-{_candidates_key(resolved)}.parquet"
 
 
-def campaign_shadow_paths(resolved: Resolved, progress: Progress | None = None) -> ShadowPaths:
+def campaign_baseline_paths(resolved: Resolved, progress: Progress | None = None) -> BaselinePaths:
     """The paths that a campaign's vehicle is to walk, of candidates from the cache, or walked and cached.
 
     Raises `RunFolderError`: the candidates could not be kept.
     """
-    key, path, settings = _candidates_key(resolved), shadow_paths_file(resolved), resolved.campaign.pool
+    key, path, settings = _candidates_key(resolved), baseline_paths_file(resolved), resolved.campaign.pool
     if (candidates := _cached(path, key)) is None:
         require_place(path.parent, mend="Change its permissions, or name another place in HARNESS_CACHE_DIR.")
         candidates = walk_candidates(resolved.environment, resolved.library, settings, key, progress)
@@ -168,7 +169,7 @@ def _cached(path: Path, key: str) -> Candidates | None:
     return Candidates(key, facts["seed"], np.array(facts["order"], np.int64), state=state, **columns)
 
 
-def vehicle_pool(resolved: Resolved, paths: ShadowPaths, runs: ShadowRuns) -> Pool:
+def vehicle_pool(resolved: Resolved, paths: BaselinePaths, runs: BaselineRuns) -> Pool:
     """Pool of the vehicle that was driven along the paths.
 
     Raises `HarnessError`: no cut-in was found on which even the envelope crashes.
@@ -179,7 +180,7 @@ def vehicle_pool(resolved: Resolved, paths: ShadowPaths, runs: ShadowRuns) -> Po
     if not found.crashes.any():
         failed = f" ({n:,} of them failed)" if (n := int(runs.failed.sum())) else ""
         raise HarnessError(
-            "shadow runs",
+            "baseline runs",
             f"no cut-in on {len(paths):,} paths{failed} after which even the most careless surrogate would crash",
             "some: the crash rate is estimated from them",
             "Raise pool.shadow_paths, or use testing.method forced; look at whether the vehicle moves at all "

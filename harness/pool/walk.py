@@ -27,7 +27,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from harness.compiled import compiled_inline, compiled_threads
+from harness.compiled import compiled_inline, compiled_threads, unboxed
 from harness.episode.path import (
     Followers,
     Trajectory,
@@ -38,15 +38,20 @@ from harness.episode.path import (
     weigh_cut_ins,
     who_crashes,
 )
-from harness.maneuvers import CUT_IN, acceleration
 from harness.progress import Progress
 from harness.random_stream import DIAGNOSTIC, INITIAL, LV_DRAWS, uniform, uniforms
-from harness.traffic.initial_state import InitialStates
 from harness.traffic.lateral import draw_lead
-from harness.traffic.laws import Environment, cut_in_hazard, draw_acceleration, free_driving, opportunity
-from harness.unboxed import unboxed
+from harness.traffic.laws import (
+    Environment,
+    InitialStates,
+    acceleration,
+    cut_in_hazard,
+    draw_acceleration,
+    free_driving,
+    opportunity,
+)
 from harness.vehicles.kinematics import CONTACT_M, gap, next_speed
-from harness.vocabulary import LV, STATE_COLUMNS, BoolArray, FloatArray, Int8Array, IntArray, RecordArray
+from harness.vocabulary import CUT_IN, LV, STATE_COLUMNS, BoolArray, FloatArray, Int8Array, IntArray, RecordArray
 
 FREE_DRAWS_PER_CUT_IN = 256
 """Stride of the uniforms for BV's free driving: each cut-in time of a path has draws of its own."""
@@ -54,7 +59,7 @@ STRIDE = 4
 """Steps between the cut-ins of a path that are asked; `benchmarks.pool_stride` says what other numbers would cost."""
 
 
-class ShadowRuns(NamedTuple):
+class BaselineRuns(NamedTuple):
     """What vehicles did without a cut-in, on paths (n,); for one that keeps its speed, `HOLDING` (0,).
 
     ``n_steps``, ``failed`` (n,): steps that are on record, and whether the vehicle failed then. ``x_m``, ``v_mps``
@@ -81,7 +86,7 @@ class ShadowRuns(NamedTuple):
         return digest.hexdigest()
 
 
-HOLDING = ShadowRuns(np.zeros(0, np.int64), np.zeros(0, np.bool_), np.zeros((0, 1)), np.zeros((0, 1)))
+HOLDING = BaselineRuns(np.zeros(0, np.int64), np.zeros(0, np.bool_), np.zeros((0, 1)), np.zeros((0, 1)))
 
 
 class CutInsOnPaths(NamedTuple):
@@ -118,7 +123,7 @@ def enumerate_cut_ins(
     state: RecordArray,
     environment: Environment,
     followers: Followers,
-    runs: ShadowRuns = HOLDING,
+    runs: BaselineRuns = HOLDING,
     stride: int = 1,
     offset: IntArray | None = None,
 ) -> CutInsOnPaths:
@@ -144,7 +149,7 @@ def _enumerate(
     offset: IntArray,
     environment: Environment,
     followers: Followers,
-    runs: ShadowRuns,
+    runs: BaselineRuns,
     path: Trajectory,
     found: CutInsOnPaths,
 ) -> None:

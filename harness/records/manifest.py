@@ -56,7 +56,7 @@ class Repeated(Stored):
     differing: list[Count]
 
 
-class StoredShadows(Stored):
+class StoredBaseline(Stored):
     """Shadow runs of a vehicle that acts before the cut-in."""
 
     n_runs: Count
@@ -86,5 +86,5 @@ class StoredManifest(Stored):
     decision: dict[str, Any] | None = None
     retraced: Retraced | None = None
     repeated: Repeated | None = None
-    shadow_runs: StoredShadows | None = None
+    shadow_runs: StoredBaseline | None = None
     reported_from: Count | None = None

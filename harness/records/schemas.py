@@ -150,7 +150,7 @@ def traces_schema(*, takes_time: bool = False) -> pa.Schema:
     )
 
 
-def shadow_schema() -> pa.Schema:
+def baseline_schema() -> pa.Schema:
     """Schema of the ``shadow`` table: one row per shadow run."""
     return pa.schema(
         [
@@ -323,7 +323,7 @@ def _came_over(shard: Shard, row: int, state: np.ndarray) -> FloatArray:
     return distance_m * np.clip((state - begins - 1) / lead, 0.0, 1.0)
 
 
-def shadow_table(shard: Shard, path: IntArray, weight: FloatArray) -> pa.Table:
+def baseline_table(shard: Shard, path: IntArray, weight: FloatArray) -> pa.Table:
     """One row per shadow run of a shard that has kept all motion; ``path``, ``weight`` (n,) as in the schema."""
     e, traces = shard.results.episode, [shard.traces[row] for row in range(shard.results.episode.size)]
     columns = _driven(shard) | {
@@ -333,4 +333,4 @@ def shadow_table(shard: Shard, path: IntArray, weight: FloatArray) -> pa.Table:
         "av_position_m": pa.array([trace[:, AV, 0] for trace in traces], pa.list_(pa.float64())),
         "av_speed_mps": pa.array([trace[:, AV, 1] for trace in traces], pa.list_(pa.float64())),
     }
-    return _table(shadow_schema(), columns, e)
+    return _table(baseline_schema(), columns, e)

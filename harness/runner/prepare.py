@@ -8,20 +8,18 @@ from pathlib import Path
 
 from harness.campaign.campaign import Campaign
 from harness.campaign.combinations import Command
-from harness.compiled import is_cached
+from harness.compiled import is_cached, unboxed
 from harness.controllers.find import require_controller
 from harness.episode.judge import judge
 from harness.episode.loop import Drawing, EpisodeLoop, RecordPolicy
 from harness.episode.path import empty_trajectory, mean_test_distance
-from harness.importance.build import build_importance
+from harness.importance.functions import build_importance
 from harness.pool.replay import Retracing
 from harness.progress import Progress
 from harness.records.schemas import shard_tables
 from harness.resolved import Resolved, resolve
 from harness.sampling import Source, source_of
-from harness.traffic.initial_state import InitialStates
-from harness.traffic.laws import Environment
-from harness.unboxed import unboxed
+from harness.traffic.laws import Environment, InitialStates
 from harness.worlds.sumo_driven import av_type
 from harness.worlds.system_libraries import require_libraries
 

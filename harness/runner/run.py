@@ -18,7 +18,7 @@ from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED, CampaignE
 from harness.estimators.answer import ending as ending_sentence
 from harness.estimators.stopping import Rule, Verdict
 from harness.pool.replay import Retracing
-from harness.pool.vehicle_pool import ShadowPaths
+from harness.pool.vehicle_pool import BaselinePaths
 from harness.progress import Progress
 from harness.records.folder import SHELLS, TABLES, shards_on_disk, sole_use, write_bytes, write_json, write_shard
 from harness.records.manifest import StoppedBy
@@ -191,7 +191,7 @@ class Run:
         self.prefix.add(shard, files)
         self.prefix.require_few_failed(self.campaign, at_least=SMALLEST_FAILED_SAMPLE)
 
-    def _make_baseline(self, paths: ShadowPaths) -> None:
+    def _make_baseline(self, paths: BaselinePaths) -> None:
         """Drive the vehicle along all paths without a cut-in, but for what an earlier run has done of it."""
         environment, n = self.resolved.environment, len(paths)
         self._progress.stage(f"baseline runs{self._workers.where}", n)

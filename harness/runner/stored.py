@@ -18,7 +18,7 @@ from harness.errors import CampaignError, RunFolderError
 from harness.estimators.answer import CampaignFacts, estimate_blocks
 from harness.estimators.block import Block
 from harness.estimators.one_pass import SPACING
-from harness.importance.build import importance_names
+from harness.importance.functions import importance_names
 from harness.processes import made_ahead
 from harness.records.folder import concatenated, no_episodes, read_manifest, read_table
 from harness.records.reader import read_shard

@@ -18,11 +18,11 @@ import pyarrow.compute as pc
 from harness.episode.cells import drawn_traffic
 from harness.episode.loop import EpisodeLoop, RecordPolicy, Shard
 from harness.errors import RunFolderError
-from harness.pool.storage import padded
-from harness.pool.vehicle_pool import ShadowPaths
-from harness.pool.walk import ShadowRuns, write_script
+from harness.pool.cut_ins import padded
+from harness.pool.vehicle_pool import BaselinePaths
+from harness.pool.walk import BaselineRuns, write_script
 from harness.records.folder import parquet, read_table
-from harness.records.schemas import shadow_table
+from harness.records.schemas import baseline_table
 from harness.traffic.laws import Environment
 from harness.vocabulary import AV, FAILED, IntArray, RecordArray
 
@@ -64,16 +64,16 @@ def baseline_file(folder: Path, request: BaselineRequest) -> Path:
 
 
 def run_baseline(
-    loop: EpisodeLoop, paths: ShadowPaths, environment: Environment, request: BaselineRequest
+    loop: EpisodeLoop, paths: BaselinePaths, environment: Environment, request: BaselineRequest
 ) -> BaselineResult:
     """Drive the loop's vehicle along a range of paths."""
     rows = slice(request.first_episode, request.first_episode + request.n_episodes)
     shard = without_cut_in(loop, paths.seed, request.first_episode, paths.index[rows], paths.state[rows], environment)
-    table = shadow_table(shard, paths.index[rows], paths.weight[rows])
+    table = baseline_table(shard, paths.index[rows], paths.weight[rows])
     return BaselineResult(request, table, parquet(table), _causes(table))
 
 
-def stored_baseline(folder: Path, paths: ShadowPaths, request: BaselineRequest) -> BaselineResult | None:
+def stored_baseline(folder: Path, paths: BaselinePaths, request: BaselineRequest) -> BaselineResult | None:
     """A range that an earlier run has finished, or None; a `RunFolderError` if it is damaged, or of other paths."""
     file = baseline_file(folder, request)
     if not file.exists():
@@ -91,7 +91,7 @@ def _causes(table: pa.Table) -> Counter[str]:
     return Counter(table.column("failure").drop_null().to_pylist())
 
 
-def read_baseline(folder: Path, paths: ShadowPaths, environment: Environment) -> ShadowRuns:
+def read_baseline(folder: Path, paths: BaselinePaths, environment: Environment) -> BaselineRuns:
     """All baseline runs of a run folder; a `RunFolderError` if some are missing or damaged."""
     found = [stored_baseline(folder, paths, request) for request in baseline_requests(len(paths))]
     if any(done is None for done in found):
@@ -104,14 +104,14 @@ def read_baseline(folder: Path, paths: ShadowPaths, environment: Environment) ->
     return as_recorded([done.table for done in found if done is not None], environment)
 
 
-def as_recorded(tables: list[pa.Table], environment: Environment) -> ShadowRuns:
+def as_recorded(tables: list[pa.Table], environment: Environment) -> BaselineRuns:
     """Consecutive baseline runs as arrays."""
     table = pa.concat_tables(tables, promote_options="none")
     width = int(environment.numbers["max_steps"]) + 1
     n_steps = table.column("n_steps").to_numpy().astype(np.int64)
     failed = np.asarray(pc.equal(table.column("outcome").cast(pa.string()), "failed"))
     motion = (padded(table.column(name), width)[0] for name in ("av_position_m", "av_speed_mps"))
-    return ShadowRuns(n_steps, failed, *motion)
+    return BaselineRuns(n_steps, failed, *motion)
 
 
 def without_cut_in(
@@ -124,10 +124,10 @@ def without_cut_in(
     return loop.beside(keep=ALL_MOTION).run(first, state, traffic)
 
 
-def recorded(shard: Shard, environment: Environment) -> ShadowRuns:
+def recorded(shard: Shard, environment: Environment) -> BaselineRuns:
     """Baseline runs as they come from the loop."""
     episode, width = shard.results.episode, int(environment.numbers["max_steps"]) + 1
     x, v = np.zeros((2, episode.size, width))
     for row, trace in shard.traces.items():
         x[row, : len(trace)], v[row, : len(trace)] = trace[:, AV, 0], trace[:, AV, 1]
-    return ShadowRuns(episode["n_steps"].astype(np.int64), episode["outcome"] == FAILED, x, v)
+    return BaselineRuns(episode["n_steps"].astype(np.int64), episode["outcome"] == FAILED, x, v)

@@ -11,14 +11,12 @@ from harness.episode.loop import EpisodeLoop, Shard
 from harness.episode.path import Followers
 from harness.pool.cut_ins import onset_steps
 from harness.pool.walk import enumerate_cut_ins, write_script
-from harness.progress import Progress
 from harness.random_stream import CUT_IN, uniforms
-from harness.resolved import Resolved
 from harness.sampling.baseline import recorded, without_cut_in
 from harness.sampling.protocol import ShardRequest, Source
 from harness.traffic.laws import Environment
 from harness.vehicles.drivers import driver_records
-from harness.vocabulary import PRESCRIBED, RecordArray
+from harness.vocabulary import RecordArray
 
 AT_ONCE = 1000
 """Baseline runs whose motion is held in memory at once: some 15 MB."""
@@ -32,13 +30,8 @@ class Forced(Source):
 
     episodes_per_s = {"sumo": 1500, "sumo with shim": 2500, "twin": 32000}
 
-    def __init__(self, resolved: Resolved, progress: Progress) -> None:
-        super().__init__(resolved, progress)
-        if self.campaign.has_shadow_runs:
-            self.policy = self.policy._replace(importance=self.policy.importance._replace(method=PRESCRIBED))
-
     def run(self, loop: EpisodeLoop, request: ShardRequest) -> Shard:
-        if not self.campaign.has_shadow_runs:
+        if not self.campaign.has_baseline_runs:
             return super().run(loop, request)
         first, states = request.first_episode, self.states(request.first_episode, request.n_episodes)
         return loop.run(first, states, forced_traffic(loop, self.policy.seed, first, states, self.policy.environment))

@@ -22,15 +22,15 @@ from harness.episode.loop import MOMENT_LIMITS, NOBODY, Drawing, EpisodeLoop, Re
 from harness.estimators.block import EPISODE_COLUMNS, Block, block_from_tables
 from harness.estimators.one_pass import accumulator
 from harness.estimators.stopping import Rule, StopRule
-from harness.importance.build import build_importance, mixture_weights
+from harness.importance.functions import build_importance, mixture_weights
 from harness.importance.tables import Tables, build_tables, table_path
 from harness.pool.shells import Draw
-from harness.pool.vehicle_pool import ShadowPaths
-from harness.pool.walk import ShadowRuns
+from harness.pool.vehicle_pool import BaselinePaths
+from harness.pool.walk import BaselineRuns
 from harness.progress import Progress
 from harness.resolved import Resolved
 from harness.strata import ShellDesign
-from harness.traffic.initial_state import InitialStates
+from harness.traffic.laws import InitialStates
 from harness.vocabulary import RecordArray
 from harness.worlds.protocol import World
 
@@ -111,7 +111,7 @@ class Source:
         self.policy = Drawing(self.campaign.seed, resolved.environment, importance, resolved.av, NOBODY)
         self.initial_states = InitialStates(resolved.environment.numbers)
         self.design: ShellDesign | None = None
-        self.baseline_paths: ShadowPaths | None = None
+        self.baseline_paths: BaselinePaths | None = None
 
     def _built_tables(self, progress: Progress) -> Tables | None:
         if not self.campaign.sampling.mixes:
@@ -150,7 +150,7 @@ class Source:
         """Strata of a stored run."""
         return None
 
-    def begin_after(self, runs: ShadowRuns) -> None:  # noqa: ARG002 - there are none
+    def begin_after(self, runs: BaselineRuns) -> None:  # noqa: ARG002 - there are none
         """Draw tests by what the vehicle did in its baseline runs, along `baseline_paths`.
 
         Raises `HarnessError`: nothing on these paths can be tested.

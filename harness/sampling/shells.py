@@ -27,11 +27,11 @@ from harness.estimators.pairs import PairCounts
 from harness.estimators.shells import Shells as SeenShells
 from harness.estimators.stopping import PairRule, RoundRule
 from harness.estimators.tally import Tally, empty_tally
+from harness.pool.build import cached_pool, campaign_pool, campaign_pool_key, pool_path
 from harness.pool.cut_ins import Pool
 from harness.pool.shells import Draw, PrescribedEpisodes, acceleration_limit, checked_boundary, design_shells
-from harness.pool.storage import cached_pool, campaign_pool, campaign_pool_key, pool_path
-from harness.pool.vehicle_pool import campaign_shadow_paths, shadow_paths_file, vehicle_pool
-from harness.pool.walk import ShadowRuns
+from harness.pool.vehicle_pool import baseline_paths_file, campaign_baseline_paths, vehicle_pool
+from harness.pool.walk import BaselineRuns
 from harness.progress import Progress
 from harness.records.folder import SHELLS, read_as, read_manifest
 from harness.resolved import Resolved
@@ -67,8 +67,8 @@ class Shells(Source):
 
     def __init__(self, resolved: Resolved, progress: Progress) -> None:
         super().__init__(resolved, progress)
-        if self.campaign.has_shadow_runs:
-            self.baseline_paths = campaign_shadow_paths(resolved, progress)
+        if self.campaign.has_baseline_runs:
+            self.baseline_paths = campaign_baseline_paths(resolved, progress)
         else:
             self._draw_from(campaign_pool(resolved, progress))
 
@@ -85,13 +85,13 @@ class Shells(Source):
 
     @classmethod
     def cached_files(cls, resolved: Resolved) -> list[Path]:
-        own = resolved.campaign.has_shadow_runs
-        return [shadow_paths_file(resolved) if own else pool_path(campaign_pool_key(resolved))]
+        own = resolved.campaign.has_baseline_runs
+        return [baseline_paths_file(resolved) if own else pool_path(campaign_pool_key(resolved))]
 
     @classmethod
     def building(cls, resolved: Resolved) -> str:
         what, make = "pool of cut-ins", "build"
-        if resolved.campaign.has_shadow_runs:
+        if resolved.campaign.has_baseline_runs:
             what, make = f"paths of {resolved.campaign.pool.shadow_paths:,} baseline runs", "choose"
         cached = all(file.is_file() for file in cls.cached_files(resolved))
         return f"{what}: " + ("cached" if cached else f"to {make} ({POOL_S} on two cores)")
@@ -100,7 +100,7 @@ class Shells(Source):
     def reach(cls, resolved: Resolved) -> dict[str, str]:
         """See `Source`: where cut-ins take time the rates of attentive vehicles are tiny."""
         campaign = resolved.campaign
-        if not resolved.environment.lateral.present or campaign.has_shadow_runs:
+        if not resolved.environment.lateral.present or campaign.has_baseline_runs:
             return {}
         if (pool := cached_pool(resolved)) is None:
             return {"within_reach": "known once the pool is built (harness pool)"}
@@ -121,7 +121,7 @@ class Shells(Source):
             raise RunFolderError(str(folder / SHELLS), found, expected, mend)
         return read_as(StoredDesign, folder / SHELLS, mend=_FINISH)
 
-    def begin_after(self, runs: ShadowRuns) -> None:
+    def begin_after(self, runs: BaselineRuns) -> None:
         if self.baseline_paths is None:
             raise ValueError("this campaign has no baseline runs")
         self._draw_from(vehicle_pool(self.resolved, self.baseline_paths, runs))

@@ -1,4 +1,6 @@
-"""The laws of traffic: how LV and BV choose accelerations, and the hazard of BV's cut-in.
+"""The laws of traffic: where a test begins, how LV and BV choose accelerations, and the hazard of BV's cut-in.
+
+Initial states (v_BV, R1, R1dot, R2, R2dot) are an inversion of five uniforms each.
 
 Accelerations come from free driving, or from car following within the guard that keeps BV off LV. Both are
 distributions over the 31 accelerations, given as cumulative probabilities P(A ≤ a_k); the tails beyond the grid
@@ -25,12 +27,27 @@ import numpy as np
 from scipy import special
 
 from harness.compiled import compiled_inline
-from harness.maneuvers import ACCELERATIONS_MPS2, N_ACCELERATIONS, acceleration, upper_edge
+from harness.random_stream import INITIAL, uniforms
 from harness.traffic.lateral import LateralMotion
-from harness.vocabulary import FloatArray, Record, State
+from harness.vocabulary import (
+    ACCELERATIONS_MPS2,
+    N_ACCELERATIONS,
+    STATE_COLUMNS,
+    FloatArray,
+    Record,
+    RecordArray,
+    State,
+    states_from,
+)
 
 FREE_DRIVING, CAR_FOLLOWING = 0, 1
 """Which table of noise a law has."""
+_SPEED_POINTS = 8001
+_GAP = ("shift_m", "shift_u_m", "log_mean", "log_mean_u", "log_sd", "log_sd_u")
+_RATE = (
+    *("location_mps", "location_u", "location_w", "location_uw", "location_uu"),
+    *("log_scale", "log_scale_u", "log_scale_w", "log_scale_ww"),
+)
 _T_LIMIT = 64.0
 _T_PER_UNIT = 32.0
 
@@ -82,6 +99,18 @@ def t_table(df: float) -> FloatArray:
     peak = special.poch(0.5 * df, 0.5) / np.sqrt(df * np.pi)
     density = peak * np.exp(-0.5 * (df + 1.0) * np.log1p(z * z / df))
     return np.column_stack([special.stdtr(df, z), density / _T_PER_UNIT])
+
+
+@compiled_inline
+def acceleration(maneuver: int) -> float:
+    """Acceleration (m/s²) of maneuver index 0 … 30."""
+    return (maneuver - 20) / 5.0
+
+
+@compiled_inline
+def upper_edge(maneuver: int) -> float:
+    """Upper edge (m/s²) of the 0.2-wide bin that maneuver index 0 … 29 stands for; the last bin has none."""
+    return (maneuver - 20) / 5.0 + 0.1
 
 
 @compiled_inline
@@ -244,3 +273,69 @@ def cut_in_hazard(opportunity_1s: float, accepted: float, environment: Environme
     n = environment.numbers
     p_1s = min(opportunity_1s * accepted, n.cut_in__max_probability_1s)
     return float(-n.scenario__step_s * math.log1p(-p_1s))
+
+
+class InitialStates:
+    """Sampler of initial states; ``speed_cdf`` is P(v_BV ≤ v) on a grid over the fit range."""
+
+    def __init__(self, numbers: Record) -> None:
+        self._n = n = numbers
+        self._speeds = np.linspace(n["fit_range__v_min_mps"], n["fit_range__v_max_mps"], _SPEED_POINTS)
+        shape, location, scale = (float(n[f"initial_state__v_{k}"]) for k in ("shape", "location_mps", "scale_mps"))
+        z = (self._speeds - location) / scale
+        cdf = special.ndtr(z) - 2.0 * special.owens_t(z, shape)  # of the skew normal distribution
+        self.speed_cdf: FloatArray = (cdf - cdf[0]) / (cdf[-1] - cdf[0])
+
+    def draw(self, seed: int, first_episode: int, n_episodes: int) -> RecordArray:
+        """States of consecutive episodes, shape (n_episodes,)."""
+        return self.from_uniforms(uniforms(seed, first_episode, n_episodes, INITIAL, len(STATE_COLUMNS)))
+
+    def from_uniforms(self, u: FloatArray) -> RecordArray:
+        """States (n,) from uniforms (n, 5), one for each of their numbers."""
+        n, of = self._n, states_from(u.T)
+        v = np.interp(of["v_bv_mps"], self.speed_cdf, self._speeds)
+        r1 = self._gap(of["r1_m"], v)
+        r1dot = self._rate(of["r1dot_mps"], v, r1)
+        r2 = n["initial_state__r2_min_m"] + of["r2_m"] * (n["initial_state__r2_max_m"] - n["initial_state__r2_min_m"])
+        span = n["initial_state__r2dot_max_mps"] - n["initial_state__r2dot_min_mps"]
+        r2dot = n["initial_state__r2dot_min_mps"] + of["r2dot_mps"] * span
+        return states_from([v, r1, r1dot, r2, r2dot])
+
+    def given_speed(self, speed: float, gap_u: FloatArray, rate_u: FloatArray) -> RecordArray:
+        """States (n,) at a fixed v_BV (m/s) from uniforms for R1 and R1dot, each (n,); the AV is nowhere."""
+        v = np.full(gap_u.size, speed)
+        r1 = self._gap(gap_u, v)
+        nowhere = np.full_like(v, np.nan)
+        return states_from([v, r1, self._rate(rate_u, v, r1), nowhere, nowhere])
+
+    def _u(self, v: FloatArray) -> FloatArray:
+        u: FloatArray = (v - self._n["fit_range__v_centre_mps"]) / self._n["fit_range__v_scale_mps"]
+        return u
+
+    def _gap(self, probability: FloatArray, v: FloatArray) -> FloatArray:
+        """R1 = shift + LogNormal, truncated to the fit range."""
+        n = self._n
+        u = self._u(v)
+        c = {name: n[f"initial_state__r1_{name}"] for name in _GAP}
+        shift, mean = c["shift_m"] + c["shift_u_m"] * u, c["log_mean"] + c["log_mean_u"] * u
+        sd = np.exp(c["log_sd"] + c["log_sd_u"] * u)
+        with np.errstate(divide="ignore"):
+            below = special.ndtr((np.log(np.maximum(n["fit_range__r1_min_m"] - shift, 0.0)) - mean) / sd)
+            upto = special.ndtr((np.log(n["fit_range__r1_max_m"] - shift) - mean) / sd)
+        gap: FloatArray = shift + np.exp(mean + sd * special.ndtri(below + probability * (upto - below)))
+        return gap
+
+    def _rate(self, probability: FloatArray, v: FloatArray, r1: FloatArray) -> FloatArray:
+        """R1dot = location + scale t, given that R1 is not closed within the smallest time to collision."""
+        n = self._n
+        u = self._u(v)
+        w = (r1 - n["fit_range__r1_centre_m"]) / n["fit_range__r1_scale_m"]
+        c = {name: n[f"initial_state__r1dot_{name}"] for name in _RATE}
+        location = c["location_mps"] + c["location_u"] * u + c["location_w"] * w
+        location = location + c["location_uw"] * (u * w) + c["location_uu"] * (u * u)
+        log_scale = c["log_scale"] + c["log_scale_u"] * u + c["log_scale_w"] * w + c["log_scale_ww"] * (w * w)
+        scale = np.exp(log_scale)
+        df = float(n["initial_state__r1dot_df"])
+        slowest = special.stdtr(df, (-r1 / n["initial_state__r1dot_min_ttc_s"] - location) / scale)
+        rate: FloatArray = location + scale * special.stdtrit(df, slowest + probability * (1.0 - slowest))
+        return rate

@@ -15,13 +15,12 @@ import numpy as np
 
 from harness.campaign.files import names_a_file, read_model
 from harness.campaign.sections import EnvironmentSettings
-from harness.compiled import compiled_threads
+from harness.compiled import compiled_threads, unboxed
 from harness.errors import CampaignError
-from harness.maneuvers import N_ACCELERATIONS
-from harness.traffic.initial_state import InitialStates
 from harness.traffic.lateral import constant_lead
 from harness.traffic.laws import (
     Environment,
+    InitialStates,
     acceleration_pmf,
     acceptance,
     build_environment,
@@ -30,8 +29,7 @@ from harness.traffic.laws import (
     opportunity,
 )
 from harness.traffic.parameters import SHIPPED_FOLDER, EnvironmentParameters, parameter_record
-from harness.unboxed import unboxed
-from harness.vocabulary import BoolArray, FloatArray, State
+from harness.vocabulary import N_ACCELERATIONS, BoolArray, FloatArray, State
 
 PROBABILITIES = np.array([2.0**-53, 1e-6, 1e-3, 0.01, 0.1, 0.5, 0.9, 0.99, 0.999, 1.0 - 1e-6, 1.0 - 2.0**-53])
 """Where quantiles are evaluated: the ends are the smallest and the largest uniform that is drawn, but zero."""

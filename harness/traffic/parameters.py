@@ -13,10 +13,9 @@ from pydantic import AfterValidator, BaseModel, model_validator
 from harness.campaign.drivers import MAX_CONFIGURED_SPEED_MPS
 from harness.campaign.problems import broken_rule
 from harness.campaign.sections import Section
-from harness.maneuvers import ACCELERATIONS_MPS2
 from harness.traffic.lateral import LateralMotion, constant_lead, in_one_step, log_normal_speed
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
-from harness.vocabulary import Record
+from harness.vocabulary import ACCELERATIONS_MPS2, Record
 
 SHIPPED_FOLDER = Path(__file__).parent
 FIXED = {"step_s": STEP_S, "vehicle_length_m": VEHICLE_LENGTH_M}
@@ -283,10 +282,7 @@ def parameter_record(parameters: EnvironmentParameters, *, lane_change_level: fl
     """The numbers as kernels read them: ``section__name``, lane-changing ``level``, ``hold_steps``, ``max_steps``."""
     read = {name: value for name, value in parameters.values().items() if not name.startswith("lateral__")}
     numbers = {**read, "level": lane_change_level}
-    steps = {
-        "hold_steps": round(hold_s / STEP_S),
-        "max_steps": round(numbers["scenario__duration_s"] / STEP_S),
-    }
+    steps = {"hold_steps": round(hold_s / STEP_S), "max_steps": round(numbers["scenario__duration_s"] / STEP_S)}
     dtype = [*((name, "f8") for name in numbers), *((name, "i8") for name in steps)]
     record: Record = np.array([(*numbers.values(), *steps.values())], dtype)[0]
     return record

@@ -23,16 +23,24 @@ import pyarrow as pa
 from harness.campaign.drivers import default_surrogates
 from harness.campaign.sections import EnvironmentSettings
 from harness.campaign.vehicle import AutomatedVehicle
+from harness.compiled import unboxed
 from harness.estimators.block import MAX_CONTROL_STEPS, Block, Drawn
 from harness.importance.challenge import roll_out
 from harness.importance.grid import GridPoints
-from harness.maneuvers import ACCELERATIONS_MPS2, N_ACCELERATIONS
 from harness.traffic.laws import Environment
 from harness.traffic.loading import evaluate_laws, load_environment
-from harness.unboxed import unboxed
 from harness.vehicles.drivers import av_records, surrogate_records
 from harness.vehicles.kinematics import CONTACT_M, STEP_S
-from harness.vocabulary import CRASH, TIMEOUT, BoolArray, FloatArray, IntArray, RecordArray
+from harness.vocabulary import (
+    ACCELERATIONS_MPS2,
+    CRASH,
+    N_ACCELERATIONS,
+    TIMEOUT,
+    BoolArray,
+    FloatArray,
+    IntArray,
+    RecordArray,
+)
 from studies.case_study.counted import Claims
 from studies.case_study.figures import exactly, figure, marked, mean_of, tests_for
 from studies.case_study.study import Context, SmallCase

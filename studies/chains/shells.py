@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from harness.pool.cut_ins import shells_of
+from harness.pool.shells import shells_of
 from harness.strata import LIBRARY_STATEMENT, OUTSIDE, ShellDesign, Statement
 from harness.vocabulary import FloatArray, IntArray
 from studies.chains.chain import Chain

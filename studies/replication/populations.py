@@ -36,18 +36,18 @@ from harness.episode.judge import motion_hashes
 from harness.episode.loop import Drawing, EpisodeLoop, RecordPolicy
 from harness.episode.path import Followers
 from harness.errors import CampaignError, HarnessError
-from harness.importance.build import build_importance
+from harness.importance.functions import build_importance
 from harness.pool.cut_ins import environment_hash, onset_steps
 from harness.pool.library import Library
 from harness.pool.shells import acceleration_limit
-from harness.pool.vehicle_pool import CANDIDATES, ShadowPaths, walk_candidates
-from harness.pool.walk import PILOT_PATHS, STRIDE, Enumerator, ShadowRuns, enumerate_cut_ins, write_script
+from harness.pool.vehicle_pool import CANDIDATES, BaselinePaths, walk_candidates
+from harness.pool.walk import PILOT_PATHS, STRIDE, BaselineRuns, Enumerator, enumerate_cut_ins, write_script
 from harness.progress import Progress
 from harness.resolved import Resolved, resolve
 from harness.sampling.baseline import recorded, without_cut_in
 from harness.traffic.laws import Environment
 from harness.vehicles.drivers import driver_records
-from harness.vocabulary import CRASH, PRESCRIBED, BoolArray, FloatArray, IntArray, RecordArray
+from harness.vocabulary import CRASH, BoolArray, FloatArray, IntArray, RecordArray
 from harness.worlds.twin import TwinWorld
 from studies.replication.work import sources_of, write_table
 
@@ -328,7 +328,7 @@ WALKED_CHUNK = 1024
 
 _SOURCES = ("pool/vehicle_pool.py", "controllers/hosts.py")
 """Files beside those of the world that decide what a vehicle meets, and is told."""
-Choose = Callable[[int, int], ShadowPaths]
+Choose = Callable[[int, int], BaselinePaths]
 """Chooses paths from a seed, so many of them; all vehicles of an experiment walk the same."""
 
 
@@ -337,7 +337,7 @@ def chooser(campaign: Campaign, progress: Progress, candidates: int = CANDIDATES
     resolved = resolve(campaign)
 
     @cache
-    def choose(seed: int, n_paths: int) -> ShadowPaths:
+    def choose(seed: int, n_paths: int) -> BaselinePaths:
         settings = campaign.pool.model_copy(update={"seed": seed})
         where, most = (resolved.environment, resolved.library), max(n_paths, candidates)
         return walk_candidates(*where, settings, "walked", progress, most).draw(n_paths)
@@ -369,7 +369,7 @@ def walk_paths(
     return cached(population_key(resolved.environment, "walked", STRIDE, *asked), walked)
 
 
-def _tasks(campaign: Campaign, paths: ShadowPaths) -> Iterator[tuple[str, int, ShadowPaths]]:
+def _tasks(campaign: Campaign, paths: BaselinePaths) -> Iterator[tuple[str, int, BaselinePaths]]:
     """Ranges of the paths, each with the number of its first one."""
     content = campaign.model_dump_json()
     for first in range(0, len(paths), WALKED_CHUNK):
@@ -378,7 +378,7 @@ def _tasks(campaign: Campaign, paths: ShadowPaths) -> Iterator[tuple[str, int, S
         yield content, first, chunk
 
 
-def _walk(campaign_json: str, first: int, paths: ShadowPaths) -> SuperPopulation:
+def _walk(campaign_json: str, first: int, paths: BaselinePaths) -> SuperPopulation:
     """Walk a range of paths, and drive their cut-ins."""
     resolved = resolve(Campaign.model_validate_json(campaign_json))
     environment, library = resolved.environment, resolved.library
@@ -400,7 +400,7 @@ def _walk(campaign_json: str, first: int, paths: ShadowPaths) -> SuperPopulation
 def _loop(resolved: Resolved) -> EpisodeLoop:
     """The vehicle in the twin, on prescribed traffic, with all of its motion kept."""
     campaign, environment = resolved.campaign, resolved.environment
-    prescribed = build_importance(campaign, None)._replace(method=PRESCRIBED)
+    prescribed = build_importance(campaign, None)
     policy = Drawing(campaign.seed, environment, prescribed, resolved.av)
     host = build_host(campaign.av, n_cells=CELLS, seed=campaign.seed)
     return EpisodeLoop(TwinWorld(CELLS), policy, RecordPolicy(0, "none", 0.0), host)
@@ -410,8 +410,8 @@ def _crashes(
     resolved: Resolved,
     loop: EpisodeLoop,
     first: int,
-    paths: ShadowPaths,
-    runs: ShadowRuns,
+    paths: BaselinePaths,
+    runs: BaselineRuns,
     row: IntArray,
     step: IntArray,
 ) -> BoolArray:

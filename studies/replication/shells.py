@@ -24,9 +24,9 @@ from harness.estimators.likelihood import Level
 from harness.estimators.pairs import CRASH, NO_CRASH, PairCounts, no_pairs
 from harness.estimators.shells import Shells
 from harness.estimators.stopping import PairRule, RoundRule
-from harness.pool.cut_ins import CutIns, Pool, shells_of
+from harness.pool.cut_ins import CutIns, Pool
 from harness.pool.library import Library
-from harness.pool.shells import cells_in_strata, design_shells, outermost, shells_in_strata
+from harness.pool.shells import cells_in_strata, design_shells, outermost, shells_in_strata, shells_of
 from harness.sampling.shells import PairRounds, ShellRounds
 from harness.strata import LIBRARY_STATEMENT, ShellDesign
 from harness.vocabulary import CRASH as CRASHED

@@ -13,7 +13,7 @@ from harness.episode.loop import EpisodeLoop
 from harness.estimators.block import Block, block_from_tables
 from harness.estimators.one_pass import accumulator
 from harness.estimators.stopping import StopRule
-from harness.importance.build import mixture_weights
+from harness.importance.functions import mixture_weights
 from harness.records.schemas import shard_tables
 from harness.resolved import resolve
 from harness.runner.prepare import prepare

@@ -61,8 +61,3 @@ def test_a_loop_can_be_used_again(ready, reference):
     loop.run(5_000, ready.states(5_000, 100))
     again = loop.run(0, ready.states(0, N)).results
     assert all(same(episodes(again), reference[: len(TABLES)]))
-
-
-def test_other_draws_would_be_noticed(ready, reference):
-    other = ready.loop(TwinWorld(64)).run(1, ready.states(0, N)).results
-    assert not any(same(episodes(other)[-2:], reference[len(TABLES) - 2 : len(TABLES)]))

@@ -2,23 +2,9 @@
 
 import numpy as np
 import pytest
-from scipy import stats
 
 from harness.vocabulary import BV_LV_CONTACT, CRASH, FAILED, PASSED, TIMEOUT
 from tests.episode.twin_runs import run
-
-N = 200_000
-
-
-def upper_limit(count, n, confidence=0.95):
-    """Clopper–Pearson."""
-    return stats.beta.ppf(confidence, count + 1, n - count)
-
-
-@pytest.mark.parametrize("settings", [{"n": N}, {"n": 80_000, "hold_s": 0.1}], ids=["1.0 s", "0.1 s"])
-def test_bv_hardly_ever_touches_lv(settings):
-    contacts = int((run("nde", **settings).episode["outcome"] == BV_LV_CONTACT).sum())
-    assert upper_limit(contacts, settings["n"]) < 1e-4
 
 
 @pytest.mark.parametrize("settings", [{"n": 100_000}, {"n": 50_000, "hold_s": 0.1}], ids=["1.0 s", "0.1 s"])
@@ -29,6 +15,7 @@ def test_how_episodes_end(settings):
     assert steps.min() > 0
     assert steps.max() == 200
     assert (steps[outcome == TIMEOUT] == 200).all()
+    assert (outcome == BV_LV_CONTACT).mean() < 1e-4
     assert done.cut_in[outcome == CRASH].all()
     assert not done.cut_in[outcome == PASSED].any()
     assert not done.cut_in[outcome == BV_LV_CONTACT].any()

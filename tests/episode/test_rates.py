@@ -64,38 +64,3 @@ def test_published_nade_where_its_weights_stay_moderate():
     assert done.rate.errors_from(nde().rate) < 4.0
     assert done.rate.std_error < 0.03 * done.rate.value
     assert Mean.of(done.crash * 1.0).errors_from(nde().rate) > 20.0  # the ratios are needed
-
-
-@pytest.mark.parametrize("n_control", [2, 3, 4])
-def test_published_nade_stratum_by_stratum(n_control):
-    """Strata that are reached have the rates that the same critical moments have under p (ε = 1 draws from p).
-
-    Not all of them are: cutting in with 0.9 at the first chance, NADE reaches k steps further with 0.1^k, and what
-    happens there is missing from any affordable sample. With three surrogates, whose critical moments last some twenty
-    steps, its total is far below the rate at every level; so no test of the total is possible for them.
-    """
-    published = raised("step_mixture", "immediate", n=60_000, surrogates="SM-I")
-    natural = raised("step_mixture", "immediate", n=60_000, surrogates="SM-I", epsilon=1.0)
-    assert (natural.log_weight == 0.0).all()
-    weighted = published.y * (published.episode["n_control_steps"] == n_control)
-    plain = natural.crash * (natural.episode["n_control_steps"] == n_control)
-    assert Mean.of(weighted).errors_from(Mean.of(plain)) < 4.0
-    assert plain.sum() > 20
-
-
-def test_cut_ins_at_a_raised_level():
-    """E_q[W 1{cut-in}] against the share of plain episodes with a cut-in."""
-    plain = Mean.of(nde().cut_in * 1.0)
-    for done in (raised("forced", n=40_000), raised("episode_mixture", n=20_000)):
-        assert Mean.of(done.weight * done.cut_in).errors_from(plain) < 4.0
-
-
-@pytest.mark.slow
-def test_all_methods_within_three_per_cent():
-    rates = {"nde": raised("nde", n=1_000_000)}
-    assert rates["nde"].crash.sum() >= 10_000
-    rates |= {method: raised(method, n=300_000) for method in REGULAR}
-    rates["published"] = raised("step_mixture", "immediate", n=1_000_000, surrogates="brakes with 2 g")
-    for one in rates.values():
-        assert abs(one.rate.value / rates["nde"].rate.value - 1.0) < 0.03
-        assert one.rate.errors_from(rates["nde"].rate) < 4.0 or one is rates["nde"]

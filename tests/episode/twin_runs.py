@@ -60,13 +60,9 @@ def campaign(
     )
 
 
-def prepared(method: str, challenge: str = "recursive", **settings) -> Source:
-    return _prepared(method, challenge, tuple(sorted(settings.items())))
-
-
 @cache
-def _prepared(method, challenge, settings) -> Source:
-    return prepare(resolve(campaign(method, challenge, **dict(settings))))
+def prepared(method: str, challenge: str = "recursive", **settings) -> Source:
+    return prepare(resolve(campaign(method, challenge, **settings)))
 
 
 @dataclass(frozen=True)
@@ -155,13 +151,9 @@ class Run:
         return out
 
 
+@cache
 def run(method: str, challenge: str = "recursive", *, n: int, traces: str = "none", **settings) -> Run:
     """The first n episodes of a campaign; the keys of ``settings`` are those of `campaign`."""
-    return _run(method, challenge, n, traces, tuple(sorted(settings.items())))
-
-
-@cache
-def _run(method, challenge, n, traces, settings) -> Run:
-    ready = prepared(method, challenge, **dict(settings))
+    ready = prepared(method, challenge, **settings)
     loop = ready.loop(TwinWorld(CELLS), traces=traces)
     return Run(ready, loop.run(0, ready.states(0, n)))

@@ -1,4 +1,4 @@
-"""Importance functions and likelihood ratios over arrays, so that tests can call the compiled functions in bulk.
+"""Challenge tables, importance functions and likelihood ratios over arrays: compiled functions, called in bulk.
 
 Import this module as ``tests.…`` everywhere: numba's cache remembers the name.
 """
@@ -7,11 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from harness.campaign.campaign import Campaign
 from harness.compiled import compiled_threads
+from harness.episode import likelihood_ratio
 from harness.episode.decide import draw_from
 from harness.importance import functions
-from harness.maneuvers import acceleration
-from harness.traffic.laws import acceleration_pmf, acceptance, cut_in_hazard, free_driving, opportunity
+from harness.importance.grid import AFTER, interpolate, locate
+from harness.traffic.laws import acceleration, acceleration_pmf, acceptance, cut_in_hazard, free_driving, opportunity
 from harness.vocabulary import State
 
 
@@ -49,23 +51,17 @@ def _before(states, maneuvers, steps, environment, importance, cut, stay, p, q, 
 
 
 @compiled_threads
-def _draws(u, method, component, alpha, q, out):
+def _draws(u, component, alpha, q, out):
     for i in range(u.size):
-        out[i] = draw_from(u[i], method, component, alpha, q)
+        out[i] = draw_from(u[i], component, alpha, q)
 
 
 @compiled_threads
-def _accumulate(method, first, alpha, ratios, v, log_ratio, martingale, sampled):
+def _accumulate(importance, ratios, v, log_ratio, martingale, sampled):
     log_sampled = 0.0
     for t in range(ratios.shape[0]):
-        sampled[t] = functions.accumulate(method, first, alpha, ratios[t], v[t], log_sampled, log_ratio, martingale)
+        sampled[t] = likelihood_ratio.accumulate(importance, ratios[t], v[t], log_sampled, log_ratio, martingale)
         log_sampled += np.log(sampled[t])
-
-
-@compiled_threads
-def _log_mixtures(alpha, log_ratio, out):
-    for i in range(log_ratio.shape[0]):
-        out[i] = functions.log_mixture(alpha, log_ratio[i])
 
 
 def after_cut_in(states, environment, importance) -> Proposals:
@@ -86,22 +82,33 @@ def before_cut_in(states, maneuvers, steps, environment, importance) -> Proposal
     return Proposals(np.stack([p, 1.0 - p], axis=-1), np.stack([q, 1.0 - q], axis=-1), v, critical)
 
 
-def drawn(u, method, component, alpha, q):
+def drawn(u, component, alpha, q):
     """Indices (n,) that uniforms are turned into, under importance functions q (J, 31)."""
     out = np.empty(u.size, np.int64)
-    _draws(u, method, component, alpha, np.ascontiguousarray(q), out)
+    _draws(u, component, alpha, np.ascontiguousarray(q), out)
     return out
 
 
-def accumulated(method, first, alpha, ratios, v):
-    """Take in ratios q_j/p (steps, M) with V (steps, J): log ratios (M,), martingale sums (J,), q_α/p (steps,)."""
+def accumulated(of_episodes, alpha, ratios, v):
+    """Take in ratios q_j/p (steps, M) with V (steps, J): log ratios (M,), martingale sums (J,), q_α/p (steps,).
+
+    The first is that of a forced cut-in; the mixture is one of whole episodes or of steps.
+    """
+    importance = functions.build_importance(Campaign(name="none", testing={"method": "nde"}), None)
+    importance = importance._replace(mixes_episodes=int(of_episodes), n_forced=1, alpha=alpha)
     log_ratio, martingale, sampled = np.zeros(alpha.size), np.zeros(v.shape[1]), np.empty(len(ratios))
-    _accumulate(method, first, alpha, ratios, v, log_ratio, martingale, sampled)
+    _accumulate(importance, ratios, v, log_ratio, martingale, sampled)
     return log_ratio, martingale, sampled
 
 
-def log_mixtures(alpha, log_ratio):
-    """Log Σ_j α_j exp(L_j) of rows (n, M)."""
-    out = np.empty(len(log_ratio))
-    _log_mixtures(np.asarray(alpha, float), np.ascontiguousarray(log_ratio, float), out)
+@compiled_threads
+def _interpolate(table, states, out):
+    for i in range(states.shape[0]):
+        out[i] = interpolate(table, locate(AFTER, states[i, 0], states[i, 1], states[i, 2]))
+
+
+def tabulated(table, states):
+    """Table (v, R2, R2dot) at states (n, 3) after the cut-in."""
+    out = np.empty(len(states))
+    _interpolate(np.ascontiguousarray(table), np.asarray(states, float), out)
     return out

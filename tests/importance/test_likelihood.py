@@ -6,8 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.special import logsumexp
 
-from harness.vocabulary import EPISODE_MIXTURE, STEP_MIXTURE
-from tests.importance.kernels import accumulated, log_mixtures
+from tests.importance.kernels import accumulated
 
 ratio = st.one_of(st.just(0.0), st.floats(1e-6, 1e6))
 weights = st.lists(st.floats(0.05, 1.0), min_size=4, max_size=4).map(lambda w: np.array(w) / sum(w))
@@ -26,49 +25,29 @@ def log(x):
         return np.log(x)
 
 
-@given(
-    weights, st.lists(st.lists(st.one_of(st.just(-np.inf), st.floats(-700, 700)), min_size=4, max_size=4), min_size=1)
-)
-def test_log_mixture_is_logsumexp(alpha, rows):
-    rows = np.array(rows)
-    possible = ~np.isneginf(rows).all(axis=1)
-    found = log_mixtures(alpha, rows)
-    assert np.isneginf(found[~possible]).all()
-    expected = logsumexp(rows[possible], b=alpha, axis=1)
-    np.testing.assert_allclose(found[possible], expected, rtol=1e-13, atol=1e-13)
-
-
 @given(weights, sequences())
 def test_the_episode_mixture_telescopes(alpha, ratios):
     """Π_t Σ_j w_j,t r_j,t with posterior weights is Σ_j α_j Π_t r_j,t: the ratio of whole episodes."""
-    log_ratio, _, sampled = accumulated(EPISODE_MIXTURE, 1, alpha, ratios, np.zeros((len(ratios), 3)))
+    log_ratio, _, sampled = accumulated(True, alpha, ratios, np.zeros((len(ratios), 3)))
     np.testing.assert_allclose(log_ratio, log(ratios).sum(axis=0), rtol=1e-12, atol=1e-12)
     assert np.log(sampled).sum() == pytest.approx(logsumexp(log_ratio, b=alpha), rel=1e-10, abs=1e-10)
 
 
 @given(weights, sequences())
 def test_the_step_mixture_is_a_product_of_mixtures(alpha, ratios):
-    log_ratio, _, sampled = accumulated(STEP_MIXTURE, 1, alpha, ratios, np.zeros((len(ratios), 3)))
+    log_ratio, _, sampled = accumulated(False, alpha, ratios, np.zeros((len(ratios), 3)))
     np.testing.assert_allclose(sampled, ratios @ alpha, rtol=1e-13)
     np.testing.assert_allclose(log_ratio, log(ratios).sum(axis=0), rtol=1e-12, atol=1e-12)
 
 
-@pytest.mark.parametrize("method", [STEP_MIXTURE, EPISODE_MIXTURE])
+@pytest.mark.parametrize("of_episodes", [False, True])
 @given(weights, sequences(st.floats(0.1, 10.0)), st.integers(0, 2**32 - 1))
-def test_martingale_terms(method, alpha, ratios, seed):
+def test_martingale_terms(of_episodes, alpha, ratios, seed):
     """Σ_t W_{t-1} V_j (q_j/q_α - 1), W being one over the ratio sampled so far; V = 0 adds nothing."""
     v = np.random.default_rng(seed).random((len(ratios), 3))
     v[::3] = 0.0
-    _, martingale, sampled = accumulated(method, 1, alpha, ratios, v)
+    _, martingale, sampled = accumulated(of_episodes, alpha, ratios, v)
     weight_before = np.concatenate([[1.0], 1.0 / np.cumprod(sampled)[:-1]])
     terms = weight_before[:, None] * v * (ratios[:, 1:] / sampled[:, None] - 1.0)
     scale = np.abs(terms).sum(axis=0) + 1e-300
     assert (np.abs(martingale - terms.sum(axis=0)) <= 1e-9 * scale).all()
-
-
-def test_fixed_weights_would_not_telescope():
-    """The check has teeth: with α in every step the product is the step mixture's, not the episode's."""
-    alpha, ratios = np.array([0.1, 0.3, 0.3, 0.3]), np.array([[1.0, 5.0, 0.2, 1.0], [1.0, 4.0, 0.1, 0.5]])
-    log_ratio, _, _ = accumulated(EPISODE_MIXTURE, 1, alpha, ratios, np.zeros((2, 3)))
-    fixed = np.log(ratios @ alpha).sum()
-    assert abs(fixed - logsumexp(log_ratio, b=alpha)) > 0.1

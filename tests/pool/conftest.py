@@ -8,8 +8,8 @@ import pytest
 
 from harness.campaign.campaign import Campaign
 from harness.campaign.files import load_campaign
+from harness.pool.build import campaign_pool
 from harness.pool.cut_ins import Pool
-from harness.pool.storage import campaign_pool
 from harness.resolved import resolve
 from harness.traffic.laws import Environment
 from harness.traffic.loading import load_environment

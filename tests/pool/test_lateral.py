@@ -8,15 +8,16 @@ import pytest
 from harness.campaign.files import load_campaign
 from harness.controllers.find import build_host
 from harness.episode.loop import Drawing, EpisodeLoop, RecordPolicy
-from harness.importance.build import build_importance
+from harness.importance.functions import build_importance
+from harness.pool.build import campaign_pool
+from harness.pool.cut_ins import read_pool, write_pool
 from harness.pool.library import load_library
 from harness.pool.shells import PrescribedEpisodes
-from harness.pool.storage import campaign_pool, read_pool, write_pool
 from harness.pool.vehicle_pool import vehicle_pool, walk_candidates
 from harness.resolved import resolve
 from harness.sampling.baseline import recorded, without_cut_in
 from harness.traffic.loading import load_environment
-from harness.vocabulary import CRASH, PASSED, PRESCRIBED
+from harness.vocabulary import CRASH, PASSED
 from harness.worlds.twin import TwinWorld
 from tests.pool.conftest import MIXTURE_FILE, SMALL_POOL
 from tests.pool.test_vehicle_pool import ACTING
@@ -81,12 +82,12 @@ def test_leads_are_kept_with_the_pool(lateral_pool, pool, tmp_path):
 
 
 def test_a_vehicle_that_acts_before_has_a_pool_of_its_own_that_its_tests_follow():
-    """Surrogates take over at the onset; a test repeats its shadow run until then, and ends inside the envelope."""
+    """Surrogates take over at the onset; a test repeats its baseline run until then, and ends inside the envelope."""
     acts = of("environment.parameters=ndd-overtaking-1-lateral", f"av={ACTING.format('Speeds')}", "world.engine=twin")
     resolved = resolve(acts)
     environment, library = resolved.environment, resolved.library
     paths = walk_candidates(environment, library, acts.pool, "test", candidates=1024).draw(60)
-    policy = Drawing(1, environment, build_importance(acts, None)._replace(method=PRESCRIBED), resolved.av)
+    policy = Drawing(1, environment, build_importance(acts, None), resolved.av)
     loop = EpisodeLoop(TwinWorld(32), policy, RecordPolicy(0, "none", 0.0), build_host(acts.av, n_cells=32, seed=1))
     motion = without_cut_in(loop, paths.seed, 0, paths.index, paths.state, environment)
     pool = vehicle_pool(resolved, paths, recorded(motion, environment))
@@ -101,8 +102,4 @@ def test_a_vehicle_that_acts_before_has_a_pool_of_its_own_that_its_tests_follow(
     assert 50 < crashed.sum() < rows.size - 50
     assert np.all(enclosed[crashed])
     other = traffic._replace(motion_hash=traffic.motion_hash + np.uint64(1))
-    assert len(loop.run(10**6, states[:40], other._replace(**_first(other, 40))).failures) == 40
-
-
-def _first(traffic, n):
-    return {name: getattr(traffic, name)[:n] for name in traffic._fields}
+    assert len(loop.run(10**6, states, other).failures) == rows.size

@@ -22,7 +22,6 @@ SHIPPED = (SHIPPED_FOLDER / "ladder-1.yaml").read_text(encoding="utf-8")
         ("delay_s: 0.7", "delay_s: 0.75", "multiple of the 0.1 s step"),
         ("delay_s: 0.7", "inattention_probability: 0.7", "unknown key"),
         ("model: constant, parameters: {acceleration_mps2: 0.0}", "model: constnt", "Did you mean .constant."),
-        ("version: 1", "version: 2", "version"),
     ],
 )
 def test_mistakes_are_named(tmp_path: Path, old: str, new: str, complaint: str):
@@ -31,15 +30,3 @@ def test_mistakes_are_named(tmp_path: Path, old: str, new: str, complaint: str):
     file.write_text(SHIPPED.replace(old, new), encoding="utf-8")
     with pytest.raises(CampaignError, match=complaint):
         load_library(str(file))
-
-
-def test_surrogates_can_be_left_out_but_not_those_with_a_role():
-    library = load_library("ladder-1")
-    assert list(library.without({"brakes-5"}).surrogates) == [n for n in library.surrogates if n != "brakes-5"]
-    with pytest.raises(ValueError, match="boundary"):
-        library.without({library.boundary})
-
-
-def test_an_unknown_library_is_refused():
-    with pytest.raises(CampaignError, match="Did you mean 'ladder-1'"):
-        load_library("ladder1")

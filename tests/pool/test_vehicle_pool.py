@@ -10,7 +10,7 @@ from harness.episode.judge import motion_hashes
 from harness.episode.path import Followers
 from harness.errors import HarnessError
 from harness.pool.vehicle_pool import CANDIDATES, EVENLY, chances, vehicle_pool
-from harness.pool.walk import Enumerator, ShadowRuns, enumerate_cut_ins
+from harness.pool.walk import BaselineRuns, Enumerator, enumerate_cut_ins
 from harness.progress import Progress
 from harness.resolved import resolve
 from harness.runner.prepare import prepare
@@ -32,7 +32,7 @@ def acting(name: str, *more: str):
 
 
 def prepared_after(campaign):
-    """The campaign after its shadow runs, its loop, and what the runs left."""
+    """The campaign after its baseline runs, its loop, and what the runs left."""
     ready = prepare(resolve(campaign))
     loop = ready.loop(TwinWorld(32))
     environment = ready.policy.environment
@@ -58,7 +58,7 @@ def test_a_vehicle_that_holds_its_speed_has_the_cut_ins_of_one_that_holds(enviro
     x = np.full(v.shape, 100.0)
     for step in steps[1:]:
         x[:, step] = x[:, step - 1] + v[:, step] * 0.1
-    runs = ShadowRuns(np.full(N, steps[-1]), np.zeros(N, np.bool_), x, v)
+    runs = BaselineRuns(np.full(N, steps[-1]), np.zeros(N, np.bool_), x, v)
     probability, crashes, unknown = enumerate_cut_ins(5, held.index, held.state, environment, followers, runs)
     asked = held.mass > 0.0
     assert asked.sum() > 10_000
@@ -74,7 +74,7 @@ def test_probabilities_are_those_of_the_states_that_were_driven(speeds):
     paths, environment = ready.baseline_paths, ready.policy.environment
     rows = slice(0, 10)
     shard = without_cut_in(loop, paths.seed, 0, paths.index[rows], paths.state[rows], environment)
-    some = ShadowRuns._make(values[rows] for values in runs)
+    some = BaselineRuns._make(values[rows] for values in runs)
     given = paths.seed, paths.index[rows], paths.state[rows], environment, Followers(driver_records([]))
     probability = enumerate_cut_ins(*given, some).probability
     for row in range(10):
@@ -112,7 +112,7 @@ def test_another_motion_is_noticed(speeds):
     shard = loop.run(0, *ready.prescribed.of_rows(rows, np.zeros(rows.size, np.int64)))
     assert len(shard.failures) == rows.size
     assert set(shard.failures.values()) == {shard.failures[0]}
-    assert "something else than in its shadow run" in shard.failures[0]
+    assert "something else than in its baseline run" in shard.failures[0]
 
 
 def test_weights_of_the_chosen_paths_keep_every_mean():

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from harness.maneuvers import CUT_IN, acceleration
+from harness.traffic.laws import acceleration
 from harness.vehicles.kinematics import VEHICLE_LENGTH_M, next_position, next_speed
-from harness.vocabulary import AV, BV, LV
+from harness.vocabulary import AV, BV, CUT_IN, LV
 from tests.episode.twin_runs import TWO
 
 STEP_PER_S = 10

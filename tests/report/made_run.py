@@ -16,7 +16,7 @@ from harness.campaign.campaign import Campaign
 from harness.episode.cells import PrescribedCutIns
 from harness.episode.loop import Shard
 from harness.estimators.answer import CampaignFacts, estimate_blocks
-from harness.importance.build import importance_names
+from harness.importance.functions import importance_names
 from harness.records.folder import encoded, write_shard
 from harness.records.schemas import shard_tables
 from harness.resolved import resolve

@@ -73,7 +73,7 @@ def test_stored_forced_tests_can_be_asked_what_surrogates_would_have_done(campai
 
 
 def test_a_vehicle_that_acts_before_the_onset_is_tested_after_shadow_runs(campaign, run_here, tmp_path):
-    """With forced cut-ins: in a test it must do what it did in its shadow run, through the step of the onset."""
+    """With forced cut-ins: in a test it must do what it did in its baseline run, through the step of the onset."""
     asked = ("testing.method=forced", "world.engine=twin", LEAD, "stop.rhw=null", "stop.episodes=120")
     speeds = f"av={ACTING.format('Speeds')}"
     forced, again = (

@@ -11,7 +11,7 @@ import pytest
 
 from harness import estimate, replay
 from harness.errors import RunFolderError, TooManyFailedError
-from harness.records.schemas import shadow_schema
+from harness.records.schemas import baseline_schema
 from tests.pool.conftest import SMALL_POOL
 from tests.pool.test_vehicle_pool import ACTING
 from tests.stored_runs import copy_of, manifest, shard_files, stored_table, unlike_columns
@@ -42,7 +42,7 @@ def test_it_reaches_the_precision_and_keeps_the_shadow_runs(early_run):
     assert manifest(folder)["shadow_runs"] == {"n_runs": 120, "n_failed": 0}
     tables = [pq.read_table(path) for path in files_of(folder)]
     assert [table.num_rows for table in tables] == [50, 50, 20]
-    assert all(table.schema.equals(shadow_schema()) for table in tables)
+    assert all(table.schema.equals(baseline_schema()) for table in tables)
     rows = [row for table in tables for row in table.to_pylist()]
     assert [row["shadow"] for row in rows] == list(range(120))
     assert {row["outcome"] for row in rows} <= {"passed", "timeout", "bv_lv_contact"}
@@ -82,7 +82,7 @@ def test_a_run_that_was_interrupted_goes_on_where_it_was(early_run, campaign, ru
 def test_a_vehicle_with_noise_of_its_own_is_refused_and_one_with_the_given_noise_is_not(campaign, run_here, tmp_path):
     noisy = "parameters: {noise_mps2: 0.2}"
     fresh = campaign(*SHELLS, SHADOWS, TWIN, f"av={of('FreshNoise', noisy)}")
-    with pytest.raises(TooManyFailedError, match="something else than in its shadow run"):
+    with pytest.raises(TooManyFailedError, match="something else than in its baseline run"):
         run_here(fresh, tmp_path / "fresh")
     episodes = stored_table(tmp_path / "fresh", "episodes")
     assert set(episodes.column("outcome").to_pylist()) == {"failed"}
@@ -139,7 +139,7 @@ def test_forced_tests_are_replayed_and_follow_from_their_index(campaign, run_her
     out = tmp_path / "run"
     run_here(campaign(*FORCED, TWIN, f"av={of('Speeds', 'parameters: {noise_mps2: 0.2}')}"), out)
     assert replay(out, 123).bit_equal
-    with pytest.raises(TooManyFailedError, match="something else than in its shadow run"):
+    with pytest.raises(TooManyFailedError, match="something else than in its baseline run"):
         run_here(campaign(*FORCED, TWIN, f"av={of('FreshNoise', 'parameters: {noise_mps2: 0.2}')}"), tmp_path / "fresh")
 
 

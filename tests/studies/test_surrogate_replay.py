@@ -20,9 +20,9 @@ from harness.episode.loop import Shard
 from harness.episode.path import Followers
 from harness.errors import RunFolderError
 from harness.estimators.block import Block, block_from_tables
-from harness.importance.build import mixture_weights
+from harness.importance.functions import mixture_weights
+from harness.pool.build import campaign_pool
 from harness.pool.cut_ins import Pool
-from harness.pool.storage import campaign_pool
 from harness.records.schemas import episodes_table
 from harness.resolved import resolve
 from harness.runner.prepare import prepare

@@ -5,19 +5,18 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from harness.compiled import unboxed
 from harness.episode.cells import PrescribedTraffic, drawn_traffic
 from harness.episode.loop import Drawing, EpisodeLoop, RecordPolicy, Shard
 from harness.episode.path import Followers, empty_trajectory
-from harness.importance.build import build_importance
-from harness.maneuvers import CUT_IN
+from harness.importance.functions import build_importance
 from harness.pool.library import load_library
 from harness.pool.replay import Retracing, stored_paths
 from harness.records.schemas import episodes_table
 from harness.resolved import resolve
 from harness.traffic.loading import load_environment
-from harness.unboxed import unboxed
 from harness.vehicles.drivers import av_records
-from harness.vocabulary import BV_LV_CONTACT, CRASH, STATE_DTYPE, TIMEOUT
+from harness.vocabulary import BV_LV_CONTACT, CRASH, CUT_IN, STATE_DTYPE, TIMEOUT
 from harness.worlds.twin import TwinWorld
 from studies.alarm import replay_surrogates
 from tests.episode.test_lateral import BESIDE, NEVER, beside, policy_of

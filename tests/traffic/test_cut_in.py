@@ -23,22 +23,3 @@ def test_the_hazard_is_the_formula(v, r1, r1dot, r2, r2dot, level):
     p_1s = wish * accepted
     assert -np.expm1(-hazard) == pytest.approx(formulas.step_probability(p_1s), rel=1e-9, abs=1e-16)
     assert 0.0 <= hazard <= 0.1 * np.log(2.0) * (1.0 + 1e-15)  # never above one half a second
-
-
-@pytest.mark.parametrize(
-    ("r2", "r2dot", "accepted"),
-    [
-        (50.0, 0.0, 1.0),  # not closing: every wish is carried out
-        (50.0, 3.0, 1.0),
-        (1e-9, 3.0, 1.0),
-        (60.0, -7.5, 0.01 + 0.99 * 0.5),  # TTC of exactly 8 s
-        (7.5, -7.5, 0.01 + 0.99 / (1.0 + np.exp(14.0))),  # TTC of 1 s: those who do not look
-        (0.0, -7.5, 0.0),  # the lanes do not allow it
-        (0.0, 7.5, 0.0),
-        (-3.0, 7.5, 0.0),
-    ],
-)
-def test_acceptance(r2, r2dot, accepted):
-    terms = cut_in_terms((30.0, 35.0, 0.0, r2, r2dot), 1e4)[0]
-    assert terms[1] == pytest.approx(accepted, rel=1e-13)
-    assert (terms[2] > 0.0) == (r2 > 0.0)

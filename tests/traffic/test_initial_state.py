@@ -6,9 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from harness.episode.path import place
-from harness.traffic.initial_state import InitialStates
-from harness.vocabulary import STATE_COLUMNS, State
+from harness.traffic.laws import InitialStates
+from harness.vocabulary import STATE_COLUMNS
 from tests.chains.seed import SEED
 from tests.traffic.kernels import environment
 
@@ -69,13 +68,6 @@ def test_speeds_are_skew_normal(states):
     assert stats.kstest(sample, lambda v: (free.cdf(v) - low) / (high - low)).pvalue > 1e-4
 
 
-def test_the_axes_are_drawn_independently_of_each_other(states):
-    """R2 and R2dot know nothing of the rest; four standard errors of a correlation."""
-    correlation = np.corrcoef([states[name] for name in STATE_COLUMNS])
-    np.fill_diagonal(correlation, 0.0)
-    assert np.abs(correlation[3:]).max() < 4.0 / np.sqrt(N)
-
-
 @given(inside_v, open_unit)
 def test_gaps_invert_their_distribution(v, probability):
     found = InitialStates(environment().numbers).given_speed(v, np.array([probability]), np.array([0.5]))["r1_m"][0]
@@ -89,20 +81,3 @@ def test_rates_invert_their_distribution_beyond_three_seconds_to_collision(v, ga
     free = rate_distribution(v, state["r1_m"])
     low = free.cdf(-state["r1_m"] / 3.0)
     assert (free.cdf(state["r1dot_mps"]) - low) / (1.0 - low) == pytest.approx(probability, abs=1e-9)
-
-
-def test_only_the_rate_is_drawn_anew_where_time_to_collision_is_short(states):
-    """v_BV and R1 keep their laws: as docs/environment.md says, whole states are not discarded."""
-    numbers = environment().numbers.copy()
-    numbers["initial_state__r1dot_min_ttc_s"] = 1e-6  # no truncation
-    free = InitialStates(numbers).draw(SEED, 0, N)
-    for name in ("v_bv_mps", "r1_m", "r2_m", "r2dot_mps"):
-        np.testing.assert_array_equal(free[name], states[name])
-    assert (free["r1dot_mps"] < -free["r1_m"] / 3.0).any()
-    assert not (states["r1dot_mps"] < -states["r1_m"] / 3.0 - 1e-9).any()
-
-
-def test_lv_does_not_start_backwards():
-    x, v = np.zeros(3), np.zeros(3)
-    place(State(20.0, 100.0, -25.0, 50.0, -7.0), x, v)
-    assert v.tolist() == [0.0, 20.0, 27.0]

@@ -34,10 +34,3 @@ def test_braking_to_a_standstill_and_staying_there(x, v):
     assert state[1] == 0.0
     again = motions((*state, -4.0))[0].tolist()
     assert again == state
-
-
-@given(positions, st.floats(1.0, 60.0))
-def test_a_first_order_step_would_be_noticed(x, v):
-    """The check has teeth: with v_after dt, as in SUMO's default integration, the distance is another."""
-    after, speed = motions((x, v, -4.0))[0]
-    assert abs(after - x - speed * 0.1) > 1e-3

@@ -60,17 +60,6 @@ def test_without_a_jerk_limit_a_driver_that_has_reacted_is_its_model(driver, del
     assert (found[late + 1 :] == accelerations(driver, drive)[late + 1 :]).all()
 
 
-@given(drivers, st.floats(0.1, 1000.0), drives)
-def test_within_the_jerk_limit_a_driver_is_its_model_and_beyond_it_moves_toward_it(driver, jerk, drive):
-    found = follow(driver, Reflexes(max_jerk_mps3=jerk), drive)
-    before = np.concatenate([[0.0], found[:-1]])[1:]
-    wanted, found = accelerations(driver, drive)[1:], found[1:]
-    change, most = np.abs(wanted - before), jerk * 0.1
-    within, beyond = change < most * (1.0 - 1e-12), change > most * (1.0 + 1e-12)  # in between rounding decides
-    assert (found[within] == wanted[within]).all()
-    assert (np.sign(found - before)[beyond] == np.sign(wanted - before)[beyond]).all()
-
-
 @given(any_driver, delays, jerks, drives)
 def test_the_limits_of_the_model_hold(driver, delay_s, jerk, drive):
     found = follow(driver, Reflexes(delay_s=delay_s, max_jerk_mps3=jerk), drive)
@@ -78,39 +67,11 @@ def test_the_limits_of_the_model_hold(driver, delay_s, jerk, drive):
     assert found.max() <= max(driver.max_acceleration_mps2, 0.0)
 
 
-def share_p_value(late, share):
-    return binomtest(int(late.sum()), late.size, share).pvalue
-
-
 @pytest.mark.parametrize("share", [0.05, 0.5, 0.9])
 def test_the_share_of_inattentive_episodes_is_the_one_asked_for(share):
     reaction = Reaction(delay_s=0.3, inattention_probability=share, inattention_delay_s=1.5)
     steps = steps_late(reaction, 40_000, seed=SEED)
     assert set(steps.tolist()) == {3, 18}
-    assert share_p_value(steps == 18, share) > FALSE_ALARM
-    assert share_p_value(steps == 18, 0.85 * share) < FALSE_ALARM  # the test would notice another share
-
-
-def test_never_and_always_are_exact():
-    always = steps_late(Reaction(inattention_probability=1.0, inattention_delay_s=0.7), 5_000, seed=SEED)
-    never = steps_late(Reaction(delay_s=0.2, inattention_probability=0.0, inattention_delay_s=0.7), 5_000, seed=SEED)
-    assert (always == 7).all()
-    assert (never == 2).all()
-
-
-@given(st.floats(0.0, 1.0), st.floats(0.0, 1.0), st.integers(0, 2**40))
-def test_a_driver_that_is_more_often_inattentive_is_so_in_the_same_episodes_and_in_more(one, other, first):
-    few, many = sorted((one, other))
-    seldom, often = (
-        steps_late(Reaction(inattention_probability=p, inattention_delay_s=1.0), 200, seed=3, first=first) > 0
-        for p in (few, many)
-    )
-    assert (often | ~seldom).all()
-
-
-def test_inattention_belongs_to_the_episode_and_the_seed():
-    reaction = Reaction(inattention_probability=0.5, inattention_delay_s=1.0)
-    whole = steps_late(reaction, 300, seed=SEED)
-    parts = np.concatenate([steps_late(reaction, 100, seed=SEED, first=first) for first in (0, 100, 200)])
-    assert (whole == parts).all()
-    assert (whole != steps_late(reaction, 300, seed=SEED + 1)).any()
+    late = int((steps == 18).sum())
+    assert binomtest(late, steps.size, share).pvalue > FALSE_ALARM
+    assert binomtest(late, steps.size, 0.85 * share).pvalue < FALSE_ALARM  # the test would notice another share

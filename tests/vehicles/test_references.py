@@ -17,8 +17,6 @@ from tests.vehicles.kernels import accelerations, follow, fuzzy_metrics, smalles
 speeds = st.floats(0.0, 60.0)
 gaps = st.floats(-5.0, 200.0)
 drives = st.lists(st.tuples(speeds, speeds, gaps), min_size=2, max_size=80)
-HALF_A_SECOND = {"evaluated_at_m": 0.45}
-"""At 1.8 m/s a quarter of a second has passed by the cut-in: they react 0.5 s after it."""
 ALONE = {"following_min_acceleration_mps2": -0.0, "max_acceleration_mps2": 1e-9}
 """Without the braking and speeding up of the IDM."""
 JERK = 12.65 * 0.1
@@ -34,48 +32,17 @@ def driven(parameters, *phases):
 # -- the delay after the cut-in --
 
 
-@pytest.mark.parametrize(
-    ("settings", "delay_s"),
-    [
-        ({}, 0.75 - 0.505 / 1.8),  # 0.47
-        ({"lateral_speed_mps": 1.0}, 0.245),
-        ({"evaluated_at_m": 0.0}, 0.75),
-        ({"evaluated_at_m": 1.6}, 0.0),  # it would brake before they overlap: it holds its speed until then
-    ],
-)
-def test_the_delay_after_the_cut_in_is_stated(settings, delay_s):
-    for section in (CarefulCompetentParameters, FuzzySafetyParameters):
-        assert section(**settings).delay_after_cut_in_s == pytest.approx(delay_s, abs=1e-12)
-
-
 @pytest.mark.parametrize("section", [CarefulCompetentParameters, FuzzySafetyParameters])
 @given(st.floats(0.2, 5.0))
 def test_the_delay_stated_is_the_one_kept(section, lateral_speed):
     driver = section(lateral_speed_mps=lateral_speed)
     found = driven(driver, (20, (30.0, 20.0, 5.0)))
     idle = -0.4 if section is CarefulCompetentParameters else 0.0
+    assert driver.delay_after_cut_in_s == pytest.approx(max(0.75 - 0.505 / lateral_speed, 0.0), abs=1e-12)
     whole, part = divmod(10.0 * driver.delay_after_cut_in_s, 1.0)
     assert found[: int(whole)] == pytest.approx(idle)
     assert found[int(whole)] == pytest.approx(idle - (1.0 - part) * JERK)
     assert found[int(whole) + 1] == pytest.approx(found[int(whole)] - JERK)
-
-
-# -- careful and competent: 30 m/s behind 20, 15 m ahead: time to collision 1.5 s --
-
-
-def test_in_the_step_in_which_the_delay_ends_it_brakes_for_the_rest_of_it():
-    found = driven(CarefulCompetentParameters(), (7, (30.0, 20.0, 15.0)))
-    part = 5.0 - 10.0 * (0.75 - 0.505 / 1.8)  # 0.31 of the fifth step
-    assert found[:4] == pytest.approx([-0.4] * 4)
-    assert found[4:] == pytest.approx([-0.4 - JERK * (part + k) for k in range(3)])
-
-
-def test_a_danger_that_comes_later_takes_the_whole_reaction_time():
-    driver = CarefulCompetentParameters(**HALF_A_SECOND, **ALONE)
-    found = driven(driver, (10, (30.0, 20.0, 20.0)), (10, (30.0, 20.0, 19.9)))
-    assert found[:10] == pytest.approx(0.0, abs=1e-6)
-    assert found[10:17] == pytest.approx([-0.4] * 7)
-    assert found[17:] == pytest.approx([-0.4 - JERK * k for k in (0.5, 1.5, 2.5)])
 
 
 # -- fuzzy safety model --
@@ -85,47 +52,21 @@ def test_a_danger_that_comes_later_takes_the_whole_reaction_time():
     ("situation", "pfs", "cfs"),
     [
         # PFS: safe 22.5 + 900/8 - 400/14 + 2 = 108.43, unsafe 22.5 + 900/12 - 400/14 = 68.93, of the gap less 2
-        ((30.0, 20.0, 2.0 + 108.5, 0.0), 0.0, 0.0),
         ((30.0, 20.0, 2.0 + 108.43 - 39.5 / 4.0, 0.0), 0.25, 0.0),
-        ((30.0, 20.0, 2.0 + 68.9, 0.0), 1.0, 0.0),
         # CFS: safe 7.5 + 100/8 = 20, unsafe 7.5 + 100/12 = 15.83
-        ((30.0, 20.0, 20.0, 0.0), 1.0, 0.0),
         ((30.0, 20.0, (20.0 + 15.0 + 5.0 / 6.0) / 2.0, 0.0), 1.0, 0.5),
-        ((30.0, 20.0, 15.8, 0.0), 1.0, 1.0),
         # while it brakes with 2: (10 - 0.75) 0.75 = 6.9375, 8.5^2/8 = 9.03125, 8.5^2/12 = 6.02083
-        ((30.0, 20.0, 15.96875, -2.0), 1.0, 0.0),
         ((30.0, 20.0, (15.96875 + 12.95833) / 2.0, -2.0), 1.0, 0.5),
         # with 6 it counts on no more than 4: (10 - 1.5) 0.75 = 6.375, 7^2/12 = 4.08333, 7^2/8 = 6.125
         ((30.0, 20.0, 6.375 + (6.125 + 4.08333) / 2.0, -6.0), 1.0, 0.5),
         # in 0.75 s it will be slower than the vehicle ahead: 1^2/(2 2) = 0.25 m are enough
         ((21.0, 20.0, 0.2, -2.0), 1.0, 1.0),
         ((21.0, 20.0, 0.3, -2.0), 1.0, 0.0),
-        # 2^2/(2 6) = 0.333
-        ((22.0, 20.0, 0.33, -6.0), 1.0, 1.0),
-        ((22.0, 20.0, 0.34, -6.0), 1.0, 0.0),
         ((20.0, 20.0, 0.1, 0.0), 1.0, 0.0),  # not closing in
     ],
 )
 def test_the_metrics_by_hand(situation, pfs, cfs):
     assert fuzzy_metrics(FuzzySafetyParameters(), situation)[0] == pytest.approx([pfs, cfs], abs=1e-3)
-
-
-@given(speeds, speeds, st.tuples(gaps, gaps), st.floats(-8.0, 2.0))
-def test_less_room_is_never_safer(v, v_lead, pair, a):
-    near, far = sorted(pair)
-    closer, wider = fuzzy_metrics(FuzzySafetyParameters(), [(v, v_lead, near, a), (v, v_lead, far, a)])
-    assert (closer >= wider).all()
-    assert ((wider >= 0.0) & (closer <= 1.0)).all()
-
-
-@given(st.tuples(speeds, speeds), st.tuples(speeds, speeds), gaps, st.floats(-8.0, 2.0))
-def test_going_faster_is_never_safer_nor_a_slower_vehicle_ahead(own, leads, gap, a):
-    (slow, fast), (slow_lead, fast_lead) = sorted(own), sorted(leads)
-    careful, careless, calm = fuzzy_metrics(
-        FuzzySafetyParameters(), [(slow, slow_lead, gap, a), (fast, slow_lead, gap, a), (slow, fast_lead, gap, a)]
-    )
-    assert (careless >= careful - 1e-9).all()
-    assert (calm <= careful + 1e-9).all()
 
 
 # -- need-based --
@@ -142,16 +83,6 @@ def test_it_speeds_up_until_it_needs_to_brake_and_brakes_a_delay_later():
 def test_it_brakes_with_what_it_needs_as_hard_as_it_can_at_most():
     drive = [(1, (30.0, 20.0, gap)) for gap in (52.0, 27.0, 18.0, 1.0)]
     assert driven(NeedBasedParameters(reaction_time_s=0.0), *drive) == pytest.approx([-1.0, -2.0, -3.0, -3.0])
-
-
-def test_it_waits_once():
-    again = driven(NeedBasedParameters(), (9, (30.0, 20.0, 10.0)), (1, (20.0, 20.0, 1.0)), (9, (30.0, 20.0, 10.0)))
-    assert again.tolist() == [1.0] * 5 + [-3.0] * 4 + [1.0] + [-3.0] * 9
-
-
-def test_its_delay_need_not_be_whole_steps():
-    found = driven(NeedBasedParameters(reaction_time_s=0.32), (5, (30.0, 20.0, 18.0)))
-    assert found == pytest.approx([1.0, 1.0, 1.0, 0.2 * 1.0 - 0.8 * 3.0, -3.0])
 
 
 # -- against a plain definition, step by step, for delays of whole steps --
@@ -242,10 +173,3 @@ def test_outcomes_of_cut_ins_are_those_of_the_published_code():
     assert not agrees(PUBLISHED, reaction_time_s=0.85)  # the test has teeth
     assert not agrees(PUBLISHED, reaction_time_s=0.65)
     assert not agrees(PUBLISHED, braking_jerk_mps3=20.0)
-
-
-def test_a_vehicle_that_waits_for_two_seconds_cannot_stop_from_60_kmh_faster():
-    """16.7 m/s of closing speed take more than the 33 m of a time to collision of 2 s, however early the cut-in."""
-    driver = CarefulCompetentParameters(**ALONE)
-    assert smallest_gaps(driver, 130 / 3.6, 70 / 3.6, [110.0])[0] < 0.0
-    assert smallest_gaps(CarefulCompetentParameters(), 130 / 3.6, 70 / 3.6, [110.0])[0] > 0.0  # but it follows, too

@@ -1,0 +1,165 @@
+"""What a test is worth: the likelihood ratio of what happened in it, naturalistic over sampled.
+
+**The weight of an episode** is p/q_sampled; what is kept is its logarithm. Per importance function j the logarithm
+L_j = Σ log(q_j/p) over the control steps so far is kept. The probability that a step was sampled with, *given the
+shared history*, is the mixture Σ_j w_j q_j with
+
+* step mixture: w_j = α_j in every step;
+* episode mixture: the posterior weights w_j ∝ α_j exp(L_j). The drawn component itself is not part of the history.
+
+Hence log q_sampled/p accumulates to Σ log Σ_j α_j q_j/p (step), or to log Σ_j α_j exp(L_j) (episode). Forced cut-ins
+and shells know it at the beginning of the episode (`harness.episode.decide`): -log P(cut-in | path), and -log p_s.
+Each control step adds its ratios (`record_lane`, `record_acceleration`), and where the episode is over
+(`harness.episode.judge`) `log_weight` is what its record says.
+"""
+
+from __future__ import annotations
+
+import math
+
+from harness.compiled import compiled_inline
+from harness.episode.cells import KernelState
+from harness.importance.functions import Importance
+from harness.vocabulary import CUT_IN, STAY, FloatArray, State
+
+
+@compiled_inline
+def log_weight(importance: Importance, log_ratio: FloatArray, log_sampled: float) -> float:
+    """Log p(x_c) − log q_sampled(x_c) of a finished episode; exactly 0 without control.
+
+    ``log_ratio`` (M,) are the L_j of the importance functions, which the episode mixture weighs; ``log_sampled`` is log
+    q_sampled/p under any other way of drawing.
+    """
+    return -log_mixture(importance.alpha, log_ratio) if importance.mixes_episodes else -log_sampled
+
+
+@compiled_inline
+def log_mixture(alpha: FloatArray, log_ratio: FloatArray) -> float:
+    """Log Σ_j α_j exp(L_j); ``alpha`` and ``log_ratio`` have shape (M,)."""
+    largest = -math.inf
+    for j in range(alpha.size):
+        largest = max(largest, log_ratio[j])
+    if largest == -math.inf:
+        return -math.inf
+    total = 0.0
+    for j in range(alpha.size):
+        total += alpha[j] * math.exp(log_ratio[j] - largest)
+    return largest + math.log(total)
+
+
+@compiled_inline
+def accumulate(
+    importance: Importance,
+    ratio: FloatArray,
+    v: FloatArray,
+    log_sampled: float,
+    log_ratio: FloatArray,
+    martingale: FloatArray,
+) -> float:
+    """Take the maneuver of one step into an episode's likelihood ratios; returns q_α/p, given the shared history.
+
+    ``ratio`` (M,) is q_j/p of the maneuver; ``v`` (J,) is V_j(s), 0 where the moment is not critical; ``log_sampled``
+    is the step mixture's Σ log q_α/p of the steps before. ``log_ratio`` (M,) is updated, ``martingale`` (J,) increased
+    by W_{t−1} V_j (q_{j,t}/q_{α,t} − 1).
+    """
+    posterior, alpha = importance.mixes_episodes, importance.alpha
+    before = log_mixture(alpha, log_ratio) if posterior else log_sampled
+    sampled = 0.0
+    for j in range(ratio.size):
+        weight = alpha[j] * math.exp(log_ratio[j] - before) if posterior else alpha[j]
+        sampled += weight * ratio[j]
+        log_ratio[j] += math.log(ratio[j])
+    weight_before = math.exp(-before)
+    for j in range(v.size):
+        if v[j] > 0.0:
+            martingale[j] += weight_before * v[j] * (ratio[importance.n_forced + j] / sampled - 1.0)
+    return sampled
+
+
+@compiled_inline
+def forced_ratio(before: float, after: float, total: float, cut: bool) -> float:
+    """q/p of a step under the forced cut-in: P(the step | a cut-in will come)/P(the step).
+
+    ``before`` and ``after`` are the hazards accumulated until and including the step, ``total`` that of the path.
+    """
+    coming = -math.expm1(before - total)
+    if coming <= 0.0:  # nothing was left of the path's hazard: the ratio so far is 0 and stays it
+        return 1.0
+    if cut:
+        return 1.0 / coming
+    return -math.expm1(min(after - total, 0.0)) / coming
+
+
+@compiled_inline
+def record_lane(
+    k: int, step: int, state: State, cut: bool, p: float, hazard: float, critical: bool, kernel: KernelState
+) -> None:
+    """Likelihood ratios of having stayed or cut in, and the moment if it was one of control.
+
+    ``scratch.q`` and ``scratch.challenge`` (J,) are q_j(cut_in) and V_j where it is critical.
+    """
+    cell, scratch, importance = kernel.cells.cell[k], kernel.scratch, kernel.importance
+    sampled = 1.0
+    if critical or importance.n_forced == 1:
+        if importance.n_forced == 1:
+            scratch.ratio[0] = forced_ratio(cell.hazard, cell.hazard + hazard, cell.hazard_total, cut)
+        for j in range(importance.n_surrogates):
+            q = scratch.q[j]
+            scratch.ratio[importance.n_forced + j] = (q / p if cut else (1.0 - q) / (1.0 - p)) if critical else 1.0
+            scratch.challenge[j] = scratch.challenge[j] if critical else 0.0
+        sampled = accumulate_step(k, kernel)
+    cell.hazard += hazard
+    if critical or (cut and importance.n_forced == 1 and not importance.mixes_episodes):
+        exposure = p if cut else 1.0 - p
+        for j in range(importance.n_surrogates):
+            scratch.q[j] = scratch.q[j] if cut else 1.0 - scratch.q[j]
+        record_moment(k, step, state, CUT_IN if cut else STAY, exposure, exposure * sampled, kernel)
+
+
+@compiled_inline
+def record_acceleration(k: int, state: State, maneuver: int, kernel: KernelState) -> None:
+    """Likelihood ratios of an acceleration at a critical moment after the cut-in, and the moment.
+
+    ``scratch.p`` (31,), ``scratch.q_acceleration`` (J, 31) and ``scratch.challenge`` (J,) are what it was drawn by.
+    """
+    cell, scratch, importance = kernel.cells.cell[k], kernel.scratch, kernel.importance
+    p = scratch.p[maneuver]
+    if importance.n_forced == 1:
+        scratch.ratio[0] = 1.0
+    for j in range(importance.n_surrogates):
+        scratch.q[j] = scratch.q_acceleration[j, maneuver]
+        scratch.ratio[importance.n_forced + j] = scratch.q[j] / p
+    sampled = accumulate_step(k, kernel)
+    record_moment(k, cell.step, state, maneuver, p, p * sampled, kernel)
+
+
+@compiled_inline
+def accumulate_step(k: int, kernel: KernelState) -> float:
+    """Take ``scratch.ratio`` and ``scratch.challenge`` of a step into the likelihood ratios; returns its q_α/p."""
+    cells, scratch, importance = kernel.cells, kernel.scratch, kernel.importance
+    cell, log_ratio, martingale = cells.cell[k], cells.log_ratio[k], cells.martingale[k]
+    sampled = accumulate(importance, scratch.ratio, scratch.challenge, cell.log_sampled, log_ratio, martingale)
+    if importance.mixes_steps:
+        cell.log_sampled += math.log(sampled)
+    return sampled
+
+
+@compiled_inline
+def record_moment(
+    k: int, step: int, state: State, maneuver: int, p: float, q_sampled: float, kernel: KernelState
+) -> None:
+    """Count a control step, and keep it if the campaign keeps that many of an episode."""
+    results, scratch, cell = kernel.results, kernel.scratch, kernel.cells.cell[k]
+    cell.n_control += 1
+    if cell.n_control > results.moment_limit:
+        return
+    i = results.moment_count[0]
+    moment = results.moment[i]
+    moment.row, moment.step, moment.maneuver = cell.row, step, maneuver
+    moment.v_bv_mps, moment.r1_m, moment.r1dot_mps = state.v_bv_mps, state.r1_m, state.r1dot_mps
+    moment.r2_m, moment.r2dot_mps = state.r2_m, state.r2dot_mps
+    moment.p, moment.q_sampled = p, q_sampled
+    for j in range(scratch.q.size):
+        results.moment_q[i, j] = scratch.q[j]
+        results.moment_v[i, j] = scratch.challenge[j]
+    results.moment_count[0] = i + 1
