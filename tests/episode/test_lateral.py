@@ -115,15 +115,23 @@ def test_every_episode_is_retraced(av, lead_s):
 BESIDE = [(-0.5, CRASH), (-9.9985, CRASH), (0.5, None), (-9.9995, PASSED), (-0.0005, None), (-0.0015, CRASH)]
 
 
+def beside(r2_m: list[float]):
+    """States and traffic of cut-ins in the first step, at an R2 each; nobody but the AV changes speed."""
+    states, zero = np.array([(25.0, 60.0, 0.0, r2, 0.0) for r2 in r2_m], STATE_DTYPE), np.zeros(len(r2_m), np.int64)
+    lv, bv = np.full((2, len(r2_m), 22), 20, np.int8)
+    bv[:, 1] = CUT_IN
+    traffic = drawn_traffic()._replace(lv=lv, bv=bv, cut_step=zero, stratum=zero, log_weight=np.zeros(len(r2_m)))
+    return states, traffic._replace(lead=zero)
+
+
+def policy_of(av: AutomatedVehicle, lead_s: float) -> Drawing:
+    resolved = resolve(one := campaign("shells", lead_s, av))
+    return Drawing(1, resolved.environment, build_importance(one, None), resolved.av)
+
+
 @pytest.mark.parametrize(("r2_m", "outcome"), BESIDE)
 def test_in_the_first_state_of_overlap_touching_is_a_crash_and_being_ahead_is_having_passed(r2_m, outcome):
-    states, zero = np.array([(25.0, 60.0, 0.0, r2_m, 0.0)], STATE_DTYPE), np.zeros(1, np.int64)
-    lv, bv = np.full((2, 1, 22), 20, np.int8)  # nobody but the AV changes speed
-    bv[0, 1] = CUT_IN
-    traffic = drawn_traffic()._replace(lv=lv, bv=bv, cut_step=zero, stratum=zero, log_weight=np.zeros(1), lead=zero)
-    resolved = resolve(one := campaign("shells", 1.0, NEVER))
-    policy = Drawing(1, resolved.environment, build_importance(one, None), resolved.av)
-    shard = EpisodeLoop(TwinWorld(1), policy, RecordPolicy(0, "none", 0.0)).run(0, states, traffic)
+    shard = EpisodeLoop(TwinWorld(1), policy_of(NEVER, 1.0), RecordPolicy(0, "none", 0.0)).run(0, *beside([r2_m]))
     episode = shard.results.episode[0]
     if outcome is None:
         assert episode["n_steps"] > 1

@@ -79,7 +79,7 @@ def test_sumo_agrees_also_with_cells_that_stay_empty(smoke, open_world, n_cells,
 
 def test_sumo_flags_vehicles_beside_each_other_by_the_rule_of_the_first_overlap(open_world):
     """Around -0.001 and -9.999 m: the loop stops where SUMO's own flag says something else than the positions."""
-    states, traffic = beside(0, 0, [r2_m for r2_m, _ in BESIDE])
+    states, traffic = beside([r2_m for r2_m, _ in BESIDE])
     episode = {}
     for name, world in (("twin", TwinWorld(4)), ("sumo", open_world(4))):
         loop = EpisodeLoop(world, policy_of(NEVER, 0.0), RecordPolicy(0, "none", 0.0))
