@@ -10,7 +10,7 @@ from harness.campaign.combinations import Command, require_combination
 from harness.pool.library import Library, load_library
 from harness.traffic.laws import Environment
 from harness.traffic.loading import load_environment, load_parameters
-from harness.vehicles.drivers import av_records, surrogate_records
+from harness.vehicles.drivers import av_records, driver_records
 from harness.vocabulary import RecordArray
 
 
@@ -52,7 +52,7 @@ def resolve(campaign: Campaign, command: Command = "run", *, controller_sha256: 
         campaign,
         environment,
         av_records(campaign.av, see_onset=environment.lateral.present),
-        surrogate_records(campaign.surrogates),
+        driver_records([each.parameters for each in campaign.surrogates.values()]),
         campaign.content_hash(parameters.content_hash()),
         controller_sha256,
     )

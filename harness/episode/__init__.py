@@ -1,1 +1,17 @@
-"""The episode loop: policy, world and controller, cell by cell and step by step."""
+"""The episode loop: what LV, BV and AV do in each step, who runs into whom, and what the test is worth.
+
+It is written for one family of scenarios, a cut-in by BV while LV drives ahead of it, and knows it in these places:
+
+- `cells`: what is remembered of a running episode, and the columns of its record;
+- `path`: how the traffic moves before and after its decision, and who runs into it;
+- `decide`: what is drawn in a step, and where an importance function is asked (`harness.importance`);
+- `drive`: what the AV sees and follows, and the boundary driver behind BV;
+- `judge`: how an episode ends, and what stays of it;
+- `likelihood_ratio`: the hazard of the one decision, in `forced_ratio` and `record_lane`; its mixtures hold for any;
+- `harness.traffic.laws`: initial states, accelerations, and the hazard of the decision; `harness.pool.walk` sums it.
+
+A second family (the vehicle ahead brakes, say) is a package beside this one that brings these files under the same
+names. `loop` calls five of their functions, each for all cells at once (`decide`, `observe`, `command`, `judge`,
+`fail`), and knows nothing else of them; worlds, runner, records and estimators know outcome, log weight, stratum and
+cell.
+"""

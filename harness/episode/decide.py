@@ -86,15 +86,12 @@ def redraw_following(k: int, state: State, kernel: KernelState) -> None:
     take_bv(k, draw_acceleration(u, car_following(state, kernel.environment), kernel.environment), kernel)
     cell.n_bv += 1
     if kernel.importance.n_surrogates > 0:
-        look_ahead(
-            state,
+        a, cut_challenge, stay_challenge = (
             acceleration(cell.bv_maneuver),
-            cell.step,
-            kernel.environment,
-            kernel.importance,
             cells.cut_challenge[k],
             cells.stay_challenge[k],
         )
+        look_ahead(state, a, cell.step, kernel.environment, kernel.importance, cut_challenge, stay_challenge)
 
 
 @compiled_inline

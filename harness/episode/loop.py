@@ -26,7 +26,7 @@ from harness.episode.drive import command, empty_observation, first, observe
 from harness.episode.judge import PASSED_M, PASSED_UNDER_CONTROL_M, fail, judge
 from harness.errors import WorldDisagreementError
 from harness.importance.functions import Importance
-from harness.traffic.lateral import LateralMotion, in_one_step
+from harness.traffic.lateral import LateralMotion, constant_lead
 from harness.traffic.laws import Environment
 from harness.vehicles.drivers import driver_records
 from harness.vehicles.kinematics import STEP_S
@@ -77,8 +77,7 @@ class RecordPolicy(NamedTuple):
 class Shard:
     """Everything that a range of episodes left behind, row by row; ``states`` (n,) are where they began.
 
-    ``cut_ins`` are those of the pool that were prescribed, if any were.
-    ``lateral`` says how cut-ins show themselves before BV overlaps.
+    ``cut_ins`` are those of the pool that were prescribed, if any were; ``lateral`` says how cut-ins show themselves.
     ``traces`` maps an episode's row to its (steps + 1, 3 vehicles, 3: x, v, a) motion, ``failures`` to the cause.
     """
 
@@ -90,7 +89,7 @@ class Shard:
     traces: dict[int, FloatArray] = field(default_factory=dict)
     failures: dict[int, str] = field(default_factory=dict)
     cut_ins: PrescribedCutIns | None = None
-    lateral: LateralMotion = field(default_factory=in_one_step)
+    lateral: LateralMotion = field(default_factory=constant_lead)
 
 
 def hash_of_index(seed: int, episodes: IntArray) -> FloatArray:
@@ -142,7 +141,7 @@ class EpisodeLoop:
             ended += self._step_and_judge(kernel, shard, placed)
             given += placed
             if shard.results.moment_count[0] > shard.results.moment.size - self._world.n_cells:
-                shard.results = with_more_room(shard.results, 2 * shard.results.moment.size)
+                shard.results = with_more_room(shard.results)
                 kernel = self._kernel_state(shard)
 
     def beside(

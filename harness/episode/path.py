@@ -7,6 +7,7 @@ any driver behind BV: beside an AV that keeps its speed until the cut-in, or one
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -26,7 +27,7 @@ from harness.traffic.laws import (
 )
 from harness.vehicles.drivers import NEED_BASED_KIND
 from harness.vehicles.kinematics import CONTACT_M, STEP_S, VEHICLE_LENGTH_M, gap, next_position, next_speed, overlaps
-from harness.vehicles.references import Memory, nothing_yet, react
+from harness.vehicles.references import Memory, react
 from harness.vocabulary import (
     AV,
     BV,
@@ -252,10 +253,9 @@ def take_over(
     driver, one, onset = drivers[d], path.follower[place], onset_of(cut, lead)
     perceives_m = 0.0 if encloses else driver.perceives_lateral_m
     perceived, earlier = perceived_in(perceives_m, cut, lead, environment.lateral.distance_m)
-    memory = nothing_yet(driver.used_up_steps + earlier)
     one.driver, one.encloses, one.first, one.end = d, encloses, perceived + late, FOLLOWS
     one.x, one.v = path.x_av[onset + 1], path.v_av[onset + 1]
-    one.acceleration, one.danger, one.used_up = memory.acceleration, memory.danger, memory.used_up
+    one.acceleration, one.danger, one.used_up = 0.0, math.inf, driver.used_up_steps + earlier
     if onset == cut and gap(path.x_after[cut + 1], one.x) < CONTACT_M:
         one.end = cut + 1
 
@@ -325,7 +325,7 @@ def who_crashes(followers: Followers, cut: int, lead: int, environment: Environm
         found = 1 << envelope
     for d in range(drivers.size):
         if d != envelope:
-            late, encloses = drivers[d].delay_steps, is_boundary(drivers[d])
+            late, encloses = drivers[d].delay_steps, drivers[d].kind == NEED_BASED_KIND
             take_over(n, d, drivers, late, encloses, cut, lead, environment, path)
             n += 1
     follow(n, drivers, cut, lead, until, path)
@@ -333,12 +333,6 @@ def who_crashes(followers: Followers, cut: int, lead: int, environment: Environm
         if path.follower[i].end >= 0:
             found |= 1 << path.follower[i].driver
     return found
-
-
-@compiled_inline
-def is_boundary(driver: Record) -> bool:
-    """Whether a driver is one that vehicles are said never to be ahead of."""
-    return bool(driver.kind == NEED_BASED_KIND)
 
 
 @compiled_threads

@@ -155,15 +155,6 @@ _ROUNDING_MPS2 = 1e-9
 
 
 @compiled_inline
-def brakes_fully(driver: Record, speed: float, lead_speed: float, shape: float) -> bool:
-    """Whether FVDM's command is below its limit even for this bound on its `fvdm_shape`, rounding included."""
-    if driver.kind != FVDM_KIND:
-        return False
-    most = fvdm_acceleration(driver, speed, lead_speed, shape)
-    return bool(most < driver.min_acceleration_mps2 - _ROUNDING_MPS2)
-
-
-@compiled_inline
 def smallest_gaps(
     speed: float,
     r2: float,
@@ -183,10 +174,14 @@ def smallest_gaps(
     out[0] = smallest
     gap_of_shape, shape = math.inf, 1.0
     for step in range((out.size - 1) * steps_per_level):
-        # tanh takes most of FVDM's time. While the gap shrinks, the last value computed is an upper bound.
-        if r2 <= gap_of_shape and brakes_fully(driver, follower, speed, shape):
-            a = driver.min_acceleration_mps2
-        else:
+        # tanh takes most of FVDM's time. While the gap shrinks, the last value computed is an upper bound of
+        # `fvdm_shape`: where the command is below the limit even for that, rounding included, it brakes fully.
+        a = driver.min_acceleration_mps2
+        if not (
+            driver.kind == FVDM_KIND
+            and r2 <= gap_of_shape
+            and fvdm_acceleration(driver, follower, speed, shape) < a - _ROUNDING_MPS2
+        ):
             a = driver_acceleration(driver, follower, speed, r2)
             if driver.kind == FVDM_KIND:
                 gap_of_shape, shape = r2, fvdm_shape(driver, max(r2, SMALLEST_GAP_M))

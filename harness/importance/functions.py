@@ -22,7 +22,7 @@ from harness.importance.grid import AFTER, BEFORE, interpolate, interpolate_mane
 from harness.importance.tables import Tables
 from harness.traffic.laws import Environment, acceptance
 from harness.vehicles.kinematics import CONTACT_M, STEP_S, next_speed
-from harness.vocabulary import N_ACCELERATIONS, SAMPLING, BoolArray, Float32Array, FloatArray, State, read_only
+from harness.vocabulary import N_ACCELERATIONS, BoolArray, Float32Array, FloatArray, State, read_only
 
 
 class Importance(NamedTuple):
@@ -57,21 +57,16 @@ _ROUNDING_M = 1e-9
 """More than interpolation between gaps of up to a kilometre can lose."""
 
 
-def needs_tables(campaign: Campaign) -> bool:
-    """Whether the campaign's method looks at surrogates at all."""
-    return SAMPLING[campaign.testing.method].mixes
-
-
 def importance_names(campaign: Campaign) -> tuple[str, ...]:
     """Names of the importance functions, in the order of ``log_q``."""
-    defensive = ("forced",) if SAMPLING[campaign.testing.method].forces else ()
-    return defensive + (tuple(campaign.surrogates) if needs_tables(campaign) else ())
+    defensive = ("forced",) if campaign.sampling.forces else ()
+    return defensive + (tuple(campaign.surrogates) if campaign.sampling.mixes else ())
 
 
 def mixture_weights(campaign: Campaign) -> tuple[float, ...]:
     """Weights α of the importance functions, in the order of `importance_names`."""
-    alpha = tuple(campaign.alpha()) if needs_tables(campaign) else ()
-    if not SAMPLING[campaign.testing.method].forces:
+    alpha = tuple(campaign.alpha()) if campaign.sampling.mixes else ()
+    if not campaign.sampling.forces:
         return alpha
     share = campaign.testing.defensive_share if alpha else 1.0
     return (share, *((1.0 - share) * weight for weight in alpha))
@@ -79,7 +74,7 @@ def mixture_weights(campaign: Campaign) -> tuple[float, ...]:
 
 def build_importance(campaign: Campaign, tables: Tables | None) -> Importance:
     """Importance functions of a campaign; ``nde`` and ``forced`` need no challenge tables."""
-    testing, sampling = campaign.testing, SAMPLING[campaign.testing.method]
+    testing, sampling = campaign.testing, campaign.sampling
     recursive = testing.challenge == "recursive"
     none = _none(5), _none(5), _none(5), np.zeros((0, 1, 1, 1), np.bool_)
     return Importance(

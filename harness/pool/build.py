@@ -36,8 +36,6 @@ POOL_SEED = 0x706F6F6C
 """Keeps a pool's random numbers apart from those of a campaign with the same seed."""
 KEEP_DRAW = 1
 """Draw of a shell within the diagnostic stream."""
-
-
 _MADE_BY = ("build.py", "cut_ins.py", "shells.py")
 """Code that decides what is in a pool, beside the kernels."""
 
@@ -45,6 +43,7 @@ _MADE_BY = ("build.py", "cut_ins.py", "shells.py")
 def campaign_pool_key(resolved: Resolved) -> str:
     """Hash of all that a pool depends on: environment, level of lane changing, library, settings, and code."""
     library = resolved.library
+    boundaries = library.boundary, *(statement.boundary for statement in library.statements.values())
     content = [
         FORMAT,
         source_hash(WORLD_SOURCES),
@@ -52,7 +51,7 @@ def campaign_pool_key(resolved: Resolved) -> str:
         environment_hash(resolved.environment),
         {name: model.model_dump() for name, model in library.surrogates.items()},
         [(name, model.model_dump()) for name, model in library.references.items()],
-        [sorted(library.boundaries), library.boundary, library.envelope],
+        [sorted(boundaries), library.boundary, library.envelope],
         resolved.campaign.pool.model_dump(exclude={"library", "shadow_paths"}),
     ]
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:24]
@@ -139,7 +138,7 @@ def _until_known(aim: Aim, settings: PoolSettings, progress: Progress) -> Enumer
     """Enumerate paths until the relative errors are small enough; what is left of them is part of every interval."""
     pilot, conservative = aim.pilot, aim.conservative
     wanted = settings.relative_error * np.where(conservative, 1.0, AGGRESSIVE_ERROR)
-    progress.stage("pool of cut-ins", _paths_needed(pilot, wanted))
+    progress.stage("pool of cut-ins", None)
     rounds: list[EnumeratedPaths] = []
     rates = np.zeros((0, pilot.shape[1]))
     while len(rates) < MOST_PATHS:
@@ -152,15 +151,6 @@ def _until_known(aim: Aim, settings: PoolSettings, progress: Progress) -> Enumer
         if np.all(error <= wanted[known]):
             break
     return joined(rounds)
-
-
-def _paths_needed(pilot: FloatArray, wanted: FloatArray) -> int:
-    """Rough number of paths, for the progress bar: aiming about halves the squared error of the pilot's."""
-    mean = pilot.mean(0)
-    known = mean > 0.0
-    relvar = pilot.var(0)[known] / mean[known] ** 2
-    needed = 0.5 * float((relvar / wanted[known] ** 2).max(initial=1.0))
-    return min(MOST_PATHS, -(-int(needed) // ROUND_PATHS) * ROUND_PATHS)
 
 
 def pool_of(

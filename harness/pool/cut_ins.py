@@ -87,28 +87,15 @@ class CutIns:
 class Pool:
     """Pool of one environment and one library.
 
-    Attributes
-    ----------
-    key : str
-        Content hash of all that it was made from; ``environment`` is that of its environment.
-    names : tuple of str, length D
-        Surrogates from careful to careless, by crash rate.
-    n_paths : int
-        Paths that the probabilities come from.
-    p_cut_in, p_cut_in_se : float
-        Probability that BV cuts in in a test, and its standard error.
-    mu, mu_covariance : ndarray, shapes (D,) and (D, D)
-        Crash rates of the surrogates, per test, and the covariance of their errors.
-    p_cut_in_at_crash : ndarray, shape (D,)
-        Mean P(cut-in | path) of the cut-ins on which each surrogate crashes, and three standard errors on top.
-    cell_shell, cell_references : ndarray of int64, shape (C,)
-        Cells divide shells by which references crash: the shell of each, and one bit per reference.
-    cell_p : ndarray, shape (C,)
-        Probability of each cell.
-    reference_rate, reference_square : ndarray, shape (R,)
-        Crash rates of the references, and mean squares of a path's probability that they crash.
-    p_unknown : float
-        Probability of cut-ins about which nothing is known, at most: of baseline runs that failed.
+    ``key`` is the content hash of all that it was made from, ``environment`` that of its environment. ``names`` (D) are
+    the surrogates, the most conservative first, ``mu`` (D,) their crash rates per test from ``n_paths`` paths, and
+    ``mu_covariance`` (D, D) of their errors. ``p_cut_in`` is the probability that BV cuts in in a test, ``p_cut_in_se``
+    its standard error, and ``p_cut_in_at_crash`` (D,) the mean P(cut-in | path) of the cut-ins on which each surrogate
+    crashes, three standard errors on top. Cells divide shells by which references crash: ``cell_shell``,
+    ``cell_references`` (C,) are the shell of each and one bit per reference, ``cell_p`` (C,) its probability.
+    ``reference_rate``, ``reference_square`` (R,) are crash rates of the references, and mean squares of a path's
+    probability that they crash. ``p_unknown`` is the probability, at most, of cut-ins about which nothing is known:
+    those of baseline runs that failed.
     """
 
     key: str

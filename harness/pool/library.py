@@ -87,11 +87,6 @@ class Library(Section):
         """Acceleration of the envelope (m/s²)."""
         return self.surrogates[self.envelope].parameters.max_acceleration_mps2
 
-    @property
-    def boundaries(self) -> tuple[str, ...]:
-        """The most careless drivers inside, of all statements."""
-        return self.boundary, *(statement.boundary for statement in self.statements.values())
-
     def without(self, names: set[str]) -> Library:
         """The library with some surrogates left out, and statements with them; never its boundary or envelope."""
         kept = {name: model for name, model in self.surrogates.items() if name not in names}

@@ -141,15 +141,12 @@ def _statements(pool: Pool, shells: ShellSettings, groups: list[list[int]]) -> t
     def inside(each: StatementSettings) -> int:
         return sum(group[-1] <= place(each) for group in groups)
 
+    keeps_to = "crashes only where the surrogate {} or a more careful one crashes"
     found = sorted(pool.library.statement_settings(shells).items(), key=lambda each: place(each[1]))
     return tuple(
-        Statement(name, each.boundary, each.assumes or _keeps_to(each.boundary), inside(each), each.checked)
+        Statement(name, each.boundary, each.assumes or keeps_to.format(each.boundary), inside(each), each.checked)
         for name, each in found
     )
-
-
-def _keeps_to(boundary: str) -> str:
-    return f"crashes only where the surrogate {boundary} or a more careful one crashes"
 
 
 def _reference(name: str, driver: LibraryDriver, *, takes_time: bool) -> Reference:
@@ -196,10 +193,6 @@ class PrescribedEpisodes:
     Each stratum's cut-ins are taken in a random order that is fixed by the campaign's seed: within a shell without
     replacement. In a stratum of several shells the shell is drawn first, by its probability; the order ends where a
     shell has no cut-in left.
-
-    Attributes
-    ----------
-    design : ShellDesign
     """
 
     def __init__(self, campaign: Campaign, pool: Pool) -> None:

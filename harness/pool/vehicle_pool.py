@@ -16,17 +16,16 @@ import hashlib
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 
 from harness.campaign.sections import PoolSettings
 from harness.compiled import cache_root
 from harness.episode.judge import motion_hashes
 from harness.errors import HarnessError
 from harness.pool.build import POOL_SEED, ROUND_PATHS, campaign_pool_key, pool_of, take_aim
-from harness.pool.cut_ins import Pool, sound_facts, stamped
+from harness.pool.cut_ins import Pool
 from harness.pool.library import Library
 from harness.pool.shells import conservative_first
 from harness.pool.walk import PILOT_PATHS, BaselineRuns, EnumeratedPaths, contributions, enumerate_cut_ins
@@ -35,7 +34,7 @@ from harness.random_stream import DIAGNOSTIC, uniforms
 from harness.records.folder import require_place, write_atomically
 from harness.resolved import Resolved
 from harness.traffic.laws import Environment
-from harness.vocabulary import STATE_COLUMNS, FloatArray, IntArray, RecordArray, states_from
+from harness.vocabulary import FloatArray, IntArray, RecordArray
 
 CANDIDATES = 32_768
 """Paths of an AV that holds its speed to choose from: they cost milliseconds each, and save two of three
@@ -48,23 +47,15 @@ EVENLY = 0.1
 """Share of the choice that does not look at surrogates: no path counts for more than ten times its even weight."""
 CHOICE_DRAW = 2
 """Draw of a baseline run within the diagnostic stream."""
-_COLUMNS = ("index", "weight", "chance")
 
 
 @dataclass(frozen=True, eq=False)
 class BaselinePaths:
     """Independent draws of paths; some may be the same path, for runs with random streams of their own.
 
-    Attributes
-    ----------
-    key : str
-        Content hash of all that they follow from.
-    seed : int
-        Of their random numbers.
-    order : ndarray of int64, shape (D,)
-        Surrogates from careful to careless behind an AV that holds its speed, as places in the library.
-    index, state, weight : ndarray, shape (n,)
-        The paths' numbers, initial states, and naturalistic density over that of the draw.
+    ``key`` is the content hash of all that they follow from, ``seed`` that of their random numbers. ``order`` (D,) are
+    the surrogates as places in the library, the most conservative behind an AV that holds its speed first. ``index``,
+    ``state``, ``weight`` (n,) are the paths' numbers, initial states, and naturalistic density over that of the draw.
     """
 
     key: str
@@ -91,6 +82,11 @@ class Candidates(BaselinePaths):
         chosen = np.minimum(np.searchsorted(cumulative, u * cumulative[-1], side="right"), len(self) - 1)
         arrays = (values[chosen] for values in (self.index, self.state, self.weight))
         return BaselinePaths(self.key, self.seed, self.order, *arrays)
+
+    def save(self, path: Path) -> None:
+        """Write all of them."""
+        with path.open("wb") as file:
+            np.savez(file, **vars(self))
 
 
 def walk_candidates(
@@ -132,7 +128,7 @@ def _candidates_key(resolved: Resolved) -> str:
 
 def baseline_paths_file(resolved: Resolved) -> Path:
     """Where the candidates of a campaign's paths are cached."""
-    return cache_root() / "pools" / f"shadow-{_candidates_key(resolved)}.parquet"
+    return cache_root() / "pools" / f"shadow-{_candidates_key(resolved)}.npz"
 
 
 def campaign_baseline_paths(resolved: Resolved, progress: Progress | None = None) -> BaselinePaths:
@@ -144,29 +140,18 @@ def campaign_baseline_paths(resolved: Resolved, progress: Progress | None = None
     if (candidates := _cached(path, key)) is None:
         require_place(path.parent, mend="Change its permissions, or name another place in HARNESS_CACHE_DIR.")
         candidates = walk_candidates(resolved.environment, resolved.library, settings, key, progress)
-        table = _table(candidates)
-        write_atomically(path, lambda temporary: pq.write_table(table, temporary, compression="zstd"))
+        write_atomically(path, candidates.save)
     return candidates.draw(settings.shadow_paths)
-
-
-def _table(paths: Candidates) -> pa.Table:
-    columns = {name: getattr(paths, name) for name in _COLUMNS} | {name: paths.state[name] for name in STATE_COLUMNS}
-    table = pa.table({name: pa.array(np.ascontiguousarray(values)) for name, values in columns.items()})
-    return stamped(table, {"key": paths.key, "seed": paths.seed, "order": paths.order.tolist()})
 
 
 def _cached(path: Path, key: str) -> Candidates | None:
     """What is kept under a key; None if there is none, or the file is damaged or of another key."""
     try:
-        table = pq.read_table(path, partitioning=None)
-        facts = sound_facts(table)
-    except (OSError, pa.ArrowException, KeyError, TypeError, ValueError):
+        with np.load(path) as stored:
+            columns = {name: stored[name] for name in ("order", "index", "state", "weight", "chance")}
+            return Candidates(key, int(stored["seed"]), **columns) if stored["key"] == key else None
+    except (OSError, EOFError, KeyError, ValueError, BadZipFile):
         return None
-    if facts.get("key") != key:
-        return None
-    columns = {name: table.column(name).to_numpy() for name in _COLUMNS}
-    state = states_from(np.asarray(table.column(name)) for name in STATE_COLUMNS)
-    return Candidates(key, facts["seed"], np.array(facts["order"], np.int64), state=state, **columns)
 
 
 def vehicle_pool(resolved: Resolved, paths: BaselinePaths, runs: BaselineRuns) -> Pool:

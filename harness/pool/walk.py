@@ -22,7 +22,7 @@ import math
 import os
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -333,20 +333,17 @@ def joined(parts: Iterable[EnumeratedPaths]) -> EnumeratedPaths:
     return EnumeratedPaths(*map(np.concatenate, columns))
 
 
+@dataclass(frozen=True, eq=False)
 class Enumerator:
     """Enumerates consecutive paths of one environment, on all cores; the number of cores changes no bit."""
 
-    def __init__(
-        self,
-        environment: Environment,
-        followers: Followers,
-        seed: int,
-        proposal: FloatArray | None = None,
-        stride: int = STRIDE,
-    ) -> None:
-        self._environment, self._followers, self._seed = environment, followers, seed
-        self._proposal, self._stride = proposal, stride
-        self._states = InitialStates(environment.numbers)
+    environment: Environment
+    followers: Followers
+    seed: int
+    proposal: FloatArray | None = None
+    stride: int = STRIDE
+
+    def __post_init__(self) -> None:
         # Compiled here, by one thread: of two that want a new kernel at once, the second would have to wait for
         # whatever else is compiled meanwhile.
         self._block(0, 0)
@@ -354,11 +351,11 @@ class Enumerator:
     def aimed(self, rates: FloatArray, share: FloatArray | float = 1.0) -> Enumerator:
         """The same, aimed at what contributes to the rates (n, columns) of its first paths; see `contributions`."""
         proposal = fit_proposal(self.uniforms(0, len(rates)), contributions(rates, share))
-        return Enumerator(self._environment, self._followers, self._seed, proposal, self._stride)
+        return replace(self, proposal=proposal)
 
     def uniforms(self, first: int, n: int) -> FloatArray:
         """Uniforms of the initial states of consecutive paths, shape (n, 5)."""
-        return uniforms(self._seed, first, n, INITIAL, len(STATE_COLUMNS))
+        return uniforms(self.seed, first, n, INITIAL, len(STATE_COLUMNS))
 
     def run(self, first: int, n: int, progress: Progress) -> EnumeratedPaths:
         """Paths ``first … first + n - 1``; ``n`` is a multiple of `BLOCK_PATHS`."""
@@ -371,11 +368,11 @@ class Enumerator:
 
     def _block(self, first: int, n: int = BLOCK_PATHS) -> EnumeratedPaths:
         u, weight = self.uniforms(first, n), np.ones(n)
-        drawn = uniforms(self._seed, first, n, DIAGNOSTIC, 2)
-        offset = (drawn[:, OFFSET_DRAW] * self._stride).astype(np.int64)
-        if self._proposal is not None:
-            u, weight = aimed_points(self._proposal, u, drawn[:, AIMED_DRAW])
-        index, state = first + np.arange(n), self._states.from_uniforms(u)
-        asked = self._environment, self._followers
-        found = enumerate_cut_ins(self._seed, index, state, *asked, stride=self._stride, offset=offset)
+        drawn = uniforms(self.seed, first, n, DIAGNOSTIC, 2)
+        offset = (drawn[:, OFFSET_DRAW] * self.stride).astype(np.int64)
+        if self.proposal is not None:
+            u, weight = aimed_points(self.proposal, u, drawn[:, AIMED_DRAW])
+        index, state = first + np.arange(n), InitialStates(self.environment.numbers).from_uniforms(u)
+        asked = self.environment, self.followers
+        found = enumerate_cut_ins(self.seed, index, state, *asked, stride=self.stride, offset=offset)
         return EnumeratedPaths(index, state, weight, found.probability * weight[:, None], found.crashes)

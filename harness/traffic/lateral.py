@@ -40,13 +40,8 @@ class LateralMotion(NamedTuple):
         return self.cumulative.size > 1
 
 
-def in_one_step() -> LateralMotion:
-    """The paper's cut-in."""
-    return constant_lead(0.0)
-
-
-def constant_lead(lead_s: float, distance_m: float = DISTANCE_M) -> LateralMotion:
-    """Every cut-in shows itself this long before overlap."""
+def constant_lead(lead_s: float = 0.0, distance_m: float = DISTANCE_M) -> LateralMotion:
+    """Every cut-in shows itself this long before overlap; not at all as in the paper."""
     cumulative = np.zeros(round(lead_s / STEP_S) + 1)
     cumulative[-1] = 1.0
     return LateralMotion(distance_m, cumulative)

@@ -43,11 +43,6 @@ from harness.vocabulary import (
 FREE_DRIVING, CAR_FOLLOWING = 0, 1
 """Which table of noise a law has."""
 _SPEED_POINTS = 8001
-_GAP = ("shift_m", "shift_u_m", "log_mean", "log_mean_u", "log_sd", "log_sd_u")
-_RATE = (
-    *("location_mps", "location_u", "location_w", "location_uw", "location_uu"),
-    *("log_scale", "log_scale_u", "log_scale_w", "log_scale_ww"),
-)
 _T_LIMIT = 64.0
 _T_PER_UNIT = 32.0
 
@@ -316,9 +311,9 @@ class InitialStates:
         """R1 = shift + LogNormal, truncated to the fit range."""
         n = self._n
         u = self._u(v)
-        c = {name: n[f"initial_state__r1_{name}"] for name in _GAP}
-        shift, mean = c["shift_m"] + c["shift_u_m"] * u, c["log_mean"] + c["log_mean_u"] * u
-        sd = np.exp(c["log_sd"] + c["log_sd_u"] * u)
+        shift = n["initial_state__r1_shift_m"] + n["initial_state__r1_shift_u_m"] * u
+        mean = n["initial_state__r1_log_mean"] + n["initial_state__r1_log_mean_u"] * u
+        sd = np.exp(n["initial_state__r1_log_sd"] + n["initial_state__r1_log_sd_u"] * u)
         with np.errstate(divide="ignore"):
             below = special.ndtr((np.log(np.maximum(n["fit_range__r1_min_m"] - shift, 0.0)) - mean) / sd)
             upto = special.ndtr((np.log(n["fit_range__r1_max_m"] - shift) - mean) / sd)
@@ -330,11 +325,13 @@ class InitialStates:
         n = self._n
         u = self._u(v)
         w = (r1 - n["fit_range__r1_centre_m"]) / n["fit_range__r1_scale_m"]
-        c = {name: n[f"initial_state__r1dot_{name}"] for name in _RATE}
-        location = c["location_mps"] + c["location_u"] * u + c["location_w"] * w
-        location = location + c["location_uw"] * (u * w) + c["location_uu"] * (u * u)
-        log_scale = c["log_scale"] + c["log_scale_u"] * u + c["log_scale_w"] * w + c["log_scale_ww"] * (w * w)
-        scale = np.exp(log_scale)
+
+        def c(name: str) -> float:
+            return float(n[f"initial_state__r1dot_{name}"])
+
+        location = c("location_mps") + c("location_u") * u + c("location_w") * w + c("location_uw") * (u * w)
+        location = location + c("location_uu") * (u * u)
+        scale = np.exp(c("log_scale") + c("log_scale_u") * u + c("log_scale_w") * w + c("log_scale_ww") * (w * w))
         df = float(n["initial_state__r1dot_df"])
         slowest = special.stdtr(df, (-r1 / n["initial_state__r1dot_min_ttc_s"] - location) / scale)
         rate: FloatArray = location + scale * special.stdtrit(df, slowest + probability * (1.0 - slowest))

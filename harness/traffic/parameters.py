@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Literal, Self
 
 import numpy as np
 from pydantic import AfterValidator, BaseModel, model_validator
@@ -13,7 +13,7 @@ from pydantic import AfterValidator, BaseModel, model_validator
 from harness.campaign.drivers import MAX_CONFIGURED_SPEED_MPS
 from harness.campaign.problems import broken_rule
 from harness.campaign.sections import Section
-from harness.traffic.lateral import LateralMotion, constant_lead, in_one_step, log_normal_speed
+from harness.traffic.lateral import LateralMotion, constant_lead, log_normal_speed
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
 from harness.vocabulary import ACCELERATIONS_MPS2, Record
 
@@ -46,8 +46,6 @@ def _within(low: float, high: float) -> AfterValidator:
     return AfterValidator(checked)
 
 
-_HARDEST, _FASTEST = float(ACCELERATIONS_MPS2[0]), float(ACCELERATIONS_MPS2[-1])
-
 # Wide limits: what a law makes of its numbers is judged by `harness.traffic.loading`.
 Coefficient = Annotated[Number, _within(-1000.0, 1000.0)]
 LogScale = Annotated[Number, _within(-50.0, 50.0)]
@@ -56,7 +54,7 @@ Gain = Annotated[Number, _within(0.0, 100.0)]
 Gap = Annotated[Number, _within(0.0, 300.0)]  # 4 km of road hold two of them and 25 s at 100 m/s
 Speed = Annotated[Number, _within(0.0, MAX_CONFIGURED_SPEED_MPS)]
 Rate = Annotated[Number, _within(-MAX_CONFIGURED_SPEED_MPS, MAX_CONFIGURED_SPEED_MPS)]
-Acceleration = Annotated[Number, _within(_HARDEST, _FASTEST)]
+Acceleration = Annotated[Number, _within(*map(float, ACCELERATIONS_MPS2[[0, -1]]))]
 Braking = Annotated[Number, _within(0.0, 20.0)]
 Time = Annotated[Number, _within(0.0, 100.0)]
 Share = Annotated[Number, _within(0.0, 1.0)]
@@ -83,15 +81,6 @@ class Scenario(Section):
 
     duration_s: Annotated[Number, _within(1.0, 25.0), AfterValidator(_whole_steps)]
     """At most 25 s: BV's free driving has 256 random numbers for each cut-in, and the road is 4 km long."""
-
-    @model_validator(mode="before")
-    @classmethod
-    def _nothing_that_is_fixed(cls, data: Any) -> Any:
-        for name in FIXED if isinstance(data, dict) else ():
-            if name in data:
-                expected = f"no such key: motion is computed for {name} {FIXED[name]:g}"
-                raise broken_rule(name, "a key that would change nothing", expected, "Delete the line.")
-        return data
 
 
 class FitRange(Section):
@@ -271,7 +260,7 @@ class EnvironmentParameters(Section):
 
     def lateral_motion(self) -> LateralMotion:
         """How long cut-ins show themselves."""
-        return in_one_step() if self.lateral is None else self.lateral.motion()
+        return constant_lead() if self.lateral is None else self.lateral.motion()
 
     def content_hash(self) -> str:
         """Hash of the numbers alone: a corrected note does not change a campaign."""

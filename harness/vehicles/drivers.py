@@ -11,7 +11,7 @@ the same bits.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -19,7 +19,6 @@ from harness.campaign.drivers import (
     BuiltInParameters,
     CarefulCompetentParameters,
     ConstantParameters,
-    Driver,
     FuzzySafetyParameters,
     FVDMParameters,
     IDMParameters,
@@ -94,11 +93,6 @@ def av_records(av: AutomatedVehicle, *, see_onset: bool = False) -> RecordArray:
     if isinstance(av.parameters, BuiltInParameters):
         return driver_records([av.parameters], [av.reaction], see_onset=see_onset)
     return driver_records([])
-
-
-def surrogate_records(surrogates: Mapping[str, Driver]) -> RecordArray:
-    """Parameters of the surrogates, in their order, shape (J,)."""
-    return driver_records([model.parameters for model in surrogates.values()])
 
 
 @compiled_inline

@@ -199,12 +199,6 @@ def reaction_steps(driver: Record, seed: int, episode: int) -> int:
 
 
 @compiled_inline
-def nothing_yet(used_up: float) -> Memory:
-    """What a driver remembers before it acts: it has kept its speed, and seen no danger."""
-    return Memory(0.0, math.inf, used_up)
-
-
-@compiled_inline
 def react(driver: Record, memory: Memory, step: int, speed: float, lead_speed: float, gap: float) -> Memory:
     """What a driver does in a step, as what it will remember of it.
 

@@ -29,7 +29,7 @@ from harness.importance.challenge import roll_out
 from harness.importance.grid import GridPoints
 from harness.traffic.laws import Environment
 from harness.traffic.loading import evaluate_laws, load_environment
-from harness.vehicles.drivers import av_records, surrogate_records
+from harness.vehicles.drivers import av_records, driver_records
 from harness.vehicles.kinematics import CONTACT_M, STEP_S
 from harness.vocabulary import (
     ACCELERATIONS_MPS2,
@@ -208,7 +208,7 @@ class _Situations(NamedTuple):
 def small_world(level: float, *, nodes: int = NODES) -> SmallWorld:
     """The tree at a level of lane changing."""
     environment = load_environment(EnvironmentSettings(lane_change_level=level))
-    records = surrogate_records(default_surrogates())
+    records = driver_records([each.parameters for each in default_surrogates().values()])
     drivers = [av_records(AutomatedVehicle()), *np.split(records, len(records))]
     x, weight = np.polynomial.legendre.leggauss(nodes)
     r1, ones = R1_M[0] + (x + 1.0) / 2.0 * (R1_M[1] - R1_M[0]), np.ones(nodes)

@@ -26,7 +26,7 @@ def _motions(situations, out):
 @compiled_threads
 def _follow(driver, seed, episode, situations, out):
     late = references.reaction_steps(driver[0], seed, episode)
-    memory = references.nothing_yet(driver[0].used_up_steps)
+    memory = references.Memory(0.0, np.inf, driver[0].used_up_steps)
     for i in range(situations.shape[0]):
         if i > late:
             v, v_lead, gap = situations[i]
@@ -75,7 +75,7 @@ def steps_late(reflexes, n, *, seed=0, first=0):
 def _approach(driver, v, v_lead, gaps, steps, out):
     for k in range(gaps.size):
         gap, speed, out[k] = gaps[k], v, gaps[k]
-        memory = references.nothing_yet(driver[0].used_up_steps)
+        memory = references.Memory(0.0, np.inf, driver[0].used_up_steps)
         for step in range(steps):
             memory = references.react(driver[0], memory, step, speed, v_lead, gap)
             after = kinematics.next_speed(speed, memory.acceleration)
