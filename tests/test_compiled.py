@@ -1,7 +1,6 @@
 """The hash that names the kernel cache covers every file that machine code can come from; tuples as one pointer."""
 
 import ast
-import inspect
 import os
 import pickle
 import shutil
@@ -16,8 +15,7 @@ import pytest
 
 import harness
 from harness.compiled import KERNEL_SOURCES, compiled, compiled_inline, is_cached, source_hash, unboxed
-from harness.random_stream import _fill_uniforms, uniform, uniforms
-from tests.kernels import alone
+from harness.random_stream import _fill_uniforms, uniforms
 
 ROOT = Path(harness.__file__).parent
 DECORATORS = {"compiled", "compiled_inline", "compiled_threads"}
@@ -119,16 +117,6 @@ def test_a_copy_of_the_package_finds_what_another_has_compiled(tmp_path):
         said = of_another_process(say_hits, HARNESS_CACHE_DIR=str(tmp_path), PYTHONPATH=path)
         hits.append(said.stdout.split())
     assert hits == [["0", "0"], ["1", "1"]]
-
-
-def test_a_part_of_kernels_is_a_function_of_python_elsewhere_and_says_the_same_alone():
-    def third(x):
-        return x / 3.0
-
-    assert compiled_inline(third) is third
-    assert inspect.isfunction(uniform)
-    uniform_alone = alone(uniform)
-    assert [uniform_alone(7, 5, 2, i) for i in range(9)] == uniforms(7, 5, 1, 2, 9)[0].tolist()
 
 
 def test_whether_a_kernel_is_cached_is_asked_of_the_disk(tmp_path):

@@ -16,6 +16,10 @@ def test_results_come_in_the_order_of_the_items(worthwhile):
 def test_what_is_made_ahead_comes_in_the_order_of_the_items(n_threads):
     assert list(made_ahead(lambda i: i * i, range(20), n_threads)) == [i * i for i in range(20)]
     assert list(made_ahead(str, [], n_threads)) == []
+    ahead = made_ahead(lambda i: 1 // i, [1, 0, 1], n_threads)
+    assert next(ahead) == 1
+    with pytest.raises(ZeroDivisionError):
+        next(ahead)
 
 
 def test_the_next_item_is_made_while_the_present_one_is_in_use():
@@ -28,10 +32,3 @@ def test_the_next_item_is_made_while_the_present_one_is_in_use():
 
     for item in made_ahead(make, [1, 2], 1):
         assert item == 2 or second_made.wait(10)
-
-
-def test_an_error_while_reading_is_raised_where_the_item_is_used():
-    ahead = made_ahead(lambda i: 1 // i, [1, 0, 1])
-    assert next(ahead) == 1
-    with pytest.raises(ZeroDivisionError):
-        next(ahead)

@@ -99,14 +99,3 @@ def test_replay_in_plain_python(method, hold_s):
         seen.add(outcome)
     assert CRASH in seen
     assert len(seen) > 1
-
-
-def test_a_path_with_one_other_maneuver_would_be_noticed():
-    done = run("forced", n=N, traces="all")
-    row = int(np.flatnonzero(done.episode["n_steps"] > 20)[0])
-    path = done.shard.results.lv_path[row]
-    path[0] += 1
-    try:
-        assert not np.array_equal(done.shard.traces[row], replay(done, row, 10)[0], equal_nan=True)
-    finally:
-        path[0] -= 1

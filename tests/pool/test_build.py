@@ -11,11 +11,13 @@ from harness.campaign.files import load_campaign
 from harness.errors import RunFolderError
 from harness.pool.build import cached_pool, campaign_pool, campaign_pool_key, pool_path
 from harness.pool.cut_ins import read_pool, write_pool
-from harness.pool.shells import Draw, PrescribedEpisodes
-from harness.pool.walk import NATURALISTIC_SHARE, aimed_points, fit_proposal
+from harness.pool.library import load_library
+from harness.pool.shells import Draw, PrescribedEpisodes, design_shells
+from harness.pool.walk import NATURALISTIC_SHARE, STRIDE, aimed_points, fit_proposal
 from harness.resolved import resolve
 from tests.chains.seed import SEED
 from tests.pool.conftest import MIXTURE_FILE, SMALL_POOL
+from tests.pool.walked import enumerated
 
 FORCED_RATE = 1.352e-7
 """Crash rate of the default vehicle, a_min -4 m/s², from tests/reference (relative error 0.42 %)."""
@@ -120,3 +122,28 @@ def test_weights_of_a_proposal_make_up_for_its_aim():
         assert abs((weights * f).mean() - mean) < 4.0 * (weights * f).std() / np.sqrt(20_000)
     unweighted = np.exp(-8.0 * points[:, 0])
     assert unweighted.mean() > 1.5 * -np.expm1(-8.0) / 8.0  # it does aim
+
+
+# -- enumerated cut-ins and strata --
+
+
+LIBRARY = load_library("ladder-1")
+NAMES = list(LIBRARY.surrogates)
+ENVELOPE = NAMES.index(LIBRARY.envelope)
+
+
+def test_a_stride_asks_the_same_cut_ins_and_each_stands_for_as_many(environment):
+    """Over all offsets every cut-in is asked once, with the same answer, so that any sum has the same mean."""
+    probability, crashes = enumerated(LIBRARY, environment, 40)
+    strided = [enumerated(LIBRARY, environment, 40, stride=STRIDE, offset=offset) for offset in range(STRIDE)]
+    assert np.array_equal(np.sum([p for p, _ in strided], axis=0), STRIDE * probability)
+    assert np.array_equal(np.sum([c for _, c in strided], axis=0), crashes)
+    assert np.max([p > 0.0 for p, _ in strided], axis=0).sum() > 1000
+
+
+def test_strata_of_a_vehicle_that_may_accelerate_harder_include_what_the_envelope_survives(pool):
+    within = design_shells(pool, limit_mps2=2.0)
+    beyond = design_shells(pool, limit_mps2=2.5)
+    assert within.p_impossible == pytest.approx(pool.shell_p[-1])
+    assert beyond.p_impossible == pytest.approx(0.0, abs=1e-17)
+    assert beyond.p[-1] == pytest.approx(within.p[-1] + pool.shell_p[-1])

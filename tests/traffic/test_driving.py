@@ -1,4 +1,4 @@
-"""Accelerations of LV and BV: probabilities against the formulas, draws against the probabilities, noise, the guard."""
+"""Laws of traffic: probabilities against the formulas, draws against the probabilities, noise, guard, cut-in."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from scipy import stats
 
 from harness.traffic.laws import t_table
 from tests.traffic import formulas
-from tests.traffic.kernels import car_following, free_driving, t_distribution
+from tests.traffic.kernels import car_following, cut_in_terms, free_driving, t_distribution
 
 speeds = st.floats(0.0, 60.0)
 gaps = st.floats(-0.001, 200.0)
@@ -78,3 +78,20 @@ def test_noise_is_within_1e_8_of_scipys_and_rises_from_0_to_1(df):
     assert np.abs(found - stats.t.cdf(z, df))[within].max() < 1e-8
     assert (np.diff(found) >= 0.0).all()
     assert t_distribution(np.array([-np.inf, -64.1, 64.1, np.inf]), table).tolist() == [0.0, 0.0, 1.0, 1.0]
+
+
+# -- the hazard of the cut-in --
+
+
+av_gaps = st.floats(-10.0, 110.0)
+levels = st.sampled_from([1e-3, 1.0, 100.0, 350.0, 1e4, 1e6, 1e8])
+
+
+@given(speeds, gaps, rates, av_gaps, rates, levels)
+def test_the_hazard_is_the_formula(v, r1, r1dot, r2, r2dot, level):
+    wish, accepted, hazard = cut_in_terms((v, r1, r1dot, r2, r2dot), level)[0]
+    assert wish == pytest.approx(formulas.opportunity(v, r1, r1dot, level), rel=1e-12)
+    assert accepted == pytest.approx(formulas.acceptance(r2, r2dot), rel=1e-12)
+    p_1s = wish * accepted
+    assert -np.expm1(-hazard) == pytest.approx(formulas.step_probability(p_1s), rel=1e-9, abs=1e-16)
+    assert 0.0 <= hazard <= 0.1 * np.log(2.0) * (1.0 + 1e-15)  # never above one half a second

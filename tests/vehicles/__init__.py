@@ -1,1 +1,0 @@
-"""Tests of the driver models and of motion within a step."""

@@ -36,8 +36,6 @@ with_memory = st.one_of(
 any_driver = drivers | with_memory
 delays = st.integers(0, 100).map(lambda steps: steps / 10.0)
 jerks = st.none() | st.floats(0.1, 1000.0)
-FALSE_ALARM = 1e-6
-"""Probability that the test of a share fails although the share is right."""
 
 
 @given(any_driver, delays, jerks, drives)
@@ -73,5 +71,5 @@ def test_the_share_of_inattentive_episodes_is_the_one_asked_for(share):
     steps = steps_late(reaction, 40_000, seed=SEED)
     assert set(steps.tolist()) == {3, 18}
     late = int((steps == 18).sum())
-    assert binomtest(late, steps.size, share).pvalue > FALSE_ALARM
-    assert binomtest(late, steps.size, 0.85 * share).pvalue < FALSE_ALARM  # the test would notice another share
+    assert binomtest(late, steps.size, share).pvalue > 1e-6  # how often it fails although the share is right
+    assert binomtest(late, steps.size, 0.85 * share).pvalue < 1e-6  # the test would notice another share
