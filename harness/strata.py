@@ -10,7 +10,7 @@ from functools import cached_property
 from typing import Annotated
 
 import numpy as np
-from pydantic import AfterValidator, FiniteFloat, PlainSerializer, PlainValidator, TypeAdapter
+from pydantic import AfterValidator, AliasChoices, Field, FiniteFloat, PlainSerializer, PlainValidator, TypeAdapter
 
 from harness.vocabulary import FloatArray
 
@@ -33,7 +33,7 @@ Numbers = Annotated[
 
 @dataclass(frozen=True)
 class Statement:
-    """What is said about vehicles that crash only inside a boundary, the most careless surrogate there.
+    """What is said about vehicles that crash only inside a boundary, the most aggressive surrogate there.
 
     ``assumes`` is the end of a sentence that begins with "If this vehicle"; ``n_inside`` strata lie inside; ``checked``
     says whether each test shows that the assumption holds in it: that the vehicle is never ahead of the boundary.
@@ -61,7 +61,7 @@ class Reference:
 
 @dataclass(frozen=True, eq=False)
 class ShellDesign:
-    """Strata of a campaign, from careful to careless.
+    """Strata of a campaign, the most conservative first.
 
     Attributes
     ----------
@@ -79,9 +79,9 @@ class ShellDesign:
         Crash rate of each reference in the pool, and the mean square of a path's probability that it crashes.
     statements : tuple of Statement
         From the narrowest boundary to the widest; strata up to the widest are shells.
-    p_cut_in, p_impossible : float
+    p_cut_in, p_unreachable : float
         Probability of a cut-in, and the part of it on which no vehicle within the envelope's acceleration can crash,
-        and which is not tested.
+        and which is not tested; runs of earlier days have it as ``p_impossible``.
     available : tuple of int, length S
         Cut-ins that the pool has kept of each; empty if that is no limit.
     shadow_runs : bool
@@ -95,7 +95,7 @@ class ShellDesign:
     n_paths: int
     statements: tuple[Statement, ...]
     p_cut_in: float
-    p_impossible: float
+    p_unreachable: Annotated[float, Field(validation_alias=AliasChoices("p_unreachable", "p_impossible"))]
     cell_references: tuple[int, ...] = ()
     references: tuple[Reference, ...] = ()
     reference_rate: Numbers = field(default_factory=lambda: np.zeros(0))

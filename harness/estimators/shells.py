@@ -209,7 +209,7 @@ class Shells:
                     design.pool,
                     *free.from_pool_relative(),
                     design.p_cut_in,
-                    design.p_impossible,
+                    design.p_unreachable,
                     references=() if cautions else compared(design, self._cells, Level.two_sided(confidence)),
                     statements=tuple(self.within(each.name, confidence) for each in design.statements),
                     shells=self._shells(tally, (1.0 - confidence) / 2.0),

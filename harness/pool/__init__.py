@@ -2,5 +2,6 @@
 
 Built once per environment and surrogate library, in the twin: initial states, paths, their cut-in times with exact
 probabilities, and the outcome of every surrogate on each. A shell is the set of cut-ins on which one surrogate is the
-most careful to crash; its probability is known, so that crashes of the AV counted within shells add up to its rate.
+most conservative to crash; its probability is known, so that crashes of the AV counted within shells add up to its
+rate.
 """

@@ -1,4 +1,4 @@
-"""The surrogate library: drivers from careful to careless, in one YAML file."""
+"""The surrogate library: drivers from conservative to aggressive, in one YAML file."""
 
 from __future__ import annotations
 
@@ -28,6 +28,13 @@ class LibraryDriver(Driver):
     """A driver with its reflexes."""
 
     reaction: Reflexes = Reflexes()
+
+    @property
+    def delay_after_cut_in_s(self) -> float | None:
+        """How long after a dangerous cut-in a reference driver begins to brake (s); None for any other driver."""
+        if not isinstance(self.parameters, Reference):
+            return None
+        return self.parameters.delay_after_cut_in_s + self.reaction.delay_s
 
 
 def library_records(models: Sequence[LibraryDriver], environment: Environment) -> RecordArray:
@@ -72,15 +79,6 @@ class Library(Section):
     def n_drivers(self) -> int:
         """Number of surrogates and references."""
         return len(self.surrogates) + len(self.references)
-
-    @property
-    def delays_after_cut_in_s(self) -> dict[str, float]:
-        """How long after a dangerous cut-in each reference driver begins to brake (s), by name."""
-        return {
-            name: model.parameters.delay_after_cut_in_s + model.reaction.delay_s
-            for name, model in self.surrogates.items()
-            if isinstance(model.parameters, Reference)
-        }
 
     @property
     def envelope_mps2(self) -> float:

@@ -16,12 +16,11 @@ import numpy as np
 
 from harness.campaign.campaign import Campaign
 from harness.campaign.drivers import BuiltInParameters
-from harness.campaign.drivers import Reference as ReferenceParameters
 from harness.campaign.sections import ShellSettings, StatementSettings
 from harness.campaign.vehicle import AutomatedVehicle
 from harness.episode.cells import PrescribedCutIns, PrescribedTraffic
 from harness.pool.cut_ins import Pool
-from harness.pool.library import Library, LibraryDriver, library_records
+from harness.pool.library import Library, library_records
 from harness.strata import FAILED_BASELINE, OUTSIDE, Reference, ShellDesign, Statement
 from harness.traffic.laws import Environment
 from harness.vocabulary import FloatArray, Int8Array, IntArray, RecordArray
@@ -99,7 +98,7 @@ def design_shells(pool: Pool, *, shells: ShellSettings | None = None, limit_mps2
     statements = _statements(pool, shells, groups)
     cells = cells_in_strata(pool, groups)
     first = np.unique(cells, return_index=True)[1][-(cells.max() + 1) :]
-    n_inside = statements[-1].n_inside
+    n_inside, takes_time = statements[-1].n_inside, bool(pool.cut_ins.lead.any())
     p = np.asarray(np.bincount(cells[cells >= 0], pool.cell_p[cells >= 0]), np.float64)
     design = ShellDesign(
         pool=pool.key,
@@ -108,14 +107,17 @@ def design_shells(pool: Pool, *, shells: ShellSettings | None = None, limit_mps2
         cell_p=p,
         cell_references=tuple(pool.cell_references[first].tolist()),
         references=tuple(
-            _reference(*each, takes_time=bool(pool.cut_ins.lead.any())) for each in pool.library.references.items()
+            Reference(
+                name, _REFERENCES.get(each.model, "the driver"), None if takes_time else each.delay_after_cut_in_s
+            )
+            for name, each in pool.library.references.items()
         ),
         reference_rate=pool.reference_rate,
         reference_square=pool.reference_square,
         n_paths=pool.n_paths,
         statements=statements,
         p_cut_in=pool.p_cut_in,
-        p_impossible=pool.p_cut_in - float(p.sum()),
+        p_unreachable=pool.p_cut_in - float(p.sum()),
         shadow_runs=pool.cut_ins.motion.size > 0,
     )
     return design if pool.p_unknown == 0.0 else _with_failed_baseline(design, pool.p_unknown)
@@ -147,13 +149,6 @@ def _statements(pool: Pool, shells: ShellSettings, groups: list[list[int]]) -> t
         Statement(name, each.boundary, each.assumes or keeps_to.format(each.boundary), inside(each), each.checked)
         for name, each in found
     )
-
-
-def _reference(name: str, driver: LibraryDriver, *, takes_time: bool) -> Reference:
-    described, delay = _REFERENCES.get(driver.model, "the driver"), None
-    if isinstance(driver.parameters, ReferenceParameters) and not takes_time:
-        delay = driver.parameters.delay_after_cut_in_s + driver.reaction.delay_s
-    return Reference(name, described, delay)
 
 
 def checked_boundary(library: Library, design: ShellDesign, environment: Environment) -> RecordArray:

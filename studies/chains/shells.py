@@ -64,7 +64,7 @@ class ChainShells:
             n_paths=len(path),
             statements=(Statement(LIBRARY_STATEMENT, names[-2], "crashes only inside", chain.n_surrogates),),
             p_cut_in=float(p.sum()),
-            p_impossible=0.0,
+            p_unreachable=0.0,
         )
         return [DrawnPool(design, mass, crash_mass)]
 

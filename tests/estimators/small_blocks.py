@@ -13,7 +13,7 @@ State = TypeVar("State")
 SHELLS = ShellDesign(
     pool="0" * 24, strata=("careful", "careless", "outside"), cell_stratum=(0, 1, 2), cell_references=(0, 0, 0),
     cell_p=np.array([1e-4, 3e-4, 2e-2]), n_paths=10**9,
-    statements=(Statement("library", "careless", "keeps to careless", 2),), p_cut_in=0.03, p_impossible=0.0096,
+    statements=(Statement("library", "careless", "keeps to careless", 2),), p_cut_in=0.03, p_unreachable=0.0096,
 )  # fmt: skip
 """Shells of a pool that is known exactly."""
 

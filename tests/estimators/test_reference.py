@@ -118,7 +118,7 @@ N_PATHS, REPLICATIONS = 300, 1_000
 CELLS = ShellDesign(
     pool="0" * 24, strata=("a", "b", "outside"), cell_stratum=(0, 0, 1, 1, 2), cell_references=(1, 0, 1, 0, 0),
     cell_p=np.zeros(5), n_paths=N_PATHS, statements=(Statement("library", "b", "keeps to b", 2),), p_cut_in=1.0,
-    p_impossible=0.0, references=(Reference("r", "a driver"),),
+    p_unreachable=0.0, references=(Reference("r", "a driver"),),
 )  # fmt: skip
 
 

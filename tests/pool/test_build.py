@@ -15,6 +15,7 @@ from harness.pool.library import load_library
 from harness.pool.shells import Draw, PrescribedEpisodes, design_shells
 from harness.pool.walk import NATURALISTIC_SHARE, STRIDE, aimed_points, fit_proposal
 from harness.resolved import resolve
+from harness.strata import STORED_DESIGN
 from tests.chains.seed import SEED
 from tests.pool.conftest import MIXTURE_FILE, SMALL_POOL
 from tests.pool.walked import enumerated
@@ -144,6 +145,9 @@ def test_a_stride_asks_the_same_cut_ins_and_each_stands_for_as_many(environment)
 def test_strata_of_a_vehicle_that_may_accelerate_harder_include_what_the_envelope_survives(pool):
     within = design_shells(pool, limit_mps2=2.0)
     beyond = design_shells(pool, limit_mps2=2.5)
-    assert within.p_impossible == pytest.approx(pool.shell_p[-1])
-    assert beyond.p_impossible == pytest.approx(0.0, abs=1e-17)
+    assert within.p_unreachable == pytest.approx(pool.shell_p[-1])
+    stored = STORED_DESIGN.dump_python(within, mode="json")
+    of_earlier_days = {("p_impossible" if name == "p_unreachable" else name): each for name, each in stored.items()}
+    assert STORED_DESIGN.validate_python(of_earlier_days).p_unreachable == within.p_unreachable
+    assert beyond.p_unreachable == pytest.approx(0.0, abs=1e-17)
     assert beyond.p[-1] == pytest.approx(within.p[-1] + pool.shell_p[-1])

@@ -37,7 +37,7 @@ DESIGN = ShellDesign(
     pool="c0ffee" * 4, strata=("brakes-hard", "brakes-late", "outside"), cell_stratum=(0, 1, 2), cell_p=P,
     cell_references=(0, 0, 0),
     n_paths=4_000, statements=(Statement("library", "brakes-late", "keeps to brakes-late", 2),),
-    p_cut_in=3.3e-5, p_impossible=2.87e-6,
+    p_cut_in=3.3e-5, p_unreachable=2.87e-6,
 )  # fmt: skip
 
 

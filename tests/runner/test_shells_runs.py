@@ -190,7 +190,7 @@ def test_another_pool_is_refused(shells_run, campaign, run_here, tmp_path):
 
 DESIGN = ShellDesign(
     pool="0" * 24, strata=("a", "b", "outside"), cell_stratum=(0, 1, 2), cell_p=np.array([1e-7, 2e-7, 3e-5]),
-    n_paths=10**9, statements=(Statement("library", "b", "keeps to b", 2),), p_cut_in=4e-5, p_impossible=0.0,
+    n_paths=10**9, statements=(Statement("library", "b", "keeps to b", 2),), p_cut_in=4e-5, p_unreachable=0.0,
 )  # fmt: skip
 
 
