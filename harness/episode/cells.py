@@ -10,23 +10,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from harness.compiled import compiled_inline
 from harness.controllers.protocol import BatchObservation
 from harness.episode.path import Trajectory, empty_trajectory, lengths
 from harness.importance.functions import Importance
 from harness.traffic.laws import Environment
-from harness.vehicles.kinematics import gap
 from harness.vocabulary import (
-    AV,
-    BV,
-    LV,
     N_ACCELERATIONS,
     STATE_COLUMNS,
     FloatArray,
     Int8Array,
     IntArray,
     RecordArray,
-    State,
     UInt64Array,
 )
 
@@ -259,10 +253,3 @@ class KernelState(NamedTuple):
     observation: BatchObservation
     acts_before_cut_in: int
     boundary: RecordArray
-
-
-@compiled_inline
-def state_of(k: int, kernel: KernelState) -> State:
-    """State of cell ``k`` from the world's positions and speeds."""
-    x, v = kernel.x, kernel.v
-    return State(v[k, BV], gap(x[k, LV], x[k, BV]), v[k, LV] - v[k, BV], gap(x[k, BV], x[k, AV]), v[k, BV] - v[k, AV])

@@ -9,24 +9,16 @@ from __future__ import annotations
 import math
 
 from harness.compiled import compiled, compiled_inline
-from harness.episode.cells import KernelState, state_of
+from harness.episode.cells import KernelState
 from harness.episode.drive import command, drive_av
 from harness.episode.likelihood_ratio import record_acceleration, record_lane
-from harness.episode.path import place, state_in, walk, weigh_cut_ins
+from harness.episode.path import place, state_of, walk, weigh_cut_ins
 from harness.importance.functions import challenges_nobody, look_ahead, propose_acceleration, propose_cut_in
 from harness.random_stream import BV_DRAWS, BV_FREE_DRAWS, LV_DRAWS, uniform
 from harness.random_stream import CUT_IN as CUT_IN_STREAM
+from harness.traffic import laws
 from harness.traffic.lateral import draw_lead, onset_of
-from harness.traffic.laws import (
-    acceleration,
-    acceleration_pmf,
-    acceptance,
-    car_following,
-    cut_in_hazard,
-    draw_acceleration,
-    free_driving,
-    opportunity,
-)
+from harness.traffic.laws import acceleration, draw_acceleration
 from harness.vocabulary import AV, BV, CUT_IN, LV, N_ACCELERATIONS, FloatArray, State
 
 
@@ -42,10 +34,11 @@ def decide(kernel: KernelState, given: int) -> int:
         cells.cut_in[k] = 0
         if cell.row < 0:
             continue
+        state = state_of(kernel.x[k], kernel.v[k])
         if kernel.traffic.cut_step.size > 0:
-            repeat_traffic(k, state_of(k, kernel), kernel)
+            repeat_traffic(k, state, kernel)
         else:
-            draw_maneuvers(k, state_of(k, kernel), kernel)
+            draw_maneuvers(k, state, kernel)
         cells.acceleration[k, LV] = acceleration(cell.lv_maneuver)
         cells.acceleration[k, BV] = acceleration(cell.bv_maneuver)
     if not kernel.asks_controller:
@@ -63,7 +56,7 @@ def draw_maneuvers(k: int, state: State, kernel: KernelState) -> None:
     redraw = cell.step % hold_steps == 0
     if redraw:
         u = uniform(kernel.seed, cell.episode, LV_DRAWS, cell.n_lv)
-        take_lv(k, draw_acceleration(u, free_driving(kernel.v[k, LV], kernel.environment), kernel.environment), kernel)
+        take_lv(k, laws.drive_freely(u, kernel.v[k, LV], kernel.environment), kernel)
     if cell.cut_step < 0:
         if redraw:
             redraw_following(k, state, kernel)
@@ -83,15 +76,11 @@ def redraw_following(k: int, state: State, kernel: KernelState) -> None:
     cells = kernel.cells
     cell = cells.cell[k]
     u = uniform(kernel.seed, cell.episode, BV_DRAWS, cell.n_bv)
-    take_bv(k, draw_acceleration(u, car_following(state, kernel.environment), kernel.environment), kernel)
+    take_bv(k, draw_acceleration(u, laws.car_following(state, kernel.environment), kernel.environment), kernel)
     cell.n_bv += 1
     if kernel.importance.n_surrogates > 0:
-        a, cut_challenge, stay_challenge = (
-            acceleration(cell.bv_maneuver),
-            cells.cut_challenge[k],
-            cells.stay_challenge[k],
-        )
-        look_ahead(state, a, cell.step, kernel.environment, kernel.importance, cut_challenge, stay_challenge)
+        a, cutting, staying = acceleration(cell.bv_maneuver), cells.cut_challenge[k], cells.stay_challenge[k]
+        look_ahead(state, a, cell.step, kernel.environment, kernel.importance, cutting, staying)
 
 
 @compiled_inline
@@ -103,7 +92,7 @@ def redraw_free(k: int, state: State, kernel: KernelState) -> None:
     if kernel.importance.n_surrogates > 0:
         take_bv(k, controlled_draw(k, u, state, kernel), kernel)
     else:
-        take_bv(k, draw_acceleration(u, free_driving(state.v_bv_mps, kernel.environment), kernel.environment), kernel)
+        take_bv(k, laws.drive_freely(u, state.v_bv_mps, kernel.environment), kernel)
 
 
 @compiled_inline
@@ -247,7 +236,7 @@ def look_for_cut_in(k: int, steps: int, kernel: KernelState) -> None:
         cell.clock += hazard[step]
         cut = cell.clock >= cell.target
         if kernel.importance.n_forced == 1:
-            state = state_in(step, kernel.scratch.path)
+            state = state_of(kernel.scratch.path.x[step], kernel.scratch.path.v[step])
             record_lane(k, step, state, cut, -math.expm1(-hazard[step]), hazard[step], False, kernel)
         if cut:
             lead = draw_lead(step, kernel.seed, cell.episode, kernel.environment.lateral)
@@ -278,8 +267,8 @@ def choose_lane(k: int, state: State, kernel: KernelState) -> None:
     """Stay or cut in."""
     cells, scratch, environment, importance = kernel.cells, kernel.scratch, kernel.environment, kernel.importance
     cell = cells.cell[k]
-    wish = opportunity(state, environment)
-    hazard = cut_in_hazard(wish, acceptance(state.r2_m, state.r2dot_mps, environment), environment)
+    wish = laws.opportunity(state, environment)
+    hazard = laws.cut_in_hazard(wish, laws.acceptance(state.r2_m, state.r2dot_mps, environment), environment)
     p = -math.expm1(-hazard) if importance.alpha.size > 0 else 0.0  # only the likelihood ratios ask for it
     critical = False
     if importance.n_surrogates > 0:
@@ -326,10 +315,10 @@ def controlled_draw(k: int, u: float, state: State, kernel: KernelState) -> int:
     """Acceleration index at a redraw time after the cut-in, which may be critical."""
     scratch, environment, importance = kernel.scratch, kernel.environment, kernel.importance
     cell, p, q = kernel.cells.cell[k], scratch.p, scratch.q_acceleration
-    law = free_driving(state.v_bv_mps, environment)
+    law = laws.free_driving(state.v_bv_mps, environment)
     if challenges_nobody(state, importance):
         return draw_acceleration(u, law, environment)
-    acceleration_pmf(law, environment, p)
+    laws.acceleration_pmf(law, environment, p)
     if not propose_acceleration(state, p, importance, q, scratch.challenge):
         return draw_acceleration(u, law, environment)
     if importance.mixes_steps or cell.component > 0:

@@ -7,9 +7,10 @@ import math
 import numpy as np
 
 from harness.compiled import compiled, compiled_inline
-from harness.episode.cells import KernelState, state_of
+from harness.episode.cells import KernelState
 from harness.episode.drive import note_if_ahead
 from harness.episode.likelihood_ratio import log_weight
+from harness.episode.path import state_of
 from harness.vehicles.kinematics import CONTACT_M, STEP_S, overlaps
 from harness.vocabulary import (
     AV,
@@ -45,7 +46,7 @@ def judge(kernel: KernelState, contact: BoolArray) -> int:
         if cell.row < 0:
             continue
         cell.step += 1
-        state = state_of(k, kernel)
+        state = state_of(kernel.x[k], kernel.v[k])
         if cell.cut_step >= 0 and state.r2dot_mps < 0.0 and state.r2_m >= 0.0:
             cell.min_ttc = min(cell.min_ttc, state.r2_m / -state.r2dot_mps)
         if kernel.boundary.size > 0:

@@ -14,17 +14,9 @@ import numpy as np
 
 from harness.compiled import compiled_inline, compiled_threads
 from harness.random_stream import BV_DRAWS, BV_FREE_DRAWS, LV_DRAWS, uniform
+from harness.traffic import laws
 from harness.traffic.lateral import onset_of, perceived_in
-from harness.traffic.laws import (
-    Environment,
-    acceleration,
-    acceptance,
-    car_following,
-    cut_in_hazard,
-    draw_acceleration,
-    free_driving,
-    opportunity,
-)
+from harness.traffic.laws import Environment, acceleration
 from harness.vehicles.drivers import NEED_BASED_KIND
 from harness.vehicles.kinematics import CONTACT_M, STEP_S, VEHICLE_LENGTH_M, gap, next_position, next_speed, overlaps
 from harness.vehicles.references import Memory, react
@@ -57,24 +49,17 @@ FOLLOWER_DTYPE = np.dtype(
 class Trajectory(NamedTuple):
     """Room for one; positions in m, speeds in m/s.
 
-    ``x``, ``v`` (3,) are the initial placement. ``lv``, ``bv`` (draws,) are maneuver indices before the cut-in,
-    ``x_lv``, ``x_bv``, ``x_av``, ``v_lv``, ``v_bv``, ``v_av`` (steps + 1,) the motion without it, and ``hazard``
-    (steps,) that of cutting in.
+    ``lv``, ``bv`` (draws,) are maneuver indices before the cut-in, ``x``, ``v`` (steps + 1, 3) the motion of LV, BV, AV
+    without it, and ``hazard`` (steps,) that of cutting in.
     ``free`` (draws,) are BV's maneuvers after the cut-in, ``x_after``, ``v_after`` (steps + 1,) its motion, and
     ``slowest`` (steps + 1,) the lowest speed that it will have from there on. ``follower`` (`MOST_FOLLOWERS`,) are
     those behind it.
     """
 
-    x: FloatArray
-    v: FloatArray
     lv: Int8Array
     bv: Int8Array
-    x_lv: FloatArray
-    x_bv: FloatArray
-    x_av: FloatArray
-    v_lv: FloatArray
-    v_bv: FloatArray
-    v_av: FloatArray
+    x: FloatArray
+    v: FloatArray
     hazard: FloatArray
     free: Int8Array
     x_after: FloatArray
@@ -106,7 +91,8 @@ def lengths(environment: Environment) -> tuple[int, int, int]:
 def empty_trajectory(environment: Environment) -> Trajectory:
     """Room for a trajectory of an environment."""
     max_steps, _, draws = lengths(environment)
-    shapes = {"x": 3, "v": 3, "lv": draws, "bv": draws, "free": draws, "hazard": max_steps, "follower": MOST_FOLLOWERS}
+    motion = dict.fromkeys(("x", "v"), (max_steps + 1, 3))
+    shapes = motion | {"lv": draws, "bv": draws, "free": draws, "hazard": max_steps, "follower": MOST_FOLLOWERS}
     kinds = dict.fromkeys(("lv", "bv", "free"), np.dtype(np.int8)) | {"follower": FOLLOWER_DTYPE}
     return Trajectory._make(
         np.zeros(shapes.get(name, max_steps + 1), kinds.get(name, np.dtype(np.float64))) for name in Trajectory._fields
@@ -125,36 +111,20 @@ def place(state: State, x: FloatArray, v: FloatArray) -> None:
 
 
 @compiled_inline
-def state_in(step: int, path: Trajectory) -> State:
-    """State before the maneuvers of a step that has been walked."""
-    x, v = path.x_bv[step], path.v_bv[step]
-    return State(v, gap(path.x_lv[step], x), path.v_lv[step] - v, gap(x, path.x_av[step]), v - path.v_av[step])
+def state_of(x: FloatArray, v: FloatArray) -> State:
+    """State from positions and speeds (3,) of LV, BV, AV."""
+    return State(v[BV], gap(x[LV], x[BV]), v[LV] - v[BV], gap(x[BV], x[AV]), v[BV] - v[AV])
 
 
 @compiled_inline
 def end_in(step: int, path: Trajectory) -> int:
     """How an episode without a cut-in ends in a step that has been walked, or `RUNNING`."""
-    if step > 0 and gap(path.x_lv[step], path.x_bv[step]) < CONTACT_M:
+    x = path.x[step]
+    if step > 0 and gap(x[LV], x[BV]) < CONTACT_M:
         return BV_LV_CONTACT
-    if step > 0 and gap(path.x_bv[step], path.x_av[step]) <= 0.0:
+    if step > 0 and gap(x[BV], x[AV]) <= 0.0:
         return PASSED
     return RUNNING
-
-
-@compiled_inline
-def take_step(step: int, seed: int, episode: int, known: int, environment: Environment, path: Trajectory) -> None:
-    """LV and BV move on; their first ``known`` maneuvers stand in ``path``, those after them are drawn."""
-    m = step // environment.numbers.hold_steps
-    v_lv, v_bv = path.v_lv[step], path.v_bv[step]
-    if step % environment.numbers.hold_steps == 0 and m >= known:
-        u = uniform(seed, episode, LV_DRAWS, m)
-        path.lv[m] = draw_acceleration(u, free_driving(v_lv, environment), environment)
-        u = uniform(seed, episode, BV_DRAWS, m)
-        path.bv[m] = draw_acceleration(u, car_following(state_in(step, path), environment), environment)
-    after_lv, after_bv = next_speed(v_lv, acceleration(path.lv[m])), next_speed(v_bv, acceleration(path.bv[m]))
-    path.x_lv[step + 1] = next_position(path.x_lv[step], v_lv, after_lv)
-    path.x_bv[step + 1] = next_position(path.x_bv[step], v_bv, after_bv)
-    path.v_lv[step + 1], path.v_bv[step + 1] = after_lv, after_bv
 
 
 @compiled_inline
@@ -173,16 +143,21 @@ def walk(
     The AV keeps its speed, and ``ends_passed`` says whether the walk ends where it has passed BV. The first ``known``
     maneuvers of LV and BV stand in ``path``; what comes after them is drawn, and written there.
     """
-    place(state, path.x, path.v)
-    path.x_lv[0], path.x_bv[0], path.x_av[0] = path.x[LV], path.x[BV], path.x[AV]
-    path.v_lv[0], path.v_bv[0], path.v_av[0] = path.v[LV], path.v[BV], path.v[AV]
+    hold_steps = environment.numbers.hold_steps
+    place(state, path.x[0], path.v[0])
     for step in range(until):
         end = end_in(step, path)
         if end == BV_LV_CONTACT or (end == PASSED and ends_passed):
             return step
-        take_step(step, seed, episode, known, environment, path)
-        path.x_av[step + 1] = next_position(path.x_av[step], path.v[AV], path.v[AV])
-        path.v_av[step + 1] = path.v[AV]
+        m, x, v, after = step // hold_steps, path.x[step], path.v[step], path.v[step + 1]
+        if step % hold_steps == 0 and m >= known:
+            u_lv, u_bv = uniform(seed, episode, LV_DRAWS, m), uniform(seed, episode, BV_DRAWS, m)
+            path.lv[m] = laws.drive_freely(u_lv, v[LV], environment)
+            path.bv[m] = laws.draw_acceleration(u_bv, laws.car_following(state_of(x, v), environment), environment)
+        after[LV], after[BV] = next_speed(v[LV], acceleration(path.lv[m])), next_speed(v[BV], acceleration(path.bv[m]))
+        after[AV] = v[AV]
+        for vehicle in range(3):
+            path.x[step + 1, vehicle] = next_position(x[vehicle], v[vehicle], after[vehicle])
     return until
 
 
@@ -191,9 +166,9 @@ def weigh_cut_ins(steps: int, environment: Environment, path: Trajectory) -> flo
     """Write the cut-in hazard of each step that has been walked; returns their sum."""
     total = 0.0
     for step in range(steps):
-        state = state_in(step, path)
-        accepted = acceptance(state.r2_m, state.r2dot_mps, environment)
-        path.hazard[step] = cut_in_hazard(opportunity(state, environment), accepted, environment)
+        state = state_of(path.x[step], path.v[step])
+        accepted = laws.acceptance(state.r2_m, state.r2dot_mps, environment)
+        path.hazard[step] = laws.cut_in_hazard(laws.opportunity(state, environment), accepted, environment)
         total += path.hazard[step]
     return total
 
@@ -214,14 +189,14 @@ def leave(
     The first ``known`` of them stand in ``path``; the others are drawn, ``first_draw`` being the index of the first.
     """
     hold_steps = environment.numbers.hold_steps
-    x, v = path.x_bv[cut], path.v_bv[cut]
+    x, v = path.x[cut, BV], path.v[cut, BV]
     a = acceleration(path.bv[cut // hold_steps])
     draws = 0
     for step in range(cut, until):
         if step > cut and (step - cut - 1) % hold_steps == 0:
             if draws >= known:
                 u = uniform(seed, episode, BV_FREE_DRAWS, first_draw + draws)
-                path.free[draws] = draw_acceleration(u, free_driving(v, environment), environment)
+                path.free[draws] = laws.drive_freely(u, v, environment)
             a = acceleration(path.free[draws])
             draws += 1
         v_after = next_speed(v, a)
@@ -254,7 +229,7 @@ def take_over(
     perceives_m = 0.0 if encloses else driver.perceives_lateral_m
     perceived, earlier = perceived_in(perceives_m, cut, lead, environment.lateral.distance_m)
     one.driver, one.encloses, one.first, one.end = d, encloses, perceived + late, FOLLOWS
-    one.x, one.v = path.x_av[onset + 1], path.v_av[onset + 1]
+    one.x, one.v = path.x[onset + 1, AV], path.v[onset + 1, AV]
     one.acceleration, one.danger, one.used_up = 0.0, math.inf, driver.used_up_steps + earlier
     if onset == cut and gap(path.x_after[cut + 1], one.x) < CONTACT_M:
         one.end = cut + 1
@@ -276,7 +251,7 @@ def follow(n: int, drivers: RecordArray, cut: int, lead: int, until: int, path: 
             return
         x_bv, v_bv, x_next = path.x_after[step], path.v_after[step], path.x_after[step + 1]
         if step <= cut:
-            x_bv, v_bv = path.x_bv[step], path.v_bv[step]
+            x_bv, v_bv = path.x[step, BV], path.v[step, BV]
         for i in range(n):
             one = path.follower[i]
             if one.end != FOLLOWS:
@@ -341,5 +316,5 @@ def mean_test_distance(seed: int, states: RecordArray, environment: Environment,
     total = 0.0
     for i in range(states.size):
         steps = walk(states[i], seed, i, 0, environment.numbers.max_steps, True, environment, path)
-        total += path.v[AV] * (0.1 * steps)
+        total += path.v[0, AV] * (0.1 * steps)
     return float(total / states.size)

@@ -34,15 +34,8 @@ import numpy as np
 
 from harness.compiled import compiled_inline, compiled_threads, unboxed
 from harness.importance.grid import AFTER, BEFORE, GridPoints, interpolate, locate, points_of, shape_of, state_at
-from harness.traffic.laws import (
-    Environment,
-    InitialStates,
-    acceleration,
-    acceleration_pmf,
-    acceptance,
-    car_following,
-    free_driving,
-)
+from harness.traffic import laws
+from harness.traffic.laws import Environment, InitialStates, acceleration
 from harness.vehicles.drivers import FVDM_KIND, SMALLEST_GAP_M, driver_acceleration, fvdm_acceleration, fvdm_shape
 from harness.vehicles.kinematics import CONTACT_M, STEP_S, next_speed
 from harness.vocabulary import N_ACCELERATIONS, Float32Array, FloatArray, Record, RecordArray
@@ -112,7 +105,7 @@ def maneuver_challenge(after: Float32Array, value: Float32Array, out: Float32Arr
 def free_driving_table(speeds: FloatArray, environment: Environment, out: FloatArray) -> None:
     """Free-driving probabilities at grid speeds; ``out`` (v, 31)."""
     for i in range(speeds.size):
-        acceleration_pmf(free_driving(speeds[i], environment), environment, out[i])
+        laws.acceleration_pmf(laws.free_driving(speeds[i], environment), environment, out[i])
 
 
 def level_steps(hold_steps: int) -> int:
@@ -259,7 +252,7 @@ def period_value(
     for i in range(n.hold_steps):
         if r2 <= 0.0:
             return total
-        accepted = acceptance(r2, speed - follower, environment)
+        accepted = laws.acceptance(r2, speed - follower, environment)
         after = next_speed(speed, bv_acceleration)
         r2 += (0.5 * (speed + after) - follower) * STEP_S
         speed = after
@@ -298,7 +291,7 @@ def mean_car_following_pmf(states: RecordArray, environment: Environment, out: F
     one = np.empty(N_ACCELERATIONS)
     out[:] = 0.0
     for i in range(states.shape[0]):
-        acceleration_pmf(car_following(states[i], environment), environment, one)
+        laws.acceleration_pmf(laws.car_following(states[i], environment), environment, one)
         for k in range(N_ACCELERATIONS):
             out[k] += one[k] / states.shape[0]
 

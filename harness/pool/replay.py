@@ -21,7 +21,7 @@ from harness.episode.path import (
     end_in,
     follow,
     leave,
-    state_in,
+    state_of,
     take_over,
     walk,
 )
@@ -44,6 +44,7 @@ from harness.vocabulary import (
     FloatArray,
     Int8Array,
     IntArray,
+    Record,
     RecordArray,
     states_from,
 )
@@ -104,19 +105,12 @@ def _lists(column: pa.ChunkedArray) -> tuple[Int8Array, IntArray]:
     return values, np.concatenate([[0], np.cumsum(lengths)])
 
 
-class Retraced(NamedTuple):
-    """What the twin says of stored episodes, one array entry (n,) each.
-
-    ``outcome``: how the episode ends, `RUNNING` where only the AV knows. ``n_steps``: when. ``onset_r2``,
-    ``onset_r2dot``: R2 (m) and R2dot (m/s) at the cut-in, or at its onset where that comes before, NaN without one.
-    ``impact``: v_AV - v_BV (m/s) at a crash, else NaN.
-    """
-
-    outcome: IntArray
-    n_steps: IntArray
-    onset_r2: FloatArray
-    onset_r2dot: FloatArray
-    impact: FloatArray
+RETRACED_DTYPE = np.dtype(
+    [(name, np.int64) for name in ("outcome", "n_steps")]
+    + [(name, np.float64) for name in ("onset_r2", "onset_r2dot", "impact")]
+)
+"""What the twin says of a stored episode: how it ends, `RUNNING` where only the AV knows, and when; R2 (m), R2dot (m/s)
+at the cut-in, or at its onset where that comes before, NaN without one; v_AV - v_BV (m/s) at a crash, else NaN."""
 
 
 @compiled_inline
@@ -164,29 +158,29 @@ def leave_stored(i: int, until: int, stored: StoredPaths, environment: Environme
 
 @compiled_inline
 def retrace_episode(
-    i: int, stored: StoredPaths, environment: Environment, driver: RecordArray, path: Trajectory, twin: Retraced
+    i: int, stored: StoredPaths, environment: Environment, driver: RecordArray, path: Trajectory, twin: Record
 ) -> None:
-    """Fill row ``i`` of ``twin``."""
+    """Fill ``twin``, a `RETRACED_DTYPE` record, for row ``i``."""
     max_steps = environment.numbers.max_steps
     cut, end = stored.cut_step[i], min(stored.n_steps[i], max_steps)
     lead = stored.lead[i]
-    twin.onset_r2[i] = twin.onset_r2dot[i] = twin.impact[i] = float("nan")
+    twin.onset_r2 = twin.onset_r2dot = twin.impact = float("nan")
     if cut < 0 or cut >= end:
-        twin.outcome[i], twin.n_steps[i] = approach(i, end, stored, environment, path)
+        twin.outcome, twin.n_steps = approach(i, end, stored, environment, path)
     else:
-        twin.outcome[i], twin.n_steps[i] = approach_cut_in(i, stored, environment, path)
-    if 0 <= cut <= twin.n_steps[i]:
-        state = state_in(onset_of(cut, lead), path)
-        twin.onset_r2[i], twin.onset_r2dot[i] = state.r2_m, state.r2dot_mps
-    if twin.outcome[i] != RUNNING:
+        twin.outcome, twin.n_steps = approach_cut_in(i, stored, environment, path)
+    if 0 <= cut <= twin.n_steps:
+        state = state_of(path.x[onset_of(cut, lead)], path.v[onset_of(cut, lead)])
+        twin.onset_r2, twin.onset_r2dot = state.r2_m, state.r2dot_mps
+    if twin.outcome != RUNNING:
         return
     if cut < 0:
         if end == max_steps:
-            twin.outcome[i] = TIMEOUT
+            twin.outcome = TIMEOUT
         return
-    twin.n_steps[i] = end
+    twin.n_steps = end
     if not leave_stored(i, end, stored, environment, path):
-        twin.outcome[i] = FAILED
+        twin.outcome = FAILED
         return
     if driver.size > 0:
         late = reaction_steps(driver[0], stored.seed, stored.first + i)
@@ -194,17 +188,17 @@ def retrace_episode(
         follow(1, driver, cut, lead, end, path)
         crash, speed = path.follower[0].end, path.follower[0].v
         if crash == WAS_AHEAD:
-            twin.outcome[i], twin.n_steps[i] = PASSED, cut + 1
+            twin.outcome, twin.n_steps = PASSED, cut + 1
         elif crash != NO_CRASH:
-            twin.outcome[i], twin.n_steps[i] = CRASH, crash
-            twin.impact[i] = speed - path.v_after[crash]
+            twin.outcome, twin.n_steps = CRASH, crash
+            twin.impact = speed - path.v_after[crash]
         elif end == max_steps:
-            twin.outcome[i] = TIMEOUT
+            twin.outcome = TIMEOUT
 
 
 @compiled_threads
 def retrace(
-    stored: StoredPaths, environment: Environment, driver: RecordArray, path: Trajectory, twin: Retraced
+    stored: StoredPaths, environment: Environment, driver: RecordArray, path: Trajectory, twin: RecordArray
 ) -> None:
     """What the twin says of every stored episode of an AV that keeps its speed until the cut-in; ``twin`` receives it.
 
@@ -212,7 +206,7 @@ def retrace(
     room to work in.
     """
     for i in range(stored.cut_step.size):
-        retrace_episode(i, stored, environment, driver, path, twin)
+        retrace_episode(i, stored, environment, driver, path, twin[i])
 
 
 class Retracing:
@@ -240,9 +234,9 @@ class Retracing:
             return 0
         stored = stored_paths(episodes, self._seed)
         n = int(episodes.num_rows)
-        twin = Retraced(np.zeros(n, np.int64), np.zeros(n, np.int64), np.zeros(n), np.zeros(n), np.zeros(n))
+        twin = np.zeros(n, RETRACED_DTYPE)
         environment, room = unboxed(self._environment), unboxed(self._room)
-        retrace(unboxed(stored), environment, self._driver, room, unboxed(twin))
+        retrace(unboxed(stored), environment, self._driver, room, twin)
         differing = _differences(episodes, stored, twin, self._at_cut_in, self._driver.size > 0)
         for column, (wrong, in_sumo, in_twin) in differing.items():
             if wrong.any():
@@ -269,26 +263,26 @@ _Difference = tuple[BoolArray, np.ndarray, np.ndarray]
 
 
 def _differences(
-    episodes: pa.Table, stored: StoredPaths, twin: Retraced, at_cut_in: tuple[str, str], built_in: bool
+    episodes: pa.Table, stored: StoredPaths, twin: RecordArray, at_cut_in: tuple[str, str], built_in: bool
 ) -> dict[str, _Difference]:
     """Per column what is to be equal."""
     outcome = _outcomes(episodes)
     r2, r2dot, impact, time = (_floats(episodes, name) for name in (*at_cut_in, "impact_speed_mps", "crash_time_s"))
     unknown = (outcome == FAILED) | ((stored.cut_step >= 0) & (not built_in))
-    expected = np.where(unknown, np.where(twin.outcome == RUNNING, outcome, twin.outcome), twin.outcome)
+    expected = np.where(unknown, np.where(twin["outcome"] == RUNNING, outcome, twin["outcome"]), twin["outcome"])
     crash = (outcome == CRASH) & built_in
     before = (outcome == FAILED) & (stored.cut_step < 0)  # it may have failed between the onset and the cut-in
     at = np.where(outcome == CRASH, stored.n_steps * STEP_S, np.nan)
     names = np.array([*OUTCOMES, "neither crash nor end"])
-    maneuvers = (twin.outcome == FAILED, names[outcome], np.full(len(outcome), "maneuvers that lead there"))
+    maneuvers = (twin["outcome"] == FAILED, names[outcome], np.full(len(outcome), "maneuvers that lead there"))
     return {
         "lv_maneuvers, bv_maneuvers": maneuvers,
-        at_cut_in[0]: (_unlike(r2, twin.onset_r2) & ~before, r2, twin.onset_r2),
-        at_cut_in[1]: (_unlike(r2dot, twin.onset_r2dot) & ~before, r2dot, twin.onset_r2dot),
+        at_cut_in[0]: (_unlike(r2, twin["onset_r2"]) & ~before, r2, twin["onset_r2"]),
+        at_cut_in[1]: (_unlike(r2dot, twin["onset_r2dot"]) & ~before, r2dot, twin["onset_r2dot"]),
         "outcome": (outcome != expected, names[outcome], names[expected]),
-        "n_steps": (stored.n_steps != twin.n_steps, stored.n_steps, twin.n_steps),
+        "n_steps": (stored.n_steps != twin["n_steps"], stored.n_steps, twin["n_steps"]),
         "crash_time_s": (_unlike(time, at), time, at),
-        "impact_speed_mps": (_unlike(impact, twin.impact) & crash, impact, twin.impact),
+        "impact_speed_mps": (_unlike(impact, twin["impact"]) & crash, impact, twin["impact"]),
     }
 
 

@@ -33,25 +33,18 @@ from harness.episode.path import (
     Trajectory,
     empty_trajectory,
     leave,
-    state_in,
+    state_of,
     walk,
     weigh_cut_ins,
     who_crashes,
 )
 from harness.progress import Progress
 from harness.random_stream import DIAGNOSTIC, INITIAL, LV_DRAWS, uniform, uniforms
+from harness.traffic import laws
 from harness.traffic.lateral import draw_lead
-from harness.traffic.laws import (
-    Environment,
-    InitialStates,
-    acceleration,
-    cut_in_hazard,
-    draw_acceleration,
-    free_driving,
-    opportunity,
-)
+from harness.traffic.laws import Environment, InitialStates
 from harness.vehicles.kinematics import CONTACT_M, gap, next_speed
-from harness.vocabulary import CUT_IN, LV, STATE_COLUMNS, BoolArray, FloatArray, Int8Array, IntArray, RecordArray
+from harness.vocabulary import AV, CUT_IN, LV, STATE_COLUMNS, BoolArray, FloatArray, Int8Array, IntArray, RecordArray
 
 FREE_DRAWS_PER_CUT_IN = 256
 """Stride of the uniforms for BV's free driving: each cut-in time of a path has draws of its own."""
@@ -161,7 +154,7 @@ def _enumerate(
             reach = walk(state[i], seed, index[i], 0, max_steps, False, environment, path)
             steps = min(runs.n_steps[i], reach)
             for step in range(steps + 1):
-                path.x_av[step], path.v_av[step] = runs.x_m[i, step], runs.v_mps[i, step]
+                path.x[step, AV], path.v[step, AV] = runs.x_m[i, step], runs.v_mps[i, step]
         weigh_cut_ins(steps, environment, path)
         hazard = 0.0
         for cut in range(steps):
@@ -173,7 +166,8 @@ def _enumerate(
         if runs.failed.size > 0 and runs.failed[i]:
             most = 0.0
             for step in range(steps, reach):
-                most += cut_in_hazard(opportunity(state_in(step, path), environment), 1.0, environment)
+                wish = laws.opportunity(state_of(path.x[step], path.v[step]), environment)
+                most += laws.cut_in_hazard(wish, 1.0, environment)
             found.unknown[i] = math.exp(-hazard) * -math.expm1(-most)
 
 
@@ -183,7 +177,7 @@ def who_crashes_after(
 ) -> int:
     """One bit for each driver that crashes if BV cuts in in a step of a path that has been walked."""
     leave(cut, environment.numbers.max_steps, seed, index, cut * FREE_DRAWS_PER_CUT_IN, 0, environment, path)
-    if gap(path.x_lv[cut + 1], path.x_after[cut + 1]) < CONTACT_M:
+    if gap(path.x[cut + 1, LV], path.x_after[cut + 1]) < CONTACT_M:
         return 0  # the episode ends as bv_lv_contact
     return who_crashes(followers, cut, draw_lead(cut, seed, index, environment.lateral), environment, path)
 
@@ -236,13 +230,13 @@ def _write(
         script.n_bv[i] += 1 + drawn
         script.lead[i] = draw_lead(cut[i], seed, index[i], environment.lateral)
         script.n_lv[i] = (n.max_steps - 1) // n.hold_steps + 1
-        v = path.v[LV]
+        v = path.v[0, LV]
         for step in range(n.max_steps):
             m = step // n.hold_steps
             if step % n.hold_steps == 0 and m >= before:
                 u = uniform(seed, index[i], LV_DRAWS, m)
-                lv[i, m] = draw_acceleration(u, free_driving(v, environment), environment)
-            v = next_speed(v, acceleration(lv[i, m]))
+                lv[i, m] = laws.drive_freely(u, v, environment)
+            v = next_speed(v, laws.acceleration(lv[i, m]))
 
 
 PILOT_PATHS = 2048

@@ -182,6 +182,12 @@ def free_driving(speed: float, environment: Environment) -> AccelerationLaw:
 
 
 @compiled_inline
+def drive_freely(u: float, speed: float, environment: Environment) -> int:
+    """Acceleration index of a vehicle that drives freely, from a uniform."""
+    return draw_acceleration(u, free_driving(speed, environment), environment)
+
+
+@compiled_inline
 def car_following(state: State, environment: Environment) -> AccelerationLaw:
     """Accelerations of BV behind LV: what the guard forbids is moved to its cap."""
     n = environment.numbers

@@ -17,17 +17,9 @@ from harness.campaign.files import names_a_file, read_model
 from harness.campaign.sections import EnvironmentSettings
 from harness.compiled import compiled_threads, unboxed
 from harness.errors import CampaignError
+from harness.traffic import laws
 from harness.traffic.lateral import constant_lead
-from harness.traffic.laws import (
-    Environment,
-    InitialStates,
-    acceleration_pmf,
-    acceptance,
-    build_environment,
-    car_following,
-    free_driving,
-    opportunity,
-)
+from harness.traffic.laws import Environment, InitialStates, build_environment
 from harness.traffic.parameters import SHIPPED_FOLDER, EnvironmentParameters, parameter_record
 from harness.vocabulary import N_ACCELERATIONS, BoolArray, FloatArray, State
 
@@ -159,12 +151,12 @@ def evaluate_laws(
 ) -> None:
     """All laws in states (n, 3) of v_BV, R1, R1dot and approaches (m, 2) of R2, R2dot, as kernels evaluate them."""
     for j in range(approaches.shape[0]):
-        accepted[j] = acceptance(approaches[j, 0], approaches[j, 1], environment)
+        accepted[j] = laws.acceptance(approaches[j, 0], approaches[j, 1], environment)
     for i in range(states.shape[0]):
         speed, r1, r1dot = states[i]
         state = State(speed, r1, r1dot, math.nan, math.nan)
-        free, following = free_driving(speed, environment), car_following(state, environment)
-        acceleration_pmf(free, environment, pmf[0, i])
-        acceleration_pmf(following, environment, pmf[1, i])
+        free, following = laws.free_driving(speed, environment), laws.car_following(state, environment)
+        laws.acceleration_pmf(free, environment, pmf[0, i])
+        laws.acceleration_pmf(following, environment, pmf[1, i])
         scale[0, i], scale[1, i] = 1.0 / free.inverse_scale, 1.0 / following.inverse_scale
-        chance[i] = opportunity(state, environment)
+        chance[i] = laws.opportunity(state, environment)
