@@ -10,6 +10,7 @@ import shutil
 import tempfile
 import time
 from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
 from typing import NamedTuple
 
@@ -26,7 +27,7 @@ from harness.resolved import resolve
 from harness.runner.prepare import prepare
 from harness.runner.workers import LocalWorkers
 from harness.sampling import ShardRequest, Source
-from harness.worlds.protocol import World
+from harness.worlds import World
 from harness.worlds.shim import shim_library
 from harness.worlds.sumo import SumoWorld, sumo_program
 from harness.worlds.twin import TwinWorld
@@ -230,7 +231,7 @@ def in_sumo(name: str, *, shim: bool, of: type[Recorded] = Recorded) -> Contende
 
 def missing(name: str) -> str | None:
     """Why a contender cannot run here, in words; None if it can."""
-    if name == "traci" and sumo_program("sumo") is None:
+    if name == "traci" and find_spec("sumo") is None:
         return "no sumo binary: pip install 'harness[sumo]'"
     if "shim" in name and shim_library() is None:
         return "no compiled shim: it is built at installation where there is a C++ compiler (pip install -e .)"
@@ -242,7 +243,7 @@ CONTENDERS: dict[str, tuple[Callable[[], Contender], int]] = {
     "harness+shim": (lambda: in_sumo("nade", shim=True), 5_000),
     "one-at-a-time": (lambda: Recorded(campaign("nade"), lambda _: in_libsumo()), 500),
     "bare one-at-a-time": (lambda: BareOneAtATime(campaign("nade")), 1_000),
-    "traci": (lambda: Recorded(campaign("nade"), lambda _: OverTraci(sumo_program("sumo"))), 50),
+    "traci": (lambda: Recorded(campaign("nade"), lambda _: OverTraci(sumo_program("sumo", "traci"))), 50),
     "floor": (lambda: Floor(campaign("nade")), 5_000),
     "recursive": (lambda: in_sumo("recursive", shim=False), 5_000),
     "recursive+shim": (lambda: in_sumo("recursive", shim=True), 5_000),

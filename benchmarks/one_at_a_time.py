@@ -30,7 +30,7 @@ def sumo_arguments() -> list[str]:
 
 
 class OneAtATime:
-    """World of one cell over either API of SUMO; see `harness.worlds.protocol.World`."""
+    """World of one cell over either API of SUMO; see `harness.worlds.World`."""
 
     n_cells = 1
 

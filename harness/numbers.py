@@ -98,11 +98,8 @@ def duration(seconds: float | None) -> str:
 
 def size(n_bytes: float) -> str:
     """``1.2 MB``."""
-    for unit in ("B", "kB", "MB", "GB"):
-        if n_bytes < 1000.0 or unit == "GB":
-            break
-        n_bytes /= 1000.0
-    return f"{n_bytes:.0f} {unit}" if unit == "B" else f"{number(n_bytes, 2, exponent=0)} {unit}"
+    unit = min(int(math.log10(max(n_bytes, 1.0))) // 3, 3)
+    return f"{number(n_bytes / 1000.0**unit, 2 if unit else 3, exponent=0)} {('B', 'kB', 'MB', 'GB')[unit]}"
 
 
 def leaves(content: Any, path: str = "") -> list[tuple[str, Any]]:

@@ -17,8 +17,6 @@ from harness.numbers import count, duration, words
 
 Figure = float | int | str
 
-LINE_INTERVAL_S = 30.0
-
 
 class Progress:
     """What the runner tells about its work; shown to nobody, as for the Python API. Nothing here changes a result."""
@@ -60,9 +58,8 @@ def episodes_left(
 class ShownProgress(Progress):
     """One bar on a terminal; elsewhere, for logs, a line every ``interval_s``: nothing of work that takes less.
 
-    The share is that of the work which is thought necessary: a campaign that stops on precision ends at 100 %, however
-    little of its budget it took. ``target_rhw`` is the relative half-width at which it stops, ``min_crashes`` what it
-    needs before it may. The stream is stderr by default, since stdout is for results.
+    The share is that of the work thought necessary: a campaign that stops on precision (``target_rhw``, after
+    ``min_crashes``) ends at 100 %. The stream is stderr by default, since stdout is for results.
     """
 
     def __init__(
@@ -71,7 +68,7 @@ class ShownProgress(Progress):
         min_crashes: int = 0,
         stream: TextIO | None = None,
         *,
-        interval_s: float = LINE_INTERVAL_S,
+        interval_s: float = 30.0,
     ) -> None:
         self._stream, self._interval_s = stream or sys.stderr, interval_s
         self._asked = target_rhw, min_crashes
@@ -109,11 +106,11 @@ class ShownProgress(Progress):
     def status(self, **figures: Figure) -> None:
         """Show figures beside the bar, keeping those not named."""
         for task in self._bars.tasks:
-            figures = task.fields["figures"] | figures
+            task.fields["figures"] |= figures
             if (budget := task.fields["budget"]) is not None:
                 # Not by `update`, which begins to measure time anew where the total is another one.
-                task.total = task.completed + episodes_left(task.completed, budget, *self._asked, figures)
-            self._bars.update(task.id, figures=figures)
+                left = episodes_left(task.completed, budget, *self._asked, task.fields["figures"])
+                task.total = task.completed + left
             self._bars.update(task.id, words=_words(task))
 
     def _print_lines(self) -> None:
@@ -133,10 +130,10 @@ def _words(task: Task) -> str:
     """Rate, figures, and time left, of what this run itself has done: an earlier run's share took no time now."""
     named = ((name.replace("_", " ").replace("rhw", "RHW"), figure) for name, figure in task.fields["figures"].items())
     figures = [f"{name} {words(figure, 2)}" for name, figure in named]
-    done, elapsed_s = task.completed - task.fields["before"], task.elapsed or 0.0
-    if done <= 0 or elapsed_s <= 0.0:
+    done = task.completed - task.fields["before"]
+    if done <= 0 or not task.elapsed:
         return " · ".join(figures)
-    s_each = elapsed_s / done
+    s_each = task.elapsed / done
     rate = f"{count(1.0 / s_each)}/s" if s_each < 1.0 else f"{duration(s_each)} each"
     left = [] if task.total is None else [f"{duration((task.total - task.completed) * s_each)} left"]
     return " · ".join([rate, *figures, *left])

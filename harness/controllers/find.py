@@ -63,26 +63,19 @@ def controller_class(name: str) -> Callable[..., Any]:
         ) from error
     found = getattr(module, class_name, None)
     if not callable(found):
-        raise CampaignError(
-            "av.controller",
-            f"no class {class_name} in {getattr(module, '__file__', module_name)}",
-            "a controller class (see docs/controllers.md)",
-            f"It has: {', '.join(name for name, value in vars(module).items() if isinstance(value, type))}.",
-        )
+        what = f"no class {class_name} in {getattr(module, '__file__', module_name)}"
+        mend = f"It has: {', '.join(name for name, value in vars(module).items() if isinstance(value, type))}."
+        raise CampaignError("av.controller", what, "a controller class (see docs/controllers.md)", mend)
     return found  # type: ignore[no-any-return]
 
 
 def _from_entry_point(name: str) -> Callable[..., Any]:
     points = entry_points(group=GROUP)
     if name not in points.names:
-        raise CampaignError(
-            "av.controller",
-            name,
-            f"an entry point of group {GROUP}: {', '.join(sorted(points.names)) or 'none is installed'}",
-            "Install the package that brings it, or write 'package.module:Class'.",
-        )
-    found: Callable[..., Any] = points[name].load()
-    return found
+        expected = f"an entry point of group {GROUP}: {', '.join(sorted(points.names)) or 'none is installed'}"
+        mend = "Install the package that brings it, or write 'package.module:Class'."
+        raise CampaignError("av.controller", name, expected, mend)
+    return points[name].load()  # type: ignore[no-any-return]
 
 
 def build_host(
@@ -101,7 +94,7 @@ def build_host(
     make: Callable[[], Any]
     if av.source == "controller":
         make = _maker(av)
-        first = _make_first(make, av, BlackBox(black_box))
+        first = _made(make, str(av.controller), BlackBox(black_box))
         if callable(getattr(first, "step_batch", None)) and callable(getattr(first, "start_batch", None)):
             return BatchHost(first, seed, guarded(), acts_before_cut_in=early)
         _require_vehicle_controller(first, str(av.controller))
@@ -117,70 +110,44 @@ def build_host(
 def _maker(av: AutomatedVehicle) -> Callable[[], Any]:
     """Makes controllers, each with parameters of its own: what one does to a list among them is nobody else's."""
     make = controller_class(str(av.controller))
-    return lambda: make(**deepcopy(_parameters(av)))
-
-
-def _parameters(av: AutomatedVehicle) -> dict[str, Any]:
-    return av.parameters if isinstance(av.parameters, dict) else {}
-
-
-def _make_first(make: Callable[[], Any], av: AutomatedVehicle, black_box: BlackBox) -> Any:
-    """Make one controller, so that what its constructor refuses is an error of the campaign, not of every episode."""
+    parameters = av.parameters if isinstance(av.parameters, dict) else {}
     try:
-        return _made(make, black_box)
-    except Exception as error:
-        if not _takes(partial(controller_class(str(av.controller)), **_parameters(av))):
-            raise CampaignError(
-                "av.parameters",
-                f"parameters that {av.controller} does not take ({cause_of(error)})",
-                "keyword arguments of the controller's constructor",
-                "Correct av.parameters, or the constructor.",
-            ) from error
+        signature(make).bind(**parameters)
+    except TypeError as error:
         raise CampaignError(
-            "av.controller",
-            f"{av.controller}, whose constructor raised {cause_of(error)}",
-            "a controller that can be made",
-            f"Mend its constructor, or what it needs; av.parameters: {', '.join(_parameters(av)) or 'none'}.",
+            "av.parameters",
+            f"{', '.join(parameters) or 'none'}, which {av.controller} does not take ({error})",
+            "keyword arguments of the controller's constructor",
+            "Correct av.parameters, or the constructor.",
         ) from error
+    except ValueError:
+        pass  # a class in C may have no signature
+    return lambda: make(**deepcopy(parameters))
 
 
-def _made(make: Callable[[], Any], black_box: BlackBox) -> Any:
-    """A new controller; whatever its constructor raises is an `Exception`."""
+def _made(make: Callable[[], Any], name: str, black_box: BlackBox) -> Any:
+    """Make one controller, so that what its constructor refuses is an error of the campaign, not of every episode."""
     black_box.enter(CONSTRUCTOR)
+    controller = None
     try:
-        controller = make()
-    except Exception:
-        raise
-    except BaseException as error:
+        controller, wrong = make(), black_box.misdeed()
+    except BaseException as error:  # noqa: BLE001 - whatever a user's code raises
         require_fault(error)
-        raise RuntimeError(cause_of(error)) from error
+        wrong = cause_of(error)
     finally:
         black_box.leave()
-    if (misdeed := black_box.misdeed()) is not None:
-        raise RuntimeError(misdeed)
-    return controller
-
-
-def _takes(make: partial[Any]) -> bool:
-    """Whether the names of the parameters suit the constructor."""
-    try:
-        signature(make.func).bind(**make.keywords)
-    except TypeError:
-        return False
-    except ValueError:  # a class in C may have no signature
-        return True
-    return True
+    if wrong is None:
+        return controller
+    mend = "Mend its constructor, or what it needs (av.parameters)."
+    raise CampaignError("av.controller", f"{name}, whose constructor failed: {wrong}", "a controller", mend)
 
 
 def _require_vehicle_controller(made: Any, name: str) -> None:
     missing = [method for method in ("start", "step", "close") if not callable(getattr(made, method, None))]
     if missing:
-        raise CampaignError(
-            "av.controller",
-            f"{name} without {', '.join(missing)}",
-            "start, step and close (per vehicle), or start_batch, step_batch and close (arrays)",
-            "See docs/controllers.md for both, in ten lines each.",
-        )
+        expected = "start, step and close (per vehicle), or start_batch, step_batch and close (arrays)"
+        mend = "See docs/controllers.md for both, in ten lines each."
+        raise CampaignError("av.controller", f"{name} without {', '.join(missing)}", expected, mend)
 
 
 def has_foreign_code(campaign: Campaign) -> bool:

@@ -62,7 +62,11 @@ def fmu_maker(fmu: FmuController) -> Callable[[], VehicleController]:
             "an FMI 2.0 co-simulation FMU",
             "Export it again, and try 'fmpy validate' on it.",
         ) from error
-    _require_co_simulation(fmu.file, description)
+    if not str(description.fmiVersion).startswith("2.") or description.coSimulation is None:
+        kind = "co-simulation" if description.coSimulation is not None else "model exchange"
+        found = f"{fmu.file}, for FMI {description.fmiVersion} {kind}"
+        mend = "Export the model as a co-simulation FMU of that version."
+        raise CampaignError("av.fmu.file", found, "FMI 2.0 co-simulation", mend)
     wiring = wire(fmu, description)
     made: list[FmuVehicleController] = []
 
@@ -80,12 +84,8 @@ def _fmpy() -> Any:
         import fmpy  # noqa: PLC0415 - an extra
         import fmpy.fmi2  # noqa: PLC0415 - an extra
     except ImportError as error:
-        raise CampaignError(
-            "av.fmu",
-            "no package fmpy",
-            "the extra for FMUs",
-            "Install it: pip install 'harness[fmi]'.",
-        ) from error
+        mend = "Install it: pip install 'harness[fmi]'."
+        raise CampaignError("av.fmu", "no package fmpy", "the extra for FMUs", mend) from error
     return fmpy
 
 
@@ -104,17 +104,6 @@ def _unpacked(file: Path) -> Path:
         finally:
             shutil.rmtree(fresh, ignore_errors=True)
     return folder
-
-
-def _require_co_simulation(file: str, description: Any) -> None:
-    if not str(description.fmiVersion).startswith("2.") or description.coSimulation is None:
-        kind = "co-simulation" if description.coSimulation is not None else "model exchange"
-        raise CampaignError(
-            "av.fmu.file",
-            f"{file}, for FMI {description.fmiVersion} {kind}",
-            "FMI 2.0 co-simulation",
-            "Export the model as a co-simulation FMU of that version.",
-        )
 
 
 def wire(fmu: FmuController, description: Any) -> Wiring:

@@ -1,12 +1,8 @@
 """Hosts: what stands between the episode loop and a user's controller, and turns its faults into failed episodes.
 
-The episode loop calls `start`, `act` and `close`, and knows nothing else of a controller.
-
-Whatever goes wrong in a call, an exception, NaN, an answer too late or outside of av.limits, ends the episode
-(`harness.episode.loop`) with the outcome ``failed``, these words in the column ``failure`` of its row, and the weight
-that it has so far. Its controller is dropped (of a batch only the cells fail), and the run goes on until failed tests
-exceed run.max_failed_share. Rate and lower limit count a failed test as no crash, upper limits as a crash. A call that
-takes too long meets an exception where Python runs, else the end of the process.
+The episode loop calls `start`, `act` and `close`, and knows nothing else of a controller. Whatever goes wrong in a call
+ends the episode as ``failed``, with its cause in the row (docs/controllers.md). A controller that failed is dropped; of
+a batch only the cells fail. A call that takes too long meets an exception, or the end of the process.
 """
 
 from __future__ import annotations
@@ -239,7 +235,7 @@ class VehicleHost:
 
     def _known_death(self, episode: int, step: int) -> str | None:
         death = self._fatal_episodes.get(episode)
-        return death.cause if death is not None and step >= death.step else None
+        return death.cause if death and step >= death.step else None
 
     def _drop(self, k: int) -> None:
         """A controller that failed is not used again: its next episode gets a new one."""

@@ -29,9 +29,8 @@ _ROUNDING = 1e-9
 
 _WOULD_MOVE = "it would move vehicles past the harness and invalidate the likelihood ratios"
 _STEPS = "the harness itself starts, steps and ends the simulation"
-_EXACT = "it has no effect here: what the AV is told it does exactly, as under speed mode 32"
 _WHY = {
-    "setSpeedMode": _EXACT,
+    "setSpeedMode": "it has no effect here: what the AV is told it does exactly, as under speed mode 32",
     "setLaneChangeMode": "it has no effect here: the AV stays on its lane",
     "addStepListener": "name the listener in the campaign: see StepListenerController",
     "changeLane": "the AV stays on its lane; " + _WOULD_MOVE,
@@ -55,11 +54,8 @@ class Domain:
     def __getattr__(self, name: str) -> Any:
         if name.startswith("_"):
             raise AttributeError(name)
-        why = _WHY.get(name)
-        if why is None and name in _REFUSED_OF_SIMULATION:
-            why = _STEPS
-        if why is None and name.startswith(_REFUSED_BEGINNINGS):
-            why = _WOULD_MOVE
+        why = _WHY.get(name) or (_STEPS if name in _REFUSED_OF_SIMULATION else None)
+        why = why or (_WOULD_MOVE if name.startswith(_REFUSED_BEGINNINGS) else None)
         if why is None:
             there = ", ".join(entry for entry in dir(self) if not entry.startswith("_") and entry != "see")
             raise AttributeError(f"{self._path} has no {name} here; it has {there}")
@@ -70,22 +66,12 @@ class Domain:
         return refused
 
 
-def _reading(table: str, about: str) -> Callable[[VehicleDomain, str], float]:
-    """A question that one of the tables by vehicle answers."""
-
-    def answer(self: VehicleDomain, vehID: str) -> float:
-        return float(self._of(getattr(self, table), vehID))
-
-    answer.__doc__ = about
-    return answer
-
-
-def _same_for_all(value: Any, about: str) -> Callable[[VehicleDomain, str], Any]:
-    """A question that has the same answer for every vehicle of the cell."""
+def _question(about: str, answer_of: Callable[[VehicleDomain], Any]) -> Callable[[VehicleDomain, str], Any]:
+    """A question about a vehicle that one of the tables by vehicle answers, or a value that is the same for all."""
 
     def answer(self: VehicleDomain, vehID: str) -> Any:
-        self.getLaneIndex(vehID)
-        return value
+        known = answer_of(self)
+        return self._of(known if isinstance(known, dict) else dict.fromkeys(self._lane, known), vehID)
 
     answer.__doc__ = about
     return answer
@@ -142,35 +128,32 @@ class VehicleDomain(Domain):
         """Their number."""
         return len(self._speed)
 
-    getSpeed = _reading("_speed", "Speed (m/s).")
-    getAcceleration = _reading(
-        "_acceleration", "Acceleration of the last step (m/s²); of LV and BV 0 at the first call of an episode."
+    getSpeed = _question("Speed (m/s).", lambda self: self._speed)
+    getAcceleration = _question(
+        "Acceleration of the last step (m/s²); of LV and BV 0 at the first call.", lambda self: self._acceleration
     )
-    getLanePosition = _reading("_position", "Front bumper along the lane (m).")
-    getLateralLanePosition = _reading(
-        "_lateral_m", "How far (m) to the left of the middle of its lane; a BV that comes over is on the right of it."
+    getLanePosition = _question("Front bumper along the lane (m).", lambda self: self._position)
+    getLateralLanePosition = _question(
+        "How far (m) to the left of its lane's middle; a BV that comes over is right of it.",
+        lambda self: self._lateral_m,
     )
-    getLateralSpeed = _reading("_lateral_mps", "Speed (m/s) to the left.")
+    getLateralSpeed = _question("Speed (m/s) to the left.", lambda self: self._lateral_mps)
+    getLaneIndex = _question("0 right, 1 left.", lambda self: self._lane)
+    getRoadID = _question("The cell's road.", lambda _: ROAD)
+    getAngle = _question("Heading (degrees, 90 is along x).", lambda _: HEADING_DEGREES)
+    getLength = _question("Length (m).", lambda _: VEHICLE_LENGTH_M)
+    getMinGap = _question("MinGap (m): zero, so that gaps are bumper to bumper.", lambda _: 0.0)
+    getMaxSpeed = _question("Speed (m/s) that the vehicle type allows.", lambda _: MAX_SPEED_MPS)
+    getTypeID = _question("Vehicle type.", lambda _: "exact")
 
     def getPosition(self, vehID: str) -> tuple[float, float]:
         """Front bumper (m) along, and the vehicle's middle across, the cell's own road."""
         along = self._of(self._position, vehID)
         return along, LANE_CENTRES_M[self._lane[vehID]] + self._lateral_m[vehID]
 
-    def getLaneIndex(self, vehID: str) -> int:
-        """0 right, 1 left."""
-        return int(self._of(self._lane, vehID))
-
     def getLaneID(self, vehID: str) -> str:
         """Road and lane index."""
         return f"{ROAD}_{self.getLaneIndex(vehID)}"
-
-    getRoadID = _same_for_all(ROAD, "The cell's road.")
-    getAngle = _same_for_all(HEADING_DEGREES, "Heading (degrees, 90 is along x).")
-    getLength = _same_for_all(VEHICLE_LENGTH_M, "Length (m).")
-    getMinGap = _same_for_all(0.0, "MinGap (m): zero, so that gaps are bumper to bumper.")
-    getMaxSpeed = _same_for_all(MAX_SPEED_MPS, "Speed (m/s) that the vehicle type allows.")
-    getTypeID = _same_for_all("exact", "Vehicle type.")
 
     def getAccel(self, vehID: str) -> float:
         """Bound that `setAccel` has put on commands (m/s²), infinite without."""
@@ -289,18 +272,13 @@ class Traci(Domain):
     _path = "traci"
 
     def __init__(self) -> None:
-        self.vehicle = VehicleDomain()
-        self.simulation = SimulationDomain()
+        self.vehicle, self.simulation = VehicleDomain(), SimulationDomain()
+        self.exceptions = self  # so that ``traci.exceptions.TraCIException`` is found
 
     def see(self, now: Observation) -> None:
         """Take in what is there before a step."""
         self.simulation.time_s = now.time_s
         self.vehicle.see(now)
-
-    @property
-    def exceptions(self) -> type[Traci]:
-        """So that ``traci.exceptions.TraCIException`` is found."""
-        return Traci
 
     def setLegacyGetLeader(self, enabled: bool) -> None:
         """Whether `getLeader` answers None (as 1.28 does by default) or ``("", -1.0)`` when nobody is ahead."""

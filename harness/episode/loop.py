@@ -31,7 +31,7 @@ from harness.traffic.laws import Environment
 from harness.vehicles.drivers import driver_records
 from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import AV, CRASH, FAILED, BoolArray, FloatArray, IntArray, RecordArray
-from harness.worlds.protocol import AVLostError, DrivingWorld, World
+from harness.worlds import AVLostError, DrivingWorld, World
 
 NOBODY = driver_records([])
 MOMENT_LIMITS = {"all": 32767, "first_9": 9, "none": 0}

@@ -12,7 +12,7 @@ from harness.estimators.estimate import Estimate, Estimates, Unavailable, finite
 from harness.estimators.one_pass import one_pass
 from harness.estimators.pairs import Contrast, Interval, PairedEstimate
 from harness.numbers import WIDEST_RHW
-from harness.records.manifest import StoppedBy
+from harness.records.folder import StoppedBy
 from harness.vocabulary import ESTIMATORS, EstimatorName
 
 _PER_KM = 1e6

@@ -14,15 +14,14 @@ import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
-from pydantic import TypeAdapter, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from harness.errors import RunFolderError, shortened, writing
-from harness.records.manifest import StoredManifest
 from harness.records.schemas import ShardTables
 
 T = TypeVar("T")
@@ -31,7 +30,6 @@ MANIFEST = "manifest.json"
 SHELLS = "shells.json"
 """Strata of a shells campaign, as its estimates need them."""
 TABLES = ("episodes", "moments", "traces")
-COMPRESSION = "zstd"
 MEND_SHARD = (
     "Delete all files of this shard (in episodes/, moments/ and traces/) and run again with --resume: "
     "the same episodes are made anew."
@@ -147,9 +145,8 @@ def encoded(tables: ShardTables) -> dict[str, bytes]:
 def parquet(table: pa.Table) -> bytes:
     """A table as the content of a file."""
     sink = pa.BufferOutputStream()
-    pq.write_table(table, sink, compression=COMPRESSION)
-    content: bytes = sink.getvalue().to_pybytes()
-    return content
+    pq.write_table(table, sink, compression="zstd")
+    return sink.getvalue().to_pybytes()  # type: ignore[no-any-return]
 
 
 def write_shard(folder: Path, index: int, shard: Mapping[str, bytes]) -> dict[str, str]:
@@ -189,13 +186,12 @@ def concatenated(tables: Sequence[pa.Table], folder: Path) -> pa.Table:
         types: dict[str, set[str]] = {}
         for field in (field for table in tables for field in table.schema):
             types.setdefault(field.name, set()).add(str(field.type))
-        mixed = [f"{name} as {' and '.join(sorted(found))}" for name, found in types.items() if len(found) > 1]
-        raise RunFolderError(
-            str(folder),
+        mixed = [f"{name} as {' and '.join(sorted(kinds))}" for name, kinds in types.items() if len(kinds) > 1]
+        found, expected = (
             f"shards of different types: {'; '.join(mixed) or error}",
-            "records that one version of the harness has written",
-            "Run the campaign again into a new folder.",
-        ) from error
+            "records of one version of the harness",
+        )
+        raise RunFolderError(str(folder), found, expected, "Run the campaign again into a new folder.") from error
 
 
 def damaged(path: Path, error: Exception, mend: str = MEND_SHARD) -> RunFolderError:
@@ -209,6 +205,83 @@ def no_episodes(folder: Path) -> RunFolderError:
     """What to say of a run that was ended before its first shard was finished."""
     found = "a run that has not finished an episode yet"
     return RunFolderError(str(folder), found, "episodes on record", "Let `harness run` go on with --resume.")
+
+
+StoppedBy = Literal["rhw", "accept", "contradicted", "two_phase", "episodes", "pool", "pool_error"]
+"""The asked precision, a decision about the limit, a vehicle that does not do what the deciding statement assumes, the
+number of tests planned for a precision, the budget, the last cut-in that the pool holds of a shell that needs more, or
+the pool's own error, which alone is wider than that."""
+Count = Annotated[int, Field(ge=0, lt=2**63)]
+ShardPath = Annotated[str, Field(pattern=r"^[a-z]+/[A-Za-z0-9_-]+\.parquet$")]
+
+
+class Stored(BaseModel):
+    """Strict in the types of the keys that it names."""
+
+    model_config = ConfigDict(extra="allow", strict=True, allow_inf_nan=False)
+
+
+class Files(Stored):
+    """Files of a shard, by table."""
+
+    episodes: ShardPath
+    moments: ShardPath | None = None
+    traces: ShardPath | None = None
+
+
+class StoredShard(Stored):
+    """A contiguous range of episodes."""
+
+    index: Count
+    first_episode: Count
+    n_episodes: Count
+    files: Files
+
+
+class Retraced(Stored):
+    """How many episodes the twin has retraced in which columns, or why none."""
+
+    n_episodes: Count | None = None
+    compared: list[str] | None = None
+    reason: str | None = None
+
+
+class Repeated(Stored):
+    """What repeating some tests has shown; `harness.runner.worker.Repeated`."""
+
+    n_episodes: Count
+    differing: list[Count]
+
+
+class StoredManifest(Stored):
+    """What ``manifest.json`` of a run may hold.
+
+    A key that is not named here is let through: later versions add some. One that is missing, as in older folders, is
+    no error, but for the three without which nothing can be read.
+    """
+
+    campaign_hash: str
+    n_episodes: Count
+    shards: list[StoredShard]
+    name: str | None = None
+    created: str | None = None
+    seed: Count | None = None
+    engine: str | None = None
+    reproducible: bool | None = None
+    versions: dict[str, str] = {}
+    cpu: str | None = None
+    controller_sha256: str | None = None
+    workers: Count | None = None
+    status: str | None = None
+    stopped_by: StoppedBy | None = None
+    wall_time_s: float | None = None
+    distance_per_test_m: float | None = None
+    ending: str | None = None
+    decision: dict[str, Any] | None = None
+    retraced: Retraced | None = None
+    repeated: Repeated | None = None
+    shadow_runs: dict[str, Count] | None = None
+    reported_from: Count | None = None
 
 
 def read_manifest(folder: Path, *, mend: str = NO_RUN) -> dict[str, Any]:
@@ -232,10 +305,9 @@ def read_as(kind: type[T], path: Path, *, mend: str) -> T:
     """Read a JSON file of a run as a type; one that no run has written is refused by the first value that is wrong."""
     try:
         return TypeAdapter(kind).validate_json(path.read_bytes(), strict=True)
-    except FileNotFoundError:
-        raise RunFolderError(str(path), "no such file", "a JSON file of a run", mend) from None
     except OSError as error:
-        raise RunFolderError(str(path), str(error), "a JSON file of a run", mend) from error
+        found = "no such file" if isinstance(error, FileNotFoundError) else str(error)
+        raise RunFolderError(str(path), found, "a JSON file of a run", mend) from error
     except ValidationError as error:
         first, *others = error.errors(include_url=False)
         where = ".".join(map(str, first["loc"])) or "content"

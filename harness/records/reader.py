@@ -44,8 +44,7 @@ def read_shards(
 ) -> Iterator[tuple[pa.Table, pa.Table | None]]:
     """Episodes and moments of every shard that the manifest lists; moments are None where the campaign kept none.
 
-    Columns are all by default, and no moments at all for an empty list. A shard with another number of episodes than
-    the manifest says is refused.
+    Columns are all by default, and no moments for an empty list. Each shard must be as long as the manifest says.
     """
     read = partial(read_shard, folder, episode_columns=episode_columns, moment_columns=moment_columns)
     yield from made_ahead(read, read_manifest(folder)["shards"], _READERS)
@@ -104,13 +103,11 @@ def table_sizes(folder: Path) -> list[TableSize]:
     for table in TABLES:
         kept = [shard for shard in shards if shard["files"].get(table)]
         files = [folder / shard["files"][table] for shard in kept]
-        episodes = (shard["n_episodes"] for shard in kept)  # a row each
-        n_rows = sum(episodes if table == "episodes" else (footer(file).num_rows for file in files))
         try:
             n_bytes = sum(file.stat().st_size for file in files)
         except OSError as error:
             raise damaged(Path(error.filename), error) from error
-        sizes.append(TableSize(table, len(files), n_rows, n_bytes))
+        sizes.append(TableSize(table, len(files), sum(footer(file).num_rows for file in files), n_bytes))
     return sizes
 
 

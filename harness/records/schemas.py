@@ -1,10 +1,7 @@
 """The tables that a run leaves: Arrow schemas with units and meanings in the field metadata, and a shard's rows.
 
-``episodes``: one row per episode, failed ones included. ``moments``: one row per control step. ``traces``: one row
-per step and vehicle. ``shadow``: one row per path that a vehicle which acts before the cut-in was driven along without
-one. Importance functions are in the order of `importance_names`: for the episode mixture the
-defensive ``forced`` cut-in first, then the surrogates; for the others the surrogates alone. Values are from
-`harness.episode.judge.end_episode`.
+Importance functions are in the order of `importance_names`: for the episode mixture the defensive ``forced`` cut-in
+first, then the surrogates; for the others the surrogates alone. Values are from `harness.episode.judge.end_episode`.
 """
 
 from __future__ import annotations
@@ -267,8 +264,7 @@ def _lateral_columns(e: RecordArray) -> dict[str, Any]:
 def _time_to_collision(r2_m: FloatArray, r2dot_mps: FloatArray) -> FloatArray:
     """NaN where nobody closes in, or has passed."""
     closing = (r2dot_mps < 0.0) & (r2_m >= 0.0)
-    found: FloatArray = np.divide(r2_m, -r2dot_mps, out=np.full(r2_m.shape, np.nan), where=closing)
-    return found
+    return np.asarray(np.divide(r2_m, -r2dot_mps, out=np.full(r2_m.shape, np.nan), where=closing))
 
 
 def moments_table(shard: Shard) -> pa.Table:
@@ -297,7 +293,7 @@ def _trace_columns(shard: Shard, row: int) -> dict[str, np.ndarray]:
     step = np.repeat(np.arange(steps, dtype=np.int16), len(VEHICLES))
     vehicle = np.tile(np.arange(len(VEHICLES), dtype=np.int8), steps)
     cut = int(shard.results.episode["cut_in_step"][row])
-    on_right = (vehicle == VEHICLES.index("AV")) | ((vehicle == VEHICLES.index("BV")) & (cut >= 0) & (step > cut))
+    on_right = (vehicle == AV) | ((vehicle == BV) & (cut >= 0) & (step > cut))
     flat = trace.reshape(-1, 3)
     return {
         "episode": np.full(step.size, shard.first_episode + row, np.int64),

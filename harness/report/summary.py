@@ -24,8 +24,7 @@ from harness.campaign.files import load_campaign
 from harness.errors import CampaignError, RunFolderError
 from harness.estimators.estimate import Estimate, Estimates, Unavailable
 from harness.estimators.shells import ShellDetails, Within
-from harness.records.folder import MANIFEST, NO_RUN, concatenated, read_as, read_manifest
-from harness.records.manifest import Count, StoredManifest
+from harness.records.folder import MANIFEST, NO_RUN, Count, StoredManifest, concatenated, read_as, read_manifest
 from harness.records.reader import read_shards, stored_columns
 from harness.strata import ASSUMPTION_FREE
 from harness.vehicles.kinematics import STEP_S

@@ -26,8 +26,7 @@ from harness.runner.repeat import Bits, bits_of
 from harness.sampling import ShardRequest, Source, source_of
 from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import AV, CRASH, FAILED, FloatArray
-from harness.worlds import build_world
-from harness.worlds.protocol import AVLostError
+from harness.worlds import AVLostError, build_world
 from harness.worlds.shim import shim_library
 
 EPISODES = 48

@@ -20,8 +20,16 @@ from harness.estimators.stopping import Rule, Verdict
 from harness.pool.replay import Retracing
 from harness.pool.vehicle_pool import BaselinePaths
 from harness.progress import Progress
-from harness.records.folder import SHELLS, TABLES, shards_on_disk, sole_use, write_bytes, write_json, write_shard
-from harness.records.manifest import StoppedBy
+from harness.records.folder import (
+    SHELLS,
+    TABLES,
+    StoppedBy,
+    shards_on_disk,
+    sole_use,
+    write_bytes,
+    write_json,
+    write_shard,
+)
 from harness.resolved import Resolved
 from harness.runner.prepare import distance_per_test_m, prepare, require_ready
 from harness.runner.resume import (
@@ -49,7 +57,7 @@ ESTIMATES = "estimates.json"
 class RunResult:
     """What a finished campaign left in its folder, ``estimates.json`` and the page ``report.html`` among it.
 
-    ``stopped_by`` is explained at `harness.records.manifest.StoppedBy`; ``ending`` says in a sentence when it ended and
+    ``stopped_by`` is explained at `harness.records.folder.StoppedBy`; ``ending`` says in a sentence when it ended and
     which condition decided. The exit code is 0, or 4 when the budget or the pool was spent before the asked precision
     or decision, or 5 where the crash rate is above the limit that was to be kept.
     """

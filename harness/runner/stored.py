@@ -30,8 +30,7 @@ from harness.sampling import source_of
 from harness.sampling.baseline import read_baseline
 from harness.sampling.protocol import block_of
 from harness.vocabulary import ESTIMATORS, EstimatorName
-from harness.worlds import build_world
-from harness.worlds.protocol import World
+from harness.worlds import World, build_world
 from harness.worlds.system_libraries import require_libraries
 
 MOST_GROUPED = 5_000

@@ -32,7 +32,7 @@ from harness.resolved import Resolved
 from harness.strata import ShellDesign
 from harness.traffic.laws import InitialStates
 from harness.vocabulary import RecordArray
-from harness.worlds.protocol import World
+from harness.worlds import World
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 import traci.constants as tc
+from sumolib.miscutils import getFreeSocketPort
 from traci.connection import Connection
 from traci.exceptions import FatalTraCIError, TraCIException
 
@@ -36,7 +37,7 @@ from harness.campaign.vehicle import TraciProcess
 from harness.errors import CampaignError, WorldDisagreementError
 from harness.processes import end
 from harness.vocabulary import AV, BV, LV, BoolArray, FloatArray, Int8Array, IntArray
-from harness.worlds.protocol import AVLostError
+from harness.worlds import AVLostError
 from harness.worlds.sumo import LEFT, NEVER_PLAN_S, OBEY, PLAN_NOW_S, RIGHT, SumoCells, sumo_program
 from harness.worlds.twin import advance
 
@@ -54,13 +55,11 @@ _LOCAL = re.compile(r"^ *\|-- ([\d.]+)\n +/32 host LOCAL$", re.MULTILINE)
 
 def own_addresses() -> set[str]:
     """IPv4 addresses of this machine's interfaces; without a ``/proc``, those that its name stands for."""
-    try:
+    with suppress(OSError):
         return set(_LOCAL.findall(_ROUTES.read_text(encoding="ascii")))
-    except OSError:
-        try:
-            return set(socket.gethostbyname_ex(socket.gethostname())[2])
-        except OSError:
-            return set()
+    with suppress(OSError):
+        return set(socket.gethostbyname_ex(socket.gethostname())[2])
+    return set()
 
 
 def require_private(program: TraciProcess) -> None:
@@ -100,15 +99,10 @@ class BatchConnection(Connection):  # type: ignore[misc] # traci has no types
         """Command vehicles (n,) to speeds (m/s)."""
         if not names:
             return
-        command, variable = tc.CMD_SET_VEHICLE_VARIABLE, tc.VAR_SPEED
-        parts = []
-        for name, speed in zip(names, speeds, strict=True):
-            encoded = name.encode()
-            body = struct.pack("!BBi", command, variable, len(encoded)) + encoded
-            body += struct.pack("!Bd", tc.TYPE_DOUBLE, speed)
-            parts.append(struct.pack("!B", len(body) + 1) + body)
-            self._queue.append(command)
-        self._string += b"".join(parts)
+        for name, speed in zip(map(str.encode, names), speeds, strict=True):
+            what = tc.CMD_SET_VEHICLE_VARIABLE, tc.VAR_SPEED, len(name), name, tc.TYPE_DOUBLE, speed
+            self._string += struct.pack(f"!BBBi{len(name)}sBd", 16 + len(name), *what)
+            self._queue.append(tc.CMD_SET_VEHICLE_VARIABLE)
         self._sendExact()
 
 
@@ -120,11 +114,11 @@ class ConnectedProgram:
     """
 
     def __init__(self, av: TraciProcess, n_cells: int, sumo_arguments: Sequence[str], step_time_s: float) -> None:
-        self._av = av
-        self._step_time_s = step_time_s
-        self._port = _free_port()
+        self._av, self._step_time_s = av, step_time_s
+        self._port = getFreeSocketPort()
         self._n_watched = 0
-        server = [str(_server_program()), *sumo_arguments, "--remote-port", str(self._port), "--num-clients", "2"]
+        server = [str(sumo_program("sumo", "av.traci")), *sumo_arguments]
+        server += ["--remote-port", str(self._port), "--num-clients", "2"]
         quiet = subprocess.DEVNULL
         with ExitStack() as ending:
             self._server = subprocess.Popen(server, stdout=quiet, stderr=quiet, start_new_session=True)  # noqa: S603
@@ -248,31 +242,16 @@ def _exit_words(code: int) -> str:
     return f"killed by signal {-code}" if code < 0 else f"exit code {code}"
 
 
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
-def _server_program() -> Path:
-    program = sumo_program("sumo")
-    if program is None:
-        raise CampaignError("av.traci", "no SUMO server", "the extra 'sumo'", "pip install 'harness[sumo]'.")
-    return program
-
-
 class TraciWorld(SumoCells):
     """World whose AVs are driven by a connected program, after the cut-in or from the start of an episode.
 
-    See `World` and `DrivingWorld` in `harness.worlds.protocol`.
+    See `World` and `DrivingWorld` in `harness.worlds`.
     """
 
     def __init__(self, n_cells: int, av: TraciProcess, step_time_s: float, *, acts_before_cut_in: bool = False) -> None:
         super().__init__(n_cells)
         self.acts_before_cut_in = acts_before_cut_in
-        self._av = av
-        self._step_time_s = step_time_s
-        self._restarts_left = av.restarts
+        self._av, self._step_time_s, self._restarts_left = av, step_time_s, av.restarts
         self._released: BoolArray = np.zeros(n_cells, np.bool_)
         self._on_right: BoolArray = np.zeros(n_cells, np.bool_)
         self._program: ConnectedProgram | None = None
@@ -280,7 +259,7 @@ class TraciWorld(SumoCells):
         atexit.register(self.close)
 
     def announce(self, cells: IntArray, episodes: IntArray) -> None:  # noqa: ARG002 - the program is not told
-        """See `harness.worlds.protocol.DrivingWorld`; SUMO and the program are started with the first episodes.
+        """See `harness.worlds.DrivingWorld`; SUMO and the program are started with the first episodes.
 
         An `AVLostError` says that the program does not connect, or has been started as often as the campaign allows.
         """
@@ -309,7 +288,7 @@ class TraciWorld(SumoCells):
         super()._move(to, k, vehicle, x, v)
 
     def place(self, cells: IntArray, x: FloatArray, v: FloatArray) -> None:
-        """See `harness.worlds.protocol.World`; the AVs of these cells are taken back under command."""
+        """See `harness.worlds.World`; the AVs of these cells are taken back under command."""
         program = self._running()
         to = program.connection.vehicle
         for k in cells.tolist():
@@ -320,7 +299,7 @@ class TraciWorld(SumoCells):
         self._on_right[cells] = False
 
     def step(self, speed: FloatArray, cut_in: Int8Array) -> BoolArray:
-        """See `harness.worlds.protocol.World`; speeds of released AVs are ignored.
+        """See `harness.worlds.World`; speeds of released AVs are ignored.
 
         Raises an `AVLostError` where the program did not take part in this step, a `WorldDisagreementError` where a
         vehicle that the harness commands is not where it should be.
@@ -373,12 +352,11 @@ class TraciWorld(SumoCells):
             raise _meddled(where, repr(float(found[k, vehicle])), f"{float(wanted[k, vehicle])!r}, as commanded")
 
     def restart(self) -> None:
-        """See `harness.worlds.protocol.DrivingWorld`; once the restarts are used up, all further episodes fail."""
+        """See `harness.worlds.DrivingWorld`; once the restarts are used up, all further episodes fail."""
         self._end_program()
         if self._restarts_left == 0:
-            self._given_up = (
-                f"the program was lost before and is not started again (av.traci.restarts: {self._av.restarts})"
-            )
+            restarts = f"av.traci.restarts: {self._av.restarts}"
+            self._given_up = f"the program was lost before and is not started again ({restarts})"
         self._restarts_left -= 1
 
     def _end_program(self) -> None:

@@ -9,7 +9,6 @@ import ctypes
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -28,13 +27,11 @@ def shim_library() -> Path | None:
 
 def open_shim(names: Sequence[str], told: FloatArray, x: FloatArray, v: FloatArray) -> Shim | None:
     """Shim for the given vehicles, or None: not built, switched off, or another libsumo than it knows."""
-    path = shim_library()
-    if path is None:
+    if (path := shim_library()) is None:
         return None
     import libsumo  # noqa: PLC0415 - takes 0.2 s, and only worlds need it
 
-    inner = getattr(libsumo, "_libsumo", None)
-    if inner is None:
+    if (inner := getattr(libsumo, "_libsumo", None)) is None:
         return None
     try:
         library = ctypes.CDLL(str(path))
@@ -49,33 +46,26 @@ def open_shim(names: Sequence[str], told: FloatArray, x: FloatArray, v: FloatArr
     handle = library.shim_open(inner.__file__.encode(), encoded, ctypes.c_long(len(names)))
     if not handle:
         return None
-    shim = Shim(library, handle, Arrays(told, x, v, np.zeros(x.size), np.zeros(x.size)))
+    shim = Shim(library, handle, told, x, v)
     shim.find_vehicles()
     return shim
 
 
-class Arrays(NamedTuple):
-    """Speed (m/s) that each vehicle was last told, where it should be after the coming step, and where SUMO says it is.
+class Shim:
+    """Vehicles of one simulation, told, read and compared in one call.
 
-    All have as many elements as there are vehicles, and stay where they are for as long as the shim is used.
+    ``told`` are the speeds (m/s) that they were last told, ``x`` and ``v`` where they should be after the coming step,
+    ``position`` (m) and ``speed`` where SUMO says they are: arrays of as many elements as there are vehicles, which
+    stay where they are.
     """
 
-    told: FloatArray
-    x: FloatArray
-    v: FloatArray
-    position: FloatArray
-    speed: FloatArray
-
-
-class Shim:
-    """Vehicles of one simulation, told, read and compared in one call."""
-
-    def __init__(self, library: ctypes.CDLL, handle: int, arrays: Arrays) -> None:
-        self.arrays = arrays
+    def __init__(self, library: ctypes.CDLL, handle: int, told: FloatArray, x: FloatArray, v: FloatArray) -> None:
+        self.told, self.x, self.v, self.position, self.speed = told, x, v, np.zeros(x.size), np.zeros(x.size)
         self._library = library
         self._handle: int | None = handle
+        arrays = told, x, v, self.position, self.speed
         self._addresses = [array.ctypes.data for array in arrays]  # to ask for them takes longer than the call
-        self._wanted, self._wanted_address = arrays.told, self._addresses[0]
+        self._wanted, self._wanted_address = told, self._addresses[0]
 
     def find_vehicles(self) -> None:
         """Look the vehicles up again: those of an earlier simulation in this process are gone.
@@ -88,12 +78,8 @@ class Shim:
     def step(self, wanted: FloatArray) -> bool:
         """Tell the speeds that differ from ``told`` (noting them there), simulate one step, read all vehicles.
 
-        Returns
-        -------
-        bool
-            Whether every position and speed is that of ``x`` and ``v``, in every bit.
-
-        Raises `RuntimeError`: SUMO raised an error, or a vehicle has left the road.
+        Returns whether every position and speed is that of ``x`` and ``v``, in every bit. Raises `RuntimeError`: SUMO
+        raised an error, or a vehicle has left the road.
         """
         if wanted is not self._wanted:
             self._wanted, self._wanted_address = wanted, wanted.ctypes.data

@@ -15,6 +15,7 @@ import os
 import sys
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -31,16 +32,9 @@ _CHECKOUT = Path(__file__).parents[2] / "sumo_networks"
 _INSTALLED = Path(__file__).parents[1] / "sumo_networks"
 
 EXACT_OPTIONS = (
-    "--step-length", "0.1",
-    "--step-method.ballistic", "true",
-    "--collision.action", "warn",
-    "--collision.mingap-factor", "0",
-    "--time-to-teleport", "-1",
-    "--default.speeddev", "0",
-    "--no-step-log", "true",
-    "--no-warnings", "true",
-    "--xml-validation", "never",
-    "--xml-validation.net", "never",
+    "--step-length", "0.1", "--step-method.ballistic", "true", "--collision.action", "warn",
+    "--collision.mingap-factor", "0", "--time-to-teleport", "-1", "--default.speeddev", "0", "--no-step-log", "true",
+    "--no-warnings", "true", "--xml-validation", "never", "--xml-validation.net", "never",
 )  # fmt: skip
 """Ballistic update; collisions reported and otherwise ignored; no teleports; nothing random."""
 
@@ -56,7 +50,7 @@ PARKED_M = {LV: 300.0, BV: 200.0, AV: 100.0}
 class SumoCells:
     """K roads in a SUMO, each with LV, BV and AV.
 
-    ``x``, ``v`` (K, 3) are as of `harness.worlds.protocol.World`.
+    ``x``, ``v`` (K, 3) are as of `harness.worlds.World`.
     """
 
     def __init__(self, n_cells: int) -> None:
@@ -133,21 +127,21 @@ def committed_file(name: str) -> Path:
     return path
 
 
-def sumo_program(name: str) -> Path | None:
-    """``sumo`` or ``sumo-gui`` of the extra ``harness[sumo]``, or None where it is not installed."""
-    try:
+def sumo_program(name: str, where: str) -> Path:
+    """``sumo`` or ``sumo-gui`` of the extra ``harness[sumo]``, which ``where`` in a campaign or call needs."""
+    with suppress(ImportError):
         import sumo  # noqa: PLC0415 - an extra
-    except ImportError:
-        return None
-    path = Path(str(sumo.SUMO_HOME)) / "bin" / name
-    return path if path.exists() else None
+
+        if (path := Path(str(sumo.SUMO_HOME)) / "bin" / name).exists():
+            return path
+    raise CampaignError(where, f"no {name}", "the extra 'sumo'", "Install it: pip install 'harness[sumo]'.")
 
 
 SPEED_CHECK_STEPS = 10
 
 
 class SumoWorld(SumoCells):
-    """World in SUMO, one in a process: libsumo holds no more; see `harness.worlds.protocol.World`.
+    """World in SUMO, one in a process: libsumo holds no more; see `harness.worlds.World`.
 
     ``vanilla`` lets SUMO plan in every step (action step 0.1 s), as a reference for tests; ``gui`` shows it; ``shim``
     uses the compiled shim where it is installed, with the same bits; ``options`` are further ones of SUMO, for instance
@@ -171,8 +165,7 @@ class SumoWorld(SumoCells):
         self._vanilla = vanilla
         self._told: FloatArray = np.zeros((n_cells, 3))
         self._n_steps = 0
-        self._running = False
-        self._options = tuple(options)
+        self._running, self._options = False, options
         self._api: Any = start_gui(self._arguments()) if gui else start_libsumo(self._arguments())
         self._running = SumoWorld._open = True
         atexit.register(self.close)
@@ -185,12 +178,9 @@ class SumoWorld(SumoCells):
         self._simulation_step = self._function("simulation", "step")
         self._shim = open_shim(self._flat, self._told, self.x, self.v) if shim and not gui else None
 
-    def _function(self, domain: str, name: str) -> Callable[..., Any]:
+    def _function(self, domain: str, name: str) -> Any:
         inner = getattr(self._api, "_libsumo", None)
-        function: Callable[..., Any] = getattr(inner, f"{domain}_{name}", None) or getattr(
-            getattr(self._api, domain), name
-        )
-        return function
+        return getattr(inner, f"{domain}_{name}", None) or getattr(getattr(self._api, domain), name)
 
     def _arguments(self) -> list[str]:
         return [*super()._arguments(), *self._options]
@@ -207,7 +197,7 @@ class SumoWorld(SumoCells):
             self._shim.find_vehicles()
 
     def place(self, cells: IntArray, x: FloatArray, v: FloatArray) -> None:
-        """See `harness.worlds.protocol.World`; positions and speeds are read back and compared."""
+        """See `harness.worlds.World`; positions and speeds are read back and compared."""
         positions, speeds = x[cells], v[cells]
         for k, at, driving in zip(cells.tolist(), positions.tolist(), speeds.tolist(), strict=True):
             for vehicle in (LV, BV, AV):
@@ -218,7 +208,7 @@ class SumoWorld(SumoCells):
         self._require_equal("m/s", self._get_speed, speeds, names)
 
     def step(self, speed: FloatArray, cut_in: Int8Array) -> BoolArray:
-        """See `harness.worlds.protocol.World`."""
+        """See `harness.worlds.World`."""
         changing = cut_in.nonzero()[0].tolist()
         for k in changing:
             self._begin_cut_in(self._names[k][BV])
@@ -241,9 +231,9 @@ class SumoWorld(SumoCells):
 
     def _require_as_read(self, shim: Shim) -> None:
         """Ask again, and by libsumo's getters, where the shim has read other values than are wanted now."""
-        if not np.array_equal(shim.arrays.position, self.x.ravel()):
+        if not np.array_equal(shim.position, self.x.ravel()):
             self._require_equal("m", self._get_position, self.x)
-        if not np.array_equal(shim.arrays.speed, self.v.ravel()):
+        if not np.array_equal(shim.speed, self.v.ravel()):
             self._require_equal("m/s", self._get_speed, self.v)
 
     def _read_released(self) -> None:
@@ -311,9 +301,7 @@ def start_gui(arguments: Sequence[str]) -> Any:
     """Start sumo-gui and connect to it; returns traci, which has libsumo's functions."""
     import traci  # noqa: PLC0415 - comes with libsumo, wanted only here
 
-    program = sumo_program("sumo-gui")
-    if program is None:
-        raise CampaignError("--gui", "no sumo-gui", "the extra 'sumo'", "Install it: pip install 'harness[sumo]'.")
+    program = sumo_program("sumo-gui", "--gui")
     display = os.environ.get("DISPLAY")
     if sys.platform.startswith("linux") and not display:
         raise _no_window("no screen (the environment variable DISPLAY is not set)")

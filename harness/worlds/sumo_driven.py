@@ -6,7 +6,6 @@ speed mode: its position and speed are read, not compared. LV and BV stay comman
 
 from __future__ import annotations
 
-import difflib
 import os
 import sys
 import tempfile
@@ -18,6 +17,7 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
+from harness.campaign.problems import did_you_mean
 from harness.controllers.hosts import episode_random
 from harness.errors import CampaignError
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
@@ -99,16 +99,14 @@ def av_type(sumo: Mapping[str, str | float]) -> dict[str, str | float]:
     """
     for name, value in sumo.items():
         if name not in ATTRIBUTES:
-            close = difflib.get_close_matches(name, ATTRIBUTES, n=1, cutoff=0.5)
-            mend = f"Did you mean '{close[0]}'?" if close else "SUMO's documentation of vType lists them."
+            mend = did_you_mean(name, ATTRIBUTES) or "SUMO's documentation of vType lists them."
             expected = "an attribute of SUMO's vType that matters to a vehicle on a straight road"
             raise _wrong(name, f"the unknown attribute '{name}'", expected, mend)
         if isinstance(value, bool):
             raise _wrong(name, value, "a number or a text", "SUMO writes 1 and 0.")
     model = sumo.get("carFollowModel", DEFAULTS["carFollowModel"])
     if model not in MODELS:
-        close = difflib.get_close_matches(str(model), MODELS, n=1, cutoff=0.3)
-        mend = f"Did you mean '{close[0]}'?" if close else "Choose one of them."
+        mend = did_you_mean(model, MODELS) or "Choose one of them."
         raise _wrong("carFollowModel", model, f"one of {', '.join(MODELS)}", mend)
     length = sumo.get("length", VEHICLE_LENGTH_M)
     if length != VEHICLE_LENGTH_M:
@@ -189,13 +187,13 @@ class SumoAvWorld(SumoWorld):
         return TYPE_NAME if vehicle == AV else super()._type_of(vehicle)
 
     def announce(self, cells: IntArray, episodes: IntArray) -> None:
-        """See `harness.worlds.protocol.DrivingWorld`; vehicles are recycled, whatever the episode."""
+        """See `harness.worlds.DrivingWorld`; vehicles are recycled, whatever the episode."""
 
     def restart(self) -> None:
-        """See `harness.worlds.protocol.DrivingWorld`; SUMO's models are never lost."""
+        """See `harness.worlds.DrivingWorld`; SUMO's models are never lost."""
 
     def place(self, cells: IntArray, x: FloatArray, v: FloatArray) -> None:
-        """See `harness.worlds.protocol.World`; the AVs of these cells are taken back under command."""
+        """See `harness.worlds.World`; the AVs of these cells are taken back under command."""
         for k in cells.tolist():
             self._api.vehicle.setSpeedMode(self._names[k][AV], OBEY)
         super().place(cells, x, v)
@@ -204,7 +202,7 @@ class SumoAvWorld(SumoWorld):
             self._let_go(cells)
 
     def step(self, speed: FloatArray, cut_in: Int8Array) -> BoolArray:
-        """See `harness.worlds.protocol.World`; speeds of released AVs are ignored."""
+        """See `harness.worlds.World`; speeds of released AVs are ignored."""
         self._wanted[:] = speed
         self._wanted[self._released, AV] = RELEASE
         contact = super().step(self._wanted, cut_in)

@@ -38,14 +38,11 @@ LIBRARIES = (
     SystemLibrary("libz.so.1", "zlib1g", "zlib", "zlib"),
     SystemLibrary("libstdc++.so.6", "libstdc++6", "libstdc++", "libstdc++"),
 )
-_INSTALL: dict[str, tuple[tuple[str, ...], ...]] = {
-    # Ubuntu's own updates hold the lock for some minutes after a first start: wait instead of failing.
-    "apt": (
-        ("apt-get", "update"),
-        ("apt-get", "-o", "DPkg::Lock::Timeout=300", "install", "-y", "--no-install-recommends"),
-    ),
-    "dnf": (("dnf", "install", "-y", "--setopt=install_weak_deps=False"),),
-    "apk": (("apk", "add", "--no-cache"),),
+# Ubuntu's own updates hold the lock for some minutes after a first start: wait instead of failing.
+_INSTALL = {
+    "apt": ("apt-get update", "apt-get -o DPkg::Lock::Timeout=300 install -y --no-install-recommends"),
+    "dnf": ("dnf install -y --setopt=install_weak_deps=False",),
+    "apk": ("apk add --no-cache",),
 }
 _ASK_NOTHING = ("env", "DEBIAN_FRONTEND=noninteractive", "LC_ALL=C")
 _QUOTED = 2
@@ -54,9 +51,7 @@ _QUOTED = 2
 
 def missing_libraries() -> list[SystemLibrary]:
     """Those that the dynamic loader does not find (it takes 40 ms to ask); none where SUMO's wheels are not Linux's."""
-    if not sys.platform.startswith("linux"):
-        return []
-    return [library for library in LIBRARIES if not _loads(library.soname)]
+    return [library for library in LIBRARIES if sys.platform.startswith("linux") and not _loads(library.soname)]
 
 
 def _loads(soname: str) -> bool:
@@ -69,8 +64,7 @@ def _loads(soname: str) -> bool:
 
 def require_libraries() -> None:
     """Refuse a machine that SUMO cannot be loaded on, naming the packages that are missing."""
-    missing = missing_libraries()
-    if missing:
+    if missing := missing_libraries():
         raise _cannot_load(missing, "Run `harness setup`, which installs them")
 
 
@@ -79,7 +73,7 @@ def install_commands(missing: Sequence[SystemLibrary]) -> list[list[str]]:
 
     Raises `HarnessError`: no package manager that is known, or neither root nor sudo.
     """
-    manager = next((name for name, commands in _INSTALL.items() if shutil.which(commands[0][0])), None)
+    manager = next((name for name, commands in _INSTALL.items() if shutil.which(commands[0].split()[0])), None)
     if manager is None:
         raise _cannot_load(missing, "None of apt-get, dnf and apk is here: install them as this system does")
     root: list[str] = []
@@ -87,9 +81,9 @@ def install_commands(missing: Sequence[SystemLibrary]) -> list[list[str]]:
         if shutil.which("sudo") is None:
             raise _cannot_load(missing, "You are not root and there is no sudo: run `harness setup` as root")
         root = ["sudo"] if sys.stdin.isatty() else ["sudo", "-n"]  # nobody is there to type a password
-    *before, last = _INSTALL[manager]
-    packages = [getattr(library, manager) for library in missing]
-    return [[*root, *_ASK_NOTHING, *command] for command in (*before, (*last, *packages))]
+    commands = [[*root, *_ASK_NOTHING, *command.split()] for command in _INSTALL[manager]]
+    commands[-1] += [getattr(library, manager) for library in missing]
+    return commands
 
 
 def install(missing: Sequence[SystemLibrary], commands: Sequence[Sequence[str]]) -> None:
@@ -103,7 +97,10 @@ def install(missing: Sequence[SystemLibrary], commands: Sequence[Sequence[str]])
         done = subprocess.run(  # noqa: S603 - our own words, and names from our own table
             command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False
         )
-        said += _complaints(done.stdout, failed=done.returncode != 0)
+        lines = [line.strip() for line in done.stdout.splitlines() if line.strip()]
+        # The lines that say what went wrong: apt marks them, the cause first; others end with them.
+        marked = [line for line in lines if line.startswith(("E:", "W:"))]
+        said += marked[:_QUOTED] or (lines[-_QUOTED:] if done.returncode else [])
     if done.returncode:
         raise HarnessError(
             shlex.join(commands[-1]),
@@ -111,13 +108,6 @@ def install(missing: Sequence[SystemLibrary], commands: Sequence[Sequence[str]])
             "the packages installed",
             f"See to what it says, or give your administrator the line for this system:\n{_install_lines(missing)}",
         )
-
-
-def _complaints(said: str, *, failed: bool) -> list[str]:
-    """The lines that say what went wrong: apt marks them, the cause first; others end with them."""
-    lines = [line.strip() for line in said.splitlines() if line.strip()]
-    marked = [line for line in lines if line.startswith(("E:", "W:"))]
-    return marked[:_QUOTED] or (lines[-_QUOTED:] if failed else [])
 
 
 def require_libsumo() -> None:
@@ -135,8 +125,8 @@ def not_importable(words: str) -> HarnessError:
         "libsumo",
         f"that it cannot be imported: {words}",
         "libsumo 1.28.0 as `pip install` brings it, and the system libraries that it names",
-        "Install the package of this system that holds the named file, or libsumo again (`pip install "
-        "--force-reinstall libsumo==1.28.0`).",
+        "Install the package of this system that holds the named file, or libsumo again: "
+        "pip install --force-reinstall libsumo==1.28.0.",
     )
 
 

@@ -48,13 +48,13 @@ class TwinWorld:
         return int(self.x.shape[0])
 
     def place(self, cells: IntArray, x: FloatArray, v: FloatArray) -> None:
-        """See `harness.worlds.protocol.World`."""
+        """See `harness.worlds.World`."""
         self.x[cells] = x[cells]
         self.v[cells] = v[cells]
         self._on_right[cells] = 0
 
     def step(self, speed: FloatArray, cut_in: Int8Array) -> BoolArray:
-        """See `harness.worlds.protocol.World`."""
+        """See `harness.worlds.World`."""
         self._on_right |= cut_in
         advance(self.x, self.v, speed)
         contacts(self.x, self._on_right, cut_in, self._contact)

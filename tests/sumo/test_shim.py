@@ -45,7 +45,7 @@ def test_where_it_is_built_it_is_used_unless_it_is_switched_off(switch, used, op
 
 
 def test_it_answers_whether_everything_is_as_wanted(shim):
-    _, x, v, position, speed = shim.arrays
+    x, v, position, speed = shim.x, shim.v, shim.position, shim.speed
     assert shim.step(V)
     assert position.tolist() == x.ravel().tolist() == read(libsumo.vehicle.getLanePosition)
     assert speed.tolist() == v.ravel().tolist() == read(libsumo.vehicle.getSpeed)
@@ -61,8 +61,8 @@ def test_a_speed_below_zero_gives_the_vehicle_back_to_sumo(shim):
     wanted = V.copy()
     wanted[0, 2] = -1.0
     shim.step(wanted)
-    assert shim.arrays.told[0, 2] == -1.0
-    assert shim.arrays.speed[2] != V[0, 2]
+    assert shim.told[0, 2] == -1.0
+    assert shim.speed[2] != V[0, 2]
     libsumo.vehicle.setSpeed("AV1", -1.0)
     libsumo.vehicle.setPreviousSpeed("AV0", 35.0)
     libsumo.vehicle.setPreviousSpeed("AV1", 35.0)
