@@ -91,6 +91,12 @@ def run_here(campaign: Campaign, out: Path, **options: Any) -> RunResult:
         return run(campaign, out, workers=1, **options)
 
 
+def run_with_workers(campaign: Campaign, out: Path, **options: Any) -> RunResult:
+    """Run a campaign with processes of its own, without its page."""
+    with without_page():
+        return run(campaign, out, **options)
+
+
 class ForkedPython(subprocess.Popen):
     """Instead of a fresh Python for a worker, a copy of this one: its imports take seconds, and are done here."""
 

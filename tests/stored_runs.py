@@ -37,6 +37,11 @@ def manifest(folder: Path) -> dict[str, Any]:
     return json.loads((folder / "manifest.json").read_text())
 
 
+def edit(folder: Path, file: str = "manifest.json", **changes: Any) -> None:
+    """Change keys of a JSON file of a run."""
+    (folder / file).write_text(json.dumps({**json.loads((folder / file).read_text()), **changes}))
+
+
 def estimates(folder: Path) -> dict[str, Any]:
     return json.loads((folder / "estimates.json").read_text())
 

@@ -1,4 +1,4 @@
-"""The same campaign gives the same bits, however it was run: worlds, workers, cells and deaths leave no trace."""
+"""The same campaign gives the same bits, however it was run: worlds, workers, cells, signals, deaths leave no trace."""
 
 from __future__ import annotations
 
@@ -6,19 +6,21 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
-import numpy as np
-import pyarrow.parquet as pq
 import pytest
 
+from harness.processes import Child, ForkServer
 from harness.progress import Progress
 from tests.golden.campaigns import BASE, IN_BOTH_WORLDS
-from tests.in_process import run_here, workers_alive
-from tests.stored_runs import MORE, copy_of, golden, manifest, sets, shard_files, stored_table, unlike_columns
+from tests.in_process import run_here, run_with_workers, workers_alive
+from tests.runner import bad_workers
+from tests.stored_runs import MORE, golden, manifest, sets, shard_files, stored_table, unlike_columns
 
-PATIENCE_S = 300.0
+PATIENCE_S, POLL_S = 300.0, 0.01
 SEVEN = "mixture-seven"
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.mark.parametrize("name", IN_BOTH_WORLDS)
@@ -34,13 +36,12 @@ def test_the_idm_however_it_is_brought(name, stored_run):
 @pytest.mark.parametrize(
     ("name", "cells"),
     [
-        *(
-            ("step-recursive-sumo", 64),
-            ("forced-inattentive", 7),
-            ("forced-acting-twin", 5),
-            ("forced-lateral-twin", 7),
-        ),
-        *(("shells-twin", 64), ("shells-acting-twin", 64), ("shells-lateral-twin", 5)),
+        ("step-recursive-sumo", 64),
+        ("forced-inattentive", 7),
+        ("forced-acting-twin", 5),
+        ("forced-lateral-twin", 7),
+        ("shells-twin", 64),
+        ("shells-lateral-twin", 5),
     ],
 )
 def test_any_number_of_cells(name, cells, stored_run, tmp_path):
@@ -48,21 +49,9 @@ def test_any_number_of_cells(name, cells, stored_run, tmp_path):
     assert unlike_columns(stored_run(name), tmp_path / "run") == []
 
 
-@pytest.mark.parametrize("name", [SEVEN, "shells-acting-twin"])
-def test_two_workers(name, stored_run, run, tmp_path):
-    run(golden(name, "world.cells=64"), tmp_path / "run", workers=2)
-    assert unlike_columns(stored_run(name), tmp_path / "run") == []
-
-
-def test_one_bit_of_one_value_makes_the_comparison_fail(stored_run, tmp_path):
-    other = copy_of(stored_run(SEVEN), tmp_path / "run")
-    path = shard_files(other, "traces")[5]
-    traces = pq.read_table(path, partitioning=None)
-    x = traces["x_m"].to_numpy().copy()
-    x[123] = np.nextafter(x[123], 0.0)
-    index = traces.column_names.index("x_m")
-    pq.write_table(traces.set_column(index, traces.schema.field("x_m"), [x]), path)
-    assert unlike_columns(stored_run(SEVEN), other) == ["traces.x_m"]
+def test_two_workers(stored_run, tmp_path):
+    run_with_workers(golden("shells-acting-twin", "world.cells=64"), tmp_path / "run", workers=2)
+    assert unlike_columns(stored_run("shells-acting-twin"), tmp_path / "run") == []
 
 
 class KillOneWorker(Progress):
@@ -78,57 +67,157 @@ class KillOneWorker(Progress):
             os.kill(self.killed[0], signal.SIGKILL)
 
 
-def test_a_worker_that_is_killed_changes_nothing(stored_run, run, tmp_path):
+def test_two_workers_of_which_one_is_killed(stored_run, tmp_path):
     progress = KillOneWorker()
-    run(golden(SEVEN), tmp_path / "run", workers=2, progress=progress)
+    run_with_workers(golden(SEVEN, "world.cells=64"), tmp_path / "run", workers=2, progress=progress)
     assert progress.killed
     assert unlike_columns(stored_run(SEVEN), tmp_path / "run") == []
 
 
-STRUCK = """
+# -- processes of their own: each costs seconds of imports --
+
+KILLED = """
 import os, signal, sys
 from pathlib import Path
 from harness.cli import main
 
-signal.signal(signal.SIGINT, signal.default_int_handler)  # whoever starts tests in the background ignores it
 n_writes, write = 0, Path.write_bytes
 
-def half_then_strike(path, content):
+def half_then_killed(path, content):
     global n_writes
-    of_shard = path.parent.name == "moments"
-    n_writes += of_shard
-    if of_shard and n_writes == int(sys.argv[2]):
+    n_writes += (of_shard := path.parent.name == "moments")
+    if of_shard and n_writes == 4:
         write(path, content[: len(content) // 2])
-        os.kill(os.getpid(), int(sys.argv[1]))
+        os.kill(os.getpid(), signal.SIGKILL)
     return write(path, content)
 
-Path.write_bytes = half_then_strike
-sys.exit(main(sys.argv[3:]))
+Path.write_bytes = half_then_killed
+sys.exit(main(sys.argv[1:]))
 """
 
 
-def struck_run(out: Path, number: signal.Signals, nth_shard: int, *options: str) -> subprocess.CompletedProcess:
-    """`harness run` that a signal reaches when a file of the n-th shard that it makes is half written."""
-    command = [sys.executable, "-c", STRUCK, str(number.value), str(nth_shard), "run", BASE, "--out", out, *options]
-    command += [*sets(*MORE[SEVEN]), "--workers", "1"]
-    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=PATIENCE_S)
-
-
-def test_interrupted_then_killed_then_resumed(stored_run, tmp_path):
+def test_killed_while_it_writes_then_resumed(stored_run, tmp_path):
     out = tmp_path / "run"
-    first = struck_run(out, signal.SIGINT, 3)
-    assert (first.returncode, "--resume" in first.stderr) == (130, True)
-    assert (manifest(out)["status"], manifest(out)["n_episodes"]) == ("interrupted", 160)
-    assert len(shard_files(out)) == 2
-    assert not list(out.rglob("*.part"))
-
-    assert struck_run(out, signal.SIGKILL, 4, "--resume").returncode == -signal.SIGKILL
+    command = [sys.executable, "-c", KILLED, "run", BASE, "--out", out, *sets(*MORE[SEVEN]), "--workers", "1"]
+    assert subprocess.run(command, check=False, timeout=PATIENCE_S).returncode == -signal.SIGKILL
     assert manifest(out)["status"] != "done"
-    assert len(shard_files(out)) == 5
-    assert len(list(out.rglob("*.part"))) == 1
+    assert (len(shard_files(out)), len(list(out.rglob("*.part")))) == (3, 1)
 
     run_here(golden(SEVEN), out, resume=True)
     assert manifest(out)["status"] == "done"
     assert stored_table(out, "episodes")["episode"].to_pylist() == list(range(560))
     assert unlike_columns(stored_run(SEVEN), out) == []
     assert not list(out.rglob("*.part"))
+
+
+def wait_for(process: subprocess.Popen, condition) -> None:
+    for _ in range(int(PATIENCE_S / POLL_S)):
+        if condition():
+            return
+        try:
+            process.wait(POLL_S)
+        except subprocess.TimeoutExpired:
+            continue
+        raise AssertionError(f"the run ended with {process.returncode}: {process.stderr.read()}")
+    raise AssertionError("too late")
+
+
+def finished(process: subprocess.Popen) -> tuple[int, str]:
+    """Exit code and stderr; the pipe ends only when nobody is left that holds it."""
+    try:
+        _, complaints = process.communicate(timeout=PATIENCE_S)
+    finally:
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+    return process.returncode, complaints
+
+
+def as_under_nohup() -> None:
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def test_what_is_ignored_stays_ignored_and_ctrl_c_to_all_processes_ends_a_run_in_order(tmp_path):
+    out = tmp_path / "run"
+    settings = ("world.engine=twin", "stop.episodes=1000000000", "stop.rhw=null", "run.shard_size=500")
+    command = [
+        sys.executable,
+        "-m",
+        "harness",
+        "run",
+        "scenarios/overtaking_forced.yaml",
+        "--out",
+        out,
+        "--workers",
+        "2",
+    ]
+    process = subprocess.Popen(
+        [*command, *sets(*settings)],
+        cwd=ROOT,
+        start_new_session=True,
+        preexec_fn=as_under_nohup,  # noqa: PLW1509 - no thread here
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    wait_for(process, lambda: len(shard_files(out)) >= 1)
+    os.killpg(process.pid, signal.SIGHUP)
+    n = len(shard_files(out))
+    wait_for(process, lambda: len(shard_files(out)) >= n + 2)  # one of them has been counted then
+    os.killpg(process.pid, signal.SIGINT)
+    code, complaints = finished(process)
+    assert code == 128 + signal.SIGINT
+    assert "the same command with --resume goes on" in complaints
+    assert "Traceback" not in complaints
+    assert manifest(out)["status"] == "interrupted"
+    assert manifest(out)["n_episodes"] >= 500
+    assert not list(out.rglob(".*"))
+
+
+ABANDONED = """
+import os, signal, sys, time
+from harness.processes import Child
+from tests.runner.bad_workers import abandoned
+
+Child(abandoned, sys.argv[1])
+while not os.path.exists(sys.argv[1] + ".done"):
+    time.sleep(0.01)
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_a_busy_worker_does_not_outlive_a_killed_parent_nor_does_what_it_has_started(tmp_path):
+    script, note = tmp_path / "parent.py", tmp_path / "pids"
+    script.write_text(ABANDONED, encoding="utf-8")
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, str(script), str(note)]
+    process = subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
+    assert finished(process) == (-signal.SIGKILL, "")
+    for pid in map(int, (tmp_path / "pids.done").read_text().split()):
+        wait_until_gone(Path(f"/proc/{pid}/stat"))
+
+
+def test_copies_of_a_fork_server_are_whole_and_end_with_it():
+    """It has one thread at the fork, and is started again when it was killed."""
+    server = ForkServer("harness.runner.workers", "libsumo")
+    first, second = (Child(bad_workers.waiting, server=server) for _ in range(2))
+    assert [first.connection.recv(), second.connection.recv()] == [1, 1]
+    assert first.send("end")
+    first.wait(PATIENCE_S)
+    assert (first.is_alive(), second.is_alive()) == (False, True)
+    os.killpg(server.start()._process.pid, signal.SIGKILL)
+    wait_until_gone(Path(f"/proc/{second._process.pid}/stat"))
+    assert (second.receive(), second.kill()) == (None, -signal.SIGKILL)
+    third = Child(bad_workers.waiting, server=server)
+    assert third.connection.recv() == 1
+    assert third.kill() == -signal.SIGKILL
+    server.close()
+
+
+def wait_until_gone(state: Path) -> None:
+    """A process closes its files a moment before it is gone."""
+    for _ in range(int(PATIENCE_S / POLL_S)):
+        if not state.exists() or state.read_text().rsplit(")", 1)[1].split()[0] == "Z":
+            return
+        time.sleep(POLL_S)
+    raise AssertionError(f"{state} is still there")
