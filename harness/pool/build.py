@@ -177,16 +177,8 @@ def pool_of(
     script = write_script(seed, paths.index[path], step, paths.state[path], environment)
     asked = np.concatenate([order, n_surrogates + np.arange(n_references)])
     crashes = ((paths.crashes[path, step][:, None] >> asked[None, :]) & 1).astype(np.bool_)
-    sample = CutIns(
-        PILOT_PATHS + path,
-        step,
-        cell[path, step],
-        paths.state[path],
-        *script[:-1],
-        crashes,
-        by_path[path].astype(np.float32),
-        script.lead,
-    )
+    cell_kept, state, mass_kept = cell[path, step], paths.state[path], by_path[path].astype(np.float32)
+    sample = CutIns(PILOT_PATHS + path, step, cell_kept, state, *script, crashes, mass_kept)
     return Pool(
         key=key,
         environment=environment_hash(environment),

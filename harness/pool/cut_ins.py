@@ -66,9 +66,9 @@ class CutIns:
     bv: Int8Array
     n_lv: IntArray
     n_bv: IntArray
+    lead: IntArray
     crashes: BoolArray
     path_mass: Float32Array
-    lead: IntArray
     motion: UInt64Array = field(default_factory=lambda: np.zeros(0, np.uint64))
 
     @property
@@ -178,31 +178,11 @@ def read_pool(path: Path) -> Pool:
     try:
         with pq.ParquetFile(path) as file:  # read_table would import, for 0.3 s, what reads folders
             table = file.read()
-        return _pool(table, sound_facts(table))
+        return _pool(table)
     except (OSError, pa.ArrowException, KeyError, TypeError, ValueError) as error:
         found = f"a file that is not a whole pool ({str(error).splitlines()[0] if str(error) else error!r})"
         mend = "Delete it: it is built again when it is needed."
         raise RunFolderError(str(path), found, "a pool that `harness pool` has written", mend) from error
-
-
-def stamped(table: pa.Table, facts: dict[str, Any]) -> pa.Table:
-    """The table with facts, and a hash of both: Parquet notices a truncated file, but hardly any flipped bit."""
-    known = json.dumps({"format": FORMAT, **facts}).encode()
-    return table.replace_schema_metadata({_METADATA: known, _DIGEST: _digest(table, known)})
-
-
-def sound_facts(table: pa.Table) -> dict[str, Any]:
-    """The facts of a `stamped` table.
-
-    Raises `KeyError`, `TypeError` or `ValueError`: it is none of this version, or its content has changed.
-    """
-    metadata = table.schema.metadata or {}
-    facts: dict[str, Any] = json.loads(metadata[_METADATA])
-    if facts["format"] != FORMAT:
-        raise ValueError(f"a pool of format {facts['format']}, this version reads {FORMAT}")
-    if metadata[_DIGEST].decode() != _digest(table, metadata[_METADATA]):
-        raise ValueError("its content has changed since it was written")
-    return facts
 
 
 def _digest(table: pa.Table, facts: bytes) -> str:
@@ -226,13 +206,10 @@ def _table(pool: Pool) -> pa.Table:
         "probability": (pa.array(probability[pool.shell]), "P under the NDE that it stands for"),
         "shell": (pa.array(pool.shell.astype(np.int8)), "first surrogate that crashes; the last shell: none does"),
         "cell": (pa.array(c.cell.astype(np.int16)), "shell and references that crash, as the metadata lists cells"),
-        "crashes": (
-            rows(c.crashes),
-            "which surrogates crash, in the order of the metadata's names, and which references",
-        ),
+        "crashes": (rows(c.crashes), "which surrogates crash, as the metadata orders names, and which references"),
         "path_mass": (
             rows(c.path_mass),
-            "P of a cut-in of each cell on the same path, times naturalistic over proposal density of the path",
+            "P of a cut-in of each cell on the path, times the path's weight",
         ),
         "lv_maneuvers": (prefixes(c.lv, c.n_lv), "LV's draws, one per hold period"),
         "bv_maneuvers": (prefixes(c.bv, c.n_bv), "BV's draws; 31 marks the cut-in"),
@@ -244,7 +221,9 @@ def _table(pool: Pool) -> pa.Table:
     known = {each.name: getattr(pool, each.name) for each in fields(pool) if each.name not in ("library", "cut_ins")}
     plain = {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in known.items()}
     table = pa.table([array for array, _ in columns.values()], schema=schema)
-    return stamped(table, {"library": pool.library.model_dump(), **plain})
+    facts = json.dumps({"format": FORMAT, "library": pool.library.model_dump(), **plain}).encode()
+    # A hash of both: Parquet notices a truncated file, but hardly any flipped bit.
+    return table.replace_schema_metadata({_METADATA: facts, _DIGEST: _digest(table, facts)})
 
 
 def padded(column: pa.ChunkedArray, width: int) -> tuple[np.ndarray, IntArray]:
@@ -256,7 +235,14 @@ def padded(column: pa.ChunkedArray, width: int) -> tuple[np.ndarray, IntArray]:
     return values, lengths
 
 
-def _pool(table: pa.Table, facts: dict[str, Any]) -> Pool:
+def _pool(table: pa.Table) -> Pool:
+    metadata = table.schema.metadata or {}
+    facts: dict[str, Any] = json.loads(metadata[_METADATA])
+    if facts["format"] != FORMAT:
+        raise ValueError(f"a pool of format {facts['format']}, this version reads {FORMAT}")
+    if metadata[_DIGEST].decode() != _digest(table, metadata[_METADATA]):
+        raise ValueError("its content has changed since it was written")
+
     def whole(name: str) -> IntArray:
         return np.asarray(table.column(name)).astype(np.int64)
 
@@ -266,19 +252,9 @@ def _pool(table: pa.Table, facts: dict[str, Any]) -> Pool:
 
     width = int(np.asarray(table.column("bv_maneuvers").combine_chunks().value_lengths()).max(initial=0))
     (lv, n_lv), (bv, n_bv) = (padded(table.column(name), width) for name in ("lv_maneuvers", "bv_maneuvers"))
-    cut_ins = CutIns(
-        path=whole("path"),
-        step=whole("cut_in_step"),
-        cell=whole("cell"),
-        state=states_from(np.asarray(table.column(name)) for name in STATE_COLUMNS),
-        lv=lv,
-        bv=bv,
-        n_lv=n_lv,
-        n_bv=n_bv,
-        crashes=matrix("crashes"),
-        path_mass=matrix("path_mass"),
-        lead=whole("lead_steps"),
-    )
+    states = states_from(np.asarray(table.column(name)) for name in STATE_COLUMNS)
+    path, step, cell, lead = map(whole, ("path", "cut_in_step", "cell", "lead_steps"))
+    cut_ins = CutIns(path, step, cell, states, lv, bv, n_lv, n_bv, lead, matrix("crashes"), matrix("path_mass"))
     known: dict[str, Any] = {
         name: np.array(value) if isinstance(value, list) else value for name, value in facts.items()
     }
