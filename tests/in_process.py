@@ -10,6 +10,7 @@ import pickle
 import subprocess
 import sys
 import tempfile
+import time
 import traceback
 import warnings
 from collections.abc import Callable, Iterator, Mapping
@@ -121,6 +122,8 @@ class ForkedPython(subprocess.Popen):
             except BaseException:  # noqa: BLE001 - nothing of pytest may go on in a copy
                 traceback.print_exc()
                 os._exit(1)
+        while os.getsid(self.pid) != self.pid:  # as after a true start: from now on it can be ended
+            time.sleep(0.0)
         self._child_created = True
 
 
