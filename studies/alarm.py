@@ -27,13 +27,13 @@ from scipy.special import logsumexp
 
 from harness.campaign.files import load_campaign
 from harness.compiled import compiled_threads, unboxed
-from harness.episode.loop import MOMENT_LIMITS, Drawing, EpisodeLoop, RecordPolicy, Shard
+from harness.episode.cells import Results
+from harness.episode.loop import MOMENT_LIMITS, Drawing, EpisodeLoop, RecordPolicy
 from harness.episode.path import Followers, Trajectory, empty_trajectory, who_crashes
 from harness.errors import CampaignError, HarnessError, RunFolderError
 from harness.estimators.block import EPISODE_COLUMNS, Block, block_from_tables
 from harness.estimators.estimate import finite_json
 from harness.importance.functions import build_importance, mixture_weights
-from harness.importance.tables import Tables
 from harness.pool.build import campaign_pool
 from harness.pool.cut_ins import Pool, environment_hash, read_pool
 from harness.pool.replay import LEAD, PATH_COLUMNS, StoredPaths, approach_cut_in, leave_stored, stored_paths
@@ -94,26 +94,22 @@ def drivers_crash(episodes: pa.Table, seed: int, environment: Environment, follo
     return found
 
 
-class SurrogateReplay:
-    """The surrogates of a pool in the place of a campaign's AV; a pool of another environment is a `CampaignError`."""
+def surrogates_crash(episodes: pa.Table, resolved: Resolved, pool: Pool) -> BoolArray:
+    """Which surrogates of a pool, in its order, would have crashed in the AV's place in consecutive episodes, (n, D).
 
-    def __init__(self, resolved: Resolved, pool: Pool) -> None:
-        self._environment, self._seed = resolved.environment, resolved.campaign.seed
-        if pool.environment != (own := environment_hash(self._environment)):
-            raise CampaignError(
-                "pool",
-                f"a pool of another environment ({pool.environment})",
-                f"one of the campaign's ({own}): crash rates of surrogates depend on traffic, level of lane "
-                "changing and hold time",
-                "Leave the pool out: the right one is built, which takes about 15 s.",
-            )
-        names = list(pool.library.surrogates)
-        self._followers = pool.library.followers_in(self._environment)
-        self._order = [names.index(name) for name in pool.names]
-
-    def crashes(self, episodes: pa.Table) -> BoolArray:
-        """Which surrogates would have crashed in consecutive episodes, shape (n, D), in the order of the pool."""
-        return drivers_crash(episodes, self._seed, self._environment, self._followers)[:, self._order]
+    A pool of another environment is a `CampaignError`.
+    """
+    environment, names = resolved.environment, list(pool.library.surrogates)
+    if pool.environment != (own := environment_hash(environment)):
+        raise CampaignError(
+            "pool",
+            f"a pool of another environment ({pool.environment})",
+            f"one of the campaign's ({own}): crash rates of surrogates depend on traffic, level of lane "
+            "changing and hold time",
+            "Leave the pool out: the right one is built, which takes about 15 s.",
+        )
+    crashes = drivers_crash(episodes, resolved.campaign.seed, environment, pool.library.followers_in(environment))
+    return crashes[:, [names.index(name) for name in pool.names]]
 
 
 LEVEL = 1e-4
@@ -178,20 +174,23 @@ class Alarm:
             lost = "failed tests have no cut-in, and what surrogates would have done in them is not known"
             no_verdict = f"{self._n_lost} {lost}"
         columns = {
-            "surrogate": known.names,
-            "n_crashes": self._hits.astype(int).tolist(),
-            "n_effective": effective.tolist(),
-            "mean": mean.tolist(),
-            "mu": known.mu.tolist(),
-            "mu_std_error": known.std_error.tolist(),
-            "p_value": [_p_value(each) for each in log_capital.tolist()],
+            "n_crashes": self._hits.astype(int),
+            "n_effective": effective,
+            "mean": mean,
+            "mu": known.mu,
+            "mu_std_error": known.std_error,
+            "p_value": np.array([_p_value(each) for each in log_capital.tolist()]),
         }
+        rows = zip(*(column.tolist() for column in columns.values()), strict=True)
         return {
             "raised": no_verdict is None and p_value <= LEVEL,
             "no_verdict": no_verdict,
             "n_episodes": self._n,
             "p_value": p_value,
-            "surrogates": [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)],
+            "surrogates": [
+                {"surrogate": name, **dict(zip(columns, row, strict=True))}
+                for name, row in zip(known.names, rows, strict=True)
+            ],
         }
 
     def _log_capital(self) -> FloatArray:
@@ -232,9 +231,8 @@ def alarm_of_run(folder: Path, pool_file: Path | None = None, progress: Progress
     """
     progress, manifest = progress or Progress(), read_manifest(folder)
     resolved = resolve(load_campaign(folder / "campaign.yaml", check_files=False))
-    campaign, environment = resolved.campaign, resolved.environment
-    if campaign.testing.method == "shells" or campaign.av.acts_before_cut_in:
-        drawn = campaign.testing.method == "shells"
+    campaign = resolved.campaign
+    if (drawn := campaign.testing.method == "shells") or campaign.av.acts_before_cut_in:
         raise HarnessError(
             str(folder),
             "tests drawn from shells" if drawn else "an AV that acted before the cut-in",
@@ -243,13 +241,14 @@ def alarm_of_run(folder: Path, pool_file: Path | None = None, progress: Progress
             "Choose another run; that SUMO and the twin agree is checked in each by retracing.",
         )
     pool = campaign_pool(resolved, progress) if pool_file is None else read_pool(pool_file)
-    surrogates, alarm, alpha = SurrogateReplay(resolved, pool), Alarm(KnownRates.of(pool)), mixture_weights(campaign)
-    columns = [*dict.fromkeys([*EPISODE_COLUMNS, *PATH_COLUMNS, *([LEAD] if environment.lateral.present else ())])]
+    alarm, alpha = Alarm(KnownRates.of(pool)), mixture_weights(campaign)
+    lead = [LEAD] if resolved.environment.lateral.present else []
+    columns = [*dict.fromkeys([*EPISODE_COLUMNS, *PATH_COLUMNS, *lead])]
 
     def replayed(shard: Mapping[str, Any]) -> tuple[Block, BoolArray]:
         episodes, _ = read_shard(folder, shard, episode_columns=columns, moment_columns=[])
         block = block_from_tables(episodes, None, method=campaign.testing.method, alpha=alpha)
-        return block, surrogates.crashes(episodes)
+        return block, surrogates_crash(episodes, resolved, pool)
 
     progress.stage("surrogates in the AV's place", sum(shard["n_episodes"] for shard in manifest["shards"]))
     for block, crashes in made_ahead(replayed, manifest["shards"]):
@@ -273,13 +272,18 @@ def table_errors(resolved: Resolved) -> Iterator[dict[str, Any]]:
     maneuver, and the mean of W V_j(s) at the first redraw after the cut-in, would both equal its crash rate. Nothing is
     told of campaigns without tables, nor of the immediate challenge, which is a yes or no by definition.
     """
-    tables = prepare(resolved).tables
-    if tables is None or resolved.campaign.testing.challenge == "immediate":
+    campaign, environment, tables = resolved.campaign, resolved.environment, prepare(resolved).tables
+    if tables is None or campaign.testing.challenge == "immediate":
         return
-    for j, surrogate in enumerate(resolved.campaign.surrogates):
-        shard = _run_surrogate(j, resolved, tables)
-        y = np.where(shard.results.episode["outcome"] == CRASH, np.exp(shard.results.episode["log_weight"]), 0.0)
-        for (table, quantity), predicted in zip(QUANTITIES.items(), _predictions(j, shard), strict=True):
+    testing = campaign.testing.model_copy(update={"method": "episode_mixture", "criticality_threshold": 0.0})
+    importance = build_importance(campaign.model_copy(update={"testing": testing}), tables)
+    states = InitialStates(environment.numbers).draw(SEED, 0, EPISODES)
+    for j, surrogate in enumerate(campaign.surrogates):
+        policy = Drawing(SEED, environment, importance, resolved.surrogates[j : j + 1])
+        all_kept = RecordPolicy(MOMENT_LIMITS["all"], "none", 0.0)
+        results = EpisodeLoop(TwinWorld(_CELLS), policy, all_kept).run(0, states).results
+        y = np.where(results.episode["outcome"] == CRASH, np.exp(results.episode["log_weight"]), 0.0)
+        for (table, quantity), predicted in zip(QUANTITIES.items(), _predictions(j, results), strict=True):
             yield {
                 "surrogate": surrogate,
                 "table": table,
@@ -290,30 +294,18 @@ def table_errors(resolved: Resolved) -> Iterator[dict[str, Any]]:
             }
 
 
-def _run_surrogate(j: int, resolved: Resolved, tables: Tables) -> Shard:
-    """Episodes of the campaign's mixture with surrogate ``j`` as the AV, every control step kept."""
-    campaign, environment = resolved.campaign, resolved.environment
-    testing = campaign.testing.model_copy(update={"method": "episode_mixture", "criticality_threshold": 0.0})
-    importance = build_importance(campaign.model_copy(update={"testing": testing}), tables)
-    policy = Drawing(SEED, environment, importance, resolved.surrogates[j : j + 1])
-    states = InitialStates(environment.numbers).draw(SEED, 0, EPISODES)
-    return EpisodeLoop(TwinWorld(_CELLS), policy, RecordPolicy(MOMENT_LIMITS["all"], "none", 0.0)).run(0, states)
-
-
-def _predictions(j: int, shard: Shard) -> tuple[FloatArray, FloatArray]:
+def _predictions(j: int, results: Results) -> tuple[FloatArray, FloatArray]:
     """Per episode V_j(s_0), and W V_j(s) at the first control step after the cut-in (0 without one)."""
-    used = int(shard.results.moment_count[0])
-    moment, v = shard.results.moment[:used], shard.results.moment_v[:used, j]
+    used = int(results.moment_count[0])
+    moment, v = results.moment[:used], results.moment_v[:used, j]
     order = np.lexsort((moment["step"], moment["row"]))
     moment, v = moment[order], v[order]
-    log_step = np.log(moment["p"]) - np.log(moment["q_sampled"])
-    first = np.searchsorted(moment["row"], moment["row"])
-    total = np.concatenate([[0.0], np.cumsum(log_step)])
-    weight_before = np.exp(total[:-1] - total[first])
-    before, after = np.zeros((2, len(shard.results.episode)))
-    at_start = moment["step"] == 0
-    before[moment["row"][at_start]] = v[at_start]
-    cut_in = shard.results.episode["cut_in_step"][moment["row"]]
-    at_redraw = (cut_in >= 0) & (moment["step"] == cut_in + 1)
-    after[moment["row"][at_redraw]] = (weight_before * v)[at_redraw]
+    row, step = moment["row"], moment["step"]
+    total = np.concatenate([[0.0], np.cumsum(np.log(moment["p"]) - np.log(moment["q_sampled"]))])
+    weight_before = np.exp(total[:-1] - total[np.searchsorted(row, row)])
+    before, after = np.zeros((2, len(results.episode)))
+    before[row[step == 0]] = v[step == 0]
+    cut_in = results.episode["cut_in_step"][row]
+    at_redraw = (cut_in >= 0) & (step == cut_in + 1)
+    after[row[at_redraw]] = (weight_before * v)[at_redraw]
     return before, after

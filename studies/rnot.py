@@ -1,7 +1,5 @@
 """The required number of tests (RNoT) as published, and what `python -m studies rnot` prints of it for stored runs.
 
-It is where, in shuffled tests, the relative half-width settles.
-
 [paper] section VI-E. For one ordering of the tests the RNoT is the first n after which the relative half-width
 RHW = z·sqrt(var/n)/estimate stays at or below a threshold; it is averaged over shuffles of the tests of one run. Where
 a shuffle is never above the threshold, the paper takes the n at which RHW is largest. The average acceleration ratio
@@ -16,11 +14,12 @@ in shards, and not by the estimator, so that two estimators of one run see the s
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from itertools import pairwise, takewhile
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -33,7 +32,7 @@ from harness.estimators.scv import Scv
 from harness.estimators.weighted import Nade, Nde
 from harness.progress import Progress
 from harness.runner.stored import stored_blocks
-from harness.vocabulary import BoolArray, FloatArray, IntArray
+from harness.vocabulary import CRASH, FAILED, BoolArray, FloatArray, Int8Array, IntArray
 
 RnotEstimator = Literal["nde", "nade", "scv"]
 _REFUSAL = {"nde": Nde.refusal, "nade": Nade.refusal, "scv": Scv.refusal}
@@ -72,6 +71,69 @@ class Procedure:
     def z(self) -> float:
         """Quantile of the normal interval."""
         return normal_half_width(1.0, self.confidence)
+
+
+class Tests(NamedTuple):
+    """So many tests ``n`` from a first one on, and (k,) rows in index order of those that crashed or failed.
+
+    ``sum_of_weights`` is that of all.
+    """
+
+    n: int
+    sum_of_weights: float
+    episode: IntArray
+    weight: FloatArray
+    failed: BoolArray
+
+    @classmethod
+    def of(cls, first: int, outcome: Int8Array, log_weight: FloatArray) -> Tests:
+        """Those of consecutive rows (n,) of records."""
+        at = np.flatnonzero((outcome == CRASH) | (outcome == FAILED))
+        weight = np.exp(np.where(np.isfinite(log_weight[at]), log_weight[at], 0.0))
+        with np.errstate(over="ignore"):
+            return cls(len(outcome), float(np.exp(log_weight).sum()), first + at, weight, outcome[at] == FAILED)
+
+    @classmethod
+    def joined(cls, parts: Iterable[Tests]) -> Tests:
+        """All in one."""
+        n, weights, *rows = zip(*parts, strict=True)
+        return cls(sum(n), math.fsum(weights), *(np.concatenate(each) for each in rows))
+
+    def first(self, n: int | None) -> Tests:
+        """The first n of them, but for the sum of weights, or all."""
+        if n is None or n >= self.n:
+            return self
+        kept = self.episode < n
+        return Tests(n, math.nan, self.episode[kept], self.weight[kept], self.failed[kept])
+
+    @property
+    def y(self) -> FloatArray:
+        """Weighted crashes (k,); a failed test counts as none."""
+        return np.where(self.failed, 0.0, self.weight)
+
+
+def read_run(folder: Path, *, with_ratios: bool = False) -> tuple[Tests, Block]:
+    """Tests of a stored run, and all of them as one block where ratios are asked for, else some of them.
+
+    Raises `HarnessError`: the folder is not a run, its records are damaged or incomplete, or its tests were drawn from
+    shells.
+    """
+    if load_campaign(folder / "campaign.yaml", check_files=False).testing.method == "shells":
+        found = "tests drawn from shells, of which each has its own probability"
+        expected = "tests that can change places: drawn by nde, forced, step_mixture or episode_mixture"
+        mend = "For shells the number of tests is what the run itself needed: see docs/shells.md."
+        raise HarnessError(str(folder), found, expected, mend)
+    parts, kept = list[Tests](), list[Block]()
+    for block in stored_blocks(folder, moments=with_ratios):
+        parts.append(Tests.of(block.first_episode, block.outcome, block.log_weight))
+        kept = [*kept, block] if with_ratios else [block]
+    return Tests.joined(parts), joined(kept)
+
+
+def first_block(folder: Path, n: int) -> Block:
+    """The first n tests of a stored run, with ratios of control steps."""
+    blocks = stored_blocks(folder, moments=True)
+    return joined(list(takewhile(lambda block: block.first_episode < n, blocks))).take(slice(0, n))
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,21 +229,15 @@ def scv_rhw(tests: Block, procedure: Procedure, done: Callable[[], None] = lambd
 
     ``tests`` are all tests of a run in index order, with ``first_ratios``; ``done`` is called after each shuffle.
     """
-    rhw = []
-    for shuffle in range(procedure.n_shuffles):
-        rhw.append(scv_rhw_of(tests, procedure, shuffle))
-        done()
-    return np.array(rhw)
-
-
-def scv_rhw_of(tests: Block, procedure: Procedure, shuffle: int) -> FloatArray:
-    """The same of one shuffle, shape (g,)."""
     grid = procedure.grid(len(tests))
-    rhw, state = np.empty(len(grid)), FailureBounds(Scv())
-    order = shuffled(procedure.seed, shuffle, tests.crash | tests.failed)
-    for at, (start, stop) in enumerate(itertools.pairwise([0, *grid.tolist()])):
-        state.add(tests.chosen(order[start:stop]))
-        rhw[at] = state.result(procedure.confidence).rhw
+    rhw = np.empty((procedure.n_shuffles, len(grid)))
+    for shuffle in range(procedure.n_shuffles):
+        state = FailureBounds(Scv())
+        order = shuffled(procedure.seed, shuffle, tests.crash | tests.failed)
+        for at, (start, stop) in enumerate(pairwise([0, *grid.tolist()])):
+            state.add(tests.chosen(order[start:stop]))
+            rhw[shuffle, at] = state.result(procedure.confidence).rhw
+        done()
     return rhw
 
 
@@ -201,20 +257,6 @@ def shuffled(seed: int, shuffle: int, placed: BoolArray) -> IntArray:
     return order
 
 
-@dataclass(frozen=True)
-class _Run:
-    """Tests of a run, as far as the asked estimators read them; ``whole`` only where `scv` is to be fitted.
-
-    ``weights`` (k,) are those of the tests that crashed or failed, ``failed`` (k,) says which have failed.
-    """
-
-    n_tests: int
-    weights: FloatArray
-    failed: BoolArray
-    sample: Block
-    whole: Block | None
-
-
 def required_tests_of_runs(
     folders: Sequence[Path],
     procedure: Procedure,
@@ -225,29 +267,26 @@ def required_tests_of_runs(
     """RNoT of every run and estimator, and its AAR over the first of them, as JSON content.
 
     The default estimator is the plain one of each run: ``nde`` for naturalistic tests, ``nade`` for weighted ones.
-
-    Raises `HarnessError`: if a folder is not a run, its records are damaged or incomplete, or its tests were drawn from
-    shells.
+    Raises `HarnessError`, see `read_run`.
     """
     told = progress or Progress()
     reference: RequiredTests | None = None
     rows = []
     for folder in folders:
-        run = _read(folder, with_ratios="scv" in estimators)
-        plain: RnotEstimator = "nde" if run.sample.drawn.method == "nde" else "nade"
-        tests = {"n_episodes": run.n_tests, "n_crashes": int(np.count_nonzero(~run.failed))}
-        grid = procedure.grid(run.n_tests)
+        tests, block = read_run(folder, with_ratios="scv" in estimators)
+        plain: RnotEstimator = "nde" if block.drawn.method == "nde" else "nade"
+        grid = procedure.grid(tests.n)
         for name in dict.fromkeys(estimators or [plain]):
             told.stage(f"{folder.name} {name}", procedure.n_shuffles)
-            row = {"run": str(folder), "estimator": name, **tests}
-            if reason := _REFUSAL[name](run.sample):
+            row = {"run": str(folder), "estimator": name, "n_episodes": tests.n}
+            row["n_crashes"] = int(np.count_nonzero(~tests.failed))
+            if reason := _REFUSAL[name](block):
                 rows.append({**row, "mean": None, "reason": reason})
                 continue
             if name == "scv":
-                assert run.whole is not None
-                rhw = scv_rhw(run.whole, procedure, lambda: told.advance(1))
+                rhw = scv_rhw(block, procedure, lambda: told.advance(1))
             else:
-                rhw = plain_rhw(run.weights, run.n_tests, procedure, lambda: told.advance(1), run.failed)
+                rhw = plain_rhw(tests.weight, tests.n, procedure, lambda: told.advance(1), tests.failed)
             found = required_tests(rhw, grid, procedure.rhw)
             reference = reference or found
             aar, side = acceleration(reference, found)
@@ -265,49 +304,27 @@ def required_tests_of_runs(
                     "never_above": int(np.count_nonzero(found.never_above)),
                     "aar": None if side == "unknown" else aar,
                     "aar_is": side,
-                    "remarks": list(_remarks(run, name, found, int(grid[-1]), procedure)),
+                    "remarks": list(_remarks(tests, name, found, int(grid[-1]), procedure)),
                 }
             )
     content: dict[str, Any] = finite_json({**asdict(procedure), "rows": rows})
     return content
 
 
-def _read(folder: Path, *, with_ratios: bool) -> _Run:
-    method = load_campaign(folder / "campaign.yaml", check_files=False).testing.method
-    if method == "shells":
-        found = "tests drawn from shells, of which each has its own probability"
-        expected = "tests that can change places: drawn by nde, forced, step_mixture or episode_mixture"
-        mend = "For shells the number of tests is what the run itself needed: see docs/shells.md."
-        raise HarnessError(str(folder), found, expected, mend)
-    weights, failed, kept, sample, n = [], [], [], None, 0
-    for block in stored_blocks(folder, moments=with_ratios):
-        sample = sample or block
-        counted = block.crash | block.failed
-        weights.append(np.exp(block.log_weight[counted]))
-        failed.append(block.failed[counted])
-        n += len(block)
-        if with_ratios and Scv.refusal(block) is None:
-            kept.append(block)
-    if sample is None:
-        raise HarnessError(str(folder), "no tests on record", "a run", "Run the campaign first.")
-    return _Run(n, np.concatenate(weights), np.concatenate(failed), sample, joined(kept) if kept else None)
-
-
-def _remarks(run: _Run, name: str, found: RequiredTests, total: int, procedure: Procedure) -> Iterator[str]:
+def _remarks(tests: Tests, name: str, found: RequiredTests, total: int, procedure: Procedure) -> Iterator[str]:
     """What limits a required number of tests."""
-    many, above = (np.count_nonzero(each) for each in (found.never_reached, found.never_above))
+    many, above, n_failed = (np.count_nonzero(x) for x in (found.never_reached, found.never_above, tests.failed))
     of_shuffles = f"of {procedure.n_shuffles} shuffles are"
     if name == "scv":
         yield SCV_REMARK
-    if run.failed.any():
-        n_failed = np.count_nonzero(run.failed)
+    if n_failed:
         yield f"{n_failed} tests failed: the lower limit counts them as no crash, the upper one as crashes"
     if found.is_lower_limit:
         at = f"{many} {of_shuffles} above RHW {procedure.rhw:g} at {total:,} tests"
         yield f"{at} and count as {total:,}: the mean is a lower limit"
-    elif found.quantile(0.95) > run.n_tests / 2:
+    elif found.quantile(0.95) > tests.n / 2:
         yield (
-            f"above half of the {run.n_tests:,} tests on record shuffles of the same tests hardly differ: ask a longer "
+            f"above half of the {tests.n:,} tests on record shuffles of the same tests hardly differ: ask a longer "
             "run for a mean and a range to rely on"
         )
     if above:

@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import pickle
 from collections.abc import Iterator, Sequence
-from itertools import pairwise, takewhile
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
 
-from harness.estimators.block import MAX_CONTROL_STEPS, Block, joined
+from harness.estimators.block import MAX_CONTROL_STEPS, Block
 from harness.estimators.estimate import FailureBounds
 from harness.estimators.limits import normal_half_width
 from harness.estimators.scv import Scv, StratumFit
 from harness.estimators.weighted import Nade
-from harness.records.folder import write_bytes
 from harness.runner.stored import stored_blocks
-from harness.vocabulary import FloatArray, IntArray, Method
+from harness.vocabulary import Method
 from studies.case_study.figures import (
     exactly,
     figure,
@@ -29,17 +27,18 @@ from studies.case_study.figures import (
     weights_are_in,
 )
 from studies.case_study.study import Context, ControlVariates, Convergence, Made, RequiredNumbers
-from studies.case_study.tested import Tests, read_tests, settled
-from studies.replication.work import kept_parts, write_table
+from studies.case_study.tested import settled, tests_of
 from studies.rnot import (
     Procedure,
     RequiredTests,
     acceleration,
+    first_block,
     plain_rhw,
     required_tests,
-    scv_rhw_of,
+    scv_rhw,
     total_and_half_width,
 )
+from studies.work import write_table
 
 
 class Claims:
@@ -76,8 +75,8 @@ class Claims:
         }
         for name, found in (("nade", nade), ("scv", scv)):
             rate, half = (0.0, 0.0) if found is None else (found.crash_rate, z * found.std_error)
-            said = figure(rate, max(rate - half, 0.0), rate + half) if rate > 0.0 else figure(None)
-            row[f"{name}_rate"] = marked(said, settled=settled)
+            interval = figure(rate, max(rate - half, 0.0), rate + half) if rate > 0.0 else figure(None)
+            row[f"{name}_rate"] = marked(interval, settled=settled)
             row[f"{name}_rhw"] = half / rate if rate > 0.0 else None
             row[f"{name}_tests"] = tests_for(self._n * (half / z / rate) ** 2, rhw, confidence) if rate > 0.0 else None
         beside = scv if scv is not None and scv.std_error > 0.0 < nade.crash_rate else None
@@ -87,36 +86,27 @@ class Claims:
 
 
 def compare_control_variates(step: ControlVariates, context: Context) -> dict[str, Any]:
-    """Both estimates at every size, in one pass that goes on from the last size; the strata after the last one."""
+    """Both estimates at every size, in one pass, and the strata after the last one."""
     run = context.made[step.of]
     sizes = [size for size in step.sizes if size <= run.result["n"]]
-    begun = context.parts / "state.pickle"
-    # Written by this very step: its folder is named after the code whose objects these are.
-    claims, rows = pickle.loads(begun.read_bytes()) if begun.is_file() else (Claims(), [])  # noqa: S301
-    done = rows[-1]["n"] if rows else 0
-    context.progress.stage(context.name, sizes[-1] if sizes else 0, done=done)
-    for block in cut_at(stored_blocks(run.folder / "run", moments=True), sizes):
-        n = block.first_episode + len(block)
-        if n <= done:
-            continue
-        if block.first_episode >= max(sizes, default=0):
-            break
+    claims, rows = Claims(), list[dict[str, Any]]()
+    context.progress.stage("both estimates", sizes[-1] if sizes else 0)
+    for block in cut_at(stored_blocks(run.folder / "run", moments=True), sizes) if sizes else ():
         claims.add(block)
         context.progress.advance(len(block))
-        if n in sizes:
+        if (n := block.first_episode + len(block)) in sizes:
             rows.append(claims.row(context.rhw, context.confidence))
-            begun.parent.mkdir(exist_ok=True)
-            write_bytes(begun, pickle.dumps((claims, rows)))
+        if n == sizes[-1]:
+            break
     fits = claims.scv.fits()
-    beyond = [fit for level, fit in fits if level > MAX_CONTROL_STEPS]
     strata = [{"control_steps": level, **_together([fit])} for level, fit in fits]
     write_table(context.folder / "sizes.parquet", pa.Table.from_pylist(rows))
     write_table(context.folder / "strata.parquet", pa.Table.from_pylist(strata))
     return {
         "sizes": rows,
-        "left_out": [size for size in step.sizes if size > run.result["n"]],
+        "left_out": [size for size in step.sizes if size not in sizes],
         "strata": strata,
-        "beyond": _together(beyond),
+        "beyond": _together([fit for level, fit in fits if level > MAX_CONTROL_STEPS]),
         "all": _together([fit for _, fit in fits]),
         "figures": _figures(rows, fits),
     }
@@ -136,18 +126,13 @@ def _together(fits: Sequence[StratumFit]) -> dict[str, Any]:
     n = sum(fit.n for fit in fits)
     mean = sum(fit.n * fit.intercept for fit in fits) / max(n, 1)
     between = sum(fit.n * (fit.intercept - mean) ** 2 for fit in fits)
-    spread = {
-        name: float(np.sqrt((sum(each) + between) / max(n, 1)))
-        for name, each in {
-            "sd_before": [fit.total_squares for fit in fits],
-            "sd_after": [fit.residual_squares for fit in fits],
-        }.items()
-    }
+    before, after = sum(fit.total_squares for fit in fits), sum(fit.residual_squares for fit in fits)
     return {
         "n": n,
         "columns": max((fit.n_columns for fit in fits), default=0),
         "rank": max((fit.rank for fit in fits), default=0),
-        **spread,
+        "sd_before": float(np.sqrt((before + between) / max(n, 1))),
+        "sd_after": float(np.sqrt((after + between) / max(n, 1))),
     }
 
 
@@ -172,10 +157,12 @@ def draw_convergence(step: Convergence, context: Context) -> dict[str, Any]:
     tables, figures = list[pa.Table](), dict[str, Any]()
     reference = context.made[step.reference].result["figures"]["crash_rate"]
     for name in step.of:
-        tests = read_tests(context.made[name])
-        n, rate, half = curve(tests, procedure)
-        tables.append(pa.table({"step": [name] * len(n), "n": n, "crash_rate": rate, "half_width": half}))
-        rhw = np.divide(half, rate, out=np.full(len(n), np.inf), where=rate > 0.0)
+        tests = tests_of(context.made[name])
+        n = procedure.grid(tests.n)
+        total, half = total_and_half_width(tests.y, np.searchsorted(tests.episode, n), n, procedure.z)
+        curve = {"step": [name] * len(n), "n": n, "crash_rate": total / n, "half_width": half / n}
+        tables.append(pa.table(curve))
+        rhw = np.divide(half / n, total / n, out=np.full(len(n), np.inf), where=total > 0.0)
         required = required_tests(rhw[None, :], n, procedure.rhw)
         found = {
             "settled": figure(None, tests.n) if required.is_lower_limit else exactly(required.n[0]),
@@ -186,13 +173,6 @@ def draw_convergence(step: Convergence, context: Context) -> dict[str, Any]:
         figures |= {f"{name}.{key}": marked(each, settled=is_in) for key, each in found.items()}
     write_table(context.folder / CURVES, pa.concat_tables(tables))
     return {"figures": figures}
-
-
-def curve(tests: Tests, procedure: Procedure) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Numbers of tests (g,), and after each the mean of Y and the half-width of its normal interval."""
-    n = procedure.grid(tests.n)
-    total, half = total_and_half_width(tests.y, np.searchsorted(tests.episode, n), n, procedure.z)
-    return n, total / n, half / n
 
 
 class _Found(NamedTuple):
@@ -223,12 +203,12 @@ class _Found(NamedTuple):
 def count_required_tests(step: RequiredNumbers, context: Context) -> dict[str, Any]:
     """RNoT of every step that is named, and of SCV beside NADE on the same shuffles of the same tests."""
     asked = context.rhw, context.confidence
-    found = {name: _plain(context.made[name], Procedure(*asked, step.shuffles), context) for name in step.of}
+    found = {name: _required(context.made[name], Procedure(*asked, step.shuffles), context) for name in step.of}
     pairs = {f"{step.of[0]}_over_{name}": (step.of[0], name) for name in step.of[1:]}
     if step.scv is not None:
         made, fewer = context.made[step.scv], Procedure(*asked, step.scv_shuffles, ratio=step.scv_ratio)
-        found["nade_beside_scv"] = _plain(made, fewer, context, first=step.scv_tests)
-        found["scv"] = _scv(made, fewer, context, first=step.scv_tests)
+        found["nade_beside_scv"] = _required(made, fewer, context, step.scv_tests)
+        found["scv"] = _required(made, fewer, context, step.scv_tests, scv=True)
         pairs["nade_over_scv"] = "nade_beside_scv", "scv"
     for name, each in found.items():
         columns = {"shuffle": np.arange(len(each.rnot.n)), "tests": each.rnot.n}
@@ -243,26 +223,18 @@ def count_required_tests(step: RequiredNumbers, context: Context) -> dict[str, A
     }
 
 
-def _plain(made: Made, procedure: Procedure, context: Context, *, first: int | None = None) -> _Found:
-    """Of the mean of Y, on all tests of a step or its first ones."""
-    tests = read_tests(made)
-    n = min(tests.n, first or tests.n)
-    kept = tests.episode < n
+def _required(
+    made: Made, procedure: Procedure, context: Context, first: int | None = None, *, scv: bool = False
+) -> _Found:
+    """Of the mean of Y, or of what SCV claims, on all tests of a step or its first ones."""
+    tests = tests_of(made).first(first)
     context.progress.stage(f"shuffles of {made.folder.name.rpartition('-')[0]}", procedure.n_shuffles)
-    rhw = plain_rhw(tests.weight[kept], n, procedure, lambda: context.progress.advance(1), tests.failed[kept])
-    return _Found(required_tests(rhw, procedure.grid(n), procedure.rhw), n, settled(made))
 
+    def done() -> None:
+        context.progress.advance(1)
 
-def _scv(made: Made, procedure: Procedure, context: Context, *, first: int) -> _Found:
-    """Of what SCV claims, a part for each shuffle; the tests are read only if any is missing."""
-    n, tests = min(made.result["n"], first), list[Block]()
-
-    def rhw_of(shuffle: int) -> pa.Table:
-        if not tests:
-            blocks = cut_at(stored_blocks(made.folder / "run", moments=True), [n])
-            tests.append(joined(list(takewhile(lambda block: block.first_episode < n, blocks))))
-        return pa.table({"rhw": scv_rhw_of(tests[0], procedure, shuffle)})
-
-    tables = kept_parts(context.parts, "scv", range(procedure.n_shuffles), rhw_of, context.progress)
-    rhw = np.array([table.column("rhw").to_numpy() for table in tables])
-    return _Found(required_tests(rhw, procedure.grid(n), procedure.rhw), n, settled(made))
+    if scv:
+        rhw = scv_rhw(first_block(made.folder / "run", tests.n), procedure, done)
+    else:
+        rhw = plain_rhw(tests.weight, tests.n, procedure, done, tests.failed)
+    return _Found(required_tests(rhw, procedure.grid(tests.n), procedure.rhw), tests.n, settled(made))

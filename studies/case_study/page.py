@@ -56,12 +56,9 @@ def write_page(study: Study, folder: Path, made: Mapping[str, Made]) -> tuple[Pa
         UNSETTLED=UNSETTLED,
         CARELESS_MEAN=CARELESS_MEAN,
     )
-    _write(
-        folder / CLAIMS,
-        json.dumps({"conclusive": study.conclusive, "claims": claims}, indent=2, ensure_ascii=False).encode("utf-8")
-        + b"\n",
-    )
-    _write(folder / PAGE, page.encode("utf-8"))
+    answers = json.dumps({"conclusive": study.conclusive, "claims": claims}, indent=2, ensure_ascii=False)
+    _write(folder / CLAIMS, f"{answers}\n".encode())
+    _write(folder / PAGE, page.encode())
     return folder / PAGE, claims
 
 
@@ -116,9 +113,9 @@ def count(value: float | None) -> str:
 
 def stratum_rows(result: Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
     """Rows of the table of strata, with labels: those of up to nine steps, longer ones together, and all."""
-    yield from (
-        (str(row["control_steps"]), row) for row in result["strata"] if row["control_steps"] <= MAX_CONTROL_STEPS
-    )
+    for row in result["strata"]:
+        if row["control_steps"] <= MAX_CONTROL_STEPS:
+            yield str(row["control_steps"]), row
     yield f"{MAX_CONTROL_STEPS + 1} and more", result["beyond"]
     yield "all together", result["all"]
 

@@ -25,7 +25,7 @@ from studies.case_study.tested import AT_ONCE, IN_THE_TWIN, figures_of_shells
 from studies.replication.experiment import load_experiment
 from studies.replication.run import REPLICATIONS, validate
 from studies.replication.weighted import prepared_twin, twin_episodes
-from studies.replication.work import write_table
+from studies.work import write_table
 
 
 def replicate(step: Replications, context: Context) -> dict[str, Any]:
@@ -33,8 +33,8 @@ def replicate(step: Replications, context: Context) -> dict[str, Any]:
 
     Where the mean of all replications is below the truth by more than chance, what each of them claims means nothing.
     """
-    experiment, parts = load_experiment(Path(step.experiment), step.set), context.parts
-    judgements = validate(experiment, context.folder, workers=context.workers, progress=context.progress, parts=parts)
+    experiment = load_experiment(Path(step.experiment), step.set)
+    judgements = validate(experiment, context.folder, workers=context.workers, progress=context.progress)
     rows = pq.read_table(context.folder / REPLICATIONS).to_pandas()
     n, confidence = experiment.campaign.stop.episodes, context.confidence
     per_relvar = tests_for(n, context.rhw, confidence)
@@ -96,12 +96,11 @@ def test_variants(step: Variants, context: Context) -> dict[str, Any]:
         prepare(resolve(campaign), context.progress)  # tables are built once, before the workers start
     make = partial(claims_in_twin, step.tests, step.replications, context.rhw, context.confidence)
     jobs = [campaign.model_dump_json() for campaign in campaigns.values()]
-    tables = context.by_workers(jobs, make)
-    rows = [{"variant": name, **table.to_pylist()[0]} for name, table in zip(campaigns, tables, strict=True)]
+    claims = context.by_workers(jobs, make)
+    rows = [{"variant": name, **row} for name, row in zip(campaigns, claims, strict=True)]
     for k, (row, campaign) in enumerate(zip(rows, variants_of(step, shells=True).values(), strict=False)):
         folder = context.folder / f"shells-{k}"
-        begun = (folder / "manifest.json").is_file()
-        done = run_campaign(campaign, folder, workers=context.workers, resume=begun, progress=context.progress)
+        done = run_campaign(campaign, folder, workers=context.workers, resume=True, progress=context.progress)
         found = figures_of_shells(done, context.rhw)
         row |= {"shells_rate": found["crash_rate"], "shells_tests": found["tests_for_rhw"]}
     write_table(context.folder / "variants.parquet", pa.Table.from_pylist(rows))
@@ -110,7 +109,7 @@ def test_variants(step: Variants, context: Context) -> dict[str, Any]:
     return {"variants": rows, "figures": {**gains, "mean": marked(mean, settled=all(row["settled"] for row in rows))}}
 
 
-def claims_in_twin(n: int, replications: int, rhw: float, confidence: float, campaign_json: str) -> pa.Table:
+def claims_in_twin(n: int, replications: int, rhw: float, confidence: float, campaign_json: str) -> dict[str, Any]:
     """What NADE and SCV say of n tests each, in so many campaigns, and what these truly scatter by."""
     campaign = Campaign.model_validate_json(campaign_json)
     asked: tuple[EstimatorName, ...] = ("nade", "scv") if campaign.testing.method == "step_mixture" else ("nade",)
@@ -126,10 +125,10 @@ def claims_in_twin(n: int, replications: int, rhw: float, confidence: float, cam
     row = whole.row(rhw, confidence)
     tests = {name: [each[f"{name}_tests"] or math.nan for each in rows] for name in ("nade", "scv")}
     rates = {name: [each[f"{name}_rate"]["value"] or 0.0 for each in rows] for name in ("nade", "scv")}
-    row |= {
+    return {
+        **row,
         "scv_tests": mean_of(tests["scv"], confidence),
         "gain_claimed": marked(ratio_of_means(tests["nade"], tests["scv"], confidence), settled=row["settled"]),
         "gain_true": ratio_of_variances(rates["nade"], rates["scv"], confidence),
         "difference": max((each["difference"] for each in rows if each["difference"] is not None), default=None),
     }
-    return pa.Table.from_pylist([row])

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache, cached_property, partial
 from itertools import product
 from typing import Any, NamedTuple
 
@@ -42,9 +42,9 @@ from harness.vocabulary import (
     RecordArray,
 )
 from studies.case_study.counted import Claims
-from studies.case_study.figures import exactly, figure, marked, mean_of, tests_for
+from studies.case_study.figures import exactly, figure, is_settled, marked, mean_of, tests_for
 from studies.case_study.study import Context, SmallCase
-from studies.replication.work import write_table
+from studies.work import write_table
 
 LV_MPS, BV_MPS, AV_MPS = 3.0, 8.0, 13.0
 R1_M, R2_M = (30.0, 32.0), 5.0
@@ -80,57 +80,48 @@ class SmallWorld:
 
     levels: Sequence[Level]
 
-    def value(self, crash: Sequence[FloatArray]) -> list[FloatArray]:
-        """Probability of a crash from each situation on, by backward induction; ``crash``: after a cut-in there."""
-        values: list[FloatArray] = [np.zeros(len(level.p)) for level in self.levels]
-        later = np.zeros(len(self.levels[-1].p))
+    def value(self, cutting: Sequence[FloatArray], staying: Sequence[FloatArray] | None = None) -> list[FloatArray]:
+        """Backward induction: in each situation what a cut-in is worth there, and a factor of what comes later.
+
+        ``cutting`` and ``staying`` hold arrays of shape (m,), or (m, J); the factor is 1 - p by default.
+        """
+        values: list[FloatArray] = [np.zeros_like(worth) for worth in cutting]
+        later = np.zeros_like(cutting[-1])
         for t in range(len(self.levels) - 1, -1, -1):
             level = self.levels[t]
-            values[t] = level.p * crash[t] + (1.0 - level.p) * later
-            if t:
-                later = self._to_parents(t, values[t])
+            values[t] = cutting[t] + (((1.0 - level.p) if staying is None else staying[t]) * later.T).T
+            if t:  # the mean over what follows each situation of the step before
+                later = np.zeros((len(self.levels[t - 1].p), *later.shape[1:]))
+                np.add.at(later, level.parent, (level.share * values[t].T).T)
         return values
 
-    def _to_parents(self, t: int, value: FloatArray) -> FloatArray:
-        """Expectation over what follows each situation of the step before."""
-        level = self.levels[t]
-        return np.bincount(level.parent, level.share * value, len(self.levels[t - 1].p)).astype(np.float64)
-
-    @property
+    @cached_property
     def crash_rate(self) -> float:
         """μ."""
-        return float(self.levels[0].share @ self.value([level.crash for level in self.levels])[0])
+        return float(self.levels[0].share @ self.value([level.p * level.crash for level in self.levels])[0])
 
     def proposals(self, epsilon: float, *, recursive: bool, threshold: float = 0.0) -> list[Proposal]:
         """Importance functions; a later cut-in counts only for the recursive challenge.
 
         A situation is critical where V_j of any surrogate is above the threshold; elsewhere all draw from p.
         """
-        n_surrogates = self.levels[0].surrogates.shape[1]
-        found = [
-            Proposal(np.repeat(level.p[:, None], n_surrogates, 1), np.zeros(len(level.p), bool))
-            for level in self.levels
-        ]
-        of_surrogates = [self.value([level.surrogates[:, j] for level in self.levels]) for j in range(n_surrogates)]
-        for t, level in enumerate(self.levels):
-            now = level.p[:, None] * level.surrogates
-            v = np.stack([values[t] for values in of_surrogates], axis=1) if recursive else now
-            aimed = np.divide(now, v, out=found[t].q.copy(), where=v > 0.0)
-            found[t].critical[:] = np.any(v > threshold, axis=1)
-            controlled = found[t].critical[:, None] & (v > 0.0)
-            found[t].q[:] = np.where(controlled, epsilon * level.p[:, None] + (1.0 - epsilon) * aimed, found[t].q)
+        now = [level.p[:, None] * level.surrogates for level in self.levels]
+        found = []
+        for level, cutting, v in zip(self.levels, now, self.value(now) if recursive else now, strict=True):
+            p = np.broadcast_to(level.p[:, None], v.shape)
+            critical = np.any(v > threshold, axis=1)
+            aimed = epsilon * p + (1.0 - epsilon) * np.divide(cutting, v, out=p.copy(), where=v > 0.0)
+            found.append(Proposal(np.where(critical[:, None] & (v > 0.0), aimed, p), critical))
         return found
 
     def relvar(self, proposals: Sequence[Proposal]) -> float:
         """Var(Y)/μ² of a test under the step mixture with equal weights, by backward induction of E[Y² | situation]."""
-        later = np.zeros(len(self.levels[-1].p))
-        for t in range(len(self.levels) - 1, -1, -1):
-            level, q = self.levels[t], proposals[t].q.mean(axis=1)
-            cutting = np.divide(level.p**2, q, out=np.zeros_like(q), where=q > 0.0) * level.crash
-            square = cutting + np.divide((1.0 - level.p) ** 2, 1.0 - q, out=np.zeros_like(q), where=q < 1.0) * later
-            if t:
-                later = self._to_parents(t, square)
-        return float(self.levels[0].share @ square) / self.crash_rate**2 - 1.0
+        cutting, staying = [], []
+        for level, proposal in zip(self.levels, proposals, strict=True):
+            q = proposal.q.mean(axis=1)
+            cutting.append(np.divide(level.p**2, q, out=np.zeros_like(q), where=q > 0.0) * level.crash)
+            staying.append(np.divide((1.0 - level.p) ** 2, 1.0 - q, out=np.zeros_like(q), where=q < 1.0))
+        return float(self.levels[0].share @ self.value(cutting, staying)[0]) / self.crash_rate**2 - 1.0
 
     def draw(self, proposals: Sequence[Proposal], n: int, rng: np.random.Generator) -> Block:
         """Tests under the step mixture, as the estimators see those of any world."""
@@ -184,14 +175,12 @@ class _Situations(NamedTuple):
     parent: IntArray
     share: FloatArray
 
-    def moved(self) -> tuple[_Situations, IntArray]:
-        """All of them after a step without cut-in, each the parent of itself, and which of them AV has not passed."""
+    def moved(self) -> _Situations:
+        """All of them after a step without cut-in, each the parent of itself."""
         after = np.maximum(self.speed + self.acceleration * STEP_S, 0.0)
         r1 = self.r1 + (LV_MPS - 0.5 * (self.speed + after)) * STEP_S
         r2 = self.r2 + (0.5 * (self.speed + after) - AV_MPS) * STEP_S
-        parent = np.arange(len(after))
-        whole = _Situations(after, r1, r2, self.acceleration, parent, np.ones(len(after)))
-        return whole, np.flatnonzero(r2 > 0.0)
+        return _Situations(after, r1, r2, self.acceleration, np.arange(len(after)), np.ones(len(after)))
 
     def drawn(self, environment: Environment) -> _Situations:
         """Each once for every acceleration that BV may draw."""
@@ -215,20 +204,19 @@ def small_world(level: float, *, nodes: int = NODES) -> SmallWorld:
     here = _Situations(ones * BV_MPS, r1, ones * R2_M, ones, np.arange(nodes), weight / 2.0).drawn(environment)
     levels: list[Level] = []
     while len(here.share) and len(levels) < STEPS:
-        after, on = here.moved()
+        after = here.moved()
         crash = _crashes(drivers, after.speed, after.r2, STEPS - 1 - len(levels))
-        p = _cut_in(here.speed, here.r1, here.r2, environment)
-        levels.append(Level(p, crash[:, 0], crash[:, 1:], here.parent, here.share))
-        here = after.taken(on)
-        if len(levels) % HOLD == 0 and len(on):
+        levels.append(Level(_cut_in(here, environment), crash[:, 0], crash[:, 1:], here.parent, here.share))
+        here = after.taken(np.flatnonzero(after.r2 > 0.0))  # AV has not passed the others
+        if len(levels) % HOLD == 0 and len(here.share):
             here = here.drawn(environment)
     return SmallWorld(levels)
 
 
-def _cut_in(speed: FloatArray, r1: FloatArray, r2: FloatArray, environment: Environment) -> FloatArray:
+def _cut_in(here: _Situations, environment: Environment) -> FloatArray:
     """Probability to cut in within the step, as `harness.traffic.laws.cut_in_hazard` gives it."""
     n = environment.numbers
-    _, chance, accepted = _laws(speed, r1, np.column_stack([r2, speed - AV_MPS]), environment)
+    _, chance, accepted = _laws(here.speed, here.r1, np.column_stack([here.r2, here.speed - AV_MPS]), environment)
     p_1s = np.minimum(chance * accepted, float(n["cut_in__max_probability_1s"]))
     return np.asarray(-np.expm1(float(n["scenario__step_s"]) * np.log1p(-p_1s)))
 
@@ -264,32 +252,21 @@ TRUE_WITHIN = 2.0
 """Factor between NADE's claim and the exact number up to which claims of a setting count, as in the page's verdicts."""
 
 
-class _Setting(NamedTuple):
-    """Of the importance functions; ``place`` is among all, and seeds its tests."""
-
-    place: int
-    recursive: bool
-    threshold: float
-    epsilon: float
-
-
 def answer_small_case(step: SmallCase, context: Context) -> dict[str, Any]:
     """Exact rate and variances, and what drawn tests claim, for every challenge, threshold and epsilon."""
-    every = product((False, True), step.thresholds, step.epsilons)
-    settings = [_Setting(place, *setting) for place, setting in enumerate(every)]
-    make = partial(claims_of_setting, step, context.confidence)
-    rows = [table.to_pylist()[0] for table in context.by_workers(settings, make)]
+    settings = list(enumerate(product((False, True), step.thresholds, step.epsilons)))
+    rows = context.by_workers(settings, partial(claims_of_setting, step, context.confidence))
     write_table(context.folder / "settings.parquet", pa.Table.from_pylist(rows))
-    rate, published = _world(step.lane_change_level).crash_rate, rows[0]
+    world, published = _world(step.lane_change_level), rows[0]
     nearest = {name: _nearest(name, wanted, rows) for name, wanted in step.reported.items()}
     return {
-        "crash_rate": rate,
+        "crash_rate": world.crash_rate,
         "rhw": step.rhw,
-        "steps": len(_world(step.lane_change_level).levels),
+        "steps": len(world.levels),
         "settings": rows,
         "nearest": nearest,
         "figures": {
-            "nde": exactly(tests_for(1.0 / rate - 1.0, step.rhw, context.confidence)),
+            "nde": exactly(tests_for(1.0 / world.crash_rate - 1.0, step.rhw, context.confidence)),
             "nade": exactly(published["nade_exact"]),
             "scv_claimed": published["scv_claimed"],
             **{f"nearest_{name}": row[name] for name, row in nearest.items()},
@@ -297,58 +274,59 @@ def answer_small_case(step: SmallCase, context: Context) -> dict[str, Any]:
     }
 
 
-def claims_of_setting(step: SmallCase, confidence: float, setting: _Setting) -> pa.Table:
-    """One setting: its exact variance, what NADE and SCV claim of the same tests, and what repeating both shows."""
+def claims_of_setting(
+    step: SmallCase, confidence: float, setting: tuple[int, tuple[bool, float, float]]
+) -> dict[str, Any]:
+    """One setting: its exact variance, what NADE and SCV claim of the same tests, and what repeating both shows.
+
+    Its place among all seeds its tests.
+    """
     world, n = _world(step.lane_change_level), step.tests_of_draw
-    proposals = world.proposals(setting.epsilon, recursive=setting.recursive, threshold=setting.threshold)
+    place, (recursive, threshold, epsilon) = setting
+    proposals = world.proposals(epsilon, recursive=recursive, threshold=threshold)
 
     def claims(tests: int, *seed: int) -> dict[str, Any]:
         found = Claims()
         found.add(world.draw(proposals, tests, np.random.default_rng(seed)))
         return found.row(step.rhw, confidence)
 
-    once = claims(step.tests, 2, setting.place)
-    many = [claims(n, 3, setting.place, k) for k in range(step.draws)]
+    once = claims(step.tests, 2, place)
+    many = [claims(n, 3, place, k) for k in range(step.draws)]
+    exact = tests_for(world.relvar(proposals), step.rhw, confidence)
+    claimed = {name: mean_of((each[f"{name}_tests"] for each in many), confidence) for name in ("nade", "scv")}
     row: dict[str, Any] = {
-        "challenge": "recursive" if setting.recursive else "immediate",
-        "threshold": setting.threshold,
-        "epsilon": setting.epsilon,
+        "challenge": "recursive" if recursive else "immediate",
+        "threshold": threshold,
+        "epsilon": epsilon,
         "mean_weight": once["mean_weight"],
         "difference": once["difference"],
-        "nade_exact": tests_for(world.relvar(proposals), step.rhw, confidence),
+        "nade_exact": exact,
     }
-    holds = _holds(mean_of((each["nade_tests"] for each in many), confidence)["value"], row["nade_exact"])
-    for name in ("nade", "scv"):
-        said = mean_of((each[f"{name}_tests"] for each in many), confidence)
-        square = np.mean([((each[f"{name}_rate"]["value"] or 0.0) / world.crash_rate - 1.0) ** 2 for each in many])
+    means_something = once["settled"] and holds(claimed["nade"]["value"], exact)
+    for name, found in claimed.items():
+        rates = [each[f"{name}_rate"] for each in many]
+        errors = [(rate["value"] or 0.0) / world.crash_rate - 1.0 for rate in rates]
+        # The interval of no crash holds nothing.
+        covers = [rate["value"] is not None and rate["low"] <= world.crash_rate <= rate["high"] for rate in rates]
         row |= {
             f"{name}_claimed_once": once[f"{name}_tests"],
-            f"{name}_claimed": marked(said, settled=once["settled"] and holds),
-            f"{name}_repeated": tests_for(n * float(square), step.rhw, confidence),
-            f"{name}_covers": float(np.mean([_covers(each[f"{name}_rate"], world) for each in many])),
+            f"{name}_claimed": marked(found, settled=means_something),
+            f"{name}_repeated": tests_for(n * float(np.mean(np.square(errors))), step.rhw, confidence),
+            f"{name}_covers": float(np.mean(covers)),
         }
-    return pa.Table.from_pylist([row])
+    return row
 
 
-def _holds(claimed: float | None, exact: float) -> bool:
+def holds(claimed: float | None, exact: float) -> bool:
     """Whether NADE claims what is known to be true, about."""
     return claimed is not None and exact / TRUE_WITHIN <= claimed <= exact * TRUE_WITHIN
 
 
-def _covers(rate: dict[str, Any], world: SmallWorld) -> bool:
-    """Whether a normal interval holds the truth; that of no crash holds nothing."""
-    return rate["value"] is not None and rate["low"] <= world.crash_rate <= rate["high"]
-
-
 def _nearest(name: str, wanted: float, rows: list[dict[str, Any]]) -> dict[str, Any]:
     """The setting whose number is nearest to a reported one: NADE's exact one, or what SCV claims."""
-
-    def found(row: dict[str, Any]) -> dict[str, Any]:
-        claimed: dict[str, Any] = row["scv_claimed"]
-        return exactly(row["nade_exact"]) if name == "nade" else claimed
-
-    known = [row for row in rows if found(row)["value"] and found(row).get("settled", True) is not False]
-    row = min(known, key=lambda each: abs(np.log(found(each)["value"] / wanted)), default=None)
-    if row is None:
+    found = [exactly(row["nade_exact"]) if name == "nade" else row["scv_claimed"] for row in rows]
+    known = [(one, row) for one, row in zip(found, rows, strict=True) if one["value"] and is_settled(one)]
+    if not known:
         return {name: figure(None)}
-    return {name: found(row), **{key: row[key] for key in ("challenge", "threshold", "epsilon")}}
+    one, row = min(known, key=lambda each: abs(np.log(each[0]["value"] / wanted)))
+    return {name: one, **{key: row[key] for key in ("challenge", "threshold", "epsilon")}}

@@ -2,15 +2,13 @@
 
 A step's key is a hash of its settings, of the content of the campaign or experiment that it names, of the code that
 makes it, and of the keys of the steps that it reads. ``steps/NAME-KEY/result.json`` is written last, all at once: where
-it is, the step is finished, and where it is not, what the step kept before it was killed lies in the same folder.
+it is, the step is finished; where it is not, it is made again.
 """
 
 from __future__ import annotations
 
 import hashlib
-import inspect
 import json
-import shutil
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -31,16 +29,9 @@ from studies.case_study.study import FILES, Context, Made, Step, Study, inputs_o
 from studies.case_study.tested import keep_run, test_in_twin
 from studies.case_study.theorems import check_theorems
 from studies.replication.experiment import load_experiment
-from studies.replication.work import sources_of
+from studies.work import sources_of
 
 RESULT = "result.json"
-_SHARED = (
-    "rnot.py",
-    "chains/*.py",
-    "replication/*.py",
-    *(f"case_study/{name}.py" for name in ("counted", "figures", "small_case", "tested")),
-)
-"""What makers have from other files than their own."""
 _MAKERS: dict[str, Callable[[Any, Context], dict[str, Any]]] = {
     "twin_tests": test_in_twin,
     "run": keep_run,
@@ -84,14 +75,12 @@ def run_study(
     with sole_use(folder):
         for name, step in study.steps.items():
             place = folder / "steps" / f"{name}-{keys[name]}"
-            context = Context(place, study.rhw, study.confidence, made, workers, progress or Progress())
             seconds[name] = None
             if not (place / RESULT).is_file():
                 began = time.monotonic()
-                place.mkdir(parents=True, exist_ok=True)
+                context = Context(place, study.rhw, study.confidence, made, workers, progress or Progress())
                 write_json(place / RESULT, finite_json({"kind": step.kind, **_MAKERS[step.kind](step, context)}))
                 seconds[name] = time.monotonic() - began
-            shutil.rmtree(context.parts, ignore_errors=True)  # what they were kept for is there
             result = read_as(dict[str, Any], place / RESULT, mend="Delete the folder of this step; it is made again.")
             made[name] = Made(place, result)
             told(name, seconds[name])
@@ -102,15 +91,16 @@ def step_keys(study: Study) -> dict[str, str]:
     """Key of every step, in their order; reads all files that the steps name."""
     keys: dict[str, str] = {}
     for name, step in study.steps.items():
-        maker = Path(str(inspect.getsourcefile(_MAKERS[step.kind])))
-        sources = WORLD_SOURCES if step.kind == "twin_tests" else (*WORLD_SOURCES, "estimators/*.py")
-        own = () if step.kind in ("twin_tests", "run") else _SHARED  # their records do not follow from any of these
+        if step.kind in ("twin_tests", "run"):  # long ones, whose records follow from these sources alone
+            code = source_hash(WORLD_SOURCES), sources_of("case_study/tested.py", "rnot.py")
+        else:
+            code = source_hash((*WORLD_SOURCES, "estimators/*.py")), sources_of("*.py", "*/*.py")
         content = {
             "step": step.model_dump(mode="json", exclude=set(FILES)),
             "file": _content(step),
             "reads": [(key, keys[wanted]) for key, wanted in inputs_of(step)],
             "asks": (study.rhw, study.confidence),
-            "code": (source_hash(sources), sources_of(*own), hashlib.sha256(maker.read_bytes()).hexdigest()),
+            "code": code,
         }
         keys[name] = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:12]
     return keys

@@ -6,9 +6,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, Self
+from typing import Annotated, Any, Literal, NamedTuple, Self, TypeVar
 
-import pyarrow as pa
 from pydantic import Field, model_validator
 
 from harness.campaign.files import Override, Places, apply_overrides, read_yaml
@@ -16,8 +15,9 @@ from harness.campaign.problems import NAME_PATTERN, broken_rule, validated
 from harness.campaign.sections import Positive, Probability, Section, Whole
 from harness.errors import CampaignError
 from harness.progress import Progress
-from studies.replication.work import kept_parts, worker_processes
+from studies.work import results_of, worker_processes
 
+_Result = TypeVar("_Result")
 StepName = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
 Overrides = list[str]
 _OVERRIDES: Any = Field(default_factory=list, description="values laid over the file's, such as testing.epsilon=0.2")
@@ -188,10 +188,9 @@ class Study(Section):
                     expected = f"one of the steps above it: {', '.join(before) or 'there is none'}"
                     mend = "Name one of them, or move that step up."
                     raise broken_rule(f"steps.{name}.{key}", f"'{wanted}'", expected, mend)
-                kind, kinds = self.steps[wanted].kind, _READS[key, step.kind]
-                if kind not in kinds:
-                    found = f"'{wanted}', a step of kind {kind}"
-                    expected = f"one of kind {' or '.join(kinds)}"
+                kinds = ["run"] if (key, step.kind) in _WITH_RECORDS else ["twin_tests", "run"]
+                if (kind := self.steps[wanted].kind) not in kinds:
+                    found, expected = f"'{wanted}', a step of kind {kind}", f"one of kind {' or '.join(kinds)}"
                     raise broken_rule(f"steps.{name}.{key}", found, expected, "Name such a step.")
             before.append(name)
         return self
@@ -209,14 +208,8 @@ class Study(Section):
 
 
 FILES = ("campaign", "experiment", "shells")
-_READS = {
-    ("of", "convergence"): ("twin_tests", "run"),
-    ("reference", "convergence"): ("twin_tests", "run"),
-    ("of", "control_variates"): ("run",),
-    ("of", "required_tests"): ("twin_tests", "run"),
-    ("scv", "required_tests"): ("run",),
-}
-"""Kinds of steps that a key of a kind of step may name."""
+_WITH_RECORDS = {("of", "control_variates"), ("scv", "required_tests")}
+"""Keys that name a step which keeps all records, by kind of step."""
 
 
 def inputs_of(step: Step) -> list[tuple[str, str]]:
@@ -275,9 +268,8 @@ class Made(NamedTuple):
 class Context:
     """Where and how a step is made.
 
-    The folder is the step's own: what it finds there it has left itself when it was killed. Required numbers of tests
-    are for ``rhw`` at a ``confidence``; ``made`` are the steps made before, by name. Without ``workers`` there is one
-    for each core.
+    Required numbers of tests are for ``rhw`` at a ``confidence``; ``made`` are the steps made before, by name. Without
+    ``workers`` there is one for each core.
     """
 
     folder: Path
@@ -287,19 +279,10 @@ class Context:
     workers: int | None
     progress: Progress
 
-    @property
-    def name(self) -> str:
-        """The step's, which its folder's begins with."""
-        return self.folder.name.rpartition("-")[0]
-
-    @property
-    def parts(self) -> Path:
-        """Where what is finished is kept until the step is."""
-        return self.folder / "parts"
-
     def by_workers(
-        self, jobs: Sequence[Any], make: Callable[[Any], pa.Table], size: Callable[[Any], int] = lambda _job: 1
-    ) -> list[pa.Table]:
-        """Tables of all jobs, made by worker processes; see `kept_parts`."""
+        self, jobs: Sequence[Any], make: Callable[[Any], _Result], size: Callable[[Any], int] = lambda _job: 1
+    ) -> list[_Result]:
+        """Results of all jobs, made by worker processes; see `results_of`."""
+        name = self.folder.name.rpartition("-")[0]
         with worker_processes(self.workers) as executor:
-            return kept_parts(self.parts, self.name, jobs, make, self.progress, run=executor.map, size=size)
+            return results_of(name, jobs, make, self.progress, run=executor.map, size=size)

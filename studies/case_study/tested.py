@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -17,33 +16,18 @@ from harness.records.folder import read_table
 from harness.resolved import resolve
 from harness.runner.prepare import prepare
 from harness.runner.run import RunResult, run_campaign
-from harness.runner.stored import stored_blocks
-from harness.vocabulary import CRASH, FAILED, BoolArray, FloatArray, IntArray, Method
+from harness.vocabulary import FloatArray, Method
 from studies.case_study.figures import exactly, figure, is_settled, marked, tests_for, weights_are_in
 from studies.case_study.study import Context, Made, Run, TwinTests
 from studies.replication.weighted import prepared_twin
-from studies.replication.work import write_table
+from studies.rnot import Tests, read_run
+from studies.work import write_table
 
 PART, AT_ONCE = 500_000, 50_000
-"""Tests of a file that a killed step goes on from, and of a call of the twin."""
+"""Tests that a worker hands back together, and of a call of the twin."""
 GROUPS = 20
 CRASHES = "crashes.parquet"
 IN_THE_TWIN = ("world.engine=twin", "records.traces=none", "records.trace_share=0.0")
-_WEIGHT = b"sum_of_weights"
-
-
-class Tests(NamedTuple):
-    """Tests of a step: ``n`` of them, and (k,) rows in index order of those that crashed or failed."""
-
-    n: int
-    episode: IntArray
-    weight: FloatArray
-    failed: BoolArray
-
-    @property
-    def y(self) -> FloatArray:
-        """Weighted crashes (k,); a failed test counts as none."""
-        return np.where(self.failed, 0.0, self.weight)
 
 
 def campaign_of(step: TwinTests | Run) -> Campaign:
@@ -60,38 +44,33 @@ def campaign_of(step: TwinTests | Run) -> Campaign:
 
 
 def test_in_twin(step: TwinTests, context: Context) -> dict[str, Any]:
-    """Test in worker processes, part by part; parts on disk are taken as they are."""
+    """Test in worker processes, part by part."""
     campaign = campaign_of(step)
     prepare(resolve(campaign), context.progress)  # tables and kernels are built once, before the workers start
     make = partial(crashes_in_twin, campaign.model_dump_json())
     jobs = [(first, min(PART, step.tests - first)) for first in range(0, step.tests, PART)]
-    return _kept(context, campaign.testing.method, step.tests, context.by_workers(jobs, make, size=lambda job: job[1]))
+    found = context.by_workers(jobs, make, size=lambda job: job[1])
+    return _kept(context, campaign.testing.method, Tests.joined(found))
 
 
-def crashes_in_twin(campaign_json: str, part: tuple[int, int]) -> pa.Table:
+def crashes_in_twin(campaign_json: str, part: tuple[int, int]) -> Tests:
     """Crashed and failed ones of the tests ``first … first + n - 1``."""
     prepared, loop = prepared_twin(campaign_json)
-    (first, n), tables = part, []
+    (first, n), parts = part, []
     for start in range(first, first + n, AT_ONCE):
         rows = loop.run(start, prepared.states(start, min(AT_ONCE, first + n - start))).results.episode
-        ends = rows["outcome"] == CRASH, rows["outcome"] == FAILED
-        tables.append(_crashes(start, *ends, rows["log_weight"], rows["n_control_steps"]))
-    return pa.concat_tables(tables).replace_schema_metadata({_WEIGHT: repr(sum(map(_weight_of, tables)))})
+        parts.append(Tests.of(start, rows["outcome"], rows["log_weight"]))
+    return Tests.joined(parts)
 
 
 def keep_run(step: Run, context: Context) -> dict[str, Any]:
     """Run the campaign, or go on with it."""
     campaign, run = campaign_of(step), context.folder / "run"
-    begun = (run / "manifest.json").is_file()
-    done = run_campaign(campaign, run, workers=context.workers, resume=begun, progress=context.progress)
-    if campaign.testing.method != "shells":
-        tables = [
-            _crashes(block.first_episode, block.crash, block.failed, block.log_weight, block.n_control_steps)
-            for block in stored_blocks(run, moments=False)
-        ]
-        n, method = int(done.estimates["n_episodes"]), campaign.testing.method
-        return {"engine": campaign.world.engine, **_kept(context, method, n, tables)}
-    return {"engine": campaign.world.engine, "figures": figures_of_shells(done, context.rhw)}
+    done = run_campaign(campaign, run, workers=context.workers, resume=True, progress=context.progress)
+    method, engine = campaign.testing.method, {"engine": campaign.world.engine}
+    if method == "shells":
+        return {**engine, "figures": figures_of_shells(done, context.rhw)}
+    return {**engine, **_kept(context, method, read_run(run)[0])}
 
 
 def figures_of_shells(done: RunResult, rhw: float) -> dict[str, Any]:
@@ -106,48 +85,25 @@ def figures_of_shells(done: RunResult, rhw: float) -> dict[str, Any]:
     }
 
 
-def _crashes(
-    first: int, crash: BoolArray, failed: BoolArray, log_weight: FloatArray, n_control_steps: IntArray
-) -> pa.Table:
-    """Rows of tests (n,) from a first one on that crashed or failed, together with the sum of the weights of all."""
-    at = np.flatnonzero(crash | failed)
-    weight = np.exp(np.where(np.isfinite(log_weight[at]), log_weight[at], 0.0))
-    columns = {"episode": first + at, "weight": weight, "n_control_steps": n_control_steps[at].astype(np.int64)}
-    with np.errstate(over="ignore"):
-        total = float(np.exp(log_weight).sum())
-    return pa.table({**columns, "failed": failed[at]}).replace_schema_metadata({_WEIGHT: repr(total)})
-
-
-def _weight_of(table: pa.Table) -> float:
-    return float(table.schema.metadata[_WEIGHT])
-
-
-def _kept(context: Context, method: Method, n: int, tables: list[pa.Table]) -> dict[str, Any]:
-    mean_weight = math.fsum(map(_weight_of, tables)) / n
-    table = pa.concat_tables(tables)
-    write_table(context.folder / CRASHES, table)
-    tests, is_in = _tests(n, table), weights_are_in(method, mean_weight)
-    relvar = relative_variance(tests)
+def _kept(context: Context, method: Method, tests: Tests) -> dict[str, Any]:
+    write_table(context.folder / CRASHES, pa.table(dict(zip(Tests._fields[2:], tests[2:], strict=True))))
+    mean_weight, n_failed = tests.sum_of_weights / tests.n, int(np.count_nonzero(tests.failed))
+    is_in, relvar = weights_are_in(method, mean_weight), relative_variance(tests)
     per_relvar = tests_for(1.0, context.rhw, context.confidence)
+    needed = figure(*(None if x is None else x * per_relvar for x in relvar.values()))
     figures = {
-        "tests": exactly(n),
-        "crashes": exactly(int(np.count_nonzero(~tests.failed))),
-        "failed": exactly(int(np.count_nonzero(tests.failed))),
+        "tests": exactly(tests.n),
+        "crashes": exactly(len(tests.episode) - n_failed),
+        "failed": exactly(n_failed),
         "crash_rate": marked(crash_rate(tests, context.confidence), settled=is_in),
         "relvar": marked(relvar, settled=is_in),
-        "tests_for_rhw": marked(
-            figure(*(None if x is None else x * per_relvar for x in relvar.values())), settled=is_in
-        ),
+        "tests_for_rhw": marked(needed, settled=is_in),
         "mean_weight": exactly(mean_weight),
     }
-    return {"n": n, "figures": figures}
+    return {"n": tests.n, "figures": figures}
 
 
-def _tests(n: int, table: pa.Table) -> Tests:
-    return Tests(n, *(table.column(name).to_numpy() for name in Tests._fields[1:]))
-
-
-def read_tests(made: Made) -> Tests:
+def tests_of(made: Made) -> Tests:
     """Tests of a finished step.
 
     Raises `HarnessError`: they were drawn from shells, each with a probability of its own.
@@ -156,7 +112,9 @@ def read_tests(made: Made) -> Tests:
         found = "tests drawn from shells, of which each has its own probability"
         expected = "tests that can be averaged: drawn by nde, forced, step_mixture or episode_mixture"
         raise HarnessError(str(made.folder), found, expected, "Name another step.")
-    return _tests(made.result["n"], read_table(made.folder / CRASHES))
+    n, table = made.result["n"], read_table(made.folder / CRASHES)
+    weights = n * made.result["figures"]["mean_weight"]["value"]
+    return Tests(n, weights, *(table.column(name).to_numpy() for name in Tests._fields[2:]))
 
 
 def settled(made: Made) -> bool:

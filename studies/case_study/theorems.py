@@ -20,7 +20,7 @@ from studies.case_study.figures import exactly
 from studies.case_study.study import Context, Theorems
 from studies.chains.chain import Chain, Episodes, enumerate_episodes, overtaking, rare_decisive
 from studies.chains.sampler import with_optimal_function
-from studies.replication.work import write_table
+from studies.work import write_table
 
 
 def small_chains() -> list[Chain]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal
@@ -225,39 +225,41 @@ P_BRAKE = 0.05
 NOISE = 0.02
 
 
-def overtaking(
-    name: str, *, skill: float, surrogates: list[float], level: float, horizon: int, **settings: Any
-) -> Chain:
-    """Chain of a vehicle with a skill in (0, 1), tested with surrogates of other skills.
+def overtaking(name: str, *, level: float, **settings: Any) -> Chain:
+    """Chain of a vehicle with a ``skill`` in (0, 1), tested with ``surrogates`` of other skills.
 
-    A skilled vehicle leaves danger fast. `level` is the probability of a cut-in per step at the closest approach.
+    A skilled vehicle leaves danger fast. ``level`` is the probability of a cut-in per step at the closest approach.
     """
-    return Chain(
-        name=name,
-        horizon=horizon,
-        start=np.array([0.0, 0.0, 0.0, 0.2, 0.3, 0.5]),
-        approach=_approach(closer=0.5, wait=0.35, back=0.15),
-        hazard=level * np.array([0.0, 1.0, 0.9, 0.7, 0.4, 0.2]),
-        entry=_entry(),
-        exposure=np.tile([1.0 - P_BRAKE, P_BRAKE], (N_DANGER, 1)),
-        response=_skilled(skill),
-        surrogate_responses=np.stack([_skilled(s) for s in surrogates]),
-        **settings,
-    )
+    hazard = level * np.array([0.0, 1.0, 0.9, 0.7, 0.4, 0.2])
+    approach = _approach(closer=0.5, wait=0.35, back=0.15)
+    return _chain(name, _skilled, start=[0.2, 0.3, 0.5], approach=approach, hazard=hazard, **settings)
 
 
-def decisive(name: str, *, skill: float, surrogates: list[float], level: float, horizon: int, brake: float) -> Chain:
+def decisive(name: str, *, level: float, **settings: Any) -> Chain:
     """Chain in which maneuvers decide nearly everything: little noise, hard braking after a certain approach."""
+    hazard = level * np.array([0.0, 1.0, 1.0, 1.0, 1.0, 1.0])
+    approach = _approach(closer=0.9, wait=0.1, back=0.0)
+    return _chain(name, _decisive, start=[1.0, 0.0, 0.0], approach=approach, hazard=hazard, **settings)
+
+
+def _chain(
+    name: str,
+    response: Callable[[float], FloatArray],
+    *,
+    skill: float,
+    surrogates: list[float],
+    start: list[float],
+    brake: float = P_BRAKE,
+    **tables: Any,
+) -> Chain:
     return Chain(
         name=name,
-        horizon=horizon,
-        start=np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0]),
-        approach=_approach(closer=0.9, wait=0.1, back=0.0),
-        hazard=level * np.array([0.0, 1.0, 1.0, 1.0, 1.0, 1.0]),
+        start=np.array([0.0, 0.0, 0.0, *start]),
         entry=_entry(),
         exposure=np.tile([1.0 - brake, brake], (N_DANGER, 1)),
-        response=_decisive(skill),
-        surrogate_responses=np.stack([_decisive(s) for s in surrogates]),
+        response=response(skill),
+        surrogate_responses=np.stack([response(s) for s in surrogates]),
+        **tables,
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -142,21 +142,17 @@ class Experiment(Section):
         if bool(self.avs) == bool(self.chains):
             mend = "Name vehicles under avs for overtaking in the twin, or exact chains under chains."
             yield "avs", "both avs and chains" if self.avs else "neither avs nor chains", "one of the two", mend
-        for name in set(self.chains) - set(CHAINS):
-            yield "chains", f"'{name}'", f"some of {', '.join(CHAINS)}", "Choose one of them."
-        for name, made in self.adversaries.items():
-            if made.of not in self.avs:
-                expected = f"one of avs: {', '.join(self.avs)}"
-                yield f"adversaries.{name}.of", f"'{made.of}'", expected, "Name one of them."
-            if name in self.avs:
-                yield f"adversaries.{name}", "a name that avs has, too", "another", "Rename it."
-        known = [*self.holding, *(name for name, made in self.adversaries.items() if made.of in self.holding)]
+        names: list[tuple[str, str, Collection[str]]] = [("chains", name, CHAINS) for name in self.chains]
+        names += [(f"adversaries.{name}.of", made.of, self.avs) for name, made in self.adversaries.items()]
+        held = [*self.holding, *(name for name, made in self.adversaries.items() if made.of in self.holding)]
         for name, pair in self.pairs.items():
-            for side, asked in (("a", pair.a), ("b", pair.b)):
-                if asked not in known:
-                    expected = f"a vehicle that holds its speed before the cut-in: {', '.join(known)}"
-                    mend = "Name one of them; `harness compare` takes no others under shells."
-                    yield f"pairs.{name}.{side}", f"'{asked}'", expected, mend
+            names += [(f"pairs.{name}.a", pair.a, held), (f"pairs.{name}.b", pair.b, held)]
+        for key, name, known in names:
+            if name not in known:
+                that_hold = " (`harness compare` takes no vehicles that act under shells)" * key.startswith("pairs")
+                yield key, f"'{name}'", f"one of {', '.join(known)}{that_hold}", "Name one of them."
+        for name in set(self.adversaries) & set(self.avs):
+            yield f"adversaries.{name}", "a name that avs has, too", "another", "Rename it."
 
     def _wrong_vehicles(self) -> Iterator[_Wrong]:
         """What has no twin."""
@@ -167,13 +163,9 @@ class Experiment(Section):
         for name, av in self.avs.items():
             built_in, acts = isinstance(av.parameters, BuiltInParameters), av.acts_before_cut_in
             if not (built_in or (av.source in ("controller", "fmu") and acts)):
-                yield (
-                    f"avs.{name}",
-                    f"an AV that av.{av.source} drives" + ("" if acts else " from the cut-in on"),
-                    "a built-in model (idm, fvdm, constant), or a controller with before_cut_in controller: "
-                    "replications run in the twin",
-                    "Leave it out here, and test it in SUMO with `harness run`.",
-                )
+                found = f"an AV that av.{av.source} drives" + ("" if acts else " from the cut-in on")
+                expected = "a built-in model (idm, fvdm, constant), or a controller with before_cut_in controller"
+                yield f"avs.{name}", found, expected, "Leave it out here, and test it in SUMO with `harness run`."
             if acts and (built_in or not shells):
                 expected = "hold_speed, but for a controller with testing.method shells, which walks paths first"
                 yield f"avs.{name}.before_cut_in", av.before_cut_in, expected, "Leave the key out."
@@ -184,13 +176,9 @@ class Experiment(Section):
         if wrong := set(self.results).difference(judged := SAMPLING[method].estimators):
             expected = f"for testing.method {method}: {', '.join(sorted(judged))}"
             yield "estimators", ", ".join(sorted(wrong)), expected, "Change one of the two."
-        for key, why in {
-            "adversaries": "their crashes are drawn within shells",
-            "pairs": "it compares on drawn cut-ins",
-            "limits": "it alone decides",
-        }.items():
+        for key in ("adversaries", "pairs", "limits"):
             if getattr(self, key) and method != "shells":
-                yield key, f"{key} for {method}", f"method shells: {why}", "Delete them."
+                yield key, f"{key} for {method}", "method shells: it alone draws cut-ins, and decides", "Delete them."
         if self.limits and self.pairs:
             yield "limits", "comparisons of two vehicles", "campaigns of single vehicles", "Delete the key."
 
@@ -208,10 +196,6 @@ def load_experiment(path: Path, overrides: Sequence[str] = ()) -> Experiment:
         return experiment
     file = (path.parent / library).resolve()
     if not file.is_file():
-        raise CampaignError(
-            f"{path}: campaign.pool.library",
-            f"{library}, but there is no file {file}",
-            "a surrogate library, or the name of a shipped one",
-            "Correct the path; it is relative to the folder of the experiment.",
-        )
+        expected, mend = "a library, or the name of a shipped one", "Correct the path, relative to the experiment's."
+        raise CampaignError(f"{path}: campaign.pool.library", f"{library}, but there is no file {file}", expected, mend)
     return experiment.replaced(("campaign", "pool", "library"), str(file))

@@ -55,7 +55,7 @@ def estimate_row(result: str, replication: int, found: Estimate, *, reached: boo
     return Row(result, replication, *counts, *numbers, reached, outside, refused=bool(found.cautions))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Subject:
     """What the experimenter knows about a vehicle or a chain.
 

@@ -49,7 +49,7 @@ from harness.traffic.laws import Environment
 from harness.vehicles.drivers import driver_records
 from harness.vocabulary import CRASH, BoolArray, FloatArray, IntArray, RecordArray
 from harness.worlds.twin import TwinWorld
-from studies.replication.work import sources_of, write_table
+from studies.work import sources_of, write_table
 
 MOST_DRIVERS = 62
 NO_ENVELOPE = -1

@@ -5,79 +5,66 @@ The folder receives results.json, all replications as Parquet, and a plot.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from functools import partial
 from pathlib import Path
 
-import numpy as np
 import pyarrow as pa
 
 from harness.estimators.estimate import finite_json
 from harness.progress import Progress
 from harness.records.folder import require_place, write_bytes, write_json
-from harness.report.style import BLUE, FULL_WIDTH_IN, GREY, INK, VERMILLION, Plot, new_figure, png
+from harness.report.style import BLUE, GREY, INK, VERMILLION, Plot, interval_bars, png, two_panels
+from harness.report.style import Row as Bar
 from studies.replication.experiment import Experiment
-from studies.replication.judgement import Judgement, Row, corrected, judge
-from studies.replication.subjects import Repeated, Tested, subjects
-from studies.replication.work import kept_parts, worker_processes, write_table
+from studies.replication.judgement import Judgement, Row, Subject, corrected, judge
+from studies.replication.subjects import subjects
+from studies.work import results_of, worker_processes, write_table
 
 TASKS_PER_SUBJECT = 8
 RESULTS, REPLICATIONS, PLOT = "results.json", "replications.parquet", "coverage.png"
 
 
 def validate(
-    experiment: Experiment,
-    folder: Path,
-    *,
-    workers: int | None = None,
-    progress: Progress | None = None,
-    parts: Path | None = None,
+    experiment: Experiment, folder: Path, *, workers: int | None = None, progress: Progress | None = None
 ) -> list[Judgement]:
     """Repeat, judge, and write the results into a folder, whose earlier ones are replaced.
 
-    Worker processes, one per core by default, change no bit. In ``parts`` finished replications of this very experiment
-    are kept, and taken from there.
+    Worker processes, one per core by default, change no bit.
     """
     progress = progress or Progress()
     require_place(folder)
-    n, found = experiment.replications, list[tuple[Tested, pa.Table]]()
+    n, found = experiment.replications, dict[Subject, list[Row]]()
     size = -(-n // TASKS_PER_SUBJECT)
     jobs = [range(first, min(first + size, n)) for first in range(0, n, size)]
     with worker_processes(workers) as executor:
-        for place, (subject, repeated) in enumerate(list(subjects(experiment, executor, progress))):
-            kept, stage = parts and parts / str(place), f"replications of {subject.name}"
-            make = partial(replications_of, repeated)
-            tables = kept_parts(kept, stage, jobs, make, progress, run=executor.map, size=len)
-            found.append(((subject, repeated), pa.concat_tables(tables)))
+        for subject, repeated in list(subjects(experiment, executor, progress)):
+            stage = f"replications of {subject.name}"
+            parts = results_of(stage, jobs, repeated.run, progress, run=executor.map, size=len)
+            found[subject] = [row for part in parts for row in part]
     judgements = []
-    for (subject, _), table in found:
-        rows = [Row(**row) for row in table.to_pylist()]
+    for subject, rows in found.items():
         for result in dict.fromkeys(row.result for row in rows):
             of_result = [row for row in rows if row.result == result]
             judgements.append(judge(subject, result, of_result, experiment.nominal))
     judgements = corrected(judgements)
-    _write(folder, experiment, judgements, found)
+    write_results(folder, experiment, judgements, found)
     return judgements
 
 
-def replications_of(repeated: Repeated, part: range) -> pa.Table:
-    """Rows of some replications."""
-    return pa.Table.from_pylist([asdict(row) for row in repeated.run(part)])
-
-
-def _write(
-    folder: Path, experiment: Experiment, judgements: Sequence[Judgement], found: Sequence[tuple[Tested, pa.Table]]
+def write_results(
+    folder: Path, experiment: Experiment, judgements: Sequence[Judgement], found: Mapping[Subject, Sequence[Row]]
 ) -> None:
-    named = [table.add_column(0, "subject", [[one.name] * len(table)]) for (one, _), table in found]
-    write_table(folder / REPLICATIONS, pa.concat_tables(named))
+    """Write all files."""
+    rows = [{"subject": subject.name, **asdict(row)} for subject, rows in found.items() for row in rows]
+    write_table(folder / REPLICATIONS, pa.Table.from_pylist(rows))
     write_bytes(folder / PLOT, png(coverage_plot(judgements, experiment.nominal)))
     content = {
         "experiment": experiment.model_dump(mode="json"),
         "confidence": experiment.nominal,
         "truth": "exact, by backward induction" if experiment.chains else "independent enumeration with another seed",
-        "largest_relative_error_of_truth": max(one.relative_error for (one, _), _ in found),
-        "subjects": [asdict(one) for (one, _), _ in found],
+        "largest_relative_error_of_truth": max(subject.relative_error for subject in found),
+        "subjects": [asdict(subject) for subject in found],
         "judgements": [one.to_json() for one in judgements],
     }
     write_json(folder / RESULTS, finite_json(content))  # of what never crashes nothing relative is known
@@ -86,20 +73,18 @@ def _write(
 def coverage_plot(judgements: Sequence[Judgement], confidence: float) -> Plot:
     """Coverage with its own uncertainty on the left, tests on the right, one line for each vehicle and result."""
     n = len(judgements)
-    figure = new_figure(FULL_WIDTH_IN, 1.2 + 0.2 * n)
-    left, right = figure.subplots(1, 2, sharey=True)
-    for place, one in enumerate(judgements):
-        colour = VERMILLION if one.too_low else BLUE if one.p_value_holm is not None else GREY
-        left.plot([one.coverage_low, one.coverage_high], [place, place], color=colour)
-        left.plot(one.coverage, place, "o", color=colour, markersize=4.0)
-        right.plot([one.tests_5, one.tests_95], [place, place], color=GREY)
-        right.plot(one.tests_median, place, "o", color=INK, markersize=4.0)
+    labels = "coverage, 95 % interval", "tests: median, 5 to 95 %"
+    figure, left, right = two_panels(1.2 + 0.2 * n, labels, sharey=True)
+    coverages, tests = list[Bar](), list[Bar]()
+    for one in judgements:
+        name, colour = f"{one.subject}: {one.result}", BLUE if one.p_value_holm is not None else GREY
+        colour = VERMILLION if one.too_low else colour
+        coverages.append(Bar(name, one.coverage, colour, one.coverage_low, one.coverage_high))
+        tests.append(Bar(name, one.tests_median, INK, one.tests_5, one.tests_95))
+    interval_bars(left, coverages)
+    interval_bars(right, tests)
     left.axvline(confidence, color=INK, linewidth=0.8)
-    left.set_title("Coverage, 95 % interval")
-    right.set_title("Tests: median, 5 to 95 %")
     right.set_xscale("log")
-    left.set_yticks(np.arange(n), [f"{one.subject}: {one.result}" for one in judgements])
-    left.set_ylim(n - 0.5, -0.5)
     low = sum(one.too_low for one in judgements)
     caption = f"{low} of {n} coverages are significantly below {confidence:g}; grey ones are not judged."
     return Plot("coverage", figure, f"Coverage and tests of {n} results. {caption}", caption)
@@ -108,9 +93,9 @@ def coverage_plot(judgements: Sequence[Judgement], confidence: float) -> Plot:
 def table_lines(judgements: Sequence[Judgement]) -> list[str]:
     """Lines of a table, aligned for a terminal."""
     table = [_cells(one) for one in judgements]
-    lines = [tuple(table[0]), *(tuple(cells.values()) for cells in table)]
-    widths = [max(len(line[k]) for line in lines) for k in range(len(lines[0]))]
-    return ["  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)) for line in lines]
+    columns = [[head, *(cells[head] for cells in table)] for head in table[0]]
+    padded = [[cell.ljust(max(map(len, column))) for cell in column] for column in columns]
+    return ["  ".join(line) for line in zip(*padded, strict=True)]
 
 
 def _cells(one: Judgement) -> dict[str, str]:

@@ -12,6 +12,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -99,9 +100,39 @@ class DrawnPool:
         paths: FloatArray = self.mass[np.searchsorted(cumulative, rng.random(n) * cumulative[-1], side="right")]
         return paths
 
+    def available(self, campaign: Campaign) -> IntArray:
+        """The most tests of each stratum, shape (S,)."""
+        return np.full(self.design.p.size, campaign.pool.cut_ins_per_shell, np.int64)
+
 
 Draw = Callable[[np.random.Generator], Sequence[DrawnPool]]
 """Draws a new pool: with the crashes of a vehicle, or without references where both of two crash, only A, only B."""
+
+
+def simulated(campaign: Campaign, drawn: DrawnPool, rng: np.random.Generator) -> Iterator[tuple[ShellRounds, bool]]:
+    """One campaign on a pool, round by round until nothing is left: its planner, and whether its own rule is content.
+
+    The planner's ``seen`` are the tests so far, with estimate and bounds; its ``rule.look`` has the decision.
+    """
+    planner = ShellRounds(campaign, drawn.design, drawn.available(campaign))
+    while (added := planner.next_round()).any():
+        yield planner, planner.enough(campaign_block(drawn, added, int(planner.tally.tests.sum()), rng))
+
+
+def campaign_block(drawn: DrawnPool, added: IntArray, first: int, rng: np.random.Generator) -> Block:
+    """What the records of a round become: within a cell the crashes come first, which no estimator can see."""
+    tests = drawn.tests_of_cells(added, rng)
+    cell, crashes = np.repeat(np.arange(tests.size), tests), rng.binomial(tests, drawn.share)
+    n = cell.size
+    rank = np.arange(n) - np.repeat(np.cumsum(tests) - tests, tests)
+    none, bad = np.zeros(n, np.bool_), rank < crashes[cell]
+    failed = bad & (rank < rng.binomial(crashes, drawn.failing)[cell]) if drawn.failing else none
+    mass = np.zeros((n, tests.size))
+    for c in np.flatnonzero(crashes).tolist():
+        mass[bad & (cell == c)] = drawn.crashed_paths(c, int(crashes[c]), rng)
+    columns = {"cut_in": ~none, "stratum": np.array(drawn.design.cell_stratum)[cell], "cell": cell, "cell_mass": mass}
+    outcome = np.select([failed, bad], [FAILED, CRASHED], TIMEOUT).astype(np.int8)
+    return Block(first, outcome, np.zeros(n), columns, Drawn("shells", shells=drawn.design))
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,32 +150,27 @@ class ShellCampaign:
 
     def run(self, replications: range) -> list[Row]:
         """Rows of all results for each replication."""
-        rounds = self._decide if self.limits else self._replicate
-        return [row for replication in replications for row in rounds(replication)]
+        found = list[Row]()
+        for replication in replications:
+            rng = np.random.default_rng([self.seed, replication])
+            (drawn,) = self.draw(rng)
+            rounds = simulated(self.campaign, drawn, rng)
+            found += (self._decide if self.limits else self._replicate)(replication, rounds, drawn.design)
+        return found
 
-    def _rounds(self, replication: int) -> tuple[ShellRounds, ShellDesign, Callable[[], bool | None]]:
-        """The planner, the design, and what runs a round: whether it was enough, None where nothing is left."""
-        rng = np.random.default_rng([self.seed, replication])
-        (drawn,) = self.draw(rng)
-        planner = ShellRounds(self.campaign, drawn.design, _most_tests(self.campaign, drawn))
-
-        def run_round() -> bool | None:
-            if not (added := planner.next_round()).any():
-                return None
-            return planner.enough(campaign_block(drawn, added, int(planner.tally.tests.sum()), rng))
-
-        return planner, drawn.design, run_round
-
-    def _decide(self, replication: int) -> Iterator[Row]:
+    def _decide(
+        self, replication: int, rounds: Iterator[tuple[ShellRounds, bool]], _design: ShellDesign
+    ) -> Iterator[Row]:
         """All limits from the same tests: what is tested next does not depend on any."""
-        planner, _, run_round = self._rounds(replication)
         pending = {
             name: RoundRule(self.campaign.model_copy(update={"accept": Accept(crash_rate_below=limit)}))
             for name, limit in self.limits.items()
         }
-        while pending and run_round() is not None:
+        for planner, _ in rounds:
             for name in [name for name, rule in pending.items() if rule.observe(planner.seen)]:
                 yield self._decision_row(planner.seen, name, replication, pending.pop(name))
+            if not pending:
+                return
         for name, rule in pending.items():
             yield self._decision_row(planner.seen, name, replication, rule)
 
@@ -157,12 +183,13 @@ class ShellCampaign:
         counts = int(tally.tests.sum()), int(tally.crashes.sum())
         return Row(name, replication, *counts, rate, seen.std_error(), low, high, reached=verdict != "undecided")
 
-    def _replicate(self, replication: int) -> Iterator[Row]:
-        planner, design, run_round = self._rounds(replication)
+    def _replicate(
+        self, replication: int, rounds: Iterator[tuple[ShellRounds, bool]], design: ShellDesign
+    ) -> Iterator[Row]:
         names = [each.name for each in design.statements]
         rules = {name: RoundRule(self.campaign.replaced(_STATEMENT, name)) for name in names}
         known: dict[str, Row] = {}
-        while (enough := run_round()) is not None:
+        for planner, enough in rounds:
             for name, rule in rules.items():
                 pending = name not in known and planner.seen.tally.tests.size
                 if pending and rule.observe(planner.seen) and rule.look.stopped:
@@ -182,27 +209,6 @@ class ShellCampaign:
         error, refused = seen.std_error(found.n_shells), math.isinf(found.rhw_from_pool)
         numbers = found.n_episodes, found.n_crashes, found.crash_rate, error, found.ci_low, found.ci_high
         return Row(result_of(name), replication, *numbers, reached, found.n_crashes_outside, refused)
-
-
-def _most_tests(campaign: Campaign, drawn: DrawnPool) -> IntArray:
-    """The most tests of each stratum, shape (S,)."""
-    return np.full(drawn.design.p.size, campaign.pool.cut_ins_per_shell, np.int64)
-
-
-def campaign_block(drawn: DrawnPool, added: IntArray, first: int, rng: np.random.Generator) -> Block:
-    """What the records of a round become: within a cell the crashes come first, which no estimator can see."""
-    tests = drawn.tests_of_cells(added, rng)
-    cell, crashes = np.repeat(np.arange(tests.size), tests), rng.binomial(tests, drawn.share)
-    n = cell.size
-    rank = np.arange(n) - np.repeat(np.cumsum(tests) - tests, tests)
-    none, bad = np.zeros(n, np.bool_), rank < crashes[cell]
-    failed = bad & (rank < rng.binomial(crashes, drawn.failing)[cell]) if drawn.failing else none
-    mass = np.zeros((n, tests.size))
-    for c in np.flatnonzero(crashes).tolist():
-        mass[bad & (cell == c)] = drawn.crashed_paths(c, int(crashes[c]), rng)
-    columns = {"cut_in": ~none, "stratum": np.array(drawn.design.cell_stratum)[cell], "cell": cell, "cell_mass": mass}
-    outcome = np.select([failed, bad], [FAILED, CRASHED], TIMEOUT).astype(np.int8)
-    return Block(first, outcome, np.zeros(n), columns, Drawn("shells", shells=drawn.design))
 
 
 def _reference_rows(estimate: Estimate, reference: str, replication: int, *, reached: bool) -> Iterator[Row]:
@@ -233,7 +239,7 @@ class PairedCampaign:
     def _replicate(self, replication: int) -> Iterator[Row]:
         rng = np.random.default_rng([self.seed, replication])
         drawn = self.draw(rng)
-        planner = PairRounds(self.campaign, drawn[0].design, _most_tests(self.campaign, drawn[0]), None)
+        planner = PairRounds(self.campaign, drawn[0].design, drawn[0].available(self.campaign), None)
         pairs, early = no_pairs(drawn[0].design), None
         inside, enough = PairRule(self.campaign.replaced(_STATEMENT, LIBRARY_STATEMENT), None), False
         while not enough and (added := planner.next_round(pairs)).any():
@@ -268,18 +274,21 @@ def _with_round(pairs: PairCounts, drawn: Sequence[DrawnPool], added: IntArray, 
 
 
 @dataclass(frozen=True, eq=False)
-class DrawnCells:
-    """Cells of a super-population's paths, of which pools are drawn.
+class OvertakingShells:
+    """Cells of a super-population's paths, of which pools of a vehicle, or of two, are drawn.
 
     The ``template`` is a pool without cut-ins, whose probabilities each draw replaces; ``left_out`` are surrogates that
     are equals of a vehicle, ``limit_mps2`` is the hardest acceleration of the vehicles, and ``mass`` (n, C) the
-    probability of a cut-in of each cell, by path of the super-population.
+    probability of a cut-in of each cell, by path of the super-population. ``crashing`` are the parts of it on which the
+    vehicle crashes, or both of two, only A, only B; ``failing`` is the share of crashes that end as failed tests.
     """
 
     template: Pool
     left_out: tuple[str, ...]
     limit_mps2: float
     mass: FloatArray
+    crashing: tuple[FloatArray, ...] = ()
+    failing: float = 0.0
 
     def crashes_outside(self, crashing: FloatArray) -> dict[str, float]:
         """Share of a crash mass by cell (n, C) that lies beyond the boundary of each statement; 0 of no crash."""
@@ -288,24 +297,11 @@ class DrawnCells:
         places = {name: names.index(each.boundary) for name, each in statements.items()}
         return {name: float(by_cell[self.template.cell_shell > place].sum() / total) for name, place in places.items()}
 
-
-@dataclass(frozen=True, eq=False)
-class OvertakingShells:
-    """Pools of a vehicle, or of two.
-
-    ``crashing`` are the parts (n, C) of ``cells.mass`` on which the vehicle crashes, or both of two, only A, only B.
-    ``failing`` is the share of crashes that end as failed tests.
-    """
-
-    cells: DrawnCells
-    crashing: tuple[FloatArray, ...]
-    failing: float = 0.0
-
     def draw(self, rng: np.random.Generator) -> list[DrawnPool]:
         """A new pool: its design, and what vehicles do on its paths by the design's cells; see `Draw`."""
-        of, limit = self.cells.template, self.cells.limit_mps2
-        rows = rng.integers(0, len(self.cells.mass), of.n_paths)
-        drawn = self.cells.mass[rows]
+        of, limit = self.template, self.limit_mps2
+        rows = rng.integers(0, len(self.mass), of.n_paths)
+        drawn = self.mass[rows]
         references = np.arange(len(of.library.references))
         by_reference = drawn @ np.asarray((of.cell_references[:, None] >> references) & 1, np.float64)
         pool = replace(
@@ -325,7 +321,7 @@ class OvertakingShells:
 
 
 class Division:
-    """Cut-ins of a super-population, divided into ``cells`` by a library without the equals of some vehicles."""
+    """Cut-ins of a super-population, divided into cells by a library without the equals of some vehicles."""
 
     def __init__(
         self,
@@ -340,10 +336,10 @@ class Division:
         """Leave out the equals of vehicles that crash on these masses of cut-ins, (m,) each."""
         bit = {name: driver for driver, name in enumerate(library.surrogates)}
         rate = {name: float(population.mass[population.crashes(driver)].sum()) for name, driver in bit.items()}
-        careful_first = tuple(sorted(bit, key=rate.__getitem__))
+        conservative_first = tuple(sorted(bit, key=rate.__getitem__))
         alike = set().union(*(equals(library, population, of_vehicle) for of_vehicle in crashing))
-        reduced = leave_out(library, alike, careful_first)
-        names = tuple(name for name in careful_first if name in reduced.surrogates)
+        reduced = leave_out(library, alike, conservative_first)
+        names = tuple(name for name in conservative_first if name in reduced.surrogates)
         self._population = population
         self._shell = shells_of(population.bits, np.array([bit[name] for name in names])).astype(np.int64)
         references = list(reference_drivers(library).values())
@@ -352,15 +348,24 @@ class Division:
             start=np.zeros(population.bits.size, np.int64),
         )
         nobody = len(names) << len(references)
-        kind = np.append((self._shell << len(references)) | crash_too, nobody)
-        kinds, cell = np.unique(kind, return_inverse=True)
+        kinds, cell = np.unique(np.append((self._shell << len(references)) | crash_too, nobody), return_inverse=True)
         self._cell, self._n_cells = cell[:-1], kinds.size
         mass = self.by_cell(population.mass)
         mass[:, cell[-1]] += np.maximum(population.cut_in - mass.sum(1), 0.0)
-        divided = kinds >> len(references), kinds & ((1 << len(references)) - 1)
-        template = _template(reduced, names, divided, mass, pool_paths, shadow_runs=shadow_runs)
-        left_out = tuple(name for name in careful_first if name not in reduced.surrogates)
-        self.cells = DrawnCells(template, left_out, limit_mps2, mass)
+        left_out = tuple(name for name in conservative_first if name not in reduced.surrogates)
+        unknown: Any = np.zeros(0)
+        content: dict[str, Any] = dict.fromkeys(Pool.__dataclass_fields__, unknown) | {
+            "cell_shell": kinds >> len(references),
+            "cell_references": kinds & ((1 << len(references)) - 1),
+            "cell_p": mass.mean(0),
+            "p_cut_in": float(mass.sum(1).mean()),
+            "cut_ins": CutIns(
+                **dict.fromkeys(CutIns.__dataclass_fields__, unknown) | {"motion": np.zeros(int(shadow_runs))}
+            ),
+            "p_unknown": 0.0,
+        }
+        template = Pool(**content | {"key": "drawn", "library": reduced, "names": names, "n_paths": pool_paths})
+        self._shells = OvertakingShells(template, left_out, limit_mps2, mass)
 
     def by_cell(self, mass: FloatArray) -> FloatArray:
         """A mass of cut-ins (m,) by path and cell, (n, C)."""
@@ -370,7 +375,7 @@ class Division:
 
     def of_vehicle(self, crashing: FloatArray, failing: float = 0.0) -> OvertakingShells:
         """Pools of a vehicle that crashes on this mass of cut-ins (m,)."""
-        return OvertakingShells(self.cells, (self.by_cell(crashing),), failing)
+        return replace(self._shells, crashing=(self.by_cell(crashing),), failing=failing)
 
     def of_pair(self, a: FloatArray, b: FloatArray) -> OvertakingShells:
         """Pools of two vehicles that crash on these masses of cut-ins (m,).
@@ -380,13 +385,13 @@ class Division:
         """
         mass = self._population.mass
         both = a * np.divide(b, mass, out=np.zeros_like(mass), where=mass > 0.0)
-        only_a, only_b = (np.maximum(one - both, 0.0) for one in (a, b))
-        return OvertakingShells(self.cells, (self.by_cell(both), self.by_cell(only_a), self.by_cell(only_b)))
+        kinds = both, np.maximum(a - both, 0.0), np.maximum(b - both, 0.0)
+        return replace(self._shells, crashing=tuple(map(self.by_cell, kinds)))
 
     def as_adversary(self, made: Adversary, crashing: FloatArray) -> FloatArray:
         """The mass of crashes (m,) of an adversary made of a vehicle."""
-        boundary, population = outermost(self.cells.template, ShellSettings()), self._population
-        inside: BoolArray = self._shell <= boundary
+        template, population = self._shells.template, self._population
+        inside: BoolArray = self._shell <= outermost(template, ShellSettings())
         if made.crashes != "everywhere":
             weight = population.by_path(crashing * inside)
             order = np.argsort(-weight if made.crashes == "on_heaviest_paths" else weight, kind="stable")
@@ -394,7 +399,7 @@ class Division:
             kept[order] = np.cumsum(weight[order]) <= made.share * weight.sum()
             crashing = crashing * kept[population.path]
         # Cut-ins on which nobody crashes are no part of a hole either: they are not tested.
-        tested = ~inside & (self._shell < len(self.cells.template.names))
+        tested = ~inside & (self._shell < len(template.names))
         return np.where(tested, np.maximum(crashing, made.hole * population.mass), crashing)
 
 
@@ -409,18 +414,16 @@ def equals(library: Library, population: SuperPopulation, crashing: FloatArray) 
     }
 
 
-def leave_out(library: Library, names: set[str], careful_first: tuple[str, ...]) -> Library:
+def leave_out(library: Library, names: set[str], conservative_first: tuple[str, ...]) -> Library:
     """The library without a vehicle's equals; the envelope stays, and another surrogate takes over as boundary.
 
-    That is the next more careful one that is left, or the next more careless one if none is; ``careful_first`` are all
-    surrogates.
-
-    Raises `CampaignError`: no surrogate is left but the envelope.
+    That is the next more conservative one that is left, or the next more aggressive one if none is. A library of which
+    the envelope alone is left is a `CampaignError`.
     """
     names = names - {library.envelope}
     if library.boundary in names:
-        place = careful_first.index(library.boundary)
-        candidates = [*reversed(careful_first[:place]), *careful_first[place + 1 :]]
+        place = conservative_first.index(library.boundary)
+        candidates = [*reversed(conservative_first[:place]), *conservative_first[place + 1 :]]
         left = [name for name in candidates if name not in names and name != library.envelope]
         if not left:
             found = f"no surrogate but the envelope, without the vehicle's equals ({', '.join(sorted(names))})"
@@ -428,49 +431,3 @@ def leave_out(library: Library, names: set[str], careful_first: tuple[str, ...])
             raise CampaignError("campaign.pool.library", found, "one that can be the boundary", mend)
         library = library.model_copy(update={"boundary": left[0]})
     return library.without(names)
-
-
-def _template(
-    library: Library,
-    names: tuple[str, ...],
-    kind: tuple[IntArray, IntArray],
-    mass: FloatArray,
-    n_paths: int,
-    *,
-    shadow_runs: bool,
-) -> Pool:
-    """Pool without cut-ins; ``kind`` are shell and references of each cell, ``mass`` is (n, C)."""
-    d, r = len(names), len(library.references)
-    none: IntArray = np.zeros(0, np.int64)
-    no_draws = np.zeros((0, 0), np.int8)
-    return Pool(
-        key="drawn",
-        environment="drawn",
-        library=library,
-        names=names,
-        n_paths=n_paths,
-        p_cut_in=float(mass.sum(1).mean()),
-        p_cut_in_se=0.0,
-        mu=np.zeros(d),
-        mu_covariance=np.zeros((d, d)),
-        p_cut_in_at_crash=np.ones(d),
-        cell_shell=kind[0],
-        cell_references=kind[1],
-        cell_p=mass.mean(0),
-        reference_rate=np.zeros(r),
-        reference_square=np.zeros(r),
-        cut_ins=CutIns(
-            path=none,
-            step=none,
-            cell=none,
-            state=np.zeros((0, 5)),
-            lv=no_draws,
-            bv=no_draws,
-            n_lv=none,
-            n_bv=none,
-            crashes=np.zeros((0, d + r), np.bool_),
-            path_mass=np.zeros((0, kind[0].size), np.float32),
-            motion=np.zeros(int(shadow_runs), np.uint64),
-            lead=none,
-        ),
-    )

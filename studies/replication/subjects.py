@@ -56,26 +56,10 @@ def subjects(experiment: Experiment, executor: Executor, progress: Progress) -> 
     if experiment.chains:
         yield from _chains(experiment)
         return
-    campaign = experiment.campaign
     if experiment.holding:
-        environment, library = load_environment(campaign.environment), load_library(campaign.pool.library)
-        drivers = Drivers.of(library, experiment.holding, see_onset=environment.lateral.present)
-        together: dict[str, set[str]] = {}
-        for one, other in [each for pair in experiment.pairs.values() for each in permutations((pair.a, pair.b))]:
-            together.setdefault(one, set()).update({other} & set(drivers.vehicles))
-        size, seed = experiment.super_population, experiment.seed
-        truths = Truths(environment, drivers, seed + 1, size.reference_paths, progress, together)
-        if campaign.testing.method == "shells":
-            pools = enumerate_paths(environment, drivers, seed, size.paths, progress)
-            shells = _Shells(experiment, library, drivers, truths, pools)
-            yield from shells.pairs() if experiment.pairs else shells.single()
-        else:
-            for name in experiment.holding:
-                tested, place = experiment.subject(name), list(experiment.avs).index(name)
-                episodes = twin_episodes(tested, experiment.seed_of(place), experiment.results)
-                yield Subject(name, truths.vehicle(name)[RATE]), WeightedCampaign(tested, episodes, experiment.results)
+        yield from _holding(experiment, progress)
     if experiment.acting and not experiment.pairs:
-        choose = chooser(campaign, progress)
+        choose = chooser(experiment.campaign, progress)
         for name in experiment.acting:
             yield _acting(experiment, name, choose, executor, progress)
 
@@ -84,14 +68,35 @@ def _chains(experiment: Experiment) -> Iterator[Tested]:
     campaign, method = experiment.campaign, experiment.campaign.testing.method
     for place, name in enumerate(experiment.chains):
         chain, seed = CHAINS[name], experiment.seed_of(place)
-        subject = Subject.exact(name, chain.crash_rate)
         if method == "shells":
             source = ChainShells(chain, experiment.super_population.pool_paths)
-            subject = replace(subject, crashes_outside={result_of(LIBRARY_STATEMENT): source.crashes_outside})
+            outside = {result_of(LIBRARY_STATEMENT): source.crashes_outside}
+            subject = Subject.exact(name, chain.crash_rate, crashes_outside=outside)
             yield _of_shells(experiment, campaign, source.draw, seed, subject)
         else:
             episodes = partial(chain_episodes, chain, method, seed)
-            yield subject, WeightedCampaign(campaign, episodes, experiment.results)
+            yield Subject.exact(name, chain.crash_rate), WeightedCampaign(campaign, episodes, experiment.results)
+
+
+def _holding(experiment: Experiment, progress: Progress) -> Iterator[Tested]:
+    """Vehicles that keep their speed before the cut-in, all enumerated together, or comparisons of these."""
+    campaign, size = experiment.campaign, experiment.super_population
+    environment, library = load_environment(campaign.environment), load_library(campaign.pool.library)
+    drivers = Drivers.of(library, experiment.holding, see_onset=environment.lateral.present)
+    together: dict[str, set[str]] = {}
+    for one, other in [each for pair in experiment.pairs.values() for each in permutations((pair.a, pair.b))]:
+        together.setdefault(one, set()).update({other} & set(drivers.vehicles))
+    truths = Truths(environment, drivers, experiment.seed + 1, size.reference_paths, progress, together)
+    if campaign.testing.method == "shells":
+        pools = enumerate_paths(environment, drivers, experiment.seed, size.paths, progress)
+        shells = _Shells(experiment, library, drivers, truths, pools)
+        yield from shells.pairs() if experiment.pairs else shells.single()
+        return
+    for name in experiment.holding:
+        seed = experiment.seed_of(list(experiment.avs).index(name))
+        tested, known = experiment.subject(name), truths.vehicle(name)[RATE]
+        episodes = twin_episodes(tested, seed, experiment.results)
+        yield Subject(name, known), WeightedCampaign(tested, episodes, experiment.results)
 
 
 def _of_shells(experiment: Experiment, campaign: Campaign, draw: Draw, seed: int, subject: Subject) -> Tested:
@@ -103,14 +108,13 @@ def _vehicle(
     experiment: Experiment, campaign: Campaign, name: str, source: OvertakingShells, known: Mapping[str, Known]
 ) -> Tested:
     """A vehicle by what is known about it, its crash rate among it; adversaries have the seed of what they are of."""
-    outside = {result_of(each): share for each, share in source.cells.crashes_outside(source.crashing[0]).items()}
+    outside = {result_of(each): share for each, share in source.crashes_outside(source.crashing[0]).items()}
     asked = result_of(campaign.testing.shells.statement)
     outside |= {limit_at(factor): outside.get(asked, 0.0) for factor in experiment.limits}
     others = {result: value for result, value in known.items() if result != RATE}
-    facts = outside, source.cells.left_out, source.cells.template.library.boundary
     of = experiment.adversaries[name].of if name in experiment.adversaries else name
-    seed = experiment.seed_of(list(experiment.avs).index(of))
-    return _of_shells(experiment, campaign, source.draw, seed, Subject(name, known[RATE], others, *facts))
+    subject = Subject(name, known[RATE], others, outside, source.left_out, source.template.library.boundary)
+    return _of_shells(experiment, campaign, source.draw, experiment.seed_of(list(experiment.avs).index(of)), subject)
 
 
 def _exactly(known: Mapping[str, Known]) -> dict[str, Known]:
@@ -120,7 +124,7 @@ def _exactly(known: Mapping[str, Known]) -> dict[str, Known]:
 
 @dataclass(frozen=True, eq=False)
 class _Shells:
-    """Vehicles that keep their speed before the cut-in, all enumerated together, and paths for their pools."""
+    """Vehicles that keep their speed before the cut-in, and paths for their pools."""
 
     experiment: Experiment
     library: Library
@@ -161,11 +165,10 @@ class _Shells:
             # Shares of the larger rate, as widths are; what only one of them does counts, whichever it is.
             differing = source.crashing[1] + source.crashing[2]
             rate = float(differing.sum()) / len(differing)
-            beyond = source.cells.crashes_outside(differing)[LIBRARY_STATEMENT] * rate / scale
-            facts = {CONDITIONAL_DIFFERENCE: beyond}, source.cells.left_out, source.cells.template.library.boundary
-            subject = Subject(name, Known(scale, 0.0, scale), dict(known), *facts)
+            outside = {CONDITIONAL_DIFFERENCE: source.crashes_outside(differing)[LIBRARY_STATEMENT] * rate / scale}
+            facts = dict(known), outside, source.left_out, source.template.library.boundary
             campaign, seed = experiment.subject(base[0]), experiment.seed_of(place)
-            yield subject, PairedCampaign(campaign, source.draw, seed)
+            yield Subject(name, Known(scale, 0.0, scale), *facts), PairedCampaign(campaign, source.draw, seed)
 
     def _division(self, *crashing: FloatArray, limit_mps2: float) -> Division:
         library, paths = self.library, self.experiment.super_population.pool_paths

@@ -1,4 +1,4 @@
-"""Work in parts: by worker processes, and kept, so that what was finished before an interruption is not done again."""
+"""Work in parts by worker processes, and what identifies the code that does it."""
 
 from __future__ import annotations
 
@@ -11,25 +11,27 @@ from contextlib import contextmanager
 from multiprocessing import get_context, parent_process
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from harness.processes import leave_signals_to_parent
 from harness.progress import Progress
-from harness.records.folder import read_table, write_atomically
+from harness.records.folder import parquet, write_bytes
+
+_Job = TypeVar("_Job")
+_Result = TypeVar("_Result")
 
 
 def sources_of(*patterns: str) -> str:
     """Hash of sources of these studies."""
-    files = sorted(path for pattern in patterns for path in Path(__file__).parents[1].glob(pattern))
+    files = sorted(path for pattern in patterns for path in Path(__file__).parent.glob(pattern))
     return hashlib.sha256(b"".join(path.name.encode() + path.read_bytes() for path in files)).hexdigest()[:16]
 
 
 def write_table(path: Path, table: pa.Table) -> None:
     """Write a table of results."""
-    write_atomically(path, lambda file: pq.write_table(table, file, compression="zstd"))
+    write_bytes(path, parquet(table))
 
 
 @contextmanager
@@ -52,38 +54,32 @@ def _end_with_parent(watched: Connection) -> None:
     """Let this worker process end when its parent closes the other end of the pipe, or is killed."""
     leave_signals_to_parent()
     parent = parent_process()
-    ends = [watched] if parent is None else [watched, parent.sentinel]
-    threading.Thread(target=_end_after, args=(ends,), daemon=True).start()
+    ends: list[Any] = [watched] if parent is None else [watched, parent.sentinel]
+
+    def end() -> None:
+        wait(ends)
+        os._exit(1)
+
+    threading.Thread(target=end, daemon=True).start()
 
 
-def _end_after(ends: list[Connection | int]) -> None:
-    wait(ends)
-    os._exit(1)
-
-
-def kept_parts(
-    folder: Path | None,
+def results_of(
     name: str,
-    jobs: Sequence[Any],
-    make: Callable[[Any], pa.Table],
+    jobs: Sequence[_Job],
+    make: Callable[[_Job], _Result],
     progress: Progress,
     *,
     run: Callable[..., Any] = map,
-    size: Callable[[Any], int] = lambda _job: 1,
-) -> list[pa.Table]:
-    """Tables of all jobs, in their order.
+    size: Callable[[_Job], int] = lambda _job: 1,
+) -> list[_Result]:
+    """Results of all jobs, in their order.
 
-    Finished ones are kept in a folder that belongs to these very jobs, if there is one. ``run`` is `map`, or that of an
-    executor, and ``make`` a function of a module then; ``name`` is that of the stage that is shown, of which a job
-    takes ``size`` units.
+    ``run`` is `map`, or that of an executor, and ``make`` a function of a module then; ``name`` is that of the stage
+    that is shown, of which a job takes ``size`` units.
     """
-    places = {} if folder is None else {k: folder / f"{k:05d}.parquet" for k in range(len(jobs))}
-    kept = {k: read_table(place) for k, place in places.items() if place.is_file()}
-    missing = [k for k in range(len(jobs)) if k not in kept]
-    progress.stage(name, sum(map(size, jobs)), done=sum(size(jobs[k]) for k in kept))
-    for k, table in zip(missing, run(make, [jobs[k] for k in missing]), strict=True):
-        if k in places:
-            write_table(places[k], table)
-        kept[k] = table
-        progress.advance(size(jobs[k]))
-    return [kept[k] for k in range(len(jobs))]
+    progress.stage(name, sum(map(size, jobs)))
+    results = []
+    for job, result in zip(jobs, run(make, jobs), strict=True):
+        results.append(result)
+        progress.advance(size(job))
+    return results
