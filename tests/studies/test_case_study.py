@@ -12,14 +12,11 @@ import pytest
 
 from harness.numbers import number
 from studies.__main__ import main
-from studies.case_study import study as context
 from studies.case_study import tested
 from studies.case_study.figures import exactly, figure, marked, ratio_of_means, ratio_of_variances, verdict
 from studies.case_study.page import count, shown
-from studies.case_study.steps import run_study, step_keys
+from studies.case_study.steps import step_keys
 from studies.case_study.study import Made, load_study
-
-from .here import Here, Interrupting
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
 SHIPPED = SCENARIOS / "case_study" / "study.yaml"
@@ -105,27 +102,6 @@ def test_a_change_makes_only_what_depends_on_it(study):
     assert {name for name in keys if keys[name] != changed[name]} == {"nade", "curves", "adjusted", "required"}
     quick = step_keys(load_study(file, quick=True))
     assert {name for name in keys if keys[name] != quick[name]} == {"nde", "curves", "required"}
-
-
-def test_a_killed_step_goes_on_from_its_parts(tmp_path, monkeypatch, made):
-    monkeypatch.setattr(tested, "PART", 2_000)
-    file = tmp_path / "study.yaml"
-    file.write_text(STUDY.partition("  nade:")[0])
-    asked_for, folder = load_study(file), tmp_path / "out"
-    with pytest.raises(KeyboardInterrupt):
-        run_study(asked_for, folder, workers=1, progress=Interrupting("nde", 2))
-    (step,) = (folder / "steps").iterdir()
-    assert not (step / "result.json").exists()
-    parts = {path.name: path.stat().st_mtime_ns for path in (step / "parts").glob("*.parquet")}
-    assert sorted(parts) == ["00000.parquet", "00001.parquet"]
-    seen: list[tuple[int, int]] = []
-    really = tested.crashes_in_twin
-    monkeypatch.setattr(tested, "crashes_in_twin", lambda campaign, part: seen.append(part) or really(campaign, part))
-    monkeypatch.setattr(context, "worker_processes", lambda workers: Here())
-    run_study(asked_for, folder, workers=1)
-    assert [first for first, _ in seen] == [4_000]
-    assert pq.read_table(step / "crashes.parquet").equals(pq.read_table(made["nde"].folder / "crashes.parquet"))
-    assert not (step / "parts").exists()
 
 
 def numbers_of(content) -> set[str]:
@@ -285,7 +261,7 @@ def test_relative_variance_of_known_weights():
     n = 4_000
     episode = np.arange(0, n, 10)
     weight = np.where(episode % 20 == 0, 1.0, 3.0)
-    tests = tested.Tests(n, episode, weight, np.zeros(len(episode), bool))
+    tests = tested.Tests(n, float(n), episode, weight, np.zeros(len(episode), bool))
     found = tested.relative_variance(tests)
     assert found["value"] == pytest.approx(0.5 / 0.2**2 - 1.0, rel=1e-12)
     assert found["low"] == pytest.approx(found["value"], rel=1e-9)

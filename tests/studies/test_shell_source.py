@@ -69,15 +69,15 @@ def test_equals_are_found_and_left_out(drivers, population):
     vehicle = drivers.vehicles["equal"].crash_mass(population)
     assert equals(LIBRARY, population, vehicle) == {"brakes-3"}
     _, source = shells_of(drivers, population, "equal")
-    assert source.cells.left_out == ("brakes-3",)
-    assert "brakes-3" not in source.cells.template.names
+    assert source.left_out == ("brakes-3",)
+    assert "brakes-3" not in source.template.names
     assert equals(LIBRARY, population, drivers.vehicles["own"].crash_mass(population)) == set()
     assert equals(LIBRARY, population, np.zeros_like(vehicle)) == set()  # one that never crashes is nobody's equal
 
 
 def test_drawn_pools_scatter_around_the_population(drivers, population):
     _, source = shells_of(drivers, population)
-    assert source.cells.mass.sum() == pytest.approx(population.cut_in.sum(), rel=1e-12)
+    assert source.mass.sum() == pytest.approx(population.cut_in.sum(), rel=1e-12)
     assert source.crashing[0].sum() == pytest.approx(drivers.vehicles["own"].crash_mass(population).sum(), rel=1e-12)
     drawn = [source.draw(np.random.default_rng([1, k]))[0] for k in range(300)]
     rates = np.array([each.design.p @ each.share for each in drawn])
@@ -94,11 +94,11 @@ def test_real_pools_have_the_shells_of_drawn_ones(drivers):
     population = enumerated(drivers, paths)
     _, source = shells_of(drivers, population, paths=paths)
     real = build_pool(ENVIRONMENT, LIBRARY, PoolSettings(relative_error=0.01, seed=7), "real")
-    template = source.cells.template
+    template = source.template
     assert real.names == template.names
     kept = [real.cut_ins.path_mass[real.shell == s, s].mean(dtype=float) for s in range(real.shell_p.size)]
     squares = (
-        (source.cells.mass**2).mean(0),
+        (source.mass**2).mean(0),
         real.shell_p * kept,
     )  # a kept cut-in is a draw in proportion to its path's mass
     errors = [
@@ -120,7 +120,7 @@ def adversary_of(drivers, population, **made):
 def test_an_adversary_on_the_heaviest_paths_has_a_share_of_the_crashes_on_few_of_them(drivers, population):
     source, heavy = adversary_of(drivers, population, crashes="on_heaviest_paths", share=0.3)
     _, light = adversary_of(drivers, population, crashes="on_lightest_paths", share=0.3)
-    inside = source.cells.template.boundary + 1
+    inside = source.template.boundary + 1
     for made in (heavy, light):
         assert 0.2 < made.crashing[0][:, :inside].sum() / source.crashing[0][:, :inside].sum() <= 0.3
     used = [int((made.crashing[0][:, :inside].sum(1) > 0.0).sum()) for made in (heavy, light)]
@@ -129,12 +129,12 @@ def test_an_adversary_on_the_heaviest_paths_has_a_share_of_the_crashes_on_few_of
 
 def test_an_adversary_with_a_hole_crashes_outside_in_that_share(drivers, population):
     source, made = adversary_of(drivers, population, hole=0.01)
-    outside, mass = slice(source.cells.template.boundary + 1, -1), source.cells.mass
+    outside, mass = slice(source.template.boundary + 1, -1), source.mass
     assert np.all(made.crashing[0][:, outside] >= (0.01 - 1e-12) * mass[:, outside])
     hole = 0.01 * mass[:, outside].sum()
     assert made.crashing[0].sum() == pytest.approx(source.crashing[0].sum() + hole, rel=0.05)
-    before = source.cells.crashes_outside(source.crashing[0])
-    after = made.cells.crashes_outside(made.crashing[0])
+    before = source.crashes_outside(source.crashing[0])
+    after = made.crashes_outside(made.crashing[0])
     assert all(after[name] > share for name, share in before.items())
 
 

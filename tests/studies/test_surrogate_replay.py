@@ -29,7 +29,7 @@ from harness.runner.prepare import prepare
 from harness.vehicles.drivers import driver_records
 from harness.vocabulary import CRASH, BoolArray
 from harness.worlds.twin import TwinWorld
-from studies.alarm import Alarm, KnownRates, SurrogateReplay, drivers_crash
+from studies.alarm import Alarm, KnownRates, drivers_crash, surrogates_crash
 from tests.chains.seed import SEED
 
 SMALL = PoolSettings(relative_error=0.03, cut_ins_per_shell=1500)
@@ -54,7 +54,7 @@ def replayed(campaign: Campaign, table: pa.Table, pool: Pool) -> tuple[Block, Bo
     """The episodes, and which surrogates would have crashed in them."""
     method = campaign.testing.method
     block = block_from_tables(table, None, method=method, alpha=mixture_weights(campaign))
-    return block, SurrogateReplay(resolve(campaign), pool).crashes(table)
+    return block, surrogates_crash(table, resolve(campaign), pool)
 
 
 def alarmed(campaign: Campaign, table: pa.Table, pool: Pool, wrong: float = 1.0) -> dict[str, Any]:
@@ -166,4 +166,4 @@ def test_maneuvers_that_do_not_fit_are_refused(forced):
     at = table.column_names.index("bv_maneuvers")
     damaged = table.set_column(at, table.schema.field(at), pa.array(paths, pa.list_(pa.int8())))
     with pytest.raises(RunFolderError, match="episode 7"):
-        SurrogateReplay(resolve(one), pool).crashes(damaged)
+        surrogates_crash(damaged, resolve(one), pool)
