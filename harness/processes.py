@@ -261,18 +261,29 @@ def _serve_forks(connection: Connection, modules: Sequence[str]) -> None:
             descriptor = recv_handle(connection)
         except (EOFError, OSError):  # the parent is gone
             return
+        answer: int | OSError
         try:
-            is_copy = os.fork() == 0
+            answer = _copied()
         except OSError as error:
-            connection.send(error)
-            is_copy = False
-        if is_copy:
-            os.setsid()
-            with connection:  # only now, as a leader of its own session, can it be ended with all that it starts
-                connection.send(os.getpid())
+            answer = error
+        if answer == 0:
+            connection.close()
             _begin(descriptor, server)
             return
         os.close(descriptor)
+        connection.send(answer)
+
+
+def _copied() -> int:
+    """Fork: 0 in the copy; here its number, once it is dead or leads a session, and can be ended with all it starts."""
+    leads, ready = os.pipe()
+    with os.fdopen(leads, "rb", 0) as until_it_leads:
+        with os.fdopen(ready, "wb", 0):
+            if (pid := os.fork()) == 0:
+                os.setsid()
+                return 0
+        until_it_leads.read()
+    return pid
 
 
 _ahead: list[ForkServer] = []

@@ -14,8 +14,7 @@ import time
 import traceback
 import warnings
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
-from itertools import pairwise
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -112,9 +111,11 @@ class ForkedPython(subprocess.Popen):
             try:
                 os.setsid()
                 sys.stdout, sys.stderr = (open(fd, "w", buffering=1, closefd=False) for fd in (1, 2))  # noqa: SIM115
-                kept = sorted({0, 1, 2, *rest[0]})
-                for before, after in pairwise([*kept, os.sysconf("SC_OPEN_MAX")]):
-                    os.closerange(before + 1, after)
+                nothing = os.open(os.devnull, os.O_RDWR)  # Arrow aborts a copy of this copy if its pipe is closed
+                for fd in {int(each.name) for each in Path("/proc/self/fd").iterdir()} - {0, 1, 2, nothing, *rest[0]}:
+                    with suppress(OSError):  # that of the folder itself
+                        os.fstat(fd)
+                        os.dup2(nothing, fd, inheritable=False)
                 exec(args[2], {"__name__": "__worker__"})
                 os._exit(0)
             except SystemExit as error:

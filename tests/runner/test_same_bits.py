@@ -214,6 +214,15 @@ def test_copies_of_a_fork_server_are_whole_and_end_with_it():
     server.close()
 
 
+def test_a_copy_that_dies_at_its_fork_is_dead_and_nobody_waits_for_it(tmp_path, monkeypatch):
+    """As Arrow lets it where its pipe was closed."""
+    (tmp_path / "aborts_copies.py").write_text("import os; os.register_at_fork(after_in_child=os.abort)")
+    monkeypatch.syspath_prepend(tmp_path)
+    server = ForkServer("aborts_copies")
+    assert Child(bad_workers.waiting, server=server).kill() == -signal.SIGABRT
+    server.close()
+
+
 def wait_until_gone(state: Path) -> None:
     """A process closes its files a moment before it is gone."""
     for _ in range(int(PATIENCE_S / POLL_S)):
