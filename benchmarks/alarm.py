@@ -69,9 +69,7 @@ def asked(method: Method, n: int) -> Asked:
 
 def drawn(found: Asked, rows: IntArray, known: KnownRates) -> Asked:
     """Some of the tests, in any order, with other known rates."""
-    columns = ("crash", "failed", "cut_in", "bv_lv_contact", "log_weight", "log_q", "n_control_steps", "log_p_cut_in")
-    taken = {name: getattr(found.tests, name)[rows] for name in columns}
-    return Asked(replace(found.tests, **taken), found.crashes[rows], known)
+    return Asked(found.tests.chosen(rows), found.crashes[rows], known)
 
 
 def by_sample_variance(found: Asked) -> float:

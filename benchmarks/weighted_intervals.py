@@ -45,9 +45,9 @@ class Population:
     def campaign(self, rng: np.random.Generator, n: int, state: Nade) -> Estimate:
         """Estimate after n more tests."""
         weights = self.weights[rng.integers(0, len(self.weights), rng.binomial(n, self.crash_share))]
-        before = state.sums.n
+        before = state.n
         state.add(_crashes(weights, self.cap))
-        state.sums.n = before + n
+        state.n = before + n
         return state.result(CONFIDENCE)
 
 
@@ -66,7 +66,7 @@ def drive(name: str, av: dict[str, object], method: Method, n: int) -> Populatio
         nade.add(block)
         parts.append(np.exp(block.log_weight[block.crash]))
     weights = np.concatenate(parts)
-    return Population(f"{name}, `{method}`", weights, len(weights) / n, nade.sums.mean(), nade.sums.known_cap())
+    return Population(f"{name}, `{method}`", weights, len(weights) / n, nade.mean(), nade.known_cap())
 
 
 def fixed(population: Population, n: int, replications: int) -> str:
@@ -76,7 +76,7 @@ def fixed(population: Population, n: int, replications: int) -> str:
         state = Nade()
         found = population.campaign(np.random.default_rng([SEED, n, k]), n, state)
         half = normal_half_width(found.std_error, CONFIDENCE)
-        below, above = hall_distances(found.std_error, state.sums.y.third_moment(n), (1.0 - CONFIDENCE) / 2.0)
+        below, above = hall_distances(found.std_error, state.y.third_moment(n), (1.0 - CONFIDENCE) / 2.0)
         error = found.crash_rate - population.rate
         covered += [abs(error) <= half, -above <= error <= below, found.ci_low <= population.rate <= found.ci_high]
         widths.append((found.ci_high - found.ci_low) / 2.0 / half)

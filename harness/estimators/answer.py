@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any
 
+from harness.campaign.campaign import Campaign
 from harness.estimators.block import Block
 from harness.estimators.estimate import Estimate, Estimates, Unavailable, finite_json
 from harness.estimators.one_pass import one_pass
-from harness.estimators.pairs import Contrast, Interval, PairedEstimate
-from harness.numbers import WIDEST_RHW
+from harness.estimators.pairs import Contrast, PairedEstimate
+from harness.importance.functions import importance_names
+from harness.numbers import WIDEST_RHW, share
 from harness.records.folder import StoppedBy
 from harness.vocabulary import ESTIMATORS, EstimatorName
 
@@ -30,74 +31,74 @@ MENDS: dict[str, str] = {
 """Why a campaign ended before its precision, and the mend."""
 
 
-@dataclass(frozen=True)
-class CampaignFacts:
-    """What estimates must say about the campaign that they belong to.
-
-    Nothing is said per km where ``distance_per_test_m``, the mean distance that the AV drives in a naturalistic test,
-    is not known. ``importance_names`` are in the order of the importance functions; the rest is what the manifest says
-    of the twin retracing episodes, of tests that ran twice, and of why the run ended.
-    """
-
-    name: str
-    content_hash: str
-    lane_change_level: float
-    confidence: float = 0.9
-    distance_per_test_m: float | None = None
-    importance_names: tuple[str, ...] = ()
-    retraced: dict[str, Any] | None = None
-    repeated: dict[str, Any] | None = None
-    ending: str | None = None
-    decision: dict[str, Any] | None = None
-
-
 def estimate_blocks(
-    blocks: Iterable[Block], facts: CampaignFacts, *, estimators: Collection[EstimatorName] | None = None
+    blocks: Iterable[Block],
+    campaign: Campaign,
+    manifest: Mapping[str, Any],
+    *,
+    estimators: Collection[EstimatorName] | None = None,
+    confidence: float | None = None,
 ) -> dict[str, Any]:
     """Estimates of blocks that cover a campaign's episodes, as JSON content.
 
-    Blocks are contiguous and in index order; ``estimators`` are reported beside the method's own, all by default.
+    Blocks are contiguous and in index order; ``manifest`` is the run's, of which nothing but ``campaign_hash`` need be
+    known. Nothing is said per km where it has no ``distance_per_test_m``, the mean distance that the AV drives in a
+    naturalistic test. ``estimators`` are reported beside the method's own, all by default; ``confidence`` is the level
+    of the intervals, by default the campaign's.
     """
-    done = one_pass(blocks, estimators or ESTIMATORS, confidence=facts.confidence)
+    done = one_pass(blocks, estimators or ESTIMATORS, confidence=confidence or campaign.stop.confidence)
     best = done.headline_estimate
     estimates = {done.headline: best, **done.estimates}
-    distance_km = None if facts.distance_per_test_m is None else facts.distance_per_test_m / 1000.0
-    retraced = facts.retraced or {"reason": "the run did not retrace its episodes"}
-    statements: dict[str, str] = {name: _said(found, facts, distance_km) for name, found in estimates.items()}
+    level, distance_m = campaign.environment.lane_change_level, manifest.get("distance_per_test_m")
+    distance_km = None if distance_m is None else distance_m / 1000.0
+    retraced = manifest.get("retraced") or {"reason": "the run did not retrace its episodes"}
+    repeated = manifest.get("repeated")
+    statements: dict[str, str] = {name: _said(of, repeated, level, distance_km) for name, of in estimates.items()}
     return finite_json(
         Estimates(
-            campaign=facts.name,
-            campaign_hash=facts.content_hash,
-            lane_change_level=facts.lane_change_level,
-            confidence=facts.confidence,
+            campaign=campaign.name,
+            campaign_hash=manifest["campaign_hash"],
+            lane_change_level=level,
+            confidence=best.confidence,
             n_episodes=best.n_episodes,
             n_crashes=best.n_crashes,
             headline=done.headline,
             distance_per_test_km=distance_km,
             crash_rate_per_1e6_km=None if distance_km is None else per_distance(best, distance_km),
-            estimates={
-                name: found.shown if isinstance(found, Estimate) else found for name, found in estimates.items()
-            },
-            diagnostics={**done.diagnostics.result(facts.importance_names), "alarm": {"retraced": retraced}},
+            estimates={name: of.shown if isinstance(of, Estimate) else of for name, of in estimates.items()},
+            diagnostics={**done.diagnostics.result(importance_names(campaign)), "alarm": {"retraced": retraced}},
             convergence=tuple(done.convergence),
             statement=statements[done.headline],
             statements=statements,
             reference_statements=tuple(reference_statements(best)),
             boundary_statements=boundary_statements(best),
             scope=SCOPE,
-            ending=facts.ending,
-            decision=facts.decision,
+            ending=manifest.get("ending"),
+            decision=manifest.get("decision"),
         )
     )
 
 
-def _said(found: Estimate | Unavailable, facts: CampaignFacts, distance_km: float | None) -> str:
-    """What an estimator says, led by what it must be warned of and the first reference driver; or why it cannot."""
+def _said(
+    found: Estimate | Unavailable, repeated: Mapping[str, Any] | None, level: float, distance_km: float | None
+) -> str:
+    """What an estimator says, led by what it must be warned of and the first reference driver; or why it cannot.
+
+    ``repeated`` is what tests that ran twice have come to, where some did.
+    """
     if isinstance(found, Unavailable):
         return f"No crash rate from these records: {found.reason.rstrip('.')}."
-    answer = statement(found, facts.lane_change_level, distance_km)
-    text = warned(repeated_cautions(facts.repeated), " ".join([*reference_statements(found)[:1], answer]))
-    return text + failed_statement(found.details) + repeated_statement(facts.repeated)
+    text = " ".join([*reference_statements(found)[:1], statement(found, level, distance_km)])
+    text += failed_statement(found.details)
+    if repeated is None or not (n := repeated["n_episodes"]):
+        return text
+    if not (n_differing := len(repeated["differing"])):
+        return f"{text} {n:,} of these tests were run a second time: same bits."
+    different = (
+        f"{n_differing:,} of {n:,} tests that were run a second time DIFFERED: this vehicle is not reproducible; its "
+        "tests cannot be replayed, and depend on what ran beside and before them"
+    )
+    return warned([different], text)
 
 
 def warned(cautions: Iterable[str], text: str) -> str:
@@ -108,11 +109,7 @@ def warned(cautions: Iterable[str], text: str) -> str:
 def per_distance(estimate: Estimate, distance_per_test_km: float) -> dict[str, float]:
     """Crash rate and interval per 1e6 km of such overtaking driving."""
     scale = _PER_KM / distance_per_test_km
-    return {
-        "rate": estimate.crash_rate * scale,
-        "ci_low": estimate.ci_low * scale,
-        "ci_high": estimate.ci_high * scale,
-    }
+    return {"rate": estimate.crash_rate * scale, "ci_low": estimate.ci_low * scale, "ci_high": estimate.ci_high * scale}
 
 
 def statement(estimate: Estimate, lane_change_level: float, distance_per_test_km: float | None) -> str:
@@ -134,19 +131,14 @@ def statement(estimate: Estimate, lane_change_level: float, distance_per_test_km
                 f"; that is {scaled['rate']:.3g} crashes per 1e6 km of such overtaking driving "
                 f"({scaled['ci_low']:.3g} to {scaled['ci_high']:.3g})"
             )
+        width = f", relative half-width {estimate.rhw:.1%}"
+        if estimate.rhw > WIDEST_RHW:
+            width = ", still open upwards: far wider than the rate"
         text = (
             f"The crash rate is {estimate.crash_rate:.3g} per test ({level} interval {estimate.ci_low:.3g} to "
-            f"{estimate.ci_high:.3g}{_width(estimate)}), estimated from {tests}"
+            f"{estimate.ci_high:.3g}{'' if estimate.cautions else width}), estimated from {tests}"
         )
     return warned(estimate.cautions, f"{text}{per_km}.")
-
-
-def _width(estimate: Estimate) -> str:
-    if estimate.cautions:
-        return ""
-    if estimate.rhw > WIDEST_RHW:
-        return ", still open upwards: far wider than the rate"
-    return f", relative half-width {estimate.rhw:.1%}"
 
 
 def failed_statement(found: Mapping[str, Any]) -> str:
@@ -175,14 +167,9 @@ def _beside(found: Mapping[str, Any], level: str) -> str:
     low, high = found["preventable_low"], found["preventable_high"]
     return (
         f"This vehicle crashes {found['ratio']:.2f} times as often as {who} would in the same traffic ({level} "
-        f"interval {found['ratio_low']:.2f} to {found['ratio_high']:.2f}); {_percent(found['preventable'])} of its "
-        f"crashes such a driver would have avoided ({_percent(low)} to {_percent(high)})."
+        f"interval {found['ratio_low']:.2f} to {found['ratio_high']:.2f}); {share(found['preventable'])} of its "
+        f"crashes such a driver would have avoided ({share(low)} to {share(high)})."
     )
-
-
-def _percent(share: float) -> str:
-    """A share to two figures at least: whether it is 0.1 or 0 % may matter."""
-    return f"{100.0 * share:.2g} %" if share < 0.1 else f"{100.0 * share:.0f} %"
 
 
 def boundary_statements(estimate: Estimate) -> dict[str, str]:
@@ -239,24 +226,6 @@ def _replayed(episodes: Sequence[int]) -> str:
     return f"episode {episodes[0]} (`{REPLAY} {episodes[0]}`)"
 
 
-def repeated_statement(repeated: Mapping[str, Any] | None) -> str:
-    """That repeated tests came out alike, as a sentence to follow the answer; empty where none did."""
-    if repeated is None or not repeated["n_episodes"] or repeated["differing"]:
-        return ""
-    return f" {repeated['n_episodes']:,} of these tests were run a second time: same bits."
-
-
-def repeated_cautions(repeated: Mapping[str, Any] | None) -> list[str]:
-    """That repeated tests came out otherwise, which is to be said first; empty where none did."""
-    if repeated is None or not repeated["differing"]:
-        return []
-    n, n_differing = repeated["n_episodes"], len(repeated["differing"])
-    return [
-        f"{n_differing:,} of {n:,} tests that were run a second time DIFFERED: this vehicle is not reproducible; its "
-        "tests cannot be replayed, and depend on what ran beside and before them"
-    ]
-
-
 def ending(stopped_by: StoppedBy, n_episodes: int, unmet: tuple[str, ...], *, precision_asked: bool) -> str:
     """When a campaign ended and what decided it, in a sentence.
 
@@ -279,27 +248,37 @@ def ending(stopped_by: StoppedBy, n_episodes: int, unmet: tuple[str, ...], *, pr
 
 
 def paired_statement(found: PairedEstimate, name_a: str, name_b: str) -> str:
-    """Without an assumption: both rates, what lies between them, and where only one of the two crashes."""
-    free = found.free
-    return (
-        f"{rates_statement(found.a, found.b, name_a, name_b)}: {_apart(free, found.a.confidence)}, from "
-        f"{free.n_pairs:,} pairs of tests. Alone, where the other one does not, "
-        f"A crashes {_alone(free.only_a)} times per test, B {_alone(free.only_b)}."
-        f"{failed_pairs_statement(found.a, found.b)}"
+    """Without an assumption: both rates, what lies between them, where only one of the two crashes, failed tests."""
+    free, a, b = found.free, found.a, found.b
+    alone_a, alone_b = (
+        f"{each.value:.3g} ({each.ci_low:.3g} to {each.ci_high:.3g})" for each in (free.only_a, free.only_b)
     )
+    text = (
+        f"A ({name_a}) crashes {a.crash_rate:.3g} times per test ({a.ci_low:.3g} to {a.ci_high:.3g}), "
+        f"B ({name_b}) {b.crash_rate:.3g} times ({b.ci_low:.3g} to {b.ci_high:.3g}): {_apart(free, a.confidence)}, "
+        f"from {free.n_pairs:,} pairs of tests. Alone, where the other one does not, "
+        f"A crashes {alone_a} times per test, B {alone_b}."
+    )
+    if (failed_a := a.details["n_failed"]) + (failed_b := b.details["n_failed"]):
+        text += (
+            f" Of these tests A FAILED in {failed_a:,} and B in {failed_b:,}: each limit counts them as crashes or as "
+            "none, whichever takes it farther."
+        )
+    return warned([f"{name}: {caution}" for name, of in (("A", a), ("B", b)) for caution in of.cautions], text)
 
 
 def conditional_paired_statement(found: PairedEstimate) -> str:
     """If both crash only where the boundary surrogate or a more careful one does."""
-    boundary, inside = found.pairs.design.library.boundary, found.conditional
+    library, inside = found.pairs.design.library, found.conditional
     if found.refuted:
-        who = " and ".join(_crashed_outside(found))
+        beyond = [int(found.pairs.tally(side).crashes[library.n_inside :].sum()) for side in (0, 1)]
+        who = " and ".join(f"{name} has {n:,} times" for name, n in zip("AB", beyond, strict=True) if n)
         return (
-            f"{who} crashed where the surrogate {boundary} does not crash: nothing can be said under the assumption "
-            f"that they crash only where {boundary} does."
+            f"{who} crashed where the surrogate {library.boundary} does not crash: nothing can be said under the "
+            f"assumption that they crash only where {library.boundary} does."
         )
     text = (
-        f"If A and B crash only where the surrogate {boundary} or a more careful one crashes: "
+        f"If A and B crash only where the surrogate {library.boundary} or a more careful one crashes: "
         f"{_apart(inside, found.a.confidence)}, from {inside.n_pairs:,} pairs of tests."
     )
     if inside.n_pairs == found.free.n_pairs:
@@ -319,34 +298,3 @@ def _apart(found: Contrast, confidence: float) -> str:
         return apart
     most = f"{found.ratio_high:.3g}" if math.isfinite(found.ratio_high) else "no limit"
     return f"{apart}, A/B = {found.ratio:.3g} ({found.ratio_low:.3g} to {most})"
-
-
-def _alone(found: Interval) -> str:
-    return f"{found.value:.3g} ({found.ci_low:.3g} to {found.ci_high:.3g})"
-
-
-def _crashed_outside(found: PairedEstimate) -> Iterator[str]:
-    for side, name in enumerate("AB"):
-        if n := int(found.pairs.tally(side).crashes[found.pairs.design.library.n_inside :].sum()):
-            yield f"{name} has {n:,} times"
-
-
-def rates_statement(a: Estimate, b: Estimate, name_a: str, name_b: str) -> str:
-    """Both rates with their intervals, after what may be wrong about them."""
-    cautions = [f"{name}: {text}" for name, of in (("A", a), ("B", b)) for text in of.cautions]
-    return warned(
-        cautions,
-        f"A ({name_a}) crashes {a.crash_rate:.3g} times per test ({a.ci_low:.3g} to {a.ci_high:.3g}), "
-        f"B ({name_b}) {b.crash_rate:.3g} times ({b.ci_low:.3g} to {b.ci_high:.3g})",
-    )
-
-
-def failed_pairs_statement(a: Estimate, b: Estimate) -> str:
-    """How failed tests count; nothing where none has failed."""
-    of_a, of_b = a.details["n_failed"], b.details["n_failed"]
-    if not of_a and not of_b:
-        return ""
-    return (
-        f" Of these tests A FAILED in {of_a:,} and B in {of_b:,}: each limit counts them as crashes or as none, "
-        "whichever takes it farther."
-    )

@@ -21,7 +21,6 @@ from harness.errors import RunFolderError
 from harness.records.folder import MEND_SHARD
 from harness.strata import ShellDesign
 from harness.vocabulary import (
-    BV_LV_CONTACT,
     CRASH,
     FAILED,
     OUTCOMES,
@@ -123,11 +122,6 @@ class Block:
         """Which episodes failed, shape (n,)."""
         return np.asarray(self.outcome == FAILED)
 
-    @property
-    def bv_lv_contact(self) -> BoolArray:
-        """Which episodes ended in a contact of BV and LV, shape (n,)."""
-        return np.asarray(self.outcome == BV_LV_CONTACT)
-
     def weights(self) -> FloatArray:
         """Likelihood ratios p/q_sampled, shape (n,); infinite where they overflow."""
         with np.errstate(over="ignore"):
@@ -164,9 +158,7 @@ class Block:
 
     def take(self, rows: slice) -> Block:
         """Cut out the block of some consecutive rows, a slice with step 1."""
-        start, stop, step = rows.indices(len(self))
-        if step != 1:
-            raise ValueError("a block holds consecutive episodes: the slice must have step 1")
+        start, stop, _ = rows.indices(len(self))
         if (start, stop) == (0, len(self)):
             return self
         return self.chosen(slice(start, stop), self.first_episode + start)
@@ -208,16 +200,10 @@ def block_from_tables(
 ) -> Block:
     """Block of one shard; rows that are missing, out of order, or contradict each other are a `RunFolderError`.
 
-    Parameters
-    ----------
-    episodes : pa.Table
-        Rows of the ``episodes`` table, consecutive and in index order; needs `EPISODE_COLUMNS`.
-    moments : pa.Table or None
-        Control steps of the same episodes, sorted by episode and step; needs `MOMENT_COLUMNS`, for the step mixture.
-    alpha : sequence of float
-        Mixture weights in the order of ``log_q``, M of them.
-    shells : ShellDesign, optional
-        Strata of the campaign, if it draws from shells; needs `SHELL_COLUMNS`.
+    ``episodes`` are rows of that table, consecutive and in index order, with `EPISODE_COLUMNS`; ``moments``, of the
+    step mixture, are the control steps of the same episodes, sorted by episode and step, with `MOMENT_COLUMNS`.
+    ``alpha`` (M,) are mixture weights in the order of ``log_q``. A campaign that draws from ``shells`` needs
+    `SHELL_COLUMNS`, too.
     """
     index = _integers(episodes, "episode")
     _require_consecutive(index)
@@ -277,11 +263,8 @@ def _require_consecutive(index: IntArray) -> None:
     gaps = np.diff(index) != 1
     if gaps.any():
         at = int(np.argmax(gaps))
-        raise _damaged(
-            f"episodes, row {at + 1}",
-            f"episode {index[at + 1]} after episode {index[at]}",
-            "every episode once, in index order; a failed one is a row too",
-        )
+        expected = "every episode once, in index order; a failed one is a row too"
+        raise _damaged(f"episodes, row {at + 1}", f"episode {index[at + 1]} after episode {index[at]}", expected)
 
 
 def _log_weights(episodes: pa.Table, failed: BoolArray, first: int) -> FloatArray:
@@ -300,11 +283,8 @@ def _first_ratios(moments: pa.Table, index: IntArray, n_control_steps: IntArray)
     """q_j/q_sampled of the first nine control steps of each episode, shape (n, 9, J); 1 beyond the last one."""
     row = _integers(moments, "episode") - index[0]
     if len(row) and (row[0] < 0 or row[-1] >= len(index) or np.any(np.diff(row) < 0)):
-        raise _damaged(
-            "moments",
-            f"rows of episodes {row.min() + index[0]} to {row.max() + index[0]}, or out of order",
-            f"episodes {index[0]} to {index[-1]}, in order",
-        )
+        found = f"rows of episodes {row.min() + index[0]} to {row.max() + index[0]}, or out of order"
+        raise _damaged("moments", found, f"episodes {index[0]} to {index[-1]}, in order")
     counts, needed = np.bincount(row, minlength=len(index)), np.minimum(n_control_steps, MAX_CONTROL_STEPS)
     if (counts < needed).any():
         at = int(np.argmax(counts < needed))

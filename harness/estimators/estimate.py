@@ -14,7 +14,6 @@ from typing import Annotated, Any, Protocol
 import numpy as np
 from pydantic import BeforeValidator
 from pydantic_core import from_json, to_json
-from typing_extensions import TypedDict
 
 from harness.estimators.block import Block
 
@@ -88,7 +87,8 @@ class Unavailable:
     crash_rate: None = None
 
 
-class Point(TypedDict):
+@dataclass(frozen=True)
+class Point:
     """The headline estimate of the first ``n`` tests."""
 
     n: int
@@ -143,7 +143,7 @@ class Accumulator(Protocol):
         ...
 
     def result(self, confidence: float) -> Estimate:
-        """Estimate from the episodes so far, at least one, else ValueError; leaves the state as it is."""
+        """Estimate from the episodes so far, at least one; leaves the state as it is."""
         ...
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from typing import Any
@@ -10,11 +11,11 @@ from typing import Any
 import numpy as np
 
 from harness.estimators.block import Block
-from harness.estimators.estimate import Accumulator, Estimate, FailureBounds, Point, Unavailable, require_episodes
+from harness.estimators.estimate import Accumulator, Estimate, FailureBounds, Point, Unavailable
 from harness.estimators.scv import MixtureCv, Scv
 from harness.estimators.shells import Shells
 from harness.estimators.weighted import Moments, Nade, Nde
-from harness.vocabulary import ESTIMATORS, SAMPLING, EstimatorName, Method
+from harness.vocabulary import BV_LV_CONTACT, ESTIMATORS, SAMPLING, EstimatorName, Method
 
 ACCUMULATORS: dict[EstimatorName, type[Accumulator]] = {
     "nde": Nde,
@@ -39,22 +40,21 @@ class Diagnostics:
     """Running moments of weights and ratios; add blocks, ask for the result."""
 
     def __init__(self) -> None:
-        self.n = self.n_failed = self.n_cut_ins = self.n_contacts = 0
+        self.n, self._counts = 0, Counter[str]()
         self.method: Method | None = None
         self._weight, self._cut_in, self._contact = Moments(), Moments(), Moments()
         self._ratios: list[Moments] = []
 
     def add(self, block: Block) -> None:
         """Add one block."""
-        weights = block.weights()
+        weights, contact = block.weights(), block.outcome == BV_LV_CONTACT
         self.method = block.drawn.method
         self.n += len(block)
-        self.n_failed += int(np.count_nonzero(block.failed))
-        self.n_cut_ins += int(np.count_nonzero(block.cut_in))
-        self.n_contacts += int(np.count_nonzero(block.bv_lv_contact))
+        counted = {"n_cut_ins": block.cut_in, "n_bv_lv_contacts": contact, "n_failed": block.failed}
+        self._counts.update({name: int(np.count_nonzero(rows)) for name, rows in counted.items()})
         self._weight.add(weights)
         self._cut_in.add(weights[block.cut_in])
-        self._contact.add(weights[block.bv_lv_contact])
+        self._contact.add(weights[contact])
         if SAMPLING[block.drawn.method].mixes:
             self._ratios = self._ratios or [Moments() for _ in block.drawn.alpha]
             for sums, ratios in zip(self._ratios, block.mixture_ratios().T, strict=True):
@@ -68,9 +68,7 @@ class Diagnostics:
             "mean_weight_cut_in": self._mean(self._cut_in),
             "mean_ratio": {name: self._mean(sums) for name, sums in zip(names, self._ratios, strict=False)},
             "bv_lv_contact_share": self._mean(self._contact),
-            "n_cut_ins": self.n_cut_ins,
-            "n_bv_lv_contacts": self.n_contacts,
-            "n_failed": self.n_failed,
+            **self._counts,
             "note": NOTE_SHELLS if self.method == "shells" else NOTE,
         }
         if self.method == "step_mixture" and (mean := self._weight.mean(self.n)) < CARELESS_MEAN:
@@ -127,23 +125,16 @@ def one_pass(
         diagnostics.add(block)
         for state in states.values():
             state.add(block)
-        if not convergence or n >= convergence[-1]["n"] * SPACING:
+        if not convergence or n >= convergence[-1].n * SPACING:
             convergence.append(_point(states[own].result(confidence)))
-    require_episodes(n)
-    assert own is not None
+    if own is None:
+        raise ValueError("an estimate needs at least one episode")
     results = {name: state.result(confidence) for name, state in states.items()}
-    if convergence[-1]["n"] != n:
+    if convergence[-1].n != n:
         convergence.append(_point(results[own]))
     estimates = {name: results.get(name) or Unavailable(str(refusals[name])) for name in names}
     return PassResult(estimates, own, results[own], diagnostics, convergence)
 
 
-def _point(estimate: Estimate) -> Point:
-    return {
-        "n": estimate.n_episodes,
-        "crash_rate": estimate.crash_rate,
-        "ci_low": estimate.ci_low,
-        "ci_high": estimate.ci_high,
-        "rhw": estimate.precision,
-        "n_crashes": estimate.n_crashes,
-    }
+def _point(of: Estimate) -> Point:
+    return Point(of.n_episodes, of.crash_rate, of.ci_low, of.ci_high, of.precision, of.n_crashes)

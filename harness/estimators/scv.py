@@ -29,10 +29,10 @@ import numpy as np
 from numba.extending import get_cython_function_address
 
 from harness.estimators.block import MAX_CONTROL_STEPS, Block
-from harness.estimators.estimate import Estimate, require_episodes
-from harness.estimators.weighted import FEW_FOR_RESIDUALS, WeightedSums, weighted_estimate
+from harness.estimators.estimate import Estimate
+from harness.estimators.weighted import FEW_FOR_RESIDUALS, WeightedMean
 from harness.processes import side_by_side
-from harness.vocabulary import FloatArray, IntArray
+from harness.vocabulary import FloatArray
 
 WARNING = (
     "this interval is known to be too narrow; use nade's (docs/scv-defect.md). The published variance is not that of "
@@ -50,13 +50,16 @@ _DTPQRT = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 12)(
 """LAPACK's own routine: scipy's Python wrapper of it keeps the interpreter lock, so that no two threads could fold."""
 
 
-class MixtureCv:
-    """Triangular factor and third moments of [1, H, Y], at most (M + 2)³ numbers however many episodes."""
+class MixtureCv(WeightedMean):
+    """Triangular factor of [1, H, Y], and Σ x_i x_j x_k over its rows: (M + 2)³ numbers however many episodes.
+
+    From the latter the skewness of any linear combination of the columns is known afterwards.
+    """
 
     def __init__(self) -> None:
-        self.sums = WeightedSums()
+        super().__init__()
         self._factor: FloatArray | None = None
-        self._cubes: ThirdMoments | None = None
+        self._cubes: FloatArray = np.zeros(())
 
     @classmethod
     def refusal(cls, block: Block) -> str | None:
@@ -72,37 +75,35 @@ class MixtureCv:
 
     def add(self, block: Block) -> None:
         """Fold one block's rows into the factor, in index order."""
-        self.sums.add(block)
+        super().add(block)
         ones = np.ones((len(block), 1))
         columns = [ones, block.mixture_ratios() - 1.0, block.weighted_crashes()[:, None]]
         rows = np.asfortranarray(np.concatenate(columns, axis=1))
-        self._factor = empty_factor(rows.shape[1]) if self._factor is None else self._factor
-        self._cubes = self._cubes or ThirdMoments(rows.shape[1])
-        self._cubes.add(rows)
-        fold_rows(self._factor, rows)
+        for start in range(0, len(rows), _ROWS_AT_ONCE):
+            part = rows[start : start + _ROWS_AT_ONCE]
+            self._cubes = self._cubes + (part[:, :, None] * part[:, None, :]).reshape(len(part), -1).T @ part
+        self._factor = fold_rows(self._factor, rows)
 
     def result(self, confidence: float) -> Estimate:
         """Intercept of the regression, with the residual variance if crashes are many, else the plain mean's."""
-        n, y = self.sums.n, self.sums.y
-        require_episodes(n)
+        n, y = self.n, self.y
         assert self._factor is not None
-        assert self._cubes is not None
         coefficients, rank, variance = _regression(self._factor, n)
         residual = std_error = math.sqrt(variance)
-        third_moment = self._cubes.of(np.array([*-coefficients, 1.0])) / n**3
+        of_residuals = np.array([*-coefficients, 1.0])
+        third_moment = float(np.outer(of_residuals, of_residuals).ravel() @ self._cubes @ of_residuals) / n**3
         plain, warnings = y.std_error(n), []
-        if self.sums.n_crashes and y.n_effective < FEW_FOR_RESIDUALS and residual < plain:
+        if self.n_crashes and y.n_effective < FEW_FOR_RESIDUALS and residual < plain:
             std_error, third_moment = plain, y.third_moment(n)
             warnings.append(
                 f"fewer than {FEW_FOR_RESIDUALS:.0f} effective crashes: the interval is as wide as that of the plain "
                 "mean of weighted crashes"
             )
-        return weighted_estimate(
-            self.sums,
+        return self.estimate(
             float(coefficients[0]),
             std_error,
+            third_moment,
             confidence,
-            third_moment=third_moment,
             method="mean of weighted crashes with the episode mixture's known-mean control variates",
             warnings=warnings,
             details={
@@ -133,11 +134,11 @@ def _regression(factor: FloatArray, n: int) -> tuple[FloatArray, int, float]:
     return coefficients, rank, variance
 
 
-class Scv:
+class Scv(WeightedMean):
     """One `Stratum` per number of control steps."""
 
     def __init__(self) -> None:
-        self.sums = WeightedSums()
+        super().__init__()
         self._strata: dict[int, Stratum] = {}
 
     @classmethod
@@ -152,7 +153,7 @@ class Scv:
     def add(self, block: Block) -> None:
         """Hand each episode to its stratum, in index order."""
         first_ratios, n_control_steps = block.first_ratios, block.n_control_steps
-        self.sums.add(block)
+        super().add(block)
         y, n_surrogates = block.weighted_crashes(), first_ratios.shape[2]
         order = np.argsort(n_control_steps, kind="stable")
         levels, starts = np.unique(n_control_steps[order], return_index=True)
@@ -161,29 +162,25 @@ class Scv:
             self._strata.setdefault(level, Stratum(level))
         # The dearest first: else one thread would be left with it when the others have finished.
         parts.sort(key=lambda part: -len(part[1]) * n_columns(part[0], n_surrogates) ** 2)
-
-        def add(part: tuple[int, IntArray]) -> None:
-            level, rows = part
-            self._strata[level].add(first_ratios[rows], y[rows])
-
-        side_by_side(add, parts, worthwhile=len(block) >= CHUNK_ROWS)
+        side_by_side(
+            lambda part: self._strata[part[0]].add(first_ratios[part[1]], y[part[1]]),
+            parts,
+            worthwhile=len(block) >= CHUNK_ROWS,
+        )
 
     def result(self, confidence: float) -> Estimate:
         """Algorithm 1's estimate and its published variance."""
-        n = self.sums.n
-        require_episodes(n)
-        levels, fits = zip(*self.fits(), strict=True)
+        n, (levels, fits) = self.n, zip(*self.fits(), strict=True)
         rate = math.fsum(fit.n * fit.intercept for fit in fits) / n
         within = math.fsum(fit.residual_squares for fit in fits)
         between = math.fsum(fit.n * (fit.intercept - rate) ** 2 for fit in fits)
         var_z = (within + between) / (n - 1) if n > 1 else math.inf
-        var_y = self.sums.y.variance(n)
-        return weighted_estimate(
-            self.sums,
+        var_y = self.y.variance(n)
+        return self.estimate(
             rate,
             math.sqrt(var_z / n),
+            None,
             confidence,
-            third_moment=None,
             method="sparse control variates as published (Algorithm 1)",
             cautions=[WARNING],
             details={
@@ -201,7 +198,7 @@ class Scv:
     def fits(self) -> list[tuple[int, StratumFit]]:
         """Every number of control steps with its regression."""
         levels = sorted(self._strata)
-        fits = side_by_side(lambda level: self._strata[level].fit(), levels, worthwhile=self.sums.n >= CHUNK_ROWS)
+        fits = side_by_side(lambda level: self._strata[level].fit(), levels, worthwhile=self.n >= CHUNK_ROWS)
         return list(zip(levels, fits, strict=True))
 
 
@@ -225,37 +222,26 @@ class Stratum:
     """
 
     def __init__(self, level: int) -> None:
-        self._level = level
-        self._n = self._n_waiting = 0
+        self._level, self._n = level, 0
         self._factor: FloatArray | None = None
         self._ratios: list[FloatArray] = []
         self._y: list[FloatArray] = []
 
     def add(self, first_ratios: FloatArray, y: FloatArray) -> None:
         """Add episodes of this stratum: ratios, shape (m, 9, J), and Y, shape (m,)."""
-        start = 0
-        while start < len(y):
-            stop = min(len(y), start + CHUNK_ROWS - self._n_waiting)
-            self._ratios.append(first_ratios[start:stop])
-            self._y.append(y[start:stop])
-            self._n_waiting += stop - start
-            if self._n_waiting == CHUNK_ROWS:
-                self._factor = self._folded(self._factor)
-                self._ratios, self._y, self._n_waiting = [], [], 0
-            start = stop
-        self._n += len(y)
-
-    def _folded(self, factor: FloatArray | None) -> FloatArray:
-        """Fold the waiting rows into `factor`, which is changed, or into a new one."""
-        rows = self._waiting_rows()
-        factor = empty_factor(rows.shape[1]) if factor is None else factor
-        fold_rows(factor, rows)
-        return factor
+        chunks = range(CHUNK_ROWS - self._n % CHUNK_ROWS, len(y), CHUNK_ROWS)
+        for ratios, of_y in zip(np.split(first_ratios, chunks), np.split(y, chunks), strict=True):
+            self._ratios.append(ratios)
+            self._y.append(of_y)
+            self._n += len(of_y)
+            if self._n % CHUNK_ROWS == 0:
+                self._factor = fold_rows(self._factor, self._waiting_rows())
+                self._ratios, self._y = [], []
 
     def _waiting_rows(self) -> FloatArray:
         """Rows [1, H, Y] that wait, shape (m, d + 2), in Fortran order."""
         first_ratios = np.concatenate(self._ratios)
-        rows = np.empty((self._n_waiting, n_columns(self._level, first_ratios.shape[2]) + 2), order="F")
+        rows = np.empty((len(first_ratios), n_columns(self._level, first_ratios.shape[2]) + 2), order="F")
         rows[:, 0], rows[:, -1] = 1.0, np.concatenate(self._y)
         fill_product_columns(first_ratios, self._level, rows[:, 1:-1])
         return rows
@@ -267,9 +253,9 @@ class Stratum:
         decomposition would take hundreds of times as long.
         """
         if self._factor is not None:
-            return self._folded(self._factor.copy(order="F")) if self._ratios else self._factor
+            return fold_rows(self._factor.copy(order="F"), self._waiting_rows()) if self._ratios else self._factor
         rows = self._waiting_rows()
-        return np.asarray(np.linalg.qr(rows, mode="r")) if rows.shape[0] < rows.shape[1] else self._folded(None)
+        return np.asarray(np.linalg.qr(rows, mode="r")) if rows.shape[0] < rows.shape[1] else fold_rows(None, rows)
 
     def fit(self) -> StratumFit:
         """Solve the regression by SVD of the centred columns' triangular factor.
@@ -324,38 +310,18 @@ def fill_product_columns(first_ratios: FloatArray, n_control_steps: int, out: Fl
     np.multiply(products[:, None, :], by_step[-1][None, :, :], out=out.T.reshape(len(products), -1, n_rows))
 
 
-class ThirdMoments:
-    """Σ x_i x_j x_k over rows of k columns: the skewness of any linear combination of these is known afterwards."""
-
-    def __init__(self, n_columns: int) -> None:
-        self._sums: FloatArray = np.zeros((n_columns * n_columns, n_columns))
-
-    def add(self, rows: FloatArray) -> None:
-        """Add rows of shape (n, k)."""
-        for start in range(0, len(rows), _ROWS_AT_ONCE):
-            part = rows[start : start + _ROWS_AT_ONCE]
-            self._sums += (part[:, :, None] * part[:, None, :]).reshape(len(part), -1).T @ part
-
-    def of(self, coefficients: FloatArray) -> float:
-        """Σ (cᵀx)³ for coefficients c of shape (k,)."""
-        return float(np.outer(coefficients, coefficients).ravel() @ self._sums @ coefficients)
-
-
-def empty_factor(n_columns: int) -> FloatArray:
-    """Factor of a matrix without rows, shape (k, k)."""
-    return np.zeros((n_columns, n_columns), order="F")
-
-
-def fold_rows(factor: FloatArray, rows: FloatArray) -> None:
+def fold_rows(factor: FloatArray | None, rows: FloatArray) -> FloatArray:
     """Make ``factor`` (k, k), upper triangular, that of the matrix behind it with more ``rows`` (m, k) below.
 
-    Both are in Fortran order, else `ValueError`; the rows are destroyed. The signs of the factor's rows are arbitrary.
+    None is that of no rows. Both are in Fortran order, else `ValueError`; the rows are destroyed. The signs of the
+    factor's rows are arbitrary.
     """
     m, k = rows.shape
+    factor = np.zeros((k, k), order="F") if factor is None else factor
     if not (factor.flags.f_contiguous and rows.flags.f_contiguous and factor.shape == (k, k)):
         raise ValueError(f"expected Fortran-ordered (k, k) and (m, k), got {factor.shape} and {rows.shape}")
     if m == 0:
-        return
+        return factor
     panel = min(_PANEL, k)
     reflectors, work = np.empty((panel, k), order="F"), np.empty(panel * k)
     sizes, info = [ctypes.c_int(value) for value in (m, k, 0, panel)], ctypes.c_int()
@@ -365,3 +331,4 @@ def fold_rows(factor: FloatArray, rows: FloatArray) -> None:
     _DTPQRT(rows_, columns, rows_already_triangular, panel_, a, columns, b, rows_, t, panel_, scratch, of_result)
     if info.value != 0:
         raise ArithmeticError(f"LAPACK dtpqrt refused argument {-info.value}")
+    return factor

@@ -1,19 +1,19 @@
 """Means of weighted crashes: `nade` ([paper] section II-B), and `nde`, the share of crashes (II-A).
 
-`WeightedSums`, over Y = 1{crash}·weight, and `weighted_estimate` serve every estimator of a mean of Y. They hold what
-decides whether it can be trusted: how many crashes carry it, how unevenly, and which cap their weights have by design.
+`WeightedMean` is every estimator of a mean of Y = 1{crash}·weight. It holds what decides whether one can be trusted:
+how many crashes carry it, how unevenly, and which cap their weights have by design.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from harness.estimators.block import Block
-from harness.estimators.estimate import Estimate, require_episodes
+from harness.estimators.estimate import Estimate
 from harness.estimators.limits import capped_mean_upper, clopper_pearson, skewed_distances
 from harness.vocabulary import FloatArray
 
@@ -117,7 +117,7 @@ class Moments:
         return third if math.isfinite(third) else 0.0
 
 
-class WeightedSums:
+class WeightedMean:
     """Running moments ``y`` of Y, numbers of episodes and crashes, and the largest weights; one pass."""
 
     def __init__(self) -> None:
@@ -152,11 +152,8 @@ class WeightedSums:
         Under forced cut-ins a crash weighs P(cut-in | path), which is known before the AV drives; the largest is taken
         over all paths driven, the few that ended in a crash and the many that did not.
         """
-        if math.isfinite(self._design_cap):
-            return max(self._design_cap, self._largest_y)
-        if math.isfinite(self._log_path_cap):
-            return max(math.exp(self._log_path_cap), self._largest_y)
-        return math.inf
+        of_paths = math.exp(self._log_path_cap) if math.isfinite(self._log_path_cap) else math.inf
+        return max(self._design_cap if math.isfinite(self._design_cap) else of_paths, self._largest_y)
 
     def cap(self) -> tuple[float, str]:
         """Cap on Y for the upper bound, and where it comes from, in words."""
@@ -207,66 +204,64 @@ class WeightedSums:
             )
         return found
 
+    def estimate(
+        self,
+        rate: float,
+        std_error: float,
+        third_moment: float | None,
+        confidence: float,
+        *,
+        method: str,
+        details: Mapping[str, Any] | None = None,
+        warnings: Sequence[str] = (),
+        cautions: Sequence[str] = (),
+    ) -> Estimate:
+        """Estimate with an interval around `rate` that is as skewed as its error, and a one-sided upper bound.
+
+        The bound is the interval's own, one-sided, where crashes are many enough for it, else Hoeffding's for the mean
+        of capped Y, which holds at every n and is in ``details`` in any case. Without a crash moments say nothing; the
+        interval is then [0, two-sided Hoeffding bound]. ``third_moment`` is that of the error of ``rate``; None for a
+        plain normal interval.
+        """
+        cap, origin = self.cap()
+        hoeffding = capped_mean_upper(self.mean(), cap, self.n, confidence)
+        below, above = skewed_distances(std_error, third_moment or 0.0, (1.0 - confidence) / 2.0)
+        low, high, half = max(0.0, rate - below), min(1.0, rate + above), (below + above) / 2.0
+        if self.n_crashes == 0:
+            low, high = 0.0, capped_mean_upper(0.0, cap, self.n, (1.0 + confidence) / 2.0)
+        upper = hoeffding
+        bound = f"Hoeffding's for the mean of Y, with {origin}; without a crash Clopper-Pearson times that cap"
+        if self.is_settled():
+            upper = min(1.0, rate + skewed_distances(std_error, third_moment or 0.0, 1.0 - confidence)[1])
+            bound = "the same, one-sided"
+        interval = "normal interval" if third_moment is None else "normal interval, widened for skewness (Hall)"
+        negative = () if rate >= 0.0 else ("the rate is negative: too few crashes for control variates, use nade",)
+        cautions = (*cautions, *negative, *self.cautions())
+        return Estimate(
+            crash_rate=rate,
+            std_error=std_error,
+            ci_low=low,
+            ci_high=high,
+            upper_bound=upper,
+            confidence=confidence,
+            rhw=half / rate if rate > 0.0 else math.inf,
+            n_episodes=self.n,
+            n_crashes=self.n_crashes,
+            n_effective=self.y.n_effective,
+            largest_weight_share=self.largest_share(),
+            method=f"{method}; {interval}; upper bound: {bound}",
+            weight_cap=self.known_cap(),
+            cautions=cautions,
+            warnings=(*cautions, *self.warnings(half), *warnings),
+            details={"upper_bound_hoeffding": hoeffding, **(details or {})},
+        )
+
 
 def count_warnings(n_crashes: int) -> list[str]:
     """Warn of too few crashes, which matters to any estimator."""
     if n_crashes >= FEW_CRASHES:
         return []
     return [f"only {n_crashes} crashes were sampled (below {FEW_CRASHES}): the interval is rough"]
-
-
-def weighted_estimate(
-    sums: WeightedSums,
-    rate: float,
-    std_error: float,
-    confidence: float,
-    *,
-    third_moment: float | None,
-    method: str,
-    details: dict[str, Any],
-    warnings: Sequence[str] = (),
-    cautions: Sequence[str] = (),
-) -> Estimate:
-    """Estimate with an interval around `rate` that is as skewed as its error, and a one-sided upper bound.
-
-    The bound is the interval's own, one-sided, where crashes are many enough for it, else Hoeffding's for the mean of
-    capped Y, which holds at every n and is in ``details`` in any case. Without a crash moments say nothing; the
-    interval is then [0, two-sided Hoeffding bound]. ``third_moment`` is that of the error of ``rate``; None for a plain
-    normal interval.
-    """
-    cap, origin = sums.cap()
-    hoeffding = capped_mean_upper(sums.mean(), cap, sums.n, confidence)
-    below, above = skewed_distances(std_error, third_moment or 0.0, (1.0 - confidence) / 2.0)
-    low, high = max(0.0, rate - below), min(1.0, rate + above)
-    if sums.n_crashes == 0:
-        low, high = 0.0, capped_mean_upper(0.0, cap, sums.n, (1.0 + confidence) / 2.0)
-    upper = hoeffding
-    bound = f"upper bound: Hoeffding's for the mean of Y, with {origin}; without a crash Clopper-Pearson times that cap"
-    if sums.is_settled():
-        upper = min(1.0, rate + skewed_distances(std_error, third_moment or 0.0, 1.0 - confidence)[1])
-        bound = "upper bound: the same, one-sided"
-    interval = "normal interval" if third_moment is None else "normal interval, widened for skewness (Hall)"
-    half = (below + above) / 2.0
-    negative = () if rate >= 0.0 else ("the rate is negative: too few crashes for control variates, use nade",)
-    cautions = (*cautions, *negative, *sums.cautions())
-    return Estimate(
-        crash_rate=rate,
-        std_error=std_error,
-        ci_low=low,
-        ci_high=high,
-        upper_bound=upper,
-        confidence=confidence,
-        rhw=half / rate if rate > 0.0 else math.inf,
-        n_episodes=sums.n,
-        n_crashes=sums.n_crashes,
-        n_effective=sums.y.n_effective,
-        largest_weight_share=sums.largest_share(),
-        method=f"{method}; {interval}; {bound}",
-        weight_cap=sums.known_cap(),
-        cautions=cautions,
-        warnings=(*cautions, *sums.warnings(half), *warnings),
-        details={"upper_bound_hoeffding": hoeffding, **details},
-    )
 
 
 def _larger(so_far: float, values: FloatArray) -> float:
@@ -277,11 +272,8 @@ def _exp(log_value: float) -> float:
     return math.exp(log_value) if log_value < 700.0 else math.inf
 
 
-class Nade:
+class Nade(WeightedMean):
     """Mean of Y = 1{crash}·weight. Unbiased for every method of drawing; without control it is the crash share."""
-
-    def __init__(self) -> None:
-        self.sums = WeightedSums()
 
     @classmethod
     def refusal(cls, block: Block) -> str | None:
@@ -292,23 +284,10 @@ class Nade:
             )
         return None
 
-    def add(self, block: Block) -> None:
-        """Add one block's weighted crashes."""
-        self.sums.add(block)
-
     def result(self, confidence: float) -> Estimate:
         """Mean of Y with its interval."""
-        n, y = self.sums.n, self.sums.y
-        require_episodes(n)
-        return weighted_estimate(
-            self.sums,
-            y.mean(n),
-            y.std_error(n),
-            confidence,
-            third_moment=y.third_moment(n),
-            method="mean of weighted crashes",
-            details={},
-        )
+        errors = self.y.std_error(self.n), self.y.third_moment(self.n)
+        return self.estimate(self.mean(), *errors, confidence, method="mean of weighted crashes")
 
 
 class Nde:
@@ -332,7 +311,6 @@ class Nde:
 
     def result(self, confidence: float) -> Estimate:
         """Share of crashes; its relative half-width is half the interval's length over the rate."""
-        require_episodes(self.n)
         rate = self.n_crashes / self.n
         low, high = map(float, clopper_pearson(self.n_crashes, self.n, (1.0 - confidence) / 2.0))
         return Estimate(

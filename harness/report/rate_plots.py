@@ -140,10 +140,10 @@ def convergence_plot(estimates: Estimates, target_rhw: float | None, *, of_state
     ``of_statement``: the target is one for a statement of a shells run about a boundary, which convergence does not
     record.
     """
-    points = sorted(estimates.convergence, key=lambda point: point["n"])
+    points = sorted(estimates.convergence, key=lambda point: point.n)
     if len(points) < 2:
         return None
-    columns = [(each["n"], each["crash_rate"], each["ci_low"], each["ci_high"], each["rhw"]) for each in points]
+    columns = [(each.n, each.crash_rate, each.ci_low, each.ci_high, each.rhw) for each in points]
     n, rate, low, high, rhw = np.array(columns, np.float64).T
     confidence, level = share(estimates.confidence), plain(estimates.lane_change_level)
     if not np.any(rate > 0.0):

@@ -15,10 +15,9 @@ from harness.campaign.campaign import Campaign
 from harness.campaign.files import load_campaign
 from harness.controllers.find import has_foreign_code, require_controller, run_apart
 from harness.errors import CampaignError, RunFolderError
-from harness.estimators.answer import CampaignFacts, estimate_blocks
+from harness.estimators.answer import estimate_blocks
 from harness.estimators.block import Block
 from harness.estimators.one_pass import SPACING
-from harness.importance.functions import importance_names
 from harness.processes import made_ahead
 from harness.records.folder import concatenated, no_episodes, read_manifest, read_table
 from harness.records.reader import read_shard
@@ -56,21 +55,8 @@ def estimate_run(
     folder = Path(folder)
     manifest = read_manifest(folder)
     campaign = load_campaign(folder / "campaign.yaml", check_files=False)
-    distance = manifest.get("distance_per_test_m")
-    facts = CampaignFacts(
-        name=campaign.name,
-        content_hash=str(manifest["campaign_hash"]),
-        lane_change_level=campaign.environment.lane_change_level,
-        confidence=campaign.stop.confidence if confidence is None else confidence,
-        distance_per_test_m=None if distance is None else float(distance),
-        importance_names=importance_names(campaign),
-        retraced=manifest.get("retraced"),
-        repeated=manifest.get("repeated"),
-        ending=manifest.get("ending"),
-        decision=manifest.get("decision"),
-    )
     blocks = stored_blocks(folder, moments="scv" in (estimators or ESTIMATORS))
-    return estimate_blocks(blocks, facts, estimators=estimators)
+    return estimate_blocks(blocks, campaign, manifest, estimators=estimators, confidence=confidence)
 
 
 def stored_blocks(folder: Path, *, moments: bool) -> Iterator[Block]:

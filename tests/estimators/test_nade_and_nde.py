@@ -59,14 +59,14 @@ def test_the_cap_comes_from_the_design_then_from_the_paths_then_from_weights():
     alpha = np.array([0.1, 0.9])
     mixed = nade(block([True, False], [-7.0, 0.0], method="episode_mixture", alpha=alpha, log_p_cut_in=paths))
     seen = nade(block([True, False], [-7.0, 0.0], method="step_mixture"))
-    assert known.sums.cap() == (5e-3, "the weight cap known by design")
-    assert driven.sums.cap()[0] == pytest.approx(2e-3)
-    assert mixed.sums.cap()[0] == pytest.approx(2e-3 / 0.1)  # over the defensive share
-    assert seen.sums.cap()[0] == pytest.approx(math.exp(-7.0))
+    assert known.cap() == (5e-3, "the weight cap known by design")
+    assert driven.cap()[0] == pytest.approx(2e-3)
+    assert mixed.cap()[0] == pytest.approx(2e-3 / 0.1)  # over the defensive share
+    assert seen.cap()[0] == pytest.approx(math.exp(-7.0))
     assert not any("upper bound rests" in w for w in known.result(0.9).warnings)
     for unknown in (driven, seen):
         assert any("upper bound rests" in w for w in unknown.result(0.9).warnings)
-        assert unknown.sums.cap()[1] in unknown.result(0.9).method
+        assert unknown.cap()[1] in unknown.result(0.9).method
 
 
 @pytest.mark.parametrize(

@@ -5,10 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import yaml
 from pydantic import TypeAdapter
 
+from harness.campaign.campaign import Campaign
 from harness.errors import RunFolderError
-from harness.estimators.answer import CampaignFacts, estimate_blocks
+from harness.estimators.answer import estimate_blocks
 from harness.estimators.estimate import Estimate, Estimates, Unavailable, finite_json
 from harness.estimators.one_pass import Diagnostics, accumulator, one_pass
 from harness.runner.stored import estimate_run
@@ -17,7 +19,7 @@ from studies.chains.chain import overtaking
 from studies.chains.sampler import blocks
 from tests.chains.seed import SEED
 
-from .run_folder import write_run
+from .run_folder import CAMPAIGN, write_run
 from .small_blocks import block, fed
 
 CHAIN = overtaking("two surrogates", skill=0.5, surrogates=[0.5, 0.2], level=0.02, horizon=6)
@@ -37,8 +39,10 @@ def drawn(method: str):
     return list(blocks(CHAIN, method, SIZES, SEED))
 
 
-def facts(**settings) -> CampaignFacts:
-    return CampaignFacts("chain", "c0ffee", 3.0, **{"confidence": 0.8, **settings})
+def answered(parts, **manifest) -> dict:
+    """Content of ``estimates.json`` from blocks in memory."""
+    campaign = yaml.safe_load(CAMPAIGN.format(method=parts[0].drawn.method))
+    return estimate_blocks(parts, Campaign.model_validate(campaign), {"campaign_hash": "c0ffee", **manifest})
 
 
 @pytest.mark.parametrize(
@@ -62,7 +66,7 @@ def test_a_stored_run_gives_what_blocks_in_memory_give(tmp_path, method, headlin
     assert finite_json(TypeAdapter(Estimates).validate_json(json.dumps(content), strict=True)) == content
     assert (content["headline"], content["n_episodes"], content["confidence"]) == (headline, sum(SIZES), 0.8)
     assert list(content["diagnostics"]["mean_ratio"]) == importance
-    memory = estimate_blocks(parts, facts(distance_per_test_m=400.0, importance_names=tuple(importance)))
+    memory = answered(parts, distance_per_test_m=400.0)
     if method == "step_mixture":  # q was stored, q/q_sampled is divided again: one rounding in the regression
         memory["estimates"].pop("scv")
         content["estimates"].pop("scv")
@@ -70,7 +74,7 @@ def test_a_stored_run_gives_what_blocks_in_memory_give(tmp_path, method, headlin
 
 
 def test_rates_are_per_test_and_per_distance_where_that_is_known():
-    unknown, known = (estimate_blocks(drawn("forced"), facts(distance_per_test_m=of)) for of in (None, 400.0))
+    unknown, known = (answered(drawn("forced"), distance_per_test_m=of) for of in (None, 400.0))
     assert unknown["crash_rate_per_1e6_km"] is None
     assert "km" not in unknown["statement"]
     assert known["distance_per_test_km"] == 0.4
@@ -82,9 +86,7 @@ def test_rates_are_per_test_and_per_distance_where_that_is_known():
 
 
 def test_without_a_crash_the_statement_gives_the_upper_bound():
-    content = estimate_blocks(
-        [block([False] * 200, method="forced", weight_cap=1e-4)], facts(distance_per_test_m=400.0)
-    )
+    content = answered([block([False] * 200, method="forced", weight_cap=1e-4)], distance_per_test_m=400.0)
     upper = content["estimates"]["nade"]["upper_bound"]
     assert f"below {upper:.3g} per test" in content["statement"]
     assert f"{upper / 0.4 * 1e6:.3g} per 1e6 km" in content["statement"]
@@ -97,12 +99,12 @@ def test_failed_tests_are_named_in_the_answer_itself(method, n_failed):
     """Failures look like a safe vehicle otherwise."""
     failed = [False] * (200 - n_failed) + [True] * n_failed
     some = block([True] * 4 + [False] * 196, failed=failed, method=method, weight_cap=1.0)
-    said = estimate_blocks([some], facts())["statement"]
+    said = answered([some])["statement"]
     assert ("50 FAILED: " in said, "Had they all crashed, the rate would be 0.27." in said) == (n_failed > 0,) * 2
 
 
 def test_unbounded_weights_lead_the_sentence_and_claim_no_precision():
-    content = estimate_blocks(drawn("step_mixture"), facts())
+    content = answered(drawn("step_mixture"))
     assert content["statement"].startswith("WARNING: the weights of these tests are unbounded: ")
     for name, n_cautions in (("nade", 1), ("scv", 2)):
         found = content["estimates"][name]
@@ -115,7 +117,7 @@ def test_unbounded_weights_lead_the_sentence_and_claim_no_precision():
 def test_one_crash_that_could_double_the_rate_leads_the_sentence(n, doubts):
     """Three tests in a hundred crash, with weight 0.001; the largest weight, 0.1, counts as much as 100 of them."""
     some = block([k % 100 < 3 for k in range(n)], [-6.9] * n, method="forced", log_p_cut_in=np.full(n, np.log(0.1)))
-    said = estimate_blocks([some], facts())["statement"]
+    said = answered([some])["statement"]
     assert said.startswith("WARNING: one more crash of the largest possible weight would add 1.65 times") == doubts
     assert ("relative half-width" in said) != doubts
 
@@ -164,15 +166,15 @@ def test_each_estimator_gets_what_it_would_get_alone(method):
 def test_convergence_is_the_headline_on_prefixes(method):
     parts = list(blocks(SHORT, method, [500] * 6, SEED))
     points = one_pass(parts).convergence
-    assert [point["n"] for point in points] == [500, 1_000, 1_500, 2_000, 2_500, 3_000]
+    assert [point.n for point in points] == [500, 1_000, 1_500, 2_000, 2_500, 3_000]
     for k in (1, 3, 6):
         prefix = one_pass(parts[:k]).headline_estimate
-        assert (points[k - 1]["crash_rate"], points[k - 1]["rhw"]) == (prefix.crash_rate, prefix.precision)
+        assert (points[k - 1].crash_rate, points[k - 1].rhw) == (prefix.crash_rate, prefix.precision)
 
 
 def test_convergence_points_are_thinned_but_end_at_the_end():
     parts = list(blocks(SHORT, "nde", [10] * 400, SEED))
-    numbers = np.array([point["n"] for point in one_pass(parts).convergence])
+    numbers = np.array([point.n for point in one_pass(parts).convergence])
     assert numbers[-1] == 4_000
     assert np.all(numbers[1:-1] >= 1.01 * numbers[:-2])
     assert len(numbers) < 300

@@ -12,7 +12,6 @@ from harness.estimators.scv import (
     MixtureCv,
     Scv,
     Stratum,
-    empty_factor,
     fill_product_columns,
     fold_rows,
     n_columns,
@@ -150,9 +149,9 @@ def test_columns_stay_within_729(level, surrogates, steps, columns):
 @pytest.mark.parametrize("k", [1, 5, 33, 100])
 def test_rows_folded_in_blocks_have_the_factor_of_the_whole_matrix(k):
     matrix = np.random.default_rng(k).normal(size=(300, k)) * np.logspace(0, 6, k)
-    factor = empty_factor(k)
+    factor = None
     for rows in np.split(matrix, [1, 40, 40, 170]):
-        fold_rows(factor, np.array(rows, order="F"))
+        factor = fold_rows(factor, np.array(rows, order="F"))
     expected = np.linalg.qr(matrix, mode="r")
     np.testing.assert_allclose(np.abs(factor), np.abs(expected), rtol=0, atol=1e-12 * np.abs(expected).max())
     assert np.array_equal(factor, np.triu(factor))
@@ -161,7 +160,7 @@ def test_rows_folded_in_blocks_have_the_factor_of_the_whole_matrix(k):
 @pytest.mark.parametrize(("k", "order"), [(3, "C"), (4, "F")])
 def test_arrays_that_would_be_misread_are_refused(k, order):
     with pytest.raises(ValueError, match="Fortran"):
-        fold_rows(empty_factor(k), np.ones((4, 3), order=order))
+        fold_rows(np.zeros((k, k), order="F"), np.ones((4, 3), order=order))
 
 
 def with_known_means(parts) -> tuple[float, float]:

@@ -15,8 +15,7 @@ import numpy as np
 from harness.campaign.campaign import Campaign
 from harness.episode.cells import PrescribedCutIns
 from harness.episode.loop import Shard
-from harness.estimators.answer import CampaignFacts, estimate_blocks
-from harness.importance.functions import importance_names
+from harness.estimators.answer import estimate_blocks
 from harness.records.folder import encoded, write_shard
 from harness.records.schemas import shard_tables
 from harness.resolved import resolve
@@ -96,10 +95,11 @@ def write_run(folder: Path, recipe: RunRecipe) -> Path:
         shards.append({"index": index, "first_episode": first, "n_episodes": n, "files": files})
         distance_m += float(e["av_distance_m"].sum()) / recipe.n_episodes
     (folder / "campaign.yaml").write_text(campaign.model_dump_json())
-    (folder / "manifest.json").write_text(json.dumps(_manifest(recipe, shards, distance_m)))
+    manifest = _manifest(recipe, shards, distance_m)
+    (folder / "manifest.json").write_text(json.dumps(manifest))
     (folder / "shells.json").write_bytes(STORED_DESIGN.dump_json(DESIGN))
-    facts = CampaignFacts("made", HASH, recipe.level, 0.9, distance_m, importance_names(campaign))
-    (folder / "estimates.json").write_text(json.dumps(estimate_blocks(stored_blocks(folder, moments=False), facts)))
+    estimates = estimate_blocks(stored_blocks(folder, moments=False), campaign, manifest)
+    (folder / "estimates.json").write_text(json.dumps(estimates))
     return folder
 
 
