@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -23,7 +23,6 @@ from tests.estimators.small_blocks import block
 
 from .seed import SEED
 
-REPLICATIONS = 400
 N = 2_000
 
 WORLD = SingleChoice(
@@ -32,22 +31,14 @@ WORLD = SingleChoice(
     q=np.array([[0.2, 0.2, 0.1, 0.2, 0.1, 0.2], [0.1, 0.1, 0.4, 0.1, 0.2, 0.1]]),
     alpha=np.array([0.5, 0.5]),
 )
-SURROGATES = np.array(
-    [
-        [False, False, False, True, True, False],  # more careful than the vehicle
-        [False, False, True, True, True, True],  # more careless
-        [False, True, True, False, False, False],  # another kind of vehicle
-    ]
-)
+SURROGATES = np.array([[0, 0, 0, 1, 1, 0], [0, 0, 1, 1, 1, 1], [0, 1, 1, 0, 0, 0]], np.bool_)
+"""More careful than the vehicle, more careless, another kind of vehicle."""
 MEAN_WEIGHT = SURROGATES @ (WORLD.p**2 / (WORLD.alpha @ WORLD.q)) / (SURROGATES @ WORLD.p)
 """Mean squares of weighted crashes over their means, exactly."""
 ERROR = 0.01
 
 
-Replayed = tuple[Block, BoolArray, KnownRates]
-
-
-def replayed(rng: np.random.Generator, *, corrupt: float = 1.0, n: int = N) -> Replayed:
+def replayed(rng: np.random.Generator, *, corrupt: float = 1.0, n: int = N) -> tuple[Block, BoolArray, KnownRates]:
     """Tests with surrogates whose rates come from a pool of its own in every replication."""
     maneuver = WORLD.maneuvers(n, rng)
     truth = SURROGATES @ WORLD.p
@@ -71,8 +62,7 @@ def test_a_corrupted_rate_raises_the_alarm(corrupt, raised):
 
 def test_the_alarm_is_rarely_false():
     """At a level of 1e-4, 400 campaigns raise it twice with a probability below 1e-3."""
-    raised = sum(told(*replayed(np.random.default_rng([SEED, k])))["raised"] for k in range(REPLICATIONS))
-    assert raised < 2
+    assert sum(told(*replayed(np.random.default_rng([SEED, k])))["raised"] for k in range(400)) < 2
 
 
 def test_blocks_may_be_added_in_any_parts():
@@ -88,26 +78,16 @@ def test_blocks_may_be_added_in_any_parts():
 
 def weighted(
     h: list[float], mu: float, *, cap: float | None = None, p_cut_in: float | None = None, error: float = 0.0
-) -> Replayed:
-    """Tests in which one surrogate, of a rate known with an error, crashes with weights ``h``, 0 for no crash.
+) -> dict[str, Any]:
+    """What the alarm says where one surrogate, of a rate known with an error, crashes with weights ``h``, 0 for none.
 
     They are bounded by a ``cap``, or are those of forced cut-ins with a mean ``p_cut_in`` where it crashes.
     """
-    n, crashes = len(h), np.array(h) > 0.0
+    crashes, one = np.array(h) > 0.0, {"log_q": np.zeros((len(h), 1)), "alpha": np.zeros(1), "weight_cap": cap}
+    method = "episode_mixture" if p_cut_in is None else "forced"
+    tests = block([False] * len(h), np.log(np.where(crashes, h, 1.0)), method=method, **one)
     rates = np.array([mu]), np.array([error]), np.array([1.0 if p_cut_in is None else p_cut_in])
-    tests = block(
-        [False] * n,
-        np.log(np.where(crashes, h, 1.0)),
-        method="episode_mixture" if p_cut_in is None else "forced",
-        log_q=np.zeros((n, 1)),
-        alpha=np.zeros(1),
-        weight_cap=cap,
-    )
-    return tests, crashes[:, None], KnownRates(("one",), *rates)
-
-
-def by_bets(h: list[float], mu: float, cap: float) -> float:
-    return told(*weighted(h, mu, cap=cap))["p_value"]
+    return told(tests, crashes[:, None], KnownRates(("one",), *rates))
 
 
 def by_sample_variance(h: list[float], mu: float, cap: float) -> float:
@@ -118,27 +98,22 @@ def by_sample_variance(h: list[float], mu: float, cap: float) -> float:
     return float(2.0 * ndtr(-abs(x.mean() - mu) / (x.std() / math.sqrt(x.size))))
 
 
-def outcomes(n: int, light: float, heavy: float) -> Iterator[tuple[float, int, int]]:
-    """Probability and numbers of light and heavy crashes in n tests; what is left out has one of 1e-6 at most."""
-    for n_heavy in np.flatnonzero(binom.pmf(np.arange(n + 1), n, heavy) > 1e-9):
-        left = n - n_heavy
-        p_light = binom.pmf(np.arange(left + 1), left, light / (1.0 - heavy))
-        for n_light in np.flatnonzero(p_light > 1e-9):
-            yield float(binom.pmf(n_heavy, n, heavy) * p_light[n_light]), int(n_light), int(n_heavy)
+def false_alarms(
+    rule: Callable[[list[float], float, float], float], n: int, light: float, heavy: float, weight: float
+) -> dict[float, float]:
+    """Exact probability of a p-value that small, by p-value, where light crashes weigh 1, of n tests.
 
-
-Rule = Callable[[list[float], float, float], float]
-
-
-def false_alarms(rule: Rule, n: int, light: float, heavy: float, weight: float) -> dict[float, float]:
-    """Exact probability of a p-value that small, by p-value, where light crashes weigh 1."""
-    mu, levels = light + heavy * weight, (0.3, 0.1, 0.01, 1e-3, LEVEL)
-    found = dict.fromkeys(levels, 0.0)
-    for probability, n_light, n_heavy in outcomes(n, light, heavy):
-        h = [weight] * n_heavy + [1.0] * n_light + [0.0] * (n - n_heavy - n_light)
-        p_value = rule(h, mu, max(weight, 1.0))
-        for level in levels:
-            found[level] += probability * (p_value <= level)
+    What is left out, numbers of light and heavy crashes that are hardly ever seen, has a probability of 1e-6 at most.
+    """
+    mu, found = light + heavy * weight, dict.fromkeys((0.3, 0.1, 0.01, 1e-3, LEVEL), 0.0)
+    p_heavy = binom.pmf(np.arange(n + 1), n, heavy)
+    for n_heavy in np.flatnonzero(p_heavy > 1e-9).tolist():
+        p_light = binom.pmf(np.arange(n - n_heavy + 1), n - n_heavy, light / (1.0 - heavy))
+        for n_light in np.flatnonzero(p_light > 1e-9).tolist():
+            h = [weight] * n_heavy + [1.0] * n_light + [0.0] * (n - n_heavy - n_light)
+            p_value = rule(h, mu, max(weight, 1.0))
+            for level in found:
+                found[level] += float(p_heavy[n_heavy] * p_light[n_light]) * (p_value <= level)
     return found
 
 
@@ -151,7 +126,8 @@ HEAVY = (220, 0.6, 1e-3, 1e3)
     [HEAVY, (80, 0.6, 0.02, 50.0), (60, 0.3, 0.0, 1.0), (40, 0.01, 0.0, 1.0), (25, 0.5, 0.2, 3.0), (5, 0.3, 0.2, 9.0)],
 )
 def test_every_p_value_holds_also_where_heavy_weights_have_not_occurred(n, light, heavy, weight):
-    for level, probability in false_alarms(by_bets, n, light, heavy, weight).items():
+    found = false_alarms(lambda h, mu, cap: weighted(h, mu, cap=cap)["p_value"], n, light, heavy, weight)
+    for level, probability in found.items():
         assert probability <= level + 1e-6
 
 
@@ -159,57 +135,47 @@ def test_a_p_value_from_the_sample_variance_does_not_hold():
     assert false_alarms(by_sample_variance, *HEAVY)[LEVEL] > 0.7
 
 
-def with_an_erring_pool(told_error: float, n: int = 1_000, p: float = 0.5, error: float = 0.04) -> float:
-    """Probability of a false alarm in plain tests where the pool's rate has a normal error, and tells of one.
+@pytest.mark.parametrize(("told_error", "holds"), [(0.04, True), (0.0, False)])
+def test_the_level_holds_where_the_pool_errs_if_its_error_is_told(told_error, holds):
+    """Probability of a false alarm in 1,000 plain tests where the pool's rate of 0.5 has a normal error of 0.04.
 
     The counts that raise it lie beyond two limits. The normal error is summed in steps of a quarter of it.
     """
-    found = 0.0
+    found, n, p = 0.0, 1_000, 0.5
     for z in np.arange(-6.0, 6.1, 0.25):
 
-        def raised(count: int, mu: float = p + error * z) -> bool:
-            h = [1.0] * count + [0.0] * (n - count)
-            return bool(told(*weighted(h, mu, cap=1.0, error=told_error))["raised"])
+        def raised(count: int, mu: float = p + 0.04 * z) -> bool:
+            return bool(weighted([1.0] * count + [0.0] * (n - count), mu, cap=1.0, error=told_error)["raised"])
 
-        centre = round(n * (p + error * z))
+        centre = round(n * (p + 0.04 * z))
         low = bisect_left(range(centre), True, key=lambda count: not raised(count))
         high = bisect_left(range(centre, n + 1), True, key=raised) + centre
-        outside = binom.cdf(low - 1, n, p) + binom.sf(high - 1, n, p)
-        found += 0.25 * float(norm.pdf(z) * outside)
-    return found
+        found += 0.25 * float(norm.pdf(z) * (binom.cdf(low - 1, n, p) + binom.sf(high - 1, n, p)))
+    assert found <= LEVEL if holds else found > 0.01
 
 
-def test_the_level_holds_where_the_pool_itself_errs():
-    assert with_an_erring_pool(0.04) <= LEVEL
+def paths_missed(rare: float, times: float, told_share: float = 1.0) -> float:
+    """Exact probability of a false alarm in 100 tests where a ``rare`` share of paths has ``times`` P(cut-in | path).
 
-
-def test_without_the_pools_error_it_would_not():
-    assert with_an_erring_pool(0.0) > 0.01
-
-
-def paths_missed(n: int, rare: float, times: float, told_share: float = 1.0) -> float:
-    """Exact probability of a false alarm where one path in 1/``rare`` has this many times the others' P(cut-in).
-
-    The surrogate crashes at every cut-in. The pool tells ``told_share`` of the mean P(cut-in | path) at its crashes.
+    The surrogate crashes at every cut-in. The pool tells ``told_share`` of the mean of that at its crashes.
     """
-    light, heavy = 1e-5, 1e-5 * times
+    light, heavy, n = 1e-5, 1e-5 * times, 100
     mu = (1.0 - rare) * light + rare * heavy
-    at_crash = ((1.0 - rare) * light**2 + rare * heavy**2) / mu
-    found = 0.0
-    for n_rare, probability in enumerate(binom.pmf(np.arange(n + 1), n, rare)):
-        h = [heavy] * n_rare + [light] * (n - n_rare)
-        found += probability * told(*weighted(h, mu, p_cut_in=told_share * at_crash))["raised"]
-    return found
+    at_crash = told_share * ((1.0 - rare) * light**2 + rare * heavy**2) / mu
+    return sum(
+        probability * weighted([heavy] * n_rare + [light] * (n - n_rare), mu, p_cut_in=at_crash)["raised"]
+        for n_rare, probability in enumerate(binom.pmf(np.arange(n + 1), n, rare))
+    )
 
 
 @pytest.mark.parametrize("rare", [0.003, 0.02, 0.5])
 @pytest.mark.parametrize("times", [2.0, 1_000.0])
 def test_forced_cut_ins_hold_the_level_where_heavy_paths_were_not_driven(rare, times):
-    assert paths_missed(100, rare, times) <= LEVEL
+    assert paths_missed(rare, times) <= LEVEL
 
 
 def test_a_pool_that_tells_too_light_paths_would_break_it():
-    assert paths_missed(100, 0.02, 1_000.0, told_share=0.05) > 0.1
+    assert paths_missed(0.02, 1_000.0, told_share=0.05) > 0.1
 
 
 @pytest.mark.parametrize(("n", "raised"), [(1_000, False), (4_000, True)])
@@ -217,22 +183,16 @@ def test_too_few_crashes_are_noticed_once_the_heaviest_would_have_occurred(n, ra
     """Not one crash, at μ = 2^-10 and a mean square of 2^-2 μ: the capital of each bet by hand."""
     few = [(1.0 + math.expm1(-(2.0 ** (8 - j))) / 2.0**8) ** -n for j in range(1, 25)]
     many = [(1.0 + 2.0**-j) ** -n for j in range(1, 25)]
-    found = told(*weighted([0.0] * n, 2.0**-10, cap=2.0**-2))
+    found = weighted([0.0] * n, 2.0**-10, cap=2.0**-2)
     assert found["p_value"] == pytest.approx(48.0 / math.fsum(many + few), rel=1e-9)
     assert found["raised"] == raised
 
 
-def test_too_many_crashes_by_hand():
+def test_without_a_bound_only_too_many_crashes_are_evidence():
+    """By hand; a surrogate without a known rate is not judged."""
     many = [((1.0 + 2.0**-j / 0.1) / (1.0 + 2.0**-j)) ** 9 for j in range(1, 25)]
     few = [math.exp(-9.0 * 2.0**-j / 0.1) for j in range(1, 25)]
-    assert told(*weighted([1.0] * 9, 0.1))["p_value"] == pytest.approx(48.0 / math.fsum(many + few), rel=1e-9)
-
-
-def test_without_a_bound_only_too_many_crashes_are_evidence():
-    none = told(*weighted([0.0] * 10_000, 0.1))
-    assert none["p_value"] == 1.0
-    assert told(*weighted([1.0] * 100, 0.1))["raised"]
-
-
-def test_a_surrogate_without_a_known_rate_is_not_judged():
-    assert told(*weighted([1.0] * 100, 0.0, cap=1.0))["p_value"] == 1.0
+    assert weighted([1.0] * 9, 0.1)["p_value"] == pytest.approx(48.0 / math.fsum(many + few), rel=1e-9)
+    assert weighted([0.0] * 10_000, 0.1)["p_value"] == 1.0
+    assert weighted([1.0] * 100, 0.1)["raised"]
+    assert weighted([1.0] * 100, 0.0, cap=1.0)["p_value"] == 1.0

@@ -12,10 +12,7 @@ from studies.chains.sampler import draw, mixture_weights
 
 from .seed import SEED
 
-
-def small() -> list:
-    immediate = {"surrogates": [0.6, 0.3], "challenge": "immediate"}
-    return [*small_chains(), overtaking("immediate", skill=0.6, level=0.05, horizon=4, **immediate)]
+IMMEDIATE = overtaking("immediate", skill=0.6, level=0.05, horizon=4, surrogates=[0.6, 0.3], challenge="immediate")
 
 
 def test_crash_rates_span_the_rare_range():
@@ -24,7 +21,7 @@ def test_crash_rates_span_the_rare_range():
     assert min(rates) < 1e-8
 
 
-@pytest.mark.parametrize("chain", small(), ids=lambda c: c.name)
+@pytest.mark.parametrize("chain", [*small_chains(), IMMEDIATE], ids=lambda c: c.name)
 def test_backward_induction_is_the_sum_over_all_episodes(chain):
     episodes = enumerate_episodes(chain)
     assert episodes.p.sum() == pytest.approx(1.0, rel=1e-12)
@@ -59,37 +56,39 @@ def test_importance_functions_sum_to_one_and_have_mean_ratio_one(chain):
     assert np.all((chain.proposals.cut >= 0.0) & (chain.proposals.cut <= 1.0))
 
 
+def drawn(chain, method: str, n: int):
+    return draw(chain, method, n, np.random.default_rng(SEED))
+
+
 def test_plain_sampling_gives_the_induced_crash_rate():
     chain = frequent_decisive()
-    block = draw(chain, "nde", 200_000, np.random.default_rng(SEED))
+    block = drawn(chain, "nde", 200_000)
     assert binomtest(int(block.crash.sum()), 200_000, chain.crash_rate).pvalue > 1e-4
     assert binomtest(int(block.cut_in.sum()), 200_000, chain.cut_in_rate).pvalue > 1e-4
 
 
 @pytest.mark.parametrize("method", ["nde", "step_mixture"])
 def test_without_control_the_log_weight_is_exactly_zero(method):
-    block = draw(panel()[3], method, 20_000, np.random.default_rng(SEED))
+    block = drawn(panel()[3], method, 20_000)
     free = block.n_control_steps == 0
-    assert np.all(block.log_weight[free] == 0.0)
-    assert np.all(block.log_q[free] == 0.0)
+    assert not np.any(block.log_weight[free])
+    assert not np.any(block.log_q[free])
 
 
 def test_forced_weights_are_the_probability_of_a_cut_in_on_the_path():
     chain = panel()[1]
-    block = draw(chain, "forced", 5_000, np.random.default_rng(SEED))
+    block = drawn(chain, "forced", 5_000)
     assert block.cut_in.all()
     assert np.all(block.log_weight == block.log_p_cut_in)
     assert block.weighted_crashes().max() <= chain.cut_in_cap
 
 
 def test_defensive_mixture_bounds_every_weighted_crash():
-    chain = panel()[2]
-    block = draw(chain, "episode_mixture", 50_000, np.random.default_rng(SEED))
-    bound = np.exp(block.log_p_cut_in) / block.drawn.alpha[0]
-    assert np.all(block.weighted_crashes() <= bound * (1.0 + 1e-12))
+    block = drawn(panel()[2], "episode_mixture", 50_000)
+    assert np.all(block.weighted_crashes() <= np.exp(block.log_p_cut_in) / block.drawn.alpha[0] * (1.0 + 1e-12))
 
 
 def test_exact_variance_of_the_step_mixture_is_that_of_replications():
     chain = frequent_decisive()
-    y = draw(chain, "step_mixture", 400_000, np.random.default_rng(SEED)).weighted_crashes()
+    y = drawn(chain, "step_mixture", 400_000).weighted_crashes()
     assert y.var() == pytest.approx(chain.step_mixture_variance, rel=0.03)

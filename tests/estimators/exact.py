@@ -17,24 +17,20 @@ def _outcomes(share: Sequence[float], n: int) -> Iterator[tuple[float, np.ndarra
     return zip(chance[likely].tolist(), counts[likely], strict=True)
 
 
-def coverage(shares: Sequence[Sequence[float]], tests: Sequence[int], covers: Callable[[np.ndarray], bool]) -> float:
-    """Probability that ``covers`` is true of counts (S, J) of independent strata, unlikely ones being misses."""
+def coverage(
+    shares: Sequence[Sequence[float]],
+    tests: Sequence[int],
+    truth: float,
+    limits: Callable[[np.ndarray], tuple[float, float]],
+) -> float:
+    """Probability that limits of counts (S, J) of independent strata hold the truth, unlikely counts being misses."""
     covered = 0.0
     for drawn in product(*(list(_outcomes(share, n)) for share, n in zip(shares, tests, strict=True))):
         chance = math.prod(probability for probability, _ in drawn)
         if chance > 1e-8:
-            covered += chance * bool(covers(np.array([counts for _, counts in drawn])))
+            low, high = limits(np.array([counts for _, counts in drawn]))
+            covered += chance * (low - 1e-9 <= truth <= high + 1e-9)  # up to rounding
     return covered
-
-
-def covering(truth: float, limits: Callable[[np.ndarray], tuple[float, float]]) -> Callable[[np.ndarray], bool]:
-    """Whether limits of counts hold the truth, up to rounding."""
-
-    def covers(counts: np.ndarray) -> bool:
-        low, high = limits(counts)
-        return low - 1e-9 <= truth <= high + 1e-9
-
-    return covers
 
 
 def tilted(a: np.ndarray, crashes: np.ndarray, tests: np.ndarray) -> tuple[np.ndarray, float]:

@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from harness.estimators.estimate import finite_json
 from harness.estimators.weighted import Nade, Nde
 
 from .small_blocks import block, fed
@@ -17,25 +16,16 @@ def nade(*blocks) -> Nade:
     return fed(Nade(), blocks)
 
 
-outcomes = st.lists(st.booleans(), min_size=1, max_size=50)
-weighted = st.lists(st.tuples(st.booleans(), st.floats(-40.0, 3.0)), min_size=1, max_size=40)
-
-
-def as_block(rows, **settings):
-    return block([c for c, _ in rows], [w for _, w in rows], **settings)
-
-
-@given(outcomes)
+@given(st.lists(st.booleans(), min_size=1, max_size=50))
 def test_without_control_nade_is_the_share_of_crashes(crash):
     some = block(crash, method="nde", weight_cap=1.0)
-    plain = fed(Nde(), [some])
-    assert nade(some).result(0.9).crash_rate == plain.result(0.9).crash_rate == np.mean(crash)
+    assert nade(some).result(0.9).crash_rate == fed(Nde(), [some]).result(0.9).crash_rate == np.mean(crash)
 
 
-@given(weighted)
+@given(st.lists(st.tuples(st.booleans(), st.floats(-40.0, 3.0)), min_size=1, max_size=40))
 def test_is_the_mean_with_its_standard_error(rows):
-    estimate = nade(as_block(rows)).result(0.9)
-    y = np.array([math.exp(w) if c else 0.0 for c, w in rows])
+    estimate = nade(block([crash for crash, _ in rows], [weight for _, weight in rows])).result(0.9)
+    y = np.array([math.exp(weight) if crash else 0.0 for crash, weight in rows])
     assert estimate.crash_rate == pytest.approx(y.mean(), rel=1e-12)
     if len(y) > 1 and y.any():
         assert estimate.std_error == pytest.approx(y.std(ddof=1) / math.sqrt(len(y)), rel=1e-6, abs=1e-9 * y.mean())
@@ -49,16 +39,14 @@ def test_no_crash_still_gives_an_upper_bound_and_an_interval():
     assert estimate.upper_bound == pytest.approx(3e-4 * (1 - 0.1 ** (1 / 100)))
     assert estimate.ci_high == pytest.approx(3e-4 * (1 - 0.05 ** (1 / 100)))
     assert estimate.rhw == math.inf
-    assert finite_json(estimate.shown)["rhw"] is None
 
 
 def test_the_cap_comes_from_the_design_then_from_the_paths_then_from_weights():
-    paths = np.log([1e-3, 2e-3])
-    known = nade(block([True, False], [-7.0, 0.0], method="forced", weight_cap=5e-3, log_p_cut_in=paths))
-    driven = nade(block([True, False], [-7.0, 0.0], method="forced", log_p_cut_in=paths))
-    alpha = np.array([0.1, 0.9])
-    mixed = nade(block([True, False], [-7.0, 0.0], method="episode_mixture", alpha=alpha, log_p_cut_in=paths))
-    seen = nade(block([True, False], [-7.0, 0.0], method="step_mixture"))
+    some, paths = ([True, False], [-7.0, 0.0]), np.log([1e-3, 2e-3])
+    known = nade(block(*some, method="forced", weight_cap=5e-3, log_p_cut_in=paths))
+    driven = nade(block(*some, method="forced", log_p_cut_in=paths))
+    mixed = nade(block(*some, method="episode_mixture", alpha=np.array([0.1, 0.9]), log_p_cut_in=paths))
+    seen = nade(block(*some, method="step_mixture"))
     assert known.cap() == (5e-3, "the weight cap known by design")
     assert driven.cap()[0] == pytest.approx(2e-3)
     assert mixed.cap()[0] == pytest.approx(2e-3 / 0.1)  # over the defensive share

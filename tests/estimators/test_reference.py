@@ -15,7 +15,7 @@ from harness.estimators.shells import compared, preventable_share, rate_ratio_li
 from harness.estimators.tally import Tally, empty_tally
 from harness.strata import Reference, ShellDesign, Statement
 
-from .exact import coverage, covering, tilted
+from .exact import coverage, tilted
 
 LEVEL = Level.two_sided(0.9)
 FEW = Level(2.6, 1e6)
@@ -108,7 +108,7 @@ def test_the_preventable_share_is_held_often_enough_whatever_the_counts(share):
         def limits(counts):
             return preventable_share(P, tally(counts[:, 0], tests), prevented, EXACT, level)[1:]
 
-        return coverage([(each,) for each in share], tests, covering(truth, limits))
+        return coverage([(each,) for each in share], tests, truth, limits)
 
     assert covered(LEVEL) >= 0.90
     assert covered(Level(0.3, 0.5)) < 0.85

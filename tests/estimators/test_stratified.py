@@ -12,20 +12,26 @@ from scipy.optimize import brentq, minimize
 from scipy.special import betaincinv, xlogy
 
 from harness.estimators.likelihood import Level, contrast_limit, likelihood_limit, ratio_limits, spread
+from harness.estimators.limits import clopper_pearson
 
-from .exact import coverage, covering, tilted
+from .exact import coverage, tilted
 
 MANY = 1e6
 """A quantile so large that the threshold for few crashes always holds."""
 STRATA = st.lists(
     st.tuples(st.floats(0.01, 100.0), *[st.integers(0, 30)] * 4), min_size=1, max_size=4, unique_by=lambda t: t[0]
-)
-"""Probability, and counts of the outcomes both, only A, only B, neither."""
+).map(lambda rows: (np.array([p for p, *_ in rows]), np.array([counts for _, *counts in rows])))
+"""Probabilities, and counts of the outcomes both, only A, only B, neither."""
 DIFFERENCE = np.array([0.0, 1.0, -1.0, 0.0])
 
 
 def both(weights, counts, level, variance=0.0):
     return tuple(contrast_limit(np.array(weights, float), np.array(counts), level, side, variance) for side in (-1, 1))
+
+
+def binomial(weights, crashes, tests, level, variance=0.0):
+    w, k, n = np.array(weights, float), np.array(crashes), np.array(tests)
+    return tuple(likelihood_limit(w, k, n, level, side, variance) for side in (-1.0, 1.0))
 
 
 def closed_form(weights, crashes, tests, threshold, side):
@@ -39,17 +45,8 @@ def test_two_outcomes_are_a_binomial_stratum_to_nine_digits():
     for _ in range(50):
         tests = rng.integers(3, 400, 4)
         crashes, weights = rng.integers(1, tests), rng.uniform(0.1, 3.0, 4) * [1, -1, 1, 1]
-        for side in (-1.0, 1.0):
-            expected = closed_form(weights, crashes, tests, 2.6, side)
-            assert likelihood_limit(weights, crashes, tests, Level(2.6, MANY), side) == pytest.approx(
-                expected, rel=1e-9, abs=1e-9
-            )
-
-
-def test_outcomes_of_equal_weight_are_one_outcome():
-    split = both([[1.0, 1.0, 0.0], [2.0, 0.0, 0.0]], [[3, 4, 13], [1, 20, 9]], Level.two_sided(0.9))
-    joined = both([[1.0, 0.0], [2.0, 0.0]], [[7, 13], [1, 29]], Level.two_sided(0.9))
-    assert split == pytest.approx(joined, rel=1e-12)
+        expected = [closed_form(weights, crashes, tests, 2.6, side) for side in (-1.0, 1.0)]
+        assert binomial(weights, crashes, tests, Level(2.6, MANY)) == pytest.approx(expected, rel=1e-9, abs=1e-9)
 
 
 @pytest.mark.parametrize("counts", [[(3, 8, 2, 27), (0, 1, 0, 89)], [(0, 4, 0, 16), (5, 0, 0, 35)]])
@@ -63,22 +60,17 @@ def test_the_limit_is_the_largest_sum_that_shares_within_the_threshold_give(coun
     def room(x):
         return level.threshold - (xlogy(k, k / n) - xlogy(k, shares(x))).sum()
 
+    how = {"constraints": {"type": "ineq", "fun": room}, "options": {"maxiter": 2000, "ftol": 1e-12}}
     for side in (-1.0, 1.0):
-        found = minimize(
-            lambda x, s=side: -s * (w * shares(x)).sum(),
-            np.log(k + 0.3).ravel(),
-            constraints={"type": "ineq", "fun": room},
-            method="SLSQP",
-            options={"maxiter": 2000, "ftol": 1e-12},
-        )
+        found = minimize(lambda x, s=side: -s * (w * shares(x)).sum(), np.log(k + 0.3).ravel(), method="SLSQP", **how)
         assert contrast_limit(w, k, level, side) == pytest.approx(-side * found.fun, rel=1e-3)
 
 
 @given(STRATA, st.sampled_from([0.9, 0.95, 0.99]), st.floats(0.0, 0.1))
 @settings(deadline=None, max_examples=50)
 def test_identities(strata, confidence, relative):
-    p, *columns = (np.array(column) for column in zip(*strata, strict=True))
-    counts, weights = np.column_stack(columns), p[:, None] * DIFFERENCE
+    p, counts = strata
+    weights = p[:, None] * DIFFERENCE
     level, variance, slack = Level.two_sided(confidence), relative * float(p @ p), 1e-9 * float(p.sum())
     low, high = both(weights, counts, level, variance)
     shares = counts / np.maximum(counts.sum(1, keepdims=True), 1)
@@ -86,6 +78,8 @@ def test_identities(strata, confidence, relative):
     assert both(-weights, counts, level, variance) == pytest.approx((-high, -low), rel=1e-6, abs=slack)
     scaled = both(5.0 * weights, counts, level, 25.0 * variance)
     assert scaled == pytest.approx((5.0 * low, 5.0 * high), rel=1e-6, abs=slack)
+    together = counts[:, :3] + np.outer(counts[:, 3], [1, 0, 0])  # outcomes of equal weight are one
+    assert both(weights[:, :3], together, level, variance) == pytest.approx((low, high), rel=1e-6, abs=slack)
     order = [2, 0, 3, 1]
     assert both(weights[:, order], counts[:, order], level, variance) == pytest.approx((low, high), rel=1e-6, abs=slack)
     if counts[0, 3]:  # one pair more in which only A crashes
@@ -100,24 +94,23 @@ def test_a_stratum_without_a_test_may_have_any_outcome():
     assert more == pytest.approx((tested[0] - 0.25, tested[1] + 0.5))
 
 
-RATES = np.array([1.0, 1.0, 0.0, 0.0]), np.array([1.0, 0.0, 1.0, 0.0])
-"""A crashes; B crashes."""
+def rates(p):
+    """Weights of outcomes in the rates of A and of B."""
+    return np.outer(p, [1.0, 1.0, 0.0, 0.0]), np.outer(p, [1.0, 0.0, 1.0, 0.0])
 
 
 def ratio(p, counts, level):
-    a, b = (np.array(p)[:, None] * of for of in RATES)
-    return ratio_limits(a, b, np.array(counts), level)
+    return ratio_limits(*rates(p), np.array(counts), level)
 
 
 @given(STRATA)
 @settings(deadline=None, max_examples=40)
 def test_ratios_are_where_the_contrast_may_be_0_and_turn_over_with_the_vehicles(strata):
-    p, *columns = (np.array(column) for column in zip(*strata, strict=True))
-    counts, level = np.column_stack(columns), Level.two_sided(0.9)
+    (p, counts), level = strata, Level.two_sided(0.9)
+    a, b = rates(p)
     low, high = ratio(p, counts, level)
     assert low <= high
     for x in (0.1, 0.5, 1.0, 3.0):
-        a, b = (p[:, None] * of for of in RATES)
         lower, upper = both(a - x * b, counts, level)
         if not min(abs(math.log(x / end)) if 0.0 < end < math.inf else 1.0 for end in (low, high)) < 1e-6:
             assert (low <= x <= high) == (lower <= 0.0 <= upper)
@@ -127,59 +120,69 @@ def test_ratios_are_where_the_contrast_may_be_0_and_turn_over_with_the_vehicles(
 
 
 def test_a_ratio_is_open_where_a_vehicle_has_not_crashed():
-    assert ratio([1.0], [[0, 9, 0, 91]], Level.two_sided(0.9))[1] == math.inf
-    assert ratio([1.0], [[0, 0, 9, 91]], Level.two_sided(0.9))[0] == 0.0
-    assert ratio([1.0], [[0, 0, 0, 100]], Level.two_sided(0.9)) == (0.0, math.inf)
-    low, high = ratio([1.0], [[50, 0, 0, 0]], Level.two_sided(0.9))
+    level = Level.two_sided(0.9)
+    assert ratio([1.0], [[0, 9, 0, 91]], level)[1] == math.inf
+    assert ratio([1.0], [[0, 0, 9, 91]], level)[0] == 0.0
+    assert ratio([1.0], [[0, 0, 0, 100]], level) == (0.0, math.inf)
+    low, high = ratio([1.0], [[50, 0, 0, 0]], level)
     assert low < 1.0 < high
 
 
-def difference(share, p):
-    return sum(w * (a - b) for w, (a, b) in zip(p, share, strict=True))
-
-
-def paired(p, confidence):
-    return lambda counts: both(np.array(p)[:, None] * [1.0, -1.0, 0.0], counts, Level.two_sided(confidence))
-
-
-def independent(p, confidence):
-    """Each vehicle's crashes as if from tests of its own: what pairs must not be taken for."""
-    w = np.array([*p, *(-x for x in p)])
-
-    def limits(k):
-        crashes, tests = np.concatenate([k[:, 0], k[:, 1]]), np.tile(k.sum(1), 2)
-        return tuple(likelihood_limit(w, crashes, tests, Level.two_sided(confidence), side) for side in (-1.0, 1.0))
-
-    return limits
+PAIRS = [
+    (((0.45, 0.45),), (25,), [1.0]),
+    (((0.47, 0.47),), (60,), [1.0]),
+    (((0.03, 0.03),), (50,), [1.0]),
+    (((0.12, 0.0),), (25,), [1.0]),
+    (((0.0, 0.2),), (12,), [1.0]),
+    (((0.5, 0.4), (0.02, 0.0)), (8, 60), [1.0, 6.0]),
+    (((0.05, 0.0), (0.0, 0.1)), (30, 15), [1.0, 1.0]),
+]
+"""Of each stratum: shares of tests in which only A crashes, and only B; tests; its probability."""
+RARE = [
+    ((1.3 / 40, 1.7 / 40), (40, 40), [1.0, 1.0]),
+    ((0.12, 0.004), (30, 400), [1.0, 12.0]),
+    ((0.9, 0.02), (20, 60), [1.0, 2.0]),
+    *((share, (12, 12, 30), [1.0, 3.0, 200.0]) for share in ((1.0, 0.3, 0.0), (0.6, 0.1, 0.002), (0.9, 0.5, 0.1))),
+]
+"""Few crashes decide: share of tests with a crash, tests, probability."""
 
 
 @pytest.mark.parametrize("confidence", [0.9, 0.95, 0.99])
 @pytest.mark.parametrize(
-    ("share", "tests", "p"),
+    ("share", "tests", "weights"),
     [
-        (((0.45, 0.45),), (25,), (1.0,)),
-        (((0.03, 0.03),), (50,), (1.0,)),
-        (((0.12, 0.0),), (25,), (1.0,)),
-        (((0.0, 0.2),), (12,), (1.0,)),
-        (((0.5, 0.4), (0.02, 0.0)), (8, 60), (1.0, 6.0)),
-        (((0.05, 0.0), (0.0, 0.1)), (30, 15), (1.0, 1.0)),
+        *((share, tests, np.outer(p, [1.0, -1.0, 0.0])) for share, tests, p in PAIRS),
+        *(([(one,) for one in share], tests, np.outer(p, [1.0, 0.0])) for share, tests, p in RARE),
     ],
 )
-def test_limits_of_a_difference_cover(confidence, share, tests, p):
-    """Shares of tests in which only A crashes, and only B."""
-    assert coverage(share, tests, covering(difference(share, p), paired(p, confidence))) >= confidence
+def test_limits_cover_whatever_the_counts(confidence, share, tests, weights):
+    truth = (weights[:, :-1] * share).sum()
+    assert coverage(share, tests, truth, lambda k: both(weights, k, Level.two_sided(confidence))) >= confidence
 
 
 def test_pairs_taken_for_independent_tests_do_not_cover():
-    assert coverage([(0.47, 0.47)], (60,), covering(0.0, paired([1.0], 0.95))) >= 0.95
-    assert coverage([(0.47, 0.47)], (60,), covering(0.0, independent([1.0], 0.95))) < 0.92
+    """The sibling that must fail: each vehicle's crashes as if from tests of its own."""
+
+    def limits(k):
+        return binomial([1.0, -1.0], k[0, :2], [60, 60], Level.two_sided(0.95))
+
+    assert coverage([(0.47, 0.47)], (60,), 0.0, limits) < 0.92
+
+
+def test_without_the_empty_stratum_they_do_not():
+    """The sibling that must fail: a stratum that was tested without a crash is left out of the limits."""
+
+    def limits(k):
+        return binomial([1.0, 3.0, 0.0], (12, k[0, 0], 0), (12, 12, 30), Level.two_sided(0.9))
+
+    assert coverage([(0.3,)], [12], 5.9, limits) < 0.5
 
 
 @pytest.mark.parametrize("confidence", [0.9, 0.95, 0.99])
 def test_limits_of_a_ratio_cover(confidence):
     """Of vehicles that crash together in 40 %, A alone in 25 %, B alone in 5 %: 1.44."""
-    covers = covering(0.65 / 0.45, lambda counts: ratio([1.0], counts, Level.two_sided(confidence)))
-    assert coverage([(0.4, 0.25, 0.05)], (16,), covers) >= confidence - 1e-3  # what was left out
+    covered = coverage([(0.4, 0.25, 0.05)], (16,), 0.65 / 0.45, lambda k: ratio([1.0], k, Level.two_sided(confidence)))
+    assert covered >= confidence - 1e-3  # what was left out
 
 
 LEVEL = Level(Level.two_sided(0.9).threshold, MANY)
@@ -187,8 +190,7 @@ LEVEL = Level(Level.two_sided(0.9).threshold, MANY)
 
 def test_further_tests_go_where_one_more_narrows_the_interval_most():
     """Against the interval itself, with a little more of each stratum; nowhere but where there is room."""
-    rng = np.random.default_rng(5)
-    decided = 0
+    rng, decided, room = np.random.default_rng(5), 0, np.full(4, 10)
     for _ in range(200):
         weights = 10.0 ** rng.uniform(-2.0, 0.0, (4, 1)) * np.array([1.0, 0.0])
         tests = rng.integers(5, 400, 4)
@@ -203,21 +205,16 @@ def test_further_tests_go_where_one_more_narrows_the_interval_most():
         best, second = np.argsort(-narrowed)[:2]
         if narrowed[best] > 1.1 * max(narrowed[second], 1e-9):
             decided += 1
-            room = np.full(4, 10)
-            np.testing.assert_array_equal(spread(weights, counts, counts, LEVEL, 1, room), np.arange(4) == best)
-            assert spread(weights, counts, counts, LEVEL, 100, np.where(np.arange(4) == best, 0, room))[best] == 0
+            is_best = np.arange(4) == best
+            np.testing.assert_array_equal(spread(weights, counts, counts, LEVEL, 1, room), is_best)
+            assert spread(weights, counts, counts, LEVEL, 100, np.where(is_best, 0, room))[best] == 0
     assert decided > 100
 
 
 def test_strata_without_a_test_come_first_and_all_that_there_is_is_given():
     weights, counts = np.array([[1.0, 0.0], [1e-9, 0.0]]), np.array([[3, 7], [0, 0]])
-    np.testing.assert_array_equal(spread(weights, counts, counts, LEVEL, 1, np.array([5, 5])), [0, 1])
-    np.testing.assert_array_equal(spread(weights, counts, counts, LEVEL, 100, np.array([5, 7])), [5, 7])
-
-
-def binomial(weights, crashes, tests, level, variance=0.0):
-    w, k, n = np.array(weights, float), np.array(crashes), np.array(tests)
-    return tuple(likelihood_limit(w, k, n, level, side, variance) for side in (-1.0, 1.0))
+    assert spread(weights, counts, counts, LEVEL, 1, np.array([5, 5])).tolist() == [0, 1]
+    assert spread(weights, counts, counts, LEVEL, 100, np.array([5, 7])).tolist() == [5, 7]
 
 
 def test_shares_end_at_0_and_1_and_without_a_crash_the_one_sided_bound_is_the_exact_one():
@@ -228,45 +225,16 @@ def test_shares_end_at_0_and_1_and_without_a_crash_the_one_sided_bound_is_the_ex
 
 
 def test_an_error_of_the_weights_alone_gives_the_normal_interval():
-    level = Level.two_sided(0.9)
-    many = 10**12
-    low, high = binomial([1.0], [many // 4], [many], level, 0.01)
-    assert (low, high) == pytest.approx((0.25 - 1.6449 * 0.1, 0.25 + 1.6449 * 0.1), abs=2e-3)
+    limits = binomial([1.0], [10**12 // 4], [10**12], Level.two_sided(0.9), 0.01)
+    assert limits == pytest.approx((0.25 - 1.6449 * 0.1, 0.25 + 1.6449 * 0.1), abs=2e-3)
 
 
-def squares(confidence):
+def squares(weights, crashes, tests, confidence):
     """Separate exact limits, their distances combined by squares: what these limits took the place of."""
-
-    def limits(crashes, tests, weights):
-        k, n, w, tail = np.array(crashes), np.array(tests), np.array(weights), (1 - confidence) / 2
-        low = np.where(k > 0, betaincinv(np.maximum(k, 0.5), n - k + 1, tail), 0.0)
-        high = np.where(k < n, betaincinv(k + 1.0, np.maximum(n - k, 0.5), 1 - tail), 1.0)
-        c = k / n
-        return w @ c - math.sqrt(((w * (c - low)) ** 2).sum()), w @ c + math.sqrt(((w * (high - c)) ** 2).sum())
-
-    return limits
-
-
-RARE = [
-    ((1.3 / 40, 1.7 / 40), (40, 40), (1.0, 1.0)),
-    ((0.12, 0.004), (30, 400), (1.0, 12.0)),
-    ((0.9, 0.02), (20, 60), (1.0, 2.0)),
-    *((share, (12, 12, 30), (1.0, 3.0, 200.0)) for share in ((1.0, 0.3, 0.0), (0.6, 0.1, 0.002), (0.9, 0.5, 0.1))),
-]
-
-
-@pytest.mark.parametrize("confidence", [0.9, 0.95, 0.99])
-@pytest.mark.parametrize(("share", "tests", "weights"), RARE)
-def test_limits_cover_where_few_crashes_decide(confidence, share, tests, weights):
-    level, truth = Level.two_sided(confidence), float(np.dot(weights, share))
-    covers = covering(truth, lambda counts: binomial(weights, counts[:, 0], tests, level))
-    assert coverage([(each,) for each in share], tests, covers) >= confidence
-
-
-def test_without_the_empty_stratum_they_do_not():
-    """The sibling that must fail: a stratum that was tested without a crash is left out of the limits."""
-    covers = covering(5.9, lambda k: binomial([1.0, 3.0, 0.0], (12, k[0, 0], 0), (12, 12, 30), Level.two_sided(0.9)))
-    assert coverage([(0.3,)], [12], covers) < 0.5
+    low, high = clopper_pearson(crashes, tests, (1.0 - confidence) / 2.0)
+    share = crashes / tests
+    below, above = (math.sqrt(((weights * away) ** 2).sum()) for away in (share - low, high - share))
+    return weights @ share - below, weights @ share + above
 
 
 def test_eight_strata_with_few_crashes_each_at_99_percent():
@@ -276,9 +244,9 @@ def test_eight_strata_with_few_crashes_each_at_99_percent():
     crashes = rng.binomial(tests, expected / tests, (4_000, shells))
     truth = shells * expected / tests
 
-    def covered(limits):
-        found = [limits(k, counts, weights) for k in crashes]
+    def covered(limits, level):
+        found = [limits(weights, k, counts, level) for k in crashes]
         return np.mean([low <= truth <= high for low, high in found])
 
-    assert covered(lambda k, n, w: binomial(w, k, n, Level.two_sided(0.99))) >= 0.99 - 0.0042
-    assert covered(squares(0.99)) < 0.98
+    assert covered(binomial, Level.two_sided(0.99)) >= 0.99 - 0.0042
+    assert covered(squares, 0.99) < 0.98
