@@ -169,7 +169,7 @@ class PairCounts:
         """Rate of cut-ins on which A (0), or B (1), crashes and the other one does not."""
         sign, weights = ((1.0, ONLY_A), (-1.0, ONLY_B))[side]  # `limit` is of what does not fall where A crashes more
         low, high = sorted(sign * self.limit(sign * weights, level, end) for end in (-1.0, 1.0))
-        return Interval(self.rate(weights), max(low, 0.0) + 0.0, min(high, float(self.p.sum())))
+        return Interval(self.rate(weights), max(low, 0.0) + 0.0, min(high, 1.0))
 
     def ratio(self, level: Level) -> Interval:
         """A over B; NaN where B has no crash, and open upwards where it may have none."""

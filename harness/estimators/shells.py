@@ -27,7 +27,7 @@ import numpy as np
 
 from harness.estimators.block import Block
 from harness.estimators.estimate import Estimate, Number, require_episodes
-from harness.estimators.likelihood import CRASH, Level, likelihood_limit, ratio_limits
+from harness.estimators.likelihood import CRASH, Level, ratio_limits
 from harness.estimators.limits import clopper_pearson
 from harness.estimators.tally import (
     FEWEST_PATHS,
@@ -193,7 +193,7 @@ class Shells:
             std_error=self.std_error(),
             ci_low=free.low,
             ci_high=free.high,
-            upper_bound=self._limits(tally, Level.one_sided(confidence, n)).high,
+            upper_bound=self._limits(tally, Level.of_bound(confidence, n)).high,
             confidence=confidence,
             rhw=free.rhw,
             n_episodes=n,
@@ -201,7 +201,7 @@ class Shells:
             n_effective=free.rate**2 / squares if squares > 0.0 else 0.0,
             largest_weight_share=float(np.max(y[tally.crashes > 0], initial=0.0)) / free.rate if free.rate > 0 else 0.0,
             method="crashes within shells of known probability; likelihood-ratio limits of their weighted sum; upper "
-            "bound: the same, one-sided",
+            "bound: the same, as an interval's upper limit",
             warnings=(*cautions, *self._warnings(tally)),
             cautions=cautions,
             details=asdict(
@@ -223,10 +223,9 @@ class Shells:
         of_tests = p * p * tally.share * (1.0 - tally.share) / tally.at_least_one
         return math.sqrt(float(of_tests.sum()) + pool_variance(p, tally, self._design.n_paths))
 
-    def limits_of(self, statement: str, confidence: float) -> RateLimits:
-        """Rate and interval of a statement, or of all strata."""
-        within = slice(0, self._design.n_within(statement))
-        return self._limits(self.tally.part(within), Level.two_sided(confidence))
+    def limits_of(self, statement: str, level: Level) -> RateLimits:
+        """Rate and limits of a statement, or of all strata."""
+        return self._limits(self.tally.part(slice(0, self._design.n_within(statement))), level)
 
     def contradicts(self, statement: str) -> bool:
         """Whether a test crashed beyond the boundary of a statement, or was ahead of it where that is checked."""
@@ -263,11 +262,11 @@ class Shells:
         n = given.n_inside
         inside, outside = tally.part(slice(0, n)), tally.part(slice(n, None)).failed_as_crashes()
         limits, n_outside = self._limits(inside, Level.two_sided(confidence)), int(outside.tests.sum())
-        level, n_failed_outside = Level.one_sided(confidence, n_outside), int(tally.failed[n:].sum())
+        n_failed_outside, p_outside = int(tally.failed[n:].sum()), design.p[n:]
         n_crashes_outside = int(outside.crashes.sum()) - n_failed_outside
         crashed = [episode for s, episodes in self._crashed.items() if s >= n for episode in episodes]
         refuted_by = tuple(sorted(crashed)[:MOST_NAMED])
-        bound = likelihood_limit(design.p[n:], outside.crashes, outside.tests, level, 1.0)
+        bound = combined(p_outside, outside, design.n_paths, Level.of_bound(confidence, n_outside)).high
         n_tests, n_crashes, n_failed = (int(counts.sum()) for counts in inside[:3])
         from_pool, at_least = limits.from_pool_relative()
         return Within(

@@ -6,9 +6,9 @@ luck; and while the rare crashes of large weight have not occurred, mean, standa
 too small. So looks at weighted tests (`StopRule`) follow from the campaign alone, two in a row must pass, and one more
 crash of the largest weight that the design allows may move the estimate by no more than the half-width asked for:
 cap/(n·rate) ≤ RHW. Tests drawn from shells (`RoundRule`) and pairs of tests of two vehicles (`PairRule`) are looked at
-after each round, and once is enough. That limits hold at a fixed number of tests says nothing about the number at which
-a rule stops: that intervals cover there, and how far rates are biased, is measured (docs/estimators.md,
-docs/compare.md).
+after each round, a limit of the crash rate less often, and once is enough. That limits hold at a fixed number of tests
+says nothing about the number at which a rule stops: that intervals cover there, how far rates are biased, and how often
+decisions are wrong, is measured (docs/estimators.md, docs/compare.md, docs/gate.md).
 """
 
 from __future__ import annotations
@@ -43,17 +43,37 @@ round. Measured where B's rate is 1 + margin times A's, by looks from 40 to 3,00
 Verdict = Literal["accepted", "rejected", "undecided"]
 
 
+DECISION_GROWTH = 1.25
+"""Of neighbouring looks at a limit: wrong decisions come evenly per e-fold of tests, and more with more looks."""
+DECISION_THRESHOLDS = ((500, 4.0), (2_000, 3.25), (20_000, 4.5), (200_000, 5.0), (math.inf, 5.5))
+"""Below so many tests, the threshold of the likelihood ratio at which a limit is decided with an error of 5 % a side.
+
+Calibrated by replication where limit = truth, over all looks (docs/gate.md). Few tests need more than some more: then
+one crash in a shell of small share decides."""
+DECISION_TAIL = 0.05
+"""Error a side for which the thresholds are."""
+
+
+def decision_level(n: int, confidence: float) -> Level:
+    """At which a look at n tests decides, so that all looks together err in (1 - confidence)/2 of campaigns a side.
+
+    The threshold is one for few crashes and many; the pool's error has the quantile that belongs to it.
+    """
+    threshold = next(threshold for most, threshold in DECISION_THRESHOLDS if n < most)
+    threshold = max(threshold + math.log(2.0 * DECISION_TAIL / (1.0 - confidence)), 0.5)
+    return Level(threshold, math.sqrt(2.0 * threshold))
+
+
 @dataclass(frozen=True)
 class Decision:
-    """What is known about a limit, by an interval that is looked at after each round.
+    """What is known about a limit, by limits of the rate that allow for every look.
 
-    Looks inflate errors, and limits by the likelihood ratio are wider than a level needs where crashes are few. What is
-    left is measured: decisions are wrong in at most 1 % where 5 % are allowed (docs/gate.md).
-
-    ``statement`` is the one that decides about the limit ``crash_rate_below``, per test, by the interval from ``low``
-    to ``high``. ``confidence`` is that the crash rate lies on the side which is said: an interval leaves out half as
-    much there as at both sides. ``contradicted`` says whether a test has shown that the vehicle does not do what the
-    statement assumes: its upper limit then says nothing, while what crashed, crashed.
+    ``statement`` is the one that decides about ``crash_rate_below``, per test, by the limits from ``low`` to ``high``
+    after ``n_episodes`` tests. ``confidence`` is that the crash rate lies on the side which is said, whatever the
+    budget: a campaign is wrong in at most 1 - ``confidence`` of cases even where the limit is the rate itself.
+    ``contradicted`` says whether a test has shown that the vehicle does not do what the statement assumes: its upper
+    limit then says nothing, while what crashed, crashed. ``asked_before`` are other limits that were asked of the same
+    tests: who asks until an answer pleases errs more often.
     """
 
     crash_rate_below: float
@@ -62,6 +82,8 @@ class Decision:
     low: float
     high: float
     contradicted: bool = False
+    n_episodes: int = 0
+    asked_before: tuple[float, ...] = ()
 
     @property
     def verdict(self) -> Verdict:
@@ -77,7 +99,15 @@ class Decision:
 
     @property
     def sentence(self) -> str:
-        """The verdict in words."""
+        """The verdict in words, and which limits were asked before."""
+        if not self.asked_before:
+            return self._verdict_sentence
+        before = ", ".join(f"{limit:.3g}" for limit in self.asked_before)
+        place = ("second", "third")[n - 1] if (n := len(self.asked_before)) < 3 else f"{n + 1}th"
+        return f"{self._verdict_sentence} This is the {place} limit asked of these tests (before: {before})."
+
+    @property
+    def _verdict_sentence(self) -> str:
         given = "" if self.statement == ASSUMPTION_FREE else f", given statement {self.statement},"
         level, limit = f"{self.confidence:.3g}", f"{self.crash_rate_below:.3g}"
         if self.verdict != "undecided":
@@ -225,29 +255,29 @@ class StopRule(Rule):
 class RoundRule(Rule):
     """Looks at the crash rate from shells after each round, or whether it is below a limit.
 
-    ``held`` is the number of tests that the run folder holds: before them nothing is given up, whatever precision is
-    asked for now. The precision is ``factor`` times wider than the one that the campaign asks for. ``of_first_tests``
-    says whether the round brings the tests that every shell gets before anything is decided of it.
+    ``held`` is the number of tests that the run folder holds: before them nothing is given up, whatever is asked for
+    now. The precision is ``factor`` times wider than the one that the campaign asks for. A limit is looked at where the
+    tests have grown by `DECISION_GROWTH`, and when the budget is spent; ``limits_before`` are others that were asked of
+    the same tests. ``of_first_tests`` says whether the round brings the tests that every shell gets before anything is
+    decided of it.
     """
 
     of_first_tests = False
 
-    def __init__(self, campaign: Campaign, held: int = 0, factor: float = 1.0) -> None:
+    def __init__(
+        self, campaign: Campaign, held: int = 0, factor: float = 1.0, limits_before: tuple[float, ...] = ()
+    ) -> None:
         rhw = campaign.stop.rhw
         super().__init__(None if rhw is None else factor * rhw, campaign.min_crashes)
-        self._held, self._confidence = held, campaign.stop.confidence
+        self._held, self._confidence, self._budget = held, campaign.stop.confidence, campaign.stop.episodes
         self._statement, self._accept = campaign.testing.shells.statement, campaign.accept
+        self._limits_before, self._next_look = limits_before, 0.0
 
     def observe(self, seen: Shells) -> bool:
         """Whether to stop at the end of a round, with all tests so far."""
-        limits, tally = seen.limits_of(self._statement, self._confidence), seen.tally
         if self._accept is not None:
-            limit, one_sided = self._accept.crash_rate_below, (1.0 + self._confidence) / 2.0
-            contradicted = seen.contradicts(self._statement)
-            found = Decision(limit, self._statement, one_sided, limits.low, limits.high, contradicted)
-            unmet = (f"accept.crash_rate_below ({limit:g})",)
-            self.look = Look(limits.rhw, stopped=found.verdict != "undecided", unmet=unmet, decision=found)
-            return found.is_final
+            return self._decided(seen, self._accept.crash_rate_below)
+        limits, tally = seen.limits_of(self._statement, Level.two_sided(self._confidence)), seen.tally
         if self._target is None:
             self.look = Look(limits.rhw)
             return False
@@ -260,6 +290,18 @@ class RoundRule(Rule):
         also = FIRST_TESTS if self.of_first_tests else None
         enough = self._looked(limits.rhw, conditions, also=also, pool=pool)
         return self.look.stopped or (enough and tally.tests.sum() >= self._held)
+
+    def _decided(self, seen: Shells, limit: float) -> bool:
+        """Look at a limit if it is time to, which follows from the number of tests alone; the first answer stays."""
+        n, found = int(seen.tally.tests.sum()), self.look.decision
+        if (found is None or not found.is_final) and n >= min(self._next_look, self._budget):
+            self._next_look = DECISION_GROWTH * n
+            limits = seen.limits_of(self._statement, decision_level(n, self._confidence))
+            confidence, contradicted = (1.0 + self._confidence) / 2.0, seen.contradicts(self._statement)
+            facts = confidence, limits.low, limits.high, contradicted, n, self._limits_before
+            found, unmet = Decision(limit, self._statement, *facts), (f"accept.crash_rate_below ({limit:g})",)
+            self.look = Look(limits.rhw, stopped=found.verdict != "undecided", unmet=unmet, decision=found)
+        return found is not None and found.is_final and n >= self._held
 
 
 class PairRule(Rule):

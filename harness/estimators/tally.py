@@ -131,7 +131,11 @@ def mean_square(scale: FloatArray, crash_mass: FloatArray) -> float:
 
 
 def combined(p: FloatArray, tally: Tally, n_paths: int, level: Level) -> RateLimits:
-    """Rate Σ p_s c_s with the two limits of an interval; ``p`` (S,) are known from ``n_paths`` paths of a pool."""
+    """Rate Σ p_s c_s with the two limits of an interval; ``p`` (S,) are known from ``n_paths`` paths of a pool.
+
+    The upper limit may lie above Σ p_s, which is as uncertain as the pool: a vehicle that crashes on all cut-ins has
+    that rate.
+    """
     worst, variance = tally.failed_as_crashes(), pool_variance(p, tally, n_paths)
     variance_of_worst = variance if worst is tally else pool_variance(p, worst, n_paths)
     low = likelihood_limit(p, tally.crashes, tally.tests, level, -1.0, variance)
@@ -139,7 +143,7 @@ def combined(p: FloatArray, tally: Tally, n_paths: int, level: Level) -> RateLim
     least = clopper_pearson(tally.crashes, tally.tests, float(ndtr(-level.z)))[0]
     least = np.divide(least, tally.share, out=np.zeros_like(least), where=tally.crashes > 0)
     from_pool, at_least = level.z * math.sqrt(variance), level.z * math.sqrt(pool_variance(p, tally, n_paths, least))
-    return RateLimits(float(p @ tally.share), max(low, 0.0), min(high, float(p.sum())), from_pool, at_least)
+    return RateLimits(float(p @ tally.share), max(low, 0.0), min(high, 1.0), from_pool, at_least)
 
 
 class CrashPaths:

@@ -51,6 +51,7 @@ class Adversary(Section):
         0.0, ge=0.0, le=1.0, description="share of cut-ins outside the boundary on which it crashes besides"
     )
     failing: float = Field(0.0, ge=0.0, lt=1.0, description="share of its crashes that end as failed tests instead")
+    failing_tests: float = Field(0.0, ge=0.0, lt=1.0, description="share of all tests that fail, crash or not")
 
 
 class Pair(Section):
@@ -88,7 +89,8 @@ class Experiment(Section):
     )
     limits: list[Positive] = Field(
         default_factory=list,
-        description="judge decisions instead of intervals: limits of `accept`, as multiples of each one's crash rate",
+        description="judge decisions instead of intervals: limits of `accept`, as multiples of each one's crash rate "
+        "in the super-population; at 1 both verdicts are wrong, and each is judged",
     )
     super_population: SuperPopulation = SuperPopulation()
 

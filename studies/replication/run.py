@@ -5,6 +5,7 @@ The folder receives results.json, all replications as Parquet, and a plot.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -104,9 +105,9 @@ def _cells(one: Judgement) -> dict[str, str]:
         "subject": one.subject,
         "result": one.result,
         "truth": f"{one.truth:.3g}",
-        "bias": f"{one.bias:+.1%} ± {one.bias_std_error:.1%}",
-        "relvar true": f"{one.true_relvar:.3g}",
-        "claimed": f"{one.claimed_relvar:.3g}",
+        "bias": "" if math.isnan(one.bias) else f"{one.bias:+.1%} ± {one.bias_std_error:.1%}",
+        "relvar true": "" if math.isnan(one.true_relvar) else f"{one.true_relvar:.3g}",
+        "claimed": "" if math.isnan(one.claimed_relvar) else f"{one.claimed_relvar:.3g}",
         "coverage [95 %]": f"{one.coverage:.3f} [{one.coverage_low:.3f}, {one.coverage_high:.3f}]",
         "p (Holm)": p + (" TOO LOW" if one.too_low else ""),
         "tests median [5, 95 %]": f"{one.tests_median:,.0f} [{one.tests_5:,.0f}, {one.tests_95:,.0f}]",

@@ -51,9 +51,19 @@ _CRASHING = ((CRASH, CRASH), (CRASH, NO_CRASH), (NO_CRASH, CRASH))
 _STATEMENT = ("testing", "shells", "statement")
 
 
-def limit_at(factor: float) -> str:
-    """Name of the decision about a limit, a multiple of the crash rate."""
-    return f"limit {factor:g} x rate"
+BOUND = "shells, upper bound"
+ACCEPTED_AT_TRUTH, REJECTED_AT_TRUTH = "limit 1 x rate, accepted", "limit 1 x rate, rejected"
+"""Where the limit is the truth, either verdict is wrong: how often each is given is an error rate of its own."""
+
+
+def limit_at(factor: float) -> tuple[str, ...]:
+    """Names of what is judged of the decision about a limit, a multiple of the crash rate."""
+    return (ACCEPTED_AT_TRUTH, REJECTED_AT_TRUTH) if factor == 1.0 else (f"limit {factor:g} x rate",)
+
+
+def bound_outside(statement: str) -> str:
+    """Name of the bound on the crash rate beyond a statement's boundary."""
+    return f"{FREE}, upper bound beyond {statement}"
 
 
 def result_of(statement: str) -> str:
@@ -66,13 +76,14 @@ class DrawnPool:
     """A pool, and what a vehicle does on its paths.
 
     ``mass`` and ``crash_mass`` (n, C) are each path's probability of a cut-in of each cell of the design, and of a
-    crash in it; ``failing`` is the share of crashes that end as failed tests.
+    crash in it; ``failing`` is the share of crashes that end as failed tests, ``failing_tests`` that of all tests.
     """
 
     design: ShellDesign
     mass: FloatArray
     crash_mass: FloatArray
     failing: float = 0.0
+    failing_tests: float = 0.0
 
     @cached_property
     def share(self) -> FloatArray:
@@ -96,7 +107,13 @@ class DrawnPool:
 
     def crashed_paths(self, cell: int, n: int, rng: np.random.Generator) -> FloatArray:
         """Mass (n, C) of the paths of n crashed tests of a cell."""
-        cumulative = self._cumulative[:, cell]
+        return self._paths(self._cumulative[:, cell], n, rng)
+
+    def tested_paths(self, cell: int, n: int, rng: np.random.Generator) -> FloatArray:
+        """The same of any tests."""
+        return self._paths(np.cumsum(self.mass[:, cell]), n, rng)
+
+    def _paths(self, cumulative: FloatArray, n: int, rng: np.random.Generator) -> FloatArray:
         paths: FloatArray = self.mass[np.searchsorted(cumulative, rng.random(n) * cumulative[-1], side="right")]
         return paths
 
@@ -130,6 +147,12 @@ def campaign_block(drawn: DrawnPool, added: IntArray, first: int, rng: np.random
     mass = np.zeros((n, tests.size))
     for c in np.flatnonzero(crashes).tolist():
         mass[bad & (cell == c)] = drawn.crashed_paths(c, int(crashes[c]), rng)
+    if drawn.failing_tests:
+        broken = rng.random(n) < drawn.failing_tests
+        failed = failed | broken
+        for c in np.unique(cell[broken & ~bad]).tolist():
+            rows = broken & ~bad & (cell == c)
+            mass[rows] = drawn.tested_paths(c, int(rows.sum()), rng)
     columns = {"cut_in": ~none, "stratum": np.array(drawn.design.cell_stratum)[cell], "cell": cell, "cell_mass": mass}
     outcome = np.select([failed, bad], [FAILED, CRASHED], TIMEOUT).astype(np.int8)
     return Block(first, outcome, np.zeros(n), columns, Drawn("shells", shells=drawn.design))
@@ -139,14 +162,14 @@ def campaign_block(drawn: DrawnPool, added: IntArray, first: int, rng: np.random
 class ShellCampaign:
     """A shells campaign to replicate, each time on a new pool; its stop rule, statement and first tests are used.
 
-    Judged are all statements and the comparisons with reference drivers. With ``limits``, by name, it is repeated until
-    all of these are decided, as by ``accept``, and they are judged instead.
+    Judged are all statements and the comparisons with reference drivers. With ``limits``, by their multiple of the
+    crash rate, it is repeated until all of these are decided, as by ``accept``, and they are judged instead.
     """
 
     campaign: Campaign
     draw: Draw
     seed: int
-    limits: Mapping[str, float] = field(default_factory=dict)
+    limits: Mapping[float, float] = field(default_factory=dict)
 
     def run(self, replications: range) -> list[Row]:
         """Rows of all results for each replication."""
@@ -163,25 +186,29 @@ class ShellCampaign:
     ) -> Iterator[Row]:
         """All limits from the same tests: what is tested next does not depend on any."""
         pending = {
-            name: RoundRule(self.campaign.model_copy(update={"accept": Accept(crash_rate_below=limit)}))
-            for name, limit in self.limits.items()
+            factor: RoundRule(self.campaign.model_copy(update={"accept": Accept(crash_rate_below=limit)}))
+            for factor, limit in self.limits.items()
         }
         for planner, _ in rounds:
-            for name in [name for name, rule in pending.items() if rule.observe(planner.seen)]:
-                yield self._decision_row(planner.seen, name, replication, pending.pop(name))
+            for factor in [factor for factor, rule in pending.items() if rule.observe(planner.seen)]:
+                yield from self._decision_rows(planner.seen, factor, replication, pending.pop(factor))
             if not pending:
                 return
-        for name, rule in pending.items():
-            yield self._decision_row(planner.seen, name, replication, rule)
+        for factor, rule in pending.items():
+            yield from self._decision_rows(planner.seen, factor, replication, rule)
 
-    def _decision_row(self, seen: Shells, name: str, replication: int, rule: RoundRule) -> Row:
-        """A decision is a one-sided interval: below the limit, or above."""
+    def _decision_rows(self, seen: Shells, factor: float, replication: int, rule: RoundRule) -> Iterator[Row]:
+        """A decision is a one-sided interval: below the limit, or above; at the truth one that is wrong is empty."""
         verdict = "undecided" if rule.look.decision is None else rule.look.decision.verdict
-        limit, tally = self.limits[name], seen.tally
-        rate = seen.limits_of(self.campaign.testing.shells.statement, self.campaign.stop.confidence).rate
-        low, high = limit if verdict == "rejected" else 0.0, limit if verdict == "accepted" else math.inf
+        limit, tally = self.limits[factor], seen.tally
+        level, statement = Level.two_sided(self.campaign.stop.confidence), self.campaign.testing.shells.statement
+        rate = seen.limits_of(statement, level).rate
         counts = int(tally.tests.sum()), int(tally.crashes.sum())
-        return Row(name, replication, *counts, rate, seen.std_error(), low, high, reached=verdict != "undecided")
+        for name in limit_at(factor):
+            low, high = limit if verdict == "rejected" else 0.0, limit if verdict == "accepted" else math.inf
+            if factor == 1.0:
+                low, high = 0.0, 0.0 if name.endswith(verdict) else math.inf
+            yield Row(name, replication, *counts, rate, seen.std_error(), low, high, reached=verdict != "undecided")
 
     def _replicate(
         self, replication: int, rounds: Iterator[tuple[ShellRounds, bool]], design: ShellDesign
@@ -198,7 +225,13 @@ class ShellCampaign:
                 break
         estimate, reached = planner.seen.result(self.campaign.stop.confidence), planner.rule.look.stopped
         outside = int(estimate.details["statements"][0]["n_crashes_outside"])
-        yield estimate_row(FREE, replication, estimate, reached=reached, outside=outside)
+        row = estimate_row(FREE, replication, estimate, reached=reached, outside=outside)
+        yield row
+        yield replace(row, result=BOUND, ci_low=0.0, ci_high=estimate.upper_bound)
+        for found in estimate.details["statements"]:
+            rate = estimate.crash_rate - found["crash_rate"]  # whose error nobody claims to know
+            beyond = replace(row, result=bound_outside(found["name"]), crash_rate=rate, std_error=0.0)
+            yield replace(beyond, ci_low=0.0, ci_high=found["upper_bound_outside"])
         for name in names:
             yield known.get(name) or self._statement_row(planner.seen, name, replication, reached=False)
         for reference in design.references:
@@ -280,7 +313,7 @@ class OvertakingShells:
     The ``template`` is a pool without cut-ins, whose probabilities each draw replaces; ``left_out`` are surrogates that
     are equals of a vehicle, ``limit_mps2`` is the hardest acceleration of the vehicles, and ``mass`` (n, C) the
     probability of a cut-in of each cell, by path of the super-population. ``crashing`` are the parts of it on which the
-    vehicle crashes, or both of two, only A, only B; ``failing`` is the share of crashes that end as failed tests.
+    vehicle crashes, or both of two, only A, only B; ``failing`` and ``failing_tests`` see `DrawnPool`.
     """
 
     template: Pool
@@ -289,6 +322,12 @@ class OvertakingShells:
     mass: FloatArray
     crashing: tuple[FloatArray, ...] = ()
     failing: float = 0.0
+    failing_tests: float = 0.0
+
+    @property
+    def crash_rate(self) -> float:
+        """That of the vehicle in the super-population."""
+        return float(self.crashing[0].sum()) / len(self.mass)
 
     def crashes_outside(self, crashing: FloatArray) -> dict[str, float]:
         """Share of a crash mass by cell (n, C) that lies beyond the boundary of each statement; 0 of no crash."""
@@ -317,7 +356,8 @@ class OvertakingShells:
         joined = np.zeros((tested.size, design.cell_p.size))
         joined[np.arange(tested.size), cells[tested]] = 1.0
         mass = drawn[:, tested] @ joined
-        return [DrawnPool(design, mass, each[rows][:, tested] @ joined, self.failing) for each in self.crashing]
+        failing = self.failing, self.failing_tests
+        return [DrawnPool(design, mass, each[rows][:, tested] @ joined, *failing) for each in self.crashing]
 
 
 class Division:
@@ -373,9 +413,10 @@ class Division:
         summed = np.bincount(place, mass, minlength=self._population.n_paths * self._n_cells)
         return np.asarray(summed, np.float64).reshape(-1, self._n_cells)
 
-    def of_vehicle(self, crashing: FloatArray, failing: float = 0.0) -> OvertakingShells:
-        """Pools of a vehicle that crashes on this mass of cut-ins (m,)."""
-        return replace(self._shells, crashing=(self.by_cell(crashing),), failing=failing)
+    def of_vehicle(self, crashing: FloatArray, made: Adversary | None = None) -> OvertakingShells:
+        """Pools of a vehicle that crashes on this mass of cut-ins (m,), and fails as an adversary does."""
+        failing, failing_tests = (0.0, 0.0) if made is None else (made.failing, made.failing_tests)
+        return replace(self._shells, crashing=(self.by_cell(crashing),), failing=failing, failing_tests=failing_tests)
 
     def of_pair(self, a: FloatArray, b: FloatArray) -> OvertakingShells:
         """Pools of two vehicles that crash on these masses of cut-ins (m,).

@@ -36,11 +36,13 @@ from studies.replication.populations import (
     walk_paths,
 )
 from studies.replication.shells import (
+    BOUND,
     Division,
     Draw,
     OvertakingShells,
     PairedCampaign,
     ShellCampaign,
+    bound_outside,
     limit_at,
     result_of,
 )
@@ -69,10 +71,11 @@ def _chains(experiment: Experiment) -> Iterator[Tested]:
     for place, name in enumerate(experiment.chains):
         chain, seed = CHAINS[name], experiment.seed_of(place)
         if method == "shells":
-            source = ChainShells(chain, experiment.super_population.pool_paths)
-            outside = {result_of(LIBRARY_STATEMENT): source.crashes_outside}
-            subject = Subject.exact(name, chain.crash_rate, crashes_outside=outside)
-            yield _of_shells(experiment, campaign, source.draw, seed, subject)
+            source, rate = ChainShells(chain, experiment.super_population.pool_paths), chain.crash_rate
+            share = {LIBRARY_STATEMENT: source.crashes_outside}
+            outside = {result_of(each): value for each, value in share.items()}
+            subject = Subject.exact(name, rate, others=_of_population(experiment, rate, share), crashes_outside=outside)
+            yield _of_shells(experiment, campaign, source.draw, seed, subject, rate)
         else:
             episodes = partial(chain_episodes, chain, method, seed)
             yield Subject.exact(name, chain.crash_rate), WeightedCampaign(campaign, episodes, experiment.results)
@@ -99,22 +102,36 @@ def _holding(experiment: Experiment, progress: Progress) -> Iterator[Tested]:
         yield Subject(name, known), WeightedCampaign(tested, episodes, experiment.results)
 
 
-def _of_shells(experiment: Experiment, campaign: Campaign, draw: Draw, seed: int, subject: Subject) -> Tested:
-    limits = {limit_at(factor): factor * subject.crash_rate.value for factor in experiment.limits}
-    return subject, ShellCampaign(campaign, draw, seed, limits)
+def _of_shells(
+    experiment: Experiment, campaign: Campaign, draw: Draw, seed: int, subject: Subject, own_rate: float
+) -> Tested:
+    return subject, ShellCampaign(campaign, draw, seed, {factor: factor * own_rate for factor in experiment.limits})
+
+
+def _of_population(experiment: Experiment, own_rate: float, outside: Mapping[str, float]) -> dict[str, Known]:
+    """What bounds and limits are judged by: rates of the population that pools are drawn from, without error.
+
+    ``outside`` is the share of the crash rate beyond the boundary of each statement.
+    """
+    names = [BOUND, *(name for factor in experiment.limits for name in limit_at(factor))]
+    found = dict.fromkeys(names, Known(own_rate, 0.0, own_rate))
+    return found | {bound_outside(each): Known(share * own_rate, 0.0, own_rate) for each, share in outside.items()}
 
 
 def _vehicle(
     experiment: Experiment, campaign: Campaign, name: str, source: OvertakingShells, known: Mapping[str, Known]
 ) -> Tested:
     """A vehicle by what is known about it, its crash rate among it; adversaries have the seed of what they are of."""
-    outside = {result_of(each): share for each, share in source.crashes_outside(source.crashing[0]).items()}
-    asked = result_of(campaign.testing.shells.statement)
-    outside |= {limit_at(factor): outside.get(asked, 0.0) for factor in experiment.limits}
+    share, own_rate = source.crashes_outside(source.crashing[0]), source.crash_rate
+    outside = {result_of(each): value for each, value in share.items()}
+    asked = outside.get(result_of(campaign.testing.shells.statement), 0.0)
+    outside |= {result: asked for factor in experiment.limits for result in limit_at(factor)}
     others = {result: value for result, value in known.items() if result != RATE}
+    others |= _of_population(experiment, own_rate, share)
     of = experiment.adversaries[name].of if name in experiment.adversaries else name
     subject = Subject(name, known[RATE], others, outside, source.left_out, source.template.library.boundary)
-    return _of_shells(experiment, campaign, source.draw, experiment.seed_of(list(experiment.avs).index(of)), subject)
+    seed = experiment.seed_of(list(experiment.avs).index(of))
+    return _of_shells(experiment, campaign, source.draw, seed, subject, own_rate)
 
 
 def _exactly(known: Mapping[str, Known]) -> dict[str, Known]:
@@ -142,7 +159,7 @@ class _Shells:
             for made_name, made in experiment.adversaries.items():
                 if made.of == name:
                     of_adversary = division.as_adversary(made, crashing)
-                    source = division.of_vehicle(of_adversary, made.failing)
+                    source = division.of_vehicle(of_adversary, made)
                     known = _exactly(of_vehicle(self.pools, of_adversary, self.drivers.references))
                     yield _vehicle(experiment, tested, made_name, source, known)
 

@@ -217,11 +217,13 @@ def test_strata_without_a_test_come_first_and_all_that_there_is_is_given():
     assert spread(weights, counts, counts, LEVEL, 100, np.array([5, 7])).tolist() == [5, 7]
 
 
-def test_shares_end_at_0_and_1_and_without_a_crash_the_one_sided_bound_is_the_exact_one():
+def test_shares_end_at_0_and_1_and_without_a_crash_the_bound_is_the_exact_one_at_its_level():
     assert binomial([1.0], [0], [20], LEVEL)[0] == pytest.approx(0.0, abs=1e-12)
     assert binomial([1.0], [20], [20], LEVEL)[1] == pytest.approx(1.0, abs=1e-12)
-    bound = likelihood_limit(np.ones(1), np.zeros(1, int), np.array([50]), Level.one_sided(0.95, 50), 1.0)
-    assert bound == pytest.approx(betaincinv(1, 50, 0.95), rel=1e-9)
+    level = Level.of_bound(0.95, 50)
+    bound = likelihood_limit(np.ones(1), np.zeros(1, int), np.array([50]), level, 1.0)
+    assert bound == pytest.approx(betaincinv(1, 50, 1.0 - math.exp(-level.threshold)), rel=1e-9)
+    assert 1.0 - math.exp(-level.threshold) > 0.95
 
 
 def test_an_error_of_the_weights_alone_gives_the_normal_interval():

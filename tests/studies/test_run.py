@@ -59,10 +59,15 @@ def test_workers_change_no_bit_and_the_online_rule_is_followed(tmp_path, monkeyp
     assert tables[0].equals(tables[1])
     content, rows = json.loads(texts[0]), tables[0].to_pylist()
     assert content["confidence"] == 0.9
-    assert [one["subject"] for one in content["judgements"]] == ["good surrogates"] * 2 + ["strong noise"] * 2
-    assert len(rows) == 2 * 2 * 12
+    assert [one["subject"] for one in content["judgements"]] == ["good surrogates"] * 4 + ["strong noise"] * 4
+    assert len(rows) == 2 * 4 * 12
     assert (folders[0] / "coverage.png").read_bytes().startswith(b"\x89PNG")
+    bounds = [row for row in rows if "upper bound" in row["result"]]
+    assert all(row["ci_low"] == 0.0 for row in bounds)
+    assert len(bounds) == 2 * 2 * 12
     for row in rows:
+        if row in bounds:
+            continue
         rhw = (row["ci_high"] - row["ci_low"]) / 2.0 / row["crash_rate"] if row["crash_rate"] else float("inf")
         assert row["reached"] == (rhw <= 0.5 and row["n_crashes"] > 0)
 

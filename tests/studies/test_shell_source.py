@@ -114,7 +114,7 @@ def adversary_of(drivers, population, **made):
     division, source = shells_of(drivers, population)
     adversary = Adversary(of="own", **made)
     crashing = drivers.vehicles["own"].crash_mass(population)
-    return source, division.of_vehicle(division.as_adversary(adversary, crashing), adversary.failing)
+    return source, division.of_vehicle(division.as_adversary(adversary, crashing), adversary)
 
 
 def test_an_adversary_on_the_heaviest_paths_has_a_share_of_the_crashes_on_few_of_them(drivers, population):
