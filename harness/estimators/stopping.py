@@ -83,7 +83,7 @@ class Decision:
     high: float
     contradicted: bool = False
     n_episodes: int = 0
-    asked_before: tuple[float, ...] = ()
+    asked_before: Sequence[float] = ()
 
     @property
     def verdict(self) -> Verdict:
@@ -257,21 +257,18 @@ class RoundRule(Rule):
 
     ``held`` is the number of tests that the run folder holds: before them nothing is given up, whatever is asked for
     now. The precision is ``factor`` times wider than the one that the campaign asks for. A limit is looked at where the
-    tests have grown by `DECISION_GROWTH`, and when the budget is spent; ``limits_before`` are others that were asked of
-    the same tests. ``of_first_tests`` says whether the round brings the tests that every shell gets before anything is
-    decided of it.
+    tests have grown by `DECISION_GROWTH`, and when the budget is spent. ``of_first_tests`` says whether the round
+    brings the tests that every shell gets before anything is decided of it.
     """
 
     of_first_tests = False
 
-    def __init__(
-        self, campaign: Campaign, held: int = 0, factor: float = 1.0, limits_before: tuple[float, ...] = ()
-    ) -> None:
+    def __init__(self, campaign: Campaign, held: int = 0, factor: float = 1.0) -> None:
         rhw = campaign.stop.rhw
         super().__init__(None if rhw is None else factor * rhw, campaign.min_crashes)
         self._held, self._confidence, self._budget = held, campaign.stop.confidence, campaign.stop.episodes
         self._statement, self._accept = campaign.testing.shells.statement, campaign.accept
-        self._limits_before, self._next_look = limits_before, 0.0
+        self._next_look = 0.0
 
     def observe(self, seen: Shells) -> bool:
         """Whether to stop at the end of a round, with all tests so far."""
@@ -298,8 +295,8 @@ class RoundRule(Rule):
             self._next_look = DECISION_GROWTH * n
             limits = seen.limits_of(self._statement, decision_level(n, self._confidence))
             confidence, contradicted = (1.0 + self._confidence) / 2.0, seen.contradicts(self._statement)
-            facts = confidence, limits.low, limits.high, contradicted, n, self._limits_before
-            found, unmet = Decision(limit, self._statement, *facts), (f"accept.crash_rate_below ({limit:g})",)
+            found = Decision(limit, self._statement, confidence, limits.low, limits.high, contradicted, n)
+            unmet = (f"accept.crash_rate_below ({limit:g})",)
             self.look = Look(limits.rhw, stopped=found.verdict != "undecided", unmet=unmet, decision=found)
         return found is not None and found.is_final and n >= self._held
 

@@ -113,7 +113,7 @@ class Manifest:
     """Keeps ``manifest.json`` and ``campaign.yaml`` of a run folder true.
 
     ``earlier`` is what `require_own_folder` found, ``began`` `time.monotonic` at the run's beginning; ``facts`` are
-    more keys.
+    more keys. ``limits_before`` are other limits that have been asked of the folder's tests.
     """
 
     def __init__(
@@ -124,6 +124,9 @@ class Manifest:
         self._campaign = dump_campaign(campaign)
         self._reproducible = campaign.av.reproducible
         self._began = began - float(earlier.get("wall_time_s") or 0.0)
+        asked = [] if campaign.accept is None else [campaign.accept.crash_rate_below]
+        earlier_limits = earlier.get("limits", []) if earlier["n_episodes"] else []
+        self.limits_before = [limit for limit in earlier_limits if limit not in asked]
         self._content: dict[str, Any] = {
             "format": 1,
             "name": campaign.name,
@@ -134,6 +137,7 @@ class Manifest:
             "versions": versions(),
             "cpu": cpu_name(),
             "controller_sha256": resolved.controller_sha256,
+            "limits": [*self.limits_before, *asked],
             **facts,
         }
         self._written = began

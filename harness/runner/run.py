@@ -7,7 +7,7 @@ import time
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from importlib import import_module
 from pathlib import Path
@@ -244,15 +244,16 @@ def finish(run: Run, rule: Rule, remark: str = "") -> RunResult:
     stopped_by, said = conclusion(run.campaign, rule, run.prefix.n_episodes, run.prefix.reported_from)
     if stopped_by == "rhw" and remark:
         said += f" {remark}"
-    decided = {} if rule.look.decision is None else {"decision": rule.look.decision.to_json()}
+    decided, decision = {}, rule.look.decision
+    if decision is not None:
+        decided["decision"] = replace(decision, asked_before=run.manifest.limits_before).to_json()
     run.close_manifest(stopped_by, said, **decided)
     estimates = estimate_run(run.out)
     write_json(run.out / ESTIMATES, estimates)
     # No worker loads matplotlib, and it has been loaded here while workers were busy.
     from harness.report.page import write_report  # noqa: PLC0415
 
-    verdict = None if rule.look.decision is None else rule.look.decision.verdict
-    code = exit_code(run.campaign, stopped_by, verdict)
+    code = exit_code(run.campaign, stopped_by, None if decision is None else decision.verdict)
     return RunResult(run.out, write_report(run.out), estimates, stopped_by, said, code)
 
 

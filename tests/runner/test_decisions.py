@@ -33,6 +33,15 @@ def test_a_limit_ends_it_with_a_decision(campaign, run_here, tmp_path, changes, 
     assert n_outside == 0 or "library" not in changes[0]
 
 
+def test_a_second_limit_is_answered_and_said(campaign, run_here, tmp_path):
+    """The first one that is asked again is no second one."""
+    for limit, before in (("5e-8", []), ("5e-8", []), ("3e-8", [5e-8]), ("5e-8", [3e-8])):
+        asked = campaign(*SHELLS, "world.engine=twin", f"accept.crash_rate_below={limit}")
+        found = run_here(asked, tmp_path / "run", resume=(tmp_path / "run").exists()).estimates["decision"]
+        assert (found["verdict"], found["asked_before"]) == ("rejected", before)
+        assert ("This is the second limit asked of these tests" in found["sentence"]) == bool(before)
+
+
 def test_nothing_is_accepted_given_what_the_vehicle_does_not_do(campaign, run_here, tmp_path):
     """SM-II crashes 8.8e-6 times per test, mostly outside, and brakes later than the need-based driver."""
     changes = (

@@ -1,0 +1,128 @@
+"""Decisions about a limit that is the truth, where an error rate is defined: both verdicts are wrong there.
+
+Seeds are fixed. The right rule's `binomtest` would refuse an error of 5 % with probability 1e-4; the rule that it took
+the place of, the interval's own limits after each tenth of tests, must fail at 1e-9.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import binomtest
+
+from harness.campaign.campaign import Campaign
+from harness.estimators import stopping
+from harness.estimators.likelihood import Level
+from harness.estimators.shells import Shells
+from harness.estimators.stopping import DECISION_GROWTH, Decision, RoundRule
+from harness.estimators.tally import Tally, combined
+from harness.strata import Statement
+
+from .small_blocks import SHELLS
+
+P, SHARE = np.array([2e-6, 1e-5, 2e-5]), np.array([0.9, 0.5, 0.15])
+"""A vehicle that crashes about 1e-5 times per test, on a share of each shell: the hardest that was measured."""
+DESIGN = replace(
+    SHELLS.without_references(), cell_p=P, n_paths=10**12, statements=(Statement("library", "outermost", "does", 2),)
+)
+BUDGET = 3_000
+REPLICATIONS = 500
+
+
+def rule(limit: float, held: int = 0, budget: int = BUDGET) -> RoundRule:
+    content = {"name": "x", "testing": {"method": "shells"}, "stop": {"episodes": budget}}
+    return RoundRule(Campaign.model_validate({**content, "accept": {"crash_rate_below": limit}}), held)
+
+
+def seen(tests, crashes) -> Shells:
+    none = np.zeros(3, np.int64)
+    return Shells.of(DESIGN, Tally(tests, crashes, none, np.outer(crashes, P), np.zeros((3, 3))))
+
+
+def verdict(seed: int, limit: float) -> str:
+    """Of a campaign whose rounds grow by a tenth, and give most tests to where the rate is least known."""
+    rng, deciding = np.random.default_rng([34, seed]), rule(limit)
+    spread = P * np.sqrt(SHARE * (1.0 - SHARE))
+    tests = crashes = np.zeros(3, np.int64)
+    while (n := int(tests.sum())) < BUDGET:
+        added = np.ceil(min(max(0.1 * n, 30), BUDGET - n) * spread / spread.sum()).astype(np.int64)
+        tests, crashes = tests + added, crashes + rng.binomial(added, SHARE)
+        if deciding.observe(seen(tests, crashes)):
+            break
+    return deciding.look.decision.verdict
+
+
+def wrong() -> tuple[int, int]:
+    """How many campaigns accept, and reject, where the limit is the crash rate."""
+    found = [verdict(seed, float(P @ SHARE)) for seed in range(REPLICATIONS)]
+    return found.count("accepted"), found.count("rejected")
+
+
+def test_either_verdict_is_wrong_in_at_most_one_of_twenty():
+    assert all(binomtest(n, REPLICATIONS, 0.05, alternative="greater").pvalue > 1e-4 for n in wrong())
+
+
+def test_the_intervals_own_limits_after_each_round_are_wrong_far_more_often(monkeypatch):
+    monkeypatch.setattr(stopping, "decision_level", lambda _, confidence: Level.two_sided(confidence))
+    monkeypatch.setattr(stopping, "DECISION_GROWTH", 1.0)
+    assert all(binomtest(n, REPLICATIONS, 0.05, alternative="greater").pvalue < 1e-9 for n in wrong())
+
+
+def test_looks_follow_from_the_number_of_tests_alone():
+    """Also where the folder holds tests already: what decides is what would have decided without them."""
+    looks = []
+    for held in (0, 500):
+        deciding, found = rule(1e-9, held), []
+        for n in range(30, 600, 10):
+            deciding.observe(seen(np.array([n - 20, 10, 10]), np.array([0, 0, 0])))
+            found.append(deciding.look.decision.n_episodes)
+        looks.append(sorted(set(found)))
+    assert looks[0] == looks[1]
+    assert all(b >= DECISION_GROWTH * a for a, b in zip(looks[0], looks[0][1:], strict=False))
+
+
+def test_a_decision_stays_and_what_the_folder_holds_is_not_given_up():
+    deciding = rule(1e-4, held=300)
+    tests = np.array([100, 50, 50])
+    assert not deciding.observe(seen(tests, np.zeros(3, int)))
+    assert deciding.look.decision.verdict == "accepted"
+    assert deciding.observe(seen(2 * tests, np.zeros(3, int)))
+    assert deciding.look.decision.n_episodes == 200
+
+
+def test_a_spent_budget_is_looked_at():
+    deciding = rule(1e-9, budget=110)
+    for n in (100, 110):
+        deciding.observe(seen(np.array([n - 20, 10, 10]), np.zeros(3, int)))
+    assert deciding.look.decision.n_episodes == 110
+
+
+@pytest.mark.parametrize(
+    ("before", "said"),
+    [
+        ([], "limit 1.9e-07)."),
+        ([3e-7], "This is the second limit asked of these tests (before: 3e-07)."),
+        ([3e-7, 1e-7], "This is the third limit asked of these tests (before: 3e-07, 1e-07)."),
+        ([3e-7, 1e-7, 4e-7], "This is the 4th limit asked of these tests (before: 3e-07, 1e-07, 4e-07)."),
+    ],
+)
+def test_other_limits_that_were_asked_are_said(before, said):
+    assert Decision(2e-7, "library", 0.95, 1e-7, 1.9e-7, asked_before=before).sentence.endswith(said)
+
+
+def test_a_vehicle_that_always_crashes_may_have_a_rate_above_that_of_this_pool():
+    """The upper limit was cut at the pool's Σp, which is too low in half of all pools."""
+    n_paths, rng, covered = 200, np.random.default_rng(35), 0
+    for _ in range(300):
+        mass = rng.lognormal(sigma=1.0, size=(n_paths, 3)) * P
+        p, tests = mass.mean(0), np.array([400, 400, 400])
+        drawn = [mass[rng.choice(n_paths, 400, p=mass[:, s] / mass[:, s].sum())].sum(0) for s in range(3)]
+        none = np.zeros(3, np.int64)
+        limits = combined(
+            p, Tally(tests, tests, none, np.array(drawn), np.zeros((3, 3))), n_paths, Level.two_sided(0.9)
+        )
+        covered += limits.low <= P.sum() * math.exp(0.5) <= limits.high
+    assert binomtest(covered, 300, 0.9, alternative="less").pvalue > 1e-4
