@@ -356,8 +356,8 @@ def fit_to_travel(error: Exception) -> Exception:
 # -- which call of a user's code a process was in when it died --
 
 
-START = -1
-"""Stands for the call of ``start``, which comes before step 0."""
+START, MAKING = -1, -2
+"""Stand for the call of ``start``, which comes before step 0, and of the constructor, before that."""
 CONSTRUCTOR, OF_EPISODE, START_BATCH, STEP_BATCH, CLOSE = range(1, 6)
 _FORMAT = struct.Struct("=qqq")
 _WORDS = {CONSTRUCTOR: "its constructor", START_BATCH: "start_batch", STEP_BATCH: "step_batch", CLOSE: "close"}
@@ -367,7 +367,7 @@ os.register_at_fork(after_in_parent=lambda: _forks.append(None))
 
 
 class Call(NamedTuple):
-    """A call of a controller: its kind, and where it belongs to one episode, that and the step, or `START`."""
+    """A call of a controller: its kind, and where it belongs to one episode, that and the step, `START` or `MAKING`."""
 
     kind: int
     episode: int
@@ -376,8 +376,13 @@ class Call(NamedTuple):
     def __str__(self) -> str:
         if self.kind != OF_EPISODE:
             return _WORDS[self.kind]
-        where = "start" if self.step == START else f"the call of step {self.step}"
+        where = {START: "start", MAKING: "the constructor"}.get(self.step, f"the call of step {self.step}")
         return f"{where} of episode {self.episode}"
+
+    @property
+    def makes(self) -> bool:
+        """Whether it is the constructor's."""
+        return self.kind == CONSTRUCTOR or self.step == MAKING
 
 
 class BlackBox:

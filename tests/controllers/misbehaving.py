@@ -22,6 +22,20 @@ class Array(np.ndarray):
         return True
 
 
+class Lying(float):
+    """A number that says it is within any limits."""
+
+    def __le__(self, other):
+        return True
+
+    __lt__ = __ge__ = __gt__ = __le__
+
+
+class UnprintableError(Exception):
+    def __str__(self):
+        raise ValueError
+
+
 ANSWERS = {
     "none": None,
     "nan": float("nan"),
@@ -30,6 +44,7 @@ ANSWERS = {
     "boolean": True,
     "shape": np.zeros(2).view(Array),
     "impossible": -99.0,
+    "lies": Lying(-1e6),
 }
 
 
@@ -57,6 +72,12 @@ class Misbehaving(IDM):
 
     def raises(self):
         raise ZeroDivisionError("no such thing")
+
+    def raises_what_cannot_be_printed(self):
+        raise UnprintableError
+
+    def raises_what_is_no_utf_8(self):
+        raise FileNotFoundError("no file caf\udce9")
 
     def exits(self):
         sys.exit(5)
@@ -120,6 +141,28 @@ class Misbehaving(IDM):
 class RaisesWhenMade(IDM):
     def __init__(self):
         raise RuntimeError("no licence")
+
+
+class HangsWhenMade(IDM):
+    """The n-th one that is made in a process, and all later ones."""
+
+    n_made = 0
+
+    def __init__(self, first=1, swallows=False):
+        super().__init__()
+        HangsWhenMade.n_made += 1
+        while HangsWhenMade.n_made >= first:
+            if swallows:
+                signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGALRM])
+            time.sleep(3600)
+
+
+def idm_of_a_function() -> IDM:
+    return IDM()
+
+
+def says_nothing():
+    Path("called").touch()
 
 
 class EndsTheProcess(IDM):

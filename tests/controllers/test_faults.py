@@ -30,6 +30,7 @@ run: {shard_size: 200, max_failed_share: 0.1}
 """
 SHORT = ", limits: {step_time_s: 0.2}"
 LATE = "no answer within 0.2 s (av.limits.step_time_s)"
+LATE_MADE = "no answer within 0.2 s (av.limits.construction_time_s)"
 
 
 @pytest.fixture(autouse=True)
@@ -75,6 +76,9 @@ IN_PROCESS = {
     "boolean": "step: returned bool, expected an acceleration in m/s2 as a number",
     "shape": "step: returned Array, expected an acceleration in m/s2 as a number",
     "impossible": "step: asked for -99 m/s2, outside of av.limits (-15 to 10)",
+    "lies": "step: asked for -1e+06 m/s2, outside of av.limits (-15 to 10)",
+    "raises_what_cannot_be_printed": "step: UnprintableError, whose text raised ValueError",
+    "raises_what_is_no_utf_8": "step: FileNotFoundError: no file caf\\udce9",
     "exits": "step: SystemExit: 5",
     "interrupts": "step: KeyboardInterrupt: ",
     "generator_exit": "step: GeneratorExit: ",
@@ -144,6 +148,18 @@ def test_too_many_failures_of_a_short_campaign_are_no_answer_either(tmp_path, ca
         ("av={controller: 'tests.controllers.misbehaving:X'}", "av.controller", "no class X"),
         (f"av={_other('RaisesWhenMade')}", "av.controller", "RuntimeError: no licence"),
         (f"av={_other('RaisesInClose', '{pth: x}')}", "av.parameters", "pth"),
+        (f"av={_other('HangsWhenMade', '{}, limits: {construction_time_s: 0.2}')}", "av.controller", LATE_MADE),
+        (
+            f"av={_other('HangsWhenMade', '{swallows: true}, limits: {construction_time_s: 0.2}')}",
+            "av.controller",
+            f"{LATE_MADE}, and the call could not be interrupted, in its constructor",
+        ),
+        (f"av={_other('says_nothing')}", "av.controller", "without start, step, close"),
+        (
+            "av={controller: 'subprocess:Popen', parameters: {args: touch called, shell: true}}",
+            "av.controller",
+            "Popen",
+        ),
         ("testing={method: shells, shells: {boundary: foo}}", "testing.shells.boundary", "foo"),
         ("testing={method: shells, shells: {statement: foo}}", "testing.shells.statement", "foo"),
         (
@@ -163,6 +179,21 @@ def test_check_refuses_what_run_refuses(change, where, words, tmp_path, capsys):
     assert complaints[0].err.startswith(f"error: {where}\n")
     assert words in complaints[0].err
     assert not (tmp_path / "run").exists()
+    assert not Path("called").exists()
+
+
+def test_a_function_may_say_which_controller_it_makes(tmp_path, undisturbed):
+    assert _run(tmp_path, _other("idm_of_a_function")) == EXIT_DONE
+    assert _episodes(tmp_path) == undisturbed
+
+
+def test_a_constructor_has_a_time_limit_of_its_own_in_tests_too(tmp_path):
+    """The first of a process, that says whether there is a controller at all, is made in time."""
+    limits = "limits: {step_time_s: 5, construction_time_s: 0.2}"
+    av = _other("HangsWhenMade", f"{{first: 40}}, {limits}")
+    assert _run(tmp_path, av, "stop.episodes=40") == EXIT_DONE
+    failed = [row["failure"] for row in _episodes(tmp_path) if row["outcome"] == "failed"]
+    assert set(failed) == {f"start: StepTimeoutError: {LATE_MADE}"}
 
 
 def test_close_is_called_and_may_raise(tmp_path, undisturbed):
