@@ -77,7 +77,7 @@ class Misbehaving(IDM):
         raise UnprintableError
 
     def raises_what_is_no_utf_8(self):
-        raise FileNotFoundError("no file caf\udce9")
+        raise FileNotFoundError("no file \udce9.csv")
 
     def exits(self):
         sys.exit(5)

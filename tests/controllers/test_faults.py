@@ -78,7 +78,7 @@ IN_PROCESS = {
     "impossible": "step: asked for -99 m/s2, outside of av.limits (-15 to 10)",
     "lies": "step: asked for -1e+06 m/s2, outside of av.limits (-15 to 10)",
     "raises_what_cannot_be_printed": "step: UnprintableError, whose text raised ValueError",
-    "raises_what_is_no_utf_8": "step: FileNotFoundError: no file caf\\udce9",
+    "raises_what_is_no_utf_8": "step: FileNotFoundError: no file \\udce9.csv",
     "exits": "step: SystemExit: 5",
     "interrupts": "step: KeyboardInterrupt: ",
     "generator_exit": "step: GeneratorExit: ",
