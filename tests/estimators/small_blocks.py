@@ -1,11 +1,12 @@
 """Blocks by hand, for tests that need particular outcomes and weights, and estimators fed with blocks."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import TypeVar
 
 import numpy as np
 
 from harness.estimators.block import Block, Drawn
+from harness.estimators.tally import Tally
 from harness.strata import ShellDesign, Statement
 from harness.vocabulary import CRASH, FAILED, TIMEOUT, Method
 
@@ -16,6 +17,8 @@ SHELLS = ShellDesign(
     statements=(Statement("library", "careless", "keeps to careless", 2),), p_cut_in=0.03, p_unreachable=0.0096,
 )  # fmt: skip
 """Shells of a pool that is known exactly."""
+EXACT = 10**12
+"""Paths of another."""
 
 
 def block(
@@ -48,6 +51,13 @@ def in_shells(strata: list[int], crash: list[bool], failed: list[bool] | None = 
     columns = {"cut_in": np.ones(n, np.bool_), "stratum": stratum, "cell": stratum}
     columns["cell_mass"] = np.tile(SHELLS.p, (n, 1))
     return Block(first, some.outcome, np.log(SHELLS.p)[strata], columns, Drawn("shells", shells=SHELLS))
+
+
+def tally(mass: np.ndarray, crashes: Sequence[int], tests: Sequence[int], failed: Sequence[int] | int = 0) -> Tally:
+    """Counts of strata; all paths have the same ``mass`` in each."""
+    k, n = np.array(crashes), np.array(tests)
+    f = np.zeros_like(k) + failed
+    return Tally(n, k, f, np.outer(k, mass), np.outer(f, mass))
 
 
 def fed(state: State, parts: Iterable[Block]) -> State:

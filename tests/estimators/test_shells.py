@@ -12,20 +12,12 @@ from harness.estimators.block import Drawn
 from harness.estimators.estimate import Estimate, finite_json
 from harness.estimators.likelihood import Level, likelihood_limit
 from harness.estimators.one_pass import one_pass
-from harness.estimators.tally import FEWEST_PATHS, CrashPaths, Tally, combined, pool_variance
+from harness.estimators.tally import FEWEST_PATHS, CrashPaths, Tally, combined, empty_tally, pool_variance
 from harness.strata import Statement
 
-from .small_blocks import SHELLS, in_shells
+from .small_blocks import EXACT, SHELLS, in_shells, tally
 
-P = SHELLS.p
-EXACT = 10**12
-"""Paths of a pool that is known exactly."""
-
-
-def tally(crashes, tests, failed=(0, 0, 0)) -> Tally:
-    """Counts of three strata; all paths have the same mass."""
-    k, f = np.array(crashes), np.array(failed)
-    return Tally(np.array(tests), k, f, np.outer(k, P), np.outer(f, P))
+P, LEVEL = SHELLS.p, Level.two_sided(0.9)
 
 
 def shells_estimate(*rows: tuple[int, int, int, int], shells=SHELLS, **columns) -> Estimate:
@@ -43,28 +35,18 @@ def within(estimate: Estimate) -> dict:
     return found
 
 
-LEVEL = Level.two_sided(0.9)
-
-
-def test_limits_without_an_error_of_the_pool_are_those_of_the_likelihood_ratio():
-    found = tally((5, 0, 0), (10, 10, 100), (1, 0, 2))
+def test_limits_are_those_of_the_likelihood_ratio_and_wider_where_the_pool_errs():
+    found = tally(P, (5, 0, 0), (10, 10, 100), (1, 0, 2))
     limits = combined(P, found, EXACT, LEVEL)
     assert limits.rate == pytest.approx(5e-5)
     assert limits.low == pytest.approx(likelihood_limit(P, found.crashes, found.tests, LEVEL, -1.0), rel=1e-5)
     worst = found.crashes + found.failed
     assert limits.high == pytest.approx(likelihood_limit(P, worst, found.tests, LEVEL, 1.0), rel=1e-5)
-
-
-def test_an_untested_stratum_may_hold_anything():
-    assert combined(P, tally((5, 5, 0), (10, 10, 0)), EXACT, LEVEL).high >= P[2]
-
-
-def test_the_error_of_the_pool_widens_the_interval():
-    found = tally((5, 5, 5), (10, 10, 10))
-    exact, rough = (
-        combined(P, found, EXACT, LEVEL),
-        combined(P, found._replace(crash_mass=found.crash_mass * 50), 100, LEVEL),
-    )
+    untested = combined(P, tally(P, (5, 5, 0), (10, 10, 0)), EXACT, LEVEL)
+    assert untested.high >= P[2]
+    found = tally(P, (5, 5, 5), (10, 10, 10))
+    exact = combined(P, found, EXACT, LEVEL)
+    rough = combined(P, found._replace(crash_mass=found.crash_mass * 50), 100, LEVEL)
     assert rough.rate == exact.rate
     assert rough.high - rough.rate > 1.3 * (exact.high - exact.rate)
 
@@ -72,12 +54,15 @@ def test_the_error_of_the_pool_widens_the_interval():
 N_PATHS = 20_000
 
 
-def vehicles(mass: np.ndarray, rng: np.random.Generator) -> dict[str, np.ndarray]:
-    """Share of each path's cut-ins of each stratum on which a vehicle crashes, (n, 3)."""
+def made_up() -> tuple[np.ndarray, dict[str, np.ndarray], np.random.Generator]:
+    """Mass of paths (n, 3), and the shares of each path's cut-ins of a stratum on which vehicles crash."""
+    rng = np.random.default_rng(3)
+    walked = rng.exponential(size=(N_PATHS, 1)) * rng.exponential(size=(N_PATHS, 3))
+    mass = walked * P * (rng.random((N_PATHS, 1)) < 0.5)
     share, whole = np.array([0.9, 0.3, 0.01]), mass.sum(1, keepdims=True)
-    on = rng.random((len(mass), 1))
-    heaviest = np.argsort(np.argsort(-whole[:, 0]))[:, None] < 0.01 * len(mass)
-    return {
+    on = rng.random((N_PATHS, 1))
+    heaviest = np.argsort(np.argsort(-whole[:, 0]))[:, None] < 0.01 * N_PATHS
+    crashes_on = {
         "here and there": np.broadcast_to(share, mass.shape),
         "on whole paths": 1.0 * (on < share.max()) * np.ones(3),
         "nested": 1.0 * (on < share),
@@ -85,42 +70,33 @@ def vehicles(mass: np.ndarray, rng: np.random.Generator) -> dict[str, np.ndarray
         "on the heaviest paths": 1.0 * heaviest * np.ones(3),
         "on the lightest paths": 1.0 * (whole < np.quantile(whole[whole > 0], 0.3)) * np.ones(3),
     }
-
-
-def made_up_pool(rng: np.random.Generator) -> np.ndarray:
-    return (
-        rng.exponential(size=(N_PATHS, 1)) * rng.exponential(size=(N_PATHS, 3)) * P * (rng.random((N_PATHS, 1)) < 0.5)
-    )
+    return mass, crashes_on, rng
 
 
 def drawn_tests(mass: np.ndarray, crashes_on: np.ndarray, n: int, rng: np.random.Generator) -> Tally:
     """Tests of paths drawn in proportion to their mass in each stratum."""
-    crashes, crash_mass = np.zeros(3, np.int64), np.zeros((3, 3))
+    found = empty_tally(3)._replace(tests=np.full(3, n))
     for s in range(3):
         rows = rng.choice(len(mass), n, p=mass[:, s] / mass[:, s].sum())
         rows = rows[rng.random(n) < crashes_on[rows, s]]
-        crashes[s], crash_mass[s] = rows.size, mass[rows].sum(0)
-    return Tally(np.full(3, n), crashes, np.zeros(3, np.int64), crash_mass, np.zeros((3, 3)))
+        found.crashes[s], found.crash_mass[s] = rows.size, mass[rows].sum(0)
+    return found
 
 
 def test_the_variance_of_the_pool_is_not_too_small_for_any_vehicle():
     """Mean over 20 times 4,000 tests a stratum; where crashes are few the least of three estimates is a little low."""
-    rng = np.random.default_rng(3)
-    mass = made_up_pool(rng)
-    p = mass.mean(0)
-    for name, crashes_on in vehicles(mass, rng).items():
+    mass, vehicles, rng = made_up()
+    for name, crashes_on in vehicles.items():
         true = (mass * crashes_on).sum(1).var() / N_PATHS
-        found = [pool_variance(p, drawn_tests(mass, crashes_on, 4_000, rng), N_PATHS) for _ in range(20)]
+        found = [pool_variance(mass.mean(0), drawn_tests(mass, crashes_on, 4_000, rng), N_PATHS) for _ in range(20)]
         assert np.mean(found) >= 0.9 * true, name
 
 
 def test_crash_shares_and_moments_alone_would_be_too_small_for_the_heaviest_paths():
     """What the variance was made of before, the sibling that must fail: Σ min(c_s, c_t) E[m_s m_t]."""
-    rng = np.random.default_rng(3)
-    mass = made_up_pool(rng)
-    crashes_on = vehicles(mass, rng)["on the heaviest paths"]
-    rate = (mass * crashes_on).sum(1)
-    share = (mass * crashes_on).mean(0) / mass.mean(0)
+    mass, vehicles, _ = made_up()
+    crashing = mass * vehicles["on the heaviest paths"]
+    rate, share = crashing.sum(1), crashing.mean(0) / mass.mean(0)
     former = (np.minimum(share[:, None], share) * (mass.T @ mass / N_PATHS)).sum() - rate.mean() ** 2
     assert former < 0.8 * rate.var()
 
@@ -141,29 +117,6 @@ def test_failed_tests_outside_are_not_taken_for_safe_ones():
     assert conditional["upper_bound_outside"] >= without_pool
     text = boundary_statements(estimate)["library"]
     assert "no crash in 400 tests outside, but 4 of them FAILED and are counted as crashes here: with" in text
-
-
-def test_two_statements():
-    strata = [0] * 10 + [1] * 20 + [2] * 400
-    crash = [True] * 8 + [False] * 2 + [True] * 3 + [False] * 417
-    found = one_pass([in_shells(strata, crash)], ("shells", "nade", "nde")).estimates
-    estimate = found["shells"]
-    assert isinstance(estimate, Estimate)
-    assert estimate.crash_rate == pytest.approx(0.8e-4 + 0.15 * 3e-4)
-    conditional = within(estimate)
-    assert conditional["crash_rate"] == pytest.approx(estimate.crash_rate)
-    assert conditional["ci_high"] < estimate.ci_high
-    assert conditional["n_episodes"] == 30
-    threshold = Level.of_bound(0.9, 400).threshold
-    assert conditional["upper_bound_outside"] == pytest.approx(2e-2 * -np.expm1(-threshold / 400))
-    assert not conditional["refuted"]
-    text = boundary_statements(estimate)["library"]
-    assert "careless" in text
-    assert "There was no crash in 400 tests outside" in text
-    assert sum(shell["contribution"] for shell in estimate.details["shells"]) == pytest.approx(estimate.crash_rate)
-    json.dumps(finite_json(estimate.shown), allow_nan=False)
-    assert "within shells" in found["nade"].reason
-    assert "nde" in found["nde"].reason
 
 
 def test_a_half_width_far_wider_than_the_rate_is_no_number():
@@ -194,6 +147,9 @@ def test_each_statement_has_its_own_inside_and_its_own_refutation(ahead_in):
     """One set of tests: a crash beyond the narrow boundary alone leaves the wide statement as it is."""
     ahead, rows = np.isin(np.arange(430), ahead_in), ((0, 8, 0, 2), (1, 3, 0, 17), (2, 0, 0, 400))
     estimate = shells_estimate(*rows, shells=replace(SHELLS, statements=TWO), ahead=ahead)
+    assert estimate.crash_rate == pytest.approx(0.8e-4 + 0.15 * 3e-4)
+    assert sum(shell["contribution"] for shell in estimate.details["shells"]) == pytest.approx(estimate.crash_rate)
+    json.dumps(finite_json(estimate.shown), allow_nan=False)
     library, need = estimate.details["statements"]
     assert (library["n_episodes"], library["n_episodes_outside"], library["refuted"]) == (10, 420, True)
     assert library["refuted_by"] == (10, 11, 12)
@@ -201,12 +157,22 @@ def test_each_statement_has_its_own_inside_and_its_own_refutation(ahead_in):
     assert (need["n_checked"], need["n_ahead"], need["ahead_in"]) == (430, len(ahead_in), ahead_in)
     assert library["crash_rate"] == pytest.approx(0.8e-4)
     assert need["crash_rate"] == pytest.approx(estimate.crash_rate)
-    alone = combined(P[:2], tally((8, 3, 0), (10, 20, 400)).part(slice(0, 2)), SHELLS.n_paths, LEVEL)
+    alone = combined(P[:2], tally(P, (8, 3, 0), (10, 20, 400)).part(slice(0, 2)), SHELLS.n_paths, LEVEL)
     assert (need["ci_low"], need["ci_high"]) == pytest.approx((alone.low, alone.high), rel=1e-9)
-    said = "In 2 of 430 tests it was AHEAD of" if ahead_in else "In none of 430 tests was it ahead"
-    assert said in boundary_statements(estimate)["need"]
-    assert "ahead" not in boundary_statements(estimate)["library"]
+    assert need["ci_high"] < estimate.ci_high
+    bound = 2e-2 * -np.expm1(-Level.of_bound(0.9, 400).threshold / 400)
+    assert need["upper_bound_outside"] == pytest.approx(bound)
+    said = boundary_statements(estimate)
+    assert "There was no crash in 400 tests outside: " in said["need"]
+    assert ("In 2 of 430 tests it was AHEAD of" if ahead_in else "In none of 430 tests was it ahead") in said["need"]
+    assert "ahead" not in said["library"]
     assert any("was ahead of careless in 2 of 430" in warning for warning in estimate.warnings) == bool(ahead_in)
+
+
+def test_plain_means_do_not_know_what_to_do_with_shells():
+    found = one_pass([in_shells([0], [True])], ("nade", "nde")).estimates
+    assert "within shells" in found["nade"].reason
+    assert "nde" in found["nde"].reason
 
 
 def counted(paths, strata, n_strata=2):
