@@ -52,13 +52,14 @@ class Diagnostics:
         self.n += len(block)
         counted = {"n_cut_ins": block.cut_in, "n_bv_lv_contacts": contact, "n_failed": block.failed}
         self._counts.update({name: int(np.count_nonzero(rows)) for name, rows in counted.items()})
-        self._weight.add(weights)
-        self._cut_in.add(weights[block.cut_in])
-        self._contact.add(weights[contact])
+        self._weight += Moments.of(weights)
+        self._cut_in += Moments.of(weights[block.cut_in])
+        self._contact += Moments.of(weights[contact])
         if SAMPLING[block.drawn.method].mixes:
-            self._ratios = self._ratios or [Moments() for _ in block.drawn.alpha]
-            for sums, ratios in zip(self._ratios, block.mixture_ratios().T, strict=True):
-                sums.add(ratios)
+            self._ratios = self._ratios or [Moments()] * block.drawn.alpha.size
+            self._ratios = [
+                sums + Moments.of(ratios) for sums, ratios in zip(self._ratios, block.mixture_ratios().T, strict=True)
+            ]
 
     def result(self, importance_names: tuple[str, ...] = ()) -> dict[str, Any]:
         """Means with standard errors; the M importance functions, in order, are numbered where names are left out."""

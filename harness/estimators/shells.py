@@ -383,12 +383,7 @@ def _ratio(
 
 
 def rate_ratio_limits(
-    p: FloatArray,
-    tally: Tally,
-    with_reference: FloatArray,
-    moments: tuple[float, float],
-    n_paths: int,
-    level: Level,
+    p: FloatArray, tally: Tally, with_reference: FloatArray, moments: tuple[float, float], n_paths: int, level: Level
 ) -> tuple[float, float]:
     """Limits of Σ p_s θ_s over the crash rate of a reference.
 

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -30,73 +31,56 @@ single test could double the rate. Default IDM under forced cut-ins, nominal 0.9
 UNBOUNDED = "the weights of these tests are unbounded: the true rate may lie far above this interval"
 
 
-class _Central(NamedTuple):
-    """Number of values, Σx (exact for counts), Σ(x - x̄)² and Σ(x - x̄)³."""
+@dataclass(frozen=True)
+class Moments:
+    """Number of values, Σx (exact for counts), Σ(x - x̄)² and Σ(x - x̄)³; of numbers that come in blocks, by adding up.
+
+    Moments are joined without the cancellation of Σx² - (Σx)²/n (T. F. Chan, G. H. Golub and R. J. LeVeque, The
+    American Statistician 37, 1983, 242; third moments: P. Pébay, Sandia report SAND2008-6212). How numbers are cut into
+    blocks shows in the last digits only; a run's blocks are its shards, which follow from the campaign alone. Numbers
+    that were never added count as zeros where a larger n is asked for.
+    """
 
     n: int = 0
     total: float = 0.0
     second: float = 0.0
     third: float = 0.0
 
-    def joined(self, other: _Central) -> _Central:
+    @classmethod
+    def of(cls, values: FloatArray) -> Moments:
+        """Those of one block; what rounding the mean has left in the distances from it is taken out again."""
+        if not len(values):
+            return cls()
+        with np.errstate(over="ignore", under="ignore", invalid="ignore"):
+            total = float(np.sum(values))
+            if not math.isfinite(total):
+                return cls(len(values), total, math.nan, math.nan)
+            away = values - total / len(values)
+            away -= np.mean(away)
+            squares = away * away  # summed by numpy alone: how BLAS adds depends on the number of its threads
+            return cls(len(values), total, float(np.sum(squares)), float(np.sum(squares * away)))
+
+    def __add__(self, other: Moments) -> Moments:
         if not self.n or not other.n:
             return self if self.n else other
         n, total = self.n + other.n, self.total + other.total
         distance = other.total / other.n - self.total / self.n
         if not math.isfinite(distance):
-            return _Central(n, total, math.nan, math.nan)
+            return Moments(n, total, math.nan, math.nan)
         spread = distance * distance * self.n * (other.n / n)
         third = self.third + other.third + spread * distance * ((self.n - other.n) / n)
         third += 3.0 * distance * (self.n * other.second - other.n * self.second) / n
-        return _Central(n, total, self.second + other.second + spread, third)
-
-
-def _central(values: FloatArray) -> _Central:
-    """Moments of one block; what rounding the mean has left in the distances from it is taken out again."""
-    with np.errstate(over="ignore", under="ignore", invalid="ignore"):
-        total = float(np.sum(values))
-        if not math.isfinite(total):
-            return _Central(len(values), total, math.nan, math.nan)
-        away = values - total / len(values)
-        away -= np.mean(away)
-        squares = away * away  # summed by numpy alone: how BLAS adds depends on the number of its threads
-        return _Central(len(values), total, float(np.sum(squares)), float(np.sum(squares * away)))
-
-
-class Moments:
-    """Running moments of numbers that come in blocks; those never added count as zeros where a larger n is asked for.
-
-    Moments of a block are joined to those before, without the cancellation of Σx² - (Σx)²/n (T. F. Chan, G. H. Golub
-    and R. J. LeVeque, The American Statistician 37, 1983, 242; third moments: P. Pébay, Sandia report SAND2008-6212).
-    How numbers are cut into blocks shows in the last digits only; a run's blocks are its shards, which follow from the
-    campaign alone.
-    """
-
-    def __init__(self) -> None:
-        self._seen = _Central()
-
-    def add(self, values: FloatArray) -> None:
-        """Add all entries of a one-dimensional array."""
-        if len(values):
-            self._seen = self._seen.joined(_central(values))
-
-    @property
-    def total(self) -> float:
-        """Σx."""
-        return self._seen.total
+        return Moments(n, total, self.second + other.second + spread, third)
 
     @property
     def squares(self) -> float:
         """Σx²."""
-        return self._seen.second + self.total * (self.total / self._seen.n) if self._seen.n else 0.0
+        return self.second + self.total * (self.total / self.n) if self.n else 0.0
 
     @property
     def n_effective(self) -> float:
         """(Σx)²/Σx², 0 where all numbers are."""
         return self.total**2 / self.squares if self.squares > 0.0 else 0.0
-
-    def _of(self, n: int) -> _Central:
-        return self._seen.joined(_Central(n - self._seen.n))
 
     def mean(self, n: int) -> float:
         """Σx/n."""
@@ -104,7 +88,7 @@ class Moments:
 
     def variance(self, n: int) -> float:
         """Sample variance; infinite for n < 2, and where a number or its square is."""
-        second = self._of(n).second
+        second = (self + Moments(n - self.n)).second
         return second / (n - 1) if n > 1 and math.isfinite(second) else math.inf
 
     def std_error(self, n: int) -> float:
@@ -113,7 +97,7 @@ class Moments:
 
     def third_moment(self, n: int) -> float:
         """Third central moment of the mean, Σ(x - x̄)³/n³; 0 where it is not finite."""
-        third = self._of(n).third / n**3 if n else 0.0
+        third = (self + Moments(n - self.n)).third / n**3 if n else 0.0
         return third if math.isfinite(third) else 0.0
 
 
@@ -131,7 +115,7 @@ class WeightedMean:
         weights = np.exp(block.log_weight[block.crash])
         self.n += len(block)
         self.n_crashes += len(weights)
-        self.y.add(weights)
+        self.y += Moments.of(weights)
         self._largest_y = _larger(self._largest_y, weights)
         self._largest_log_weight = _larger(self._largest_log_weight, block.log_weight)
         self._largest_cut_in_log_weight = _larger(self._largest_cut_in_log_weight, block.log_weight[block.cut_in])

@@ -12,10 +12,7 @@ from harness.estimators.weighted import Moments
 
 
 def moments(*blocks: list[float]) -> Moments:
-    sums = Moments()
-    for values in blocks:
-        sums.add(np.array(values, dtype=np.float64))
-    return sums
+    return sum((Moments.of(np.array(values, dtype=np.float64)) for values in blocks), Moments())
 
 
 @given(st.lists(st.floats(-1e3, 1e3), min_size=2, max_size=40), st.integers(0, 40), st.integers(0, 40))
