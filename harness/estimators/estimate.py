@@ -147,12 +147,6 @@ class Accumulator(Protocol):
         ...
 
 
-def require_episodes(n: int) -> None:
-    """Refuse to estimate from nothing."""
-    if n < 1:
-        raise ValueError("an estimate needs at least one episode")
-
-
 class FailureBounds:
     """An estimator that is fed twice from the first failed test on: failed tests as no crash, and as crashes.
 

@@ -9,7 +9,7 @@ round, whichever takes it farther.
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -48,10 +48,6 @@ class MarginDecision:
     verdict: MarginVerdict
     confidence: float
     given_the_library: bool
-
-    def after(self, pairs: PairCounts) -> MarginDecision:
-        """The same, after more pairs."""
-        return replace(self, verdict=pairs.verdict(self.margin, Level.two_sided(self.confidence)))
 
     @property
     def sentence(self) -> str:

@@ -26,7 +26,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from harness.estimators.block import Block
-from harness.estimators.estimate import Estimate, Number, require_episodes
+from harness.estimators.estimate import Estimate, Number
 from harness.estimators.likelihood import CRASH, Level, ratio_limits
 from harness.estimators.limits import clopper_pearson
 from harness.estimators.tally import (
@@ -183,8 +183,7 @@ class Shells:
     def result(self, confidence: float) -> Estimate:
         """Assumption-free estimate; the other statements are among its details."""
         tally, design = self.tally, self._design
-        n = int(tally.tests.sum())
-        require_episodes(n)
+        n, n_crashes, _ = tally.totals
         cautions = tuple(self._cautions(tally))
         free, y = self._limits(tally, Level.two_sided(confidence)), design.p / tally.at_least_one
         squares = float((tally.crashes * y * y).sum())
@@ -197,7 +196,7 @@ class Shells:
             confidence=confidence,
             rhw=free.rhw,
             n_episodes=n,
-            n_crashes=int(tally.crashes.sum()),
+            n_crashes=n_crashes,
             n_effective=free.rate**2 / squares if squares > 0.0 else 0.0,
             largest_weight_share=float(np.max(y[tally.crashes > 0], initial=0.0)) / free.rate if free.rate > 0 else 0.0,
             method="crashes within shells of known probability; likelihood-ratio limits of their weighted sum; upper "
@@ -259,42 +258,17 @@ class Shells:
         """One of the design's statements."""
         design, tally = self._design, self.tally
         given = next(each for each in design.statements if each.name == statement)
-        n = given.n_inside
-        inside, outside = tally.part(slice(0, n)), tally.part(slice(n, None)).failed_as_crashes()
-        limits, n_outside = self._limits(inside, Level.two_sided(confidence)), int(outside.tests.sum())
-        n_failed_outside, p_outside = int(tally.failed[n:].sum()), design.p[n:]
-        n_crashes_outside = int(outside.crashes.sum()) - n_failed_outside
-        crashed = [episode for s, episodes in self._crashed.items() if s >= n for episode in episodes]
-        refuted_by = tuple(sorted(crashed)[:MOST_NAMED])
-        bound = combined(p_outside, outside, design.n_paths, Level.of_bound(confidence, n_outside)).high
-        n_tests, n_crashes, n_failed = (int(counts.sum()) for counts in inside[:3])
-        from_pool, at_least = limits.from_pool_relative()
-        return Within(
-            name=given.name,
-            boundary=given.boundary,
-            assumes=given.assumes,
-            n_shells=n,
-            crash_rate=limits.rate,
-            ci_low=limits.low,
-            ci_high=limits.high,
-            rhw=limits.rhw,
-            rhw_from_pool=from_pool,
-            rhw_from_pool_at_least=at_least,
-            n_episodes=n_tests,
-            n_crashes=n_crashes,
-            n_failed=n_failed,
-            crash_rate_if_failed_had_crashed=float(design.p[:n] @ inside.failed_as_crashes().share),
-            n_episodes_outside=n_outside,
-            n_crashes_outside=n_crashes_outside,
-            n_failed_outside=n_failed_outside,
-            refuted=n_crashes_outside > 0,
-            refuted_by=refuted_by,
-            upper_bound_outside=bound,
-            checked=given.checked,
-            n_checked=self._n_checked if given.checked else 0,
-            n_ahead=self._n_ahead if given.checked else 0,
-            ahead_in=tuple(self._ahead_in) if given.checked else (),
-        )
+        n, level = given.n_inside, Level.two_sided(confidence)
+        inside, outside = tally.part(slice(0, n)), tally.part(slice(n, None))
+        limits, (n_outside, n_crashes_outside, _) = self._limits(inside, level), outside.totals
+        bound = combined(design.p[n:], outside, design.n_paths, Level.of_bound(confidence, n_outside)).high
+        crashed = sorted(episode for s, episodes in self._crashed.items() if s >= n for episode in episodes)
+        who = given.name, given.boundary, given.assumes, n
+        rate = limits.rate, limits.low, limits.high, limits.rhw, *limits.from_pool_relative()
+        if_failed = float(design.p[:n] @ inside.failed_as_crashes().share)
+        beyond = n_crashes_outside > 0, tuple(crashed[:MOST_NAMED]), bound
+        ahead = (self._n_checked, self._n_ahead, tuple(self._ahead_in)) if given.checked else (0, 0, ())
+        return Within(*who, *rate, *inside.totals, if_failed, *outside.totals, *beyond, given.checked, *ahead)
 
     def _shells(self, tally: Tally, tail: float) -> tuple[Shell, ...]:
         p, inside = self._design.p, np.arange(self._design.p.size) < self._design.n_inside

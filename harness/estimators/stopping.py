@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
 from harness.campaign.campaign import Campaign
@@ -41,8 +41,6 @@ MARGIN_LOOKS = 6
 """A margin is decided at a level that leaves out so many times less than the campaign's, as it is looked at after each
 round. Measured where B's rate is 1 + margin times A's, by looks from 40 to 3,000 pairs: docs/compare.md."""
 Verdict = Literal["accepted", "rejected", "undecided"]
-
-
 DECISION_GROWTH = 1.25
 """Of neighbouring looks at a limit: wrong decisions come evenly per e-fold of tests, and more with more looks."""
 DECISION_THRESHOLDS = ((500, 4.0), (2_000, 3.25), (20_000, 4.5), (200_000, 5.0), (math.inf, 5.5))
@@ -100,32 +98,26 @@ class Decision:
     @property
     def sentence(self) -> str:
         """The verdict in words, and which limits were asked before."""
-        if not self.asked_before:
-            return self._verdict_sentence
-        before = ", ".join(f"{limit:.3g}" for limit in self.asked_before)
-        place = ("second", "third")[n - 1] if (n := len(self.asked_before)) < 3 else f"{n + 1}th"
-        return f"{self._verdict_sentence} This is the {place} limit asked of these tests (before: {before})."
-
-    @property
-    def _verdict_sentence(self) -> str:
         given = "" if self.statement == ASSUMPTION_FREE else f", given statement {self.statement},"
-        level, limit = f"{self.confidence:.3g}", f"{self.crash_rate_below:.3g}"
-        if self.verdict != "undecided":
-            side, word, shown = ("below", "upper", self.high)
-            if self.verdict == "rejected":
-                side, word, shown = ("above", "lower", self.low)
-            return (
-                f"{self.verdict.upper()}: with confidence {level} the crash rate{given} is {side} {limit} per test "
-                f"({word} limit {shown:.3g})."
-            )
-        if self.contradicted:
-            return (
+        limit, before = f"{self.crash_rate_below:.3g}", self.asked_before
+        side = f"below {limit} per test (upper limit {self.high:.3g})"
+        if self.verdict == "rejected":
+            side = f"above {limit} per test (lower limit {self.low:.3g})"
+        text = f"{self.verdict.upper()}: with confidence {self.confidence:.3g} the crash rate{given} is {side}."
+        if self.verdict == "undecided" and self.contradicted:
+            text = (
                 f"UNDECIDED: whether the crash rate is below {limit} per test is not known: the vehicle does not do "
                 f"what statement {self.statement} assumes. Ask for accept.statement: {ASSUMPTION_FREE}, and use a new "
                 "folder."
             )
-        between = f"it may be {self.low:.3g} as well as {self.high:.3g}"
-        return f"UNDECIDED: whether the crash rate{given} is below {limit} per test is not known; {between}."
+        elif self.verdict == "undecided":
+            between = f"it may be {self.low:.3g} as well as {self.high:.3g}"
+            text = f"UNDECIDED: whether the crash rate{given} is below {limit} per test is not known; {between}."
+        if not before:
+            return text
+        place = ("second", "third")[len(before) - 1] if len(before) < 3 else f"{len(before) + 1}th"
+        limits = ", ".join(f"{limit:.3g}" for limit in before)
+        return f"{text} This is the {place} limit asked of these tests (before: {limits})."
 
     def to_json(self) -> dict[str, Any]:
         """All of it."""
@@ -165,23 +157,34 @@ class Rule:
     def _looked(
         self,
         rhw: float,
-        met: Mapping[str, bool],
+        n_crashes: int,
         *,
+        of: str = "",
         one_more_crash: float = 0.0,
+        more: Mapping[str, bool] | None = None,
         also: str | None = None,
         pool: tuple[float, float] = (0.0, 0.0),
     ) -> bool:
-        """Note a look at a precision, with conditions by name, and whether they are ``met``; say whether to stop.
+        """Note a look at a precision, ``of`` which it is, and say whether to stop.
 
-        ``also`` is what was waited for besides, if nothing is unmet; ``pool`` has the half-widths that the pool's own
-        error would leave by itself, as it was seen, and at least.
+        ``more`` are further conditions by name, and whether they are met; ``also`` is what was waited for besides, if
+        nothing is unmet; ``pool`` has the half-widths that the pool's own error would leave by itself, as it was seen,
+        and at least.
         """
+        if self._target is None:
+            self.look = Look(rhw, one_more_crash)
+            return False
+        asked = f"stop.rhw ({self._target:g}{of})"
+        met = {
+            asked: rhw <= self._target,
+            f"{asked} for one more crash of the largest possible weight": one_more_crash <= self._target,
+            f"stop.min_crashes ({self._min_crashes:,})": n_crashes >= self._min_crashes,
+            **(more or {}),
+        }
         unmet = tuple(condition for condition, is_met in met.items() if not is_met)
         self._passes = 0 if unmet else self._passes + 1
-        stopped = self._passes >= self._needed
-        remembered = unmet or ((also,) if also else self.look.unmet)
-        too_rough = self._target is not None and pool[1] > self._target
-        self.look = Look(rhw, one_more_crash, stopped, remembered, too_rough)
+        stopped, too_rough = self._passes >= self._needed, pool[1] > self._target
+        self.look = Look(rhw, one_more_crash, stopped, unmet or ((also,) if also else self.look.unmet), too_rough)
         return stopped or (too_rough and pool[0] ** 2 >= POOL_SHARE * rhw**2)
 
 
@@ -237,19 +240,10 @@ class StopRule(Rule):
             raise ValueError(f"no look is due at {n} episodes with an estimate of {estimate.n_episodes}")
         self._n_looks += 1
         last, total = self._n_looks == len(self.looks), n * estimate.crash_rate
-        rhw, one_more = estimate.precision, estimate.weight_cap / total if total > 0.0 else math.inf
-        if self._target is None:
-            self.look = Look(rhw, one_more)
-            return last
-        wanted = f"stop.rhw ({self._target:g})"
-        conditions = {
-            wanted: rhw <= self._target,
-            f"{wanted} for one more crash of the largest possible weight": one_more <= self._target,
-            f"stop.min_crashes ({self._min_crashes:,})": estimate.n_crashes >= self._min_crashes,
-        }
-        first_pass_at_last = last and self._passes == 0 and all(conditions.values())
-        also = "the same at a second look" if first_pass_at_last else None
-        return self._looked(rhw, conditions, one_more_crash=one_more, also=also) or last
+        one_more = estimate.weight_cap / total if total > 0.0 else math.inf
+        also = "the same at a second look" if last and self._passes == 0 else None
+        crashes = estimate.n_crashes
+        return self._looked(estimate.precision, crashes, one_more_crash=one_more, also=also) or last
 
 
 class RoundRule(Rule):
@@ -275,17 +269,9 @@ class RoundRule(Rule):
         if self._accept is not None:
             return self._decided(seen, self._accept.crash_rate_below)
         limits, tally = seen.limits_of(self._statement, Level.two_sided(self._confidence)), seen.tally
-        if self._target is None:
-            self.look = Look(limits.rhw)
-            return False
-        enough_crashes = int(tally.crashes.sum()) >= self._min_crashes
-        conditions = {
-            f"stop.rhw ({self._target:g})": limits.rhw <= self._target,
-            f"stop.min_crashes ({self._min_crashes:,})": enough_crashes,
-        }
-        pool = limits.from_pool_relative() if enough_crashes else (0.0, 0.0)
-        also = FIRST_TESTS if self.of_first_tests else None
-        enough = self._looked(limits.rhw, conditions, also=also, pool=pool)
+        n_crashes, also = int(tally.crashes.sum()), FIRST_TESTS if self.of_first_tests else None
+        pool = limits.from_pool_relative() if n_crashes >= self._min_crashes else (0.0, 0.0)
+        enough = self._looked(limits.rhw, n_crashes, also=also, pool=pool)
         return self.look.stopped or (enough and tally.tests.sum() >= self._held)
 
     def _decided(self, seen: Shells, limit: float) -> bool:
@@ -320,19 +306,11 @@ class PairRule(Rule):
     def observe(self, pairs: PairCounts) -> bool:
         """Whether to stop at the end of a round."""
         watched, level = pairs.inside(pairs.design.n_within(self._statement)), Level.two_sided(self._confidence)
-        rhw = watched.rhw(level)
-        if self.margin is not None:
-            self.margin = self.margin.after(watched)
-            stopped = self.margin.verdict != "open"
-            self.look = Look(rhw, stopped=stopped, unmet=(f"--margin ({self.margin.margin:g})",))
-            return stopped
-        if self._target is None:
-            self.look = Look(rhw)
-            return False
-        conditions = {
-            f"stop.rhw ({self._target:g}, of the difference)": rhw <= self._target,
-            f"stop.min_crashes ({self._min_crashes:,})": pairs.n_crashes >= self._min_crashes,
-            FIRST_TESTS: not self.of_first_tests,
-        }
-        pool = watched.rhw_from_pool(level)
-        return self._looked(rhw, conditions, pool=(pool, pool))
+        rhw, pool = watched.rhw(level), watched.rhw_from_pool(level)
+        if self.margin is None:
+            more = {FIRST_TESTS: not self.of_first_tests}
+            return self._looked(rhw, pairs.n_crashes, of=", of the difference", more=more, pool=(pool, pool))
+        verdict = watched.verdict(self.margin.margin, Level.two_sided(self.margin.confidence))
+        self.margin = replace(self.margin, verdict=verdict)
+        self.look = Look(rhw, stopped=verdict != "open", unmet=(f"--margin ({self.margin.margin:g})",))
+        return self.look.stopped

@@ -84,6 +84,11 @@ class Tally(NamedTuple):
         """Crashes and other tests, shape (S, 2)."""
         return np.column_stack([self.crashes, self.tests - self.crashes])
 
+    @property
+    def totals(self) -> tuple[int, int, int]:
+        """Tests, crashes and failed tests of all strata."""
+        return int(self.tests.sum()), int(self.crashes.sum()), int(self.failed.sum())
+
     def scaled(self, tests: IntArray) -> Tally:
         """What so many tests of each stratum are expected to come to."""
         scale = tests / self.at_least_one
