@@ -82,7 +82,7 @@ ATTRIBUTES = (*_VEHICLE, *_MODEL, *_LANE_CHANGE)
 """Those that can matter to a vehicle on a straight road. SUMO ignores names that it does not know without a word."""
 
 RECYCLABLE_MODELS = ("Krauss", "IDM", "ACC", "CACC")
-"""Models measured to keep nothing of an episode for the next: bit-equal to a fresh simulation (tests/sumo_av)."""
+"""Models measured to keep nothing of an episode for the next: bit-equal to a fresh simulation (tests/worlds)."""
 _RECYCLABLE_ATTRIBUTES = frozenset(
     {"carFollowModel", "length", "minGap", "maxSpeed", "desiredMaxSpeed", "speedFactor", "accel", "decel",
      "emergencyDecel", "apparentDecel", "tau", "delta", "stepping", "lcOvertakeRight", "vClass", "color",

@@ -15,15 +15,16 @@ from harness.episode.loop import Shard
 from harness.vocabulary import AV, BV, BV_LV_CONTACT, CRASH, LV, PASSED, STATE_DTYPE
 from harness.worlds.twin import TwinWorld
 from tests.episode.twin_runs import TWO
-from tests.sumo.raw_getters import (
+from tests.worlds.raw_getters import (
     Job,
+    Recording,
     differences,
     motions_computed,
-    motions_seen,
     record_in_another_process,
     run_episodes,
 )
 
+FORCED, NDE, STEP = (f"testing.method={name}" for name in ("forced", "nde", "step_mixture"))
 AVS = {
     "late": "{model: idm, reaction: {delay_s: 0.6}}",
     "smooth": "{model: idm, reaction: {max_jerk_mps3: 5}}",
@@ -37,70 +38,58 @@ AVS = {
     " inattention_delay_s: 0.9}}",
     "need_based": "{model: need-based, reaction: {max_jerk_mps3: 12}}",
 }
-LATERAL = {
-    "seen": ("environment.parameters=ndd-overtaking-1-lateral", "av={model: idm}"),
-    "seen_by_a_reference": ("environment.parameters=ndd-overtaking-1-lateral", "av={model: r157-cc}"),
-    "overtaken": (
-        "environment.cut_in_lead_s=4",
-        "av={model: constant, parameters: {acceleration_mps2: 5}, reaction: {perceives_lateral_m: 0}}",
-    ),
-}
-"""Cut-ins that take time; before some that take long the AV has passed BV."""
-MIXTURE = "mixture"
+LATERAL = "environment.parameters=ndd-overtaking-1-lateral"
+OUTRUNS = "av={model: constant, parameters: {acceleration_mps2: 5}, reaction: {perceives_lateral_m: 0}}"
 EPISODES = 150
 """Of each driver."""
-PAIRS = [(0.5, -12.0), (1.0, -15.0), (0.2, -8.0), (3.0, -20.0)]
-"""R1 (m) and R1dot (m/s) of starts from which no braking of BV can avoid LV."""
-
-
-def hopeless_starts() -> np.ndarray:
-    """Initial states (16,) from which BV runs into LV before AV is past."""
-    rows = [(v, r1, r1dot, 60.0, -5.0) for v in (22.0, 28.0, 33.0, 37.5) for r1, r1dot in PAIRS]
-    return np.array(rows, STATE_DTYPE)
-
-
-METHODS = (MIXTURE, "forced_without_shim", "forced_drawn_in_every_step", "published", "bv_into_lv")
-VANILLA = ("vanilla", "vanilla_bv_into_lv")
-SMALL = ("five_in_64_cells", "five_in_64_cells_without_shim", "late_under_step_mixture")
-
-
-@pytest.fixture(scope="module")
-def jobs(smoke) -> dict[str, Job]:
-    forced, weak = "testing.method=forced", "av.parameters.min_acceleration_mps2=-1"
-    published = ("testing.method=step_mixture", "testing.challenge=immediate", TWO)
-    draw_often = "environment.acceleration_hold_s=0.1"
-    late = smoke("testing.method=step_mixture", f"av={AVS['late']}")
-    of_methods = (
-        Job(smoke(), 800, 64),
-        Job(smoke(forced), 400, 64, shim=False),
-        Job(smoke(forced, draw_often, "seed=5"), 64, 64),
-        Job(smoke(*published, weak, "seed=7"), 200, 32),
-        Job(smoke("testing.method=nde"), 16, 5, states=hopeless_starts()),
-        Job(smoke("seed=3"), 250, 1, vanilla=True),
-        Job(smoke("testing.method=nde"), 16, 1, vanilla=True, states=hopeless_starts()),
-    )
+HOPELESS = np.array(
+    [
+        (v, r1, r1dot, 60.0, -5.0)
+        for v in (22.0, 28.0, 33.0, 37.5)
+        for r1, r1dot in [(0.5, -12.0), (1.0, -15.0), (0.2, -8.0), (3.0, -20.0)]
+    ],
+    STATE_DTYPE,
+)
+"""Starts from which no braking of BV can avoid LV, which it runs into before AV is past."""
+PUBLISHED = (STEP, "testing.challenge=immediate", TWO, "av.parameters.min_acceleration_mps2=-1", "seed=7")
+METHODS = {
+    "mixture": Job((), 800, 64),
+    "forced_without_shim": Job((FORCED,), 400, 64, shim=False),
+    "forced_drawn_in_every_step": Job((FORCED, "environment.acceleration_hold_s=0.1", "seed=5"), 64, 64),
+    "published": Job(PUBLISHED, 200, 32),
+    "bv_into_lv": Job((NDE,), 16, 5, states=HOPELESS),
+}
+JOBS = {
+    **METHODS,
+    "vanilla": Job(("seed=3",), 250, 1, vanilla=True),
+    "vanilla_bv_into_lv": Job((NDE,), 16, 1, vanilla=True, states=HOPELESS),
     # Fewer episodes than cells: the other cells stay parked, where nothing may be compared with where they are not.
-    small = (Job(smoke(forced), 5, 64), Job(smoke(forced), 5, 64, shim=False), Job(late, 60, 16))
-    of_avs = {name: Job(smoke(forced, f"av={av}"), EPISODES, 32) for name, av in AVS.items()}
-    of_avs |= {name: Job(smoke(forced, *of), 2 * EPISODES, 32) for name, of in LATERAL.items()}
-    return {**dict(zip((*METHODS, *VANILLA, *SMALL), (*of_methods, *small), strict=True)), **of_avs}
+    "five_in_64_cells": Job((FORCED,), 5, 64),
+    "five_in_64_cells_without_shim": Job((FORCED,), 5, 64, shim=False),
+    "late_under_step_mixture": Job((STEP, f"av={AVS['late']}"), 60, 16),
+    **{name: Job((FORCED, f"av={av}"), EPISODES, 32) for name, av in AVS.items()},
+    # Cut-ins that take time; before some that take long the AV has passed BV.
+    "seen": Job((FORCED, LATERAL, "av={model: idm}"), 300, 32),
+    "seen_by_a_reference": Job((FORCED, LATERAL, "av={model: r157-cc}"), 300, 32),
+    "overtaken": Job((FORCED, "environment.cut_in_lead_s=4", OUTRUNS), 300, 32),
+}
 
 
 @pytest.fixture(scope="module")
-def recordings(jobs, tmp_path_factory) -> dict[str, dict[str, np.ndarray]]:
-    return record_in_another_process(jobs, tmp_path_factory.mktemp("sumo"))
+def recordings() -> dict[str, Recording]:
+    return record_in_another_process(JOBS)
 
 
 @pytest.fixture(scope="module")
-def twins(jobs) -> dict[str, Shard]:
+def twins() -> dict[str, Shard]:
     # Another number of cells than SUMO has: an episode must not know in which cell it runs, or beside whom.
-    return {name: run_episodes(job, TwinWorld(48)) for name, job in jobs.items()}
+    return {name: run_episodes(job, TwinWorld(48)) for name, job in JOBS.items()}
 
 
-@pytest.mark.parametrize("name", [*METHODS, *VANILLA, *SMALL, *AVS, *LATERAL])
+@pytest.mark.parametrize("name", JOBS)
 def test_sumo_and_twin_agree_in_every_bit(name, recordings, twins):
-    assert differences(motions_seen(recordings[name]), motions_computed(twins[name])) == {}
-    assert np.array_equal(recordings[name]["outcome"], twins[name].results.episode["outcome"])
+    assert differences(recordings[name].motions, motions_computed(twins[name])) == {}
+    assert np.array_equal(recordings[name].outcome, twins[name].results.episode["outcome"])
 
 
 def test_the_episodes_compared_are_many_and_of_every_kind(twins):
@@ -130,7 +119,7 @@ def test_among_cut_ins_that_take_time_are_side_contacts_and_vehicles_that_have_p
 
 
 @pytest.mark.parametrize(("vehicle", "toward"), [(LV, 0.0), (BV, 0.0), (BV, 100.0), (AV, 100.0)])
-def test_one_speed_command_off_by_one_unit_in_the_last_place_is_found(vehicle, toward, jobs, recordings):
+def test_one_speed_command_off_by_one_unit_in_the_last_place_is_found(vehicle, toward, recordings):
     class PerturbedTwin(TwinWorld):
         steps = 0
 
@@ -140,17 +129,17 @@ def test_one_speed_command_off_by_one_unit_in_the_last_place_is_found(vehicle, t
                 speed[5, vehicle] = np.nextafter(speed[5, vehicle], toward)
             return super().step(speed, cut_in)
 
-    perturbed = run_episodes(jobs[MIXTURE], PerturbedTwin(48))
-    found = differences(motions_seen(recordings[MIXTURE]), motions_computed(perturbed))
+    perturbed = run_episodes(JOBS["mixture"], PerturbedTwin(48))
+    found = differences(recordings["mixture"].motions, motions_computed(perturbed))
     assert list(found) == [5]
     assert "v" in found[5]
 
 
 def test_a_crash_flagged_a_step_late_is_found(recordings, twins):
-    recording = {name: values.copy() for name, values in recordings[MIXTURE].items()}
-    time, cell = np.argwhere(recording["contact"])[0]
-    recording["contact"][time, cell] = False
-    assert len(differences(motions_seen(recording), motions_computed(twins[MIXTURE]))) == 1
+    motions = list(recordings["mixture"].motions)
+    row = next(row for row, motion in enumerate(motions) if motion.contact.any())
+    motions[row] = motions[row]._replace(contact=np.zeros_like(motions[row].contact))
+    assert differences(motions, motions_computed(twins["mixture"])) == {row: {"contact"}}
 
 
 def av_after_cut_in(shard: Shard, row: int) -> np.ndarray:
@@ -176,7 +165,6 @@ def test_the_drivers_compared_show_what_they_are_about(twins):
     assert crashes["accelerates"] > crashes["never_brakes"] > crashes["late"]
 
 
-def test_another_delay_would_be_found(smoke, recordings):
-    campaign = smoke("testing.method=forced", "av={model: idm, reaction: {delay_s: 0.5}}")
-    other = run_episodes(Job(campaign, EPISODES, 32), TwinWorld(48))
-    assert len(differences(motions_seen(recordings["late"]), motions_computed(other))) >= 100
+def test_another_delay_would_be_found(recordings):
+    other = run_episodes(Job((FORCED, "av={model: idm, reaction: {delay_s: 0.5}}"), EPISODES, 32), TwinWorld(48))
+    assert len(differences(recordings["late"].motions, motions_computed(other))) >= 100

@@ -13,7 +13,7 @@ from harness.worlds import build_world
 from harness.worlds.sumo_driven import FreshWorld, SumoAvWorld
 from tests.controllers.test_same_bits import ROOT, fmu_av
 from tests.pool.conftest import MIXTURE_FILE, SMALL_POOL
-from tests.sumo_av.running import EXAMPLE, program
+from tests.worlds.running import EXAMPLE, program
 
 SHOWN = 60
 EARLY = ", before_cut_in: controller}"

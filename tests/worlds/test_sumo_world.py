@@ -15,9 +15,10 @@ from harness.episode.loop import EpisodeLoop, RecordPolicy, Shard
 from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, WorldDisagreementError
 from harness.resolved import resolve
 from harness.runner.prepare import prepare
-from harness.vocabulary import AV, BV, CRASH, LV
+from harness.vocabulary import AV, CRASH, LV
 from harness.worlds.shim import shim_library
 from harness.worlds.twin import TwinWorld
+from tests.worlds.running import smoke
 
 X, V = (np.tile(values, (8, 1)) for values in ([300.0, 200.0, 100.0], [30.0, 28.0, 35.0]))
 """Positions and speeds of vehicles that do not meet."""
@@ -100,31 +101,20 @@ def test_a_speed_one_unit_in_the_last_place_off_is_noticed_within_ten_steps(vict
         drive(world, steps=steps)
 
 
-def test_a_speed_that_was_not_set_at_placement_is_noticed(driving, monkeypatch):
-    set_previous = libsumo.vehicle.setPreviousSpeed
-    monkeypatch.setattr(
-        libsumo.vehicle,
-        "setPreviousSpeed",
-        lambda name, speed: set_previous(name, np.nextafter(speed, 0.0) if name == "AV1" else speed),
-    )
-    with pytest.raises(WorldDisagreementError, match="AV1, m/s"):
-        driving(3)
+def place_and_cut_in(world) -> None:
+    world.place(np.arange(4), X[:4] + 22.0, np.nextafter(V[:4], 0.0))
+    world.step(V[:4], np.array([0, 0, 1, 0], np.int8))
 
 
-def test_a_vehicle_that_was_not_put_where_it_belongs_is_noticed(driving, monkeypatch):
-    world, x = driving(4), X[:4].copy()
-    move_to = libsumo.vehicle.moveTo
-    monkeypatch.setattr(libsumo.vehicle, "moveTo", lambda name, *at: None if name == "BV2" else move_to(name, *at))
-    x[:, BV] = 222.0
-    with pytest.raises(WorldDisagreementError, match="BV2, m"):
-        world.place(np.arange(4), x, V[:4])
-
-
-def test_a_lane_change_that_does_not_happen_is_noticed(driving, monkeypatch):
-    world = driving(4)
-    monkeypatch.setattr(libsumo.vehicle, "changeLane", lambda *arguments: None)
-    with pytest.raises(WorldDisagreementError, match="BV2, lane"):
-        world.step(V[:4], np.array([0, 0, 1, 0], np.int8))
+@pytest.mark.parametrize(
+    ("command", "victim", "quantity"),
+    [("setPreviousSpeed", "AV1", "m/s"), ("moveTo", "BV2", "m"), ("changeLane", "BV2", "lane")],
+)
+def test_a_command_to_one_vehicle_that_has_no_effect_is_noticed(command, victim, quantity, driving, monkeypatch):
+    world, do = driving(4), getattr(libsumo.vehicle, command)
+    monkeypatch.setattr(libsumo.vehicle, command, lambda name, *how: None if name == victim else do(name, *how))
+    with pytest.raises(WorldDisagreementError, match=f"{victim}, {quantity}: "):
+        place_and_cut_in(world)
 
 
 # -- the collision flag and the formula --
@@ -143,19 +133,19 @@ class LyingTwin(TwinWorld):
         return flag | ((self.steps == 20) & (np.arange(self.n_cells) == 3)) if self.nervous else flag & False
 
 
-def run_in(world, campaign) -> Shard:
-    prepared = prepare(resolve(campaign))
+def run_in(world) -> Shard:
+    prepared = prepare(resolve(smoke()))
     return EpisodeLoop(world, prepared.policy, RecordPolicy(0, "none", 0.0)).run(500, prepared.states(500, 60))
 
 
-def test_a_flag_that_the_positions_do_not_show_or_lack_stops_the_run_and_names_the_episode(smoke):
-    run = run_in(TwinWorld(16), smoke()).results.episode
+def test_a_flag_that_the_positions_do_not_show_or_lack_stops_the_run_and_names_the_episode():
+    run = run_in(TwinWorld(16)).results.episode
     crashes = {f"episode {500 + row}, step {run['n_steps'][row]}" for row in np.flatnonzero(run["outcome"] == CRASH)}
     with pytest.raises(WorldDisagreementError, match="found no collision where the positions show one") as raised:
-        run_in(LyingTwin(16, nervous=False), smoke())
+        run_in(LyingTwin(16, nervous=False))
     assert raised.value.where in crashes
     with pytest.raises(WorldDisagreementError, match="episode 503, step 20: found a collision that the positions do"):
-        run_in(LyingTwin(16, nervous=True), smoke())
+        run_in(LyingTwin(16, nervous=True))
 
 
 # -- cells are used again --
@@ -168,7 +158,7 @@ def test_a_collision_in_the_first_step_of_a_refilled_cell_is_flagged(open_world)
     for _ in range(3):
         world.place(np.arange(2), np.tile([172.3, 166.0, 100.0], (2, 1)), speed)
         assert world.step(speed, nobody).tolist() == [True, True]
-    world.place(np.array([0]), np.tile([300.0, 200.0, 100.0], (2, 1)), speed)
+    world.place(np.array([0]), X[:2], speed)
     assert world.step(speed, nobody).tolist() == [False, True]
 
 

@@ -18,6 +18,12 @@ SMOKE = str(Path(__file__).parents[2] / "scenarios" / "smoke.yaml")
 NOWHERE = SystemLibrary("libnowhere.so.7", "libnowhere7", "nowhere-libs", "nowhere")
 ALWAYS_THERE = ("ld-linux", "libc.", "libdl.", "libgcc_s.", "libm.", "libpthread.", "libresolv.", "librt.")
 LEAN = "--no-install-recommends"
+MANAGERS = {
+    "apt-get": ["apt-get update", f"apt-get -o DPkg::Lock::Timeout=300 install -y {LEAN} libnowhere7"],
+    "dnf": ["dnf install -y --setopt=install_weak_deps=False nowhere-libs"],
+    "apk": ["apk add --no-cache nowhere"],
+}
+"""What each package manager is called with."""
 
 
 def _needed_of_the_system(package):
@@ -110,7 +116,7 @@ def test_a_libsumo_that_does_not_load_for_another_reason_is_told_too(monkeypatch
 
 
 def test_setup_does_nothing_where_nothing_is_missing(programs, capsys):
-    for name in ("sudo", "apt-get", "dnf", "apk"):
+    for name in ("sudo", *MANAGERS):
         programs(name)
     programs.user(1000)
     assert main(["setup"]) == 0
@@ -119,22 +125,15 @@ def test_setup_does_nothing_where_nothing_is_missing(programs, capsys):
     assert programs.calls() == []
 
 
-@pytest.mark.parametrize(
-    ("manager", "expected"),
-    [
-        ("apt-get", ["apt-get update", f"apt-get -o DPkg::Lock::Timeout=300 install -y {LEAN} libnowhere7"]),
-        ("dnf", ["dnf install -y --setopt=install_weak_deps=False nowhere-libs"]),
-        ("apk", ["apk add --no-cache nowhere"]),
-    ],
-)
-def test_root_installs_without_sudo(manager, expected, bare_machine, programs, capsys):
+@pytest.mark.parametrize("manager", MANAGERS)
+def test_root_installs_without_sudo(manager, bare_machine, programs, capsys):
     programs(manager)
     programs.user(0)
     assert main(["setup", "--dry-run"]) == 0
-    assert [line.partition("LC_ALL=C ")[2] for line in capsys.readouterr().out.splitlines()] == expected
+    assert [line.partition("LC_ALL=C ")[2] for line in capsys.readouterr().out.splitlines()] == MANAGERS[manager]
     assert programs.calls() == []
     assert main(["setup"]) == 0
-    assert programs.calls() == expected
+    assert programs.calls() == MANAGERS[manager]
 
 
 @pytest.mark.parametrize(("terminal", "sudo"), [(False, "sudo -n env"), (True, "sudo env")])
@@ -145,22 +144,22 @@ def test_others_install_by_sudo_which_asks_only_at_a_terminal(terminal, sudo, ba
     assert main(["setup"]) == 0
     asked, installed = programs.calls()
     assert asked.startswith(f"{sudo} DEBIAN_FRONTEND=noninteractive")
-    assert installed == "apk add --no-cache nowhere"
+    assert [installed] == MANAGERS["apk"]
 
 
-def test_who_is_neither_root_nor_has_sudo_gets_the_line_for_an_administrator(bare_machine, programs, capsys):
-    programs("apt-get")
-    programs.user(1000)
+FAILS = 'if [ "$1" = update ]; then echo "W: no mirror" >&2; exit 0; fi; echo "E: no libnowhere7"; exit 100'
+REFUSED = {
+    "no sudo": (1000, 0, f"apt-get update && apt-get install -y {LEAN} libnowhere7\n"),
+    "it fails": (0, 2, "exit code 100: W: no mirror | E: no libnowhere7\n"),
+}
+
+
+@pytest.mark.parametrize(("user", "calls", "words"), REFUSED.values(), ids=REFUSED)
+def test_where_it_cannot_install_is_the_line_for_an_administrator(user, calls, words, bare_machine, programs, capsys):
+    programs("apt-get", FAILS)
+    programs.user(user)
     assert main(["setup"]) == EXIT_BAD_INPUT
-    assert f"apt-get update && apt-get install -y {LEAN} libnowhere7\n" in capsys.readouterr().err
-    assert programs.calls() == []
-
-
-def test_a_package_manager_that_fails_is_quoted(bare_machine, programs, capsys):
-    update = 'if [ "$1" = update ]; then echo reading; echo "W: no mirror" >&2; exit 0; fi'
-    programs("apt-get", f'{update}; echo "E: no libnowhere7"; exit 100')
-    programs.user(0)
-    assert main(["setup"]) == EXIT_BAD_INPUT
+    assert len(programs.calls()) == calls
     said = capsys.readouterr().err
-    assert "exit code 100: W: no mirror | E: no libnowhere7\n" in said
+    assert words in said
     assert "give your administrator" in said

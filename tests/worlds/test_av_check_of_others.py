@@ -9,7 +9,7 @@ import pytest
 
 from harness.cli import main
 from tests.controllers.test_same_bits import fmu_av
-from tests.sumo_av.running import EXAMPLE, ROOT
+from tests.worlds.running import EXAMPLE, ROOT
 
 
 @pytest.fixture

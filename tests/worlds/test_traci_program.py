@@ -1,15 +1,17 @@
-import json
+"""A program that drives AVs by TraCI: it is the built-in IDM, its faults, and who may connect to SUMO's server."""
 
 import numpy as np
 import pytest
 
 from harness.errors import CampaignError, TooManyFailedError, WorldDisagreementError
+from harness.runner.look import plan_campaign
 from harness.runner.run import run_campaign
 from harness.runner.stored import replay_episode
 from harness.vocabulary import AV, FAILED
-from harness.worlds.program import TraciWorld
-from tests.sumo_av.misbehaving_client import FAULT_STEP
-from tests.sumo_av.running import EXAMPLE, MISBEHAVING, bits, campaign, program, run, run_idm, run_in
+from harness.worlds.program import TraciWorld, own_addresses, require_neighbour
+from tests.stored_runs import manifest
+from tests.worlds.misbehaving_client import FAULT_STEP
+from tests.worlds.running import EXAMPLE, MISBEHAVING, bits, campaign, program, run, run_idm, run_in, smoke
 
 
 def assert_same_motion(shard, expected, rows):
@@ -36,11 +38,7 @@ def test_commands_to_an_av_that_must_hold_its_speed_are_overruled():
 
 def test_with_before_cut_in_controller_the_program_drives_from_the_start():
     av = program(MISBEHAVING, "pushes_held_avs")
-    world = TraciWorld(2, av.traci, 60.0, acts_before_cut_in=True)
-    try:
-        (shard,) = run_in(world, av, [(0, 2)])
-    finally:
-        world.close()
+    (shard,) = run_in(TraciWorld(2, av.traci, 60.0, acts_before_cut_in=True), av, [(0, 2)])
     assert not shard.failures
     assert shard.traces[0][3, AV, 1] < shard.traces[0][0, AV, 1] - 1.0
 
@@ -91,11 +89,13 @@ def test_moving_what_is_not_the_clients_stops_the_run(fault, vehicle):
     assert "may only command AVs" in str(caught.value)
 
 
+def load(command, more=""):
+    return smoke(f"av={{traci: {{command: '{command}'{more}}}}}")
+
+
 def test_a_command_that_cannot_be_started_is_an_error_of_the_campaign():
-    av = program(EXAMPLE)
-    av = av.model_copy(update={"traci": av.traci.model_copy(update={"command": "./no_such_program {port}"})})
     with pytest.raises(CampaignError, match=r"av\.traci\.command.*no_such_program"):
-        run(av, 0, 1)
+        run(load("./no_such_program {port}").av, 0, 1)
 
 
 def test_a_campaign_whose_program_ends_at_once_ends_with_exit_code_3(tmp_path):
@@ -107,6 +107,35 @@ def test_a_campaign_whose_program_ends_at_once_ends_with_exit_code_3(tmp_path):
 def test_a_run_says_that_it_is_not_reproducible_and_is_not_replayed(tmp_path):
     folder = tmp_path / "run"
     run_campaign(campaign(program(EXAMPLE), episodes=4), folder, workers=1)
-    assert json.loads((folder / "manifest.json").read_text())["reproducible"] is False
+    assert manifest(folder)["reproducible"] is False
     with pytest.raises(CampaignError, match="not reproducible"):
         replay_episode(folder, 0)
+
+
+def test_a_machine_with_a_public_address_is_refused_unless_it_is_allowed(monkeypatch):
+    assert "127.0.0.1" in own_addresses()
+    addresses = {"127.0.0.1", "10.1.2.3", "192.168.0.9"}
+    monkeypatch.setattr("harness.worlds.program.own_addresses", lambda: addresses)
+    monkeypatch.setattr("harness.runner.look.seconds_per_test", lambda _: 0.1)
+    plain, allowed = (load(f"{EXAMPLE} {{port}} {{cells}}", more) for more in ("", ", allow_public: true"))
+    plan_campaign(plain)
+    addresses.add("8.8.4.4")
+    plan_campaign(allowed)
+    with pytest.raises(CampaignError, match=r"8\.8\.4\.4.*allow_public") as caught:
+        plan_campaign(plain)
+    assert caught.value.where == "av.traci"
+    assert plain.av.identity() == allowed.av.identity()
+
+
+def test_a_client_of_another_machine_ends_the_run():
+    require_neighbour("0100007F:B267", "0100007F:A6BC")
+    require_neighbour("0A01A8C0:B267", "0A01A8C0:A6BC")  # this machine, by its own address
+    with pytest.raises(WorldDisagreementError, match="a client at"):
+        require_neighbour("0A01A8C0:B267", "0B01A8C0:A6BC")
+
+
+@pytest.mark.parametrize("command", ["x {port.x}", "x {}", "x {port:5}", "x {ports}", "x {", "x '", " "])
+def test_only_port_and_cells_stand_in_braces(command):
+    with pytest.raises(CampaignError, match="the only things in braces"):
+        load(command.replace("'", "''"))
+    assert load("x {{}} {port} {cells}").av.traci.words(1, 2) == ["x", "{}", "1", "2"]

@@ -5,21 +5,21 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from harness.campaign.vehicle import AutomatedVehicle
 from harness.compiled import unboxed
 from harness.episode.cells import PrescribedTraffic, drawn_traffic
-from harness.episode.loop import Drawing, EpisodeLoop, RecordPolicy, Shard
+from harness.episode.loop import EpisodeLoop, RecordPolicy, Shard
 from harness.episode.path import Followers, empty_trajectory
-from harness.importance.functions import build_importance
 from harness.pool.library import load_library
 from harness.pool.replay import Retracing, stored_paths
 from harness.records.schemas import episodes_table
 from harness.resolved import resolve
 from harness.traffic.loading import load_environment
-from harness.vehicles.drivers import av_records
 from harness.vocabulary import BV_LV_CONTACT, CRASH, CUT_IN, STATE_DTYPE, TIMEOUT
 from harness.worlds.twin import TwinWorld
 from studies.alarm import replay_surrogates
 from tests.episode.test_lateral import BESIDE, NEVER, beside, policy_of
+from tests.worlds.running import smoke
 
 KEEP_SPEED, BRAKE = 20, 0
 STATES = np.array(
@@ -43,18 +43,15 @@ def cut_in_at_once() -> PrescribedTraffic:
     return drawn_traffic()._replace(lv=lv, bv=bv, cut_step=zeros, stratum=zeros, log_weight=np.zeros(n), lead=zeros)
 
 
-def run(world, smoke) -> Shard:
-    campaign = smoke("testing.method=shells")
-    policy = Drawing(
-        1, load_environment(campaign.environment), build_importance(campaign, None), av_records(campaign.av)
-    )
-    return EpisodeLoop(world, policy, RecordPolicy(0, "all", 0.0)).run(0, STATES, cut_in_at_once())
+def run(world) -> Shard:
+    loop = EpisodeLoop(world, policy_of(AutomatedVehicle(), 0.0), RecordPolicy(0, "all", 0.0))
+    return loop.run(0, STATES, cut_in_at_once())
 
 
-def test_contact_in_the_step_of_the_cut_in_is_retraced_and_no_surrogate_crashes(smoke):
+def test_contact_in_the_step_of_the_cut_in_is_retraced_and_no_surrogate_crashes():
     campaign = smoke("testing.method=shells")
     environment, library = load_environment(campaign.environment), load_library("ladder-1")
-    shard = run(TwinWorld(4), smoke)
+    shard = run(TwinWorld(4))
     assert shard.results.episode["outcome"].tolist() == OUTCOMES
     assert shard.results.episode["n_steps"].tolist() == [1, 200, 1, 1]
     episodes = episodes_table(shard, campaign.seed)
@@ -70,8 +67,8 @@ def test_contact_in_the_step_of_the_cut_in_is_retraced_and_no_surrogate_crashes(
 
 @pytest.mark.parametrize("shim", [True, False])
 @pytest.mark.parametrize("n_cells", [1, 4, 64])
-def test_sumo_agrees_also_with_cells_that_stay_empty(smoke, open_world, n_cells, shim):
-    twin, sumo = run(TwinWorld(4), smoke), run(open_world(n_cells, shim=shim), smoke)
+def test_sumo_agrees_also_with_cells_that_stay_empty(open_world, n_cells, shim):
+    twin, sumo = run(TwinWorld(4)), run(open_world(n_cells, shim=shim))
     assert twin.results.episode.tobytes() == sumo.results.episode.tobytes()
     for row, trace in twin.traces.items():
         assert np.array_equal(trace, sumo.traces[row], equal_nan=True)

@@ -1,3 +1,5 @@
+from contextlib import closing
+
 import numpy as np
 import pytest
 
@@ -5,15 +7,11 @@ from harness.errors import CampaignError
 from harness.vocabulary import AV, BV, CRASH, LV
 from harness.worlds import sumo_driven
 from harness.worlds.sumo_driven import DEFAULTS, SumoAvWorld, recyclable
-from tests.sumo_av.running import ROOT, bits, run, run_idm, run_in, sumo_av
+from tests.worlds.running import ROOT, bits, run, run_idm, run_in, sumo_av
 
 
 def driven(av, ranges, *, cells=4, **options):
-    world = SumoAvWorld(cells, av.sumo, **options)
-    try:
-        return run_in(world, av, ranges)
-    finally:
-        world.close()
+    return run_in(SumoAvWorld(cells, av.sumo, **options), av, ranges)
 
 
 def fresh_bits(av, first, n):
@@ -82,7 +80,7 @@ def test_collision_flag_and_formula_agree_for_an_av_that_keeps_a_gap_but_hardly_
 def test_neither_the_shim_nor_the_speed_mode_of_a_released_av_matters(monkeypatch):
     """Nothing is commanded then."""
     av = sumo_av(carFollowModel="CACC")
-    (with_shim,), (without,) = driven(av, [(0, 12)]), driven(av, [(0, 12)], shim=False)
+    (with_shim,), (without,) = (driven(av, [(0, 12)], shim=shim) for shim in (True, False))
     monkeypatch.setattr(sumo_driven, "SUMO_DECIDES", sumo_driven.OBEY)
     (obeying,) = driven(av, [(0, 12)])
     for row in range(12):
@@ -117,13 +115,9 @@ def test_documented_defaults_are_the_real_ones():
 
 @pytest.mark.parametrize(("overtakes", "speed_mps"), [(1.0, 40.0), (0.0, 26.0)])
 def test_by_default_the_av_looks_at_its_own_lane_alone(overtakes, speed_mps):
-    world = SumoAvWorld(1, {"lcOvertakeRight": overtakes})
-    try:
+    with closing(SumoAvWorld(1, {"lcOvertakeRight": overtakes})) as world:
         speeds = np.array([[20.0, 30.0, 30.0]])
         world.place(np.array([0]), np.array([[700.0, 640.0, 100.0]]), speeds)
-        world.step(speeds, np.ones(1, np.int8))
-        for _ in range(300):
-            world.step(speeds, np.zeros(1, np.int8))
+        for cut_in in [1, *[0] * 300]:
+            world.step(speeds, np.array([cut_in], np.int8))
         assert world.v[0, AV] == pytest.approx(speed_mps, abs=1.0)  # LV, at 20 m/s, is 24 m or 106 m ahead on the left
-    finally:
-        world.close()

@@ -1,13 +1,14 @@
-"""Episodes with an AV that SUMO moves, and the same episodes with the built-in IDM in the twin."""
+"""Campaigns and episodes in worlds of SUMO, and the same episodes with the built-in IDM in the twin."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 
 from harness.campaign.campaign import Campaign
-from harness.campaign.sections import Records, Run, Stop, Testing, World
+from harness.campaign.files import load_campaign
 from harness.campaign.vehicle import AutomatedVehicle, Limits, TraciProcess
 from harness.episode.loop import Shard
 from harness.resolved import resolve
@@ -18,18 +19,17 @@ from harness.worlds.twin import TwinWorld
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "examples" / "traci_client" / "idm_client.py"
 MISBEHAVING = Path(__file__).parent / "misbehaving_client.py"
+SMALL = ("testing.method=forced", "records={moments: none, traces: all}")
+
+
+def smoke(*overrides: str) -> Campaign:
+    """The episode mixture with overrides."""
+    return load_campaign(ROOT / "scenarios/overtaking_mixture.yaml", ["stop.rhw=null", *overrides])
 
 
 def campaign(av: AutomatedVehicle, *, cells: int = 4, episodes: int = 100) -> Campaign:
-    return Campaign(
-        name="test",
-        av=av,
-        testing=Testing(method="forced"),
-        records=Records(moments="none", traces="all"),
-        world=World(cells=cells),
-        stop=Stop(episodes=episodes),
-        run=Run(shard_size=episodes),
-    )
+    sizes = (f"world.cells={cells}", f"stop.episodes={episodes}", f"run.shard_size={episodes}")
+    return smoke(*SMALL, *sizes).model_copy(update={"av": av})
 
 
 def sumo_av(**attributes) -> AutomatedVehicle:
@@ -43,19 +43,16 @@ def program(*words: str | Path, connect_time_s: float = 60.0, restarts: int = 3,
 
 
 def run_in(world, av: AutomatedVehicle, ranges: Sequence[tuple[int, int]]) -> list[Shard]:
-    """Run ranges (first episode, number) one after another in a world."""
+    """Run ranges (first episode, number) one after another in a world, which is then closed."""
     prepared = prepare(resolve(campaign(av)))
-    loop = prepared.loop(world, traces="all")
-    return [loop.run(first, prepared.states(first, n)) for first, n in ranges]
+    with closing(world):
+        loop = prepared.loop(world, traces="all")
+        return [loop.run(first, prepared.states(first, n)) for first, n in ranges]
 
 
 def run(av: AutomatedVehicle, first: int, n: int, *, cells: int = 4) -> Shard:
     """Episodes in a world of their own, as a campaign would have it."""
-    world = build_world(campaign(av, cells=cells))
-    try:
-        return run_in(world, av, [(first, n)])[0]
-    finally:
-        world.close()
+    return run_in(build_world(campaign(av, cells=cells)), av, [(first, n)])[0]
 
 
 def run_idm(first: int, n: int) -> Shard:

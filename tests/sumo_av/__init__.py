@@ -1,1 +1,0 @@
-"""AVs that SUMO moves: its own models, and programs connected to it."""
