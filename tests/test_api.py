@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import json
 import subprocess
 import sys
 from pathlib import Path
@@ -12,17 +11,11 @@ import pytest
 
 import harness
 from harness.errors import CampaignError, RunFolderError
+from tests.stored_runs import estimates
 
 MIXTURE_FILE = Path(__file__).parents[1] / "scenarios" / "overtaking_mixture.yaml"
-SMALL = [
-    "world.engine=twin",
-    "testing.method=forced",
-    "av={model: fvdm}",
-    "stop.episodes=3000",
-    "stop.rhw=0.5",
-    "stop.min_crashes=20",
-    "run.shard_size=60",
-]
+BUDGET = ("stop.episodes=3000", "stop.rhw=0.5", "stop.min_crashes=20", "run.shard_size=60")
+SMALL = ["world.engine=twin", "testing.method=forced", "av={model: fvdm}", *BUDGET]
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +49,7 @@ def test_a_campaign_is_loaded_with_overrides():
 def test_a_run_returns_what_the_folder_holds(result):
     assert result.exit_code == 0
     assert result.stopped_by == "rhw"
-    assert result.estimates == json.loads((result.folder / "estimates.json").read_text())
+    assert result.estimates == estimates(result.folder)
     assert "crash" in result.estimates["statement"]
     headline = result.estimates["estimates"][result.estimates["headline"]]
     assert headline["ci_low"] < headline["crash_rate"] < headline["ci_high"]

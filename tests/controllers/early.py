@@ -56,20 +56,6 @@ class Speeds(HoldsThenIdm):
         return (0.8 if seen.speed_mps < self._wanted else 0.0) + noise
 
 
-class SpeedsBatch(idm_batch.IDM):
-    """`Speeds` without noise over arrays."""
-
-    def start_batch(self, cells, episodes, random):
-        self.wanted = getattr(self, "wanted", np.zeros(4096))
-        self.wanted[cells] = np.nan
-
-    def step_batch(self, seen):
-        wanted = self.wanted[seen.cell]
-        self.wanted[seen.cell] = wanted = np.where(np.isnan(wanted), 1.2 * seen.speed_mps, wanted)
-        free = np.where(seen.speed_mps < wanted, 0.8, 0.0)
-        return np.where(np.isinf(seen.gap_m), free, super().step_batch(seen))
-
-
 class SpeedsTraci(TraciStyleController):
     """A script that speeds up until someone is ahead, and then is the IDM."""
 

@@ -3,16 +3,12 @@
 import numpy as np
 import pytest
 
-from harness.campaign.files import load_campaign
 from harness.controllers.hosts import BatchHost, Guard
 from harness.errors import CampaignError
-from harness.resolved import resolve
-from harness.runner.prepare import prepare
 from harness.vocabulary import PASSED
-from harness.worlds.twin import TwinWorld
-from tests.controllers.test_same_bits import ROOT
+from tests.controllers.driving import ROOT, drive, forced
 
-EARLY = "{controller: 'tests.controllers.test_before_cut_in:Faster', before_cut_in: controller}"
+EARLY = "av={controller: 'tests.controllers.test_before_cut_in:Faster', before_cut_in: controller}"
 
 
 class Faster:
@@ -33,18 +29,10 @@ class Faster:
         pass
 
 
-def load(method, *more):
-    changes = [f"av={EARLY}", f"testing={{method: {method}}}", "world.engine=twin", "stop.rhw=null", *more]
-    return load_campaign(ROOT / "scenarios/overtaking_mixture.yaml", changes)
-
-
 @pytest.mark.parametrize("method", ["nde", "step_mixture"])
 def test_a_controller_acts_from_the_first_step(method, monkeypatch):
     monkeypatch.chdir(ROOT)
-    prepared = prepare(resolve(load(method, "environment.lane_change_level=350")))
-    loop = prepared.loop(TwinWorld(32), traces="all")
-    shard = loop.run(0, prepared.states(0, 300))
-    loop.close()
+    shard = drive(EARLY, f"testing={{method: {method}}}", "environment.lane_change_level=350", n=300)
     assert shard.failures == {}
     rows = shard.results.episode
     cut = np.flatnonzero(rows["cut_in_step"] > 0)
@@ -62,7 +50,7 @@ def test_a_controller_acts_from_the_first_step(method, monkeypatch):
 
 def test_a_method_that_draws_the_path_ahead_refuses_it():
     with pytest.raises(CampaignError, match=r"draws LV's and BV's path ahead.*shells \(or forced\)"):
-        load("episode_mixture")
+        forced(EARLY, "testing={method: episode_mixture}")
 
 
 def test_tests_of_one_baseline_run_that_begin_together_have_streams_of_their_own():
@@ -76,7 +64,7 @@ def test_tests_of_one_baseline_run_that_begin_together_have_streams_of_their_own
         def step_batch(self, observation): ...
         def close(self): ...
 
-    host = BatchHost(Draws(), 7, Guard(load("nde").av.limits, None))
+    host = BatchHost(Draws(), 7, Guard(forced(EARLY).av.limits, None))
     assert host.start(np.arange(3), np.arange(3), np.array([3, 5, 3])) == {}
     host.close()
     np.testing.assert_array_equal(seen[0], seen[2])

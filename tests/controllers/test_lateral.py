@@ -10,26 +10,17 @@ import pytest
 
 from examples import idm_batch
 from examples.idm import IDM, idm_acceleration
-from harness.campaign.files import load_campaign
 from harness.controllers.protocol import Neighbour, Observation
 from harness.controllers.traci_style import Traci, TraciStyleController
-from harness.resolved import resolve
-from harness.runner.prepare import prepare
-from harness.worlds.twin import TwinWorld
+from tests.controllers.driving import LATERAL, drive
 
-N = 400
 HERE = "tests.controllers.test_lateral"
-LATERAL = "environment.parameters=ndd-overtaking-1-lateral"
-FORCED = ("testing.method=forced", "world.engine=twin")
 SEEN: list[Observation] = []
 """What `Notes` has seen: of this module as the campaign imports it, which is another one than pytest's."""
 
 
-def drive(*overrides: str):
-    ready = prepare(resolve(load_campaign("scenarios/smoke.yaml", [*FORCED, *overrides])))
-    loop = ready.loop(TwinWorld(32))
-    shard = loop.run(0, ready.states(0, N))
-    loop.close()
+def episodes(*overrides: str) -> np.ndarray:
+    shard = drive(*overrides, n=400)
     assert shard.failures == {}
     return shard.results.episode
 
@@ -94,7 +85,7 @@ class YieldsFmu(Fmi2Slave):
 
 @pytest.fixture(scope="module")
 def built_in():
-    return drive(LATERAL)
+    return episodes(LATERAL)
 
 
 FORMS = ("examples.sees_lateral:Yields", f"{HERE}:YieldsBatch", f"{HERE}:YieldsScript")
@@ -102,7 +93,7 @@ FORMS = ("examples.sees_lateral:Yields", f"{HERE}:YieldsBatch", f"{HERE}:YieldsS
 
 @pytest.mark.parametrize("controller", FORMS)
 def test_a_controller_that_sees_it_is_the_built_in_model_to_the_last_bit(built_in, controller):
-    assert drive(LATERAL, f"av={{controller: '{controller}'}}").tobytes() == built_in.tobytes()
+    assert episodes(LATERAL, f"av={{controller: '{controller}'}}").tobytes() == built_in.tobytes()
 
 
 def test_so_is_an_fmu_that_sees_it(built_in, tmp_path):
@@ -111,15 +102,15 @@ def test_so_is_an_fmu_that_sees_it(built_in, tmp_path):
     fmu = builder.FmuBuilder.build_FMU(tmp_path / "yields.py", dest=tmp_path, project_files=["examples/idm.py"])
     inputs = "position_m: x, speed_mps: v, bv_position_m: x_bv, bv_speed_mps: v_bv, bv_lateral_m: over"
     inputs += ", bv_lateral_speed_mps: moves, bv_overlaps: overlaps"
-    found = drive(LATERAL, f"av={{fmu: {{file: '{fmu}', inputs: {{{inputs}}}, output: a}}}}", "world.cells=1")
+    found = episodes(LATERAL, f"av={{fmu: {{file: '{fmu}', inputs: {{{inputs}}}, output: a}}}}", "world.cells=1")
     assert found.tobytes() == built_in.tobytes()
 
 
 def test_one_that_waits_for_the_overlap_is_another_vehicle(built_in):
     """The sibling that must fail; it is the built-in model that is blind until then."""
-    waits = drive(LATERAL, "av={controller: 'examples.sees_lateral:Yields', parameters: {perceives_m: 2.0}}")
+    waits = episodes(LATERAL, "av={controller: 'examples.sees_lateral:Yields', parameters: {perceives_m: 2.0}}")
     assert waits.tobytes() != built_in.tobytes()
-    blind = drive(LATERAL, "av.reaction.perceives_lateral_m=2.0")
+    blind = episodes(LATERAL, "av.reaction.perceives_lateral_m=2.0")
     assert waits.tobytes() == blind.tobytes()
 
 
@@ -127,7 +118,7 @@ def test_one_that_waits_for_the_overlap_is_another_vehicle(built_in):
 def test_what_is_seen_of_a_lead(lead_s):
     SEEN = importlib.import_module(HERE).SEEN  # noqa: N806 - the other one
     SEEN.clear()
-    drive(f"environment.cut_in_lead_s={lead_s}", f"av={{controller: '{HERE}:Notes'}}", "world.cells=1")
+    episodes(f"environment.cut_in_lead_s={lead_s}", f"av={{controller: '{HERE}:Notes'}}", "world.cells=1")
     assert len(SEEN) > 10_000
     assert all(seen.bv_overlaps == (seen.bv.lane == 0) == math.isfinite(seen.gap_m) for seen in SEEN)
     assert all((seen.bv_lateral_m == 1.7) and (seen.bv_lateral_speed_mps == 0.0) for seen in SEEN if seen.bv_overlaps)

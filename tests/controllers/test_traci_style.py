@@ -118,17 +118,6 @@ def test_an_unknown_name_lists_what_there_is(traci):
         traci.trafficlight.getIDList()
 
 
-def test_wrong_commands_are_tracis_errors(traci):
-    for command in (
-        lambda: traci.vehicle.slowDown("AV", -1.0, 1.0),
-        lambda: traci.vehicle.slowDown("AV", 1.0, -1.0),
-        lambda: traci.vehicle.setAcceleration("AV", 1.0, -1.0),
-        lambda: traci.vehicle.setAcceleration("AV", float("nan"), 1.0),
-    ):
-        with pytest.raises(traci.exceptions.TraCIException):
-            command()
-
-
 def start(episode=0):
     return EpisodeStart(episode, 0.1, np.random.default_rng(episode))
 

@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from harness.cli import main
-from tests.controllers.test_same_bits import fmu_av
+from tests.controllers.driving import fmu_av
 from tests.worlds.running import EXAMPLE, ROOT
 
 

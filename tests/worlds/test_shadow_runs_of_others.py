@@ -11,7 +11,7 @@ from harness.runner.prepare import prepare
 from harness.sampling.baseline import as_recorded, baseline_requests, run_baseline
 from harness.worlds import build_world
 from harness.worlds.sumo_driven import FreshWorld, SumoAvWorld
-from tests.controllers.test_same_bits import ROOT, fmu_av
+from tests.controllers.driving import ROOT, fmu_av
 from tests.pool.conftest import MIXTURE_FILE, SMALL_POOL
 from tests.worlds.running import EXAMPLE, program
 
