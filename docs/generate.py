@@ -98,13 +98,13 @@ def _default(field: FieldInfo) -> str:
     return "see below" if isinstance(value, BaseModel | dict) else f"`{value}`"
 
 
-def _settings_table(section: type[BaseModel]) -> str:
+def _settings_rows(section: type[BaseModel]) -> list[tuple[str, ...]]:
     rows = []
     for name, field in section.model_fields.items():
         kind = ", ".join(filter(None, [_kind(field.annotation), _limits(field)]))
         text = field.description or _own_words(field.annotation)
         rows.append((f"`{name}`", kind, _default(field), text.replace("|", "\\|")))
-    return _table(("key", "value", "default", "meaning"), rows)
+    return rows
 
 
 def _is_section(annotation: Any) -> bool:
@@ -126,16 +126,26 @@ def _sections(annotation: Any, path: str = "") -> Iterator[tuple[str, type[BaseM
 
 
 def settings_reference() -> str:
-    """All sections, each with a heading and its table; one that was shown already is only named."""
+    """All sections, each with a heading and its table; a section or a row that was shown already is only named."""
     shown: dict[type[BaseModel], str] = {}
+    rows_of: dict[tuple[str, ...], str] = {}
     text = []
     for path, section in _sections(Campaign):
         text.append(f"### {f'`{path}`' if path else 'Top level'}\n\n")
         if section in shown:
             text.append(f"As `{shown[section]}`.\n\n")
             continue
+        rows = _settings_rows(section)
+        known = {row: rows_of[row] for row in rows if row in rows_of}
+        text.append(f"{_own_words(section)}\n\n")
+        text += [
+            f"As in `{other}`: {', '.join(row[0] for row in known if known[row] == other)}.\n\n"
+            for other in dict.fromkeys(known.values())
+        ]
+        new = [row for row in rows if row not in known]
+        text.append(f"{_table(('key', 'value', 'default', 'meaning'), new)}\n")
         shown[section] = path
-        text.append(f"{_own_words(section)}\n\n{_settings_table(section)}\n")
+        rows_of = dict.fromkeys(new, path) | rows_of
     return "\n" + "".join(text)
 
 
@@ -244,7 +254,7 @@ def limits_table() -> str:
     )
 
 
-VALIDATED = ("shells_panel", "shells_acting", "shells_pairs", "chains_shells", "chains_forced", "twin_forced_online")
+VALIDATED = ("shells_acting", "shells_pairs", "chains_shells", "chains_forced", "twin_forced_online")
 """Replication experiments that are shown line by line."""
 METHODS = {
     "twin_nde": "no control, level 10,000",
@@ -263,19 +273,45 @@ def _command(name: str) -> str:
 
 
 def validated_table(name: str) -> str:
-    """Tables of a replication experiment, rates and what else it judged, with its command."""
-    head = ("vehicle or chain", "statement", "true rate", "bias", "coverage", "p (Holm)", "tests", "5–95 %", "alarm")
+    """Table of a replication experiment, a row for what it judged unconditionally, ranges of the rest; its command."""
+    head = ("vehicle or chain", "true rate", "bias", "coverage", "tests", "5–95 %", "crash outside")
     judgements = _result(name)["judgements"]
-    rates = _table(head, [_validated_cells(one) for one in judgements if _is_rate(one)])
-    others: dict[str, dict[str, str]] = {}
-    for one in judgements:
-        if not _is_rate(one):
-            cell = f"{one['truth']:.3g}, {one['bias']:+.1%}, {one['coverage']:.3f}"
-            others.setdefault(one["subject"], {})[one["result"]] = cell
-    compared = [(subject, *cells.values()) for subject, cells in others.items()]
-    names = next(iter(others.values()), {})
-    beside = f"\nTruth, bias and coverage:\n\n{_table(('vehicle', *names), compared)}" if others else ""
-    return f"{rates}{beside}\n{_command(name)}\n"
+    rows = [_validated_cells(one) for one in judgements if _is_headline(one)]
+    text = f"{_table(head, rows)}\n{_ranges_table([judgements], ('',))}"
+    lowest = min(one["p_value_holm"] for one in judgements if one["p_value_holm"] is not None)
+    return f"{text}\nLowest p (Holm): {lowest:.2g}. {_command(name)}\n"
+
+
+def _ranges_table(found: list[list[dict[str, Any]]], words: tuple[str, ...]) -> str:
+    """Table of the results that have no row of their own: their ranges over vehicles, for each variant."""
+    rows = []
+    for result in dict.fromkeys(_family(one) for one in found[0] if not _is_headline(one)):
+        cells = [result]
+        for judgements in found:
+            of = [one for one in judgements if _family(one) == result and _is_judged(one)]
+            biases, tests = [one["bias"] for one in of], [one["tests_median"] for one in of]
+            cell = f"{min(biases):+.1%} to {max(biases):+.1%}; {min(one['coverage'] for one in of):.3f}"
+            cells.append(cell + (f"; {min(tests):,.0f} to {max(tests):,.0f}" if _is_rate(of[0]) else ""))
+        rows.append(tuple(cells))
+    legend = (
+        "Other results, over the vehicles that meet the assumption: range of bias; lowest coverage; range of tests."
+    )
+    return f"{legend}\n\n{_table(('result', *words), rows)}" if rows else ""
+
+
+def _family(one: dict[str, Any]) -> str:
+    """A result's name, the same for all reference drivers."""
+    return f"`{one['result']}`" if _is_rate(one) else f"{one['result'].partition(' r157')[0]} a reference driver"
+
+
+def _is_headline(one: dict[str, Any]) -> bool:
+    """Whether a result is the rate or difference itself, without an assumption."""
+    return one["result"] in {"shells", "difference", "nade"}
+
+
+def _is_judged(one: dict[str, Any]) -> bool:
+    """Whether the vehicle keeps to what the result assumes; ratios and shares assume nothing."""
+    return not _is_rate(one) or one["p_value_holm"] is not None
 
 
 VARIED = {
@@ -294,20 +330,18 @@ def varied_files(name: str) -> list[str]:
 
 
 def varied_table(name: str) -> str:
-    """Table of a replication experiment with several values of a key, with its commands."""
+    """Table of a replication experiment with several values of a key, ranges of the rest, its commands."""
     key, values = VARIED[name]
-    found = [
-        {(one["subject"], one["result"]): one for one in _result(file)["judgements"]} for file in varied_files(name)
-    ]
-    judged = [each for each, one in found[0].items() if _is_rate(one) and one["p_value_holm"] is not None]
-    rows = [(*each, *(_varied_cell(one[each]) for one in found)) for each in judged]
-    others = [min(one["coverage"] for one in of.values() if not _is_rate(one)) for of in found]
-    lowest = ", ".join(f"{coverage:.3f}" for coverage in others)
-    short = key.rpartition(".")[2]
+    found = [_result(file)["judgements"] for file in varied_files(name)]
+    of_subject = [{one["subject"]: one for one in judgements if _is_headline(one)} for judgements in found]
+    rows = []
+    for subject in of_subject[0]:
+        truths = dict.fromkeys(f"{of[subject]['truth']:.3g}" for of in of_subject)
+        rows.append((subject, ", ".join(truths), *(_varied_cell(of[subject]) for of in of_subject)))
+    words = tuple(f"{key.rpartition('.')[2]} {value}" for value in values)
     return (
-        _table(("vehicle", "statement", *(f"{short} {value}" for value in values)), rows)
-        + "\nBias, coverage, median of tests. Lowest coverage of ratios to reference drivers and preventable shares: "
-        + f"{lowest}.\n\n"
+        _table(("vehicle", "true rate", *words), rows)
+        + f"\nBias, coverage, median of tests.\n\n{_ranges_table(found, words)}\n"
         + "\n".join([f"- {_command(name)}", *(f"- … `--set {key}={value}`" for value in values[1:])])
         + "\n"
     )
@@ -322,14 +356,11 @@ def _is_rate(one: dict[str, Any]) -> bool:
 
 
 def _validated_cells(one: dict[str, Any]) -> tuple[str, ...]:
-    p = one["p_value_holm"]
     return (
         one["subject"],
-        one["result"],
         f"{one['truth']:.3g}",
         f"{one['bias']:+.1%} ± {one['bias_std_error']:.1%}",
         f"{one['coverage']:.3f}",
-        "not judged" if p is None else f"{p:.2g}",
         f"{one['tests_median']:,.0f}",
         f"{one['tests_5']:,.0f}–{one['tests_95']:,.0f}",
         f"{one['alarm']:.1%}",
