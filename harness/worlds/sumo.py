@@ -12,10 +12,12 @@ from __future__ import annotations
 
 import atexit
 import os
+import struct
 import sys
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
+from itertools import compress
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -241,11 +243,10 @@ class SumoWorld(SumoCells):
 
     def _tell(self, speed: FloatArray) -> None:
         """Command the speeds that differ from the last ones commanded."""
-        told, wanted = self._told.ravel(), speed.ravel()
-        changed = np.flatnonzero(told != wanted)
-        names = map(self._flat.__getitem__, changed.tolist())
-        deque(map(self._set_speed, names, wanted[changed].tolist()), maxlen=0)
-        told[changed] = wanted[changed]
+        changed = self._told != speed
+        names = compress(self._flat, changed.tobytes())
+        deque(map(self._set_speed, names, speed[changed].tolist()), maxlen=0)
+        self._told[:] = speed
 
     def _begin_cut_in(self, name: str) -> None:
         if not self._vanilla:
@@ -263,10 +264,12 @@ class SumoWorld(SumoCells):
         self, unit: str, getter: Callable[[str], float], expected: FloatArray, names: Sequence[str] | None = None
     ) -> None:
         """Every value that SUMO reports of vehicles (default: all) must be the commanded one, in every bit."""
-        names, wanted = names or self._flat, expected.ravel().tolist()
-        if (read := list(map(getter, names))) != wanted:
-            at = next(i for i, value in enumerate(read) if value != wanted[i])
-            raise _disobeyed(f"{names[at]}, {unit}", read[at], wanted[at])
+        names = names or self._flat
+        read = list(map(getter, names))
+        if struct.pack(f"{len(read)}d", *read) != expected.tobytes():  # a third faster than to compare numbers
+            for name, value, wanted in zip(names, read, expected.ravel().tolist(), strict=True):
+                if value != wanted:  # all but a zero's sign
+                    raise _disobeyed(f"{name}, {unit}", value, wanted)
 
     def close(self) -> None:
         """End the simulation; a world that is closed already leaves alone what others have opened since."""
