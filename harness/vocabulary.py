@@ -82,6 +82,8 @@ class Sampling:
         Whether something bounds the weights; else no precision can be promised.
     strata : bool
         Whether tests are cut-ins of the pool, counted within strata of known probability.
+    controlled : bool
+        Whether anything is drawn otherwise than the environment would; else every test weighs 1.
     """
 
     estimators: tuple[EstimatorName, ...]
@@ -92,6 +94,7 @@ class Sampling:
     baseline_runs: bool = False
     bounded: bool = True
     strata: bool = False
+    controlled: bool = True
 
     @property
     def headline(self) -> EstimatorName:
@@ -105,7 +108,7 @@ class Sampling:
 
 
 SAMPLING: dict[Method, Sampling] = {
-    "nde": Sampling(("nde", "nade")),
+    "nde": Sampling(("nde", "nade"), controlled=False),
     "forced": Sampling(("nade",), forces=True, baseline_runs=True),
     "step_mixture": Sampling(("nade", "scv"), mixes_steps=True, bounded=False),
     "episode_mixture": Sampling(("mixture_cv", "nade"), mixes_episodes=True, forces=True, holds_speed=True),

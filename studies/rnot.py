@@ -29,13 +29,11 @@ from harness.estimators.block import Block, joined
 from harness.estimators.estimate import FailureBounds, finite_json
 from harness.estimators.limits import normal_half_width
 from harness.estimators.scv import Scv
-from harness.estimators.weighted import Nade, Nde
 from harness.progress import Progress
 from harness.runner.stored import stored_blocks
 from harness.vocabulary import CRASH, FAILED, BoolArray, FloatArray, Int8Array, IntArray
 
 RnotEstimator = Literal["nde", "nade", "scv"]
-_REFUSAL = {"nde": Nde.refusal, "nade": Nade.refusal, "scv": Scv.refusal}
 SCV_REMARK = (
     "rests on the variance that scv claims, which is too small (docs/scv-defect.md): this is the number that the "
     "published procedure reports, not the number of tests that is needed"
@@ -280,7 +278,7 @@ def required_tests_of_runs(
             told.stage(f"{folder.name} {name}", procedure.n_shuffles)
             row = {"run": str(folder), "estimator": name, "n_episodes": tests.n}
             row["n_crashes"] = int(np.count_nonzero(~tests.failed))
-            if reason := _REFUSAL[name](block):
+            if reason := block.refusal(name):
                 rows.append({**row, "mean": None, "reason": reason})
                 continue
             if name == "scv":

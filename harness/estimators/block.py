@@ -26,10 +26,12 @@ from harness.vocabulary import (
     OUTCOMES,
     SAMPLING,
     BoolArray,
+    EstimatorName,
     FloatArray,
     Int8Array,
     IntArray,
     Method,
+    Sampling,
 )
 
 MAX_CONTROL_STEPS = 9
@@ -38,6 +40,14 @@ EPISODE_COLUMNS = ("episode", "outcome", "cut_in_step", "n_control_steps", "log_
 SHELL_COLUMNS = ("component", "cell", "cell_mass", "ahead_step")
 MOMENT_COLUMNS = ("episode", "q_sampled", "q")
 Column = NDArray[Any]
+NEEDS: dict[EstimatorName, str] = {
+    "nde": "a share of crashes needs naturalistic tests (method nde)",
+    "nade": "shares of crashes within shells must be added by the shells' probabilities (estimator shells)",
+    "mixture_cv": "needs the episode mixture: it alone has control variates of known means without heavy tails",
+    "scv": "is defined for the step mixture ([paper] section III-C)",
+    "shells": "tests must be drawn from shells (testing.method shells)",
+}
+"""Of each estimator, why not every method's records allow it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,12 +65,16 @@ class Drawn:
     shells: ShellDesign | None = None
 
     @property
+    def sampling(self) -> Sampling:
+        """What is to be known of the method."""
+        return SAMPLING[self.method]
+
+    @property
     def forced_share(self) -> float:
         """Share of forced cut-ins among what the method draws from."""
-        sampling = SAMPLING[self.method]
-        if not sampling.forces:
+        if not self.sampling.forces:
             return 0.0
-        return float(self.alpha[0]) if sampling.mixes else 1.0  # the defensive component is the first
+        return float(self.alpha[0]) if self.sampling.mixes else 1.0  # the defensive component is the first
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,6 +125,14 @@ class Block:
         if name.startswith("_") or name == "columns" or name not in self.columns:
             raise AttributeError(f"the block has no {name}")
         return self.columns[name]
+
+    def refusal(self, estimator: EstimatorName) -> str | None:
+        """Why records like this block do not allow an estimator; None if they do."""
+        if estimator not in self.drawn.sampling.estimators:
+            return f"{NEEDS[estimator]}; these were drawn by {self.drawn.method}"
+        if estimator == "scv" and "first_ratios" not in self.columns:
+            return "needs the control steps of every episode: set records.moments to first_9 or all"
+        return None
 
     @property
     def crash(self) -> BoolArray:
@@ -214,7 +236,7 @@ def block_from_tables(
         "log_q": _nested(episodes, "log_q", len(alpha)),
         "n_control_steps": n_control_steps,
     }
-    if moments is not None and method == "step_mixture":
+    if moments is not None and SAMPLING[method].mixes_steps:
         columns["first_ratios"] = _first_ratios(moments, index, np.where(failed, 0, n_control_steps))
     if np.all(_known(episodes, "log_p_cut_in") | failed):
         columns["log_p_cut_in"] = np.asarray(pc.fill_null(episodes.column("log_p_cut_in"), -np.inf).to_numpy())
@@ -223,7 +245,7 @@ def block_from_tables(
         columns["cell_mass"] = _nested(episodes, "cell_mass", len(shells.cell_stratum))
         if shells.checked is not None:
             columns["ahead"] = _known(episodes, "ahead_step")
-    drawn = Drawn(method, np.asarray(alpha, dtype=np.float64), 1.0 if method == "nde" else None, shells)
+    drawn = Drawn(method, np.asarray(alpha, dtype=np.float64), None if SAMPLING[method].controlled else 1.0, shells)
     return Block(int(index[0]), outcome, _log_weights(episodes, failed, int(index[0])), columns, drawn)
 
 

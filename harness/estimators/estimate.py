@@ -133,11 +133,6 @@ def finite_json(content: Any) -> dict[str, Any]:
 class Accumulator(Protocol):
     """One estimator's running state, of bounded size."""
 
-    @classmethod
-    def refusal(cls, block: Block) -> str | None:
-        """Why records like this block do not allow this estimator; None if they do."""
-        ...
-
     def add(self, block: Block) -> None:
         """Add the episodes of one block."""
         ...

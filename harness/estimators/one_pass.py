@@ -15,7 +15,7 @@ from harness.estimators.estimate import Accumulator, Estimate, FailureBounds, Po
 from harness.estimators.scv import MixtureCv, Scv
 from harness.estimators.shells import Shells
 from harness.estimators.weighted import Moments, Nade, Nde
-from harness.vocabulary import BV_LV_CONTACT, ESTIMATORS, SAMPLING, EstimatorName, Method
+from harness.vocabulary import BV_LV_CONTACT, ESTIMATORS, EstimatorName, Sampling
 
 ACCUMULATORS: dict[EstimatorName, type[Accumulator]] = {
     "nde": Nde,
@@ -39,23 +39,24 @@ CARELESS_MEAN = 0.5
 class Diagnostics:
     """Running moments of weights and ratios; add blocks, ask for the result."""
 
+    _sampling: Sampling  # of the first block
+
     def __init__(self) -> None:
         self.n, self._counts = 0, Counter[str]()
-        self.method: Method | None = None
         self._weight, self._cut_in, self._contact = Moments(), Moments(), Moments()
         self._ratios: list[Moments] = []
 
     def add(self, block: Block) -> None:
         """Add one block."""
         weights, contact = block.weights(), block.outcome == BV_LV_CONTACT
-        self.method = block.drawn.method
+        self._sampling = block.drawn.sampling
         self.n += len(block)
         counted = {"n_cut_ins": block.cut_in, "n_bv_lv_contacts": contact, "n_failed": block.failed}
         self._counts.update({name: int(np.count_nonzero(rows)) for name, rows in counted.items()})
         self._weight += Moments.of(weights)
         self._cut_in += Moments.of(weights[block.cut_in])
         self._contact += Moments.of(weights[contact])
-        if SAMPLING[block.drawn.method].mixes:
+        if self._sampling.mixes:
             self._ratios = self._ratios or [Moments()] * block.drawn.alpha.size
             self._ratios = [
                 sums + Moments.of(ratios) for sums, ratios in zip(self._ratios, block.mixture_ratios().T, strict=True)
@@ -70,16 +71,16 @@ class Diagnostics:
             "mean_ratio": {name: self._mean(sums) for name, sums in zip(names, self._ratios, strict=False)},
             "bv_lv_contact_share": self._mean(self._contact),
             **self._counts,
-            "note": NOTE_SHELLS if self.method == "shells" else NOTE,
+            "note": NOTE_SHELLS if self._sampling.strata else NOTE,
         }
-        if self.method == "step_mixture" and (mean := self._weight.mean(self.n)) < CARELESS_MEAN:
+        if not self._sampling.bounded and (mean := self._weight.mean(self.n)) < CARELESS_MEAN:
             result["heavy_tail"] = (
                 f"the mean weight is {mean:.3g} where 1 is expected: the episodes with large weights are still missing"
             )
         return result
 
     def _mean(self, sums: Moments) -> dict[str, float]:
-        if self.method == "shells":
+        if self._sampling.strata:
             return {"mean": math.nan, "std_error": math.inf}
         return {"mean": sums.mean(self.n), "std_error": sums.std_error(self.n)}
 
@@ -119,8 +120,8 @@ def one_pass(
         if block.first_episode != n:
             raise ValueError(f"expected a block from episode {n} on, got one from {block.first_episode}")
         if own is None:
-            own = SAMPLING[block.drawn.method].headline
-            refusals = {name: ACCUMULATORS[name].refusal(block) for name in (own, *names)}
+            own = block.drawn.sampling.headline
+            refusals = {name: block.refusal(name) for name in (own, *names)}
             states = {name: accumulator(name) for name, reason in refusals.items() if reason is None}
         n += len(block)
         diagnostics.add(block)

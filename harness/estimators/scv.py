@@ -61,18 +61,6 @@ class MixtureCv(WeightedMean):
         self._factor: FloatArray | None = None
         self._cubes: FloatArray = np.zeros(())
 
-    @classmethod
-    def refusal(cls, block: Block) -> str | None:
-        """Only the episode mixture has few control variates whose means are known and whose values are bounded."""
-        if block.drawn.method == "step_mixture":
-            return (
-                "needs the episode mixture: under the step mixture the products of q_j/q_alpha have mean 1 too, "
-                "but tails too heavy for a regression"
-            )
-        if block.drawn.method != "episode_mixture":
-            return f"needs the episode mixture; {block.drawn.method} draws from a single distribution"
-        return None
-
     def add(self, block: Block) -> None:
         """Fold one block's rows into the factor, in index order."""
         super().add(block)
@@ -140,15 +128,6 @@ class Scv(WeightedMean):
     def __init__(self) -> None:
         super().__init__()
         self._strata: dict[int, Stratum] = {}
-
-    @classmethod
-    def refusal(cls, block: Block) -> str | None:
-        """Needs the step mixture and the ratios of its first control steps."""
-        if (method := block.drawn.method) != "step_mixture":
-            return f"is defined for the step mixture ([paper] section III-C), these tests were drawn by {method}"
-        if "first_ratios" not in block.columns:
-            return "needs the control steps of every episode: set records.moments to first_9 or all"
-        return None
 
     def add(self, block: Block) -> None:
         """Hand each episode to its stratum, in index order."""

@@ -149,13 +149,6 @@ class Shells:
         shells._design, shells._cells = design.without_references(), tally
         return shells
 
-    @classmethod
-    def refusal(cls, block: Block) -> str | None:
-        """Shells must have been drawn from, and their probabilities be known."""
-        if block.drawn.shells is None:
-            return f"tests must be drawn from shells (testing.method shells), these were drawn by {block.drawn.method}"
-        return None
-
     def add(self, block: Block) -> None:
         """Count one block."""
         design, crash = block.drawn.shells, block.crash

@@ -259,15 +259,6 @@ def _exp(log_value: float) -> float:
 class Nade(WeightedMean):
     """Mean of Y = 1{crash}·weight. Unbiased for every method of drawing; without control it is the crash share."""
 
-    @classmethod
-    def refusal(cls, block: Block) -> str | None:
-        """Refuses shells: how many tests each gets depends on results, so that no plain mean is meant."""
-        if block.drawn.method == "shells":
-            return (
-                "tests were drawn within shells, whose shares must be added by their probabilities (estimator shells)"
-            )
-        return None
-
     def result(self, confidence: float) -> Estimate:
         """Mean of Y with its interval."""
         errors = self.y.std_error(self.n), self.y.third_moment(self.n)
@@ -280,13 +271,6 @@ class Nde:
     def __init__(self) -> None:
         self.n = 0
         self.n_crashes = 0
-
-    @classmethod
-    def refusal(cls, block: Block) -> str | None:
-        """Crash counts mean something only where nothing was controlled."""
-        if block.drawn.method != "nde":
-            return f"a share of crashes needs naturalistic tests (method nde), these were drawn by {block.drawn.method}"
-        return None
 
     def add(self, block: Block) -> None:
         """Count one block."""

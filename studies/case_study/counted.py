@@ -53,7 +53,7 @@ class Claims:
     def add(self, block: Block) -> None:
         """Add tests."""
         self._method = block.drawn.method
-        self._with_scv = self._with_scv and Scv.refusal(block) is None
+        self._with_scv = self._with_scv and block.refusal("scv") is None
         self._n += len(block)
         self._weight += float(block.weights().sum())
         self.nade.add(block)

@@ -147,7 +147,7 @@ def test_each_estimator_gets_what_it_would_get_alone_and_convergence_is_the_head
     assert set(done.estimates) == set(ESTIMATORS)
     for name, estimate in done.estimates.items():
         alone = accumulator(name)
-        if (reason := alone.seen.refusal(parts[0])) is None:
+        if (reason := parts[0].refusal(name)) is None:
             assert estimate == fed(alone, parts).result(0.9)
         else:
             assert estimate == Unavailable(reason)
