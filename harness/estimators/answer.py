@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 from harness.campaign.campaign import Campaign
-from harness.estimators.block import Block
+from harness.estimators.block import DANGER_TTC_S, Block
 from harness.estimators.estimate import Estimate, Estimates, Unavailable, finite_json
 from harness.estimators.one_pass import one_pass
 from harness.estimators.pairs import Contrast, PairedEstimate
@@ -213,11 +213,14 @@ def _ahead(found: Mapping[str, Any]) -> str:
     if not found["n_checked"]:
         return ""
     if not found["n_ahead"]:
-        return f" In none of {found['n_checked']:,} tests was it ahead of such a vehicle: each keeps to the assumption."
+        return (
+            f" In none of {found['n_checked']:,} tests was it ahead of such a vehicle and less than {DANGER_TTC_S:g} s "
+            "from a collision: each keeps to the assumption."
+        )
     return (
-        f" In {found['n_ahead']:,} of {found['n_checked']:,} tests it was AHEAD of such a vehicle, first in "
-        f"{_replayed(found['ahead_in'])}: it does not do what is assumed, and nothing but the lack of crashes outside "
-        "speaks for the statement."
+        f" In {found['n_ahead']:,} of {found['n_checked']:,} tests it was AHEAD of such a vehicle and less than "
+        f"{DANGER_TTC_S:g} s from a collision, first in {_replayed(found['ahead_in'])}: it does not do what is "
+        "assumed, and nothing but the lack of crashes outside speaks for the statement."
     )
 
 

@@ -82,7 +82,8 @@ class Within:
     """A row of the table of statements: the rate given that there are no crashes outside, and what is known of those.
 
     ``refuted_by`` are the first few tests (episodes) that crashed outside, and ``ahead_in`` those in which the vehicle
-    was ahead of the boundary, of the ``n_checked`` that were asked; ``n_ahead`` is their number.
+    was ahead of the boundary and came within `DANGER_TTC_S` of a collision, of the ``n_checked`` that were asked;
+    ``n_ahead`` is their number.
     """
 
     name: str

@@ -17,7 +17,8 @@ SHELLS = (
 )  # fmt: skip
 TWIN = "world.engine=twin"
 EQUAL = "av={model: need-based}"
-FASTER = "av={model: idm, parameters: {min_acceleration_mps2: -1.5}, reaction: {delay_s: 0.3}}"
+KEEN = "{min_acceleration_mps2: -2.0, acceleration_mps2: 6.0, time_headway_s: 0.6}"
+FASTER = f"av={{model: idm, parameters: {KEEN}, reaction: {{delay_s: 0.3}}}}"
 
 
 def walked_beside(trace, cut_in_step: int) -> int | None:
@@ -61,9 +62,13 @@ def test_it_is_ahead_where_a_plain_walk_says_so(faster):
     assert 10 < ahead < len(episodes) - 10
 
 
-def test_the_statement_says_so(faster):
+def test_the_statement_says_so_where_it_matters(faster):
+    """A vehicle that is ahead and never comes within 4 s of a collision does no harm; one that crashes has."""
     need = faster.estimates["estimates"]["shells"]["details"]["statements"][1]
-    ahead = stored_table(faster.folder, "episodes").column("ahead_step").is_valid().to_numpy()
+    tests = stored_table(faster.folder, "episodes").to_pandas()
+    was_ahead, crashed = tests["ahead_step"].notna(), tests["outcome"] == "crash"
+    ahead = (was_ahead & (crashed | (tests["min_ttc_s"] < 4.0))).to_numpy()
+    assert 0 < (was_ahead & crashed).sum() < ahead.sum() < was_ahead.sum()
     assert (need["n_checked"], need["n_ahead"]) == (400, ahead.sum())
     assert need["ahead_in"] == np.flatnonzero(ahead)[:10].tolist()
     assert estimate(faster.folder)["boundary_statements"] == faster.estimates["boundary_statements"]
