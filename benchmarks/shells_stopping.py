@@ -38,9 +38,9 @@ def main(replications: int) -> None:
         with tempfile.TemporaryDirectory() as folder:
             judgements = validate(stopped_at(experiment, rhw), Path(folder))
         for found in judgements:
-            if found.result == FREE:
-                bias = f"{100 * found.bias:+.1f} % ± {100 * found.bias_std_error:.1f} %"
-                print(f"| {rhw} | {found.subject} | {found.tests_median:,.0f} | {bias} | {found.coverage:.3f} |")
+            if found["result"] == FREE:
+                row = "{subject} | {tests_median:,.0f} | {bias:+.1%} ± {bias_std_error:.1%} | {coverage:.3f}"
+                print(f"| {rhw} | {row.format_map(found)} |")
 
 
 if __name__ == "__main__":

@@ -93,16 +93,18 @@ def validate(
     experiment = load_experiment(experiment_file, overrides)
     if replications is not None:
         experiment = experiment.model_copy(update={"replications": replications})
-    from studies.replication.run import RESULTS, table_lines  # noqa: PLC0415 - slow to import: once the file is right
+    from harness.estimators.estimate import finite_json  # noqa: PLC0415 - slow to import: once the file is right
+    from studies.replication.run import RESULTS, table_row  # noqa: PLC0415
     from studies.replication.run import validate as repeat  # noqa: PLC0415
 
     bar = shown_progress(quiet=quiet)
     with bar:
         judgements = repeat(experiment, folder, workers=workers, progress=bar)
     if as_json:
-        print_json([one.to_json() for one in judgements])
+        print_json(finite_json(judgements))
     else:
-        click.echo("\n".join([*table_lines(judgements), str(folder / RESULTS)]))
+        print_table(f"{experiment.replications:,} replications", [table_row(one) for one in judgements])
+        click.echo(str(folder / RESULTS))
 
 
 @cli.command(

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.stats import t as student
 
 from harness.estimators.limits import normal_half_width
@@ -51,9 +52,9 @@ def mean_of(values: Iterable[float | None], confidence: float) -> dict[str, Any]
     return figure(known.mean(), max(known.mean() - half, 0.0), known.mean() + half)
 
 
-def ratio_of_means(above: Sequence[float], below: Sequence[float], confidence: float) -> dict[str, Any]:
+def ratio_of_means(above: ArrayLike, below: ArrayLike, confidence: float) -> dict[str, Any]:
     """Ratio of the means of paired repetitions, with the t interval of its logarithm, to the first order."""
-    pairs = np.array([above, below], dtype=np.float64)
+    pairs = np.array([above, below], np.float64)
     pairs = pairs[:, np.isfinite(pairs).all(axis=0)]
     if not (pairs.size and np.all(means := pairs.mean(axis=1))):
         return figure(None)
@@ -65,9 +66,9 @@ def ratio_of_means(above: Sequence[float], below: Sequence[float], confidence: f
     return figure(value, value * math.exp(-half), value * math.exp(half))
 
 
-def ratio_of_variances(above: Sequence[float], below: Sequence[float], confidence: float) -> dict[str, Any]:
+def ratio_of_variances(above: ArrayLike, below: ArrayLike, confidence: float) -> dict[str, Any]:
     """Ratio of the variances of two estimates of the same tests; limits from leaving out one repetition at a time."""
-    pairs = np.array([above, below], dtype=np.float64)
+    pairs = np.array([above, below], np.float64)
     n = pairs.shape[1]
     if n < 3 or not np.all(pairs.var(axis=1)):
         return figure(None)

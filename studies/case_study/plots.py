@@ -1,4 +1,4 @@
-"""Plots of a study: convergence on the paper's two axes, strata, theorems, and tests by method."""
+"""Plots of a study: convergence on the paper's two axes, strata, and tests by method."""
 
 from __future__ import annotations
 
@@ -18,7 +18,6 @@ from harness.report.style import (
     GREY,
     INK,
     MUTED,
-    PAPER,
     VERMILLION,
     Plot,
     Row,
@@ -47,8 +46,6 @@ def plots_of(study: Study, made: Mapping[str, Made], ours: Mapping[str, dict[str
             plots.append(convergence_plot(name, step, made, study.rhw, study.confidence))
         elif step.kind == "control_variates":
             plots.append(strata_plot(name, made[name].result["strata"]))
-        elif step.kind == "theorems":
-            plots.append(theorems_plot(name, made[name].result))
     return {plot.name: plot for plot in plots if plot is not None}
 
 
@@ -145,46 +142,3 @@ def strata_plot(name: str, strata: list[dict[str, Any]]) -> Plot | None:
         "Left: tests, control variates and rank of the columns. Right: spread of Y (NADE) and of Z = Y − Hβ (SCV)."
     )
     return Plot(name, figure, "By number of control steps. " + caption, caption)
-
-
-def theorems_plot(name: str, result: dict[str, Any]) -> Plot:
-    """Means and variances on exact chains, and what known and estimated means give where it should be zero."""
-    figure = new_figure(FULL_WIDTH_IN, 3.3)
-    first, second, third = figure.subplots(1, 3)
-    chains = result["chains"]
-    places = range(len(chains))
-    looks = {
-        "plain": ("NADE", "o", BLUE, 11),
-        "best": ("best β, known means", "o", GREEN, 7),
-        "any": ("another β", "o", GREY, 3),
-        "bound": ("bound", "|", INK, 9),
-    }
-    for key, (label, marker, colour, size) in looks.items():
-        style = {"linestyle": "none", "marker": marker, "color": colour, "markersize": size}
-        first.plot([chain["means"].get(key, np.nan) for chain in chains], places, label=label, **style)
-        second.plot([chain.get(key, np.nan) for chain in chains], places, **style)
-    first.set_xlim(0.9, 1.1)
-    first.set_yticks(places, [chain["chain"] for chain in chains])
-    first.set_title("Theorem 1: unbiased")
-    first.set_xlabel("exact mean / crash rate μ")
-    second.set_xscale("log")
-    decades(second.xaxis, *second.get_xlim())
-    second.set_yticks(places, [])
-    second.set_title("Theorem 2: bounded")
-    second.set_xlabel("exact variance per test / μ²")
-    for axes in (first, second):
-        axes.set_ylim(len(chains) - 0.5, -0.5)
-    figure.legend(*first.get_legend_handles_labels(), ncols=4, fontsize=8, loc="outside lower left")
-    third.hist(np.asarray(result["draws"]["estimated"]) - 1.0, bins=30, color=VERMILLION, label="estimated means")
-    third.axvline(0.0, color=GREEN, label="known means: all of them")
-    third.set_xlabel("error of an estimate / μ; claimed: 0")
-    third.set_ylabel("repetitions")
-    third.set_title("Theorem 3: zero variance")
-    third.set_ylim(0.0, 1.45 * third.get_ylim()[1])
-    third.legend(fontsize=7.5, loc="upper left", frameon=True, framealpha=1.0, facecolor=PAPER, edgecolor=PAPER)
-    caption = (
-        "Left: exact means, of NADE and with two choices of control parameters. Middle: exact variances, below "
-        "Theorem 2's bound. Right: repeated estimates in a world that meets Theorem 3's assumptions, with known "
-        "means of the control variates and, as in Algorithm 1, with those of the same tests."
-    )
-    return Plot(name, figure, caption, caption)

@@ -17,7 +17,7 @@ from harness.campaign.files import load_campaign
 from harness.resolved import resolve
 from harness.runner.prepare import prepare
 from harness.runner.run import run_campaign
-from harness.vocabulary import EstimatorName
+from harness.vocabulary import EstimatorName, FloatArray
 from studies.case_study.counted import Claims
 from studies.case_study.figures import figure, marked, mean_of, ratio_of_means, ratio_of_variances, tests_for
 from studies.case_study.study import Context, Replications, Variants
@@ -39,29 +39,25 @@ def replicate(step: Replications, context: Context) -> dict[str, Any]:
     n, confidence = experiment.campaign.stop.episodes, context.confidence
     per_relvar = tests_for(n, context.rhw, confidence)
     figures: dict[str, Any] = {}
-    claims, rates, settled = {}, {}, True
+    claims, rates, settled = dict[str, FloatArray](), dict[str, FloatArray](), True
     for one in judgements:
-        missed = one.bias + 2.0 * one.bias_std_error < 0.0
-        settled &= not missed
-        own = rows[rows["result"] == one.result]
-        rates[one.result] = own["crash_rate"].to_numpy()
+        name, centre, error = one["result"], 1.0 + one["bias"], 2.0 * one["bias_std_error"]
+        settled &= not (missed := centre + error < 1.0)
+        own = rows[rows["result"] == name]
+        rates[name] = own["crash_rate"].to_numpy()
         with np.errstate(divide="ignore", invalid="ignore"):
-            claims[one.result] = (own["std_error"].to_numpy() / rates[one.result]) ** 2 * per_relvar
-        found = {
-            "true": _scattered(one.true_relvar * per_relvar, one.replications, missed=missed),
-            "claimed": marked(mean_of(claims[one.result], confidence), settled=not missed),
-            "covers": figure(one.coverage, one.coverage_low, one.coverage_high),
-            "over_truth": figure(
-                1.0 + one.bias, *(1.0 + one.bias + side * 2.0 * one.bias_std_error for side in (-1.0, 1.0))
-            ),
+            claims[name] = (own["std_error"].to_numpy() / rates[name]) ** 2 * per_relvar
+        figures |= {
+            f"{name}_true": _scattered(one["true_relvar"] * per_relvar, one["replications"], missed=missed),
+            f"{name}_claimed": marked(mean_of(claims[name], confidence), settled=not missed),
+            f"{name}_covers": figure(one["coverage"], one["coverage_low"], one["coverage_high"]),
+            f"{name}_over_truth": figure(centre, centre - error, centre + error),
         }
-        figures |= {f"{one.result}_{key}": each for key, each in found.items()}
     for plain, other in pairwise(claims):
         gain = ratio_of_means(claims[plain], claims[other], confidence)
         figures[f"{other}_gain_claimed"] = marked(gain, settled=settled)
         figures[f"{other}_gain_true"] = ratio_of_variances(rates[plain], rates[other], confidence)
-    said = [one.to_json() for one in judgements]
-    return {"tests": n, "replications": experiment.replications, "judgements": said, "figures": figures}
+    return {"tests": n, "replications": experiment.replications, "judgements": judgements, "figures": figures}
 
 
 def _scattered(value: float, replications: int, *, missed: bool) -> dict[str, Any]:

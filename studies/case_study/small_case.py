@@ -1,4 +1,4 @@
-"""The smaller case of the 2022 conference version as a finite tree, on which everything is known exactly.
+"""The smaller case of the 2022 conference version, of which every course is listed, so that all is known exactly.
 
 LV keeps 3 m/s, BV follows it from 8 m/s, AV keeps 13 m/s on the other lane, 5 m behind BV; only R1 is random at the
 start. BV draws an acceleration each second and may cut in in each step; AV has passed it within two seconds. After the
@@ -38,7 +38,6 @@ from harness.vocabulary import (
     TIMEOUT,
     BoolArray,
     FloatArray,
-    IntArray,
     RecordArray,
 )
 from studies.case_study.counted import Claims
@@ -52,23 +51,8 @@ STEPS, HOLD = 100, 10
 NODES = 8
 
 
-class Level(NamedTuple):
-    """Situations of one step, m of them, in which BV has its acceleration and may cut in.
-
-    ``p`` is the probability to cut in here, ``crash`` whether the vehicle under test would crash then, ``surrogates``
-    (m, J) which surrogates would. ``parent`` is the situation of the step before that staying in lane led here from,
-    ``share`` (m,) with which probability (of the first step: with which it begins).
-    """
-
-    p: FloatArray
-    crash: FloatArray
-    surrogates: FloatArray
-    parent: IntArray
-    share: FloatArray
-
-
 class Proposal(NamedTuple):
-    """Per situation: q_j(cut_in) (m, J), and whether it is critical (m,)."""
+    """q_j(cut_in) by step and course (T, R, A, A, J), and where it is critical (T, R, A, A)."""
 
     q: FloatArray
     critical: BoolArray
@@ -76,147 +60,122 @@ class Proposal(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class SmallWorld:
-    """The tree; surrogates as published are the default."""
+    """Every course of a test: R1 (R) and the accelerations that BV draws first and second (A each), without a cut-in.
 
-    levels: Sequence[Level]
+    ``first`` (R, A) and ``second`` (R, A, A) are the probability of R1 with the first acceleration, and of the second
+    given those. By step and course, (T, R, A, A): ``running``, as AV has not passed; the probability ``p`` to cut in,
+    0 if it has; whether the vehicle under test would crash then, ``crash``, and which surrogates would, with a last
+    axis (J).
+    """
 
-    def value(self, cutting: Sequence[FloatArray], staying: Sequence[FloatArray] | None = None) -> list[FloatArray]:
-        """Backward induction: in each situation what a cut-in is worth there, and a factor of what comes later.
+    first: FloatArray
+    second: FloatArray
+    running: BoolArray
+    p: FloatArray
+    crash: FloatArray
+    surrogates: FloatArray
 
-        ``cutting`` and ``staying`` hold arrays of shape (m,), or (m, J); the factor is 1 - p by default.
-        """
-        values: list[FloatArray] = [np.zeros_like(worth) for worth in cutting]
+    def value(self, cutting: FloatArray, staying: FloatArray) -> FloatArray:
+        """Induce backwards what a cut-in is worth in each step, and a factor of what comes later; (T, R, A, A, …)."""
+        values = np.zeros_like(cutting)
         later = np.zeros_like(cutting[-1])
-        for t in range(len(self.levels) - 1, -1, -1):
-            level = self.levels[t]
-            values[t] = cutting[t] + (((1.0 - level.p) if staying is None else staying[t]) * later.T).T
-            if t:  # the mean over what follows each situation of the step before
-                later = np.zeros((len(self.levels[t - 1].p), *later.shape[1:]))
-                np.add.at(later, level.parent, (level.share * values[t].T).T)
+        for t in range(len(cutting) - 1, -1, -1):
+            values[t] = later = cutting[t] + (staying[t].T * later.T).T
+            if t == HOLD:
+                later = np.broadcast_to(np.einsum("rab,rab...->ra...", self.second, later)[:, :, None], later.shape)
         return values
+
+    def mean(self, value: FloatArray) -> float:
+        """Mean over the beginnings of a test of a value (T, R, A, A) in its first step."""
+        return float(np.sum(self.first * value[0, :, :, 0]))
 
     @cached_property
     def crash_rate(self) -> float:
         """μ."""
-        return float(self.levels[0].share @ self.value([level.p * level.crash for level in self.levels])[0])
+        return self.mean(self.value(self.p * self.crash, 1.0 - self.p))
 
-    def proposals(self, epsilon: float, *, recursive: bool, threshold: float = 0.0) -> list[Proposal]:
+    def proposals(self, epsilon: float, *, recursive: bool, threshold: float = 0.0) -> Proposal:
         """Importance functions; a later cut-in counts only for the recursive challenge.
 
         A situation is critical where V_j of any surrogate is above the threshold; elsewhere all draw from p.
         """
-        now = [level.p[:, None] * level.surrogates for level in self.levels]
-        found = []
-        for level, cutting, v in zip(self.levels, now, self.value(now) if recursive else now, strict=True):
-            p = np.broadcast_to(level.p[:, None], v.shape)
-            critical = np.any(v > threshold, axis=1)
-            aimed = epsilon * p + (1.0 - epsilon) * np.divide(cutting, v, out=p.copy(), where=v > 0.0)
-            found.append(Proposal(np.where(critical[:, None] & (v > 0.0), aimed, p), critical))
-        return found
+        p = np.broadcast_to(self.p[..., None], self.surrogates.shape)
+        cutting = p * self.surrogates
+        v = self.value(cutting, 1.0 - self.p) if recursive else cutting
+        critical = np.any(v > threshold, axis=-1)
+        aimed = epsilon * p + (1.0 - epsilon) * np.divide(cutting, v, out=p.copy(), where=v > 0.0)
+        return Proposal(np.where(critical[..., None] & (v > 0.0), aimed, p), critical)
 
-    def relvar(self, proposals: Sequence[Proposal]) -> float:
+    def relvar(self, proposals: Proposal) -> float:
         """Var(Y)/μ² of a test under the step mixture with equal weights, by backward induction of E[Y² | situation]."""
-        cutting, staying = [], []
-        for level, proposal in zip(self.levels, proposals, strict=True):
-            q = proposal.q.mean(axis=1)
-            cutting.append(np.divide(level.p**2, q, out=np.zeros_like(q), where=q > 0.0) * level.crash)
-            staying.append(np.divide((1.0 - level.p) ** 2, 1.0 - q, out=np.zeros_like(q), where=q < 1.0))
-        return float(self.levels[0].share @ self.value(cutting, staying)[0]) / self.crash_rate**2 - 1.0
+        q = proposals.q.mean(axis=-1)
+        cutting = np.divide(self.p**2, q, out=np.zeros_like(q), where=q > 0.0) * self.crash
+        staying = np.divide((1.0 - self.p) ** 2, 1.0 - q, out=np.zeros_like(q), where=q < 1.0)
+        return self.mean(self.value(cutting, staying)) / self.crash_rate**2 - 1.0
 
-    def draw(self, proposals: Sequence[Proposal], n: int, rng: np.random.Generator) -> Block:
+    def draw(self, proposals: Proposal, n: int, rng: np.random.Generator) -> Block:
         """Tests under the step mixture, as the estimators see those of any world."""
-        n_surrogates = self.levels[0].surrogates.shape[1]
-        at = rng.choice(len(self.levels[0].p), n, p=self.levels[0].share / self.levels[0].share.sum())
+        n_surrogates = self.surrogates.shape[-1]
+        begun = rng.choice(self.first.size, n, p=self.first.ravel() / self.first.sum())
+        course = np.array([*np.unravel_index(begun, self.first.shape), np.zeros(n, np.int64)])
         log_weight, steps, ratios = np.zeros(n), np.zeros(n, np.int64), np.ones((n, MAX_CONTROL_STEPS, n_surrogates))
         crash, cut_in, running = np.zeros(n, bool), np.zeros(n, bool), np.arange(n)
         log_q = np.zeros((n, n_surrogates))
-        for t, (level, proposal) in enumerate(zip(self.levels, proposals, strict=True)):
-            here = at[running]
-            p, q = level.p[here], proposal.q[here]
-            cut = rng.random(len(here)) < q.mean(axis=1)
+        for t in range(len(self.p)):
+            if t:
+                u = rng.random(len(running))
+                if t == HOLD:
+                    total = np.cumsum(self.second[*course[:2, running]], axis=1)
+                    course[2, running] = np.minimum((total <= u[:, None]).sum(axis=1), N_ACCELERATIONS - 1)
+                running = running[self.running[t, *course[:, running]]]
+            here = t, *course[:, running]
+            p, q, critical = self.p[here], proposals.q[here], proposals.critical[here]
+            cut = rng.random(len(running)) < q.mean(axis=1)
             chosen_p, chosen_q = np.where(cut, p, 1.0 - p), np.where(cut[:, None], q, 1.0 - q)
             sampled = chosen_q.mean(axis=1)
             log_weight[running] += np.log(chosen_p / sampled)
             log_q[running] += np.log(chosen_q / chosen_p[:, None])
-            critical = proposal.critical[here]
             kept = critical & (steps[running] < MAX_CONTROL_STEPS)
             ratios[running[kept], steps[running[kept]]] = (chosen_q / sampled[:, None])[kept]
             steps[running] += critical
-            crash[running[cut]] = level.crash[here[cut]] > 0.0
-            cut_in[running[cut]] = True
+            crash[running], cut_in[running] = cut & (self.crash[here] > 0.0), cut
             running = running[~cut]
-            if t + 1 < len(self.levels):
-                at[running], alive = self._next(t + 1, at[running], rng)
-                running = running[alive]
         columns = {"cut_in": cut_in, "log_q": log_q, "n_control_steps": steps, "first_ratios": ratios}
         drawn = Drawn("step_mixture", np.full(n_surrogates, 1.0 / n_surrogates))
         return Block(0, np.where(crash, CRASH, TIMEOUT).astype(np.int8), log_weight, columns, drawn)
 
-    def _next(self, t: int, at: IntArray, rng: np.random.Generator) -> tuple[IntArray, BoolArray]:
-        """Situations that follow, and which tests still have one: AV has not passed."""
-        level, n_before = self.levels[t], len(self.levels[t - 1].p)
-        order = np.argsort(level.parent, kind="stable")
-        total = np.concatenate([[0.0], np.cumsum(level.share[order])])
-        first = np.searchsorted(level.parent[order], np.arange(n_before + 1))
-        start, stop = total[first[at]], total[first[at + 1]]
-        u = start + rng.random(len(at))
-        place = np.minimum(np.searchsorted(total, u, side="right") - 1, len(order) - 1)
-        alive = u < stop
-        return np.where(alive, order[place], 0), alive
-
-
-class _Situations(NamedTuple):
-    """What is told apart in a step: v_BV, R1, R2, BV's acceleration; where it comes from, how likely."""
-
-    speed: FloatArray
-    r1: FloatArray
-    r2: FloatArray
-    acceleration: FloatArray
-    parent: IntArray
-    share: FloatArray
-
-    def moved(self) -> _Situations:
-        """All of them after a step without cut-in, each the parent of itself."""
-        after = np.maximum(self.speed + self.acceleration * STEP_S, 0.0)
-        r1 = self.r1 + (LV_MPS - 0.5 * (self.speed + after)) * STEP_S
-        r2 = self.r2 + (0.5 * (self.speed + after) - AV_MPS) * STEP_S
-        return _Situations(after, r1, r2, self.acceleration, np.arange(len(after)), np.ones(len(after)))
-
-    def drawn(self, environment: Environment) -> _Situations:
-        """Each once for every acceleration that BV may draw."""
-        pmf, _, _ = _laws(self.speed, self.r1, np.zeros((0, 2)), environment)
-        row, maneuver = np.nonzero(pmf)
-        every = self.taken(row)
-        return every._replace(acceleration=ACCELERATIONS_MPS2[maneuver], share=every.share * pmf[row, maneuver])
-
-    def taken(self, rows: IntArray) -> _Situations:
-        """Some of them."""
-        return _Situations._make(column[rows] for column in self)
-
 
 def small_world(level: float, *, nodes: int = NODES) -> SmallWorld:
-    """The tree at a level of lane changing."""
+    """All courses at a level of lane changing."""
     environment = load_environment(EnvironmentSettings(lane_change_level=level))
     records = driver_records([each.parameters for each in default_surrogates().values()])
     drivers = [av_records(AutomatedVehicle()), *np.split(records, len(records))]
     x, weight = np.polynomial.legendre.leggauss(nodes)
-    r1, ones = R1_M[0] + (x + 1.0) / 2.0 * (R1_M[1] - R1_M[0]), np.ones(nodes)
-    here = _Situations(ones * BV_MPS, r1, ones * R2_M, ones, np.arange(nodes), weight / 2.0).drawn(environment)
-    levels: list[Level] = []
-    while len(here.share) and len(levels) < STEPS:
-        after = here.moved()
-        crash = _crashes(drivers, after.speed, after.r2, STEPS - 1 - len(levels))
-        levels.append(Level(_cut_in(here, environment), crash[:, 0], crash[:, 1:], here.parent, here.share))
-        here = after.taken(np.flatnonzero(after.r2 > 0.0))  # AV has not passed the others
-        if len(levels) % HOLD == 0 and len(here.share):
-            here = here.drawn(environment)
-    return SmallWorld(levels)
+    courses = nodes, N_ACCELERATIONS, N_ACCELERATIONS
+    speed, r2 = np.full(courses, BV_MPS), np.full(courses, R2_M)
+    r1 = np.broadcast_to((R1_M[0] + (x + 1.0) / 2.0 * (R1_M[1] - R1_M[0]))[:, None, None], courses)
+    steps, drawn = list[tuple[BoolArray, FloatArray, FloatArray]](), list[FloatArray]()
+    while np.any(running := r2 > 0.0):
+        if len(steps) % HOLD == 0:  # BV draws: before AV has passed it does so twice
+            pmf, _, _ = _laws(speed[:, :, 0].ravel(), r1[:, :, 0].ravel(), np.zeros((0, 2)), environment)
+            drawn.append(pmf.reshape(courses))
+        p = np.zeros(courses)
+        p[running] = _cut_in(speed[running], r1[running], r2[running], environment)
+        after = np.maximum(speed + ACCELERATIONS_MPS2[:, None if len(steps) < HOLD else ...] * STEP_S, 0.0)
+        r1 = r1 + (LV_MPS - 0.5 * (speed + after)) * STEP_S
+        r2 = r2 + (0.5 * (speed + after) - AV_MPS) * STEP_S
+        speed, crash = after, np.zeros((*courses, len(drivers)))
+        crash[running] = _crashes(drivers, speed[running], r2[running], STEPS - 1 - len(steps))
+        steps.append((running, p, crash))
+    all_running, all_p, crashes = map(np.stack, zip(*steps, strict=True))
+    first = weight[:, None] / 2.0 * drawn[0][:, 0]
+    return SmallWorld(first, drawn[1], all_running, all_p, crashes[..., 0], crashes[..., 1:])
 
 
-def _cut_in(here: _Situations, environment: Environment) -> FloatArray:
+def _cut_in(speed: FloatArray, r1: FloatArray, r2: FloatArray, environment: Environment) -> FloatArray:
     """Probability to cut in within the step, as `harness.traffic.laws.cut_in_hazard` gives it."""
     n = environment.numbers
-    _, chance, accepted = _laws(here.speed, here.r1, np.column_stack([here.r2, here.speed - AV_MPS]), environment)
+    _, chance, accepted = _laws(speed, r1, np.column_stack([r2, speed - AV_MPS]), environment)
     p_1s = np.minimum(chance * accepted, float(n["cut_in__max_probability_1s"]))
     return np.asarray(-np.expm1(float(n["scenario__step_s"]) * np.log1p(-p_1s)))
 
@@ -262,7 +221,7 @@ def answer_small_case(step: SmallCase, context: Context) -> dict[str, Any]:
     return {
         "crash_rate": world.crash_rate,
         "rhw": step.rhw,
-        "steps": len(world.levels),
+        "steps": len(world.p),
         "settings": rows,
         "nearest": nearest,
         "figures": {

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
 from scipy.stats import binomtest
 
-from harness.estimators.estimate import Estimate, finite_json
+from harness.estimators.estimate import Estimate
 from harness.estimators.limits import clopper_pearson, normal_half_width
 from harness.vocabulary import FloatArray
 from studies.replication.populations import Known
@@ -90,56 +90,18 @@ class Subject:
         return self.crashes_outside.get(result, 0.0) < NEGLIGIBLE_OUTSIDE
 
 
-@dataclass(frozen=True)
-class Judgement:
-    """One method on one vehicle; `python -m studies validate --help` says what is printed of it.
-
-    Bias and relative variances are over the ``scale`` of the truth (`Known`). The assumption is not met by a statement
-    about vehicles that do not crash outside, and one that does; coverage is not judged then, and has no p-values. Tests
-    for the wanted RHW, 0.3, follow from the true variance at this number of tests, if it was fixed. ``reached`` is the
-    share of replications that reached the precision asked for. Those refused count as covered; where they have no value
-    either, nothing else takes notice of them.
-    """
-
-    subject: str
-    result: str
-    replications: int
-    truth: float
-    scale: float
-    assumption_met: bool
-    bias: float
-    bias_std_error: float
-    true_relvar: float
-    claimed_relvar: float
-    covered: int
-    coverage: float
-    coverage_low: float
-    coverage_high: float
-    p_value: float | None
-    p_value_holm: float | None
-    tests_median: float
-    tests_5: float
-    tests_95: float
-    tests_for_wanted_rhw: float | None
-    reached: float
-    alarm: float
-    refused: float
-
-    @property
-    def too_low(self) -> bool:
-        """Whether the coverage is significantly below nominal."""
-        return self.p_value_holm is not None and self.p_value_holm < SIGNIFICANCE
-
-    def to_json(self) -> dict[str, Any]:
-        """Plain content."""
-        content: dict[str, Any] = finite_json({**asdict(self), "coverage_too_low": self.too_low})
-        return content
+Judgement = dict[str, Any]
+"""What `judge` finds, by the names of its keys."""
 
 
 def judge(subject: Subject, result: str, rows: Sequence[Row], confidence: float) -> Judgement:
-    """Judge one method on one vehicle by its rows; `corrected` then fills in the corrected p-values.
+    """Judge one method on one vehicle by its rows; `corrected` then adds the corrected p-values.
 
-    ``confidence`` is the nominal coverage.
+    ``confidence`` is the nominal coverage. Bias and relative variances are over the ``scale`` of the truth (`Known`).
+    The assumption is not met by a statement about vehicles that do not crash outside, and one that does; coverage is
+    not judged then, and has no p-values. Tests for the wanted RHW, 0.3, follow from the true variance at this number of
+    tests, if it was fixed. ``reached`` is the share of replications that reached the precision asked for. Those refused
+    count as covered; where they have no value either, nothing else takes notice of them.
     """
     columns = {field.name: np.array([getattr(row, field.name) for row in rows]) for field in fields(Row)}
     tests, reached, known, n = columns["n_tests"], columns["reached"], subject.truth(result), len(rows)
@@ -153,31 +115,30 @@ def judge(subject: Subject, result: str, rows: Sequence[Row], confidence: float)
     tests_5, median, tests_95 = (float(q) for q in np.quantile(tests, [0.05, 0.5, 0.95]))
     fixed, relvar = not reached.any() and bool(np.all(tests == tests[0])), _mean(errors**2)
     met, z = subject.meets_assumption_of(result), normal_half_width(1.0, confidence)
-    return Judgement(
-        subject=subject.name,
-        result=result,
-        replications=n,
-        truth=truth,
-        scale=scale,
-        assumption_met=met,
-        bias=_mean(errors),
-        bias_std_error=float(errors.std(ddof=1)) / math.sqrt(errors.size) if errors.size > 1 else math.nan,
-        true_relvar=relvar,
-        claimed_relvar=_mean(claimed**2),
-        covered=covered,
-        coverage=covered / n,
-        coverage_low=low,
-        coverage_high=high,
-        p_value=float(binomtest(covered, n, confidence, alternative="less").pvalue) if met else None,
-        p_value_holm=None,
-        tests_median=median,
-        tests_5=tests_5,
-        tests_95=tests_95,
-        tests_for_wanted_rhw=(z / WANTED_RHW) ** 2 * (relvar * median) if fixed else None,
-        reached=float(reached.mean()),
-        alarm=float(np.mean(columns["n_crashes_outside"] > 0)),
-        refused=float(columns["refused"].mean()),
-    )
+    return {
+        "subject": subject.name,
+        "result": result,
+        "replications": n,
+        "truth": truth,
+        "scale": scale,
+        "assumption_met": met,
+        "bias": _mean(errors),
+        "bias_std_error": float(errors.std(ddof=1)) / math.sqrt(errors.size) if errors.size > 1 else math.nan,
+        "true_relvar": relvar,
+        "claimed_relvar": _mean(claimed**2),
+        "covered": covered,
+        "coverage": covered / n,
+        "coverage_low": low,
+        "coverage_high": high,
+        "p_value": float(binomtest(covered, n, confidence, alternative="less").pvalue) if met else None,
+        "tests_median": median,
+        "tests_5": tests_5,
+        "tests_95": tests_95,
+        "tests_for_wanted_rhw": (z / WANTED_RHW) ** 2 * (relvar * median) if fixed else None,
+        "reached": float(reached.mean()),
+        "alarm": float(np.mean(columns["n_crashes_outside"] > 0)),
+        "refused": float(columns["refused"].mean()),
+    }
 
 
 def _mean(values: FloatArray) -> float:
@@ -186,12 +147,17 @@ def _mean(values: FloatArray) -> float:
 
 
 def corrected(judgements: Sequence[Judgement]) -> list[Judgement]:
-    """The same with p-values corrected over all subjects, for each result by itself."""
-    found: dict[tuple[str, str], float] = {}
-    for result in {one.result for one in judgements}:
-        known = {one.subject: one.p_value for one in judgements if one.result == result and one.p_value is not None}
-        found |= {(name, result): p for name, p in zip(known, holm(list(known.values())), strict=True)}
-    return [replace(one, p_value_holm=found.get((one.subject, one.result))) for one in judgements]
+    """The same with p-values corrected over all subjects, for each result by itself, and what they say at 5 %."""
+    found: dict[int, float] = {}
+    for result in {one["result"] for one in judgements}:
+        known = {k: one["p_value"] for k, one in enumerate(judgements) if one["result"] == result}
+        known = {k: p for k, p in known.items() if p is not None}
+        found |= dict(zip(known, holm(list(known.values())), strict=True))
+    p_values = [found.get(k) for k in range(len(judgements))]
+    return [
+        {**one, "p_value_holm": p, "coverage_too_low": p is not None and p < SIGNIFICANCE}
+        for one, p in zip(judgements, p_values, strict=True)
+    ]
 
 
 def holm(p_values: Sequence[float]) -> list[float]:

@@ -66,7 +66,7 @@ def write_results(
         "truth": "exact, by backward induction" if experiment.chains else "independent enumeration with another seed",
         "largest_relative_error_of_truth": max(subject.relative_error for subject in found),
         "subjects": [asdict(subject) for subject in found],
-        "judgements": [one.to_json() for one in judgements],
+        "judgements": judgements,
     }
     write_json(folder / RESULTS, finite_json(content))  # of what never crashes nothing relative is known
 
@@ -78,39 +78,33 @@ def coverage_plot(judgements: Sequence[Judgement], confidence: float) -> Plot:
     figure, left, right = two_panels(1.2 + 0.2 * n, labels, sharey=True)
     coverages, tests = list[Bar](), list[Bar]()
     for one in judgements:
-        name, colour = f"{one.subject}: {one.result}", BLUE if one.p_value_holm is not None else GREY
-        colour = VERMILLION if one.too_low else colour
-        coverages.append(Bar(name, one.coverage, colour, one.coverage_low, one.coverage_high))
-        tests.append(Bar(name, one.tests_median, INK, one.tests_5, one.tests_95))
+        colour = VERMILLION if one["coverage_too_low"] else GREY if one["p_value_holm"] is None else BLUE
+        name = "{subject}: {result}".format_map(one)
+        coverages.append(Bar(name, one["coverage"], colour, one["coverage_low"], one["coverage_high"]))
+        tests.append(Bar(name, one["tests_median"], INK, one["tests_5"], one["tests_95"]))
     interval_bars(left, coverages)
     interval_bars(right, tests)
     left.axvline(confidence, color=INK, linewidth=0.8)
     right.set_xscale("log")
-    low = sum(one.too_low for one in judgements)
+    low = sum(one["coverage_too_low"] for one in judgements)
     caption = f"{low} of {n} coverages are significantly below {confidence:g}; grey ones are not judged."
     return Plot("coverage", figure, f"Coverage and tests of {n} results. {caption}", caption)
 
 
-def table_lines(judgements: Sequence[Judgement]) -> list[str]:
-    """Lines of a table, aligned for a terminal."""
-    table = [_cells(one) for one in judgements]
-    columns = [[head, *(cells[head] for cells in table)] for head in table[0]]
-    padded = [[cell.ljust(max(map(len, column))) for cell in column] for column in columns]
-    return ["  ".join(line) for line in zip(*padded, strict=True)]
-
-
-def _cells(one: Judgement) -> dict[str, str]:
-    p = "not judged" if one.p_value_holm is None else f"{one.p_value_holm:.2g}"
-    return {
-        "subject": one.subject,
-        "result": one.result,
-        "truth": f"{one.truth:.3g}",
-        "bias": "" if math.isnan(one.bias) else f"{one.bias:+.1%} ± {one.bias_std_error:.1%}",
-        "relvar true": "" if math.isnan(one.true_relvar) else f"{one.true_relvar:.3g}",
-        "claimed": "" if math.isnan(one.claimed_relvar) else f"{one.claimed_relvar:.3g}",
-        "coverage [95 %]": f"{one.coverage:.3f} [{one.coverage_low:.3f}, {one.coverage_high:.3f}]",
-        "p (Holm)": p + (" TOO LOW" if one.too_low else ""),
-        "tests median [5, 95 %]": f"{one.tests_median:,.0f} [{one.tests_5:,.0f}, {one.tests_95:,.0f}]",
-        "alarm": f"{one.alarm:.1%}",
-        "refused": f"{one.refused:.1%}",
+def table_row(one: Judgement) -> dict[str, str]:
+    """What a terminal shows of a judgement."""
+    judged = "not judged" if one["p_value_holm"] is None else "{p_value_holm:.2g}"
+    forms = {
+        "subject": "{subject}",
+        "result": "{result}",
+        "truth": "{truth:.3g}",
+        "bias": "" if math.isnan(one["bias"]) else "{bias:+.1%} ± {bias_std_error:.1%}",
+        "relvar true": "" if math.isnan(one["true_relvar"]) else "{true_relvar:.3g}",
+        "claimed": "" if math.isnan(one["claimed_relvar"]) else "{claimed_relvar:.3g}",
+        "coverage [95 %]": "{coverage:.3f} [{coverage_low:.3f}, {coverage_high:.3f}]",
+        "p (Holm)": judged + " TOO LOW" * one["coverage_too_low"],
+        "tests median [5, 95 %]": "{tests_median:,.0f} [{tests_5:,.0f}, {tests_95:,.0f}]",
+        "alarm": "{alarm:.1%}",
+        "refused": "{refused:.1%}",
     }
+    return {heading: form.format_map(one) for heading, form in forms.items()}

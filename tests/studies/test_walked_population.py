@@ -99,8 +99,8 @@ def test_redrawn_pools_cover_and_wrong_ones_are_found(speeds):
     assert drawn.design.shadow_runs
     assert drawn.design.n_paths == len(drawn.mass) == 200
     for name in (FREE, ratio_to("r157-cc"), preventable_by("r157-cc")):
-        assert right[name].p_value > 0.01
-        assert right[name].refused <= 0.15  # 200 paths, of which 40 are to count
+        assert right[name]["p_value"] > 0.01
+        assert right[name]["refused"] <= 0.15  # 200 paths, of which 40 are to count
     heaviest = int(np.argmax(np.bincount(drawn.design.cell_stratum, drawn.crash_mass.sum(0))))
     _, wrong = repeated(speeds, crashing, (heaviest, 3.0))
     assert wrong[FREE].p_value < 1e-6
@@ -113,6 +113,6 @@ def test_crashes_on_few_paths_are_covered_or_refused(speeds):
     weight = speeds.by_path(crashing)
     few = np.argsort(-weight)[:12]
     source, found = repeated(speeds, crashing * np.isin(speeds.path, few))
-    assert found[FREE].refused > 0.5
-    assert found[FREE].coverage >= 0.9
+    assert found[FREE]["refused"] > 0.5
+    assert found[FREE]["coverage"] >= 0.9
     assert source.crashing[0].sum() < 0.5 * weight.sum()
