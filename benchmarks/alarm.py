@@ -26,7 +26,7 @@ from harness.resolved import resolve
 from harness.runner.prepare import prepare
 from harness.vocabulary import BoolArray, FloatArray, IntArray, Method
 from harness.worlds.twin import TwinWorld
-from studies.alarm import LEVEL, Alarm, KnownRates, SurrogateReplay
+from studies.alarm import LEVEL, Alarm, KnownRates, surrogates_crash
 
 SEED = 77
 TESTS, MOST = 20_000, 50_000
@@ -64,7 +64,7 @@ def asked(method: Method, n: int) -> Asked:
     ready, pool = prepare(resolve(campaign)), campaign_pool(resolve(campaign))
     table = episodes_table(ready.loop(TwinWorld(256)).run(0, ready.states(0, n)), SEED)
     block = block_from_tables(table, None, method=method, alpha=mixture_weights(campaign))
-    return Asked(block, SurrogateReplay(resolve(campaign), pool).crashes(table), KnownRates.of(pool))
+    return Asked(block, surrogates_crash(table, resolve(campaign), pool), KnownRates.of(pool))
 
 
 def drawn(found: Asked, rows: IntArray, known: KnownRates) -> Asked:

@@ -239,6 +239,17 @@ def scv_rhw(tests: Block, procedure: Procedure, done: Callable[[], None] = lambd
     return rhw
 
 
+def over_shuffles(
+    tests: Tests, procedure: Procedure, done: Callable[[], None] = lambda: None, *, scv_of: Block | None = None
+) -> RequiredTests:
+    """RNoT of the mean of Y of tests; or, of a block of the same tests, of what `scv` claims."""
+    if scv_of is None:
+        rhw = plain_rhw(tests.weight, tests.n, procedure, done, tests.failed)
+    else:
+        rhw = scv_rhw(scv_of, procedure, done)
+    return required_tests(rhw, procedure.grid(tests.n), procedure.rhw)
+
+
 def _crash_places(seed: int, shuffle: int, n_tests: int, n_crashes: int) -> tuple[np.random.Generator, IntArray]:
     """Place of every crash in a shuffle, shape (k,), and the generator to go on with."""
     generator = np.random.default_rng([seed, shuffle])
@@ -281,11 +292,7 @@ def required_tests_of_runs(
             if reason := block.refusal(name):
                 rows.append({**row, "mean": None, "reason": reason})
                 continue
-            if name == "scv":
-                rhw = scv_rhw(block, procedure, lambda: told.advance(1))
-            else:
-                rhw = plain_rhw(tests.weight, tests.n, procedure, lambda: told.advance(1), tests.failed)
-            found = required_tests(rhw, grid, procedure.rhw)
+            found = over_shuffles(tests, procedure, lambda: told.advance(1), scv_of=block if name == "scv" else None)
             reference = reference or found
             aar, side = acceleration(reference, found)
             rows.append(

@@ -33,9 +33,8 @@ from studies.rnot import (
     RequiredTests,
     acceleration,
     first_block,
-    plain_rhw,
+    over_shuffles,
     required_tests,
-    scv_rhw,
     total_and_half_width,
 )
 from studies.work import write_table
@@ -230,11 +229,6 @@ def _required(
     tests = tests_of(made).first(first)
     context.progress.stage(f"shuffles of {made.folder.name.rpartition('-')[0]}", procedure.n_shuffles)
 
-    def done() -> None:
-        context.progress.advance(1)
-
-    if scv:
-        rhw = scv_rhw(first_block(made.folder / "run", tests.n), procedure, done)
-    else:
-        rhw = plain_rhw(tests.weight, tests.n, procedure, done, tests.failed)
-    return _Found(required_tests(rhw, procedure.grid(tests.n), procedure.rhw), tests.n, settled(made))
+    block = first_block(made.folder / "run", tests.n) if scv else None
+    found = over_shuffles(tests, procedure, lambda: context.progress.advance(1), scv_of=block)
+    return _Found(found, tests.n, settled(made))

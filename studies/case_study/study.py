@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, Self, TypeVar
 
@@ -13,7 +12,6 @@ from pydantic import Field, model_validator
 from harness.campaign.files import Override, Places, apply_overrides, read_yaml
 from harness.campaign.problems import NAME_PATTERN, broken_rule, validated
 from harness.campaign.sections import Positive, Probability, Section, Whole
-from harness.errors import CampaignError
 from harness.progress import Progress
 from studies.work import results_of, worker_processes
 
@@ -55,12 +53,6 @@ class ControlVariates(Section):
     of: StepName = Field(description="step of kind run: a step mixture with records.moments first_9 or all")
     sizes: list[Whole] = Field(min_length=1, description="numbers of tests, rising")
 
-    @model_validator(mode="after")
-    def _rises(self) -> Self:
-        if self.sizes[0] < 2 or any(a >= b for a, b in pairwise(self.sizes)):
-            raise broken_rule("sizes", f"{self.sizes}", "rising numbers from 2 on", "Put them in order.")
-        return self
-
 
 class RequiredNumbers(Section):
     """Required numbers of tests (RNoT) over shuffles of the same tests, and their ratios (AAR)."""
@@ -101,13 +93,6 @@ class Variants(Section):
         default_factory=list, description="lists of such settings, of which every combination is another variant"
     )
     reported: dict[str, Positive] = Field(default_factory=dict, description="the paper's gains, by variant")
-
-    @model_validator(mode="after")
-    def _has_any(self) -> Self:
-        if not (self.avs or self.settings or self.each_of):
-            found, expected = "no variant", "some under avs, settings or each_of"
-            raise broken_rule("avs", found, expected, "Name some.")
-        return self
 
 
 class Theorems(Section):
@@ -180,36 +165,22 @@ class Study(Section):
     picture: dict[str, Line] = Field(default_factory=dict, description="numbers of tests, by a label for each line")
 
     @model_validator(mode="after")
-    def _names_steps_before(self) -> Self:
-        before: list[str] = []
-        for name, step in self.steps.items():
-            for key, wanted in inputs_of(step):
-                if wanted not in before:
-                    expected = f"one of the steps above it: {', '.join(before) or 'there is none'}"
-                    mend = "Name one of them, or move that step up."
-                    raise broken_rule(f"steps.{name}.{key}", f"'{wanted}'", expected, mend)
-                kinds = ["run"] if (key, step.kind) in _WITH_RECORDS else ["twin_tests", "run"]
-                if (kind := self.steps[wanted].kind) not in kinds:
-                    found, expected = f"'{wanted}', a step of kind {kind}", f"one of kind {' or '.join(kinds)}"
-                    raise broken_rule(f"steps.{name}.{key}", found, expected, "Name such a step.")
-            before.append(name)
-        return self
-
-    @model_validator(mode="after")
     def _asks_steps_that_are_there(self) -> Self:
-        asked = [(f"claims.{k}.ours", claim.ours) for k, claim in enumerate(self.claims)]
-        asked += [(f"picture.{label}.ours", line.ours) for label, line in self.picture.items()]
-        asked += [(f"quick.{name}", f"{name}.") for name in self.quick]
-        for key, path in asked:
-            if (name := path.partition(".")[0]) not in self.steps:
-                expected = f"one of the steps {', '.join(self.steps)}"
+        asked = [(f"claims.{k}.ours", claim.ours, self.steps) for k, claim in enumerate(self.claims)]
+        asked += [(f"picture.{label}.ours", line.ours, self.steps) for label, line in self.picture.items()]
+        asked += [(f"quick.{name}", name, self.steps) for name in self.quick]
+        before: dict[str, Step] = {}
+        for name, step in self.steps.items():
+            asked += [(f"steps.{name}.{key}", wanted, dict(before)) for key, wanted in inputs_of(step)]
+            before[name] = step
+        for key, path, known in asked:
+            if (name := path.partition(".")[0]) not in known:
+                expected = f"one of the steps above it, {', '.join(known) or 'of which there is none'}"
                 raise broken_rule(key, f"the step '{name}'", expected, "Name one of them.")
         return self
 
 
 FILES = ("campaign", "experiment", "shells")
-_WITH_RECORDS = {("of", "control_variates"), ("scv", "required_tests")}
-"""Keys that name a step which keeps all records, by kind of step."""
 
 
 def inputs_of(step: Step) -> list[tuple[str, str]]:
@@ -240,21 +211,11 @@ def load_study(path: Path, *, quick: bool = False) -> Study:
     if quick:
         title = f"{small.title} (quick: too few tests for conclusions)"
         study = small.model_copy(update={"title": title, "conclusive": False})
-    return study.model_copy(update={"steps": {name: _placed(step, path, name) for name, step in study.steps.items()}})
-
-
-def _placed(step: Step, path: Path, name: str) -> Step:
-    """A step whose file is absolute, and there."""
-    for key in FILES:
-        if (named := getattr(step, key, None)) is None:
-            continue
-        file = (path.parent / named).resolve()
-        if not file.is_file():
-            expected = f"a file with {'an experiment' if key == 'experiment' else 'a campaign'}"
-            mend = "Correct the path; it is relative to the folder of the study."
-            raise CampaignError(f"{path}: steps.{name}.{key}", f"{named}, but there is no file {file}", expected, mend)
-        step = step.model_copy(update={key: str(file)})
-    return step
+    placed = {}
+    for name, step in study.steps.items():
+        files = {key: str((path.parent / named).resolve()) for key in FILES if (named := getattr(step, key, None))}
+        placed[name] = step.model_copy(update=files)
+    return study.model_copy(update={"steps": placed})
 
 
 class Made(NamedTuple):

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
-from itertools import chain
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -19,8 +18,6 @@ from harness.errors import CampaignError
 from harness.vocabulary import SAMPLING, EstimatorName
 from studies.chains.chain import CHAINS
 
-_Wrong = tuple[str, str, str, str]
-"""Where it is, what was found, what was expected, how to mend it."""
 AvName = Annotated[str, Field(pattern=NAME_PATTERN)]
 
 
@@ -135,54 +132,35 @@ class Experiment(Section):
 
     @model_validator(mode="after")
     def _can_be_repeated(self) -> Self:
-        for key, found, expected, mend in chain(self._wrong_subjects(), self._wrong_vehicles(), self._wrong_results()):
-            raise broken_rule(key, found, expected, mend)
-        return self
-
-    def _wrong_subjects(self) -> Iterator[_Wrong]:
-        """Subjects, and those made of others."""
-        if bool(self.avs) == bool(self.chains):
-            mend = "Name vehicles under avs for overtaking in the twin, or exact chains under chains."
-            yield "avs", "both avs and chains" if self.avs else "neither avs nor chains", "one of the two", mend
+        """Refuse what would be repeated as something else, or not at all."""
+        method = self.campaign.testing.method
+        held = [*self.holding, *(name for name, made in self.adversaries.items() if made.of in self.holding)]
         names: list[tuple[str, str, Collection[str]]] = [("chains", name, CHAINS) for name in self.chains]
         names += [(f"adversaries.{name}.of", made.of, self.avs) for name, made in self.adversaries.items()]
-        held = [*self.holding, *(name for name, made in self.adversaries.items() if made.of in self.holding)]
-        for name, pair in self.pairs.items():
-            names += [(f"pairs.{name}.a", pair.a, held), (f"pairs.{name}.b", pair.b, held)]
+        names += [(f"pairs.{name}", one, held) for name, pair in self.pairs.items() for one in (pair.a, pair.b)]
+        names += [("estimators", name, SAMPLING[method].estimators) for name in self.results]
+        names += [("campaign.world.engine", self.campaign.world.engine, ["twin"])]
+        for key in ("adversaries", "pairs", "limits"):
+            names += [("campaign.testing.method", method, ["shells"])] * bool(getattr(self, key))
+        names += [
+            (f"adversaries.{name}", name, ["a name that avs has not"]) for name in {*self.adversaries} & {*self.avs}
+        ]
+        names += [("limits", "limits for pairs", ["limits for single vehicles"])] * bool(self.limits and self.pairs)
+        for name, av in self.avs.items():
+            driven = "a built-in model" if isinstance(av.parameters, BuiltInParameters) else f"av.{av.source}"
+            if av.acts_before_cut_in and method == "shells":  # it walks the paths of its pools first
+                names.append((f"avs.{name}", driven, ["av.controller", "av.fmu"]))
+            else:
+                found = f"{driven} with before_cut_in {av.before_cut_in}"
+                names.append((f"avs.{name}", found, ["a built-in model with before_cut_in hold_speed"]))
         for key, name, known in names:
             if name not in known:
-                that_hold = " (`harness compare` takes no vehicles that act under shells)" * key.startswith("pairs")
-                yield key, f"'{name}'", f"one of {', '.join(known)}{that_hold}", "Name one of them."
-        for name in set(self.adversaries) & set(self.avs):
-            yield f"adversaries.{name}", "a name that avs has, too", "another", "Rename it."
-
-    def _wrong_vehicles(self) -> Iterator[_Wrong]:
-        """What has no twin."""
-        engine, shells = self.campaign.world.engine, self.campaign.testing.method == "shells"
-        if engine != "twin":
-            expected = "twin: thousands of replications are not affordable in SUMO, whose records the twin's equal"
-            yield "campaign.world.engine", engine, expected, "Leave the key out."
-        for name, av in self.avs.items():
-            built_in, acts = isinstance(av.parameters, BuiltInParameters), av.acts_before_cut_in
-            if not (built_in or (av.source in ("controller", "fmu") and acts)):
-                found = f"an AV that av.{av.source} drives" + ("" if acts else " from the cut-in on")
-                expected = "a built-in model (idm, fvdm, constant), or a controller with before_cut_in controller"
-                yield f"avs.{name}", found, expected, "Leave it out here, and test it in SUMO with `harness run`."
-            if acts and (built_in or not shells):
-                expected = "hold_speed, but for a controller with testing.method shells, which walks paths first"
-                yield f"avs.{name}.before_cut_in", av.before_cut_in, expected, "Leave the key out."
-
-    def _wrong_results(self) -> Iterator[_Wrong]:
-        """What the method does not allow."""
-        method = self.campaign.testing.method
-        if wrong := set(self.results).difference(judged := SAMPLING[method].estimators):
-            expected = f"for testing.method {method}: {', '.join(sorted(judged))}"
-            yield "estimators", ", ".join(sorted(wrong)), expected, "Change one of the two."
-        for key in ("adversaries", "pairs", "limits"):
-            if getattr(self, key) and method != "shells":
-                yield key, f"{key} for {method}", "method shells: it alone draws cut-ins, and decides", "Delete them."
-        if self.limits and self.pairs:
-            yield "limits", "comparisons of two vehicles", "campaigns of single vehicles", "Delete the key."
+                mend = "Change it, or leave it out; what has no twin can be tested in SUMO with `harness run`."
+                raise broken_rule(key, f"'{name}'", " or ".join(known), mend)
+        if bool(self.avs) == bool(self.chains):
+            found, mend = "both avs and chains" if self.avs else "neither avs nor chains", "Keep one of the two."
+            raise broken_rule("avs", found, "vehicles that overtake in the twin, or exact chains", mend)
+        return self
 
 
 def load_experiment(path: Path, overrides: Sequence[str] = ()) -> Experiment:

@@ -56,6 +56,8 @@ NO_ENVELOPE = -1
 CHUNK_PATHS = 2048
 _FORMAT = 1
 _COLUMNS = ("path", "mass", "bits")
+Mixed = dict[int, float]
+"""A vehicle as drivers of an enumeration: the share of episodes in which it is each."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,24 +82,14 @@ class SuperPopulation:
         """On which cut-ins a driver crashes, shape (m,)."""
         return np.asarray((self.bits >> driver) & 1 == 1)
 
+    def crash_mass(self, mixed: Mixed) -> FloatArray:
+        """Probability that a cut-in happens and a vehicle crashes on it, shape (m,)."""
+        shares = (share * self.crashes(driver) for driver, share in mixed.items())
+        return np.asarray(sum(shares, start=np.zeros(self.mass.size)) * self.mass)
+
     def by_path(self, mass: FloatArray) -> FloatArray:
         """Sum of a mass of cut-ins (m,) over each path, shape (n,)."""
         return np.asarray(np.bincount(self.path, mass, minlength=self.cut_in.size), np.float64)
-
-
-@dataclass(frozen=True)
-class Mixed:
-    """A vehicle as drivers of the enumeration, each with the share of episodes in which it is that one."""
-
-    drivers: tuple[int, ...]
-    shares: tuple[float, ...]
-
-    def crash_mass(self, population: SuperPopulation) -> FloatArray:
-        """Probability that a cut-in happens and the vehicle crashes on it, shape (m,)."""
-        crashing = np.zeros(population.mass.size)
-        for driver, share in zip(self.drivers, self.shares, strict=True):
-            crashing += share * population.crashes(driver)
-        return crashing * population.mass
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +116,7 @@ class Drivers:
         vehicles = {}
         for name, av in avs.items():
             reflexes, shares = zip(*_reactions(av), strict=True)
-            vehicles[name] = Mixed(tuple(range(len(parameters), len(parameters) + len(shares))), shares)
+            vehicles[name] = dict(enumerate(shares, start=len(parameters)))
             parameters += [cast(BuiltInParameters, av.parameters)] * len(shares)
             reactions += reflexes
         if len(parameters) > MOST_DRIVERS:
@@ -144,8 +136,8 @@ class Drivers:
         vehicles = {name: one for name, one in self.vehicles.items() if name in names}
         enclosed = self.envelope != NO_ENVELOPE
         kept = [self.envelope] * enclosed + [*self.references.values()]
-        kept += [d for one in vehicles.values() for d in one.drivers]
-        renumbered = {name: Mixed(tuple(map(kept.index, one.drivers)), one.shares) for name, one in vehicles.items()}
+        kept += [d for one in vehicles.values() for d in one]
+        renumbered = {name: {kept.index(d): share for d, share in one.items()} for name, one in vehicles.items()}
         references = {name: kept.index(driver) for name, driver in self.references.items()}
         return Drivers(self.records[kept], 0 if enclosed else NO_ENVELOPE, renumbered, references)
 
@@ -318,7 +310,7 @@ class Truths:
     def _where(self, *names: str) -> tuple[Drivers, SuperPopulation, list[FloatArray]]:
         """The most precise paths that have all of them, and their masses of crashes."""
         drivers, population = next(found for found in self._enumerated if set(names) <= set(found[0].vehicles))
-        return drivers, population, [drivers.vehicles[name].crash_mass(population) for name in names]
+        return drivers, population, [population.crash_mass(drivers.vehicles[name]) for name in names]
 
 
 CELLS = 1024

@@ -25,7 +25,6 @@ from studies.replication.populations import (
     Choose,
     Drivers,
     Known,
-    Mixed,
     SuperPopulation,
     Truths,
     chooser,
@@ -153,7 +152,7 @@ class _Shells:
         """Each vehicle, followed by the adversaries that are made of it."""
         experiment = self.experiment
         for name, av in experiment.holding.items():
-            tested, crashing = experiment.subject(name), self.drivers.vehicles[name].crash_mass(self.pools)
+            tested, crashing = experiment.subject(name), self.pools.crash_mass(self.drivers.vehicles[name])
             division = self._division(crashing, limit_mps2=acceleration_limit(av))
             yield _vehicle(experiment, tested, name, division.of_vehicle(crashing), self.truths.vehicle(name))
             for made_name, made in experiment.adversaries.items():
@@ -170,7 +169,7 @@ class _Shells:
             both = [pair.a, pair.b]
             adversaries = [experiment.adversaries.get(one) for one in both]
             base = [one if made is None else made.of for one, made in zip(both, adversaries, strict=True)]
-            of_base = [self.drivers.vehicles[one].crash_mass(self.pools) for one in base]
+            of_base = [self.pools.crash_mass(self.drivers.vehicles[one]) for one in base]
             limit = max(acceleration_limit(experiment.avs[one]) for one in base)
             division = self._division(*of_base, limit_mps2=limit)
             a, b = (
@@ -198,11 +197,11 @@ def _acting(experiment: Experiment, name: str, choose: Choose, executor: Executo
     """A vehicle that acts before the cut-in, on paths of its own."""
     campaign, size = experiment.subject(name), experiment.super_population
     library = load_library(campaign.pool.library)
-    vehicle = Mixed((library.n_drivers,), (1.0,))
+    vehicle = {library.n_drivers: 1.0}
     truth = walk_paths(campaign, choose, experiment.seed + 1, size.reference_paths, executor, progress)
     pools = walk_paths(campaign, choose, experiment.seed, size.paths, executor, progress)
-    known = of_vehicle(truth, vehicle.crash_mass(truth), reference_drivers(library))
-    crashing, limit = vehicle.crash_mass(pools), acceleration_limit(campaign.av)
+    known = of_vehicle(truth, truth.crash_mass(vehicle), reference_drivers(library))
+    crashing, limit = pools.crash_mass(vehicle), acceleration_limit(campaign.av)
     paths = campaign.pool.shadow_paths
     division = Division(library, pools, [crashing], paths, limit_mps2=limit, shadow_runs=True)
     return _vehicle(experiment, campaign, name, division.of_vehicle(crashing), known)

@@ -1,11 +1,9 @@
 """The benchmark compares like with like, and says so when it does not."""
 
-import os
-
 import pytest
 
-from benchmarks.contender_process import Measurement, descendants_cpu_s
-from benchmarks.contenders import CONTENDERS, Recorded, Workers, campaign
+from benchmarks.contender_process import Measurement
+from benchmarks.contenders import CONTENDERS, Recorded, campaign
 from benchmarks.one_at_a_time import in_libsumo
 from benchmarks.speed import RATES, RATIOS, Ratio, ratio, require_equal_rows
 from harness.worlds.twin import TwinWorld
@@ -29,15 +27,6 @@ def test_one_episode_at_a_time_runs_the_episodes_of_the_twin():
     twin.close()
 
 
-def test_workers_are_those_of_a_run(monkeypatch):
-    monkeypatch.setattr("benchmarks.contenders.SHARD", 20)
-    workers = Workers(campaign("nde", **{"world.engine": "twin", "records.moments": "none"}), 1)
-    try:
-        assert workers.run(0, 40).episodes == 40
-    finally:
-        workers.close()
-
-
 def test_a_ratio_is_the_median_of_ratios_within_rounds():
     found = {"a": [measured(100, 1.0), measured(100, 2.0), measured(100, 50.0)], "b": [measured(100, 2.0)] * 3}
     assert ratio(found, Ratio("a", "b", "episodes_per_cpu_s")) == pytest.approx(1.0)
@@ -54,22 +43,5 @@ def test_contenders_with_other_rows_stop_the_benchmark():
         require_equal_rows([Process("harness", b"1"), Process("traci", b"2")])
 
 
-def test_the_recorded_twin_takes_the_cells_of_the_twin():
-    recorded = CONTENDERS["twin recorded"][0]()
-    try:
-        assert recorded.run(0, 20).episodes == 20
-    finally:
-        recorded.close()
-
-
 def test_what_is_asked_for_names_contenders_that_exist():
     assert {name for wanted in RATIOS for name in (wanted.of, wanted.to)} | set(RATES) <= set(CONTENDERS)
-
-
-def test_cpu_time_of_a_process_without_children_is_zero():
-    child = os.spawnlp(os.P_NOWAIT, "sleep", "sleep", "5")
-    try:
-        assert descendants_cpu_s(child) == 0.0
-    finally:
-        os.kill(child, 15)
-        os.waitpid(child, 0)

@@ -180,11 +180,9 @@ def test_variants_are_tested_on_the_same_traffic(made):
 
 def test_the_theorems_hold_on_exact_chains(made):
     figures = made["theorems"].result["figures"]
-    assert figures["largest_bias"]["value"] < 1e-10
-    assert figures["variance_over_bound"]["value"] <= 1.0
-    assert figures["best_over_plain"]["value"] <= 1.0 + 1e-9
-    assert figures["largest_error_known"]["value"] < 1e-12
-    assert figures["claimed_error_estimated"]["value"] < 1e-12
+    most = {"largest_bias": 1e-10, "variance_over_bound": 1.0, "best_over_plain": 1.0 + 1e-9,
+            "largest_error_known": 1e-12, "claimed_error_estimated": 1e-12}  # fmt: skip
+    assert all(figures[name]["value"] <= limit for name, limit in most.items())
     assert figures["scatter_estimated"]["value"] > 0.01
 
 
@@ -195,16 +193,10 @@ def test_the_theorems_hold_on_exact_chains(made):
         (("tests: 6_000", "test: 6_000"), "'test'"),
         (("kind: theorems", "kind: theorem"), "does not match any of the expected tags"),
         (("reference: nade", "reference: nobody"), "steps.curves.reference"),
-        (("of: nade, sizes", "of: nde, sizes"), "steps.adjusted.of"),
-        (("sizes: [700, 1_200", "sizes: [1_200, 700"), "steps.adjusted.sizes"),
         (("{tests: 2_000}", "{tests: many}"), "quick: steps.nde.tests"),
         (("quick:\n  nde", "quick:\n  nothing"), "quick.nothing"),
         (("ours: theorems.var", "ours: theory.var"), "claims"),
-        (("ours: required.nde", "ours: nobody.nde"), "picture.NDE"),
-        (("overtaking_nde.yaml", "overtaking_nowhere.yaml"), "steps.nde.campaign"),
-        (("lane_change_level=1e4]", "lane_change_levels=1e4]"), "lane_change_levels"),
-        (("avs: [alpha-0.5]", "avs: [alpha-0.6]"), "alpha-0.6"),
-        (("version: 1", "version: 2"), "version"),
+        (("overtaking_nde.yaml", "overtaking_nowhere.yaml"), "overtaking_nowhere.yaml"),
     ],
 )
 def test_a_wrong_file_is_refused_before_anything_is_made(tmp_path, capsys, wrong, said):

@@ -12,7 +12,8 @@ from studies.replication.experiment import load_experiment
 
 FOLDER = Path(__file__).parents[2] / "scenarios" / "validate"
 HEAD = "format: validation-experiment\nversion: 1\nname: x\n"
-SHELLS = "campaign: {testing: {method: shells}}\n"
+SHELLS, FORCED = (f"campaign: {{testing: {{method: {method}}}}}\n" for method in ("shells", "forced"))
+ACTS = "avs: {c: {controller: 'a.b:C', before_cut_in: controller}}\n"
 
 
 def written(tmp_path, text: str) -> Path:
@@ -31,22 +32,15 @@ def test_shipped_experiments_are_right(file):
 @pytest.mark.parametrize(
     ("text", "where", "found"),
     [
-        ("avs: {acc: {sumo: {carFollowModel: ACC}}}\n" + SHELLS, "avs.acc", "an AV that av.sumo drives"),
-        ("avs: {mine: {controller: 'a.b:C'}}\n" + SHELLS, "avs.mine", "av.controller drives from the cut-in on"),
-        (
-            "avs: {mine: {controller: 'a.b:C', before_cut_in: controller}}\ncampaign: {testing: {method: forced}}\n",
-            "avs.mine.before_cut_in",
-            "controller",
-        ),
-        ("avs: {a: {}}\npairs: {p: {a: a, b: nobody}}\n" + SHELLS, "pairs.p.b", "nobody"),
-        (
-            "avs: {a: {}, c: {controller: 'a.b:C', before_cut_in: controller}}\npairs: {p: {a: a, b: c}}\n" + SHELLS,
-            "pairs.p.b",
-            "'c'",
-        ),
-        ("avs: {a: {}}\npairs: {p: {a: a, b: a}}\ncampaign: {testing: {method: nde}}\n", "pairs", "nde"),
-        ("avs: {a: {}}\nadversaries: {a: {of: a}}\n" + SHELLS, "adversaries.a", "a name that avs has"),
-        ("avs: {a: {before_cut_in: controller}}\n" + SHELLS, "avs.a.before_cut_in", "controller"),
+        ("avs: {acc: {sumo: {carFollowModel: ACC}}}\n" + SHELLS, "avs.acc", "av.sumo"),
+        ("avs: {mine: {controller: 'a.b:C'}}\n" + SHELLS, "avs.mine", "av.controller with before_cut_in hold_speed"),
+        (ACTS + FORCED, "avs.c", "controller"),
+        ("avs: {a: {}}\npairs: {p: {a: a, b: nobody}}\n" + SHELLS, "pairs.p", "nobody"),
+        (ACTS + "pairs: {p: {a: c, b: c}}\n" + SHELLS, "pairs.p", "'c'"),
+        ("avs: {a: {}}\npairs: {p: {a: a, b: a}}\n" + FORCED, "campaign.testing.method", "forced"),
+        ("avs: {a: {}}\npairs: {p: {a: a, b: a}}\nlimits: [1]\n" + SHELLS, "limits", "pairs"),
+        ("avs: {a: {}}\nadversaries: {a: {of: a}}\n" + SHELLS, "adversaries.a", "a"),
+        ("avs: {a: {before_cut_in: controller}}\n" + SHELLS, "avs.a", "a built-in model"),
         (SHELLS, "avs", "neither"),
         ("avs: {a: {}}\nchains: [rare]\n" + SHELLS, "avs", "both"),
         ("chains: [unheard-of]\n" + SHELLS, "chains", "unheard-of"),

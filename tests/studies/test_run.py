@@ -18,7 +18,7 @@ import pytest
 from studies.__main__ import main
 from studies.replication import run
 from studies.replication.experiment import load_experiment
-from studies.replication.judgement import Row, Subject, judge
+from studies.replication.judgement import Row, Subject, corrected, judge
 from studies.work import worker_processes
 
 from .here import Here
@@ -76,7 +76,7 @@ def test_what_never_crashes_has_results_too(tmp_path):
     (tmp_path / "x.yaml").write_text(CHAINS)
     never, rows = Subject.exact("never", 0.0), [Row("x", k, 9, 0, 0.0, 0.0, 0.0, 0.1, False) for k in range(5)]
     experiment = load_experiment(tmp_path / "x.yaml")
-    run.write_results(tmp_path, experiment, [judge(never, "x", rows, 0.9)], {never: rows})
+    run.write_results(tmp_path, experiment, corrected([judge(never, "x", rows, 0.9)]), {never: rows})
     content = json.loads((tmp_path / "results.json").read_text())
     assert content["largest_relative_error_of_truth"] is None
     assert [(one["bias"], one["coverage"]) for one in content["judgements"]] == [(None, 1.0)]

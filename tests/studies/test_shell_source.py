@@ -52,7 +52,7 @@ def population(drivers):
 
 def shells_of(drivers, population, name="own", paths=256):
     """Cut-ins without the equals of a vehicle, and its pools."""
-    crashing = drivers.vehicles[name].crash_mass(population)
+    crashing = population.crash_mass(drivers.vehicles[name])
     division = Division(LIBRARY, population, [crashing], paths, limit_mps2=acceleration_limit(AVS[name]))
     return division, division.of_vehicle(crashing)
 
@@ -66,19 +66,19 @@ def test_imprecise_truths_are_enumerated_again_and_agree():
 
 
 def test_equals_are_found_and_left_out(drivers, population):
-    vehicle = drivers.vehicles["equal"].crash_mass(population)
+    vehicle = population.crash_mass(drivers.vehicles["equal"])
     assert equals(LIBRARY, population, vehicle) == {"brakes-3"}
     _, source = shells_of(drivers, population, "equal")
     assert source.left_out == ("brakes-3",)
     assert "brakes-3" not in source.template.names
-    assert equals(LIBRARY, population, drivers.vehicles["own"].crash_mass(population)) == set()
+    assert equals(LIBRARY, population, population.crash_mass(drivers.vehicles["own"])) == set()
     assert equals(LIBRARY, population, np.zeros_like(vehicle)) == set()  # one that never crashes is nobody's equal
 
 
 def test_drawn_pools_scatter_around_the_population(drivers, population):
     _, source = shells_of(drivers, population)
     assert source.mass.sum() == pytest.approx(population.cut_in.sum(), rel=1e-12)
-    assert source.crashing[0].sum() == pytest.approx(drivers.vehicles["own"].crash_mass(population).sum(), rel=1e-12)
+    assert source.crashing[0].sum() == pytest.approx(population.crash_mass(drivers.vehicles["own"]).sum(), rel=1e-12)
     drawn = [source.draw(np.random.default_rng([1, k]))[0] for k in range(300)]
     rates = np.array([each.design.p @ each.share for each in drawn])
     exact = source.crashing[0].sum() / population.cut_in.size
@@ -113,7 +113,7 @@ def test_real_pools_have_the_shells_of_drawn_ones(drivers):
 def adversary_of(drivers, population, **made):
     division, source = shells_of(drivers, population)
     adversary = Adversary(of="own", **made)
-    crashing = drivers.vehicles["own"].crash_mass(population)
+    crashing = population.crash_mass(drivers.vehicles["own"])
     return source, division.of_vehicle(division.as_adversary(adversary, crashing), adversary)
 
 
@@ -143,7 +143,7 @@ def test_cells_divide_strata_by_what_references_do():
     library = load_library("ladder-2")
     drivers = Drivers.of(library, {"own": AVS["own"]})
     population = enumerated(drivers)
-    crashing = drivers.vehicles["own"].crash_mass(population)
+    crashing = population.crash_mass(drivers.vehicles["own"])
     source = Division(library, population, [crashing], 512, limit_mps2=2.0).of_vehicle(crashing)
     (drawn,) = source.draw(np.random.default_rng(4))
     design = drawn.design
@@ -164,7 +164,7 @@ def test_cells_divide_strata_by_what_references_do():
 
 
 def test_pairs_are_divided_into_both_only_a_and_only_b(drivers, population):
-    a, b = (drivers.vehicles[name].crash_mass(population) for name in ("own", "equal"))
+    a, b = (population.crash_mass(drivers.vehicles[name]) for name in ("own", "equal"))
     division = Division(LIBRARY, population, [a, b], 256, limit_mps2=2.0)
     both, only_a, only_b = division.of_pair(a, b).crashing
     np.testing.assert_allclose(both + only_a, division.by_cell(a), atol=1e-22)

@@ -24,13 +24,10 @@ def world():
     return small_world(1e4)
 
 
-def test_backward_induction_is_the_sum_over_all_paths(world):
-    """Forwards: the probability to reach each situation, times that of a cut-in there which ends in a crash."""
-    reach, total = world.levels[0].share, 0.0
-    for t, level in enumerate(world.levels):
-        if t:
-            reach = (reach * (1.0 - world.levels[t - 1].p))[level.parent] * level.share
-        total += float(reach @ (level.p * level.crash))
+def test_backward_induction_is_the_sum_over_all_courses(world):
+    """Forwards: the probability to reach each step of a course, times that of a cut-in there which ends in a crash."""
+    stayed = np.cumprod(np.concatenate([np.ones_like(world.p[:1]), 1.0 - world.p[:-1]]), axis=0)
+    total = np.sum(world.first[:, :, None] * world.second * stayed * world.p * world.crash)
     assert total == pytest.approx(world.crash_rate, rel=1e-12)
 
 

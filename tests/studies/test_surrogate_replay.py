@@ -133,16 +133,6 @@ def test_the_step_mixture_is_shown_and_not_judged():
         assert 0.5 < entry["mean"] / entry["mu"] < 2.0
 
 
-@pytest.mark.parametrize("factor", [0.5, 2.0])
-@pytest.mark.parametrize("name", ["brakes-2-late-1s", "never-brakes", "full-throttle-2"])
-def test_one_corrupted_rate_raises_the_alarm(forced, name, factor):
-    one, table, pool = forced
-    mu = pool.mu.copy()
-    mu[pool.names.index(name)] *= factor
-    for rates, raised in ((pool.mu, False), (mu, True)):
-        assert alarmed(one, table, replace(pool, mu=rates))["raised"] == raised
-
-
 def test_the_pool_knows_how_likely_a_cut_in_is_where_surrogates_crash(forced):
     """Forced cut-ins weigh exactly that, so that their mean squares are known; four standard errors."""
     one, table, pool = forced

@@ -103,8 +103,8 @@ def test_redrawn_pools_cover_and_wrong_ones_are_found(speeds):
         assert right[name]["refused"] <= 0.15  # 200 paths, of which 40 are to count
     heaviest = int(np.argmax(np.bincount(drawn.design.cell_stratum, drawn.crash_mass.sum(0))))
     _, wrong = repeated(speeds, crashing, (heaviest, 3.0))
-    assert wrong[FREE].p_value < 1e-6
-    assert wrong[ratio_to("r157-cc")].p_value < 1e-6
+    assert wrong[FREE]["p_value"] < 1e-6
+    assert wrong[ratio_to("r157-cc")]["p_value"] < 1e-6
 
 
 def test_crashes_on_few_paths_are_covered_or_refused(speeds):
