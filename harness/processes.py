@@ -1,7 +1,8 @@
 """Work beside the main thread: worker processes, other programs, threads, and how all of them end.
 
 A worker leads a session of its own, so that a terminal's signals do not reach it and everything that it starts ends
-with it. It ends when its parent does, however that ends.
+with it. It ends when its parent does, however that ends. What it has started in further sessions falls to the process
+that has started the worker, a `ForkServer`, which ends it with itself.
 
 Ctrl-C, SIGTERM and SIGHUP end a command in the same way: what is finished is kept. What the shell has set to be ignored
 stays ignored: SIGHUP under ``nohup``, SIGINT in the background of a script.
@@ -9,6 +10,7 @@ stays ignored: SIGHUP under ``nohup``, SIGINT in the background of a script.
 
 from __future__ import annotations
 
+import ctypes
 import gc
 import math
 import mmap
@@ -42,7 +44,12 @@ if TYPE_CHECKING:
 FROM_USER = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 LOOK_S = 0.5
 """Time between two looks at a process whose pipe is silent: a copy that a controller made of it keeps the pipe open."""
+CLOSED_PIPE_EXIT_CODE = 76
+"""Exit code of a process whose controller has closed its pipe."""
 _POLL_S, _FORK_ATTEMPTS = 0.005, 3
+_DYING_S, _ENDING_S = 1.0, 5.0
+"""How long a process may take to end once its pipe has, and a server to end all that it is left with."""
+_PR_SET_CHILD_SUBREAPER = 36
 _LEFT_TO_US = (signal.SIG_DFL, signal.default_int_handler)
 
 _Item = TypeVar("_Item")
@@ -149,6 +156,14 @@ class Child:
         self.connection.close()
         return exit_code
 
+    def died(self) -> int:
+        """Exit code of one that has ended its pipe; if it lives on without it, it is ended."""
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(_DYING_S)
+            return self.kill()
+        self.kill()
+        return CLOSED_PIPE_EXIT_CODE
+
     def wait(self, seconds: float) -> None:
         """Give it a little time to end by itself; then end it."""
         with suppress(subprocess.TimeoutExpired):
@@ -183,7 +198,8 @@ class ForkServer:
     """A process that imports modules once and then copies itself: a child begins at once, and shares their memory.
 
     It has one thread and runs nobody's code, so that a copy lacks nothing. Its children end with it, as it does with
-    its parent. It starts when it is first needed, and again if it was killed.
+    its parent, and so does what they have started in sessions of their own (but for systems other than Linux). It
+    starts when it is first needed, and again if it was killed.
     """
 
     def __init__(self, *modules: str) -> None:
@@ -211,9 +227,10 @@ class ForkServer:
         return Forked(child, answer)
 
     def close(self) -> None:
-        """End it, once its children have ended."""
+        """Let it end all that its children have left, and itself."""
         if self._child is not None:
-            self._child.kill()
+            self._child.connection.close()
+            self._child.wait(2.0 * _ENDING_S)
             self._child = None
 
 
@@ -250,16 +267,22 @@ def _serve_forks(connection: Connection, modules: Sequence[str]) -> None:
         with suppress(ImportError):  # who needs it will say so
             import_module(name)
     gc.freeze()  # what is never looked through is never copied
-    server = os.getpid()
+    if sys.platform == "linux":  # what children leave behind becomes a child of this process
+        ctypes.CDLL(None).prctl(_PR_SET_CHILD_SUBREAPER, 1)
+    server, parent = os.getpid(), os.getppid()
+    ended: dict[int, int] = {}
     while True:
         try:
+            while not connection.poll(LOOK_S) and os.getppid() == parent:
+                _reap(ended)
             pid = connection.recv()
             if pid is not None:
-                ended, status = os.waitpid(pid, os.WNOHANG)
-                connection.send(os.waitstatus_to_exitcode(status) if ended else None)
+                _reap(ended)
+                connection.send(ended.pop(pid, None))
                 continue
             descriptor = recv_handle(connection)
         except (EOFError, OSError):  # the parent is gone
+            _end_children()
             return
         answer: int | OSError
         try:
@@ -271,7 +294,30 @@ def _serve_forks(connection: Connection, modules: Sequence[str]) -> None:
             _begin(descriptor, server)
             return
         os.close(descriptor)
+        if isinstance(answer, int):
+            ended.pop(answer, None)  # of one that had this number before
         connection.send(answer)
+
+
+def _reap(ended: dict[int, int]) -> None:
+    """Note the exit codes of children that have ended."""
+    with suppress(ChildProcessError):  # there is none
+        while (found := os.waitpid(-1, os.WNOHANG))[0]:
+            ended[found[0]] = os.waitstatus_to_exitcode(found[1])
+
+
+def _end_children() -> None:
+    """End all children; what these leave to this process ends in the next turn."""
+    until = time.monotonic() + _ENDING_S
+    with suppress(ChildProcessError):
+        while time.monotonic() < until:
+            for task in Path("/proc/self/task").glob("*/children"):
+                for pid in task.read_text(encoding="ascii").split():
+                    with suppress(OSError):
+                        os.kill(int(pid), signal.SIGKILL)
+            while os.waitpid(-1, os.WNOHANG)[0]:
+                pass
+            time.sleep(_POLL_S)
 
 
 def _copied() -> int:
@@ -325,6 +371,7 @@ def _begin(descriptor: int, parent: int) -> None:
     with suppress(OSError):  # stderr may be closed
         os.dup2(2, 1)
     connection = Connection(descriptor)
+    _pipe[:] = [descriptor]
     try:
         work = connection.recv_bytes()
     except (EOFError, OSError):  # the parent has been killed before it could say what to do
@@ -339,6 +386,7 @@ def _end_with(parent: int) -> None:
     """End this process and all that it has started once its parent has been killed: a shard may take hours more."""
     while os.getppid() == parent:
         time.sleep(LOOK_S)
+    _end_children()
     os.killpg(0, signal.SIGKILL)
 
 
@@ -361,6 +409,8 @@ START, MAKING = -1, -2
 CONSTRUCTOR, OF_EPISODE, START_BATCH, STEP_BATCH, CLOSE = range(1, 6)
 _FORMAT = struct.Struct("=qqq")
 _WORDS = {CONSTRUCTOR: "its constructor", START_BATCH: "start_batch", STEP_BATCH: "step_batch", CLOSE: "close"}
+_pipe: list[int] = []
+"""Descriptor by which this process is connected with its parent, if it is."""
 _forks: list[None] = []
 """One entry for each `os.fork` of this process; what starts programs (subprocess) does not pass here."""
 os.register_at_fork(after_in_parent=lambda: _forks.append(None))
@@ -407,9 +457,17 @@ class BlackBox:
         self._forks = len(_forks)
 
     def leave(self) -> None:
-        """The call has come back; a process that dies does not come here, and one that was copied must not go on."""
+        """The call has come back; a process that dies does not come here.
+
+        One that was copied must not go on, and one whose pipe was closed cannot.
+        """
         if os.getpid() != self._pid:
             os._exit(0)
+        try:
+            for descriptor in _pipe:
+                os.get_inheritable(descriptor)
+        except OSError:
+            os._exit(CLOSED_PIPE_EXIT_CODE)
         self._note[0] = 0
 
     def misdeed(self) -> str | None:

@@ -6,7 +6,7 @@ import hashlib
 import importlib
 import sys
 from collections.abc import Callable, Mapping
-from contextlib import suppress
+from contextlib import closing, suppress
 from copy import deepcopy
 from importlib.metadata import entry_points
 from inspect import signature
@@ -27,7 +27,7 @@ from harness.controllers.hosts import (
     death_cause,
 )
 from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, HarnessError
-from harness.processes import CONSTRUCTOR, Child, first_to_answer, fit_to_travel, last_call
+from harness.processes import CONSTRUCTOR, Child, ForkServer, first_to_answer, fit_to_travel, last_call
 
 GROUP = "harness.controllers"
 _Answer = TypeVar("_Answer")
@@ -169,22 +169,20 @@ def run_apart(av: AutomatedVehicle, work: Callable[..., _Answer], *arguments: An
 
     Raises whatever that raises, or an `AvEndedProcessError` if the controller ended the process, naming the call.
     """
-    with TemporaryDirectory(prefix="harness-apart-") as folder:
+    with TemporaryDirectory(prefix="harness-apart-") as folder, closing(ForkServer()) as server:
         black_box = Path(folder) / "black-box"
-        child = Child(_work_and_tell, work, arguments, black_box)
+        child = Child(_work_and_tell, work, arguments, black_box, server=server)
         try:
-            answer = first_to_answer([child]).receive()
+            if (answer := first_to_answer([child]).receive()) is None:
+                cause, call = death_cause(child.died(), av.limits, last_call(black_box)), last_call(black_box)
+                raise AvEndedProcessError(
+                    f"av.{av.source}",
+                    f"{cause}, {'while it was found' if call is None else f'in {call}'}",
+                    "a controller that returns or raises",
+                    "Look for os._exit, a crash of compiled code, or a shortage of memory; then check again.",
+                )
         finally:
-            exit_code = child.kill()
-        call = last_call(black_box)
-    if answer is None:
-        when = "while it was found" if call is None else f"in {call}"
-        raise AvEndedProcessError(
-            f"av.{av.source}",
-            f"{death_cause(exit_code, av.limits, call)}, {when}",
-            "a controller that returns or raises",
-            "Look for os._exit, a crash of compiled code, or a shortage of memory; then check again.",
-        )
+            child.kill()
     (result,) = answer
     if isinstance(result, Exception):
         raise result

@@ -29,7 +29,17 @@ from harness.controllers.protocol import (
     Observation,
     VehicleController,
 )
-from harness.processes import CLOSE, MAKING, OF_EPISODE, START, START_BATCH, STEP_BATCH, BlackBox, Call
+from harness.processes import (
+    CLOSE,
+    CLOSED_PIPE_EXIT_CODE,
+    MAKING,
+    OF_EPISODE,
+    START,
+    START_BATCH,
+    STEP_BATCH,
+    BlackBox,
+    Call,
+)
 from harness.random_stream import AV_DRAWS
 from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import FloatArray, IntArray, read_only
@@ -69,6 +79,8 @@ def death_cause(exit_code: int | None, limits: Limits, call: Call | None) -> str
     if exit_code == HUNG_EXIT_CODE:
         late = TimeLimit.of(limits, makes=call is not None and call.makes)
         return f"{late}, and the call could not be interrupted"
+    if exit_code == CLOSED_PIPE_EXIT_CODE:
+        return "the controller closed file descriptors that are not its own (os.close, os.closerange)"
     return f"the controller ended the worker process (exit code {exit_code})"
 
 

@@ -25,6 +25,7 @@ from harness.errors import HarnessError, TooManyFailedError
 from harness.estimators.block import Block
 from harness.pool.replay import Retracing
 from harness.processes import (
+    CLOSED_PIPE_EXIT_CODE,
     OF_EPISODE,
     Call,
     Child,
@@ -219,7 +220,7 @@ class WorkerProcess(Child):
         """See `Worker`."""
         answer = self.receive()
         if answer is None:
-            return WorkerDeath(self.kill(), last_call(self._black_box))
+            return WorkerDeath(self.died(), last_call(self._black_box))
         if isinstance(answer, BaseException):
             raise answer
         return answer  # type: ignore[no-any-return]
@@ -330,13 +331,15 @@ class Workers:
         job.suspected = call
         cause = death_cause(death.exit_code, self._campaign.av.limits, call)
         own = call is not None and not (death.exit_code in SENT_FROM_OUTSIDE and first_time)  # the controller's own
+        own |= death.exit_code == CLOSED_PIPE_EXIT_CODE
         if own and call is not None and call.kind == OF_EPISODE:
             job.fatal_episodes[call.episode] = Death(call.step, cause)
             self._require_few_deaths(job)
             return
         job.n_deaths += 1
         if job.n_deaths == ATTEMPTS:
-            raise _lost(job.request, death.exit_code, f"{cause}, in {call}" if own else None)
+            words = cause if call is None else f"{cause}, in {call}"
+            raise _lost(job.request, death.exit_code, words if own else None)
 
     def _require_few_deaths(self, job: _Job) -> None:
         """Each death costs a new process: a controller that dies too often is not run to the end of its shard."""
@@ -359,7 +362,7 @@ def _lost(request: Request, exit_code: int | None, blamed: str | None) -> Worker
     mend = "Look for a memory limit (fewer --workers), then continue with --resume."
     if blamed is not None:
         how = f"because {blamed}"
-        mend = "Mend the controller: look for os._exit, or a crash of compiled code (`harness av-check`)."
+        mend = "Mend the controller: look for os._exit or a crash of compiled code (`harness av-check`)."
     return WorkerLostError(
         f"shard {request.index} (from episode {request.first_episode})",
         f"{ATTEMPTS} worker processes that died, the last {how}",

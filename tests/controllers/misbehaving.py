@@ -3,6 +3,7 @@
 import os
 import random
 import signal
+import subprocess
 import sys
 import time
 from contextlib import suppress
@@ -117,6 +118,10 @@ class Misbehaving(IDM):
             time.sleep(3600)
         os._exit(7)
 
+    def closes_descriptors(self):
+        os.closerange(3, 200)
+        return 0.0
+
     def ends_the_process(self):
         os._exit(7)
 
@@ -157,26 +162,46 @@ class HangsWhenMade(IDM):
             time.sleep(3600)
 
 
+class StartsPrograms(IDM):
+    """In sessions of their own; one is left to whoever adopts it."""
+
+    def __init__(self, note):
+        super().__init__()
+        daemon = f"sleep 600 & echo $! >> {note}"
+        apart = [["sleep", "600"], ["sh", "-c", daemon]]
+        started = [subprocess.Popen(words, start_new_session=True) for words in apart]
+        with Path(note).open("a") as file:
+            file.write(f"{started[0].pid}\n")
+
+
+class EndsTheProcess(IDM):
+    """In every call of one name."""
+
+    end = staticmethod(lambda: os._exit(7))
+
+    def __init__(self, where):
+        super().__init__()
+        for name in ("start", "step", "start_batch", "step_batch", "close"):
+            if name == where:
+                setattr(self, name, lambda *_: self.end())
+            elif name.endswith("batch") and where.endswith("batch"):
+                setattr(self, name, lambda *_: None)
+        if where == "constructor":
+            self.end()
+
+
+class ClosesDescriptors(EndsTheProcess):
+    """In every call of one name."""
+
+    end = staticmethod(lambda: os.closerange(3, 200))
+
+
 def idm_of_a_function() -> IDM:
     return IDM()
 
 
 def says_nothing():
     Path("called").touch()
-
-
-class EndsTheProcess(IDM):
-    """In every call of one name."""
-
-    def __init__(self, where):
-        super().__init__()
-        for name in ("start", "step", "start_batch", "step_batch", "close"):
-            if name == where:
-                setattr(self, name, lambda *_: os._exit(7))
-            elif name.endswith("batch") and where.endswith("batch"):
-                setattr(self, name, lambda *_: None)
-        if where == "constructor":
-            os._exit(7)
 
 
 class Prints(IDM):

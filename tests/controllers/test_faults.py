@@ -92,6 +92,7 @@ OF_THE_PROCESS = {
     "ends_the_process": "step: the controller ended the worker process (exit code 7)",
     "ends_the_process_in_start": "start: the controller ended the worker process (exit code 7)",
     "copies_and_ends_the_process": "step: the controller ended the worker process (exit code 7)",
+    "closes_descriptors": "step: the controller closed file descriptors that are not its own (os.close, os.closerange)",
     "crashes": "step: the controller ended the worker process (exit code -11)",
     "is_killed": "step: the controller ended the worker process (exit code -9)",
     "hangs_for_good": f"step: {LATE}, and the call could not be interrupted",
@@ -212,13 +213,22 @@ def test_a_batch_controllers_fault_is_laid_at_one_cell_or_else_fails_all_that_we
 
 
 @pytest.mark.parametrize("where", ["constructor", "step", "step_batch"])
-def test_a_controller_that_always_ends_its_process_is_named_after_a_few_workers(where, tmp_path, capsys, monkeypatch):
+@pytest.mark.parametrize(
+    ("how", "words"),
+    [
+        ("EndsTheProcess", "the controller ended the worker process (exit code 7)"),
+        ("ClosesDescriptors", "the controller closed file descriptors that are not its own"),
+    ],
+)
+def test_a_controller_that_always_ends_its_process_is_named_after_a_few_workers(
+    how, words, where, tmp_path, capsys, monkeypatch
+):
     started = []
     start = LocalWorkers.new_worker
     monkeypatch.setattr(LocalWorkers, "new_worker", lambda self: (started.append(self), start(self))[1])
-    code = _run(tmp_path, _other("EndsTheProcess", f"{{where: {where}}}"), "run.max_failed_share=0.01")
+    code = _run(tmp_path, _other(how, f"{{where: {where}}}"), "run.max_failed_share=0.01")
     err = capsys.readouterr().err
-    assert "the controller ended the worker process (exit code 7)" in err
+    assert words in err
     assert "memory limit" not in err
     if where == "constructor":
         assert (code, "in its constructor" in err, len(started)) == (EXIT_BAD_INPUT, True, 0)
@@ -227,6 +237,17 @@ def test_a_controller_that_always_ends_its_process_is_named_after_a_few_workers(
         assert code == EXIT_TOO_MANY_FAILED
         assert 2 <= len(started) <= 7
         assert f"in {where}" in err or "run.max_failed_share" in err
+
+
+@pytest.mark.parametrize("command", [["run"], ["check"], ["av-check", "--episodes", "4"]], ids=lambda words: words[0])
+def test_what_a_controller_starts_does_not_outlive_the_command(command, tmp_path):
+    (tmp_path / "c.yaml").write_text(SMALL)
+    out = ["--out", str(tmp_path / "run"), "--workers", "2"] if command == ["run"] else []
+    av = _other("StartsPrograms", f"{{note: {tmp_path}/started}}")
+    assert main([*command, str(tmp_path / "c.yaml"), *out, "--set", f"av={av}"]) == EXIT_DONE
+    started = (tmp_path / "started").read_text().split()
+    assert len(started) >= (160 if command == ["run"] else 2)
+    assert not [pid for pid in started if Path(f"/proc/{pid}").exists()]
 
 
 def test_a_process_that_ends_in_close_has_done_its_work(tmp_path, undisturbed):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -32,8 +31,8 @@ def waiting(connection) -> None:
 
 
 def abandoned(connection, note) -> None:
-    """Starts a program, writes down who they are, and is busy."""
-    helper = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"])
-    Path(note).write_text(f"{os.getpid()} {helper.pid}", encoding="utf-8")
+    """Starts a program, another in a session of its own, and writes down who they are; then it is busy."""
+    helpers = [subprocess.Popen(["/bin/sleep", "600"], start_new_session=apart).pid for apart in (False, True)]
+    Path(note).write_text(" ".join(map(str, (os.getpid(), *helpers))), encoding="utf-8")
     Path(note).rename(note + ".done")
     time.sleep(600)

@@ -176,10 +176,10 @@ def test_what_is_ignored_stays_ignored_and_ctrl_c_to_all_processes_ends_a_run_in
 
 ABANDONED = """
 import os, signal, sys, time
-from harness.processes import Child
+from harness.processes import Child, ForkServer
 from tests.runner.bad_workers import abandoned
 
-Child(abandoned, sys.argv[1])
+child = Child(abandoned, sys.argv[1], server=ForkServer())
 while not os.path.exists(sys.argv[1] + ".done"):
     time.sleep(0.01)
 os.kill(os.getpid(), signal.SIGKILL)
