@@ -6,6 +6,7 @@ Anything that is *not* a `HarnessError` is a defect of the harness itself and is
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -22,8 +23,21 @@ LONGEST_ADVICE = 1200
 """Advice may hold several commands."""
 
 
+_CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
+
+
+def printable(text: str) -> str:
+    r"""The text with control characters as ``\u001b``: what a user named may move a cursor, or end an XML document.
+
+    So are marks that turn the direction of writing, and halves of surrogate pairs, which no encoding has. JSON stays
+    the same JSON.
+    """
+    return _CONTROL.sub(lambda found: f"\\u{ord(found.group()):04x}", text)
+
+
 def shortened(text: str, most: int = LONGEST_PART) -> str:
-    """The text, or its beginning with its full length where it is longer than ``most`` characters."""
+    """The text as it is `printable`, or its beginning with its full length where that is longer than ``most``."""
+    text = printable(text)
     if len(text) <= most:
         return text
     end = f"… ({len(text):,} characters)"

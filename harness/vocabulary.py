@@ -115,6 +115,9 @@ SAMPLING: dict[Method, Sampling] = {
     "shells": Sampling(("shells",), baseline_runs=True, strata=True),
 }
 
+RUN_FOLDER = "FOLDER"
+"""Stands for the run's folder in sentences of ``estimates.json``, which may be moved; what shows them names it."""
+
 OUTCOMES = ("crash", "passed", "timeout", "bv_lv_contact", "failed")
 CRASH, PASSED, TIMEOUT, BV_LV_CONTACT, FAILED = range(len(OUTCOMES))
 RUNNING = -1

@@ -4,6 +4,7 @@ import errno
 import json
 import os
 from dataclasses import dataclass, field
+from itertools import filterfalse
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -14,6 +15,7 @@ from pyarrow import csv, parquet
 
 from harness.campaign.files import load_campaign
 from harness.cli import cli, main
+from harness.commands.printing import in_folder
 from harness.errors import EXIT_BAD_INPUT, RunFolderError, TooManyFailedError
 from harness.progress import ShownProgress
 
@@ -47,6 +49,7 @@ ESTIMATES = {
         "nade": "The vehicle crashes once in 8.3 million tests.",
         "nde": "No crash rate from these records: weights are not 1.",
     },
+    "boundary_statements": {"library": "REFUTED, first in episode 3 (`harness replay FOLDER 3`)."},
     "scope": "Sampling error only.",
 }
 
@@ -117,11 +120,12 @@ def test_check_prints_a_campaign_file(calls, capsys, tmp_path):
 
 
 def test_run_prints_the_answer_and_where_more_is(calls, capsys, tmp_path):
-    folder = tmp_path / "out"
+    folder = tmp_path / "an out"
     assert main(["run", SMOKE, "--out", str(folder), "--workers", "2", "--resume", "--set", "seed=7"]) == 0
     out, err = capsys.readouterr()
     assert out.splitlines() == [
         ESTIMATES["statement"],
+        f"Statement library: REFUTED, first in episode 3 (`harness replay '{folder}' 3`).",
         ESTIMATES["scope"],
         Result.ending,
         str(folder / "report.html"),
@@ -139,7 +143,7 @@ def test_run_as_json_and_with_the_budget_spent(calls, capsys, tmp_path):
         "harness.runner.run.run_campaign", lambda _, folder: Result(folder, folder / "report.html", exit_code=4)
     )
     assert main(["run", SMOKE, "--out", str(tmp_path / "out"), "--json"]) == 4
-    assert json.loads(capsys.readouterr().out) == ESTIMATES
+    assert json.loads(capsys.readouterr().out) == in_folder(ESTIMATES, tmp_path / "out")
 
 
 def test_wrong_campaign_leaves_nothing_behind(calls, capsys, tmp_path):
@@ -198,6 +202,32 @@ def test_wrong_calls_end_with_2(calls, capsys, arguments):
         assert "Usage: harness" in err
 
 
+@pytest.mark.parametrize(
+    ("arguments", "code"),
+    [
+        (["check", "{}.yaml"], 2),
+        (["check", SMOKE, "--set", "{}=1"], 2),
+        (["check", SMOKE, "--av", "{}"], 2),
+        (["replay", ".", "{}"], 2),
+        (["{}"], 2),
+        (["run", SMOKE, "--out", "{}"], 0),
+        (["report", "{}"], 0),
+        (["estimate", "{}"], 0),
+        (["replay", "{}", "1", "--fcd", "{}.xml"], 0),
+        (["run", SMOKE, "--out", "{}", "--json"], 0),
+    ],
+)
+def test_names_move_no_cursor(calls, capsys, tmp_path, monkeypatch, arguments, code):
+    """Escape sequences, in seven and in eight bits, and names that are not UTF-8."""
+    name = "runs\x1b[31m\x9b2J\udcff"
+    monkeypatch.chdir(tmp_path)
+    Path(name).mkdir()
+    assert main([each.format(name) for each in arguments]) == code
+    shown = "".join(capsys.readouterr())
+    assert shown.isprintable() or set(filterfalse(str.isprintable, shown)) == {"\n"}
+    assert "[31m" in shown
+
+
 @pytest.mark.parametrize("kind", [RunFolderError, TooManyFailedError])
 def test_errors_of_the_work_keep_their_exit_code(calls, capsys, tmp_path, kind):
     error = kind("episodes/0.parquet", found="half a file", expected="a whole one", mend="Delete it.")
@@ -250,7 +280,7 @@ def test_estimate_prints_a_table(calls, capsys, tmp_path):
     assert all(text in row for text in ("1.200 × 10⁻⁷", "(1.14 to 1.26) × 10⁻⁷", "0.0500", "1,234", "1.2 %"))
     assert "nade: a remark on the weights" in out
     assert "nde: weights are not 1" in out
-    assert out.splitlines()[-2:] == [ESTIMATES["statement"], ESTIMATES["scope"]]
+    assert [out.splitlines()[line] for line in (-3, -1)] == [ESTIMATES["statement"], ESTIMATES["scope"]]
     assert list(tmp_path.iterdir()) == []
 
 
@@ -265,7 +295,7 @@ def test_estimate_closes_with_what_was_asked(calls, capsys, tmp_path):
 
 def test_estimate_writes_only_when_asked(calls, capsys, tmp_path):
     assert main(["estimate", str(tmp_path), "--write", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out) == ESTIMATES
+    assert json.loads(capsys.readouterr().out) == in_folder(ESTIMATES, tmp_path)
     assert json.loads((tmp_path / "estimates.json").read_text()) == ESTIMATES
     assert [file.name for file in tmp_path.iterdir()] == ["estimates.json"]
 

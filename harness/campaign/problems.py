@@ -100,18 +100,18 @@ def in_words(error: ValidationError, section: type[BaseModel]) -> ValidationErro
 def _parts(details: ErrorDetails, section: type[BaseModel]) -> dict[str, str]:
     """Found, expected and how to mend it, of an error about a key of a section."""
     kind, loc, value, context = details["type"], details["loc"], details["input"], details.get("ctx", {})
-    field = section.model_fields.get(str(loc[0])) if loc else None
+    field, last = section.model_fields.get(str(loc[0])) if loc else None, str(loc[-1]) if loc else ""
     key, found = "", describe_found(value)
     mend = _how_to_mend(value, kind, field)
     if kind == "missing":
-        key, found, mend = str(loc[-1]), "no such key", f"Add '{loc[-1]}: …' to this section."
+        key, found, mend = last, "no such key", f"Add '{last}: …' to this section."
         expected = (field and field.description) or "a value"
     elif kind == "extra_forbidden":
-        found, known = f"the unknown key '{str(loc[-1])[:_LONGEST]}'", list(section.model_fields)
-        expected, mend = f"one of the keys {', '.join(known)}", did_you_mean(loc[-1], known)
+        found, known = f"the unknown key '{last[:_LONGEST]}'", list(section.model_fields)
+        expected, mend = f"one of the keys {', '.join(known)}", did_you_mean(last, known)
     elif kind == "model_type":
         expected = f"a section with keys such as {', '.join(list(section.model_fields)[:4])}"
-    elif loc[-1] == "[key]":
+    elif last == "[key]":
         found, expected, mend = f"the name {found}", _PATTERNS[context["pattern"]], "Choose another name."
     elif kind == "literal_error":
         words = re.findall("'(.*?)'", context["expected"])
@@ -120,7 +120,7 @@ def _parts(details: ErrorDetails, section: type[BaseModel]) -> dict[str, str]:
         examples = " or ".join(map(str, (field and field.examples) or ()))
         expected = f"text such as {examples}" if examples else _PATTERNS[context["pattern"]]
     else:
-        unit = next((f" ({unit})" for suffix, unit in _UNITS.items() if str(loc[-1]).endswith(suffix)), "")
+        unit = next((f" ({unit})" for suffix, unit in _UNITS.items() if last.endswith(suffix)), "")
         expected = _KINDS.get(kind, details["msg"].removeprefix("Input should be ")) + unit
         expected += ", or null" if field and len(loc) == 1 and type(None) in get_args(field.annotation) else ""
     return {"key": key, "found": found, "expected": expected, "mend": mend}

@@ -24,7 +24,7 @@ from harness.commands.options import (
     workers_option,
     written_file,
 )
-from harness.commands.printing import print_json, print_plan, print_statements, print_table
+from harness.commands.printing import in_folder, print_json, print_plan, print_statements, print_table, say
 from harness.numbers import leaves, words
 
 
@@ -120,17 +120,17 @@ def run(
 
         with shown_progress(campaign.stop.rhw, campaign.min_crashes, quiet=quiet) as bar:
             result = run_campaign(campaign, folder, workers=workers, resume=resume, progress=bar)
+    content = in_folder(result.estimates, folder)
     if junit is not None:
         from harness.report.junit import statement_cases, write_junit  # noqa: PLC0415 - keeps --help fast
 
-        asked = campaign.testing.shells.statement
-        write_junit(junit, campaign.name, statement_cases(result.estimates, asked, result.exit_code), [result.report])
+        cases = statement_cases(content, campaign.testing.shells.statement, result.exit_code)
+        write_junit(junit, campaign.name, cases, [result.report])
     if as_json:
-        print_json(result.estimates)
+        print_json(content)
     else:
-        print_statements(result.estimates)
-        for line in (result.ending, result.report, result.folder / "estimates.json"):
-            click.echo(str(line))
+        print_statements(content)
+        say(result.ending, result.report, result.folder / "estimates.json")
     ctx.exit(result.exit_code)
 
 
@@ -254,7 +254,7 @@ def compare(
         print_json(found.content)
     else:
         remarks = [f"note: {remark}" for remark in found.difference.warnings]
-        click.echo("\n".join([*found.content["statements"], *remarks, str(folder / "compare.json")]))
+        say(*found.content["statements"], *remarks, folder / "compare.json")
     ctx.exit(found.exit_code)
 
 
@@ -295,9 +295,9 @@ def pool(campaign_file: Path, *, out: Path | None, overrides: Sequence[str], as_
     if references := content.pop("references", ()):
         print_table("Reference drivers", references)
     for name, value in leaves(content):
-        click.echo(f"{name.replace('_', ' ')}: {words(value, 4)}")
+        say(f"{name.replace('_', ' ')}: {words(value, 4)}")
     if out is not None:
-        click.echo(str(out))
+        say(out)
 
 
 @click.command(

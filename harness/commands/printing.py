@@ -4,16 +4,25 @@ from __future__ import annotations
 
 import errno
 import json
+import shlex
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from pathlib import Path
 from typing import Any, Literal
 
 import click
 
-from harness.errors import HarnessError
+from harness.errors import HarnessError, printable
 from harness.numbers import half_width, interval, share, words
+from harness.vocabulary import RUN_FOLDER
 
 _WIDTH_OF_FILES = 140
+_PARTS = "found", "expected", "mend"
+
+
+def say(*lines: object, err: bool = False) -> None:
+    """Print lines; control characters in what a user named, as a folder, do not reach the terminal."""
+    click.echo(printable("\n".join(map(str, lines))), err=err)
 
 
 def show_error(error: HarnessError) -> None:
@@ -21,12 +30,10 @@ def show_error(error: HarnessError) -> None:
     parts = getattr(error, "problems", (error,))
     if len(parts) > 1:
         click.secho("error:", fg="red", bold=True, err=True, nl=False)
-        click.echo(f" {error.where}: {len(parts)} problems", err=True)
+        say(f" {error.where}: {len(parts)} problems", err=True)
     for part in parts:
         click.secho("error:", fg="red", bold=True, err=True, nl=False)
-        click.echo(f" {part.where}", err=True)
-        for label in ("found", "expected", "mend"):
-            click.echo(f"  {label + ':':<9} {getattr(part, label)}", err=True)
+        say(f" {part.where}", *(f"  {each + ':':<9} {getattr(part, each)}" for each in _PARTS), err=True)
 
 
 _HOW_TO_GO_ON = {
@@ -76,16 +83,23 @@ def usage_error(error: click.UsageError, context: click.Context) -> HarnessError
     return HarnessError(context.command_path, error.format_message().rstrip("."), f"a call of the form: {usage}", mend)
 
 
+def in_folder(content: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """``estimates.json``, with commands in its sentences that name the run folder as it was typed."""
+    typed = shlex.quote(str(folder))
+    sentences = {name: text.replace(RUN_FOLDER, typed) for name, text in content["boundary_statements"].items()}
+    return {**content, "boundary_statements": sentences}
+
+
 def print_json(content: Any) -> None:
     """Print strict JSON (no NaN) on stdout."""
-    click.echo(json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False))
+    say(json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False))
 
 
 def print_plan(plan: dict[str, Any]) -> None:
     """Print what a campaign will cost as YAML comments, so that the whole output stays a campaign file."""
-    click.echo("# What it will cost")
+    say("# What it will cost")
     for key, value in plan.items():
-        click.echo(f"#   {key.replace('_', ' ')}: {words(value, 4)}")
+        say(f"#   {key.replace('_', ' ')}: {words(value, 4)}")
 
 
 def print_table(title: str, rows: Sequence[Mapping[str, Any]]) -> None:
@@ -98,7 +112,7 @@ def print_table(title: str, rows: Sequence[Mapping[str, Any]]) -> None:
         justify: Literal["left", "right"] = "left" if isinstance(cell, str) else "right"
         table.add_column(heading.replace("_", " "), justify=justify, overflow="fold")
     for row in rows:
-        table.add_row(*(words(cell, 4) for cell in row.values()))
+        table.add_row(*(printable(words(cell, 4)) for cell in row.values()))
     console = Console()
     if not console.is_terminal:
         console.width = _WIDTH_OF_FILES
@@ -127,7 +141,7 @@ def print_estimates(content: dict[str, Any], asked: Sequence[str] = ()) -> None:
     for name, entry in shown.items():
         # Without the campaign's own estimator the reason is the answer, and comes last.
         for remark in [*entry.get("warnings", ()), *filter(None, [entry.get("reason") if answered else None])]:
-            click.echo(f"{name}: {remark}")
+            say(f"{name}: {remark}")
     if shells := shown.get("shells", {}).get("details", {}).get("shells"):
         names = ("shell", "inside", "p", "n_episodes", "n_crashes", "contribution")
         print_table("Shells, from careful to careless", [{name: shell[name] for name in names} for shell in shells])
@@ -135,17 +149,13 @@ def print_estimates(content: dict[str, Any], asked: Sequence[str] = ()) -> None:
         print_statements(content)
         return
     for name in shown:
-        click.echo(f"{name}: {content['statements'][name]}")
+        say(f"{name}: {content['statements'][name]}")
     if any(entry["crash_rate"] is not None for entry in shown.values()):
-        click.echo(content["scope"])
+        say(content["scope"])
 
 
 def print_statements(content: dict[str, Any]) -> None:
     """Print the answer in a sentence, what else is stated under which assumption, and what all this is about."""
-    if decision := content.get("decision"):
-        click.echo(decision["sentence"])
-    click.echo(content["statement"])
-    for name, sentence in content.get("boundary_statements", {}).items():
-        click.echo(f"Statement {name}: {sentence}")
-    for sentence in (*content.get("reference_statements", [])[1:], content["scope"]):
-        click.echo(sentence)
+    decided = [decision["sentence"]] if (decision := content.get("decision")) else []
+    within = (f"Statement {name}: {sentence}" for name, sentence in content["boundary_statements"].items())
+    say(*decided, content["statement"], *within, *content.get("reference_statements", [])[1:], content["scope"])

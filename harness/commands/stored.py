@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from harness.commands.options import FILE, RUN_FOLDER, examples, json_option, written_file
-from harness.commands.printing import print_estimates, print_json
+from harness.commands.printing import in_folder, print_estimates, print_json, say
 from harness.errors import EXIT_BAD_INPUT, WorldDisagreementError
 from harness.vocabulary import ESTIMATORS
 
@@ -62,9 +62,9 @@ def estimate(
 
         write_json(folder / "estimates.json", content)
     if as_json:
-        print_json(content)
+        print_json(in_folder(content, folder))
     else:
-        print_estimates(content, estimators)
+        print_estimates(in_folder(content, folder), estimators)
     if estimators and all(content["estimates"][name]["crash_rate"] is None for name in estimators):
         ctx.exit(EXIT_BAD_INPUT)
 
@@ -75,7 +75,7 @@ def report(folder: Path) -> None:
     """Write DIR/report.html and its plots anew, and print where the page is."""
     from harness.report.page import write_report  # noqa: PLC0415 - keeps --help fast
 
-    click.echo(str(write_report(folder)))
+    say(write_report(folder))
 
 
 @click.command(
@@ -117,11 +117,9 @@ def replay(folder: Path, episode: int, *, out: Path | None, fcd: Path | None, gu
         print_json({**said, **{name: result.row[name] for name in LATERAL if name in result.row}})
     else:
         compared = {None: "no stored trace to compare with", True: "bit for bit as stored", False: "NOT as stored"}
-        click.echo(f"episode {episode}: {result.outcome}; {compared[result.bit_equal]}")
-        if result.row.get("onset_step") is not None and result.row["cut_in_step"] is not None:
-            click.echo(_onset(result.row))
-        for file in files:
-            click.echo(file)
+        takes_time = result.row.get("onset_step") is not None and result.row["cut_in_step"] is not None
+        onset = [_onset(result.row)] if takes_time else []
+        say(f"episode {episode}: {result.outcome}; {compared[result.bit_equal]}", *onset, *files)
     if result.bit_equal is False:
         found = "a replay that differs from the stored trace"
         raise WorldDisagreementError(f"episode {episode} of {folder}", found, "the same bits", str(result.suspects))

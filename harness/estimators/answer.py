@@ -14,11 +14,9 @@ from harness.estimators.pairs import Contrast, PairedEstimate
 from harness.importance.functions import importance_names
 from harness.numbers import WIDEST_RHW, share
 from harness.records.folder import StoppedBy
-from harness.vocabulary import ESTIMATORS, EstimatorName
+from harness.vocabulary import ESTIMATORS, RUN_FOLDER, EstimatorName
 
 _PER_KM = 1e6
-REPLAY = "harness replay FOLDER"
-"""Command that replays a test, without its number; FOLDER stands for the run's."""
 SCOPE = "The interval is about sampling error in this environment, not about how well the environment matches the road."
 MENDS: dict[str, str] = {
     "episodes": "stop.episodes was spent; raise it and go on with --resume",
@@ -226,7 +224,7 @@ def _ahead(found: Mapping[str, Any]) -> str:
 
 def _replayed(episodes: Sequence[int]) -> str:
     """The first of some tests, and how to see it."""
-    return f"episode {episodes[0]} (`{REPLAY} {episodes[0]}`)"
+    return f"episode {episodes[0]} (`harness replay {RUN_FOLDER} {episodes[0]}`)"
 
 
 def ending(stopped_by: StoppedBy, n_episodes: int, unmet: tuple[str, ...], *, precision_asked: bool) -> str:

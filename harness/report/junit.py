@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE
+from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, printable
 from harness.records.folder import write_text
 from harness.strata import ASSUMPTION_FREE
 
@@ -64,4 +64,4 @@ def write_junit(path: Path, suite: str, cases: Sequence[Case], attachments: Sequ
         attached = "\n".join(f"[[ATTACHMENT|{each.resolve()}]]" for each in attachments)
         ET.SubElement(element, "system-out").text = f"{case.message}\n{attached}\n"
     ET.indent(root)
-    write_text(path, ET.tostring(root, encoding="unicode", xml_declaration=True) + "\n")
+    write_text(path, printable(ET.tostring(root, encoding="unicode", xml_declaration=True)) + "\n")

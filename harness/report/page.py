@@ -15,6 +15,7 @@ from pydantic import BaseModel
 
 from harness import numbers
 from harness.campaign.campaign import Campaign, written_out
+from harness.errors import printable
 from harness.estimators.answer import MENDS
 from harness.estimators.estimate import Estimate
 from harness.estimators.shells import ShellDetails, Within
@@ -26,7 +27,7 @@ from harness.report.rate_plots import answer_plot, convergence_plot, rate_expone
 from harness.report.style import RC, Plot, inline_svg, png, svg
 from harness.report.summary import RunFolder, RunSummary, lateral_facts, read_run_folder, summarise
 from harness.report.test_plots import crash_time_plot, cut_in_plot, impact_speed_plot, strata_plot, weight_plot
-from harness.vocabulary import OUTCOMES
+from harness.vocabulary import OUTCOMES, RUN_FOLDER
 
 PLOT_NAMES = re.compile(
     r"(answer|shells|convergence|weights|strata|cut_ins|impact_speed|crash_time|crash-\d+)\.(png|svg)"
@@ -72,10 +73,11 @@ def write_report(folder: str | Path) -> Path:
         details=details(run),
         settings=setting_sections(run.campaign, reproducible=run.manifest.get("reproducible")),
         folder=run.typed,
+        run_folder=RUN_FOLDER,
         style=Markup((Path(__file__).parent / "report.css").read_text(encoding="utf-8")),  # noqa: S704 - our own file
     )
     _write_plots(folder / "plots", files)
-    write_bytes(folder / "report.html", page.encode("utf-8"))
+    write_bytes(folder / "report.html", printable(page).encode("utf-8"))
     return folder / "report.html"
 
 
@@ -84,7 +86,7 @@ def _plots(run: RunFolder, summary: RunSummary, gallery: list[GalleryRow]) -> li
     drawn_by = [weight_plot(summary), strata_plot(summary)] if run.shells is None else [shells_plot(run.shells)]
     plots = [
         answer_plot(run.estimates, run.shells),
-        convergence_plot(run.estimates, run.campaign.stop.rhw, of_statement=run.asked_statement),
+        convergence_plot(run.estimates, run.target_rhw, of_statement=run.asked_statement),
         *drawn_by,
         cut_in_plot(summary),
         impact_speed_plot(summary),
@@ -151,9 +153,9 @@ def run_notes(run: RunFolder, summary: RunSummary) -> list[str]:
     if n_estimated not in (n_tests, n_tests - summary.n_failed):
         notes.append(
             f"The estimates cover {count(n_estimated)} tests but the records hold {count(n_tests)}: run "
-            "harness estimate DIR --write."
+            f"harness estimate {run.typed} --write."
         )
-    target, rhw = run.campaign.stop.rhw, run.headline.rhw
+    target, rhw = run.target_rhw, run.headline.rhw
     if run.asked_statement and run.shells is not None:
         rhw = next(each.rhw for each in run.shells.statements if each.name == run.asked_statement)
     if target is not None and not rhw <= target:

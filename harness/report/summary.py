@@ -105,6 +105,11 @@ class RunFolder:
         asked = ASSUMPTION_FREE if self.shells is None else self.campaign.testing.shells.statement
         return None if asked == ASSUMPTION_FREE else asked
 
+    @property
+    def target_rhw(self) -> float | None:
+        """The relative half-width that was asked for; None where there is a limit to decide: that looks at no width."""
+        return None if self.campaign.accept is not None else self.campaign.stop.rhw
+
     def episodes(self, *columns: str) -> Iterator[pa.RecordBatch]:
         """Columns of the tests that count, in index order; small shards come together."""
         counted = int(self.manifest["n_episodes"])

@@ -8,7 +8,7 @@ from junitparser import JUnitXml
 from harness.report.junit import Case, outcome_of, statement_cases, write_junit
 
 CONTENT = {
-    "decision": {"sentence": "REJECTED: <above> & beyond."},
+    "decision": {"sentence": "REJECTED: <above> & beyond\x1b[31m."},
     "statement": "The crash rate is 1e-07 per test.",
     "boundary_statements": {"library": "If it crashes only where …"},
 }
@@ -25,7 +25,8 @@ def test_what_was_asked_decides_and_the_rest_is_shown(tmp_path, code, kind):
     assert (asked.name, other.name) == ("assumption_free", "library")
     assert [type(each).__name__ for each in asked.result] == ([] if kind is None else [kind])
     assert [type(each).__name__ for each in other.result] == ["Skipped"]
-    assert all(each.message == f"{CONTENT['decision']['sentence']} {CONTENT['statement']}" for each in asked.result)
+    message = f"REJECTED: <above> & beyond\\u001b[31m. {CONTENT['statement']}"
+    assert all(each.message == message for each in asked.result)
     assert f"[[ATTACHMENT|{report}]]" in asked.system_out
 
 

@@ -12,6 +12,7 @@ from xml.etree import ElementTree
 import matplotlib.pyplot as plt
 import pytest
 
+from harness.campaign.sections import Accept
 from harness.report.page import run_notes, verdict, write_report
 from harness.report.summary import read_run_folder, summarise, typed_folder
 from tests.report.made_run import RECIPES, write_run
@@ -93,6 +94,13 @@ def test_notes_say_what_was_not_reached_and_what_is_stale(run_folder):
     assert "cover 2,000 tests but the records hold 3,000" in notes
 
 
+def test_a_gate_is_not_blamed_for_a_width_that_it_does_not_look_at(runs):
+    run = runs["shells"]
+    notes = run_notes(run, summarise(run))
+    gate = replace(run, campaign=run.campaign.replaced(("accept",), Accept(crash_rate_below=1e-6)))
+    assert run_notes(gate, summarise(run)) == [note for note in notes if "half-width" not in note] != notes
+
+
 @pytest.mark.parametrize(
     ("changed", "said"),
     [
@@ -111,7 +119,7 @@ def test_the_label_says_what_tests_have_shown(runs, changed, said):
 def test_hostile_texts_are_escaped_and_no_formula(tmp_path):
     hostile = "<script>alert('x')</script>$\\frac{&"
     folder = write_run(tmp_path / "run", replace(RECIPES["no_crash"], n_episodes=300))
-    edit(folder / "campaign.yaml", description=hostile)
+    edit(folder / "campaign.yaml", description=hostile + "\x1b[31m")
     path = folder / "estimates.json"
     estimates = edit(path, campaign=hostile, statement=hostile, headline=hostile)["estimates"]
     edit(path, estimates=estimates | {hostile: {**estimates["nade"], "warnings": [hostile]}})
@@ -119,6 +127,7 @@ def test_hostile_texts_are_escaped_and_no_formula(tmp_path):
     page = Page(folder)
     assert "<script" not in page.html
     assert page.words.count(hostile) >= 5
+    assert hostile + "\\u001b[31m" in page.words
 
 
 def contents(folder: Path) -> dict[str, bytes]:
