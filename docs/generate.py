@@ -15,11 +15,10 @@ import json
 import math
 import re
 import shutil
-import types
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any, Union, get_args, get_origin
+from typing import Any, get_args, get_origin
 
 import pyarrow as pa
 from pydantic import BaseModel
@@ -61,30 +60,11 @@ def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _kind(annotation: Any) -> str:
-    """Type of a setting in words."""
-    origin = get_origin(annotation)
-    if origin in (Union, types.UnionType):
-        inner = [option for option in get_args(annotation) if option is not type(None)]
-        return " or ".join(dict.fromkeys(_kind(option) for option in inner))
-    if origin is not None and hasattr(annotation, "__metadata__"):
-        return _kind(get_args(annotation)[0])
-    if origin is dict:
-        return "mapping"
-    if str(origin) == "typing.Literal":
+def _choices(annotation: Any) -> str:
+    """The values that a setting can have, where they can be listed."""
+    if str(get_origin(annotation)) == "typing.Literal":
         return ", ".join(f"`{value}`" for value in get_args(annotation))
-    if _is_section(annotation):
-        return "section"
-    return {float: "number", int: "whole number", str: "text", bool: "`true` or `false`"}.get(
-        annotation, str(annotation)
-    )
-
-
-def _limits(field: FieldInfo) -> str:
-    """Limits of a number, from its own constraints and those of its annotated type."""
-    signs = {"ge": "≥", "gt": ">", "le": "≤", "lt": "<"}
-    rules = [(sign, getattr(rule, name, None)) for name, sign in signs.items() for rule in field.metadata]
-    return ", ".join(f"{sign} {limit:g}" for sign, limit in rules if limit is not None)
+    return ", ".join(filter(None, map(_choices, get_args(annotation)))) if get_origin(annotation) is not dict else ""
 
 
 def _default(field: FieldInfo) -> str:
@@ -95,15 +75,17 @@ def _default(field: FieldInfo) -> str:
         return "none"
     if value in ("", {}):
         return "empty"
-    return "see below" if isinstance(value, BaseModel | dict) else f"`{value}`"
+    return "below" if isinstance(value, BaseModel | dict) else f"`{value}`"
 
 
 def _settings_rows(section: type[BaseModel]) -> list[tuple[str, ...]]:
+    """Rows of a section's keys, but for sections in it, which have a heading and words of their own."""
     rows = []
     for name, field in section.model_fields.items():
-        kind = ", ".join(filter(None, [_kind(field.annotation), _limits(field)]))
-        text = field.description or _own_words(field.annotation)
-        rows.append((f"`{name}`", kind, _default(field), text.replace("|", "\\|")))
+        if not field.description and _is_section(field.annotation):
+            continue
+        text = ": ".join(filter(None, [_choices(field.annotation), field.description]))
+        rows.append((f"`{name}`", _default(field), text.replace("|", "\\|")))
     return rows
 
 
@@ -143,7 +125,9 @@ def settings_reference() -> str:
             for other in dict.fromkeys(known.values())
         ]
         new = [row for row in rows if row not in known]
-        text.append(f"{_table(('key', 'value', 'default', 'meaning'), new)}\n")
+        text += [f"{_table(('key', 'default', 'meaning'), new)}\n"] if new else []
+        below = [f"`{name}`" for name, field in section.model_fields.items() if _is_section(field.annotation)]
+        text += [f"Sections, below: {', '.join(below)}.\n\n"] if below else []
         shown[section] = path
         rows_of = dict.fromkeys(new, path) | rows_of
     return "\n" + "".join(text)
@@ -154,16 +138,21 @@ def _own_words(annotation: Any) -> str:
     return str(annotation.__doc__).strip().splitlines()[0] if _is_section(annotation) else ""
 
 
-def columns_table(schema: pa.Schema) -> str:
-    """Table of a schema's columns."""
+def columns_table(name: str) -> str:
+    """Table of a schema's columns; those that episodes have as well are only named."""
+    rows = _column_rows(SCHEMAS[name])
+    known = [row for row in rows if name != "episodes" and row in _column_rows(SCHEMAS["episodes"])]
+    shared = f"As in `episodes`: {', '.join(row[0] for row in known)}.\n\n" if known else ""
+    return shared + _table(("column", "unit", "meaning"), [row for row in rows if row not in known])
+
+
+def _column_rows(schema: pa.Schema) -> list[tuple[str, ...]]:
     rows = []
     for field in schema:
         words = {key.decode(): value.decode() for key, value in field.metadata.items()}
-        kind = re.sub(r"(?:fixed_size_)?list<\w+: (\w+).*", r"list of \1", str(field.type))
-        kind = re.sub(r"dictionary<values=(\w+),.*", r"\1 (dictionary)", kind)
-        optional = " or null" if field.nullable else ""
-        rows.append((f"`{field.name}`", kind + optional, words["unit"] or "–", words["doc"].replace("|", "\\|")))
-    return _table(("column", "type", "unit", "meaning"), rows)
+        unit = (words["unit"] or "–") + (" or null" if field.nullable else "")
+        rows.append((f"`{field.name}`", unit, words["doc"].replace("|", "\\|")))
+    return rows
 
 
 def environment_table() -> str:
@@ -369,15 +358,14 @@ def _validated_cells(one: dict[str, Any]) -> tuple[str, ...]:
 
 def methods_table() -> str:
     """Table of methods on the default vehicle, all by replication."""
-    head = ("method", "estimator", "replications × tests", "bias", "true relvar", "claimed relvar", "coverage")
+    head = ("method", "experiment", "estimator", "replications × tests", "bias", "true relvar", "claimed relvar")
     rows = [
-        (words, *_method_cells(one))
+        (words, f"`{name}`", *_method_cells(one))
         for name, words in METHODS.items()
         for one in _result(name)["judgements"]
-        if one["subject"] == "idm" and _is_rate(one)
+        if one["subject"] == "idm" and _is_rate(one) and "shells, " not in one["result"]
     ]
-    commands = [f"- {words}: {_command(name)}" for name, words in METHODS.items()]
-    return _table((*head, "tests for RHW 0.3", "as claimed"), rows) + "\n" + "\n".join(commands) + "\n"
+    return _table((*head, "coverage", "tests for RHW 0.3", "as claimed"), rows) + f"\n{_command('EXPERIMENT')}\n"
 
 
 def _method_cells(one: dict[str, Any]) -> tuple[str, ...]:
@@ -400,7 +388,7 @@ PARTS: dict[str, Callable[[], str]] = {
     "environment": environment_table,
     "validated-methods": methods_table,
     "limits": limits_table,
-    **{f"columns-{name}": partial(columns_table, schema) for name, schema in SCHEMAS.items()},
+    **{f"columns-{name}": partial(columns_table, name) for name in SCHEMAS},
     **{f"results-{name}": partial(results_table, results) for name, results in RESULTS.items()},
     **{f"validated-{name}": partial(validated_table, name) for name in VALIDATED},
     **{f"varied-{name}": partial(varied_table, name) for name in VARIED},
