@@ -23,7 +23,7 @@ from harness.estimators.estimate import finite_json
 from harness.resolved import resolve
 from harness.runner.prepare import prepare, require_ready, require_world
 from harness.runner.repeat import Bits, bits_of
-from harness.sampling import ShardRequest, Source, source_of
+from harness.sampling import EPISODES_PER_S, ShardRequest, Source, source_of
 from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import AV, CRASH, FAILED, FloatArray
 from harness.worlds import AVLostError, build_world
@@ -255,7 +255,7 @@ def plan_campaign(campaign: Campaign) -> dict[str, Any]:
     """
     resolved, source = require_ready(campaign), source_of(campaign)
     engine = "sumo with shim" if campaign.world.engine == "sumo" and shim_library() else campaign.world.engine
-    per_core: float = source.episodes_per_s[engine]
+    per_core: float = EPISODES_PER_S[campaign.testing.method][engine]
     of_av: dict[str, float | str] = {}
     if campaign.av.model is None:
         measured = seconds_per_test(campaign)
@@ -359,7 +359,7 @@ def _measure(campaign: Campaign, *, black_box: Path | None = None) -> float | st
     finally:
         loop.close()
         world.close()
-    rare = source_of(campaign).cut_ins_are_rare
+    rare = not campaign.sampling.controlled
     if host is None:
         n_steps = STEPS if rare else STEPS_WITH_CUT_IN
     else:

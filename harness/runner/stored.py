@@ -16,7 +16,7 @@ from harness.campaign.files import load_campaign
 from harness.controllers.find import has_foreign_code, require_controller, run_apart
 from harness.errors import CampaignError, RunFolderError
 from harness.estimators.answer import estimate_blocks
-from harness.estimators.block import Block
+from harness.estimators.block import MOMENT_COLUMNS, Block
 from harness.estimators.one_pass import SPACING
 from harness.processes import made_ahead
 from harness.records.folder import concatenated, no_episodes, read_manifest, read_table
@@ -73,7 +73,7 @@ def stored_blocks(folder: Path, *, moments: bool) -> Iterator[Block]:
         raise no_episodes(folder)
     source = source_of(campaign)
     design, needed = source.stored_design(folder), list(source.columns)
-    ratios = list(source.moment_columns) if moments else []
+    ratios = list(MOMENT_COLUMNS) if moments and campaign.sampling.mixes_steps else []
 
     def read(group: _Shards) -> Block:
         stored = [read_shard(folder, shard, episode_columns=needed, moment_columns=ratios) for shard in group]

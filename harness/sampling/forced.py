@@ -28,8 +28,6 @@ class Forced(Source):
     A vehicle that acts before the cut-in is driven along the path without one first, which prescribes the test.
     """
 
-    episodes_per_s = {"sumo": 1500, "sumo with shim": 2500, "twin": 32000}
-
     def run(self, loop: EpisodeLoop, request: ShardRequest) -> Shard:
         if not self.campaign.has_baseline_runs:
             return super().run(loop, request)

@@ -96,13 +96,8 @@ class Source:
     driven without a cut-in before tests can be drawn; see `begin_after`.
     """
 
-    episodes_per_s: ClassVar[Mapping[str, int]]
-    """On one core of a 2020s server by engine, recording included: orders of magnitude; `benchmarks/` tells yours."""
     columns: ClassVar[tuple[str, ...]] = EPISODE_COLUMNS
     """Of the episodes table, that estimates need."""
-    moment_columns: ClassVar[tuple[str, ...]] = ()
-    """Of the table of control steps, that one of its estimators needs."""
-    cut_ins_are_rare: ClassVar = False
 
     def __init__(self, resolved: Resolved, progress: Progress) -> None:
         self.resolved, self.campaign = resolved, resolved.campaign

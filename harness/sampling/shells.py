@@ -62,7 +62,6 @@ USUAL_RHW = 0.3
 class Shells(Source):
     """Tests of strata of the pool's cut-ins; a vehicle that acts before the cut-in makes the pool itself."""
 
-    episodes_per_s = {"sumo": 1700, "sumo with shim": 2700, "twin": 30000}
     columns = (*EPISODE_COLUMNS, *SHELL_COLUMNS)
 
     def __init__(self, resolved: Resolved, progress: Progress) -> None:
