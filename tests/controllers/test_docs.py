@@ -1,6 +1,7 @@
 """Every recipe of docs/controllers.md is run, as it stands on the page, by ``harness run``."""
 
 import contextlib
+import json
 import os
 import re
 import shlex
@@ -13,6 +14,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from harness.cli import main
+from tests.pool.conftest import SMALL_POOL
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs/controllers.md").read_text(encoding="utf-8")
@@ -100,6 +102,21 @@ def test_entry_points_are_found_by_name(folder, tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.syspath_prepend(folder)
     assert controller_class(name).__name__ == "Follows"
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/tutorial.md"])
+def test_the_first_vehicle_of_a_new_user_runs(page, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    blocks = re.findall(
+        r"^```(?:py|yaml)\n# (\S+)\n(.*?)^```$", (ROOT / page).read_text("utf-8"), re.MULTILINE | re.DOTALL
+    )
+    assert [name for name, _ in blocks] == ["my_av.py", "my.yaml"]
+    for name, text in blocks:
+        Path(name).write_text(text, encoding="utf-8")
+    short = [f"--set={setting}" for setting in ("stop.rhw=0.5", *SMALL_POOL)]
+    assert main(["run", "my.yaml", "--out", "runs/mine", "--workers", "1", "--quiet", *short]) == 0
+    statement = json.loads(Path("runs/mine/estimates.json").read_text("utf-8"))["statement"]
+    assert "times as often as a careful and competent driver" in statement
 
 
 def test_the_costs_are_within_what_was_promised():
