@@ -66,6 +66,9 @@ class Contender:
         """Close what was opened."""
 
 
+NADE = "nade_epsilon_0.1"
+
+
 def campaign(name: str, **settings: object) -> Campaign:
     """A shipped campaign; motion is not traced, so that only what estimates need is recorded."""
     fixed = {"records.traces": "none", "records.trace_share": 0, **settings}
@@ -239,27 +242,27 @@ def missing(name: str) -> str | None:
 
 
 CONTENDERS: dict[str, tuple[Callable[[], Contender], int]] = {
-    "harness": (lambda: in_sumo("nade", shim=False), 5_000),
-    "harness+shim": (lambda: in_sumo("nade", shim=True), 5_000),
-    "one-at-a-time": (lambda: Recorded(campaign("nade"), lambda _: in_libsumo()), 500),
-    "bare one-at-a-time": (lambda: BareOneAtATime(campaign("nade")), 1_000),
-    "traci": (lambda: Recorded(campaign("nade"), lambda _: OverTraci(sumo_program("sumo", "traci"))), 50),
-    "floor": (lambda: Floor(campaign("nade")), 5_000),
+    "harness": (lambda: in_sumo(NADE, shim=False), 5_000),
+    "harness+shim": (lambda: in_sumo(NADE, shim=True), 5_000),
+    "one-at-a-time": (lambda: Recorded(campaign(NADE), lambda _: in_libsumo()), 500),
+    "bare one-at-a-time": (lambda: BareOneAtATime(campaign(NADE)), 1_000),
+    "traci": (lambda: Recorded(campaign(NADE), lambda _: OverTraci(sumo_program("sumo", "traci"))), 50),
+    "floor": (lambda: Floor(campaign(NADE)), 5_000),
     "recursive": (lambda: in_sumo("recursive", shim=False), 5_000),
     "recursive+shim": (lambda: in_sumo("recursive", shim=True), 5_000),
-    "twin nade": (lambda: TwinAlone(campaign("nade", **{"records.moments": "none"})), 50_000),
+    "twin nade": (lambda: TwinAlone(campaign(NADE, **{"records.moments": "none"})), 50_000),
     "twin nde": (lambda: TwinAlone(campaign("nde")), 100_000),
     "twin recursive": (lambda: TwinAlone(campaign("recursive", **{"records.moments": "none"})), 40_000),
     "twin recorded": (
         lambda: Recorded(
-            campaign("nade", **{"world.engine": "twin", "world.cells": TWIN_CELLS}),
+            campaign(NADE, **{"world.engine": "twin", "world.cells": TWIN_CELLS}),
             lambda c: TwinWorld(c.world.cells),
         ),
         40_000,
     ),
-    "1 worker": (lambda: Workers(campaign("nade"), 1), 5_000),
-    "2 workers": (lambda: Workers(campaign("nade"), 2), 10_000),
-    "parts": (lambda: in_sumo("nade", shim=False, of=WithParts), 5_000),
-    "parts+shim": (lambda: in_sumo("nade", shim=True, of=WithParts), 5_000),
+    "1 worker": (lambda: Workers(campaign(NADE), 1), 5_000),
+    "2 workers": (lambda: Workers(campaign(NADE), 2), 10_000),
+    "parts": (lambda: in_sumo(NADE, shim=False, of=WithParts), 5_000),
+    "parts+shim": (lambda: in_sumo(NADE, shim=True, of=WithParts), 5_000),
 }
 """Name → how to build it, and episodes per measurement (about two seconds each)."""

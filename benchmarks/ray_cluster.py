@@ -26,7 +26,7 @@ FORCED = ("overtaking_forced", "stop.rhw=null")
 BITS = {
     "forced": (*FORCED, "world.engine=twin", "stop.episodes=20000", "run.shard_size=500"),
     "step_mixture": (
-        "overtaking_nade",
+        "overtaking_nade_epsilon_0.1",
         "stop.rhw=null",
         "world.engine=twin",
         "stop.episodes=20000",

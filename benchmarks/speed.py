@@ -23,13 +23,13 @@ from statistics import median
 from typing import NamedTuple
 
 from benchmarks.contender_process import ContenderProcess, Measurement
-from benchmarks.contenders import CONTENDERS, TWIN_CELLS, campaign, missing
+from benchmarks.contenders import CONTENDERS, NADE, TWIN_CELLS, campaign, missing
 from benchmarks.startup import Start, cold_and_warm
 from harness.runner.resume import cpu_name, versions
 
 STARTUP = "startup"
 HOW = f"""\
-Campaign: scenarios/overtaking_nade.yaml (published NADE), {campaign("nade").world.cells} cells side by side in SUMO,
+Campaign: scenarios/overtaking_nade_epsilon_0.1.yaml, {campaign(NADE).world.cells} cells side by side in SUMO,
 {TWIN_CELLS} in the twin.
 What ends an episode, everywhere: a crash; BV and LV in contact; AV past BV without a cut-in; 20 s (about 99 of 100).
 Recorded: one row per episode and the first nine control steps, written to Parquet; "twin" alone keeps nothing.

@@ -84,9 +84,7 @@ def _settings_rows(section: type[BaseModel]) -> list[tuple[str, ...]]:
     for name, field in section.model_fields.items():
         if not field.description and _is_section(field.annotation):
             continue
-        choices, words = _choices(field.annotation), field.description or ""
-        told = all(choice.strip("`") in words for choice in choices.split(", "))
-        text = words if told or not choices else f"{choices}: {words}"
+        text = ": ".join(filter(None, [_choices(field.annotation), field.description]))
         rows.append((f"`{name}`", _default(field), text.replace("|", "\\|")))
     return rows
 
@@ -249,7 +247,7 @@ VALIDATED = ("shells_acting", "shells_pairs", "chains_shells", "chains_forced", 
 """Replication experiments that are shown line by line."""
 METHODS = {
     "twin_nde": "no control, level 10,000",
-    "twin_nade": "step mixture, immediate challenge (published NADE)",
+    "twin_nade": "step mixture, immediate challenge, ε = 0.1",
     "twin_step_recursive": "step mixture, recursive challenge",
     "twin_episode": "episode mixture, recursive challenge",
     "twin_forced": "forced cut-ins",

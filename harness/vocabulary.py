@@ -128,4 +128,4 @@ LV, BV, AV = range(len(VEHICLES))
 N_ACCELERATIONS, CUT_IN, STAY = 31, 31, 32
 """Maneuvers of BV: accelerations 0 … 30, and then, before a cut-in, changing lanes or not."""
 ACCELERATIONS_MPS2 = (np.arange(N_ACCELERATIONS) - 20) / 5.0
-"""-4 … 2 m/s² in steps of 0.2 [paper]; written as a quotient so that every value is the nearest double."""
+"""-4 … 2 m/s² in steps of 0.2 [ndd]; written as a quotient so that every value is the nearest double."""

@@ -174,7 +174,7 @@ def draw_convergence(step: Convergence, context: Context) -> dict[str, Any]:
     return {"figures": figures}
 
 
-class _Found(NamedTuple):
+class Counted(NamedTuple):
     """RNoT of every shuffle of some tests, and whether their weights have come in."""
 
     rnot: RequiredTests
@@ -188,7 +188,7 @@ class _Found(NamedTuple):
             mean = figure(None if self.rnot.never_reached.all() else mean["value"], mean["low"] or mean["value"])
         return marked(mean, settled=self.settled)
 
-    def over(self, other: _Found, confidence: float) -> dict[str, Any]:
+    def over(self, other: Counted, confidence: float) -> dict[str, Any]:
         """AAR of the other one: ratio of the means, open where one of them is a lower limit."""
         found = ratio_of_means(self.rnot.n.tolist(), other.rnot.n.tolist(), confidence)
         side = acceleration(self.rnot, other.rnot)[1]
@@ -224,11 +224,11 @@ def count_required_tests(step: RequiredNumbers, context: Context) -> dict[str, A
 
 def _required(
     made: Made, procedure: Procedure, context: Context, first: int | None = None, *, scv: bool = False
-) -> _Found:
+) -> Counted:
     """Of the mean of Y, or of what SCV claims, on all tests of a step or its first ones."""
     tests = tests_of(made).first(first)
     context.progress.stage(f"shuffles of {made.folder.name.rpartition('-')[0]}", procedure.n_shuffles)
 
     block = first_block(made.folder / "run", tests.n) if scv else None
     found = over_shuffles(tests, procedure, lambda: context.progress.advance(1), scv_of=block)
-    return _Found(found, tests.n, settled(made))
+    return Counted(found, tests.n, settled(made))

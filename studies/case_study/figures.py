@@ -52,6 +52,21 @@ def mean_of(values: Iterable[float | None], confidence: float) -> dict[str, Any]
     return figure(known.mean(), max(known.mean() - half, 0.0), known.mean() + half)
 
 
+def scattered(relvar: float, n: int, missed: bool) -> dict[str, Any]:
+    """A relative variance by the spread of n replications, with two standard errors as if errors were normal.
+
+    Where their mean is below the truth, what has not occurred in any of them is missing from the spread, too: it is a
+    lower limit.
+    """
+    error = 2.0 * relvar * math.sqrt(2.0 / n)
+    return figure(None, relvar) if missed else figure(relvar, max(relvar - error, 0.0), relvar + error)
+
+
+def scaled(found: dict[str, Any], factor: float) -> dict[str, Any]:
+    """The number and its limits, times a factor."""
+    return {**found, **{key: None if (x := found[key]) is None else x * factor for key in ("value", "low", "high")}}
+
+
 def ratio_of_means(above: ArrayLike, below: ArrayLike, confidence: float) -> dict[str, Any]:
     """Ratio of the means of paired repetitions, with the t interval of its logarithm, to the first order."""
     pairs = np.array([above, below], np.float64)

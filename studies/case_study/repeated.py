@@ -18,13 +18,24 @@ from harness.resolved import resolve
 from harness.runner.prepare import prepare
 from harness.runner.run import run_campaign
 from harness.vocabulary import EstimatorName, FloatArray
-from studies.case_study.counted import Claims
-from studies.case_study.figures import figure, marked, mean_of, ratio_of_means, ratio_of_variances, tests_for
+from studies.case_study.counted import Claims, Counted
+from studies.case_study.figures import (
+    figure,
+    is_settled,
+    marked,
+    mean_of,
+    ratio_of_means,
+    ratio_of_variances,
+    scaled,
+    scattered,
+    tests_for,
+)
 from studies.case_study.study import Context, Replications, Variants
 from studies.case_study.tested import AT_ONCE, IN_THE_TWIN, figures_of_shells
 from studies.replication.experiment import load_experiment
 from studies.replication.run import REPLICATIONS, validate
 from studies.replication.weighted import prepared_twin, twin_episodes
+from studies.rnot import Procedure, Tests, over_shuffles
 from studies.work import write_table
 
 
@@ -48,7 +59,7 @@ def replicate(step: Replications, context: Context) -> dict[str, Any]:
         with np.errstate(divide="ignore", invalid="ignore"):
             claims[name] = (own["std_error"].to_numpy() / rates[name]) ** 2 * per_relvar
         figures |= {
-            f"{name}_true": _scattered(one["true_relvar"] * per_relvar, one["replications"], missed=missed),
+            f"{name}_true": scaled(scattered(one["true_relvar"], one["replications"], missed), per_relvar),
             f"{name}_claimed": marked(mean_of(claims[name], confidence), settled=not missed),
             f"{name}_covers": figure(one["coverage"], one["coverage_low"], one["coverage_high"]),
             f"{name}_over_truth": figure(centre, centre - error, centre + error),
@@ -60,25 +71,13 @@ def replicate(step: Replications, context: Context) -> dict[str, Any]:
     return {"tests": n, "replications": experiment.replications, "judgements": judgements, "figures": figures}
 
 
-def _scattered(value: float, replications: int, *, missed: bool) -> dict[str, Any]:
-    """Tests by the spread of replications, with two standard errors as if errors were normal.
-
-    Where their mean is below the truth, what has not occurred in any of them is missing from the spread, too: it is a
-    lower limit.
-    """
-    if missed:
-        return figure(None, value)
-    error = value * np.sqrt(2.0 / replications)
-    return figure(value, max(value - 2.0 * error, 0.0), value + 2.0 * error)
-
-
 def variants_of(step: Variants, *, shells: bool = False) -> dict[str, Campaign]:
     """The campaign in each of its forms, in the twin, by name; or the one of shells for the same vehicles."""
     file, always = (step.shells, step.shells_set) if shells else (step.campaign, step.set)
     if file is None:
         return {}
     always = [*always, *IN_THE_TWIN]
-    settings = dict(step.settings)
+    settings = {**step.settings, **{f"ε = {each:g}": [f"testing.epsilon={each}"] for each in step.epsilons}}
     for chosen in product(*(options.items() for options in step.each_of)) if step.each_of else ():
         settings[", ".join(name for name, _ in chosen)] = [value for _, values in chosen for value in values]
     vehicles = {name: load_campaign(file, always, av=name) for name in step.avs}
@@ -90,7 +89,8 @@ def test_variants(step: Variants, context: Context) -> dict[str, Any]:
     campaigns = variants_of(step)
     for campaign in campaigns.values():
         prepare(resolve(campaign), context.progress)  # tables are built once, before the workers start
-    make = partial(claims_in_twin, step.tests, step.replications, context.rhw, context.confidence)
+    reference = None if step.reference is None else context.made[step.reference].result["figures"]["crash_rate"]
+    make = partial(claims_in_twin, step, context.rhw, context.confidence, reference and reference["value"])
     jobs = [campaign.model_dump_json() for campaign in campaigns.values()]
     claims = context.by_workers(jobs, make)
     rows = [{"variant": name, **row} for name, row in zip(campaigns, claims, strict=True)]
@@ -100,31 +100,71 @@ def test_variants(step: Variants, context: Context) -> dict[str, Any]:
         found = figures_of_shells(done, context.rhw)
         row |= {"shells_rate": found["crash_rate"], "shells_tests": found["tests_for_rhw"]}
     write_table(context.folder / "variants.parquet", pa.Table.from_pylist(rows))
-    gains = {row["variant"]: row["gain_claimed"] for row in rows}
-    mean = mean_of((gain["value"] for gain in gains.values()), context.confidence)
-    return {"variants": rows, "figures": {**gains, "mean": marked(mean, settled=all(row["settled"] for row in rows))}}
+    figures = {row["variant"]: row["gain_claimed"] for row in rows}
+    mean = mean_of((gain["value"] for gain in figures.values()), context.confidence)
+    figures |= {f"{key}, {row['variant']}": row[key] for row in rows for key in ("claimed", "true", "rnot")}
+    figures["mean"] = marked(mean, settled=all(row["settled"] for row in rows))
+    figures["minimum_at"] = _minimum_at({name: figures[name] for name in step.avs})
+    most = [row["most_frequent_steps"] for row in rows]
+    figures["most_frequent_steps"] = figure(most[-1], min(most), max(most))
+    return {"variants": rows, "figures": figures}
 
 
-def claims_in_twin(n: int, replications: int, rhw: float, confidence: float, campaign_json: str) -> dict[str, Any]:
-    """What NADE and SCV say of n tests each, in so many campaigns, and what these truly scatter by."""
-    campaign = Campaign.model_validate_json(campaign_json)
+def _minimum_at(gains: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    """The number in the name of the variant with the smallest gain, and the range of those that may have it."""
+    known = {name: gain for name, gain in gains.items() if gain["high"] is not None}
+    if not known:
+        return figure(None)
+    lowest = min(known.values(), key=lambda gain: float(gain["value"]))
+    at = {float(name.rpartition("-")[2]): gain for name, gain in known.items() if name.startswith("alpha-")}
+    may = [number for number, gain in at.items() if gain["low"] <= lowest["high"]]
+    value = next((number for number, gain in at.items() if gain is lowest), None)
+    return marked(figure(value, min(may, default=None), max(may, default=None)), settled=is_settled(*known.values()))
+
+
+def claims_in_twin(
+    step: Variants, rhw: float, confidence: float, reference: float | None, campaign_json: str
+) -> dict[str, Any]:
+    """What NADE and SCV say of a variant's tests in each of its campaigns, and what these truly scatter by."""
+    campaign, n = Campaign.model_validate_json(campaign_json), step.tests
     asked: tuple[EstimatorName, ...] = ("nade", "scv") if campaign.testing.method == "step_mixture" else ("nade",)
-    source, whole, rows = twin_episodes(campaign, campaign.seed, asked), Claims(with_scv=False), []
-    for start in range(0, n * replications, n):
+    source, whole = twin_episodes(campaign, campaign.seed, asked), Claims(with_scv=False)
+    rows, parts, steps = list[dict[str, Any]](), list[Tests](), np.zeros(0, np.int64)
+    for start in range(0, n * step.replications, n):
         claims = Claims()
         for first in range(start, start + n, AT_ONCE):
             block = source(first, min(AT_ONCE, start + n - first))
             whole.add(block)
             claims.add(block)
+            parts.append(Tests.of(block.first_episode, block.outcome, block.log_weight))
+            counts = np.bincount(block.n_control_steps, minlength=len(steps))
+            steps = counts + np.pad(steps, (0, len(counts) - len(steps)))
         rows.append(claims.row(rhw, confidence))
     prepared_twin.cache_clear()  # or a worker would keep the tables of all variants
     row = whole.row(rhw, confidence)
     tests = {name: [each[f"{name}_tests"] or math.nan for each in rows] for name in ("nade", "scv")}
-    rates = {name: [each[f"{name}_rate"]["value"] or 0.0 for each in rows] for name in ("nade", "scv")}
+    rates = {name: np.array([each[f"{name}_rate"]["value"] or 0.0 for each in rows]) for name in ("nade", "scv")}
+    rnot = figure(None)
+    if step.shuffles:
+        found = over_shuffles(Tests.joined(parts), Procedure(rhw, confidence, step.shuffles))
+        rnot = Counted(found, n * step.replications, row["settled"]).figure(confidence)
     return {
         **row,
+        "claimed": marked(mean_of(tests["nade"], confidence), settled=row["settled"]),
+        "true": true_tests(rates["nade"], reference, tests_for(n, rhw, confidence)),
+        "rnot": rnot,
+        "most_frequent_steps": int(np.argmax(steps[1:]) + 1) if len(steps) > 1 else 0,
         "scv_tests": mean_of(tests["scv"], confidence),
         "gain_claimed": marked(ratio_of_means(tests["nade"], tests["scv"], confidence), settled=row["settled"]),
         "gain_true": ratio_of_variances(rates["nade"], rates["scv"], confidence),
         "difference": max((each["difference"] for each in rows if each["difference"] is not None), default=None),
     }
+
+
+def true_tests(rates: FloatArray, reference: float | None, per_relvar: float) -> dict[str, Any]:
+    """Tests by the spread of repeated estimates around a known rate."""
+    if reference is None or len(rates) < 2:
+        return figure(None)
+    errors = rates / reference - 1.0
+    missed = errors.mean() + 2.0 * errors.std(ddof=1) / math.sqrt(len(errors)) < 0.0
+    return scaled(scattered(float(np.mean(errors**2)), len(errors), bool(missed)), per_relvar)

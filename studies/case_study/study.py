@@ -51,7 +51,9 @@ class ControlVariates(Section):
 
     kind: Literal["control_variates"]
     of: StepName = Field(description="step of kind run: a step mixture with records.moments first_9 or all")
-    sizes: list[Whole] = Field(min_length=1, description="numbers of tests, rising")
+    sizes: list[Whole] = Field(min_length=1, description="numbers of tests, rising, for the table")
+    looks: Whole = Field(12, ge=2, le=100, description="numbers of tests between 300 and the last one, for the plot")
+    spread_tests: Whole = Field(200_000, ge=10, description="first tests whose results are shown one by one")
 
 
 class RequiredNumbers(Section):
@@ -92,6 +94,9 @@ class Variants(Section):
     each_of: list[dict[Annotated[str, Field(pattern=r"^[^.|]+$")], Overrides]] = Field(
         default_factory=list, description="lists of such settings, of which every combination is another variant"
     )
+    epsilons: list[Probability] = Field(default_factory=list, description="values of testing.epsilon, a variant each")
+    reference: StepName | None = Field(None, description="step with the crash rate of all, for tests by replication")
+    shuffles: Whole = Field(0, ge=0, le=10_000, description="orderings of all tests of a variant, for their RNoT")
     reported: dict[str, Positive] = Field(default_factory=dict, description="the paper's gains, by variant")
 
 
@@ -131,7 +136,7 @@ class Claim(Section):
     says: str = Field(description="what the paper says, in a few words")
     where: str = Field(description="section, figure or table")
     paper: float
-    ours: str = Field(pattern=r"^\w+\.[\w.-]+$", description="STEP.FIGURE that answers it")
+    ours: str = Field(pattern=r"^\w+\..+$", description="STEP.FIGURE that answers it")
     within: float = Field(2.0, gt=1.0, description="factor within which our number counts as the same")
     tolerance: Positive | None = Field(None, description="distance that counts as the same, instead of a factor")
     at_most: bool = Field(False, description="whether the paper's number is a limit that ours does not exceed")
@@ -142,7 +147,7 @@ class Claim(Section):
 class Line(Section):
     """A line of the last picture."""
 
-    ours: str = Field(pattern=r"^\w+\.[\w.-]+$", description="STEP.FIGURE")
+    ours: str = Field(pattern=r"^\w+\..+$", description="STEP.FIGURE")
     paper: Positive | None = Field(None, description="what the paper reports")
 
 

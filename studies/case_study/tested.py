@@ -99,8 +99,15 @@ def _kept(context: Context, method: Method, tests: Tests) -> dict[str, Any]:
         "relvar": marked(relvar, settled=is_in),
         "tests_for_rhw": marked(needed, settled=is_in),
         "mean_weight": exactly(mean_weight),
+        "plain_tests": marked(_plain_tests(crash_rate(tests, context.confidence), per_relvar), settled=is_in),
     }
     return {"n": tests.n, "figures": figures}
+
+
+def _plain_tests(rate: dict[str, Any], per_relvar: float) -> dict[str, Any]:
+    """Tests that plain simulation would need at this crash rate: z²(1 - μ)/(RHW² μ)."""
+    value, high, low = (per_relvar * (1.0 / x - 1.0) if x else None for x in rate.values())
+    return figure(value, low, high)
 
 
 def tests_of(made: Made) -> Tests:

@@ -13,7 +13,8 @@ FOLDER = Path(__file__).parents[2] / "scenarios"
 SHIPPED = {
     "overtaking_forced": "b372a814b6bd6800",
     "overtaking_mixture": "418c17ecd91dbf05",
-    "overtaking_nade": "9c126fcf2823adcd",
+    "overtaking_nade": "399ca2421adf69d9",
+    "overtaking_nade_epsilon_0.1": "9c126fcf2823adcd",
     "overtaking_nde": "71294e917364cdb2",
     "overtaking_recursive": "a43f69057d98143b",
     "smoke": "e96a008c5e8b50b4",

@@ -93,8 +93,9 @@ def test_scenarios_ask_for_what_is_promised():
     assert (smoke.testing.method, smoke.testing.shells.statement) == ("shells", "assumption_free")
     assert (smoke.stop.rhw, smoke.stop.min_crashes, smoke.stop.episodes) == (0.05, None, 400_000)
     assert (smoke.world.engine, smoke.records.moments, smoke.records.traces) == ("sumo", "none", "crash")
-    nade = load_campaign(FOLDER / "overtaking_nade.yaml").testing
-    assert (nade.method, nade.challenge, nade.epsilon) == ("step_mixture", "immediate", 0.1)
+    for name, epsilon in {"overtaking_nade": 0.95, "overtaking_nade_epsilon_0.1": 0.1}.items():
+        nade = load_campaign(FOLDER / f"{name}.yaml").testing
+        assert (nade.method, nade.challenge, nade.epsilon) == ("step_mixture", "immediate", epsilon)
 
 
 # -- written out, and the editor's schema --
