@@ -6,9 +6,9 @@ luck; and while the rare crashes of large weight have not occurred, mean, standa
 too small. So looks at weighted tests (`StopRule`) follow from the campaign alone, two in a row must pass, and one more
 crash of the largest weight that the design allows may move the estimate by no more than the half-width asked for:
 cap/(n·rate) ≤ RHW. Tests drawn from shells (`RoundRule`) and pairs of tests of two vehicles (`PairRule`) are looked at
-after each round, a limit of the crash rate less often, and once is enough. That limits hold at a fixed number of tests
-says nothing about the number at which a rule stops: that intervals cover there, how far rates are biased, and how often
-decisions are wrong, is measured (docs/estimators.md, docs/compare.md, docs/gate.md).
+after each round, and once is enough. That limits hold at a fixed number of tests says nothing about the number at which
+a rule stops: that intervals cover there, how far rates are biased, and how often decisions are wrong, is measured
+(docs/estimators.md, docs/compare.md, docs/gate.md).
 """
 
 from __future__ import annotations
@@ -41,13 +41,12 @@ MARGIN_LOOKS = 6
 """A margin is decided at a level that leaves out so many times less than the campaign's, as it is looked at after each
 round. Measured where B's rate is 1 + margin times A's, by looks from 40 to 3,000 pairs: docs/compare.md."""
 Verdict = Literal["accepted", "rejected", "undecided"]
-DECISION_GROWTH = 1.25
-"""Of neighbouring looks at a limit: wrong decisions come evenly per e-fold of tests, and more with more looks."""
-DECISION_THRESHOLDS = ((500, 4.0), (2_000, 3.25), (20_000, 4.5), (200_000, 5.0), (math.inf, 5.5))
+DECISION_THRESHOLDS = ((500, 4.5), (2_000, 3.4), (20_000, 4.5), (200_000, 5.0), (math.inf, 5.5))
 """Below so many tests, the threshold of the likelihood ratio at which a limit is decided with an error of 5 % a side.
 
-Calibrated by replication where limit = truth, over all looks (docs/gate.md). Few tests need more than some more: then
-one crash in a shell of small share decides."""
+Calibrated by replication where limit = truth, looked at after every round and in the midst of each (docs/gate.md): the
+error is spent where vehicles at half and at twice the limit are decided. Few tests need more than some more: then one
+crash in a shell of small share decides."""
 DECISION_TAIL = 0.05
 """Error a side for which the thresholds are."""
 
@@ -250,19 +249,20 @@ class RoundRule(Rule):
     """Looks at the crash rate from shells after each round, or whether it is below a limit.
 
     ``held`` is the number of tests that the run folder holds: before them nothing is given up, whatever is asked for
-    now. The precision is ``factor`` times wider than the one that the campaign asks for. A limit is looked at where the
-    tests have grown by `DECISION_GROWTH`, and when the budget is spent. ``of_first_tests`` says whether the round
-    brings the tests that every shell gets before anything is decided of it.
+    now. The precision is ``factor`` times wider than the one that the campaign asks for. A limit is decided by
+    ``level_at`` a number of tests and a confidence, whatever the budget: a run that is continued is looked at where it
+    would have been without the break, and once more where that was. ``of_first_tests`` says whether the round brings
+    the tests that every shell gets before anything is decided of it.
     """
 
     of_first_tests = False
+    level_at = staticmethod(decision_level)
 
     def __init__(self, campaign: Campaign, held: int = 0, factor: float = 1.0) -> None:
         rhw = campaign.stop.rhw
         super().__init__(None if rhw is None else factor * rhw, campaign.min_crashes)
-        self._held, self._confidence, self._budget = held, campaign.stop.confidence, campaign.stop.episodes
+        self._held, self._confidence = held, campaign.stop.confidence
         self._statement, self._accept = campaign.testing.shells.statement, campaign.accept
-        self._next_look = 0.0
 
     def observe(self, seen: Shells) -> bool:
         """Whether to stop at the end of a round, with all tests so far."""
@@ -275,16 +275,15 @@ class RoundRule(Rule):
         return self.look.stopped or (enough and tally.tests.sum() >= self._held)
 
     def _decided(self, seen: Shells, limit: float) -> bool:
-        """Look at a limit if it is time to, which follows from the number of tests alone; the first answer stays."""
+        """Look at a limit until it is decided; that answer stays, also while the folder holds further tests."""
         n, found = int(seen.tally.tests.sum()), self.look.decision
-        if (found is None or not found.is_final) and n >= min(self._next_look, self._budget):
-            self._next_look = DECISION_GROWTH * n
-            limits = seen.limits_of(self._statement, decision_level(n, self._confidence))
+        if found is None or not found.is_final:
+            limits = seen.limits_of(self._statement, self.level_at(n, self._confidence))
             confidence, contradicted = (1.0 + self._confidence) / 2.0, seen.contradicts(self._statement)
             found = Decision(limit, self._statement, confidence, limits.low, limits.high, contradicted, n)
             unmet = (f"accept.crash_rate_below ({limit:g})",)
             self.look = Look(limits.rhw, stopped=found.verdict != "undecided", unmet=unmet, decision=found)
-        return found is not None and found.is_final and n >= self._held
+        return found.is_final and n >= self._held
 
 
 class PairRule(Rule):

@@ -89,6 +89,10 @@ class Experiment(Section):
         description="judge decisions instead of intervals: limits of `accept`, as multiples of each one's crash rate "
         "in the super-population; at 1 both verdicts are wrong, and each is judged",
     )
+    siblings: bool = Field(
+        False,
+        description="also judge the rules that those of limits and bounds took the place of, which err more often",
+    )
     super_population: SuperPopulation = SuperPopulation()
 
     @property

@@ -24,6 +24,8 @@ SIGNIFICANCE = 0.05
 NEGLIGIBLE_OUTSIDE = 1e-3
 """Largest share of a vehicle's crashes beyond the boundary with which it still meets the assumption of a statement."""
 WANTED_RHW = 0.3
+FORMER = ", by the former rule"
+"""Ends the name of a result that is a sibling, to fail: what the rule of that name took the place of."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +80,7 @@ class Subject:
 
     def truth(self, result: str) -> Known:
         """What a result estimates."""
-        return self.others.get(result, self.crash_rate)
+        return self.others.get(result.removesuffix(FORMER), self.crash_rate)
 
     @property
     def relative_error(self) -> float:
@@ -87,7 +89,7 @@ class Subject:
 
     def meets_assumption_of(self, result: str) -> bool:
         """Whether what a result assumes holds for it."""
-        return self.crashes_outside.get(result, 0.0) < NEGLIGIBLE_OUTSIDE
+        return self.crashes_outside.get(result.removesuffix(FORMER), 0.0) < NEGLIGIBLE_OUTSIDE
 
 
 Judgement = dict[str, Any]

@@ -15,16 +15,18 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from scipy.special import ndtri
 
 from harness.campaign.campaign import Campaign
 from harness.campaign.sections import Accept, ShellSettings
 from harness.errors import CampaignError
 from harness.estimators.block import Block, Drawn
 from harness.estimators.estimate import Estimate
-from harness.estimators.likelihood import Level
+from harness.estimators.likelihood import Level, likelihood_limit
 from harness.estimators.pairs import CRASH, NO_CRASH, PairCounts, no_pairs
 from harness.estimators.shells import Shells
 from harness.estimators.stopping import PairRule, RoundRule
+from harness.estimators.tally import Tally
 from harness.pool.cut_ins import CutIns, Pool
 from harness.pool.library import Library
 from harness.pool.shells import cells_in_strata, design_shells, outermost, shells_in_strata, shells_of
@@ -33,7 +35,7 @@ from harness.strata import LIBRARY_STATEMENT, ShellDesign
 from harness.vocabulary import CRASH as CRASHED
 from harness.vocabulary import FAILED, TIMEOUT, BoolArray, FloatArray, IntArray
 from studies.replication.experiment import Adversary
-from studies.replication.judgement import Row, estimate_row
+from studies.replication.judgement import FORMER, Row, estimate_row
 from studies.replication.populations import (
     CONDITIONAL_DIFFERENCE,
     DIFFERENCE,
@@ -158,18 +160,36 @@ def campaign_block(drawn: DrawnPool, added: IntArray, first: int, rng: np.random
     return Block(first, outcome, np.zeros(n), columns, Drawn("shells", shells=drawn.design))
 
 
+class FormerRule(RoundRule):
+    """A sibling of the rule of decisions: limits of the interval, which allow for no look but one."""
+
+    @staticmethod
+    def level_at(_n: int, confidence: float) -> Level:
+        """That of the interval."""
+        return Level.two_sided(confidence)
+
+
+def former_bound(p: FloatArray, tally: Tally, confidence: float) -> float:
+    """A sibling of bounds: it leaves out all of 1 - confidence above, and knows of no error of the pool."""
+    worst, tail = tally.failed_as_crashes(), 1.0 - confidence
+    level = Level(-math.log(tail), -float(ndtri(tail)))
+    return min(likelihood_limit(p, worst.crashes, worst.tests, level, 1.0), float(p.sum()))
+
+
 @dataclass(frozen=True, eq=False)
 class ShellCampaign:
     """A shells campaign to replicate, each time on a new pool; its stop rule, statement and first tests are used.
 
     Judged are all statements and the comparisons with reference drivers. With ``limits``, by their multiple of the
     crash rate, it is repeated until all of these are decided, as by ``accept``, and they are judged instead.
+    ``siblings`` see `FORMER`.
     """
 
     campaign: Campaign
     draw: Draw
     seed: int
     limits: Mapping[float, float] = field(default_factory=dict)
+    siblings: bool = False
 
     def run(self, replications: range) -> list[Row]:
         """Rows of all results for each replication."""
@@ -185,19 +205,21 @@ class ShellCampaign:
         self, replication: int, rounds: Iterator[tuple[ShellRounds, bool]], _design: ShellDesign
     ) -> Iterator[Row]:
         """All limits from the same tests: what is tested next does not depend on any."""
-        pending = {
-            factor: RoundRule(self.campaign.model_copy(update={"accept": Accept(crash_rate_below=limit)}))
-            for factor, limit in self.limits.items()
-        }
+        pending: dict[tuple[float, str], RoundRule] = {}
+        for factor, limit in self.limits.items():
+            asked = self.campaign.model_copy(update={"accept": Accept(crash_rate_below=limit)})
+            pending[factor, ""] = RoundRule(asked)
+            if self.siblings:
+                pending[factor, FORMER] = FormerRule(asked)
         for planner, _ in rounds:
-            for factor in [factor for factor, rule in pending.items() if rule.observe(planner.seen)]:
-                yield from self._decision_rows(planner.seen, factor, replication, pending.pop(factor))
+            for which in [which for which, rule in pending.items() if rule.observe(planner.seen)]:
+                yield from self._decision_rows(planner.seen, *which, replication, pending.pop(which))
             if not pending:
                 return
-        for factor, rule in pending.items():
-            yield from self._decision_rows(planner.seen, factor, replication, rule)
+        for which, rule in pending.items():
+            yield from self._decision_rows(planner.seen, *which, replication, rule)
 
-    def _decision_rows(self, seen: Shells, factor: float, replication: int, rule: RoundRule) -> Iterator[Row]:
+    def _decision_rows(self, seen: Shells, factor: float, by: str, replication: int, rule: RoundRule) -> Iterator[Row]:
         """A decision is a one-sided interval: below the limit, or above; at the truth one that is wrong is empty."""
         verdict = "undecided" if rule.look.decision is None else rule.look.decision.verdict
         limit, tally = self.limits[factor], seen.tally
@@ -208,7 +230,9 @@ class ShellCampaign:
             low, high = limit if verdict == "rejected" else 0.0, limit if verdict == "accepted" else math.inf
             if factor == 1.0:
                 low, high = 0.0, 0.0 if name.endswith(verdict) else math.inf
-            yield Row(name, replication, *counts, rate, seen.std_error(), low, high, reached=verdict != "undecided")
+            yield Row(
+                name + by, replication, *counts, rate, seen.std_error(), low, high, reached=verdict != "undecided"
+            )
 
     def _replicate(
         self, replication: int, rounds: Iterator[tuple[ShellRounds, bool]], design: ShellDesign
@@ -227,11 +251,17 @@ class ShellCampaign:
         outside = int(estimate.details["statements"][0]["n_crashes_outside"])
         row = estimate_row(FREE, replication, estimate, reached=reached, outside=outside)
         yield row
-        yield replace(row, result=BOUND, ci_low=0.0, ci_high=estimate.upper_bound)
+        bounds = [(BOUND, 0, estimate.crash_rate, row.std_error, estimate.upper_bound)]
         for found in estimate.details["statements"]:
             rate = estimate.crash_rate - found["crash_rate"]  # whose error nobody claims to know
-            beyond = replace(row, result=bound_outside(found["name"]), crash_rate=rate, std_error=0.0)
-            yield replace(beyond, ci_low=0.0, ci_high=found["upper_bound_outside"])
+            bounds.append((bound_outside(found["name"]), found["n_shells"], rate, 0.0, found["upper_bound_outside"]))
+        for name, first, rate, error, bound in bounds:
+            beyond = replace(row, result=name, crash_rate=rate, std_error=error, ci_low=0.0, ci_high=bound)
+            yield beyond
+            if self.siblings:
+                part = planner.tally.part(slice(first, None))
+                former = former_bound(design.p[first:], part, self.campaign.stop.confidence)
+                yield replace(beyond, result=name + FORMER, ci_high=former)
         for name in names:
             yield known.get(name) or self._statement_row(planner.seen, name, replication, reached=False)
         for reference in design.references:

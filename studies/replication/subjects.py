@@ -104,7 +104,8 @@ def _holding(experiment: Experiment, progress: Progress) -> Iterator[Tested]:
 def _of_shells(
     experiment: Experiment, campaign: Campaign, draw: Draw, seed: int, subject: Subject, own_rate: float
 ) -> Tested:
-    return subject, ShellCampaign(campaign, draw, seed, {factor: factor * own_rate for factor in experiment.limits})
+    limits = {factor: factor * own_rate for factor in experiment.limits}
+    return subject, ShellCampaign(campaign, draw, seed, limits, siblings=experiment.siblings)
 
 
 def _of_population(experiment: Experiment, own_rate: float, outside: Mapping[str, float]) -> dict[str, Known]:

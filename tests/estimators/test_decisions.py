@@ -1,7 +1,7 @@
 """Decisions about a limit that is the truth, where an error rate is defined: both verdicts are wrong there.
 
 Seeds are fixed. The right rule's `binomtest` would refuse an error of 5 % with probability 1e-4; the rule that it took
-the place of, the interval's own limits after each tenth of tests, must fail at 1e-9.
+the place of, the interval's own limits after each tenth of tests, must fail at 1e-9. Of whole campaigns: docs/gate.md.
 """
 
 from __future__ import annotations
@@ -14,10 +14,9 @@ import pytest
 from scipy.stats import binomtest
 
 from harness.campaign.campaign import Campaign
-from harness.estimators import stopping
 from harness.estimators.likelihood import Level
 from harness.estimators.shells import Shells
-from harness.estimators.stopping import DECISION_GROWTH, Decision, RoundRule
+from harness.estimators.stopping import Decision, RoundRule
 from harness.estimators.tally import Tally, combined
 from harness.strata import Statement
 
@@ -32,8 +31,8 @@ BUDGET = 3_000
 REPLICATIONS = 500
 
 
-def rule(limit: float, held: int = 0, budget: int = BUDGET) -> RoundRule:
-    content = {"name": "x", "testing": {"method": "shells"}, "stop": {"episodes": budget}}
+def rule(limit: float, held: int = 0) -> RoundRule:
+    content = {"name": "x", "testing": {"method": "shells"}, "stop": {"episodes": BUDGET}}
     return RoundRule(Campaign.model_validate({**content, "accept": {"crash_rate_below": limit}}), held)
 
 
@@ -42,22 +41,25 @@ def seen(tests, crashes) -> Shells:
     return Shells.of(DESIGN, Tally(tests, crashes, none, np.outer(crashes, P), np.zeros((3, 3))))
 
 
-def verdict(seed: int, limit: float) -> str:
-    """Of a campaign whose rounds grow by a tenth, and give most tests to where the rate is least known."""
+def decided(seed: int, limit: float) -> Decision:
+    """By a campaign whose rounds grow by a tenth, and give most tests to where the rate is least known.
+
+    It is looked at in the midst of each round, too, as if a budget had ended there, and been raised.
+    """
     rng, deciding = np.random.default_rng([34, seed]), rule(limit)
     spread = P * np.sqrt(SHARE * (1.0 - SHARE))
     tests = crashes = np.zeros(3, np.int64)
     while (n := int(tests.sum())) < BUDGET:
-        added = np.ceil(min(max(0.1 * n, 30), BUDGET - n) * spread / spread.sum()).astype(np.int64)
+        added = np.ceil(min(max(0.05 * n, 15), BUDGET - n) * spread / spread.sum()).astype(np.int64)
         tests, crashes = tests + added, crashes + rng.binomial(added, SHARE)
         if deciding.observe(seen(tests, crashes)):
             break
-    return deciding.look.decision.verdict
+    return deciding.look.decision
 
 
 def wrong() -> tuple[int, int]:
     """How many campaigns accept, and reject, where the limit is the crash rate."""
-    found = [verdict(seed, float(P @ SHARE)) for seed in range(REPLICATIONS)]
+    found = [decided(seed, float(P @ SHARE)).verdict for seed in range(REPLICATIONS)]
     return found.count("accepted"), found.count("rejected")
 
 
@@ -66,22 +68,17 @@ def test_either_verdict_is_wrong_in_at_most_one_of_twenty():
 
 
 def test_the_intervals_own_limits_after_each_round_are_wrong_far_more_often(monkeypatch):
-    monkeypatch.setattr(stopping, "decision_level", lambda _, confidence: Level.two_sided(confidence))
-    monkeypatch.setattr(stopping, "DECISION_GROWTH", 1.0)
+    monkeypatch.setattr(RoundRule, "level_at", staticmethod(lambda _, confidence: Level.two_sided(confidence)))
     assert all(binomtest(n, REPLICATIONS, 0.05, alternative="greater").pvalue < 1e-9 for n in wrong())
 
 
-def test_looks_follow_from_the_number_of_tests_alone():
-    """Also where the folder holds tests already: what decides is what would have decided without them."""
-    looks = []
+def test_every_round_is_looked_at_whatever_the_folder_holds():
+    """So that the looks of a run are those of one with a larger budget; and none waits for the next e-fold."""
     for held in (0, 500):
-        deciding, found = rule(1e-9, held), []
+        deciding = rule(1e-9, held)
         for n in range(30, 600, 10):
             deciding.observe(seen(np.array([n - 20, 10, 10]), np.array([0, 0, 0])))
-            found.append(deciding.look.decision.n_episodes)
-        looks.append(sorted(set(found)))
-    assert looks[0] == looks[1]
-    assert all(b >= DECISION_GROWTH * a for a, b in zip(looks[0], looks[0][1:], strict=False))
+            assert deciding.look.decision.n_episodes == n
 
 
 def test_a_decision_stays_and_what_the_folder_holds_is_not_given_up():
@@ -91,13 +88,6 @@ def test_a_decision_stays_and_what_the_folder_holds_is_not_given_up():
     assert deciding.look.decision.verdict == "accepted"
     assert deciding.observe(seen(2 * tests, np.zeros(3, int)))
     assert deciding.look.decision.n_episodes == 200
-
-
-def test_a_spent_budget_is_looked_at():
-    deciding = rule(1e-9, budget=110)
-    for n in (100, 110):
-        deciding.observe(seen(np.array([n - 20, 10, 10]), np.zeros(3, int)))
-    assert deciding.look.decision.n_episodes == 110
 
 
 @pytest.mark.parametrize(
