@@ -84,7 +84,9 @@ def _settings_rows(section: type[BaseModel]) -> list[tuple[str, ...]]:
     for name, field in section.model_fields.items():
         if not field.description and _is_section(field.annotation):
             continue
-        text = ": ".join(filter(None, [_choices(field.annotation), field.description]))
+        choices, words = _choices(field.annotation), field.description or ""
+        told = all(choice.strip("`") in words for choice in choices.split(", "))
+        text = words if told or not choices else f"{choices}: {words}"
         rows.append((f"`{name}`", _default(field), text.replace("|", "\\|")))
     return rows
 

@@ -47,7 +47,7 @@ def resolve(campaign: Campaign, command: Command = "run", *, controller_sha256: 
     """
     parameters = load_parameters(campaign.environment)
     environment = load_environment(campaign.environment, parameters)
-    require_combination(campaign.parts, command, takes_time=environment.lateral.present)
+    require_combination(campaign, command, takes_time=environment.lateral.present)
     return Resolved(
         campaign,
         environment,

@@ -16,6 +16,7 @@ import pyarrow.parquet as pq
 
 from harness.campaign.campaign import Campaign
 from harness.campaign.files import load_campaign
+from harness.records.folder import SEAL
 from tests.golden.campaigns import BASE, RUNS
 from tests.golden.record import TABLES, tables_of
 
@@ -38,12 +39,25 @@ def manifest(folder: Path) -> dict[str, Any]:
 
 
 def edit(folder: Path, file: str = "manifest.json", **changes: Any) -> None:
-    """Change keys of a JSON file of a run."""
-    (folder / file).write_text(json.dumps({**json.loads((folder / file).read_text()), **changes}))
+    """Change keys of a JSON file of a run, which then has no checksum."""
+    content = {**json.loads((folder / file).read_text()), **changes}
+    content.pop(SEAL, None)
+    (folder / file).write_text(json.dumps(content))
+
+
+def of_before(folder: Path) -> Path:
+    """Let a folder be as earlier versions left it: without a checksum."""
+    shards = [{key: value for key, value in shard.items() if key != SEAL} for shard in manifest(folder)["shards"]]
+    edit(folder, shards=shards, campaign_crc32=None, shadow_crc32=[])
+    edit(folder, "estimates.json")
+    return folder
 
 
 def estimates(folder: Path) -> dict[str, Any]:
-    return json.loads((folder / "estimates.json").read_text())
+    """Content of estimates.json, without its checksum."""
+    content = json.loads((folder / "estimates.json").read_text())
+    del content[SEAL]
+    return content
 
 
 def shard_files(folder: Path, table: str = "episodes") -> list[Path]:

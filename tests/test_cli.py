@@ -18,6 +18,7 @@ from harness.cli import cli, main
 from harness.commands.printing import in_folder
 from harness.errors import EXIT_BAD_INPUT, RunFolderError, TooManyFailedError
 from harness.progress import ShownProgress
+from tests.stored_runs import estimates
 
 SCENARIOS = Path(__file__).parents[1] / "scenarios"
 SMOKE = str(SCENARIOS / "smoke.yaml")
@@ -296,7 +297,7 @@ def test_estimate_closes_with_what_was_asked(calls, capsys, tmp_path):
 def test_estimate_writes_only_when_asked(calls, capsys, tmp_path):
     assert main(["estimate", str(tmp_path), "--write", "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == in_folder(ESTIMATES, tmp_path)
-    assert json.loads((tmp_path / "estimates.json").read_text()) == ESTIMATES
+    assert estimates(tmp_path) == ESTIMATES
     assert [file.name for file in tmp_path.iterdir()] == ["estimates.json"]
 
 

@@ -18,7 +18,7 @@ from pydantic import Field, model_validator
 from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
 from pydantic_core import CoreSchema, core_schema
 
-from harness.campaign.combinations import Parts, refusal
+from harness.campaign.combinations import refusal
 from harness.campaign.drivers import Surrogate, default_surrogates
 from harness.campaign.problems import NAME_PATTERN, broken_rule
 from harness.campaign.sections import (
@@ -77,15 +77,9 @@ class Campaign(Section):
             expected = f"one weight for each surrogate: {listed(self.surrogates)}"
             mend = "Name the surrogates exactly, or leave alpha out for equal weights."
             raise broken_rule("testing.alpha", f"weights for {listed(alpha)}", expected, mend)
-        if (words := refusal(self.parts)) is not None:
+        if (words := refusal(self)) is not None:
             raise broken_rule(*words)
         return self
-
-    @property
-    def parts(self) -> Parts:
-        """What `harness.campaign.combinations` asks of it."""
-        sections = self.av, self.surrogates, self.testing, self.world, self.records, self.stop, self.accept
-        return Parts(*sections, has_baseline_runs=self.has_baseline_runs)
 
     @property
     def sampling(self) -> Sampling:

@@ -7,31 +7,18 @@ command, and is known whether its cut-ins take time (`lateral` of the environmen
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
-from harness.campaign.drivers import Surrogate
-from harness.campaign.sections import Accept, Records, Stop, Testing, World
-from harness.campaign.vehicle import AutomatedVehicle
 from harness.errors import CampaignError
 from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT
-from harness.vocabulary import METHODS, SAMPLING, Sampling
+from harness.vocabulary import METHODS, SAMPLING
+
+if TYPE_CHECKING:
+    from harness.campaign.campaign import Campaign
 
 Command = Literal["run", "compare", "av-check"]
 MOST_SUMO_CELLS = 256
 """Roads of the largest committed network."""
-
-
-class Parts(NamedTuple):
-    """What is asked of a campaign: its sections, and what follows from several of them."""
-
-    av: AutomatedVehicle
-    surrogates: dict[str, Surrogate]
-    testing: Testing
-    world: World
-    records: Records
-    stop: Stop
-    accept: Accept | None
-    has_baseline_runs: bool
 
 
 class Use(NamedTuple):
@@ -44,15 +31,11 @@ class Use(NamedTuple):
 WHILE_READ = Use()
 
 
-def _sampling(parts: Parts) -> Sampling:
-    return SAMPLING[parts.testing.method]
-
-
 class Combination(NamedTuple):
     """What is refused: where to put the blame, when, and the words, with values of the campaign in braces."""
 
     where: str
-    is_asked: Callable[[Parts, Use], bool]
+    is_asked: Callable[[Campaign, Use], bool]
     found: str
     expected: str
     mend: str
@@ -65,7 +48,7 @@ REFUSED = (
     # -- limits --
     Combination(
         "accept",
-        lambda c, _: c.accept is not None and not _sampling(c).strata,
+        lambda c, _: c.accept is not None and not c.sampling.strata,
         "a limit, with testing.method {testing.method}",
         "testing.method shells: how often decisions are wrong is known for its intervals alone",
         "Choose shells, or delete the section and compare the interval with the limit yourself.",
@@ -87,7 +70,7 @@ REFUSED = (
     # -- vehicles that act before the cut-in --
     Combination(
         "av.before_cut_in",
-        lambda c, _: c.av.acts_before_cut_in and _sampling(c).holds_speed,
+        lambda c, _: c.av.acts_before_cut_in and c.sampling.holds_speed,
         "controller, with testing.method {testing.method}",
         "hold_speed: the method draws LV's and BV's path ahead, which needs to know the AV's",
         "Choose hold_speed, or testing.method shells (or forced), which drives the AV along its paths first.",
@@ -117,14 +100,14 @@ REFUSED = (
     # -- what methods need and allow --
     Combination(
         "surrogates",
-        lambda c, _: not c.surrogates and _sampling(c).mixes,
+        lambda c, _: not c.surrogates and c.sampling.mixes,
         "none",
         "at least one surrogate for testing.method {testing.method}",
         "Leave surrogates out for the three of the paper, or choose method forced or nde.",
     ),
     Combination(
         "stop.rhw",
-        lambda c, _: c.stop.rhw is not None and not _sampling(c).bounded,
+        lambda c, _: c.stop.rhw is not None and not c.sampling.bounded,
         "{stop.rhw:g}, with testing.method {testing.method}",
         "no precision to stop at: nothing bounds the weights of the step mixture, and while the large ones are missing "
         "its interval looks narrow",
@@ -139,7 +122,7 @@ REFUSED = (
     ),
     Combination(
         "stop.estimator",
-        lambda c, _: c.stop.estimator is not None and c.stop.estimator not in _sampling(c).estimators,
+        lambda c, _: c.stop.estimator is not None and c.stop.estimator not in c.sampling.estimators,
         "{stop.estimator}, with testing.method {testing.method}",
         "testing.method {allowing}",
         "Change one of the two, or leave stop.estimator out for the method's own.",
@@ -155,7 +138,7 @@ REFUSED = (
     ),
     Combination(
         "testing.method",
-        lambda c, use: use.takes_time and _sampling(c).mixes,
+        lambda c, use: use.takes_time and c.sampling.mixes,
         "{testing.method}, " + _TAKES_TIME,
         "shells, forced or nde: the tables of criticality are for cut-ins of one step, and would aim at those that an "
         "attentive vehicle avoids",
@@ -163,7 +146,7 @@ REFUSED = (
     ),
     Combination(
         "av.before_cut_in",
-        lambda c, use: use.takes_time and c.av.acts_before_cut_in and not _sampling(c).baseline_runs,
+        lambda c, use: use.takes_time and c.av.acts_before_cut_in and not c.sampling.baseline_runs,
         "controller, with testing.method {testing.method}, " + _TAKES_TIME,
         "a method that drives the AV along its paths first: only then the onset is known in time",
         "Choose testing.method shells or forced, or hold_speed.",
@@ -171,7 +154,7 @@ REFUSED = (
     # -- comparisons --
     Combination(
         "testing.method",
-        lambda c, use: use.command == "compare" and not _sampling(c).strata,
+        lambda c, use: use.command == "compare" and not c.sampling.strata,
         "{testing.method}, in a comparison",
         "shells, under which both vehicles meet the same cut-ins",
         "Write --set testing.method=shells; or run both by themselves and put their intervals side by side.",
@@ -210,18 +193,18 @@ REFUSED = (
 """All that is refused, in the order in which it is told."""
 
 
-def refusal(parts: Parts, use: Use = WHILE_READ) -> tuple[str, str, str, str] | None:
+def refusal(campaign: Campaign, use: Use = WHILE_READ) -> tuple[str, str, str, str] | None:
     """Where, found, expected and mend of the first combination that is refused; None if the campaign may go on."""
-    allowing = (name for name in METHODS if parts.stop.estimator in SAMPLING[name].estimators)
-    values = {**parts._asdict(), "allowing": " or ".join(allowing)}
+    allowing = (name for name in METHODS if campaign.stop.estimator in SAMPLING[name].estimators)
+    values = {**dict(campaign), "allowing": " or ".join(allowing)}
     for row in REFUSED:
         # A command may change a campaign that has been read: what it was allowed with then is not asked again.
-        if row.is_asked(parts, use) and not (use != WHILE_READ and row.is_asked(parts, WHILE_READ)):
+        if row.is_asked(campaign, use) and not (use != WHILE_READ and row.is_asked(campaign, WHILE_READ)):
             return row.where, row.found.format(**values), row.expected.format(**values), row.mend
     return None
 
 
-def require_combination(parts: Parts, command: Command, *, takes_time: bool) -> None:
+def require_combination(campaign: Campaign, command: Command, *, takes_time: bool) -> None:
     """Refuse (`CampaignError`) a campaign that does not go with the command that it is for, or with its cut-ins."""
-    if (words := refusal(parts, Use(command, takes_time))) is not None:
+    if (words := refusal(campaign, Use(command, takes_time))) is not None:
         raise CampaignError(*words)

@@ -82,20 +82,20 @@ class Reference(Following):
         0.75, ge=0.0, le=5.0, description="from the evaluated risk to the brakes [JRC-FSM: CC_rt, FSM_rt]"
     )
     lateral_speed_mps: Positive = Field(
-        1.8, le=10.0, description="at which BV is taken to have come over [JRC-FSM: 0.72 m in 0.4 s]"
+        1.8, le=10.0, description="BV's, where the cut-in is one step [JRC-FSM: 0.72 m in 0.4 s]"
     )
     evaluated_at_m: float = Field(
         0.505,
         ge=0.0,
         le=5.0,
-        description="distance of their sides when the risk has been evaluated: 1.6 of two vehicles of 1.9 in lanes of "
-        "3.5, less 0.375 of wandering, less 0.72 in which it is evaluated [JRC-FSM: CC_calc_dist_to_react]",
+        description="lateral distance when the risk has been evaluated: 1.6, less 0.375 of wandering, less 0.72 in "
+        "which it is evaluated [JRC-FSM: CC_calc_dist_to_react]",
     )
     risk_evaluation_s: StepTime = Field(
         RISK_EVALUATION_S,
         ge=0.0,
         le=5.0,
-        description="how long it evaluates what it has perceived, where cut-ins take time [JRC-FSM: 0.4 s]",
+        description="from seeing a cut-in that takes time to the evaluated risk [JRC-FSM: 0.4 s]",
     )
     min_acceleration_mps2: Braking = Field(
         -7.59294, description="hardest braking, 0.774 g [JRC-FSM: CC_max_deceleration]"
@@ -281,8 +281,8 @@ class Reflexes(Section):
         PERCEIVES_LATERAL_M,
         ge=0.0,
         le=10.0,
-        description="how far a vehicle has to have come over before the driver sees that it cuts in: 0 acts from the "
-        "onset, the way to overlap or more only from there; where cut-ins take time [JRC-FSM: 0.375 of wandering]",
+        description="lateral distance after which the driver sees a cut-in that takes time; 0: from its onset "
+        "[JRC-FSM: 0.375 of wandering]",
     )
 
 

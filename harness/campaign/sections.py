@@ -96,8 +96,7 @@ class EnvironmentSettings(Section):
     )
     cut_in_lead_s: LeadTime | None = Field(
         None,
-        description="how long before overlap every cut-in shows itself, in place of the lateral motion that the "
-        "parameters describe",
+        description="time from onset to overlap of every cut-in, in place of the parameters' lateral motion",
     )
 
 
@@ -122,13 +121,12 @@ class ShellSettings(Section):
     )
     statement: str = Field(
         ASSUMPTION_FREE,
-        description="what has to reach stop.rhw: assumption_free, library, or one of the statements, beyond whose "
-        "boundary nothing is tested then",
+        description="what has to reach stop.rhw: assumption_free, or a statement, outside of which nothing is tested",
     )
     stopping: Literal["sequential", "two_phase"] = Field(
         "sequential",
-        description="sequential: stop at the first interval that is narrow enough, which biases a rate that is only "
-        "roughly known; two_phase: first tests plan how many more there are, and these alone are reported",
+        description="sequential: stop at the first interval that is narrow enough; two_phase: first tests plan how "
+        "many more there are, which alone are reported",
     )
     first_tests: Annotated[int, Field(ge=1, le=10_000), BeforeValidator(whole)] | None = Field(
         None, description="tests of each shell before any is preferred; by its probability"
@@ -137,7 +135,7 @@ class ShellSettings(Section):
         1,
         ge=1,
         le=10_000,
-        description="tests of a round at least: as many as workers, where a test takes seconds",
+        description="fewest tests of a round: as many as workers, where a test takes seconds",
     )
 
     @field_validator("statement")
@@ -208,8 +206,8 @@ class PoolSettings(Section):
         0.005,
         ge=0.001,
         le=0.2,
-        description="standard error of the surrogates' crash rates to reach, relative; four times as much for those "
-        "beyond the boundary, or that crash in rare traffic of their own",
+        description="relative standard error to reach of the surrogates' crash rates; four times as much for those "
+        "beyond the boundary",
     )
     cut_ins_per_shell: Whole = Field(
         25_000, ge=100, le=1_000_000, description="cut-ins kept of each shell: the most tests that it can give"
@@ -218,8 +216,7 @@ class PoolSettings(Section):
         500,
         ge=50,
         le=100_000,
-        description="paths that a vehicle which acts before the cut-in (av.before_cut_in: controller) is driven along "
-        "without one, to know where it is",
+        description="baseline runs of a vehicle that acts before the cut-in (av.before_cut_in: controller)",
     )
     seed: Whole = Field(1, ge=0, lt=2**63, description="every random number of the pool follows from it")
 
@@ -292,8 +289,7 @@ class Run(Section):
 
     shard_size: Annotated[int, Field(ge=1, le=LARGEST_SHARD), BeforeValidator(whole)] | None = Field(
         None,
-        description="episodes per file and per task; null: 5,000, and in a long run a 32nd of the episodes before, "
-        "from 2.5 million on a 16th, so that a run of 100 million has 200 files",
+        description="episodes per file and per task; null: 5,000, and more in long runs",
     )
     max_failed_share: Probability = Field(0.01, description="stop with exit code 3 above this share of failures")
     executor: Literal["local", "ray"] = Field("local", description="where workers run: on this machine, or a cluster")

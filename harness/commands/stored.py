@@ -58,9 +58,9 @@ def estimate(
 
     content = estimate_run(folder, estimators=estimators or None, confidence=confidence)
     if write:
-        from harness.records.folder import write_json  # noqa: PLC0415 - keeps --help fast
+        from harness.records.folder import write_sealed  # noqa: PLC0415 - keeps --help fast
 
-        write_json(folder / "estimates.json", content)
+        write_sealed(folder / "estimates.json", content)
     if as_json:
         print_json(in_folder(content, folder))
     else:

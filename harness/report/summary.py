@@ -20,12 +20,11 @@ import pyarrow.compute as pc
 from pydantic import TypeAdapter, ValidationError
 
 from harness.campaign.campaign import Campaign
-from harness.campaign.files import load_campaign
-from harness.errors import CampaignError, RunFolderError
+from harness.errors import RunFolderError
 from harness.estimators.estimate import Estimate, Estimates, Unavailable
 from harness.estimators.shells import ShellDetails, Within
 from harness.records.folder import MANIFEST, NO_RUN, Count, StoredManifest, concatenated, read_as, read_manifest
-from harness.records.reader import read_shards, stored_columns
+from harness.records.reader import read_campaign, read_shards, stored_columns
 from harness.strata import ASSUMPTION_FREE
 from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import CRASH, FAILED, OUTCOMES, FloatArray, IntArray
@@ -144,17 +143,8 @@ def read_run_folder(path: Path) -> RunFolder:
     read_as(ShownManifest, path / MANIFEST, mend=NO_RUN)
     estimates = _read_estimates(path, manifest["campaign_hash"])
     shells = _shells(path, estimates.estimates[estimates.headline])
-    campaign = _read_campaign(path / "campaign.yaml")
+    campaign = read_campaign(path, manifest)
     return RunFolder(path, campaign, manifest, estimates, shells, typed_folder(path))
-
-
-def _read_campaign(path: Path) -> Campaign:
-    try:
-        return load_campaign(path, check_files=False)
-    except CampaignError as error:
-        found = error.found if error.where == str(path) else f"{error.found} ({error.where})"
-        expected = "a campaign with all its sections, as the run has written it"
-        raise RunFolderError(str(path), found, expected, "Restore the file, or run the campaign again.") from error
 
 
 def _read_estimates(folder: Path, campaign_hash: str) -> Estimates:

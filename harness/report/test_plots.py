@@ -31,7 +31,6 @@ from harness.report.summary import RunSummary
 from harness.vocabulary import CRASH, FAILED, FloatArray, IntArray
 
 WEIGHT_BINS, STRATUM_BINS, CRASH_BINS = 70, 40, 36
-MERGE_FACTORS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1_000, 2_000)
 R2DOT_MPS, R2_M = np.arange(-30.0, 20.5, 0.5), np.arange(0.0, 152.5, 2.5)
 """Edges of the cells of maps; a cut-in beyond them is counted in the outermost cell."""
 LEVELS_PER_DECADE = 2
@@ -47,20 +46,6 @@ class Bins(NamedTuple):
     shares: FloatArray
 
 
-def edges_for(values: FloatArray, width: float, most: int) -> FloatArray:
-    """Edges of at most ``most`` bins that hold all values, multiples of the width times 1, 2 or 5 and powers of ten."""
-    low, high = float(values.min(initial=math.inf)), float(values.max(initial=-math.inf))
-    if low > high:
-        return width * np.arange(2.0)
-    for factor in MERGE_FACTORS:
-        wide = factor * width
-        # A value such as 0.3 on bins of 0.1 must not fall below its edge by rounding.
-        first, last = math.floor(low / wide + 1e-9), math.floor(high / wide + 1e-9) + 1
-        if last - first <= most:
-            break
-    return wide * np.arange(first, last + 1.0)
-
-
 def binned(values: FloatArray, weights: FloatArray, edges: FloatArray) -> Bins:
     """Values (n,) that are finite in bins, those on an edge in the upper one."""
     known = np.isfinite(values)
@@ -69,12 +54,19 @@ def binned(values: FloatArray, weights: FloatArray, edges: FloatArray) -> Bins:
     return Bins(edges, counts, _percent(sums))
 
 
+def edges_for(values: FloatArray, width: float, most: int) -> FloatArray:
+    """Edges of about ``most`` bins that hold all values, multiples of the width times 1, 2 or 5 and powers of ten."""
+    ends = (values.min(), values.max()) if values.size else (0.0, 0.0)
+    # A value such as 0.3 on bins of 0.1 must not fall below its edge by rounding.
+    first, last = (math.floor(end / width + 1e-9) for end in ends)
+    return width * np.asarray(MaxNLocator(most, steps=[1, 2, 5, 10], integer=True).tick_values(first, last + 1))
+
+
 def weighted_quantile(values: FloatArray, weights: FloatArray, quantile: float) -> float:
-    """Value below which this share of the weight lies; NaN without weight."""
-    order, total = np.argsort(values), float(weights.sum())
-    if total <= 0.0:
+    """Value up to which this share of the weight lies; NaN without weight."""
+    if not weights.any():
         return math.nan
-    return float(values[order][np.searchsorted(np.cumsum(weights[order]), quantile * total).clip(max=values.size - 1)])
+    return float(np.quantile(values, quantile, method="inverted_cdf", weights=weights))
 
 
 def _percent(values: FloatArray) -> FloatArray:
@@ -137,7 +129,7 @@ def strata_plot(summary: RunSummary) -> Plot | None:
     steps = crashes["n_control_steps"]
     if np.unique(steps).size < 2:
         return None
-    bins = binned(steps, crashes["weight"], edges_for(steps + 0.5, 1.0, STRATUM_BINS))
+    bins = binned(steps, crashes["weight"], edges_for(steps, 1.0, STRATUM_BINS))
     labels = ("control steps in the test",) * 2
     figure, sampled, weighted = two_panels(2.9, labels, sharex=True)
     width = float(bins.edges[1] - bins.edges[0])

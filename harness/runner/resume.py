@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import platform
 import time
+import zlib
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from importlib import metadata
@@ -19,15 +21,18 @@ from harness.campaign.campaign import Campaign, dump_campaign
 from harness.errors import RunFolderError, TooManyFailedError
 from harness.pool.replay import Retracing
 from harness.records.folder import (
+    CAMPAIGN,
     MANIFEST,
     SHELLS,
+    checksum,
+    listed_crc32,
     read_as,
     read_manifest,
     read_table,
     require_place,
     shard_files,
-    write_json,
-    write_text,
+    write_bytes,
+    write_sealed,
 )
 from harness.records.schemas import ShardTables
 from harness.resolved import Resolved
@@ -70,7 +75,7 @@ class Prefix:
         self.repeated: Repeated | None = None
         self._causes: Counter[str] = Counter()
 
-    def add(self, done: ShardResult, files: dict[str, str]) -> None:
+    def add(self, done: ShardResult) -> None:
         """Append a shard that is on disk."""
         request = done.request
         self.shards.append(
@@ -78,7 +83,8 @@ class Prefix:
                 "index": request.index,
                 "first_episode": request.first_episode,
                 "n_episodes": request.n_episodes,
-                "files": files,
+                "files": done.files,
+                "crc32": done.crc32,
             }
         )
         self.n_episodes += request.n_episodes
@@ -113,7 +119,8 @@ class Manifest:
     """Keeps ``manifest.json`` and ``campaign.yaml`` of a run folder true.
 
     ``earlier`` is what `require_own_folder` found, ``began`` `time.monotonic` at the run's beginning; ``facts`` are
-    more keys. ``limits_before`` are other limits that have been asked of the folder's tests.
+    more keys. ``limits_before`` are other limits that have been asked of the folder's tests, ``listed_baseline``
+    the checksums of its baseline runs.
     """
 
     def __init__(
@@ -121,16 +128,18 @@ class Manifest:
     ) -> None:
         campaign = resolved.campaign
         self._folder, self._earlier = folder, earlier
-        self._campaign = dump_campaign(campaign)
+        self._campaign = dump_campaign(campaign).encode()
         self._reproducible = campaign.av.reproducible
         self._began = began - float(earlier.get("wall_time_s") or 0.0)
         asked = [] if campaign.accept is None else [campaign.accept.crash_rate_below]
+        self.listed_baseline: list[int] = earlier.get("shadow_crc32", [])
         earlier_limits = earlier.get("limits", []) if earlier["n_episodes"] else []
         self.limits_before = [limit for limit in earlier_limits if limit not in asked]
         self._content: dict[str, Any] = {
             "format": 1,
             "name": campaign.name,
             "campaign_hash": resolved.content_hash,
+            "campaign_crc32": zlib.crc32(self._campaign),
             "created": earlier.get("created") or datetime.now(UTC).isoformat(timespec="seconds"),
             "seed": campaign.seed,
             "engine": campaign.world.engine,
@@ -144,22 +153,28 @@ class Manifest:
         self._last: dict[str, Any] = {}
         self.write(Prefix(), "running")  # first: --resume knows a folder by its manifest
 
+    def listed(self, request: ShardRequest) -> dict[str, Any]:
+        """What an earlier run has noted of a shard of the same place and size; empty if it has not."""
+        found: list[dict[str, Any]] = self._earlier["shards"][request.index : request.index + 1]
+        return next((shard for shard in found if shard["n_episodes"] == request.n_episodes), {})
+
     def forget_replaced(self, request: ShardRequest) -> None:
         """Cut what an earlier run has left before the shard that this one is about to take the place of, if it does.
 
         One of the same size whose file is missing is only made anew.
         """
-        shards = self._earlier["shards"]
+        shards, listed = self._earlier["shards"], self.listed(request)
         if request.index >= len(shards):
             return
-        shard = shards[request.index]
-        if shard["n_episodes"] == request.n_episodes and not (self._folder / shard["files"]["episodes"]).exists():
+        if listed and not (self._folder / listed["files"]["episodes"]).exists():
+            listed.pop("crc32", None)  # another version of pyarrow writes other bytes
+            write_sealed(self._folder / MANIFEST, self._earlier)
             return
         kept = shards[: request.index]
         cut = {"status": "interrupted", "stopped_by": None, "ending": None}
         n_kept = sum(shard["n_episodes"] for shard in kept)
         self._earlier = {**self._earlier, **cut, "n_episodes": n_kept, "shards": kept}
-        write_json(self._folder / MANIFEST, self._earlier)
+        write_sealed(self._folder / MANIFEST, self._earlier)
 
     def note(self, **facts: Any) -> None:
         """More keys, from the next time on that it is written."""
@@ -200,8 +215,12 @@ class Manifest:
             "reported_from": prefix.reported_from if prefix.reported_from < prefix.n_episodes else 0,
             "shards": prefix.shards,
         }
-        write_json(self._folder / MANIFEST, self._last)
-        write_text(self._folder / "campaign.yaml", self._campaign)
+        path = self._folder / CAMPAIGN
+        if not path.exists() or path.read_bytes() != self._campaign:
+            # Until it is there no checksum is told: not of the old one, nor of this.
+            write_sealed(self._folder / MANIFEST, {**self._last, "campaign_crc32": None})
+            write_bytes(path, self._campaign)
+        write_sealed(self._folder / MANIFEST, self._last)
 
 
 def require_own_folder(folder: Path, resolved: Resolved, *, resume: bool) -> dict[str, Any]:
@@ -264,8 +283,10 @@ def require_same_pool(folder: Path, source: Source) -> None:
         raise RunFolderError(str(path), f"cut-ins of pool {found}", expected, mend)
 
 
-def stored_shard(folder: Path, source: Source, retracing: Retracing, request: ShardRequest) -> ShardResult | None:
-    """A shard that needs not be run again, or None.
+def stored_shard(
+    folder: Path, source: Source, retracing: Retracing, listed: Mapping[str, Any], request: ShardRequest
+) -> ShardResult | None:
+    """A shard that needs not be run again, or None; ``listed`` is what the manifest tells of it (`Manifest.listed`).
 
     It is taken over if its episodes are on disk, and its moments where the campaign keeps some, with as many rows as
     are wanted and, of shells, the cut-ins that are to be drawn now. The twin retraces it.
@@ -277,8 +298,9 @@ def stored_shard(folder: Path, source: Source, retracing: Retracing, request: Sh
     needed = {"episodes"} | ({"moments"} if source.campaign.records.moments != "none" else set())
     if not needed <= files.keys():
         return None
-    tables = {name: read_table(folder / path) for name, path in files.items()}
+    tables = {name: read_table(folder / path, crc32=listed_crc32(listed, name)) for name, path in files.items()}
     kept = ShardTables(tables["episodes"], tables.get("moments"), tables.get("traces"))
     if not source.is_shard(request, kept.episodes):
         return None
-    return replace(finished(source, retracing, request, kept), files=files)
+    crc32 = {name: checksum(folder / path) for name, path in files.items()}
+    return replace(finished(source, retracing, request, kept), files=files, crc32=crc32)

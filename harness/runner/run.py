@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+import zlib
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
@@ -24,10 +25,11 @@ from harness.records.folder import (
     SHELLS,
     TABLES,
     StoppedBy,
+    checksum,
     shards_on_disk,
     sole_use,
     write_bytes,
-    write_json,
+    write_sealed,
     write_shard,
 )
 from harness.resolved import Resolved
@@ -185,32 +187,37 @@ class Run:
 
     def _known(self, request: ShardRequest) -> ShardResult | None:
         """See `stored_shard`; workers are about to be busy with the first shard that it does not know."""
-        shard = stored_shard(self.out, self.source, self._retracing, request)
+        shard = stored_shard(self.out, self.source, self._retracing, self.manifest.listed(request), request)
         if shard is None:
             load_report_meanwhile()
         return shard
 
     def _add(self, shard: ShardResult) -> None:
         """Write a shard that is not there yet, and count it."""
-        files = shard.files
         if shard.parquet:
             self.manifest.forget_replaced(shard.request)
             files = write_shard(self.out, shard.request.index, shard.parquet)
-        self.prefix.add(shard, files)
+            crc32 = {name: zlib.crc32(content) for name, content in shard.parquet.items()}
+            shard = replace(shard, files=files, crc32=crc32)
+        self.prefix.add(shard)
         self.prefix.require_few_failed(self.campaign, at_least=SMALLEST_FAILED_SAMPLE)
 
     def _make_baseline(self, paths: BaselinePaths) -> None:
         """Drive the vehicle along all paths without a cut-in, but for what an earlier run has done of it."""
         environment, n = self.resolved.environment, len(paths)
         self._progress.stage(f"baseline runs{self._workers.where}", n)
-        tables, causes = [], Counter[str]()
-        for result in self._workers.run(baseline_requests(n), partial(stored_baseline, self.out, paths)):
+        tables, causes, crc32 = [], Counter[str](), []
+        known = partial(stored_baseline, self.out, paths, self.manifest.listed_baseline)
+        for result in self._workers.run(baseline_requests(n), known):
+            file = baseline_file(self.out, result.request)
             if result.parquet:
-                write_bytes(baseline_file(self.out, result.request), result.parquet)
+                write_bytes(file, result.parquet)
+            crc32.append(checksum(file))
             tables.append(result.table)
             causes += result.failures
             self._progress.advance(result.request.n_episodes)
-            self.manifest.note(shadow_runs={"n_runs": sum(map(len, tables)), "n_failed": causes.total()})
+            counts = {"n_runs": sum(map(len, tables)), "n_failed": causes.total()}
+            self.manifest.note(shadow_runs=counts, shadow_crc32=crc32)
             self.manifest.follow(self.prefix)
         most, where = self.campaign.run.max_failed_share, "the run folder's shadow/ tables"
         require_few_failed(causes.total(), n, causes, most, "baseline runs", where)
@@ -221,7 +228,7 @@ class Run:
     def _write_design(self) -> None:
         """Keep the strata: without them nothing can be estimated."""
         if self.source.design is not None:
-            write_json(self.out / SHELLS, STORED_DESIGN.dump_python(self.source.design, mode="json"))
+            write_sealed(self.out / SHELLS, STORED_DESIGN.dump_python(self.source.design, mode="json"))
 
     def discard_uncounted(self) -> None:
         """Remove shards that an earlier, longer run has left beyond the stop."""
@@ -249,7 +256,7 @@ def finish(run: Run, rule: Rule, remark: str = "") -> RunResult:
         decided["decision"] = replace(decision, asked_before=run.manifest.limits_before).to_json()
     run.close_manifest(stopped_by, said, **decided)
     estimates = estimate_run(run.out)
-    write_json(run.out / ESTIMATES, estimates)
+    write_sealed(run.out / ESTIMATES, estimates)
     # No worker loads matplotlib, and it has been loaded here while workers were busy.
     from harness.report.page import write_report  # noqa: PLC0415
 

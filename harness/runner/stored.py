@@ -12,15 +12,14 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from harness.campaign.campaign import Campaign
-from harness.campaign.files import load_campaign
 from harness.controllers.find import has_foreign_code, require_controller, run_apart
 from harness.errors import CampaignError, RunFolderError
 from harness.estimators.answer import estimate_blocks
 from harness.estimators.block import MOMENT_COLUMNS, Block
 from harness.estimators.one_pass import SPACING
 from harness.processes import made_ahead
-from harness.records.folder import concatenated, no_episodes, read_manifest, read_table
-from harness.records.reader import read_shard
+from harness.records.folder import CAMPAIGN, concatenated, no_episodes, read_kept, read_manifest
+from harness.records.reader import read_campaign, read_shard, require_campaign
 from harness.records.schemas import shard_tables
 from harness.resolved import Resolved, resolve
 from harness.runner.prepare import prepare, require_world
@@ -54,7 +53,7 @@ def estimate_run(
     """
     folder = Path(folder)
     manifest = read_manifest(folder)
-    campaign = load_campaign(folder / "campaign.yaml", check_files=False)
+    campaign = read_campaign(folder, manifest)
     blocks = stored_blocks(folder, moments="scv" in (estimators or ESTIMATORS))
     return estimate_blocks(blocks, campaign, manifest, estimators=estimators, confidence=confidence)
 
@@ -66,8 +65,8 @@ def stored_blocks(folder: Path, *, moments: bool) -> Iterator[Block]:
 
     Raises `HarnessError`: if the folder is not a run, or its records are damaged or incomplete.
     """
-    campaign = load_campaign(folder / "campaign.yaml", check_files=False)
     manifest = read_manifest(folder)
+    campaign = read_campaign(folder, manifest)
     n_counted, reported_from = int(manifest["n_episodes"]), int(manifest.get("reported_from") or 0)
     if n_counted == 0:
         raise no_episodes(folder)
@@ -143,20 +142,17 @@ def replay_episode(
     ``episode`` is its index in the campaign. With ``gui`` it is shown in sumo-gui (extra ``harness[sumo]``); ``fcd`` is
     a file for SUMO's floating-car data.
 
-    Raises `RunFolderError`: the folder is no run, or has no such episode. Raises `CampaignError`: the environment's
-    parameter file has changed since, or the AV is not reproducible. Raises `HarnessError`: SUMO's system libraries are
-    missing.
+    Raises `RunFolderError`: the folder is no run, has no such episode, or the campaign or the environment's parameter
+    file has changed since. Raises `CampaignError`: the AV is not reproducible. Raises `HarnessError`: SUMO's system
+    libraries are missing.
     """
     folder, fcd = Path(folder), None if fcd is None else Path(fcd)
     manifest = read_manifest(folder)
     _require_reproducible(manifest)
     stored = _stored(folder, manifest, episode)
-    campaign = load_campaign(folder / "campaign.yaml")
+    campaign = read_campaign(folder, manifest, check_files=True)
     resolved = resolve(campaign)
-    if resolved.content_hash != manifest["campaign_hash"]:
-        expected = f"campaign {manifest['campaign_hash']}, which made the records"
-        mend = "Restore campaign.yaml and the environment parameter file that it names."
-        raise CampaignError(str(folder / "campaign.yaml"), f"campaign {resolved.content_hash}", expected, mend)
+    require_campaign(folder / CAMPAIGN, resolved.content_hash, manifest)
     if gui or fcd is not None:
         require_libraries()
     else:
@@ -182,7 +178,8 @@ def _replay(
     """Row and trace of the episode, run again."""
     source = prepare(resolved)
     if source.baseline_paths is not None:
-        source.begin_after(read_baseline(folder, source.baseline_paths, resolved.environment))
+        listed = read_manifest(folder).get("shadow_crc32", ())
+        source.begin_after(read_baseline(folder, source.baseline_paths, resolved.environment, listed))
     require_same_pool(folder, source)
     world = _world(resolved.campaign, gui=gui, fcd=fcd)
     try:
@@ -237,7 +234,7 @@ def _stored(folder: Path, manifest: dict[str, Any], episode: int) -> dict[str, p
     """Rows of the episode in the episodes and traces tables."""
     for shard in manifest["shards"]:
         if shard["first_episode"] <= episode < shard["first_episode"] + shard["n_episodes"]:
-            tables = {name: read_table(folder / path) for name, path in shard["files"].items() if name != "moments"}
+            tables = {name: read_kept(folder, shard, name) for name in shard["files"] if name != "moments"}
             return {name: table.filter(pc.equal(table["episode"], episode)) for name, table in tables.items()}
     if not manifest["n_episodes"]:
         raise no_episodes(folder)

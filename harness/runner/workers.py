@@ -60,8 +60,8 @@ CLOSING_S = 10.0
 class ShardResult:
     """A finished shard: what the stop rule needs of it, how many episodes the twin has retraced, causes of failures.
 
-    ``repeated`` is None where no test was run twice; ``parquet`` are its tables as files, or, where they are on disk
-    already, ``files`` their paths by table.
+    ``repeated`` is None where no test was run twice; ``parquet`` are its tables as files. Once they are on disk,
+    ``files`` are their paths and ``crc32`` their checksums, by table.
     """
 
     request: ShardRequest
@@ -71,6 +71,7 @@ class ShardResult:
     repeated: Repeated | None
     parquet: dict[str, bytes] = field(default_factory=dict)
     files: dict[str, str] = field(default_factory=dict)
+    crc32: dict[str, int] = field(default_factory=dict)
 
 
 Request = ShardRequest | BaselineRequest

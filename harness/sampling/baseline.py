@@ -7,7 +7,7 @@ random stream. What the vehicle did through the step of the cut-in must be the s
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -73,12 +73,18 @@ def run_baseline(
     return BaselineResult(request, table, parquet(table), _causes(table))
 
 
-def stored_baseline(folder: Path, paths: BaselinePaths, request: BaselineRequest) -> BaselineResult | None:
-    """A range that an earlier run has finished, or None; a `RunFolderError` if it is damaged, or of other paths."""
+def stored_baseline(
+    folder: Path, paths: BaselinePaths, listed: Sequence[int], request: BaselineRequest
+) -> BaselineResult | None:
+    """A range that an earlier run has finished, or None; a `RunFolderError` if it is damaged, or of other paths.
+
+    ``listed`` are checksums of the files, as far as the manifest lists them.
+    """
     file = baseline_file(folder, request)
     if not file.exists():
         return None
-    table = read_table(file, mend=_MEND)
+    crc32 = listed[request.index] if request.index < len(listed) else None
+    table = read_table(file, crc32=crc32, mend=_MEND)
     rows = slice(request.first_episode, request.first_episode + request.n_episodes)
     if not np.array_equal(table.column("path").to_numpy(), paths.index[rows]):
         expected = "those of this campaign and this version of the harness"
@@ -91,9 +97,11 @@ def _causes(table: pa.Table) -> Counter[str]:
     return Counter(table.column("failure").drop_null().to_pylist())
 
 
-def read_baseline(folder: Path, paths: BaselinePaths, environment: Environment) -> BaselineRuns:
+def read_baseline(
+    folder: Path, paths: BaselinePaths, environment: Environment, listed: Sequence[int] = ()
+) -> BaselineRuns:
     """All baseline runs of a run folder; a `RunFolderError` if some are missing or damaged."""
-    found = [stored_baseline(folder, paths, request) for request in baseline_requests(len(paths))]
+    found = [stored_baseline(folder, paths, listed, request) for request in baseline_requests(len(paths))]
     if any(done is None for done in found):
         raise RunFolderError(
             str(folder / SHADOW),

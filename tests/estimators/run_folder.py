@@ -8,6 +8,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from harness.estimators.block import Block
+from harness.records.folder import checksum
 from harness.records.schemas import episodes_schema, moments_schema
 from harness.vocabulary import OUTCOMES
 
@@ -70,7 +71,8 @@ def write_run(folder: Path, blocks: list[Block], *, with_moments: bool = True, *
             (folder / name).mkdir(parents=True, exist_ok=True)
             pq.write_table(table, folder / files[name], compression="zstd")
         shards.append({"index": index, "first_episode": block.first_episode, "n_episodes": len(block), "files": files})
-    content = {"campaign_hash": "c0ffee", "n_episodes": sum(map(len, blocks)), "shards": shards, **manifest}
-    (folder / "manifest.json").write_text(json.dumps(content), encoding="utf-8")
     (folder / "campaign.yaml").write_text(CAMPAIGN.format(method=blocks[0].drawn.method), encoding="utf-8")
+    content = {"campaign_hash": "c0ffee", "n_episodes": sum(map(len, blocks)), "shards": shards, **manifest}
+    content["campaign_crc32"] = checksum(folder / "campaign.yaml")
+    (folder / "manifest.json").write_text(json.dumps(content), encoding="utf-8")
     return folder

@@ -2,6 +2,7 @@
 
 import math
 
+import pyarrow as pa
 import pytest
 
 import harness
@@ -42,9 +43,23 @@ def test_frames_have_all_rows_and_say_what_columns_mean(folder):
 
 
 def test_only_named_columns_are_read(folder):
-    tests = harness.read(folder()).episodes(["outcome"])
+    run = harness.read(folder("records.traces=all"))
+    tests = run.episodes(["outcome"])
     assert list(tests.columns) == ["outcome", "weight"]
     assert tests.attrs["unit"].keys() == {"outcome", "weight"}
+    assert list(run.moments(["p", "episode"]).columns) == ["p", "episode"]
+    assert list(run.traces(["v_mps"]).columns) == ["v_mps"]
+    with pytest.raises(RunFolderError, match="no column 'weight' in moments"):
+        run.moments(["weight"])
+
+
+def test_arrow_tables_and_batches_are_what_the_frames_are(folder, stored_run):
+    for run in (harness.read(folder()), harness.read(stored_run("shells-twin"))):
+        table, pieces = run.table("episodes", ["outcome"]), list(run.batches("episodes", ["outcome"]))
+        assert len(pieces) > 1
+        assert pa.concat_tables(pieces).to_pydict() == table.to_pydict()
+        assert table["weight"].to_pylist() == run.episodes()["weight"].tolist()
+        assert table.schema.field("weight").metadata[b"unit"] == b"1"
 
 
 def test_what_is_not_there_is_one_error(folder, tmp_path):

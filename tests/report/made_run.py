@@ -16,7 +16,7 @@ from harness.campaign.campaign import Campaign
 from harness.episode.cells import PrescribedCutIns
 from harness.episode.loop import Shard
 from harness.estimators.answer import estimate_blocks
-from harness.records.folder import encoded, write_shard
+from harness.records.folder import checksum, encoded, write_shard
 from harness.records.schemas import shard_tables
 from harness.resolved import resolve
 from harness.runner.prepare import prepare
@@ -95,7 +95,7 @@ def write_run(folder: Path, recipe: RunRecipe) -> Path:
         shards.append({"index": index, "first_episode": first, "n_episodes": n, "files": files})
         distance_m += float(e["av_distance_m"].sum()) / recipe.n_episodes
     (folder / "campaign.yaml").write_text(campaign.model_dump_json())
-    manifest = _manifest(recipe, shards, distance_m)
+    manifest = _manifest(recipe, shards, distance_m) | {"campaign_crc32": checksum(folder / "campaign.yaml")}
     (folder / "manifest.json").write_text(json.dumps(manifest))
     (folder / "shells.json").write_bytes(STORED_DESIGN.dump_json(DESIGN))
     estimates = estimate_blocks(stored_blocks(folder, moments=False), campaign, manifest)

@@ -13,6 +13,7 @@ import matplotlib.pyplot as plt
 import pytest
 
 from harness.campaign.sections import Accept
+from harness.records.folder import checksum
 from harness.report.page import run_notes, verdict, write_report
 from harness.report.summary import read_run_folder, summarise, typed_folder
 from tests.report.made_run import RECIPES, write_run
@@ -120,6 +121,7 @@ def test_hostile_texts_are_escaped_and_no_formula(tmp_path):
     hostile = "<script>alert('x')</script>$\\frac{&"
     folder = write_run(tmp_path / "run", replace(RECIPES["no_crash"], n_episodes=300))
     edit(folder / "campaign.yaml", description=hostile + "\x1b[31m")
+    edit(folder / "manifest.json", campaign_crc32=checksum(folder / "campaign.yaml"))
     path = folder / "estimates.json"
     estimates = edit(path, campaign=hostile, statement=hostile, headline=hostile)["estimates"]
     edit(path, estimates=estimates | {hostile: {**estimates["nade"], "warnings": [hostile]}})

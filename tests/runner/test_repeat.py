@@ -11,7 +11,7 @@ from harness.campaign.files import load_campaign
 from harness.errors import CampaignError
 from harness.records.folder import read_manifest
 from harness.runner.stored import replay_episode, suspects
-from tests.stored_runs import copy_of
+from tests.stored_runs import copy_of, edit
 
 FORCED = Path(__file__).parents[2] / "scenarios/overtaking_forced.yaml"
 SMALL = ("world.engine=twin", "stop.rhw=null", "stop.episodes=400", "run.shard_size=100", "records.traces=none")
@@ -64,7 +64,7 @@ def test_a_replay_that_differs_names_what_it_knows(run_av):
     manifest = read_manifest(folder)
     path = folder / "estimates.json"
     path.unlink()
-    (folder / "manifest.json").write_text(json.dumps({**manifest, "repeated": None}))
+    edit(folder, repeated=None)
     assert replay_episode(folder, 3).suspects is None
     campaign = load_campaign(folder / "campaign.yaml")
     assert "the vehicle does not do the same again" in suspects(manifest, campaign)

@@ -82,7 +82,7 @@ def test_a_disk_that_is_full_at_the_very_end(run_here, campaign, twin_run, tmp_p
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "estimates.json")
 
     with monkeypatch.context() as patch:
-        patch.setattr(running, "write_json", full)
+        patch.setattr(running, "write_sealed", full)
         with pytest.raises(OSError, match="No space left"):
             run_here(campaign(*TWIN), out, resume=True)
     assert not (out / "estimates.json").exists()

@@ -13,7 +13,7 @@ import pytest
 from harness.cli import main
 from harness.runner.stored import replay_episode
 from tests.golden.record import column_hash
-from tests.stored_runs import copy_of, shard_files, stored_table
+from tests.stored_runs import copy_of, of_before, shard_files, stored_table
 
 
 def rows_of(table: pa.Table, episode: int) -> pa.Table:
@@ -63,7 +63,7 @@ def tampered(folder, table: str, column: str) -> int:
 
 @pytest.mark.parametrize(("table", "column"), [("traces", "x_m"), ("traces", "v_mps"), ("episodes", "log_weight")])
 def test_a_record_that_was_tampered_with_is_noticed(table, column, twin_run, tmp_path, capsys):
-    folder = copy_of(twin_run, tmp_path / "run")
+    folder = of_before(copy_of(twin_run, tmp_path / "run"))
     episode = tampered(folder, table, column)
     assert replay_episode(folder, episode).bit_equal is False
     assert main(["replay", str(folder), str(episode)]) == 3

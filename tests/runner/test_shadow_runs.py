@@ -14,7 +14,7 @@ from harness.errors import RunFolderError, TooManyFailedError
 from harness.records.schemas import baseline_schema
 from tests.pool.conftest import SMALL_POOL
 from tests.pool.test_vehicle_pool import ACTING
-from tests.stored_runs import copy_of, manifest, shard_files, stored_table, unlike_columns
+from tests.stored_runs import copy_of, edit, manifest, shard_files, stored_table, unlike_columns
 
 SHELLS = ("testing.method=shells", "stop.rhw=0.5", "stop.episodes=3000", "stop.min_crashes=null", *SMALL_POOL)
 SHADOWS, TWIN = "pool.shadow_paths=120", "world.engine=twin"
@@ -68,9 +68,7 @@ def test_a_run_that_was_interrupted_goes_on_where_it_was(early_run, campaign, ru
         shutil.rmtree(out / table)
     files_of(out)[1].unlink()
     kept = {path.name: path.stat().st_mtime_ns for path in files_of(out)}
-    (out / "manifest.json").write_text(
-        json.dumps({**manifest(out), "n_episodes": 0, "shards": [], "status": "interrupted"})
-    )
+    edit(out, n_episodes=0, shards=[], status="interrupted")
     run_here(asked, out, resume=True)
     assert unlike_columns(whole.folder, out) == []
     assert {path.name: path.stat().st_mtime_ns for path in files_of(out) if path.name in kept} == kept

@@ -14,18 +14,18 @@ from harness.errors import RunFolderError
 from harness.estimators.block import joined
 from harness.runner import stored
 from harness.runner.stored import estimate_run, stored_blocks
-from tests.stored_runs import copy_of, stored_table
+from tests.stored_runs import copy_of, estimates, of_before, stored_table
 
 
 def test_estimating_again_gives_the_same_content(sumo_run, twin_run, capsys):
     for folder in (sumo_run, twin_run):
-        assert estimate_run(folder) == json.loads((folder / "estimates.json").read_text())
+        assert estimate_run(folder) == estimates(folder)
     assert main(["estimate", str(twin_run), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out) == json.loads((twin_run / "estimates.json").read_text())
+    assert json.loads(capsys.readouterr().out) == estimates(twin_run)
 
 
 def test_another_confidence_changes_intervals_and_not_the_rate(twin_run):
-    stored = json.loads((twin_run / "estimates.json").read_text())
+    stored = estimates(twin_run)
     wider = estimate_run(twin_run, confidence=0.99)
     headline = stored["headline"]
     assert wider["estimates"][headline]["crash_rate"] == stored["estimates"][headline]["crash_rate"]
@@ -58,7 +58,7 @@ def test_shards_are_read_in_groups_without_changing_a_bit(most, sizes, twin_run,
 
 
 def test_shards_with_columns_of_other_types_are_refused(twin_run, tmp_path, monkeypatch):
-    folder = copy_of(twin_run, tmp_path / "run")
+    folder = of_before(copy_of(twin_run, tmp_path / "run"))
     path = folder / "episodes" / sorted(path.name for path in (folder / "episodes").iterdir())[2]
     table = pq.read_table(path)
     column = table.schema.get_field_index("cut_in_step")
