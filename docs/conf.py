@@ -41,15 +41,20 @@ html_additional_pages = {"index": "redirect.html"}  # a host shows index.html fi
 html_copy_source = html_show_sourcelink = False
 html_show_copyright = html_show_sphinx = False
 
-_TOP = ("docs/index", "CONTRIBUTING", "CHANGELOG")
+_SECTION = re.compile(r"^\*\*([^*]+)\*\*", re.MULTILINE)
 _PAGE = re.compile(r"\]\(([\w/-]+)\.md\)")
 
 
 def _list_pages(_app: Sphinx, page: str, source: list[str]) -> None:
-    """Add tables of contents, which a code host would show as code: the pages that docs/index.md names, in order."""
-    pages = {"README": _TOP, "docs/index": dict.fromkeys(_PAGE.findall(source[0]))}.get(page, ())
-    if pages:
-        source[0] += "\n".join(["\n```{toctree}", ":hidden:", "", *pages, "```\n"])
+    """Add tables of contents to the first page, which a code host would show as code: sections of docs/index.md."""
+    if page == "README":
+        _, *parts = _SECTION.split((ROOT / "docs" / "index.md").read_text(encoding="utf-8"))
+        sections = {
+            title: [f"docs/{found}" for found in dict.fromkeys(_PAGE.findall(text))]
+            for title, text in zip(parts[::2], parts[1::2], strict=True)
+        }
+        for title, pages in {**sections, "The project": ["docs/index", "CONTRIBUTING", "CHANGELOG"]}.items():
+            source[0] += "\n".join(["\n```{toctree}", ":hidden:", f":caption: {title.strip('.')}", "", *pages, "```\n"])
 
 
 def setup(app: Sphinx) -> None:
