@@ -68,7 +68,7 @@ def replay_surrogates(
             continue
         if decided != RUNNING or not leave_stored(i, max_steps, stored, environment, path):
             return i
-        crashes[i] = who_crashes(followers, cut, stored.lead[i], environment, path)
+        crashes[i] = who_crashes(followers, cut, stored.script.lead[i], environment, path)
     return -1
 
 

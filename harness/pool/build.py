@@ -1,4 +1,4 @@
-"""Pools of campaigns, from the cache or built: a pilot run, and aimed paths until crash rates are known well enough."""
+"""Pools of campaigns, from the cache or built: a pilot run says where paths are aimed, and how many there are."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from harness.errors import RunFolderError
 from harness.pool.cut_ins import FORMAT, CutIns, Pool, environment_hash, read_pool, write_pool
 from harness.pool.library import Library
 from harness.pool.shells import cells_of, conservative_first, shells_of
-from harness.pool.walk import PILOT_PATHS, EnumeratedPaths, Enumerator, joined, write_script
+from harness.pool.walk import PILOT_PATHS, EnumeratedPaths, Enumerator, write_script
 from harness.progress import Progress
 from harness.random_stream import DIAGNOSTIC, uniforms
 from harness.records.folder import require_place
@@ -93,9 +93,10 @@ def build_pool(
     """Build a pool in the twin, which will carry the content hash ``key``."""
     progress = progress or Progress()
     aim = take_aim(environment, library, settings, progress)
-    paths = _until_known(aim, settings, progress)
-    order = conservative_first(paths.rates(len(library.surrogates)))
-    return pool_of(paths, settings.seed ^ POOL_SEED, order, environment, library, settings, key)
+    n = planned_number(aim, settings)
+    progress.stage("pool of cut-ins", n)
+    paths = aim.enumerator.run(PILOT_PATHS, n, progress)
+    return pool_of(paths, settings.seed ^ POOL_SEED, None, environment, library, settings, key)
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,29 +135,26 @@ def _conservative(rates: FloatArray, boundary: int) -> BoolArray:
     return conservative
 
 
-def _until_known(aim: Aim, settings: PoolSettings, progress: Progress) -> EnumeratedPaths:
-    """Enumerate paths until the relative errors are small enough; what is left of them is part of every interval."""
-    pilot, conservative = aim.pilot, aim.conservative
-    wanted = settings.relative_error * np.where(conservative, 1.0, AGGRESSIVE_ERROR)
-    progress.stage("pool of cut-ins", None)
-    rounds: list[EnumeratedPaths] = []
-    rates = np.zeros((0, pilot.shape[1]))
-    while len(rates) < MOST_PATHS:
-        rounds.append(aim.enumerator.run(PILOT_PATHS + len(rates), ROUND_PATHS, progress))
-        rates = np.concatenate([rates, rounds[-1].rates(pilot.shape[1] - 1)])
-        mean = rates.mean(0)
-        known = mean > 0.0
-        error = rates.std(0)[known] / np.sqrt(len(rates)) / mean[known]
-        progress.status(error=f"{error[conservative[known]].max(initial=0.0):.2%}")
-        if np.all(error <= wanted[known]):
-            break
-    return joined(rounds)
+def planned_number(aim: Aim, settings: PoolSettings) -> int:
+    """How many aimed paths the relative errors need by the pilot run; what is left of these is part of every interval.
+
+    Were paths added until their own errors look small, the rate of a surrogate that few of them meet would come out too
+    low (docs/internals/performance.md). The pilot's paths are none of them; each counts by the weight that it has under
+    the proposal.
+    """
+    rates, weight = aim.pilot, aim.enumerator.weights(0, len(aim.pilot))
+    mean = rates.mean(0)
+    seen = mean > 0.0
+    relvar = (rates * rates * weight[:, None]).mean(0)[seen] / mean[seen] ** 2 - 1.0
+    wanted = settings.relative_error * np.where(aim.conservative, 1.0, AGGRESSIVE_ERROR)[seen]
+    rounds = np.ceil(np.max(relvar / wanted**2, initial=1.0) / ROUND_PATHS)
+    return ROUND_PATHS * min(int(rounds), MOST_PATHS // ROUND_PATHS)
 
 
 def pool_of(
     paths: EnumeratedPaths,
     seed: int,
-    order: IntArray,
+    order: IntArray | None,
     environment: Environment,
     library: Library,
     settings: PoolSettings,
@@ -164,10 +162,11 @@ def pool_of(
 ) -> Pool:
     """Sort the cut-ins of paths into shells, by surrogates in this order, and cells; keep a sample of each shell.
 
-    ``seed`` is that of the paths.
+    ``seed`` is that of the paths; without an order surrogates are put into that of their rates.
     """
     n_surrogates, n_references = len(library.surrogates), len(library.references)
     rates, mass = paths.rates(n_surrogates), paths.mass
+    order = conservative_first(rates) if order is None else order
     n = len(rates)
     ordered = rates[:, order]
     shell, references = shells_of(paths.crashes, order), paths.crashes >> n_surrogates

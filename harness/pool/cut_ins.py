@@ -226,12 +226,13 @@ def _table(pool: Pool) -> pa.Table:
     return table.replace_schema_metadata({_METADATA: facts, _DIGEST: _digest(table, facts)})
 
 
-def padded(column: pa.ChunkedArray, width: int) -> tuple[np.ndarray, IntArray]:
-    """Lists (n,) as rows of zeros beyond their lengths, shape (n, width), and their lengths (n,)."""
+def padded(column: pa.ChunkedArray, width: int | None = None) -> tuple[np.ndarray, IntArray]:
+    """Lists (n,) as rows of zeros beyond their lengths, shape (n, width of the longest), and their lengths (n,)."""
     lists = column.combine_chunks()
     lengths, flat = np.asarray(lists.value_lengths()).astype(np.int64), np.asarray(lists.flatten())
-    values = np.zeros((len(lists), width), flat.dtype)
-    values[np.arange(width) < lengths[:, None]] = flat
+    places = np.arange(lengths.max(initial=0) if width is None else width)
+    values = np.zeros((len(lists), places.size), flat.dtype)
+    values[places < lengths[:, None]] = flat
     return values, lengths
 
 

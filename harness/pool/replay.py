@@ -26,6 +26,8 @@ from harness.episode.path import (
     walk,
 )
 from harness.errors import WorldDisagreementError
+from harness.pool.cut_ins import padded
+from harness.pool.walk import Script
 from harness.resolved import Resolved
 from harness.traffic.lateral import onset_of
 from harness.traffic.laws import Environment
@@ -42,7 +44,6 @@ from harness.vocabulary import (
     TIMEOUT,
     BoolArray,
     FloatArray,
-    Int8Array,
     IntArray,
     Record,
     RecordArray,
@@ -59,9 +60,7 @@ class StoredPaths(NamedTuple):
     """Consecutive stored episodes, ``first …`` of a campaign with seed ``seed``.
 
     ``state`` (n,) are initial states; ``n_steps``, ``cut_step`` (n,) steps simulated and that of the cut-in, -1
-    without one. ``lv``, ``bv`` are the maneuver indices of all episodes one after another, those of row i at
-    ``begin[i] … begin[i + 1] - 1``; 31 in ``bv`` marks the cut-in. ``lead`` (n,) is how many steps before its cut-in BV
-    begins to move sideways.
+    without one; ``script`` is what LV and BV did in them.
     """
 
     seed: int
@@ -69,40 +68,26 @@ class StoredPaths(NamedTuple):
     state: RecordArray
     n_steps: IntArray
     cut_step: IntArray
-    lv: Int8Array
-    lv_begin: IntArray
-    bv: Int8Array
-    bv_begin: IntArray
-    lead: IntArray
+    script: Script
 
 
 def stored_paths(episodes: pa.Table, seed: int) -> StoredPaths:
     """Initial states and maneuvers of consecutive rows of the episodes table; needs `PATH_COLUMNS`."""
+    n = int(episodes.num_rows)
+    lead = _whole(episodes, LEAD, 0) if LEAD in episodes.column_names else np.zeros(n, np.int64)
+    (lv, n_lv), (bv, n_bv) = (padded(episodes.column(name)) for name in ("lv_maneuvers", "bv_maneuvers"))
     return StoredPaths(
         seed,
         int(episodes.column("episode")[0].as_py()),
         states_from(np.asarray(episodes.column(name)) for name in STATE_COLUMNS),
-        np.asarray(episodes.column("n_steps")).astype(np.int64),
-        np.asarray(episodes.column("cut_in_step").fill_null(-1)).astype(np.int64),
-        *_lists(episodes.column("lv_maneuvers")),
-        *_lists(episodes.column("bv_maneuvers")),
-        _leads(episodes),
+        _whole(episodes, "n_steps", 0),
+        _whole(episodes, "cut_in_step", -1),
+        Script(lv, bv, n_lv, n_bv, lead),
     )
 
 
-def _leads(episodes: pa.Table) -> IntArray:
-    """Leads (steps) of the cut-ins, shape (n,); zero where those were one step."""
-    if LEAD not in episodes.column_names:
-        return np.zeros(episodes.num_rows, np.int64)
-    return np.asarray(episodes.column(LEAD).fill_null(0)).astype(np.int64)
-
-
-def _lists(column: pa.ChunkedArray) -> tuple[Int8Array, IntArray]:
-    """All entries of a list column one after another, and where each row begins, with the end (n + 1,)."""
-    lists = column.combine_chunks()
-    lengths = np.asarray(lists.value_lengths()).astype(np.int64)
-    values = np.array(lists.flatten(), dtype=np.int8)  # a copy: Arrow's own memory is read-only
-    return values, np.concatenate([[0], np.cumsum(lengths)])
+def _whole(episodes: pa.Table, name: str, null: int) -> IntArray:
+    return np.asarray(episodes.column(name).fill_null(null)).astype(np.int64)
 
 
 RETRACED_DTYPE = np.dtype(
@@ -119,10 +104,10 @@ def approach(i: int, until: int, stored: StoredPaths, environment: Environment, 
 
     `FAILED` where fewer maneuvers are stored than that takes.
     """
-    lv, bv = stored.lv_begin[i], stored.bv_begin[i]
-    known = min(stored.lv_begin[i + 1] - lv, stored.bv_begin[i + 1] - bv, path.lv.size)
+    script = stored.script
+    known = min(script.n_lv[i], script.n_bv[i], path.lv.size)
     for m in range(known):
-        path.lv[m], path.bv[m] = stored.lv[lv + m], stored.bv[bv + m]
+        path.lv[m], path.bv[m] = script.lv[i, m], script.bv[i, m]
     reach = min(until, known * environment.numbers.hold_steps, environment.numbers.max_steps)
     step = walk(stored.state[i], stored.seed, stored.first + i, known, reach, True, environment, path)
     decided = end_in(step, path)
@@ -145,13 +130,13 @@ def leave_stored(i: int, until: int, stored: StoredPaths, environment: Environme
 
     The path up to the cut-in must have been walked.
     """
-    cut = stored.cut_step[i]
-    mark = stored.bv_begin[i] + cut // environment.numbers.hold_steps + 1
-    known = stored.bv_begin[i + 1] - mark - 1
-    if known < 0 or stored.bv[mark] != CUT_IN:
+    cut, bv = stored.cut_step[i], stored.script.bv[i]
+    mark = cut // environment.numbers.hold_steps + 1
+    known = stored.script.n_bv[i] - mark - 1
+    if known < 0 or bv[mark] != CUT_IN:
         return False
     for m in range(min(known, path.free.size)):
-        path.free[m] = stored.bv[mark + 1 + m]
+        path.free[m] = bv[mark + 1 + m]
     leave(cut, until, stored.seed, stored.first + i, 0, known, environment, path)
     return True
 
@@ -163,7 +148,7 @@ def retrace_episode(
     """Fill ``twin``, a `RETRACED_DTYPE` record, for row ``i``."""
     max_steps = environment.numbers.max_steps
     cut, end = stored.cut_step[i], min(stored.n_steps[i], max_steps)
-    lead = stored.lead[i]
+    lead = stored.script.lead[i]
     twin.onset_r2 = twin.onset_r2dot = twin.impact = float("nan")
     if cut < 0 or cut >= end:
         twin.outcome, twin.n_steps = approach(i, end, stored, environment, path)

@@ -258,14 +258,20 @@ def aimed_points(density: FloatArray, u: FloatArray, choice: FloatArray) -> tupl
     edges = np.linspace(0.0, 1.0, N_BINS + 1)
     aimed = choice >= NATURALISTIC_SHARE
     points = u.copy()
-    own = np.ones(len(u))
     for d, levels in enumerate(density):
         cumulative = np.concatenate([[0.0], np.cumsum(levels) / N_BINS])
         cumulative[-1] = 1.0
         points[aimed, d] = np.interp(u[aimed, d], cumulative, edges)
+    return points, weights_under(density, points)
+
+
+def weights_under(density: FloatArray, points: FloatArray) -> FloatArray:
+    """Naturalistic density over that of a proposal (see `aimed_points`) at points (n, dimensions), shape (n,)."""
+    own = np.ones(len(points))
+    for d, levels in enumerate(density):
         own *= levels[_bin_of(points[:, d])]
     weights: FloatArray = 1.0 / (NATURALISTIC_SHARE + (1.0 - NATURALISTIC_SHARE) * own)
-    return points, weights
+    return weights
 
 
 def fit_proposal(u: FloatArray, contribution: FloatArray) -> FloatArray:
@@ -317,7 +323,7 @@ class EnumeratedPaths:
 
     def rates(self, n_surrogates: int) -> FloatArray:
         """Per path: its weighted probability that each surrogate crashes, and of a cut-in; shape (n, D + 1)."""
-        columns = [(self.mass * ((self.crashes >> d) & 1)).sum(1) for d in range(n_surrogates)]
+        columns = [np.where(self.crashes & (1 << d), self.mass, 0.0).sum(1) for d in range(n_surrogates)]
         return np.column_stack([*columns, self.mass.sum(1)])
 
 
@@ -350,6 +356,10 @@ class Enumerator:
     def uniforms(self, first: int, n: int) -> FloatArray:
         """Uniforms of the initial states of consecutive paths, shape (n, 5)."""
         return uniforms(self.seed, first, n, INITIAL, len(STATE_COLUMNS))
+
+    def weights(self, first: int, n: int) -> FloatArray:
+        """Weights of consecutive naturalistic paths under the proposal, shape (n,)."""
+        return np.ones(n) if self.proposal is None else weights_under(self.proposal, self.uniforms(first, n))
 
     def run(self, first: int, n: int, progress: Progress) -> EnumeratedPaths:
         """Paths ``first … first + n - 1``; ``n`` is a multiple of `BLOCK_PATHS`."""

@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 
 from harness.campaign.files import load_campaign
+from harness.campaign.sections import PoolSettings
 from harness.errors import RunFolderError
-from harness.pool.build import cached_pool, campaign_pool, campaign_pool_key, pool_path
+from harness.pool.build import build_pool, cached_pool, campaign_pool, campaign_pool_key, pool_path
 from harness.pool.cut_ins import read_pool, write_pool
 from harness.pool.library import load_library
 from harness.pool.shells import Draw, PrescribedEpisodes, design_shells
-from harness.pool.walk import NATURALISTIC_SHARE, STRIDE, aimed_points, fit_proposal
+from harness.pool.walk import NATURALISTIC_SHARE, STRIDE, Enumerator, aimed_points, fit_proposal
 from harness.resolved import resolve
 from harness.strata import STORED_DESIGN
 from tests.chains.seed import SEED
@@ -111,6 +112,20 @@ def test_draws_are_a_permutation_within_a_shell_and_follow_probabilities_outside
     assert abs(share - p) < 4.0 * np.sqrt(p * (1.0 - p) / 500)  # misses with probability 6e-5
     with pytest.raises(IndexError):
         prescribed.rows((Draw(0, within.size, 1),))
+
+
+def test_how_many_paths_a_pool_has_does_not_depend_on_them(environment, monkeypatch):
+    """One that ends where its paths look alike has the rates of paths that look alike, which are too low."""
+    settings, run = PoolSettings(relative_error=0.015, cut_ins_per_shell=100), Enumerator.run
+
+    def alike(self, first, n, progress):
+        paths = run(self, first, n, progress)
+        same = {"mass": np.full_like(paths.mass, 1e-9), "crashes": np.full_like(paths.crashes, 1)}
+        return dataclasses.replace(paths, **same) if first else paths
+
+    n_paths = build_pool(environment, LIBRARY, settings, "of the paths").n_paths
+    monkeypatch.setattr(Enumerator, "run", alike)
+    assert build_pool(environment, LIBRARY, settings, "of equal ones").n_paths == n_paths > 1024
 
 
 def test_weights_of_a_proposal_make_up_for_its_aim():
