@@ -86,9 +86,3 @@ def test_forced_weights_are_the_probability_of_a_cut_in_on_the_path():
 def test_defensive_mixture_bounds_every_weighted_crash():
     block = drawn(panel()[2], "episode_mixture", 50_000)
     assert np.all(block.weighted_crashes() <= np.exp(block.log_p_cut_in) / block.drawn.alpha[0] * (1.0 + 1e-12))
-
-
-def test_exact_variance_of_the_step_mixture_is_that_of_replications():
-    chain = frequent_decisive()
-    y = drawn(chain, "step_mixture", 400_000).weighted_crashes()
-    assert y.var() == pytest.approx(chain.step_mixture_variance, rel=0.03)

@@ -74,16 +74,6 @@ def test_a_failed_test_has_the_weight_that_it_had():
     )
 
 
-def test_no_crash_but_failures_leave_no_small_upper_bound():
-    n = 2_000
-    some = block([False] * n, method="nde", failed=[k < 20 for k in range(n)], weight_cap=1.0)
-    found = one_pass([some], ("nde", "nade")).estimates
-    for estimate in found.values():
-        assert estimate.crash_rate == estimate.ci_low == 0.0
-        assert estimate.upper_bound > 20 / n
-        assert estimate.ci_high > 20 / n
-
-
 def test_required_numbers_of_tests_grow_with_failures():
     whole = joined(some_failed(list(blocks(CHAIN, "step_mixture", [500] * 4, SEED)), first=0))
     counted = whole.crash | whole.failed

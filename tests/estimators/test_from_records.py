@@ -92,12 +92,6 @@ def test_damaged_tables_name_the_place(damage, text):
         read(block, episodes=episodes, moments=moments)
 
 
-def test_records_of_another_campaign_are_refused():
-    block = drawn("step_mixture")
-    with pytest.raises(RunFolderError, match="column log_q"):
-        block_from_tables(episodes_table(block), None, method="step_mixture", alpha=[0.2, 0.3, 0.5])
-
-
 def test_weighted_crashes_and_ratios():
     some = made([True, False], [-1.0, -2.0], log_q=np.array([[1.0, -np.inf], [2.0, 0.0]]))
     np.testing.assert_allclose(some.weighted_crashes(), [np.exp(-1.0), 0.0])

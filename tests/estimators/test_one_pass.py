@@ -1,17 +1,13 @@
 """One pass feeds all estimators in order; the whole way from a run folder to the content of ``estimates.json``."""
 
-import json
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import yaml
-from pydantic import TypeAdapter
 
 from harness.campaign.campaign import Campaign
 from harness.errors import RunFolderError
 from harness.estimators.answer import estimate_blocks
-from harness.estimators.estimate import Estimates, Unavailable, finite_json
+from harness.estimators.estimate import Unavailable, finite_json
 from harness.estimators.one_pass import Diagnostics, accumulator, one_pass
 from harness.runner.stored import estimate_run
 from harness.vocabulary import BV_LV_CONTACT, ESTIMATORS, SAMPLING
@@ -24,11 +20,6 @@ from .small_blocks import block, fed
 
 CHAIN = overtaking("two surrogates", skill=0.5, surrogates=[0.5, 0.2], level=0.02, horizon=6)
 SIZES = [600, 600, 300]
-KEYS = """campaign campaign_hash lane_change_level confidence n_episodes n_crashes headline distance_per_test_km
-crash_rate_per_1e6_km estimates diagnostics convergence statement statements reference_statements boundary_statements
-scope ending decision"""
-OF_ONE = """crash_rate std_error ci_low ci_high upper_bound confidence rhw n_episodes n_crashes n_effective
-largest_weight_share weight_cap method warnings cautions details"""
 
 
 def drawn(method: str):
@@ -39,34 +30,6 @@ def answered(parts, **manifest) -> dict:
     """Content of ``estimates.json`` from blocks in memory."""
     campaign = yaml.safe_load(CAMPAIGN.format(method=parts[0].drawn.method))
     return estimate_blocks(parts, Campaign.model_validate(campaign), {"campaign_hash": "c0ffee", **manifest})
-
-
-@pytest.mark.parametrize(
-    ("method", "headline", "importance"),
-    [
-        ("nde", "nde", []),
-        ("forced", "nade", []),
-        ("step_mixture", "nade", ["one", "two"]),
-        ("episode_mixture", "mixture_cv", ["forced", "one", "two"]),
-    ],
-)
-def test_a_stored_run_gives_what_blocks_in_memory_give(tmp_path, method, headline, importance):
-    parts = drawn(method)
-    if method != "nde":  # of which records say nothing, as those of real campaigns do not
-        parts = [replace(part, drawn=replace(part.drawn, weight_cap=None)) for part in parts]
-    folder = write_run(tmp_path, parts, distance_per_test_m=400.0)
-    content = estimate_run(folder)
-    assert set(content) == set(KEYS.split())
-    assert content["estimates"][headline].keys() == set(OF_ONE.split())
-    assert content["convergence"][0].keys() == {"n", "crash_rate", "ci_low", "ci_high", "rhw", "n_crashes"}
-    assert finite_json(TypeAdapter(Estimates).validate_json(json.dumps(content), strict=True)) == content
-    assert (content["headline"], content["n_episodes"], content["confidence"]) == (headline, sum(SIZES), 0.8)
-    assert list(content["diagnostics"]["mean_ratio"]) == importance
-    memory = answered(parts, distance_per_test_m=400.0)
-    if method == "step_mixture":  # q was stored, q/q_sampled is divided again: one rounding in the regression
-        memory["estimates"].pop("scv")
-        content["estimates"].pop("scv")
-    assert json.loads(json.dumps(content, allow_nan=False)) == memory
 
 
 def test_rates_are_per_test_and_per_distance_where_that_is_known():
@@ -177,22 +140,6 @@ def test_a_gap_is_refused(kept, text):
 
 def diagnosed(*parts, names=()) -> dict:
     return fed(Diagnostics(), parts).result(names)
-
-
-def test_means_are_those_of_numpy():
-    parts = list(blocks(SHORT, "episode_mixture", [3_000, 2_000], SEED))
-    result = diagnosed(*parts, names=("forced", "one", "two"))
-    columns = [(part.weights(), part.cut_in, part.mixture_ratios()) for part in parts]
-    weights, cut_in, ratios = (np.concatenate(each) for each in zip(*columns, strict=True))
-    for found, values in (
-        (result["mean_weight"], weights),
-        (result["mean_weight_cut_in"], weights * cut_in),
-        (result["mean_ratio"]["forced"], ratios[:, 0]),
-        (result["mean_ratio"]["two"], ratios[:, 2]),
-    ):
-        assert found["mean"] == pytest.approx(values.mean(), rel=1e-12)
-        assert found["std_error"] == pytest.approx(values.std(ddof=1) / np.sqrt(5_000), rel=1e-9)
-    assert result["n_cut_ins"] == cut_in.sum()
 
 
 def test_what_is_counted_and_a_small_mean_weight_are_told_and_nothing_stops_the_estimate():

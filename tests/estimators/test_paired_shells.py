@@ -66,11 +66,6 @@ def test_intervals_hold_what_was_seen_and_the_conditional_one_is_within():
     assert free.ci_high - inside.ci_high < 3e-5 * 2.6 / 4000
 
 
-def test_pairing_is_worth_more_where_both_crash_alike():
-    alike, apart = (pairs_of(counts, (0, 0, 0, 2000)) for counts in ((49, 1, 0, 50), (24, 26, 25, 25)))
-    assert alike.inside().difference(LEVEL).half_width < 0.35 * apart.inside().difference(LEVEL).half_width
-
-
 def test_vehicles_changed_over_change_signs():
     swapped = PairCounts(DESIGN, PAIRS.ends.transpose(0, 2, 1), PAIRS.mass.transpose(0, 2, 1, 3))
     there, back = PAIRS.difference(LEVEL), swapped.difference(LEVEL)
@@ -108,15 +103,6 @@ def test_the_pool_adds_the_error_of_pairs_that_differ():
     assert both.pool_variance(A_CRASHES) == pytest.approx(expected)
     each = pairs_of((0, 40, 40, 20), mass=mass)
     assert each.pool_variance(A_CRASHES - B_CRASHES) == pytest.approx(2 * 1e-7 * 0.4 * mass / n_paths, rel=1e-3)
-
-
-@pytest.mark.parametrize(
-    ("inside", "n_outside", "verdict"),
-    [((50, 0, 0, 50), 60_000, "proven"), ((50, 0, 20, 30), 60_000, "refuted"), ((50, 0, 0, 50), 300, "open")],
-)
-def test_a_margin_is_proven_or_refuted_or_open(inside, n_outside, verdict):
-    pairs = pairs_of(inside, (0, 0, 0, 1000), (0, 0, 0, n_outside))
-    assert pairs.verdict(0.1, LEVEL) == verdict
 
 
 def test_a_margin_is_where_the_ratio_ends():

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from itertools import product
 
 import numpy as np
 import pytest
 from scipy.optimize import brentq
-from scipy.stats import binomtest
 
 from harness.estimators.likelihood import Level, likelihood_limit
-from harness.estimators.shells import compared, preventable_share, rate_ratio_limits
-from harness.estimators.tally import Tally, empty_tally
-from harness.strata import Reference, ShellDesign, Statement
+from harness.estimators.shells import preventable_share, rate_ratio_limits
+from harness.estimators.tally import Tally
 
 from .exact import coverage, tilted
 from .small_blocks import EXACT, tally
@@ -102,54 +99,3 @@ def test_the_preventable_share_is_held_often_enough_whatever_the_counts(share):
 
     assert covered(LEVEL) >= 0.90
     assert covered(Level(0.3, 0.5)) < 0.85
-
-
-N_PATHS, REPLICATIONS = 300, 1_000
-CELLS = ShellDesign(
-    pool="0" * 24, strata=("a", "b", "outside"), cell_stratum=(0, 0, 1, 1, 2), cell_references=(1, 0, 1, 0, 0),
-    cell_p=np.zeros(5), n_paths=N_PATHS, statements=(Statement("library", "b", "keeps to b", 2),), p_cut_in=1.0,
-    p_unreachable=0.0, references=(Reference("r", "a driver"),),
-)  # fmt: skip
-
-
-def replicated(seed: int, *, pool_error: bool) -> np.ndarray:
-    """Numbers of pools, each drawn anew, whose campaign holds the ratio, and the preventable share."""
-    rng = np.random.default_rng(seed)
-    population = rng.exponential(size=(20_000, 1)) * rng.exponential(size=(20_000, 5)) * [4.0, 2.0, 3.0, 3.0, 40.0]
-    on = rng.random((20_000, 1)) < np.array([0.9, 0.5, 0.4, 0.3, 0.002])  # it crashes on whole paths
-    true, crashes_too = (population * on).mean(0), np.array([True, False, True, False, False])
-    reference = population @ crashes_too
-    truths = true.sum() / reference.mean(), true[~crashes_too].sum() / true.sum()
-    tests, held = np.array([400, 400, 600]), np.zeros(2)
-    for _ in range(REPLICATIONS):
-        rows = rng.integers(0, len(population), N_PATHS)
-        mass, crash_on, of_reference = population[rows], on[rows], reference[rows]
-        cells = empty_tally(5)
-        for stratum, n in enumerate(tests):
-            within = mass * (np.array(CELLS.cell_stratum) == stratum)
-            drawn = np.searchsorted(np.cumsum(within), rng.random(n) * within.sum(), side="right")
-            path, cell = np.divmod(np.minimum(drawn, within.size - 1), 5)
-            crashed = crash_on[path, cell]
-            np.add.at(cells.tests, cell, 1)
-            np.add.at(cells.crashes, cell[crashed], 1)
-            np.add.at(cells.crash_mass, cell[crashed], mass[path[crashed]])
-        design = replace(
-            CELLS,
-            cell_p=mass.mean(0),
-            n_paths=N_PATHS if pool_error else EXACT,
-            reference_rate=np.array([of_reference.mean()]),
-            reference_square=np.array([(of_reference**2).mean()]),
-        )
-        (found,) = compared(design, cells, LEVEL)
-        limits = (found.ratio_low, found.ratio_high), (found.preventable_low, found.preventable_high)
-        held += [low <= truth <= high for truth, (low, high) in zip(truths, limits, strict=True)]
-    return held
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("pool_error", [True, False])
-def test_both_are_held_often_enough_over_pools_drawn_anew_unless_the_error_of_the_pool_is_left_out(pool_error):
-    """Nominal 0.90; with a coverage of 0.90 a test fails with a probability of 0.001."""
-    for held in replicated(11, pool_error=pool_error):
-        found = binomtest(int(held), REPLICATIONS, 0.9, alternative="less")
-        assert (found.pvalue > 0.001) == pool_error

@@ -105,20 +105,6 @@ def test_columns_that_never_vary_explain_nothing():
     assert fit.residual_squares == pytest.approx(np.sum((y - y.mean()) ** 2), rel=1e-12)
 
 
-@pytest.mark.parametrize("n", [1, 2, 31, 33, 34, 35, 100])
-def test_a_factor_of_few_rows_fits_as_the_square_one_does(n):
-    rng = np.random.default_rng(n)
-    ratios, y = rng.uniform(0.5, 1.5, size=(n, 9, 3)), rng.exponential(size=n)
-    stratum = Stratum(5)
-    stratum.add(ratios, y)
-    fit = stratum.fit()
-    whole = block([True] * n, list(np.log(y)), first_ratios=ratios, n_control_steps=np.full(n, 5))
-    _, var_z, strata = algorithm_1([whole])
-    assert (fit.n, fit.n_columns, fit.rank) == strata[5]
-    assert fit.intercept == pytest.approx(np.mean(y), rel=1e-12)
-    assert fit.residual_squares == pytest.approx(var_z * (n - 1), rel=1e-8, abs=1e-15)
-
-
 def test_columns_are_products_in_the_order_of_vec():
     ratios = np.arange(1.0, 2 * 9 * 3 + 1).reshape(2, 9, 3)
     columns = np.empty((2, 4), order="F")

@@ -206,11 +206,3 @@ def test_it_is_the_number_of_equal_paths_and_the_guard_tells_few_from_many(n_pat
     numbers = np.array([counted(rng.integers(n_paths, size=80), [0] * 80).number(np.ones(2)) for _ in range(1000)])
     assert np.mean(1.0 / numbers) == pytest.approx(1.0 / n_paths, rel=0.05)
     assert np.all((numbers < FEWEST_PATHS) == (n_paths < FEWEST_PATHS))
-
-
-def test_unequal_paths_count_as_far_as_they_carry():
-    """G = 4, 1, 1, 1, 1: (8)^2/20 = 3.2 paths."""
-    rng = np.random.default_rng(5)
-    share = np.array([4, 1, 1, 1, 1]) / 8
-    pairs = [1.0 / counted(rng.choice(5, size=60, p=share), [0] * 60).number(np.ones(2)) for _ in range(400)]
-    assert np.mean(pairs) == pytest.approx(20 / 64, rel=0.03)

@@ -9,13 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from harness.campaign.sections import Run, Stop
-from harness.estimators.answer import ending
 from harness.estimators.one_pass import accumulator
 from harness.estimators.stopping import LOOK_RATIO, Decision, StopRule, look_grid
-from harness.strata import ASSUMPTION_FREE
-from studies.chains.chain import frequent_decisive
-from studies.chains.sampler import blocks
-from tests.chains.seed import SEED
 
 from .small_blocks import block
 
@@ -61,38 +56,6 @@ def test_one_more_crash_of_the_largest_weight_must_not_matter(weight_cap, stops)
     assert rule.observe(rule.looks[1], replace(passing(400), weight_cap=2 * weight_cap)) == stops
 
 
-def test_without_a_precision_the_budget_decides():
-    rule = StopRule(Stop(episodes=1_050), "nde", ENDS)
-    answers = [rule.observe(n, passing(n)) for n in rule.looks]
-    assert answers == [False] * (len(rule.looks) - 1) + [True]
-    assert rule.looks[-1] == 1_050
-    assert not rule.look.stopped
-
-
-def test_watches_the_methods_own_estimator_unless_told_otherwise():
-    assert StopRule(Stop(), "episode_mixture", ENDS).estimator == "mixture_cv"
-    assert StopRule(Stop(estimator="nade"), "episode_mixture", ENDS).estimator == "nade"
-
-
-@pytest.mark.parametrize("method", ["nde", "forced", "episode_mixture"])
-def test_the_same_campaign_stops_at_the_same_test(method):
-    """However many tests are ready beyond the prefix, and however often it is run."""
-
-    def stopped_at(n_ready: int) -> tuple[int, float]:
-        rule = StopRule(Stop(episodes=40_000, rhw=0.2, min_crashes=30), method, ENDS)
-        state, n = accumulator(rule.estimator), 0
-        for part in blocks(frequent_decisive(), method, [SHARD] * n_ready, SEED):
-            state.add(part)
-            n += len(part)
-            if rule.due(n) and rule.observe(n, estimate := state.result(0.9)):
-                return n, estimate.crash_rate
-        raise AssertionError("the prefix was too short")
-
-    first = stopped_at(200)
-    assert first == stopped_at(180 if first[0] <= 180 * SHARD else 200)
-    assert first[0] % SHARD == 0
-
-
 def test_looking_elsewhere_is_refused():
     rule = StopRule(Stop(episodes=10_000, rhw=0.3, min_crashes=10), "nde", ENDS)
 
@@ -133,25 +96,6 @@ def test_two_looks_in_turn_must_pass_and_what_was_missing_is_remembered(looks, r
     assert (rule.look.stopped, rule.look.unmet) == (reached, unmet)
 
 
-BOTH = ("stop.rhw (0.1)", "stop.min_crashes (50)")
-
-
-@pytest.mark.parametrize(
-    ("stopped_by", "unmet", "said"),
-    [
-        ("rhw", BOTH[1:], ": the last condition to be met was stop.min_crashes (50)."),
-        ("rhw", (), ": every condition was met at the first look."),
-        ("episodes", None, ": stop.episodes was all that was asked for."),
-        ("episodes", BOTH, " without stop.rhw (0.1) and stop.min_crashes (50): stop.episodes was spent; "),
-        ("pool_error", BOTH[:1], " without stop.rhw (0.1): the pool's own error alone is wider; "),
-        ("pool", None, ": all cut-ins that the pool keeps of a shell were tested; "),
-    ],
-)
-def test_every_end_has_its_sentence(stopped_by, unmet, said):
-    text = ending(stopped_by, 46_735, unmet or (), precision_asked=unmet is not None)
-    assert text.startswith("Stopped after 46,735 tests" + said)
-
-
 RATES = st.floats(1e-9, 1e-3)
 
 
@@ -164,9 +108,3 @@ def test_a_verdict_says_that_the_whole_interval_is_on_one_side(limit, one, other
     assert (found.verdict == "accepted") == (high < limit and not contradicted)
     assert found.is_final == (not low <= limit <= high)
     assert ("does not do what statement library assumes" in found.sentence) == (contradicted and low <= limit)
-
-
-def test_it_is_said_in_a_sentence():
-    said = "ACCEPTED: with confidence 0.95 the crash rate{} is below 2e-07 per test (upper limit 1.9e-07)."
-    for statement, given_what in ((ASSUMPTION_FREE, ""), ("library", ", given statement library,")):
-        assert Decision(2e-7, statement, 0.95, 1e-7, 1.9e-7).sentence == said.format(given_what)

@@ -12,7 +12,6 @@ from scipy.optimize import brentq, minimize
 from scipy.special import betaincinv, xlogy
 
 from harness.estimators.likelihood import Level, contrast_limit, likelihood_limit, ratio_limits, spread
-from harness.estimators.limits import clopper_pearson
 
 from .exact import coverage, tilted
 
@@ -229,26 +228,3 @@ def test_shares_end_at_0_and_1_and_without_a_crash_the_bound_is_the_exact_one_at
 def test_an_error_of_the_weights_alone_gives_the_normal_interval():
     limits = binomial([1.0], [10**12 // 4], [10**12], Level.two_sided(0.9), 0.01)
     assert limits == pytest.approx((0.25 - 1.6449 * 0.1, 0.25 + 1.6449 * 0.1), abs=2e-3)
-
-
-def squares(weights, crashes, tests, confidence):
-    """Separate exact limits, their distances combined by squares: what these limits took the place of."""
-    low, high = clopper_pearson(crashes, tests, (1.0 - confidence) / 2.0)
-    share = crashes / tests
-    below, above = (math.sqrt(((weights * away) ** 2).sum()) for away in (share - low, high - share))
-    return weights @ share - below, weights @ share + above
-
-
-def test_eight_strata_with_few_crashes_each_at_99_percent():
-    """4,000 replications: 0.0042 is three standard errors at 0.99, so that 1.6 % fewer tell squares apart."""
-    rng, shells, tests, expected = np.random.default_rng(11), 8, 100, 1.6
-    weights, counts = np.ones(shells), np.full(shells, tests)
-    crashes = rng.binomial(tests, expected / tests, (4_000, shells))
-    truth = shells * expected / tests
-
-    def covered(limits, level):
-        found = [limits(weights, k, counts, level) for k in crashes]
-        return np.mean([low <= truth <= high for low, high in found])
-
-    assert covered(binomial, Level.two_sided(0.99)) >= 0.99 - 0.0042
-    assert covered(squares, 0.99) < 0.98
