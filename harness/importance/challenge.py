@@ -116,12 +116,7 @@ def level_steps(hold_steps: int) -> int:
 def build_after_cut_in(environment: Environment, driver: RecordArray) -> tuple[Float32Array, Float32Array]:
     """Tables of one surrogate, ``driver`` (1,).
 
-    Returns
-    -------
-    value : ndarray of float32, shape (LEVELS + 1, v, R2, R2dot)
-        U by remaining time, level 0 being none.
-    maneuvers : ndarray of float32, shape (v, R2, R2dot, 31)
-        C(s, a) with the longest remaining time.
+    U by remaining time (LEVELS + 1, v, R2, R2dot), level 0 being none; C(s, a) with the longest (v, R2, R2dot, 31).
     """
     points, shape = points_of(AFTER), shape_of(AFTER)
     hold = int(environment.numbers["hold_steps"])

@@ -96,16 +96,15 @@ def design_shells(pool: Pool, *, shells: ShellSettings | None = None, limit_mps2
     shells = shells or ShellSettings()
     groups = shells_in_strata(pool, outermost(pool, shells), limit_mps2)
     statements = _statements(pool, shells, groups)
-    cells = cells_in_strata(pool, groups)
-    first = np.unique(cells, return_index=True)[1][-(cells.max() + 1) :]
+    cells, stratum, references = cells_in_strata(pool, groups)
     n_inside, takes_time = statements[-1].n_inside, bool(pool.cut_ins.lead.any())
     p = np.asarray(np.bincount(cells[cells >= 0], pool.cell_p[cells >= 0]), np.float64)
     design = ShellDesign(
         pool=pool.key,
         strata=(*(pool.names[group[0]] for group in groups[:n_inside]), *([OUTSIDE] * (len(groups) - n_inside))),
-        cell_stratum=tuple(_stratum_of_shell(pool, groups)[pool.cell_shell[first]].tolist()),
+        cell_stratum=tuple(stratum.tolist()),
         cell_p=p,
-        cell_references=tuple(pool.cell_references[first].tolist()),
+        cell_references=tuple(references.tolist()),
         references=tuple(
             Reference(
                 name, _REFERENCES.get(each.model, "the driver"), None if takes_time else each.delay_after_cut_in_s
@@ -120,16 +119,13 @@ def design_shells(pool: Pool, *, shells: ShellSettings | None = None, limit_mps2
         p_unreachable=pool.p_cut_in - float(p.sum()),
         shadow_runs=pool.cut_ins.motion.size > 0,
     )
-    return design if pool.p_unknown == 0.0 else _with_failed_baseline(design, pool.p_unknown)
-
-
-def _with_failed_baseline(design: ShellDesign, p: float) -> ShellDesign:
-    """One more stratum, of probability ``p`` at most: as it has no test, it may crash as often as it happens."""
-    return replace(
+    if pool.p_after_failure == 0.0:
+        return design
+    return replace(  # one more stratum: as it has no test, it may crash as often as it happens
         design,
         strata=(*design.strata, FAILED_BASELINE),
         cell_stratum=(*design.cell_stratum, len(design.strata)),
-        cell_p=np.append(design.cell_p, p),
+        cell_p=np.append(design.cell_p, pool.p_after_failure),
         cell_references=(*design.cell_references, 0),
     )
 
@@ -157,20 +153,16 @@ def checked_boundary(library: Library, design: ShellDesign, environment: Environ
     return library_records(models, environment)
 
 
-def _stratum_of_shell(pool: Pool, groups: list[list[int]]) -> IntArray:
-    """Stratum that each shell of the pool belongs to, -1 for none, shape (D + 1,)."""
-    stratum = np.full(pool.shell_p.size, -1, np.int64)
+def cells_in_strata(pool: Pool, groups: list[list[int]]) -> tuple[IntArray, IntArray, IntArray]:
+    """Cell of a campaign that each cell of the pool belongs to, -1 for none, (C,); stratum and references of each."""
+    stratum_of = np.full(pool.shell_p.size, -1, np.int64)
     for place, group in enumerate(groups):
-        stratum[group] = place
-    return stratum
-
-
-def cells_in_strata(pool: Pool, groups: list[list[int]]) -> IntArray:
-    """Cell of a campaign that each cell of the pool belongs to, by stratum and references; -1 for none, shape (C,)."""
-    stratum = _stratum_of_shell(pool, groups)[pool.cell_shell]
-    kind = np.where(stratum < 0, -1, (stratum << len(pool.library.references)) | pool.cell_references)
+        stratum_of[group] = place
+    stratum, n_references = stratum_of[pool.cell_shell], len(pool.library.references)
+    kind = np.where(stratum < 0, -1, (stratum << n_references) | pool.cell_references)
     kinds = np.unique(kind[kind >= 0])
-    return np.where(kind < 0, -1, np.searchsorted(kinds, kind))
+    cells = np.where(kind < 0, -1, np.searchsorted(kinds, kind))
+    return cells, kinds >> n_references, kinds & ((1 << n_references) - 1)
 
 
 @dataclass(frozen=True)
@@ -195,7 +187,7 @@ class PrescribedEpisodes:
         design = design_shells(pool, shells=campaign.testing.shells, limit_mps2=limit)
         groups = shells_in_strata(pool, outermost(pool, campaign.testing.shells), limit)
         self._cut_ins = pool.cut_ins
-        self._cells = cells_in_strata(pool, groups)
+        self._cells = cells_in_strata(pool, groups)[0]
         self._order = [_order(pool, group, campaign.seed, stratum) for stratum, group in enumerate(groups)]
         self._order += [np.zeros(0, np.int64)] * (len(design.strata) - len(groups))
         self.design = replace(design, available=tuple(order.size for order in self._order))

@@ -177,4 +177,4 @@ def vehicle_pool(resolved: Resolved, paths: BaselinePaths, runs: BaselineRuns) -
     pool = pool_of(enumerated, paths.seed, paths.order, environment, library, resolved.campaign.pool, key)
     hashes = motion_hashes(runs.x_m, runs.v_mps)
     cut_ins = replace(pool.cut_ins, motion=hashes[pool.cut_ins.row, pool.cut_ins.onset])
-    return replace(pool, cut_ins=cut_ins, p_unknown=float((found.unknown * paths.weight).mean()))
+    return replace(pool, cut_ins=cut_ins, p_after_failure=float((found.p_after_failure * paths.weight).mean()))

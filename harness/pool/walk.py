@@ -19,9 +19,6 @@ from __future__ import annotations
 
 import hashlib
 import math
-import os
-from collections.abc import Iterable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -38,6 +35,7 @@ from harness.episode.path import (
     weigh_cut_ins,
     who_crashes,
 )
+from harness.processes import made_ahead
 from harness.progress import Progress
 from harness.random_stream import DIAGNOSTIC, INITIAL, LV_DRAWS, uniform, uniforms
 from harness.traffic import laws
@@ -87,13 +85,13 @@ class CutInsOnPaths(NamedTuple):
 
     ``probability`` (n, steps) is ``stride`` · P(BV cuts in in that step | path) where it is asked, else 0: with uniform
     offsets the sum over any set of cut-ins has its probability as mean. ``crashes`` (n, steps) has one bit per driver.
-    ``unknown`` (n,) is the most that the probability of a cut-in after a failure of the AV can be, wherever it may be
-    then: every wish to change lanes is carried out.
+    ``p_after_failure`` (n,) is the most that the probability of a cut-in after a failure of the AV can be, wherever it
+    may be then: every wish to change lanes is carried out.
     """
 
     probability: FloatArray
     crashes: IntArray
-    unknown: FloatArray
+    p_after_failure: FloatArray
 
 
 class Script(NamedTuple):
@@ -168,7 +166,7 @@ def _enumerate(
             for step in range(steps, reach):
                 wish = laws.opportunity(state_of(path.x[step], path.v[step]), environment)
                 most += laws.cut_in_hazard(wish, 1.0, environment)
-            found.unknown[i] = math.exp(-hazard) * -math.expm1(-most)
+            found.p_after_failure[i] = math.exp(-hazard) * -math.expm1(-most)
 
 
 @compiled_inline
@@ -327,12 +325,6 @@ class EnumeratedPaths:
         return np.column_stack([*columns, self.mass.sum(1)])
 
 
-def joined(parts: Iterable[EnumeratedPaths]) -> EnumeratedPaths:
-    """Consecutive paths in one."""
-    columns = zip(*(vars(part).values() for part in parts), strict=True)
-    return EnumeratedPaths(*map(np.concatenate, columns))
-
-
 @dataclass(frozen=True, eq=False)
 class Enumerator:
     """Enumerates consecutive paths of one environment, on all cores; the number of cores changes no bit."""
@@ -364,11 +356,10 @@ class Enumerator:
     def run(self, first: int, n: int, progress: Progress) -> EnumeratedPaths:
         """Paths ``first … first + n - 1``; ``n`` is a multiple of `BLOCK_PATHS`."""
         blocks: list[EnumeratedPaths] = []
-        with ThreadPoolExecutor(os.cpu_count()) as threads:
-            for block in threads.map(self._block, range(first, first + n, BLOCK_PATHS)):
-                blocks.append(block)
-                progress.advance(BLOCK_PATHS)
-        return joined(blocks)
+        for block in made_ahead(self._block, range(first, first + n, BLOCK_PATHS)):
+            blocks.append(block)
+            progress.advance(BLOCK_PATHS)
+        return EnumeratedPaths(*map(np.concatenate, zip(*(vars(block).values() for block in blocks), strict=True)))
 
     def _block(self, first: int, n: int = BLOCK_PATHS) -> EnumeratedPaths:
         u, weight = self.uniforms(first, n), np.ones(n)

@@ -54,7 +54,7 @@ def _forced(
     n, index = len(state), first + np.arange(len(state))
     runs = recorded(without_cut_in(loop, seed, first, index, state, environment), environment)
     nobody = Followers(driver_records([]))
-    probability, _, unknown = enumerate_cut_ins(seed, index, state, environment, nobody, runs)
+    probability, _, p_after_failure = enumerate_cut_ins(seed, index, state, environment, nobody, runs)
     cumulative = np.cumsum(probability, axis=1)
     p_cut_in = cumulative[:, -1]
     u = uniforms(seed, first, n, CUT_IN, CUT_IN_DRAW + 1)[:, CUT_IN_DRAW]
@@ -62,4 +62,4 @@ def _forced(
     step[runs.failed] = -1
     lv, bv, _, _, lead = write_script(seed, index, step, state, environment, draws_per_cut_in=0)
     motion = motion_hashes(runs.x_m, runs.v_mps)[np.arange(n), onset_steps(step, lead)]
-    return PrescribedTraffic(lv, bv, step, np.full(n, -1), np.log(p_cut_in + unknown), index, motion, lead)
+    return PrescribedTraffic(lv, bv, step, np.full(n, -1), np.log(p_cut_in + p_after_failure), index, motion, lead)

@@ -381,7 +381,7 @@ class OvertakingShells:
             reference_square=(by_reference * by_reference).mean(0),
         )
         design = design_shells(pool, limit_mps2=limit)
-        cells = cells_in_strata(pool, shells_in_strata(pool, outermost(pool, ShellSettings()), limit))
+        cells = cells_in_strata(pool, shells_in_strata(pool, outermost(pool, ShellSettings()), limit))[0]
         tested = np.flatnonzero(cells >= 0)
         joined = np.zeros((tested.size, design.cell_p.size))
         joined[np.arange(tested.size), cells[tested]] = 1.0
@@ -432,7 +432,7 @@ class Division:
             "cut_ins": CutIns(
                 **dict.fromkeys(CutIns.__dataclass_fields__, unknown) | {"motion": np.zeros(int(shadow_runs))}
             ),
-            "p_unknown": 0.0,
+            "p_after_failure": 0.0,
         }
         template = Pool(**content | {"key": "drawn", "library": reduced, "names": names, "n_paths": pool_paths})
         self._shells = OvertakingShells(template, left_out, limit_mps2, mass)
