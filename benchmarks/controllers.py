@@ -74,7 +74,9 @@ def main() -> None:
         world = SumoWorld(96)
         loops, best = {}, dict.fromkeys(forms, float("inf"))
         for name, (av, _) in forms.items():
-            prepared = prepare(resolve(load_campaign(ROOT / "scenarios/overtaking_mixture.yaml", [f"av={av}"])))
+            prepared = prepare(
+                resolve(load_campaign(ROOT / "scenarios/overtaking_mixture.yaml", [f"av={av}", "av.warm_up_s=0"]))
+            )
             loops[name] = prepared.loop(world, traces="none", black_box=Path(folder) / "black-box")
             loops[name].run(0, prepared.states(0, 96))
         states = prepared.states(0, given.episodes)

@@ -20,7 +20,7 @@ from harness.campaign.drivers import (
     schema_by_model,
 )
 from harness.campaign.problems import broken_rule
-from harness.campaign.sections import Positive, Section, Whole, listed
+from harness.campaign.sections import Positive, Section, StepTime, Whole, listed
 
 AV_SOURCES = ("model", "controller", "sumo", "traci", "fmu")
 READS_NO_PARAMETERS = {
@@ -132,6 +132,13 @@ class AutomatedVehicle(Section):
         "hold_speed",
         description="until the cut-in the AV keeps its speed [itsc], or its controller acts from the start",
     )
+    warm_up_s: StepTime = Field(
+        2.0,
+        ge=0.0,
+        le=60.0,
+        description="time before the cut-in that a controller or FMU whose AV keeps its speed until then is shown, "
+        "without its answers being used; others ignore it",
+    )
     limits: Limits = Limits()
 
     @property
@@ -143,6 +150,12 @@ class AutomatedVehicle(Section):
     def acts_before_cut_in(self) -> bool:
         """Whether its controller acts from the start of a test."""
         return self.before_cut_in == "controller"
+
+    @property
+    def warm_up_steps(self) -> int:
+        """Steps before the cut-in that its controller is shown; 0 for what is not asked by the harness, or always."""
+        warms_up = self.source in ("controller", "fmu") and not self.acts_before_cut_in
+        return round(10.0 * self.warm_up_s) if warms_up else 0
 
     @property
     def reproducible(self) -> bool:
@@ -157,6 +170,8 @@ class AutomatedVehicle(Section):
             if content[section].get(key) == usual:
                 del content[section][key]
         del content["limits"]["construction_time_s"]  # changes no test
+        if not self.warm_up_steps:  # as before there was one
+            del content["warm_up_s"]
         if self.fmu is not None and (file := Path(self.fmu.file)).is_file():
             content["fmu"]["file"] = hashlib.sha256(file.read_bytes()).hexdigest()
         if self.traci is not None:

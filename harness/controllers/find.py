@@ -90,18 +90,19 @@ def build_host(
     """
     if av.source not in ("controller", "fmu"):
         return None
-    early, guard = av.acts_before_cut_in, Guard(av.limits, black_box)
+    guard = Guard(av.limits, black_box)
+    when: dict[str, Any] = {"acts_before_cut_in": av.acts_before_cut_in, "warm_up_steps": av.warm_up_steps}
     make: Callable[[], Any]
     if av.fmu is None:
         make = _maker(av)
         first = _made(make, str(av.controller), guard)
         if is_batch(first):
-            return BatchHost(first, seed, guard, acts_before_cut_in=early)
+            return BatchHost(first, seed, guard, **when)
     else:
         from harness.controllers.fmu import fmu_maker  # noqa: PLC0415 - an extra
 
         make = fmu_maker(av.fmu)
-    return VehicleHost(make, n_cells, seed, guard, fatal_episodes=fatal_episodes, acts_before_cut_in=early)
+    return VehicleHost(make, n_cells, seed, guard, fatal_episodes=fatal_episodes, **when)
 
 
 def _maker(av: AutomatedVehicle) -> Callable[[], Any]:

@@ -227,8 +227,9 @@ class VehicleHost:
         *,
         fatal_episodes: Mapping[int, Death] | None = None,
         acts_before_cut_in: bool = False,
+        warm_up_steps: int = 0,
     ) -> None:
-        self.acts_before_cut_in = acts_before_cut_in
+        self.acts_before_cut_in, self.warm_up_steps = acts_before_cut_in, warm_up_steps
         self._make, self._seed, self._guard = make, seed, guard
         self._controllers: list[VehicleController | None] = [None] * n_cells
         self._episodes = [-1] * n_cells
@@ -252,26 +253,29 @@ class VehicleHost:
                     self._drop(k)
         return failures
 
-    def act(self, observation: BatchObservation) -> tuple[FloatArray, Failures]:
-        """Accelerations (m/s²), shape (n,), and the cells whose controller failed (their value is not used)."""
+    def act(self, observation: BatchObservation, *, warms_up: bool = False) -> tuple[FloatArray, Failures]:
+        """Accelerations (m/s²), shape (n,), and the cells whose controller failed (their value is not used).
+
+        One that ``warms_up`` is shown what was: what it answers is neither used nor judged, what it raises counts.
+        """
         answer = np.zeros(observation.cell.size)
         failures = {}
         rows = zip(*(column.tolist() for column in observation), strict=True)
-        call, check = self._guard.call, self._guard.acceleration
+        call, check = self._guard.call, None if warms_up else self._guard.acceleration
         with self._guard:
             for i, (k, _, *seen) in enumerate(rows):
                 controller, episode = self._controllers[k], self._episodes[k]
                 if controller is None:
                     continue  # its episode has failed in this turn's start
-                step = round(seen[0] / STEP_S)
+                step = max(round(seen[0] / STEP_S), 0)
                 wrong = self._known_death(episode, step)
                 if wrong is None:
                     value, wrong = call(OF_EPISODE, _step, controller, seen, episode=episode, step=step, check=check)
-                if wrong is None:
-                    answer[i] = value
-                else:
-                    failures[k] = f"step: {wrong}"
+                if wrong is not None:
+                    failures[k] = f"{'step, warming up' if warms_up else 'step'}: {wrong}"
                     self._drop(k)
+                elif not warms_up:
+                    answer[i] = value
         return answer, failures
 
     def _known_death(self, episode: int, step: int) -> str | None:
@@ -305,9 +309,15 @@ class BatchHost:
     """One controller object for all cells. A fault that cannot be laid at one cell's door fails all that were asked."""
 
     def __init__(
-        self, controller: BatchController, seed: int, guard: Guard, *, acts_before_cut_in: bool = False
+        self,
+        controller: BatchController,
+        seed: int,
+        guard: Guard,
+        *,
+        acts_before_cut_in: bool = False,
+        warm_up_steps: int = 0,
     ) -> None:
-        self.acts_before_cut_in = acts_before_cut_in
+        self.acts_before_cut_in, self.warm_up_steps = acts_before_cut_in, warm_up_steps
         self._controller, self._seed, self._guard = controller, seed, guard
 
     def start(self, cells: IntArray, _episodes: IntArray, announced: IntArray) -> Failures:
@@ -318,17 +328,21 @@ class BatchHost:
             _, wrong = self._guard.call(START_BATCH, lambda: self._controller.start_batch(*handed, random))
         return {} if wrong is None else dict.fromkeys(cells.tolist(), f"start_batch: {wrong}")
 
-    def act(self, observation: BatchObservation) -> tuple[FloatArray, Failures]:
+    def act(self, observation: BatchObservation, *, warms_up: bool = False) -> tuple[FloatArray, Failures]:
         """As `VehicleHost.act`."""
         n, cells = observation.cell.size, observation.cell
+
+        def ask() -> Any:
+            answer = self._controller.step_batch(observation)
+            return np.zeros(n) if warms_up else np.array(answer, dtype=np.float64)
+
         with self._guard:
-            answer, wrong = self._guard.call(
-                STEP_BATCH, lambda: np.array(self._controller.step_batch(observation), dtype=np.float64)
-            )
+            answer, wrong = self._guard.call(STEP_BATCH, ask)
         if wrong is None and answer.shape != (n,):
             wrong = f"returned an array of shape {answer.shape}, expected ({n},)"
         if wrong is not None:
-            return np.zeros(n), dict.fromkeys(cells.tolist(), f"step_batch: {wrong}")
+            call = "step_batch, warming up" if warms_up else "step_batch"
+            return np.zeros(n), dict.fromkeys(cells.tolist(), f"{call}: {wrong}")
         outside = self._guard.outside(answer).tolist()
         return answer, {int(cells[i]): f"step_batch: {self._guard.acceleration(answer[i])[1]}" for i in outside}
 

@@ -77,6 +77,36 @@ def first(observation: BatchObservation, n: int) -> BatchObservation:
     return _rows(read_only(whole[:, :n].copy()), read_only(real[:, :n].copy()))
 
 
+class Past:
+    """The last states of K cells: what a controller whose AV keeps its speed until the cut-in is shown of them."""
+
+    def __init__(self, n_steps: int, n_cells: int) -> None:
+        self._states = np.zeros((n_steps, 2, n_cells, 3))
+        self._n_noted = 0
+
+    def note(self, x: FloatArray, v: FloatArray) -> None:
+        """Keep positions and speeds (K, 3) before a step."""
+        if n_steps := len(self._states):
+            self._states[self._n_noted % n_steps] = x, v
+            self._n_noted += 1
+
+    def before(self, seen: BatchObservation) -> list[BatchObservation]:
+        """What the AVs (n,) of observations would have seen in each of the last steps, the oldest first.
+
+        Nobody was ahead, and nobody changed speed before the episode began: there time is negative.
+        """
+        n_steps, step = len(self._states), np.rint(seen.time_s / STEP_S).astype(np.int64)
+        ago = np.arange(n_steps, 0, -1)[:, None]
+        known = np.minimum(ago, step)
+        x, v = np.moveaxis(self._states[(self._n_noted - known) % n_steps, :, seen.cell], (2, 3), (0, 1))
+        x = x - v * ((ago - known) * STEP_S)
+        nobody = np.full(known.shape, math.inf), np.full(known.shape, math.nan)
+        zero = np.zeros(known.shape)
+        real = (step - ago) * STEP_S, x[AV], v[AV], zero, *nobody, x[BV], v[BV], x[LV], v[LV], zero, zero
+        whole = read_only(np.stack((seen.cell, seen.episode, np.ones_like(seen.cell), np.zeros_like(seen.cell))))
+        return [_rows(whole, rows) for rows in read_only(np.stack(real, axis=1))]
+
+
 def _rows(whole: IntArray, real: FloatArray) -> BatchObservation:
     cell, episode, bv_lane, bv_overlaps = whole
     return BatchObservation._make([cell, episode, *real[:8], bv_lane, *real[8:], bv_overlaps])

@@ -10,6 +10,7 @@ import numpy as np
 
 from harness.compiled import unboxed
 from harness.controllers.hosts import ControllerHost
+from harness.controllers.protocol import BatchObservation
 from harness.episode.cells import (
     KernelState,
     PrescribedCutIns,
@@ -22,7 +23,7 @@ from harness.episode.cells import (
     with_more_room,
 )
 from harness.episode.decide import decide
-from harness.episode.drive import command, empty_observation, first, observe
+from harness.episode.drive import Past, command, empty_observation, first, observe
 from harness.episode.judge import PASSED_M, PASSED_UNDER_CONTROL_M, fail, judge
 from harness.errors import WorldDisagreementError
 from harness.importance.functions import Importance
@@ -119,6 +120,7 @@ class EpisodeLoop:
         self._driving: DrivingWorld | None = world if isinstance(world, DrivingWorld) else None
         self._scratch = empty_scratch(environment, importance)
         self._observation = empty_observation(world.n_cells)
+        self._past = Past(0 if av is None else av.warm_up_steps, world.n_cells)
         self._cells = idle_cells(world.n_cells, environment, importance, keep_traces=keep.any_trace)
 
     def run(self, first_episode: int, states: RecordArray, traffic: PrescribedTraffic | None = None) -> Shard:
@@ -200,10 +202,22 @@ class EpisodeLoop:
             begun = cells.cell[refilled]
             failures.update(av.start(refilled, begun["episode"], begun["announced_index"]))
         if n := observe(kernel):
-            acting = self._observation.cell[:n]
-            cells.acceleration[acting, AV], failed = av.act(first(self._observation, n))
+            seen = first(self._observation, n)
+            if av.warm_up_steps:
+                failures = {**self._warm_up(av, seen), **failures}
+            cells.acceleration[seen.cell, AV], failed = av.act(seen)
             failures = {**failed, **failures}
+        self._past.note(self._world.x, self._world.v)
         return self._fail(failures, kernel, shard)
+
+    def _warm_up(self, av: ControllerHost, seen: BatchObservation) -> dict[int, str]:
+        """Show controllers that are asked for the first time in their episode what was before; returns who failed."""
+        cell, failures = self._cells.cell[seen.cell], dict[int, str]()
+        new = cell["step"] == cell["onset_step"] + 1
+        if new.any():
+            for before in self._past.before(BatchObservation._make(column[new] for column in seen)):
+                failures = {**av.act(before, warms_up=True)[1], **failures}
+        return failures
 
     def _step_and_judge(self, kernel: KernelState, shard: Shard, placed: int) -> int:
         """Let the world take the step, and end what is over; returns how many episodes that are."""

@@ -363,5 +363,5 @@ def _measure(campaign: Campaign, *, black_box: Path | None = None) -> float | st
     if host is None:
         n_steps = STEPS if rare else STEPS_WITH_CUT_IN
     else:
-        n_steps = STEPS_ACTED if not rare else STEPS * host.acts_before_cut_in
+        n_steps = STEPS_ACTED + host.warm_up_steps if not rare else STEPS * host.acts_before_cut_in
     return n_steps * clock.spent_s / clock.n_steps

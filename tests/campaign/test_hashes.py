@@ -25,6 +25,7 @@ CHANGED = [
     (["environment.cut_in_lead_s=0.5"], "849f9c8cd132d0f4"),
     (["testing.shells.smallest_round=8"], "9effa1d477121757"),
     (["av={controller: 'a:B', parameters: {x: 1}, before_cut_in: controller}"], "0b74ded34c4cb2ce"),
+    (["av={controller: 'a:B', warm_up_s: 0}"], "e554cf95f11fe057"),  # as before there was one
     (["av={traci: {command: x}}"], "bd13597d5b96bc4b"),
     (["av={sumo: {tau: 1}}"], "32f3238a2fdebd9c"),
     (["testing.shells.statements={mine: {boundary: brakes-3, checked: true}}"], "ebd005bdfd4934f6"),

@@ -10,6 +10,7 @@ from harness.campaign.files import load_campaign
 from harness.episode.loop import Shard
 from harness.resolved import resolve
 from harness.runner.prepare import prepare
+from harness.worlds import World
 from harness.worlds.twin import TwinWorld
 
 ROOT = Path(__file__).parents[2]
@@ -22,10 +23,10 @@ def forced(*overrides: str) -> Campaign:
     return load_campaign(ROOT / "scenarios/overtaking_mixture.yaml", changes)
 
 
-def drive(*overrides: str, cells: int = 32, first: int = 0, n: int = 150) -> Shard:
-    """Run episodes from the first on, all of them traced."""
+def drive(*overrides: str, cells: int = 32, first: int = 0, n: int = 150, world: World | None = None) -> Shard:
+    """Run episodes from the first on, all of them traced, in the twin or in another world."""
     ready = prepare(resolve(forced(*overrides)))
-    with closing(ready.loop(TwinWorld(cells), traces="all")) as loop:
+    with closing(ready.loop(world or TwinWorld(cells), traces="all")) as loop:
         return loop.run(first, ready.states(first, n))
 
 

@@ -264,7 +264,7 @@ def test_nothing_that_a_batch_controller_is_handed_can_be_written_into(field):
     loop = prepared.loop(TwinWorld(8))
     shard = loop.run(0, prepared.states(0, 24))
     loop.close()
-    call = "start_batch" if field in ("cells", "episodes") else "step_batch"
+    call = "start_batch" if field in ("cells", "episodes") else "step_batch, warming up"
     assert set(shard.failures.values()) == {f"{call}: ValueError: assignment destination is read-only"}
 
 

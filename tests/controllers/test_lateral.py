@@ -118,7 +118,7 @@ def test_one_that_waits_for_the_overlap_is_another_vehicle(built_in):
 def test_what_is_seen_of_a_lead(lead_s):
     SEEN = importlib.import_module(HERE).SEEN  # noqa: N806 - the other one
     SEEN.clear()
-    episodes(f"environment.cut_in_lead_s={lead_s}", f"av={{controller: '{HERE}:Notes'}}", "world.cells=1")
+    episodes(f"environment.cut_in_lead_s={lead_s}", f"av={{controller: '{HERE}:Notes', warm_up_s: 0}}", "world.cells=1")
     assert len(SEEN) > 10_000
     assert all(seen.bv_overlaps == (seen.bv.lane == 0) == math.isfinite(seen.gap_m) for seen in SEEN)
     assert all((seen.bv_lateral_m == 1.7) and (seen.bv_lateral_speed_mps == 0.0) for seen in SEEN if seen.bv_overlaps)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import sys
 import time
+from collections import deque
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "examples" / "traci_client"))
@@ -57,6 +59,22 @@ class Faulty:
         return self._connection.simulationStep()
 
 
+def delays(sumo, cells):
+    """An IDM that acts on what it has measured half a second ago (tests/controllers/test_warm_up.py)."""
+    sumo.setOrder(1)
+    sumo.simulationStep()
+    measured = [deque(maxlen=6) for _ in range(cells)]
+    while True:
+        sumo.simulationStep()
+        vehicle = sumo.vehicle
+        for k in range(cells):
+            av, bv, speed = f"AV{k}", f"BV{k}", vehicle.getSpeed(f"AV{k}")
+            gap = vehicle.getLanePosition(bv) - 5.0 - vehicle.getLanePosition(av)
+            measured[k].append((speed, vehicle.getSpeed(bv), gap) if vehicle.getLaneIndex(bv) == 0 else None)
+            a = 0.0 if measured[k][0] is None else idm_client.idm(*measured[k][0])
+            vehicle.setSpeed(av, max(speed + a * 0.1, 0.0))
+
+
 def main():
     fault, port, cells = sys.argv[1], int(sys.argv[3]), int(sys.argv[5])
     if fault == "never_connects":
@@ -64,6 +82,10 @@ def main():
     if fault == "connects_late":
         time.sleep(1.5)
         fault = "pushes_held_avs"
+    if fault == "delays":
+        with contextlib.suppress(idm_client.traci.exceptions.FatalTraCIError):
+            delays(idm_client.connect(port), cells)
+        return
     idm_client.drive(Faulty(idm_client.connect(port), fault), cells)
 
 
