@@ -12,7 +12,7 @@ import pyarrow as pa
 from harness.estimators.block import MAX_CONTROL_STEPS, Block
 from harness.estimators.estimate import FailureBounds
 from harness.estimators.limits import normal_half_width
-from harness.estimators.scv import Scv, StratumFit
+from harness.estimators.scv import Scv, StratumFit, fill_product_columns, n_columns
 from harness.estimators.weighted import Nade
 from harness.runner.stored import stored_blocks
 from harness.vocabulary import Method
@@ -87,7 +87,9 @@ class Claims:
 def compare_control_variates(step: ControlVariates, context: Context) -> dict[str, Any]:
     """Both estimates at every size, in one pass, and the strata after the last one."""
     run = context.made[step.of]
-    sizes = [size for size in step.sizes if size <= run.result["n"]]
+    shown = [size for size in step.sizes if size <= run.result["n"]]
+    between = np.geomspace(min(300, shown[-1]), shown[-1], step.looks) if shown else np.zeros(0)
+    sizes = sorted({*shown, *between.astype(int).tolist()})
     claims, rows = Claims(), list[dict[str, Any]]()
     context.progress.stage("both estimates", sizes[-1] if sizes else 0)
     for block in cut_at(stored_blocks(run.folder / "run", moments=True), sizes) if sizes else ():
@@ -99,16 +101,36 @@ def compare_control_variates(step: ControlVariates, context: Context) -> dict[st
             break
     fits = claims.scv.fits()
     strata = [{"control_steps": level, **_together([fit])} for level, fit in fits]
-    write_table(context.folder / "sizes.parquet", pa.Table.from_pylist(rows))
     write_table(context.folder / "strata.parquet", pa.Table.from_pylist(strata))
+    first = first_block(run.folder / "run", min(step.spread_tests, run.result["n"]))
+    write_table(context.folder / SPREAD, spread(first))
     return {
-        "sizes": rows,
-        "left_out": [size for size in step.sizes if size not in sizes],
+        "looks": rows,
+        "sizes": [row for row in rows if row["n"] in shown],
+        "left_out": [size for size in step.sizes if size not in shown],
         "strata": strata,
         "beyond": _together([fit for level, fit in fits if level > MAX_CONTROL_STEPS]),
         "all": _together([fit for _, fit in fits]),
         "figures": _figures(rows, fits),
     }
+
+
+SPREAD = "results.parquet"
+
+
+def spread(block: Block) -> pa.Table:
+    """Results of some tests before and after adjustment, Y and Z = Y - Hβ, those that are not 0, by control steps."""
+    y, parts = block.weighted_crashes(), list[pa.Table]()
+    for level in np.unique(block.n_control_steps).tolist():
+        rows = np.flatnonzero(block.n_control_steps == level)
+        ratios, of_y = block.first_ratios[rows], y[rows]
+        columns = np.empty((len(rows), n_columns(level, ratios.shape[2])), order="F")
+        fill_product_columns(ratios, level, columns)
+        columns -= columns.mean(axis=0)
+        z = of_y - columns @ np.linalg.lstsq(columns, of_y - of_y.mean())[0]
+        kept = (of_y != 0.0) | (z != 0.0)
+        parts.append(pa.table({"control_steps": np.full(kept.sum(), level), "y": of_y[kept], "z": z[kept]}))
+    return pa.concat_tables(parts)
 
 
 def cut_at(blocks: Iterator[Block], sizes: list[int]) -> Iterator[Block]:
@@ -139,10 +161,12 @@ def _figures(rows: list[dict[str, Any]], fits: list[tuple[int, StratumFit]]) -> 
     if not rows:
         return {}
     last, most = rows[-1], max(((fit.n, level) for level, fit in fits if level > 0), default=(0, None))[1]
-    gain = last["gain_claimed"]
+    gain, late = last["gain_claimed"], _together([fit for level, fit in fits if level >= 4])
+    left = late["sd_after"] / late["sd_before"] if late["sd_before"] else None
     return {
         "claimed_gain": marked(figure(None) if gain is None else exactly(gain), settled=last["settled"]),
-        "difference": figure(last["difference"]),
+        "rate_over_nade": exactly(1.0 + max(row["difference"] or 0.0 for row in rows)),
+        "sd_left_from_4": figure(None) if left is None else marked(exactly(left), settled=last["settled"]),
         "most_frequent_stratum": figure(None) if most is None else exactly(most),
     }
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -60,6 +60,18 @@ def scattered(relvar: float, n: int, missed: bool) -> dict[str, Any]:
     """
     error = 2.0 * relvar * math.sqrt(2.0 / n)
     return figure(None, relvar) if missed else figure(relvar, max(relvar - error, 0.0), relvar + error)
+
+
+def range_of(found: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """The first number between the least and the most of all; a limit stands for a number that is not known."""
+    known = [x for each in found if (x := each["value"] or each["low"] or each["high"])]
+    return figure(found[0]["value"], min(known, default=None), max(known, default=None))
+
+
+def quotient(above: float, found: dict[str, Any]) -> dict[str, Any]:
+    """A number over another, whose limits change places."""
+    value, high, low = (above / x if x else None for x in (found["value"], found["low"], found["high"]))
+    return figure(value, low, high)
 
 
 def scaled(found: dict[str, Any], factor: float) -> dict[str, Any]:

@@ -51,6 +51,7 @@ def write_page(study: Study, folder: Path, made: Mapping[str, Made]) -> tuple[Pa
         claims=claims,
         steps=steps,
         plots=plots,
+        remarks=_remarks(claims),
         answers=dict(Counter(claim["verdict"] for claim in claims)),
         stratum_rows=stratum_rows,
         UNSETTLED=UNSETTLED,
@@ -60,6 +61,15 @@ def write_page(study: Study, folder: Path, made: Mapping[str, Made]) -> tuple[Pa
     _write(folder / CLAIMS, f"{answers}\n".encode())
     _write(folder / PAGE, page.encode())
     return folder / PAGE, claims
+
+
+def _remarks(claims: list[dict[str, Any]]) -> dict[str, list[int]]:
+    """Every remark once, with the numbers of its claims."""
+    found: dict[str, list[int]] = {}
+    for number, claim in enumerate(claims, start=1):
+        if claim["why"]:
+            found.setdefault(claim["why"], []).append(number)
+    return found
 
 
 def asked(path: str, made: Mapping[str, Made]) -> dict[str, Any]:
@@ -81,6 +91,7 @@ def _answered(claim: dict[str, Any], made: Mapping[str, Made], *, conclusive: bo
     """A claim with our number and the verdict; the reason of a difference only where there is one."""
     found = asked(claim["ours"], made)
     answer: Verdict = "ours to choose" if claim["ours_to_choose"] else "cannot be told"
+    conclusive |= made[claim["ours"].partition(".")[0]].result["kind"] == "theorems"  # exact whatever the sizes
     if conclusive and not claim["ours_to_choose"]:
         answer = verdict(claim["paper"], found, **{key: claim[key] for key in ("within", "tolerance", "at_most")})
     return {**claim, "found": found, "verdict": answer, "why": "" if answer == "reproduced" else claim["why"]}

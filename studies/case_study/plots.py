@@ -6,8 +6,9 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.compute as pc
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from harness.estimators.block import MAX_CONTROL_STEPS
 from harness.records.folder import read_table
@@ -20,21 +21,21 @@ from harness.report.style import (
     MUTED,
     VERMILLION,
     Plot,
-    Row,
     decades,
     head,
-    interval_bars,
     new_figure,
+    note,
     only_horizontal_grid,
     scaled,
     tick_label,
     two_panels,
 )
-from studies.case_study.counted import CURVES
+from studies.case_study.counted import CURVES, SPREAD
 from studies.case_study.figures import is_settled
 from studies.case_study.study import Convergence, Line, Made, Study
 
-_COLOURS = (INK, BLUE, VERMILLION, GREEN)
+_COLOURS = {"low": GREY, "nade": BLUE, "scv": VERMILLION, "nde": INK, "": GREEN}
+"""Of a method in all plots, by what its step or label contains."""
 _DASHED: dict[str, Any] = {"color": MUTED, "linewidth": 0.9, "linestyle": (0, (4, 3))}
 
 
@@ -46,36 +47,38 @@ def plots_of(study: Study, made: Mapping[str, Made], ours: Mapping[str, dict[str
             plots.append(convergence_plot(name, step, made, study.rhw, study.confidence))
         elif step.kind == "control_variates":
             plots.append(strata_plot(name, made[name].result["strata"]))
+            plots.append(growth_plot(f"{name}_growth", made[name].result["looks"], study.rhw))
+            plots.append(spread_plot(f"{name}_results", read_table(made[name].folder / SPREAD)))
     return {plot.name: plot for plot in plots if plot is not None}
 
 
 def tests_plot(picture: Mapping[str, Line], ours: Mapping[str, dict[str, Any]], rhw: float) -> Plot | None:
     """Tests that each method asks for, on a logarithmic axis, and what the paper reports."""
-    ends = [end for found in ours.values() for end in (found["value"], found["low"], found["high"]) if end]
-    if not ends:
+    if not any(found["value"] or found["low"] for found in ours.values()):
         return None
-    ends += [line.paper for line in picture.values() if line.paper is not None]
-    figure = new_figure(FULL_WIDTH_IN, 1.1 + 0.36 * len(picture))
+    figure = new_figure(FULL_WIDTH_IN, 3.6)
     axes = figure.subplots()
-    axes.set_xscale("log")
-    axes.set_xlim(min(ends) / 3.0, max(ends) * 3.0)
-    decades(axes.xaxis, *axes.get_xlim())
-    rows = []
+    axes.set_yscale("log")
     for place, (label, found) in enumerate(ours.items()):
         if (paper := picture[label].paper) is not None:
-            axes.plot(paper, place, "D", markerfacecolor="none", color=VERMILLION, markersize=8)
-        if not (value := found["value"] or found["low"]):
-            rows.append(Row(label, np.nan, GREY, text="not reached"))
+            axes.plot(place, paper, "D", markerfacecolor="none", color=INK, markersize=8)
+        if (value := found["value"] or found["low"]) is None:
             continue
+        colour = GREY if not is_settled(found) else next(c for name, c in _COLOURS.items() if name in label.lower())
+        ends = [[value - (found["low"] or value)], [(found["high"] or value) - value]]
         is_limit = found["high"] is None and found["low"] is not None
-        words = ("> " if is_limit else "") + tick_label(float(f"{value:.2g}"))
-        colour, mark = (BLUE, "") if is_settled(found) else (GREY, " †")
-        rows.append(Row(label, value, colour, found["low"] or value, found["high"] or value, words + mark))
-    interval_bars(axes, rows)
-    axes.set_xlabel(f"tests until the relative half-width is {rhw:g}")
+        axes.errorbar(place, value, yerr=ends, fmt="^" if is_limit else "o", color=colour, capsize=4.0, markersize=7)
+        words = ("> " if is_limit else "") + tick_label(float(f"{value:.2g}")) + (" †" if colour == GREY else "")
+        note(axes, words, (place, found["high"] or value), (0, 7), ha="center", color=INK, fontsize=8)
+    low, high = axes.get_ylim()
+    axes.set_ylim(low / 2.0, high * 4.0)
+    decades(axes.yaxis, *axes.get_ylim())
+    axes.set_xticks(range(len(ours)), list(ours), fontsize=8)
+    axes.grid(visible=False, axis="x")
+    axes.set_ylabel(f"tests for a relative half-width of {rhw:g}")
     caption = (
-        "Filled: here, with intervals (grey, †: not converged), > for lower limits; all by one definition, tests made "
-        f"times the square of their relative half-width over {rhw:g}. Hollow: reported in the paper."
+        "Filled: here, with intervals (triangles: lower limits; grey, †: not converged). NADE's are by the spread of "
+        "repeated campaigns around the known rate, the others by what their intervals say. Hollow: the paper's."
     )
     return Plot("tests", figure, "Number of tests by method, on a logarithmic axis. " + caption, caption)
 
@@ -86,7 +89,8 @@ def convergence_plot(name: str, step: Convergence, made: Mapping[str, Made], rhw
     top = reference = made[step.reference].result["figures"]["crash_rate"]["value"] or 0.0
     figure, left, right = two_panels(3.6, ("", "tests"))
     left.axhline(reference, **_DASHED)
-    for place, (label, colour) in enumerate(zip(step.of, _COLOURS, strict=False)):
+    for place, label in enumerate(step.of):
+        colour = next(colour for name, colour in _COLOURS.items() if name in label)
         rows = table.filter(pc.equal(table.column("step"), label))
         n, rate, half = (rows.column(column).to_numpy() for column in ("n", "crash_rate", "half_width"))
         axes = left if place == 0 else left.twiny()
@@ -126,7 +130,7 @@ def strata_plot(name: str, strata: list[dict[str, Any]]) -> Plot | None:
     steps = [row["control_steps"] for row in shown]
     beneath = "control steps l; from 10 on columns are of the first 9"
     figure, left, right = two_panels(3.2, (beneath, beneath), sharex=True)
-    counts = (("n", "tests", BLUE), ("columns", "control variates", VERMILLION), ("rank", "rank", GREEN))
+    counts = (("n", "tests", INK), ("columns", "control variates", GREY), ("rank", "rank", GREEN))
     for key, label, colour in counts:
         left.plot(steps, [max(row[key], 0.8) for row in shown], "o-", color=colour, label=label, markersize=3)
     for key, label, colour in (("sd_before", "Y, NADE", BLUE), ("sd_after", "Z, SCV", VERMILLION)):
@@ -142,3 +146,58 @@ def strata_plot(name: str, strata: list[dict[str, Any]]) -> Plot | None:
         "Left: tests, control variates and rank of the columns. Right: spread of Y (NADE) and of Z = Y − Hβ (SCV)."
     )
     return Plot(name, figure, "By number of control steps. " + caption, caption)
+
+
+def growth_plot(name: str, looks: list[dict[str, Any]], rhw: float) -> Plot | None:
+    """RHW of NADE and of SCV against tests, and the gain that SCV claims."""
+    known = [row for row in looks if row["nade_rhw"] and row["scv_rhw"] and row["gain_claimed"]]
+    if not known:
+        return None
+    n = [row["n"] for row in known]
+    figure, left, right = two_panels(3.0, ("tests", "tests"))
+    for key, label in (("nade", "NADE"), ("scv", "SCV, as it claims")):
+        style: dict[str, Any] = {"color": _COLOURS[key], "linewidth": 4.0 if key == "nade" else 1.4, "markersize": 3}
+        left.plot(n, [row[f"{key}_rhw"] for row in known], "o-", label=label, **style)
+    right.plot(n, [row["gain_claimed"] for row in known], "o-", color=_COLOURS["scv"], markersize=3)
+    left.axhline(rhw, **_DASHED)
+    left.set_yscale("log")
+    decades(left.yaxis, *left.get_ylim())
+    right.axhline(1.0, **_DASHED)
+    right.set_ylim(0.0, max(2.0, *right.get_ylim()))
+    for axes, title in ((left, "relative half-width"), (right, "gain that SCV claims")):
+        axes.set_xscale("log")
+        decades(axes.xaxis, *axes.get_xlim())
+        head(axes, title)
+    caption = (
+        f"Left: relative half-widths on growing parts of one run; dashed: {rhw:g}. Right: NADE's variance over that "
+        "which SCV claims; its estimate is NADE's at every size, so that the true gain is 1 (dashed)."
+    )
+    return Plot(name, figure, caption, caption)
+
+
+def spread_plot(name: str, results: pa.Table) -> Plot | None:
+    """Distributions of results before and after adjustment, by number of control steps and of all."""
+    steps, y, z = (results.column(key).to_numpy() for key in ("control_steps", "y", "z"))
+    scale = np.quantile(y[y > 0.0], 0.5) if np.any(y > 0.0) else 0.0
+    if scale == 0.0:
+        return None
+    most = max(np.abs(y).max(), np.abs(z).max()) / scale
+    edges = np.concatenate([-(side := np.geomspace(1e-2, 2.0 * most, 25))[::-1], side])
+    figure = new_figure(FULL_WIDTH_IN, 3.4)
+    panels = figure.subplots(2, 5, sharex=True, sharey=True).ravel()
+    for level, axes in enumerate(panels, start=1):
+        rows = steps == level if level <= MAX_CONTROL_STEPS else np.full(len(steps), True)
+        for values, key, label in ((y, "nade", "Y, NADE"), (z, "scv", "Z, SCV")):
+            style = {"histtype": "step", "color": _COLOURS[key], "linewidth": 1.1}
+            axes.hist(values[rows] / scale, edges, label=label, **style)
+        axes.set_title(f"l = {level}" if level <= MAX_CONTROL_STEPS else "all", fontsize=8.5)
+        axes.set_xscale("symlog", linthresh=1e-2, linscale=0.5)
+        axes.set_yscale("symlog", linthresh=1.0)
+        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: tick_label(value) or "0"))
+        axes.set_xticks([-1.0, 0.0, 1.0], ["-1", "0", "1"])
+    figure.legend(*panels[0].get_legend_handles_labels(), ncols=2, fontsize=8, loc="outside lower left")
+    caption = (
+        "Tests by their result over the median of all weighted crashes, before (Y) and after adjustment (Z = Y − Hβ), "
+        "by number of control steps l, and all; those with result 0 are left out."
+    )
+    return Plot(name, figure, caption, caption)

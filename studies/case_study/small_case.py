@@ -216,7 +216,7 @@ def answer_small_case(step: SmallCase, context: Context) -> dict[str, Any]:
     settings = list(enumerate(product((False, True), step.thresholds, step.epsilons)))
     rows = context.by_workers(settings, partial(claims_of_setting, step, context.confidence))
     write_table(context.folder / "settings.parquet", pa.Table.from_pylist(rows))
-    world, published = _world(step.lane_change_level), rows[0]
+    world = _world(step.lane_change_level)
     nearest = {name: _nearest(name, wanted, rows) for name, wanted in step.reported.items()}
     return {
         "crash_rate": world.crash_rate,
@@ -226,9 +226,7 @@ def answer_small_case(step: SmallCase, context: Context) -> dict[str, Any]:
         "nearest": nearest,
         "figures": {
             "nde": exactly(tests_for(1.0 / world.crash_rate - 1.0, step.rhw, context.confidence)),
-            "nade": exactly(published["nade_exact"]),
-            "scv_claimed": published["scv_claimed"],
-            **{f"nearest_{name}": row[name] for name, row in nearest.items()},
+            **{f"{name}_range": _range(row[name], name, rows) for name, row in nearest.items()},
         },
     }
 
@@ -281,10 +279,20 @@ def holds(claimed: float | None, exact: float) -> bool:
     return claimed is not None and exact / TRUE_WITHIN <= claimed <= exact * TRUE_WITHIN
 
 
+def _tests_of(name: str, row: dict[str, Any]) -> dict[str, Any]:
+    """Of a setting, NADE's exact number of tests, or what SCV claims."""
+    return exactly(row["nade_exact"]) if name == "nade" else row["scv_claimed"]
+
+
+def _range(nearest: dict[str, Any], name: str, rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """The number that is nearest to a reported one, between the least and the most of all settings."""
+    known = [found["value"] for row in rows if is_settled(found := _tests_of(name, row)) and found["value"]]
+    return figure(nearest["value"], min(known, default=None), max(known, default=None))
+
+
 def _nearest(name: str, wanted: float, rows: list[dict[str, Any]]) -> dict[str, Any]:
     """The setting whose number is nearest to a reported one: NADE's exact one, or what SCV claims."""
-    found = [exactly(row["nade_exact"]) if name == "nade" else row["scv_claimed"] for row in rows]
-    known = [(one, row) for one, row in zip(found, rows, strict=True) if one["value"] and is_settled(one)]
+    known = [(one, row) for row in rows if (one := _tests_of(name, row))["value"] and is_settled(one)]
     if not known:
         return {name: figure(None)}
     one, row = min(known, key=lambda each: abs(np.log(each[0]["value"] / wanted)))

@@ -10,13 +10,17 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
+from harness.estimators.scv import Scv
 from harness.numbers import number
 from studies.__main__ import main
-from studies.case_study import tested
+from studies.case_study import repeated, tested
+from studies.case_study.counted import spread
 from studies.case_study.figures import exactly, figure, marked, ratio_of_means, ratio_of_variances, verdict
-from studies.case_study.page import count, shown
+from studies.case_study.page import _answered, count, shown
 from studies.case_study.steps import step_keys
 from studies.case_study.study import Made, load_study
+from studies.chains.chain import CHAINS
+from studies.chains.sampler import blocks
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
 SHIPPED = SCENARIOS / "case_study" / "study.yaml"
@@ -49,6 +53,9 @@ steps:
     replications: 3
     avs: [alpha-0.5]
     settings: {{same: []}}
+    epsilons: [0.1, 0.9]
+    reference: nade
+    shuffles: 3
     each_of:
       - {{immediate: [], recursive: [testing.challenge=recursive, testing.epsilon=0.1]}}
       - {{step: [], episode: [testing.method=episode_mixture]}}
@@ -99,7 +106,13 @@ def test_a_change_makes_only_what_depends_on_it(study):
     other = file.with_name("other.yaml")
     other.write_text(STUDY.replace("stop.episodes=1_200", "stop.episodes=1_300"))
     keys, changed = step_keys(load_study(file)), step_keys(load_study(other))
-    assert {name for name in keys if keys[name] != changed[name]} == {"nade", "curves", "adjusted", "required"}
+    assert {name for name in keys if keys[name] != changed[name]} == {
+        "nade",
+        "curves",
+        "adjusted",
+        "required",
+        "variants",
+    }
     quick = step_keys(load_study(file, quick=True))
     assert {name for name in keys if keys[name] != quick[name]} == {"nde", "curves", "required"}
 
@@ -126,7 +139,7 @@ def test_every_number_of_the_page_is_one_of_a_result_or_of_the_paper(study, made
     with_digits = [cell for cell in cells if re.search(r"\d", cell)]
     assert len(with_digits) > 60
     titles = re.compile(
-        r"n|RHW 0\.3 .*|.*Theorem 2.*|Var.*|alpha-.*|.*V-B.*|10 and more|.*half-width of its.*|weighted.*"
+        r"n|RHW 0\.3 .*|.*Theorem 2.*|Var.*|alpha-.*|.*V-B.*|10 and more|.*half-width of its.*|weighted.*|ε = 0\.."
     )
     assert [cell for cell in with_digits if cell not in known and not titles.fullmatch(cell)] == []
 
@@ -139,7 +152,7 @@ def test_claims_say_where_they_are_from_and_are_judged(study, made):
     assert (wrong["verdict"], wrong["why"]) == ("not reproduced", "it was made up")
     page = (folder / "case_study.md").read_text()
     assert r"a \| bound" in page
-    assert "wrong: it was made up" in page
+    assert "- 2: it was made up" in page
     assert (folder / "plots" / "tests.png").read_bytes().startswith(b"\x89PNG")
 
 
@@ -152,7 +165,7 @@ def test_steps_agree_with_the_run_that_they_keep(made):
     assert [row["n"] for row in rows] == [700, 1_200]
     assert made["adjusted"].result["left_out"] == [5_000]
     assert rows[-1]["nade_rate"]["value"] == pytest.approx(estimates["crash_rate"], rel=1e-12)
-    assert all(row["difference"] < 1e-12 and row["gain_claimed"] >= 1.0 for row in rows)
+    assert all(row["difference"] < 1e-12 and row["gain_claimed"] >= 1.0 for row in made["adjusted"].result["looks"])
     assert sum(row["n"] for row in made["adjusted"].result["strata"]) == 1_200
     assert made["adjusted"].result["all"]["n"] == 1_200
     curves = pq.read_table(made["curves"].folder / "curves.parquet").to_pandas()
@@ -163,7 +176,7 @@ def test_steps_agree_with_the_run_that_they_keep(made):
 
 
 def test_variants_are_tested_on_the_same_traffic(made):
-    by_alpha, same, *_, recursive = made["variants"].result["variants"]
+    by_alpha, same, low, high, *_, recursive = made["variants"].result["variants"]
     assert by_alpha["n_crashes"] == same["n_crashes"] > 0  # alpha moves nothing: its braking is at the limit
     assert by_alpha["nade_rate"] == same["nade_rate"]
     gain, scv = same["gain_claimed"], same["scv_tests"]
@@ -171,6 +184,9 @@ def test_variants_are_tested_on_the_same_traffic(made):
     assert 1.0 < gain["value"] == pytest.approx(same["nade_tests"] / scv["value"], rel=0.2)
     assert same["gain_true"]["value"] == pytest.approx(1.0, abs=1e-9)
     assert same["difference"] < 1e-12
+    assert (low["true"]["value"], high["variant"]) == (None, "ε = 0.9")  # misses what carries the rate, and shows it
+    assert 0.3 < high["true"]["value"] / high["claimed"]["value"] < 3.0
+    assert 0.3 < high["rnot"]["value"] / high["claimed"]["value"] < 3.0
     assert (recursive["scv_tests"]["value"], recursive["gain_claimed"]["value"]) == (None, None)
     assert recursive["nade_tests"] < same["nade_tests"]
     gains = [row["gain_claimed"]["value"] for row in made["variants"].result["variants"]]
@@ -246,6 +262,30 @@ def test_ratios_of_paired_repetitions():
     rates = [1.0, 2.0, 4.0]
     assert ratio_of_variances(rates, rates, 0.9) == exactly(1.0)
     assert ratio_of_variances(rates, [1.0, 1.0, 1.0], 0.9) == figure(None)
+
+
+def test_replicated_tests_are_a_lower_limit_where_the_rate_is_missed():
+    assert repeated.true_tests(np.array([0.9, 1.1]), 1.0, 100.0)["value"] == pytest.approx(1.0)
+    missed = repeated.true_tests(np.array([0.2, 0.21, 0.22]), 1.0, 100.0)
+    assert (missed["value"], missed["low"]) == (None, pytest.approx(62.4, rel=0.01))
+    assert repeated.true_tests(np.array([1.0, 1.0]), None, 100.0) == figure(None)
+
+
+def test_exact_claims_are_judged_whatever_the_sizes(made):
+    claim = {"ours": "theorems.variance_over_bound", "paper": 1.0, "within": 2.0, "tolerance": None, "at_most": True}
+    for ours, expected in ((claim["ours"], "reproduced"), ("nade.crashes", "cannot be told")):
+        asked = {**claim, "ours": ours, "ours_to_choose": False, "why": ""}
+        assert _answered(asked, made, conclusive=False)["verdict"] == expected
+
+
+def test_the_spread_after_adjustment_is_what_algorithm_1_claims():
+    (block,) = blocks(CHAINS["decisive"], "step_mixture", [2_000], 1)
+    found, scv = spread(block).to_pandas(), Scv()
+    scv.add(block)
+    for level, fit in scv.fits():
+        z = found[found.control_steps == level].z.to_numpy()
+        squares = np.sum((z - fit.intercept) ** 2) + (fit.n - len(z)) * fit.intercept**2
+        assert squares == pytest.approx(fit.residual_squares, rel=1e-9, abs=1e-20)
 
 
 def test_relative_variance_of_known_weights():
