@@ -1,12 +1,15 @@
 """Loading a campaign: every mistake is named with YAML path and line, several at once; --set and --av are laid over."""
 
+import json
 import pickle
 import re
 import shutil
 
+import jsonschema
 import pytest
+import yaml
 
-from harness.campaign.campaign import Campaign
+from harness.campaign.campaign import Campaign, schema_text
 from harness.campaign.drivers import IDMParameters, Surrogate
 from harness.campaign.files import SHIPPED_PANEL, SHIPPED_PARAMETERS, load_campaign, load_panel, panel_av, read_model
 from harness.campaign.problems import InvalidFileError
@@ -26,56 +29,60 @@ def load(tmp_path):
     return load_text
 
 
-@pytest.mark.parametrize(
-    ("text", "path", "line", "words"),
-    [
-        ("testin:\n  epsilon: 0.2", "testin", 2, "Did you mean 'testing'?"),
-        ("testing:\n  epsilom: 0.2", "testing.epsilom", 3, "Did you mean 'epsilon'?"),
-        ("epsilon: 0.2", "epsilon", 2, "belongs under testing"),
-        ("zzz: 0.2", "zzz", 2, "Delete it"),
-        ("testing:\n  epsilon: '0.2'", "testing.epsilon", 3, "Remove the quotes"),
-        ("testing:\n  epsilon: true", "testing.epsilon", 3, "truth value"),
-        ("testing: 5", "testing", 2, "a section with keys such as method"),
-        ("world:", "world", 2, "delete the key for its default"),
-        ("description: 5", "description", 2, "in quotes"),
-        ("stop:\n  episodes: 1.5", "stop.episodes", 3, "a whole number"),
-        ("seed: " + "9" * 4299, "seed", 2, "999…"),
-        ("stop:\n  rhw: true", "stop.rhw", 3, "a number, or null"),
-        ("stop:\n  rhw: 10", "stop.rhw", 3, "less than 10, or null"),
-        ("testing:\n  method: ndee", "testing.method", 3, "Did you mean 'nde'?"),
-        ("av:\n  parameters:\n    desired_speed_mps: 300", "av.parameters.desired_speed_mps", 4, "equal to 60 (m/s)"),
-        ("av:\n  model: fvdm\n  parameters: {time_headway_s: 1}", "av.parameters.time_headway_s", 4, "kappa_per_s"),
-        ("av:\n  parameters: {kappa_per_s: 1}", "av.parameters.kappa_per_s", 3, "surrogates.NAME.parameters"),
-        ("av: {model: krauss, parameters: {tau: 1}}", "av.model", 2, "idm, fvdm"),
-        ("surrogates:\n  A:\n    parameters: {}", "surrogates.A.model", 3, "no such key"),
-        ("surrogates:\n  A: 5", "surrogates.A", 3, "a section"),
-        ("surrogates:\n  a.b: {model: idm}", "surrogates.a.b", 3, "another name"),
-        ("surrogates: {}", "surrogates", 2, "at least one surrogate"),
-        ("testing:\n  alpha: {SM-I: 0.5, SM-II: 0.4, SM-III: 0.2}", "testing.alpha", 3, "sum to 1.1"),
-        ("testing:\n  alpha: {SM-I: 0.5, SM-II: 0.5}", "testing.alpha", 3, "SM-I, SM-II, SM-III"),
-        ("environment:\n  acceleration_hold_s: 0.25", "environment.acceleration_hold_s", 3, "multiple of the 0.1 s"),
-        ("environment:\n  parameters: gone.yaml", "environment.parameters", 3, "a parameter file"),
-        ("environment:\n  parameters: ndd-overtaking-2", "environment.parameters", 3, "Did you mean"),
-        ("stop:\n  estimator: nde", "stop.estimator", 3, "testing.method nde"),
-        ("stop:\n  estimator: scv\nrecords: {moments: none}", "stop.estimator", 3, "records.moments"),
-        ("av:\n  controler: a:B", "av.controler", 3, "Did you mean 'controller'?"),
-        ("av:\n  model: idm\n  controller: a:B", "av", 2, "An AV has one driver"),
-        ("av:\n  controller:", "av.controller", 3, "Write a value after 'controller:'"),
-        ("av:\n  controller: my module.py", "av.controller", 3, "text such as my_package.my_module:MyController"),
-        ("av:\n  controller: a:B\n  parameters: [1]", "av.parameters", 4, "names, each with its value"),
-        ("av:\n  sumo:\n    carFollowModel: ACC\n    minGap: true", "av.sumo.minGap", 5, "text or a number"),
-        ("av:\n  sumo: {tau: 1}\n  parameters: {tau: 1}", "av.parameters", 4, "under av.sumo itself"),
-        ("av:\n  sumo: {tau: 1}\nworld: {engine: twin}", "world.engine", 4, "Write engine: sumo"),
-        ("av:\n  traci: {command: ''}", "av.traci.command", 3, "starts the program"),
-        ("av:\n  traci: {command: 'x {host}'}", "av.traci.command", 3, "Double a brace"),
-        ("av:\n  fmu: {file: a.fmu, output: a}", "av.fmu.inputs", 3, "Add 'inputs: …'"),
-        ("av:\n  before_cut_in: controller", "av.before_cut_in", 3, "hold_speed"),
-        ("stop:\n  rhw: 1\n  rhw: 2", "stop.rhw", 4, "again, first written on line 3"),
-        ("world: {cells: 257}", "world.cells", 2, "at most 256"),
-        ("testing: {method: step_mixture}\nstop:\n  rhw: 0.3", "stop.rhw", 4, "a fixed number of tests"),
-        ("accept: {crash_rate_below: 0.1}", "accept", 2, "testing.method shells"),
-    ],
+MISTAKES = (
+    ("testin:\n  epsilon: 0.2", "testin", 2, "Did you mean 'testing'?"),
+    ("testing:\n  epsilom: 0.2", "testing.epsilom", 3, "Did you mean 'epsilon'?"),
+    ("epsilon: 0.2", "epsilon", 2, "belongs under testing"),
+    ("zzz: 0.2", "zzz", 2, "Delete it"),
+    ("testing:\n  epsilon: '0.2'", "testing.epsilon", 3, "Remove the quotes"),
+    ("testing:\n  epsilon: true", "testing.epsilon", 3, "truth value"),
+    ("testing: 5", "testing", 2, "a section with keys such as method"),
+    ("world:", "world", 2, "delete the key for its default"),
+    ("description: 5", "description", 2, "in quotes"),
+    ("stop:\n  episodes: 1.5", "stop.episodes", 3, "a whole number"),
+    ("seed: " + "9" * 4299, "seed", 2, "999…"),
+    ("stop:\n  rhw: true", "stop.rhw", 3, "a number, or null"),
+    ("stop:\n  rhw: 10", "stop.rhw", 3, "less than 10, or null"),
+    ("testing:\n  method: ndee", "testing.method", 3, "Did you mean 'nde'?"),
+    ("av:\n  parameters:\n    desired_speed_mps: 300", "av.parameters.desired_speed_mps", 4, "equal to 60 (m/s)"),
+    ("av:\n  model: fvdm\n  parameters: {time_headway_s: 1}", "av.parameters.time_headway_s", 4, "kappa_per_s"),
+    ("av:\n  parameters: {kappa_per_s: 1}", "av.parameters.kappa_per_s", 3, "surrogates.NAME.parameters"),
+    ("av: {model: krauss, parameters: {tau: 1}}", "av.model", 2, "idm, fvdm"),
+    ("surrogates:\n  A:\n    parameters: {}", "surrogates.A.model", 3, "no such key"),
+    ("surrogates:\n  A: 5", "surrogates.A", 3, "a section"),
+    ("surrogates:\n  a.b: {model: idm}", "surrogates.a.b", 3, "another name"),
+    ("av:\n  controler: a:B", "av.controler", 3, "Did you mean 'controller'?"),
+    ("av:\n  model: idm\n  controller: a:B", "av", 2, "An AV has one driver"),
+    ("av:\n  controller:", "av.controller", 3, "Write a value after 'controller:'"),
+    ("av:\n  controller: my module.py", "av.controller", 3, "text such as my_package.my_module:MyController"),
+    ("av:\n  controller: a:B\n  parameters: [1]", "av.parameters", 4, "names, each with its value"),
+    ("av:\n  sumo:\n    carFollowModel: ACC\n    minGap: true", "av.sumo.minGap", 5, "text or a number"),
+    ("av:\n  sumo: {tau: 1}\n  parameters: {tau: 1}", "av.parameters", 4, "under av.sumo itself"),
+    ("av:\n  traci: {command: ''}", "av.traci.command", 3, "starts the program"),
+    ("av:\n  fmu: {file: a.fmu, output: a}", "av.fmu.inputs", 3, "Add 'inputs: …'"),
 )
+"""Which an editor's schema refuses, too."""
+BROKEN_RULES = (
+    ("surrogates: {}", "surrogates", 2, "at least one surrogate"),
+    ("testing:\n  alpha: {SM-I: 0.5, SM-II: 0.4, SM-III: 0.2}", "testing.alpha", 3, "sum to 1.1"),
+    ("testing:\n  alpha: {SM-I: 0.5, SM-II: 0.5}", "testing.alpha", 3, "SM-I, SM-II, SM-III"),
+    ("environment:\n  acceleration_hold_s: 0.25", "environment.acceleration_hold_s", 3, "multiple of the 0.1 s"),
+    ("environment:\n  parameters: gone.yaml", "environment.parameters", 3, "a parameter file"),
+    ("environment:\n  parameters: ndd-overtaking-2", "environment.parameters", 3, "Did you mean"),
+    ("stop:\n  estimator: nde", "stop.estimator", 3, "testing.method nde"),
+    ("stop:\n  estimator: scv\nrecords: {moments: none}", "stop.estimator", 3, "records.moments"),
+    ("av:\n  sumo: {tau: 1}\nworld: {engine: twin}", "world.engine", 4, "Write engine: sumo"),
+    ("av:\n  traci: {command: 'x {host}'}", "av.traci.command", 3, "Double a brace"),
+    ("av:\n  before_cut_in: controller", "av.before_cut_in", 3, "hold_speed"),
+    ("stop:\n  rhw: 1\n  rhw: 2", "stop.rhw", 4, "again, first written on line 3"),
+    ("world: {cells: 257}", "world.cells", 2, "at most 256"),
+    ("testing: {method: step_mixture}\nstop:\n  rhw: 0.3", "stop.rhw", 4, "a fixed number of tests"),
+    ("accept: {crash_rate_below: 0.1}", "accept", 2, "testing.method shells"),
+)
+SCHEMA = jsonschema.Draft202012Validator(json.loads(schema_text()))
+
+
+@pytest.mark.parametrize(("text", "path", "line", "words"), MISTAKES + BROKEN_RULES)
 def test_a_mistake_is_named(load, text, path, line, words):
     with pytest.raises(CampaignError) as caught:
         load(text)
@@ -85,6 +92,8 @@ def test_a_mistake_is_named(load, text, path, line, words):
     assert words in str(error)
     assert error.exit_code == EXIT_BAD_INPUT
     assert all((error.found, error.expected, error.mend))
+    in_schema = (text, path, line, words) in MISTAKES
+    assert not in_schema or not SCHEMA.is_valid(yaml.safe_load(f"name: bad\n{text}"))
 
 
 def test_all_mistakes_are_named_at_once(load):
@@ -214,11 +223,8 @@ def test_the_shipped_panel_has_what_the_design_asks_for():
     avs = load_panel().avs
     table_1 = [av.parameters.acceleration_mps2 for name, av in avs.items() if name.startswith("alpha-")]
     assert table_1 == [0.5 * k for k in range(1, 13)]
-    assert [avs[name].parameters.min_acceleration_mps2 for name in ("brakes-3", "SM-II", "SM-III")] == [
-        -3.0,
-        -1.0,
-        -6.0,
-    ]
+    limits = [avs[name].parameters.min_acceleration_mps2 for name in ("brakes-3", "SM-II", "SM-III")]
+    assert limits == [-3.0, -1.0, -6.0]
     assert [avs[name].reaction.delay_s for name in ("late-300ms", "late-600ms", "late-1000ms")] == [0.3, 0.6, 1.0]
     assert [av.sumo["carFollowModel"] for av in avs.values() if av.sumo is not None] == ["ACC", "Krauss"]
     content = {}
@@ -247,9 +253,8 @@ def test_a_vehicle_replaces_the_campaigns_and_overrides_are_laid_over_it(load, p
 def test_an_fmu_lies_beside_the_panel(load, panel, tmp_path):
     (tmp_path / "deep").mkdir()
     (tmp_path / "deep" / "av.fmu").write_bytes(b"x")
-    file = panel("  box: {fmu: {file: av.fmu, inputs: {speed_mps: v}, output: a}}\n").rename(
-        tmp_path / "deep" / "p.yaml"
-    )
+    file = panel("  box: {fmu: {file: av.fmu, inputs: {speed_mps: v}, output: a}}\n")
+    file = file.rename(tmp_path / "deep" / "p.yaml")
     assert load("", av=f"{file}:box").av.fmu.file == str(tmp_path / "deep" / "av.fmu")
 
 
@@ -270,17 +275,19 @@ def test_a_mistake_in_a_panel_names_its_place(panel, entries, where, words):
     assert caught.value.where.startswith(f"{where} ({file}:")
 
 
-def test_a_vehicle_that_is_unknown_or_breaks_a_rule_names_the_option(load, panel):
-    with pytest.raises(CampaignError, match=r"--av late-60ms: found no vehicle .* Did you mean 'late-600ms'"):
-        load("", av="late-60ms")
-    with pytest.raises(CampaignError, match=r"expected one of a; or PANEL"):
-        load("", av=f"{panel('  a: {model: idm}')}:idm")
-    with pytest.raises(CampaignError, match=r"gone\.yaml: found no such file"):
-        load("", av="gone.yaml:idm")
-    with pytest.raises(CampaignError, match=r"^--set world\.engine=twin"):
-        load("", "world.engine=twin", av="sumo-acc")
-    with pytest.raises(CampaignError, match="sumo-acc"):
-        load("", "av.reaction.delay_s=0.1", av="sumo-acc")
+@pytest.mark.parametrize(
+    ("av", "override", "said"),
+    [
+        ("late-60ms", [], r"--av late-60ms: found no vehicle .* Did you mean 'late-600ms'"),
+        ("{}:idm", [], r"expected one of a; or PANEL"),
+        ("gone.yaml:idm", [], r"gone\.yaml: found no such file"),
+        ("sumo-acc", ["world.engine=twin"], r"^--set world\.engine=twin"),
+        ("sumo-acc", ["av.reaction.delay_s=0.1"], "sumo-acc"),
+    ],
+)
+def test_a_vehicle_that_is_unknown_or_breaks_a_rule_names_the_option(load, panel, av, override, said):
+    with pytest.raises(CampaignError, match=said):
+        load("", *override, av=av.format(panel("  a: {model: idm}")))
 
 
 def test_the_commands_take_a_vehicle(tmp_path, capsys, monkeypatch):

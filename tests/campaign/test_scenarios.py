@@ -18,6 +18,7 @@ SCENARIOS = sorted(file for file in FOLDER.glob("*.yaml") if file.name != "av_pa
 CONTENTS = [read_yaml(file)[0] for file in SCENARIOS]
 TEXTS = [file.read_text() for file in SCENARIOS]
 SCHEMA = json.loads(schema_text())
+jsonschema.Draft202012Validator.check_schema(SCHEMA)
 CHANGES = [
     "av={controller: 'a:B', parameters: {x: [1, {y: null}], time_headway_s: true}}",
     "av={traci: {command: './a --port {port}', restarts: 0}}",
@@ -88,11 +89,7 @@ def test_scenario_is_valid(file):
     jsonschema.validate(read_yaml(file)[0], SCHEMA)
 
 
-def test_scenarios_ask_for_what_is_promised():
-    smoke = load_campaign(FOLDER / "smoke.yaml")
-    assert (smoke.testing.method, smoke.testing.shells.statement) == ("shells", "assumption_free")
-    assert (smoke.stop.rhw, smoke.stop.min_crashes, smoke.stop.episodes) == (0.05, None, 400_000)
-    assert (smoke.world.engine, smoke.records.moments, smoke.records.traces) == ("sumo", "none", "crash")
+def test_published_nade_is_shipped_with_either_epsilon():
     for name, epsilon in {"overtaking_nade": 0.95, "overtaking_nade_epsilon_0.1": 0.1}.items():
         nade = load_campaign(FOLDER / f"{name}.yaml").testing
         assert (nade.method, nade.challenge, nade.epsilon) == ("step_mixture", "immediate", epsilon)
@@ -133,35 +130,6 @@ def test_texts_that_other_readers_misread_are_quoted(load, text):
     dumped = dump_campaign(Campaign(name="x", description=text))
     assert 'description: "' in dumped
     assert load(dumped).description == text
-
-
-def test_committed_schema_is_current():
-    jsonschema.Draft202012Validator.check_schema(SCHEMA)
-    committed = (FOLDER / "campaign.schema.json").read_text(encoding="utf-8")
-    assert committed == schema_text(), "write it anew: harness schema > scenarios/campaign.schema.json"
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"testin": {}},
-        {"av": {"parameters": {"desired_speed_mps": 300}}},
-        {"av": {"model": "fvdm", "parameters": {"time_headway_s": 1}}},
-        {"av": {"parameters": {"kappa_per_s": 1}}},
-        {"av": {"model": "idm", "controller": "a:B"}},
-        {"av": {"controller": "a b"}},
-        {"av": {"sumo": {"tau": 1}, "parameters": {"tau": 1}}},
-        {"av": {"fmu": {"file": "a.fmu", "output": "a"}}},
-        {"surrogates": {"a.b": {"model": "idm"}}},
-        {"surrogates": {"A": {"model": "fvdm", "parameters": {"time_headway_s": 1}}}},
-        {"stop": {"episodes": 1.5}},
-    ],
-)
-def test_schema_refuses_what_the_loader_refuses(wrong, load):
-    data = {"name": "x", **wrong}
-    assert not jsonschema.Draft202012Validator(SCHEMA).is_valid(data)
-    with pytest.raises(CampaignError):
-        load(data)
 
 
 # -- broken --
