@@ -35,7 +35,9 @@ def test_the_answer_is_that_of_the_reference(folder):
     assert abs(found["crash_rate"] - REFERENCE["crash_rate"]) < 2.0 * combined
     assert "as often as a careful and competent driver (r157-cc) would" in estimates["statement"]
     assert "If this vehicle brakes as hard as it takes, up to 3 m/s²" in estimates["boundary_statements"]["need-based"]
-    assert not any(each["refuted"] or each["rhw"] >= 0.03 for each in found["details"]["statements"])
+    statements = found["details"]["statements"]
+    assert not any(each["refuted"] or each["n_ahead"] or each["rhw"] >= 0.03 for each in statements)
+    assert found["warnings"] == []
     rows = [pq.read_table(path, columns=["outcome"]) for path in (folder / "episodes").glob("*.parquet")]
     share = sum(table["outcome"].to_pylist().count("crash") for table in rows) / estimates["n_episodes"]
     assert share > 1e5 * REFERENCE["crash_rate"], "tests count without the probabilities of their shells"
@@ -44,6 +46,8 @@ def test_the_answer_is_that_of_the_reference(folder):
 def test_everything_a_user_expects_is_in_the_folder(folder):
     manifest = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))
     assert (manifest["status"], manifest["stopped_by"]) == ("done", "rhw")
-    assert "1.3" in (folder / "report.html").read_text(encoding="utf-8")
+    page = (folder / "report.html").read_text(encoding="utf-8")
+    assert "1.3" in page
+    assert "Read this before using the number" not in page
     for pattern in ("plots/*.png", "plots/*.svg", "episodes/shard-*.parquet", "traces/shard-*.parquet"):
         assert list(folder.glob(pattern)), pattern

@@ -68,9 +68,6 @@ def test_the_page_is_self_contained_and_has_the_plots_that_make_sense(reports, n
     [
         ("weighted", ["SM-III.parameters.min_acceleration_mps2", "hardest braking a_min [assumed]"], []),
         ("failed", ["25 of 1,500 tests failed", "the world lost vehicle AV", "--set records.traces=crash"], []),
-        ("no_crash", ["No crash was sampled"], ["harness replay"]),
-        ("nde", ["Every weight is exactly 1", "impact no. 1"], ["weight no."]),
-        ("shells", ["4 more need other records than these: nde, nade, mixture_cv, scv"], ["refuted by these tests"]),
         ("shells_refuted", ["Statement library: refuted by these tests", "outermost no. 1"], ["Of statement library"]),
         (
             "shells_inside_only",
