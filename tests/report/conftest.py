@@ -9,7 +9,7 @@ import pytest
 
 from harness.report.page import write_report
 from harness.report.summary import RunFolder, read_run_folder
-from tests.report.made_run import RECIPES, write_run
+from tests.report.page_runs import write_run
 
 
 class OnDemand(dict):
@@ -25,8 +25,8 @@ class OnDemand(dict):
 
 @pytest.fixture(scope="session")
 def folders(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """One run folder per recipe, without its report unless `reports` was asked for it; tests must not change them."""
-    return OnDemand(lambda name: write_run(tmp_path_factory.mktemp(name) / "run", RECIPES[name]))
+    """One run folder of each, without its report unless `reports` was asked for it; tests must not change them."""
+    return OnDemand(lambda name: write_run(tmp_path_factory.mktemp(name) / "run", name))
 
 
 @pytest.fixture(scope="session")

@@ -10,9 +10,9 @@ import pytest
 
 import harness.report
 from harness.estimators.estimate import Estimate, Estimates, Unavailable
+from harness.numbers import number
 from harness.report.rate_plots import POOL, answer_plot, shells_plot
 from harness.report.style import CSS_NAMES, INK, RC, Plot, inline_svg, new_figure, svg
-from tests.report.made_run import DESIGN
 
 CSS = (Path(harness.report.__file__).parent / "report.css").read_text(encoding="utf-8")
 LIGHT, DARK, PRINT = re.findall(r":root \{(.*?)\n\s*\}", CSS, flags=re.DOTALL)
@@ -100,17 +100,20 @@ def test_the_plot_shows_contributions_and_half_widths(runs):
     """The latter are what is not known, that of the pool included; a refuted statement has no interval."""
     found = runs["shells"].shells
     rates, widths = shells_plot(found).figure.axes
-    assert [label.get_text() for label in rates.get_yticklabels()] == [*DESIGN.strata, POOL]
+    assert [label.get_text() for label in rates.get_yticklabels()] == [*(s.shell for s in found.shells), POOL]
     assert [bar.get_width() for bar in rates.patches] == [*(s.contribution for s in found.shells), 0.0]
     half_widths = [*(s.half_width for s in found.shells), found.pool_half_width]
     assert [bar.get_width() for bar in widths.patches] == half_widths
     assert sum(map(found.share_of_uncertainty, half_widths)) == pytest.approx(1.0)
-    for name, rows in (("shells", ["shells", "given library"]), ("shells_refuted", ["shells"])):
+    for name, rows in (("shells", ["shells", "given library", "given need-based"]), ("shells_refuted", ["shells"])):
         axes = answer_plot(runs[name].estimates, runs[name].shells).figure.axes[0]
         assert [label.get_text() for label in axes.get_yticklabels()] == rows
 
 
 def test_a_shell_without_tests_is_said_so_and_runs_out_of_the_plot(runs):
-    rates, widths = shells_plot(runs["shells_inside_only"].shells).figure.axes
-    assert rates.get_yticklabels()[2].get_text() == "outside\nnot tested: up to 3.00 × 10⁻⁵"
-    assert max(rates.get_xlim()[1], widths.get_xlim()[1]) < 1e-6
+    found = runs["shells_inside_only"].shells
+    rates, widths = shells_plot(found).figure.axes
+    outside = found.shells[-1]
+    label = f"{outside.shell}\nnot tested: up to {number(outside.p)}"
+    assert rates.get_yticklabels()[len(found.shells) - 1].get_text() == label
+    assert max(rates.get_xlim()[1], widths.get_xlim()[1]) < 0.1 * outside.p
