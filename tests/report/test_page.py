@@ -13,7 +13,6 @@ import matplotlib.pyplot as plt
 import pytest
 
 from harness.campaign.sections import Accept
-from harness.records.folder import checksum
 from harness.report.page import run_notes, verdict, write_report
 from harness.report.summary import read_run_folder, summarise, typed_folder
 from tests.report.page_runs import PAGES
@@ -121,7 +120,6 @@ def test_hostile_texts_are_escaped_and_no_formula(folders, tmp_path):
     text = (folder / "campaign.yaml").read_text()
     described = text.replace('\ndescription: ""', f"\ndescription: {json.dumps(hostile + chr(27) + '[31m')}")
     (folder / "campaign.yaml").write_text(described)
-    edit(folder / "manifest.json", campaign_crc32=checksum(folder / "campaign.yaml"))
     path = folder / "estimates.json"
     estimates = edit(path, campaign=hostile, statement=hostile, headline=hostile)["estimates"]
     edit(path, estimates=estimates | {hostile: {**estimates["nade"], "warnings": [hostile]}})
