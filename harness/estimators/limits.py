@@ -31,31 +31,22 @@ def normal_half_width(std_error: float, confidence: float) -> float:
     return -float(ndtri((1.0 - confidence) / 2.0)) * std_error
 
 
-def hall_distances(std_error: float, third_moment: float, tail: float) -> tuple[float, float]:
-    """Distances of Hall's lower and upper limit from an estimate whose error is skewed.
-
-    His transformation (P. Hall, On the removal of skewness by transformation, JRSS B 54, 1992) makes the studentised
-    mean T nearly normal by g(T) = T + κT²/3 + κ²T³/27 + κ/6, which moves both limits towards the skew κ, the third
-    central moment of the estimate's error over std_error³. ``tail`` is left out on each side.
-    """
-    z = -float(ndtri(tail))
-    if third_moment == 0.0 or not 0.0 < std_error < math.inf:
-        return z * std_error, z * std_error
-    skewness = third_moment / std_error**3
-    return _hall(z, skewness) * std_error, -_hall(-z, skewness) * std_error
-
-
 def skewed_distances(std_error: float, third_moment: float, tail: float) -> tuple[float, float]:
-    """Distances of the limits that are reported, below and above: the farther one of Hall's and the normal.
+    """Distances of the limits of an estimate whose error is skewed, below and above: the farther of Hall's and normal.
 
     A mean of rare large values is skewed: samples without the largest have both a mean and a standard error that are
-    too small, so that normal limits miss the truth above. Hall's limits mend that. But their lower limit is nearer than
-    the normal one on the word of a skewness that is itself estimated, and misses too often (measured in
-    docs/estimators.md). Parameters are those of `hall_distances`.
+    too small, so that normal limits miss the truth above. Hall's transformation (P. Hall, On the removal of skewness by
+    transformation, JRSS B 54, 1992) makes the studentised mean T nearly normal by g(T) = T + κT²/3 + κ²T³/27 + κ/6,
+    which moves both limits towards the skew κ, the third central moment of the estimate's error over std_error³. But
+    its lower limit is nearer than the normal one on the word of a skewness that is itself estimated, and misses too
+    often (measured in docs/estimators.md). ``tail`` is left out on each side.
     """
-    normal = -float(ndtri(tail)) * std_error
-    below, above = hall_distances(std_error, third_moment, tail)
-    return max(normal, below), max(normal, above)
+    z = -float(ndtri(tail))
+    normal = z * std_error
+    if third_moment == 0.0 or not 0.0 < std_error < math.inf:
+        return normal, normal
+    skewness = third_moment / std_error**3
+    return max(normal, _hall(z, skewness) * std_error), max(normal, -_hall(-z, skewness) * std_error)
 
 
 def _hall(z: float, skewness: float) -> float:

@@ -15,10 +15,11 @@ from scipy.stats import binomtest
 
 from harness.campaign.campaign import Campaign
 from harness.estimators.likelihood import Level
+from harness.estimators.pairs import CRASH, NO_CRASH, no_pairs
 from harness.estimators.shells import Shells
 from harness.estimators.stopping import Decision, RoundRule
-from harness.estimators.tally import Tally, combined
-from harness.strata import Statement
+from harness.estimators.tally import Tally
+from harness.strata import ASSUMPTION_FREE, Statement
 
 from .small_blocks import SHELLS
 
@@ -27,6 +28,7 @@ P, SHARE = np.array([2e-6, 1e-5, 2e-5]), np.array([0.9, 0.5, 0.15])
 DESIGN = replace(
     SHELLS.without_references(), cell_p=P, n_paths=10**12, statements=(Statement("library", "outermost", "does", 2),)
 )
+LEVEL = Level.two_sided(0.9)
 BUDGET = 3_000
 REPLICATIONS = 500
 
@@ -68,7 +70,7 @@ def test_either_verdict_is_wrong_in_at_most_one_of_twenty():
 
 
 def test_the_intervals_own_limits_after_each_round_are_wrong_far_more_often(monkeypatch):
-    monkeypatch.setattr(RoundRule, "level_at", staticmethod(lambda _, confidence: Level.two_sided(confidence)))
+    monkeypatch.setattr(RoundRule, "level_at", staticmethod(lambda *_: LEVEL))
     assert all(binomtest(n, REPLICATIONS, 0.05, alternative="greater").pvalue < 1e-9 for n in wrong())
 
 
@@ -104,15 +106,21 @@ def test_other_limits_that_were_asked_are_said(before, said):
 
 
 def test_a_vehicle_that_always_crashes_may_have_a_rate_above_that_of_this_pool():
-    """The upper limit was cut at the pool's Σp, which is too low in half of all pools."""
-    n_paths, rng, covered = 200, np.random.default_rng(35), 0
+    """Rate, what lies outside, and what A alone does: cut at the pool's Σp these are too low in half of all pools."""
+    n_paths, rng, covered, cut = 200, np.random.default_rng(35), np.zeros(3, int), np.zeros(3, int)
+    tests, none, truth = np.full(3, 400), np.zeros(3, np.int64), P * math.exp(0.5)
     for _ in range(300):
         mass = rng.lognormal(sigma=1.0, size=(n_paths, 3)) * P
-        p, tests = mass.mean(0), np.array([400, 400, 400])
-        drawn = [mass[rng.choice(n_paths, 400, p=mass[:, s] / mass[:, s].sum())].sum(0) for s in range(3)]
-        none = np.zeros(3, np.int64)
-        limits = combined(
-            p, Tally(tests, tests, none, np.array(drawn), np.zeros((3, 3))), n_paths, Level.two_sided(0.9)
-        )
-        covered += limits.low <= P.sum() * math.exp(0.5) <= limits.high
-    assert binomtest(covered, 300, 0.9, alternative="less").pvalue > 1e-4
+        drawn = np.array([mass[rng.choice(n_paths, 400, p=of / of.sum())].sum(0) for of in mass.T])
+        design = replace(DESIGN, cell_p=mass.mean(0), n_paths=n_paths)
+        found = Shells.of(design, Tally(tests, tests, none, drawn, np.zeros((3, 3))))
+        pairs = no_pairs(design)
+        pairs.ends[:, CRASH, NO_CRASH], pairs.mass[:, CRASH, NO_CRASH] = tests, drawn
+        free, alone = found.limits_of(ASSUMPTION_FREE, LEVEL), pairs.alone(0, LEVEL)
+        low = np.array([free.low, 0.0, alone.ci_low])
+        high = np.array([free.high, found.within("library", 0.9).upper_bound_outside, alone.ci_high])
+        true = np.array([truth.sum(), truth[2], truth.sum()])
+        covered += (low <= true) & (true <= high)
+        cut += true <= np.minimum(high, [design.p.sum(), design.p[2], design.p.sum()])
+    assert all(binomtest(n, 300, 0.9, alternative="less").pvalue > 1e-4 for n in covered.tolist())
+    assert all(binomtest(n, 300, 0.9, alternative="less").pvalue < 1e-9 for n in cut.tolist())
