@@ -51,16 +51,6 @@ def test_the_weight_is_that_of_the_mixture_over_whole_episodes():
     np.testing.assert_allclose(done.log_weight, -logsumexp(done.log_q, b=done.alpha, axis=1), rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize(("challenge", "surrogates"), [("immediate", "two"), ("recursive", "default")])
-def test_moments_of_the_step_mixture_multiply_to_its_weights(challenge, surrogates):
-    done = run("step_mixture", challenge, surrogates=surrogates, **ALL)
-    assert (np.bincount(done.moment["row"], minlength=4_000) == done.episode["n_control_steps"]).all()
-    sampled = done.summed(log(done.moment["q_sampled"]) - log(done.moment["p"]))
-    np.testing.assert_allclose(done.log_weight, -sampled, rtol=0, atol=1e-10)
-    each = done.summed(log(done.moment_q) - log(done.moment["p"])[:, None])
-    np.testing.assert_allclose(done.log_q, each, rtol=0, atol=1e-10)
-
-
 def fully_recorded(done):
     """Episodes whose every step before the cut-in was critical.
 
@@ -71,14 +61,25 @@ def fully_recorded(done):
     return np.bincount(done.moment["row"][before], minlength=len(steps)) == steps
 
 
-def test_moments_of_the_episode_mixture_multiply_to_its_weights():
-    done = run("episode_mixture", **ALL)
+@pytest.mark.parametrize(
+    ("method", "challenge", "surrogates"),
+    [
+        ("step_mixture", "immediate", "two"),
+        ("step_mixture", "recursive", "default"),
+        ("episode_mixture", "recursive", "default"),
+    ],
+)
+def test_moments_multiply_to_weights(method, challenge, surrogates):
+    done = run(method, challenge, surrogates=surrogates, **ALL)
+    forces = method == "episode_mixture"
     each = done.summed(log(done.moment_q) - log(done.moment["p"])[:, None])
-    np.testing.assert_allclose(done.log_q[:, 1:], each, rtol=0, atol=1e-10)
-    whole = fully_recorded(done)
+    np.testing.assert_allclose(done.log_q[:, int(forces) :], each, rtol=0, atol=1e-10)
+    whole = fully_recorded(done) if forces else np.full(len(done.episode), True)
     assert whole.mean() > 0.95
     sampled = done.summed(log(done.moment["q_sampled"]) - log(done.moment["p"]))
     np.testing.assert_allclose(done.log_weight[whole], -sampled[whole], rtol=0, atol=1e-10)
+    if not forces:
+        assert (np.bincount(done.moment["row"], minlength=4_000) == done.episode["n_control_steps"]).all()
 
 
 def test_mean_ratio_of_every_component_is_one():

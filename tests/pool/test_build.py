@@ -18,8 +18,7 @@ from harness.pool.walk import NATURALISTIC_SHARE, STRIDE, Enumerator, aimed_poin
 from harness.resolved import resolve
 from harness.strata import STORED_DESIGN
 from tests.chains.seed import SEED
-from tests.pool.conftest import MIXTURE_FILE, SMALL_POOL
-from tests.pool.walked import enumerated
+from tests.pool.conftest import MIXTURE_FILE, SMALL_POOL, enumerated
 
 FORCED_RATE = 1.352e-7
 """Crash rate of the default vehicle, a_min -4 m/s², from tests/reference (relative error 0.42 %)."""

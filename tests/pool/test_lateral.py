@@ -12,16 +12,15 @@ from harness.importance.functions import build_importance
 from harness.pool.build import campaign_pool
 from harness.pool.cut_ins import read_pool, write_pool
 from harness.pool.library import load_library
-from harness.pool.shells import PrescribedEpisodes
+from harness.pool.shells import Draw, PrescribedEpisodes
 from harness.pool.vehicle_pool import vehicle_pool, walk_candidates
 from harness.resolved import resolve
 from harness.sampling.baseline import recorded, without_cut_in
 from harness.traffic.loading import load_environment
 from harness.vocabulary import CRASH, PASSED
 from harness.worlds.twin import TwinWorld
-from tests.pool.conftest import MIXTURE_FILE, SMALL_POOL
+from tests.pool.conftest import MIXTURE_FILE, SMALL_POOL, enumerated
 from tests.pool.test_vehicle_pool import ACTING
-from tests.pool.walked import driven, enumerated
 
 LIBRARY = load_library("ladder-lateral-1")
 NAMES = list(LIBRARY.surrogates)
@@ -63,7 +62,15 @@ def test_full_throttle_contains_every_driver_also_where_it_passes(lateral, lead_
 
 @pytest.mark.parametrize("name", [*NAMES, *LIBRARY.references])
 def test_a_prescribed_episode_ends_as_the_pool_says(lateral, lateral_pool, name):
-    rows, episode, _ = driven(lateral, lateral_pool, LIBRARY, name)
+    """Sixty cut-ins of each stratum."""
+    prescribed = PrescribedEpisodes(lateral, lateral_pool)
+    states, traffic, cut_ins = prescribed.episodes(tuple(Draw(s, 0, 60) for s in range(prescribed.design.p.size)))
+    environment, rows = load_environment(lateral.environment), cut_ins.row
+    driver = LIBRARY.followers_in(environment).drivers[[*NAMES, *LIBRARY.references].index(name)][None].copy()
+    if name == LIBRARY.envelope:  # it acts from the onset
+        driver["perceives_lateral_m"] = 0.0
+    policy = Drawing(1, environment, build_importance(lateral, None), driver)
+    episode = EpisodeLoop(TwinWorld(16), policy, RecordPolicy(0, "none", 0.0)).run(0, states, traffic).results.episode
     reached = episode["outcome"] == CRASH
     if name == LIBRARY.envelope:
         reached |= episode["outcome"] == PASSED

@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 import yaml
 
-from harness.campaign.files import load_campaign, read_model
+from harness.campaign.files import read_model
 from harness.campaign.sections import EnvironmentSettings
 from harness.errors import CampaignError
 from harness.pool.cut_ins import environment_hash
-from harness.resolved import resolve
 from harness.traffic.lateral import (
     constant_lead,
     draw_lead,
@@ -33,8 +32,11 @@ def leads(lateral, n=20_000, seed=1):
 
 
 @pytest.mark.parametrize("lead_s", [0.0, 0.1, 0.5, 2.0])
-def test_a_constant_lead_is_always_that(lead_s):
-    assert set(leads(constant_lead(lead_s), 500).tolist()) == {round(10 * lead_s)}
+def test_a_constant_lead_is_always_that_also_in_place_of_the_files(lead_s):
+    instead = load_environment(EnvironmentSettings(parameters=LATERAL, cut_in_lead_s=lead_s)).lateral
+    assert instead.distance_m == 1.7
+    for lateral in (constant_lead(lead_s), instead):
+        assert set(leads(lateral, 500).tolist()) == {round(10 * lead_s)}
 
 
 def test_leads_of_a_log_normal_speed_have_its_quantiles():
@@ -83,20 +85,14 @@ def test_the_shipped_environment_is_the_papers_with_a_section_more():
     assert numbers[0] == numbers[1]
 
 
-def test_what_says_nothing_of_leads_has_the_hashes_of_before():
-    """Written down before cut-ins could take time."""
-    smoke = load_campaign("scenarios/smoke.yaml")
-    assert load_parameters(smoke.environment).content_hash() == "838b5235175d4be5"
-    assert environment_hash(load_environment(smoke.environment)) == "e5b943592be3f1b7d3db2db8"
-    assert resolve(smoke).content_hash == "e96a008c5e8b50b4"
-    reference = load_campaign("scenarios/smoke.yaml", ["av={model: r157-cc}"])
-    assert resolve(reference).content_hash == "8e61b44d997bf0d0"
-    zero = load_campaign("scenarios/smoke.yaml", ["environment.cut_in_lead_s=0"])
-    assert environment_hash(load_environment(zero.environment)) == "e5b943592be3f1b7d3db2db8"
-    for override in ("environment.parameters=ndd-overtaking-1-lateral", "environment.cut_in_lead_s=0.5"):
-        other = load_campaign("scenarios/smoke.yaml", [override])
-        assert resolve(other).content_hash != "e96a008c5e8b50b4"
-        assert environment_hash(load_environment(other.environment)) != "e5b943592be3f1b7d3db2db8"
+@pytest.mark.parametrize(
+    ("settings", "of_before"),
+    [({}, True), ({"cut_in_lead_s": 0.0}, True), ({"cut_in_lead_s": 0.5}, False), ({"parameters": LATERAL}, False)],
+)
+def test_what_says_nothing_of_leads_has_the_hash_of_before(settings, of_before):
+    """Written down before cut-ins could take time; those of campaigns are in tests/campaign."""
+    found = environment_hash(load_environment(EnvironmentSettings(**settings)))
+    assert (found == "e5b943592be3f1b7d3db2db8") == of_before
 
 
 @pytest.mark.parametrize(
@@ -117,10 +113,3 @@ def test_a_section_that_says_too_little_or_too_much_is_refused(section, found, t
         load_parameters(EnvironmentSettings(parameters=str(file)))
     assert "lateral" in error.value.where
     assert found in error.value.found
-
-
-def test_a_lead_in_the_campaign_replaces_that_of_the_file():
-    settings = EnvironmentSettings(parameters=LATERAL, cut_in_lead_s=0.7)
-    lateral = load_environment(settings).lateral
-    assert set(leads(lateral, 100).tolist()) == {7}
-    assert lateral.distance_m == 1.7
