@@ -237,7 +237,7 @@ KB_PER_MOMENT = 0.1
 MOMENTS_PER_EPISODE = {"all": 70, "first_9": 9, "none": 0}
 MEASURED_S = 1.0
 SLOW_TEST_S = 0.1
-"""Time of a test from which on handing tests out one by one costs less than workers that wait (docs/performance.md)."""
+"""Time of a test from which tests are handed out one by one, to keep workers busy (docs/internals/performance.md)."""
 STEPS, STEPS_WITH_CUT_IN = 89, 185
 """Mean steps of a test without and with a cut-in, of the default IDM in 5,000 tests of `nde` and of `forced`."""
 STEPS_ACTED = 162
