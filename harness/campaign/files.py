@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -57,10 +57,9 @@ def load_campaign(
 
     Raises `CampaignError`: the file cannot be read, is not YAML, or says something wrong; the error names every place.
     """
-    data, lines = read_yaml(path)
-    changes = [*([] if av is None else [av_override(av)]), *map(parse_override, overrides)]
-    place = Places(lines, changes)
-    campaign = validated(apply_overrides(data, changes), Campaign, str(path), place)
+    campaign, place = _read(
+        path, Campaign, [*([] if av is None else [av_override(av)]), *map(parse_override, overrides)]
+    )
     folder = Path(path).parent
     for where, expected in _FILES.items():
         name = campaign.at(where)
@@ -150,21 +149,27 @@ def apply_overrides(data: dict[str, Any], overrides: Sequence[Override]) -> dict
     return changed
 
 
+@dataclass(frozen=True)
 class Places:
-    """Says where a value was written: in the file, or by one of the overrides, in the order they were applied in."""
+    """Where values were written: in a file (lines from 1, by path), or by an override, of which later ones win."""
 
-    def __init__(self, lines: Lines, overrides: Sequence[Override]) -> None:
-        self._lines = lines
-        self._overrides = overrides
+    path: str
+    lines: dict[tuple[str | int, ...], int]
+    overrides: Sequence[Override] = ()
 
-    def __call__(self, path: YamlPath) -> str:
-        """``--set a.b=c``, or ``a.b (file:line)`` with the overrides that changed parts of it."""
-        for override in reversed(self._overrides):
-            if tuple(path[: len(override.path)]) == override.path:
+    def line_of(self, where: YamlPath) -> int:
+        """Line of the value at ``where``, or of its nearest ancestor that is in the file."""
+        return next(self.lines[at] for n in range(len(where), -1, -1) if (at := tuple(where[:n])) in self.lines)
+
+    def __call__(self, where: YamlPath) -> str:
+        """``--set a.b=c``; or ``a.b (smoke.yaml:12)``, with overrides of its parts; file and line for the whole."""
+        for override in reversed(self.overrides):
+            if tuple(where[: len(override.path)]) == override.path:
                 return override.option
-        section = tuple(path) if tuple(path) in self._lines.lines else tuple(path[:-1])  # of a key that is missing
-        inside = [item.option for item in self._overrides if item.path[: len(section)] == section]
-        place = self._lines.place(path)
+        spot = f"{self.path}:{self.line_of(where)}"
+        place = f"{dotted(where)} ({spot})" if where else spot
+        section = tuple(where) if tuple(where) in self.lines else tuple(where[:-1])  # of a key that is missing
+        inside = [item.option for item in self.overrides if item.path[: len(section)] == section]
         return f"{place} with {' '.join(inside)}" if inside and section else place
 
 
@@ -211,10 +216,15 @@ def av_override(text: str) -> Override:
 # -- strict YAML 1.2: every value is what it looks like, and knows its line --
 
 
-def read_model(path: str | Path, model: type[Model]) -> Model:
+def read_model(path: str | Path, model: type[Model], overrides: Sequence[Override] = ()) -> Model:
     """Read a YAML file into a model, or name the path and line of every problem (`CampaignError`)."""
-    data, lines = read_yaml(path)
-    return validated(data, model, str(path), lines.place)
+    return _read(path, model, overrides)[0]
+
+
+def _read(path: str | Path, model: type[Model], overrides: Sequence[Override]) -> tuple[Model, Places]:
+    data, places = read_yaml(path)
+    places = replace(places, overrides=overrides)
+    return validated(apply_overrides(data, overrides), model, str(path), places), places
 
 
 LARGEST_FILE = 100_000
@@ -234,24 +244,7 @@ def dotted(where: YamlPath) -> str:
     return ".".join(map(str, where))
 
 
-@dataclass(frozen=True)
-class Lines:
-    """Where each value of a YAML document was written: the file, and lines, from 1, by path."""
-
-    path: str
-    lines: dict[tuple[str | int, ...], int]
-
-    def line_of(self, where: YamlPath) -> int:
-        """Line of the value at ``where``, or of its nearest ancestor that is in the file."""
-        return next(self.lines[at] for n in range(len(where), -1, -1) if (at := tuple(where[:n])) in self.lines)
-
-    def place(self, where: YamlPath) -> str:
-        """``testing.alpha (smoke.yaml:12)``, or just file and line for the whole document."""
-        spot = f"{self.path}:{self.line_of(where)}"
-        return f"{dotted(where)} ({spot})" if where else spot
-
-
-def read_yaml(path: str | Path) -> tuple[dict[str, Any], Lines]:
+def read_yaml(path: str | Path) -> tuple[dict[str, Any], Places]:
     """Read a UTF-8 file with one YAML 1.2 document whose top level is a mapping: its plain data, and their lines.
 
     Any other file, and one that says a key twice, is a `CampaignError`.
@@ -264,7 +257,7 @@ def read_yaml(path: str | Path) -> tuple[dict[str, Any], Lines]:
         found = f"a {'list' if isinstance(data, list) else 'single value'} at the top level"
         mend = "Write 'key: value' lines, without a dash before the first one."
         raise CampaignError(f"{name}:{lines[()]}", found, "keys and values", mend)
-    return data, Lines(name, lines)
+    return data, Places(name, lines)
 
 
 def parse_value(text: str, where: str) -> Any:

@@ -286,18 +286,12 @@ def _outcome_index(column: pa.Array, run: RunFolder) -> IntArray:
     return np.asarray(index).astype(np.int64)
 
 
-@dataclass(frozen=True)
-class LateralFacts:
-    """Of the tests as sampled: 5 %, 50 % and 95 % quantiles of the leads (s) of cut-ins, and crashes by contact."""
+def lateral_facts(run: RunFolder) -> dict[str, Any] | None:
+    """How cut-ins of the tests showed themselves, as sampled; None where they are one step.
 
-    n_cut_ins: int
-    lead_s: list[float]
-    n_crashes: int
-    n_side: int
-
-
-def lateral_facts(run: RunFolder) -> LateralFacts | None:
-    """How cut-ins showed themselves before BV overlapped; None where they are one step."""
+    ``lead_s`` are 5 %, 50 % and 95 % quantiles of the leads of ``n_cut_ins``; ``n_side`` of ``n_crashes`` were side
+    contacts.
+    """
     if "lead_steps" not in stored_columns(run.path):
         return None
     leads, contacts = [np.zeros(0)], Counter[str]()
@@ -306,4 +300,5 @@ def lateral_facts(run: RunFolder) -> LateralFacts | None:
         contacts.update(batch.column("contact").drop_null().to_pylist())
     lead_s = STEP_S * np.concatenate(leads)
     quantiles = np.quantile(lead_s, (0.05, 0.5, 0.95)).tolist() if lead_s.size else [math.nan] * 3
-    return LateralFacts(lead_s.size, quantiles, contacts.total(), contacts["side"])
+    crashes = {"n_crashes": contacts.total(), "n_side": contacts["side"]}
+    return {"n_cut_ins": lead_s.size, "lead_s": quantiles, **crashes}

@@ -9,8 +9,8 @@ from typing import Annotated, Any, Literal, NamedTuple, Self, TypeVar
 
 from pydantic import Field, model_validator
 
-from harness.campaign.files import Override, Places, apply_overrides, read_yaml
-from harness.campaign.problems import NAME_PATTERN, broken_rule, validated
+from harness.campaign.files import Override, read_model
+from harness.campaign.problems import NAME_PATTERN, broken_rule
 from harness.campaign.sections import Positive, Probability, Section, Whole
 from harness.progress import Progress
 from studies.work import results_of, worker_processes
@@ -204,14 +204,13 @@ def load_study(path: Path, *, quick: bool = False) -> Study:
 
     Raises `CampaignError`: the file cannot be read or says something wrong; the error names every place.
     """
-    data, lines = read_yaml(path)
-    full = validated(data, Study, str(path), lines.place)
+    full = read_model(path, Study)
     changes = [
         Override(("steps", name, key), value, f"quick: steps.{name}.{key}")
         for name, values in full.quick.items()
         for key, value in values.items()
     ]
-    small = validated(apply_overrides(data, changes), Study, str(path), Places(lines, changes))
+    small = read_model(path, Study, changes)
     study = full
     if quick:
         title = f"{small.title} (quick: too few tests for conclusions)"

@@ -10,8 +10,8 @@ from pydantic import Field, field_validator, model_validator
 
 from harness.campaign.campaign import Campaign
 from harness.campaign.drivers import BuiltInParameters
-from harness.campaign.files import Places, apply_overrides, parse_override, read_yaml
-from harness.campaign.problems import NAME_PATTERN, broken_rule, validated
+from harness.campaign.files import parse_override, read_model
+from harness.campaign.problems import NAME_PATTERN, broken_rule
 from harness.campaign.sections import Positive, Section, Whole
 from harness.campaign.vehicle import AutomatedVehicle
 from harness.errors import CampaignError
@@ -172,9 +172,7 @@ def load_experiment(path: Path, overrides: Sequence[str] = ()) -> Experiment:
 
     Raises `CampaignError`: the file cannot be read or says something wrong; the error names every place.
     """
-    data, lines = read_yaml(path)
-    changes = [parse_override(text) for text in overrides]
-    experiment = validated(apply_overrides(data, changes), Experiment, str(path), Places(lines, changes))
+    experiment = read_model(path, Experiment, [parse_override(text) for text in overrides])
     library = experiment.campaign.pool.library
     if "/" not in library and not library.endswith((".yaml", ".yml")):
         return experiment

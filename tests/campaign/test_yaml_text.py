@@ -54,8 +54,8 @@ def test_lines_fall_back_to_the_nearest_ancestor(read):
     assert lines.line_of([]) == 1
     assert lines.line_of(["b", "c", 1, "d"]) == 5
     assert lines.line_of(["b", "missing", "deeper"]) == 2
-    assert lines.place(["b", "c"]).startswith("b.c (")
-    assert lines.place(["b", "c"]).endswith("some.yaml:3)")
+    assert lines(["b", "c"]).startswith("b.c (")
+    assert lines(["b", "c"]).endswith("some.yaml:3)")
 
 
 @pytest.mark.parametrize(
