@@ -274,9 +274,10 @@ def validated_table(name: str) -> str:
 
 
 def _ranges_table(found: list[list[dict[str, Any]]], words: tuple[str, ...]) -> str:
-    """Table of the results that have no row of their own: their ranges over vehicles, for each variant."""
+    """Table of ranges over vehicles: of several variants of all results, of one of those that have no row."""
     rows = []
-    for result in dict.fromkeys(_family(one) for one in found[0] if not _is_headline(one)):
+    alone = len(found) == 1
+    for result in dict.fromkeys(_family(one) for one in found[0] if not (alone and _is_headline(one))):
         cells = [result]
         for judgements in found:
             of = [one for one in judgements if _family(one) == result and _is_judged(one)]
@@ -284,9 +285,7 @@ def _ranges_table(found: list[list[dict[str, Any]]], words: tuple[str, ...]) -> 
             cell = f"{min(biases):+.1%} to {max(biases):+.1%}; {min(one['coverage'] for one in of):.3f}"
             cells.append(cell + (f"; {min(tests):,.0f} to {max(tests):,.0f}" if _is_rate(of[0]) else ""))
         rows.append(tuple(cells))
-    legend = (
-        "Other results, over the vehicles that meet the assumption: range of bias; lowest coverage; range of tests."
-    )
+    legend = "Over the vehicles that meet the assumption: range of bias; lowest coverage; range of tests."
     return f"{legend}\n\n{_table(('result', *words), rows)}" if rows else ""
 
 
@@ -321,18 +320,19 @@ def varied_files(name: str) -> list[str]:
 
 
 def varied_table(name: str) -> str:
-    """Table of a replication experiment with several values of a key, ranges of the rest, its commands."""
+    """Table of a replication experiment, rows of its own value of the key (all where truths differ); ranges of all."""
     key, values = VARIED[name]
     found = [_result(file)["judgements"] for file in varied_files(name)]
     of_subject = [{one["subject"]: one for one in judgements if _is_headline(one)} for judgements in found]
     rows = []
     for subject in of_subject[0]:
         truths = dict.fromkeys(f"{of[subject]['truth']:.3g}" for of in of_subject)
-        rows.append((subject, ", ".join(truths), *(_varied_cell(of[subject]) for of in of_subject)))
-    words = tuple(f"{key.rpartition('.')[2]} {value}" for value in values)
+        rows.append([subject, ", ".join(truths), *(_varied_cell(of[subject]) for of in of_subject)])
+    words = [f"{key.rpartition('.')[2]} {value}" for value in values]
+    shown = len(values) if any("," in row[1] for row in rows) else 1
     return (
-        _table(("vehicle", "true rate", *words), rows)
-        + f"\nBias, coverage, median of tests.\n\n{_ranges_table(found, words)}\n"
+        _table(("vehicle", "true rate", *words[:shown]), [tuple(row[: 2 + shown]) for row in rows])
+        + f"\nBias, coverage, median of tests.\n\n{_ranges_table(found, tuple(words))}\n"
         + "\n".join([f"- {_command(name)}", *(f"- … `--set {key}={value}`" for value in values[1:])])
         + "\n"
     )
