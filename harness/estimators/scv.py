@@ -30,7 +30,7 @@ from numba.extending import get_cython_function_address
 
 from harness.estimators.block import MAX_CONTROL_STEPS, Block
 from harness.estimators.estimate import Estimate
-from harness.estimators.weighted import FEW_FOR_RESIDUALS, WeightedMean
+from harness.estimators.weighted import FEW_FOR_RESIDUALS, Nade
 from harness.processes import side_by_side
 from harness.vocabulary import FloatArray
 
@@ -50,7 +50,7 @@ _DTPQRT = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 12)(
 """LAPACK's own routine: scipy's Python wrapper of it keeps the interpreter lock, so that no two threads could fold."""
 
 
-class MixtureCv(WeightedMean):
+class MixtureCv(Nade):
     """Triangular factor of [1, H, Y], and Σ x_i x_j x_k over its rows: (M + 2)³ numbers however many episodes.
 
     From the latter the skewness of any linear combination of the columns is known afterwards.
@@ -122,7 +122,7 @@ def _regression(factor: FloatArray, n: int) -> tuple[FloatArray, int, float]:
     return coefficients, rank, variance
 
 
-class Scv(WeightedMean):
+class Scv(Nade):
     """One `Stratum` per number of control steps."""
 
     def __init__(self) -> None:

@@ -1,7 +1,7 @@
 """Means of weighted crashes: `nade` ([paper] section II-B), and `nde`, the share of crashes (II-A).
 
-`WeightedMean` is every estimator of a mean of Y = 1{crash}·weight. It holds what decides whether one can be trusted:
-how many crashes carry it, how unevenly, and which cap their weights have by design.
+`Nade` is also the part that all estimators of a mean of Y = 1{crash}·weight have in common. It holds what decides
+whether one can be trusted: how many crashes carry it, how unevenly, and which cap their weights have by design.
 """
 
 from __future__ import annotations
@@ -101,8 +101,11 @@ class Moments:
         return third if math.isfinite(third) else 0.0
 
 
-class WeightedMean:
-    """Running moments ``y`` of Y, numbers of episodes and crashes, and the largest weights; one pass."""
+class Nade:
+    """Mean of Y = 1{crash}·weight. Unbiased for every method of drawing; without control it is the crash share.
+
+    One pass keeps running moments ``y`` of Y, numbers of episodes and crashes, and the largest weights.
+    """
 
     def __init__(self) -> None:
         self.n = self.n_crashes = 0
@@ -188,6 +191,11 @@ class WeightedMean:
             )
         return found
 
+    def result(self, confidence: float) -> Estimate:
+        """Mean of Y with its interval."""
+        errors = self.y.std_error(self.n), self.y.third_moment(self.n)
+        return self.estimate(self.mean(), *errors, confidence, method="mean of weighted crashes")
+
     def estimate(
         self,
         rate: float,
@@ -254,15 +262,6 @@ def _larger(so_far: float, values: FloatArray) -> float:
 
 def _exp(log_value: float) -> float:
     return math.exp(log_value) if log_value < 700.0 else math.inf
-
-
-class Nade(WeightedMean):
-    """Mean of Y = 1{crash}·weight. Unbiased for every method of drawing; without control it is the crash share."""
-
-    def result(self, confidence: float) -> Estimate:
-        """Mean of Y with its interval."""
-        errors = self.y.std_error(self.n), self.y.third_moment(self.n)
-        return self.estimate(self.mean(), *errors, confidence, method="mean of weighted crashes")
 
 
 class Nde:
