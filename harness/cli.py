@@ -17,7 +17,7 @@ from harness.commands.options import examples
 from harness.commands.printing import show_error, show_interrupted, system_error, usage_error
 from harness.commands.stored import estimate, replay, report
 from harness.errors import EXIT_DONE, HarnessError, shortened
-from harness.processes import Interruption, interruptible
+from harness.processes import Interruption, interruptible, open_streams
 
 
 @click.group(
@@ -51,6 +51,7 @@ def main(arguments: Sequence[str] | None = None, group: click.Group = cli, name:
 
     Anything that is not a user's error is a defect and leaves as its own exception.
     """
+    open_streams()
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     with interruptible() as interruption:
         return _main(group, name, arguments, interruption)

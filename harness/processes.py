@@ -33,6 +33,7 @@ from multiprocessing import Pipe
 from multiprocessing.connection import Connection, wait
 from multiprocessing.reduction import recv_handle, send_handle
 from pathlib import Path
+from tempfile import NamedTemporaryFile, TemporaryFile
 from types import FrameType
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
@@ -96,6 +97,16 @@ def handlers_restored() -> Iterator[dict[signal.Signals, Any]]:
             signal.signal(number, handler)
 
 
+def open_streams() -> None:
+    """Open what the shell has closed of the three standard streams: else a file or a pipe would take its number."""
+    while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
+        pass
+    os.close(descriptor)
+    for name in ("stdin", "stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "r" if name == "stdin" else "w", encoding="utf-8"))  # noqa: SIM115, PTH123
+
+
 @contextmanager
 def interruptible() -> Iterator[Interruption]:
     """Let signals interrupt what is inside."""
@@ -114,6 +125,22 @@ def leave_signals_to_parent() -> None:
 
 
 # -- processes --
+
+
+class SharedFile:
+    """A file without a name, which ends with this process however that ends; children open it by its ``path``."""
+
+    def __init__(self, content: bytes = b"") -> None:
+        # Where there is no /proc it has a name, and is left behind by a process that is killed.
+        has_proc = Path("/proc/self/fd").exists()
+        self._file = TemporaryFile() if has_proc else NamedTemporaryFile(prefix="harness-")  # noqa: SIM115
+        self._file.write(content)
+        self._file.flush()
+        self.path = Path(f"/proc/{os.getpid()}/fd/{self._file.fileno()}" if has_proc else str(self._file.name))
+
+    def close(self) -> None:
+        """Let it go; those who have opened it keep it."""
+        self._file.close()
 
 
 class Child:

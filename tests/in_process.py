@@ -43,7 +43,7 @@ def without_page() -> Iterator[None]:
 class WorkerInThisProcess:
     """Stands in for `WorkerProcess` where the tests are not about processes: spares starting one."""
 
-    def __init__(self, server: ForkServer, resolved: Path, folder: Path, black_box: Path) -> None:
+    def __init__(self, server: ForkServer, resolved: Path, folder: Path) -> None:
         self._runner = ShardRunner(pickle.loads(resolved.read_bytes()), folder)
 
     def give(self, spec: ShardRequest, fatal_episodes: Mapping[int, Death]) -> bool:

@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import sys
 from dataclasses import dataclass, field
 from itertools import filterfalse
 from pathlib import Path
@@ -362,3 +363,16 @@ def test_schema_prints_what_is_committed(capsys):
     assert main(["schema"]) == 0
     committed = (SCENARIOS / "campaign.schema.json").read_text(encoding="utf-8")
     assert capsys.readouterr().out == committed, "write it anew: harness schema > scenarios/campaign.schema.json"
+
+
+def test_a_closed_stdout_is_no_error_and_its_number_is_nobody_elses(monkeypatch):
+    """As after ``>&-``: a file or a pipe that took number 1 would receive what is printed."""
+    kept = os.dup(1)
+    try:
+        os.close(1)
+        monkeypatch.setattr(sys, "stdout", None)
+        assert main(["schema"]) == 0
+        assert os.fstat(1).st_rdev == Path(os.devnull).stat().st_rdev
+    finally:
+        os.dup2(kept, 1)
+        os.close(kept)

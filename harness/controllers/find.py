@@ -12,7 +12,6 @@ from importlib.metadata import entry_points
 from inspect import signature
 from multiprocessing.connection import Connection
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, TypeVar, get_type_hints
 
 from harness.campaign.campaign import Campaign
@@ -27,7 +26,7 @@ from harness.controllers.hosts import (
     death_cause,
 )
 from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, HarnessError
-from harness.processes import CONSTRUCTOR, Child, ForkServer, first_to_answer, fit_to_travel, last_call
+from harness.processes import CONSTRUCTOR, Child, ForkServer, SharedFile, first_to_answer, fit_to_travel, last_call
 
 GROUP = "harness.controllers"
 _Answer = TypeVar("_Answer")
@@ -170,12 +169,11 @@ def run_apart(av: AutomatedVehicle, work: Callable[..., _Answer], *arguments: An
 
     Raises whatever that raises, or an `AvEndedProcessError` if the controller ended the process, naming the call.
     """
-    with TemporaryDirectory(prefix="harness-apart-") as folder, closing(ForkServer()) as server:
-        black_box = Path(folder) / "black-box"
-        child = Child(_work_and_tell, work, arguments, black_box, server=server)
+    with closing(SharedFile()) as black_box, closing(ForkServer()) as server:
+        child = Child(_work_and_tell, work, arguments, black_box.path, server=server)
         try:
             if (answer := first_to_answer([child]).receive()) is None:
-                cause, call = death_cause(child.died(), av.limits, last_call(black_box)), last_call(black_box)
+                cause, call = death_cause(child.died(), av.limits, last_call(black_box.path)), last_call(black_box.path)
                 raise AvEndedProcessError(
                     f"av.{av.source}",
                     f"{cause}, {'while it was found' if call is None else f'in {call}'}",

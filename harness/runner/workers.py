@@ -11,10 +11,9 @@ import signal
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import count, islice
+from itertools import islice
 from multiprocessing.connection import Connection
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, Protocol, TypeVar
 
 from scipy.special import bdtrc
@@ -30,6 +29,7 @@ from harness.processes import (
     Call,
     Child,
     ForkServer,
+    SharedFile,
     first_to_answer,
     fit_to_travel,
     fork_server,
@@ -209,9 +209,9 @@ class Worker(Protocol):
 class WorkerProcess(Child):
     """A process that runs one shard after another, at the end of a pipe of its own."""
 
-    def __init__(self, server: ForkServer, resolved: Path, folder: Path, black_box: Path) -> None:
-        super().__init__(serve, resolved, folder, black_box, server=server)
-        self._black_box = black_box
+    def __init__(self, server: ForkServer, resolved: Path, folder: Path) -> None:
+        self._black_box = SharedFile()
+        super().__init__(serve, resolved, folder, self._black_box.path, server=server)
 
     def give(self, request: Request, fatal_episodes: Mapping[int, Death]) -> bool:
         """See `Worker`."""
@@ -221,7 +221,7 @@ class WorkerProcess(Child):
         """See `Worker`."""
         answer = self.receive()
         if answer is None:
-            return WorkerDeath(self.died(), last_call(self._black_box))
+            return WorkerDeath(self.died(), last_call(self._black_box.path))
         if isinstance(answer, BaseException):
             raise answer
         return answer  # type: ignore[no-any-return]
@@ -378,17 +378,13 @@ class LocalWorkers(Workers):
     def __init__(self, resolved: Resolved, folder: Path, n_workers: int | None) -> None:
         super().__init__(resolved, n_workers or os.cpu_count() or 1)
         self._folder = folder
-        self._own = TemporaryDirectory(prefix="harness-workers-")
         # As a file: what a pipe cannot hold is waited for until the new process has imported all that it needs.
-        self._resolved = Path(self._own.name) / "resolved"
-        self._resolved.write_bytes(pickle.dumps(resolved))
-        self._numbers = count()
+        self._resolved = SharedFile(pickle.dumps(resolved))
         self._server = fork_server(*worker_modules(resolved.campaign.world.engine))
 
     def new_worker(self) -> WorkerProcess:
         """See `Workers.new_worker`."""
-        black_box = Path(self._own.name) / str(next(self._numbers))
-        return WorkerProcess(self._server, self._resolved, self._folder, black_box)
+        return WorkerProcess(self._server, self._resolved.path, self._folder)
 
     def first_to_answer(self, busy: Sequence[WorkerProcess]) -> WorkerProcess:
         """See `Workers.first_to_answer`."""
@@ -398,4 +394,4 @@ class LocalWorkers(Workers):
         """See `Workers.close`."""
         super().close()
         self._server.close()
-        self._own.cleanup()
+        self._resolved.close()

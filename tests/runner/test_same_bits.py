@@ -97,9 +97,12 @@ sys.exit(main(sys.argv[1:]))
 
 
 def test_killed_while_it_writes_then_resumed(stored_run, tmp_path):
-    out = tmp_path / "run"
+    out, temporary = tmp_path / "run", tmp_path / "tmp"
+    temporary.mkdir()
     command = [sys.executable, "-c", KILLED, "run", BASE, "--out", out, *sets(*MORE[SEVEN]), "--workers", "1"]
-    assert subprocess.run(command, check=False, timeout=PATIENCE_S).returncode == -signal.SIGKILL
+    environment = {**os.environ, "TMPDIR": str(temporary)}
+    killed = subprocess.run(command, check=False, timeout=PATIENCE_S, env=environment)
+    assert (killed.returncode, list(temporary.iterdir())) == (-signal.SIGKILL, [])
     assert manifest(out)["status"] != "done"
     assert (len(shard_files(out)), len(list(out.rglob("*.part")))) == (3, 1)
 
