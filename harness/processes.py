@@ -36,6 +36,7 @@ from pathlib import Path
 from tempfile import NamedTemporaryFile, TemporaryFile
 from types import FrameType
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from weakref import finalize
 
 from harness.errors import writing
 
@@ -128,7 +129,7 @@ def leave_signals_to_parent() -> None:
 
 
 class SharedFile:
-    """A file without a name, which ends with this process however that ends; children open it by its ``path``."""
+    """A file without a name, which ends with this object or process, however that ends; children open its ``path``."""
 
     def __init__(self, content: bytes = b"") -> None:
         # Where there is no /proc it has a name, and is left behind by a process that is killed.
@@ -136,11 +137,8 @@ class SharedFile:
         self._file = TemporaryFile() if has_proc else NamedTemporaryFile(prefix="harness-")  # noqa: SIM115
         self._file.write(content)
         self._file.flush()
+        finalize(self, self._file.close)
         self.path = Path(f"/proc/{os.getpid()}/fd/{self._file.fileno()}" if has_proc else str(self._file.name))
-
-    def close(self) -> None:
-        """Let it go; those who have opened it keep it."""
-        self._file.close()
 
 
 class Child:

@@ -16,6 +16,7 @@ from rich.progress import Progress as Bars
 from harness.numbers import count, duration, words
 
 Figure = float | int | str
+FORESEEN = 10.0
 
 
 class Progress:
@@ -39,20 +40,21 @@ class Progress:
 
 def episodes_left(
     done: float, budget: float, target_rhw: float | None, min_crashes: int, figures: Mapping[str, Figure]
-) -> int:
-    """Estimate how many more episodes a campaign needs until it stops.
+) -> int | None:
+    """Estimate how many more episodes a campaign needs until it stops; None as long as nobody can tell.
 
     The relative half-width falls as 1/√n and crashes come at a steady rate, so that a target needs about
     n·(rhw/target)² episodes. One crash of the largest weight moves the estimate in proportion to 1/n, and may do so by
-    no more than the target (`harness.estimators.stopping`). The budget ends the campaign in any case.
+    no more than the target (`harness.estimators.stopping`). From n episodes no more than `FORESEEN` times n are
+    foreseen. The budget is the answer only where there is no target: else it is a limit, and no forecast.
     """
-    rhw, crashes, one_more_crash = (float(figures.get(name, 0.0)) for name in ("rhw", "crashes", "one_more_crash"))
-    if not done or not target_rhw or "rhw" not in figures or not crashes:
+    if not target_rhw or "crashes" not in figures:
         return max(math.ceil(budget - done), 0)
-    # No ratio beyond the budget matters, and an infinite one could not be squared.
-    ratio = min(rhw / target_rhw, math.sqrt(budget))
-    needed = done * max(ratio * ratio, min_crashes / crashes, min(one_more_crash / target_rhw, budget))
-    return max(math.ceil(min(needed, budget) - done), 0)
+    rhw, crashes, one_more_crash = (float(figures.get(name, 0.0)) for name in ("rhw", "crashes", "one_more_crash"))
+    if not done or not crashes or not rhw or not math.isfinite(rhw):
+        return None
+    times = max(min(rhw / target_rhw, FORESEEN) ** 2, min_crashes / crashes, one_more_crash / target_rhw)
+    return max(math.ceil(done * times - done), 0) if times <= FORESEEN and done * times <= budget else None
 
 
 class ShownProgress(Progress):
@@ -74,10 +76,11 @@ class ShownProgress(Progress):
         self._asked = target_rhw, min_crashes
         columns = "{task.description}", BarColumn(bar_width=12), TaskProgressColumn(), "{task.fields[words]}"
         self._bars = Bars(*columns, console=Console(file=self._stream))
-        self._ended = threading.Event()
+        self._ended, self._told = threading.Event(), False
         self._thread = threading.Thread(target=self._print_lines, daemon=True)  # a shard may take longer than that
 
     def __enter__(self) -> Self:
+        self.stage("preparing", None)
         if self._stream.isatty():
             self._bars.start()
         else:
@@ -92,10 +95,12 @@ class ShownProgress(Progress):
             self._bars.stop()
 
     def stage(self, name: str, total: int | None, *, done: int = 0) -> None:
-        """Begin a bar; it takes the place of the last stage's, for there is one line on the terminal."""
+        """Begin a bar in the place of the last stage's; a log that has had a line is told at once."""
         for task_id in self._bars.task_ids:
             self._bars.remove_task(task_id)
         self._bars.add_task(name, total=total, completed=done, before=done, budget=total, figures={}, words="")
+        if self._told:
+            self._print()
 
     def advance(self, n: int) -> None:
         """Move the bar on."""
@@ -110,26 +115,37 @@ class ShownProgress(Progress):
             if (budget := task.fields["budget"]) is not None:
                 # Not by `update`, which begins to measure time anew where the total is another one.
                 left = episodes_left(task.completed, budget, *self._asked, task.fields["figures"])
-                task.total = task.completed + left
+                task.total = None if left is None else task.completed + left
             self._bars.update(task.id, words=_words(task))
 
     def _print_lines(self) -> None:
         while not self._ended.wait(self._interval_s):
-            for line in self.lines():
-                print(line, file=self._stream, flush=True)
+            self._print()
+
+    def _print(self) -> None:
+        for line in self.lines():
+            self._told = True
+            print(line, file=self._stream, flush=True)
 
     def lines(self) -> Iterator[str]:
         """What a log is told now, with the time of day: nothing until a stage begins."""
         for task in self._bars.tasks:
-            of = "" if task.total is None else f" of {count(task.total)}"
+            of = f" of {count(task.total)}" if task.total is not None else ""
+            of = of or (f" of at most {count(task.fields['budget'])}" if task.fields["budget"] is not None else "")
             done = f" {count(task.completed)}{of}" if task.completed else ""
             yield f"{time.strftime('%H:%M:%S')} {task.description}:{done} · {_words(task)}".rstrip(" ·:")
 
 
 def _words(task: Task) -> str:
-    """Rate, figures, and time left, of what this run itself has done: an earlier run's share took no time now."""
-    named = ((name.replace("_", " ").replace("rhw", "RHW"), figure) for name, figure in task.fields["figures"].items())
-    figures = [f"{name} {words(figure, 2)}" for name, figure in named]
+    """Rate, figures, and time left, of what this run itself has done: an earlier run's share took no time now.
+
+    Shares of the rate (half-widths) that are no smaller than it say nothing yet.
+    """
+    figures = [
+        f"{name.replace('_', ' ').replace('rhw', 'RHW')} {words(figure, 2)}"
+        for name, figure in task.fields["figures"].items()
+        if not isinstance(figure, float) or figure < 1.0
+    ]
     done = task.completed - task.fields["before"]
     if done <= 0 or not task.elapsed:
         return " · ".join(figures)

@@ -115,11 +115,11 @@ def run(
     from harness.progress import shown_progress  # noqa: PLC0415 - keeps --help fast
 
     is_local = campaign.run.executor == "local"
-    with imports_ahead(*worker_modules(campaign.world.engine)) if is_local else nullcontext():
-        from harness.runner.run import run_campaign  # noqa: PLC0415 - slow to import: only once the campaign is right
+    ahead = imports_ahead(*worker_modules(campaign.world.engine)) if is_local else nullcontext()
+    with ahead, shown_progress(campaign.stop.rhw, campaign.min_crashes, quiet=quiet) as bar:
+        from harness.runner.run import run_campaign  # noqa: PLC0415 - slow to import: the bar is there meanwhile
 
-        with shown_progress(campaign.stop.rhw, campaign.min_crashes, quiet=quiet) as bar:
-            result = run_campaign(campaign, folder, workers=workers, resume=resume, progress=bar)
+        result = run_campaign(campaign, folder, workers=workers, resume=resume, progress=bar)
     content = in_folder(result.estimates, folder)
     if junit is not None:
         from harness.report.junit import statement_cases, write_junit  # noqa: PLC0415 - keeps --help fast
@@ -237,11 +237,12 @@ def compare(
     if stored is not None:  # how far it was run before says nothing about now
         a = a.model_copy(update={"stop": b.stop})
     from harness.progress import shown_progress  # noqa: PLC0415 - keeps --help fast
-    from harness.runner.compare import compare_campaigns  # noqa: PLC0415 - slow to import: only once the campaigns are right
 
     label_b = ", ".join([b.name, *filter(None, [against_av]), *against]) if file_b is None else b.name
     labels = a.name, label_b
     with shown_progress(a.stop.rhw, a.min_crashes, quiet=quiet) as bar:
+        from harness.runner.compare import compare_campaigns  # noqa: PLC0415 - slow to import: the bar is there meanwhile
+
         found = compare_campaigns(
             a, b, folder, workers=workers, progress=bar, labels=labels, stored=stored, margin=margin
         )
@@ -278,12 +279,13 @@ def pool(campaign_file: Path, *, out: Path | None, overrides: Sequence[str], as_
     the first in this order that a surrogate crashes on. A pool is built once and kept; `harness run` builds it, too.
     """
     campaign = loaded(campaign_file, overrides)
-    from harness.pool.build import campaign_pool  # noqa: PLC0415 - slow to import
-    from harness.pool.cut_ins import write_pool  # noqa: PLC0415 - slow to import
     from harness.progress import shown_progress  # noqa: PLC0415 - keeps --help fast
-    from harness.resolved import resolve  # noqa: PLC0415 - slow to import
 
     with shown_progress() as bar:
+        from harness.pool.build import campaign_pool  # noqa: PLC0415 - slow to import: the bar is there meanwhile
+        from harness.pool.cut_ins import write_pool  # noqa: PLC0415 - slow to import
+        from harness.resolved import resolve  # noqa: PLC0415 - slow to import
+
         found = campaign_pool(resolve(campaign), bar)
     if out is not None:
         write_pool(out, found)

@@ -169,7 +169,8 @@ def run_apart(av: AutomatedVehicle, work: Callable[..., _Answer], *arguments: An
 
     Raises whatever that raises, or an `AvEndedProcessError` if the controller ended the process, naming the call.
     """
-    with closing(SharedFile()) as black_box, closing(ForkServer()) as server:
+    black_box = SharedFile()
+    with closing(ForkServer()) as server:
         child = Child(_work_and_tell, work, arguments, black_box.path, server=server)
         try:
             if (answer := first_to_answer([child]).receive()) is None:

@@ -122,7 +122,7 @@ def _compared(
         design, available = source.prescribed.design, source.prescribed.available
         rounds, pairs = PairRounds(campaign, design, available, margin), PairedShells(design)
         both = [_Side(run, side, pairs, rounds.rule) for side, run in enumerate(runs)]
-        progress.stage("tests of A and B", 2 * campaign.stop.episodes)
+        progress.stage("tests of A and B", None if margin is not None else 2 * campaign.stop.episodes)
         for side, requests in zip(both, stored, strict=True):
             side.run(iter(requests))
         counts = _drive(rounds, pairs, both)

@@ -56,9 +56,12 @@ def require_world(campaign: Campaign) -> None:
 
 def prepare(resolved: Resolved, progress: Progress | None = None) -> Source:
     """Build (or read) what a campaign's tests are drawn from, while kernels are compiled if they have to be."""
+    progress, is_warm = progress or Progress(), is_cached(judge)
+    if not is_warm:
+        progress.stage("compiling, once per version", None)
     with ThreadPoolExecutor(1) as thread:
-        building = thread.submit(source_of(resolved.campaign), resolved, progress or Progress())
-        if not is_cached(judge):
+        building = thread.submit(source_of(resolved.campaign), resolved, progress)
+        if not is_warm:
             gc.disable()  # a compiler makes many small objects, and next to no garbage
             try:
                 compile_kernels(resolved)

@@ -179,10 +179,10 @@ class Run:
 
         Only what a rule asks for is called ``rhw``: a bar reckons from it when the campaign will stop.
         """
-        self._progress.advance(min(max(self.prefix.n_episodes - self.held, 0), shard.request.n_episodes))
         watched = "half_width" if self.campaign.stop.rhw is None else "rhw"
         one_more = {"one_more_crash": rule.look.one_more_crash} if self.campaign.sampling.forces else {}
         self._progress.status(crashes=self.prefix.n_crashes, **{watched: rule.look.rhw}, **one_more)
+        self._progress.advance(min(max(self.prefix.n_episodes - self.held, 0), shard.request.n_episodes))
         self.manifest.follow(self.prefix)
 
     def _known(self, request: ShardRequest) -> ShardResult | None:
@@ -243,7 +243,7 @@ class Run:
         self.manifest.note(**facts)
         retraced = self._retracing.summary(self.prefix.n_retraced)
         self.manifest.write(self.prefix, "done", stopped_by=stopped_by, ending=ending, retraced=retraced)
-        self._progress.stage("estimates and report", None)
+        self._progress.stage("writing estimates and report", None)
 
 
 def finish(run: Run, rule: Rule, remark: str = "") -> RunResult:

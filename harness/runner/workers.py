@@ -394,4 +394,3 @@ class LocalWorkers(Workers):
         """See `Workers.close`."""
         super().close()
         self._server.close()
-        self._resolved.close()
