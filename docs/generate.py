@@ -152,8 +152,9 @@ def _column_rows(schema: pa.Schema) -> list[tuple[str, ...]]:
     rows = []
     for field in schema:
         words = {key.decode(): value.decode() for key, value in field.metadata.items()}
-        unit = (words["unit"] or "–") + (" or null" if field.nullable else "")
-        rows.append((f"`{field.name}`", unit, words["doc"].replace("|", "\\|")))
+        unit = [words["unit"]] if words["unit"] not in ("", "1") else []
+        text = words["doc"].replace("|", "\\|")
+        rows.append((f"`{field.name}`", ", ".join([*unit, *(["null"] if field.nullable else [])]), text))
     return rows
 
 
