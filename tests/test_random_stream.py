@@ -5,16 +5,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from harness.compiled import compiled
-from harness.random_stream import DIAGNOSTIC, philox_block, uniform, uniforms
+from harness.random_stream import DIAGNOSTIC, uniform, uniforms
 
-word = st.integers(0, 2**64 - 1)
 natural = st.integers(0, 2**62)
 streams = st.integers(0, DIAGNOSTIC)
-
-
-@compiled
-def one_block(keys, counters, out):
-    out[0], out[1], out[2], out[3] = philox_block(keys[0], keys[1], counters[0], counters[1], counters[2], counters[3])
 
 
 @compiled
@@ -33,13 +27,6 @@ def at(seed, episode, stream, indices):
     out = np.empty(len(indices))
     uniforms_at(seed, episode, stream, np.array(indices, np.int64), out)
     return out
-
-
-@given(st.tuples(word, word), st.tuples(word, word, word, word))
-def test_a_block_is_numpys_block(key, counter):
-    out = np.empty(4, np.uint64)
-    one_block(np.array(key, np.uint64), np.array(counter, np.uint64), out)
-    np.testing.assert_array_equal(out, numpy_words(key, counter))
 
 
 @given(natural, natural, streams, st.lists(natural, min_size=1, max_size=9))

@@ -10,8 +10,14 @@ It is written for one family of scenarios, a cut-in by BV while LV drives ahead 
 - `likelihood_ratio`: the hazard of the one decision, in `forced_ratio` and `record_lane`; its mixtures hold for any;
 - `harness.traffic.laws`: initial states, accelerations, and the hazard of the decision; `harness.pool.walk` sums it.
 
+They exchange arrays alone, all in one `cells.KernelState`: the world's positions and speeds (K cells, 3 vehicles),
+`Cells` (the K running episodes), `Results` (rows of the shard), `PrescribedTraffic` (what LV and BV do, where a pool or
+a baseline run says it), and the numbers and tables of `Environment` and `Importance`.
+
 A second family (the vehicle ahead brakes, say) is a package beside this one that brings these files under the same
 names. `loop` calls five of their functions, each for all cells at once (`decide`, `observe`, `command`, `judge`,
-`fail`), and knows nothing else of them; worlds, runner, records and estimators know outcome, log weight, stratum and
-cell.
+`fail`), and knows nothing else of them; runner, estimators and report know outcome, log weight, stratum and cell.
+Beyond these files the cut-in has a name where a family would add its own: maneuvers and outcomes in
+`harness.vocabulary`, columns in `harness.records.schemas`, what a controller sees in `harness.controllers.protocol`,
+the change of lanes in `harness.worlds`, and the plots of where crashes lie in `harness.report.test_plots`.
 """

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 
 from harness.compiled import compiled_inline, compiled_threads, unboxed
 from harness.episode.path import (
@@ -188,7 +189,7 @@ def retrace(
     """What the twin says of every stored episode of an AV that keeps its speed until the cut-in; ``twin`` receives it.
 
     ``driver`` is (1,) for a built-in AV, else (0,): nothing is known about another one after the cut-in. ``path`` is
-    room to work in.
+    scratch space.
     """
     for i in range(stored.cut_step.size):
         retrace_episode(i, stored, environment, driver, path, twin[i])
@@ -208,7 +209,7 @@ class Retracing:
         # After an onset the AV may act: where it is then, nothing on record says of one that is not built in.
         self._at_cut_in = _AT_ONSET if resolved.environment.lateral.present else _AT_CUT_IN
         self._driver = resolved.av
-        self._room = empty_trajectory(resolved.environment)
+        self._scratch = empty_trajectory(resolved.environment)
 
     def check(self, episodes: pa.Table) -> int:
         """Retrace the rows of an episodes table; returns how many, all of them equal.
@@ -220,8 +221,8 @@ class Retracing:
         stored = stored_paths(episodes, self._seed)
         n = int(episodes.num_rows)
         twin = np.zeros(n, RETRACED_DTYPE)
-        environment, room = unboxed(self._environment), unboxed(self._room)
-        retrace(unboxed(stored), environment, self._driver, room, twin)
+        environment, scratch = unboxed(self._environment), unboxed(self._scratch)
+        retrace(unboxed(stored), environment, self._driver, scratch, twin)
         differing = _differences(episodes, stored, twin, self._at_cut_in, self._driver.size > 0)
         for column, (wrong, in_sumo, in_twin) in differing.items():
             if wrong.any():
@@ -251,7 +252,7 @@ def _differences(
     episodes: pa.Table, stored: StoredPaths, twin: RecordArray, at_cut_in: tuple[str, str], built_in: bool
 ) -> dict[str, _Difference]:
     """Per column what is to be equal."""
-    outcome = _outcomes(episodes)
+    outcome = np.asarray(pc.index_in(episodes.column("outcome").cast(pa.string()), pa.array(OUTCOMES))).astype(np.int64)
     r2, r2dot, impact, time = (_floats(episodes, name) for name in (*at_cut_in, "impact_speed_mps", "crash_time_s"))
     unknown = (outcome == FAILED) | ((stored.cut_step >= 0) & (not built_in))
     expected = np.where(unknown, np.where(twin["outcome"] == RUNNING, outcome, twin["outcome"]), twin["outcome"])
@@ -279,12 +280,4 @@ def _unlike(a: FloatArray, b: FloatArray) -> BoolArray:
 
 def _floats(episodes: pa.Table, name: str) -> FloatArray:
     """A column with NaN for null."""
-    values: FloatArray = episodes.column(name).to_numpy().astype(np.float64)
-    return np.ascontiguousarray(values)
-
-
-def _outcomes(episodes: pa.Table) -> IntArray:
-    whole = episodes.column("outcome").unify_dictionaries().combine_chunks()
-    codes = np.array([OUTCOMES.index(name) for name in whole.dictionary.to_pylist()], np.int64)
-    found: IntArray = codes[whole.indices.to_numpy()]
-    return found
+    return np.ascontiguousarray(episodes.column(name).to_numpy(), np.float64)

@@ -125,9 +125,9 @@ def enumerate_cut_ins(
     shape = index.size, int(environment.numbers["max_steps"])
     found = CutInsOnPaths(np.zeros(shape), np.zeros(shape, np.int64), np.zeros(index.size))
     first = np.zeros(index.size, np.int64) if offset is None else offset
-    room = empty_trajectory(environment)
+    scratch = empty_trajectory(environment)
     known = unboxed(environment), unboxed(followers), unboxed(runs)
-    _enumerate(seed, index, state, stride, first, *known, unboxed(room), unboxed(found))
+    _enumerate(seed, index, state, stride, first, *known, unboxed(scratch), unboxed(found))
     return found
 
 
@@ -192,11 +192,11 @@ def write_script(
 
     After a cut-in LV goes on to draw, to the end of the episode. ``draws_per_cut_in`` is 0 for an episode.
     """
-    room, n = empty_trajectory(environment), index.size
-    lv, bv = np.zeros((2, n, room.lv.size), np.int8)
+    scratch, n = empty_trajectory(environment), index.size
+    lv, bv = np.zeros((2, n, scratch.lv.size), np.int8)
     n_lv, n_bv = np.zeros((2, n), np.int64)
     script = Script(lv, bv, n_lv, n_bv, np.zeros(n, np.int64))
-    _write(seed, index, cut, state, draws_per_cut_in, unboxed(environment), unboxed(room), unboxed(script))
+    _write(seed, index, cut, state, draws_per_cut_in, unboxed(environment), unboxed(scratch), unboxed(script))
     return script
 
 

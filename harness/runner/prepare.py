@@ -99,5 +99,5 @@ def distance_per_test_m(environment: Environment) -> float:
     Overtakings without cut-in: the others are too few (some 3e-5 at level 1) to matter.
     """
     states = InitialStates(environment.numbers).draw(DISTANCE_SEED, 0, DISTANCE_PATHS)
-    room = empty_trajectory(environment)
-    return float(mean_test_distance(DISTANCE_SEED, states, unboxed(environment), unboxed(room)))
+    scratch = empty_trajectory(environment)
+    return float(mean_test_distance(DISTANCE_SEED, states, unboxed(environment), unboxed(scratch)))

@@ -49,20 +49,6 @@ def outcome_bits(episode) -> list[bytes]:
     return [episode[name].tobytes() for name in names]
 
 
-@pytest.mark.parametrize(("method", "level"), [("nde", 1e5), ("forced", 1.0)])
-@pytest.mark.parametrize("av", [IDM, AutomatedVehicle(model="fvdm"), AutomatedVehicle(model="need-based")])
-def test_a_lead_of_zero_gives_every_bit_of_the_cut_in_of_one_step(method, level, av):
-    """The crossing is looked for ahead with a lead, and met on the way without one."""
-    without, zero = drive(campaign(method, None, av, level=level)), drive(campaign(method, 0.0, av, level=level))
-    for name in without.results.episode.dtype.names:
-        if not name.startswith("onset_r2"):
-            assert without.results.episode[name].tobytes() == zero.results.episode[name].tobytes(), name
-    assert without.results.log_q.tobytes() == zero.results.log_q.tobytes()
-    assert without.results.bv_path.tobytes() == zero.results.bv_path.tobytes()
-    assert without.results.lv_path.tobytes() == zero.results.lv_path.tobytes()
-    assert (without.results.episode["cut_in_step"] >= 0).sum() > 300
-
-
 @pytest.mark.parametrize("log_normal", [False, True])
 @pytest.mark.parametrize(("method", "level"), [("nde", 1e5), ("forced", 1.0)])
 def test_the_crossing_looked_for_ahead_is_the_one_met_on_the_way(method, level, log_normal):
