@@ -83,3 +83,8 @@ def uniforms(seed: int, first_episode: int, n_episodes: int, stream: int, count:
     out = np.empty((n_episodes, count))
     _fill_uniforms(seed, first_episode, stream, out)
     return out
+
+
+def controller_random(seed: int, episode: int) -> np.random.Generator:
+    """Random numbers of the AV's controller in an episode, by numpy: a stream of the same generator."""
+    return np.random.Generator(np.random.Philox(key=seed, counter=[0, episode, AV_DRAWS, 0]))

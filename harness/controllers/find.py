@@ -25,6 +25,7 @@ from harness.controllers.hosts import (
     cause_of,
     death_cause,
 )
+from harness.controllers.protocol import BatchController
 from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, HarnessError
 from harness.processes import CONSTRUCTOR, Child, ForkServer, SharedFile, first_to_answer, fit_to_travel, last_call
 
@@ -90,18 +91,17 @@ def build_host(
     if av.source not in ("controller", "fmu"):
         return None
     guard = Guard(av.limits, black_box)
-    when: dict[str, Any] = {"acts_before_cut_in": av.acts_before_cut_in, "warm_up_steps": av.warm_up_steps}
     make: Callable[[], Any]
     if av.fmu is None:
         make = _maker(av)
         first = _made(make, str(av.controller), guard)
-        if is_batch(first):
-            return BatchHost(first, seed, guard, **when)
+        if isinstance(first, BatchController):
+            return BatchHost(first, av, seed, guard)
     else:
         from harness.controllers.fmu import fmu_maker  # noqa: PLC0415 - an extra
 
         make = fmu_maker(av.fmu)
-    return VehicleHost(make, n_cells, seed, guard, fatal_episodes=fatal_episodes, **when)
+    return VehicleHost(make, n_cells, av, seed, guard, fatal_episodes)
 
 
 def _maker(av: AutomatedVehicle) -> Callable[[], Any]:
@@ -133,14 +133,9 @@ def _what_it_makes(make: Callable[..., Any]) -> Any:
         return None
 
 
-def is_batch(controller: Any) -> bool:
-    """Whether it is a controller of all cells, by its methods."""
-    return all(callable(getattr(controller, method, None)) for method in ("start_batch", "step_batch", "close"))
-
-
 def _require_controller(made: Any, name: str) -> None:
     missing = [method for method in ("start", "step", "close") if not callable(getattr(made, method, None))]
-    if missing and not is_batch(made):
+    if missing and not isinstance(made, BatchController):
         expected = "start, step and close (per vehicle), or start_batch, step_batch and close (arrays)"
         mend = (
             "See docs/controllers.md for both, in ten lines each. A function says what it makes: `def make() -> MyAv:`."

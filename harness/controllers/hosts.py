@@ -20,7 +20,7 @@ from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 
-from harness.campaign.vehicle import Limits
+from harness.campaign.vehicle import AutomatedVehicle, Limits
 from harness.controllers.protocol import (
     BatchController,
     BatchObservation,
@@ -40,7 +40,7 @@ from harness.processes import (
     BlackBox,
     Call,
 )
-from harness.random_stream import AV_DRAWS
+from harness.random_stream import controller_random
 from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import FloatArray, IntArray, read_only
 
@@ -58,26 +58,17 @@ class Death(NamedTuple):
     cause: str
 
 
-class TimeLimit(NamedTuple):
-    """Of a call, in seconds, with the key of ``av.limits`` that says so."""
-
-    seconds: float
-    key: str
-
-    @classmethod
-    def of(cls, limits: Limits, *, makes: bool) -> TimeLimit:
-        """That of a constructor, or of any other call."""
-        key = "construction_time_s" if makes else "step_time_s"
-        return cls(getattr(limits, key), key)
-
-    def __str__(self) -> str:
-        return f"no answer within {self.seconds:g} s (av.limits.{self.key})"
+def time_limit(limits: Limits, *, makes: bool) -> tuple[float, str]:
+    """Of a constructor or of any other call: seconds, and the cause where they are over."""
+    key = "construction_time_s" if makes else "step_time_s"
+    seconds: float = getattr(limits, key)
+    return seconds, f"no answer within {seconds:g} s (av.limits.{key})"
 
 
 def death_cause(exit_code: int | None, limits: Limits, call: Call | None) -> str:
     """Cause for the record of an episode whose controller took the worker process along, in this call."""
     if exit_code == HUNG_EXIT_CODE:
-        late = TimeLimit.of(limits, makes=call is not None and call.makes)
+        _, late = time_limit(limits, makes=call is not None and call.makes)
         return f"{late}, and the call could not be interrupted"
     if exit_code == CLOSED_PIPE_EXIT_CODE:
         return "the controller closed file descriptors that are not its own (os.close, os.closerange)"
@@ -118,8 +109,8 @@ class Guard:
 
     def __init__(self, limits: Limits, black_box: Path | None) -> None:
         self._low, self._high = limits.min_acceleration_mps2, limits.max_acceleration_mps2
-        self._step, self._construction = (TimeLimit.of(limits, makes=makes) for makes in (False, True))
-        self._limit = self._step
+        self._limits = [time_limit(limits, makes=makes) for makes in (False, True)]
+        self._seconds, self._late = self._limits[False]
         """Of the call under way."""
         self._black_box = BlackBox(black_box)
         self._since: float | None = None
@@ -151,9 +142,9 @@ class Guard:
         One that ``makes`` a controller has a time limit of its own.
         """
         self._black_box.enter(kind, episode, step)
-        self._limit = self._construction if makes else self._step
+        self._seconds, self._late = self._limits[makes]
         self._since = time.monotonic()
-        signal.setitimer(signal.ITIMER_REAL, self._limit.seconds)
+        signal.setitimer(signal.ITIMER_REAL, self._seconds)
         try:
             answer = function(*arguments)
             if (misdeed := self._black_box.misdeed()) is not None:
@@ -196,23 +187,26 @@ class Guard:
 
     def _interrupt(self, _signal: int, _frame: FrameType | None) -> None:
         if self._since is not None:
-            raise StepTimeoutError(str(self._limit))
+            raise StepTimeoutError(self._late)
 
     def _watch(self) -> None:
         """End the process when a call outlasts the exception that should have ended it."""
         while True:
             time.sleep(0.5)
             since = self._since
-            if since is not None and time.monotonic() - since > 2.0 * self._limit.seconds + 1.0:
+            if since is not None and time.monotonic() - since > 2.0 * self._seconds + 1.0:
                 os._exit(HUNG_EXIT_CODE)
 
 
-def episode_random(seed: int, episode: int) -> np.random.Generator:
-    """The controller's own random numbers: another stream of the same counter-based generator."""
-    return np.random.Generator(np.random.Philox(key=seed, counter=[0, episode, AV_DRAWS, 0]))
+class _Host:
+    """What both hosts are told: the campaign's seed, who makes the calls, and when the loop asks."""
+
+    def __init__(self, av: AutomatedVehicle, seed: int, guard: Guard) -> None:
+        self.acts_before_cut_in, self.warm_up_steps = av.acts_before_cut_in, av.warm_up_steps
+        self._seed, self._guard = seed, guard
 
 
-class VehicleHost:
+class VehicleHost(_Host):
     """One controller object per cell, made by ``make``.
 
     ``fatal_episodes`` are known to kill the process: they fail just before the call that did. They may become more.
@@ -222,15 +216,13 @@ class VehicleHost:
         self,
         make: Callable[[], VehicleController],
         n_cells: int,
+        av: AutomatedVehicle,
         seed: int,
         guard: Guard,
-        *,
         fatal_episodes: Mapping[int, Death] | None = None,
-        acts_before_cut_in: bool = False,
-        warm_up_steps: int = 0,
     ) -> None:
-        self.acts_before_cut_in, self.warm_up_steps = acts_before_cut_in, warm_up_steps
-        self._make, self._seed, self._guard = make, seed, guard
+        super().__init__(av, seed, guard)
+        self._make = make
         self._controllers: list[VehicleController | None] = [None] * n_cells
         self._episodes = [-1] * n_cells
         self._fatal_episodes = {} if fatal_episodes is None else fatal_episodes
@@ -246,8 +238,9 @@ class VehicleHost:
                     made = OF_EPISODE, self._make
                     self._controllers[k], wrong = self._guard.call(*made, episode=episode, step=MAKING, makes=True)
                 if wrong is None:
-                    start = EpisodeStart(index, STEP_S, episode_random(self._seed, index))
-                    _, wrong = self._guard.call(OF_EPISODE, _start, self._controllers[k], start, episode=episode)
+                    start = EpisodeStart(index, STEP_S, controller_random(self._seed, index))
+                    begin = OF_EPISODE, methodcaller("start", start), self._controllers[k]
+                    _, wrong = self._guard.call(*begin, episode=episode)
                 if wrong is not None:
                     failures[k] = f"start: {wrong}"
                     self._drop(k)
@@ -293,10 +286,6 @@ class VehicleHost:
         self._controllers[:] = [None] * len(self._controllers)
 
 
-def _start(controller: VehicleController, start: EpisodeStart) -> None:
-    controller.start(start)
-
-
 def _step(controller: VehicleController, seen: list[Any]) -> Any:
     """Answer to a row of a `BatchObservation`, without cell and episode."""
     *row, bv_position_m, bv_speed_mps, bv_lane, lv_position_m, lv_speed_mps, lateral_m, lateral_mps, overlaps = seen
@@ -305,24 +294,16 @@ def _step(controller: VehicleController, seen: list[Any]) -> Any:
     return controller.step(Observation(*row))
 
 
-class BatchHost:
+class BatchHost(_Host):
     """One controller object for all cells. A fault that cannot be laid at one cell's door fails all that were asked."""
 
-    def __init__(
-        self,
-        controller: BatchController,
-        seed: int,
-        guard: Guard,
-        *,
-        acts_before_cut_in: bool = False,
-        warm_up_steps: int = 0,
-    ) -> None:
-        self.acts_before_cut_in, self.warm_up_steps = acts_before_cut_in, warm_up_steps
-        self._controller, self._seed, self._guard = controller, seed, guard
+    def __init__(self, controller: BatchController, av: AutomatedVehicle, seed: int, guard: Guard) -> None:
+        super().__init__(av, seed, guard)
+        self._controller = controller
 
     def start(self, cells: IntArray, _episodes: IntArray, announced: IntArray) -> Failures:
         """As `VehicleHost.start`."""
-        random = [episode_random(self._seed, index) for index in announced.tolist()]
+        random = [controller_random(self._seed, index) for index in announced.tolist()]
         handed = read_only(cells.copy()), read_only(announced.copy())
         with self._guard:
             _, wrong = self._guard.call(START_BATCH, lambda: self._controller.start_batch(*handed, random))

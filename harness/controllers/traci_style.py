@@ -345,20 +345,17 @@ class StepListenerController(TraciStyleController):
 
     def on_start(self, random: np.random.Generator) -> None:  # noqa: ARG002 - listeners know no randomness
         """Make the episode's listener."""
-        self._remove()
+        self.close()
         self._listener = self._make(self._traci, **deepcopy(self._parameters))
 
     def on_step(self, traci: Traci, veh_id: str, time: float) -> None:  # noqa: ARG002 - a listener has its own
         """Call the listener with the time (s), as ``traci.simulationStep(time)`` would."""
         if self._listener is not None and not self._listener.step(time):
-            self._remove()
+            self.close()
 
-    def _remove(self) -> None:
+    def close(self) -> None:
+        """Remove the last listener."""
         listener, self._listener = self._listener, None
         clean_up = getattr(listener, "cleanUp", None)
         if clean_up is not None:
             clean_up()
-
-    def close(self) -> None:
-        """Remove the last listener."""
-        self._remove()

@@ -18,8 +18,8 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from harness.campaign.problems import did_you_mean
-from harness.controllers.hosts import episode_random
 from harness.errors import CampaignError
+from harness.random_stream import controller_random
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
 from harness.vocabulary import AV, BoolArray, FloatArray, Int8Array, IntArray
 from harness.worlds.sumo import OBEY, SumoWorld
@@ -245,7 +245,7 @@ class FreshWorld(SumoAvWorld):
 
 def sumo_seed(seed: int, episode: int) -> int:
     """SUMO's seed (31 bits) for an episode: from the AV's own stream of random numbers."""
-    return int(episode_random(seed, episode).integers(2**31))
+    return int(controller_random(seed, episode).integers(2**31))
 
 
 @contextmanager

@@ -107,6 +107,7 @@ def test_entry_points_are_found_by_name(folder, tmp_path, monkeypatch):
 @pytest.mark.parametrize("page", ["README.md", "docs/tutorial.md"])
 def test_the_first_vehicle_of_a_new_user_runs(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.delitem(sys.modules, "my_av", raising=False)  # the page's, where it has been imported here
     blocks = re.findall(
         r"^```(?:py|yaml)\n# (\S+)\n(.*?)^```$", (ROOT / page).read_text("utf-8"), re.MULTILINE | re.DOTALL
     )
