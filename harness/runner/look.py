@@ -245,10 +245,11 @@ STEPS_ACTED = 162
 
 
 def plan_campaign(campaign: Campaign) -> dict[str, Any]:
-    """Cost of a campaign that runs to its budget of episodes.
+    """Cost of a campaign: what it is expected to take, and at most.
 
-    That is ``episodes``, ``episodes_per_second_estimate`` (all cores), ``seconds_estimate``, ``tables`` (in words) and
-    ``disk_mb``; of an AV that is not built in ``av_ms_per_test``, measured, or in words why there is none. Where
+    That is ``expected_tests`` and ``expected_seconds`` (to within a factor of three; in words where nobody can tell),
+    ``most_tests`` and ``most_seconds``, the budget; ``tests_per_second`` (all cores), ``tables`` (in words) and
+    ``most_disk_mb``; of an AV that is not built in ``av_ms_per_test``, measured, or in words why there is none. Where
     cut-ins take time, ``within_reach_of_`` each statement: which rates it can tell, in words.
 
     Raises `CampaignError`: a run would refuse the campaign before it starts.
@@ -266,13 +267,16 @@ def plan_campaign(campaign: Campaign) -> dict[str, Any]:
             of_av |= _if_slow(measured, campaign)
     rate = _rounded(per_core * (os.cpu_count() or 1))
     moments = MOMENTS_PER_EPISODE[campaign.records.moments] if campaign.sampling.mixes else 0
-    episodes = campaign.stop.episodes
+    episodes, expected = campaign.stop.episodes, source.expected_tests(resolved)
+    until = "the limit is decided" if campaign.accept is not None else "stop.rhw is reached"
     return {
-        "episodes": episodes,
-        "episodes_per_second_estimate": rate,
-        "seconds_estimate": round(episodes / rate),
+        "expected_tests": int(_rounded(expected)) if expected else f"not known beforehand: until {until}",
+        **({"expected_seconds": round(expected / rate)} if expected else {}),
+        "most_tests": episodes,
+        "most_seconds": round(episodes / rate),
+        "tests_per_second": rate,
         "tables": source.building(resolved),
-        "disk_mb": round(episodes * (KB_PER_EPISODE + KB_PER_MOMENT * moments) / 1000.0, 1),
+        "most_disk_mb": round(episodes * (KB_PER_EPISODE + KB_PER_MOMENT * moments) / 1000.0, 1),
         **of_av,
         **source.reach(resolved),
     }

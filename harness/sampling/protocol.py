@@ -136,6 +136,12 @@ class Source:
         return f"to build (about {per_driver_s * len(resolved.campaign.surrogates)} s of one core)"
 
     @classmethod
+    def expected_tests(cls, resolved: Resolved) -> int | None:
+        """About how many tests a campaign takes until it stops; None where that is not known beforehand."""
+        stop = resolved.campaign.stop
+        return stop.episodes if stop.rhw is None and resolved.campaign.accept is None else None
+
+    @classmethod
     def reach(cls, resolved: Resolved) -> dict[str, str]:  # noqa: ARG003 - nothing is known of it
         """Which rates the statements of a campaign can tell, in words, by key; nothing where that is no question."""
         return {}

@@ -96,6 +96,21 @@ class Shells(Source):
         return f"{what}: " + ("cached" if cached else f"to {make} ({POOL_S} on two cores)")
 
     @classmethod
+    def expected_tests(cls, resolved: Resolved) -> int | None:
+        """See `Source`: those of a vehicle that crashes as often as the first reference driver (`within_reach`)."""
+        campaign = resolved.campaign
+        rhw, asked = campaign.stop.rhw, campaign.testing.shells.statement
+        if rhw is None or campaign.accept is not None or campaign.has_baseline_runs:
+            return super().expected_tests(resolved)
+        if (pool := cached_pool(resolved)) is None or not pool.reference_rate.any():
+            return None
+        design = design_shells(pool, shells=campaign.testing.shells, limit_mps2=acceleration_limit(campaign.av))
+        n_inside = next((each.n_inside for each in design.statements if each.name == asked), len(design.p))
+        at_stake = float(design.p[:n_inside].sum())
+        n = OVER_BOUND * _nats(campaign.stop) * at_stake / (2.0 * rhw * float(pool.reference_rate[0]))
+        return min(max(round(n), campaign.min_crashes), campaign.stop.episodes)
+
+    @classmethod
     def reach(cls, resolved: Resolved) -> dict[str, str]:
         """See `Source`: where cut-ins take time the rates of attentive vehicles are tiny."""
         campaign = resolved.campaign
@@ -146,6 +161,10 @@ class Shells(Source):
         return super().is_shard(request, episodes) and not cut_ins.null_count and np.array_equal(cut_ins, wanted)
 
 
+def _nats(stop: Stop) -> float:
+    return math.log(1.0 / (1.0 - stop.confidence))
+
+
 def within_reach(p: float, stop: Stop) -> str:
     """What can be said of a rate where cut-ins of probability ``p`` have to be shown not to crash.
 
@@ -155,7 +174,7 @@ def within_reach(p: float, stop: Stop) -> str:
     vehicle falls by orders of magnitude, and that number of tests grows as its inverse; what remains is the upper limit
     ln(1/α) p/n.
     """
-    rhw, n, nats = stop.rhw or USUAL_RHW, stop.episodes, math.log(1.0 / (1.0 - stop.confidence))
+    rhw, n, nats = stop.rhw or USUAL_RHW, stop.episodes, _nats(stop)
     smallest, limit = OVER_BOUND * nats * p / (2.0 * rhw * n), nats * p / n
     return (
         f"a rate to within ±{100.0 * rhw:.0f} % from some {smallest:.1e} per test on, with {n:,} tests; of a vehicle "

@@ -98,6 +98,13 @@ def test_check_says_what_is_within_reach(lateral_run, campaign):
     said = {name: text for name, text in plan.items() if name.startswith("within_reach_of_")}
     assert set(said) == {f"within_reach_of_{name}" for name in ("assumption_free", "library", "sees-the-overlap")}
     assert all("upper limit" in text for text in said.values())
+    assert 0 < plan["expected_tests"] < plan["most_tests"]
+    assert plan["expected_seconds"] < plan["most_seconds"]
+    assert (
+        "until the limit is decided"
+        in plan_campaign(campaign(*SHELLS, "accept.crash_rate_below=1e-7"))["expected_tests"]
+    )
+    assert plan_campaign(campaign(*SHELLS, "stop.rhw=null"))["expected_tests"] == plan["most_tests"]
     smallest = {name: float(text.split("some ")[1].split(" per test")[0]) for name, text in said.items()}
     assert smallest["within_reach_of_library"] < smallest["within_reach_of_assumption_free"] / 10.0
     shells = json.loads((lateral_run.folder / "shells.json").read_text(encoding="utf-8"))
