@@ -113,8 +113,8 @@ def replay(folder: Path, episode: int, *, out: Path | None, fcd: Path | None, gu
         write = csv.write_csv if out.suffix == ".csv" else parquet.write_table
         write_atomically(out, lambda unfinished: write(result.trace, unfinished))
     if as_json:
-        said = {"episode": episode, "outcome": result.outcome, "bit_equal": result.bit_equal, "files": files}
-        print_json({**said, **{name: result.row[name] for name in LATERAL if name in result.row}})
+        content = {"episode": episode, "outcome": result.outcome, "bit_equal": result.bit_equal, "files": files}
+        print_json({**content, **{name: result.row[name] for name in LATERAL if name in result.row}})
     else:
         compared = {None: "no stored trace to compare with", True: "bit for bit as stored", False: "NOT as stored"}
         takes_time = result.row.get("onset_step") is not None and result.row["cut_in_step"] is not None

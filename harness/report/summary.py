@@ -23,7 +23,7 @@ from harness.campaign.campaign import Campaign
 from harness.errors import RunFolderError
 from harness.estimators.estimate import Estimate, Estimates, Unavailable
 from harness.estimators.shells import ShellDetails, Within
-from harness.records.folder import MANIFEST, NO_RUN, Count, StoredManifest, concatenated, read_as, read_manifest
+from harness.records.folder import concatenated, read_as, read_manifest
 from harness.records.reader import read_campaign, read_shards, stored_columns
 from harness.strata import ASSUMPTION_FREE
 from harness.vehicles.kinematics import STEP_S
@@ -36,14 +36,6 @@ COLUMNS = (
     "episode", "component", "log_weight", "n_control_steps", "impact_speed_mps", "crash_time_s", "cut_in_step",
     "cut_in_r2_m", "cut_in_r2dot_mps",
 )  # fmt: skip
-
-
-class ShownManifest(StoredManifest):
-    """A manifest with what the page shows of every run."""
-
-    created: str
-    versions: dict[str, str]
-    seed: Count
 
 
 @dataclass(frozen=True)
@@ -140,7 +132,6 @@ def typed_folder(folder: Path) -> str:
 def read_run_folder(path: Path) -> RunFolder:
     """Read campaign, manifest and estimates of a run."""
     manifest = read_manifest(path)
-    read_as(ShownManifest, path / MANIFEST, mend=NO_RUN)
     estimates = _read_estimates(path, manifest["campaign_hash"])
     shells = _shells(path, estimates.estimates[estimates.headline])
     campaign = read_campaign(path, manifest)
