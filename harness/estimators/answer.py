@@ -51,7 +51,7 @@ def estimate_blocks(
     distance_km = None if distance_m is None else distance_m / 1000.0
     retraced = manifest.get("retraced") or {"reason": "the run did not retrace its episodes"}
     repeated = manifest.get("repeated")
-    statements: dict[str, str] = {name: _said(of, repeated, level, distance_km) for name, of in estimates.items()}
+    statements: dict[str, str] = {name: _answer(of, repeated, level, distance_km) for name, of in estimates.items()}
     return finite_json(
         Estimates(
             campaign=campaign.name,
@@ -77,7 +77,7 @@ def estimate_blocks(
     )
 
 
-def _said(
+def _answer(
     found: Estimate | Unavailable, repeated: Mapping[str, Any] | None, level: float, distance_km: float | None
 ) -> str:
     """What an estimator says, led by what it must be warned of and the first reference driver; or why it cannot.
@@ -269,7 +269,7 @@ def paired_statement(found: PairedEstimate, name_a: str, name_b: str) -> str:
 
 
 def conditional_paired_statement(found: PairedEstimate) -> str:
-    """If both crash only where the boundary surrogate or a more careful one does."""
+    """If both crash only where the boundary surrogate or a more conservative one does."""
     library, inside = found.pairs.design.library, found.conditional
     if found.refuted:
         beyond = [int(found.pairs.tally(side).crashes[library.n_inside :].sum()) for side in (0, 1)]

@@ -33,7 +33,7 @@ NOTE = (
     "been met yet, not that a weight is wrong."
 )
 NOTE_SHELLS = "Every test within a shell stands for the same probability: there are no weights to be diagnosed."
-CARELESS_MEAN = 0.5
+LOW_MEAN_WEIGHT = 0.5
 
 
 class Diagnostics:
@@ -73,7 +73,7 @@ class Diagnostics:
             **self._counts,
             "note": NOTE_SHELLS if self._sampling.strata else NOTE,
         }
-        if not self._sampling.bounded and (mean := self._weight.mean(self.n)) < CARELESS_MEAN:
+        if not self._sampling.bounded and (mean := self._weight.mean(self.n)) < LOW_MEAN_WEIGHT:
             result["heavy_tail"] = (
                 f"the mean weight is {mean:.3g} where 1 is expected: the episodes with large weights are still missing"
             )

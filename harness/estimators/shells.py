@@ -114,7 +114,7 @@ class Within:
 
 @dataclass(frozen=True)
 class ShellDetails:
-    """``details`` of the estimate: shells from careful to careless, and the pool that they come from."""
+    """``details`` of the estimate: shells from conservative to aggressive, and the pool that they come from."""
 
     pool: str
     rhw_from_pool: float

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from scipy.stats import t as student
 
 from harness.estimators.limits import normal_half_width
-from harness.estimators.one_pass import CARELESS_MEAN
+from harness.estimators.one_pass import LOW_MEAN_WEIGHT
 from harness.vocabulary import Method
 
 Verdict = Literal["reproduced", "not reproduced", "cannot be told", "ours to choose"]
@@ -40,7 +40,7 @@ def is_settled(*found: dict[str, Any]) -> bool:
 
 def weights_are_in(method: Method, mean_weight: float) -> bool:
     """Whether the large weights of the step mixture, which nothing bounds, have come in: their mean is 1 if so."""
-    return method != "step_mixture" or mean_weight >= CARELESS_MEAN
+    return method != "step_mixture" or mean_weight >= LOW_MEAN_WEIGHT
 
 
 def mean_of(values: Iterable[float | None], confidence: float) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from harness import numbers
 from harness.errors import HarnessError
 from harness.estimators.block import MAX_CONTROL_STEPS
-from harness.estimators.one_pass import CARELESS_MEAN
+from harness.estimators.one_pass import LOW_MEAN_WEIGHT
 from harness.records.folder import write_bytes
 from harness.report.style import RC, png
 from studies.case_study.figures import Verdict, is_settled, verdict
@@ -55,7 +55,7 @@ def write_page(study: Study, folder: Path, made: Mapping[str, Made]) -> tuple[Pa
         answers=dict(Counter(claim["verdict"] for claim in claims)),
         stratum_rows=stratum_rows,
         UNSETTLED=UNSETTLED,
-        CARELESS_MEAN=CARELESS_MEAN,
+        LOW_MEAN_WEIGHT=LOW_MEAN_WEIGHT,
     )
     answers = json.dumps({"conclusive": study.conclusive, "claims": claims}, indent=2, ensure_ascii=False)
     _write(folder / CLAIMS, f"{answers}\n".encode())
