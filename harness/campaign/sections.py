@@ -138,15 +138,6 @@ class ShellSettings(Section):
         description="fewest tests of a round: as many as workers, where a test takes seconds",
     )
 
-    @field_validator("statement")
-    @classmethod
-    def _is_not_called_conditional(cls, statement: str) -> str:
-        if statement == "conditional":
-            expected = f"{ASSUMPTION_FREE}, or the name of a statement"
-            mend = f"The former one is called {LIBRARY_STATEMENT}."
-            raise broken_rule("", "conditional, of which there are several now", expected, mend)
-        return statement
-
     @field_validator("statements")
     @classmethod
     def _can_be_told_apart(cls, found: dict[str, StatementSettings] | None) -> dict[str, StatementSettings] | None:
