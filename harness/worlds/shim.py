@@ -63,9 +63,9 @@ class Shim:
         self.told, self.x, self.v, self.position, self.speed = told, x, v, np.zeros(x.size), np.zeros(x.size)
         self._library = library
         self._handle: int | None = handle
-        arrays = told, x, v, self.position, self.speed
+        self._wanted = np.zeros_like(told)
+        arrays = self._wanted, told, x, v, self.position, self.speed
         self._addresses = [array.ctypes.data for array in arrays]  # to ask for them takes longer than the call
-        self._wanted, self._wanted_address = told, self._addresses[0]
 
     def find_vehicles(self) -> None:
         """Look the vehicles up again: those of an earlier simulation in this process are gone.
@@ -81,9 +81,8 @@ class Shim:
         Returns whether every position and speed is that of ``x`` and ``v``, in every bit. Raises `RuntimeError`: SUMO
         raised an error, or a vehicle has left the road.
         """
-        if wanted is not self._wanted:
-            self._wanted, self._wanted_address = wanted, wanted.ctypes.data
-        answer: int = self._library.shim_step(self._handle, self._wanted_address, *self._addresses)
+        self._wanted[:] = wanted
+        answer: int = self._library.shim_step(self._handle, *self._addresses)
         if answer == _FAILED:
             raise self._error()
         return answer == _OBEYED

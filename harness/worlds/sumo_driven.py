@@ -161,12 +161,12 @@ class SumoAvWorld(SumoWorld):
         self._wanted: FloatArray = np.zeros((n_cells, 3))
         self._xml = type_xml(av)
         with self._written_type() as folder:
-            said = folder / "stderr"
+            stderr = folder / "stderr"
             try:
-                with _stderr_to(said):
+                with _stderr_to(stderr):
                     super().__init__(n_cells, **options)
             except Exception as error:
-                lines = said.read_text(encoding="utf-8").splitlines()
+                lines = stderr.read_text(encoding="utf-8").splitlines()
                 messages = [line.removeprefix("Error: ") for line in lines if line.startswith("Error: ")]
                 if not messages:
                     raise

@@ -71,7 +71,7 @@ def test_more_room_or_a_faster_leader_never_means_harder_braking(parameters, v, 
     assert by_lead >= careful - 1e-9 * max(1.0, abs(careful))
 
 
-# -- motion within a step: constant acceleration, no reversing, standstill --
+# -- motion within a step; tests/worlds/test_sumo_motion.py has its bits, standstill, and the textbook's formula --
 
 
 positions = st.floats(0.0, 2_000.0)
@@ -83,20 +83,3 @@ def test_never_backwards(x, v, a):
     assert speed >= 0.0
     assert after >= x
     assert speed == max(v + a * 0.1, 0.0)
-
-
-@given(positions, speeds, st.floats(-20.0, 20.0))
-def test_distance_is_mean_speed_times_the_step(x, v, a):
-    """0.5 (v + v_after) dt, within the rounding of x; at a standstill SUMO's own form differs by less than that."""
-    after, speed = motions((x, v, a))[0]
-    assert after - x == pytest.approx(0.5 * (v + speed) * 0.1, abs=1e-12)
-
-
-@given(positions, st.floats(0.0, 2.0))
-def test_braking_to_a_standstill_and_staying_there(x, v):
-    state = (x, v)
-    for _ in range(10):
-        state = motions((*state, -4.0))[0].tolist()
-    assert state[1] == 0.0
-    again = motions((*state, -4.0))[0].tolist()
-    assert again == state

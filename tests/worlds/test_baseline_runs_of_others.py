@@ -1,4 +1,4 @@
-"""Vehicles that SUMO, a program or an FMU drives from the start: shadow runs, and tests that find the same motion."""
+"""Vehicles that SUMO, a program or an FMU drives from the start: baseline runs, and tests that find the same motion."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def driven(av: str, engine: str = "sumo"):
 
 
 def driven_in(world, campaign):
-    """Causes of failure of the shadow runs, what tests on their paths left, and the motion of the former."""
+    """Causes of failure of the baseline runs, what tests on their paths left, and the motion of the former."""
     ready = prepare(resolve(campaign))
     loop, environment = ready.loop(world), ready.policy.environment
     try:
@@ -60,7 +60,7 @@ def driven_in(world, campaign):
     ],
     ids=["SUMO's ACC", "SUMO's Krauss with seeded noise", "TraCI style"],
 )
-def test_it_does_in_tests_what_it_did_in_its_shadow_runs(av):
+def test_it_does_in_tests_what_it_did_in_its_baseline_runs(av):
     failures, shard, runs = driven(av)
     assert not failures
     assert shard.failures == {}
