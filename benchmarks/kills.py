@@ -7,9 +7,10 @@ runs a campaign of each of three methods in the twin, once undisturbed and once 
 run's own process, with equal chances, at random moments less than ``--pause`` seconds apart, again and again with
 ``--resume``, until all kills are spent (a run that comes to its end before is begun anew); with ``--machines`` on a
 Ray cluster of so many (namespaces of this one), also to actors, and to the raylets of machines, which are then started
-again. Then it compares every file of records, and ``estimates.json``, byte by byte. What a killed run had started must
-be gone soon after. Kills follow from ``--seed``; what they strike depends on the machine's load, and so differs each
-time.
+again. Without ``--machines`` commands are killed as a whole, too: `compare`, `pool` in a cache of its own, `estimate
+--write` and `report`, each again and again until it comes to its end. Then it compares every file of records, and
+``estimates.json``, byte by byte. What a killed run had started must be gone soon after. Kills follow from ``--seed``;
+what they strike depends on the machine's load, and so differs each time.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ import subprocess
 import sys
 import time
 from collections import Counter
+from collections.abc import Collection
 from contextlib import suppress
 from pathlib import Path
 
@@ -44,6 +46,16 @@ def command(method: str, out: Path, episodes: int) -> list[str]:
     settings = (*SETTINGS, f"stop.episodes={episodes}")
     words = [sys.executable, "-m", "harness", "run", str(SCENARIOS / f"{METHODS[method]}.yaml"), "--resume", "--quiet"]
     return [*words, "--out", str(out), *(word for setting in settings for word in ("--set", setting))]
+
+
+COMMANDS = {
+    "compare": "compare {scenario} --out {work} --against-av late-600ms --workers 2 --quiet --set world.engine=twin "
+    "--set stop.rhw=0.3",
+    "pool": "pool {scenario} --set pool.relative_error=0.05 --out {work}/pool.parquet",
+    "estimate": "estimate {work} --write",
+    "report": "report {work}",
+}
+"""What is killed as a whole; the last two on a copy of a finished run."""
 
 
 class Here:
@@ -174,6 +186,49 @@ def disturbed(
     return done
 
 
+def struck_command(name: str, folder: Path, run: Path, chance: random.Random, kills: int, pause_s: float) -> list[str]:
+    """Kill a command so many times; what differs of an undisturbed one's files, lives on, or is left in ``TMPDIR``."""
+    wrong: list[str] = []
+    shutil.rmtree(folder, ignore_errors=True)
+    for side in ("undisturbed", "killed"):  # in folders of one name: a page names its own
+        work, temporary, left = folder / side / "work", folder / side / "tmp", kills if side == "killed" else 0
+        temporary.mkdir(parents=True)
+        shutil.copytree(run, work) if name in ("estimate", "report") else work.mkdir()
+        words = COMMANDS[name].format(scenario=SCENARIOS / "smoke.yaml", work=work.name).split()
+        cache = {"HARNESS_CACHE_DIR": str(folder / side / "cache")} if name == "pool" else {}
+        environment = {**os.environ, "TMPDIR": str(temporary), **cache}
+        while True:
+            process = subprocess.Popen(
+                [sys.executable, "-m", "harness", *words],
+                cwd=work.parent,
+                env=environment,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.PIPE,
+            )
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(chance.uniform(0.0, pause_s) if left else LONGEST_WAIT_S)
+            if process.poll() is None:
+                below = descendants(process.pid)
+                process.kill()
+                left -= 1
+                wrong += [f"process {pid}" for pid in orphans(below, Here.grace_s)]
+            _, complaints = process.communicate()
+            if process.returncode not in (*DONE, -signal.SIGKILL):
+                raise RuntimeError(f"{name} ended with {process.returncode}: {complaints.decode()}")
+            if not left and process.returncode in DONE:
+                break
+        wrong += [str(path) for path in temporary.iterdir()]
+    of_time = ("manifest.json", "report.html") if name == "compare" else ()
+    return wrong + differing_files(folder / "undisturbed" / "work", folder / "killed" / "work", of_time)
+
+
+def differing_files(a: Path, b: Path, ignored: Collection[str]) -> list[str]:
+    """Files of two folders that differ; unfinished files are of killed writers."""
+    names = {path.relative_to(side) for side in (a, b) for path in side.rglob("*") if path.is_file()}
+    compared = [name for name in names if name.name not in ignored and name.suffix != ".part"]
+    return sorted(str(name) for name in compared if _bytes(a / name) != _bytes(b / name))
+
+
 def unlike(a: Path, b: Path) -> list[str]:
     """Files of records that differ in a byte or are in one folder only."""
     names = {f"{table}/{path.name}" for table in TABLES for out in (a, b) for path in (out / table).glob("*")}
@@ -221,6 +276,12 @@ def campaigns(place: Here, folder: Path, options: argparse.Namespace) -> int:
         verdict = f"DIFFERENT: {', '.join(differing)}" if differing else "records equal, byte for byte"
         killed = ", ".join(f"{n} {kind}s" for kind, n in sorted(done.items()) if kind != "orphan")
         print(f"{method}: {killed} killed, {done['orphan']} orphans; {verdict}", flush=True)
+    if options.machines is None and not options.only:
+        run, kills = folder / methods[-1] / "undisturbed", options.kills // len(COMMANDS)
+        for name in COMMANDS:
+            wrong = struck_command(name, folder / name, run, chance, kills, options.pause)
+            failed |= bool(wrong)
+            print(f"{name}: {kills} killed; {', '.join(wrong) or 'files equal, byte for byte'}", flush=True)
     return int(failed)
 
 
