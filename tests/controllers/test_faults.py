@@ -183,6 +183,15 @@ def test_check_refuses_what_run_refuses(change, where, words, tmp_path, capsys):
     assert not Path("called").exists()
 
 
+def test_av_check_makes_nothing_but_a_controller(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("c.yaml").write_text(SMALL)
+    av = "{controller: 'subprocess:Popen', parameters: {args: touch called, shell: true}}"
+    assert main(["av-check", "c.yaml", "--set", f"av={av}"]) == EXIT_BAD_INPUT
+    assert "Popen without start, step, close" in capsys.readouterr().err
+    assert not Path("called").exists()
+
+
 def test_a_function_may_say_which_controller_it_makes(tmp_path, undisturbed):
     assert _run(tmp_path, _other("idm_of_a_function")) == EXIT_DONE
     assert _episodes(tmp_path) == undisturbed
