@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
+import math
 import sys
 import tempfile
 from collections.abc import Iterable
@@ -105,8 +106,11 @@ def seen_in_comparison(folder: Path) -> dict[str, Any]:
     return {"compare": numbers_of(content), **{side: seen_in(folder / side) for side in "ab"}}
 
 
-def unlike(found: Any, golden: Any, path: str = "") -> list[str]:
-    """Where two such trees differ in any bit or type."""
+def unlike(found: Any, golden: Any, path: str = "", *, digits: float = 0.0) -> list[str]:
+    """Where two such trees differ in any bit or type; estimates may differ by so many relative ``digits``.
+
+    BLAS adds up in an order of the CPU family's own. Records know no BLAS: these are hashes, equal or not.
+    """
     if isinstance(found, dict) and isinstance(golden, dict):
         keys = sorted(found.keys() | golden.keys())
         missing = [
@@ -116,10 +120,12 @@ def unlike(found: Any, golden: Any, path: str = "") -> list[str]:
             line
             for key in keys
             if key in found and key in golden
-            for line in unlike(found[key], golden[key], f"{path}/{key}")
+            for line in unlike(found[key], golden[key], f"{path}/{key}", digits=digits)
         ]
         return missing + both
     same = type(found) is type(golden) and repr(found) == repr(golden)
+    if isinstance(found, float) and isinstance(golden, float):
+        same |= math.isclose(found, golden, rel_tol=digits, abs_tol=digits * 1e-12)
     return [] if same else [f"{path}: {found!r}, was {golden!r}"]
 
 
