@@ -112,10 +112,13 @@ def test_the_first_vehicle_of_a_new_user_runs(page, tmp_path, monkeypatch):
         r"^```(?:py|yaml)\n# (\S+)\n(.*?)^```$", (ROOT / page).read_text("utf-8"), re.MULTILINE | re.DOTALL
     )
     assert [name for name, _ in blocks] == ["my_av.py", "my.yaml"]
+    sys.modules.pop("my_av", None)  # another page's
     for name, text in blocks:
         Path(name).write_text(text, encoding="utf-8")
     short = [f"--set={setting}" for setting in ("stop.rhw=0.5", *SMALL_POOL)]
-    assert main(["run", "my.yaml", "--out", "runs/mine", "--workers", "1", "--quiet", *short]) == 0
+    code = main(["run", "my.yaml", "--out", "runs/mine", "--workers", "1", "--quiet", *short])
+    sys.modules.pop("my_av", None)
+    assert code == 0
     statement = json.loads(Path("runs/mine/estimates.json").read_text("utf-8"))["statement"]
     assert "times as often as a careful and competent driver" in statement
 
