@@ -17,6 +17,7 @@ from harness.numbers import count, duration, words
 
 Figure = float | int | str
 FORESEEN = 10.0
+"""How many times as many tests as there have been can be foreseen."""
 
 
 class Progress:

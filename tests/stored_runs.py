@@ -48,7 +48,7 @@ def edit(folder: Path, file: str = "manifest.json", **changes: Any) -> None:
 def of_before(folder: Path) -> Path:
     """Let a folder be as earlier versions left it: without a checksum."""
     shards = [{key: value for key, value in shard.items() if key != SEAL} for shard in manifest(folder)["shards"]]
-    edit(folder, shards=shards, campaign_crc32=None, shadow_crc32=[])
+    edit(folder, shards=shards, campaign_crc32=None, baseline_crc32=[])
     edit(folder, "estimates.json")
     return folder
 

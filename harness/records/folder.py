@@ -347,7 +347,7 @@ class StoredManifest(Stored):
     retraced: Retraced | None = None
     repeated: Repeated | None = None
     shadow_runs: dict[str, Count] | None = None
-    shadow_crc32: list[Count] = []
+    baseline_crc32: list[Count] = []
     reported_from: Count | None = None
 
 

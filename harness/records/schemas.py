@@ -148,7 +148,7 @@ def traces_schema(*, takes_time: bool = False) -> pa.Schema:
 
 
 def baseline_schema() -> pa.Schema:
-    """Schema of the ``shadow`` table: one row per shadow run."""
+    """Schema of the ``shadow`` table: one row per baseline run."""
     return pa.schema(
         [
             _field("shadow", _I8, "1", "index of the run; tests on its path tell it to the vehicle"),
@@ -219,7 +219,7 @@ def _names(codes: Int8Array, names: tuple[str, ...]) -> pa.Array:
 
 
 def _driven(shard: Shard) -> dict[str, Any]:
-    """Columns that tests and shadow runs have in common."""
+    """Columns that tests and baseline runs have in common."""
     results = shard.results
     e = results.episode
     return {
@@ -320,7 +320,7 @@ def _came_over(shard: Shard, row: int, state: np.ndarray) -> FloatArray:
 
 
 def baseline_table(shard: Shard, path: IntArray, weight: FloatArray) -> pa.Table:
-    """One row per shadow run of a shard that has kept all motion; ``path``, ``weight`` (n,) as in the schema."""
+    """One row per baseline run of a shard that has kept all motion; ``path``, ``weight`` (n,) as in the schema."""
     e, traces = shard.results.episode, [shard.traces[row] for row in range(shard.results.episode.size)]
     columns = _driven(shard) | {
         "shadow": shard.first_episode + np.arange(e.size),

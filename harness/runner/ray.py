@@ -90,7 +90,7 @@ class OnMachine:
 
     def __init__(self, resolved: Resolved) -> None:
         self._resolved = resolved
-        self._folder = TemporaryDirectory(prefix="harness-shadow-runs-")
+        self._folder = TemporaryDirectory(prefix="harness-baseline-runs-")
         self._workers = LocalWorkers(resolved, Path(self._folder.name), 1)
         self._worker: WorkerProcess | None = None
 
@@ -103,11 +103,11 @@ class OnMachine:
             return fit_to_travel(error)
 
     def run(
-        self, request: Request, fatal_episodes: Mapping[int, Death], shadows: Files
+        self, request: Request, fatal_episodes: Mapping[int, Death], baseline: Files
     ) -> Result | WorkerDeath | Exception:
-        """Run a shard; tests may follow from the ``shadows``, files of the run folder."""
+        """Run a shard; tests may follow from the ``baseline`` runs, files of the run folder."""
         try:
-            _place(shadows, Path(self._folder.name))
+            _place(baseline, Path(self._folder.name))
             worker = self._worker or self._workers.new_worker()
             worker.give(request, fatal_episodes)  # if it is dead, it has no answer either
             answer = self._workers.first_to_answer([worker]).answer()
@@ -143,7 +143,7 @@ class RayWorker:
 
     def give(self, request: Request, fatal_episodes: Mapping[int, Death]) -> bool:
         """See `harness.runner.workers.Worker`: that it is dead shows in its answer."""
-        self.pending = self._actor.run.remote(request, dict(fatal_episodes), self._workers.shadows(request))
+        self.pending = self._actor.run.remote(request, dict(fatal_episodes), self._workers.baseline(request))
         return True
 
     def answer(self) -> Result | WorkerDeath:
@@ -208,7 +208,7 @@ class RayWorkers(Workers):
         self._here = Machine.this(resolved, resolved.controller_sha256)
         self._cpus: set[str] = set()
         self._lost_at_start, self._patient_until = 0, time.monotonic() + PATIENCE_S
-        self._shadows: Files | None = None
+        self._baseline: Files | None = None
         self._content = ray.put(resolved)
         self._cached = {} if address == LOCAL else _stored(cached_files(resolved), cache_root())
         self._actor_class = ray.remote(OnMachine).options(
@@ -221,13 +221,13 @@ class RayWorkers(Workers):
         """See `Workers.cpus`."""
         return self._cpus
 
-    def shadows(self, request: Request) -> Files:
+    def baseline(self, request: Request) -> Files:
         """Baseline runs that tests follow from: they have all been written before the first test."""
         if not isinstance(request, ShardRequest):
             return {}
-        if self._shadows is None:
-            self._shadows = _stored(sorted((self._folder / SHADOW).glob("*.parquet")), self._folder)
-        return self._shadows
+        if self._baseline is None:
+            self._baseline = _stored(sorted((self._folder / SHADOW).glob("*.parquet")), self._folder)
+        return self._baseline
 
     def new_worker(self) -> RayWorker | None:
         """See `Workers.new_worker`."""

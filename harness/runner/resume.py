@@ -132,7 +132,7 @@ class Manifest:
         self._reproducible = campaign.av.reproducible
         self._began = began - float(earlier.get("wall_time_s") or 0.0)
         asked = [] if campaign.accept is None else [campaign.accept.crash_rate_below]
-        self.listed_baseline: list[int] = earlier.get("shadow_crc32", [])
+        self.listed_baseline: list[int] = earlier.get("baseline_crc32", [])
         earlier_limits = earlier.get("limits", []) if earlier["n_episodes"] else []
         self.limits_before = [limit for limit in earlier_limits if limit not in asked]
         self._content: dict[str, Any] = {

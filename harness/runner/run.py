@@ -217,7 +217,7 @@ class Run:
             causes += result.failures
             self._progress.advance(result.request.n_episodes)
             counts = {"n_runs": sum(map(len, tables)), "n_failed": causes.total()}
-            self.manifest.note(shadow_runs=counts, shadow_crc32=crc32)
+            self.manifest.note(shadow_runs=counts, baseline_crc32=crc32)
             self.manifest.follow(self.prefix)
         most, where = self.campaign.run.max_failed_share, "the run folder's shadow/ tables"
         require_few_failed(causes.total(), n, causes, most, "baseline runs", where)

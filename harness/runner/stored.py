@@ -178,7 +178,7 @@ def _replay(
     """Row and trace of the episode, run again."""
     source = prepare(resolved)
     if source.baseline_paths is not None:
-        listed = read_manifest(folder).get("shadow_crc32", ())
+        listed = read_manifest(folder).get("baseline_crc32", ())
         source.begin_after(read_baseline(folder, source.baseline_paths, resolved.environment, listed))
     require_same_pool(folder, source)
     world = _world(resolved.campaign, gui=gui, fcd=fcd)

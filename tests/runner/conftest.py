@@ -18,11 +18,6 @@ SMALL = ("stop.episodes=1600", "stop.rhw=null", "run.shard_size=80", "records.tr
 TWIN = ("world.engine=twin", "stop.episodes=400")
 
 
-def sets(*overrides: str) -> list[str]:
-    """The same on a command line."""
-    return [word for override in overrides for word in ("--set", override)]
-
-
 @pytest.fixture(scope="session")
 def campaign() -> Callable[..., Campaign]:
     """The smoke campaign in small, with overrides."""

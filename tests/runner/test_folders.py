@@ -151,21 +151,6 @@ def test_what_is_not_as_it_was_left(damage, commands, said, stored, complaint_of
         assert said in complaint
 
 
-@pytest.mark.parametrize("table", ["episodes", "moments", "traces"])
-def test_resuming_with_a_truncated_shard_names_it_and_its_mend_works(table, stored, complaint_of, whole):
-    """Finished tests stay in the manifest, so that no estimate passes over a shard that was deleted meanwhile."""
-    broken = shard_files(stored, table)[1]
-    truncate(broken)
-    said = complaint_of(*RUN, stored, "--resume")
-    assert str(broken) in said
-    assert "Delete all files of this shard" in said
-    for path in stored.glob(f"*/{broken.name}"):
-        path.unlink()
-    assert broken.name in complaint_of("estimate", stored)
-    run_here(golden(NAME), stored, resume=True)
-    assert unlike_columns(whole, stored) == []
-
-
 def test_a_manifest_cut_anywhere_is_named_and_nothing_is_touched(stored):
     """Nothing of it is taken for the whole: neither read nor gone on with."""
     path, resolved = stored / "manifest.json", resolve(golden(NAME))

@@ -21,8 +21,8 @@ from harness.runner.workers import WorkerLostError
 from harness.sampling import ShardRequest
 from tests.in_process import workers_alive
 from tests.runner import bad_workers
-from tests.runner.conftest import MIXTURE_FILE, SMALL, TWIN, sets
-from tests.stored_runs import copy_of, manifest, shard_files, unlike_columns
+from tests.runner.conftest import MIXTURE_FILE, SMALL, TWIN
+from tests.stored_runs import copy_of, manifest, sets, shard_files, unlike_columns
 
 SHARDS_BEFORE_FAILURE = 3
 
