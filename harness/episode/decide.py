@@ -13,6 +13,7 @@ from harness.episode.cells import KernelState
 from harness.episode.drive import command, drive_av
 from harness.episode.likelihood_ratio import record_acceleration, record_lane
 from harness.episode.path import place, state_of, walk, weigh_cut_ins
+from harness.importance.challenge import remaining_level
 from harness.importance.functions import challenges_nobody, look_ahead, propose_acceleration, propose_cut_in
 from harness.random_stream import BV_DRAWS, BV_FREE_DRAWS, LV_DRAWS, uniform
 from harness.random_stream import CUT_IN as CUT_IN_STREAM
@@ -316,10 +317,12 @@ def controlled_draw(k: int, u: float, state: State, kernel: KernelState) -> int:
     scratch, environment, importance = kernel.scratch, kernel.environment, kernel.importance
     cell, p, q = kernel.cells.cell[k], scratch.p, scratch.q_acceleration
     law = laws.free_driving(state.v_bv_mps, environment)
-    if challenges_nobody(state, importance):
+    levels = importance.harmless.shape[1] - 1
+    level = remaining_level(cell.step, environment.numbers.max_steps, importance.steps_per_level, levels)
+    if challenges_nobody(state, level, importance):
         return draw_acceleration(u, law, environment)
     laws.acceleration_pmf(law, environment, p)
-    if not propose_acceleration(state, p, importance, q, scratch.challenge):
+    if not propose_acceleration(state, level, p, importance, q, scratch.challenge):
         return draw_acceleration(u, law, environment)
     if importance.mixes_steps or cell.component > 0:
         maneuver = draw_from(u, cell.component, importance.alpha, q)

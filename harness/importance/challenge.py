@@ -7,7 +7,8 @@ freely and redraws its acceleration every hold period; the surrogate reacts in e
     U_0 = 0,   U_{i+1}(s) = Σ_a p(a | v_BV) [1 if the pair collides while a is held, else U_i(s'(s, a))].
 
 Levels of U are stored about one second apart (time remaining in the episode); the challenge of a maneuver,
-C(s, a) = 1 or U(s'), is stored for the longest remaining time.
+C(s, a) = 1 or U(s'), is stored for the longest remaining time. Where U of the time that remains is 0, no surrogate can
+crash any more, and nothing is controlled.
 
 **Immediate**, as published for NADE: whether the surrogate crashes if BV acts now and then keeps its speed. The
 answer is yes or no, so what is tabulated is smooth: the smallest gap of the roll-out, which goes on below zero as if
@@ -190,32 +191,39 @@ def roll_out(
     points: GridPoints,
     value: Float32Array,
     maneuvers: Float32Array,
+    least: Float32Array,
 ) -> None:
-    """Fill ``value`` (levels + 1, v, R2, R2dot) and ``maneuvers`` (v, R2, R2dot, 31) with smallest gaps (m)."""
+    """Fill ``maneuvers`` (v, R2, R2dot, 31) with smallest gaps (m), and by remaining time (levels + 1, v, R2, R2dot).
+
+    ``value`` is that of keeping speed, ``least`` the smallest of all maneuvers.
+    """
     by_level = np.empty(value.shape[0])
+    least[:] = _NO_CONTACT_M
     for i, j, k, m in np.ndindex(maneuvers.shape):
         v, r2, r2dot = state_at(points, i, j, k)
         smallest_gaps(v, r2, r2dot, m, hold, steps_per_level, driver[0], by_level)
         maneuvers[i, j, k, m] = by_level[-1]
+        for level in range(by_level.size):
+            least[level, i, j, k] = min(least[level, i, j, k], by_level[level])
         if m == _KEEP_SPEED:
             value[:, i, j, k] = by_level
 
 
-def build_immediate(environment: Environment, driver: RecordArray) -> tuple[Float32Array, Float32Array]:
-    """Tables of one surrogate, in metres; the shapes are those of `build_after_cut_in`."""
+def build_immediate(environment: Environment, driver: RecordArray) -> tuple[Float32Array, Float32Array, Float32Array]:
+    """Tables of one surrogate, in metres: value, maneuvers (see `build_after_cut_in`), and least, shaped as value."""
     points, shape = points_of(AFTER), shape_of(AFTER)
     hold = int(environment.numbers["hold_steps"])
-    value = np.empty((LEVELS + 1, *shape), np.float32)
+    value, least = np.empty((2, LEVELS + 1, *shape), np.float32)
     maneuvers = np.empty((*shape, N_ACCELERATIONS), np.float32)
 
     def at_speed(i: int) -> None:
         here = slice(i, i + 1)
         part = points._replace(speed=points.speed[here])
-        roll_out(driver, hold, level_steps(hold), part, value[:, here], maneuvers[here])
+        roll_out(driver, hold, level_steps(hold), part, value[:, here], maneuvers[here], least[:, here])
 
     with ThreadPoolExecutor(os.cpu_count()) as threads:  # one surrogate may take as long as all others together
         list(threads.map(at_speed, range(points.speed.size)))
-    return value, maneuvers
+    return value, maneuvers, least
 
 
 _NEGLIGIBLE = 1e-7
@@ -226,6 +234,12 @@ _NEGLIGIBLE = 1e-7
 def level_of(step: int, max_steps: int, steps_per_level: int, levels: int) -> int:
     """Level of U that a cut-in in ``step`` has left: the cut-in itself takes one step."""
     return min((max_steps - step - 1) // steps_per_level, levels)
+
+
+@compiled_inline
+def remaining_level(step: int, max_steps: int, steps_per_level: int, levels: int) -> int:
+    """Level of U after which nothing of a test can come that redraws in ``step``: rounded up."""
+    return min((max_steps - step + steps_per_level - 1) // steps_per_level, levels)
 
 
 @compiled_inline

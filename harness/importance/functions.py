@@ -34,8 +34,9 @@ class Importance(NamedTuple):
     ``steps_per_level`` lie between two levels of ``value``.
     ``alpha`` (M,) are the mixture weights. ``value`` (J, levels + 1, v, R2, R2dot), ``maneuvers`` (J, v, R2, R2dot, 31)
     and ``before`` (J, redraw times + 1, v, R2, R2dot) are the challenge tables (see `harness.importance.tables`).
-    ``harmless`` (J, v - 1, R2 - 1, R2dot - 1) marks the grid cells after the cut-in in which no acceleration challenges
-    a surrogate: most of what is driven lies there, and nothing needs to be interpolated.
+    ``harmless`` (J, levels + 1, v - 1, R2 - 1, R2dot - 1) marks the grid cells after the cut-in in which no
+    acceleration challenges a surrogate within a remaining time: most of what is driven lies there, and nothing needs
+    to be interpolated.
     """
 
     recursive: int
@@ -76,7 +77,7 @@ def build_importance(campaign: Campaign, tables: Tables | None) -> Importance:
     """Importance functions of a campaign; ``nde`` and ``forced`` need no challenge tables."""
     testing, sampling = campaign.testing, campaign.sampling
     recursive = testing.challenge == "recursive"
-    none = _none(5), _none(5), _none(5), np.zeros((0, 1, 1, 1), np.bool_)
+    none = _none(5), _none(5), _none(5), np.zeros((0, 1, 1, 1, 1), np.bool_)
     return Importance(
         int(recursive),
         int(sampling.mixes_steps),
@@ -87,18 +88,19 @@ def build_importance(campaign: Campaign, tables: Tables | None) -> Importance:
         testing.epsilon,
         testing.criticality_threshold,
         np.array(mixture_weights(campaign), dtype=np.float64),
-        *(none if tables is None else (*tables, harmless_cells(tables.maneuvers, recursive=recursive))),
+        *(none if tables is None else (*tables[:3], harmless_cells(tables, recursive=recursive))),
     )
 
 
-def harmless_cells(maneuvers: Float32Array, *, recursive: bool) -> BoolArray:
+def harmless_cells(tables: Tables, *, recursive: bool) -> BoolArray:
     """Grid cells in which every acceleration has challenge 0, wherever in the cell it is interpolated.
 
-    ``maneuvers`` (J, v, R2, R2dot, 31) are probabilities (recursive) or smallest gaps in metres (immediate); the result
-    has shape (J, v - 1, R2 - 1, R2dot - 1).
+    By remaining time, (J, levels + 1, v - 1, R2 - 1, R2dot - 1); with the longest that of the maneuvers' own table.
     """
-    cells: BoolArray = maneuvers.max(-1) == 0.0 if recursive else maneuvers.min(-1) > CONTACT_M + _ROUNDING_M
-    for axis in (1, 2, 3):
+    at, maneuvers = tables.value if recursive else tables.least, tables.maneuvers
+    cells: BoolArray = at == 0.0 if recursive else at > CONTACT_M + _ROUNDING_M
+    cells[:, -1] = maneuvers.max(-1) == 0.0 if recursive else maneuvers.min(-1) > CONTACT_M + _ROUNDING_M
+    for axis in (2, 3, 4):
         n = cells.shape[axis]
         cells = cells.take(range(n - 1), axis) & cells.take(range(1, n), axis)
     return cells
@@ -194,26 +196,31 @@ def propose_cut_in(
 
 
 @compiled_inline
-def challenges_nobody(state: State, importance: Importance) -> bool:
-    """Whether a state after the cut-in is seen to be uncritical without a look at any acceleration."""
+def challenges_nobody(state: State, level: int, importance: Importance) -> bool:
+    """Whether a state after the cut-in is seen to be uncritical without a look at any acceleration.
+
+    ``level`` is the `remaining_level` of the test.
+    """
     i, _, j, _, k, _ = locate(AFTER, state.v_bv_mps, state.r2_m, state.r2dot_mps)
     harmless = True
     for surrogate in range(importance.n_surrogates):
-        harmless = harmless and importance.harmless[surrogate, i, j, k]
+        harmless = harmless and importance.harmless[surrogate, level, i, j, k]
     return harmless
 
 
 @compiled_inline
-def propose_acceleration(state: State, p: FloatArray, importance: Importance, q: FloatArray, v: FloatArray) -> bool:
+def propose_acceleration(
+    state: State, level: int, p: FloatArray, importance: Importance, q: FloatArray, v: FloatArray
+) -> bool:
     """Probabilities of the 31 accelerations under every surrogate's importance function.
 
-    ``p`` (31,) is the exposure; ``q`` (J, 31) and ``v`` (J,) receive the results. Returns whether the moment is
-    critical.
+    ``level`` is the `remaining_level` of the test, ``p`` (31,) the exposure; ``q`` (J, 31) and ``v`` (J,) receive the
+    results. Returns whether the moment is critical.
     """
     where = locate(AFTER, state.v_bv_mps, state.r2_m, state.r2dot_mps)
     critical = False
     for j in range(importance.n_surrogates):
-        if importance.harmless[j, where[0], where[2], where[4]]:
+        if importance.harmless[j, level, where[0], where[2], where[4]]:
             v[j] = 0.0
             for m in range(N_ACCELERATIONS):
                 q[j, m] = p[m]

@@ -24,7 +24,7 @@ from harness.traffic.laws import Environment
 from harness.vehicles.drivers import MODEL_FIELDS
 from harness.vocabulary import Float32Array, RecordArray
 
-_FORMAT = 3
+_FORMAT = 4
 """Raise it when the meaning of a table changes."""
 
 
@@ -33,12 +33,14 @@ class Tables(NamedTuple):
 
     ``value`` (J, levels + 1, v, R2, R2dot): U by remaining time. ``maneuvers`` (J, v, R2, R2dot, 31): C(s, a).
     ``before`` (J, redraw times + 1, v, R2, R2dot): expected challenge per unit of OL before the cut-in. With the
-    immediate challenge the first two are smallest gaps in metres and the last is empty.
+    immediate challenge the first two are smallest gaps in metres and ``before`` is empty; ``least``, shaped as value,
+    is then the smallest gap of all maneuvers, and else empty.
     """
 
     value: Float32Array
     maneuvers: Float32Array
     before: Float32Array
+    least: Float32Array
 
 
 def tables_hash(environment: Environment, drivers: RecordArray, challenge: str) -> str:
@@ -80,10 +82,12 @@ def _save(path: Path, tables: Tables) -> None:
 
 def build_one(environment: Environment, driver: RecordArray, challenge: str) -> Tables:
     """Tables of one surrogate, ``driver`` (1,), without its axis."""
+    none = np.zeros((0, 2, 2, 2), np.float32)
     if challenge == "immediate":
-        return Tables(*build_immediate(environment, driver), np.zeros((0, 2, 2, 2), np.float32))
+        value, maneuvers, least = build_immediate(environment, driver)
+        return Tables(value, maneuvers, none, least)
     value, maneuvers = build_after_cut_in(environment, driver)
-    return Tables(value, maneuvers, build_before_cut_in(environment, value))
+    return Tables(value, maneuvers, build_before_cut_in(environment, value), none)
 
 
 def build_tables(

@@ -12,6 +12,7 @@ from harness.compiled import compiled_threads
 from harness.episode import likelihood_ratio
 from harness.episode.decide import draw_from
 from harness.importance import functions
+from harness.importance.challenge import remaining_level
 from harness.importance.grid import AFTER, interpolate, locate
 from harness.traffic.laws import acceleration, acceleration_pmf, acceptance, cut_in_hazard, free_driving, opportunity
 from harness.vocabulary import State
@@ -30,12 +31,14 @@ class Proposals(NamedTuple):
 
 
 @compiled_threads
-def _after(states, environment, importance, p, q, v, critical):
+def _after(states, steps, environment, importance, p, q, v, critical):
+    levels = importance.harmless.shape[1] - 1
     for i in range(states.shape[0]):
         speed, r1, r1dot, r2, r2dot = states[i]
         acceleration_pmf(free_driving(speed, environment), environment, p[i])
         state = State(speed, r1, r1dot, r2, r2dot)
-        critical[i] = functions.propose_acceleration(state, p[i], importance, q[i], v[i])
+        level = remaining_level(steps[i], environment.numbers.max_steps, importance.steps_per_level, levels)
+        critical[i] = functions.propose_acceleration(state, level, p[i], importance, q[i], v[i])
 
 
 @compiled_threads
@@ -64,11 +67,12 @@ def _accumulate(importance, ratios, v, log_ratio, martingale, sampled):
         log_sampled += np.log(sampled[t])
 
 
-def after_cut_in(states, environment, importance) -> Proposals:
-    """Proposals at redraw times after the cut-in; states (n, 5)."""
+def after_cut_in(states, environment, importance, steps=None) -> Proposals:
+    """Proposals at redraw times after the cut-in; states (n, 5), in ``steps`` (n,), or at the beginning of a test."""
     n, j = len(states), importance.maneuvers.shape[0]
     out = Proposals(np.empty((n, 31)), np.empty((n, j, 31)), np.empty((n, j)), np.empty(n, np.bool_))
-    _after(np.ascontiguousarray(states, float), environment, importance, *out)
+    steps = np.zeros(n, np.int64) if steps is None else np.asarray(steps, np.int64)
+    _after(np.ascontiguousarray(states, float), steps, environment, importance, *out)
     return out
 
 

@@ -12,10 +12,11 @@ from hypothesis import strategies as st
 
 from harness.importance.functions import as_challenge, harmless_cells
 from harness.importance.grid import interpolate_maneuvers
+from harness.importance.tables import Tables
 from harness.vehicles.kinematics import CONTACT_M
 from harness.vocabulary import CUT_IN, STATE_COLUMNS, STAY
 from tests.episode.twin_runs import prepared, run
-from tests.importance.kernels import after_cut_in, before_cut_in, drawn
+from tests.importance.kernels import after_cut_in, before_cut_in, drawn, tabulated
 
 CHALLENGES = {"immediate": "two", "recursive": "default"}  # and the surrogates
 EPSILONS = (0.0, 0.1, 1.0)
@@ -75,7 +76,7 @@ def test_identities_anywhere(challenge, epsilon, situations):
     environment, importance = policy_of(challenge, epsilon)
     state, maneuver, step = (np.array(column) for column in zip(*situations, strict=True))
     require_identities(before_cut_in(state, maneuver, step, environment, importance), epsilon)
-    require_identities(after_cut_in(state, environment, importance), epsilon)
+    require_identities(after_cut_in(state, environment, importance, step), epsilon)
 
 
 @pytest.mark.parametrize("challenge", CHALLENGES)
@@ -90,8 +91,8 @@ def test_records_hold_what_was_drawn_from(challenge):
     np.testing.assert_array_equal(done.moment_v[before], found.v)
     np.testing.assert_array_equal(done.moment_q[before], found.q[each, :, taken])
     np.testing.assert_array_equal(rows["p"], found.p[each, taken])
-    found = after_cut_in(state[after], policy.environment, policy.importance)
     rows, each = done.moment[after], np.arange(after.sum())
+    found = after_cut_in(state[after], policy.environment, policy.importance, rows["step"])
     np.testing.assert_array_equal(done.moment_v[after], found.v)
     np.testing.assert_array_equal(done.moment_q[after], found.q[each, :, rows["maneuver"]])
     np.testing.assert_array_equal(rows["p"], found.p[each, rows["maneuver"]])
@@ -142,7 +143,8 @@ def scattered(recursive):
 @pytest.mark.parametrize("recursive", [True, False])
 def test_harmless_cells_are_those_without_a_challenge_wherever_they_are_read(recursive):
     table = scattered(recursive)
-    harmless = harmless_cells(table, recursive=recursive)
+    by_time = np.stack([table.max(-1) if recursive else table.min(-1)] * 2, axis=1)
+    harmless = harmless_cells(Tables(by_time, table, by_time, by_time), recursive=recursive)[:, -1]
     rng = np.random.default_rng(1)
     out = np.empty(31)
     found = np.argwhere(harmless[0])
@@ -154,3 +156,21 @@ def test_harmless_cells_are_those_without_a_challenge_wherever_they_are_read(rec
     challenging = np.any(table[0] > 0.0 if recursive else table[0] < CONTACT_M, axis=-1)
     for i, g, k in np.ndindex(harmless.shape[1:]):
         assert harmless[0, i, g, k] == (not challenging[i : i + 2, g : g + 2, k : k + 2].any())
+
+
+@pytest.mark.parametrize("challenge", ["recursive", "immediate"])
+def test_after_a_cut_in_nothing_is_controlled_that_could_end_in_a_crash_only_after_the_test(challenge):
+    """Of every control step some surrogate has a challenge in the time that remains, rounded up to a second."""
+    found = run("step_mixture", challenge, n=3_000, surrogates="two", epsilon=0.9, moments="all")
+    tables, moment = found.prepared.tables, found.moment
+    rows = np.flatnonzero(moment["step"] > found.episode["cut_in_step"][moment["row"]])
+    rows = rows[found.cut_in[moment["row"][rows]]]
+    level = np.minimum(-(-(200 - moment["step"][rows]) // 10), 12)
+    states = np.column_stack([moment[name][rows] for name in (STATE_COLUMNS[0], *STATE_COLUMNS[3:])])
+    challenged = tables.value > 0.0 if challenge == "recursive" else tables.least < CONTACT_M + 1e-6
+    seen = np.zeros(len(rows))
+    for j, each in np.ndindex(2, 12):  # with the longest time the table of maneuvers decides
+        at = level == each
+        seen[at] += tabulated(challenged[j, each].astype(np.float32), states[at])
+    assert np.count_nonzero(level < 6) > 20
+    assert np.all(seen[level < 12] > 0.0)
