@@ -188,7 +188,7 @@ def rnot(folders: Sequence[Path], *, estimators: Sequence[RnotEstimator], as_jso
     'scv' is computed only when asked for. It solves its regressions anew at each look of each shuffle, which takes
     minutes: a larger --ratio and a smaller --total make it quicker. Its RHW rests on a variance that is too small.
     """
-    from studies.rnot import Procedure, required_tests_of_runs, table_row  # noqa: PLC0415 - keeps --help fast
+    from studies.rnot import SHOWN, Procedure, required_tests_of_runs  # noqa: PLC0415 - keeps --help fast
 
     bar = shown_progress()
     with bar:
@@ -198,7 +198,7 @@ def rnot(folders: Sequence[Path], *, estimators: Sequence[RnotEstimator], as_jso
         return
     print_table(
         f"Tests until RHW stays at most {content['rhw']:g} ({content['confidence']:.0%} normal interval)",
-        [table_row(row) for row in content["rows"]],
+        [{key: row.get(key) for key in SHOWN} for row in content["rows"]],
     )
     for row in content["rows"]:
         for remark in [*row.get("remarks", ()), *filter(None, [row.get("reason")])]:

@@ -15,7 +15,7 @@ in shards, and not by the estimator, so that two estimators of one run see the s
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from itertools import pairwise, takewhile
 from pathlib import Path
@@ -34,6 +34,8 @@ from harness.runner.stored import stored_blocks
 from harness.vocabulary import CRASH, FAILED, BoolArray, FloatArray, Int8Array, IntArray
 
 RnotEstimator = Literal["nde", "nade", "scv"]
+SHOWN = ("run", "estimator", "n_episodes", "grid", "mean", "low_5", "high_95", "never_reached", "aar", "aar_is")
+"""What a terminal shows of a row."""
 SCV_REMARK = (
     "rests on the variance that scv claims, which is too small (docs/scv-defect.md): this is the number that the "
     "published procedure reports, not the number of tests that is needed"
@@ -299,8 +301,6 @@ def required_tests_of_runs(
                 row
                 | {
                     "grid": f"{grid[0]:,} to {grid[-1]:,} by {procedure.ratio - 1.0:.3g} n ({len(grid)} looks)",
-                    "grid_points": len(grid),
-                    "total": int(grid[-1]),
                     "mean": found.mean,
                     "mean_is_lower_limit": found.is_lower_limit,
                     "low_5": found.quantile(0.05),
@@ -335,18 +335,3 @@ def _remarks(tests: Tests, name: str, found: RequiredTests, total: int, procedur
     if above:
         nowhere = f"{above} {of_shuffles} nowhere above RHW {procedure.rhw:g}"
         yield f"{nowhere}: each counts with the n of its largest RHW, as in the paper"
-
-
-def table_row(row: Mapping[str, Any]) -> dict[str, str]:
-    """What a terminal shows of a row."""
-    shown = {"run": row["run"], "estimator": row["estimator"], "tests on record": f"{row['n_episodes']:,}"}
-    if row["mean"] is None:
-        return shown | dict.fromkeys(("grid", "mean RNoT", "5-95 %", "never", "AAR"), "-")
-    aar = {"equal": "", "at least": "≥ ", "at most": "≤ "}.get(row["aar_is"])
-    return shown | {
-        "grid": row["grid"],
-        "mean RNoT": f"{'≥ ' if row['mean_is_lower_limit'] else ''}{row['mean']:,.0f}",
-        "5-95 %": f"{row['low_5']:,} to {row['high_95']:,}",
-        "never": f"{row['never_reached']:,}",
-        "AAR": "-" if aar is None else f"{aar}{row['aar']:.3g}",
-    }

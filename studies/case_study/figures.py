@@ -65,7 +65,7 @@ def scattered(relvar: float, n: int, missed: bool) -> dict[str, Any]:
 def range_of(found: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """The first number between the least and the most of all; a limit stands for a number that is not known."""
     known = [x for each in found if (x := each["value"] or each["low"] or each["high"])]
-    return figure(found[0]["value"], min(known, default=None), max(known, default=None))
+    return figure(found[0]["value"] if found else None, min(known, default=None), max(known, default=None))
 
 
 def quotient(above: float, found: dict[str, Any]) -> dict[str, Any]:

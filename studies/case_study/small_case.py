@@ -11,6 +11,7 @@ end at 20 m/s and are held constant below, and its default vehicle and surrogate
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property, partial
@@ -41,7 +42,7 @@ from harness.vocabulary import (
     RecordArray,
 )
 from studies.case_study.counted import Claims
-from studies.case_study.figures import exactly, figure, is_settled, marked, mean_of, tests_for
+from studies.case_study.figures import exactly, is_settled, marked, mean_of, range_of, tests_for
 from studies.case_study.study import Context, SmallCase
 from studies.work import write_table
 
@@ -218,17 +219,23 @@ def answer_small_case(step: SmallCase, context: Context) -> dict[str, Any]:
     rows = context.by_workers(settings, partial(claims_of_setting, step, context.confidence))
     write_table(context.folder / "settings.parquet", pa.Table.from_pylist(rows))
     world = _world(step.lane_change_level)
-    nearest = {name: _nearest(name, wanted, rows) for name, wanted in step.reported.items()}
+    nearest: dict[str, Any] = {}
+    figures = {"nde": exactly(tests_for(1.0 / world.crash_rate - 1.0, step.rhw, context.confidence))}
+    for name, wanted in step.reported.items():  # NADE's exact numbers, or what SCV claims: the nearest first
+        found = [exactly(row["nade_exact"]) if name == "nade" else row["scv_claimed"] for row in rows]
+        known = [(one, row) for one, row in zip(found, rows, strict=True) if one["value"] and is_settled(one)]
+        known.sort(key=lambda each: abs(math.log(each[0]["value"] / wanted)))
+        figures[f"{name}_range"] = range_of([one for one, _ in known])
+        if known:
+            one, row = known[0]
+            nearest[name] = {name: one, **{key: row[key] for key in ("challenge", "threshold", "epsilon")}}
     return {
         "crash_rate": world.crash_rate,
         "rhw": step.rhw,
         "steps": len(world.p),
         "settings": rows,
         "nearest": nearest,
-        "figures": {
-            "nde": exactly(tests_for(1.0 / world.crash_rate - 1.0, step.rhw, context.confidence)),
-            **{f"{name}_range": _range(row[name], name, rows) for name, row in nearest.items()},
-        },
+        "figures": figures,
     }
 
 
@@ -278,23 +285,3 @@ def claims_of_setting(
 def holds(claimed: float | None, exact: float) -> bool:
     """Whether NADE claims what is known to be true, about."""
     return claimed is not None and exact / TRUE_WITHIN <= claimed <= exact * TRUE_WITHIN
-
-
-def _tests_of(name: str, row: dict[str, Any]) -> dict[str, Any]:
-    """Of a setting, NADE's exact number of tests, or what SCV claims."""
-    return exactly(row["nade_exact"]) if name == "nade" else row["scv_claimed"]
-
-
-def _range(nearest: dict[str, Any], name: str, rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """The number that is nearest to a reported one, between the least and the most of all settings."""
-    known = [found["value"] for row in rows if is_settled(found := _tests_of(name, row)) and found["value"]]
-    return figure(nearest["value"], min(known, default=None), max(known, default=None))
-
-
-def _nearest(name: str, wanted: float, rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """The setting whose number is nearest to a reported one: NADE's exact one, or what SCV claims."""
-    known = [(one, row) for row in rows if (one := _tests_of(name, row))["value"] and is_settled(one)]
-    if not known:
-        return {name: figure(None)}
-    one, row = min(known, key=lambda each: abs(np.log(each[0]["value"] / wanted)))
-    return {name: one, **{key: row[key] for key in ("challenge", "threshold", "epsilon")}}
