@@ -32,7 +32,7 @@ from harness.report.style import (
 )
 from studies.case_study.counted import CURVES, SPREAD
 from studies.case_study.figures import is_settled
-from studies.case_study.study import Convergence, Line, Made, Study
+from studies.case_study.study import Convergence, Line, Made, Study, Variants
 
 _COLOURS = {"low": GREY, "nade": BLUE, "scv": VERMILLION, "nde": INK, "": GREEN}
 """Of a method in all plots, by what its step or label contains."""
@@ -45,6 +45,9 @@ def plots_of(study: Study, made: Mapping[str, Made], ours: Mapping[str, dict[str
     for name, step in study.steps.items():
         if isinstance(step, Convergence):
             plots.append(convergence_plot(name, step, made, study.rhw, study.confidence))
+        elif isinstance(step, Variants) and step.reference:
+            known = made[step.reference].result["figures"]["crash_rate"]["value"]
+            plots.append(settings_plot(name, made[name].result["variants"], known, study.rhw))
         elif step.kind == "control_variates":
             plots.append(strata_plot(name, made[name].result["strata"]))
             plots.append(growth_plot(f"{name}_growth", made[name].result["looks"], study.rhw))
@@ -199,5 +202,35 @@ def spread_plot(name: str, results: pa.Table) -> Plot | None:
     caption = (
         "Tests by their result over the median of all weighted crashes, before (Y) and after adjustment (Z = Y − Hβ), "
         "by number of control steps l, and all; those with result 0 are left out."
+    )
+    return Plot(name, figure, caption, caption)
+
+
+def settings_plot(name: str, variants: list[dict[str, Any]], known_rate: float, rhw: float) -> Plot:
+    """Of each setting tests as claimed, by replication and over shuffles; mean weight and rate over the known one."""
+    figure, left, right = two_panels(3.4, ("", ""))
+    places = range(len(variants))
+    looks = (("claimed", "as claimed", "o", GREY), ("rnot", "RNoT", "s", GREEN), ("true", "by replication", "o", BLUE))
+    for key, label, marker, colour in looks:
+        values = [row[key]["value"] for row in variants]
+        style: dict[str, Any] = {"color": colour, "linestyle": "none", "markersize": 8 if key == "claimed" else 5}
+        left.plot(places, [x or np.nan for x in values], marker, label=label, **style)
+        limits = [row[key]["low"] if x is None else np.nan for row, x in zip(variants, values, strict=True)]
+        left.plot(places, [np.nan if x is None else x for x in limits], "^", **style)
+    for values, label, colour in (
+        ([row["mean_weight"] for row in variants], "mean weight", INK),
+        ([(row["nade_rate"]["value"] or np.nan) / known_rate for row in variants], "rate / known rate", BLUE),
+    ):
+        right.plot(places, values, "o-", color=colour, label=label, markersize=4)
+    right.axhline(1.0, **_DASHED)
+    right.set_ylim(bottom=0.0)
+    left.set_yscale("log")
+    decades(left.yaxis, *left.get_ylim())
+    for axes, title in ((left, f"tests for a relative half-width of {rhw:g}"), (right, "should be 1")):
+        axes.set_xticks(places, [row["variant"] for row in variants], fontsize=7.5, rotation=30)
+        head(axes, title)
+    caption = (
+        "Left: tests that campaigns claim to need, RNoT over shuffles, and tests by what the campaigns' estimates "
+        "scatter by around the known rate; triangles: lower limits. Right: how a run shows that it works."
     )
     return Plot(name, figure, caption, caption)
