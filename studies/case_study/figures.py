@@ -52,14 +52,10 @@ def mean_of(values: Iterable[float | None], confidence: float) -> dict[str, Any]
     return figure(known.mean(), max(known.mean() - half, 0.0), known.mean() + half)
 
 
-def scattered(relvar: float, n: int, missed: bool) -> dict[str, Any]:
-    """A relative variance by the spread of n replications, with two standard errors as if errors were normal.
-
-    Where their mean is below the truth, what has not occurred in any of them is missing from the spread, too: it is a
-    lower limit.
-    """
-    error = 2.0 * relvar * math.sqrt(2.0 / n)
-    return figure(None, relvar) if missed else figure(relvar, max(relvar - error, 0.0), relvar + error)
+def covered(rates: Sequence[dict[str, Any]], truth: float | None) -> float:
+    """Share of rates whose interval holds the truth; that of no crash holds nothing."""
+    holds = [rate["value"] is not None and rate["low"] <= (truth or 0.0) <= rate["high"] for rate in rates]
+    return float(np.mean(holds))
 
 
 def range_of(found: Sequence[dict[str, Any]]) -> dict[str, Any]:
@@ -72,11 +68,6 @@ def quotient(above: float, found: dict[str, Any]) -> dict[str, Any]:
     """A number over another, whose limits change places."""
     value, high, low = (above / x if x else None for x in (found["value"], found["low"], found["high"]))
     return figure(value, low, high)
-
-
-def scaled(found: dict[str, Any], factor: float) -> dict[str, Any]:
-    """The number and its limits, times a factor."""
-    return {**found, **{key: None if (x := found[key]) is None else x * factor for key in ("value", "low", "high")}}
 
 
 def ratio_of_means(above: ArrayLike, below: ArrayLike, confidence: float) -> dict[str, Any]:

@@ -45,7 +45,7 @@ def plots_of(study: Study, made: Mapping[str, Made], ours: Mapping[str, dict[str
     for name, step in study.steps.items():
         if isinstance(step, Convergence):
             plots.append(convergence_plot(name, step, made, study.rhw, study.confidence))
-        elif isinstance(step, Variants) and step.reference:
+        elif isinstance(step, Variants) and step.epsilons and step.reference:
             known = made[step.reference].result["figures"]["crash_rate"]["value"]
             plots.append(settings_plot(name, made[name].result["variants"], known, study.rhw))
         elif step.kind == "control_variates":

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import math
 from functools import partial
-from itertools import pairwise, product
-from pathlib import Path
+from itertools import product
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 from scipy.stats import ttest_1samp
 
 from harness.campaign.campaign import Campaign
@@ -21,6 +19,7 @@ from harness.runner.run import run_campaign
 from harness.vocabulary import EstimatorName, FloatArray
 from studies.case_study.counted import Claims, Counted
 from studies.case_study.figures import (
+    covered,
     exactly,
     figure,
     is_settled,
@@ -30,49 +29,13 @@ from studies.case_study.figures import (
     range_of,
     ratio_of_means,
     ratio_of_variances,
-    scaled,
-    scattered,
     tests_for,
 )
-from studies.case_study.study import Context, Replications, Variants
+from studies.case_study.study import Context, Variants
 from studies.case_study.tested import AT_ONCE, IN_THE_TWIN, figures_of_shells
-from studies.replication.experiment import load_experiment
-from studies.replication.run import REPLICATIONS, validate
 from studies.replication.weighted import prepared_twin, twin_episodes
 from studies.rnot import Procedure, Tests, over_shuffles
 from studies.work import write_table
-
-
-def replicate(step: Replications, context: Context) -> dict[str, Any]:
-    """Results of a validation, and what one estimator gains over the one named before it, claimed and true.
-
-    Where the mean of all replications is below the truth by more than chance, what each of them claims means nothing.
-    """
-    experiment = load_experiment(Path(step.experiment), step.set)
-    judgements = validate(experiment, context.folder, workers=context.workers, progress=context.progress)
-    rows = pq.read_table(context.folder / REPLICATIONS).to_pandas()
-    n, confidence = experiment.campaign.stop.episodes, context.confidence
-    per_relvar = tests_for(n, context.rhw, confidence)
-    figures: dict[str, Any] = {}
-    claims, rates, settled = dict[str, FloatArray](), dict[str, FloatArray](), True
-    for one in judgements:
-        name, centre, error = one["result"], 1.0 + one["bias"], 2.0 * one["bias_std_error"]
-        settled &= not (missed := centre + error < 1.0)
-        own = rows[rows["result"] == name]
-        rates[name] = own["crash_rate"].to_numpy()
-        with np.errstate(divide="ignore", invalid="ignore"):
-            claims[name] = (own["std_error"].to_numpy() / rates[name]) ** 2 * per_relvar
-        figures |= {
-            f"{name}_true": scaled(scattered(one["true_relvar"], one["replications"], missed), per_relvar),
-            f"{name}_claimed": marked(mean_of(claims[name], confidence), settled=not missed),
-            f"{name}_covers": figure(one["coverage"], one["coverage_low"], one["coverage_high"]),
-            f"{name}_over_truth": figure(centre, centre - error, centre + error),
-        }
-    for plain, other in pairwise(claims):
-        gain = ratio_of_means(claims[plain], claims[other], confidence)
-        figures[f"{other}_gain_claimed"] = marked(gain, settled=settled)
-        figures[f"{other}_gain_true"] = ratio_of_variances(rates[plain], rates[other], confidence)
-    return {"tests": n, "replications": experiment.replications, "judgements": judgements, "figures": figures}
 
 
 def variants_of(step: Variants, *, shells: bool = False) -> dict[str, Campaign]:
@@ -86,6 +49,10 @@ def variants_of(step: Variants, *, shells: bool = False) -> dict[str, Campaign]:
         settings[", ".join(name for name, _ in chosen)] = [value for _, values in chosen for value in values]
     vehicles = {name: load_campaign(file, always, av=name) for name in step.avs}
     return vehicles | {name: load_campaign(file, [*always, *more]) for name, more in settings.items()}
+
+
+SHOWN = ("claimed", "true", "rnot", "gain_true", "scv_claimed")
+"""Figures of each variant beside its claimed gain."""
 
 
 def test_variants(step: Variants, context: Context) -> dict[str, Any]:
@@ -106,7 +73,7 @@ def test_variants(step: Variants, context: Context) -> dict[str, Any]:
     write_table(context.folder / "variants.parquet", pa.Table.from_pylist(rows))
     figures = {row["variant"]: row["gain_claimed"] for row in rows}
     mean = mean_of((gain["value"] for gain in figures.values()), context.confidence)
-    figures |= {f"{key}, {row['variant']}": row[key] for row in rows for key in ("claimed", "true", "rnot")}
+    figures |= {f"{key}, {row['variant']}": row[key] for row in rows for key in SHOWN}
     figures["mean"] = marked(mean, settled=all(row["settled"] for row in rows))
     figures["minimum_at"] = _minimum_at({name: figures[name] for name in step.avs})
     if step.reference:
@@ -166,7 +133,9 @@ def claims_in_twin(
         "true": true_tests(rates["nade"], reference, tests_for(n, rhw, confidence)),
         "rnot": rnot,
         "most_frequent_steps": int(np.argmax(steps[1:]) + 1) if len(steps) > 1 else 0,
+        "covers": {name: covered([each[f"{name}_rate"] for each in rows], reference) for name in ("nade", "scv")},
         "scv_tests": mean_of(tests["scv"], confidence),
+        "scv_claimed": marked(mean_of(tests["scv"], confidence), settled=row["settled"]),
         "gain_claimed": marked(ratio_of_means(tests["nade"], tests["scv"], confidence), settled=row["settled"]),
         "gain_true": ratio_of_variances(rates["nade"], rates["scv"], confidence),
         "difference": max((each["difference"] for each in rows if each["difference"] is not None), default=None),
@@ -178,9 +147,16 @@ MISSED = 1e-3
 
 
 def true_tests(rates: FloatArray, reference: float | None, per_relvar: float) -> dict[str, Any]:
-    """Tests by the spread of repeated estimates around a known rate."""
+    """Tests by the spread of repeated estimates around a known rate, with two standard errors as if it were normal.
+
+    Where the mean of the estimates is below that, what has not occurred in any campaign is missing from the spread,
+    too: it is a lower limit.
+    """
     if reference is None or len(rates) < 2:
         return figure(None)
     errors = rates / reference - 1.0
-    missed = ttest_1samp(errors, 0.0, alternative="less").pvalue < MISSED
-    return scaled(scattered(float(np.mean(errors**2)), len(errors), bool(missed)), per_relvar)
+    tests = per_relvar * float(np.mean(errors**2))
+    if ttest_1samp(errors, 0.0, alternative="less").pvalue < MISSED:
+        return figure(None, tests)
+    error = 2.0 * tests * math.sqrt(2.0 / len(errors))
+    return figure(tests, max(tests - error, 0.0), tests + error)

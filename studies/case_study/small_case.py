@@ -42,7 +42,7 @@ from harness.vocabulary import (
     RecordArray,
 )
 from studies.case_study.counted import Claims
-from studies.case_study.figures import exactly, is_settled, marked, mean_of, range_of, tests_for
+from studies.case_study.figures import covered, exactly, is_settled, marked, mean_of, range_of, tests_for
 from studies.case_study.study import Context, SmallCase
 from studies.work import write_table
 
@@ -271,13 +271,11 @@ def claims_of_setting(
     for name, found in claimed.items():
         rates = [each[f"{name}_rate"] for each in many]
         errors = [(rate["value"] or 0.0) / world.crash_rate - 1.0 for rate in rates]
-        # The interval of no crash holds nothing.
-        covers = [rate["value"] is not None and rate["low"] <= world.crash_rate <= rate["high"] for rate in rates]
         row |= {
             f"{name}_claimed_once": once[f"{name}_tests"],
             f"{name}_claimed": marked(found, settled=means_something),
             f"{name}_repeated": tests_for(n * float(np.mean(np.square(errors))), step.rhw, confidence),
-            f"{name}_covers": float(np.mean(covers)),
+            f"{name}_covers": covered(rates, world.crash_rate),
         }
     return row
 

@@ -20,15 +20,13 @@ from harness.estimators.estimate import finite_json
 from harness.progress import Progress
 from harness.records.folder import read_as, sole_use, write_json
 from harness.resolved import resolve
-from harness.traffic.loading import load_parameters
 from studies.case_study.counted import compare_control_variates, count_required_tests, draw_convergence
 from studies.case_study.page import write_page
-from studies.case_study.repeated import replicate, test_variants, variants_of
+from studies.case_study.repeated import test_variants, variants_of
 from studies.case_study.small_case import answer_small_case
 from studies.case_study.study import FILES, Context, Made, Step, Study, inputs_of
 from studies.case_study.tested import keep_run, test_in_twin
 from studies.case_study.theorems import check_theorems
-from studies.replication.experiment import load_experiment
 from studies.work import sources_of
 
 RESULT = "result.json"
@@ -38,7 +36,6 @@ _MAKERS: dict[str, Callable[[Any, Context], dict[str, Any]]] = {
     "convergence": draw_convergence,
     "control_variates": compare_control_variates,
     "required_tests": count_required_tests,
-    "replications": replicate,
     "variants": test_variants,
     "theorems": check_theorems,
     "small_case": answer_small_case,
@@ -114,8 +111,4 @@ def _content(step: Step) -> Any:
     if step.kind == "variants":
         forms = [*variants_of(step).items(), *variants_of(step, shells=True).items()]
         return [(name, one.model_dump(mode="json", exclude={"run"}), resolve(one).content_hash) for name, one in forms]
-    if step.kind == "replications":
-        experiment = load_experiment(Path(step.experiment), step.set)
-        parameters = load_parameters(experiment.campaign.environment).content_hash()
-        return experiment.model_dump(mode="json"), parameters
     return None

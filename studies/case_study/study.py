@@ -68,14 +68,6 @@ class RequiredNumbers(Section):
     scv_ratio: float = Field(1.5, gt=1.0, description="from one look of it to the next")
 
 
-class Replications(Section):
-    """A whole campaign repeated, as `python -m studies validate` does, to see what estimates truly scatter by."""
-
-    kind: Literal["replications"]
-    experiment: str = Field(description="experiment file, relative to the study's, of one vehicle or chain")
-    set: Overrides = _OVERRIDES
-
-
 class Variants(Section):
     """One campaign with other vehicles or settings: what NADE and SCV claim of each, and shells beside it."""
 
@@ -125,7 +117,7 @@ class SmallCase(Section):
 
 
 Step = Annotated[
-    TwinTests | Run | Variants | Convergence | ControlVariates | RequiredNumbers | Replications | Theorems | SmallCase,
+    TwinTests | Run | Variants | Convergence | ControlVariates | RequiredNumbers | Theorems | SmallCase,
     Field(discriminator="kind"),
 ]
 
@@ -185,7 +177,7 @@ class Study(Section):
         return self
 
 
-FILES = ("campaign", "experiment", "shells")
+FILES = ("campaign", "shells")
 
 
 def inputs_of(step: Step) -> list[tuple[str, str]]:

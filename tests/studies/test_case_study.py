@@ -186,6 +186,7 @@ def test_variants_are_tested_on_the_same_traffic(made):
     assert same["difference"] < 1e-12
     assert (low["true"]["value"], high["variant"]) == (None, "ε = 0.9")  # misses what carries the rate, and shows it
     assert 0.3 < high["true"]["value"] / high["claimed"]["value"] < 3.0
+    assert high["covers"]["nade"] >= high["covers"]["scv"]
     assert 0.3 < high["rnot"]["value"] / high["claimed"]["value"] < 3.0
     assert (recursive["scv_tests"]["value"], recursive["gain_claimed"]["value"]) == (None, None)
     assert recursive["nade_tests"] < same["nade_tests"]
