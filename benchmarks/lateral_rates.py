@@ -16,10 +16,10 @@ import numpy as np
 
 from harness.campaign.sections import EnvironmentSettings, PoolSettings
 from harness.pool.build import take_aim
-from harness.pool.library import load_library
 from harness.pool.walk import PILOT_PATHS
 from harness.progress import Progress
 from harness.traffic.loading import load_environment
+from harness.vehicles.library import load_library
 
 LIBRARY = Path(__file__).parent / "lateral_rows.yaml"
 PAPER, LATERAL = "ndd-overtaking-1", "ndd-overtaking-1-lateral"

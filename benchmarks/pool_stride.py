@@ -12,10 +12,10 @@ from __future__ import annotations
 import time
 
 from harness import load_campaign
-from harness.pool.library import load_library
 from harness.pool.walk import PILOT_PATHS, Enumerator
 from harness.progress import Progress
 from harness.traffic.loading import load_environment
+from harness.vehicles.library import load_library
 
 PATHS = 8192
 STRIDES = (1, 2, 3, 4, 6, 8)
@@ -28,7 +28,7 @@ def main() -> None:
     environment, library = load_environment(campaign.environment), load_library(campaign.pool.library)
     names = list(library.surrogates)
     before = names[: names.index(library.boundary) + 1]
-    followers = library.followers_in(environment)
+    followers = library.followers(environment.lateral.present)
     pilot = Enumerator(environment, followers, SEED)
     pilot_rates = pilot.run(0, PILOT_PATHS, Progress()).rates(len(names))[:, : len(before)]
     print("stride  ms/path  cost  " + "  ".join(before))

@@ -7,10 +7,10 @@ from functools import cached_property
 
 from harness.campaign.campaign import Campaign
 from harness.campaign.combinations import Command, require_combination
-from harness.pool.library import Library, load_library
 from harness.traffic.laws import Environment
 from harness.traffic.loading import load_environment, load_parameters
 from harness.vehicles.drivers import av_records, driver_records
+from harness.vehicles.library import Library, load_library
 from harness.vocabulary import RecordArray
 
 

@@ -29,7 +29,7 @@ from harness.campaign.files import load_campaign
 from harness.compiled import compiled_threads, unboxed
 from harness.episode.cells import Results
 from harness.episode.loop import MOMENT_LIMITS, Drawing, EpisodeLoop, RecordPolicy
-from harness.episode.path import Followers, Trajectory, empty_trajectory, who_crashes
+from harness.episode.path import Trajectory, empty_trajectory, who_crashes
 from harness.errors import CampaignError, HarnessError, RunFolderError
 from harness.estimators.block import EPISODE_COLUMNS, Block, block_from_tables
 from harness.estimators.estimate import finite_json
@@ -44,6 +44,7 @@ from harness.records.reader import read_shard
 from harness.resolved import Resolved, resolve
 from harness.runner.prepare import prepare
 from harness.traffic.laws import Environment, InitialStates
+from harness.vehicles.drivers import Followers
 from harness.vocabulary import BV_LV_CONTACT, CRASH, RUNNING, BoolArray, FloatArray, IntArray, Method
 from harness.worlds.twin import TwinWorld
 
@@ -108,7 +109,9 @@ def surrogates_crash(episodes: pa.Table, resolved: Resolved, pool: Pool) -> Bool
             "changing and hold time",
             "Leave the pool out: the right one is built, which takes about 15 s.",
         )
-    crashes = drivers_crash(episodes, resolved.campaign.seed, environment, pool.library.followers_in(environment))
+    crashes = drivers_crash(
+        episodes, resolved.campaign.seed, environment, pool.library.followers(environment.lateral.present)
+    )
     return crashes[:, [names.index(name) for name in pool.names]]
 
 

@@ -17,7 +17,7 @@ from harness.random_stream import BV_DRAWS, BV_FREE_DRAWS, LV_DRAWS, uniform
 from harness.traffic import laws
 from harness.traffic.lateral import onset_of, perceived_in
 from harness.traffic.laws import Environment, acceleration
-from harness.vehicles.drivers import NEED_BASED_KIND
+from harness.vehicles.drivers import MOST_FOLLOWERS, NEED_BASED_KIND, Followers
 from harness.vehicles.kinematics import CONTACT_M, STEP_S, VEHICLE_LENGTH_M, gap, next_position, next_speed, overlaps
 from harness.vehicles.references import Memory, react
 from harness.vocabulary import (
@@ -36,8 +36,6 @@ from harness.vocabulary import (
 
 AV_START_M = 100.0
 NO_CRASH, WAS_AHEAD, FOLLOWS = -1, -2, -3
-MOST_FOLLOWERS = 62
-"""Whether they crash are bits of one integer."""
 SAFE_M = 0.01
 """A gap that no rounding of positions makes a contact."""
 FOLLOWER_DTYPE = np.dtype(
@@ -66,17 +64,6 @@ class Trajectory(NamedTuple):
     v_after: FloatArray
     slowest: FloatArray
     follower: RecordArray
-
-
-class Followers(NamedTuple):
-    """Drivers (D,) to be put in the AV's place: at most `MOST_FOLLOWERS`, without inattention.
-
-    ``envelope`` is the place of the one that crashes wherever another one does: where it does not, nobody else is
-    asked; -1 for none.
-    """
-
-    drivers: RecordArray
-    envelope: int = -1
 
 
 def lengths(environment: Environment) -> tuple[int, int, int]:

@@ -13,7 +13,6 @@ from harness.campaign.sections import PoolSettings
 from harness.compiled import WORLD_SOURCES, cache_root, source_hash
 from harness.errors import RunFolderError
 from harness.pool.cut_ins import FORMAT, CutIns, Pool, environment_hash, read_pool, write_pool
-from harness.pool.library import Library
 from harness.pool.shells import cells_of, conservative_first, shells_of
 from harness.pool.walk import PILOT_PATHS, EnumeratedPaths, Enumerator, write_script
 from harness.progress import Progress
@@ -21,6 +20,7 @@ from harness.random_stream import DIAGNOSTIC, uniforms
 from harness.records.folder import require_place
 from harness.resolved import Resolved
 from harness.traffic.laws import Environment
+from harness.vehicles.library import Library
 from harness.vocabulary import BoolArray, FloatArray, Int8Array, IntArray
 
 ROUND_PATHS = 1024
@@ -116,7 +116,7 @@ class Aim:
 def take_aim(environment: Environment, library: Library, settings: PoolSettings, progress: Progress) -> Aim:
     """Find out by a pilot run of naturalistic paths where surrogates crash."""
     names = list(library.surrogates)
-    pilot = Enumerator(environment, library.followers_in(environment), settings.seed ^ POOL_SEED)
+    pilot = Enumerator(environment, library.followers(environment.lateral.present), settings.seed ^ POOL_SEED)
     progress.stage("pool: pilot", PILOT_PATHS)
     rates = pilot.run(0, PILOT_PATHS, progress).rates(len(names))
     aim = Aim(pilot, rates, _conservative(rates, names.index(library.boundary)))

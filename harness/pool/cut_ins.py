@@ -17,11 +17,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from harness.errors import RunFolderError
-from harness.pool.library import Library
 from harness.pool.walk import PILOT_PATHS
 from harness.records.folder import write_atomically
 from harness.records.schemas import prefixes, rows
 from harness.traffic.laws import Environment
+from harness.vehicles.library import Library
 from harness.vocabulary import (
     STATE_COLUMNS,
     BoolArray,

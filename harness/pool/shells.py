@@ -20,9 +20,9 @@ from harness.campaign.sections import ShellSettings, StatementSettings
 from harness.campaign.vehicle import AutomatedVehicle
 from harness.episode.cells import PrescribedCutIns, PrescribedTraffic
 from harness.pool.cut_ins import Pool
-from harness.pool.library import Library, library_records
 from harness.strata import FAILED_BASELINE, OUTSIDE, Reference, ShellDesign, Statement
 from harness.traffic.laws import Environment
+from harness.vehicles.library import Library, library_records
 from harness.vocabulary import FloatArray, Int8Array, IntArray, RecordArray
 
 _REFERENCES = {"r157-cc": "a careful and competent driver", "r157-fsm": "a driver by the fuzzy safety model"}
@@ -150,7 +150,7 @@ def _statements(pool: Pool, shells: ShellSettings, groups: list[list[int]]) -> t
 def checked_boundary(library: Library, design: ShellDesign, environment: Environment) -> RecordArray:
     """The driver that a vehicle is compared with in each test, shape (1,); (0,) if no statement is checked."""
     models = [] if design.checked is None else [library.surrogates[design.checked.boundary]]
-    return library_records(models, environment)
+    return library_records(models, environment.lateral.present)
 
 
 def cells_in_strata(pool: Pool, groups: list[list[int]]) -> tuple[IntArray, IntArray, IntArray]:

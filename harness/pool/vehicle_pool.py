@@ -26,7 +26,6 @@ from harness.episode.judge import motion_hashes
 from harness.errors import HarnessError
 from harness.pool.build import POOL_SEED, ROUND_PATHS, campaign_pool_key, pool_of, take_aim
 from harness.pool.cut_ins import Pool
-from harness.pool.library import Library
 from harness.pool.shells import conservative_first
 from harness.pool.walk import PILOT_PATHS, BaselineRuns, EnumeratedPaths, contributions, enumerate_cut_ins
 from harness.progress import Progress
@@ -34,6 +33,7 @@ from harness.random_stream import DIAGNOSTIC, uniforms
 from harness.records.folder import require_place, write_atomically
 from harness.resolved import Resolved
 from harness.traffic.laws import Environment
+from harness.vehicles.library import Library
 from harness.vocabulary import FloatArray, IntArray, RecordArray
 
 CANDIDATES = 32_768
@@ -160,7 +160,7 @@ def vehicle_pool(resolved: Resolved, paths: BaselinePaths, runs: BaselineRuns) -
     Raises `HarnessError`: no cut-in was found on which even the envelope crashes.
     """
     environment, library = resolved.environment, resolved.library
-    followers = library.followers_in(environment)
+    followers = library.followers(environment.lateral.present)
     found = enumerate_cut_ins(paths.seed, paths.index, paths.state, environment, followers, runs)
     if not found.crashes.any():
         failed = f" ({n:,} of them failed)" if (n := int(runs.failed.sum())) else ""

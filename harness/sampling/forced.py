@@ -8,14 +8,13 @@ from harness.episode.cells import PrescribedTraffic
 from harness.episode.decide import CUT_IN_DRAW
 from harness.episode.judge import motion_hashes
 from harness.episode.loop import EpisodeLoop, Shard
-from harness.episode.path import Followers
 from harness.pool.cut_ins import onset_steps
 from harness.pool.walk import enumerate_cut_ins, write_script
 from harness.random_stream import CUT_IN, uniforms
 from harness.sampling.baseline import recorded, without_cut_in
 from harness.sampling.protocol import ShardRequest, Source
 from harness.traffic.laws import Environment
-from harness.vehicles.drivers import driver_records
+from harness.vehicles.drivers import Followers, driver_records
 from harness.vocabulary import RecordArray
 
 AT_ONCE = 1000

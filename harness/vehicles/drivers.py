@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -37,6 +38,9 @@ CAREFUL_COMPETENT_KIND, FUZZY_SAFETY_KIND, NEED_BASED_KIND = -1, -2, -3
 SMALLEST_GAP_M = 0.1
 """Gap below which the models see this gap: they divide by it."""
 
+MOST_FOLLOWERS = 62
+"""Whether they crash are bits of one integer."""
+
 _COMMON = ("min_acceleration_mps2", "max_acceleration_mps2")
 _IDM = ("acceleration_mps2", "comfortable_deceleration_mps2", "time_headway_s", "minimum_gap_m", "desired_speed_mps")
 _FVDM = ("kappa_per_s", "lambda_per_s", "max_speed_mps", "v1", "v2", "c1_per_m", "c2")
@@ -53,6 +57,17 @@ DRIVER_DTYPE = np.dtype(
     + [(name, np.float64) for name in (*_COMMON, *_IDM, *_FVDM, *_REACTION)]
     + [(name, np.float64) for name in (*_REFERENCE, *_CAREFUL_COMPETENT, *_FUZZY_SAFETY, *_NEED_BASED)]
 )
+
+
+class Followers(NamedTuple):
+    """Drivers (D,) to be put in the AV's place: at most `MOST_FOLLOWERS`, without inattention.
+
+    ``envelope`` is the place of the one that crashes wherever another one does: where it does not, nobody else is
+    asked; -1 for none.
+    """
+
+    drivers: RecordArray
+    envelope: int = -1
 
 
 def driver_records(

@@ -34,11 +34,9 @@ from harness.controllers.find import build_host, require_controller
 from harness.episode.cells import PrescribedTraffic
 from harness.episode.judge import motion_hashes
 from harness.episode.loop import Drawing, EpisodeLoop, RecordPolicy
-from harness.episode.path import Followers
 from harness.errors import CampaignError, HarnessError
 from harness.importance.functions import build_importance
 from harness.pool.cut_ins import environment_hash, onset_steps
-from harness.pool.library import Library
 from harness.pool.shells import acceleration_limit
 from harness.pool.vehicle_pool import CANDIDATES, BaselinePaths, walk_candidates
 from harness.pool.walk import PILOT_PATHS, STRIDE, BaselineRuns, Enumerator, enumerate_cut_ins, write_script
@@ -46,7 +44,8 @@ from harness.progress import Progress
 from harness.resolved import Resolved, resolve
 from harness.sampling.baseline import recorded, without_cut_in
 from harness.traffic.laws import Environment
-from harness.vehicles.drivers import driver_records
+from harness.vehicles.drivers import Followers, driver_records
+from harness.vehicles.library import Library
 from harness.vocabulary import CRASH, BoolArray, FloatArray, IntArray, RecordArray
 from harness.worlds.twin import TwinWorld
 from studies.work import sources_of, write_table
@@ -346,7 +345,7 @@ def walk_paths(
     """
     code = require_controller(campaign), source_hash(_SOURCES), sources_of("replication/populations.py")
     resolved = resolve(campaign)
-    drivers = resolved.library.followers_in(resolved.environment).drivers.tolist()
+    drivers = resolved.library.followers(resolved.environment.lateral.present).drivers.tolist()
     asked = drivers, campaign.av.identity(), *code, campaign.seed, seed, n_paths
 
     def walked() -> SuperPopulation:
@@ -378,7 +377,7 @@ def _walk(campaign_json: str, first: int, paths: BaselinePaths) -> SuperPopulati
     runs = recorded(without_cut_in(loop, paths.seed, first, paths.index, paths.state, environment), environment)
     _require_none_failed(resolved, int(runs.failed.sum()), len(paths), "shadow runs")
     offset = np.random.default_rng([paths.seed, first]).integers(0, STRIDE, len(paths))
-    where = paths.seed, paths.index, paths.state, environment, library.followers_in(environment)
+    where = paths.seed, paths.index, paths.state, environment, library.followers(environment.lateral.present)
     probability, bits, _ = enumerate_cut_ins(*where, runs, STRIDE, offset)
     mass = probability * paths.weight[:, None]
     row, step = np.nonzero(mass > 0.0)

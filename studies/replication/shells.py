@@ -28,10 +28,10 @@ from harness.estimators.shells import Shells
 from harness.estimators.stopping import PairRule, RoundRule
 from harness.estimators.tally import Tally
 from harness.pool.cut_ins import CutIns, Pool
-from harness.pool.library import Library
 from harness.pool.shells import cells_in_strata, design_shells, outermost, shells_in_strata, shells_of
 from harness.sampling.shells import PairRounds, ShellRounds
 from harness.strata import LIBRARY_STATEMENT, ShellDesign
+from harness.vehicles.library import Library
 from harness.vocabulary import CRASH as CRASHED
 from harness.vocabulary import FAILED, TIMEOUT, BoolArray, FloatArray, IntArray
 from studies.replication.experiment import Adversary

@@ -9,11 +9,11 @@ from functools import partial
 from itertools import permutations
 
 from harness.campaign.campaign import Campaign
-from harness.pool.library import Library, load_library
 from harness.pool.shells import acceleration_limit
 from harness.progress import Progress
 from harness.strata import LIBRARY_STATEMENT
 from harness.traffic.loading import load_environment
+from harness.vehicles.library import Library, load_library
 from harness.vocabulary import FloatArray
 from studies.chains.chain import CHAINS
 from studies.chains.shells import ChainShells

@@ -9,13 +9,13 @@ import pytest
 
 from harness.campaign.campaign import Campaign
 from harness.campaign.files import load_campaign
-from harness.episode.path import Followers
 from harness.pool.build import campaign_pool
 from harness.pool.cut_ins import Pool
 from harness.pool.walk import enumerate_cut_ins
 from harness.resolved import resolve
 from harness.traffic.laws import Environment, InitialStates
 from harness.traffic.loading import load_environment
+from harness.vehicles.drivers import Followers
 from tests.chains.seed import SEED
 
 MIXTURE_FILE = Path(__file__).parents[2] / "scenarios" / "overtaking_mixture.yaml"
@@ -40,7 +40,7 @@ def pool(campaign) -> Pool:
 def enumerated(library, environment: Environment, n: int, *, enclosed=True, stride=1, offset=0):
     """Probability of each cut-in of n paths, and who crashes on it; with or without an envelope that is asked first."""
     states, offsets = InitialStates(environment.numbers).draw(SEED, 0, n), np.full(n, offset)
-    followers = library.followers_in(environment)
+    followers = library.followers(environment.lateral.present)
     asked = environment, followers if enclosed else Followers(followers.drivers)
     found = enumerate_cut_ins(SEED, np.arange(n), states, *asked, stride=stride, offset=offsets)
     return found.probability, found.crashes

@@ -12,11 +12,11 @@ from harness.campaign.sections import PoolSettings
 from harness.errors import RunFolderError
 from harness.pool.build import build_pool, cached_pool, campaign_pool, campaign_pool_key, pool_path
 from harness.pool.cut_ins import read_pool, write_pool
-from harness.pool.library import load_library
 from harness.pool.shells import Draw, PrescribedEpisodes, design_shells
 from harness.pool.walk import NATURALISTIC_SHARE, STRIDE, Enumerator, aimed_points, fit_proposal
 from harness.resolved import resolve
 from harness.strata import STORED_DESIGN
+from harness.vehicles.library import load_library
 from tests.chains.seed import SEED
 from tests.pool.conftest import MIXTURE_FILE, SMALL_POOL, enumerated
 

@@ -11,12 +11,12 @@ from harness.episode.loop import Drawing, EpisodeLoop, RecordPolicy
 from harness.importance.functions import build_importance
 from harness.pool.build import campaign_pool
 from harness.pool.cut_ins import read_pool, write_pool
-from harness.pool.library import load_library
 from harness.pool.shells import Draw, PrescribedEpisodes
 from harness.pool.vehicle_pool import vehicle_pool, walk_candidates
 from harness.resolved import resolve
 from harness.sampling.baseline import recorded, without_cut_in
 from harness.traffic.loading import load_environment
+from harness.vehicles.library import load_library
 from harness.vocabulary import CRASH, PASSED
 from harness.worlds.twin import TwinWorld
 from tests.pool.conftest import MIXTURE_FILE, SMALL_POOL, enumerated
@@ -66,7 +66,9 @@ def test_a_prescribed_episode_ends_as_the_pool_says(lateral, lateral_pool, name)
     prescribed = PrescribedEpisodes(lateral, lateral_pool)
     states, traffic, cut_ins = prescribed.episodes(tuple(Draw(s, 0, 60) for s in range(prescribed.design.p.size)))
     environment, rows = load_environment(lateral.environment), cut_ins.row
-    driver = LIBRARY.followers_in(environment).drivers[[*NAMES, *LIBRARY.references].index(name)][None].copy()
+    driver = (
+        LIBRARY.followers(environment.lateral.present).drivers[[*NAMES, *LIBRARY.references].index(name)][None].copy()
+    )
     if name == LIBRARY.envelope:  # it acts from the onset
         driver["perceives_lateral_m"] = 0.0
     policy = Drawing(1, environment, build_importance(lateral, None), driver)

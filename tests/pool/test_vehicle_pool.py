@@ -7,7 +7,6 @@ import pytest
 
 from harness.campaign.files import load_campaign
 from harness.episode.judge import motion_hashes
-from harness.episode.path import Followers
 from harness.errors import HarnessError
 from harness.pool.vehicle_pool import CANDIDATES, EVENLY, chances, vehicle_pool
 from harness.pool.walk import BaselineRuns, Enumerator, enumerate_cut_ins
@@ -15,7 +14,7 @@ from harness.progress import Progress
 from harness.resolved import resolve
 from harness.runner.prepare import prepare
 from harness.sampling.baseline import as_recorded, baseline_requests, run_baseline, without_cut_in
-from harness.vehicles.drivers import driver_records
+from harness.vehicles.drivers import Followers, driver_records
 from harness.vocabulary import CRASH
 from harness.worlds.twin import TwinWorld
 from tests.pool.conftest import MIXTURE_FILE, SMALL_POOL
@@ -51,7 +50,7 @@ def speeds():
 
 def test_a_vehicle_that_holds_its_speed_has_the_cut_ins_of_one_that_holds(environment, campaign):
     """Every bit: same hazards, same probabilities, same crashes, on naturalistic paths."""
-    followers = resolve(campaign).library.followers_in(environment)
+    followers = resolve(campaign).library.followers(environment.lateral.present)
     held = Enumerator(environment, followers, 5, stride=1).run(0, N, Progress())
     steps = np.arange(int(environment.numbers["max_steps"]) + 1)
     v = np.repeat((held.state["v_bv_mps"] - held.state["r2dot_mps"])[:, None], steps.size, 1)

@@ -8,10 +8,10 @@ import pytest
 from harness.campaign.sections import EnvironmentSettings, PoolSettings
 from harness.campaign.vehicle import AutomatedVehicle
 from harness.pool.build import build_pool
-from harness.pool.library import load_library
 from harness.pool.shells import acceleration_limit
 from harness.progress import Progress
 from harness.traffic.loading import load_environment
+from harness.vehicles.library import load_library
 from studies.replication.experiment import Adversary
 from studies.replication.populations import RATE, Drivers, Truths, enumerate_paths
 from studies.replication.shells import Division, campaign_block, equals

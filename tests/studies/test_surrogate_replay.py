@@ -17,7 +17,6 @@ from harness.campaign.drivers import IDMParameters, Reaction
 from harness.campaign.sections import PoolSettings
 from harness.campaign.vehicle import AutomatedVehicle
 from harness.episode.loop import Shard
-from harness.episode.path import Followers
 from harness.errors import RunFolderError
 from harness.estimators.block import Block, block_from_tables
 from harness.importance.functions import mixture_weights
@@ -26,7 +25,7 @@ from harness.pool.cut_ins import Pool
 from harness.records.schemas import episodes_table
 from harness.resolved import resolve
 from harness.runner.prepare import prepare
-from harness.vehicles.drivers import driver_records
+from harness.vehicles.drivers import Followers, driver_records
 from harness.vocabulary import CRASH, BoolArray
 from harness.worlds.twin import TwinWorld
 from studies.alarm import Alarm, KnownRates, drivers_crash, surrogates_crash
@@ -102,7 +101,7 @@ def test_other_draws_after_the_end_do_not_change_what_was_driven(hold_s):
     other = campaign("forced", av=AutomatedVehicle(), acceleration_hold_s=hold_s)
     _, longer = drive(other, 400)
     environment = resolve(one).environment
-    followers = resolve(one).library.followers_in(environment)
+    followers = resolve(one).library.followers(environment.lateral.present)
     short, long = (drivers_crash(paths, one.seed, environment, followers) for paths in (table, longer))
     assert np.count_nonzero(shard.results.episode["outcome"] == CRASH) > 100
     np.testing.assert_array_equal(short, long)

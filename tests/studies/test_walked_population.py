@@ -7,8 +7,8 @@ import pytest
 
 from harness.campaign.campaign import Campaign
 from harness.errors import HarnessError
-from harness.pool.library import load_library
 from harness.progress import Progress
+from harness.vehicles.library import load_library
 from studies.replication.judgement import Subject, judge
 from studies.replication.populations import (
     RATE,

@@ -9,12 +9,13 @@ from harness.campaign.vehicle import AutomatedVehicle
 from harness.compiled import unboxed
 from harness.episode.cells import PrescribedTraffic, drawn_traffic
 from harness.episode.loop import EpisodeLoop, RecordPolicy, Shard
-from harness.episode.path import Followers, empty_trajectory
-from harness.pool.library import load_library
+from harness.episode.path import empty_trajectory
 from harness.pool.replay import Retracing, stored_paths
 from harness.records.schemas import episodes_table
 from harness.resolved import resolve
 from harness.traffic.loading import load_environment
+from harness.vehicles.drivers import Followers
+from harness.vehicles.library import load_library
 from harness.vocabulary import BV_LV_CONTACT, CRASH, CUT_IN, STATE_DTYPE, TIMEOUT
 from harness.worlds.twin import TwinWorld
 from studies.alarm import replay_surrogates
@@ -58,7 +59,7 @@ def test_contact_in_the_step_of_the_cut_in_is_retraced_and_no_surrogate_crashes(
     assert Retracing(resolve(campaign)).check(episodes) == len(STATES)
     crashes = np.full(len(STATES), -1, np.int64)
     stored, room = stored_paths(episodes, campaign.seed), empty_trajectory(environment)
-    followers = Followers(library.followers_in(environment).drivers)
+    followers = Followers(library.followers(environment.lateral.present).drivers)
     assert replay_surrogates(*map(unboxed, (stored, environment, followers, room)), crashes) == -1
     everybody = 2 ** len(library.surrogates) - 1
     assert crashes.tolist()[::2] == [0, everybody]

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from harness.errors import CampaignError
-from harness.pool.library import SHIPPED_FOLDER, load_library
+from harness.vehicles.library import SHIPPED_FOLDER, load_library
 
 SHIPPED = (SHIPPED_FOLDER / "ladder-1.yaml").read_text(encoding="utf-8")
 

@@ -12,11 +12,9 @@ from harness.campaign.drivers import Driver, Reference, Reflexes
 from harness.campaign.files import read_model, shipped_or_own
 from harness.campaign.problems import broken_rule, did_you_mean
 from harness.campaign.sections import Section, ShellSettings, StatementSettings, SurrogateName, checked_statements
-from harness.episode.path import Followers
 from harness.errors import CampaignError
 from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT
-from harness.traffic.laws import Environment
-from harness.vehicles.drivers import driver_records
+from harness.vehicles.drivers import Followers, driver_records
 from harness.vocabulary import RecordArray
 
 SHIPPED_FOLDER = Path(__file__).parent
@@ -37,10 +35,10 @@ class LibraryDriver(Driver):
         return self.parameters.delay_after_cut_in_s + self.reaction.delay_s
 
 
-def library_records(models: Sequence[LibraryDriver], environment: Environment) -> RecordArray:
-    """Drivers of a library as kernels read them in an environment, shape (D,)."""
+def library_records(models: Sequence[LibraryDriver], see_onset: bool) -> RecordArray:
+    """Drivers of a library as kernels read them, shape (D,); ``see_onset`` says that cut-ins take time."""
     parameters, reactions = [model.parameters for model in models], [model.reaction for model in models]
-    return driver_records(parameters, reactions, see_onset=environment.lateral.present)
+    return driver_records(parameters, reactions, see_onset=see_onset)
 
 
 class Library(Section):
@@ -70,9 +68,9 @@ class Library(Section):
         default_factory=dict, description="drivers that the vehicle is compared with; no shell is made of them"
     )
 
-    def followers_in(self, environment: Environment) -> Followers:
+    def followers(self, see_onset: bool) -> Followers:
         """The surrogates and then the references as kernels read them, in the order of the file, D + R of them."""
-        drivers = library_records([*self.surrogates.values(), *self.references.values()], environment)
+        drivers = library_records([*self.surrogates.values(), *self.references.values()], see_onset)
         return Followers(drivers, list(self.surrogates).index(self.envelope))
 
     @property
