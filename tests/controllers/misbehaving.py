@@ -1,5 +1,6 @@
 """Controllers that are the built-in IDM until an episode in which they go wrong, in each in its own way."""
 
+import math
 import os
 import random
 import signal
@@ -37,110 +38,80 @@ class UnprintableError(Exception):
         raise ValueError
 
 
-ANSWERS = {
-    "none": None,
-    "nan": float("nan"),
-    "inf": float("inf"),
-    "string": "fast",
-    "boolean": True,
-    "shape": np.zeros(2).view(Array),
-    "impossible": -99.0,
-    "lies": Lying(-1e6),
+def raises(error):
+    raise error
+
+
+def hangs(seconds=3600):
+    time.sleep(seconds)
+
+
+def hangs_and_swallows():
+    while True:
+        with suppress(Exception):
+            hangs()
+
+
+def hangs_for_good():
+    signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGALRM])
+    hangs()
+
+
+def copies_the_process():
+    """What is left of it keeps the worker's pipe open."""
+    if os.fork() == 0:
+        hangs()
+    return 0.0
+
+
+FAULTS = {
+    "none": lambda: None,
+    "nan": lambda: math.nan,
+    "inf": lambda: math.inf,
+    "string": lambda: "fast",
+    "boolean": lambda: True,
+    "shape": lambda: np.zeros(2).view(Array),
+    "impossible": lambda: -99.0,
+    "lies": lambda: Lying(-1e6),
+    "raises": lambda: raises(ZeroDivisionError("no such thing")),
+    "raises_what_cannot_be_printed": lambda: raises(UnprintableError()),
+    "raises_what_is_no_utf_8": lambda: raises(FileNotFoundError("no file \udce9.csv")),
+    "exits": lambda: sys.exit(5),
+    "interrupts": lambda: raises(KeyboardInterrupt()),
+    "generator_exit": lambda: raises(GeneratorExit()),
+    "copies_the_process": lambda: 0.0 * os.fork(),
+    "copies_the_process_for_good": copies_the_process,
+    "copies_and_ends_the_process": lambda: os._exit(7 + int(copies_the_process())),
+    "hangs": hangs,
+    "hangs_and_swallows": hangs_and_swallows,
+    "hangs_for_good": hangs_for_good,
+    "closes_descriptors": lambda: os.closerange(3, 200) or 0.0,
+    "ends_the_process": lambda: os._exit(7),
+    "crashes": lambda: os.kill(os.getpid(), signal.SIGSEGV),
+    "is_killed": lambda: os.kill(os.getpid(), signal.SIGKILL),
 }
 
 
 class Misbehaving(IDM):
-    """``bad`` maps an episode to what is done in its third step, or in its start if the name says so."""
+    """``bad`` maps an episode to its fault, in its third step or ``_in_start``; a file remembers what is done once."""
 
-    def __init__(self, bad, path=None):
+    def __init__(self, bad, once=None):
         super().__init__()
-        self.bad = bad
-        self.path = path
-        self.calls = 0
+        self.bad, self.once = bad, once
 
     def start(self, episode):
-        self.fault, self.calls = self.bad.get(str(episode.episode)), 0
-        if self.fault is not None and self.fault.endswith("_in_start"):
-            getattr(self, self.fault)()
+        self.fault, _, in_start = self.bad.get(str(episode.episode), "").partition("_in_")
+        self.calls = 0
+        if in_start:
+            FAULTS[self.fault]()
 
-    def step(self, observation):
-        self.calls += observation.bv_overlaps  # not while it is shown what was before
-        if self.fault is not None and self.calls == THIRD_CALL and not self.fault.endswith("_in_start"):
-            answer = ANSWERS[self.fault] if self.fault in ANSWERS else getattr(self, self.fault)()
-            if answer != "drive on":
-                return answer
-        return super().step(observation)
-
-    def raises(self):
-        raise ZeroDivisionError("no such thing")
-
-    def raises_what_cannot_be_printed(self):
-        raise UnprintableError
-
-    def raises_what_is_no_utf_8(self):
-        raise FileNotFoundError("no file \udce9.csv")
-
-    def exits(self):
-        sys.exit(5)
-
-    def hangs(self):
-        time.sleep(3600)
-
-    hangs_in_start = hangs
-
-    def hangs_and_swallows(self):
-        while True:
-            with suppress(Exception):
-                time.sleep(3600)
-
-    def hangs_for_good(self):
-        signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGALRM])
-        time.sleep(3600)
-
-    def interrupts(self):
-        raise KeyboardInterrupt
-
-    def generator_exit(self):
-        raise GeneratorExit
-
-    def copies_the_process(self):
-        os.fork()
-        return 0.0
-
-    def copies_the_process_for_good(self):
-        if os.fork() == 0:
-            time.sleep(3600)
-        return 0.0
-
-    def copies_and_ends_the_process(self):
-        """What is left of it keeps the worker's pipe open."""
-        if os.fork() == 0:
-            time.sleep(3600)
-        os._exit(7)
-
-    def closes_descriptors(self):
-        os.closerange(3, 200)
-        return 0.0
-
-    def ends_the_process(self):
-        os._exit(7)
-
-    ends_the_process_in_start = ends_the_process
-
-    def crashes(self):
-        os.kill(os.getpid(), signal.SIGSEGV)
-
-    def is_killed(self):
-        os.kill(os.getpid(), signal.SIGKILL)
-
-    def is_killed_once(self):
-        """By an operator, say; a file remembers."""
-        try:
-            Path(self.path).touch(exist_ok=False)
-            os.kill(os.getpid(), signal.SIGKILL)
-        except FileExistsError:
-            pass
-        return "drive on"
+    def step(self, seen):
+        self.calls += seen.bv_overlaps  # not while it is shown what was before
+        if self.fault and self.calls == THIRD_CALL and not (self.once and Path(self.once).exists()):
+            if self.once:
+                Path(self.once).touch()
+            return FAULTS[self.fault]()
+        return super().step(seen)
 
 
 class RaisesWhenMade(IDM):
@@ -153,13 +124,11 @@ class HangsWhenMade(IDM):
 
     n_made = 0
 
-    def __init__(self, first=1, swallows=False):
+    def __init__(self, first=1, how="hangs"):
         super().__init__()
         HangsWhenMade.n_made += 1
         while HangsWhenMade.n_made >= first:
-            if swallows:
-                signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGALRM])
-            time.sleep(3600)
+            FAULTS[how]()
 
 
 class StartsPrograms(IDM):
@@ -174,26 +143,18 @@ class StartsPrograms(IDM):
             file.write(f"{started[0].pid}\n")
 
 
-class EndsTheProcess(IDM):
-    """In every call of one name."""
+class Always(IDM):
+    """Commits its fault in every call of one name."""
 
-    end = staticmethod(lambda: os._exit(7))
-
-    def __init__(self, where):
+    def __init__(self, where, how="ends_the_process"):
         super().__init__()
         for name in ("start", "step", "start_batch", "step_batch", "close"):
             if name == where:
-                setattr(self, name, lambda *_: self.end())
+                setattr(self, name, lambda *_: FAULTS[how]())
             elif name.endswith("batch") and where.endswith("batch"):
                 setattr(self, name, lambda *_: None)
         if where == "constructor":
-            self.end()
-
-
-class ClosesDescriptors(EndsTheProcess):
-    """In every call of one name."""
-
-    end = staticmethod(lambda: os.closerange(3, 200))
+            FAULTS[how]()
 
 
 def idm_of_a_function() -> IDM:
@@ -207,19 +168,21 @@ def says_nothing():
 class Prints(IDM):
     def __init__(self):
         super().__init__()
-        print("made, in Python")  # noqa: T201 - what it is for
-        os.write(1, b"made, below Python\n")
+        self.prints("made")
 
     def start(self, episode):
-        print("started, in Python")  # noqa: T201 - what it is for
-        os.write(1, b"started, below Python\n")
+        self.prints("started")
+
+    def prints(self, what):
+        print(f"{what}, in Python")  # noqa: T201 - what it is for
+        os.write(1, f"{what}, below Python\n".encode())
 
 
 class Global(IDM):
     """Draws from a stream of its own."""
 
-    def step(self, observation):
-        return super().step(observation) - 1e-9 * random.random()
+    def step(self, seen):
+        return super().step(seen) - 1e-9 * random.random()
 
 
 class ChangesItsParameters(IDM):
@@ -232,50 +195,33 @@ class ChangesItsParameters(IDM):
 
 
 class RaisesInClose(IDM):
-    def __init__(self, path):
+    def __init__(self, note):
         super().__init__()
-        self.path = Path(path)
+        self.note = note
 
     def close(self):
-        with self.path.open("a") as file:
+        with Path(self.note).open("a") as file:
             file.write("closed\n")
         raise RuntimeError("cannot be closed")
 
 
 class Batch:
-    """A batch controller that returns NaN for one episode, and once an array of the wrong shape."""
+    """Over arrays: NaN for one episode, once an array of the wrong shape, or it writes into what it is handed."""
 
-    def __init__(self, nan=-1, wrong_shape=False):
-        self.nan = nan
-        self.wrong_shape = wrong_shape
+    def __init__(self, nan=-1, wrong_shape=False, overwrites=""):
+        self.nan, self.wrong_shape, self.overwrites = nan, wrong_shape, overwrites
 
     def start_batch(self, cells, episodes, random):
-        pass
+        for name, handed in (("cells", cells), ("episodes", episodes)):
+            if name == self.overwrites:
+                handed[:] = 0
 
-    def step_batch(self, observation):
-        answer = np.where(observation.episode == self.nan, np.nan, 0.0)
-        if self.wrong_shape and observation.bv_overlaps.all():
+    def step_batch(self, seen):
+        if self.overwrites in seen._fields:
+            getattr(seen, self.overwrites)[:] = 0
+        if self.wrong_shape and seen.bv_overlaps.all():
             self.wrong_shape = False
-            return np.zeros((answer.size, 2))
-        return answer
+            return np.zeros((seen.episode.size, 2))
+        return np.where(seen.episode == self.nan, np.nan, 0.0)
 
-    def close(self):
-        pass
-
-
-class BatchThatWrites(Batch):
-    """Brakes harder the higher the speed, and then writes into what it was handed."""
-
-    def __init__(self, field):
-        super().__init__()
-        self.field = field
-
-    def start_batch(self, cells, episodes, random):
-        if self.field in ("cells", "episodes"):
-            {"cells": cells, "episodes": episodes}[self.field][:] = 0
-
-    def step_batch(self, observation):
-        answer = -0.1 * observation.speed_mps
-        if self.field in observation._fields:
-            getattr(observation, self.field)[:] = 0
-        return answer
+    def close(self): ...

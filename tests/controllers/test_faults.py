@@ -4,25 +4,18 @@ import json
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 
-from harness.campaign.files import load_campaign
 from harness.cli import main
 from harness.controllers.find import build_host
 from harness.errors import EXIT_BAD_INPUT, EXIT_DONE, EXIT_TOO_MANY_FAILED
-from harness.resolved import resolve
-from harness.runner.look import plan_campaign
-from harness.runner.prepare import prepare
 from harness.runner.workers import LocalWorkers
-from harness.worlds.twin import TwinWorld
+from tests.controllers.driving import drive, forced
 from tests.controllers.misbehaving import ChangesItsParameters
+from tests.stored_runs import sets, stored_table
 
-ROOT = Path(__file__).parents[2]
 SMALL = """\
 name: faults
-testing: {method: forced}
 world: {engine: twin, cells: 40}
 records: {moments: none}
 stop: {episodes: 400}
@@ -33,31 +26,30 @@ LATE = "no answer within 0.2 s (av.limits.step_time_s)"
 LATE_MADE = "no answer within 0.2 s (av.limits.construction_time_s)"
 
 
-@pytest.fixture(autouse=True)
-def _in_the_checkout(monkeypatch):
-    monkeypatch.chdir(ROOT)
-    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+def _main(command, folder, av, *more, testing="testing: {method: forced}"):
+    """Exit code of a command with the small campaign."""
+    (folder / "c.yaml").write_text(f"{testing}\n{SMALL}")
+    words, *options = command.split()
+    out = ["--out", str(folder / "run"), "--workers", "1"] if words == "run" else []
+    return main([words, str(folder / "c.yaml"), *options, *out, *sets(f"av={av}", *more)])
 
 
 def _run(folder, av, *more):
-    (folder / "c.yaml").write_text(SMALL)
-    changes = [word for change in (f"av={av}", *more) for word in ("--set", change)]
-    return main(["run", str(folder / "c.yaml"), "--out", str(folder / "run"), "--workers", "1", *changes])
+    return _main("run", folder, av, *more)
+
+
+def _of(name, more="", **parameters):
+    """YAML of an AV that misbehaves."""
+    return f"{{controller: 'tests.controllers.misbehaving:{name}', parameters: {json.dumps(parameters)}{more}}}"
 
 
 def _misbehaving(bad, more="", **parameters):
-    """YAML of an AV whose episodes misbehave as ``bad`` says."""
-    parameters = json.dumps({"bad": {str(episode): fault for episode, fault in bad.items()}, **parameters})
-    return f"{{controller: 'tests.controllers.misbehaving:Misbehaving', parameters: {parameters}{more}}}"
-
-
-def _other(name, parameters="{}"):
-    return f"{{controller: 'tests.controllers.misbehaving:{name}', parameters: {parameters}}}"
+    """Of one whose episodes misbehave as ``bad`` says."""
+    return _of("Misbehaving", more, bad={str(episode): fault for episode, fault in bad.items()}, **parameters)
 
 
 def _episodes(folder):
-    shards = sorted((folder / "run/episodes").glob("*.parquet"))
-    return pa.concat_tables([pq.read_table(shard) for shard in shards]).to_pylist()
+    return stored_table(folder / "run", "episodes").to_pylist()
 
 
 @pytest.fixture(scope="module")
@@ -118,187 +110,124 @@ def test_a_fault_ends_its_episode_and_changes_no_other(faults, tmp_path, undistu
     assert headline["details"]["crash_rate_if_failed_had_crashed"] > headline["crash_rate"]
 
 
-def test_a_worker_killed_from_outside_is_not_the_controllers_fault(tmp_path, undisturbed):
-    av = _misbehaving({57: "is_killed_once"}, path=str(tmp_path / "killed"))
-    assert _run(tmp_path, av) == EXIT_DONE
-    assert (tmp_path / "killed").exists()
+NO_FAULT = {
+    "a worker killed from outside": (_misbehaving({57: "is_killed"}, once="NOTE"), 0),
+    "a function that says which controller it makes": (_of("idm_of_a_function"), None),
+    "close raises": (_of("RaisesInClose", note="NOTE"), 40),
+    "close ends the process": (_of("Always", where="close"), None),
+}
+
+
+@pytest.mark.parametrize(("av", "noted"), NO_FAULT.values(), ids=NO_FAULT)
+def test_what_is_no_fault_of_an_episode_changes_none(av, noted, tmp_path, undisturbed):
+    note = tmp_path / "note"
+    assert _run(tmp_path, av.replace("NOTE", str(note))) == EXIT_DONE
     assert _episodes(tmp_path) == undisturbed
+    assert noted is None or note.read_text().count("closed") >= noted
 
 
-def test_too_many_failures_end_the_campaign(tmp_path, capsys):
+@pytest.mark.parametrize(("episodes", "n", "share"), [(400, 200, 0.005), (40, 40, 0.04)])
+def test_too_many_failures_are_no_answer(episodes, n, share, tmp_path, capsys):
+    """They end a campaign halfway; one with fewer tests than that takes has no answer either."""
     av = _misbehaving({5: "raises", 6: "raises"})
-    assert _run(tmp_path, av, "run.max_failed_share=0.005") == EXIT_TOO_MANY_FAILED
+    assert _run(tmp_path, av, f"stop.episodes={episodes}", f"run.max_failed_share={share}") == EXIT_TOO_MANY_FAILED
     err = capsys.readouterr().err
     assert "run.max_failed_share" in err
-    assert "2 of 200 episodes failed, 2 of them with: step: ZeroDivisionError: no such thing" in err
-
-
-def test_too_many_failures_of_a_short_campaign_are_no_answer_either(tmp_path, capsys):
-    """Fewer tests than it takes to end a campaign halfway."""
-    bad, short = {5: "raises", 6: "ends_the_process"}, ("stop.episodes=40", "run.max_failed_share=0.04")
-    assert _run(tmp_path, _misbehaving(bad), *short) == EXIT_TOO_MANY_FAILED
-    assert "2 of 40 episodes failed" in capsys.readouterr().err
+    assert f"2 of {n} episodes failed, 2 of them with: step: ZeroDivisionError: no such thing" in err
     assert not (tmp_path / "run/estimates.json").exists()
-    assert _run(tmp_path, _misbehaving(bad), *short[:1], "run.max_failed_share=0.05", "name=again") == EXIT_BAD_INPUT
+
+
+HANGS = ", limits: {construction_time_s: 0.2}"
+POPEN = "{controller: 'subprocess:Popen', parameters: {args: touch called, shell: true}}"
+REFUSED = [
+    ("{controller: 'no_such_module:X'}", "av.controller", "cannot be imported"),
+    (_of("X"), "av.controller", "no class X"),
+    (_of("RaisesWhenMade"), "av.controller", "RuntimeError: no licence"),
+    (_of("RaisesInClose", pth="x"), "av.parameters", "pth"),
+    (_of("HangsWhenMade", HANGS), "av.controller", LATE_MADE),
+    (_of("HangsWhenMade", HANGS, how="hangs_for_good"), "av.controller", f"{LATE_MADE}, and the call could not be in"),
+    (_of("Always", where="constructor"), "av.controller", "the controller ended the worker process (exit code 7), in "),
+    (_of("Always", where="constructor", how="closes_descriptors"), "av.controller", "closed file descriptors"),
+    (_of("says_nothing"), "av.controller", "without start, step, close"),
+    (POPEN, "av.controller", "Popen without start, step, close"),
+]
+SETTINGS = [
+    ("{boundary: foo}", "testing.shells.boundary"),
+    ("{statement: foo}", "testing.shells.statement"),
+    ("{statements: {a: {boundary: foo}}}", "testing.shells.statements.a.boundary"),
+]
 
 
 @pytest.mark.parametrize(
-    ("change", "where", "words"),
-    [
-        ("av={controller: 'no_such_module:X'}", "av.controller", "cannot be imported"),
-        ("av={controller: 'tests.controllers.misbehaving:X'}", "av.controller", "no class X"),
-        (f"av={_other('RaisesWhenMade')}", "av.controller", "RuntimeError: no licence"),
-        (f"av={_other('RaisesInClose', '{pth: x}')}", "av.parameters", "pth"),
-        (f"av={_other('HangsWhenMade', '{}, limits: {construction_time_s: 0.2}')}", "av.controller", LATE_MADE),
-        (
-            f"av={_other('HangsWhenMade', '{swallows: true}, limits: {construction_time_s: 0.2}')}",
-            "av.controller",
-            f"{LATE_MADE}, and the call could not be interrupted, in its constructor",
-        ),
-        (f"av={_other('says_nothing')}", "av.controller", "without start, step, close"),
-        (
-            "av={controller: 'subprocess:Popen', parameters: {args: touch called, shell: true}}",
-            "av.controller",
-            "Popen",
-        ),
-        ("testing={method: shells, shells: {boundary: foo}}", "testing.shells.boundary", "foo"),
-        ("testing={method: shells, shells: {statement: foo}}", "testing.shells.statement", "foo"),
-        (
-            "testing={method: shells, shells: {statements: {a: {boundary: foo}}}}",
-            "testing.shells.statements.a.boundary",
-            "foo",
-        ),
-    ],
+    ("av", "testing", "where", "words"),
+    [(av, "", where, words) for av, where, words in REFUSED]
+    + [("{model: idm}", f"testing: {{method: shells, shells: {shells}}}", where, "foo") for shells, where in SETTINGS],
 )
-def test_check_refuses_what_run_refuses(change, where, words, tmp_path, capsys):
-    (tmp_path / "c.yaml").write_text(SMALL.replace("testing: {method: forced}\n", ""))
+def test_check_refuses_what_run_refuses_and_makes_nothing_but_controllers(av, testing, where, words, tmp_path, capsys):
     complaints = []
-    for command in (["check"], ["run", "--out", str(tmp_path / "run")]):
-        assert main([*command, str(tmp_path / "c.yaml"), "--set", change]) == EXIT_BAD_INPUT
+    for command in ("check", "run", "av-check") if words.startswith("Popen") else ("check", "run"):
+        assert _main(command, tmp_path, av, testing=testing) == EXIT_BAD_INPUT
         complaints.append(capsys.readouterr())
-    assert complaints[0] == complaints[1]
+    assert set(complaints) == {complaints[0]}
     assert complaints[0].err.startswith(f"error: {where}\n")
     assert words in complaints[0].err
     assert not (tmp_path / "run").exists()
     assert not Path("called").exists()
 
 
-def test_av_check_makes_nothing_but_a_controller(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    Path("c.yaml").write_text(SMALL)
-    av = "{controller: 'subprocess:Popen', parameters: {args: touch called, shell: true}}"
-    assert main(["av-check", "c.yaml", "--set", f"av={av}"]) == EXIT_BAD_INPUT
-    assert "Popen without start, step, close" in capsys.readouterr().err
-    assert not Path("called").exists()
-
-
-def test_a_function_may_say_which_controller_it_makes(tmp_path, undisturbed):
-    assert _run(tmp_path, _other("idm_of_a_function")) == EXIT_DONE
-    assert _episodes(tmp_path) == undisturbed
-
-
 def test_a_constructor_has_a_time_limit_of_its_own_in_tests_too(tmp_path):
     """The first of a process, that says whether there is a controller at all, is made in time."""
-    limits = "limits: {step_time_s: 5, construction_time_s: 0.2}"
-    av = _other("HangsWhenMade", f"{{first: 40}}, {limits}")
+    av = _of("HangsWhenMade", ", limits: {step_time_s: 5, construction_time_s: 0.2}", first=40)
     assert _run(tmp_path, av, "stop.episodes=40") == EXIT_DONE
     failed = [row["failure"] for row in _episodes(tmp_path) if row["outcome"] == "failed"]
     assert set(failed) == {f"start: StepTimeoutError: {LATE_MADE}"}
 
 
-def test_close_is_called_and_may_raise(tmp_path, undisturbed):
-    assert _run(tmp_path, _other("RaisesInClose", f"{{path: {tmp_path}/closed}}")) == EXIT_DONE
-    assert (tmp_path / "closed").read_text().count("closed") >= 40
-    assert _episodes(tmp_path) == undisturbed
-
-
 def test_a_batch_controllers_fault_is_laid_at_one_cell_or_else_fails_all_that_were_asked(tmp_path):
-    av = _other("Batch", "{nan: 357, wrong_shape: true}")
-    assert _run(tmp_path, av, "run.max_failed_share=0.5") == EXIT_DONE
+    assert _run(tmp_path, _of("Batch", nan=357, wrong_shape=True), "run.max_failed_share=0.5") == EXIT_DONE
     failed = {row["episode"]: row["failure"] for row in _episodes(tmp_path) if row["outcome"] == "failed"}
     assert failed.pop(357) == "step_batch: returned nan, expected a finite acceleration in m/s2"
     assert failed
     assert all("step_batch: returned an array of shape (" in cause for cause in failed.values())
 
 
-@pytest.mark.parametrize("where", ["constructor", "step", "step_batch"])
+@pytest.mark.parametrize("where", ["step", "step_batch"])
 @pytest.mark.parametrize(
     ("how", "words"),
     [
-        ("EndsTheProcess", "the controller ended the worker process (exit code 7)"),
-        ("ClosesDescriptors", "the controller closed file descriptors that are not its own"),
+        ("ends_the_process", "the controller ended the worker process (exit code 7)"),
+        ("closes_descriptors", "the controller closed file descriptors that are not its own"),
     ],
 )
-def test_a_controller_that_always_ends_its_process_is_named_after_a_few_workers(
+def test_one_that_always_ends_its_process_is_named_after_a_few_workers(
     how, words, where, tmp_path, capsys, monkeypatch
 ):
-    started = []
-    start = LocalWorkers.new_worker
+    started, start = [], LocalWorkers.new_worker
     monkeypatch.setattr(LocalWorkers, "new_worker", lambda self: (started.append(self), start(self))[1])
-    code = _run(tmp_path, _other(how, f"{{where: {where}}}"), "run.max_failed_share=0.01")
+    assert _run(tmp_path, _of("Always", where=where, how=how), "run.max_failed_share=0.01") == EXIT_TOO_MANY_FAILED
     err = capsys.readouterr().err
     assert words in err
     assert "memory limit" not in err
-    if where == "constructor":
-        assert (code, "in its constructor" in err, len(started)) == (EXIT_BAD_INPUT, True, 0)
-        assert not (tmp_path / "run").exists()
-    else:
-        assert code == EXIT_TOO_MANY_FAILED
-        assert 2 <= len(started) <= 7
-        assert f"in {where}" in err or "run.max_failed_share" in err
+    assert 2 <= len(started) <= 7
+    assert f"in {where}" in err or "run.max_failed_share" in err
 
 
-@pytest.mark.parametrize("command", [["run"], ["check"], ["av-check", "--episodes", "4"]], ids=lambda words: words[0])
+@pytest.mark.parametrize("command", ["run", "check", "av-check --episodes 4"])
 def test_what_a_controller_starts_does_not_outlive_the_command(command, tmp_path):
-    (tmp_path / "c.yaml").write_text(SMALL)
-    out = ["--out", str(tmp_path / "run"), "--workers", "2"] if command == ["run"] else []
-    av = _other("StartsPrograms", f"{{note: {tmp_path}/started}}")
-    assert main([*command, str(tmp_path / "c.yaml"), *out, "--set", f"av={av}"]) == EXIT_DONE
+    assert _main(command, tmp_path, _of("StartsPrograms", note=f"{tmp_path}/started")) == EXIT_DONE
     started = (tmp_path / "started").read_text().split()
-    assert len(started) >= (160 if command == ["run"] else 2)
+    assert len(started) >= (80 if command == "run" else 2)
     assert not [pid for pid in started if Path(f"/proc/{pid}").exists()]
 
 
-def test_a_process_that_ends_in_close_has_done_its_work(tmp_path, undisturbed):
-    assert _run(tmp_path, _other("EndsTheProcess", "{where: close}")) == EXIT_DONE
-    assert _episodes(tmp_path) == undisturbed
-
-
-@pytest.mark.parametrize("field", ["cell", "episode", "gap_m", "lv_speed_mps", "cells", "episodes"])
-def test_nothing_that_a_batch_controller_is_handed_can_be_written_into(field):
-    av = _other("BatchThatWrites", f"{{field: {field}}}")
-    prepared = prepare(
-        resolve(load_campaign(ROOT / "scenarios/overtaking_forced.yaml", [f"av={av}", "world.engine=twin"]))
-    )
-    loop = prepared.loop(TwinWorld(8))
-    shard = loop.run(0, prepared.states(0, 24))
-    loop.close()
-    call = "start_batch" if field in ("cells", "episodes") else "step_batch, warming up"
-    assert set(shard.failures.values()) == {f"{call}: ValueError: assignment destination is read-only"}
-
-
-def test_controllers_do_not_share_the_lists_among_their_parameters():
-    av = load_campaign(
-        ROOT / "scenarios/overtaking_forced.yaml", [f"av={_other('ChangesItsParameters', '{braking: [1.0]}')}"]
-    ).av
-    hosts = [build_host(av, n_cells=3, seed=1) for _ in range(2)]
-    for host in hosts:
-        assert host.start(*3 * (np.arange(3),)) == {}
-        host.close()
-    assert ChangesItsParameters.made[-6:] == [[1.0, 0.01]] * 6
-    assert av.parameters == {"braking": [1.0]}
-
-
-@pytest.mark.parametrize("command", [["run"], ["check"], ["av-check", "--episodes", "4"]], ids=lambda words: words[0])
+@pytest.mark.parametrize("command", ["run --json", "check --json", "av-check --json --episodes 4"])
 def test_what_a_controller_prints_does_not_reach_stdout(command, tmp_path, capfd):
-    (tmp_path / "c.yaml").write_text(SMALL)
-    out = ["--out", str(tmp_path / "run"), "--workers", "1"] if command == ["run"] else []
-    assert main([*command, str(tmp_path / "c.yaml"), *out, "--json", "--set", f"av={_other('Prints')}"]) == EXIT_DONE
+    assert _main(command, tmp_path, _of("Prints")) == EXIT_DONE
     printed = capfd.readouterr()
     json.loads(printed.out)
     assert "made, in Python" in printed.err
     assert "made, below Python" in printed.err
-    if command == ["run"]:
+    if command.startswith("run"):
         assert main(["replay", str(tmp_path / "run"), "3", "--json"]) == EXIT_DONE
         printed = capfd.readouterr()
         assert json.loads(printed.out)["bit_equal"] is True
@@ -306,16 +235,33 @@ def test_what_a_controller_prints_does_not_reach_stdout(command, tmp_path, capfd
 
 
 def test_check_survives_a_controller_that_does_not(tmp_path, capsys):
-    (tmp_path / "c.yaml").write_text(SMALL)
-    av = f"av={_other('EndsTheProcess', '{where: step}')}"
-    assert main(["check", str(tmp_path / "c.yaml"), "--json", "--set", av]) == EXIT_DONE
+    assert _main("check --json", tmp_path, _of("Always", where="step")) == EXIT_DONE
     assert "in the call of step" in json.loads(capsys.readouterr().out)["plan"]["av_ms_per_test"]
 
 
-def test_check_says_how_a_slow_controller_keeps_many_workers_busy(tmp_path, monkeypatch):
+def test_check_says_how_a_slow_controller_keeps_many_workers_busy(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("harness.runner.look.seconds_per_test", lambda _: 12.0)
-    (tmp_path / "c.yaml").write_text(SMALL)
-    settings = [f"av={_other('Prints')}", "run.shard_size=100"]
-    plan = plan_campaign(load_campaign(tmp_path / "c.yaml", settings))
-    assert plan["slow_av"].startswith("with run.shard_size 1 a task is one test of 12 s, and now up to 1,200 s")
-    assert "slow_av" not in plan_campaign(load_campaign(tmp_path / "c.yaml", [settings[0], "run.shard_size=1"]))
+    for size in (100, 1):
+        assert _main("check --json", tmp_path, _of("Prints"), f"run.shard_size={size}") == EXIT_DONE
+        plan = json.loads(capsys.readouterr().out)["plan"]
+        said = plan.get("slow_av", "").startswith(
+            "with run.shard_size 1 a task is one test of 12 s, and now up to 1,200 s"
+        )
+        assert said == (size == 100)
+
+
+@pytest.mark.parametrize("field", ["cell", "episode", "gap_m", "lv_speed_mps", "cells", "episodes"])
+def test_nothing_that_a_batch_controller_is_handed_can_be_written_into(field):
+    failures = drive(f"av={_of('Batch', overwrites=field)}", cells=8, n=24).failures
+    call = "start_batch" if field in ("cells", "episodes") else "step_batch, warming up"
+    assert failures == dict.fromkeys(range(24), f"{call}: ValueError: assignment destination is read-only")
+
+
+def test_controllers_do_not_share_the_lists_among_their_parameters():
+    av = forced(f"av={_of('ChangesItsParameters', braking=[1.0])}").av
+    hosts = [build_host(av, n_cells=3, seed=1) for _ in range(2)]
+    for host in hosts:
+        assert host.start(*3 * (np.arange(3),)) == {}
+        host.close()
+    assert ChangesItsParameters.made[-6:] == [[1.0, 0.01]] * 6
+    assert av.parameters == {"braking": [1.0]}
