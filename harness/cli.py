@@ -6,7 +6,6 @@ What does the work is imported inside each command, so that ``--help`` answers a
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Sequence
 
@@ -14,7 +13,7 @@ import click
 
 from harness.commands.campaigns import av_check, check, compare, pool, run, schema, setup
 from harness.commands.options import examples
-from harness.commands.printing import show_error, show_interrupted, system_error, usage_error
+from harness.commands.printing import go_on_unread, show_error, show_interrupted, system_error, usage_error
 from harness.commands.stored import estimate, replay, report
 from harness.errors import EXIT_DONE, HarnessError, shortened
 from harness.processes import Interruption, interruptible, open_streams
@@ -88,8 +87,7 @@ def _end_early(arguments: list[str], interruption: Interruption) -> int:
 
 def _show_system_error(error: OSError) -> int:
     if isinstance(error, BrokenPipeError):
-        # The reader of the pipe is gone: let the interpreter flush into nothing at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        go_on_unread(sys.stdout)
         return EXIT_DONE
     known = system_error(error)
     if known is None:

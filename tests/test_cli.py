@@ -9,6 +9,7 @@ from itertools import filterfalse
 from pathlib import Path
 from types import SimpleNamespace
 
+import click
 import pyarrow as pa
 import pytest
 from click.testing import CliRunner
@@ -16,8 +17,8 @@ from pyarrow import csv, parquet
 
 from harness.campaign.files import load_campaign
 from harness.cli import cli, main
-from harness.commands.printing import in_folder
-from harness.errors import EXIT_BAD_INPUT, RunFolderError, TooManyFailedError
+from harness.commands.printing import in_folder, say
+from harness.errors import EXIT_BAD_INPUT, EXIT_REFUTED, RunFolderError, TooManyFailedError
 from harness.progress import ShownProgress
 from tests.stored_runs import estimates
 
@@ -376,3 +377,17 @@ def test_a_closed_stdout_is_no_error_and_its_number_is_nobody_elses(monkeypatch)
     finally:
         os.dup2(kept, 1)
         os.close(kept)
+
+
+def test_a_reader_that_has_gone_does_not_change_the_exit_code(monkeypatch):
+    """As ``| head -1``: a gate that rejects must fail its job all the same."""
+    reading, writing = os.pipe()
+    os.close(reading)
+
+    def rejected() -> int:
+        say("This vehicle crashes too often.")
+        return EXIT_REFUTED
+
+    with os.fdopen(writing, "w") as pipe:
+        monkeypatch.setattr(sys, "stdout", pipe)
+        assert main([], click.Command("run", callback=rejected)) == EXIT_REFUTED

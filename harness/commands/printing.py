@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import errno
 import json
+import os
 import shlex
+import sys
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TextIO
 
 import click
 
@@ -21,8 +23,19 @@ _PARTS = "found", "expected", "mend"
 
 
 def say(*lines: object, err: bool = False) -> None:
-    """Print lines; control characters in what a user named, as a folder, do not reach the terminal."""
-    click.echo(printable("\n".join(map(str, lines))), err=err)
+    """Print lines; control characters in what a user named, as a folder, do not reach the terminal.
+
+    A reader that has gone, as ``head``, is no error: the command still ends with its own exit code.
+    """
+    try:
+        click.echo(printable("\n".join(map(str, lines))), err=err)
+    except BrokenPipeError:
+        go_on_unread(sys.stderr if err else sys.stdout)
+
+
+def go_on_unread(stream: TextIO) -> None:
+    """Send a stream into nothing from here on, also what the interpreter flushes at exit."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def show_error(error: HarnessError) -> None:
