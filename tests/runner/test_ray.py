@@ -99,9 +99,16 @@ def test_a_shard_that_is_lost_thrice_with_its_machine_is_named(run, campaign, tm
     assert lost.value.exit_code == EXIT_TOO_MANY_FAILED
 
 
-def test_no_room_for_one_worker(run, campaign, tmp_path):
-    with pytest.raises(HarnessError, match=r"run\.ray\.resources: found a cluster of 2 CPUs and 0 GPUs"):
-        run(campaign(*TWIN, ON_RAY, "run.ray.resources.gpus=0.25"), tmp_path / "run")
+@pytest.mark.parametrize(
+    ("asked", "said"),
+    [
+        ("resources.gpus=0.25", r"run\.ray\.resources: found a cluster of 2 CPUs and 0 GPUs"),
+        ("runtime_env={working_dir: nowhere-at-all}", r"run\.ray\.runtime_env"),
+    ],
+)
+def test_what_the_cluster_cannot_give(run, campaign, tmp_path, asked, said):
+    with pytest.raises(HarnessError, match=said):
+        run(campaign(*TWIN, ON_RAY, f"run.ray.{asked}"), tmp_path / "run")
     assert not (tmp_path / "run/manifest.json").exists()
 
 
@@ -131,11 +138,6 @@ def test_sigterm_while_it_connects_is_the_harness_s(run, campaign, tmp_path, mon
     finally:
         signal.signal(signal.SIGTERM, before)
     assert seen == [signal.SIGTERM]
-
-
-def test_an_environment_that_cannot_be_set_up(run, campaign, tmp_path):
-    with pytest.raises(HarnessError, match=r"run\.ray\.runtime_env"):
-        run(campaign(*TWIN, ON_RAY, "run.ray.runtime_env={working_dir: nowhere-at-all}"), tmp_path / "run")
 
 
 def test_another_version_on_a_machine_is_refused(run, campaign, tmp_path, monkeypatch):

@@ -7,60 +7,30 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from harness.campaign.campaign import Campaign
-from harness.campaign.drivers import IDMParameters, Reaction
-from harness.campaign.vehicle import AutomatedVehicle
 from harness.errors import WorldDisagreementError
 from harness.pool.replay import Retracing
-from harness.records.schemas import episodes_table
 from harness.resolved import resolve
-from harness.runner.prepare import prepare
-from harness.worlds.twin import TwinWorld
-from tests.chains.seed import SEED
 from tests.in_process import run_here
 from tests.stored_runs import copy_of, golden, manifest, of_before, shard_files, stored_table
 
-N = 600
-AVS = {
-    "idm": AutomatedVehicle(),
-    "late, smooth, now and then inattentive": AutomatedVehicle(
-        parameters=IDMParameters(min_acceleration_mps2=-3.0),
-        reaction=Reaction(delay_s=0.4, max_jerk_mps3=8.0, inattention_probability=0.3, inattention_delay_s=1.0),
-    ),
-    "fvdm": AutomatedVehicle(model="fvdm"),
-    "constant": AutomatedVehicle(model="constant"),
-}
+RETRACED = (
+    *("nde-sumo", "forced-sumo", "step-recursive-sumo", "shells-lateral-sumo", "shells-refuted", "shells-need-based"),
+    *("forced-inattentive", "forced-reference", "nde-lateral", "shells-stops"),
+)
 
 
-def of_av(method: str, av: AutomatedVehicle) -> Campaign:
-    one = Campaign(name="retraced", seed=SEED, av=av)
-    level = 1e5 if method == "nde" else 1.0
-    environment = one.environment.model_copy(update={"lane_change_level": level})
-    return one.model_copy(
-        update={"environment": environment, "testing": one.testing.model_copy(update={"method": method})}
-    )
+def check(name: str, table: pa.Table, *overrides: str) -> int:
+    return Retracing(resolve(golden(name, "world.engine=sumo", *overrides))).check(table)
 
 
-def retracing(one: Campaign) -> Retracing:
-    return Retracing(resolve(one))
-
-
-def drive(one: Campaign) -> pa.Table:
-    ready = prepare(resolve(one))
-    return episodes_table(ready.loop(TwinWorld(64)).run(0, ready.states(0, N)), one.seed)
-
-
-@pytest.fixture(scope="module")
-def forced() -> tuple[Campaign, pa.Table]:
-    one = of_av("forced", AVS["constant"])
-    return one, drive(one)
-
-
-@pytest.mark.parametrize("name", AVS)
-@pytest.mark.parametrize("method", ["nde", "forced"])
-def test_every_episode_of_a_built_in_av_is_retraced(method, name):
-    one = of_av(method, AVS[name])
-    assert retracing(one).check(drive(one)) == N
+@pytest.mark.parametrize("name", RETRACED)
+def test_every_episode_of_a_built_in_av_is_retraced(name, stored_run):
+    table = stored_table(stored_run(name), "episodes")
+    assert check(name, table) == table.num_rows
+    if name.endswith("sumo"):
+        said = manifest(stored_run(name))["retraced"]
+        assert said["n_episodes"] == said["n_equal"] == table.num_rows
+        assert ("onset_r2_m" if "lateral" in name else "cut_in_r2_m") in said["compared"]
 
 
 def changed(table: pa.Table, name: str, value) -> pa.Table:
@@ -78,6 +48,11 @@ def one_bit(value: float) -> float:
     return float(np.nextafter(value, np.inf))
 
 
+@pytest.fixture
+def forced(stored_run) -> pa.Table:
+    return stored_table(stored_run("forced-twin"), "episodes")
+
+
 @pytest.mark.parametrize(
     ("column", "value", "named"),
     [
@@ -93,33 +68,18 @@ def one_bit(value: float) -> float:
     ],
 )
 def test_one_changed_value_raises_the_alarm(forced, column, value, named):
-    one, table = forced
-    assert retracing(one).check(table) == N
     with pytest.raises(WorldDisagreementError, match=named):
-        retracing(one).check(changed(table, column, value))
+        check("forced-twin", changed(forced, column, value))
 
 
 def test_of_another_av_only_the_way_to_the_cut_in_is_known(forced):
-    one, table = forced
-    unknown = one.model_copy(update={"av": AutomatedVehicle(sumo={"carFollowModel": "IDM"})})
-    impact = changed(table, "impact_speed_mps", one_bit)
-    assert retracing(unknown).check(impact) == N
-    assert "outcome" not in retracing(unknown).summary(N)["compared"]
+    unknown = "av={sumo: {carFollowModel: IDM}}"
+    assert check("forced-sumo", changed(forced, "impact_speed_mps", one_bit), unknown) == forced.num_rows
     with pytest.raises(WorldDisagreementError):
-        retracing(unknown).check(changed(table, "cut_in_r2_m", one_bit))
-
-
-def test_an_av_that_acts_before_the_cut_in_cannot_be_retraced(forced):
-    one, table = forced
-    early = one.model_copy(update={"av": one.av.model_copy(update={"before_cut_in": "controller"})})
-    assert retracing(early).check(table) == 0
-    assert "before the cut-in" in retracing(early).summary(0)["reason"]
-
-
-def test_a_run_in_sumo_says_that_all_is_equal(sumo_run):
-    said = manifest(sumo_run)["retraced"]
-    assert said["n_episodes"] == said["n_equal"] == stored_table(sumo_run, "episodes").num_rows
-    assert {"cut_in_r2_m", "impact_speed_mps"} <= set(said["compared"])
+        check("forced-sumo", changed(forced, "cut_in_r2_m", one_bit), unknown)
+    early = Retracing(resolve(golden("forced-acting-sumo")))
+    assert early.check(forced) == 0
+    assert "before the cut-in" in early.summary(0)["reason"]
 
 
 def test_a_stored_shard_is_retraced_when_a_run_goes_on(sumo_run, tmp_path):
