@@ -3,16 +3,17 @@
 import numpy as np
 import pytest
 
+from examples.idm import IDM
 from harness.controllers.hosts import BatchHost, Guard
 from harness.errors import CampaignError
 from harness.vocabulary import PASSED
-from tests.controllers.driving import ROOT, drive, forced
+from tests.controllers.driving import drive, forced
 
 EARLY = "av={controller: 'tests.controllers.test_before_cut_in:Faster', before_cut_in: controller}"
 
 
-class Faster:
-    """Accelerates until someone is ahead, and remembers nothing but that."""
+class Faster(IDM):
+    """Accelerates until someone is ahead, and remembers nothing but its steps."""
 
     def start(self, episode):
         self.steps = 0
@@ -25,27 +26,21 @@ class Faster:
         assert ahead or np.isnan(seen.lead_speed_mps)
         return -3.0 if ahead else 0.5
 
-    def close(self):
-        pass
-
 
 @pytest.mark.parametrize("method", ["nde", "step_mixture"])
-def test_a_controller_acts_from_the_first_step(method, monkeypatch):
-    monkeypatch.chdir(ROOT)
+def test_a_controller_acts_from_the_first_step(method):
     shard = drive(EARLY, f"testing={{method: {method}}}", "environment.lane_change_level=350", n=300)
     assert shard.failures == {}
-    rows = shard.results.episode
-    cut = np.flatnonzero(rows["cut_in_step"] > 0)
-    assert cut.size > 0
-    for i in range(300):
-        av = shard.traces[i][:, 2]
-        last = rows["cut_in_step"][i] if rows["cut_in_step"][i] >= 0 else len(av) - 1
-        np.testing.assert_array_equal(av[:last, 2], 0.5)
-    passed = np.flatnonzero(rows["outcome"] == PASSED)
-    assert passed.size > 0
-    for i in passed:
-        r2 = shard.traces[i][:, 1, 0] - 5.0 - shard.traces[i][:, 2, 0]
-        assert r2[-1] < -10.0 <= r2[-2]
+    passed = cut_in = 0
+    for i, row in enumerate(shard.results.episode):
+        trace, cut = shard.traces[i], row["cut_in_step"]
+        np.testing.assert_array_equal(trace[: cut if cut >= 0 else -1, 2, 2], 0.5)
+        cut_in += cut > 0
+        if row["outcome"] == PASSED:
+            r2 = trace[:, 1, 0] - 5.0 - trace[:, 2, 0]
+            assert r2[-1] < -10.0 <= r2[-2]
+            passed += 1
+    assert min(passed, cut_in) > 0
 
 
 def test_a_method_that_draws_the_path_ahead_refuses_it():

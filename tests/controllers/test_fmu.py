@@ -5,6 +5,7 @@ import os
 import re
 import sys
 import zipfile
+from contextlib import closing
 
 import pytest
 
@@ -15,33 +16,15 @@ from harness.controllers.find import build_host, require_controller
 from harness.controllers.fmu import fmu_maker
 from harness.errors import CampaignError
 from harness.resolved import resolve
+from tests.controllers.driving import make_fmu
 
-WIRED = "inputs: {speed_mps: x}, output: total"
-COUNTER = '''
-from pythonfmu import Fmi2Causality, Fmi2Slave, Real
-
-
-class Counter(Fmi2Slave):
-    """Output: the sum of its inputs so far, in hundredths."""
-
-    def __init__(self, **kwargs):
-        super().__init__(**kwargs)
-        self.total, self.x = 0.0, 0.0
-        self.register_variable(Real("x", causality=Fmi2Causality.input))
-        self.register_variable(Real("total", causality=Fmi2Causality.output))
-
-    def do_step(self, current_time, step_size):
-        self.total += self.x / 100.0
-        return True
-'''
+WIRED = "inputs: {speed_mps: x}, output: a"
 
 
 @pytest.fixture(scope="module")
 def fmu(tmp_path_factory):
-    builder = pytest.importorskip("pythonfmu.builder", reason="pythonfmu builds the FMU")
-    folder = tmp_path_factory.mktemp("fmu")
-    (folder / "counter.py").write_text(COUNTER)
-    return builder.FmuBuilder.build_FMU(folder / "counter.py", dest=folder)
+    """Output: the sum of its inputs so far, in hundredths."""
+    return make_fmu(tmp_path_factory.mktemp("fmu"), "Counter", "x", "self.a += self.x / 100.0")
 
 
 def load(folder, text):
@@ -56,20 +39,19 @@ def check(fmu, tmp_path, text):
 @pytest.mark.parametrize(
     ("text", "where", "found"),
     [
-        ("inputs: {speed_mps: y}, output: total", "av.fmu.inputs.speed_mps", "y, no variable of the FMU"),
-        ("inputs: {speed_mps: total}, output: total", "av.fmu.inputs.speed_mps", "total, a Real output"),
-        ("inputs: {speed: x}, output: total", "av.fmu.inputs.speed", "no such observation"),
-        ("inputs: {speed_mps: x}, output: x", "av.fmu.output", "x, a Real input"),
-        ("inputs: {speed_mps: x}, output: total, start_values: {k: 1.0}", "av.fmu.start_values", "k, no variable"),
+        ("inputs: {speed_mps: y}, output: a", "inputs.speed_mps", "y, no variable of the FMU"),
+        ("inputs: {speed_mps: a}, output: a", "inputs.speed_mps", "a, a Real output"),
+        ("inputs: {speed: x}, output: a", "inputs.speed", "no such observation"),
+        ("inputs: {speed_mps: x}, output: x", "output", "x, a Real input"),
+        ("inputs: {speed_mps: x}, output: a, start_values: {k: 1.0}", "start_values", "k, no variable"),
     ],
 )
 def test_a_wrong_wiring_is_named_with_the_variables(fmu, tmp_path, text, where, found):
     with pytest.raises(CampaignError) as error:
         check(fmu, tmp_path, text)
-    assert error.value.where == where
+    assert error.value.where == f"av.fmu.{where}"
     assert found in error.value.found
-    if "observation" not in found:
-        assert "x (Real input), total (Real output)" in error.value.mend
+    assert "x (Real input), a (Real output)" in error.value.mend or "observation" in found
 
 
 def test_a_full_cache_disk_is_not_the_fault_of_the_fmu(fmu, tmp_path, monkeypatch):
@@ -88,7 +70,7 @@ def test_a_full_cache_disk_is_not_the_fault_of_the_fmu(fmu, tmp_path, monkeypatc
 @pytest.mark.parametrize(
     ("old", "new", "found"),
     [
-        (rb"<CoSimulation[^>]*>", b'<ModelExchange modelIdentifier="counter"/>', "for FMI 2.0 model exchange"),
+        (rb"<CoSimulation[^>]*>", b'<ModelExchange modelIdentifier="Counter"/>', "for FMI 2.0 model exchange"),
         (rb'fmiVersion="2.0"', b'fmiVersion="7.0"', "7.0"),
         (None, b"nothing", "cannot be read"),
         (None, None, "there is no file"),
@@ -134,10 +116,9 @@ def test_instances_are_apart_and_an_episode_forgets_the_last(fmu, tmp_path):
         seen = Observation(time_s, 0.0, 20.0, 0.0, 5.0, 20.0, Neighbour(10.0, 20.0, 0), Neighbour(90.0, 20.0, 1))
         return controller.step(seen)
 
-    for controller in (first, second):
-        controller.start(EpisodeStart(0, 0.1, None))
-    assert [step(first, 0.0), step(first, 0.1), step(second, 3.0)] == pytest.approx([0.2, 0.4, 0.2])
-    first.start(EpisodeStart(1, 0.1, None))
-    assert [step(first, 5.0), step(second, 3.1)] == pytest.approx([0.2, 0.4])
-    first.close()
-    second.close()
+    with closing(first), closing(second):
+        for controller in (first, second):
+            controller.start(EpisodeStart(0, 0.1, None))
+        assert [step(first, 0.0), step(first, 0.1), step(second, 3.0)] == pytest.approx([0.2, 0.4, 0.2])
+        first.start(EpisodeStart(1, 0.1, None))
+        assert [step(first, 5.0), step(second, 3.1)] == pytest.approx([0.2, 0.4])

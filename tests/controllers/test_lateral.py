@@ -10,9 +10,9 @@ import pytest
 
 from examples import idm_batch
 from examples.idm import IDM, idm_acceleration
-from harness.controllers.protocol import Neighbour, Observation
-from harness.controllers.traci_style import Traci, TraciStyleController
-from tests.controllers.driving import LATERAL, drive
+from harness.controllers.protocol import Observation
+from harness.controllers.traci_style import TraciStyleController
+from tests.controllers.driving import LATERAL, ROOT, drive, make_fmu
 
 HERE = "tests.controllers.test_lateral"
 SEEN: list[Observation] = []
@@ -57,30 +57,11 @@ class YieldsScript(TraciStyleController):
         vehicle.setAcceleration(veh_id, a, 0.1)
 
 
-YIELDS_FMU = '''
-from pythonfmu import Fmi2Causality, Fmi2Slave, Real
-
-try:
-    from examples.idm import idm_acceleration
-except ImportError:  # in the FMU the files are beside each other
-    from idm import idm_acceleration
-
-
-class YieldsFmu(Fmi2Slave):
-    """The same as an FMU."""
-
-    def __init__(self, **kwargs):
-        super().__init__(**kwargs)
-        for name in ("x", "v", "x_bv", "v_bv", "over", "moves", "overlaps", "a"):
-            setattr(self, name, 0.0)
-            self.register_variable(Real(name, causality=Fmi2Causality.output if name == "a" else Fmi2Causality.input))
-
-    def do_step(self, current_time, step_size):
-        comes = self.moves > 0.0 and self.over >= 0.375 - 1e-9
-        gap = self.x_bv - 5.0 - self.x
-        self.a = idm_acceleration(self.v, self.v_bv, gap) if comes or self.overlaps else 0.0
-        return True
-'''
+YIELDS_FMU = """
+gap = self.x_bv - 5.0 - self.x
+comes = self.moves > 0.0 and self.over >= 0.375 - 1e-9
+self.a = idm_acceleration(self.v, self.v_bv, gap) if comes or self.overlaps else 0.0
+"""
 
 
 @pytest.fixture(scope="module")
@@ -88,22 +69,16 @@ def built_in():
     return episodes(LATERAL)
 
 
-FORMS = ("examples.sees_lateral:Yields", f"{HERE}:YieldsBatch", f"{HERE}:YieldsScript")
-
-
-@pytest.mark.parametrize("controller", FORMS)
-def test_a_controller_that_sees_it_is_the_built_in_model_to_the_last_bit(built_in, controller):
-    assert episodes(LATERAL, f"av={{controller: '{controller}'}}").tobytes() == built_in.tobytes()
-
-
-def test_so_is_an_fmu_that_sees_it(built_in, tmp_path):
-    builder = pytest.importorskip("pythonfmu.builder", reason="pythonfmu builds the FMU")
-    (tmp_path / "yields.py").write_text(YIELDS_FMU)
-    fmu = builder.FmuBuilder.build_FMU(tmp_path / "yields.py", dest=tmp_path, project_files=["examples/idm.py"])
-    inputs = "position_m: x, speed_mps: v, bv_position_m: x_bv, bv_speed_mps: v_bv, bv_lateral_m: over"
-    inputs += ", bv_lateral_speed_mps: moves, bv_overlaps: overlaps"
-    found = episodes(LATERAL, f"av={{fmu: {{file: '{fmu}', inputs: {{{inputs}}}, output: a}}}}", "world.cells=1")
-    assert found.tobytes() == built_in.tobytes()
+@pytest.mark.parametrize("form", ["examples.sees_lateral:Yields", f"{HERE}:YieldsBatch", f"{HERE}:YieldsScript", "fmu"])
+def test_a_controller_that_sees_it_is_the_built_in_model_to_the_last_bit(form, built_in, tmp_path):
+    av = f"{{controller: '{form}'}}"
+    if form == "fmu":
+        imports, files = "from idm import idm_acceleration", [ROOT / "examples/idm.py"]
+        fmu = make_fmu(tmp_path, "YieldsFmu", "x v x_bv v_bv over moves overlaps", YIELDS_FMU, imports, files)
+        inputs = "position_m: x, speed_mps: v, bv_position_m: x_bv, bv_speed_mps: v_bv, bv_lateral_m: over"
+        inputs += ", bv_lateral_speed_mps: moves, bv_overlaps: overlaps"
+        av = f"{{fmu: {{file: '{fmu}', inputs: {{{inputs}}}, output: a}}}}"
+    assert episodes(LATERAL, f"av={av}").tobytes() == built_in.tobytes()
 
 
 def test_one_that_waits_for_the_overlap_is_another_vehicle(built_in):
@@ -123,18 +98,3 @@ def test_what_is_seen_of_a_lead(lead_s):
     assert all(seen.bv_overlaps == (seen.bv.lane == 0) == math.isfinite(seen.gap_m) for seen in SEEN)
     assert all((seen.bv_lateral_m == 1.7) and (seen.bv_lateral_speed_mps == 0.0) for seen in SEEN if seen.bv_overlaps)
     assert {seen.bv_lateral_speed_mps for seen in SEEN if not seen.bv_overlaps} == ({1.7} if lead_s else set())
-
-
-def test_a_script_sees_it_on_the_right_of_its_lane_until_it_is_on_the_other():
-    traci = Traci()
-    lv = Neighbour(400.0, 30.0, 1)
-    traci.see(Observation(1.0, 100.0, 30.0, 0.0, math.inf, math.nan, Neighbour(140.0, 28.0, 1), lv, 0.5, 0.7, False))
-    vehicle = traci.vehicle
-    assert (vehicle.getLateralLanePosition("BV"), vehicle.getLateralSpeed("BV")) == (-0.5, -0.7)
-    assert vehicle.getPosition("BV") == (140.0, pytest.approx(1.1))
-    assert vehicle.getLaneIndex("BV") == 1
-    assert (vehicle.getLateralLanePosition("AV"), vehicle.getLateralSpeed("LV")) == (0.0, 0.0)
-    assert vehicle.getLeader("AV") is None
-    traci.see(Observation(1.1, 103.0, 30.0, 0.0, 35.0, 28.0, Neighbour(143.0, 28.0, 0), lv, 1.7, 0.0, True))
-    assert (vehicle.getLateralLanePosition("BV"), vehicle.getPosition("BV")) == (0.0, (143.0, -1.6))
-    assert vehicle.getLeader("AV")[0] == "BV"

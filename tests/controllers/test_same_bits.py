@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from tests.controllers.driving import LATERAL, ROOT, drive, fmu_av
+from tests.controllers.driving import LATERAL, drive, fmu_av, motion
 
-EPISODES = 150
 FORMS = {
     "per vehicle": "av={controller: 'examples.idm:IDM'}",
     "batch": "av={controller: 'examples.idm_batch:IDM'}",
@@ -15,37 +14,23 @@ FORMS = {
 }
 
 
-@pytest.fixture(autouse=True)
-def _in_the_checkout(monkeypatch):
-    monkeypatch.chdir(ROOT)
-
-
-@pytest.fixture(scope="module")
-def built_in():
-    return drive("av={model: idm}")
-
-
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("cells", [32, 7])
-def test_every_form_gives_the_bits_of_the_built_in_model_in_any_number_of_cells(form, cells, built_in):
-    other = drive(FORMS[form], cells=cells)
-    assert other.failures == {}
-    assert other.results.episode.tobytes() == built_in.results.episode.tobytes()
-    assert all(other.traces[i].tobytes() == built_in.traces[i].tobytes() for i in range(EPISODES))
+def test_every_form_gives_the_bits_of_the_built_in_model_in_any_number_of_cells(form, cells):
+    assert motion(FORMS[form], cells=cells) == motion("av={model: idm}")
 
 
 def test_over_arrays_it_knows_too_what_to_do_while_nobody_is_ahead():
     """Where cut-ins take time, controllers act from the onset on: then the gap is infinite and the speed ahead NaN."""
-    one, batch = (drive(FORMS[form], LATERAL, n=30) for form in ("per vehicle", "batch"))
-    assert one.failures == batch.failures == {}
-    assert all(batch.traces[i].tobytes() == one.traces[i].tobytes() for i in range(30))
+    assert motion(FORMS["batch"], LATERAL, n=30) == motion(FORMS["per vehicle"], LATERAL, n=30)
 
 
-def test_an_fmu_gives_the_same_motion_and_gets_its_start_values_in_every_episode(fmu, built_in):
+def test_an_fmu_gives_the_same_motion_and_gets_its_start_values_in_every_episode(fmu):
+    built_in = drive("av={model: idm}")
     other = drive(f"av={fmu_av(fmu)}")
     assert other.failures == {}
-    for i in range(EPISODES):
+    for i in built_in.traces:
         np.testing.assert_allclose(other.traces[i], built_in.traces[i], rtol=0, atol=1e-9)
     weaker = drive(f"av={fmu_av(fmu)}", "av.fmu.start_values={a_min: -1.5}")
-    braking = [min(run.traces[i][:-1, 2, 2].min() for i in range(EPISODES)) for run in (weaker, built_in)]
+    braking = [min(run.traces[i][:-1, 2, 2].min() for i in built_in.traces) for run in (weaker, built_in)]
     assert braking[0] == -1.5 > braking[1]

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import signal
 import sys
 import time
-from collections import deque
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "examples" / "traci_client"))
+sys.path.extend(str(Path(__file__).parents[2] / each) for each in ("examples/traci_client", "tests/controllers"))
 
 import idm_client
+from delay_line import Line
 
 FAULT_STEP = 60
 
@@ -60,18 +61,17 @@ class Faulty:
 
 
 def delays(sumo, cells):
-    """An IDM that acts on what it has measured half a second ago (tests/controllers/test_warm_up.py)."""
+    """An IDM that acts on what it has measured half a second ago."""
     sumo.setOrder(1)
     sumo.simulationStep()
-    measured = [deque(maxlen=6) for _ in range(cells)]
+    lines = [Line(idm_client.idm) for _ in range(cells)]
     while True:
         sumo.simulationStep()
         vehicle = sumo.vehicle
-        for k in range(cells):
+        for k, line in enumerate(lines):
             av, bv, speed = f"AV{k}", f"BV{k}", vehicle.getSpeed(f"AV{k}")
             gap = vehicle.getLanePosition(bv) - 5.0 - vehicle.getLanePosition(av)
-            measured[k].append((speed, vehicle.getSpeed(bv), gap) if vehicle.getLaneIndex(bv) == 0 else None)
-            a = 0.0 if measured[k][0] is None else idm_client.idm(*measured[k][0])
+            a = line.acceleration(speed, vehicle.getSpeed(bv), gap if vehicle.getLaneIndex(bv) == 0 else math.inf)
             vehicle.setSpeed(av, max(speed + a * 0.1, 0.0))
 
 
