@@ -58,7 +58,7 @@ def test_a_bv_that_comes_over_is_on_the_right_of_its_lane_until_it_is_on_the_oth
     assert (vehicle.getLeader("AV"), vehicle.getLeader("BV")) == (None, ("LV", 95.0))
     traci.setLegacyGetLeader(False)
     assert vehicle.getLeader("AV") == ("", -1.0)
-    traci.see(seen(0.1, 20.0, 1.7, 0.0))
+    traci.see(seen(0.1, 20.0, 1.7, 0.0, True))
     assert (vehicle.getLateralLanePosition("BV"), vehicle.getPosition("BV")) == (0.0, (300.0, -1.6))
 
 
