@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 
 import numpy as np
@@ -12,9 +11,10 @@ import pytest
 from harness import estimate, replay
 from harness.errors import RunFolderError, TooManyFailedError
 from harness.records.schemas import baseline_schema
+from tests.in_process import run_here as run_golden
 from tests.pool.conftest import SMALL_POOL
 from tests.pool.test_vehicle_pool import ACTING
-from tests.stored_runs import copy_of, edit, manifest, shard_files, stored_table, unlike_columns
+from tests.stored_runs import copy_of, edit, estimates, golden, manifest, shard_files, stored_table, unlike_columns
 
 SHELLS = ("testing.method=shells", "stop.rhw=0.5", "stop.episodes=3000", "stop.min_crashes=null", *SMALL_POOL)
 SHADOWS, TWIN = "pool.shadow_paths=120", "world.engine=twin"
@@ -29,64 +29,44 @@ def files_of(folder):
     return sorted((folder / "shadow").glob("*.parquet"))
 
 
-@pytest.fixture(scope="module")
-def early_run(campaign, run_here, tmp_path_factory):
-    """Eight cells, in SUMO. Never written to."""
-    out = tmp_path_factory.mktemp("early") / "run"
-    return run_here(campaign(*SHELLS, SHADOWS, f"av={of('Speeds')}", "world.cells=8"), out)
+ACTS = "shells-acting-twin"
+"""Its shadow runs are in two files."""
 
 
-def test_it_reaches_the_precision_and_keeps_the_shadow_runs(early_run):
-    assert (early_run.exit_code, early_run.stopped_by) == (0, "rhw")
-    folder = early_run.folder
-    assert manifest(folder)["shadow_runs"] == {"n_runs": 120, "n_failed": 0}
-    tables = [pq.read_table(path) for path in files_of(folder)]
-    assert [table.num_rows for table in tables] == [50, 50, 20]
-    assert all(table.schema.equals(baseline_schema()) for table in tables)
-    rows = [row for table in tables for row in table.to_pylist()]
-    assert [row["shadow"] for row in rows] == list(range(120))
-    assert {row["outcome"] for row in rows} <= {"passed", "timeout", "bv_lv_contact"}
-    assert all(len(row["av_position_m"]) == len(row["av_speed_mps"]) == row["n_steps"] + 1 for row in rows)
-    assert any(row["av_speed_mps"][-1] > row["av_speed_mps"][0] + 2.0 for row in rows)
-    episodes = stored_table(folder, "episodes")
-    assert episodes.column("failure").null_count == episodes.num_rows
-    assert json.loads((folder / "shells.json").read_text())["n_paths"] == 120
-
-
-def test_a_test_is_replayed_bit_for_bit(early_run):
-    again = replay(early_run.folder, 5)
-    assert again.bit_equal
-    assert again.row["pool_cut_in"] is not None
-
-
-def test_a_run_that_was_interrupted_goes_on_where_it_was(early_run, campaign, run_here, tmp_path, monkeypatch):
+def test_a_run_that_was_interrupted_goes_on_where_it_was(stored_run, tmp_path):
     """Ended in the middle of the shadow runs, and again among the tests: the end is that of a run in one go."""
-    asked = campaign(*SHELLS, SHADOWS, f"av={of('Speeds')}", TWIN)
-    whole = run_here(asked, tmp_path / "whole")
-    out = copy_of(whole.folder, tmp_path / "run")
+    out = copy_of(stored_run(ACTS), tmp_path / "run")
+    tables = [pq.read_table(path) for path in files_of(out)]
+    assert [table.num_rows for table in tables] == [50, 10]
+    assert all(table.schema.equals(baseline_schema()) for table in tables)
     for table in ("episodes", "traces"):
         shutil.rmtree(out / table)
     files_of(out)[1].unlink()
-    kept = {path.name: path.stat().st_mtime_ns for path in files_of(out)}
+    kept = files_of(out)[0].stat().st_mtime_ns
     edit(out, n_episodes=0, shards=[], status="interrupted")
-    run_here(asked, out, resume=True)
-    assert unlike_columns(whole.folder, out) == []
-    assert {path.name: path.stat().st_mtime_ns for path in files_of(out) if path.name in kept} == kept
+    run_golden(golden(ACTS), out, resume=True)
+    assert unlike_columns(stored_run(ACTS), out) == []
+    assert files_of(out)[0].stat().st_mtime_ns == kept
     shard_files(out)[-1].unlink()
-    run_here(asked, out, resume=True)
-    assert unlike_columns(whole.folder, out) == []
+    run_golden(golden(ACTS), out, resume=True)
+    assert unlike_columns(stored_run(ACTS), out) == []
 
 
-def test_a_vehicle_with_noise_of_its_own_is_refused_and_one_with_the_given_noise_is_not(campaign, run_here, tmp_path):
-    noisy = "parameters: {noise_mps2: 0.2}"
-    fresh = campaign(*SHELLS, SHADOWS, TWIN, f"av={of('FreshNoise', noisy)}")
+NOISY = "parameters: {noise_mps2: 0.2}"
+
+
+@pytest.mark.parametrize("method", [SHELLS, FORCED], ids=["shells", "forced"])
+def test_a_vehicle_with_noise_of_its_own_is_refused_and_one_with_the_given_noise_is_not(
+    method, campaign, run_here, tmp_path
+):
+    asked = (*method, SHADOWS, TWIN)
     with pytest.raises(TooManyFailedError, match="something else than in its baseline run"):
-        run_here(fresh, tmp_path / "fresh")
-    episodes = stored_table(tmp_path / "fresh", "episodes")
-    assert set(episodes.column("outcome").to_pylist()) == {"failed"}
-    seeded = run_here(campaign(*SHELLS, SHADOWS, TWIN, f"av={of('Speeds', noisy)}"), tmp_path / "seeded")
-    assert manifest(seeded.folder)["repeated"]["differing"] == []
-    assert stored_table(seeded.folder, "episodes").column("failure").drop_null().to_pylist() == []
+        run_here(campaign(*asked, f"av={of('FreshNoise', NOISY)}"), tmp_path / "fresh")
+    assert set(stored_table(tmp_path / "fresh", "episodes").column("outcome").to_pylist()) == {"failed"}
+    seeded = run_here(campaign(*asked, f"av={of('Speeds', NOISY)}"), tmp_path / "seeded").folder
+    assert manifest(seeded)["repeated"]["differing"] == []
+    assert stored_table(seeded, "episodes").column("failure").drop_null().to_pylist() == []
+    assert replay(seeded, 123).bit_equal
 
 
 def test_shadow_runs_that_fail_count_against_the_vehicle(campaign, run_here, tmp_path):
@@ -133,14 +113,6 @@ def test_forced_cut_ins_of_a_vehicle_that_holds_are_those_of_one_that_holds(camp
     assert one["n_crashes"] > 0
 
 
-def test_forced_tests_are_replayed_and_follow_from_their_index(campaign, run_here, tmp_path):
-    out = tmp_path / "run"
-    run_here(campaign(*FORCED, TWIN, f"av={of('Speeds', 'parameters: {noise_mps2: 0.2}')}"), out)
-    assert replay(out, 123).bit_equal
-    with pytest.raises(TooManyFailedError, match="something else than in its baseline run"):
-        run_here(campaign(*FORCED, TWIN, f"av={of('FreshNoise', 'parameters: {noise_mps2: 0.2}')}"), tmp_path / "fresh")
-
-
 def test_a_forced_test_fails_where_its_shadow_run_did(campaign, run_here, tmp_path):
     """A row, with the weight of the cut-in that it may have hidden, and counted as a crash in the upper limit."""
     loose = campaign(*FORCED, TWIN, "run.max_failed_share=0.05", f"av={of('Breaks')}")
@@ -151,15 +123,15 @@ def test_a_forced_test_fails_where_its_shadow_run_did(campaign, run_here, tmp_pa
     assert all(np.isfinite(row["log_weight"]) and row["log_weight"] < 0.0 for row in rows)
 
 
-def test_shadow_runs_that_are_gone_or_damaged_are_named(early_run, campaign, run_here, tmp_path):
-    folder = copy_of(early_run.folder, tmp_path / "run")
+def test_shadow_runs_that_are_gone_or_damaged_are_named(stored_run, tmp_path):
+    folder = copy_of(stored_run(ACTS), tmp_path / "run")
     files_of(folder)[0].write_bytes(b"PAR1")
     with pytest.raises(RunFolderError, match=r"shard-000000\.parquet.*Delete this file"):
         replay(folder, 5)
     files_of(folder)[0].unlink()
-    with pytest.raises(RunFolderError, match="baseline runs of 2 of 3 files"):
+    with pytest.raises(RunFolderError, match="baseline runs of 1 of 2 files"):
         replay(folder, 5)
-    assert estimate(folder)["n_episodes"] == early_run.estimates["n_episodes"]  # needs no path
+    assert estimate(folder) == estimates(folder)  # needs no path
 
 
 def test_a_vehicle_that_ends_its_process_in_a_shadow_run_fails_there(campaign, run, tmp_path):

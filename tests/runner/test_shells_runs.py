@@ -1,4 +1,4 @@
-"""A shells campaign gives the same bits however it was run, follows its counts, and stops where it says."""
+"""A shells campaign follows its counts, stops where it says, and goes on from what is there."""
 
 from __future__ import annotations
 
@@ -16,44 +16,11 @@ from harness.runner.resume import Manifest, Prefix
 from harness.sampling.allocation import GROWTH, Allocation, first_tests
 from harness.sampling.shells import round_requests
 from harness.strata import ShellDesign, Statement
+from tests.in_process import run_here as run_golden
 from tests.pool.conftest import SMALL_POOL
-from tests.stored_runs import copy_of, edit, manifest, shard_files, stored_table, unlike_columns
+from tests.stored_runs import copy_of, edit, golden, manifest, shard_files, stored_table
 
 SHELLS = ("testing.method=shells", "stop.rhw=0.5", "stop.episodes=3000", "stop.min_crashes=null", *SMALL_POOL)
-
-
-@pytest.fixture(scope="session")
-def shells_run(campaign, run_here, tmp_path_factory):
-    """Eight cells, in SUMO. Never written to."""
-    out = tmp_path_factory.mktemp("shells") / "run"
-    return run_here(campaign(*SHELLS, "world.cells=8"), out)
-
-
-def test_it_reaches_the_precision_and_says_both_things(shells_run):
-    assert (shells_run.exit_code, shells_run.stopped_by) == (0, "rhw")
-    content = shells_run.estimates
-    assert content["headline"] == "shells"
-    estimate = content["estimates"]["shells"]
-    assert estimate["rhw"] <= 0.5
-    assert pytest.approx(estimate["crash_rate"], rel=0.5) == 1.352e-7
-    assert estimate["ci_low"] < 1.352e-7 < estimate["ci_high"]
-    assert content["statement"].startswith("This vehicle crashes ")
-    assert "as often as a careful and competent driver (r157-cc) would in the same traffic" in content["statement"]
-    assert list(content["boundary_statements"]) == ["library", "need-based"]
-    assert "brakes as hard as it takes, up to 3 m/s²" in content["boundary_statements"]["need-based"]
-    assert not any(each["refuted"] for each in estimate["details"]["statements"])
-
-
-def test_continued_to_a_narrower_interval(shells_run, campaign, run_here, tmp_path):
-    """Twin: a rougher run, continued; shards are taken over, and the end is that of a run in one go."""
-    twin = "world.engine=twin"
-    out = tmp_path / "run"
-    run_here(campaign(*SHELLS, twin, "stop.rhw=1.5"), out)
-    begun = {file.name: file.read_bytes() for file in shard_files(out)}
-    run_here(campaign(*SHELLS, twin), out, resume=True)
-    assert len(begun) < len(shard_files(out))
-    assert all((out / "episodes" / name).read_bytes() == content for name, content in begun.items())
-    assert [name for name in unlike_columns(shells_run.folder, out) if name != "estimates.json"] == []
 
 
 def test_a_pool_that_is_used_up_ends_the_run(campaign, run_here, tmp_path):
@@ -129,63 +96,17 @@ def test_a_continuation_that_dies_leaves_a_manifest_that_is_true(campaign, run_h
     assert estimate(out)["n_episodes"] == manifest(out)["n_episodes"]
 
 
-@pytest.mark.parametrize(("asked", "place"), [("library", 0), ("need-based", 1)])
-def test_a_statement_alone_stays_inside(asked, place, campaign, run_here, tmp_path):
-    conditional = (f"testing.shells.statement={asked}", "stop.rhw=0.3", "world.engine=twin")
-    result = run_here(campaign(*SHELLS, *conditional), tmp_path / "run")
-    found = result.estimates["estimates"]["shells"]["details"]["statements"][place]
-    assert result.exit_code == 0
-    assert found["name"] == asked
-    assert found["rhw"] <= 0.3
-    assert found["n_episodes_outside"] == 0
-    assert "Nothing was tested outside" in result.estimates["boundary_statements"][asked]
-    assert any(
-        "outside: the interval allows for any share" in warning
-        for warning in result.estimates["estimates"]["shells"]["warnings"]
-    )
-
-
-def test_a_careless_vehicle_is_found_out(campaign, run_here, tmp_path):
-    careless = ("world.engine=twin", "av.model=constant", "av.parameters={acceleration_mps2: 0.0}")
-    result = run_here(campaign(*SHELLS, *careless), tmp_path / "run")
-    refuted = result.estimates["boundary_statements"]["need-based"]
-    assert refuted.startswith("REFUTED: it is not so that this vehicle brakes as hard as it takes, up to 3 m/s²")
-    first = result.estimates["estimates"]["shells"]["details"]["statements"][1]["refuted_by"][0]
-    assert f"`harness replay FOLDER {first}`" in refuted
-    assert replay(tmp_path / "run", first).row["outcome"] == "crash"
-    assert result.estimates["estimates"]["shells"]["crash_rate"] == pytest.approx(2.4e-5, rel=0.5)
-
-
-def test_a_run_without_its_shells_is_named(shells_run, tmp_path):
-    folder = copy_of(shells_run.folder, tmp_path / "run")
-    (folder / "shells.json").write_text(json.dumps({"strata": ["a"]}))
-    with pytest.raises(RunFolderError, match="shells"):
-        estimate(folder)
-
-
-def test_a_run_of_an_earlier_version_is_told_so(shells_run, tmp_path):
-    folder = copy_of(shells_run.folder, tmp_path / "run")
+def test_shells_of_an_earlier_version_or_of_another_pool_are_refused(stored_run, tmp_path):
+    folder = copy_of(stored_run("shells-twin"), tmp_path / "run")
+    edit(folder, "shells.json", pool="f" * 24)
+    for act in (lambda: replay(folder, 3), lambda: run_golden(golden("shells-twin"), folder, resume=True)):
+        with pytest.raises(RunFolderError, match="cut-ins of pool ffff"):
+            act()
     content = json.loads((folder / "shells.json").read_text())
     del content["statements"]
-    del content["crc32"]
     (folder / "shells.json").write_text(json.dumps({**content, "n_inside": 6, "boundary": "brakes-2-late-1s"}))
     with pytest.raises(RunFolderError, match=r"an earlier version.*Run the campaign again into a new folder"):
         estimate(folder)
-
-
-def test_an_episode_is_replayed_bit_for_bit(shells_run):
-    again = replay(shells_run.folder, 3)
-    assert again.bit_equal
-    assert again.row["pool_cut_in"] is not None
-
-
-def test_another_pool_is_refused(shells_run, campaign, run_here, tmp_path):
-    folder = copy_of(shells_run.folder, tmp_path / "run")
-    edit(folder, "shells.json", pool="f" * 24)
-    with pytest.raises(RunFolderError, match="cut-ins of pool ffff"):
-        replay(folder, 3)
-    with pytest.raises(RunFolderError, match="cut-ins of pool ffff"):
-        run_here(campaign(*SHELLS, "world.cells=8"), folder, resume=True)
 
 
 DESIGN = ShellDesign(
@@ -223,14 +144,7 @@ def test_each_boundary_is_passed_when_what_lies_within_is_known():
     assert rule.next_round(tally(tests, crashes, NONE), 10**6).tolist() == [0, 0, 12]
     inside = Allocation(rule.design, TWELVE, MANY, "wide")
     assert inside.next_round(tally(tests, crashes, NONE), 10**6)[2] == 0
-
-
-def test_what_lies_inside_is_tested_first():
-    rule = Allocation(DESIGN, TWELVE, MANY)
-    assert rule.next_round(tally(NONE, NONE, NONE), 10**6).tolist() == [12, 12, 0]
-    assert rule.next_round(tally(np.array([12, 12, 0]), np.array([6, 0, 0]), NONE), 10**6)[2] == 0
-    assert rule.next_round(tally(np.array([400, 400, 0]), np.array([200, 0, 0]), NONE), 10**6).tolist() == [0, 0, 12]
-    hopeless = rule.next_round(tally(np.array([96, 96, 0]), NONE, NONE), 10**6)
+    hopeless = Allocation(DESIGN, TWELVE, MANY).next_round(tally(np.array([96, 96, 0]), NONE, NONE), 10**6)
     assert hopeless.tolist() == [0, 0, 12]
 
 
@@ -323,10 +237,10 @@ def test_two_phases_cannot_be_continued_to_another_precision(campaign, run_here,
         run_here(campaign(*planned, "stop.rhw=0.8"), tmp_path / "run", resume=True)
 
 
-def test_a_run_that_stops_at_a_wide_interval_says_what_that_does(campaign, run_here, tmp_path):
-    wide = run_here(campaign(*SHELLS, "world.engine=twin", "stop.rhw=0.6"), tmp_path / "wide")
-    assert wide.ending.endswith("Ask for a smaller stop.rhw, or for testing.shells.stopping: two_phase.")
-    assert "two_phase" not in run_here(campaign(*SHELLS, "world.engine=twin"), tmp_path / "narrow").ending
+def test_a_run_that_stops_at_a_wide_interval_says_what_that_does(stored_run):
+    wide = manifest(stored_run("shells-stops"))["ending"]
+    assert wide.endswith("Ask for a smaller stop.rhw, or for testing.shells.stopping: two_phase.")
+    assert "two_phase" not in manifest(stored_run("shells-need-based"))["ending"]
 
 
 def test_a_second_phase_is_planned_at_the_campaigns_own_level():
