@@ -50,15 +50,12 @@ def test_shipped_experiments_are_right(file):
         ("chains: [rare]\ncampaign: {pool: {library: ./none.yaml}}\n", "campaign.pool.library", "no file"),
     ],
 )
-def test_wrong_ones_name_the_place(tmp_path, text, where, found):
+def test_wrong_ones_name_the_place_before_anything_is_written(tmp_path, capsys, text, where, found):
+    file = written(tmp_path, text)
     with pytest.raises(CampaignError) as caught:
-        load_experiment(written(tmp_path, text))
+        load_experiment(file)
     assert where in caught.value.where
     assert found in caught.value.found
-
-
-def test_the_command_refuses_before_anything_is_written(tmp_path, capsys):
-    file = written(tmp_path, "avs: {krauss: {sumo: {carFollowModel: Krauss}}}\n" + SHELLS)
     assert main(["validate", str(file), "--out", str(tmp_path / "out")]) == 2
-    assert "avs.krauss" in capsys.readouterr().err
+    assert where in capsys.readouterr().err
     assert not (tmp_path / "out").exists()

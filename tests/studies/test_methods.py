@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 from functools import cache, partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -98,18 +99,22 @@ COMMITTED = ["chains_shells", "chains_forced"]
 CONDITIONAL = result_of(LIBRARY_STATEMENT)
 
 
-def same_but_for_shards(content: dict, shipped: Experiment) -> bool:
-    """Whether committed results are of this experiment: how tests are cut into shards has no part in it."""
-    content.pop("fault", None)  # of earlier versions, and always null
-    committed = Experiment.model_validate(content)
-    return committed.model_dump(exclude={"campaign": {"run"}}) == shipped.model_dump(exclude={"campaign": {"run"}})
+def committed(name: str) -> tuple[dict[str, Any], Experiment]:
+    """Results in docs/, and the experiment that they are of: how tests are cut into shards has no part in it."""
+    content = json.loads((ROOT / "docs" / "validation" / f"{name}.json").read_text())
+    content["experiment"].pop("fault", None)  # of earlier versions, and always null
+    shipped = load_experiment(ROOT / "scenarios" / "validate" / f"{name}.yaml")
+    one, other = (
+        each.model_dump(exclude={"campaign": {"run"}})
+        for each in (Experiment.model_validate(content["experiment"]), shipped)
+    )
+    assert one == other
+    return content, shipped
 
 
 @pytest.mark.parametrize("name", COMMITTED)
 def test_committed_experiments_say_so_at_full_length(name):
-    content = json.loads((ROOT / "docs" / "validation" / f"{name}.json").read_text())
-    shipped = load_experiment(ROOT / "scenarios" / "validate" / f"{name}.yaml")
-    assert same_but_for_shards(content["experiment"], shipped)
+    content, _ = committed(name)
     judgements = [one for one in content["judgements"] if one["result"] != CONDITIONAL]
     assert len(judgements) >= 4
     for one in judgements:
@@ -119,9 +124,7 @@ def test_committed_experiments_say_so_at_full_length(name):
 
 
 def test_the_committed_panel_meets_what_shells_promise():
-    content = json.loads((ROOT / "docs" / "validation" / "shells_panel.json").read_text())
-    shipped = load_experiment(ROOT / "scenarios" / "validate" / "shells_panel.yaml")
-    assert same_but_for_shards(content["experiment"], shipped)
+    content, shipped = committed("shells_panel")
     assert content["largest_relative_error_of_truth"] <= 0.005
     found = {(one["subject"], one["result"]): one for one in content["judgements"]}
     assert {subject for subject, _ in found} == set(shipped.avs)
@@ -139,7 +142,6 @@ def test_the_committed_panel_meets_what_shells_promise():
 @pytest.mark.slow
 @pytest.mark.parametrize("name", COMMITTED)
 def test_committed_experiments_are_what_the_command_gives(name, tmp_path):
-    validate(load_experiment(ROOT / "scenarios" / "validate" / f"{name}.yaml"), tmp_path)
-    found = json.loads((tmp_path / "results.json").read_text())
-    committed = json.loads((ROOT / "docs" / "validation" / f"{name}.json").read_text())
-    assert found["judgements"] == committed["judgements"]
+    content, shipped = committed(name)
+    validate(shipped, tmp_path)
+    assert json.loads((tmp_path / "results.json").read_text())["judgements"] == content["judgements"]

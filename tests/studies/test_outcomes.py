@@ -47,24 +47,13 @@ def test_with_shared_noise_the_more_skilled_crashes_only_where_the_less_skilled_
     assert joint[:, :, [mask for mask in range(8) if mask not in nested]].max() < 1e-15
 
 
-def test_shells_add_up(chain):
+def test_shells_add_up_and_drawn_pools_scatter_around_them(chain):
     source = ChainShells(chain, 512)
     assert source.shell_p.sum() == pytest.approx(chain.cut_in_rate, rel=1e-11)
     assert source.crash_p.sum() == pytest.approx(chain.crash_rate, rel=1e-11)
-
-
-def test_drawn_pools_scatter_around_the_exact_probabilities(chain):
-    source = ChainShells(chain, 512)
     drawn = [source.draw(np.random.default_rng([1, k]))[0] for k in range(200)]
     p = np.array([each.design.p for each in drawn])
     crash = np.array([each.design.p * each.share for each in drawn])
     for found, exact in ((p, source.shell_p), (crash, source.crash_p)):
         error = found.std(axis=0) / np.sqrt(len(found))
         assert np.all(np.abs(found.mean(axis=0) - exact) <= 4.5 * error + 1e-18)
-
-
-def test_maneuvers_that_depend_on_the_vehicle_are_refused(chain):
-    exposure = chain.exposure.copy()
-    exposure[0] = exposure[0, ::-1]
-    with pytest.raises(ValueError, match="depend on the danger"):
-        joint_outcomes(replace(chain, exposure=exposure))
