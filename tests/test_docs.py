@@ -135,23 +135,6 @@ def test_every_long_run_is_in_the_table():
     assert {path.stem for path in (ROOT / "docs/validation").glob("*.json")} <= shown
 
 
-def test_a_full_study_becomes_a_page_of_the_docs_and_a_quick_one_is_refused(tmp_path, monkeypatch):
-    docs, study = tmp_path / "docs", tmp_path / "study"
-    monkeypatch.setattr(generate, "FOLDER", docs)
-    for folder in (docs, study / "plots"):
-        folder.mkdir(parents=True)
-    (study / "plots" / "tests.png").write_bytes(b"picture")
-    (study / "case_study.md").write_text("# Title\n\n![tests](plots/tests.png), defect (docs/scv-defect.md)\n\nend\n")
-    (study / "claims.json").write_text('{"conclusive": false}')
-    with pytest.raises(SystemExit, match="quick"):
-        generate.take_case_study(study)
-    (study / "claims.json").write_text('{"conclusive": true}')
-    generate.take_case_study(study)
-    page = (docs / "case_study.md").read_text()
-    assert (docs / re.search(r"!\[tests\]\(([^)]+)\)", page)[1]).read_bytes() == b"picture"
-    assert "([why](scv-defect.md))" in page
-
-
 def test_the_lock_pins_what_the_project_depends_on():
     lines = (ROOT / "requirements.lock").read_text(encoding="utf-8").splitlines()
     pins = dict(line.split("==") for line in lines if line and not line.startswith("#"))
@@ -189,10 +172,3 @@ def test_imports_lead_where_they_should(folder, imported):
     wrong = re.compile(rf"^\s*(?:from|import) {imported}\b", re.MULTILINE)
     files = (ROOT / folder).rglob("*.py")
     assert [file for file in files if wrong.search(file.read_text(encoding="utf-8"))] == []
-
-
-def test_the_wheel_has_every_folder_of_the_package():
-    folders = {
-        path.parent.relative_to(ROOT).as_posix().replace("/", ".") for path in ROOT.glob("harness/**/__init__.py")
-    }
-    assert folders == set(PROJECT["tool"]["setuptools"]["packages"]) - {"harness.scenarios", "harness.sumo_networks"}

@@ -5,8 +5,6 @@ import re
 import threading
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from harness.progress import Progress, ShownProgress, episodes_left, shown_progress
 
@@ -46,18 +44,6 @@ def test_episodes_left(figures, target_rhw, min_crashes, left):
     assert episodes_left(1_000, 10_000, target_rhw, min_crashes, figures) == left
 
 
-@given(
-    done=st.integers(0, 10**10),
-    budget=st.integers(1, 10**10),
-    figures=st.fixed_dictionaries(
-        {}, optional={"rhw": st.floats(0, allow_nan=False), "crashes": st.integers(0, 10**9)}
-    ),
-)
-def test_episodes_left_stays_within_the_budget(done, budget, figures):
-    left = episodes_left(done, budget, 0.05, 3_000, figures)
-    assert left is None or 0 <= left <= max(budget - done, 0)
-
-
 def test_a_narrow_terminal_shows_rate_figures_and_time_left(monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
     stream = Terminal()
@@ -89,28 +75,14 @@ def test_the_share_is_that_of_the_work_thought_necessary(watched, target, share)
     assert re.findall(r"(\d+)%", stream.getvalue())[-1] == share
 
 
-def test_work_of_an_earlier_run_does_not_count_as_speed_and_what_is_not_known_is_not_said():
+def test_work_of_an_earlier_run_is_not_its_speed():
     stream = Terminal()
     with ShownProgress(stream=stream) as bar:
         bar.advance(1)  # before any stage it is no error
         bar.stage("episodes", total=10_000, done=5_000)
         bar.status(crashes=3, half_width=float("inf"))
-    assert "50%" in stream.getvalue()
-    assert "/s" not in stream.getvalue()
-    assert "crashes 3" in stream.getvalue()
-    assert "half width" not in stream.getvalue()
-
-
-def test_slow_tests_show_the_time_of_each(monkeypatch):
-    now_s = 100.0
-    log = ShownProgress(stream=Log())
-    log._bars.get_time = lambda: now_s
-    log.stage("episodes", total=1_600)
-    now_s += 120.0
-    log.advance(30)
-    assert next(log.lines()).endswith("episodes: 30 of 1,600 · 4.0 s each · 1 h 44 min left")
-    log.stage("writing estimates and report", None)
-    assert next(log.lines()).endswith(" writing estimates and report")
+    assert [text for text in ("50%", "crashes 3") if text not in stream.getvalue()] == []
+    assert [text for text in ("/s", "half width") if text in stream.getvalue()] == []
 
 
 def test_a_log_gets_a_line_now_and_then_while_a_shard_is_under_way(monkeypatch):
