@@ -9,7 +9,7 @@ import pytest
 
 from harness.report.page import write_report
 from harness.report.summary import RunFolder, read_run_folder
-from tests.report.page_runs import write_run
+from tests.report.page_text import write_run
 
 
 class OnDemand(dict):

@@ -12,14 +12,10 @@ import pytest
 
 from harness.errors import RunFolderError
 from harness.report.page import write_report
+from tests.stored_runs import truncate
 
 SHARDS = [f"{table}/shard-000001.parquet" for table in ("episodes", "moments", "traces")]
 FILES = ["manifest.json", "estimates.json", "campaign.yaml"]
-
-
-def truncated(path: Path) -> None:
-    content = path.read_bytes()
-    path.write_bytes(content[: len(content) // 2])
 
 
 def pages_broken(path: Path) -> None:
@@ -38,17 +34,10 @@ def rewritten(change):
     return lambda path: pq.write_table(change(pq.read_table(path)), path)
 
 
-def with_column(table: pa.Table, name: str, values: pa.Array) -> pa.Table:
-    place = table.schema.get_field_index(name)
-    return table.set_column(place, table.schema.field(place).with_type(values.type), values)
-
-
 def of_unknown_outcome(table: pa.Table) -> pa.Table:
-    return with_column(table, "outcome", pa.array(["flew away"] * 1000, table.column("outcome").type))
-
-
-def in_single_precision(table: pa.Table) -> pa.Table:
-    return with_column(table, "log_weight", table.column("log_weight").cast(pa.float32()))
+    place = table.schema.get_field_index("outcome")
+    values = pa.array(["flew away"] * 1000, table.column("outcome").type)
+    return table.set_column(place, table.schema.field(place), values)
 
 
 def edited(**changes):
@@ -57,14 +46,13 @@ def edited(**changes):
 
 POINT_WITHOUT_RATE = {"n": 1, "ci_low": 0, "ci_high": 1, "rhw": 1}  # which must not be drawn as zero
 DAMAGES = [
-    *((shard, damage, re.escape(shard)) for shard in SHARDS for damage in (truncated, Path.unlink)),
+    *((shard, damage, re.escape(shard)) for shard in SHARDS for damage in (truncate, Path.unlink)),
     *((shard, pages_broken, re.escape(shard)) for shard in (SHARDS[0], SHARDS[2])),
     *((file, damage, file) for file in FILES for damage in (Path.unlink, *map(holding, ("{broken", "[]", "\x00")))),
     *(("campaign.yaml", holding(text), "expected a campaign") for text in ("{}", "testing: 5")),
     (SHARDS[0], rewritten(lambda table: table.slice(0, 990)), "found 990 rows; expected 1000 rows"),
     (SHARDS[0], rewritten(lambda table: table.drop_columns(["log_weight"])), "no column 'log_weight'"),
     (SHARDS[0], rewritten(of_unknown_outcome), "flew away"),
-    (SHARDS[0], rewritten(in_single_precision), "log_weight as double and float"),
     ("estimates.json", edited(campaign_hash="feedfeedfeedfeed"), "feedfeedfeedfeed"),
     ("estimates.json", edited(headline="oracle"), "oracle"),
     ("estimates.json", edited(convergence=[POINT_WITHOUT_RATE]), r"convergence\.0\.crash_rate"),
