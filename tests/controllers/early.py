@@ -8,28 +8,21 @@ import os
 import numpy as np
 
 from examples import idm_batch
-from examples.idm import idm_acceleration
+from examples.idm import IDM, idm_acceleration
 from harness.controllers.traci_style import TraciStyleController
 
 
-class HoldsThenIdm:
+class HoldsThenIdm(IDM):
     """Keeps its speed until the cut-in, as a vehicle that is only asked from then on would."""
-
-    def __init__(self, min_acceleration_mps2: float = -4.0) -> None:
-        self._min = min_acceleration_mps2
 
     def start(self, episode):
         self.random, self.index = episode.random, episode.episode
 
     def step(self, seen):
-        if math.isinf(seen.gap_m):
-            return self.before(seen)
-        return idm_acceleration(seen.speed_mps, seen.lead_speed_mps, seen.gap_m, self._min)
+        return self.before(seen) if math.isinf(seen.gap_m) else super().step(seen)
 
     def before(self, seen):
         return 0.0
-
-    def close(self): ...
 
 
 class HoldsBatch(idm_batch.IDM):
@@ -91,7 +84,7 @@ class YieldsMostly(HoldsThenIdm):
         gap = seen.bv.position_m - 5.0 - seen.position_m
         if self.index % 40 == 3 or gap <= 0.0:
             return 0.0
-        return idm_acceleration(seen.speed_mps, seen.bv.speed_mps, gap, self._min)
+        return idm_acceleration(seen.speed_mps, seen.bv.speed_mps, gap, self.min_acceleration_mps2)
 
 
 class FreshNoise(Speeds):

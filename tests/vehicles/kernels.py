@@ -16,14 +16,6 @@ def _accelerations(driver, situations, out):
 
 
 @compiled_threads
-def _motions(situations, out):
-    for i in range(situations.shape[0]):
-        x, v, a = situations[i]
-        out[i, 1] = kinematics.next_speed(v, a)
-        out[i, 0] = kinematics.next_position(x, v, out[i, 1])
-
-
-@compiled_threads
 def _follow(driver, seed, episode, situations, out):
     late = references.reaction_steps(driver[0], seed, episode)
     memory = references.Memory(0.0, np.inf, driver[0].used_up_steps)
@@ -45,14 +37,6 @@ def accelerations(parameters, situations):
     situations = np.atleast_2d(np.asarray(situations, float))
     out = np.empty(len(situations))
     _accelerations(drivers.driver_records([parameters]), situations, out)
-    return out
-
-
-def motions(situations):
-    """Positions and speeds (n, 2) a step after position, speed and acceleration: (n, 3)."""
-    situations = np.atleast_2d(np.asarray(situations, float))
-    out = np.empty((len(situations), 2))
-    _motions(situations, out)
     return out
 
 

@@ -1,4 +1,4 @@
-"""Motion within a step, and IDM and FVDM against plain Python: the IDM in every bit, FVDM (with its tanh) to 1e-12."""
+"""IDM and FVDM against plain Python: the IDM in every bit, FVDM (with its tanh) to 1e-12."""
 
 import math
 
@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from harness.campaign.drivers import FVDMParameters, IDMParameters
-from tests.vehicles.kernels import accelerations, motions
+from tests.vehicles.kernels import accelerations
 
 speeds = st.floats(0.0, 60.0)
 gaps = st.floats(-5.0, 200.0)
@@ -60,26 +60,3 @@ def test_idm_in_every_bit(parameters, situation):
 @given(fvdm_parameters, situations)
 def test_fvdm(parameters, situation):
     assert accelerations(parameters, situation)[0] == pytest.approx(fvdm(parameters, *situation), rel=1e-12, abs=1e-12)
-
-
-@given(st.one_of(idm_parameters, fvdm_parameters), speeds, st.tuples(speeds, speeds), st.tuples(gaps, gaps))
-def test_more_room_or_a_faster_leader_never_means_harder_braking(parameters, v, leads, pair):
-    near, far = sorted(pair)
-    slow, fast = sorted(leads)
-    careful, by_gap, by_lead = accelerations(parameters, [(v, slow, near), (v, slow, far), (v, fast, near)])
-    assert by_gap >= careful - 1e-9 * max(1.0, abs(careful))
-    assert by_lead >= careful - 1e-9 * max(1.0, abs(careful))
-
-
-# -- motion within a step; tests/worlds/test_sumo_motion.py has its bits, standstill, and the textbook's formula --
-
-
-positions = st.floats(0.0, 2_000.0)
-
-
-@given(positions, speeds, st.floats(-20.0, 20.0))
-def test_never_backwards(x, v, a):
-    after, speed = motions((x, v, a))[0]
-    assert speed >= 0.0
-    assert after >= x
-    assert speed == max(v + a * 0.1, 0.0)

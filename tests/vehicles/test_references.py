@@ -9,7 +9,6 @@ from harness.campaign.drivers import (
     CarefulCompetentParameters,
     FuzzySafetyParameters,
     IDMParameters,
-    NeedBasedParameters,
     Reflexes,
 )
 from tests.vehicles.kernels import accelerations, follow, fuzzy_metrics, smallest_gaps
@@ -67,22 +66,6 @@ def test_the_delay_stated_is_the_one_kept(section, lateral_speed):
 )
 def test_the_metrics_by_hand(situation, pfs, cfs):
     assert fuzzy_metrics(FuzzySafetyParameters(), situation)[0] == pytest.approx([pfs, cfs], abs=1e-3)
-
-
-# -- need-based --
-
-
-def test_it_speeds_up_until_it_needs_to_brake_and_brakes_a_delay_later():
-    driver = NeedBasedParameters()
-    # 10^2/(2 1) + 2 = 52 m: from there on 1 m/s^2 is needed
-    found = driven(driver, (3, (30.0, 20.0, 52.1)), (9, (30.0, 20.0, 42.0)), (4, (30.0, 20.0, 52.1)))
-    assert found.tolist() == [1.0] * 8 + [-1.25] * 4 + [1.0] * 4
-    assert driven(driver, (9, (20.0, 20.1, 0.5))).tolist() == [1.0] * 9  # the vehicle ahead gets away
-
-
-def test_it_brakes_with_what_it_needs_as_hard_as_it_can_at_most():
-    drive = [(1, (30.0, 20.0, gap)) for gap in (52.0, 27.0, 18.0, 1.0)]
-    assert driven(NeedBasedParameters(reaction_time_s=0.0), *drive) == pytest.approx([-1.0, -2.0, -3.0, -3.0])
 
 
 # -- against a plain definition, step by step, for delays of whole steps --

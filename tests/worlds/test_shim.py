@@ -56,22 +56,6 @@ def test_it_answers_whether_everything_is_as_wanted(shim):
     assert position.tolist() == x.ravel().tolist()
 
 
-def test_a_speed_below_zero_gives_the_vehicle_back_to_sumo(shim):
-    """As with setSpeed itself: the AV, told nothing any more, drives its own speed."""
-    wanted = V.copy()
-    wanted[0, 2] = -1.0
-    shim.step(wanted)
-    assert shim.told[0, 2] == -1.0
-    assert shim.speed[2] != V[0, 2]
-    libsumo.vehicle.setSpeed("AV1", -1.0)
-    libsumo.vehicle.setPreviousSpeed("AV0", 35.0)
-    libsumo.vehicle.setPreviousSpeed("AV1", 35.0)
-    for name in ("AV0", "AV1"):
-        libsumo.vehicle.setActionStepLength(name, 0.1, True)
-    libsumo.simulationStep()
-    assert libsumo.vehicle.getSpeed("AV0") == libsumo.vehicle.getSpeed("AV1") != 35.0
-
-
 def test_a_vehicle_that_leaves_the_road_is_an_error_and_stays_one(shim):
     libsumo.vehicle.moveTo("LV0", "cell0_1", libsumo.lane.getLength("cell0_1") - 1.0)
     for _ in range(2):

@@ -6,8 +6,8 @@ import pytest
 from harness.errors import CampaignError
 from harness.vocabulary import AV, BV, CRASH, LV
 from harness.worlds import sumo_driven
-from harness.worlds.sumo_driven import DEFAULTS, SumoAvWorld, recyclable
-from tests.worlds.running import ROOT, bits, run, run_idm, run_in, sumo_av
+from harness.worlds.sumo_driven import SumoAvWorld, recyclable
+from tests.worlds.running import bits, run, run_idm, run_in, sumo_av
 
 
 def driven(av, ranges, *, cells=4, **options):
@@ -41,16 +41,9 @@ def test_other_models_do_not_and_get_a_seeded_simulation_per_episode(attributes)
     assert [bits(in_order, row) for row in (5, 6)] == [bits(alone, row) for row in (0, 1)]
 
 
-def test_random_numbers_differ_between_episodes_and_campaigns():
-    seeds = {sumo_driven.sumo_seed(seed, episode) for seed in (1, 2) for episode in range(50)}
-    assert len(seeds) == 100
-
-
-@pytest.mark.parametrize(
-    "attributes", [{"sigma": 0.1}, {"speedDev": 0.1}, {"actionStepLength": 0.5}, {"startupDelay": 1}]
-)
-def test_attributes_that_nobody_has_measured_are_not_recycled(attributes):
-    assert not recyclable(attributes)
+def test_each_episode_has_a_seed_of_its_own_and_what_nobody_has_measured_is_not_recycled():
+    assert len({sumo_driven.sumo_seed(seed, episode) for seed in (1, 2) for episode in range(50)}) == 100
+    assert not any(map(recyclable, ({"sigma": 0.1}, {"speedDev": 0.1}, {"actionStepLength": 0.5}, {"startupDelay": 1})))
 
 
 def test_lv_and_bv_move_as_with_any_other_av_and_the_av_holds_its_speed_until_the_step_after_the_cut_in():
@@ -105,12 +98,6 @@ def test_wrong_attributes_are_named_with_what_sumo_says(attributes, where, words
     assert words in str(caught.value)
     assert "Error" not in capfd.readouterr().err
     SumoAvWorld(1, {}).close()  # as if SUMO had not been asked
-
-
-def test_documented_defaults_are_the_real_ones():
-    text = (ROOT / "docs" / "sumo-av.md").read_text(encoding="utf-8")
-    for name, value in DEFAULTS.items():
-        assert f"| `{name}` | {value if isinstance(value, str) else format(value, 'g')} |" in text
 
 
 @pytest.mark.parametrize(("overtakes", "speed_mps"), [(1.0, 40.0), (0.0, 26.0)])

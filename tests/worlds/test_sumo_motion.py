@@ -6,7 +6,7 @@ import libsumo
 import numpy as np
 import pytest
 
-from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M, gap, next_position
+from harness.vehicles.kinematics import STEP_S, next_position
 from harness.vocabulary import AV, BV, LV, VEHICLES
 
 CELLS, ROUNDS, SEED = 64, 40, 20_261_121
@@ -65,16 +65,3 @@ def test_these_samples_tell_sumos_formula_from_the_textbooks():
     exact = np.array([next_position(*pair, 0.0) for pair in zip(x, speed, strict=True)])
     assert (textbook != exact).sum() >= 5
     np.testing.assert_allclose(textbook, exact, rtol=1e-14)
-
-
-@pytest.mark.parametrize("overlap_m", [0.0, 0.0005, 0.00099, 0.00101, 0.01, 3.0])
-def test_sumo_flags_a_collision_exactly_beyond_a_millimetre(overlap_m, open_world):
-    world = open_world(1)
-    speed = np.full((1, 3), 20.0)
-    x = np.array([[1000.0, 500.0, 500.0 - VEHICLE_LENGTH_M + overlap_m]])
-    nobody, bv = np.zeros(1, np.int8), np.ones(1, np.int8)
-    world.place(np.arange(1), x, speed)
-    assert not world.step(speed, nobody)[0], "side by side, on two lanes"
-    contact = world.step(speed, bv)[0]
-    assert contact == (gap(world.x[0, BV], world.x[0, AV]) < -0.001)
-    assert contact == (overlap_m > 0.001)

@@ -15,7 +15,7 @@ from harness.episode.loop import EpisodeLoop, RecordPolicy, Shard
 from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, WorldDisagreementError
 from harness.resolved import resolve
 from harness.runner.prepare import prepare
-from harness.vocabulary import AV, CRASH, LV
+from harness.vocabulary import CRASH, LV
 from harness.worlds.shim import shim_library
 from harness.worlds.twin import TwinWorld
 from tests.worlds.running import smoke
@@ -160,15 +160,3 @@ def test_a_collision_in_the_first_step_of_a_refilled_cell_is_flagged(open_world)
         assert world.step(speed, nobody).tolist() == [True, True]
     world.place(np.array([0]), X[:2], speed)
     assert world.step(speed, nobody).tolist() == [False, True]
-
-
-def test_a_cut_in_changes_only_its_own_cell(driving):
-    world = driving(4)
-    world.step(V[:4], np.array([0, 1, 0, 0], np.int8))
-    lanes = {name: libsumo.vehicle.getLaneIndex(name) for name in libsumo.vehicle.getIDList()}
-    assert lanes == {
-        f"{name}{k}": int(name != "AV" and (name, k) != ("BV", 1)) for name in ("LV", "BV", "AV") for k in range(4)
-    }
-    world.place(np.array([1]), X, V)
-    assert libsumo.vehicle.getLaneIndex("BV1") == 1
-    assert world.x[1, AV] == X[1, AV]
