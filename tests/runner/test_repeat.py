@@ -15,11 +15,7 @@ from tests.stored_runs import copy_of, edit
 
 FORCED = Path(__file__).parents[2] / "scenarios/overtaking_forced.yaml"
 SMALL = ("world.engine=twin", "stop.rhw=null", "stop.episodes=400", "run.shard_size=100", "records.traces=none")
-GOOD = "{controller: 'examples.idm:IDM'}"
-BATCH = "{controller: 'examples.idm_batch:IDM'}"
 GLOBAL = "{controller: 'tests.controllers.misbehaving:Global'}"
-SUMO = "{sumo: {carFollowModel: ACC}}"
-ALL_SAME = {"n_episodes": 10, "differing": []}
 
 
 @pytest.fixture
@@ -34,14 +30,12 @@ def statement(folder):
     return json.loads((folder / "estimates.json").read_text())["statement"]
 
 
-@pytest.mark.parametrize(
-    ("av", "overrides"), [(GOOD, ()), (BATCH, ("world.engine=sumo",)), (SUMO, ("world.engine=sumo", "world.cells=8"))]
-)
-def test_a_vehicle_that_does_the_same_again_is_said_to(av, overrides, run_av):
-    folder = run_av(av, *overrides)
-    manifest = read_manifest(folder)
-    assert (manifest["repeated"], manifest["reproducible"]) == (ALL_SAME, True)
-    assert statement(folder).endswith("10 of these tests were run a second time: same bits.")
+@pytest.mark.parametrize("name", ["shells-controller-twin", "forced-batch", "forced-krauss", "forced-traci-style"])
+def test_a_vehicle_that_does_the_same_again_is_said_to(name, stored_run):
+    manifest = read_manifest(stored_run(name))
+    assert (manifest["repeated"]["differing"], manifest["reproducible"]) == ([], True)
+    assert (n := manifest["repeated"]["n_episodes"]) > 5
+    assert statement(stored_run(name)).endswith(f"{n} of these tests were run a second time: same bits.")
 
 
 def test_a_vehicle_that_does_not_is_found_out_for_any_number_of_workers_and_after_a_resume(run_av, run, tmp_path):
@@ -59,15 +53,13 @@ def test_a_vehicle_that_does_not_is_found_out_for_any_number_of_workers_and_afte
     assert (longer["repeated"], longer["reproducible"], longer["n_episodes"]) == (one["repeated"], False, 500)
 
 
-def test_a_replay_that_differs_names_what_it_knows(run_av):
-    folder = run_av(GOOD, "stop.episodes=100")
+def test_a_replay_that_differs_names_what_it_knows(stored_run, tmp_path):
+    folder = copy_of(stored_run("shells-controller-twin"), tmp_path / "run")
     manifest = read_manifest(folder)
-    path = folder / "estimates.json"
-    path.unlink()
+    (folder / "estimates.json").unlink()
     edit(folder, repeated=None)
     assert replay_episode(folder, 3).suspects is None
     campaign = load_campaign(folder / "campaign.yaml")
     assert "the vehicle does not do the same again" in suspects(manifest, campaign)
     assert "source file has been changed" in suspects({**manifest, "controller_sha256": "0"}, campaign)
-    assert "the run was made with" in suspects({**manifest, "cpu": "Z80"}, campaign).lower()
     assert "CPU Z80 (here" in suspects({**manifest, "cpu": "Z80"}, campaign)

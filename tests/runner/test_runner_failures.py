@@ -129,9 +129,7 @@ class Pipe:
 def serve(campaign, tmp_path, monkeypatch):
     """Serve shards with stand-ins for preparing and running one; returns what was noted."""
 
-    def served(
-        pipe: Pipe, run: Callable[[ShardRequest], object], prepare: Callable[[], None] = lambda: None
-    ) -> list[str]:
+    def served(pipe: Pipe, run: Callable = lambda spec: spec.index, prepare: Callable = lambda: None) -> list[str]:
         events = []
 
         class Runner:
@@ -154,53 +152,39 @@ def serve(campaign, tmp_path, monkeypatch):
     return served
 
 
-def index_of(spec: ShardRequest) -> int:
-    return spec.index
-
-
-def test_a_worker_prepares_once_and_ends_with_its_parent(serve):
-    pipe = Pipe(3)
-    assert serve(pipe, index_of) == ["prepared", "closed"]
-    assert pipe.sent == [0, 1, 2]
-
-
-@pytest.mark.parametrize(("lost", "error"), [("recv", ConnectionResetError), ("send", BrokenPipeError)])
-def test_a_worker_ends_quietly_when_its_parent_was_killed(lost, error, serve, monkeypatch):
+@pytest.mark.parametrize(("lost", "error"), [(None, None), ("recv", ConnectionResetError), ("send", BrokenPipeError)])
+def test_a_worker_prepares_once_and_ends_quietly_with_its_parent(lost, error, serve, monkeypatch):
     def broken(*_: object) -> None:
         raise error
 
-    pipe = Pipe(2)
-    monkeypatch.setattr(pipe, lost, broken)
-    assert serve(pipe, index_of) == (["prepared", "closed"] if lost == "send" else [])
+    pipe = Pipe(3)
+    if lost:
+        monkeypatch.setattr(pipe, lost, broken)
+    assert serve(pipe) == ([] if lost == "recv" else ["prepared", "closed"])
+    assert pipe.sent == ([] if lost else [0, 1, 2])
 
 
-def test_an_error_of_preparation_reaches_the_parent(serve):
-    def prepare() -> None:
-        raise CampaignError("world.cells", found="300", expected="at most 256", mend="Use fewer.")
-
-    pipe = Pipe(1)
-    serve(pipe, index_of, prepare)
-    (error,) = pipe.sent
-    assert isinstance(error, CampaignError)
-    assert str(error) == "world.cells: found 300; expected at most 256. Use fewer."
-
-
-def test_a_defect_reaches_the_parent_with_the_workers_traceback(serve):
-    pipe = Pipe(1)
-    serve(pipe, lambda spec: 1 / spec.index)
-    (error,) = pipe.sent
-    assert isinstance(error, ZeroDivisionError)
-    assert "lambda spec: 1 / spec.index" in pickle.loads(pickle.dumps(error)).__notes__[0]
-
-
-def test_an_error_that_cannot_be_pickled_reaches_the_parent_in_words(serve):
-    def run(_: ShardRequest) -> None:
-        error = ValueError("of a strange kind")
-        error.handle = lambda: None
+def raises(error: Exception) -> Callable[..., None]:
+    def raising(*_: object) -> None:
         raise error
 
-    pipe = Pipe(1)
-    serve(pipe, run)
-    (error,) = pipe.sent
+    return raising
+
+
+def test_errors_reach_the_parent(serve):
+    """As they are, a defect with the worker's traceback, and one that cannot be pickled in words."""
+    refused = CampaignError("world.cells", found="300", expected="at most 256", mend="Use fewer.")
+    strange = ValueError("of a strange kind")
+    strange.handle = lambda: None
+    prepared, defect, unpicklable = Pipe(1), Pipe(1), Pipe(1)
+    serve(prepared, prepare=raises(refused))
+    serve(defect, lambda spec: 1 / spec.index)
+    serve(unpicklable, raises(strange))
+    (error,) = prepared.sent
+    assert (type(error), str(error)) == (CampaignError, "world.cells: found 300; expected at most 256. Use fewer.")
+    (error,) = defect.sent
+    assert isinstance(error, ZeroDivisionError)
+    assert "lambda spec: 1 / spec.index" in pickle.loads(pickle.dumps(error)).__notes__[0]
+    (error,) = unpicklable.sent
     assert isinstance(error, RuntimeError)
     assert "ValueError: of a strange kind" in str(error)
