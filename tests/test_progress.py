@@ -85,7 +85,7 @@ def test_work_of_an_earlier_run_is_not_its_speed():
     assert [text for text in ("/s", "half width") if text in stream.getvalue()] == []
 
 
-def test_a_log_gets_a_line_now_and_then_while_a_shard_is_under_way(monkeypatch):
+def test_a_log_gets_a_line_now_and_then_and_none_of_what_is_quickly_done(monkeypatch):
     log = Log()
     monkeypatch.setattr("sys.stderr", log)
     assert type(shown_progress(quiet=True)) is Progress
@@ -101,11 +101,8 @@ def test_a_log_gets_a_line_now_and_then_while_a_shard_is_under_way(monkeypatch):
     assert re.match(r"\d\d:\d\d:\d\d ", log.getvalue())
     lines.stage("writing estimates and report", None)  # at once: it may be a while until the next line
     assert log.getvalue().endswith("writing estimates and report\n")
-
-
-def test_a_log_gets_no_line_of_what_is_quickly_done():
-    log = Log()
-    with ShownProgress(stream=log) as lines:
+    quick = Log()
+    with ShownProgress(stream=quick) as lines:
         lines.stage("episodes", total=10)
         lines.advance(10)
-    assert log.getvalue() == ""
+    assert quick.getvalue() == ""

@@ -1,21 +1,19 @@
-"""One pass feeds all estimators in order; the whole way from a run folder to the content of ``estimates.json``."""
+"""One pass feeds all estimators in order; the content of ``estimates.json``."""
 
 import numpy as np
 import pytest
 import yaml
 
 from harness.campaign.campaign import Campaign
-from harness.errors import RunFolderError
 from harness.estimators.answer import estimate_blocks
 from harness.estimators.estimate import Unavailable, finite_json
 from harness.estimators.one_pass import Diagnostics, accumulator, one_pass
-from harness.runner.stored import estimate_run
 from harness.vocabulary import BV_LV_CONTACT, ESTIMATORS, SAMPLING
 from studies.chains.chain import overtaking
 from studies.chains.sampler import blocks
 from tests.chains.seed import SEED
 
-from .run_folder import CAMPAIGN, write_run
+from .run_folder import CAMPAIGN
 from .small_blocks import block, fed
 
 CHAIN = overtaking("two surrogates", skill=0.5, surrogates=[0.5, 0.2], level=0.02, horizon=6)
@@ -77,26 +75,6 @@ def test_one_crash_that_could_double_the_rate_leads_the_sentence(n, doubts):
     said = answered([some])["statement"]
     assert said.startswith("WARNING: one more crash of the largest possible weight would add 1.65 times") == doubts
     assert ("relative half-width" in said) != doubts
-
-
-def test_of_the_prefix_that_counts_what_is_asked_and_the_headline_are_estimated(tmp_path):
-    folder = write_run(tmp_path, drawn("step_mixture"), with_moments=False, n_episodes=700)
-    content, asked = estimate_run(folder), estimate_run(folder, estimators=["scv"])
-    assert content["n_episodes"] == content["convergence"][-1]["n"] == 700
-    assert asked["estimates"] == {name: content["estimates"][name] for name in ("nade", "scv")}
-    assert content["estimates"]["scv"]["crash_rate"] is None
-    assert "records.moments" in content["estimates"]["scv"]["reason"]
-
-
-@pytest.mark.parametrize(
-    ("kept", "n_episodes", "text"),
-    [((0, 1, 2), 5_000, "1500 episodes on record"), ((0, 2), 900, "begins at episode 1200")],
-    ids=["too few episodes", "a shard missing in between"],
-)
-def test_missing_episodes_are_an_error(tmp_path, kept, n_episodes, text):
-    parts = drawn("forced")
-    with pytest.raises(RunFolderError, match=text):
-        estimate_run(write_run(tmp_path, [parts[k] for k in kept], n_episodes=n_episodes))
 
 
 SHORT = overtaking("short", skill=0.5, surrogates=[0.5, 0.2, 0.8], level=0.02, horizon=5)

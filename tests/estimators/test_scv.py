@@ -12,7 +12,6 @@ from harness.estimators.scv import (
     MixtureCv,
     Scv,
     Stratum,
-    fill_product_columns,
     fold_rows,
     n_columns,
     steps_used,
@@ -103,13 +102,6 @@ def test_columns_that_never_vary_explain_nothing():
     fit = stratum.fit()
     assert (fit.n_columns, fit.rank) == (512, 0)
     assert fit.residual_squares == pytest.approx(np.sum((y - y.mean()) ** 2), rel=1e-12)
-
-
-def test_columns_are_products_in_the_order_of_vec():
-    ratios = np.arange(1.0, 2 * 9 * 3 + 1).reshape(2, 9, 3)
-    columns = np.empty((2, 4), order="F")
-    fill_product_columns(ratios, 2, columns)
-    np.testing.assert_array_equal(columns, [[r[0, i] * r[1, j] for i in range(2) for j in range(2)] for r in ratios])
 
 
 @pytest.mark.parametrize(

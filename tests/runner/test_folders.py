@@ -138,6 +138,7 @@ def written(file: str, text: str | None):
         (lambda run: edit(run, n_episodes=0, shards=[]), READERS[::2], "has not finished an episode yet"),
         (lambda run: edit(run, part={"number": 1}), READERS[:1], "a part of a run"),
         (lambda run: edit(run, n_episodes=500), READERS[:1], "240 episodes"),
+        (lambda run: edit(run, shards=manifest(run)["shards"][::2]), READERS[:1], "begins at episode 160"),
         (lambda run: edit(run, campaign_hash="0" * 16), READERS[2:], "campaign.yaml"),
         *((written("manifest.json", text), READERS, "manifest.json") for text in (None, "{", "[]", '{"shards": 5}')),
         *((written("campaign.yaml", text), READERS, "campaign.yaml") for text in (None, "{", "{}")),

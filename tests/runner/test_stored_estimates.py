@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -14,7 +13,7 @@ from harness.errors import RunFolderError
 from harness.estimators.block import joined
 from harness.runner import stored
 from harness.runner.stored import estimate_run, stored_blocks
-from tests.stored_runs import copy_of, estimates, of_before, stored_table
+from tests.stored_runs import copy_of, edit, estimates, manifest, of_before
 
 
 def test_estimating_again_gives_the_same_content(sumo_run, twin_run, capsys):
@@ -32,14 +31,15 @@ def test_another_confidence_changes_intervals_and_not_the_rate(twin_run):
     assert wider["estimates"][headline]["ci_high"] > stored["estimates"][headline]["ci_high"]
 
 
-def test_rate_and_counts_can_be_had_from_the_table_alone(sumo_run):
-    """The estimate `nade` is the plain mean of exp(log_weight) over crashes."""
-    rows = stored_table(sumo_run, "episodes")
-    outcomes, log_weights = rows["outcome"].to_pylist(), rows["log_weight"].to_pylist()
-    weights = [math.exp(w) for w, outcome in zip(log_weights, outcomes, strict=True) if outcome == "crash"]
-    nade = estimate_run(sumo_run)["estimates"]["nade"]
-    assert math.isclose(nade["crash_rate"], math.fsum(weights) / rows.num_rows, rel_tol=1e-12)
-    assert nade["n_crashes"] == len(weights)
+def test_of_the_prefix_that_counts_what_is_asked_and_the_headline_are_estimated(stored_run, tmp_path):
+    folder = copy_of(stored_run("step-recursive-twin"), tmp_path / "run")
+    shards = [{**shard, "files": {"episodes": shard["files"]["episodes"]}} for shard in manifest(folder)["shards"]]
+    edit(folder, n_episodes=200, shards=shards)
+    content, asked = estimate_run(folder), estimate_run(folder, estimators=["scv"])
+    assert content["n_episodes"] == content["convergence"][-1]["n"] == 200
+    assert asked["estimates"] == {name: content["estimates"][name] for name in ("nade", "scv")}
+    assert content["estimates"]["scv"]["crash_rate"] is None
+    assert "records.moments" in content["estimates"]["scv"]["reason"]
 
 
 @pytest.mark.parametrize(("most", "sizes"), [(90, [80, 160, 160]), (170, [80, 240, 80]), (5_000, [80, 320])])
