@@ -31,17 +31,12 @@ def load(tmp_path):
 
 MISTAKES = (
     ("testin:\n  epsilon: 0.2", "testin", 2, "Did you mean 'testing'?"),
-    ("testing:\n  epsilom: 0.2", "testing.epsilom", 3, "Did you mean 'epsilon'?"),
     ("epsilon: 0.2", "epsilon", 2, "belongs under testing"),
     ("zzz: 0.2", "zzz", 2, "Delete it"),
     ("testing:\n  epsilon: '0.2'", "testing.epsilon", 3, "Remove the quotes"),
-    ("testing:\n  epsilon: true", "testing.epsilon", 3, "truth value"),
     ("testing: 5", "testing", 2, "a section with keys such as method"),
     ("world:", "world", 2, "delete the key for its default"),
-    ("description: 5", "description", 2, "in quotes"),
-    ("stop:\n  episodes: 1.5", "stop.episodes", 3, "a whole number"),
     ("seed: " + "9" * 4299, "seed", 2, "999…"),
-    ("stop:\n  rhw: true", "stop.rhw", 3, "a number, or null"),
     ("stop:\n  rhw: 10", "stop.rhw", 3, "less than 10, or null"),
     ("testing:\n  method: ndee", "testing.method", 3, "Did you mean 'nde'?"),
     ("av:\n  parameters:\n    desired_speed_mps: 300", "av.parameters.desired_speed_mps", 4, "equal to 60 (m/s)"),
@@ -49,13 +44,10 @@ MISTAKES = (
     ("av:\n  parameters: {kappa_per_s: 1}", "av.parameters.kappa_per_s", 3, "surrogates.NAME.parameters"),
     ("av: {model: krauss, parameters: {tau: 1}}", "av.model", 2, "idm, fvdm"),
     ("surrogates:\n  A:\n    parameters: {}", "surrogates.A.model", 3, "no such key"),
-    ("surrogates:\n  A: 5", "surrogates.A", 3, "a section"),
     ("surrogates:\n  a.b: {model: idm}", "surrogates.a.b", 3, "another name"),
-    ("av:\n  controler: a:B", "av.controler", 3, "Did you mean 'controller'?"),
     ("av:\n  model: idm\n  controller: a:B", "av", 2, "An AV has one driver"),
     ("av:\n  controller:", "av.controller", 3, "Write a value after 'controller:'"),
     ("av:\n  controller: my module.py", "av.controller", 3, "text such as my_package.my_module:MyController"),
-    ("av:\n  controller: a:B\n  parameters: [1]", "av.parameters", 4, "names, each with its value"),
     ("av:\n  sumo:\n    carFollowModel: ACC\n    minGap: true", "av.sumo.minGap", 5, "text or a number"),
     ("av:\n  sumo: {tau: 1}\n  parameters: {tau: 1}", "av.parameters", 4, "under av.sumo itself"),
     ("av:\n  traci: {command: ''}", "av.traci.command", 3, "starts the program"),
@@ -217,20 +209,6 @@ def panel(tmp_path):
         return file
 
     return write
-
-
-def test_the_shipped_panel_has_what_the_design_asks_for():
-    avs = load_panel().avs
-    table_1 = [av.parameters.acceleration_mps2 for name, av in avs.items() if name.startswith("alpha-")]
-    assert table_1 == [0.5 * k for k in range(1, 13)]
-    limits = [avs[name].parameters.min_acceleration_mps2 for name in ("brakes-3", "SM-II", "SM-III")]
-    assert limits == [-3.0, -1.0, -6.0]
-    assert [avs[name].reaction.delay_s for name in ("late-300ms", "late-600ms", "late-1000ms")] == [0.3, 0.6, 1.0]
-    assert [av.sumo["carFollowModel"] for av in avs.values() if av.sumo is not None] == ["ACC", "Krauss"]
-    content = {}
-    for name, av in avs.items():
-        content.setdefault(av.model_dump_json(), []).append(name)
-    assert [names for names in content.values() if len(names) > 1] == [["idm", "alpha-2.0"]]
 
 
 def test_every_number_of_the_shipped_panel_carries_a_tag():

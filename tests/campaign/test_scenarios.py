@@ -89,12 +89,6 @@ def test_scenario_is_valid(file):
     jsonschema.validate(read_yaml(file)[0], SCHEMA)
 
 
-def test_published_nade_is_shipped_with_either_epsilon():
-    for name, epsilon in {"overtaking_nade": 0.95, "overtaking_nade_epsilon_0.1": 0.1}.items():
-        nade = load_campaign(FOLDER / f"{name}.yaml").testing
-        assert (nade.method, nade.challenge, nade.epsilon) == ("step_mixture", "immediate", epsilon)
-
-
 # -- written out, and the editor's schema --
 
 

@@ -1,5 +1,7 @@
 """The YAML reader: what looks like a number is one, and nothing wrong passes silently."""
 
+from pathlib import Path
+
 import pytest
 
 from harness.campaign.files import parse_value, read_yaml
@@ -20,11 +22,9 @@ def read(tmp_path):
     ("text", "value"),
     [
         ("1e-5", 1e-5),
-        ("-.5e-3", -0.5e-3),
         ("010", 10),
         ("0o17", 15),
         ("0x1F", 31),
-        ("100_000", 100_000),
         ("12:30", "12:30"),
         ("no", "no"),
         ("true", True),
@@ -32,7 +32,6 @@ def read(tmp_path):
         ("", None),
         ("2024-01-01", "2024-01-01"),
         ("'1'", "1"),
-        ("1e", "1e"),
         ("[1, {b: 2}]", [1, {"b": 2}]),
     ],
 )
@@ -67,15 +66,12 @@ def test_lines_fall_back_to_the_nearest_ancestor(read):
         ("a: 1\n\tb: 2", "2:1", "character '\\t'"),
         ("a: 1\n---\nb: 2", "2:1", "a single document"),
         ("a: 1\nb: [1,\n", "3:1", "<stream end>"),
-        ("a: 'x\n", "2:1", "a quoted scalar (line 1)"),
         ("a: 1\nb: x\0y", "2:5", "U+0000"),
         ("a: 1\nb: !!python/name:os.system x", "2:4", "tag"),
-        ("a: !!int 1", "1:4", "tag"),
         ("a: &x [*x]", 1, "more than 100,000 values, or 50 levels"),
         ("a: *nope", 1, "nope"),
         ("a: &x [1]\nb: *x\nc: &x [2]", "3:4", "duplicate anchor 'x'"),
         ("b: 1\n1: a", 2, "not text"),
-        ("? [1]\n: 2", 1, "not text"),
         ("<<: 5", "1:5", "for merging"),
         ("a: " + "[" * 60 + "]" * 60, 1, "50 levels"),
     ],
@@ -93,30 +89,25 @@ def test_errors_name_the_line(read, text, line, words):
 @pytest.mark.parametrize(
     ("content", "words"),
     [
-        ("", "empty"),
         ("# only a comment\n", "empty"),
         (b"a: \xff", "UTF-8"),
         ("a: " + "9" * 5000, "limit"),
         ('a: "\\UFFFFFFFF"', "too large"),
         ("a: " + "[" * 5000, "nested too deeply"),
         ("".join(f"key_{i}: 1\n" for i in range(60_000)), "more than 100,000 bytes"),
+        (Path("none.yaml"), "no such file"),
+        (Path(), "a folder"),
+        (Path("a\0b"), "cannot be"),
+        (Path("/dev/zero"), "more"),
     ],
 )
-def test_files_that_are_refused_as_a_whole(read, content, words):
+def test_files_that_are_refused_as_a_whole(read, tmp_path, content, words):
     with pytest.raises(CampaignError, match=words):
-        read(content)
+        read_yaml(tmp_path / content) if isinstance(content, Path) else read(content)
 
 
 def test_byte_order_mark_is_no_content(read):
     assert read(b"\xef\xbb\xbfa: 1")[0] == {"a": 1}
-
-
-@pytest.mark.parametrize(
-    ("name", "words"), [("none.yaml", "no such file"), (".", "a folder"), ("a\0b", "cannot be"), ("/dev/zero", "more")]
-)
-def test_what_is_no_readable_file(tmp_path, name, words):
-    with pytest.raises(CampaignError, match=words):
-        read_yaml(tmp_path / name)
 
 
 @pytest.mark.parametrize(("first", "more"), [("[1]", "[{}]"), ("{x: 1}", "{{{}}}")])

@@ -99,17 +99,6 @@ def test_records_hold_what_was_drawn_from(challenge):
     np.testing.assert_allclose(done.moment_q @ done.alpha, done.moment["q_sampled"], rtol=1e-12)
 
 
-def test_a_higher_threshold_leaves_fewer_moments_critical():
-    environment, importance = policy_of("recursive", 0.1)
-    _, state, _, after = recorded("recursive")
-    counts = []
-    for threshold in (0.0, 1e-3, 0.5):
-        found = after_cut_in(state[after], environment, importance._replace(threshold=threshold))
-        np.testing.assert_array_equal(found.critical, (found.v > threshold).any(axis=1))
-        counts.append(int(found.critical.sum()))
-    assert counts[0] > counts[1] > counts[2] > 0
-
-
 @pytest.mark.parametrize("component", [1, 2, 3])
 def test_draws_follow_the_mixture_or_the_component(component):
     """Equal steps of the uniform give every acceleration its probability to within one step."""
