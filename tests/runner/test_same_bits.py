@@ -42,11 +42,19 @@ def test_the_idm_however_it_is_brought(name, stored_run):
         ("forced-lateral-twin", 7),
         ("shells-twin", 64),
         ("shells-lateral-twin", 5),
+        ("nde-twin", 256),
+        ("mixture-twin", 1),
     ],
 )
 def test_any_number_of_cells(name, cells, stored_run, tmp_path):
     run_here(golden(name, f"world.cells={cells}"), tmp_path / "run")
     assert unlike_columns(stored_run(name), tmp_path / "run") == []
+
+
+@pytest.mark.parametrize(("name", "size"), [("nde-twin", 7), ("mixture-twin", 101), ("forced-twin", 240)])
+def test_any_split_into_shards(name, size, stored_run, tmp_path):
+    run_here(golden(name, f"run.shard_size={size}"), tmp_path / "run")
+    assert set(unlike_columns(stored_run(name), tmp_path / "run")) <= {"estimates.json"}
 
 
 def test_two_workers(stored_run, tmp_path):
