@@ -37,7 +37,7 @@ def test_load_run_estimate_and_replay_in_a_few_lines(tmp_path):
     assert (result.exit_code, result.stopped_by, result.folder) == (0, "rhw", folder)
     assert result.estimates == estimates(folder) == harness.estimate(str(folder))
     assert harness.estimate(folder, estimators=["nade"], confidence=0.5)["confidence"] == 0.5
-    files = {"campaign.yaml", "manifest.json", "estimates.json", "report.html", "episodes", "moments", "traces"}
+    files = {"campaign.yaml", "manifest.json", "estimates.json", "report.html", "plots", "episodes", "traces"}
     assert {path.name for path in folder.iterdir()} >= files
     assert harness.load_campaign(folder / "campaign.yaml") == harness.load_campaign(MIXTURE_FILE, SMALL)
     replayed = harness.replay(str(folder), 17, fcd=str(tmp_path / "fcd.xml"))

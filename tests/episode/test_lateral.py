@@ -12,7 +12,6 @@ from harness.campaign.vehicle import AutomatedVehicle
 from harness.episode.cells import drawn_traffic
 from harness.episode.loop import Drawing, EpisodeLoop, RecordPolicy
 from harness.importance.functions import build_importance
-from harness.pool.replay import Retracing
 from harness.records.schemas import episodes_table
 from harness.resolved import resolve
 from harness.runner.prepare import prepare
@@ -80,22 +79,6 @@ def test_the_av_keeps_its_speed_until_it_may_act_and_acts_then():
         assert (commanded[: onset + 1] == 0.0).all()
         acted += commanded.size > onset + 1 and commanded[onset + 1] != 0.0
     assert acted > 450
-
-
-@pytest.mark.parametrize("lead_s", [0.1, 0.8, None])
-@pytest.mark.parametrize(
-    "av",
-    [IDM, AutomatedVehicle(model="r157-cc"), AutomatedVehicle(model="constant", parameters={"acceleration_mps2": 2.0})],
-    ids=["idm", "r157-cc", "accelerates"],
-)
-def test_every_episode_is_retraced(av, lead_s):
-    one = campaign("forced", lead_s, av, log_normal=lead_s is None)
-    table = episodes_table(drive(one), one.seed)
-    sumo = Retracing(resolve(one))
-    assert sumo.check(table) == N
-    assert "onset_r2_m" in sumo.summary(N)["compared"]
-    contact = table.column("contact").to_pylist()
-    assert set(contact) >= {None, "rear"}
 
 
 BESIDE = [(-0.5, CRASH), (-9.9985, CRASH), (0.5, None), (-9.9995, PASSED), (-0.0005, None), (-0.0015, CRASH)]

@@ -47,11 +47,10 @@ def campaign(
     epsilon: float = 0.1,
     threshold: float = 0.0,
     moments: str = "none",
-    seed: int = SEED,
 ) -> Campaign:
     return Campaign(
         name="test",
-        seed=seed,
+        seed=SEED,
         environment=EnvironmentSettings(lane_change_level=level, acceleration_hold_s=hold_s),
         av=AVS[av],
         surrogates=SURROGATES[surrogates],
@@ -102,10 +101,6 @@ class Run:
     def log_q(self):
         return self.shard.results.log_q
 
-    @cached_property
-    def weight(self):
-        return np.exp(self.log_weight)
-
     @property
     def crash(self):
         return self.episode["outcome"] == CRASH
@@ -116,7 +111,7 @@ class Run:
 
     @cached_property
     def y(self):
-        return np.where(self.crash, self.weight, 0.0)
+        return np.where(self.crash, np.exp(self.log_weight), 0.0)
 
     @property
     def rate(self) -> Mean:
