@@ -29,7 +29,7 @@ from harness.records.reader import read_shards
 from harness.resolved import Resolved
 from harness.runner.prepare import require_ready
 from harness.runner.resume import require_own_folder
-from harness.runner.run import Run, finish
+from harness.runner.run import Run
 from harness.sampling import ShardRequest
 from harness.sampling.shells import PairRounds, Shells, round_requests
 from harness.vocabulary import IntArray
@@ -128,8 +128,7 @@ def _compared(
         counts = _drive(rounds, pairs, both)
         working.close()
         for run in runs:
-            run.discard_uncounted()
-            finish(run, rounds.rule)
+            run.finish(rounds.rule)
     return paired_estimate(counts, campaign.stop.confidence), rounds.rule
 
 
@@ -150,11 +149,11 @@ class _Side:
 
     def drive(self, n_pairs: IntArray) -> None:
         """Test what is missing of the first cut-ins of each stratum."""
-        tested, prefix = self.pairs.tests(self.side), self.into.prefix
+        tested, done = self.pairs.tests(self.side), self.into.manifest
         missing = np.maximum(n_pairs - tested, 0)
         if missing.any():
             size = self.into.campaign.run.smallest_shard
-            self.run(iter(round_requests(tested, missing, len(prefix.shards), prefix.n_episodes, size)))
+            self.run(iter(round_requests(tested, missing, len(done.shards), done.n_episodes, size)))
 
 
 def _drive(rounds: PairRounds, pairs: PairedShells, both: list[_Side]) -> PairCounts:

@@ -17,7 +17,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from harness.campaign.campaign import Campaign, dump_campaign
+from harness.campaign.campaign import dump_campaign
 from harness.errors import RunFolderError, TooManyFailedError
 from harness.pool.replay import Retracing
 from harness.records.folder import (
@@ -66,40 +66,6 @@ def cpu_name() -> str:
     return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.machine())
 
 
-class Prefix:
-    """Finished shards in order, from the first on, as the manifest lists them, and what is counted over them."""
-
-    def __init__(self) -> None:
-        self.shards: list[dict[str, Any]] = []
-        self.n_episodes = self.n_crashes = self.n_failed = self.n_retraced = self.reported_from = 0
-        self.repeated: Repeated | None = None
-        self._causes: Counter[str] = Counter()
-
-    def add(self, done: ShardResult) -> None:
-        """Append a shard that is on disk."""
-        request = done.request
-        self.shards.append(
-            {
-                "index": request.index,
-                "first_episode": request.first_episode,
-                "n_episodes": request.n_episodes,
-                "files": done.files,
-                "crc32": done.crc32,
-            }
-        )
-        self.n_episodes += request.n_episodes
-        self.n_retraced += done.n_retraced
-        self.n_crashes += int(done.block.crash.sum())
-        self.n_failed += int(done.block.failed.sum())
-        self._causes += done.failures
-        self.repeated = self.repeated or done.repeated
-
-    def require_few_failed(self, campaign: Campaign, *, at_least: int = 0) -> None:
-        """Refuse an answer from tests of which too many failed, once there are ``at_least`` so many."""
-        if self.n_episodes >= at_least:
-            require_few_failed(self.n_failed, self.n_episodes, self._causes, campaign.run.max_failed_share)
-
-
 def require_few_failed(
     n_failed: int, n: int, causes: Counter[str], most: float, what: str = "episodes", where: str = "the episodes table"
 ) -> None:
@@ -116,7 +82,7 @@ def require_few_failed(
 
 
 class Manifest:
-    """Keeps ``manifest.json`` and ``campaign.yaml`` of a run folder true.
+    """Finished shards in order, from the first on, and counts over them: keeps ``manifest.json`` and its campaign true.
 
     ``earlier`` is what `require_own_folder` found, ``began`` `time.monotonic` at the run's beginning; ``facts`` are
     more keys. ``limits_before`` are other limits that have been asked of the folder's tests, ``listed_baseline``
@@ -126,10 +92,12 @@ class Manifest:
     def __init__(
         self, folder: Path, resolved: Resolved, earlier: dict[str, Any], *, began: float, **facts: Any
     ) -> None:
-        campaign = resolved.campaign
-        self._folder, self._earlier = folder, earlier
-        self._campaign = dump_campaign(campaign).encode()
-        self._reproducible = campaign.av.reproducible
+        self._folder, self._earlier, self._campaign = folder, earlier, resolved.campaign
+        campaign, self._yaml = self._campaign, dump_campaign(self._campaign).encode()
+        self.shards: list[dict[str, Any]] = []
+        self.n_episodes = self.n_crashes = self.n_retraced = self.reported_from = self._n_failed = 0
+        self._repeated: Repeated | None = None
+        self._causes: Counter[str] = Counter()
         self._began = began - float(earlier.get("wall_time_s") or 0.0)
         asked = [] if campaign.accept is None else [campaign.accept.crash_rate_below]
         self.listed_baseline: list[int] = earlier.get("baseline_crc32", [])
@@ -139,7 +107,7 @@ class Manifest:
             "format": 1,
             "name": campaign.name,
             "campaign_hash": resolved.content_hash,
-            "campaign_crc32": zlib.crc32(self._campaign),
+            "campaign_crc32": zlib.crc32(self._yaml),
             "created": earlier.get("created") or datetime.now(UTC).isoformat(timespec="seconds"),
             "seed": campaign.seed,
             "engine": campaign.world.engine,
@@ -150,8 +118,25 @@ class Manifest:
             **facts,
         }
         self._written = began
-        self._last: dict[str, Any] = {}
-        self.write(Prefix(), "running")  # first: --resume knows a folder by its manifest
+        self.write("running")  # first: --resume knows a folder by its manifest
+
+    def add(self, done: ShardResult) -> None:
+        """Append a shard that is on disk."""
+        request = done.request
+        place = {name: getattr(request, name) for name in ("index", "first_episode", "n_episodes")}
+        self.shards.append({**place, "files": done.files, "crc32": done.crc32})
+        self.n_episodes += request.n_episodes
+        self.n_retraced += done.n_retraced
+        self.n_crashes += int(done.block.crash.sum())
+        self._n_failed += int(done.block.failed.sum())
+        self._causes += done.failures
+        self._repeated = self._repeated or done.repeated
+
+    def require_few_failed(self, *, at_least: int = 0) -> None:
+        """Refuse an answer from tests of which too many failed, once there are ``at_least`` so many."""
+        if self.n_episodes >= at_least:
+            most = self._campaign.run.max_failed_share
+            require_few_failed(self._n_failed, self.n_episodes, self._causes, most)
 
     def listed(self, request: ShardRequest) -> dict[str, Any]:
         """What an earlier run has noted of a shard of the same place and size; empty if it has not."""
@@ -180,47 +165,38 @@ class Manifest:
         """More keys, from the next time on that it is written."""
         self._content.update(facts)
 
-    def follow(self, prefix: Prefix) -> None:
+    def follow(self) -> None:
         """Write it every few seconds, so that a run which goes on can be read."""
         if time.monotonic() - self._written > INTERVAL_S:
-            self.write(prefix, "running")
+            self.write("running")
 
-    def write(
-        self,
-        prefix: Prefix,
-        status: str,
-        *,
-        stopped_by: str | None = None,
-        ending: str | None = None,
-        retraced: dict[str, Any] | None = None,
-    ) -> None:
-        """Record the contiguous prefix of finished shards.
+    def write(self, status: str, **of_the_end: Any) -> None:
+        """Record the finished shards.
 
         While a run goes on and has not come as far as an earlier one, what that one has left stays true.
         """
         self._written = time.monotonic()
-        if status != "done" and prefix.n_episodes < self._earlier["n_episodes"]:
+        if status != "done" and self.n_episodes < self._earlier["n_episodes"]:
             return
-        repeated = prefix.repeated
-        self._last = {
+        repeated = self._repeated
+        content = {
             **self._content,
             "status": status,
-            "stopped_by": stopped_by,
-            "ending": ending,
-            "retraced": retraced,
-            "reproducible": self._reproducible and not (repeated and repeated.differing),
+            **dict.fromkeys(("stopped_by", "ending", "retraced")),
+            **of_the_end,
+            "reproducible": self._campaign.av.reproducible and not (repeated and repeated.differing),
             "repeated": None if repeated is None else asdict(repeated),
             "wall_time_s": round(self._written - self._began, 3),
-            "n_episodes": prefix.n_episodes,
-            "reported_from": prefix.reported_from if prefix.reported_from < prefix.n_episodes else 0,
-            "shards": prefix.shards,
+            "n_episodes": self.n_episodes,
+            "reported_from": self.reported_from if self.reported_from < self.n_episodes else 0,
+            "shards": self.shards,
         }
         path = self._folder / CAMPAIGN
-        if not path.exists() or path.read_bytes() != self._campaign:
+        if not path.exists() or path.read_bytes() != self._yaml:
             # Until it is there no checksum is told: not of the old one, nor of this.
-            write_sealed(self._folder / MANIFEST, {**self._last, "campaign_crc32": None})
-            write_bytes(path, self._campaign)
-        write_sealed(self._folder / MANIFEST, self._last)
+            write_sealed(self._folder / MANIFEST, {**content, "campaign_crc32": None})
+            write_bytes(path, self._yaml)
+        write_sealed(self._folder / MANIFEST, content)
 
 
 def require_own_folder(folder: Path, resolved: Resolved, *, resume: bool) -> dict[str, Any]:

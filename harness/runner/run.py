@@ -37,7 +37,6 @@ from harness.runner.prepare import distance_per_test_m, prepare, require_ready
 from harness.runner.resume import (
     SMALLEST_FAILED_SAMPLE,
     Manifest,
-    Prefix,
     cpu_name,
     require_few_failed,
     require_no_fewer,
@@ -95,9 +94,8 @@ def run_campaign(
             run.make_ready()
             rounds = run.source.rounds(run.held)
             run_rounds(run, rounds)
-        require_no_fewer(out, earlier, run.prefix.n_episodes)
-        run.discard_uncounted()
-        return finish(run, rounds.rule, rounds.remark)
+        require_no_fewer(out, earlier, run.manifest.n_episodes)
+        return run.finish(rounds.rule, rounds.remark)
 
 
 def run_rounds(run: Run, rounds: Rounds) -> None:
@@ -105,7 +103,7 @@ def run_rounds(run: Run, rounds: Rounds) -> None:
     for requests in rounds:
         for shard in run.results(requests):
             enough = rounds.enough(shard.block)
-            run.prefix.reported_from = rounds.reported_from
+            run.manifest.reported_from = rounds.reported_from
             run.follow(rounds.rule, shard)
             if enough:
                 return
@@ -114,8 +112,8 @@ def run_rounds(run: Run, rounds: Rounds) -> None:
 class Run:
     """A campaign on its way into a folder, in which nobody but this process writes.
 
-    ``source`` is what its tests are drawn from, ``prefix`` what is finished, ``held`` how many tests the folder held
-    before.
+    ``source`` is what its tests are drawn from, ``manifest`` tells what is finished, ``held`` how many tests the folder
+    held before.
     """
 
     def __init__(
@@ -133,7 +131,7 @@ class Run:
         for left in out.rglob(".*.part"):  # of an earlier run that was killed
             left.unlink()
         self.source = prepare(resolved, progress)
-        self.prefix, self.held = Prefix(), int(earlier["n_episodes"])
+        self.held = int(earlier["n_episodes"])
         self._retracing = Retracing(resolved)
         self._workers = workers_of(resolved, out, n_workers, n_runs=n_runs)
         with ExitStack() as refused:
@@ -142,8 +140,7 @@ class Run:
             self.manifest = Manifest(
                 out, resolved, earlier, began=began, workers=self._workers.n_workers, distance_per_test_m=distance_m
             )
-            require_same_pool(out, self.source)
-            self._write_design()
+            self._keep_design()
             refused.pop_all()
 
     @contextmanager
@@ -151,9 +148,9 @@ class Run:
         """Tests are run within this: the manifest follows, so that an interrupted run can be read, and workers end."""
         try:
             yield self
-            self.prefix.require_few_failed(self.campaign)
+            self.manifest.require_few_failed()
         except BaseException:
-            self.manifest.write(self.prefix, "interrupted")
+            self.manifest.write("interrupted")
             raise
         finally:
             self._workers.close()
@@ -162,8 +159,7 @@ class Run:
         """Make baseline runs, if tests follow from some, and say how many tests there will be at most."""
         if (paths := self.source.baseline_paths) is not None:
             self._make_baseline(paths)
-            require_same_pool(self.out, self.source)
-            self._write_design()
+            self._keep_design()
         # Until a decision nobody knows how many.
         most = self.campaign.stop.episodes if self.campaign.accept is None else None
         self._progress.stage(f"episodes{self._workers.where}", most, done=self.held)
@@ -181,9 +177,9 @@ class Run:
         """
         watched = "half_width" if self.campaign.stop.rhw is None else "rhw"
         one_more = {"one_more_crash": rule.look.one_more_crash} if self.campaign.sampling.forces else {}
-        self._progress.status(crashes=self.prefix.n_crashes, **{watched: rule.look.rhw}, **one_more)
-        self._progress.advance(min(max(self.prefix.n_episodes - self.held, 0), shard.request.n_episodes))
-        self.manifest.follow(self.prefix)
+        self._progress.status(crashes=self.manifest.n_crashes, **{watched: rule.look.rhw}, **one_more)
+        self._progress.advance(min(max(self.manifest.n_episodes - self.held, 0), shard.request.n_episodes))
+        self.manifest.follow()
 
     def _known(self, request: ShardRequest) -> ShardResult | None:
         """See `stored_shard`; workers are about to be busy with the first shard that it does not know."""
@@ -199,8 +195,8 @@ class Run:
             files = write_shard(self.out, shard.request.index, shard.parquet)
             crc32 = {name: zlib.crc32(content) for name, content in shard.parquet.items()}
             shard = replace(shard, files=files, crc32=crc32)
-        self.prefix.add(shard)
-        self.prefix.require_few_failed(self.campaign, at_least=SMALLEST_FAILED_SAMPLE)
+        self.manifest.add(shard)
+        self.manifest.require_few_failed(at_least=SMALLEST_FAILED_SAMPLE)
 
     def _make_baseline(self, paths: BaselinePaths) -> None:
         """Drive the vehicle along all paths without a cut-in, but for what an earlier run has done of it."""
@@ -218,58 +214,44 @@ class Run:
             self._progress.advance(result.request.n_episodes)
             counts = {"n_runs": sum(map(len, tables)), "n_failed": causes.total()}
             self.manifest.note(shadow_runs=counts, baseline_crc32=crc32)
-            self.manifest.follow(self.prefix)
+            self.manifest.follow()
         most, where = self.campaign.run.max_failed_share, "the run folder's shadow/ tables"
         require_few_failed(causes.total(), n, causes, most, "baseline runs", where)
         runs = as_recorded(tables, environment)
         self.manifest.note(distance_per_test_m=runs.mean_distance_m(paths.weight))
         self.source.begin_after(runs)
 
-    def _write_design(self) -> None:
-        """Keep the strata: without them nothing can be estimated."""
+    def _keep_design(self) -> None:
+        """Write the strata, without which nothing can be estimated, where the folder has no others."""
+        require_same_pool(self.out, self.source)
         if self.source.design is not None:
             write_sealed(self.out / SHELLS, STORED_DESIGN.dump_python(self.source.design, mode="json"))
 
-    def discard_uncounted(self) -> None:
-        """Remove shards that an earlier, longer run has left beyond the stop."""
-        counted = {self.out / file for shard in self.prefix.shards for file in shard["files"].values()}
+    def finish(self, rule: Rule, remark: str = "") -> RunResult:
+        """Write manifest, estimates and report once the rule has seen enough; no shard beyond the stop is left."""
+        manifest, decision, decided = self.manifest, rule.look.decision, {}
+        counted = {self.out / file for shard in manifest.shards for file in shard["files"].values()}
         for path in {path for table in TABLES for path in shards_on_disk(self.out, table)} - counted:
             path.unlink()
-
-    def close_manifest(self, stopped_by: StoppedBy, ending: str, **facts: Any) -> None:
-        """Write the manifest of what is finished."""
+        stopped_by, said = conclusion(self.campaign, rule, manifest.n_episodes, manifest.reported_from)
+        if stopped_by == "rhw" and remark:
+            said += f" {remark}"
+        missed = self.campaign.stop.rhw is not None and stopped_by not in ("rhw", "two_phase")
+        code = EXIT_BUDGET_SPENT if missed else EXIT_DONE
+        if decision is not None:
+            code = EXIT_OF[decision.verdict]
+            decided["decision"] = replace(decision, asked_before=manifest.limits_before).to_json()
         if others := self._workers.cpus():  # bits may have come from any of them
-            self.manifest.note(cpu=", ".join(sorted({cpu_name(), *others})))
-        self.manifest.note(**facts)
-        retraced = self._retracing.summary(self.prefix.n_retraced)
-        self.manifest.write(self.prefix, "done", stopped_by=stopped_by, ending=ending, retraced=retraced)
+            manifest.note(cpu=", ".join(sorted({cpu_name(), *others})))
+        retraced = self._retracing.summary(manifest.n_retraced)
+        manifest.write("done", stopped_by=stopped_by, ending=said, retraced=retraced, **decided)
         self._progress.stage("writing estimates and report", None)
+        estimates = estimate_run(self.out)
+        write_sealed(self.out / ESTIMATES, estimates)
+        # No worker loads matplotlib, and it has been loaded here while workers were busy.
+        from harness.report.page import write_report  # noqa: PLC0415
 
-
-def finish(run: Run, rule: Rule, remark: str = "") -> RunResult:
-    """Write manifest, estimates and report of a run whose rule has seen enough."""
-    stopped_by, said = conclusion(run.campaign, rule, run.prefix.n_episodes, run.prefix.reported_from)
-    if stopped_by == "rhw" and remark:
-        said += f" {remark}"
-    decided, decision = {}, rule.look.decision
-    if decision is not None:
-        decided["decision"] = replace(decision, asked_before=run.manifest.limits_before).to_json()
-    run.close_manifest(stopped_by, said, **decided)
-    estimates = estimate_run(run.out)
-    write_sealed(run.out / ESTIMATES, estimates)
-    # No worker loads matplotlib, and it has been loaded here while workers were busy.
-    from harness.report.page import write_report  # noqa: PLC0415
-
-    code = exit_code(run.campaign, stopped_by, None if decision is None else decision.verdict)
-    return RunResult(run.out, write_report(run.out), estimates, stopped_by, said, code)
-
-
-def exit_code(campaign: Campaign, stopped_by: StoppedBy, verdict: Verdict | None) -> int:
-    """See `RunResult`."""
-    if verdict is not None:
-        return EXIT_OF[verdict]
-    missed = campaign.stop.rhw is not None and stopped_by not in ("rhw", "two_phase")
-    return EXIT_BUDGET_SPENT if missed else EXIT_DONE
+        return RunResult(self.out, write_report(self.out), estimates, stopped_by, said, code)
 
 
 def conclusion(campaign: Campaign, rule: Rule, n_episodes: int, reported_from: int) -> tuple[StoppedBy, str]:

@@ -6,7 +6,7 @@ import pytest
 
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, RunFolderError
 from harness.progress import Progress
-from harness.runner.resume import Prefix
+from harness.runner.resume import Manifest
 from tests.runner.conftest import TWIN
 from tests.stored_runs import copy_of, estimates, manifest, shard_files, unlike_columns
 
@@ -76,13 +76,13 @@ def test_a_spent_budget_is_exit_code_4_and_can_be_enlarged(runs, run_here, campa
 
 def test_a_shard_is_written_when_all_before_it_are_in(campaign, run_here, tmp_path, monkeypatch):
     """Whatever ends the run, the folder holds a prefix of its shards: here the worker is ahead by one."""
-    counted, on_disk, add = [], [], Prefix.add
+    counted, on_disk, add = [], [], Manifest.add
 
-    def noted(prefix, done):
-        add(prefix, done)
-        counted.append(len(prefix.shards))
+    def noted(manifest, done):
+        add(manifest, done)
+        counted.append(len(manifest.shards))
         on_disk.append(len(shard_files(tmp_path / "run")))
 
-    monkeypatch.setattr(Prefix, "add", noted)
+    monkeypatch.setattr(Manifest, "add", noted)
     run_here(campaign(*TWIN), tmp_path / "run")
     assert on_disk == counted == [1, 2, 3, 4, 5]

@@ -12,7 +12,7 @@ from harness import estimate, replay
 from harness.errors import RunFolderError
 from harness.estimators.likelihood import Level
 from harness.estimators.tally import Tally, combined
-from harness.runner.resume import Manifest, Prefix
+from harness.runner.resume import Manifest
 from harness.sampling.allocation import GROWTH, Allocation, first_tests
 from harness.sampling.shells import round_requests
 from harness.strata import ShellDesign, Statement
@@ -74,15 +74,15 @@ def test_a_continuation_that_dies_leaves_a_manifest_that_is_true(campaign, run_h
     run_here(campaign(*SHELLS, "world.engine=twin", SPENT), out)
     before = {path.name: path.read_bytes() for path in shard_files(out)}
 
-    add = Prefix.add
+    add = Manifest.add
 
-    def add_or_die(prefix, done):
+    def add_or_die(manifest, done):
         if done.parquet:
             raise KeyboardInterrupt
-        add(prefix, done)
+        add(manifest, done)
 
     with monkeypatch.context() as patch:
-        patch.setattr(Prefix, "add", add_or_die)
+        patch.setattr(Manifest, "add", add_or_die)
         patch.setattr(Manifest, "write", lambda *arguments, **options: None)  # a killed process writes no last word
         with pytest.raises(KeyboardInterrupt):
             run_here(campaign(*SHELLS, "world.engine=twin", MORE), out, resume=True)
