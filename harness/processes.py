@@ -160,34 +160,11 @@ class Child:
         """Whether it runs."""
         return self._process.poll() is None
 
-    def send(self, message: Any) -> bool:
-        """Send it something; False if it is dead."""
-        try:
-            self.connection.send(message)
-        except OSError:
-            return False
-        return True
-
-    def receive(self) -> Any:
-        """What it has sent; None where there is nothing, because it has died."""
-        try:
-            return self.connection.recv() if self.connection.poll() else None
-        except (EOFError, OSError):
-            return None
-
     def kill(self) -> int:
         """End it at once, with everything that it has started; returns its exit code."""
         exit_code = end(self._process)
         self.connection.close()
         return exit_code
-
-    def died(self) -> int:
-        """Exit code of one that has ended its pipe; if it lives on without it, it is ended."""
-        with suppress(subprocess.TimeoutExpired):
-            self._process.wait(_DYING_S)
-            return self.kill()
-        self.kill()
-        return CLOSED_PIPE_EXIT_CODE
 
     def wait(self, seconds: float) -> None:
         """Give it a little time to end by itself; then end it."""
@@ -196,10 +173,58 @@ class Child:
         self.kill()
 
 
-_Child = TypeVar("_Child", bound=Child)
+class WorkerDeath(NamedTuple):
+    """How a worker died: in which ``call`` of a controller, if in one; no ``exit_code`` if it went with its machine."""
+
+    exit_code: int | None
+    call: Call | None
 
 
-def first_to_answer(children: Sequence[_Child]) -> _Child:
+class Apart(Child):
+    """A child in which a user's code may run: it `tell`s what its work comes to, or leaves the call that it died in."""
+
+    def __init__(self, server: ForkServer, target: Callable[..., None], *arguments: Any) -> None:
+        self._black_box = SharedFile()
+        super().__init__(target, *arguments, self._black_box.path, server=server)
+
+    def answer(self) -> Any:
+        """What it has told, raised if that is an error, or its `WorkerDeath`: no more care is needed then."""
+        answer: Any = self  # as long as nothing has been told
+        with suppress(EOFError, OSError):
+            if self.connection.poll():
+                answer = self.connection.recv()
+        if answer is self:
+            return WorkerDeath(self._died(), last_call(self._black_box.path))
+        if isinstance(answer, BaseException):
+            raise answer
+        return answer
+
+    def _died(self) -> int:
+        """Exit code of one that has ended its pipe; if it lives on without it, it is ended."""
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(_DYING_S)
+            return self.kill()
+        self.kill()
+        return CLOSED_PIPE_EXIT_CODE
+
+
+def tell(connection: Connection, work: Callable[[], Any]) -> bool:
+    """Send what some work comes to, or its error; False if the parent was killed: nobody is left to tell."""
+    try:
+        answer = work()
+    except Exception as error:  # noqa: BLE001 - whatever goes wrong here is the parent's to judge
+        answer = fit_to_travel(error)
+    try:
+        connection.send(answer)
+    except OSError:
+        return False
+    return True
+
+
+_Apart = TypeVar("_Apart", bound=Apart)
+
+
+def first_to_answer(children: Sequence[_Apart]) -> _Apart:
     """Wait for one that has sent something, or has died."""
     while True:
         dead = [child for child in children if not child.is_alive()]

@@ -6,8 +6,9 @@ import hashlib
 import importlib
 import sys
 from collections.abc import Callable, Mapping
-from contextlib import closing, suppress
+from contextlib import closing
 from copy import deepcopy
+from functools import partial
 from importlib.metadata import entry_points
 from inspect import signature
 from multiprocessing.connection import Connection
@@ -27,7 +28,7 @@ from harness.controllers.hosts import (
 )
 from harness.controllers.protocol import BatchController
 from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, HarnessError
-from harness.processes import CONSTRUCTOR, Child, ForkServer, SharedFile, first_to_answer, fit_to_travel, last_call
+from harness.processes import CONSTRUCTOR, Apart, ForkServer, WorkerDeath, first_to_answer, tell
 
 GROUP = "harness.controllers"
 _Answer = TypeVar("_Answer")
@@ -164,35 +165,27 @@ def run_apart(av: AutomatedVehicle, work: Callable[..., _Answer], *arguments: An
 
     Raises whatever that raises, or an `AvEndedProcessError` if the controller ended the process, naming the call.
     """
-    black_box = SharedFile()
     with closing(ForkServer()) as server:
-        child = Child(_work_and_tell, work, arguments, black_box.path, server=server)
+        child = Apart(server, _work_and_tell, work, arguments)
         try:
-            if (answer := first_to_answer([child]).receive()) is None:
-                cause, call = death_cause(child.died(), av.limits, last_call(black_box.path)), last_call(black_box.path)
-                raise AvEndedProcessError(
-                    f"av.{av.source}",
-                    f"{cause}, {'while it was found' if call is None else f'in {call}'}",
-                    "a controller that returns or raises",
-                    "Look for os._exit, a crash of compiled code, or a shortage of memory; then check again.",
-                )
+            answer = first_to_answer([child]).answer()
         finally:
             child.kill()
-    (result,) = answer
-    if isinstance(result, Exception):
-        raise result
-    return result  # type: ignore[no-any-return]
+    if isinstance(answer, WorkerDeath):
+        cause, call = death_cause(answer.exit_code, av.limits, answer.call), answer.call
+        raise AvEndedProcessError(
+            f"av.{av.source}",
+            f"{cause}, {'while it was found' if call is None else f'in {call}'}",
+            "a controller that returns or raises",
+            "Look for os._exit, a crash of compiled code, or a shortage of memory; then check again.",
+        )
+    return answer  # type: ignore[no-any-return]
 
 
 def _work_and_tell(
     connection: Connection, work: Callable[..., Any], arguments: tuple[Any, ...], black_box: Path
 ) -> None:
-    try:
-        answer = work(*arguments, black_box=black_box)
-    except Exception as error:  # noqa: BLE001 - whatever goes wrong here is the parent's to judge
-        answer = fit_to_travel(error)
-    with suppress(OSError):  # the parent was killed: nobody is left to tell
-        connection.send((answer,))
+    tell(connection, partial(work, *arguments, black_box=black_box))
 
 
 def require_controller(campaign: Campaign) -> str | None:

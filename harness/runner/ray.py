@@ -30,7 +30,7 @@ from harness.compiled import cache_root, source_hash
 from harness.controllers.find import require_controller
 from harness.controllers.hosts import Death
 from harness.errors import CampaignError, HarnessError
-from harness.processes import fit_to_travel, handlers_restored
+from harness.processes import WorkerDeath, fit_to_travel, handlers_restored
 from harness.records.folder import write_bytes
 from harness.resolved import Resolved
 from harness.runner.prepare import cached_files
@@ -40,7 +40,6 @@ from harness.runner.workers import (
     LocalWorkers,
     Request,
     Result,
-    WorkerDeath,
     WorkerLostError,
     WorkerProcess,
     Workers,
@@ -110,7 +109,7 @@ class OnMachine:
             _place(baseline, Path(self._folder.name))
             worker = self._worker or self._workers.new_worker()
             worker.give(request, fatal_episodes)  # if it is dead, it has no answer either
-            answer = self._workers.first_to_answer([worker]).answer()
+            answer: Result | WorkerDeath = self._workers.first_to_answer([worker]).answer()
         except Exception as error:  # noqa: BLE001 - see the class
             return fit_to_travel(error)
         self._worker = None if isinstance(answer, WorkerDeath) else worker
@@ -142,12 +141,12 @@ class RayWorker:
         self._actor, self.pending, self._workers = actor, pending, workers
 
     def give(self, request: Request, fatal_episodes: Mapping[int, Death]) -> bool:
-        """See `harness.runner.workers.Worker`: that it is dead shows in its answer."""
+        """See `harness.runner.workers.WorkerProcess`: that it is dead shows in its answer."""
         self.pending = self._actor.run.remote(request, dict(fatal_episodes), self._workers.baseline(request))
         return True
 
     def answer(self) -> Result | WorkerDeath:
-        """See `harness.runner.workers.Worker`."""
+        """See `harness.runner.workers.WorkerProcess`."""
         answer = self.result()
         if isinstance(answer, WorkerDeath):
             self._workers.ready.append(self)  # its actor lives, and will start another process
@@ -168,15 +167,15 @@ class RayWorker:
         return result
 
     def kill(self) -> None:
-        """See `harness.runner.workers.Worker`; its process follows it at once."""
+        """See `harness.runner.workers.WorkerProcess`; its process follows it at once."""
         ray.kill(self._actor)
 
     def dismiss(self) -> None:
-        """See `harness.runner.workers.Worker`."""
+        """See `harness.runner.workers.WorkerProcess`."""
         self.pending = self._actor.close.remote()
 
     def wait(self, seconds: float) -> None:
-        """See `harness.runner.workers.Worker`."""
+        """See `harness.runner.workers.WorkerProcess`."""
         ray.wait([self.pending], timeout=2.0 * seconds)
         self.kill()
 

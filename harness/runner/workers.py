@@ -10,11 +10,13 @@ import pickle
 import signal
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import islice
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 from scipy.special import bdtrc
 
@@ -26,14 +28,14 @@ from harness.pool.replay import Retracing
 from harness.processes import (
     CLOSED_PIPE_EXIT_CODE,
     OF_EPISODE,
+    Apart,
     Call,
-    Child,
     ForkServer,
     SharedFile,
+    WorkerDeath,
     first_to_answer,
-    fit_to_travel,
     fork_server,
-    last_call,
+    tell,
     worker_modules,
 )
 from harness.records.folder import encoded
@@ -88,21 +90,16 @@ def serve(connection: Connection, resolved: Path, folder: Path, black_box: Path)
     follow from, once there are some.
     """
     runner: ShardRunner | None = None
-    while True:
-        try:
-            request, fatal_episodes = connection.recv()
-        except (EOFError, OSError):
-            break
-        try:
-            if runner is None:
-                runner = ShardRunner(pickle.loads(resolved.read_bytes()), folder, black_box)  # noqa: S301 - our own
-            answer: Result | Exception = runner.run(request, fatal_episodes)
-        except Exception as error:  # noqa: BLE001 - whatever goes wrong here is the parent's to judge
-            answer = fit_to_travel(error)
-        try:
-            connection.send(answer)
-        except OSError:  # the parent was killed: nobody is left to tell
-            break
+
+    def run(request: Request, fatal_episodes: Mapping[int, Death]) -> Result:
+        nonlocal runner
+        if runner is None:
+            runner = ShardRunner(pickle.loads(resolved.read_bytes()), folder, black_box)  # noqa: S301 - our own
+        return runner.run(request, fatal_episodes)
+
+    with suppress(EOFError, OSError):
+        while tell(connection, partial(run, *connection.recv())):
+            pass
     if runner is not None:
         runner.close()
 
@@ -168,66 +165,22 @@ class WorkerLostError(HarnessError):
     exit_code = 3
 
 
-@dataclass(frozen=True)
-class WorkerDeath:
-    """What is known of a worker that died on its shard.
+class WorkerProcess(Apart):
+    """A process that runs one shard after another: what any worker is, also one on another machine."""
 
-    ``exit_code`` is None where it went with its machine; ``call`` is the controller's that it was in, if it was in one.
-    """
-
-    exit_code: int | None
-    call: Call | None
-
-
-class Worker(Protocol):
-    """Runs one shard after another, here or on another machine."""
+    def __init__(self, server: ForkServer, resolved: Path, folder: Path) -> None:
+        super().__init__(server, serve, resolved, folder)
 
     def give(self, request: Request, fatal_episodes: Mapping[int, Death]) -> bool:
         """Give it a shard to run, with the episodes known to end a process; False if it is dead."""
-        ...
-
-    def answer(self) -> Result | WorkerDeath:
-        """The shard of a worker that has answered, or why it has died: no more care is needed then.
-
-        Raises whatever running the shard has raised.
-        """
-        ...
-
-    def kill(self) -> object:
-        """End it at once, whatever it does."""
-        ...
+        try:
+            self.connection.send((request, dict(fatal_episodes)))
+        except OSError:
+            return False
+        return True
 
     def dismiss(self) -> None:
-        """Tell an idle worker that nothing more comes: it releases its controllers."""
-        ...
-
-    def wait(self, seconds: float) -> None:
-        """Give a dismissed worker a little time; then end it."""
-        ...
-
-
-class WorkerProcess(Child):
-    """A process that runs one shard after another, at the end of a pipe of its own."""
-
-    def __init__(self, server: ForkServer, resolved: Path, folder: Path) -> None:
-        self._black_box = SharedFile()
-        super().__init__(serve, resolved, folder, self._black_box.path, server=server)
-
-    def give(self, request: Request, fatal_episodes: Mapping[int, Death]) -> bool:
-        """See `Worker`."""
-        return self.send((request, dict(fatal_episodes)))
-
-    def answer(self) -> Result | WorkerDeath:
-        """See `Worker`."""
-        answer = self.receive()
-        if answer is None:
-            return WorkerDeath(self.died(), last_call(self._black_box.path))
-        if isinstance(answer, BaseException):
-            raise answer
-        return answer  # type: ignore[no-any-return]
-
-    def dismiss(self) -> None:
-        """See `Worker`."""
+        """Tell it, when it is idle, that nothing more comes: it releases its controllers."""
         self.connection.close()
 
 
@@ -292,11 +245,11 @@ class Workers:
                 self._hand_out(waiting)
             yield wanted.popleft().result  # type: ignore[misc]
 
-    def new_worker(self) -> Worker | None:
+    def new_worker(self) -> Any:
         """Another worker beside those that are busy; None as long as none is ready."""
         raise NotImplementedError
 
-    def first_to_answer(self, busy: Sequence[Any]) -> Worker | None:
+    def first_to_answer(self, busy: Sequence[Any]) -> Any:
         """Wait until one of the busy workers has answered or died; None when a new one has become ready instead."""
         raise NotImplementedError
 

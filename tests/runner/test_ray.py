@@ -23,7 +23,7 @@ from tests.stored_runs import manifest, shard_files, unlike_columns
 
 ray = pytest.importorskip("ray")
 import harness.runner.ray as on_ray  # noqa: E402 - not without the extra
-from harness.runner.workers import WorkerDeath  # noqa: E402
+from harness.processes import WorkerDeath  # noqa: E402
 
 ROOT = Path(__file__).parents[2]
 ON_RAY = "run.executor=ray"
