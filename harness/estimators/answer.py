@@ -10,7 +10,7 @@ from harness.campaign.campaign import Campaign
 from harness.estimators.block import DANGER_TTC_S, Block
 from harness.estimators.estimate import Estimate, Estimates, Unavailable, finite_json
 from harness.estimators.one_pass import one_pass
-from harness.estimators.pairs import Contrast, PairedEstimate
+from harness.estimators.pairs import PairedEstimate
 from harness.importance.functions import importance_names
 from harness.numbers import WIDEST_RHW, share
 from harness.records.folder import StoppedBy
@@ -251,13 +251,11 @@ def ending(stopped_by: StoppedBy, n_episodes: int, unmet: tuple[str, ...], *, pr
 def paired_statement(found: PairedEstimate, name_a: str, name_b: str) -> str:
     """Without an assumption: both rates, what lies between them, where only one of the two crashes, failed tests."""
     free, a, b = found.free, found.a, found.b
-    alone_a, alone_b = (
-        f"{each.value:.3g} ({each.ci_low:.3g} to {each.ci_high:.3g})" for each in (free.only_a, free.only_b)
-    )
+    alone_a, alone_b = ("{value:.3g} ({ci_low:.3g} to {ci_high:.3g})".format(**free[of]) for of in ("only_a", "only_b"))
     text = (
         f"A ({name_a}) crashes {a.crash_rate:.3g} times per test ({a.ci_low:.3g} to {a.ci_high:.3g}), "
         f"B ({name_b}) {b.crash_rate:.3g} times ({b.ci_low:.3g} to {b.ci_high:.3g}): {_apart(free, a.confidence)}, "
-        f"from {free.n_pairs:,} pairs of tests. Alone, where the other one does not, "
+        f"from {free['n_pairs']:,} pairs of tests. Alone, where the other one does not, "
         f"A crashes {alone_a} times per test, B {alone_b}."
     )
     if (failed_a := a.details["n_failed"]) + (failed_b := b.details["n_failed"]):
@@ -280,22 +278,22 @@ def conditional_paired_statement(found: PairedEstimate) -> str:
         )
     text = (
         f"If A and B crash only where the surrogate {library.boundary} or a more careful one crashes: "
-        f"{_apart(inside, found.a.confidence)}, from {inside.n_pairs:,} pairs of tests."
+        f"{_apart(inside, found.a.confidence)}, from {inside['n_pairs']:,} pairs of tests."
     )
-    if inside.n_pairs == found.free.n_pairs:
+    if not (n_outside := found.free["n_pairs"] - inside["n_pairs"]):
         return f"{text} Nothing was tested outside: whether the assumption holds is not known."
-    return f"{text} In {found.free.n_pairs - inside.n_pairs:,} pairs of tests outside neither crashed."
+    return f"{text} In {n_outside:,} pairs of tests outside neither crashed."
 
 
-def _apart(found: Contrast, confidence: float) -> str:
+def _apart(found: Mapping[str, Any], confidence: float) -> str:
     """Which of them crashes more often, and by how much."""
-    low, high, verdict = found.ci_low, found.ci_high, "the difference is not distinguishable from 0"
-    if found.n_differing and low > 0.0:
+    low, high, verdict = found["ci_low"], found["ci_high"], "the difference is not distinguishable from 0"
+    if found["n_differing"] and low > 0.0:
         verdict = "A crashes more often"
-    elif found.n_differing and high < 0.0:
+    elif found["n_differing"] and high < 0.0:
         verdict = "A crashes less often"
-    apart = f"{verdict}, A - B = {found.difference:.3g} ({confidence:.0%} interval {low:.3g} to {high:.3g})"
-    if not math.isfinite(found.ratio):
+    apart = f"{verdict}, A - B = {found['difference']:.3g} ({confidence:.0%} interval {low:.3g} to {high:.3g})"
+    if not math.isfinite(found["ratio"]):
         return apart
-    most = f"{found.ratio_high:.3g}" if math.isfinite(found.ratio_high) else "no limit"
-    return f"{apart}, A/B = {found.ratio:.3g} ({found.ratio_low:.3g} to {most})"
+    most = f"{found['ratio_high']:.3g}" if math.isfinite(found["ratio_high"]) else "no limit"
+    return f"{apart}, A/B = {found['ratio']:.3g} ({found['ratio_low']:.3g} to {most})"

@@ -9,7 +9,7 @@ round, whichever takes it farther.
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -240,43 +240,27 @@ def no_pairs(design: ShellDesign) -> PairCounts:
     return PairCounts(design, np.zeros((n, N_ENDS, N_ENDS), np.int64), np.zeros((n, N_ENDS, N_ENDS, n)))
 
 
-@dataclass(frozen=True)
-class Contrast:
-    """What lies between A and B, difference A - B and ratio A/B; rates are crashes per test.
+def contrast(pairs: PairCounts, level: Level) -> dict[str, Any]:
+    """What lies between A and B in some strata, difference A - B and ratio A/B; rates are crashes per test.
 
     ``rhw`` is the half-width of the difference over the larger of the two rates, ``rhw_from_pool`` what the pool's own
     error alone would leave of it; ``only_a`` and ``only_b`` are rates of cut-ins on which only one of the two crashes.
     """
-
-    difference: float
-    ci_low: float
-    ci_high: float
-    rhw: float
-    rhw_from_pool: float
-    ratio: float
-    ratio_low: float
-    ratio_high: float
-    only_a: Interval
-    only_b: Interval
-    n_pairs: int
-    n_differing: int
-
-    @classmethod
-    def of(cls, pairs: PairCounts, level: Level) -> Contrast:
-        """Of the strata that ``pairs`` holds."""
-        widths, alone = (pairs.rhw(level), pairs.rhw_from_pool(level)), (pairs.alone(0, level), pairs.alone(1, level))
-        n_pairs = int(pairs.tests.sum())
-        return cls(*pairs.difference(level), *widths, *pairs.ratio(level), *alone, n_pairs, pairs.n_differing)
-
-    def to_json(self) -> dict[str, Any]:
-        """Plain content."""
-        of_one = {"only_a": self.only_a._asdict(), "only_b": self.only_b._asdict()}
-        return finite_json(asdict(self) | of_one)
+    return {
+        **dict(zip(("difference", "ci_low", "ci_high"), pairs.difference(level), strict=True)),
+        "rhw": pairs.rhw(level),
+        "rhw_from_pool": pairs.rhw_from_pool(level),
+        **dict(zip(("ratio", "ratio_low", "ratio_high"), pairs.ratio(level), strict=True)),
+        "only_a": pairs.alone(0, level)._asdict(),
+        "only_b": pairs.alone(1, level)._asdict(),
+        "n_pairs": int(pairs.tests.sum()),
+        "n_differing": pairs.n_differing,
+    }
 
 
 @dataclass(frozen=True)
 class PairedEstimate:
-    """Two vehicles compared: each by itself, and what lies between them.
+    """Two vehicles compared: each by itself, and what lies between them, as `contrast` says it.
 
     ``free`` is over all strata, ``conditional`` over those inside: if neither vehicle crashes beyond the boundary,
     ``refuted`` once one has.
@@ -284,8 +268,8 @@ class PairedEstimate:
 
     a: Estimate
     b: Estimate
-    free: Contrast
-    conditional: Contrast
+    free: dict[str, Any]
+    conditional: dict[str, Any]
     refuted: bool
     pairs: PairCounts
 
@@ -296,20 +280,15 @@ class PairedEstimate:
 
     def to_json(self) -> dict[str, Any]:
         """Content of ``compare.json``, as far as it comes from counts."""
-        return {
-            "a": finite_json(self.a.shown),
-            "b": finite_json(self.b.shown),
-            **self.free.to_json(),
-            "confidence": self.a.confidence,
-            "conditional": {
-                **self.conditional.to_json(),
-                "boundary": self.pairs.design.library.boundary,
-                "n_pairs_outside": self.free.n_pairs - self.conditional.n_pairs,
-                "refuted": self.refuted,
-            },
-            "shells": _shells(self.pairs),
-            "warnings": list(self.warnings),
+        inside = {
+            **self.conditional,
+            "boundary": self.pairs.design.library.boundary,
+            "n_pairs_outside": self.free["n_pairs"] - self.conditional["n_pairs"],
+            "refuted": self.refuted,
         }
+        each = {"a": self.a.shown, "b": self.b.shown}
+        more = {"confidence": self.a.confidence, "conditional": inside, "shells": _shells(self.pairs)}
+        return finite_json({**each, **self.free, **more, "warnings": self.warnings})
 
 
 def paired_estimate(pairs: PairCounts, confidence: float) -> PairedEstimate:
@@ -318,8 +297,8 @@ def paired_estimate(pairs: PairCounts, confidence: float) -> PairedEstimate:
     return PairedEstimate(
         a=_own(pairs, 0, confidence),
         b=_own(pairs, 1, confidence),
-        free=Contrast.of(pairs, level),
-        conditional=Contrast.of(pairs.inside(), level),
+        free=contrast(pairs, level),
+        conditional=contrast(pairs.inside(), level),
         refuted=any(pairs.tally(side).crashes[n_inside:].any() for side in (0, 1)),
         pairs=pairs,
     )

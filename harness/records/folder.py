@@ -14,6 +14,7 @@ import uuid
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -310,8 +311,9 @@ class Retraced(Stored):
     reason: str | None = None
 
 
-class Repeated(Stored):
-    """What repeating some tests has shown; `harness.runner.worker.Repeated`."""
+@dataclass(frozen=True)
+class Repeated:
+    """How many tests were run once more, and which of them (campaign indices) came out otherwise."""
 
     n_episodes: Count
     differing: list[Count]

@@ -14,7 +14,6 @@ import socket
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -64,21 +63,12 @@ Files = Mapping[str, ray.ObjectRef]
 # -- on another machine --
 
 
-@dataclass(frozen=True)
-class Machine:
-    """What must be equal on all machines, ``made_of``, and what is said of one."""
-
-    made_of: dict[str, str | None]
-    cpu: str
-
-    @classmethod
-    def this(cls, resolved: Resolved, controller_sha256: str | None) -> Machine:
-        """The one that this runs on."""
-        packages = ["harness", *(["libsumo"] if resolved.campaign.world.engine == "sumo" else [])]
-        made_of: dict[str, str | None] = {package: metadata.version(package) for package in packages}
-        made_of["sources of its kernels"] = source_hash()
-        made_of["source of the controller"] = controller_sha256
-        return cls(made_of, cpu_name())
+def this_machine(resolved: Resolved, controller_sha256: str | None) -> tuple[dict[str, str | None], str]:
+    """What must be equal on all machines, and the name of this one's processor."""
+    packages = ["harness", *(["libsumo"] if resolved.campaign.world.engine == "sumo" else [])]
+    versions = {package: metadata.version(package) for package in packages}
+    sources = {"sources of its kernels": source_hash(), "source of the controller": controller_sha256}
+    return {**versions, **sources}, cpu_name()
 
 
 class OnMachine:
@@ -93,11 +83,11 @@ class OnMachine:
         self._workers = LocalWorkers(resolved, Path(self._folder.name), 1)
         self._worker: WorkerProcess | None = None
 
-    def begin(self, cached: Files) -> Machine | Exception:
+    def begin(self, cached: Files) -> tuple[dict[str, str | None], str] | Exception:
         """Fill the cache, and say what there is."""
         try:
             _place(cached, cache_root())
-            return Machine.this(self._resolved, require_controller(self._resolved.campaign))
+            return this_machine(self._resolved, require_controller(self._resolved.campaign))
         except Exception as error:  # noqa: BLE001 - see the class
             return fit_to_travel(error)
 
@@ -204,7 +194,7 @@ class RayWorkers(Workers):
         self.where = f" on {n_machines} machine{'s' * (n_machines > 1)} at {address}"
         self.ready: list[RayWorker] = []
         self._starting: list[RayWorker] = []
-        self._here = Machine.this(resolved, resolved.controller_sha256)
+        self._here = this_machine(resolved, resolved.controller_sha256)[0]
         self._cpus: set[str] = set()
         self._lost_at_start, self._patient_until = 0, time.monotonic() + PATIENCE_S
         self._baseline: Files | None = None
@@ -251,7 +241,7 @@ class RayWorkers(Workers):
     def _admit(self, worker: RayWorker) -> None:
         """Let a worker in that is ready, if it is one of ours."""
         try:
-            machine: Machine | None = worker.result()
+            machine = worker.result()
         except RuntimeEnvSetupError as error:
             raise _wrong_environment(error) from error
         if machine is None:
@@ -264,8 +254,9 @@ class RayWorkers(Workers):
                     "Install the same harness on all of them, and look at Ray's logs there (/tmp/ray).",
                 )
             return
-        for what, here in self._here.made_of.items():
-            if (there := machine.made_of.get(what)) != here:
+        made_of, cpu = machine
+        for what, here in self._here.items():
+            if (there := made_of.get(what)) != here:
                 raise HarnessError(
                     "run.executor",
                     f"a machine with {what} {there}",
@@ -274,7 +265,7 @@ class RayWorkers(Workers):
                     "(working_dir), or install its package on all machines.",
                 )
         self._lost_at_start = 0
-        self._cpus.add(machine.cpu)
+        self._cpus.add(cpu)
         self.ready.append(worker)
 
     def _tell_of_waiting(self) -> None:

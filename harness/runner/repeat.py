@@ -8,7 +8,7 @@ episodes, or shares state between cells does not; its tests cannot be replayed, 
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 
 import numpy as np
 import pyarrow as pa
@@ -16,6 +16,7 @@ import pyarrow as pa
 from harness.campaign.campaign import Campaign
 from harness.episode.cells import PrescribedTraffic
 from harness.episode.loop import EpisodeLoop, Shard, hash_of_index
+from harness.records.folder import Repeated
 from harness.vocabulary import FAILED
 from harness.worlds.twin import TwinWorld
 
@@ -31,14 +32,6 @@ Of a vehicle that is random in one of four tests, ten miss all with a probabilit
 Bits = tuple[bytes, bytes, str | None]
 
 
-@dataclass(frozen=True)
-class Repeated:
-    """How many tests were run once more, and which of them (campaign indices) came out otherwise."""
-
-    n_episodes: int
-    differing: tuple[int, ...]
-
-
 def repeat(loop: EpisodeLoop, campaign: Campaign, shard: Shard) -> Repeated:
     """Run some tests of a loop's shard again, alone and after all the others."""
     # The twin does one episode at little cost; an AV that SUMO moves has to be moved by SUMO again.
@@ -50,7 +43,7 @@ def repeat(loop: EpisodeLoop, campaign: Campaign, shard: Shard) -> Repeated:
         again = alone.run(shard.first_episode + row, shard.states[row : row + 1], traffic)
         if bits_of(shard, row) != bits_of(again, 0):
             differing.append(shard.first_episode + row)
-    return Repeated(len(rows), tuple(sorted(differing)))
+    return Repeated(len(rows), sorted(differing))
 
 
 def _rows_to_repeat(shard: Shard, seed: int, *, acts_early: bool) -> list[int]:
@@ -80,7 +73,4 @@ def with_repeated(episodes: pa.Table, repeated: Repeated) -> pa.Table:
 def repeated_of(episodes: pa.Table) -> Repeated | None:
     """What an episodes table says of tests that were run twice; None of all but the first shard's."""
     found = (episodes.schema.metadata or {}).get(REPEATED)
-    if found is None:
-        return None
-    content = json.loads(found)
-    return Repeated(content["n_episodes"], tuple(content["differing"]))
+    return None if found is None else Repeated(**json.loads(found))

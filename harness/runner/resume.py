@@ -24,6 +24,7 @@ from harness.records.folder import (
     CAMPAIGN,
     MANIFEST,
     SHELLS,
+    Repeated,
     checksum,
     listed_crc32,
     read_as,
@@ -36,7 +37,6 @@ from harness.records.folder import (
 )
 from harness.records.schemas import ShardTables
 from harness.resolved import Resolved
-from harness.runner.repeat import Repeated
 from harness.runner.workers import ShardResult, finished
 from harness.sampling import ShardRequest, Source
 

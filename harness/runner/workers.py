@@ -38,11 +38,11 @@ from harness.processes import (
     tell,
     worker_modules,
 )
-from harness.records.folder import encoded
+from harness.records.folder import Repeated, encoded
 from harness.records.schemas import ShardTables, shard_tables
 from harness.resolved import Resolved
 from harness.runner.prepare import prepare
-from harness.runner.repeat import Repeated, repeat, repeated_of, with_repeated
+from harness.runner.repeat import repeat, repeated_of, with_repeated
 from harness.sampling import ShardRequest, Source
 from harness.sampling.baseline import BaselineRequest, BaselineResult, read_baseline, run_baseline
 from harness.worlds import build_world
