@@ -249,7 +249,7 @@ def alarm_of_run(folder: Path, pool_file: Path | None = None, progress: Progress
     columns = [*dict.fromkeys([*EPISODE_COLUMNS, *PATH_COLUMNS, *lead])]
 
     def replayed(shard: Mapping[str, Any]) -> tuple[Block, BoolArray]:
-        episodes, _ = read_shard(folder, shard, episode_columns=columns, moment_columns=[])
+        episodes = read_shard(folder, shard, columns)
         block = block_from_tables(episodes, None, method=campaign.testing.method, alpha=alpha)
         return block, surrogates_crash(episodes, resolved, pool)
 

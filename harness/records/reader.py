@@ -81,34 +81,19 @@ def require_campaign(path: Path, content_hash: str, manifest: Mapping[str, Any])
         raise RunFolderError(str(path), f"campaign {content_hash}", expected, mend)
 
 
-def read_shards(
-    folder: Path, *, episode_columns: list[str] | None = None, moment_columns: list[str] | None = None
-) -> Iterator[tuple[pa.Table, pa.Table | None]]:
-    """Episodes and moments of every shard that the manifest lists; moments are None where the campaign kept none.
-
-    Columns are all by default, and no moments for an empty list. Each shard must be as long as the manifest says.
-    """
-    read = partial(read_shard, folder, episode_columns=episode_columns, moment_columns=moment_columns)
-    yield from made_ahead(read, read_manifest(folder)["shards"], _READERS)
+def read_shards(folder: Path, columns: list[str] | None = None) -> Iterator[pa.Table]:
+    """Episodes of every shard that the manifest lists, see `read_shard`."""
+    yield from made_ahead(partial(read_shard, folder, columns=columns), read_manifest(folder)["shards"], _READERS)
 
 
-def read_shard(
-    folder: Path,
-    shard: Mapping[str, Any],
-    *,
-    episode_columns: list[str] | None = None,
-    moment_columns: list[str] | None = None,
-) -> tuple[pa.Table, pa.Table | None]:
-    """Episodes and moments of one shard, as the manifest lists it; see `read_shards`."""
-    files = shard["files"]
-    episodes = read_kept(folder, shard, "episodes", episode_columns)
+def read_shard(folder: Path, shard: Mapping[str, Any], columns: list[str] | None = None) -> pa.Table:
+    """Episodes of one shard, which must be as long as the manifest says; all columns by default."""
+    episodes = read_kept(folder, shard, "episodes", columns)
     if episodes.num_rows != shard["n_episodes"]:
         expected = f"{shard['n_episodes']} rows (manifest.json)"
-        raise RunFolderError(str(folder / files["episodes"]), f"{episodes.num_rows} rows", expected, MEND_SHARD)
-    moments = None
-    if "moments" in files and moment_columns != []:
-        moments = read_kept(folder, shard, "moments", moment_columns)
-    return episodes, moments
+        found = f"{episodes.num_rows} rows"
+        raise RunFolderError(str(folder / shard["files"]["episodes"]), found, expected, MEND_SHARD)
+    return episodes
 
 
 def read_traces(folder: Path, episodes: Collection[int], columns: list[str]) -> pa.Table | None:

@@ -105,7 +105,7 @@ class RunFolder:
         """Columns of the tests that count, in index order; small shards come together."""
         counted = int(self.manifest["n_episodes"])
         together: list[pa.Table] = []
-        for table, _ in read_shards(self.path, episode_columns=list(columns), moment_columns=[]):
+        for table in read_shards(self.path, list(columns)):
             together.append(table.slice(0, counted))
             counted -= together[-1].num_rows
             if sum(part.num_rows for part in together) >= ROWS_TOGETHER:

@@ -88,6 +88,11 @@ def compare_campaigns(
     require_same_shells(sides)
     found, rule = _compared(sides, folders, margin, workers, progress or Progress())
     labels = labels or (a.name, b.name)
+    statements = [paired_statement(found, *labels), conditional_paired_statement(found)]
+    if rule.conditional:
+        statements.reverse()
+    if rule.margin is not None:
+        statements.insert(0, rule.margin.sentence)
     content = {
         "format": 1,
         "method": a.testing.method,
@@ -97,7 +102,10 @@ def compare_campaigns(
             name: {"label": label, "campaign_hash": side.content_hash}
             for name, label, side in zip(SIDES, labels, sides, strict=True)
         },
-        **_answer(found, rule, labels),
+        **found.to_json(),
+        "margin": None if rule.margin is None else asdict(rule.margin),
+        "statement": statements[0],
+        "statements": statements,
     }
     write_json(out / "compare.json", content)
     missed = a.stop.rhw is not None and not rule.look.stopped
@@ -175,8 +183,7 @@ def _stored_requests(folder: Path, earlier: Mapping[str, Any]) -> Iterator[Shard
     if not earlier["shards"]:
         return
     taken: dict[int, int] = {}
-    tables = read_shards(folder, episode_columns=["component"], moment_columns=[])
-    for shard, (episodes, _) in zip(earlier["shards"], tables, strict=True):
+    for shard, episodes in zip(earlier["shards"], read_shards(folder, ["component"]), strict=True):
         stratum = episodes.column("component").to_numpy()
         edges = [0, *(np.flatnonzero(np.diff(stratum)) + 1).tolist(), stratum.size]
         draws = []
@@ -185,17 +192,6 @@ def _stored_requests(folder: Path, earlier: Mapping[str, Any]) -> Iterator[Shard
             draws.append(Draw(s, taken.get(s, 0), n))
             taken[s] = taken.get(s, 0) + n
         yield ShardRequest(shard["index"], shard["first_episode"], shard["n_episodes"], tuple(draws))
-
-
-def _answer(found: PairedEstimate, rule: PairRule, labels: tuple[str, str]) -> dict[str, Any]:
-    """What ``compare.json`` says of the difference."""
-    statements = [paired_statement(found, *labels), conditional_paired_statement(found)]
-    if rule.conditional:
-        statements.reverse()
-    if rule.margin is not None:
-        statements.insert(0, rule.margin.sentence)
-    decided = None if rule.margin is None else asdict(rule.margin)
-    return {**found.to_json(), "margin": decided, "statement": statements[0], "statements": statements}
 
 
 def _take_over(stored: Path, folder: Path, resolved: Resolved) -> None:

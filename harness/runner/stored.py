@@ -28,7 +28,7 @@ from harness.sampling import source_of
 from harness.sampling.baseline import read_baseline
 from harness.sampling.protocol import block_of
 from harness.vocabulary import ESTIMATORS, EstimatorName
-from harness.worlds import World, build_world
+from harness.worlds import build_world
 from harness.worlds.system_libraries import require_libraries
 
 MOST_GROUPED = 5_000
@@ -75,9 +75,10 @@ def stored_blocks(folder: Path, *, moments: bool) -> Iterator[Block]:
     ratios = list(MOMENT_COLUMNS) if moments and campaign.sampling.mixes_steps else []
 
     def read(group: _Shards) -> Block:
-        stored = [read_shard(folder, shard, episode_columns=needed, moment_columns=ratios) for shard in group]
-        episodes = concatenated([table for table, _ in stored], folder)
-        kept = [table for _, table in stored if table is not None]
+        episodes = concatenated([read_shard(folder, shard, needed) for shard in group], folder)
+        kept = [
+            read_kept(folder, shard, "moments", ratios) for shard in group if ratios and "moments" in shard["files"]
+        ]
         steps = concatenated(kept, folder) if kept else None
         return block_of(campaign, episodes, steps, design)
 
@@ -181,7 +182,8 @@ def _replay(
         listed = read_manifest(folder).get("baseline_crc32", ())
         source.begin_after(read_baseline(folder, source.baseline_paths, resolved.environment, listed))
     require_same_pool(folder, source)
-    world = _world(resolved.campaign, gui=gui, fcd=fcd)
+    options = () if fcd is None else ("--fcd-output", str(fcd), "--precision", "9")
+    world = build_world(resolved.campaign, 1, in_sumo=gui or fcd is not None, gui=gui, options=options)
     try:
         shard = source.run_again(source.loop(world, traces="all", black_box=black_box), episode, stored)
     finally:
@@ -223,11 +225,6 @@ def _require_reproducible(manifest: dict[str, Any]) -> None:
     found = "a run that is not reproducible: a program outside of the harness drove the AV"
     mend = "Look at the traces that the run has kept (records.traces: crash), or let the program write a log."
     raise CampaignError("av.traci", found, "an AV that does the same again: model, controller, sumo or fmu", mend)
-
-
-def _world(campaign: Campaign, *, gui: bool, fcd: Path | None) -> World:
-    options = () if fcd is None else ("--fcd-output", str(fcd), "--precision", "9")
-    return build_world(campaign, 1, in_sumo=gui or fcd is not None, gui=gui, options=options)
 
 
 def _stored(folder: Path, manifest: dict[str, Any], episode: int) -> dict[str, pa.Table]:

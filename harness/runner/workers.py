@@ -292,8 +292,17 @@ class Workers:
             return
         job.n_deaths += 1
         if job.n_deaths == ATTEMPTS:
-            words = cause if call is None else f"{cause}, in {call}"
-            raise _lost(job.request, death.exit_code, words if own else None)
+            how = f"with {'its machine' if death.exit_code is None else f'exit code {death.exit_code}'}"
+            mend = "Look for a memory limit (fewer --workers), then continue with --resume."
+            if own:
+                how = f"because {cause}" + ("" if call is None else f", in {call}")
+                mend = "Mend the controller: look for os._exit or a crash of compiled code (`harness av-check`)."
+            raise WorkerLostError(
+                f"shard {job.request.index} (from episode {job.request.first_episode})",
+                f"{ATTEMPTS} worker processes that died, the last {how}",
+                "a worker that finishes the shard",
+                mend,
+            )
 
     def _require_few_deaths(self, job: _Job) -> None:
         """Each death costs a new process: a controller that dies too often is not run to the end of its shard."""
@@ -308,21 +317,6 @@ class Workers:
                 f"a share of at most {share:g}",
                 "Mend the controller (`harness av-check` looks at it in seconds), or raise the share to go on.",
             )
-
-
-def _lost(request: Request, exit_code: int | None, blamed: str | None) -> WorkerLostError:
-    """What to say of a shard that no worker survives; ``blamed`` is what the controller did, if it did."""
-    how = f"with {'its machine' if exit_code is None else f'exit code {exit_code}'}"
-    mend = "Look for a memory limit (fewer --workers), then continue with --resume."
-    if blamed is not None:
-        how = f"because {blamed}"
-        mend = "Mend the controller: look for os._exit or a crash of compiled code (`harness av-check`)."
-    return WorkerLostError(
-        f"shard {request.index} (from episode {request.first_episode})",
-        f"{ATTEMPTS} worker processes that died, the last {how}",
-        "a worker that finishes the shard",
-        mend,
-    )
 
 
 class LocalWorkers(Workers):

@@ -58,8 +58,7 @@ def driven(monkeypatch):
 def by_stratum(folder):
     """Cut-in, initial range and outcome of each test, in order, by stratum."""
     found = defaultdict(list)
-    columns = ["component", "pool_cut_in", "r2_m", "outcome"]
-    for episodes, _ in read_shards(folder, episode_columns=columns, moment_columns=[]):
+    for episodes in read_shards(folder, ["component", "pool_cut_in", "r2_m", "outcome"]):
         for row in episodes.to_pylist():
             found[row["component"]].append((row["pool_cut_in"], row["r2_m"], row["outcome"]))
     return found
