@@ -11,6 +11,7 @@ from harness.estimators.block import DANGER_TTC_S, Block
 from harness.estimators.estimate import Estimate, Estimates, Unavailable, finite_json
 from harness.estimators.one_pass import one_pass
 from harness.estimators.pairs import PairedEstimate
+from harness.estimators.stopping import Rule
 from harness.importance.functions import importance_names
 from harness.numbers import WIDEST_RHW, share
 from harness.records.folder import StoppedBy
@@ -227,25 +228,30 @@ def _replayed(episodes: Sequence[int]) -> str:
     return f"episode {episodes[0]} (`harness replay {RUN_FOLDER} {episodes[0]}`)"
 
 
-def ending(stopped_by: StoppedBy, n_episodes: int, unmet: tuple[str, ...], *, precision_asked: bool) -> str:
-    """When a campaign ended and what decided it, in a sentence.
-
-    ``unmet`` are the conditions that were not met when the stop rule last said no; without a ``precision_asked`` there
-    was only a budget.
-    """
-    after = f"Stopped after {n_episodes:,} tests"
-    conditions = " and ".join(unmet)
+def conclusion(campaign: Campaign, rule: Rule, n_episodes: int, reported_from: int) -> tuple[StoppedBy, str]:
+    """Why a campaign ended after so many tests; those from ``reported_from`` on are reported. In a sentence, too."""
+    look, budget = rule.look, campaign.stop.episodes
+    stopped_by: StoppedBy = "pool"
+    if 0 < reported_from < n_episodes < budget:
+        stopped_by = "two_phase"
+    elif look.stopped:
+        stopped_by = "rhw" if look.decision is None else "accept"
+    elif look.decision is not None and look.decision.is_final:
+        stopped_by = "contradicted"
+    elif look.pool_error_above_target:  # whatever else is spent: more of it would not help
+        stopped_by = "pool_error"
+    elif n_episodes >= budget:
+        stopped_by = "episodes"
+    after, unmet = f"Stopped after {n_episodes:,} tests", " and ".join(look.unmet)
     if stopped_by in ("rhw", "accept"):
-        if not unmet:
-            return f"{after}: every condition was met at the first look."
-        return f"{after}: the last condition to be met was {conditions}."
-    if stopped_by == "two_phase":
-        return f"{after}: as many as the first phase had planned, which are reported without it."
-    if precision_asked:
-        return f"{after} without {conditions}: {MENDS[stopped_by]}."
-    if stopped_by == "episodes":
-        return f"{after}: stop.episodes was all that was asked for."
-    return f"{after}: {MENDS[stopped_by]}."
+        why = f"the last condition to be met was {unmet}" if unmet else "every condition was met at the first look"
+    elif stopped_by == "two_phase":
+        why = "as many as the first phase had planned, which are reported without it"
+    elif campaign.stop.rhw is not None or look.decision is not None:
+        after, why = f"{after} without {unmet}", MENDS[stopped_by]
+    else:
+        why = "stop.episodes was all that was asked for" if stopped_by == "episodes" else MENDS[stopped_by]
+    return stopped_by, f"{after}: {why}."
 
 
 def paired_statement(found: PairedEstimate, name_a: str, name_b: str) -> str:

@@ -279,44 +279,33 @@ def moments_table(shard: Shard) -> pa.Table:
 
 def traces_table(shard: Shard) -> pa.Table:
     """One row per step and vehicle of the traced episodes."""
-    schema = traces_schema(takes_time=shard.lateral.present)
-    if not shard.traces:
+    schema, rows = traces_schema(takes_time=shard.lateral.present), sorted(shard.traces)
+    if not rows:
         return schema.empty_table()
-    parts = [_trace_columns(shard, row) for row in sorted(shard.traces)]
-    joined = {name: np.concatenate([part[name] for part in parts]) for name in schema.names}
-    return _table(schema, joined | {"vehicle": _names(joined["vehicle"], VEHICLES)})
-
-
-def _trace_columns(shard: Shard, row: int) -> dict[str, np.ndarray]:
-    trace = shard.traces[row]
-    steps = trace.shape[0]
-    step = np.repeat(np.arange(steps, dtype=np.int16), len(VEHICLES))
-    vehicle = np.tile(np.arange(len(VEHICLES), dtype=np.int8), steps)
-    cut = int(shard.results.episode["cut_in_step"][row])
+    n_states = [shard.traces[row].shape[0] for row in rows]
+    row = np.repeat(rows, len(VEHICLES) * np.array(n_states))
+    step = np.repeat(np.concatenate([np.arange(n, dtype=np.int16) for n in n_states]), len(VEHICLES))
+    vehicle = np.tile(np.arange(len(VEHICLES), dtype=np.int8), sum(n_states))
+    episode, motion = shard.results.episode[row], np.concatenate([shard.traces[each].reshape(-1, 3) for each in rows])
+    cut = episode["cut_in_step"]
     on_right = (vehicle == AV) | ((vehicle == BV) & (cut >= 0) & (step > cut))
-    flat = trace.reshape(-1, 3)
-    return {
-        "episode": np.full(step.size, shard.first_episode + row, np.int64),
+    columns = {
+        "episode": shard.first_episode + row,
         "step": step,
-        "vehicle": vehicle,
+        "vehicle": _names(vehicle, VEHICLES),
         "lane": np.where(on_right, 0, 1).astype(np.int8),
-        "x_m": flat[:, 0],
-        "v_mps": flat[:, 1],
-        "a_mps2": flat[:, 2],
-        "lateral_m": np.where(vehicle == BV, _came_over(shard, row, step), 0.0),
+        **dict(zip(("x_m", "v_mps", "a_mps2"), motion.T, strict=True)),
+        "lateral_m": np.where(vehicle == BV, _came_over(episode, step, shard.lateral.distance_m), 0.0),
     }
+    return _table(schema, columns)
 
 
-def _came_over(shard: Shard, row: int, state: np.ndarray) -> FloatArray:
-    """How far (m) BV has come over in states (n,) of an episode."""
-    episode, distance_m = shard.results.episode[row], shard.lateral.distance_m
-    lead, onset, cut = (int(episode[name]) for name in ("lead_steps", "onset_step", "cut_in_step"))
-    if onset < 0:
-        return np.zeros(state.shape)
-    if lead == 0:
-        return np.where(state > onset, distance_m, 0.0)
-    begins = cut - lead if cut >= 0 else onset  # it may have begun before the test
-    return distance_m * np.clip((state - begins - 1) / lead, 0.0, 1.0)
+def _came_over(episode: RecordArray, state: np.ndarray, distance_m: float) -> FloatArray:
+    """How far (m) BV has come over in states (n,), each of its ``episode`` (n,)."""
+    lead, onset, cut = (episode[name].astype(np.int64) for name in ("lead_steps", "onset_step", "cut_in_step"))
+    begins = np.where(cut >= 0, cut - lead, onset)  # it may have begun before the test
+    share = np.where(lead == 0, state > onset, np.clip((state - begins - 1) / np.maximum(lead, 1), 0.0, 1.0))
+    return np.where(onset < 0, 0.0, distance_m * share)
 
 
 def baseline_table(shard: Shard, path: IntArray, weight: FloatArray) -> pa.Table:

@@ -22,7 +22,7 @@ from harness.errors import EXIT_DONE, EXIT_TOO_MANY_FAILED
 from harness.estimators.estimate import finite_json
 from harness.resolved import resolve
 from harness.runner.prepare import prepare, require_ready, require_world
-from harness.runner.repeat import Bits, bits_of
+from harness.runner.workers import Bits, bits_of
 from harness.sampling import EPISODES_PER_S, ShardRequest, Source, source_of
 from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import AV, CRASH, FAILED, FloatArray

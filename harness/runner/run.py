@@ -16,7 +16,7 @@ from typing import Any
 
 from harness.campaign.campaign import Campaign
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED, CampaignError
-from harness.estimators.answer import ending as ending_sentence
+from harness.estimators.answer import conclusion
 from harness.estimators.stopping import Rule, Verdict
 from harness.pool.replay import Retracing
 from harness.pool.vehicle_pool import BaselinePaths
@@ -252,23 +252,6 @@ class Run:
         from harness.report.page import write_report  # noqa: PLC0415
 
         return RunResult(self.out, write_report(self.out), estimates, stopped_by, said, code)
-
-
-def conclusion(campaign: Campaign, rule: Rule, n_episodes: int, reported_from: int) -> tuple[StoppedBy, str]:
-    """Why a campaign ended after so many tests; those from ``reported_from`` on are reported. In a sentence."""
-    by: StoppedBy
-    if 0 < reported_from < n_episodes < campaign.stop.episodes:
-        by = "two_phase"
-    elif rule.look.stopped:
-        by = "rhw" if rule.look.decision is None else "accept"
-    elif rule.look.decision is not None and rule.look.decision.is_final:
-        by = "contradicted"
-    elif rule.look.pool_error_above_target:  # whatever else is spent: more of it would not help
-        by = "pool_error"
-    else:
-        by = "episodes" if n_episodes >= campaign.stop.episodes else "pool"
-    asked = campaign.stop.rhw is not None or rule.look.decision is not None
-    return by, ending_sentence(by, n_episodes, rule.look.unmet, precision_asked=asked)
 
 
 @cache
