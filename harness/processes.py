@@ -61,12 +61,8 @@ _Result = TypeVar("_Result")
 # -- signals to a command --
 
 
-class Interrupted(KeyboardInterrupt):
-    """A signal asks for the end: raised in the main thread, so that every ``finally`` on the way does its work."""
-
-
 class Interruption:
-    """Which signal has asked for the end, if one has."""
+    """Which signal has asked for the end, if one has: as Ctrl-C does, so that every ``finally`` does its work."""
 
     def __init__(self) -> None:
         self.signal: signal.Signals | None = None
@@ -82,7 +78,7 @@ class Interruption:
             signal.signal(other, signal.SIG_IGN)
         signal.signal(signal.SIGINT, signal.default_int_handler)
         self.signal = signal.Signals(number)
-        raise Interrupted(self.signal.name)
+        raise KeyboardInterrupt(self.signal.name)
 
 
 @contextmanager

@@ -323,31 +323,27 @@ class BesideReference:
 
 def compared(design: ShellDesign, cells: Tally, level: Level) -> tuple[BesideReference, ...]:
     """The vehicle beside each reference of a design; ``cells`` are its tests by the design's cells."""
-    found = []
+    found, own, worst = [], float(design.p @ cells.joined(design.joined).share), cells.failed_as_crashes()
     for r, reference in enumerate(design.references):
         crashes_too = ((np.array(design.cell_references) >> r) & 1).astype(np.bool_)
         rate, square = float(design.reference_rate[r]), float(design.reference_square[r])
-        ratio = _ratio(design, cells, crashes_too, (rate, square), level)
+        low, high = (
+            rate_ratio_limits(
+                design.p,
+                tests.joined(design.joined),
+                design.joined.T @ (tests.crash_mass @ crashes_too),
+                (rate, square),
+                design.n_paths,
+                level,
+            )
+            for tests in (cells, worst)
+        )
+        ratio = own / rate if rate > 0.0 else math.nan, low[0], high[1]
         preventable = preventable_share(design.cell_p, cells, ~crashes_too, design.n_paths, level)
         error = math.sqrt(max(square - rate * rate, 0.0) / design.n_paths)
         who = reference.name, reference.described, reference.delay_s
         found.append(BesideReference(*who, rate, error, *ratio, *preventable))
     return tuple(found)
-
-
-def _ratio(
-    design: ShellDesign, cells: Tally, crashes_too: BoolArray, moments: tuple[float, float], level: Level
-) -> tuple[float, float, float]:
-    """Ratio with its limits."""
-
-    def limits(found: Tally) -> tuple[float, float]:
-        strata = found.joined(design.joined)
-        with_reference = design.joined.T @ (found.crash_mass @ crashes_too)
-        return rate_ratio_limits(design.p, strata, with_reference, moments, design.n_paths, level)
-
-    rate = float(design.p @ cells.joined(design.joined).share)
-    low, high = limits(cells)[0], limits(cells.failed_as_crashes())[1]
-    return rate / moments[0] if moments[0] > 0.0 else math.nan, low, high
 
 
 def rate_ratio_limits(

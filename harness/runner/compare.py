@@ -7,7 +7,7 @@ folder holds already, from an earlier call or because it is the copy of a stored
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from itertools import pairwise
@@ -20,7 +20,7 @@ import numpy as np
 from harness.campaign.campaign import Campaign
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED, CampaignError, RunFolderError
 from harness.estimators.answer import conditional_paired_statement, paired_statement
-from harness.estimators.pairs import MarginVerdict, PairCounts, PairedEstimate, PairedShells, paired_estimate
+from harness.estimators.pairs import MarginVerdict, PairedEstimate, PairedShells, paired_estimate
 from harness.estimators.stopping import PairRule
 from harness.pool.shells import Draw, acceleration_limit
 from harness.progress import Progress
@@ -32,7 +32,6 @@ from harness.runner.resume import require_own_folder
 from harness.runner.run import Run
 from harness.sampling import ShardRequest
 from harness.sampling.shells import PairRounds, Shells, round_requests
-from harness.vocabulary import IntArray
 
 SIDES = ("a", "b")
 MAY_DIFFER = frozenset({"av", "name", "description"})
@@ -116,6 +115,7 @@ def compare_campaigns(
 def _compared(
     sides: Both, folders: tuple[Path, Path], margin: float | None, workers: int | None, progress: Progress
 ) -> tuple[PairedEstimate, PairRule]:
+    """Rounds of pairs until the rule is content: what those say that it has seen."""
     campaign = sides[0].campaign
     with ExitStack() as held, ExitStack() as working:
         runs, stored = [], []
@@ -129,53 +129,31 @@ def _compared(
             raise TypeError("the campaigns do not draw from shells")
         design, available = source.prescribed.design, source.prescribed.available
         rounds, pairs = PairRounds(campaign, design, available, margin), PairedShells(design)
-        both = [_Side(run, side, pairs, rounds.rule) for side, run in enumerate(runs)]
+
+        def drive(side: int, requests: Sequence[ShardRequest]) -> None:
+            for shard in runs[side].results(iter(requests)):
+                pairs.add(side, shard.block)
+                runs[side].follow(rounds.rule, shard)
+
         progress.stage("tests of A and B", None if margin is not None else 2 * campaign.stop.episodes)
-        for side, requests in zip(both, stored, strict=True):
-            side.run(iter(requests))
-        counts = _drive(rounds, pairs, both)
+        for side, requests in enumerate(stored):
+            drive(side, requests)
+        n_pairs = np.zeros_like(pairs.tests(0))
+        counts = pairs.first(n_pairs)
+        while (added := rounds.next_round(counts)).any():
+            n_pairs = n_pairs + added
+            for side, run in enumerate(runs):  # what is missing of the first cut-ins of each stratum
+                tested, done = pairs.tests(side), run.manifest
+                if (missing := np.maximum(n_pairs - tested, 0)).any():
+                    places = len(done.shards), done.n_episodes, campaign.run.smallest_shard
+                    drive(side, round_requests(tested, missing, *places))
+            counts = pairs.first(n_pairs)
+            if rounds.rule.observe(counts):
+                break
         working.close()
         for run in runs:
             run.finish(rounds.rule)
     return paired_estimate(counts, campaign.stop.confidence), rounds.rule
-
-
-@dataclass(frozen=True)
-class _Side:
-    """One vehicle's run, and where its tests go."""
-
-    into: Run
-    side: int
-    pairs: PairedShells
-    rule: PairRule
-
-    def run(self, requests: Iterator[ShardRequest]) -> None:
-        """Test what is asked for."""
-        for shard in self.into.results(requests):
-            self.pairs.add(self.side, shard.block)
-            self.into.follow(self.rule, shard)
-
-    def drive(self, n_pairs: IntArray) -> None:
-        """Test what is missing of the first cut-ins of each stratum."""
-        tested, done = self.pairs.tests(self.side), self.into.manifest
-        missing = np.maximum(n_pairs - tested, 0)
-        if missing.any():
-            size = self.into.campaign.run.smallest_shard
-            self.run(iter(round_requests(tested, missing, len(done.shards), done.n_episodes, size)))
-
-
-def _drive(rounds: PairRounds, pairs: PairedShells, both: list[_Side]) -> PairCounts:
-    """Rounds of pairs until the rule is content; the pairs that it has seen."""
-    n_pairs = np.zeros_like(pairs.tests(0))
-    counts = pairs.first(n_pairs)
-    while (added := rounds.next_round(counts)).any():
-        n_pairs = n_pairs + added
-        for side in both:
-            side.drive(n_pairs)
-        counts = pairs.first(n_pairs)
-        if rounds.rule.observe(counts):
-            break
-    return counts
 
 
 def _stored_requests(folder: Path, earlier: Mapping[str, Any]) -> Iterator[ShardRequest]:

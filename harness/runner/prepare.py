@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gc
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
 from harness.campaign.campaign import Campaign
 from harness.campaign.combinations import Command
@@ -68,11 +67,6 @@ def prepare(resolved: Resolved, progress: Progress | None = None) -> Source:
             finally:
                 gc.enable()
         return building.result()
-
-
-def cached_files(resolved: Resolved) -> list[Path]:
-    """What `prepare` leaves in the cache, or has found there: with these another machine builds nothing."""
-    return source_of(resolved.campaign).cached_files(resolved)
 
 
 def compile_kernels(resolved: Resolved) -> None:

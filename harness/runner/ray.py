@@ -32,7 +32,6 @@ from harness.errors import CampaignError, HarnessError
 from harness.processes import WorkerDeath, fit_to_travel, handlers_restored
 from harness.records.folder import write_bytes
 from harness.resolved import Resolved
-from harness.runner.prepare import cached_files
 from harness.runner.resume import cpu_name
 from harness.runner.workers import (
     CLOSING_S,
@@ -43,7 +42,7 @@ from harness.runner.workers import (
     WorkerProcess,
     Workers,
 )
-from harness.sampling import ShardRequest
+from harness.sampling import ShardRequest, source_of
 from harness.sampling.baseline import SHADOW
 
 LOCAL = "local"
@@ -199,7 +198,8 @@ class RayWorkers(Workers):
         self._lost_at_start, self._patient_until = 0, time.monotonic() + PATIENCE_S
         self._baseline: Files | None = None
         self._content = ray.put(resolved)
-        self._cached = {} if address == LOCAL else _stored(cached_files(resolved), cache_root())
+        cached = source_of(resolved.campaign).cached_files(resolved)
+        self._cached = {} if address == LOCAL else _stored(cached, cache_root())
         self._actor_class = ray.remote(OnMachine).options(
             num_cpus=settings.resources.cpus / n_runs,
             num_gpus=settings.resources.gpus / n_runs,
