@@ -122,22 +122,16 @@ class Run:
         return self.prepared.policy.importance.alpha
 
     @cached_property
-    def moment_order(self):
-        moment = self.shard.results.moment[: self.shard.results.moment_count[0]]
-        return np.lexsort((moment["step"], moment["row"]))
+    def moments(self):
+        """Control steps (m,) by episode and step, with q_j and V_j (m, J) of each."""
+        results = self.shard.results
+        used = slice(results.moment_count[0])
+        order = np.lexsort((results.moment["step"][used], results.moment["row"][used]))
+        return results.moment[used][order], results.moment_q[used][order], results.moment_v[used][order]
 
-    @cached_property
-    def moment(self):
-        """Control steps (m,), by episode and step."""
-        return self.shard.results.moment[self.moment_order]
-
-    @cached_property
-    def moment_q(self):
-        return self.shard.results.moment_q[self.moment_order]
-
-    @cached_property
-    def moment_v(self):
-        return self.shard.results.moment_v[self.moment_order]
+    moment = property(lambda self: self.moments[0])
+    moment_q = property(lambda self: self.moments[1])
+    moment_v = property(lambda self: self.moments[2])
 
     def summed(self, per_moment):
         """Per episode the sum over its control steps (m,) or (m, J)."""

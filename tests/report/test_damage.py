@@ -69,9 +69,3 @@ def test_what_no_run_has_written_is_named(run_folder, file, damage, said):
     assert caught.value.exit_code == 2
     assert caught.value.mend
     assert (run_folder / "report.html").read_text() == "of an earlier report"
-
-
-def test_a_folder_that_is_no_run_is_refused_and_stays_empty(tmp_path):
-    with pytest.raises(RunFolderError, match=r"manifest\.json"):
-        write_report(tmp_path)
-    assert list(tmp_path.iterdir()) == []
