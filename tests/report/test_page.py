@@ -10,12 +10,16 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import matplotlib.pyplot as plt
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from harness.campaign.sections import Accept
+from harness.errors import RunFolderError
 from harness.report.page import run_notes, verdict, write_report
 from harness.report.summary import read_run_folder, summarise, typed_folder
 from tests.report.page_text import GOLDEN, KINDS, PAGES, Page, golden_text
+from tests.stored_runs import truncate
 
 OF_CRASHES = {"cut_ins", "impact_speed", "crash_time"}
 SEEN = {
@@ -132,3 +136,54 @@ def test_commands_name_the_folder_as_it_is_typed(typed, shown, tmp_path, monkeyp
     assert typed_folder(tmp_path / "here" / typed) == shown
     assert typed_folder(tmp_path / "elsewhere") == "elsewhere"
     assert typed_folder(tmp_path / "here") == "."
+
+
+# -- what no run has written: one error that names the file, and nothing is written (more in runner/test_folders.py) --
+
+
+def pages_broken(path: Path) -> None:
+    """A shard with a good footer."""
+    content = path.read_bytes()
+    quarter, half = len(content) // 4, len(content) // 2
+    path.write_bytes(content[:quarter] + bytes(b ^ 0xFF for b in content[quarter:half]) + content[half:])
+
+
+def rewritten(change):
+    return lambda path: pq.write_table(change(pq.read_table(path)), path)
+
+
+def of_unknown_outcome(table: pa.Table) -> pa.Table:
+    place = table.schema.get_field_index("outcome")
+    values = pa.array(["flew away"] * 1000, table.column("outcome").type)
+    return table.set_column(place, table.schema.field(place), values)
+
+
+def edited(**changes):
+    return lambda path: edit(path, **changes)
+
+
+EPISODES, MOMENTS, TRACES = (f"{table}/shard-000001.parquet" for table in ("episodes", "moments", "traces"))
+POINT_WITHOUT_RATE = {"n": 1, "ci_low": 0, "ci_high": 1, "rhw": 1}  # which must not be drawn as zero
+
+
+@pytest.mark.parametrize(
+    ("file", "damage", "said"),
+    [
+        *((shard, truncate, shard) for shard in (MOMENTS, TRACES)),
+        *((shard, pages_broken, shard) for shard in (EPISODES, TRACES)),
+        (EPISODES, rewritten(lambda table: table.slice(0, 990)), "found 990 rows; expected 1000 rows"),
+        (EPISODES, rewritten(lambda table: table.drop_columns(["log_weight"])), "no column 'log_weight'"),
+        (EPISODES, rewritten(of_unknown_outcome), "flew away"),
+        *(("estimates.json", lambda path, text=text: path.write_text(text), "estimates.json") for text in ("{", "[]")),
+        ("estimates.json", edited(campaign_hash="feedfeedfeedfeed"), "feedfeedfeedfeed"),
+        ("estimates.json", edited(headline="oracle"), "oracle"),
+        ("estimates.json", edited(convergence=[POINT_WITHOUT_RATE]), r"convergence\.0\.crash_rate"),
+    ],
+)
+def test_what_no_run_has_written_is_named(run_folder, file, damage, said):
+    damage(run_folder / file)
+    (run_folder / "report.html").write_text("of an earlier report")
+    with pytest.raises(RunFolderError, match=said) as caught:
+        write_report(run_folder)
+    assert (caught.value.exit_code, caught.value.mend != "") == (2, True)
+    assert (run_folder / "report.html").read_text() == "of an earlier report"
