@@ -8,6 +8,7 @@ import os
 import numpy as np
 
 from examples import idm_batch
+from examples.acting import Holds as HoldsBatch  # noqa: F401
 from examples.idm import IDM, idm_acceleration
 from harness.controllers.traci_style import TraciStyleController
 
@@ -23,13 +24,6 @@ class HoldsThenIdm(IDM):
 
     def before(self, seen):
         return 0.0
-
-
-class HoldsBatch(idm_batch.IDM):
-    """The same over arrays."""
-
-    def step_batch(self, seen):
-        return np.where(np.isinf(seen.gap_m), 0.0, super().step_batch(seen))
 
 
 class Speeds(HoldsThenIdm):
@@ -58,14 +52,6 @@ class SpeedsTraci(TraciStyleController):
         if leader is not None:
             a = idm_acceleration(speed, traci.vehicle.getSpeed(leader[0]), leader[1])
         traci.vehicle.setAcceleration(veh_id, a, traci.simulation.getDeltaT())
-
-
-class Beside(idm_batch.IDM):
-    """Speeds up by 1.5 m/s² from 20 m behind BV's bumper on, to get past it."""
-
-    def step_batch(self, seen):
-        gap = seen.bv_position_m - 5.0 - seen.position_m
-        return np.where(np.isinf(seen.gap_m), np.where(gap < 20.0, 1.5, 0.0), super().step_batch(seen))
 
 
 class Yields(idm_batch.IDM):

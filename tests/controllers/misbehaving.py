@@ -114,23 +114,6 @@ class Misbehaving(IDM):
         return super().step(seen)
 
 
-class RaisesWhenMade(IDM):
-    def __init__(self):
-        raise RuntimeError("no licence")
-
-
-class HangsWhenMade(IDM):
-    """The n-th one that is made in a process, and all later ones."""
-
-    n_made = 0
-
-    def __init__(self, first=1, how="hangs"):
-        super().__init__()
-        HangsWhenMade.n_made += 1
-        while HangsWhenMade.n_made >= first:
-            FAULTS[how]()
-
-
 class StartsPrograms(IDM):
     """In sessions of their own; one is left to whoever adopts it."""
 
@@ -144,16 +127,19 @@ class StartsPrograms(IDM):
 
 
 class Always(IDM):
-    """Commits its fault in every call of one name."""
+    """Commits its fault in every call of one name; in the constructor, from the n-th on that a process makes."""
 
-    def __init__(self, where, how="ends_the_process"):
+    n_made = 0
+
+    def __init__(self, where, how="ends_the_process", first=1):
         super().__init__()
         for name in ("start", "step", "start_batch", "step_batch", "close"):
             if name == where:
                 setattr(self, name, lambda *_: FAULTS[how]())
             elif name.endswith("batch") and where.endswith("batch"):
                 setattr(self, name, lambda *_: None)
-        if where == "constructor":
+        Always.n_made += 1
+        if where == "constructor" and Always.n_made >= first:
             FAULTS[how]()
 
 

@@ -137,17 +137,23 @@ def test_too_many_failures_are_no_answer(episodes, n, share, tmp_path, capsys):
     assert not (tmp_path / "run/estimates.json").exists()
 
 
-HANGS = ", limits: {construction_time_s: 0.2}"
+SHORT_MADE = ", limits: {construction_time_s: 0.2}"
 POPEN = "{controller: 'subprocess:Popen', parameters: {args: touch called, shell: true}}"
+IN_CONSTRUCTOR = {
+    "raises": "ZeroDivisionError: no such thing",
+    "hangs": LATE_MADE,
+    "hangs_for_good": f"{LATE_MADE}, and the call could not be interrupted, in its constructor",
+    "ends_the_process": "the controller ended the worker process (exit code 7), in its constructor",
+    "closes_descriptors": "the controller closed file descriptors that are not its own",
+}
 REFUSED = [
     ("{controller: 'no_such_module:X'}", "av.controller", "cannot be imported"),
     (_of("X"), "av.controller", "no class X"),
-    (_of("RaisesWhenMade"), "av.controller", "RuntimeError: no licence"),
     (_of("RaisesInClose", pth="x"), "av.parameters", "pth"),
-    (_of("HangsWhenMade", HANGS), "av.controller", LATE_MADE),
-    (_of("HangsWhenMade", HANGS, how="hangs_for_good"), "av.controller", f"{LATE_MADE}, and the call could not be in"),
-    (_of("Always", where="constructor"), "av.controller", "the controller ended the worker process (exit code 7), in "),
-    (_of("Always", where="constructor", how="closes_descriptors"), "av.controller", "closed file descriptors"),
+    *(
+        (_of("Always", SHORT_MADE, where="constructor", how=how), "av.controller", words)
+        for how, words in IN_CONSTRUCTOR.items()
+    ),
     (_of("says_nothing"), "av.controller", "without start, step, close"),
     (POPEN, "av.controller", "Popen without start, step, close"),
 ]
@@ -177,7 +183,7 @@ def test_check_refuses_what_run_refuses_and_makes_nothing_but_controllers(av, te
 
 def test_a_constructor_has_a_time_limit_of_its_own_in_tests_too(tmp_path):
     """The first of a process, that says whether there is a controller at all, is made in time."""
-    av = _of("HangsWhenMade", ", limits: {step_time_s: 5, construction_time_s: 0.2}", first=40)
+    av = _of("Always", SHORT_MADE, where="constructor", how="hangs", first=40)
     assert _run(tmp_path, av, "stop.episodes=40") == EXIT_DONE
     failed = [row["failure"] for row in _episodes(tmp_path) if row["outcome"] == "failed"]
     assert set(failed) == {f"start: StepTimeoutError: {LATE_MADE}"}

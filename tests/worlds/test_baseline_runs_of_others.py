@@ -11,17 +11,12 @@ from harness.runner.prepare import prepare
 from harness.sampling.baseline import as_recorded, baseline_requests, run_baseline
 from harness.worlds import build_world
 from harness.worlds.sumo_driven import FreshWorld, SumoAvWorld
-from tests.controllers.driving import ROOT, fmu_av
+from tests.controllers.driving import fmu_av
 from tests.pool.conftest import MIXTURE_FILE, SMALL_POOL
 from tests.worlds.running import EXAMPLE, program
 
 SHOWN = 60
 EARLY = ", before_cut_in: controller}"
-
-
-@pytest.fixture(autouse=True)
-def _in_the_checkout(monkeypatch):
-    monkeypatch.chdir(ROOT)
 
 
 def acting(av: str, engine: str):
@@ -51,21 +46,21 @@ def driven_in(world, campaign):
     return sum((part.failures for part in done), start=done[0].failures), shard, runs
 
 
-@pytest.mark.parametrize(
-    "av",
-    [
-        "{sumo: {carFollowModel: ACC}" + EARLY,
-        "{sumo: {carFollowModel: Krauss, sigma: 0.5}" + EARLY,
-        "{controller: 'tests.controllers.early:SpeedsTraci'" + EARLY,
-    ],
-    ids=["SUMO's ACC", "SUMO's Krauss with seeded noise", "TraCI style"],
-)
+FORMS = {
+    "SUMO's ACC": "{sumo: {carFollowModel: ACC}",
+    "SUMO's Krauss with seeded noise": "{sumo: {carFollowModel: Krauss, sigma: 0.5}",
+    "TraCI style": "{controller: 'tests.controllers.early:SpeedsTraci'",
+    "a program": f"{{traci: {{command: {program(EXAMPLE).traci.command!r}}}",
+}
+
+
+@pytest.mark.parametrize("av", [av + EARLY for av in FORMS.values()], ids=FORMS)
 def test_it_does_in_tests_what_it_did_in_its_baseline_runs(av):
     failures, shard, runs = driven(av)
     assert not failures
     assert shard.failures == {}
     moved = np.abs(runs.v_mps[np.arange(120), runs.n_steps] - runs.v_mps[:, 0]) > 0.1
-    assert moved.mean() > 0.2, "it never acted"
+    assert moved.mean() > 0.2 or "idm_client" in av, "it never acted"  # but the client holds its speed, too
     assert np.all(shard.results.episode["cut_in_step"] >= 0)
 
 
@@ -77,13 +72,6 @@ def test_models_that_are_recycled_otherwise_remember_the_last_cut_in():
     world.close()
     _, shard, _ = driven_in(SumoAvWorld(8, campaign.av.sumo, acts_before_cut_in=True), campaign)
     assert len(shard.failures) > 5
-
-
-def test_a_program_of_its_own_process():
-    av = program(EXAMPLE).traci.command
-    failures, shard, _ = driven(f"{{traci: {{command: {av!r}}}" + EARLY)
-    assert not failures
-    assert shard.failures == {}
 
 
 def test_an_fmu_in_both_worlds(fmu):

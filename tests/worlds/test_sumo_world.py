@@ -44,16 +44,12 @@ def drive(world, *, steps: int = 1) -> None:
 # -- one simulation per process --
 
 
-def test_a_second_simulation_is_refused_and_the_first_goes_on(open_world, driving):
-    world = driving(2)
+def test_a_second_simulation_is_refused_and_closing_twice_leaves_the_next_one_alone(open_world, driving):
+    first = driving(2)
     with pytest.raises(CampaignError, match="already runs in this process"):
         open_world(2)
-    drive(world)
-    assert world.x[1, LV] == pytest.approx(303.0)
-
-
-def test_closing_a_world_twice_leaves_the_next_one_alone(open_world, driving):
-    first = open_world(2)
+    drive(first)
+    assert first.x[1, LV] == pytest.approx(303.0)
     first.close()
     second = driving(2)
     first.close()
