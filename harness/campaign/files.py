@@ -27,9 +27,15 @@ from harness.campaign.vehicle import AutomatedVehicle
 from harness.errors import CampaignError
 
 SHIPPED_PARAMETERS = Path(__file__).parents[1] / "traffic"
-_CHECKOUT = Path(__file__).parents[2] / "scenarios"
-_INSTALLED = Path(__file__).parents[1] / "scenarios"
-SHIPPED_PANEL = (_INSTALLED if _INSTALLED.exists() else _CHECKOUT) / "av_panel.yaml"
+
+
+def shipped_folder(name: str) -> Path:
+    """A folder that comes with the harness: of the installed package, or of the checkout."""
+    installed = Path(__file__).parents[1] / name
+    return installed if installed.exists() else Path(__file__).parents[2] / name
+
+
+SHIPPED_PANEL = shipped_folder("scenarios") / "av_panel.yaml"
 _FILES = {
     ("av", "fmu", "file"): "an FMI 2.0 co-simulation FMU",
     ("pool", "library"): "a surrogate library, or the name of a shipped one",
@@ -57,9 +63,8 @@ def load_campaign(
 
     Raises `CampaignError`: the file cannot be read, is not YAML, or says something wrong; the error names every place.
     """
-    campaign, place = _read(
-        path, Campaign, [*([] if av is None else [av_override(av)]), *map(parse_override, overrides)]
-    )
+    laid = [] if av is None else [Override(("av",), panel_av(av).model_dump(exclude_unset=True), f"--av {av}")]
+    campaign, place = _read(path, Campaign, [*laid, *map(parse_override, overrides)])
     folder = Path(path).parent
     for where, expected in _FILES.items():
         name = campaign.at(where)
@@ -206,11 +211,6 @@ def panel_av(text: str) -> AutomatedVehicle:
         mend = did_you_mean(name, list(avs)) or "Name one of them."
         raise CampaignError(f"--av {text}", f"no vehicle '{name}' in {file or 'the shipped panel'}", expected, mend)
     return avs[name]
-
-
-def av_override(text: str) -> Override:
-    """``--av``: the vehicle's section in place of the campaign's own, with only what the panel writes."""
-    return Override(("av",), panel_av(text).model_dump(exclude_unset=True), f"--av {text}")
 
 
 # -- strict YAML 1.2: every value is what it looks like, and knows its line --

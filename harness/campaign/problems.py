@@ -79,9 +79,8 @@ def validated(data: Any, model: type[Model], path: str, place: Place) -> Model:
             where = (*_path_of(details["loc"], data), *filter(None, parts["key"].split(".")))
             alike = problems.get((where, parts["found"]))
             expected = parts["expected"]
-            if (
-                alike is not None and expected not in alike.expected
-            ):  # a value of several kinds is refused once for each
+            # A value of several kinds is refused once for each.
+            if alike is not None and expected not in alike.expected:
                 expected = f"{alike.expected} or {expected}"
             mend = parts["mend"] or _where_it_belongs(str(where[-1]), model)
             problems[where, parts["found"]] = CampaignError(place(where), parts["found"], expected, mend)

@@ -49,6 +49,7 @@ def show_error(error: HarnessError) -> None:
         say(f" {part.where}", *(f"  {each + ':':<9} {getattr(part, each)}" for each in _PARTS), err=True)
 
 
+_AGAIN = "Nothing finished is lost: then give the same command again (`run` with --resume)."
 _HOW_TO_GO_ON = {
     "run": " Finished shards are kept: the same command with --resume goes on.",
     "compare": " Finished shards are kept: the same command goes on.",
@@ -64,29 +65,20 @@ def show_interrupted(command: str, signal_name: str | None) -> None:
 
 def system_error(error: OSError) -> HarnessError | None:
     """Translate an error of the operating system that a user can mend; None for any other."""
-    where = str(error.filename or f"disk of the output folder, or of the cache {_cache_folder()}")
+    from harness.compiled import cache_root  # noqa: PLC0415 - keeps --help fast
+
+    # Numba does not say of a file in its cache which it was.
+    where = str(error.filename or f"disk of the output folder, or of the cache {cache_root()}")
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        mend = "Nothing finished is lost: free some space, then give the same command again (`run` with --resume)."
-        return HarnessError(where, "no space left", "room for what is written there", mend)
+        return HarnessError(where, "no space left", "room for what is written there", f"Free some space. {_AGAIN}")
     if error.errno in (errno.EFBIG, errno.EIO):
-        return HarnessError(
-            where,
-            f"a file that could not be written or read on ({error.strerror})",
-            "a sound disk, and no limit on the size of files (`ulimit -f`)",
-            "Nothing finished is lost: lift the limit or choose another disk, then give the same command again "
-            "(`run` with --resume).",
-        )
+        found = f"a file that cannot be written or read on ({error.strerror})"
+        expected = "a sound disk, and no limit on the size of files (`ulimit -f`)"
+        return HarnessError(where, found, expected, f"Lift the limit or choose another disk. {_AGAIN}")
     if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
         mend = "Change its permissions, or choose another place."
         return HarnessError(where, f"no permission ({error.strerror})", "a place that may be read and written", mend)
     return None
-
-
-def _cache_folder() -> str:
-    """Where compiled kernels are kept: numba does not say of a file of its own which it was."""
-    from harness.compiled import cache_root  # noqa: PLC0415 - keeps --help fast
-
-    return str(cache_root())
 
 
 def usage_error(error: click.UsageError, context: click.Context) -> HarnessError:

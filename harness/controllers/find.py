@@ -54,12 +54,9 @@ def controller_class(name: str) -> Callable[..., Any]:
     try:
         module = importlib.import_module(module_name)
     except (Exception, SystemExit) as error:
-        raise CampaignError(
-            "av.controller",
-            f"{name}, whose module cannot be imported ({cause_of(error)})",
-            "a Python module that can be imported",
-            "Start the harness in the folder that holds it, or install it beside the harness.",
-        ) from error
+        cause = f"{name}, whose module cannot be imported ({cause_of(error)})"
+        mend = "Start the harness in the folder that holds it, or install it beside the harness."
+        raise CampaignError("av.controller", cause, "a Python module that can be imported", mend) from error
     found = getattr(module, class_name, None)
     if not callable(found):
         what = f"no class {class_name} in {getattr(module, '__file__', module_name)}"
@@ -113,12 +110,10 @@ def _maker(av: AutomatedVehicle) -> Callable[[], Any]:
     try:
         signature(make).bind(**parameters)
     except TypeError as error:
-        raise CampaignError(
-            "av.parameters",
-            f"{', '.join(parameters) or 'none'}, which {av.controller} does not take ({error})",
-            "keyword arguments of the controller's constructor",
-            "Correct av.parameters, or the constructor.",
-        ) from error
+        found = f"{', '.join(parameters) or 'none'}, which {av.controller} does not take ({error})"
+        mend = "Correct av.parameters, or the constructor."
+        expected = "keyword arguments of the controller's constructor"
+        raise CampaignError("av.parameters", found, expected, mend) from error
     except ValueError:
         pass  # a class in C may have no signature
     return lambda: make(**deepcopy(parameters))
@@ -173,12 +168,9 @@ def run_apart(av: AutomatedVehicle, work: Callable[..., _Answer], *arguments: An
             child.kill()
     if isinstance(answer, WorkerDeath):
         cause, call = death_cause(answer.exit_code, av.limits, answer.call), answer.call
-        raise AvEndedProcessError(
-            f"av.{av.source}",
-            f"{cause}, {'while it was found' if call is None else f'in {call}'}",
-            "a controller that returns or raises",
-            "Look for os._exit, a crash of compiled code, or a shortage of memory; then check again.",
-        )
+        found = f"{cause}, {'while it was found' if call is None else f'in {call}'}"
+        mend = "Look for os._exit, a crash of compiled code, or a shortage of memory; then check again."
+        raise AvEndedProcessError(f"av.{av.source}", found, "a controller that returns or raises", mend)
     return answer  # type: ignore[no-any-return]
 
 

@@ -56,12 +56,9 @@ def fmu_maker(fmu: FmuController) -> Callable[[], VehicleController]:
     except Exception as error:
         if isinstance(error, OSError) and error.errno in _OF_THE_DISK:
             raise  # it names the file or the cache: nothing is wrong with the FMU
-        raise CampaignError(
-            "av.fmu.file",
-            f"{fmu.file}, which cannot be read ({' '.join(str(error).split())[:300]})",
-            "an FMI 2.0 co-simulation FMU",
-            "Export it again, and try 'fmpy validate' on it.",
-        ) from error
+        found = f"{fmu.file}, which cannot be read ({' '.join(str(error).split())[:300]})"
+        mend = "Export it again, and try 'fmpy validate' on it."
+        raise CampaignError("av.fmu.file", found, "an FMI 2.0 co-simulation FMU", mend) from error
     if not str(description.fmiVersion).startswith("2.") or description.coSimulation is None:
         kind = "co-simulation" if description.coSimulation is not None else "model exchange"
         found = f"{fmu.file}, for FMI {description.fmiVersion} {kind}"
@@ -110,12 +107,8 @@ def wire(fmu: FmuController, description: Any) -> Wiring:
     """Check ``av.fmu`` against the FMU's variables: a `CampaignError` names the key, and what there is."""
     for name in fmu.inputs:
         if name not in OBSERVATIONS:
-            raise CampaignError(
-                f"av.fmu.inputs.{name}",
-                "no such observation",
-                f"one of {', '.join(OBSERVATIONS)}",
-                "The keys are observations, the values the FMU's input variables.",
-            )
+            expected, mend = f"one of {', '.join(OBSERVATIONS)}", "The values are the FMU's input variables."
+            raise CampaignError(f"av.fmu.inputs.{name}", "no such observation", expected, mend)
     inputs = [_reference(f"av.fmu.inputs.{key}", name, description, ("input",)) for key, name in fmu.inputs.items()]
     starts = [_reference("av.fmu.start_values", name, description, ("parameter", "input", "local", "output"))
               for name in fmu.start_values]  # fmt: skip
@@ -129,12 +122,8 @@ def _reference(where: str, name: str, description: Any, causalities: Sequence[st
     if found is not None and found.type == "Real" and found.causality in causalities:
         return int(found.valueReference)
     listed = ", ".join(f"{each.name} ({each.type} {each.causality})" for each in variables.values())
-    raise CampaignError(
-        where,
-        f"{name}, " + ("no variable of the FMU" if found is None else f"a {found.type} {found.causality}"),
-        f"a Real {' or '.join(causalities)}",
-        f"The FMU has: {listed}.",
-    )
+    kind = "no variable of the FMU" if found is None else f"a {found.type} {found.causality}"
+    raise CampaignError(where, f"{name}, {kind}", f"a Real {' or '.join(causalities)}", f"The FMU has: {listed}.")
 
 
 class FmuVehicleController:

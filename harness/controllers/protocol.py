@@ -25,16 +25,10 @@ class Neighbour(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class EpisodeStart:
-    """What a per-vehicle controller is told when an episode begins.
+    """What a per-vehicle controller is told when an episode begins: its index, and the time (s) between two steps.
 
-    Attributes
-    ----------
-    episode : int
-        Index in the campaign.
-    step_s : float
-        Time between two calls of ``step`` (s).
-    random : numpy.random.Generator
-        The only randomness that a controller may use: seeded by campaign and episode, so that a replay sees the same.
+    ``random`` is the only randomness that a controller may use: seeded by campaign and episode, so that a replay sees
+    the same.
     """
 
     episode: int

@@ -177,9 +177,8 @@ def read_pool(path: Path) -> Pool:
     Raises `RunFolderError`: the file is missing, damaged, or not a pool.
     """
     try:
-        with pq.ParquetFile(
-            path, page_checksum_verification=True
-        ) as file:  # read_table would import, for 0.3 s, what reads folders
+        # read_table would import, for 0.3 s, what reads folders.
+        with pq.ParquetFile(path, page_checksum_verification=True) as file:
             table = file.read()
         return _pool(table)
     except (OSError, pa.ArrowException, KeyError, TypeError, ValueError) as error:
@@ -199,10 +198,7 @@ def _table(pool: Pool) -> pa.Table:
         "shell": (pa.array(pool.shell.astype(np.int8)), "first surrogate that crashes; the last shell: none does"),
         "cell": (pa.array(c.cell.astype(np.int16)), "shell and references that crash, as the metadata lists cells"),
         "crashes": (rows(c.crashes), "which surrogates crash, as the metadata orders names, and which references"),
-        "path_mass": (
-            rows(c.path_mass),
-            "P of a cut-in of each cell on the path, times the path's weight",
-        ),
+        "path_mass": (rows(c.path_mass), "P of a cut-in of each cell on the path, times the path's weight"),
         "lv_maneuvers": (prefixes(c.lv, c.n_lv), "LV's draws, one per hold period"),
         "bv_maneuvers": (prefixes(c.bv, c.n_bv), "BV's draws; 31 marks the cut-in"),
         "lead_steps": (pa.array(c.lead.astype(np.int16)), "steps from the onset of lateral motion to overlap"),

@@ -253,19 +253,21 @@ def _differences(
 ) -> dict[str, _Difference]:
     """Per column what is to be equal."""
     outcome = np.asarray(pc.index_in(episodes.column("outcome").cast(pa.string()), pa.array(OUTCOMES))).astype(np.int64)
-    r2, r2dot, impact, time = (_floats(episodes, name) for name in (*at_cut_in, "impact_speed_mps", "crash_time_s"))
+    names = *at_cut_in, "impact_speed_mps", "crash_time_s"
+    columns = (episodes.column(name).to_numpy() for name in names)  # NaN for null
+    r2, r2dot, impact, time = (np.ascontiguousarray(column, np.float64) for column in columns)
     unknown = (outcome == FAILED) | ((stored.cut_step >= 0) & (not built_in))
     expected = np.where(unknown, np.where(twin["outcome"] == RUNNING, outcome, twin["outcome"]), twin["outcome"])
     crash = (outcome == CRASH) & built_in
     before = (outcome == FAILED) & (stored.cut_step < 0)  # it may have failed between the onset and the cut-in
     at = np.where(outcome == CRASH, stored.n_steps * STEP_S, np.nan)
-    names = np.array([*OUTCOMES, "neither crash nor end"])
-    maneuvers = (twin["outcome"] == FAILED, names[outcome], np.full(len(outcome), "maneuvers that lead there"))
+    words = np.array([*OUTCOMES, "neither crash nor end"])
+    maneuvers = (twin["outcome"] == FAILED, words[outcome], np.full(len(outcome), "maneuvers that lead there"))
     return {
         "lv_maneuvers, bv_maneuvers": maneuvers,
         at_cut_in[0]: (_unlike(r2, twin["onset_r2"]) & ~before, r2, twin["onset_r2"]),
         at_cut_in[1]: (_unlike(r2dot, twin["onset_r2dot"]) & ~before, r2dot, twin["onset_r2dot"]),
-        "outcome": (outcome != expected, names[outcome], names[expected]),
+        "outcome": (outcome != expected, words[outcome], words[expected]),
         "n_steps": (stored.n_steps != twin["n_steps"], stored.n_steps, twin["n_steps"]),
         "crash_time_s": (_unlike(time, at), time, at),
         "impact_speed_mps": (_unlike(impact, twin["impact"]) & crash, impact, twin["impact"]),
@@ -276,8 +278,3 @@ def _unlike(a: FloatArray, b: FloatArray) -> BoolArray:
     """Where two arrays differ in a bit; undefined numbers are alike."""
     unlike: BoolArray = (a.view(np.int64) != b.view(np.int64)) & ~(np.isnan(a) & np.isnan(b))
     return unlike
-
-
-def _floats(episodes: pa.Table, name: str) -> FloatArray:
-    """A column with NaN for null."""
-    return np.ascontiguousarray(episodes.column(name).to_numpy(), np.float64)

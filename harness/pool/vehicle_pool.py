@@ -164,13 +164,11 @@ def vehicle_pool(resolved: Resolved, paths: BaselinePaths, runs: BaselineRuns) -
     found = enumerate_cut_ins(paths.seed, paths.index, paths.state, environment, followers, runs)
     if not found.crashes.any():
         failed = f" ({n:,} of them failed)" if (n := int(runs.failed.sum())) else ""
-        raise HarnessError(
-            "baseline runs",
-            f"no cut-in on {len(paths):,} paths{failed} after which even the most careless surrogate would crash",
-            "some: the crash rate is estimated from them",
-            "Raise pool.shadow_paths, or use testing.method forced; look at whether the vehicle moves at all "
-            "(`harness av-check`).",
+        none = f"no cut-in on {len(paths):,} paths{failed} after which even the most careless surrogate would crash"
+        mend = (
+            "Raise pool.shadow_paths, use testing.method forced, or see whether the vehicle moves (`harness av-check`)."
         )
+        raise HarnessError("baseline runs", none, "some: the crash rate is estimated from them", mend)
     mass = found.probability * paths.weight[:, None]
     enumerated = EnumeratedPaths(paths.index, paths.state, paths.weight, mass, found.crashes)
     key = hashlib.sha256(" ".join((paths.key, resolved.content_hash, runs.digest())).encode()).hexdigest()[:24]

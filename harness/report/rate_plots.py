@@ -19,6 +19,7 @@ from harness.report.style import (
     decades,
     head,
     interval_bars,
+    log_axis,
     new_figure,
     note,
     scaled,
@@ -150,7 +151,7 @@ def convergence_plot(estimates: Estimates, target_rhw: float | None, *, of_state
         return _plot_without_crash(n, high, confidence, level)
     figure, left, right = two_panels(3.5, ("tests", "tests"), sharex=True)
     for axes in (left, right):
-        _count_tests(axes, n)
+        log_axis(axes.xaxis, n[0], n[-1])
     left.fill_between(n, low, high, color=BLUE, alpha=0.16, linewidth=0, label=f"{confidence} interval")
     left.plot(n, rate, color=BLUE, label="estimate")
     left.axhline(rate[-1], color=MUTED, linewidth=0.9, linestyle=(0, (4, 3)), label="at the end")
@@ -174,13 +175,11 @@ def _plot_without_crash(n: FloatArray, high: FloatArray, confidence: str, level:
     """Draw only the upper end of the interval: without a crash it is all that changes, and RHW is not defined."""
     figure = new_figure(FULL_WIDTH_IN, 2.9)
     axes = figure.subplots()
-    _count_tests(axes, n)
+    log_axis(axes.xaxis, n[0], n[-1])
     axes.plot(n, high, color=BLUE)
     known = high[np.isfinite(high) & (high > 0.0)]
     if known.size:
-        axes.set_yscale("log")
-        axes.set_ylim(float(known.min()) / 1.6, float(known.max()) * 1.6)
-        decades(axes.yaxis, *axes.get_ylim())
+        log_axis(axes.yaxis, float(known.min()) / 1.6, float(known.max()) * 1.6)
     axes.set_xlabel("tests")
     axes.set_ylabel(f"crash rate per test (level {level})")
     axes.set_title(f"Upper end of the {confidence} interval")
@@ -190,12 +189,6 @@ def _plot_without_crash(n: FloatArray, high: FloatArray, confidence: str, level:
         "in. The relative half-width is not defined without a crash."
     )
     return Plot("convergence", figure, alt, caption)
-
-
-def _count_tests(axes: Axes, n: FloatArray) -> None:
-    axes.set_xscale("log")
-    axes.set_xlim(n[0], n[-1])
-    decades(axes.xaxis, *axes.get_xlim())
 
 
 def _rate_limit(rate: FloatArray, high: FloatArray) -> float:
@@ -216,9 +209,7 @@ def _draw_rhw(axes: Axes, n: FloatArray, rhw: FloatArray, target_rhw: float | No
         return
     n, rhw = n[known], rhw[known]
     shown = rhw if target_rhw is None else np.append(rhw, target_rhw)
-    axes.set_yscale("log")
-    axes.set_ylim(float(shown.min()) / 1.5, float(shown.max()) * 1.6)
-    decades(axes.yaxis, *axes.get_ylim())
+    log_axis(axes.yaxis, float(shown.min()) / 1.5, float(shown.max()) * 1.6)
     axes.plot(n, rhw, color=BLUE, label=f"RHW, {rhw[-1]:.3g} at the end")
     if target_rhw is not None:
         axes.axhline(target_rhw, color=VERMILLION, linewidth=1.1, linestyle=(0, (5, 2)), label=f"target {target_rhw:g}")

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import matplotlib as mpl
 from matplotlib.axes import Axes
-from matplotlib.axis import Axis
+from matplotlib.axis import Axis, XAxis, YAxis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
@@ -163,6 +163,12 @@ def only_horizontal_grid(axes: Axes) -> None:
     axes.grid(visible=False, axis="x")
 
 
+def log_axis(axis: XAxis | YAxis, low: float, high: float) -> None:
+    """Make an axis logarithmic from ``low`` to ``high``, with the labels of `decades`."""
+    axis.axes.set(**{f"{axis.axis_name}scale": "log", f"{axis.axis_name}lim": (low, high)})
+    decades(axis, low, high)
+
+
 def decades(axis: Axis, low: float, high: float) -> None:
     """Label a logarithmic axis from ``low`` to ``high`` by powers of ten; also by 2 and 5 where it spans few."""
     few = math.log10(high / low) < FEW_DECADES
@@ -222,12 +228,8 @@ def inline_svg(svg_file: bytes) -> str:
     rest = re.sub(r'<g id="[^"]*"', "<g", rest)
     # matplotlib writes the typeface as `font` or as `font-family`, depending on its version.
     rest = re.sub(r"(font-family:|font: (?:[a-z0-9]+ )*[\d.]+px) [^;\"]*", r"\1 var(--sans)", rest)
-    rest = re.sub(r"#[0-9a-f]{6}\b", lambda match: _themed(match.group()), rest)
+    rest = re.sub(r"#[0-9a-f]{6}\b", lambda of: f"var(--{CSS_NAMES[of[0]]})" if of[0] in CSS_NAMES else of[0], rest)
     return f'<svg {view_box.group() if view_box else ""} aria-hidden="true">{rest.strip()}'
-
-
-def _themed(colour: str) -> str:
-    return f"var(--{CSS_NAMES[colour]})" if colour in CSS_NAMES else colour
 
 
 def _saved(plot: Plot, **options: Any) -> bytes:

@@ -21,8 +21,8 @@ from harness.report.style import (
     REDS,
     VERMILLION,
     Plot,
-    decades,
     head,
+    log_axis,
     new_figure,
     only_horizontal_grid,
     two_panels,
@@ -90,9 +90,7 @@ def weight_plot(summary: RunSummary) -> Plot | None:
     for bins, colour, label in ((everything, GREY, "all tests"), (crashed, VERMILLION, "crashes")):
         if bins.counts.any():
             upper.stairs(bins.counts, bins.edges, baseline=0.5, fill=True, color=colour, label=label)
-    upper.set_yscale("log")
-    upper.set_ylim(0.5, 2.0 * max(float(everything.counts.max()), 1.0))
-    decades(upper.yaxis, *upper.get_ylim())
+    log_axis(upper.yaxis, 0.5, 2.0 * max(float(everything.counts.max()), 1.0))
     upper.set_ylabel("tests per bin")
     head(upper, "How often each weight occurs")
     for axes in lower:

@@ -103,12 +103,9 @@ def read_baseline(
     """All baseline runs of a run folder; a `RunFolderError` if some are missing or damaged."""
     found = [stored_baseline(folder, paths, listed, request) for request in baseline_requests(len(paths))]
     if any(done is None for done in found):
-        raise RunFolderError(
-            str(folder / SHADOW),
-            f"baseline runs of {sum(done is not None for done in found)} of {len(found)} files",
-            "those of all paths: they say how probable each test is",
-            "Let `harness run` go on with --resume.",
-        )
+        there = f"baseline runs of {sum(done is not None for done in found)} of {len(found)} files"
+        expected = "those of all paths: they say how probable each test is"
+        raise RunFolderError(str(folder / SHADOW), there, expected, "Let `harness run` go on with --resume.")
     return as_recorded([done.table for done in found if done is not None], environment)
 
 

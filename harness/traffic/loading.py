@@ -9,11 +9,10 @@ from __future__ import annotations
 
 import math
 from itertools import product
-from pathlib import Path
 
 import numpy as np
 
-from harness.campaign.files import names_a_file, read_model
+from harness.campaign.files import read_model, shipped_or_own
 from harness.campaign.sections import EnvironmentSettings
 from harness.compiled import compiled_threads, unboxed
 from harness.errors import CampaignError
@@ -37,17 +36,12 @@ AV_GAPS_M = (0.1, 1.0, 10.0, 50.0, 300.0)
 _IN_STATE = " at v = {:.3g} m/s, R1 = {:.3g} m, R1dot = {:.3g} m/s"
 
 
-def parameter_file(name: str) -> Path:
-    """Path of a shipped parameter file, or of the user's own."""
-    return Path(name) if names_a_file(name) else SHIPPED_FOLDER / f"{name}.yaml"
-
-
 def load_parameters(settings: EnvironmentSettings) -> EnvironmentParameters:
     """The numbers that a campaign's environment names.
 
     Raises `CampaignError`: the file is missing or wrong, every place being named, or its laws give no probabilities.
     """
-    file = parameter_file(settings.parameters)
+    file = shipped_or_own(settings.parameters, SHIPPED_FOLDER, "environment.parameters")
     parameters = read_model(file, EnvironmentParameters)
     require_sound_laws(load_environment(settings, parameters), str(file))
     return parameters

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import AfterValidator, BaseModel, model_validator
@@ -61,11 +61,21 @@ Share = Annotated[Number, _within(0.0, 1.0)]
 DegreesOfFreedom = Annotated[Number, _within(2.0, 1000.0)]  # below 2 more than 1e-4 lies outside of the t table
 
 
-def _require_order(numbers: BaseModel, low: str, high: str, *, equal: bool) -> None:
-    least, most = getattr(numbers, low).value, getattr(numbers, high).value
-    if least > most or (least == most and not equal):
-        expected = f"a number {'of at most' if equal else 'below'} {high}"
-        raise broken_rule(low, f"{least:g}, with {high} {most:g}", expected, "Change places, or correct one of them.")
+def _ordered(*ranges: tuple[str, str], equal: bool) -> Any:
+    """Validator of a section: the ends of each range are in order, and may be ``equal``."""
+
+    def checked(self: BaseModel) -> BaseModel:
+        for low, high in ranges:
+            least, most = getattr(self, low).value, getattr(self, high).value
+            if least > most or (least == most and not equal):
+                found, expected = (
+                    f"{least:g}, with {high} {most:g}",
+                    f"a number {'of at most' if equal else 'below'} {high}",
+                )
+                raise broken_rule(low, found, expected, "Change places, or correct one of them.")
+        return self
+
+    return model_validator(mode="after")(checked)
 
 
 def _whole_steps(number: Number) -> Number:
@@ -95,11 +105,7 @@ class FitRange(Section):
     r1_centre_m: Gap
     r1_scale_m: Scale
 
-    @model_validator(mode="after")
-    def _is_a_range(self) -> Self:
-        _require_order(self, "v_min_mps", "v_max_mps", equal=False)
-        _require_order(self, "r1_min_m", "r1_max_m", equal=False)
-        return self
+    _ranges = _ordered(("v_min_mps", "v_max_mps"), ("r1_min_m", "r1_max_m"), equal=False)
 
 
 class InitialState(Section):
@@ -130,11 +136,7 @@ class InitialState(Section):
     r2dot_min_mps: Rate
     r2dot_max_mps: Rate
 
-    @model_validator(mode="after")
-    def _has_ranges(self) -> Self:
-        _require_order(self, "r2_min_m", "r2_max_m", equal=True)
-        _require_order(self, "r2dot_min_mps", "r2dot_max_mps", equal=True)
-        return self
+    _ranges = _ordered(("r2_min_m", "r2_max_m"), ("r2dot_min_mps", "r2dot_max_mps"), equal=True)
 
 
 class FreeDriving(Section):

@@ -141,12 +141,12 @@ class Library(Section):
             raise broken_rule(f"{place}.model", envelope.model, expected, mend)
         for name, driver in (self.surrogates | self.references).items():
             if (fastest := driver.parameters.max_acceleration_mps2) > most:
-                raise broken_rule(
-                    f"{place}.parameters.acceleration_mps2",
+                found, mend = (
                     f"{most:g} m/s², less than {name}'s {fastest:g}",
-                    "an envelope that accelerates at least as hard as every surrogate",
                     f"Raise it to {fastest:g}, or limit {name}.",
                 )
+                expected = "an envelope that accelerates at least as hard as every surrogate"
+                raise broken_rule(f"{place}.parameters.acceleration_mps2", found, expected, mend)
         return self
 
 

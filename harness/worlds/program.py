@@ -66,12 +66,10 @@ def require_private(program: TraciProcess) -> None:
     """Refuse to open a TraCI server where the internet can reach it, unless the campaign says that this is right."""
     public = sorted(address for address in own_addresses() if ipaddress.ip_address(address).is_global)
     if public and not program.allow_public:
-        raise CampaignError(
-            "av.traci",
-            f"a machine with the public address {public[0]}, on which SUMO's TraCI server would listen, too",
-            "a machine with private addresses only: SUMO cannot be told to listen on this machine alone",
-            "Run in a container or behind a firewall that closes all ports, then set av.traci.allow_public: true.",
-        )
+        found = f"a machine with the public address {public[0]}, on which SUMO's TraCI server would listen, too"
+        expected = "a machine with private addresses only: SUMO cannot be told to listen on this machine alone"
+        mend = "Run in a container or behind a firewall that closes all ports, then set av.traci.allow_public: true."
+        raise CampaignError("av.traci", found, expected, mend)
 
 
 class BatchConnection(Connection):  # type: ignore[misc] # traci has no types
@@ -218,24 +216,17 @@ def _start_program(av: TraciProcess, port: int, n_cells: int) -> subprocess.Pope
         # What it prints belongs on the terminal, but stdout is for the harness's results.
         return subprocess.Popen(words, stdout=sys.stderr.fileno(), start_new_session=True)  # noqa: S603 - the user's own
     except (OSError, ValueError) as error:  # a null character in a word is a ValueError
-        raise CampaignError(
-            "av.traci.command",
-            f"{av.command} ({error})",
-            "a program that can be started",
-            "Try it in a shell, in the folder in which you start the harness.",
-        ) from error
+        found, mend = f"{av.command} ({error})", "Try it in a shell, in the folder in which you start the harness."
+        raise CampaignError("av.traci.command", found, "a program that can be started", mend) from error
 
 
 def require_neighbour(own: str, theirs: str) -> None:
     """Refuse a client of another machine; both ends as the table of connections writes them (proc(5), net/tcp)."""
     address = socket.inet_ntoa(int(theirs.partition(":")[0], 16).to_bytes(4, sys.byteorder))
     if not address.startswith("127.") and own.partition(":")[0] != theirs.partition(":")[0]:
-        raise WorldDisagreementError(
-            "SUMO's TraCI server",
-            f"a client at {address}",
-            "the program that av.traci.command starts, on this machine",
-            "Close this machine's ports to others, or let the program run here.",
-        )
+        expected = "the program that av.traci.command starts, on this machine"
+        mend = "Close this machine's ports to others, or let the program run here."
+        raise WorldDisagreementError("SUMO's TraCI server", f"a client at {address}", expected, mend)
 
 
 def _exit_words(code: int) -> str:
@@ -372,10 +363,8 @@ class TraciWorld(SumoCells):
 
 
 def _meddled(where: str, found: str, expected: str) -> WorldDisagreementError:
-    return WorldDisagreementError(
-        f"SUMO, {where}",
-        found,
-        expected,
+    mend = (
         "A TraCI client may only command AVs ('AV0', 'AV1', ...), on their lane, after the cut-in: moving LV or "
-        "BV, or changing lanes, would make the likelihood ratios wrong. If yours does not, please report it.",
+        "BV, or changing lanes, would make the likelihood ratios wrong. If yours does not, please report it."
     )
+    return WorldDisagreementError(f"SUMO, {where}", found, expected, mend)

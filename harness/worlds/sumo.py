@@ -24,14 +24,12 @@ from typing import Any, ClassVar
 import numpy as np
 
 from harness.campaign.combinations import MOST_SUMO_CELLS
+from harness.campaign.files import shipped_folder
 from harness.errors import CampaignError, WorldDisagreementError
 from harness.vocabulary import AV, BV, LV, VEHICLES, BoolArray, FloatArray, Int8Array, IntArray
 from harness.worlds.shim import Shim, open_shim
 from harness.worlds.system_libraries import not_importable
 from harness.worlds.twin import advance
-
-_CHECKOUT = Path(__file__).parents[2] / "sumo_networks"
-_INSTALLED = Path(__file__).parents[1] / "sumo_networks"
 
 EXACT_OPTIONS = (
     "--step-length", "0.1", "--step-method.ballistic", "true", "--collision.action", "warn",
@@ -123,7 +121,7 @@ def network_file(n_cells: int) -> Path:
 
 def committed_file(name: str) -> Path:
     """A file of ``sumo_networks/``, from the installed package or from the checkout."""
-    path = (_INSTALLED if _INSTALLED.exists() else _CHECKOUT) / name
+    path = shipped_folder("sumo_networks") / name
     if not path.exists():
         raise CampaignError(str(path), "no file", "the committed network", "Reinstall the harness from a checkout.")
     return path
@@ -157,12 +155,8 @@ class SumoWorld(SumoCells):
         self, n_cells: int, *, vanilla: bool = False, gui: bool = False, shim: bool = True, options: Sequence[str] = ()
     ) -> None:
         if SumoWorld._open:
-            raise CampaignError(
-                "libsumo",
-                "a simulation that already runs in this process",
-                "one at a time",
-                "Close the other world first, or use another process.",
-            )
+            mend = "Close the other world first, or use another process."
+            raise CampaignError("libsumo", "a simulation that already runs in this process", "one at a time", mend)
         super().__init__(n_cells)
         self._vanilla = vanilla
         self._told: FloatArray = np.zeros((n_cells, 3))
@@ -282,12 +276,9 @@ class SumoWorld(SumoCells):
 
 
 def _disobeyed(where: str, found: float, expected: float) -> WorldDisagreementError:
-    return WorldDisagreementError(
-        f"SUMO, {where}",
-        float(found).hex(),
-        f"{float(expected).hex()}, as commanded",
-        "The bits are promised for libsumo 1.28.0; check `pip show libsumo`. Otherwise please report it.",
-    )
+    mend = "The bits are promised for libsumo 1.28.0; check `pip show libsumo`. Otherwise please report it."
+    wanted = f"{float(expected).hex()}, as commanded"
+    return WorldDisagreementError(f"SUMO, {where}", float(found).hex(), wanted, mend)
 
 
 def start_libsumo(arguments: Sequence[str]) -> Any:
@@ -316,9 +307,5 @@ def start_gui(arguments: Sequence[str]) -> Any:
 
 
 def _no_window(found: str) -> CampaignError:
-    return CampaignError(
-        "--gui",
-        found,
-        "a desktop that sumo-gui can open its window on",
-        "Start it from a desktop session (or with ssh -X), or write the motion to a file: --out FILE.csv.",
-    )
+    mend = "Start it from a desktop session (or with ssh -X), or write the motion to a file: --out FILE.csv."
+    return CampaignError("--gui", found, "a desktop that sumo-gui can open its window on", mend)

@@ -138,12 +138,9 @@ def refused(sumo: Mapping[str, str | float], message: str) -> CampaignError:
     """The error for a type that SUMO itself refuses, naming the attribute that SUMO's message names."""
     attributes = av_type(sumo)
     named = max((name for name in attributes if name.lower() in message.lower()), key=len, default="")
-    return CampaignError(
-        f"av.sumo.{named}" if named else "av.sumo",
-        f"{attributes[named]}, which SUMO refuses" if named else "values which SUMO refuses",
-        "a vType that SUMO accepts",
-        f"SUMO says: {message}",
-    )
+    where, values = (f"av.sumo.{named}", attributes[named]) if named else ("av.sumo", "values")
+    found = f"{values}, which SUMO refuses"
+    return CampaignError(where, found, "a vType that SUMO accepts", f"SUMO says: {message}")
 
 
 def _wrong(name: str, found: str | float, expected: str, mend: str) -> CampaignError:

@@ -102,12 +102,9 @@ def install(missing: Sequence[SystemLibrary], commands: Sequence[Sequence[str]])
         marked = [line for line in lines if line.startswith(("E:", "W:"))]
         said += marked[:_QUOTED] or (lines[-_QUOTED:] if done.returncode else [])
     if done.returncode:
-        raise HarnessError(
-            shlex.join(commands[-1]),
-            f"exit code {done.returncode}: {' | '.join(said)}",
-            "the packages installed",
-            f"See to what it says, or give your administrator the line for this system:\n{_install_lines(missing)}",
-        )
+        found = f"exit code {done.returncode}: {' | '.join(said)}"
+        mend = f"See to what it says, or give your administrator the line for this system:\n{_install_lines(missing)}"
+        raise HarnessError(shlex.join(commands[-1]), found, "the packages installed", mend)
 
 
 def require_libsumo() -> None:
@@ -121,22 +118,17 @@ def require_libsumo() -> None:
 
 def not_importable(words: str) -> HarnessError:
     """Error for a libsumo that does not load though the known libraries are there, with the loader's own words."""
-    return HarnessError(
-        "libsumo",
-        f"that it cannot be imported: {words}",
-        "libsumo 1.28.0 as `pip install` brings it, and the system libraries that it names",
-        "Install the package of this system that holds the named file, or libsumo again: "
-        "pip install --force-reinstall libsumo==1.28.0.",
-    )
+    expected = "libsumo 1.28.0 as `pip install` brings it, and the system libraries that it names"
+    again = "pip install --force-reinstall libsumo==1.28.0"
+    mend = f"Install the package of this system that holds the named file, or libsumo again: {again}."
+    return HarnessError("libsumo", f"that it cannot be imported: {words}", expected, mend)
 
 
 def _cannot_load(missing: Sequence[SystemLibrary], advice: str) -> HarnessError:
-    return HarnessError(
-        "system libraries of SUMO",
-        f"no {', '.join(library.soname for library in missing)}",
-        "the shared libraries that libsumo needs of the system",
-        f"{advice}, or give your administrator the line for this system:\n{_install_lines(missing)}",
-    )
+    found = f"no {', '.join(library.soname for library in missing)}"
+    expected = "the shared libraries that libsumo needs of the system"
+    mend = f"{advice}, or give your administrator the line for this system:\n{_install_lines(missing)}"
+    return HarnessError("system libraries of SUMO", found, expected, mend)
 
 
 def _install_lines(libraries: Sequence[SystemLibrary]) -> str:

@@ -19,8 +19,8 @@ from harness.traffic.lateral import (
     log_normal_speed,
     perceived_in,
 )
-from harness.traffic.loading import load_environment, load_parameters, parameter_file
-from harness.traffic.parameters import EnvironmentParameters
+from harness.traffic.loading import load_environment, load_parameters
+from harness.traffic.parameters import SHIPPED_FOLDER, EnvironmentParameters
 from tests.kernels import alone
 
 draw_lead = alone(draw_lead)
@@ -75,7 +75,7 @@ def test_an_onset_before_the_test_is_seen_in_its_first_step_with_what_has_come_o
 
 
 def test_the_shipped_environment_is_the_papers_with_a_section_more():
-    paper, lateral = (read_model(parameter_file(name), EnvironmentParameters) for name in (PAPER, LATERAL))
+    paper, lateral = (read_model(SHIPPED_FOLDER / f"{name}.yaml", EnvironmentParameters) for name in (PAPER, LATERAL))
     assert lateral.model_copy(update={"lateral": None}) == paper
     assert {name for name in lateral.values() if name not in paper.values()} == {
         f"lateral__{name}" for name in ("distance_m", "speed_median_mps", "speed_log_sd", "longest_lead_s")
@@ -105,7 +105,7 @@ def test_what_says_nothing_of_leads_has_the_hash_of_before(settings, of_before):
     ],
 )
 def test_a_section_that_says_too_little_or_too_much_is_refused(section, found, tmp_path):
-    content = yaml.safe_load(parameter_file(PAPER).read_text(encoding="utf-8"))
+    content = yaml.safe_load((SHIPPED_FOLDER / f"{PAPER}.yaml").read_text(encoding="utf-8"))
     content["lateral"] = {name: {"value": value, "source": "user"} for name, value in section.items()}
     file = tmp_path / "mine.yaml"
     file.write_text(yaml.safe_dump(content), encoding="utf-8")

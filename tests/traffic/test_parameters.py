@@ -5,9 +5,10 @@ import pytest
 from harness.campaign.files import read_yaml
 from harness.campaign.sections import EnvironmentSettings
 from harness.errors import CampaignError
-from harness.traffic.loading import load_environment, load_parameters, parameter_file
+from harness.traffic.loading import load_environment, load_parameters
+from harness.traffic.parameters import SHIPPED_FOLDER
 
-SHIPPED = parameter_file("ndd-overtaking-1")
+SHIPPED = SHIPPED_FOLDER / "ndd-overtaking-1.yaml"
 TEXT = SHIPPED.read_text(encoding="utf-8")
 DATA, _ = read_yaml(SHIPPED)
 NUMBERS = [(section, name) for section, numbers in DATA.items() if isinstance(numbers, dict) for name in numbers]
