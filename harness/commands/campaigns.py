@@ -254,7 +254,7 @@ def compare(
     if as_json:
         print_json(found.content)
     else:
-        remarks = [f"note: {remark}" for remark in found.difference.warnings]
+        remarks = [f"note: {remark}" for remark in found.content["warnings"]]
         say(*found.content["statements"], *remarks, folder / "compare.json")
     ctx.exit(found.exit_code)
 

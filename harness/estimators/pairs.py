@@ -273,11 +273,6 @@ class PairedEstimate:
     refuted: bool
     pairs: PairCounts
 
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """What is to be known of the tests of either vehicle."""
-        return tuple(f"{name}: {text}" for name, of in (("A", self.a), ("B", self.b)) for text in of.warnings)
-
     def to_json(self) -> dict[str, Any]:
         """Content of ``compare.json``, as far as it comes from counts."""
         inside = {
@@ -288,7 +283,8 @@ class PairedEstimate:
         }
         each = {"a": self.a.shown, "b": self.b.shown}
         more = {"confidence": self.a.confidence, "conditional": inside, "shells": _shells(self.pairs)}
-        return finite_json({**each, **self.free, **more, "warnings": self.warnings})
+        warnings = [f"{name}: {text}" for name, of in (("A", self.a), ("B", self.b)) for text in of.warnings]
+        return finite_json({**each, **self.free, **more, "warnings": warnings})
 
 
 def paired_estimate(pairs: PairCounts, confidence: float) -> PairedEstimate:

@@ -111,21 +111,17 @@ def sole_use(folder: Path) -> Iterator[None]:
     with _made(folder):
         handle = os.open(folder, os.O_RDONLY)
         try:
-            _lock(handle, folder)
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                found = "a folder into which another process is running a campaign"
+                mend = "Wait for the other one, or end it, or choose another folder with --out."
+                raise RunFolderError(str(folder), found, "a folder for this process alone", mend) from None
+            except OSError:
+                pass  # some network file systems cannot lock a folder
             yield
         finally:
             os.close(handle)
-
-
-def _lock(handle: int, folder: Path) -> None:
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        found = "a folder into which another process is running a campaign"
-        mend = "Wait for the other one, or end it, or choose another folder with --out."
-        raise RunFolderError(str(folder), found, "a folder for this process alone", mend) from None
-    except OSError:
-        pass  # some network file systems cannot lock a folder
 
 
 def write_bytes(path: Path, content: bytes) -> None:

@@ -194,17 +194,16 @@ class StoredRun:
             raise RunFolderError(str(self.folder), found, f"one of {', '.join(sorted(kept))}", "Correct its name.")
         of_weight = ["log_weight", "component"] if weighed else []
         needed = None if asked is None else list(dict.fromkeys([*asked, *of_weight]))
-        per_shell = self._tests_per_shell(shards) if weighed and (self.folder / SHELLS).is_file() else None
+        per_shell = None
+        if weighed and (self.folder / SHELLS).is_file():
+            components = (read_kept(self.folder, shard, name, ["component"])["component"] for shard in shards)
+            per_shell = np.sum([np.bincount(shells, minlength=_MOST_SHELLS) for shells in components], axis=0)
         for piece in made_ahead(lambda shard: read_kept(self.folder, shard, name, needed), shards, _READERS):
             if not weighed:
                 yield piece
                 continue
             shown = list(dict.fromkeys([*(piece.column_names if columns is None else columns), _WEIGHT.name]))
             yield piece.append_column(_WEIGHT, _weights(piece, per_shell)).select(shown)
-
-    def _tests_per_shell(self, shards: Sequence[Mapping[str, Any]]) -> IntArray:
-        components = (read_kept(self.folder, shard, "episodes", ["component"])["component"] for shard in shards)
-        return sum((np.bincount(shells, minlength=_MOST_SHELLS) for shells in components), np.zeros(_MOST_SHELLS, int))
 
 
 def _weights(episodes: pa.Table, per_shell: IntArray | None) -> pa.Array:

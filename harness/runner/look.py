@@ -25,7 +25,7 @@ from harness.runner.prepare import prepare, require_ready, require_world
 from harness.runner.workers import Bits, bits_of
 from harness.sampling import EPISODES_PER_S, ShardRequest, Source, source_of
 from harness.vehicles.kinematics import STEP_S
-from harness.vocabulary import AV, CRASH, FAILED, FloatArray
+from harness.vocabulary import AV, CRASH, FAILED
 from harness.worlds import AVLostError, build_world
 from harness.worlds.shim import shim_library
 
@@ -204,7 +204,8 @@ def _behaviour(shard: Shard, limits: tuple[float, float], *, early: bool) -> Beh
         if early or cut >= 0:
             acted.append(commanded[0 if early else onset + 1 :])
         if cut >= 0:
-            reactions.append(_reaction_s(commanded[onset + 1 :]))
+            braking = np.flatnonzero(commanded[onset + 1 :] < BRAKING_MPS2)
+            reactions.append(float(braking[0]) * STEP_S if braking.size else np.inf)
     a = np.concatenate([*acted, np.empty(0)])
     reaction = np.array(reactions)
     braked = np.isfinite(reaction)
@@ -220,12 +221,6 @@ def _behaviour(shard: Shard, limits: tuple[float, float], *, early: bool) -> Beh
         n_cut_ins=len(reactions),
         n_crashes=int(np.count_nonzero(episode["outcome"] == CRASH)),
     )
-
-
-def _reaction_s(a: FloatArray) -> float:
-    """Time (s) from the onset of the cut-in to the step that brakes; infinite if none does."""
-    braking = np.flatnonzero(a < BRAKING_MPS2)
-    return float(braking[0]) * STEP_S if braking.size else np.inf
 
 
 # -- what a campaign costs --
@@ -311,36 +306,31 @@ class _TimeIsUpError(Exception):
     """Enough has been measured, or the AV has failed, which is the message."""
 
 
-class _Clock:
-    """Time spent in calls, and for how many vehicles; it ends the loop that makes them."""
-
-    def __init__(self) -> None:
-        self.spent_s, self.n_steps, self._until = 0.0, 0, time.perf_counter() + MEASURED_S
-
-    def watch(self, owner: object, name: str, n_vehicles: Callable[[Any], int], failures: Callable[[Any], Any]) -> None:
-        """Measure a method of an object; what it answers says which vehicles have failed, and why."""
-        call = getattr(owner, name)
-
-        def measured(*arguments: Any, **options: Any) -> Any:
-            began = time.perf_counter()
-            answer = call(*arguments, **options)
-            now = time.perf_counter()
-            self.spent_s, self.n_steps = self.spent_s + now - began, self.n_steps + n_vehicles(arguments[0])
-            for cause in failures(answer).values():
-                raise _TimeIsUpError(cause)
-            if now > self._until and self.n_steps:
-                raise _TimeIsUpError
-            return answer
-
-        setattr(owner, name, measured)
-
-
 def _measure(campaign: Campaign, *, black_box: Path | None = None) -> float | str:
     """Forced cut-ins in the loop itself until the clock ends it."""
     testing = campaign.testing.model_copy(update={"method": "forced"})
     records = campaign.records.model_copy(update={"moments": "none"})
     source = prepare(resolve(campaign.model_copy(update={"testing": testing, "records": records})))
-    clock = _Clock()
+    spent_s, n_seen, until = 0.0, 0, time.perf_counter() + MEASURED_S
+
+    def watch(owner: object, name: str, n_vehicles: Callable[[Any], int], failures: Callable[[Any], Any]) -> None:
+        """Measure a method of an object; what it answers says which vehicles have failed, and why."""
+        call = getattr(owner, name)
+
+        def measured(*arguments: Any, **options: Any) -> Any:
+            nonlocal spent_s, n_seen
+            began = time.perf_counter()
+            answer = call(*arguments, **options)
+            now = time.perf_counter()
+            spent_s, n_seen = spent_s + now - began, n_seen + n_vehicles(arguments[0])
+            for cause in failures(answer).values():
+                raise _TimeIsUpError(cause)
+            if now > until and n_seen:
+                raise _TimeIsUpError
+            return answer
+
+        setattr(owner, name, measured)
+
     try:
         world = build_world(campaign)
     except AVLostError as error:
@@ -349,10 +339,10 @@ def _measure(campaign: Campaign, *, black_box: Path | None = None) -> float | st
     loop = EpisodeLoop(world, source.policy, RecordPolicy(0, "none", 0.0), host)
     try:
         if host is not None:
-            clock.watch(host, "start", lambda _: 0, dict)
-            clock.watch(host, "act", lambda seen: len(seen[0]), lambda answer: answer[1])
+            watch(host, "start", lambda _: 0, dict)
+            watch(host, "act", lambda seen: len(seen[0]), lambda answer: answer[1])
         else:
-            clock.watch(world, "step", lambda _: world.n_cells, lambda _: {})
+            watch(world, "step", lambda _: world.n_cells, lambda _: {})
         for k in count():
             source.run(loop, ShardRequest(0, k * world.n_cells, world.n_cells))
     except (AVLostError, _TimeIsUpError) as error:
@@ -366,4 +356,4 @@ def _measure(campaign: Campaign, *, black_box: Path | None = None) -> float | st
         n_steps = STEPS if rare else STEPS_WITH_CUT_IN
     else:
         n_steps = STEPS_ACTED + host.warm_up_steps if not rare else STEPS * host.acts_before_cut_in
-    return n_steps * clock.spent_s / clock.n_steps
+    return n_steps * spent_s / n_seen
