@@ -8,8 +8,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
-from multiprocessing import get_context, parent_process
-from multiprocessing.connection import Connection, wait
+from multiprocessing import active_children, get_context, parent_process
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -39,26 +38,23 @@ def worker_processes(workers: int | None) -> Iterator[ProcessPoolExecutor]:
     """Worker processes that end at once when the work in the parent is interrupted or fails, or it is killed."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     context = get_context("spawn")
-    watched, held = context.Pipe(duplex=False)
-    with ProcessPoolExecutor(
-        workers or os.cpu_count(), mp_context=context, initializer=_end_with_parent, initargs=(watched,)
-    ) as executor:
+    with ProcessPoolExecutor(workers or os.cpu_count(), mp_context=context, initializer=_end_with_parent) as executor:
         try:
             yield executor
         except BaseException:
-            held.close()  # or the executor would wait for minutes of work that nobody wants any more
+            for worker in active_children():  # or the executor would wait for minutes of work that nobody wants
+                worker.kill()  # nothing less ends one that is in a kernel, which holds the interpreter lock
             raise
 
 
-def _end_with_parent(watched: Connection) -> None:
-    """Let this worker process end when its parent closes the other end of the pipe, or is killed."""
+def _end_with_parent() -> None:
+    """Let this worker process end when its parent is killed."""
     leave_signals_to_parent()
-    parent = parent_process()
-    ends: list[Any] = [watched] if parent is None else [watched, parent.sentinel]
 
     def end() -> None:
-        wait(ends)
-        os._exit(1)
+        if (parent := parent_process()) is not None:
+            parent.join()
+            os._exit(1)
 
     threading.Thread(target=end, daemon=True).start()
 
