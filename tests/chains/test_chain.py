@@ -4,21 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.stats import binomtest
 
 from studies.case_study.theorems import small_chains
-from studies.chains.chain import enumerate_episodes, frequent_decisive, overtaking, panel
+from studies.chains.chain import enumerate_episodes, overtaking, panel
 from studies.chains.sampler import draw, mixture_weights
 
 from .seed import SEED
 
 IMMEDIATE = overtaking("immediate", skill=0.6, level=0.05, horizon=4, surrogates=[0.6, 0.3], challenge="immediate")
-
-
-def test_crash_rates_span_the_rare_range():
-    rates = [chain.crash_rate for chain in panel()]
-    assert max(rates) > 1e-3
-    assert min(rates) < 1e-8
 
 
 @pytest.mark.parametrize("chain", [*small_chains(), IMMEDIATE], ids=lambda c: c.name)
@@ -48,23 +41,8 @@ def test_whole_episodes_have_columns_of_mean_zero_and_lemma_1_bounds_their_varia
     assert best <= plain * (1.0 + 1e-9)
 
 
-@pytest.mark.parametrize("chain", panel(), ids=lambda c: c.name)
-def test_importance_functions_sum_to_one_and_have_mean_ratio_one(chain):
-    maneuver = chain.proposals.maneuver
-    np.testing.assert_allclose(maneuver.sum(axis=-1), 1.0, rtol=1e-12)
-    np.testing.assert_allclose((maneuver * (chain.exposure / maneuver)).sum(axis=-1), 1.0, rtol=1e-12)
-    assert np.all((chain.proposals.cut >= 0.0) & (chain.proposals.cut <= 1.0))
-
-
 def drawn(chain, method: str, n: int):
     return draw(chain, method, n, np.random.default_rng(SEED))
-
-
-def test_plain_sampling_gives_the_induced_crash_rate():
-    chain = frequent_decisive()
-    block = drawn(chain, "nde", 200_000)
-    assert binomtest(int(block.crash.sum()), 200_000, chain.crash_rate).pvalue > 1e-4
-    assert binomtest(int(block.cut_in.sum()), 200_000, chain.cut_in_rate).pvalue > 1e-4
 
 
 @pytest.mark.parametrize("method", ["nde", "step_mixture"])
@@ -75,14 +53,11 @@ def test_without_control_the_log_weight_is_exactly_zero(method):
     assert not np.any(block.log_q[free])
 
 
-def test_forced_weights_are_the_probability_of_a_cut_in_on_the_path():
+def test_weights_are_the_probability_of_a_cut_in_on_the_path_or_bounded_by_it():
     chain = panel()[1]
     block = drawn(chain, "forced", 5_000)
     assert block.cut_in.all()
     assert np.all(block.log_weight == block.log_p_cut_in)
     assert block.weighted_crashes().max() <= chain.cut_in_cap
-
-
-def test_defensive_mixture_bounds_every_weighted_crash():
     block = drawn(panel()[2], "episode_mixture", 50_000)
     assert np.all(block.weighted_crashes() <= np.exp(block.log_p_cut_in) / block.drawn.alpha[0] * (1.0 + 1e-12))

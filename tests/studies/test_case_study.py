@@ -106,13 +106,8 @@ def test_a_change_makes_only_what_depends_on_it(study):
     other = file.with_name("other.yaml")
     other.write_text(STUDY.replace("stop.episodes=1_200", "stop.episodes=1_300"))
     keys, changed = step_keys(load_study(file)), step_keys(load_study(other))
-    assert {name for name in keys if keys[name] != changed[name]} == {
-        "nade",
-        "curves",
-        "adjusted",
-        "required",
-        "variants",
-    }
+    of_nade = {"nade", "curves", "adjusted", "required", "variants"}
+    assert {name for name in keys if keys[name] != changed[name]} == of_nade
     quick = step_keys(load_study(file, quick=True))
     assert {name for name in keys if keys[name] != quick[name]} == {"nde", "curves", "required"}
 
@@ -207,11 +202,8 @@ def test_the_theorems_hold_on_exact_chains(made):
     ("wrong", "said"),
     [
         (("tests: 6_000", "tests: 0"), "steps.nde.tests"),
-        (("tests: 6_000", "test: 6_000"), "'test'"),
-        (("kind: theorems", "kind: theorem"), "does not match any of the expected tags"),
         (("reference: nade", "reference: nobody"), "steps.curves.reference"),
         (("{tests: 2_000}", "{tests: many}"), "quick: steps.nde.tests"),
-        (("quick:\n  nde", "quick:\n  nothing"), "quick.nothing"),
         (("ours: theorems.var", "ours: theory.var"), "claims"),
         (("overtaking_nde.yaml", "overtaking_nowhere.yaml"), "overtaking_nowhere.yaml"),
     ],

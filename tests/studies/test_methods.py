@@ -23,7 +23,8 @@ from studies.replication.populations import preventable_by, ratio_to
 from studies.replication.run import validate
 from studies.replication.shells import FREE, ShellCampaign, limit_at, result_of
 from studies.replication.weighted import WeightedCampaign, chain_episodes
-from tests.chains.coverage import wrong_shell
+
+from .here import wrong_shell
 
 ROOT = Path(__file__).parents[2]
 CONFIDENCE = 0.9

@@ -20,9 +20,8 @@ from studies.replication.populations import (
     walk_paths,
 )
 from studies.replication.shells import FREE, Division, ShellCampaign
-from tests.chains.coverage import wrong_shell
 
-from .here import Here
+from .here import Here, wrong_shell
 
 LIBRARY = load_library("ladder-2")
 PATHS = 1024
