@@ -184,16 +184,13 @@ class Alarm:
             "mu_std_error": known.std_error,
             "p_value": np.array([_p_value(each) for each in log_capital.tolist()]),
         }
-        rows = zip(*(column.tolist() for column in columns.values()), strict=True)
+        rows = zip(known.names, *(column.tolist() for column in columns.values()), strict=True)
         return {
             "raised": no_verdict is None and p_value <= LEVEL,
             "no_verdict": no_verdict,
             "n_episodes": self._n,
             "p_value": p_value,
-            "surrogates": [
-                {"surrogate": name, **dict(zip(columns, row, strict=True))}
-                for name, row in zip(known.names, rows, strict=True)
-            ],
+            "surrogates": [dict(zip(("surrogate", *columns), row, strict=True)) for row in rows],
         }
 
     def _log_capital(self) -> FloatArray:

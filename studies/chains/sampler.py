@@ -129,23 +129,17 @@ class Sampler:
     def _sampled(
         self, rows: IntArray, p: FloatArray, q: FloatArray, forced: FloatArray, critical: BoolArray
     ) -> FloatArray:
-        match self.method:
-            case "nde":
-                return p
-            case "forced":
-                return forced
-            case "step_mixture":
-                return np.where(critical[:, None], np.einsum("mja,j->ma", q, self.alpha), p)
+        if self.method == "nde":
+            return p
+        if self.method == "step_mixture":
+            return np.where(critical[:, None], np.einsum("mja,j->ma", q, self.alpha), p)
         candidates = np.concatenate([forced[:, None, :], q], axis=1)
         return candidates[np.arange(len(rows)), self.component[rows]]
 
     def _log_q(self) -> FloatArray:
-        forced = np.where(self.cut_in, -self.log_p_cut, -np.inf)[:, None]
-        if self.method == "nde":
-            return np.empty((self.n, 0))
-        if self.method == "forced":
-            return forced
-        return self.log_ratio if self.method == "step_mixture" else np.concatenate([forced, self.log_ratio], axis=1)
+        forced = np.where(self.cut_in, -self.log_p_cut, -np.inf)
+        all_of_them = [self.log_ratio] if self.method == "step_mixture" else [forced, self.log_ratio]
+        return np.column_stack(all_of_them)[:, : len(self.alpha)]
 
     def _log_weight(self, log_q: FloatArray) -> FloatArray:
         if self.method == "forced":

@@ -15,11 +15,11 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from typing import cast
 
 import numpy as np
@@ -351,8 +351,9 @@ def walk_paths(
     def walked() -> SuperPopulation:
         paths = choose(seed, n_paths)
         progress.stage(f"walked paths of seed {seed}", n_paths)
-        parts = []
-        for part in executor.map(_walk, *zip(*_tasks(campaign, paths), strict=True)):
+        parts, walk = [], partial(_walk, campaign.model_dump_json())
+        firsts = range(0, n_paths, WALKED_CHUNK)
+        for part in executor.map(walk, firsts, [_chunk(paths, first) for first in firsts]):
             parts.append(part)
             progress.advance(part.n_paths)
         return joined(parts)
@@ -360,20 +361,18 @@ def walk_paths(
     return cached(population_key(resolved.environment, "walked", STRIDE, *asked), walked)
 
 
-def _tasks(campaign: Campaign, paths: BaselinePaths) -> Iterator[tuple[str, int, BaselinePaths]]:
-    """Ranges of the paths, each with the number of its first one."""
-    content = campaign.model_dump_json()
-    for first in range(0, len(paths), WALKED_CHUNK):
-        rows = slice(first, first + WALKED_CHUNK)
-        chunk = replace(paths, index=paths.index[rows], state=paths.state[rows], weight=paths.weight[rows])
-        yield content, first, chunk
+def _chunk(paths: BaselinePaths, first: int) -> BaselinePaths:
+    rows = slice(first, first + WALKED_CHUNK)
+    return replace(paths, index=paths.index[rows], state=paths.state[rows], weight=paths.weight[rows])
 
 
 def _walk(campaign_json: str, first: int, paths: BaselinePaths) -> SuperPopulation:
     """Walk a range of paths, and drive their cut-ins."""
     resolved = resolve(Campaign.model_validate_json(campaign_json))
-    environment, library = resolved.environment, resolved.library
-    loop = _loop(resolved)
+    campaign, environment, library = resolved.campaign, resolved.environment, resolved.library
+    policy = Drawing(campaign.seed, environment, build_importance(campaign, None), resolved.av)
+    host = build_host(campaign.av, n_cells=CELLS, seed=campaign.seed)
+    loop = EpisodeLoop(TwinWorld(CELLS), policy, RecordPolicy(0, "none", 0.0), host)  # with all of its motion kept
     runs = recorded(without_cut_in(loop, paths.seed, first, paths.index, paths.state, environment), environment)
     _require_none_failed(resolved, int(runs.failed.sum()), len(paths), "shadow runs")
     offset = np.random.default_rng([paths.seed, first]).integers(0, STRIDE, len(paths))
@@ -386,15 +385,6 @@ def _walk(campaign_json: str, first: int, paths: BaselinePaths) -> SuperPopulati
     somebody = of_cut_ins != 0
     row, step = row[somebody], step[somebody]
     return SuperPopulation(mass.sum(1), first + row, mass[row, step], of_cut_ins[somebody])
-
-
-def _loop(resolved: Resolved) -> EpisodeLoop:
-    """The vehicle in the twin, on prescribed traffic, with all of its motion kept."""
-    campaign, environment = resolved.campaign, resolved.environment
-    prescribed = build_importance(campaign, None)
-    policy = Drawing(campaign.seed, environment, prescribed, resolved.av)
-    host = build_host(campaign.av, n_cells=CELLS, seed=campaign.seed)
-    return EpisodeLoop(TwinWorld(CELLS), policy, RecordPolicy(0, "none", 0.0), host)
 
 
 def _crashes(

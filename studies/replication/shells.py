@@ -94,10 +94,6 @@ class DrawnPool:
         share = np.divide(crash_p, p, out=np.zeros_like(p), where=p > 0.0)
         return np.asarray(np.clip(share, 0.0, 1.0))  # rounding may leave the unit interval
 
-    @cached_property
-    def _cumulative(self) -> FloatArray:
-        return np.cumsum(self.crash_mass, axis=0)
-
     def tests_of_cells(self, added: IntArray, rng: np.random.Generator) -> IntArray:
         """How many of so many tests of each stratum (S,) are of each cell, shape (C,)."""
         if added.size == self.mass.shape[1]:
@@ -107,15 +103,9 @@ class DrawnPool:
         found: IntArray = rng.multinomial(added, p).sum(0)
         return found
 
-    def crashed_paths(self, cell: int, n: int, rng: np.random.Generator) -> FloatArray:
-        """Mass (n, C) of the paths of n crashed tests of a cell."""
-        return self._paths(self._cumulative[:, cell], n, rng)
-
-    def tested_paths(self, cell: int, n: int, rng: np.random.Generator) -> FloatArray:
-        """The same of any tests."""
-        return self._paths(np.cumsum(self.mass[:, cell]), n, rng)
-
-    def _paths(self, cumulative: FloatArray, n: int, rng: np.random.Generator) -> FloatArray:
+    def paths_of(self, tests: FloatArray, cell: int, n: int, rng: np.random.Generator) -> FloatArray:
+        """Mass (n, C) of the paths of n tests of a cell: any by ``mass``, crashed ones by ``crash_mass``."""
+        cumulative = np.cumsum(tests[:, cell])
         paths: FloatArray = self.mass[np.searchsorted(cumulative, rng.random(n) * cumulative[-1], side="right")]
         return paths
 
@@ -148,13 +138,13 @@ def campaign_block(drawn: DrawnPool, added: IntArray, first: int, rng: np.random
     failed = bad & (rank < rng.binomial(crashes, drawn.failing)[cell]) if drawn.failing else none
     mass = np.zeros((n, tests.size))
     for c in np.flatnonzero(crashes).tolist():
-        mass[bad & (cell == c)] = drawn.crashed_paths(c, int(crashes[c]), rng)
+        mass[bad & (cell == c)] = drawn.paths_of(drawn.crash_mass, c, int(crashes[c]), rng)
     if drawn.failing_tests:
         broken = rng.random(n) < drawn.failing_tests
         failed = failed | broken
         for c in np.unique(cell[broken & ~bad]).tolist():
             rows = broken & ~bad & (cell == c)
-            mass[rows] = drawn.tested_paths(c, int(rows.sum()), rng)
+            mass[rows] = drawn.paths_of(drawn.mass, c, int(rows.sum()), rng)
     columns = {"cut_in": ~none, "stratum": np.array(drawn.design.cell_stratum)[cell], "cell": cell, "cell_mass": mass}
     outcome = np.select([failed, bad], [FAILED, CRASHED], TIMEOUT).astype(np.int8)
     return Block(first, outcome, np.zeros(n), columns, Drawn("shells", shells=drawn.design))
@@ -332,7 +322,7 @@ def _with_round(pairs: PairCounts, drawn: Sequence[DrawnPool], added: IntArray, 
     ends[:, NO_CRASH, NO_CRASH] += counts[:, -1]
     for kind, pool, of_kind in zip(_CRASHING, drawn, counts.T[:-1], strict=True):
         ends[:, *kind] += of_kind
-        mass[:, *kind] += [pool.crashed_paths(s, k, rng).sum(0) for s, k in enumerate(of_kind.tolist())]
+        mass[:, *kind] += [pool.paths_of(pool.crash_mass, s, k, rng).sum(0) for s, k in enumerate(of_kind.tolist())]
     return PairCounts(pairs.design, ends, mass)
 
 
