@@ -7,34 +7,17 @@ import pytest
 
 import harness
 from harness.errors import RunFolderError
-from harness.records.folder import encoded, write_json, write_shard
 from harness.records.schemas import moments_schema, traces_schema
+from tests.stored_runs import copy_of, edit, manifest
 
 
-@pytest.fixture
-def folder(record, tmp_path):
-    """Two shards."""
-
-    def written(*overrides):
-        shards = []
-        for index in range(2):
-            tables = record(*overrides, first=40 * index, n=40).tables
-            files = write_shard(tmp_path, index, encoded(tables))
-            shards.append({"index": index, "first_episode": 40 * index, "n_episodes": 40, "files": files})
-        write_json(tmp_path / "manifest.json", {"campaign_hash": "x", "n_episodes": 80, "shards": shards})
-        return tmp_path
-
-    return written
-
-
-def test_frames_have_all_rows_and_say_what_columns_mean(folder):
-    run = harness.read(str(folder("records.traces=all", "records.moments=all")))
+def test_frames_have_all_rows_and_say_what_columns_mean(stored_run):
+    run = harness.read(str(stored_run("forced-inattentive")))
     tests = run.episodes()
-    assert tests.episode.tolist() == list(range(80))
+    assert tests.episode.tolist() == list(range(240))
     assert tests.attrs["unit"]["r1_m"] == "m"
     assert tests.attrs["unit"].keys() == tests.attrs["doc"].keys() == set(tests.columns)
     assert tests.weight.to_numpy() == pytest.approx([math.exp(log_weight) for log_weight in tests.log_weight])
-    assert list(run.moments().columns) == moments_schema(3).names
     assert run.moments().attrs["unit"]["q_sampled"] == "1"
     traces = run.traces()
     assert list(traces.columns) == traces_schema().names
@@ -46,29 +29,33 @@ def test_frames_have_all_rows_and_say_what_columns_mean(folder):
     assert list(run.traces(["v_mps"]).columns) == ["v_mps"]
     with pytest.raises(RunFolderError, match="no column 'weight' in moments"):
         run.moments(["weight"])
+    assert list(harness.read(stored_run("mixture-twin")).moments().columns) == moments_schema(3).names
 
 
-def test_arrow_tables_and_batches_are_what_the_frames_are(folder, stored_run):
-    for run in (harness.read(folder()), harness.read(stored_run("shells-twin"))):
-        table, pieces = run.table("episodes", ["outcome"]), list(run.batches("episodes", ["outcome"]))
-        assert len(pieces) > 1
-        assert pa.concat_tables(pieces).to_pydict() == table.to_pydict()
-        assert table["weight"].to_pylist() == run.episodes()["weight"].tolist()
-        assert table.schema.field("weight").metadata[b"unit"] == b"1"
+@pytest.mark.parametrize("name", ["mixture-twin", "shells-twin"])
+def test_arrow_tables_and_batches_are_what_the_frames_are(name, stored_run):
+    run = harness.read(stored_run(name))
+    table, pieces = run.table("episodes", ["outcome"]), list(run.batches("episodes", ["outcome"]))
+    assert len(pieces) > 1
+    assert pa.concat_tables(pieces).to_pydict() == table.to_pydict()
+    assert table["weight"].to_pylist() == run.episodes()["weight"].tolist()
+    assert table.schema.field("weight").metadata[b"unit"] == b"1"
 
 
-def test_what_is_not_there_is_one_error(folder, tmp_path):
-    run = harness.read(folder("records.moments=none", "records.traces=none"))
+def test_what_is_not_there_is_one_error(stored_run, tmp_path):
+    folder = copy_of(stored_run("mixture-twin"), tmp_path / "run")
+    run, shards = harness.read(folder), manifest(folder)["shards"]
+    edit(folder, shards=[{**shard, "files": {"episodes": shard["files"]["episodes"]}} for shard in shards])
     for table in (run.moments, run.traces):
         with pytest.raises(RunFolderError, match=f"no {table.__name__}.*records.{table.__name__}=all"):
             table()
     with pytest.raises(RunFolderError, match="no column 'nothing' in episodes"):
         run.episodes(["nothing"])
-    (tmp_path / "episodes" / "shard-000001.parquet").unlink()
+    (folder / "episodes" / "shard-000001.parquet").unlink()
     with pytest.raises(RunFolderError, match="no such file"):
         run.episodes()
-    write_json(tmp_path / "manifest.json", {"campaign_hash": "x", "n_episodes": 0, "shards": []})
+    edit(folder, n_episodes=0, shards=[])
     with pytest.raises(RunFolderError, match="not finished an episode"):
         run.episodes()
     with pytest.raises(RunFolderError, match="no run folder"):
-        harness.read(tmp_path / "episodes").episodes()
+        harness.read(folder / "episodes").episodes()

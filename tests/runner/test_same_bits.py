@@ -36,14 +36,9 @@ def test_the_idm_however_it_is_brought(name, stored_run):
 @pytest.mark.parametrize(
     ("name", "cells"),
     [
-        ("step-recursive-sumo", 64),
-        ("forced-inattentive", 7),
-        ("forced-acting-twin", 5),
-        ("forced-lateral-twin", 7),
-        ("shells-twin", 64),
-        ("shells-lateral-twin", 5),
-        ("nde-twin", 256),
-        ("mixture-twin", 1),
+        *(("step-recursive-sumo", 64), ("forced-inattentive", 7), ("forced-acting-twin", 5)),
+        *(("forced-lateral-twin", 7), ("shells-twin", 64), ("shells-lateral-twin", 5)),
+        *(("nde-twin", 256), ("mixture-twin", 1)),
     ],
 )
 def test_any_number_of_cells(name, cells, stored_run, tmp_path):
@@ -151,19 +146,9 @@ def as_under_nohup() -> None:
 def test_what_is_ignored_stays_ignored_and_ctrl_c_to_all_processes_ends_a_run_in_order(tmp_path):
     out = tmp_path / "run"
     settings = ("world.engine=twin", "stop.episodes=1000000000", "stop.rhw=null", "run.shard_size=500")
-    command = [
-        sys.executable,
-        "-m",
-        "harness",
-        "run",
-        "scenarios/overtaking_forced.yaml",
-        "--out",
-        out,
-        "--workers",
-        "2",
-    ]
+    asked = ["run", "scenarios/overtaking_forced.yaml", "--out", out, "--workers", "2", *sets(*settings)]
     process = subprocess.Popen(
-        [*command, *sets(*settings)],
+        [sys.executable, "-m", "harness", *asked],
         cwd=ROOT,
         start_new_session=True,
         preexec_fn=as_under_nohup,  # noqa: PLW1509 - no thread here
@@ -208,8 +193,8 @@ def test_a_busy_worker_does_not_outlive_a_killed_parent_nor_does_what_it_has_sta
         wait_until_gone(Path(f"/proc/{pid}/stat"))
 
 
-def test_copies_of_a_fork_server_are_whole_and_end_with_it():
-    """It has one thread at the fork, and is started again when it was killed."""
+def test_copies_of_a_fork_server_are_whole_and_end_with_it(tmp_path, monkeypatch):
+    """It has one thread at the fork, and is started again when it was killed. Nobody waits for a copy that aborts."""
     server = ForkServer("harness.runner.workers", "libsumo")
     first, second = (Child(bad_workers.waiting, server=server) for _ in range(2))
     assert [first.connection.recv(), second.connection.recv()] == [1, 1]
@@ -223,13 +208,9 @@ def test_copies_of_a_fork_server_are_whole_and_end_with_it():
     assert third.connection.recv() == 1
     assert third.kill() == -signal.SIGKILL
     server.close()
-
-
-def test_a_copy_that_dies_at_its_fork_is_dead_and_nobody_waits_for_it(tmp_path, monkeypatch):
-    """As Arrow lets it where its pipe was closed."""
     (tmp_path / "aborts_copies.py").write_text("import os; os.register_at_fork(after_in_child=os.abort)")
     monkeypatch.syspath_prepend(tmp_path)
-    server = ForkServer("aborts_copies")
+    server = ForkServer("aborts_copies")  # as Arrow does where its pipe was closed
     assert Child(bad_workers.waiting, server=server).kill() == -signal.SIGABRT
     server.close()
 
