@@ -17,6 +17,11 @@ SHELLS = ShellDesign(
     statements=(Statement("library", "careless", "keeps to careless", 2),), p_cut_in=0.03, p_unreachable=0.0096,
 )  # fmt: skip
 """Shells of a pool that is known exactly."""
+RARE = ShellDesign(
+    pool="0" * 24, strata=("a", "b", "outside"), cell_stratum=(0, 1, 2), cell_p=np.array([1e-7, 2e-7, 3e-5]),
+    n_paths=10**9, statements=(Statement("library", "b", "keeps to b", 2),), p_cut_in=4e-5, p_unreachable=0.0,
+)  # fmt: skip
+"""Others, of rare cut-ins."""
 EXACT = 10**12
 """Paths of another."""
 

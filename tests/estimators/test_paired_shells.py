@@ -23,14 +23,10 @@ from harness.estimators.pairs import (
     no_pairs,
     paired_estimate,
 )
-from harness.strata import ShellDesign, Statement
+from tests.estimators.small_blocks import RARE as DESIGN
 from tests.estimators.small_blocks import SHELLS, in_shells
 
 LEVEL = Level.two_sided(0.9)
-DESIGN = ShellDesign(
-    pool="0" * 24, strata=("a", "b", "outside"), cell_stratum=(0, 1, 2), cell_p=np.array([1e-7, 2e-7, 3e-5]),
-    n_paths=10**9, statements=(Statement("library", "b", "keeps to b", 2),), p_cut_in=4e-5, p_unreachable=0.0,
-)  # fmt: skip
 
 
 def pairs_of(*strata, mass=0.0):

@@ -1,19 +1,26 @@
-"""`harness estimate` on a stored run is `estimates.json`, exactly."""
+"""`harness estimate` on a stored run is `estimates.json`, exactly, and the rate is the mean of stored weights."""
 
 from __future__ import annotations
 
 import json
+import re
+from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
+import harness
 from harness.cli import main
 from harness.errors import RunFolderError
 from harness.estimators.block import joined
 from harness.runner import stored
 from harness.runner.stored import estimate_run, stored_blocks
 from tests.stored_runs import copy_of, edit, estimates, manifest, of_before
+
+ESTIMATOR = {"shells-twin": "shells", "nde-twin": "nde"}
+RECORDS = (Path(__file__).parents[2] / "docs/records.md").read_text()
+LINES = "\n".join(re.findall(r"^```python\n(.*?)^```$", RECORDS, re.MULTILINE | re.DOTALL))
 
 
 def test_estimating_again_gives_the_same_content(sumo_run, twin_run, capsys):
@@ -66,3 +73,17 @@ def test_shards_with_columns_of_other_types_are_refused(twin_run, tmp_path, monk
     monkeypatch.setattr(stored, "SPACING", 100.0)
     with pytest.raises(RunFolderError, match="cut_in_step as double and int16"):
         list(stored_blocks(folder, moments=False))
+
+
+@pytest.mark.parametrize("name", ["shells-twin", "forced-twin", "nde-twin", "step-recursive-twin", "mixture-twin"])
+def test_the_weights_give_the_rate_of_every_method_as_docs_have_it(name, stored_run, capsys):
+    folder = stored_run(name)
+    rate = estimates(folder)["estimates"][ESTIMATOR.get(name, "nade")]["crash_rate"]
+    assert rate > 0.0
+    tests = harness.read(folder).episodes(["outcome", "log_weight"])
+    crash = tests.outcome == "crash"
+    assert (tests.weight * crash).mean() == pytest.approx(rate, rel=1e-9)
+    plain = (np.exp(tests.log_weight) * crash).mean()
+    assert (plain == pytest.approx(rate, rel=1e-9)) == (name != "shells-twin")
+    exec(LINES.replace("runs/hard-braking", str(folder)), {})
+    assert float(capsys.readouterr().out.split()[-1]) == pytest.approx(rate, rel=1e-9)
