@@ -4,7 +4,7 @@ import sys
 from pathlib import Path
 from zipfile import ZipFile
 
-DATA = {".yaml", ".j2", ".css", ".xml", ".typed", ".py"}
+DATA = {".yaml", ".j2", ".css", ".js", ".xml", ".typed", ".py"}
 NOT_SHIPPED = {Path("sumo_networks/rebuild.py")}
 
 

@@ -86,7 +86,7 @@ def drivers_crash(episodes: pa.Table, seed: int, environment: Environment, follo
     wrong = replay_surrogates(unboxed(stored), unboxed(environment), unboxed(followers), unboxed(room), bits)
     if wrong >= 0:
         raise RunFolderError(
-            f"episodes, episode {stored.first + wrong}",
+            f"episodes, episode {stored.episode[wrong]}",
             f"maneuvers that do not lead to a cut-in in step {stored.cut_step[wrong]}",
             "the maneuvers that were driven: they determine the episode",
             MEND_SHARD,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -82,6 +82,7 @@ def report(folder: Path) -> None:
     short_help="Simulate one episode of a run again, bit for bit.",
     epilog=examples(
         "harness replay runs/smoke 17",
+        "harness replay runs/smoke 17 --html episode_17.html",
         "harness replay runs/smoke 17 --out episode_17.csv",
         "harness replay runs/smoke 17 --gui",
     ),
@@ -91,20 +92,28 @@ def report(folder: Path) -> None:
 @click.option(
     "--out", type=FILE, callback=written_file(".csv", ".parquet"), help="Write the trace: FILE.parquet or FILE.csv."
 )
+@click.option("--html", type=FILE, callback=written_file(".html"), help="Write a page that plays the episode.")
 @click.option("--fcd", type=FILE, callback=written_file(), help="Write SUMO's floating car data (XML) of the episode.")
 @click.option("--gui", is_flag=True, help="Show the episode in sumo-gui (extra 'sumo').")
 @json_option
-def replay(folder: Path, episode: int, *, out: Path | None, fcd: Path | None, gui: bool, as_json: bool) -> None:
-    """Simulate episode number EPISODE of the run in DIR again, bit for bit.
+def replay(
+    folder: Path, episode: int, *, out: Path | None, html: Path | None, fcd: Path | None, gui: bool, as_json: bool
+) -> None:
+    """Simulate episode number EPISODE of the run in DIR again, bit for bit, and say what happens when.
 
-    Where cut-ins take time, it is said when BV began to come over; the trace holds how far it had.
+    And what would have happened with others in the vehicle's place: the careful and competent driver of UN Regulation
+    No. 157 (r157-cc), and one that brakes at once, at up to 8 m/s2 (brakes-8).
 
     Where the run has stored the episode's trace, the replay is compared with it; a difference ends with exit code 3.
     """
     from harness.runner.stored import replay_episode  # noqa: PLC0415 - keeps --help fast
 
     result = replay_episode(folder, episode, gui=gui, fcd=fcd)
-    files = [str(file) for file in (out, fcd) if file is not None]
+    files = [str(file) for file in (out, html, fcd) if file is not None]
+    if html is not None:
+        from harness.report.player import write_player  # noqa: PLC0415 - keeps --help fast
+
+        write_player(result.scene, html)
     if out is not None:
         from pyarrow import csv, parquet  # noqa: PLC0415 - keeps --help fast
 
@@ -117,19 +126,8 @@ def replay(folder: Path, episode: int, *, out: Path | None, fcd: Path | None, gu
         print_json({**content, **{name: result.row[name] for name in LATERAL if name in result.row}})
     else:
         compared = {None: "no stored trace to compare with", True: "bit for bit as stored", False: "NOT as stored"}
-        takes_time = result.row.get("onset_step") is not None and result.row["cut_in_step"] is not None
-        onset = [_onset(result.row)] if takes_time else []
-        say(f"episode {episode}: {result.outcome}; {compared[result.bit_equal]}", *onset, *files)
+        facts = [f"  {name:<13} {fact}" for name, fact in result.scene["facts"]]
+        say(f"episode {episode}: {result.outcome}; {compared[result.bit_equal]}", *facts, *files)
     if result.bit_equal is False:
         found = "a replay that differs from the stored trace"
         raise WorldDisagreementError(f"episode {episode} of {folder}", found, "the same bits", str(result.suspects))
-
-
-def _onset(row: dict[str, Any]) -> str:
-    """When BV began to come over, and overlapped, in a sentence."""
-    onset_s, overlap_s = 0.1 * (row["onset_step"] + 1), 0.1 * (row["cut_in_step"] + 1)
-    contact = "" if row["contact"] is None else f"; {row['contact']} contact"
-    return (
-        f"BV comes over from {onset_s:.1f} s on, {row['onset_r2_m']:.1f} m ahead of the AV, and overlaps at "
-        f"{overlap_s:.1f} s{contact}"
-    )

@@ -7,6 +7,7 @@ too, with its time and impact speed. It takes a few microseconds per episode, wh
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -35,6 +36,7 @@ from harness.traffic.laws import Environment
 from harness.vehicles.kinematics import STEP_S
 from harness.vehicles.references import reaction_steps
 from harness.vocabulary import (
+    AV,
     CRASH,
     CUT_IN,
     FAILED,
@@ -58,14 +60,14 @@ LEAD = "lead_steps"
 
 
 class StoredPaths(NamedTuple):
-    """Consecutive stored episodes, ``first …`` of a campaign with seed ``seed``.
+    """Stored episodes of a campaign with seed ``seed``, ``episode`` (n,) being their indices.
 
     ``state`` (n,) are initial states; ``n_steps``, ``cut_step`` (n,) steps simulated and that of the cut-in, -1
     without one; ``script`` is what LV and BV did in them.
     """
 
     seed: int
-    first: int
+    episode: IntArray
     state: RecordArray
     n_steps: IntArray
     cut_step: IntArray
@@ -73,13 +75,13 @@ class StoredPaths(NamedTuple):
 
 
 def stored_paths(episodes: pa.Table, seed: int) -> StoredPaths:
-    """Initial states and maneuvers of consecutive rows of the episodes table; needs `PATH_COLUMNS`."""
+    """Initial states and maneuvers of rows of the episodes table; needs `PATH_COLUMNS`."""
     n = int(episodes.num_rows)
     lead = _whole(episodes, LEAD, 0) if LEAD in episodes.column_names else np.zeros(n, np.int64)
     (lv, n_lv), (bv, n_bv) = (padded(episodes.column(name)) for name in ("lv_maneuvers", "bv_maneuvers"))
     return StoredPaths(
         seed,
-        int(episodes.column("episode")[0].as_py()),
+        np.asarray(episodes.column("episode")).astype(np.int64),
         states_from(np.asarray(episodes.column(name)) for name in STATE_COLUMNS),
         _whole(episodes, "n_steps", 0),
         _whole(episodes, "cut_in_step", -1),
@@ -100,17 +102,24 @@ at the cut-in, or at its onset where that comes before, NaN without one; v_AV - 
 
 
 @compiled_inline
+def recall(i: int, stored: StoredPaths, path: Trajectory) -> int:
+    """Put the stored maneuvers into the path; returns how many there are of both LV and BV."""
+    script = stored.script
+    known = min(script.n_lv[i], script.n_bv[i], path.lv.size)
+    for m in range(known):
+        path.lv[m], path.bv[m] = script.lv[i, m], script.bv[i, m]
+    return int(known)
+
+
+@compiled_inline
 def approach(i: int, until: int, stored: StoredPaths, environment: Environment, path: Trajectory) -> tuple[int, int]:
     """LV's and BV's stored motion to a step or a decision without cut-in; how it is decided, and the step.
 
     `FAILED` where fewer maneuvers are stored than that takes.
     """
-    script = stored.script
-    known = min(script.n_lv[i], script.n_bv[i], path.lv.size)
-    for m in range(known):
-        path.lv[m], path.bv[m] = script.lv[i, m], script.bv[i, m]
+    known = recall(i, stored, path)
     reach = min(until, known * environment.numbers.hold_steps, environment.numbers.max_steps)
-    step = walk(stored.state[i], stored.seed, stored.first + i, known, reach, True, environment, path)
+    step = walk(stored.state[i], stored.seed, stored.episode[i], known, reach, True, environment, path)
     decided = end_in(step, path)
     return FAILED if decided == RUNNING and step < until else decided, step
 
@@ -138,7 +147,7 @@ def leave_stored(i: int, until: int, stored: StoredPaths, environment: Environme
         return False
     for m in range(min(known, path.free.size)):
         path.free[m] = bv[mark + 1 + m]
-    leave(cut, until, stored.seed, stored.first + i, 0, known, environment, path)
+    leave(cut, until, stored.seed, stored.episode[i], 0, known, environment, path)
     return True
 
 
@@ -169,7 +178,7 @@ def retrace_episode(
         twin.outcome = FAILED
         return
     if driver.size > 0:
-        late = reaction_steps(driver[0], stored.seed, stored.first + i)
+        late = reaction_steps(driver[0], stored.seed, stored.episode[i])
         take_over(0, 0, driver, late, False, cut, lead, environment, path)
         follow(1, driver, cut, lead, end, path)
         crash, speed = path.follower[0].end, path.follower[0].v
@@ -193,6 +202,45 @@ def retrace(
     """
     for i in range(stored.cut_step.size):
         retrace_episode(i, stored, environment, driver, path, twin[i])
+
+
+@compiled_threads
+def drive_others(
+    stored: StoredPaths,
+    start: FloatArray,
+    environment: Environment,
+    drivers: RecordArray,
+    path: Trajectory,
+    end: IntArray,
+    motion: FloatArray,
+) -> None:
+    """Drive others in the AV's place along stored episodes with a cut-in, from the end of the step of its onset.
+
+    ``start`` (n, 2) is the AV's position (m) and speed (m/s) then, NaN where it has kept its speed until there. ``end``
+    (n, D) receives the step after which each of ``drivers`` (D,) has run into BV, `NO_CRASH` or `WAS_AHEAD`, and
+    ``motion`` (D, steps + 1, 2) its position (m) and speed (m/s) in the last of the episodes; (0, 0, 0) is not filled.
+    ``path`` is room to work in, and holds BV's motion of the last episode, as if nobody had hit it.
+    """
+    most = environment.numbers.max_steps
+    for i in range(stored.cut_step.size):
+        cut, lead = stored.cut_step[i], stored.script.lead[i]
+        known, after = recall(i, stored, path), onset_of(cut, lead) + 1
+        walk(stored.state[i], stored.seed, stored.episode[i], known, cut + 1, False, environment, path)
+        leave_stored(i, most, stored, environment, path)
+        if not math.isnan(start[i, 0]):
+            path.x[after, AV], path.v[after, AV] = start[i]
+        if motion.size > 0:
+            path.slowest[:] = -math.inf  # nobody is let off before the end because nothing can happen any more
+        for d in range(drivers.size):
+            late = drivers[d].delay_steps
+            for until in range(after if motion.size > 0 else most, most + 1):
+                take_over(0, d, drivers, late, False, cut, lead, environment, path)
+                follow(1, drivers, cut, lead, until, path)
+                if motion.size > 0:
+                    motion[d, until, 0], motion[d, until, 1] = path.follower[0].x, path.follower[0].v
+                end[i, d] = path.follower[0].end
+                if end[i, d] != NO_CRASH:
+                    break
 
 
 class Retracing:
@@ -227,7 +275,7 @@ class Retracing:
         for column, (wrong, in_sumo, in_twin) in differing.items():
             if wrong.any():
                 row = int(np.argmax(wrong))
-                where = f"episode {stored.first + row}, {column}"
+                where = f"episode {stored.episode[row]}, {column}"
                 expected = f"{in_twin[row]}, to the last bit: the twin retraced its maneuvers"
                 mend = "Please report this episode: its campaign.yaml and index reproduce it."
                 raise WorldDisagreementError(where, f"{in_sumo[row]} in SUMO", expected, mend)

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import matplotlib.style
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 from pydantic import BaseModel
 
@@ -22,7 +21,8 @@ from harness.estimators.shells import ShellDetails, Within
 from harness.numbers import MISSING, count, exponent_of, half_width, leaves, number, power_of_ten, share, words
 from harness.records.folder import write_bytes
 from harness.records.reader import table_sizes
-from harness.report.crashes import GalleryRow, crash_gallery
+from harness.report.crashes import crash_gallery
+from harness.report.player import templates
 from harness.report.rate_plots import answer_plot, convergence_plot, rate_exponent, shells_plot
 from harness.report.style import RC, Plot, inline_svg, png, svg
 from harness.report.summary import RunFolder, RunSummary, lateral_facts, read_run_folder, summarise
@@ -48,21 +48,16 @@ def write_report(folder: str | Path) -> Path:
     run = read_run_folder(folder)
     sizes, summary = table_sizes(folder), summarise(run)
     with matplotlib.style.context(["default", RC]):
-        gallery = crash_gallery(run, summary)
-        files, figures = _rendered(_plots(run, summary, gallery))
-    environment = Environment(
-        loader=PackageLoader("harness.report", "."),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
+        files, figures = _rendered(_plots(run, summary))
+    gallery, scenes = crash_gallery(run, summary)
+    environment = templates()
     environment.filters.update(getmembers(numbers, isfunction), verdict=verdict, sentence=sentence)
     page = environment.get_template("report.html.j2").render(
         run=run,
         summary=summary,
         sizes=sizes,
         gallery=gallery,
+        scenes=scenes,
         figures=figures,
         lateral=lateral_facts(run),
         estimators=sorted(run.estimates.estimates.items(), key=lambda item: item[0] != run.estimates.headline),
@@ -74,14 +69,13 @@ def write_report(folder: str | Path) -> Path:
         settings=setting_sections(run.campaign, reproducible=run.manifest.get("reproducible")),
         folder=run.typed,
         run_folder=RUN_FOLDER,
-        style=Markup((Path(__file__).parent / "report.css").read_text(encoding="utf-8")),  # noqa: S704 - our own file
     )
     _write_plots(folder / "plots", files)
     write_bytes(folder / "report.html", printable(page).encode("utf-8"))
     return folder / "report.html"
 
 
-def _plots(run: RunFolder, summary: RunSummary, gallery: list[GalleryRow]) -> list[Plot]:
+def _plots(run: RunFolder, summary: RunSummary) -> list[Plot]:
     # Within a shell all tests weigh the same and there is one control step, the cut-in: nothing to draw of either.
     drawn_by = [weight_plot(summary), strata_plot(summary)] if run.shells is None else [shells_plot(run.shells)]
     plots = [
@@ -91,7 +85,6 @@ def _plots(run: RunFolder, summary: RunSummary, gallery: list[GalleryRow]) -> li
         cut_in_plot(summary),
         impact_speed_plot(summary),
         crash_time_plot(summary),
-        *(row.plot for row in gallery),
     ]
     return [plot for plot in plots if plot is not None]
 

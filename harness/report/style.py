@@ -26,7 +26,6 @@ INK, MUTED, GRID, PAPER = "#1c2126", "#5d6873", "#dde2e7", "#ffffff"
 BLUE, VERMILLION, GREEN, GREY = "#0067a8", "#c94f0a", "#00795a", "#8b95a0"
 BLUES = ("#dceaf5", "#b3d1e8", "#7fb2d7", "#478fc1", "#166ba3", "#083f68")
 REDS = ("#fbe5d8", "#f5c3a5", "#ea9a6c", "#d96f36", "#b34a10", "#6f2a05")
-VEHICLE_COLOURS = {"LV": GREEN, "BV": VERMILLION, "AV": BLUE}
 
 CSS_NAMES = {
     INK: "ink",
@@ -41,7 +40,7 @@ CSS_NAMES = {
     **{colour: f"red-{level}" for level, colour in enumerate(REDS, 1)},
 }
 
-FULL_WIDTH_IN, HALF_WIDTH_IN = 8.6, 4.9
+FULL_WIDTH_IN = 8.6
 PNG_DPI = 160
 FEW_DECADES = 1.7
 

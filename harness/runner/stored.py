@@ -124,7 +124,8 @@ class ReplayResult:
     """An episode run again: its row of the episodes table, and its motion with the schema of the traces table.
 
     ``bit_equal`` says whether what is stored, in the tables ``compared``, was reproduced in every bit, None where
-    nothing is; ``suspects`` is what may be why if it was not.
+    nothing is; ``suspects`` is what may be why if it was not. ``scene`` is for `harness.write_player`; its ``facts``
+    are what happens, as pairs of a name and a phrase.
     """
 
     outcome: str
@@ -132,6 +133,7 @@ class ReplayResult:
     trace: pa.Table
     bit_equal: bool | None
     compared: tuple[str, ...]
+    scene: dict[str, Any]
     suspects: str | None = None
 
 
@@ -147,6 +149,8 @@ def replay_episode(
     file has changed since. Raises `CampaignError`: the AV is not reproducible. Raises `HarnessError`: SUMO's system
     libraries are missing.
     """
+    from harness.report.player import Scenes  # noqa: PLC0415 - `run` and `estimate` draw nothing
+
     folder, fcd = Path(folder), None if fcd is None else Path(fcd)
     manifest = read_manifest(folder)
     _require_reproducible(manifest)
@@ -164,7 +168,8 @@ def replay_episode(
     bit_equal = all(_equal(again[name], stored[name]) for name in compared) if compared else None
     row: dict[str, Any] = again["episodes"].to_pylist()[0]
     why = None if bit_equal is not False else suspects(manifest, campaign)
-    return ReplayResult(str(row["outcome"]), row, again["traces"], bit_equal, compared, why)
+    scene = Scenes(campaign, resolved.environment).scene(again["episodes"], again["traces"])
+    return ReplayResult(str(row["outcome"]), row, again["traces"], bit_equal, compared, scene, why)
 
 
 def _replay(

@@ -91,7 +91,7 @@ class Page(HTMLParser):
         assert self.open.pop() == tag
 
     def handle_data(self, data: str) -> None:
-        if text := " ".join(data.split()) if self.open and not {"style", "svg"} & set(self.open) else "":
+        if text := " ".join(data.split()) if self.open and not {"style", "svg", "script"} & set(self.open) else "":
             self.lines.append(text)
 
 

@@ -54,14 +54,15 @@ def test_the_page_is_self_contained_with_plots_and_words_that_make_sense(reports
     assert "://" not in page.html
     assert len(page.ids) == len(set(page.ids))
     for tag, attribute, value in page.attributes:
-        assert tag not in {"script", "link", "iframe"}
+        assert tag not in {"link", "iframe"}
+        assert (tag, attribute) != ("script", "src")
         assert not attribute.startswith("on")
         assert attribute not in {"href", "xlink:href", "src"} or value.removeprefix("#") in page.ids
     assert {reference[1:] for reference in re.findall(r"url\(([^)]*)\)", page.html)} <= set(page.ids)
     plots, words = SEEN[name]
     assert [each for each in words if each not in page.words] == []
     stems = {path.stem for path in (folder / "plots").iterdir()}
-    assert {stem for stem in stems if not stem.startswith("crash-")} == {"answer", "convergence"} | plots
+    assert stems == {"answer", "convergence"} | plots
     for stem in stems:
         assert (folder / "plots" / f"{stem}.png").read_bytes().startswith(b"\x89PNG")
         ElementTree.parse(folder / "plots" / f"{stem}.svg")
@@ -103,7 +104,7 @@ def test_hostile_texts_are_escaped_and_no_formula(folders, tmp_path):
     edit(path, estimates=estimates | {hostile: {**estimates["nade"], "warnings": [hostile]}})
     write_report(folder)
     page = Page(folder)
-    assert "<script" not in page.html
+    assert hostile not in page.html
     assert page.words.count(hostile) >= 5
     assert hostile + "\\u001b[31m" in page.words
 

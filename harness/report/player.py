@@ -1,0 +1,232 @@
+"""An episode to watch: its motion, and that of others in the AV's place, as the script of a page plays it.
+
+The others meet the same cut-in in the twin, from where the AV was at its onset. What BV does after it was hit is drawn
+as if it had not been.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from jinja2 import Environment as Templates
+from jinja2 import PackageLoader, StrictUndefined
+from markupsafe import Markup
+
+from harness.campaign.campaign import Campaign
+from harness.compiled import unboxed
+from harness.episode.path import Trajectory, empty_trajectory
+from harness.errors import printable
+from harness.numbers import tenths
+from harness.pool.cut_ins import onset_steps
+from harness.pool.replay import drive_others, stored_paths
+from harness.records.folder import write_bytes
+from harness.report.summary import floats
+from harness.traffic.laws import Environment
+from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
+from harness.vehicles.library import LibraryDriver, library_records
+from harness.vocabulary import VEHICLES, FloatArray, IntArray
+
+OTHERS = {
+    "r157-cc": ("a careful and competent driver", LibraryDriver(model="r157-cc")),
+    "brakes-8": (
+        "braking at once, at up to 8 m/s²",
+        LibraryDriver.model_validate({"model": "idm", "parameters": {"min_acceleration_mps2": -8.0}}),
+    ),
+}
+"""Who is driven in the AV's place, and in words: the reference driver first."""
+UNKNOWN = -9
+"""How it ends for them where the AV acts before the cut-in and its motion is not on record."""
+MOTION = ("x_m", "v_mps")
+TRACE_COLUMNS = ("episode", "step", "vehicle", "lane", *MOTION)
+LANE_M = 3.6
+BRAKES_MPS2 = 0.5
+"""Who slows down by less only coasts."""
+BEFORE, AFTER, LEFT, FEWEST = 20, 40, 5, 40
+"""Steps shown before the onset, at most after a crash, and when all is over; and at least up to the crash."""
+
+Scene = dict[str, Any]
+"""What the script reads. Moments are steps of the episode, positions (m) and speeds (m/s) those from ``first`` on."""
+
+
+class Scenes:
+    """Scenes of a campaign's episodes; without its environment nobody else is driven.
+
+    Rows are of the episodes table, in index order, with `PATH_COLUMNS`; traces are those of the same episodes.
+    """
+
+    def __init__(self, campaign: Campaign, environment: Environment | None) -> None:
+        self._name, self._seed, self._acts = campaign.name, campaign.seed, campaign.av.acts_before_cut_in
+        self._environment = environment
+
+    def ends(self, rows: pa.Table, traces: pa.Table | None) -> IntArray:
+        """After which step each of `OTHERS` runs into BV in episodes with a cut-in, below zero for never, (n, D)."""
+        if self._environment is None or not rows.num_rows:
+            return np.full((rows.num_rows, len(OTHERS)), UNKNOWN)
+        return self._drive(self._environment, rows, traces, np.zeros((0, 0, 0)))[0]
+
+    def _drive(
+        self, environment: Environment, rows: pa.Table, traces: pa.Table | None, motion: FloatArray
+    ) -> tuple[IntArray, Trajectory]:
+        """The same, and the path as `drive_others` leaves it, which may fill ``motion``."""
+        stored, path = stored_paths(rows, self._seed), empty_trajectory(environment)
+        start, end = np.full((rows.num_rows, 2), np.nan), np.zeros((rows.num_rows, len(OTHERS)), np.int64)
+        if traces is not None:
+            episode, step, x, v = (floats(_of(traces, "AV").column(name)) for name in ("episode", "step", *MOTION))
+            row = np.searchsorted(stored.episode, episode)
+            begins = step == onset_steps(stored.cut_step, stored.script.lead)[row] + 1
+            start[row[begins]] = np.stack((x, v), axis=1)[begins]
+        drivers = library_records([driver for _, driver in OTHERS.values()], environment.lateral.present)
+        drive_others(unboxed(stored), start, unboxed(environment), drivers, unboxed(path), end, motion)
+        if self._acts:
+            end[np.isnan(start[:, 0])] = UNKNOWN
+        return end, path
+
+    def scene(self, row: pa.Table, trace: pa.Table, *, why: str = "") -> Scene:
+        """One episode, given its row and its trace, from shortly before the cut-in on; all of one without."""
+        episode, outcome, cut = (row.column(name)[0].as_py() for name in ("episode", "outcome", "cut_in_step"))
+        tracks = [{"name": name, **_states(_of(trace, name)), "crash": None} for name in VEHICLES]
+        _, bv, av = tracks
+        last, over = av["x"].size - 1, 1.0 - floats(_of(trace, "BV").column("lane"))
+        if "lateral_m" in trace.column_names:
+            over = np.maximum(over, floats(_of(trace, "BV").column("lateral_m")) / LANE_M)
+        av["crash"] = last if outcome == "crash" else None
+        first, onset, ghosts = 0, None, list[Scene]()
+        if cut is not None and cut < last:
+            stored = stored_paths(row, self._seed)
+            onset = int(onset_steps(stored.cut_step, stored.script.lead)[0])
+            first = max(min(onset - BEFORE, last - FEWEST), 0)
+            if self._environment is not None:
+                ghosts = self._ghosts(self._environment, row, trace, onset, bv, av)
+        for each in (*tracks, *ghosts):
+            each |= {key: each[key][first:] for key in "xv"}
+            each["brakes"] = _brakes(each["v"], first)
+        moments = [(cut, "BV cuts in"), (av["brakes"], "AV brakes"), (av["crash"], "crash")]
+        moments += [(onset, "BV comes over")] if onset != cut else []
+        scene = {
+            "campaign": self._name, "episode": episode, "title": f"Episode {episode:,}: {why or outcome}",
+            "first": first, "onset": onset, "cut_in": cut, "over": over[first:], "tracks": tracks, "ghosts": ghosts,
+            "moments": sorted(each for each in moments if each[0] is not None),
+        }  # fmt: skip
+        return {**scene, "facts": _facts(scene, bv, av)}
+
+    def _ghosts(
+        self, environment: Environment, row: pa.Table, trace: pa.Table, onset: int, bv: Scene, av: Scene
+    ) -> list[Scene]:
+        """`OTHERS` along an episode from its begin; after a crash BV goes on as long as they are shown."""
+        motion = np.zeros((len(OTHERS), int(environment.numbers["max_steps"]) + 1, 2))
+        [end], path = self._drive(environment, row, trace, motion)
+        last = shown = av["x"].size - 1
+        if av["crash"] is not None:
+            shown = max(_over(last, int(ended), driven, path) for ended, driven in zip(end, motion, strict=True))
+            bv["x"] = np.append(bv["x"], path.x_after[last + 1 : shown + 1])
+            bv["v"] = np.append(bv["v"], path.v_after[last + 1 : shown + 1])
+        ghosts = []
+        for name, ended, driven in zip(OTHERS, end.tolist(), motion, strict=True):
+            until = min(shown, onset + int(np.count_nonzero(driven[:, 0])))
+            own = driven[onset + 1 : until + 1].T
+            begun = {key: np.append(av[key][: onset + 1], own[k]) for k, key in enumerate("xv")}
+            ghosts.append({"name": name, **begun, "crash": ended if ended == until else None})
+        return ghosts
+
+
+def _states(rows: pa.Table) -> dict[str, Any]:
+    return {"x": floats(rows.column("x_m")), "v": floats(rows.column("v_mps"))}
+
+
+def _of(traces: pa.Table, vehicle: str) -> pa.Table:
+    return traces.filter(pc.equal(traces.column("vehicle").cast(pa.string()), vehicle))
+
+
+def _over(crash: int, end: int, driven: FloatArray, path: Trajectory) -> int:
+    """Last step that is shown of another driver after the AV's crash: it too has crashed, or no longer closes in."""
+    until = end
+    if end < 0:
+        safe = np.flatnonzero(driven[crash:, 1] <= path.v_after[crash:])
+        until = crash + int(safe[0]) if safe.size else crash + AFTER
+    return int(min(max(until, crash), crash + AFTER, path.v_after.size - 1 - LEFT)) + LEFT
+
+
+def _brakes(v: FloatArray, first: int) -> int | None:
+    """In which step a vehicle first brakes; ``v`` are its speeds from the step ``first`` on."""
+    braking = np.flatnonzero(np.diff(v) <= -BRAKES_MPS2 * STEP_S)
+    return first + int(braking[0]) if braking.size else None
+
+
+def _facts(scene: Scene, bv: Scene, av: Scene) -> list[tuple[str, str]]:
+    """What happens, as pairs of a name and a phrase."""
+    first, onset, cut = scene["first"], scene["onset"], scene["cut_in"]
+    if onset is None:
+        return [("BV", "does not cut in")]
+    rate, hardest = _closing(av, bv, cut - first), tenths(-float(np.diff(av["v"]).min()) / STEP_S)
+    told = {
+        "BV comes over": f"{tenths(_gap(av, bv, onset - first))} m ahead",
+        "BV cuts in": f"{tenths(_gap(av, bv, cut - first))} m ahead and {tenths(abs(rate))} m/s "
+        + ("slower" if rate > 0.0 else "faster"),
+        "AV brakes": f"at up to {hardest} m/s²",
+    }
+    facts = [(name, f"{_when(step, cut)}: {told[name]}") for step, name in scene["moments"] if name in told]
+    facts += [("AV brakes", "never")] if av["brakes"] is None else []
+    facts.append(("AV", _ending(av, bv, scene)))
+    for each in scene["ghosts"]:
+        facts.append((each["name"], f"{OTHERS[each['name']][0]}: {_ending(each, bv, scene)}"))
+    return facts
+
+
+def _ending(track: Scene, bv: Scene, scene: Scene) -> str:
+    """How it ends for one who follows BV from its cut-in on."""
+    first, cut, crash = scene["first"], scene["cut_in"], track["crash"]
+    if crash is None:
+        places = range(cut + 1 - first, min(len(track["x"]), len(bv["x"])))
+        return f"avoids it, {tenths(min(_gap(track, bv, place) for place in places))} m at the closest"
+    v, v_bv = (tenths(float(each["v"][crash - first])) for each in (track, bv))
+    side = ", from the side" if scene["onset"] < cut and crash == cut + 1 else ""
+    impact = tenths(_closing(track, bv, crash - first))
+    return f"crashes at {_when(crash, cut)}: {v} m/s into BV at {v_bv} m/s, impact {impact} m/s{side}"
+
+
+def _gap(track: Scene, bv: Scene, place: int) -> float:
+    return float(bv["x"][place] - VEHICLE_LENGTH_M - track["x"][place])
+
+
+def _closing(track: Scene, bv: Scene, place: int) -> float:
+    return float(track["v"][place] - bv["v"][place])
+
+
+def _when(step: int, cut: int) -> str:
+    """The time of a step, and how far it is from the cut-in."""
+    if step == cut:
+        return f"{STEP_S * step:.1f} s"
+    side = "after" if step > cut else "before"
+    return f"{STEP_S * step:.1f} s, {STEP_S * abs(step - cut):.1f} s {side} the cut-in"
+
+
+def templates() -> Templates:
+    """Templates of pages, with what both kinds hold that the player needs."""
+    place = Path(__file__).parent
+    css, more_css, script = (
+        (place / name).read_text(encoding="utf-8") for name in ("report.css", "player.css", "player.js")
+    )
+    found = Templates(
+        loader=PackageLoader("harness.report", "."),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    # Our own files, of which the policy of the page lets this one script run, by its hash.
+    found.globals.update(style=Markup(css + more_css), script=Markup(script), script_hash=Markup(digest))  # noqa: S704
+    found.policies["json.dumps_kwargs"] = {"default": np.ndarray.tolist, "separators": (",", ":")}
+    return found
+
+
+def write_player(scene: Scene, file: str | Path) -> None:
+    """Write a page with nothing but the player of a scene, such as `harness.runner.stored.ReplayResult` has."""
+    page = templates().get_template("replay.html.j2").render(scene=scene, scenes=[scene])
+    write_bytes(Path(file), printable(page).encode("utf-8"))

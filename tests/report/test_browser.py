@@ -1,0 +1,216 @@
+"""The player in a real browser, the system's own: it plays, follows the slider and the keys, and says no error."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+import harness
+from harness.report.page import write_report
+from tests.report.test_player import crashed, scenes_in
+from tests.stored_runs import copy_of
+
+BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+OPTIONS = (
+    "no-sandbox disable-gpu disable-quic no-first-run disable-background-networking disable-component-update "
+    "disable-sync"
+)
+LENGTH_M, WIDTH_M, STEP_S = 5.0, 1.9, 0.1
+api = pytest.importorskip("playwright.sync_api", reason="playwright drives the browser")
+pytestmark = pytest.mark.skipif(BROWSER is None, reason="there is no Chromium or Chrome on this machine")
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory) -> Iterator[api.BrowserContext]:
+    with api.sync_playwright() as driver:
+        launched = driver.chromium.launch(executable_path=BROWSER, args=[f"--{option}" for option in OPTIONS.split()])
+        yield launched
+        launched.close()
+
+
+@pytest.fixture(scope="module")
+def report(stored_run, tmp_path_factory) -> Path:
+    return write_report(copy_of(stored_run("shells-twin"), tmp_path_factory.mktemp("report") / "run"))
+
+
+@pytest.fixture(scope="module")
+def replayed(stored_run, tmp_path_factory) -> Path:
+    folder, file = stored_run("shells-lateral-sumo"), tmp_path_factory.mktemp("replay") / "crash.html"
+    harness.write_player(harness.replay(folder, crashed(folder)[0]).scene, file)
+    return file
+
+
+@pytest.fixture
+def opened(browser) -> Iterator[Callable[..., api.Page]]:
+    """Opens a page, whose clock stands still; nothing may be said on the console, nor asked of anybody else."""
+    said, contexts = [], []
+
+    def open_page(file: Path, width: int = 1280, scheme: str = "light") -> api.Page:
+        contexts.append(browser.new_context(viewport={"width": width, "height": 900}, color_scheme=scheme))
+        page = contexts[-1].new_page()
+        page.on("console", lambda message: said.append(message.text))
+        page.on("pageerror", lambda error: said.append(str(error)))
+        page.on("request", lambda request: said.append(request.url) if request.url != file.as_uri() else None)
+        page.clock.install(time=0)
+        page.goto(file.as_uri())
+        page.clock.pause_at(1000)
+        return page
+
+    yield open_page
+    for context in contexts:
+        context.close()
+    assert said == []
+
+
+def seconds(page: api.Page) -> float:
+    return float(page.inner_text(".clock").removesuffix(" s"))
+
+
+def cell(page: api.Page, vehicle: str, column: str) -> str:
+    head = page.locator(".now thead th").all_text_contents()
+    row = page.locator(".now tbody tr").filter(has=page.get_by_role("rowheader", name=vehicle, exact=True))
+    return row.locator("th, td").nth(head.index(column)).inner_text()
+
+
+def test_it_plays_at_the_chosen_speed_and_stops(opened, replayed):
+    page, [scene] = opened(replayed), scenes_in(replayed.read_text())
+    begin = seconds(page)
+    page.select_option(".bar select", "0.5")
+    page.click(".go")
+    page.clock.run_for(1000)
+    assert seconds(page) == pytest.approx(begin + 0.5, abs=0.03)
+    page.click(".go")
+    stopped = seconds(page)
+    page.clock.run_for(1000)
+    assert seconds(page) == stopped
+    page.click(".go")
+    page.clock.run_for(60_000)
+    end = scene["first"] + max(len(each["x"]) for each in (*scene["tracks"], *scene["ghosts"])) - 1
+    assert seconds(page) == pytest.approx(STEP_S * end)
+    assert "Play" in page.inner_text(".go")
+    page.click(".go")
+    assert seconds(page) == pytest.approx(STEP_S * scene["first"])
+
+
+def test_the_slider_shows_each_step_as_it_was(opened, replayed):
+    page, [scene] = opened(replayed), scenes_in(replayed.read_text())
+    _, bv, av = scene["tracks"]
+    for step in (scene["first"], scene["cut_in"], scene["cut_in"] + 2, av["crash"]):
+        page.fill(".bar input", str(step))
+        i = step - scene["first"]
+        assert seconds(page) == pytest.approx(STEP_S * step)
+        assert cell(page, "AV", "speed") == f"{av['v'][i]:.1f} m/s"
+        gap = bv["x"][i] - LENGTH_M - av["x"][i]
+        assert cell(page, "AV", "gap to BV") == f"{gap if abs(gap) >= 0.05 else 0.0:.1f} m".replace("-", "−")
+        assert page.locator(".star").is_visible() == (step == av["crash"])
+
+
+def test_the_road_is_in_scale(opened, replayed):
+    page, [scene] = opened(replayed), scenes_in(replayed.read_text())
+    lv, bv, av = scene["tracks"]
+    step = scene["cut_in"] + 2
+    page.fill(".bar input", str(step))
+    body = page.locator(".car:not(.dashed) .body").first
+    pixels = float(body.get_attribute("width")) / LENGTH_M
+    assert float(body.get_attribute("height")) == pytest.approx(WIDTH_M * pixels)
+    place = {}
+    for car in page.locator(".car:not(.dashed)").all():
+        x, y = re.findall(r"[-\d.]+", car.get_attribute("transform"))
+        place[car.locator("text").text_content()] = float(x), float(y)
+    i = step - scene["first"]
+    assert place["BV"][0] - place["AV"][0] == pytest.approx((bv["x"][i] - av["x"][i]) * pixels, abs=0.02)
+    assert place["LV"][0] - place["AV"][0] == pytest.approx((lv["x"][i] - av["x"][i]) * pixels, abs=0.02)
+    assert place["BV"][1] == place["AV"][1]
+    assert place["AV"][1] - place["LV"][1] == pytest.approx(3.6 * pixels, abs=0.02)
+
+
+def test_keys(opened, replayed):
+    page, [scene] = opened(replayed), scenes_in(replayed.read_text())
+    first = STEP_S * scene["first"]
+    page.focus(".player")
+    for key, after in (
+        ("Home", first), ("ArrowRight", first + 0.1), ("Shift+ArrowRight", first + 1.1), ("ArrowLeft", first + 1.0),
+    ):  # fmt: skip
+        page.keyboard.press(key)
+        assert seconds(page) == pytest.approx(after)
+    page.keyboard.press("ArrowUp")
+    assert page.input_value(".bar select") == "0.5"
+    page.keyboard.press("Space")
+    page.clock.run_for(400)
+    assert seconds(page) == pytest.approx(first + 1.2, abs=0.03)
+    page.keyboard.press("Space")
+    page.keyboard.press("ArrowDown")
+    page.keyboard.press("End")
+    assert (seconds(page) > first + 1.3, page.input_value(".bar select")) == (True, "0.25")
+
+
+def test_moments_and_curves_lead_there(opened, replayed):
+    page, [scene] = opened(replayed), scenes_in(replayed.read_text())
+    names = page.locator(".jumps button").all_text_contents()
+    assert names == ["start", *(name for _, name in scene["moments"]), "end"]
+    for step, name in scene["moments"]:
+        page.get_by_role("button", name=name, exact=True).click()
+        assert seconds(page) == pytest.approx(STEP_S * step)
+    curve = page.locator(".curves svg").first
+    box = curve.bounding_box()
+    page.mouse.click(box["x"] + 34, box["y"] + 100)
+    assert seconds(page) == pytest.approx(STEP_S * scene["first"], abs=0.02)
+    line = curve.locator(".cursor")
+    assert float(line.get_attribute("x1")) == pytest.approx(34, abs=2)
+
+
+def test_a_report_changes_between_crashes(opened, report):
+    page, scenes = opened(report), scenes_in(report.read_text())
+    assert page.locator(".pick button").all_text_contents() == [str(scene["episode"]) for scene in scenes]
+    assert page.inner_text(".player h3") == scenes[0]["title"]
+    page.locator(".pick button").nth(1).click()
+    assert page.inner_text(".player h3") == scenes[1]["title"]
+    page.locator("a[data-scene='0']").click()
+    assert page.inner_text(".player h3") == scenes[0]["title"]
+    assert page.locator(".told dt").all_text_contents() == [name for name, _ in scenes[0]["facts"]]
+    page.keyboard.press("End")
+    assert page.locator(".go").is_visible()
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("width", [1280, 400])
+def test_it_is_readable_wide_and_narrow_in_light_and_in_the_dark(width, scheme, opened, report, replayed):
+    for file in (report, replayed):
+        page = opened(file, width, scheme)
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+        outside = page.evaluate(
+            "[...document.querySelectorAll('.player > *, .player button, .player svg')]"
+            ".filter((each) => each.getBoundingClientRect().right > innerWidth).length"
+        )
+        assert outside == 0
+        ink, paper = page.evaluate("[getComputedStyle(document.body)].flatMap((s) => [s.color, s.backgroundColor])")
+        light = [sum(map(int, re.findall(r"\d+", colour)[:3])) for colour in (ink, paper)]
+        assert (light[0] < light[1]) == (scheme == "light")
+        sizes = page.evaluate(
+            "[...document.querySelectorAll('.player text, .player td')].map((e) => getComputedStyle(e).fontSize)"
+        )
+        assert min(float(size.removesuffix("px")) for size in sizes) >= 8
+        page.set_viewport_size({"width": 700, "height": 900})  # what was drawn for one width is drawn for the next
+        page.wait_for_function(
+            "document.querySelector('.road').viewBox.baseVal.width === document.querySelector('.road').clientWidth"
+        )
+
+
+def test_the_policy_lets_no_other_script_run(browser, report):
+    page = browser.new_page()
+    page.goto(report.as_uri())
+    blocked = page.evaluate(
+        """new Promise((found) => {
+            document.addEventListener("securitypolicyviolation", (event) => found(event.effectiveDirective));
+            const script = document.createElement("script");
+            script.textContent = "window.ran = true";
+            document.body.append(script);
+        })"""
+    )
+    assert blocked.startswith("script-src")
+    assert page.evaluate("window.ran") is None
+    page.close()

@@ -1,0 +1,200 @@
+"""What the player plays is what was simulated, and what the twin says of others; which crashes come first."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pytest
+
+import harness
+from harness.campaign.files import load_campaign
+from harness.cli import main
+from harness.report import crashes
+from harness.report.page import write_report
+from harness.report.player import OTHERS, UNKNOWN, Scenes
+from harness.report.summary import read_run_folder, summarise
+from harness.resolved import resolve
+from tests.in_process import run_here
+from tests.stored_runs import copy_of, edit, golden, stored_table
+
+OTHER_VEHICLES = {"r157-cc": "{model: r157-cc}", "brakes-8": "{model: idm, parameters: {min_acceleration_mps2: -8}}"}
+KINDS = ("shells-twin", "shells-lateral-sumo", "forced-lateral-twin", "shells-acting-twin", "forced-krauss", "nde-twin")
+
+
+def scenes_in(page: str) -> list[dict]:
+    return json.loads(re.search(r'<script type="application/json">(.*?)</script>', page, re.DOTALL)[1])
+
+
+def crashed(folder, most: int = 5) -> list[int]:
+    episodes = stored_table(folder, "episodes")
+    return episodes.filter(pc.equal(episodes["outcome"].cast(pa.string()), "crash"))["episode"].to_pylist()[:most]
+
+
+def motion(trace: pa.Table, vehicle: str, key: str) -> list[float]:
+    return trace.filter(pc.equal(trace["vehicle"].cast(pa.string()), vehicle))[key].to_pylist()
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_a_page_holds_the_motion_to_the_last_bit(name, stored_run, tmp_path):
+    """And that of those who end without a crash, or without a cut-in."""
+    folder, file = stored_run(name), tmp_path / "crash.html"
+    for episode in sorted({*crashed(folder, 2), 0, 1}):
+        result = harness.replay(folder, episode)
+        harness.write_player(result.scene, file)
+        [scene] = scenes_in(file.read_text(encoding="utf-8"))
+        first, n = scene["first"], result.row["n_steps"] + 1
+        for track in scene["tracks"]:
+            for ours, theirs in (("x", "x_m"), ("v", "v_mps")):
+                assert track[ours][: n - first] == motion(result.trace, track["name"], theirs)[first:]
+        assert [track["name"] for track in scene["tracks"] if len(track["x"]) > n - first] in ([], ["BV"])
+        crash = n - 1 if result.outcome == "crash" else None
+        assert [track["crash"] for track in scene["tracks"]] == [None, None, crash]
+        cut_in = result.row["cut_in_step"]
+        assert scene["cut_in"] == cut_in
+        assert scene["onset"] == result.row.get("onset_step", cut_in)
+        assert len(scene["ghosts"]) == (0 if cut_in is None else 2)
+        touched = [fact for name, fact in scene["facts"] if name == "AV" and fact.endswith("from the side")]
+        assert bool(touched) == (result.row.get("contact") == "side" and scene["onset"] < cut_in)
+
+
+@pytest.mark.parametrize("name", ["forced-twin", "forced-lateral-twin"])
+def test_others_drive_as_they_would_if_they_were_tested(name, stored_run, tmp_path):
+    """The same campaign with another vehicle has the same traffic: before the AV's crash and after it."""
+    folder = stored_run(name)
+    episodes, ended = crashed(folder), []
+    for other, av in OTHER_VEHICLES.items():
+        theirs = run_here(golden(name, f"av={av}"), tmp_path / other).folder
+        for episode in episodes:
+            scene, tested = harness.replay(folder, episode).scene, harness.replay(theirs, episode)
+            [ghost] = [ghost for ghost in scene["ghosts"] if ghost["name"] == other]
+            first, n = scene["first"], len(ghost["x"])
+            for ours, column in (("x", "x_m"), ("v", "v_mps")):
+                assert ghost[ours].tolist() == motion(tested.trace, "AV", column)[first : first + n]
+                [bv] = [track[ours] for track in scene["tracks"] if track["name"] == "BV"]
+                assert bv[:n].tolist() == motion(tested.trace, "BV", column)[first : first + n]
+            if ghost["crash"] is not None:
+                assert (tested.outcome, tested.row["n_steps"]) == ("crash", ghost["crash"])
+            ended.append((other, tested.outcome))
+    assert len(set(ended)) >= 3, "both kinds of endings are needed"
+
+
+@pytest.mark.parametrize("name", ["shells-twin", "shells-acting-twin", "shells-lateral-sumo"])
+def test_who_crashes_is_what_the_records_say(name, stored_run):
+    """The pool knows how BV goes on after the AV's crash, the records of the test do not: up to there all are equal."""
+    folder = stored_run(name)
+    design = json.loads((folder / "shells.json").read_text())
+    bit = [each["name"] for each in design["references"]].index("r157-cc")
+    episodes = stored_table(folder, "episodes")
+    rows = episodes.filter(pc.equal(episodes["outcome"].cast(pa.string()), "crash"))
+    on_record = (np.array(design["cell_references"])[rows["cell"].to_numpy()] >> bit) & 1 == 1
+    campaign = load_campaign(folder / "campaign.yaml")
+    traces = stored_table(folder, "traces").filter(pc.field("episode").isin(rows["episode"]))
+    ends = Scenes(campaign, resolve(campaign).environment).ends(rows, traces)[:, 0]
+    known = (ends >= 0) & (ends <= rows["n_steps"].to_numpy())
+    assert known.sum() >= 10
+    assert on_record[known].all()
+    assert (on_record != (ends >= 0)).mean() < 0.03
+
+
+def test_of_a_vehicle_that_acts_nobody_knows_without_its_motion(stored_run):
+    folder = stored_run("shells-acting-twin")
+    campaign = load_campaign(folder / "campaign.yaml")
+    rows = stored_table(folder, "episodes").slice(0, 3)
+    scenes = Scenes(campaign, resolve(campaign).environment)
+    assert (scenes.ends(rows, None) == UNKNOWN).all()
+    assert (Scenes(campaign, None).ends(rows, stored_table(folder, "traces")) == UNKNOWN).all()
+
+
+NOBODY, BRAKES, BOTH = (30, 30), (30, -1), (-1, -1)
+
+
+@pytest.mark.parametrize(
+    ("who", "leads"),
+    [
+        ({1: BOTH, 3: BRAKES, 4: BOTH}, ["avoidable no. 1", "avoidable no. 2", "impact no. 2"]),
+        ({5: BRAKES}, ["impact no. 1, typical no. 1, weight no. 1"]),
+        ({}, ["impact no. 1", "impact no. 2", "impact no. 3"]),
+    ],
+)
+def test_crashes_that_the_reference_driver_avoids_come_first_and_hopeless_ones_not(who, leads, runs, monkeypatch):
+    """``who`` avoids the hardest crashes, by rank; nobody the others."""
+    run = runs["weighted"]
+    summary = summarise(run)
+    impact = summary.crashes["impact_speed_mps"]
+    by_rank = np.argsort(-impact, kind="stable")
+    ends = np.full((impact.size, len(OTHERS)), 30)
+    for rank, end in who.items():
+        ends[by_rank[rank]] = end
+    monkeypatch.setattr(crashes, "_ends", lambda *_: ends)
+    rows, scenes = crashes.crash_gallery(run, summary)
+    assert [row.reason.split(", ")[0] for row in rows][: len(leads)] == [lead.split(", ")[0] for lead in leads]
+    shown = [row.crash.episode for row in rows]
+    allowed = [int(summary.crashes["episode"][by_rank[rank]]) for rank in who or range(impact.size)]
+    assert set(shown) <= set(allowed)
+    words = {NOBODY: "nobody", BRAKES: "brakes-8", BOTH: "r157-cc, brakes-8"}
+    avoided = {allowed[i]: words[end] for i, end in enumerate(who.values())}
+    assert [row.avoided_by for row in rows] == [avoided.get(episode, "nobody") for episode in shown]
+    assert [scene["episode"] for scene in scenes] == shown
+    hardest = [row.crash.impact_speed_mps for row in rows if row.reason.startswith("avoidable")]
+    assert hardest == sorted(hardest, reverse=True)
+
+
+def test_a_report_shows_crashes_with_those_who_avoid_them(stored_run, tmp_path):
+    folder = copy_of(stored_run("shells-twin"), tmp_path / "run")
+    scenes = scenes_in(write_report(folder).read_text(encoding="utf-8"))
+    rows, _ = crashes.crash_gallery(run := read_run_folder(folder), summarise(run))
+    assert [row.crash.episode for row in rows if row.scene is not None] == [scene["episode"] for scene in scenes]
+    for row, scene in zip(rows, scenes, strict=True):
+        avoids = [ghost["name"] for ghost in scene["ghosts"] if ghost["crash"] is None]
+        assert row.avoided_by == (", ".join(avoids) or "nobody")
+        again = harness.replay(folder, row.crash.episode).scene | {"title": scene["title"]}
+        assert scene == json.loads(json.dumps(again, default=np.ndarray.tolist))
+
+
+def test_without_the_runs_traffic_its_vehicles_are_played_alone(stored_run, tmp_path):
+    folder = copy_of(stored_run("shells-twin"), tmp_path / "run")
+    for name in ("manifest.json", "estimates.json"):
+        edit(folder, name, campaign_hash="0" * 16)
+    scenes = scenes_in(write_report(folder).read_text(encoding="utf-8"))
+    assert scenes
+    assert not any(scene["ghosts"] for scene in scenes)
+    rows, _ = crashes.crash_gallery(run := read_run_folder(folder), summarise(run))
+    assert {row.avoided_by for row in rows} == {"–"}
+
+
+def test_hostile_names_stay_text(stored_run, tmp_path):
+    hostile = "</script><script>alert('x')</script><!--"
+    scene = harness.replay(stored_run("shells-twin"), 0).scene | {"campaign": hostile, "title": hostile}
+    file = tmp_path / "page.html"
+    harness.write_player(scene, file)
+    page = file.read_text(encoding="utf-8")
+    assert page.count("<script") == 2
+    assert hostile not in page
+    assert scenes_in(page)[0]["title"] == hostile
+
+
+def test_replay_says_what_happens_and_writes_the_page(stored_run, tmp_path, capsys):
+    folder, file = stored_run("forced-lateral-sumo"), tmp_path / "crash.html"
+    episode = crashed(folder)[0]
+    assert main(["replay", str(folder), str(episode), "--html", str(file)]) == 0
+    first, *lines, last = capsys.readouterr().out.splitlines()
+    assert first == f"episode {episode}: crash; bit for bit as stored"
+    assert last == str(file)
+    told = {line[2:15].strip(): line[16:] for line in lines}
+    assert set(told) == {"BV comes over", "BV cuts in", "AV brakes", "AV", *OTHERS}
+    row = harness.replay(folder, episode).row
+    assert f"crashes at {row['crash_time_s']:.1f} s" in told["AV"]
+    assert f"impact {row['impact_speed_mps']:.1f} m/s" in told["AV"]
+    assert f"{row['cut_in_r2_m']:.1f} m ahead and {-row['cut_in_r2dot_mps']:.1f} m/s slower" in told["BV cuts in"]
+    assert f"{row['onset_r2_m']:.1f} m ahead" in told["BV comes over"]
+    assert scenes_in(file.read_text(encoding="utf-8"))[0]["episode"] == episode
+
+
+def test_a_crash_that_was_not_traced_is_listed_without_a_scene(reports):
+    page = (reports["failed"] / "report.html").read_text(encoding="utf-8")
+    assert "<script" not in page
+    assert "nothing to watch" in page
