@@ -9,14 +9,13 @@ from pathlib import Path
 import pytest
 
 from harness.campaign.campaign import Campaign
-from harness.campaign.files import load_campaign
 from harness.episode.loop import Shard
 from harness.resolved import resolve
 from harness.runner.prepare import prepare
 from harness.worlds import World
 from harness.worlds.twin import TwinWorld
+from tests.worlds.running import smoke
 
-ROOT = Path(__file__).parents[2]
 LATERAL = "environment.parameters=ndd-overtaking-1-lateral"
 FMU = """
 from pythonfmu import Fmi2Causality, Fmi2Slave, Real
@@ -38,8 +37,7 @@ class {name}(Fmi2Slave):
 
 def forced(*overrides: str) -> Campaign:
     """Forced cut-ins."""
-    changes = ["testing={method: forced}", "world.engine=twin", "stop.rhw=null", *overrides]
-    return load_campaign(ROOT / "scenarios/overtaking_mixture.yaml", changes)
+    return smoke("testing={method: forced}", "world.engine=twin", *overrides)
 
 
 def drive(*overrides: str, cells: int = 32, first: int = 0, n: int = 150, world: World | None = None) -> Shard:

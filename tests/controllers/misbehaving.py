@@ -17,13 +17,6 @@ from examples.idm import IDM
 THIRD_CALL = 3
 
 
-class Array(np.ndarray):
-    """An array that can be compared with a word."""
-
-    def __ne__(self, other):
-        return True
-
-
 class Lying(float):
     """A number that says it is within any limits."""
 
@@ -70,7 +63,7 @@ FAULTS = {
     "inf": lambda: math.inf,
     "string": lambda: "fast",
     "boolean": lambda: True,
-    "shape": lambda: np.zeros(2).view(Array),
+    "shape": lambda: np.zeros(2),
     "impossible": lambda: -99.0,
     "lies": lambda: Lying(-1e6),
     "raises": lambda: raises(ZeroDivisionError("no such thing")),

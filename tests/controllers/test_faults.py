@@ -66,7 +66,7 @@ IN_PROCESS = {
     "inf": "step: returned inf, expected a finite acceleration in m/s2",
     "string": "step: returned str, expected an acceleration in m/s2 as a number",
     "boolean": "step: returned bool, expected an acceleration in m/s2 as a number",
-    "shape": "step: returned Array, expected an acceleration in m/s2 as a number",
+    "shape": "step: returned ndarray, expected an acceleration in m/s2 as a number",
     "impossible": "step: asked for -99 m/s2, outside of av.limits (-15 to 10)",
     "lies": "step: asked for -1e+06 m/s2, outside of av.limits (-15 to 10)",
     "raises_what_cannot_be_printed": "step: UnprintableError, whose text raised ValueError",

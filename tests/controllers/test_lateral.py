@@ -12,7 +12,8 @@ from examples import idm_batch
 from examples.idm import IDM, idm_acceleration
 from harness.controllers.protocol import Observation
 from harness.controllers.traci_style import TraciStyleController
-from tests.controllers.driving import LATERAL, ROOT, drive, make_fmu
+from tests.controllers.driving import LATERAL, drive, make_fmu
+from tests.worlds.running import ROOT
 
 HERE = "tests.controllers.test_lateral"
 SEEN: list[Observation] = []

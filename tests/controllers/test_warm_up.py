@@ -14,8 +14,8 @@ from harness.campaign.files import load_campaign
 from harness.controllers.traci_style import TraciStyleController
 from harness.worlds.sumo import SumoWorld
 from tests.controllers.delay_line import DELAY_STEPS, Line
-from tests.controllers.driving import LATERAL, ROOT, drive, fmu_av, make_fmu, motion
-from tests.worlds.running import MISBEHAVING, program
+from tests.controllers.driving import LATERAL, drive, fmu_av, make_fmu, motion
+from tests.worlds.running import MISBEHAVING, ROOT, program
 from tests.worlds.running import run as run_in_sumo
 
 HERE = "tests.controllers.test_warm_up"
