@@ -264,17 +264,8 @@ def _exp(log_value: float) -> float:
     return math.exp(log_value) if log_value < 700.0 else math.inf
 
 
-class Nde:
+class Nde(Nade):
     """Share of crashes among naturalistic tests, with the Clopper-Pearson interval."""
-
-    def __init__(self) -> None:
-        self.n = 0
-        self.n_crashes = 0
-
-    def add(self, block: Block) -> None:
-        """Count one block."""
-        self.n += len(block)
-        self.n_crashes += int(np.count_nonzero(block.crash))
 
     def result(self, confidence: float) -> Estimate:
         """Share of crashes; its relative half-width is half the interval's length over the rate."""
