@@ -40,7 +40,7 @@ def pytest_sessionstart(session: pytest.Session) -> None:
 
     if (mark := Path(os.environ["NUMBA_CACHE_DIR"]) / "compiled-for-tests").exists():
         return
-    command = [sys.executable, "-m", "tests.golden.record", "--only"]
+    command = [sys.executable, "-m", "tests.golden.record", "--digits", "1e-9", "--only"]
     compiling = [subprocess.Popen([*command, *names]) for names in TO_COMPILE]
     if not any([process.wait() for process in compiling]):  # noqa: C419 - wait for all
         mark.touch()

@@ -129,6 +129,8 @@ def test_wrong_calls_end_with_2(capsys, arguments):
         (["check", SMOKE, "--set", "{}=1"], 2),
         (["check", SMOKE, "--av", "{}"], 2),
         (["replay", ".", "{}"], 2),
+        (["report", "{}"], 2),
+        (["run", SMOKE, "--out", "{}"], 2),
         (["{}"], 2),
         (["run", *CAMPAIGN, "--out", "an out", "--resume"], 0),
         (["report", "an out"], 0),

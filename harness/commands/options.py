@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -13,8 +13,22 @@ from harness.errors import HarnessError
 if TYPE_CHECKING:
     from harness.campaign.campaign import Campaign
 
-FOLDER = click.Path(path_type=Path, file_okay=False)
-RUN_FOLDER = click.Path(path_type=Path, file_okay=False, exists=True)
+
+class FolderPath(click.Path):
+    """A folder of Parquet files, whose library takes names in UTF-8 alone."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Refuse what is no UTF-8 (`HarnessError`) before anything is written."""
+        try:
+            str(value).encode()
+        except UnicodeEncodeError as error:
+            mend = "Rename the folder, or change into the one above it and name it from there."
+            raise HarnessError(str(value), "a name with bytes that are no UTF-8", "a name in UTF-8", mend) from error
+        return super().convert(value, param, ctx)
+
+
+FOLDER = FolderPath(path_type=Path, file_okay=False)
+RUN_FOLDER = FolderPath(path_type=Path, file_okay=False, exists=True)
 FILE = click.Path(path_type=Path, dir_okay=False)
 CAMPAIGN = click.Path(path_type=Path)
 

@@ -147,11 +147,12 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--processes", type=int, help="record nothing: do so many workers give the same?")
     parser.add_argument("--only", nargs="+", choices=RUNS, help="record nothing: are these the same?")
+    parser.add_argument("--digits", type=float, default=0.0, help="how far estimates may be off, relatively")
     asked = parser.parse_args()
     runs = record(asked.only or RUNS, asked.processes)
     if asked.only or asked.processes:
         golden = json.loads(GOLDEN.read_text())["runs"]
-        differences = unlike(json.loads(json.dumps(runs)), {name: golden[name] for name in runs})
+        differences = unlike(json.loads(json.dumps(runs)), {name: golden[name] for name in runs}, digits=asked.digits)
         sys.stdout.writelines(f"{line}\n" for line in differences)
         return bool(differences)
     with tempfile.TemporaryDirectory() as folder:
