@@ -97,10 +97,8 @@ def test_real_pools_have_the_shells_of_drawn_ones(drivers):
     template = source.template
     assert real.names == template.names
     kept = [real.cut_ins.path_mass[real.shell == s, s].mean(dtype=float) for s in range(real.shell_p.size)]
-    squares = (
-        (source.mass**2).mean(0),
-        real.shell_p * kept,
-    )  # a kept cut-in is a draw in proportion to its path's mass
+    # A kept cut-in is a draw in proportion to its path's mass.
+    squares = (source.mass**2).mean(0), real.shell_p * kept
     errors = [
         np.sqrt(np.maximum(square - pool.shell_p**2, 0.0) / n)
         for square, pool, n in zip(squares, (template, real), (paths, real.n_paths), strict=True)
