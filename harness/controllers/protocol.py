@@ -38,7 +38,7 @@ class EpisodeStart:
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """What a per-vehicle controller sees before a step.
+    """What a per-vehicle controller sees before a step; filled by `harness.episode.drive.observe`.
 
     Attributes
     ----------

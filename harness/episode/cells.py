@@ -162,10 +162,10 @@ class PrescribedTraffic(NamedTuple):
 
     ``lv``, ``bv`` (rows, draws) int8 are maneuver indices as an episode records them, 31 in ``bv`` being the cut-in in
     step ``cut_step`` (rows,), which is -1 for a run without a cut-in, and in which BV begins to move sideways ``lead``
-    (rows,) steps earlier. ``stratum`` (rows,) is the shell and ``log_weight`` (rows,) its log probability.
-    ``announced_index`` (rows,) are the indices that AVs are told, ``motion_hash`` (rows,) of what they must have done
-    when the step of the onset is over: those of their baseline runs. Both are empty where an AV keeps its speed until
-    then.
+    (rows,) steps earlier. ``stratum`` (rows,) is a shell, or all that lie outside, and ``log_weight`` (rows,) its log
+    probability. ``announced_index`` (rows,) are the indices that AVs are told, ``motion_hash`` (rows,) of what they
+    must have done when the step of the onset is over: those of their baseline runs. Both are empty where an AV keeps
+    its speed until then.
     """
 
     lv: Int8Array
