@@ -93,7 +93,8 @@ class OnMachines(Here):
 
     def targets(self, run: subprocess.Popen[bytes]) -> dict[str, list[int]]:
         """See `Here`; the head's raylet is spared: a cluster without its head is none."""
-        machines = [descendants(self._nodes.init(k)) for k in range(self._nodes.n)]
+        on = (k for k in range(self._nodes.n) if not self._nodes.is_off(k))  # one may end while it joins again
+        machines = [descendants(self._nodes.init(k)) for k in on]
         everywhere = [pid for machine in machines for pid in machine]
         return {
             "run": [pid for pid in descendants(run.pid) if started_by(pid, b"harness\0run")],
