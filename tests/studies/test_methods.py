@@ -23,6 +23,7 @@ from studies.replication.populations import preventable_by, ratio_to
 from studies.replication.run import validate
 from studies.replication.shells import FREE, ShellCampaign, limit_at, result_of
 from studies.replication.weighted import WeightedCampaign, chain_episodes
+from tests.golden.record import unlike
 
 from .here import wrong_shell
 
@@ -145,4 +146,6 @@ def test_the_committed_panel_meets_what_shells_promise():
 def test_committed_experiments_are_what_the_command_gives(name, tmp_path):
     content, shipped = committed(name)
     validate(shipped, tmp_path)
-    assert json.loads((tmp_path / "results.json").read_text())["judgements"] == content["judgements"]
+    found = json.loads((tmp_path / "results.json").read_text())["judgements"]
+    as_trees = (dict(enumerate(judgements)) for judgements in (found, content["judgements"]))
+    assert unlike(*as_trees, digits=1e-9) == []  # in all digits on one CPU family
