@@ -220,8 +220,7 @@ def alarm(ctx: click.Context, folder: Path, *, pool_file: Path | None, as_json: 
     """Put the surrogates of a pool in the AV's place in all tests of RUN, and see if they crash as the pool says.
 
     The alarm is raised, and the exit code is 3, where they do not, which a sound run shows once in 10,000 times: then a
-    weight, a maneuver on record, the twin or the pool is wrong. With the recursive challenge its tables are compared
-    with Monte Carlo, too; their error costs efficiency and leaves the crash rate unbiased.
+    weight, a maneuver on record, the twin or the pool is wrong.
     """
     from studies.alarm import alarm_of_run  # noqa: PLC0415 - slow to import
 
@@ -232,8 +231,6 @@ def alarm(ctx: click.Context, folder: Path, *, pool_file: Path | None, as_json: 
         print_json(found)
     else:
         print_table(f"Weighted crashes of surrogates in {found['n_episodes']:,} tests", found["surrogates"])
-        if found["tables"]:
-            print_table("Challenge tables against Monte Carlo", found["tables"])
         verdict = found["no_verdict"] or ("ALARM: weights, maneuvers, twin or pool are wrong" * found["raised"])
         click.echo(f"{verdict or 'nothing is wrong that these tests could show'} (p-value {found['p_value']:.2g})")
     if found["raised"]:

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -27,13 +27,11 @@ from scipy.special import logsumexp
 
 from harness.campaign.files import load_campaign
 from harness.compiled import compiled_threads, unboxed
-from harness.episode.cells import Results
-from harness.episode.loop import MOMENT_LIMITS, Drawing, EpisodeLoop, RecordPolicy
 from harness.episode.path import Trajectory, empty_trajectory, who_crashes
 from harness.errors import CampaignError, HarnessError, RunFolderError
 from harness.estimators.block import EPISODE_COLUMNS, Block, block_from_tables
 from harness.estimators.estimate import finite_json
-from harness.importance.functions import build_importance, mixture_weights
+from harness.importance.functions import mixture_weights
 from harness.pool.build import campaign_pool
 from harness.pool.cut_ins import Pool, environment_hash, read_pool
 from harness.pool.replay import LEAD, PATH_COLUMNS, StoredPaths, approach_cut_in, leave_stored, stored_paths
@@ -42,11 +40,9 @@ from harness.progress import Progress
 from harness.records.folder import MEND_SHARD, read_manifest
 from harness.records.reader import read_shard
 from harness.resolved import Resolved, resolve
-from harness.runner.prepare import prepare
-from harness.traffic.laws import Environment, InitialStates
+from harness.traffic.laws import Environment
 from harness.vehicles.drivers import Followers
-from harness.vocabulary import BV_LV_CONTACT, CRASH, RUNNING, BoolArray, FloatArray, IntArray, Method
-from harness.worlds.twin import TwinWorld
+from harness.vocabulary import BV_LV_CONTACT, RUNNING, BoolArray, FloatArray, IntArray, Method
 
 
 @compiled_threads
@@ -254,58 +250,5 @@ def alarm_of_run(folder: Path, pool_file: Path | None = None, progress: Progress
     for block, crashes in made_ahead(replayed, manifest["shards"]):
         alarm.add(block, crashes)
         progress.advance(len(block))
-    tables = list(table_errors(resolved))
-    content: dict[str, Any] = finite_json({"run": str(folder), "pool": pool.key, **alarm.result(), "tables": tables})
+    content: dict[str, Any] = finite_json({"run": str(folder), "pool": pool.key, **alarm.result()})
     return content
-
-
-EPISODES = 6_000
-SEED = 40_001
-_CELLS = 512
-QUANTITIES = {"before the cut-in": "mean of V_j(s_0)", "after the cut-in": "mean of W V_j(s) at BV's first redraw"}
-
-
-def table_errors(resolved: Resolved) -> Iterator[dict[str, Any]]:
-    """How far the tables of the recursive challenge are from Monte Carlo, by surrogate and table.
-
-    A surrogate is run in the AV's place in the twin. If its tables were exact, the mean of V_j(s_0) before any
-    maneuver, and the mean of W V_j(s) at the first redraw after the cut-in, would both equal its crash rate. Nothing is
-    told of campaigns without tables, nor of the immediate challenge, which is a yes or no by definition.
-    """
-    campaign, environment, tables = resolved.campaign, resolved.environment, prepare(resolved).tables
-    if tables is None or campaign.testing.challenge == "immediate":
-        return
-    testing = campaign.testing.model_copy(update={"method": "episode_mixture", "criticality_threshold": 0.0})
-    importance = build_importance(campaign.model_copy(update={"testing": testing}), tables)
-    states = InitialStates(environment.numbers).draw(SEED, 0, EPISODES)
-    for j, surrogate in enumerate(campaign.surrogates):
-        policy = Drawing(SEED, environment, importance, resolved.surrogates[j : j + 1])
-        all_kept = RecordPolicy(MOMENT_LIMITS["all"], "none", 0.0)
-        results = EpisodeLoop(TwinWorld(_CELLS), policy, all_kept).run(0, states).results
-        y = np.where(results.episode["outcome"] == CRASH, np.exp(results.episode["log_weight"]), 0.0)
-        for (table, quantity), predicted in zip(QUANTITIES.items(), _predictions(j, results), strict=True):
-            yield {
-                "surrogate": surrogate,
-                "table": table,
-                "quantity": quantity,
-                "table_value": float(predicted.mean()),
-                "monte_carlo": float(y.mean()),
-                "std_error": float((predicted - y).std(ddof=1)) / math.sqrt(y.size),
-            }
-
-
-def _predictions(j: int, results: Results) -> tuple[FloatArray, FloatArray]:
-    """Per episode V_j(s_0), and W V_j(s) at the first control step after the cut-in (0 without one)."""
-    used = int(results.moment_count[0])
-    moment, v = results.moment[:used], results.moment_v[:used, j]
-    order = np.lexsort((moment["step"], moment["row"]))
-    moment, v = moment[order], v[order]
-    row, step = moment["row"], moment["step"]
-    total = np.concatenate([[0.0], np.cumsum(np.log(moment["p"]) - np.log(moment["q_sampled"]))])
-    weight_before = np.exp(total[:-1] - total[np.searchsorted(row, row)])
-    before, after = np.zeros((2, len(results.episode)))
-    before[row[step == 0]] = v[step == 0]
-    cut_in = results.episode["cut_in_step"][row]
-    at_redraw = (cut_in >= 0) & (step == cut_in + 1)
-    after[row[at_redraw]] = (weight_before * v)[at_redraw]
-    return before, after
