@@ -4,6 +4,7 @@ Bit for bit in positions, speeds and accelerations, with IDM, motion and clocks 
 """
 
 import math
+from itertools import product
 
 import numpy as np
 import pytest
@@ -81,8 +82,7 @@ def replay(done, row, hold):
             return end.value
 
 
-@pytest.mark.parametrize("hold_s", [1.0, 0.1])
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(("method", "hold_s"), [*product(METHODS, [1.0, 0.1]), ("forced", 0.7)])
 def test_replay_in_plain_python(method, hold_s):
     surrogates = "default" if hold_s == 1.0 else "SM-I"  # tables for draws in every step take 12 s of a core each
     done = run(method, n=N, traces="all", hold_s=hold_s, surrogates=surrogates, **METHODS[method])

@@ -22,6 +22,14 @@ from harness.records.folder import (
     write_shard,
 )
 from harness.records.reader import read_shards
+from harness.records.schemas import ShardTables
+from tests.stored_runs import stored_table
+
+
+@pytest.fixture
+def tables(stored_run) -> ShardTables:
+    """A shard with all three."""
+    return ShardTables(*(stored_table(stored_run("mixture-twin"), name) for name in ShardTables._fields))
 
 
 def files_below(path: Path) -> set[str]:
@@ -43,9 +51,8 @@ def test_a_write_that_fails_leaves_nothing_but_the_old_file(tmp_path):
     assert path.read_text() == "old"
 
 
-def test_a_real_limit_on_file_size_leaves_nothing(tmp_path, record):
+def test_a_real_limit_on_file_size_leaves_nothing(tmp_path, tables):
     """The kernel itself refuses to write more than a kilobyte, as a full disk would."""
-    tables = record("records.traces=all", n=20).tables
     before, handler = resource.getrlimit(resource.RLIMIT_FSIZE), signal.getsignal(signal.SIGXFSZ)
     signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1024, before[1]))
@@ -62,7 +69,7 @@ def test_a_real_limit_on_file_size_leaves_nothing(tmp_path, record):
     assert set(write_shard(tmp_path, 0, encoded(tables))) == {"episodes", "moments", "traces"}
 
 
-def test_episodes_come_last_so_that_they_say_that_a_shard_is_complete(tmp_path, record, monkeypatch):
+def test_episodes_come_last_so_that_they_say_that_a_shard_is_complete(tmp_path, tables, monkeypatch):
     written = []
     write = Path.write_bytes
 
@@ -74,7 +81,7 @@ def test_episodes_come_last_so_that_they_say_that_a_shard_is_complete(tmp_path, 
 
     monkeypatch.setattr(Path, "write_bytes", fail_at_third)
     with pytest.raises(OSError, match="No space left"):
-        write_shard(tmp_path, 4, encoded(record("records.traces=all", n=20).tables))
+        write_shard(tmp_path, 4, encoded(tables))
     assert written == ["traces", "moments", "episodes"]
     assert files_below(tmp_path) == {shard_file("traces", 4), shard_file("moments", 4)}
 
@@ -88,8 +95,8 @@ def test_json_is_strict(tmp_path):
 
 
 @pytest.mark.parametrize("damage", [lambda content: content[:-30], lambda content: b"", lambda content: content[::-1]])
-def test_a_damaged_table_is_named(damage, tmp_path, record):
-    path = tmp_path / write_shard(tmp_path, 0, encoded(record("records.traces=none", n=20).tables))["episodes"]
+def test_a_damaged_table_is_named(damage, tmp_path, tables):
+    path = tmp_path / write_shard(tmp_path, 0, encoded(tables))["episodes"]
     path.write_bytes(damage(path.read_bytes()))
     with pytest.raises(RunFolderError, match="a file that cannot be read") as raised:
         read_table(path)
@@ -97,10 +104,10 @@ def test_a_damaged_table_is_named(damage, tmp_path, record):
     assert "--resume" in raised.value.mend
 
 
-def test_shards_are_read_in_the_manifests_order_and_no_others(tmp_path, record):
+def test_shards_are_read_in_the_manifests_order_and_no_others(tmp_path, tables):
     shards = []
     for index, first in enumerate((0, 30, 60)):
-        files = write_shard(tmp_path, index, encoded(record("records.traces=none", first=first, n=30).tables))
+        files = write_shard(tmp_path, index, encoded(ShardTables(tables.episodes.slice(first, 30), None, None)))
         shards.append({"index": index, "first_episode": first, "n_episodes": 30, "files": files})
     write_json(tmp_path / "manifest.json", {"campaign_hash": "", "n_episodes": 60, "shards": shards[:2]})
     assert [episodes["episode"].to_pylist()[0] for episodes in read_shards(tmp_path)] == [0, 30]
