@@ -40,9 +40,9 @@ def rebuild(n_cells: int) -> Path:
     with tempfile.TemporaryDirectory() as folder:
         (Path(folder) / "cells.nod.xml").write_text(nodes)
         (Path(folder) / "cells.edg.xml").write_text(edges)
-        netconvert = Path(sumo.SUMO_HOME) / "bin" / "netconvert"
-        command = [netconvert, "-n", "cells.nod.xml", "-e", "cells.edg.xml", "-o", target, "--no-turnarounds", "true"]
-        subprocess.run([*command, "--output.street-names", "false", "--no-warnings", "true"], cwd=folder, check=True)  # noqa: S603
+        command = [f"{sumo.SUMO_HOME}/bin/netconvert", "-n", "cells.nod.xml", "-e", "cells.edg.xml", "-o", str(target)]
+        command += ["--no-turnarounds", "true", "--output.street-names", "false", "--no-warnings", "true"]
+        subprocess.run(command, cwd=folder, check=True)  # noqa: S603
     text = target.read_text()
     begin, end = text.index("<!--"), text.index("-->") + 3  # the comment holds the date and this machine's paths
     target.write_text(text[:begin] + text[end:].lstrip("\n"))

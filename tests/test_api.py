@@ -5,6 +5,8 @@ from __future__ import annotations
 import inspect
 import subprocess
 import sys
+from importlib.machinery import PathFinder
+from importlib.metadata import distributions
 from pathlib import Path
 
 import pytest
@@ -29,6 +31,17 @@ def test_importing_it_loads_nothing_slow():
     command = [sys.executable, "-c", f"import harness.cli, sys; print({slow} & set(sys.modules))"]
     done = subprocess.run(command, cwd=MIXTURE_FILE.parents[1], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"
+
+
+def test_beside_the_clone_it_is_not_an_empty_namespace_package(tmp_path):
+    (tmp_path / "harness" / "docs").mkdir(parents=True)  # as a clone looks from the folder above
+    files = [file for each in distributions(name="harness") for file in each.files or () if file.suffix == ".pth"]
+    if not files:
+        pytest.skip("the harness is not installed editable")
+    paths = Path(str(files[0].locate())).read_text().splitlines()
+    found = PathFinder.find_spec("harness", [str(tmp_path), *paths])
+    assert found is not None
+    assert found.origin == harness.__file__
 
 
 def test_load_run_estimate_and_replay_in_a_few_lines(tmp_path):

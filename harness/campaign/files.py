@@ -29,13 +29,7 @@ from harness.errors import CampaignError
 SHIPPED_PARAMETERS = Path(__file__).parents[1] / "traffic"
 
 
-def shipped_folder(name: str) -> Path:
-    """A folder that comes with the harness: of the installed package, or of the checkout."""
-    installed = Path(__file__).parents[1] / name
-    return installed if installed.exists() else Path(__file__).parents[2] / name
-
-
-SHIPPED_PANEL = shipped_folder("scenarios") / "av_panel.yaml"
+SHIPPED_PANEL = Path(__file__).parents[1] / "scenarios" / "av_panel.yaml"
 _FILES = {
     ("av", "fmu", "file"): "an FMI 2.0 co-simulation FMU",
     ("pool", "library"): "a surrogate library, or the name of a shipped one",

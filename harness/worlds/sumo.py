@@ -24,7 +24,6 @@ from typing import Any, ClassVar
 import numpy as np
 
 from harness.campaign.combinations import MOST_SUMO_CELLS
-from harness.campaign.files import shipped_folder
 from harness.errors import CampaignError, WorldDisagreementError
 from harness.vocabulary import AV, BV, LV, VEHICLES, BoolArray, FloatArray, Int8Array, IntArray
 from harness.worlds.shim import Shim, open_shim
@@ -120,8 +119,8 @@ def network_file(n_cells: int) -> Path:
 
 
 def committed_file(name: str) -> Path:
-    """A file of ``sumo_networks/``, from the installed package or from the checkout."""
-    path = shipped_folder("sumo_networks") / name
+    """A file of ``sumo_networks/``, which in a checkout is a link."""
+    path = Path(__file__).parents[1] / "sumo_networks" / name
     if not path.exists():
         raise CampaignError(str(path), "no file", "the committed network", "Reinstall the harness from a checkout.")
     return path
