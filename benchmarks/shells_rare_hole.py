@@ -1,6 +1,6 @@
 """What stopping costs shells when the vehicle has a rare hole: bias and coverage of campaigns on the default pool.
 
-    python -m benchmarks.shells_rare_hole [REPLICATIONS] [testing.shells.stopping=two_phase ...]
+    python -m benchmarks.shells_rare_hole [REPLICATIONS] [testing.shells.first_tests=6 ...]
 
 The vehicle crashes as the default IDM does inside the boundary, and in a small share of the cut-ins outside. Shell
 probabilities are those of the pool and taken as exact; allocation, rounds, stop rule and estimator are those of a

@@ -111,16 +111,15 @@ class Campaign(Section):
         smaller RHW or with other resources.
         """
         shells = self.sampling.strata
-        planned = shells and self.testing.shells.stopping == "two_phase"
         environment, testing = self.environment.model_dump(exclude={"parameters"}), self.testing.model_dump()
         # What came later changes no hash of before where it is left as it is.
         if environment["cut_in_lead_s"] is None:
             del environment["cut_in_lead_s"]
         if testing["shells"]["smallest_round"] == 1:
             del testing["shells"]["smallest_round"]
+        testing["shells"]["stopping"] = "sequential"  # nor does what went
         unused = {"shadow_paths"} if not self.av.acts_before_cut_in else set()
         content = {
-            **({"rhw": self.stop.rhw} if planned else {}),  # it decides where the second phase begins
             "seed": self.seed,
             "environment": environment,
             "environment_parameters": environment_parameters,

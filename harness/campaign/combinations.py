@@ -60,13 +60,6 @@ REFUSED = (
         "the same statement, or one of the two keys alone",
         "Delete one of them.",
     ),
-    Combination(
-        "accept",
-        lambda c, _: c.accept is not None and c.testing.shells.stopping != "sequential",
-        "a limit, with testing.shells.stopping {testing.shells.stopping}",
-        "sequential: a decision plans no second phase",
-        "Delete testing.shells.stopping.",
-    ),
     # -- vehicles that act before the cut-in --
     Combination(
         "av.before_cut_in",
@@ -172,13 +165,6 @@ REFUSED = (
         "controller: a vehicle that acts before the cut-in has cut-ins of its own",
         "hold_speed in A and B: pairs need the same cut-ins",
         "Run both campaigns by themselves and put their intervals side by side, or write hold_speed.",
-    ),
-    Combination(
-        "testing.shells.stopping",
-        lambda c, use: use.command == "compare" and c.testing.shells.stopping != "sequential",
-        "{testing.shells.stopping}",
-        "sequential: a comparison plans no second phase",
-        "Write --set testing.shells.stopping=sequential.",
     ),
     Combination(
         "testing.shells.statement",

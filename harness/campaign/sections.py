@@ -123,11 +123,6 @@ class ShellSettings(Section):
         ASSUMPTION_FREE,
         description="what has to reach stop.rhw: assumption_free, or a statement, outside of which nothing is tested",
     )
-    stopping: Literal["sequential", "two_phase"] = Field(
-        "sequential",
-        description="sequential: stop at the first interval that is narrow enough; two_phase: first tests plan how "
-        "many more there are, which alone are reported",
-    )
     first_tests: Annotated[int, Field(ge=1, le=10_000), BeforeValidator(whole)] | None = Field(
         None, description="tests of each shell before any is preferred; by its probability"
     )
@@ -137,6 +132,14 @@ class ShellSettings(Section):
         le=10_000,
         description="fewest tests of a round: as many as workers, where a test takes seconds",
     )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_before(cls, content: Any) -> Any:
+        """Campaigns of earlier versions name the one way to stop that is left."""
+        if isinstance(content, dict) and content.get("stopping") == "sequential":
+            return {key: value for key, value in content.items() if key != "stopping"}
+        return content
 
     @field_validator("statements")
     @classmethod

@@ -28,6 +28,12 @@ MENDS: dict[str, str] = {
     "vehicle that acts before the cut-in) and use a new folder",
 }
 """Why a campaign ended before its precision, and the mend."""
+BIASED_RHW = 0.5
+"""Precision from which on stopping at the first interval biases the rate noticeably."""
+TOO_WIDE = (
+    f" A relative half-width above {BIASED_RHW:g} is reached by chance: stopping at the first such interval makes "
+    "rates too high on the mean. Ask for a smaller stop.rhw."
+)
 
 
 def estimate_blocks(
@@ -228,13 +234,11 @@ def _replayed(episodes: Sequence[int]) -> str:
     return f"episode {episodes[0]} (`harness replay {RUN_FOLDER} {episodes[0]}`)"
 
 
-def conclusion(campaign: Campaign, rule: Rule, n_episodes: int, reported_from: int) -> tuple[StoppedBy, str]:
-    """Why a campaign ended after so many tests; those from ``reported_from`` on are reported. In a sentence, too."""
+def conclusion(campaign: Campaign, rule: Rule, n_episodes: int) -> tuple[StoppedBy, str]:
+    """Why a campaign ended after so many tests, also in a sentence."""
     look, budget = rule.look, campaign.stop.episodes
     stopped_by: StoppedBy = "pool"
-    if 0 < reported_from < n_episodes < budget:
-        stopped_by = "two_phase"
-    elif look.stopped:
+    if look.stopped:
         stopped_by = "rhw" if look.decision is None else "accept"
     elif look.decision is not None and look.decision.is_final:
         stopped_by = "contradicted"
@@ -245,13 +249,12 @@ def conclusion(campaign: Campaign, rule: Rule, n_episodes: int, reported_from: i
     after, unmet = f"Stopped after {n_episodes:,} tests", " and ".join(look.unmet)
     if stopped_by in ("rhw", "accept"):
         why = f"the last condition to be met was {unmet}" if unmet else "every condition was met at the first look"
-    elif stopped_by == "two_phase":
-        why = "as many as the first phase had planned, which are reported without it"
     elif campaign.stop.rhw is not None or look.decision is not None:
         after, why = f"{after} without {unmet}", MENDS[stopped_by]
     else:
         why = "stop.episodes was all that was asked for" if stopped_by == "episodes" else MENDS[stopped_by]
-    return stopped_by, f"{after}: {why}."
+    wide = stopped_by == "rhw" and campaign.sampling.strata and (campaign.stop.rhw or 0.0) > BIASED_RHW
+    return stopped_by, f"{after}: {why}." + (TOO_WIDE if wide else "")
 
 
 def paired_statement(found: PairedEstimate, name_a: str, name_b: str) -> str:

@@ -249,18 +249,16 @@ class RoundRule(Rule):
     """Looks at the crash rate from shells after each round, or whether it is below a limit.
 
     ``held`` is the number of tests that the run folder holds: before them nothing is given up, whatever is asked for
-    now. The precision is ``factor`` times wider than the one that the campaign asks for. A limit is decided by
-    ``level_at`` a number of tests and a confidence, whatever the budget: a run that is continued is looked at where it
-    would have been without the break, and once more where that was. ``of_first_tests`` says whether the round brings
-    the tests that every shell gets before anything is decided of it.
+    now. A limit is decided by ``level_at`` a number of tests and a confidence, whatever the budget: a run that is
+    continued is looked at where it would have been without the break, and once more where that was. ``of_first_tests``
+    says whether the round brings the tests that every shell gets before anything is decided of it.
     """
 
     of_first_tests = False
     level_at = staticmethod(decision_level)
 
-    def __init__(self, campaign: Campaign, held: int = 0, factor: float = 1.0) -> None:
-        rhw = campaign.stop.rhw
-        super().__init__(None if rhw is None else factor * rhw, campaign.min_crashes)
+    def __init__(self, campaign: Campaign, held: int = 0) -> None:
+        super().__init__(campaign.stop.rhw, campaign.min_crashes)
         self._held, self._confidence = held, campaign.stop.confidence
         self._statement, self._accept = campaign.testing.shells.statement, campaign.accept
 

@@ -89,12 +89,6 @@ class Tally(NamedTuple):
         """Tests, crashes and failed tests of all strata."""
         return int(self.tests.sum()), int(self.crashes.sum()), int(self.failed.sum())
 
-    def scaled(self, tests: IntArray) -> Tally:
-        """What so many tests of each stratum are expected to come to."""
-        scale = tests / self.at_least_one
-        mass = self.crash_mass * scale[:, None], self.failed_mass * scale[:, None]
-        return Tally(tests, self.crashes * scale, self.failed * scale, *mass)
-
     @property
     def share(self) -> FloatArray:
         """Share of tests that crashed, shape (S,)."""

@@ -267,10 +267,10 @@ def no_episodes(folder: Path) -> RunFolderError:
     return RunFolderError(str(folder), found, "episodes on record", "Let `harness run` go on with --resume.")
 
 
-StoppedBy = Literal["rhw", "accept", "contradicted", "two_phase", "episodes", "pool", "pool_error"]
+StoppedBy = Literal["rhw", "accept", "contradicted", "episodes", "pool", "pool_error"]
 """The asked precision, a decision about the limit, a vehicle that does not do what the deciding statement assumes, the
-number of tests planned for a precision, the budget, the last cut-in that the pool holds of a shell that needs more, or
-the pool's own error, which alone is wider than that."""
+budget, the last cut-in that the pool holds of a shell that needs more, or the pool's own error, which alone is wider
+than that."""
 Count = Annotated[int, Field(ge=0, lt=2**63)]
 ShardPath = Annotated[str, Field(pattern=r"^[a-z]+/[A-Za-z0-9_-]+\.parquet$")]
 
@@ -336,7 +336,7 @@ class StoredManifest(Stored):
     controller_sha256: str | None = None
     workers: Count | None = None
     status: str | None = None
-    stopped_by: StoppedBy | None = None
+    stopped_by: StoppedBy | Literal["two_phase"] | None = None
     wall_time_s: float | None = None
     distance_per_test_m: float | None = None
     ending: str | None = None
@@ -346,23 +346,23 @@ class StoredManifest(Stored):
     repeated: Repeated | None = None
     shadow_runs: dict[str, Count] | None = None
     baseline_crc32: list[Count] = []
-    reported_from: Count | None = None
 
 
 def read_manifest(folder: Path, *, mend: str = NO_RUN) -> dict[str, Any]:
     """Read ``manifest.json`` of a run, as `StoredManifest` says; ``mend`` is the advice where it cannot be.
 
-    Earlier versions could divide a run: a folder that holds only a part or the plan of one is refused.
+    Earlier versions could divide a run into parts, or into two phases: such a folder is refused.
     """
     path = folder / MANIFEST
     if not path.exists():
         expected = "a run folder, which holds a manifest.json"
         raise RunFolderError(str(path), "no such file: this is no run folder", expected, mend)
     content = read_as(StoredManifest, path, mend=mend).model_dump(exclude_unset=True)
-    if kind := next((kind for kind in ("part", "plan") if content.get(kind)), None):
+    divided = {"part": "a part of a run", "plan": "a plan of a run", "reported_from": "a run in two phases"}
+    if kind := next((kind for kind in divided if content.get(kind)), None):
         version = (content.get("versions") or {}).get("harness", "that made it")
-        again = f"Bring the parts together with version {version}, or run the campaign.yaml again into a new folder."
-        raise RunFolderError(str(folder), f"a {kind} of a run", "a whole run", again)
+        again = f"Read it with version {version}, or run the campaign.yaml again into a new folder."
+        raise RunFolderError(str(folder), divided[kind], "a whole run, as this version makes it", again)
     return content
 
 

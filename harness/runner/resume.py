@@ -95,7 +95,7 @@ class Manifest:
         self._folder, self._earlier, self._campaign = folder, earlier, resolved.campaign
         campaign, self._yaml = self._campaign, dump_campaign(self._campaign).encode()
         self.shards: list[dict[str, Any]] = []
-        self.n_episodes = self.n_crashes = self.n_retraced = self.reported_from = self._n_failed = 0
+        self.n_episodes = self.n_crashes = self.n_retraced = self._n_failed = 0
         self._repeated: Repeated | None = None
         self._causes: Counter[str] = Counter()
         self._began = began - float(earlier.get("wall_time_s") or 0.0)
@@ -188,7 +188,6 @@ class Manifest:
             "repeated": None if repeated is None else asdict(repeated),
             "wall_time_s": round(self._written - self._began, 3),
             "n_episodes": self.n_episodes,
-            "reported_from": self.reported_from if self.reported_from < self.n_episodes else 0,
             "shards": self.shards,
         }
         path = self._folder / CAMPAIGN

@@ -95,7 +95,7 @@ def run_campaign(
             rounds = run.source.rounds(run.held)
             run_rounds(run, rounds)
         require_no_fewer(out, earlier, run.manifest.n_episodes)
-        return run.finish(rounds.rule, rounds.remark)
+        return run.finish(rounds.rule)
 
 
 def run_rounds(run: Run, rounds: Rounds) -> None:
@@ -103,7 +103,6 @@ def run_rounds(run: Run, rounds: Rounds) -> None:
     for requests in rounds:
         for shard in run.results(requests):
             enough = rounds.enough(shard.block)
-            run.manifest.reported_from = rounds.reported_from
             run.follow(rounds.rule, shard)
             if enough:
                 return
@@ -227,16 +226,14 @@ class Run:
         if self.source.design is not None:
             write_sealed(self.out / SHELLS, STORED_DESIGN.dump_python(self.source.design, mode="json"))
 
-    def finish(self, rule: Rule, remark: str = "") -> RunResult:
+    def finish(self, rule: Rule) -> RunResult:
         """Write manifest, estimates and report once the rule has seen enough; no shard beyond the stop is left."""
         manifest, decision, decided = self.manifest, rule.look.decision, {}
         counted = {self.out / file for shard in manifest.shards for file in shard["files"].values()}
         for path in {path for table in TABLES for path in shards_on_disk(self.out, table)} - counted:
             path.unlink()
-        stopped_by, said = conclusion(self.campaign, rule, manifest.n_episodes, manifest.reported_from)
-        if stopped_by == "rhw" and remark:
-            said += f" {remark}"
-        missed = self.campaign.stop.rhw is not None and stopped_by not in ("rhw", "two_phase")
+        stopped_by, said = conclusion(self.campaign, rule, manifest.n_episodes)
+        missed = self.campaign.stop.rhw is not None and stopped_by != "rhw"
         code = EXIT_BUDGET_SPENT if missed else EXIT_DONE
         if decision is not None:
             code = EXIT_OF[decision.verdict]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -67,8 +67,7 @@ def stored_blocks(folder: Path, *, moments: bool) -> Iterator[Block]:
     """
     manifest = read_manifest(folder)
     campaign = read_campaign(folder, manifest)
-    n_counted, reported_from = int(manifest["n_episodes"]), int(manifest.get("reported_from") or 0)
-    if n_counted == 0:
+    if not (n_counted := int(manifest["n_episodes"])):
         raise no_episodes(folder)
     source = source_of(campaign)
     design, needed = source.stored_design(folder), list(source.columns)
@@ -86,10 +85,10 @@ def stored_blocks(folder: Path, *, moments: bool) -> Iterator[Block]:
     for block in made_ahead(read, _groups(manifest["shards"])):
         if block.first_episode != n:
             raise _incomplete(folder, f"a shard that begins at episode {block.first_episode}", f"episode {n}")
-        counted = block.take(slice(max(reported_from - n, 0), n_counted - n))
-        n = counted.first_episode + len(counted)
+        counted = block.take(slice(0, n_counted - n))
+        n += len(counted)
         if len(counted):
-            yield replace(counted, first_episode=counted.first_episode - reported_from) if reported_from else counted
+            yield counted
         if n == n_counted:
             return
     raise _incomplete(folder, f"{n} episodes on record", f"{n_counted} (manifest.json)")

@@ -114,32 +114,6 @@ class Allocation:
         filled: IntArray = np.ceil(max(missing, 0) * p / p.sum()).astype(np.int64) if p.any() else np.zeros(p.size, int)
         return filled
 
-    def second_phase(self, first: Tally, available: IntArray, budget: int, rhw: float, confidence: float) -> IntArray:
-        """Tests per stratum, in proportion to a first phase's, of which an interval as narrow as ``rhw`` is expected.
-
-        No more than ``available``, shape (S,), and together at most ``budget``.
-        """
-
-        def tests(factor: float) -> IntArray:
-            return np.asarray(np.minimum(np.ceil(factor * first.tests).astype(np.int64), available))
-
-        def too_wide(factor: float) -> bool:
-            return self.expected_rhw(first, tests(factor), confidence) > rhw
-
-        low, high = 0.0, 1.0
-        while too_wide(high) and tests(high).sum() < budget and np.any(tests(2.0 * high) > tests(high)):
-            low, high = high, 2.0 * high
-        while tests(high).sum() - tests(low).sum() > first.tests.size:
-            middle = (low + high) / 2.0
-            low, high = (middle, high) if too_wide(middle) and tests(middle).sum() < budget else (low, middle)
-        return _cut(tests(high), budget)
-
-    def expected_rhw(self, first: Tally, tests: IntArray, confidence: float) -> float:
-        """Relative half-width of what is asked about after so many tests per stratum, if they go as the first did."""
-        watched = slice(0, self.n_asked)
-        expected, level = first.scaled(tests).part(watched), Level.two_sided(confidence)
-        return combined(self.design.p[watched], expected, self.design.n_paths, level).rhw
-
     def _used_up(self, tally: Tally) -> bool:
         """Whether nearly all that is left to know lies in strata without further cut-ins."""
         tests, (low, high) = tally.tests, clopper_pearson(tally.crashes, tally.tests, _TAIL, tally.failed)

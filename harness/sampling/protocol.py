@@ -48,13 +48,10 @@ class ShardRequest:
 class Rounds:
     """Requests in rounds; the next round is asked for when all of the last one have been added.
 
-    ``rule`` says why it is enough, ``reported_from`` is the first test of those that the answer is from (0 where all
-    are), ``remark`` what the ending is to say besides; mostly nothing.
+    ``rule`` says why it is enough.
     """
 
     rule: Rule
-    reported_from = 0
-    remark = ""
 
     def __iter__(self) -> Iterator[Iterator[ShardRequest]]:
         """Requests of each round."""

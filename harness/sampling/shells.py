@@ -42,16 +42,6 @@ from harness.vocabulary import IntArray
 
 MOST_SHARDS_PER_ROUND = 16
 SMALLEST_SHARD = 64
-BIASED_RHW = 0.5
-"""Precision from which on stopping at the first interval biases the rate noticeably."""
-TOO_WIDE = (
-    f"A relative half-width above {BIASED_RHW:g} is reached by chance: stopping at the first such interval makes rates "
-    "too high on the mean. Ask for a smaller stop.rhw, or for testing.shells.stopping: two_phase."
-)
-FIRST_PHASE = 1.7
-"""Precision of the first of two phases over that of the second (measured: docs/estimators.md)."""
-
-
 _FINISH = "Run `harness run` with --resume, which makes missing shards."
 POOL_S = "about 15 s"
 OVER_BOUND = 1.6
@@ -185,50 +175,34 @@ def within_reach(p: float, stop: Stop) -> str:
 class ShellRounds(Rounds):
     """Fed with finished tests of shells in order; says what is tested next, and when it is enough.
 
-    In two phases the tests up to a wider precision only plan the number of the others, which alone are reported: that
-    number does not depend on their results.
-
-    ``available``, shape (S,), are the most tests of each stratum, ``held`` see `RoundRule`; ``seen`` are the tests of
-    this phase, ``drawn`` those of both, (S,); ``reported_from`` is the first test of the second phase, ``planned`` its
-    tests, (S,), once they are.
+    ``available``, shape (S,), are the most tests of each stratum, ``held`` see `RoundRule`; ``seen`` are the tests.
     """
 
     rule: RoundRule
 
     def __init__(self, campaign: Campaign, design: ShellDesign, available: IntArray, held: int = 0) -> None:
-        shells = campaign.testing.shells
-        self._plans = shells.stopping == "two_phase" and campaign.stop.rhw is not None
-        self.rule = RoundRule(campaign, held, FIRST_PHASE if self._plans else 1.0)
-        wide = campaign.stop.rhw is not None and campaign.stop.rhw > BIASED_RHW and not self._plans
-        self.remark = TOO_WIDE if wide else ""
+        self.rule = RoundRule(campaign, held)
         self._campaign = campaign
-        self._allocation = Allocation.of(shells, design, available)
-        self.drawn = np.zeros(design.p.size, np.int64)
-        self.planned: IntArray | None = None
-        self._begin_phase()
-
-    def _begin_phase(self) -> None:
+        self._allocation = Allocation.of(campaign.testing.shells, design, available)
         self.seen = SeenShells()
         self._n_episodes = self._look = 0
 
     @property
     def tally(self) -> Tally:
         """What the tests of each stratum have come to so far."""
-        return self.seen.tally if self._n_episodes else empty_tally(self.drawn.size)
+        return self.seen.tally if self._n_episodes else empty_tally(self._allocation.available.size)
 
     def __iter__(self) -> Iterator[Iterator[ShardRequest]]:
-        n_shards = 0
+        n_shards, size = 0, self._campaign.run.smallest_shard
         while (added := self.next_round()).any():
-            first = self.reported_from + self._n_episodes
-            requests = round_requests(self.drawn, added, n_shards, first, self._campaign.run.smallest_shard)
-            self.drawn = self.drawn + added
+            requests = round_requests(self.tally.tests, added, n_shards, self._n_episodes, size)
             n_shards += len(requests)
             yield iter(requests)
 
     def next_round(self) -> IntArray:
         """Tests to add per stratum, shape (S,); all 0 when no stratum or no budget is left."""
-        tally, budget = self.tally, self._campaign.stop.episodes - self.reported_from - self._n_episodes
-        added = self._allocation.next_round(tally, budget) if self.planned is None else self.planned - tally.tests
+        tally = self.tally
+        added = self._allocation.next_round(tally, self._campaign.stop.episodes - self._n_episodes)
         self.rule.of_first_tests = self._allocation.is_first(tally.tests, added)
         self._look = self._n_episodes + int(added.sum())
         return added
@@ -236,18 +210,7 @@ class ShellRounds(Rounds):
     def enough(self, block: Block) -> bool:
         self.seen.add(block)
         self._n_episodes += len(block)
-        if self._n_episodes != self._look:
-            return False
-        enough = self.rule.observe(self.seen)
-        if not (enough and self._plans and self.rule.look.stopped and self.planned is None):
-            return enough or self.planned is not None
-        budget = self._campaign.stop.episodes - self._n_episodes
-        stop, left = self._campaign.stop, self._allocation.available - self.drawn
-        rhw = stop.rhw or math.inf
-        self.planned = self._allocation.second_phase(self.tally, left, budget, rhw, stop.confidence)
-        self.rule, self.reported_from = RoundRule(self._campaign), self._n_episodes
-        self._begin_phase()
-        return False
+        return self._n_episodes == self._look and self.rule.observe(self.seen)
 
 
 class PairRounds:

@@ -21,7 +21,7 @@ SHIPPED = {
 }
 PANEL = "85f51781dfe16fec"
 CHANGED = [
-    (["testing.shells.stopping=two_phase"], "e7860c2dad207a83"),
+    (["testing.shells.stopping=sequential"], "7af628145960e74a"),  # of before; the only way that is left
     (["environment.cut_in_lead_s=0.5"], "849f9c8cd132d0f4"),
     (["testing.shells.smallest_round=8"], "9effa1d477121757"),
     (["av={controller: 'a:B', parameters: {x: 1}, before_cut_in: controller}"], "0b74ded34c4cb2ce"),

@@ -38,7 +38,6 @@ IN_THE_TWIN = {
     ),
     "forced-batch": (FORCED, "av.controller=examples.idm_batch:IDM"),
     "forced-reference": (FORCED, LATERAL, "av.model=r157-fsm"),
-    "shells-two-phase": (*SHELLS, "testing.shells.stopping=two_phase", "stop.rhw=0.5", "stop.episodes=1500"),
     "shells-accepted": (*SHELLS, "accept.crash_rate_below=4e-7", "stop.episodes=1500"),
     "shells-need-based": (*SHELLS, "testing.shells.statement=need-based", "av.model=need-based", "stop.rhw=0.5"),
     "shells-refuted": (*SHELLS, "av={model: constant, parameters: {acceleration_mps2: 0}}"),

@@ -59,7 +59,6 @@ def test_nothing_is_accepted_given_what_the_vehicle_does_not_do(campaign, run_he
     [
         (("testing.method=forced", "accept.crash_rate_below=1e-7"), "accept"),
         (("accept={crash_rate_below: 1e-7, statement: library}", "testing.shells.statement=need-based"), "statement"),
-        (("accept.crash_rate_below=1e-7", "testing.shells.stopping=two_phase"), "two_phase"),
         (("accept.crash_rate_below=0",), "accept.crash_rate_below"),
         (("accept={crash_rate_below: 1e-7, statement: nobody}",), "nobody"),
     ],

@@ -137,6 +137,7 @@ def written(file: str, text: str | None):
         (lambda run: (run / "estimates.json").unlink(), READERS[1:2], "`harness estimate"),
         (lambda run: edit(run, n_episodes=0, shards=[]), READERS[::2], "has not finished an episode yet"),
         (lambda run: edit(run, part={"number": 1}), READERS[:1], "a part of a run"),
+        (lambda run: edit(run, reported_from=90, stopped_by="two_phase"), READERS[:1], "a run in two phases"),
         (lambda run: edit(run, n_episodes=500), READERS[:1], "240 episodes"),
         (lambda run: edit(run, shards=manifest(run)["shards"][::2]), READERS[:1], "begins at episode 160"),
         (lambda run: edit(run, campaign_hash="0" * 16), READERS[2:], "campaign.yaml"),
