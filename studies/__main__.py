@@ -48,7 +48,7 @@ def cli() -> None:
         "relvar true  mean squared error of the estimates, over the square of the truth",
         "claimed      the same, as the campaigns themselves estimate it",
         "coverage     share of the intervals that hold the truth, with its 95 % interval",
-        "p (Holm)     of so low a coverage if the intervals were right, for as many lines",
+        "p (Holm)     of so low a coverage if the intervals were right, for as many lines: too low below 0.05",
         "tests        that a campaign needed: median, 5 % and 95 % quantile",
         "alarm        share of replications with a crash outside the library's boundary",
         "refused      share without an interval, as crashes lie on too few paths; counted as covered",
@@ -58,13 +58,13 @@ def cli() -> None:
     + examples(
         f"{_ME} validate scenarios/validate/shells_panel.yaml --out runs/shells_panel",
         f"{_ME} validate scenarios/validate/shells_panel.yaml --set campaign.stop.confidence=0.99 --out x",
+        f"{_ME} validate scenarios/validate/chains_forced.yaml --set replications=100 --out quick",
         f"{_ME} validate scenarios/validate/shells_acting.yaml --out runs/acting   # walks paths first",
         f"{_ME} validate scenarios/validate/shells_pairs.yaml --out runs/pairs     # of `compare`",
     ),
 )
 @click.argument("experiment_file", metavar="EXPERIMENT", type=CAMPAIGN)
 @_out_option
-@click.option("--replications", type=click.IntRange(min=2), help="Instead of the experiment's own number.")
 @click.option("--set", "overrides", multiple=True, metavar="KEY=VALUE", help="Instead of what the file says.")
 @_workers_option
 @quiet_option
@@ -73,7 +73,6 @@ def validate(
     experiment_file: Path,
     folder: Path,
     *,
-    replications: int | None,
     overrides: Sequence[str],
     workers: int | None,
     quiet: bool,
@@ -85,14 +84,12 @@ def validate(
     pools are drawn from once, which takes minutes and is kept. Under shells the ratio to each reference driver of the
     library, and the share of crashes that it would have avoided, are judged as well.
 
-    Printed is a line per vehicle and result, with the columns below. The folder receives results.json,
-    replications.parquet (one row each) and coverage.png.
+    Printed is a line per vehicle and result, with the columns below. The folder receives results.json and
+    replications.parquet (one row each).
     """
     from studies.replication.experiment import load_experiment  # noqa: PLC0415 - keeps --help fast
 
     experiment = load_experiment(experiment_file, overrides)
-    if replications is not None:
-        experiment = experiment.model_copy(update={"replications": replications})
     from harness.estimators.estimate import finite_json  # noqa: PLC0415 - slow to import: once the file is right
     from studies.replication.run import RESULTS, table_row  # noqa: PLC0415
     from studies.replication.run import validate as repeat  # noqa: PLC0415
