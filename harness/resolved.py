@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
-from harness.campaign.campaign import Campaign
-from harness.campaign.combinations import Command, require_combination
+from harness.campaign.campaign import Campaign, Command, Use, refusal
+from harness.errors import CampaignError
 from harness.traffic.laws import Environment
 from harness.traffic.loading import load_environment, load_parameters
 from harness.vehicles.drivers import av_records, driver_records
@@ -40,14 +40,15 @@ class Resolved:
 
 
 def resolve(campaign: Campaign, command: Command = "run", *, controller_sha256: str | None = None) -> Resolved:
-    """Read what a campaign names, and refuse what does not go together (`harness.campaign.combinations`).
+    """Read what a campaign names, and refuse what does not go together (`harness.campaign.campaign.REFUSED`).
 
     Raises `CampaignError`: the environment's parameter file is missing or wrong, or something of the campaign does not
     go with the command.
     """
     parameters = load_parameters(campaign.environment)
     environment = load_environment(campaign.environment, parameters)
-    require_combination(campaign, command, takes_time=environment.lateral.present)
+    if (words := refusal(campaign, Use(command, environment.lateral.present))) is not None:
+        raise CampaignError(*words)
     return Resolved(
         campaign,
         environment,

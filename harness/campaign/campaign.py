@@ -2,23 +2,20 @@
 
 A campaign says which traffic (``environment``) meets which vehicle (``av``), how critical moments are found and
 sampled (``surrogates``, ``testing``), where it is simulated (``world``), what is kept (``records``) and when it is
-enough (``stop``). Units are in the field names.
+enough (``stop``). Units are in the field names. What does not go together is one table, `REFUSED`: it is asked while a
+campaign is read, so that the error names file and line, and once more where it is resolved for a command, and is known
+whether its cut-ins take time (`lateral` of the environment).
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-import math
-import re
-from typing import Any, Self
+from collections.abc import Callable
+from typing import Any, Literal, NamedTuple, Self
 
-import yaml
 from pydantic import Field, model_validator
-from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
-from pydantic_core import CoreSchema, core_schema
 
-from harness.campaign.combinations import refusal
 from harness.campaign.drivers import Surrogate, default_surrogates
 from harness.campaign.problems import NAME_PATTERN, broken_rule
 from harness.campaign.sections import (
@@ -35,8 +32,9 @@ from harness.campaign.sections import (
     World,
     listed,
 )
-from harness.campaign.vehicle import AV_SOURCES, AutomatedVehicle
-from harness.vocabulary import SAMPLING, Sampling
+from harness.campaign.vehicle import AutomatedVehicle
+from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT
+from harness.vocabulary import METHODS, SAMPLING, Sampling
 
 
 class Campaign(Section):
@@ -134,68 +132,177 @@ class Campaign(Section):
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
 
 
-# -- campaigns and their schema, written --
+# -- what does not go with what: one table of methods, vehicles, cut-ins, engines and commands --
 
-_HEADER = """\
-# Campaign {name}, resolved: every value is written out, defaults included.
-# Lists of allowed keys and values: harness schema. Run it again: harness run THIS_FILE --out DIR
-"""
-
-
-class _Dumper(yaml.SafeDumper):
-    """Quotes every text that is not a plain word: other YAML readers see numbers, dates and truth values in many."""
-
-    def ignore_aliases(self, _data: Any) -> bool:
-        """Write every value out."""
-        return True
-
-    def represent_text(self, text: str) -> yaml.ScalarNode:
-        """Node of a text."""
-        plain = re.fullmatch(r"[A-Za-z][A-Za-z0-9_-]*", text) and text.lower() not in _MISREAD
-        node: yaml.ScalarNode = self.represent_scalar("tag:yaml.org,2002:str", text, style=None if plain else '"')
-        return node
+Command = Literal["run", "compare", "av-check"]
+MOST_SUMO_CELLS = 256
+"""Roads of the largest committed network."""
 
 
-_Dumper.add_representer(str, _Dumper.represent_text)
-_MISREAD = {"y", "n", "yes", "no", "on", "off", "true", "false", "null"}
+class Use(NamedTuple):
+    """What a campaign is for (no command while it is read), and whether its cut-ins are known to take time."""
+
+    command: Command | None = None
+    takes_time: bool = False
 
 
-def dump_campaign(campaign: Campaign) -> str:
-    """YAML text of a campaign; `harness.campaign.files.load_campaign` reads an equal campaign from it."""
-    parts = [_HEADER.format(name=campaign.name)]
-    for key, value in written_out(campaign).items():
-        section = getattr(campaign, key)
-        about = section.__doc__ if isinstance(section, Section) else type(campaign).model_fields[key].description
-        parts.append(f"\n# {(about or key).splitlines()[0]}\n{yaml_text({key: value})}")
-    return "".join(parts)
+WHILE_READ = Use()
 
 
-def written_out(campaign: Campaign) -> dict[str, Any]:
-    """Plain data of a campaign with every default, but of the sources of an AV only the one that drives it."""
-    data = campaign.model_dump()
-    data["av"] = {key: value for key, value in data["av"].items() if key not in AV_SOURCES or value is not None}
-    return data
+class Combination(NamedTuple):
+    """What is refused: where to put the blame, when, and the words, with values of the campaign in braces."""
+
+    where: str
+    is_asked: Callable[[Campaign, Use], bool]
+    found: str
+    expected: str
+    mend: str
 
 
-def yaml_text(data: dict[str, Any]) -> str:
-    """YAML of plain data, which `harness.campaign.files` reads back as it is."""
-    # Escapes keep every character, control characters included, through any editor; math.inf never folds a line.
-    text: str = yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=False, width=math.inf)
-    return text
+_COMPARED = ASSUMPTION_FREE, LIBRARY_STATEMENT
+_TAKES_TIME = "where cut-ins take time (`lateral` of the environment)"
+
+REFUSED = (
+    # -- limits --
+    Combination(
+        "accept",
+        lambda c, _: c.accept is not None and not c.sampling.strata,
+        "a limit, with testing.method {testing.method}",
+        "testing.method shells: how often decisions are wrong is known for its intervals alone",
+        "Choose shells, or delete the section and compare the interval with the limit yourself.",
+    ),
+    Combination(
+        "accept.statement",
+        lambda c, _: c.accept is not None and c.accept.statement not in (None, c.testing.shells.statement),
+        "{accept.statement}, and {testing.shells.statement} in testing.shells.statement",
+        "the same statement, or one of the two keys alone",
+        "Delete one of them.",
+    ),
+    # -- vehicles that act before the cut-in --
+    Combination(
+        "av.before_cut_in",
+        lambda c, _: c.av.acts_before_cut_in and c.sampling.holds_speed,
+        "controller, with testing.method {testing.method}",
+        "hold_speed: the method draws LV's and BV's path ahead, which needs to know the AV's",
+        "Choose hold_speed, or testing.method shells (or forced), which drives the AV along its paths first.",
+    ),
+    Combination(
+        "av.before_cut_in",
+        lambda c, _: c.av.acts_before_cut_in and c.av.model is not None,
+        "controller, with the built-in model {av.model}",
+        "hold_speed: a built-in model has nothing to follow before the cut-in",
+        "Delete the key, or bring a controller of your own.",
+    ),
+    # -- where tests are simulated --
+    Combination(
+        "world.engine",
+        lambda c, _: c.world.engine == "twin" and c.av.source in ("sumo", "traci"),
+        "twin, with an AV that SUMO moves (av.{av.source})",
+        "sumo",
+        "Write engine: sumo.",
+    ),
+    Combination(
+        "world.cells",
+        lambda c, _: c.world.engine == "sumo" and c.world.cells > MOST_SUMO_CELLS,
+        "{world.cells}, with engine sumo",
+        f"at most {MOST_SUMO_CELLS}: so many roads has the largest network",
+        "Lower it; about 64 is fastest. It never changes a result.",
+    ),
+    # -- what methods need and allow --
+    Combination(
+        "surrogates",
+        lambda c, _: not c.surrogates and c.sampling.mixes,
+        "none",
+        "at least one surrogate for testing.method {testing.method}",
+        "Leave surrogates out for the three of the paper, or choose method forced or nde.",
+    ),
+    Combination(
+        "stop.rhw",
+        lambda c, _: c.stop.rhw is not None and not c.sampling.bounded,
+        "{stop.rhw:g}, with testing.method {testing.method}",
+        "no precision to stop at: nothing bounds the weights of the step mixture, and while the large ones are missing "
+        "its interval looks narrow",
+        "Set it to null for a fixed number of tests (stop.episodes), or choose shells, forced or episode_mixture.",
+    ),
+    Combination(
+        "stop.estimator",
+        lambda c, _: c.stop.estimator == "scv" and c.records.moments == "none",
+        "scv, with records.moments none",
+        "records.moments first_9 or all, whose control steps it is computed from",
+        "Change one of the two, or leave stop.estimator out for the method's own.",
+    ),
+    Combination(
+        "stop.estimator",
+        lambda c, _: c.stop.estimator is not None and c.stop.estimator not in c.sampling.estimators,
+        "{stop.estimator}, with testing.method {testing.method}",
+        "testing.method {allowing}",
+        "Change one of the two, or leave stop.estimator out for the method's own.",
+    ),
+    # -- cut-ins that take time --
+    Combination(
+        "av.before_cut_in",
+        lambda c, use: use.takes_time and c.av.acts_before_cut_in and use.command == "av-check",
+        "controller, " + _TAKES_TIME,
+        "hold_speed, or cut-ins of one step: a look at a vehicle makes no baseline runs, without which nobody knows "
+        "the onset in time",
+        "Add --set av.before_cut_in=hold_speed, or --set environment.parameters=ndd-overtaking-1.",
+    ),
+    Combination(
+        "testing.method",
+        lambda c, use: use.takes_time and c.sampling.mixes,
+        "{testing.method}, " + _TAKES_TIME,
+        "shells, forced or nde: the tables of criticality are for cut-ins of one step, and would aim at those that an "
+        "attentive vehicle avoids",
+        "Choose shells, or an environment without that section.",
+    ),
+    Combination(
+        "av.before_cut_in",
+        lambda c, use: use.takes_time and c.av.acts_before_cut_in and not c.sampling.baseline_runs,
+        "controller, with testing.method {testing.method}, " + _TAKES_TIME,
+        "a method that drives the AV along its paths first: only then the onset is known in time",
+        "Choose testing.method shells or forced, or hold_speed.",
+    ),
+    # -- comparisons --
+    Combination(
+        "testing.method",
+        lambda c, use: use.command == "compare" and not c.sampling.strata,
+        "{testing.method}, in a comparison",
+        "shells, under which both vehicles meet the same cut-ins",
+        "Write --set testing.method=shells; or run both by themselves and put their intervals side by side.",
+    ),
+    Combination(
+        "accept",
+        lambda c, use: use.command == "compare" and c.accept is not None,
+        "a limit of one crash rate",
+        "none in a comparison",
+        "Write --set accept=null, and --margin if something is to be decided.",
+    ),
+    Combination(
+        "av.before_cut_in",
+        lambda c, use: use.command == "compare" and c.has_baseline_runs,
+        "controller: a vehicle that acts before the cut-in has cut-ins of its own",
+        "hold_speed in A and B: pairs need the same cut-ins",
+        "Run both campaigns by themselves and put their intervals side by side, or write hold_speed.",
+    ),
+    Combination(
+        "testing.shells.statement",
+        lambda c, use: (
+            use.command == "compare" and c.testing.shells.statement not in (ASSUMPTION_FREE, LIBRARY_STATEMENT)
+        ),
+        "{testing.shells.statement}",
+        f"{' or '.join(_COMPARED)}: a comparison has these two",
+        "Choose one of them.",
+    ),
+)
+"""All that is refused, in the order in which it is told."""
 
 
-class _Schema(GenerateJsonSchema):
-    """Without titles that repeat the keys; mappings whose names follow a pattern have no others."""
-
-    def field_title_should_be_set(self, _schema: CoreSchema) -> bool:
-        return False
-
-    def dict_schema(self, schema: core_schema.DictSchema) -> JsonSchemaValue:
-        return {"additionalProperties": False, **super().dict_schema(schema)}
-
-
-def schema_text() -> str:
-    """JSON schema (draft 2020-12) of a campaign, committed beside the scenarios and printed by ``harness schema``."""
-    about = {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "harness campaign"}
-    schema = {**about, **Campaign.model_json_schema(schema_generator=_Schema), **about}
-    return json.dumps(schema, indent=2, ensure_ascii=False) + "\n"
+def refusal(campaign: Campaign, use: Use = WHILE_READ) -> tuple[str, str, str, str] | None:
+    """Where, found, expected and mend of the first combination that is refused; None if the campaign may go on."""
+    allowing = (name for name in METHODS if campaign.stop.estimator in SAMPLING[name].estimators)
+    values = {**dict(campaign), "allowing": " or ".join(allowing)}
+    for row in REFUSED:
+        # A command may change a campaign that has been read: what it was allowed with then is not asked again.
+        if row.is_asked(campaign, use) and not (use != WHILE_READ and row.is_asked(campaign, WHILE_READ)):
+            return row.where, row.found.format(**values), row.expected.format(**values), row.mend
+    return None

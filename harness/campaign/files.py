@@ -1,30 +1,29 @@
-"""Files of campaigns: read as strict YAML, overridden (``--set``, ``--av``), and checked with every problem named.
+"""Files of campaigns: read, overridden (``--set``, ``--av``), checked with every problem named; and written.
 
-``1e-5`` is a number, ``12:30`` and ``no`` are texts, a date stays text. A key written twice, a second document, a tag,
-a syntax error or an empty file is a `CampaignError` that names file, line and column.
+How YAML is read stands in `harness.campaign.yaml_text`, what is wrong with a value in `harness.campaign.problems`.
 """
 
 from __future__ import annotations
 
-import re
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
 
-from pydantic import Field
-from yaml import SafeLoader
-from yaml.composer import ComposerError
-from yaml.error import MarkedYAMLError
-from yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
-from yaml.reader import ReaderError
+from pydantic import BaseModel, Field, ValidationError
+from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
+from pydantic_core import CoreSchema, core_schema
 
 from harness.campaign.campaign import Campaign
 from harness.campaign.drivers import default_surrogates
-from harness.campaign.problems import NAME_PATTERN, Model, YamlPath, describe_found, did_you_mean, validated
+from harness.campaign.problems import NAME_PATTERN, describe_found, did_you_mean, in_words
 from harness.campaign.sections import Section
-from harness.campaign.vehicle import AutomatedVehicle
+from harness.campaign.vehicle import AV_SOURCES, AutomatedVehicle
+from harness.campaign.yaml_text import Lines, YamlPath, dotted, parse_value, read_yaml, yaml_text
 from harness.errors import CampaignError
+
+Model = TypeVar("Model", bound=BaseModel)
 
 SHIPPED_PARAMETERS = Path(__file__).parents[1] / "traffic"
 
@@ -153,7 +152,7 @@ class Places:
     """Where values were written: in a file (lines from 1, by path), or by an override, of which later ones win."""
 
     path: str
-    lines: dict[tuple[str | int, ...], int]
+    lines: Lines
     overrides: Sequence[Override] = ()
 
     def line_of(self, where: YamlPath) -> int:
@@ -207,7 +206,23 @@ def panel_av(text: str) -> AutomatedVehicle:
     return avs[name]
 
 
-# -- strict YAML 1.2: every value is what it looks like, and knows its line --
+# -- a file as a model, or every problem by its place --
+
+
+class InvalidFileError(CampaignError):
+    """A file with one or more problems, each with its own place."""
+
+    def __init__(self, path: str, problems: Sequence[CampaignError]) -> None:
+        first, *more = self.problems = tuple(problems)
+        super().__init__(first.where, first.found, first.expected, first.mend)
+        if more:
+            super().__init__(path, f"{len(self.problems)} problems", "none", "")
+            # Not shortened: each of its lines is short.
+            self.mend = "Mend each:\n" + "\n".join(f"  {problem}" for problem in self.problems)
+        self.path = path
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self.path, self.problems)
 
 
 def read_model(path: str | Path, model: type[Model], overrides: Sequence[Override] = ()) -> Model:
@@ -216,157 +231,97 @@ def read_model(path: str | Path, model: type[Model], overrides: Sequence[Overrid
 
 
 def _read(path: str | Path, model: type[Model], overrides: Sequence[Override]) -> tuple[Model, Places]:
-    data, places = read_yaml(path)
-    places = replace(places, overrides=overrides)
+    data, lines = read_yaml(path)
+    places = Places(str(path), lines, overrides)
     return validated(apply_overrides(data, overrides), model, str(path), places), places
 
 
-LARGEST_FILE = 100_000
-"""Bytes of a YAML file that is read, in about a second: eight times the largest that comes with the harness."""
-MOST_VALUES = 100_000
-"""Values of a document with every alias written out."""
-DEEPEST = 50
-"""Levels of nesting, aliases written out; a campaign needs five."""
-
-_TAG = "tag:yaml.org,2002:"
-_TEXT = _TAG + "str"
-_BASES = {"0o": 8, "0x": 16}
-
-
-def dotted(where: YamlPath) -> str:
-    """``testing.alpha``, the way a path is written in messages and after ``--set``."""
-    return ".".join(map(str, where))
-
-
-def read_yaml(path: str | Path) -> tuple[dict[str, Any], Places]:
-    """Read a UTF-8 file with one YAML 1.2 document whose top level is a mapping: its plain data, and their lines.
-
-    Any other file, and one that says a key twice, is a `CampaignError`.
-    """
-    name = str(path)
-    data, lines = _load(_read_text(Path(path)), name)
-    if not lines:
-        raise CampaignError(name, "an empty file", "YAML keys and values", "Is it the right file, fully written?")
-    if not isinstance(data, dict):
-        found = f"a {'list' if isinstance(data, list) else 'single value'} at the top level"
-        mend = "Write 'key: value' lines, without a dash before the first one."
-        raise CampaignError(f"{name}:{lines[()]}", found, "keys and values", mend)
-    return data, Places(name, lines)
-
-
-def parse_value(text: str, where: str) -> Any:
-    """Read one value by the rules of `read_yaml`, as after the ``=`` of ``--set a.b=value``; errors name ``where``."""
+def validated(data: Any, model: type[Model], path: str, place: Places) -> Model:
+    """Data of a file as a model; an `InvalidFileError` names every place where they do not fit."""
     try:
-        data, lines = _load(text, where)
-    except CampaignError as error:
-        raise CampaignError(where, error.found, error.expected, error.mend) from None
-    if not lines:
-        mend = "Write null if you mean none, '\"\"' for no text."
-        raise CampaignError(where, "no value after '='", "a value", mend)
+        return model.model_validate(data)
+    except ValidationError as error:
+        problems: dict[tuple[YamlPath, str], CampaignError] = {}
+        for details in in_words(error, model).errors(include_url=False):
+            parts = details["ctx"]
+            where = (*_path_of(details["loc"], data), *filter(None, parts["key"].split(".")))
+            alike = problems.get((where, parts["found"]))
+            expected = parts["expected"]
+            # A value of several kinds is refused once for each.
+            if alike is not None and expected not in alike.expected:
+                expected = f"{alike.expected} or {expected}"
+            mend = parts["mend"] or _where_it_belongs(str(where[-1]), model)
+            problems[where, parts["found"]] = CampaignError(place(where), parts["found"], expected, mend)
+        raise InvalidFileError(path, list(problems.values())) from None
+
+
+def _path_of(loc: Sequence[str | int], data: Any) -> tuple[str | int, ...]:
+    """Path in the document for pydantic's ``loc``, which also holds members of unions and ``[key]`` marks."""
+    path: list[str | int] = []
+    for part in loc:
+        if part in data if isinstance(data, dict) else isinstance(data, list) and isinstance(part, int):
+            path.append(part)
+            data = data[part]
+    return tuple(path)
+
+
+def _where_it_belongs(key: str, model: type[BaseModel]) -> str:
+    """How to mend an unknown key that resembles none beside it."""
+    places = list(dict.fromkeys(_places_of(key, model, "")))
+    if places:
+        return f"'{key}' belongs under {' or '.join(place or 'the top level' for place in places)}."
+    return "Delete it, or correct its name."
+
+
+def _places_of(key: str, kind: Any, prefix: str) -> Iterator[str]:
+    """Dotted paths of the sections of a type that know a key, names of one's own choice written as ``NAME``."""
+    if not (isinstance(kind, type) and issubclass(kind, BaseModel)):
+        for option in get_args(kind):
+            yield from _places_of(key, option, f"{prefix}.NAME" if get_origin(kind) is dict else prefix)
+        return
+    if key in kind.model_fields:
+        yield prefix
+    for name, field in kind.model_fields.items():
+        yield from _places_of(key, field.annotation, f"{prefix}.{name}".lstrip("."))
+
+
+# -- campaigns and their schema, written --
+
+_HEADER = """\
+# Campaign {name}, resolved: every value is written out, defaults included.
+# Lists of allowed keys and values: harness schema. Run it again: harness run THIS_FILE --out DIR
+"""
+
+
+def dump_campaign(campaign: Campaign) -> str:
+    """YAML text of a campaign; `load_campaign` reads an equal campaign from it."""
+    parts = [_HEADER.format(name=campaign.name)]
+    for key, value in written_out(campaign).items():
+        section = getattr(campaign, key)
+        about = section.__doc__ if isinstance(section, Section) else type(campaign).model_fields[key].description
+        parts.append(f"\n# {(about or key).splitlines()[0]}\n{yaml_text({key: value})}")
+    return "".join(parts)
+
+
+def written_out(campaign: Campaign) -> dict[str, Any]:
+    """Plain data of a campaign with every default, but of the sources of an AV only the one that drives it."""
+    data = campaign.model_dump()
+    data["av"] = {key: value for key, value in data["av"].items() if key not in AV_SOURCES or value is not None}
     return data
 
 
-def _read_text(path: Path) -> str:
-    try:
-        with path.open("rb") as file:
-            content = file.read(LARGEST_FILE + 1)  # not all of what may be a device without an end
-        if len(content) <= LARGEST_FILE:
-            return content.decode("utf-8-sig")
-        found, mend = f"more than {LARGEST_FILE:,} bytes", "Is it the right file?"
-    except FileNotFoundError:
-        found, mend = "no such file", "Check the spelling and the folder that you are in."
-    except IsADirectoryError:
-        found, mend = "a folder", "Name the file inside it."
-    except UnicodeDecodeError as error:
-        found, mend = f"bytes that are not UTF-8 (at byte {error.start})", "Save the file as UTF-8 text."
-    except (OSError, ValueError) as error:
-        found, mend = f"a file that cannot be read ({error})", "Check its name and permissions."
-    raise CampaignError(str(path), found, "a readable YAML file in UTF-8", mend)
+class _Schema(GenerateJsonSchema):
+    """Without titles that repeat the keys; mappings whose names follow a pattern have no others."""
+
+    def field_title_should_be_set(self, _schema: CoreSchema) -> bool:
+        return False
+
+    def dict_schema(self, schema: core_schema.DictSchema) -> JsonSchemaValue:
+        return {"additionalProperties": False, **super().dict_schema(schema)}
 
 
-def _load(text: str, name: str) -> tuple[Any, dict[tuple[str | int, ...], int]]:
-    """Value of a text, and the line of each of its parts by path; there are none when it is empty."""
-    where, mend = name, "Correct or delete it."
-    try:
-        loader = StrictLoader(text)
-        root = loader.get_single_node()
-        lines = {} if root is None else _checked_lines(root)
-        return (loader.construct_document(root) if lines else None), lines
-    except MarkedYAMLError as error:
-        # In the parser's words: what it was at, and since which line, then the problem.
-        mark, since = error.problem_mark or error.context_mark, error.context_mark
-        context = f"{error.context} (line {since.line + 1})" if since else None
-        found = ": ".join(filter(None, [context, error.problem])).removeprefix("found ")
-        where = name if mark is None else f"{name}:{mark.line + 1}:{mark.column + 1}"
-        if error.context and not since:  # the path of a key, of `_checked_lines`
-            where = f"{error.context} ({where})"
-        mend = str(error.note or "Check indentation, quotes and brackets just before it.")
-    except ReaderError as error:
-        before = text[: error.position].split("\n")
-        where, found = f"{name}:{len(before)}:{len(before[-1]) + 1}", f"the character U+{error.character:04X}"
-    except RecursionError:
-        found, mend = "values nested too deeply", "Close the brackets that were left open."
-    except (ValueError, OverflowError) as error:  # a number or an escape that is out of all bounds
-        found = str(error).splitlines()[0]
-    raise CampaignError(where, found, "plain YAML 1.2", mend)
-
-
-class StrictLoader(SafeLoader):
-    """PyYAML's safe loader of one document with YAML 1.2's core schema, and no tags."""
-
-    yaml_implicit_resolvers = {}
-
-    def compose_node(self, parent: Node | None, index: Any) -> Node | None:
-        """Compose a value that claims no tag."""
-        event = self.peek_event()  # type: ignore[no-untyped-call]
-        if getattr(event, "tag", None) is not None:
-            raise ComposerError(None, None, f"a tag, {event.tag}", event.start_mark, "Delete it; quote what is text.")
-        return super().compose_node(parent, index)
-
-    def construct_whole_number(self, node: ScalarNode) -> int:
-        """Value of ``010``, which is ten, ``0o17``, ``0x1F`` or ``1_000``."""
-        digits = node.value.replace("_", "").lower()
-        return int(digits, _BASES.get(digits[:2], 10))
-
-
-def _checked_lines(root: Node) -> dict[tuple[str | int, ...], int]:
-    """Line of every value by its path, aliases written out.
-
-    Refused are too many values or levels, for with aliases a few lines can stand for billions of values, and keys that
-    are no text or stand there twice.
-    """
-    lines: dict[tuple[str | int, ...], int] = {(): root.start_mark.line + 1}
-    waiting: list[tuple[tuple[str | int, ...], Node]] = [((), root)]
-    while waiting:
-        path, node = waiting.pop()
-        inner = node.value if isinstance(node, MappingNode) else []
-        if isinstance(node, SequenceNode):
-            inner = [(ScalarNode(_TEXT, i, item.start_mark), item) for i, item in enumerate(node.value)]
-        if len(lines) + len(inner) > MOST_VALUES or len(path) > DEEPEST:
-            most = f"more than {MOST_VALUES:,} values, or {DEEPEST} levels of nesting, aliases (*) written out"
-            raise ComposerError(None, None, most, node.start_mark, "Delete aliases.")
-        for key, value in inner:
-            if not isinstance(key, ScalarNode) or key.tag not in (_TEXT, _TAG + "merge"):
-                shown = key.value[:40] if isinstance(key, ScalarNode) else "made of a list or mapping"
-                found = f"a key {shown}, which is not text"
-                raise ComposerError(None, None, found, key.start_mark, "Quote the key if it is meant as text.")
-            at = (*path, key.value)
-            if at in lines:
-                found = f"the key {key.value!r} again, first written on line {lines[at]}"
-                raise ComposerError(dotted(at), None, found, key.start_mark, "Delete one of the two.")
-            lines[at] = key.start_mark.line + 1
-            waiting.append((at, value))
-    return lines
-
-
-# YAML 1.2, chapter 10.3.2; and, as in Python, underscores between digits.
-for _kind, _pattern, _beginnings in (
-    ("null", r"~|null|Null|NULL|", ["~", "n", "N", ""]),
-    ("bool", r"true|True|TRUE|false|False|FALSE", list("tTfF")),
-    ("int", r"[-+]?[0-9][0-9_]*|0o[0-7_]+|0x[0-9a-fA-F_]+", list("-+0123456789")),
-    ("float", r"[-+]?(\.[0-9][0-9_]*|[0-9][0-9_]*(\.[0-9_]*)?)([eE][-+]?[0-9]+)?", list("-+.0123456789")),
-    ("float", r"[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)", list("-+.")),
-    ("merge", r"<<", ["<"]),
-):
-    StrictLoader.add_implicit_resolver(_TAG + _kind, re.compile(rf"^(?:{_pattern})$"), _beginnings)
-StrictLoader.add_constructor(_TAG + "int", StrictLoader.construct_whole_number)
+def schema_text() -> str:
+    """JSON schema (draft 2020-12) of a campaign, committed beside the scenarios and printed by ``harness schema``."""
+    about = {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "harness campaign"}
+    schema = {**about, **Campaign.model_json_schema(schema_generator=_Schema), **about}
+    return json.dumps(schema, indent=2, ensure_ascii=False) + "\n"

@@ -1,25 +1,19 @@
-"""From a pydantic `ValidationError` to one error that names each problem: place and line, found, expected, how to mend.
+"""What is wrong with a section, in words: found, expected, how to mend.
 
-Every section puts the errors of its own keys into words (`in_words`), for it knows what they mean.
+Every section puts the errors of its own keys into words (`in_words`), for it knows what they mean. Place and line come
+to them in `harness.campaign.files`, which reads the file.
 """
 
 from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Callable, Iterator, Sequence
-from typing import Any, TypeVar, get_args, get_origin
+from collections.abc import Sequence
+from typing import Any, get_args
 
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
-
-from harness.errors import CampaignError
-
-YamlPath = Sequence[str | int]
-Place = Callable[[YamlPath], str]
-"""From a path in the data to the words that say where it was written."""
-Model = TypeVar("Model", bound=BaseModel)
 
 NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_.-]*$"
 SURROGATE_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_-]*$"
@@ -42,22 +36,6 @@ MOST_SHOWN = 20
 """Errors of a section that are put into words; a file of another kind has thousands."""
 
 
-class InvalidFileError(CampaignError):
-    """A file with one or more problems, each with its own place."""
-
-    def __init__(self, path: str, problems: Sequence[CampaignError]) -> None:
-        first, *more = self.problems = tuple(problems)
-        super().__init__(first.where, first.found, first.expected, first.mend)
-        if more:
-            super().__init__(path, f"{len(self.problems)} problems", "none", "")
-            # Not shortened: each of its lines is short.
-            self.mend = "Mend each:\n" + "\n".join(f"  {problem}" for problem in self.problems)
-        self.path = path
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return type(self), (self.path, self.problems)
-
-
 def broken_rule(key: str, found: str, expected: str, mend: str) -> PydanticCustomError:
     """Error of a section in the parts of a `harness.errors.HarnessError`.
 
@@ -66,25 +44,6 @@ def broken_rule(key: str, found: str, expected: str, mend: str) -> PydanticCusto
     parts = {"key": key, "found": found, "expected": expected, "mend": mend}
     where = "{key}: " if key else ""
     return PydanticCustomError("broken_rule", where + "found {found}; expected {expected}. {mend}", parts)
-
-
-def validated(data: Any, model: type[Model], path: str, place: Place) -> Model:
-    """Data of a file as a model; an `InvalidFileError` names every place where they do not fit."""
-    try:
-        return model.model_validate(data)
-    except ValidationError as error:
-        problems: dict[tuple[YamlPath, str], CampaignError] = {}
-        for details in in_words(error, model).errors(include_url=False):
-            parts = details["ctx"]
-            where = (*_path_of(details["loc"], data), *filter(None, parts["key"].split(".")))
-            alike = problems.get((where, parts["found"]))
-            expected = parts["expected"]
-            # A value of several kinds is refused once for each.
-            if alike is not None and expected not in alike.expected:
-                expected = f"{alike.expected} or {expected}"
-            mend = parts["mend"] or _where_it_belongs(str(where[-1]), model)
-            problems[where, parts["found"]] = CampaignError(place(where), parts["found"], expected, mend)
-        raise InvalidFileError(path, list(problems.values())) from None
 
 
 def in_words(error: ValidationError, section: type[BaseModel]) -> ValidationError:
@@ -141,36 +100,6 @@ def did_you_mean(word: object, words: Sequence[str]) -> str:
     return next(
         (f"Did you mean '{close}'?" for close in difflib.get_close_matches(str(word)[:_LONGEST], words, n=1)), ""
     )
-
-
-def _path_of(loc: Sequence[str | int], data: Any) -> tuple[str | int, ...]:
-    """Path in the document for pydantic's ``loc``, which also holds members of unions and ``[key]`` marks."""
-    path: list[str | int] = []
-    for part in loc:
-        if part in data if isinstance(data, dict) else isinstance(data, list) and isinstance(part, int):
-            path.append(part)
-            data = data[part]
-    return tuple(path)
-
-
-def _where_it_belongs(key: str, model: type[BaseModel]) -> str:
-    """How to mend an unknown key that resembles none beside it."""
-    places = list(dict.fromkeys(_places_of(key, model, "")))
-    if places:
-        return f"'{key}' belongs under {' or '.join(place or 'the top level' for place in places)}."
-    return "Delete it, or correct its name."
-
-
-def _places_of(key: str, kind: Any, prefix: str) -> Iterator[str]:
-    """Dotted paths of the sections of a type that know a key, names of one's own choice written as ``NAME``."""
-    if not (isinstance(kind, type) and issubclass(kind, BaseModel)):
-        for option in get_args(kind):
-            yield from _places_of(key, option, f"{prefix}.NAME" if get_origin(kind) is dict else prefix)
-        return
-    if key in kind.model_fields:
-        yield prefix
-    for name, field in kind.model_fields.items():
-        yield from _places_of(key, field.annotation, f"{prefix}.{name}".lstrip("."))
 
 
 def describe_found(value: Any) -> str:

@@ -45,7 +45,7 @@ def check(campaign_file: Path, overrides: Sequence[str], av: str | None, *, as_j
     The output is itself a campaign file; its cost stands in comments.
     """
     campaign = loaded(campaign_file, overrides, av)
-    from harness.campaign.campaign import dump_campaign  # noqa: PLC0415 - keeps --help fast
+    from harness.campaign.files import dump_campaign  # noqa: PLC0415 - keeps --help fast
     from harness.runner.look import plan_campaign  # noqa: PLC0415 - slow to import: only once the campaign is right
 
     plan = plan_campaign(campaign)
@@ -310,7 +310,7 @@ def schema() -> None:
 
     Let the first line of a campaign name the file: '# yaml-language-server: $schema=campaign.schema.json'.
     """
-    from harness.campaign.campaign import schema_text  # noqa: PLC0415 - keeps --help fast
+    from harness.campaign.files import schema_text  # noqa: PLC0415 - keeps --help fast
 
     click.echo(schema_text(), nl=False)
 

@@ -13,7 +13,8 @@ from markupsafe import Markup
 from pydantic import BaseModel
 
 from harness import numbers
-from harness.campaign.campaign import Campaign, written_out
+from harness.campaign.campaign import Campaign
+from harness.campaign.files import written_out
 from harness.errors import printable
 from harness.estimators.answer import MENDS
 from harness.estimators.estimate import Estimate

@@ -5,8 +5,7 @@ from __future__ import annotations
 import gc
 from concurrent.futures import ThreadPoolExecutor
 
-from harness.campaign.campaign import Campaign
-from harness.campaign.combinations import Command
+from harness.campaign.campaign import Campaign, Command
 from harness.compiled import is_cached, unboxed
 from harness.controllers.find import require_controller
 from harness.episode.judge import judge

@@ -17,7 +17,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from harness.campaign.campaign import dump_campaign
+from harness.campaign.files import dump_campaign
 from harness.errors import RunFolderError, TooManyFailedError
 from harness.pool.replay import Retracing
 from harness.records.folder import (

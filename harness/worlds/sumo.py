@@ -23,7 +23,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from harness.campaign.combinations import MOST_SUMO_CELLS
+from harness.campaign.campaign import MOST_SUMO_CELLS
 from harness.errors import CampaignError, WorldDisagreementError
 from harness.vocabulary import AV, BV, LV, VEHICLES, BoolArray, FloatArray, Int8Array, IntArray
 from harness.worlds.shim import Shim, open_shim

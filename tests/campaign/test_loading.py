@@ -9,10 +9,18 @@ import jsonschema
 import pytest
 import yaml
 
-from harness.campaign.campaign import Campaign, schema_text
+from harness.campaign.campaign import Campaign
 from harness.campaign.drivers import IDMParameters, Surrogate
-from harness.campaign.files import SHIPPED_PANEL, SHIPPED_PARAMETERS, load_campaign, load_panel, panel_av, read_model
-from harness.campaign.problems import InvalidFileError
+from harness.campaign.files import (
+    SHIPPED_PANEL,
+    SHIPPED_PARAMETERS,
+    InvalidFileError,
+    load_campaign,
+    load_panel,
+    panel_av,
+    read_model,
+    schema_text,
+)
 from harness.campaign.vehicle import AutomatedVehicle
 from harness.cli import main
 from harness.errors import EXIT_BAD_INPUT, CampaignError

@@ -9,8 +9,9 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from harness.campaign.campaign import Campaign, dump_campaign, schema_text, written_out, yaml_text
-from harness.campaign.files import load_campaign, load_panel, read_yaml
+from harness.campaign.campaign import Campaign
+from harness.campaign.files import dump_campaign, load_campaign, load_panel, schema_text, written_out
+from harness.campaign.yaml_text import read_yaml, yaml_text
 from harness.errors import CampaignError
 
 FOLDER = Path(__file__).parents[2] / "scenarios"

@@ -4,7 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from harness.campaign.files import parse_value, read_yaml
+from harness.campaign.files import Places
+from harness.campaign.yaml_text import parse_value, read_yaml
 from harness.errors import CampaignError
 
 
@@ -13,7 +14,8 @@ def read(tmp_path):
     def read_text(text):
         file = tmp_path / "some.yaml"
         file.write_bytes(text if isinstance(text, bytes) else text.encode())
-        return read_yaml(file)
+        data, lines = read_yaml(file)
+        return data, Places(str(file), lines)
 
     return read_text
 

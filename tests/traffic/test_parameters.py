@@ -2,8 +2,8 @@
 
 import pytest
 
-from harness.campaign.files import read_yaml
 from harness.campaign.sections import EnvironmentSettings
+from harness.campaign.yaml_text import read_yaml
 from harness.errors import CampaignError
 from harness.traffic.loading import load_environment, load_parameters
 from harness.traffic.parameters import SHIPPED_FOLDER
