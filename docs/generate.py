@@ -246,8 +246,17 @@ def limits_table() -> str:
     )
 
 
-VALIDATED = ("shells_acting", "shells_pairs", "chains_shells", "chains_forced", "twin_forced_online")
-"""Replication experiments that are shown line by line."""
+VALIDATED = (
+    "shells_panel",
+    "shells_adversaries",
+    "shells_acting",
+    "shells_pairs",
+    "lateral",
+    "chains_shells",
+    "chains_forced",
+    "twin_forced_online",
+)
+"""Replication experiments with a table of their vehicles."""
 METHODS = {
     "twin_nde": "no control, level 10,000",
     "twin_nade": "step mixture, immediate challenge, ε = 0.1",
@@ -265,34 +274,31 @@ def _command(name: str) -> str:
 
 
 def validated_table(name: str) -> str:
-    """Table of a replication experiment, a row for what it judged unconditionally, ranges of the rest; its command."""
-    head = ("vehicle or chain", "true rate", "bias", "coverage", "tests", "5–95 %", "crash outside")
-    judgements = _result(name)["judgements"]
-    rows = [_validated_cells(one) for one in judgements if _is_headline(one)]
-    text = f"{_table(head, rows)}\n{_ranges_table([judgements], ('',))}"
-    lowest = min(one["p_value_holm"] for one in judgements if one["p_value_holm"] is not None)
-    return f"{text}\nLowest p (Holm): {lowest:.2g}. {_command(name)}\n"
+    """Table of a replication experiment: what it judged without an assumption, a row for each vehicle; its command."""
+    head = ("vehicle or chain", "true rate", "bias", "coverage", "tests")
+    rows = [_validated_cells(one) for one in _result(name)["judgements"] if _is_headline(one)]
+    return f"{_table(head, rows)}\n{_command(name)}\n"
 
 
-def _ranges_table(found: list[list[dict[str, Any]]], words: tuple[str, ...]) -> str:
-    """Table of ranges over vehicles: of several variants of all results, of one of those that have no row."""
+def coverage_table() -> str:
+    """Lowest coverage over the vehicles that meet the assumption, by experiment, its variants, and kind of result."""
+    kinds = ("assumption-free", "given a statement", "ratio to a reference", "preventable")
     rows = []
-    alone = len(found) == 1
-    for result in dict.fromkeys(_family(one) for one in found[0] if not (alone and _is_headline(one))):
-        cells = [result]
-        for judgements in found:
-            of = [one for one in judgements if _family(one) == result and _is_judged(one)]
-            biases, tests = [one["bias"] for one in of], [one["tests_median"] for one in of]
-            cell = f"{min(biases):+.1%} to {max(biases):+.1%}; {min(one['coverage'] for one in of):.3f}"
-            cells.append(cell + (f"; {min(tests):,.0f} to {max(tests):,.0f}" if _is_rate(of[0]) else ""))
-        rows.append(tuple(cells))
-    legend = "Over the vehicles that meet the assumption: range of bias; lowest coverage; range of tests."
-    return f"{legend}\n\n{_table(('result', *words), rows)}" if rows else ""
+    for name, (key, values) in VARIED.items():
+        for value, file in zip(values, varied_files(name), strict=True):
+            lowest = dict.fromkeys(kinds, math.inf)
+            for one in filter(_is_judged, _result(file)["judgements"]):
+                lowest[_kind(one)] = min(one["coverage"], lowest[_kind(one)])
+            variant = "" if value == values[0] else f", {key.rpartition('.')[2]} {value}"
+            cells = (f"{coverage:.3f}" if coverage < math.inf else "–" for coverage in lowest.values())
+            rows.append((f"`{name}`{variant}", value if "confidence" in key else "0.9", *cells))
+    return _table(("experiment", "nominal", *kinds), rows)
 
 
-def _family(one: dict[str, Any]) -> str:
-    """A result's name, the same for all reference drivers."""
-    return f"`{one['result']}`" if _is_rate(one) else f"{one['result'].partition(' r157')[0]} a reference driver"
+def _kind(one: dict[str, Any]) -> str:
+    if not _is_rate(one):
+        return "ratio to a reference" if one["result"].startswith("ratio to ") else "preventable"
+    return "assumption-free" if _is_headline(one) else "given a statement"
 
 
 def _is_headline(one: dict[str, Any]) -> bool:
@@ -307,40 +313,20 @@ def _is_judged(one: dict[str, Any]) -> bool:
 
 VARIED = {
     "shells_panel": ("campaign.stop.confidence", ("0.9", "0.95", "0.99")),
-    "shells_heaviest": ("campaign.stop.rhw", ("0.15", "0.05")),
     "shells_adversaries": ("campaign.stop.confidence", ("0.9", "0.95", "0.99")),
+    "shells_heaviest": ("campaign.stop.rhw", ("0.15", "0.05")),
     "lateral": ("campaign.environment.cut_in_lead_s", ("log-normal", "0.5", "1.0")),
+    "shells_acting": ("", ("",)),
+    "shells_pairs": ("", ("",)),
+    "chains_shells": ("", ("",)),
 }
-"""Replication experiments repeated with other values of one key, shown side by side; the first is the file's own."""
+"""Replication experiments of shells, repeated with other values of one key; the first is the file's own."""
 
 
 def varied_files(name: str) -> list[str]:
-    """Names of the results of an experiment of `VARIED`."""
+    """Names of an experiment's committed results."""
     _, (_, *others) = VARIED[name]
     return [name, *(f"{name}-{value}" for value in others)]
-
-
-def varied_table(name: str) -> str:
-    """Table of a replication experiment, rows of its own value of the key (all where truths differ); ranges of all."""
-    key, values = VARIED[name]
-    found = [_result(file)["judgements"] for file in varied_files(name)]
-    of_subject = [{one["subject"]: one for one in judgements if _is_headline(one)} for judgements in found]
-    rows = []
-    for subject in of_subject[0]:
-        truths = dict.fromkeys(f"{of[subject]['truth']:.3g}" for of in of_subject)
-        rows.append([subject, ", ".join(truths), *(_varied_cell(of[subject]) for of in of_subject)])
-    words = [f"{key.rpartition('.')[2]} {value}" for value in values]
-    shown = len(values) if any("," in row[1] for row in rows) else 1
-    return (
-        _table(("vehicle", "true rate", *words[:shown]), [tuple(row[: 2 + shown]) for row in rows])
-        + f"\nBias, coverage, median of tests.\n\n{_ranges_table(found, tuple(words))}\n"
-        + "\n".join([f"- {_command(name)}", *(f"- … `--set {key}={value}`" for value in values[1:])])
-        + "\n"
-    )
-
-
-def _varied_cell(one: dict[str, Any]) -> str:
-    return f"{one['bias']:+.1%}, {one['coverage']:.3f}, {one['tests_median']:,.0f}"
 
 
 def _is_rate(one: dict[str, Any]) -> bool:
@@ -354,8 +340,6 @@ def _validated_cells(one: dict[str, Any]) -> tuple[str, ...]:
         f"{one['bias']:+.1%} ± {one['bias_std_error']:.1%}",
         f"{one['coverage']:.3f}",
         f"{one['tests_median']:,.0f}",
-        f"{one['tests_5']:,.0f}–{one['tests_95']:,.0f}",
-        f"{one['alarm']:.1%}",
     )
 
 
@@ -394,7 +378,7 @@ PARTS: dict[str, Callable[[], str]] = {
     **{f"columns-{name}": partial(columns_table, name) for name in SCHEMAS},
     **{f"results-{name}": partial(results_table, results) for name, results in RESULTS.items()},
     **{f"validated-{name}": partial(validated_table, name) for name in VALIDATED},
-    **{f"varied-{name}": partial(varied_table, name) for name in VARIED},
+    "coverage": coverage_table,
 }
 """All generated parts by name."""
 
