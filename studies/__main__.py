@@ -81,7 +81,7 @@ def validate(
     """Repeat the campaign of EXPERIMENT for each of its vehicles, pairs or chains, and judge its intervals by that.
 
     Vehicles may be built-in models or, under shells, controllers that act before the cut-in: these walk all paths that
-    pools are drawn from once, which takes minutes and is kept. Under shells the ratio to each reference driver of the
+    pools are drawn from first, which takes minutes. Under shells the ratio to each reference driver of the
     library, and the share of crashes that it would have avoided, are judged as well.
 
     Printed is a line per vehicle and result, with the columns below. The folder receives results.json and

@@ -13,48 +13,40 @@ would: told the index of its shadow run, and held to the hash of what it did the
 
 from __future__ import annotations
 
-import hashlib
-import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
-from contextlib import suppress
-from dataclasses import dataclass, replace
-from functools import cache, partial
+from dataclasses import dataclass, fields, replace
+from functools import partial
 from typing import cast
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 
 from harness.campaign.campaign import Campaign
 from harness.campaign.drivers import BuiltInParameters, Reflexes
 from harness.campaign.vehicle import AutomatedVehicle
-from harness.compiled import WORLD_SOURCES, cache_root, source_hash
-from harness.controllers.find import build_host, require_controller
+from harness.controllers.find import build_host
 from harness.episode.cells import PrescribedTraffic
 from harness.episode.judge import motion_hashes
 from harness.episode.loop import Drawing, EpisodeLoop, RecordPolicy
 from harness.errors import CampaignError, HarnessError
 from harness.importance.functions import build_importance
-from harness.pool.cut_ins import environment_hash, onset_steps
+from harness.pool.cut_ins import onset_steps
 from harness.pool.shells import acceleration_limit
 from harness.pool.vehicle_pool import CANDIDATES, BaselinePaths, walk_candidates
-from harness.pool.walk import PILOT_PATHS, STRIDE, BaselineRuns, Enumerator, enumerate_cut_ins, write_script
+from harness.pool.walk import PILOT_PATHS, STRIDE, Enumerator, enumerate_cut_ins, write_script
 from harness.progress import Progress
-from harness.resolved import Resolved, resolve
+from harness.resolved import resolve
 from harness.sampling.baseline import recorded, without_cut_in
 from harness.traffic.laws import Environment
 from harness.vehicles.drivers import Followers, driver_records
 from harness.vehicles.library import Library
 from harness.vocabulary import CRASH, BoolArray, FloatArray, IntArray, RecordArray
 from harness.worlds.twin import TwinWorld
-from studies.work import sources_of, write_table
+from studies.work import results_of
 
 MOST_DRIVERS = 62
 NO_ENVELOPE = -1
 CHUNK_PATHS = 2048
-_FORMAT = 1
-_COLUMNS = ("path", "mass", "bits")
 Mixed = dict[int, float]
 """A vehicle as drivers of an enumeration: the share of episodes in which it is each."""
 
@@ -159,34 +151,10 @@ def _reactions(av: AutomatedVehicle) -> list[tuple[Reflexes, float]]:
 def enumerate_paths(
     environment: Environment, drivers: Drivers, seed: int, n_paths: int, progress: Progress
 ) -> SuperPopulation:
-    """Enumerate paths that are aimed at the drivers' crashes, or read them from the cache."""
-    asked = environment, Followers(drivers.records, drivers.envelope), seed
-
-    def enumerated() -> SuperPopulation:
-        pilot = Enumerator(*asked)
-        progress.stage(f"super-population of seed {seed}", n_paths + PILOT_PATHS)
-        rates = pilot.run(0, PILOT_PATHS, progress).rates(drivers.records.size)
-        return _compressed(pilot.aimed(rates), n_paths, progress)
-
-    return cached(population_key(environment, drivers.records.tolist(), drivers.envelope, seed, n_paths), enumerated)
-
-
-def cached(key: str, make: Callable[[], SuperPopulation]) -> SuperPopulation:
-    """A population of a key, read from the cache or made and kept there."""
-    file = cache_root() / "super_populations" / f"{key}.parquet"
-    with suppress(OSError, pa.ArrowException, KeyError, TypeError, ValueError):  # a damaged one is made anew
-        table = pq.read_table(file, partitioning=None)
-        cut_in = np.frombuffer(table.schema.metadata[b"cut_in"], np.float64)
-        return SuperPopulation(cut_in, *(np.asarray(table.column(name)) for name in _COLUMNS))
-    population = make()
-    table = pa.table({name: getattr(population, name) for name in _COLUMNS})
-    write_table(file, table.replace_schema_metadata({b"cut_in": population.cut_in.tobytes()}))
-    return population
-
-
-def _compressed(aimed: Enumerator, n_paths: int, progress: Progress) -> SuperPopulation:
-    """Enumerate chunk by chunk, and keep the cut-ins with crashes of each."""
-    parts = []
+    """Enumerate paths that are aimed at the drivers' crashes, and keep the cut-ins with crashes."""
+    pilot = Enumerator(environment, Followers(drivers.records, drivers.envelope), seed)
+    progress.stage(f"super-population of seed {seed}", n_paths + PILOT_PATHS)
+    aimed, parts = pilot.aimed(pilot.run(0, PILOT_PATHS, progress).rates(drivers.records.size)), []
     for first in range(0, n_paths, CHUNK_PATHS):
         paths = aimed.run(PILOT_PATHS + first, min(CHUNK_PATHS, n_paths - first), progress)
         mass, bits = paths.mass, paths.crashes
@@ -197,14 +165,8 @@ def _compressed(aimed: Enumerator, n_paths: int, progress: Progress) -> SuperPop
 
 def joined(parts: Sequence[SuperPopulation]) -> SuperPopulation:
     """All in one; each part knows the numbers that its paths have in the whole."""
-    columns = ("cut_in", *_COLUMNS)
+    columns = (field.name for field in fields(SuperPopulation))
     return SuperPopulation(*(np.concatenate([getattr(part, name) for part in parts]) for name in columns))
-
-
-def population_key(environment: Environment, *content_of: object) -> str:
-    """Hash of all that a population depends on: plain content, an environment, and code."""
-    content = [_FORMAT, source_hash(WORLD_SOURCES), environment_hash(environment), *content_of]
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:24]
 
 
 LARGEST_ERROR = 0.005
@@ -317,100 +279,61 @@ WALKED_CHUNK = 1024
 """Paths that one task walks: some 15 MB of motion."""
 
 
-_SOURCES = ("pool/vehicle_pool.py", "controllers/hosts.py")
-"""Files beside those of the world that decide what a vehicle meets, and is told."""
-Choose = Callable[[int, int], BaselinePaths]
-"""Chooses paths from a seed, so many of them; all vehicles of an experiment walk the same."""
+def choose_paths(
+    campaign: Campaign, seed: int, n_paths: int, progress: Progress, candidates: int = CANDIDATES
+) -> BaselinePaths:
+    """Choose paths in the traffic of a campaign, out of so many, or of as many as are asked for."""
+    resolved, settings = resolve(campaign), campaign.pool.model_copy(update={"seed": seed})
+    where, most = (resolved.environment, resolved.library), max(n_paths, candidates)
+    return walk_candidates(*where, settings, "walked", progress, most).draw(n_paths)
 
 
-def chooser(campaign: Campaign, progress: Progress, candidates: int = CANDIDATES) -> Choose:
-    """Chooses paths in the traffic of a campaign, out of so many, or of as many as are asked for."""
-    resolved = resolve(campaign)
-
-    @cache
-    def choose(seed: int, n_paths: int) -> BaselinePaths:
-        settings = campaign.pool.model_copy(update={"seed": seed})
-        where, most = (resolved.environment, resolved.library), max(n_paths, candidates)
-        return walk_candidates(*where, settings, "walked", progress, most).draw(n_paths)
-
-    return choose
-
-
-def walk_paths(
-    campaign: Campaign, choose: Choose, seed: int, n_paths: int, executor: Executor, progress: Progress
-) -> SuperPopulation:
-    """Let the campaign's vehicle walk so many paths, or read what it did from the cache.
+def walk_paths(campaign: Campaign, paths: BaselinePaths, executor: Executor, progress: Progress) -> SuperPopulation:
+    """Let the campaign's vehicle walk paths.
 
     Raises `HarnessError`: the vehicle failed, or did something else in a test than in its shadow run.
     """
-    code = require_controller(campaign), source_hash(_SOURCES), sources_of("replication/populations.py")
-    resolved = resolve(campaign)
-    drivers = resolved.library.followers(resolved.environment.lateral.present).drivers.tolist()
-    asked = drivers, campaign.av.identity(), *code, campaign.seed, seed, n_paths
-
-    def walked() -> SuperPopulation:
-        paths = choose(seed, n_paths)
-        progress.stage(f"walked paths of seed {seed}", n_paths)
-        parts, walk = [], partial(_walk, campaign.model_dump_json())
-        firsts = range(0, n_paths, WALKED_CHUNK)
-        for part in executor.map(walk, firsts, [_chunk(paths, first) for first in firsts]):
-            parts.append(part)
-            progress.advance(part.n_paths)
-        return joined(parts)
-
-    return cached(population_key(resolved.environment, "walked", STRIDE, *asked), walked)
+    firsts = range(0, len(paths), WALKED_CHUNK)
+    parts = (
+        replace(paths, **{name: getattr(paths, name)[first : first + WALKED_CHUNK] for name in _BY_PATH})
+        for first in firsts
+    )
+    jobs = list(zip(firsts, parts, strict=True))
+    name, walk = "walked paths", partial(_walk, campaign.model_dump_json())
+    return joined(results_of(name, jobs, walk, progress, run=executor.map, size=lambda job: len(job[1])))
 
 
-def _chunk(paths: BaselinePaths, first: int) -> BaselinePaths:
-    rows = slice(first, first + WALKED_CHUNK)
-    return replace(paths, index=paths.index[rows], state=paths.state[rows], weight=paths.weight[rows])
+_BY_PATH = ("index", "state", "weight")
 
 
-def _walk(campaign_json: str, first: int, paths: BaselinePaths) -> SuperPopulation:
-    """Walk a range of paths, and drive their cut-ins."""
+def _walk(campaign_json: str, job: tuple[int, BaselinePaths]) -> SuperPopulation:
+    """Walk paths that have numbers from a first one on, and drive the vehicle on their cut-ins as tests would be."""
+    first, paths = job
     resolved = resolve(Campaign.model_validate_json(campaign_json))
     campaign, environment, library = resolved.campaign, resolved.environment, resolved.library
     policy = Drawing(campaign.seed, environment, build_importance(campaign, None), resolved.av)
     host = build_host(campaign.av, n_cells=CELLS, seed=campaign.seed)
     loop = EpisodeLoop(TwinWorld(CELLS), policy, RecordPolicy(0, "none", 0.0), host)  # with all of its motion kept
     runs = recorded(without_cut_in(loop, paths.seed, first, paths.index, paths.state, environment), environment)
-    _require_none_failed(resolved, int(runs.failed.sum()), len(paths), "shadow runs")
     offset = np.random.default_rng([paths.seed, first]).integers(0, STRIDE, len(paths))
     where = paths.seed, paths.index, paths.state, environment, library.followers(environment.lateral.present)
     probability, bits, _ = enumerate_cut_ins(*where, runs, STRIDE, offset)
     mass = probability * paths.weight[:, None]
     row, step = np.nonzero(mass > 0.0)
-    crashes = _crashes(resolved, loop, first, paths, runs, row, step)
+    lv, bv, _, _, lead = write_script(paths.seed, paths.index[row], step, paths.state[row], environment)
+    motion = motion_hashes(runs.x_m, runs.v_mps)[row, onset_steps(step, lead)]
+    nowhere, weightless = np.full(row.size, -1), np.zeros(row.size)
+    traffic = PrescribedTraffic(lv, bv, step, nowhere, weightless, first + row, motion, lead)
+    tests = loop.run(0, paths.state[row], traffic)
+    if n_failed := int(runs.failed.sum()) + len(tests.failures):
+        raise HarnessError(
+            f"avs: {campaign.av.controller or campaign.av.fmu}",
+            f"{n_failed:,} of {len(paths):,} shadow runs and {row.size:,} tests failed",
+            "none: what a vehicle would have done is not known, and so neither is its crash rate",
+            "Mend the vehicle (`harness av-check` looks at it in seconds), or leave it out of the experiment.",
+        )
+    crashes = tests.results.episode["outcome"] == CRASH
     of_cut_ins = bits[row, step] | (crashes.astype(np.int64) << library.n_drivers)  # the vehicle comes after these
     somebody = of_cut_ins != 0
     row, step = row[somebody], step[somebody]
     return SuperPopulation(mass.sum(1), first + row, mass[row, step], of_cut_ins[somebody])
-
-
-def _crashes(
-    resolved: Resolved,
-    loop: EpisodeLoop,
-    first: int,
-    paths: BaselinePaths,
-    runs: BaselineRuns,
-    row: IntArray,
-    step: IntArray,
-) -> BoolArray:
-    """Drive the vehicle on cut-ins of paths in given rows and steps (n,): whether it crashed on each."""
-    lv, bv, _, _, lead = write_script(paths.seed, paths.index[row], step, paths.state[row], resolved.environment)
-    motion = motion_hashes(runs.x_m, runs.v_mps)[row, onset_steps(step, lead)]
-    nowhere, weightless = np.full(row.size, -1), np.zeros(row.size)
-    traffic = PrescribedTraffic(lv, bv, step, nowhere, weightless, first + row, motion, lead)
-    outcome = loop.run(0, paths.state[row], traffic)
-    _require_none_failed(resolved, len(outcome.failures), row.size, "tests")
-    return np.asarray(outcome.results.episode["outcome"] == CRASH)
-
-
-def _require_none_failed(resolved: Resolved, n_failed: int, n: int, what: str) -> None:
-    if n_failed:
-        raise HarnessError(
-            f"avs: {resolved.campaign.av.controller or resolved.campaign.av.fmu}",
-            f"{n_failed:,} of {n:,} {what} failed",
-            "none: what a vehicle would have done is not known, and so neither is its crash rate",
-            "Mend the vehicle (`harness av-check` looks at it in seconds), or leave it out of the experiment.",
-        )

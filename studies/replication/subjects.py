@@ -22,12 +22,11 @@ from studies.replication.judgement import Subject
 from studies.replication.populations import (
     CONDITIONAL_DIFFERENCE,
     RATE,
-    Choose,
     Drivers,
     Known,
     SuperPopulation,
     Truths,
-    chooser,
+    choose_paths,
     enumerate_paths,
     of_pair,
     of_vehicle,
@@ -60,9 +59,12 @@ def subjects(experiment: Experiment, executor: Executor, progress: Progress) -> 
     if experiment.holding:
         yield from _holding(experiment, progress)
     if experiment.acting and not experiment.pairs:
-        choose = chooser(experiment.campaign, progress)
+        size, seeds = experiment.super_population, (experiment.seed + 1, experiment.seed)
+        sizes = zip(seeds, (size.reference_paths, size.paths), strict=True)
+        walked = [choose_paths(experiment.campaign, seed, n_paths, progress) for seed, n_paths in sizes]
         for name in experiment.acting:
-            yield _acting(experiment, name, choose, executor, progress)
+            campaign = experiment.subject(name)
+            yield _acting(experiment, name, *(walk_paths(campaign, paths, executor, progress) for paths in walked))
 
 
 def _chains(experiment: Experiment) -> Iterator[Tested]:
@@ -194,15 +196,12 @@ class _Shells:
         return Division(library, self.pools, crashing, paths, limit_mps2=limit_mps2)
 
 
-def _acting(experiment: Experiment, name: str, choose: Choose, executor: Executor, progress: Progress) -> Tested:
-    """A vehicle that acts before the cut-in, on paths of its own."""
-    campaign, size = experiment.subject(name), experiment.super_population
-    library = load_library(campaign.pool.library)
+def _acting(experiment: Experiment, name: str, truth: SuperPopulation, pools: SuperPopulation) -> Tested:
+    """A vehicle that acts before the cut-in, by the paths that it has walked."""
+    campaign = experiment.subject(name)
+    library, limit = load_library(campaign.pool.library), acceleration_limit(campaign.av)
     vehicle = {library.n_drivers: 1.0}
-    truth = walk_paths(campaign, choose, experiment.seed + 1, size.reference_paths, executor, progress)
-    pools = walk_paths(campaign, choose, experiment.seed, size.paths, executor, progress)
     known = of_vehicle(truth, truth.crash_mass(vehicle), reference_drivers(library))
-    crashing, limit = pools.crash_mass(vehicle), acceleration_limit(campaign.av)
-    paths = campaign.pool.shadow_paths
+    crashing, paths = pools.crash_mass(vehicle), campaign.pool.shadow_paths
     division = Division(library, pools, [crashing], paths, limit_mps2=limit, shadow_runs=True)
     return _vehicle(experiment, campaign, name, division.of_vehicle(crashing), known)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -12,7 +14,7 @@ from harness.vehicles.library import load_library
 from studies.replication.judgement import Subject, judge
 from studies.replication.populations import (
     RATE,
-    chooser,
+    choose_paths,
     of_vehicle,
     preventable_by,
     ratio_to,
@@ -43,10 +45,11 @@ def campaign(controller: str, **parameters) -> Campaign:
 
 @pytest.fixture(scope="module")
 def walk():
-    choose = chooser(campaign("examples.acting:Holds"), Progress(), 2048)
+    paths = choose_paths(campaign("examples.acting:Holds"), 5, PATHS, Progress(), 2048)
 
     def walked(of: Campaign, n_paths: int):
-        return walk_paths(of, choose, 5, n_paths, Here(), Progress())
+        columns = {name: getattr(paths, name)[:n_paths] for name in ("index", "state", "weight")}
+        return walk_paths(of, replace(paths, **columns), Here(), Progress())
 
     return walked
 
