@@ -60,17 +60,6 @@ def test_a_corrupted_rate_raises_the_alarm(corrupt, raised):
     assert told(*replayed(np.random.default_rng(SEED), corrupt=corrupt, n=20_000))["raised"] == raised
 
 
-def test_blocks_may_be_added_in_any_parts():
-    tests, crashes, known = replayed(np.random.default_rng(SEED), corrupt=2.5)
-    alarm = Alarm(known)
-    for rows in (slice(0, 1), slice(1, 1_300), slice(1_300, N)):
-        alarm.add(tests.take(rows), crashes[rows])
-    found, at_once = alarm.result(), told(tests, crashes, known)
-    for one, other in zip([found, *found["surrogates"]], [at_once, *at_once["surrogates"]], strict=True):
-        assert one["p_value"] == pytest.approx(other["p_value"], rel=1e-9)
-    assert found["p_value"] < 0.1
-
-
 def weighted(
     h: list[float], mu: float, *, cap: float | None = None, p_cut_in: float | None = None, error: float = 0.0
 ) -> dict[str, Any]:

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from studies.case_study.theorems import small_chains
-from studies.chains.chain import enumerate_episodes, overtaking, panel
+from studies.chains.chain import enumerate_episodes, overtaking, panel, replayed
 from studies.chains.sampler import draw, mixture_weights
+from studies.chains.shells import ChainShells, joint_outcomes
 
 from .seed import SEED
 
@@ -61,3 +62,44 @@ def test_weights_are_the_probability_of_a_cut_in_on_the_path_or_bounded_by_it():
     assert block.weighted_crashes().max() <= chain.cut_in_cap
     block = drawn(panel()[2], "episode_mixture", 50_000)
     assert np.all(block.weighted_crashes() <= np.exp(block.log_p_cut_in) / block.drawn.alpha[0] * (1.0 + 1e-12))
+
+
+# -- vehicles on the same cut-ins: joint outcomes, and shells that they make --
+
+
+@pytest.fixture(params=replayed(), ids=lambda c: c.name)
+def chain(request):
+    return request.param
+
+
+def given_a_cut_in(chain, response):
+    _, after = chain.values(response)
+    return np.stack([chain.entry @ after[t + 1] for t in range(chain.horizon)])
+
+
+def test_marginals_are_those_of_each_vehicle_alone(chain):
+    joint = joint_outcomes(chain)
+    np.testing.assert_allclose(joint.sum(axis=(2, 3)), 1.0, rtol=1e-12)
+    np.testing.assert_allclose(joint[..., 1].sum(axis=2), given_a_cut_in(chain, chain.response), atol=1e-14)
+    masks = np.arange(joint.shape[2])
+    for j, response in enumerate(chain.surrogate_responses):
+        crashes = joint[:, :, (masks >> j) & 1 == 1].sum(axis=(2, 3))
+        np.testing.assert_allclose(crashes, given_a_cut_in(chain, response), atol=1e-14)
+
+
+def test_with_shared_noise_the_more_skilled_crashes_only_where_the_less_skilled_does():
+    joint = joint_outcomes(replayed()[0]).sum(axis=3)  # skills 0.8, 0.65, 0.5
+    nested = {0b000, 0b100, 0b110, 0b111}
+    assert joint[:, :, [mask for mask in range(8) if mask not in nested]].max() < 1e-15
+
+
+def test_shells_add_up_and_drawn_pools_scatter_around_them(chain):
+    source = ChainShells(chain, 512)
+    assert source.shell_p.sum() == pytest.approx(chain.cut_in_rate, rel=1e-11)
+    assert source.crash_p.sum() == pytest.approx(chain.crash_rate, rel=1e-11)
+    drawn = [source.draw(np.random.default_rng([1, k]))[0] for k in range(200)]
+    p = np.array([each.design.p for each in drawn])
+    crash = np.array([each.design.p * each.share for each in drawn])
+    for found, exact in ((p, source.shell_p), (crash, source.crash_p)):
+        error = found.std(axis=0) / np.sqrt(len(found))
+        assert np.all(np.abs(found.mean(axis=0) - exact) <= 4.5 * error + 1e-18)

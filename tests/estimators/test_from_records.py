@@ -5,16 +5,47 @@ import pyarrow as pa
 import pytest
 
 from harness.errors import RunFolderError
-from harness.estimators.block import block_from_tables
-from harness.vocabulary import FAILED
+from harness.estimators.block import Block, block_from_tables
+from harness.records.schemas import episodes_schema, moments_schema
+from harness.vocabulary import FAILED, OUTCOMES
 from studies.chains.chain import overtaking
 from studies.chains.sampler import draw
 from tests.chains.seed import SEED
 
-from .run_folder import episodes_table, moments_table
 from .small_blocks import block as made
 
 CHAIN = overtaking("ten steps", skill=0.5, surrogates=[0.5, 0.2], level=0.02, horizon=11)
+
+
+def episodes_table(block: Block) -> pa.Table:
+    """The rows of an ``episodes`` shard; columns that estimates do not read are left out."""
+    n, m = block.log_q.shape
+    index = block.first_episode + np.arange(n)
+    columns = {
+        "episode": pa.array(index),
+        "outcome": pa.DictionaryArray.from_arrays(pa.array(block.outcome), pa.array(OUTCOMES)),
+        "cut_in_step": pa.array(np.full(n, 7, dtype=np.int16), mask=~block.cut_in),
+        "n_control_steps": pa.array(block.n_control_steps.astype(np.int16)),
+        "log_weight": pa.array(block.log_weight),
+        "log_p_cut_in": pa.array(block.log_p_cut_in) if "log_p_cut_in" in block.columns else pa.nulls(n, pa.float64()),
+        "log_q": pa.array(block.log_q.tolist(), pa.list_(pa.float64(), m)),
+    }
+    schema = episodes_schema(m, 2)
+    return pa.table(columns, schema=pa.schema([schema.field(name) for name in columns]))
+
+
+def moments_table(block: Block) -> pa.Table:
+    """Control steps of a ``moments`` shard under the policy ``first_9``, with q_sampled = 1/2 throughout."""
+    ratios, steps = block.first_ratios, np.minimum(block.n_control_steps, 9)
+    used = np.arange(9) < steps[:, None]
+    q = 0.5 * ratios[used]
+    columns = {
+        "episode": pa.array(np.repeat(block.first_episode + np.arange(len(block)), steps)),
+        "q_sampled": pa.array(np.full(len(q), 0.5)),
+        "q": pa.FixedSizeListArray.from_arrays(pa.array(q.ravel()), q.shape[1]),
+    }
+    schema = moments_schema(q.shape[1])
+    return pa.table(columns, schema=pa.schema([schema.field(name) for name in columns]))
 
 
 def drawn(method: str):

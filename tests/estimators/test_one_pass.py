@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import yaml
 
 from harness.campaign.campaign import Campaign
 from harness.estimators.answer import estimate_blocks
@@ -13,7 +12,6 @@ from studies.chains.chain import overtaking
 from studies.chains.sampler import blocks
 from tests.chains.seed import SEED
 
-from .run_folder import CAMPAIGN
 from .small_blocks import block, fed
 
 CHAIN = overtaking("two surrogates", skill=0.5, surrogates=[0.5, 0.2], level=0.02, horizon=6)
@@ -26,7 +24,9 @@ def drawn(method: str):
 
 def answered(parts, **manifest) -> dict:
     """Content of ``estimates.json`` from blocks in memory."""
-    campaign = yaml.safe_load(CAMPAIGN.format(method=parts[0].drawn.method))
+    campaign = {"name": "chain", "environment": {"lane_change_level": 3.0}, "stop": {"confidence": 0.8}}
+    campaign |= {"surrogates": {"one": {"model": "idm"}, "two": {"model": "fvdm"}}}
+    campaign["testing"] = {"method": parts[0].drawn.method}
     return estimate_blocks(parts, Campaign.model_validate(campaign), {"campaign_hash": "c0ffee", **manifest})
 
 

@@ -5,15 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from harness.campaign.sections import EnvironmentSettings, PoolSettings
+from harness.campaign.sections import EnvironmentSettings
 from harness.campaign.vehicle import AutomatedVehicle
-from harness.pool.build import build_pool
 from harness.pool.shells import acceleration_limit
 from harness.progress import Progress
 from harness.traffic.loading import load_environment
 from harness.vehicles.library import load_library
 from studies.replication.experiment import Adversary
-from studies.replication.populations import RATE, Drivers, Truths, enumerate_paths
+from studies.replication.populations import Drivers, enumerate_paths
 from studies.replication.shells import Division, campaign_block, equals
 
 PATHS = 1024
@@ -57,14 +56,6 @@ def shells_of(drivers, population, name="own", paths=256):
     return division, division.of_vehicle(crashing)
 
 
-def test_imprecise_truths_are_enumerated_again_and_agree():
-    truths = Truths(ENVIRONMENT, drivers_of("own", "wild"), 3, PATHS, Progress())
-    own, wild = (truths.vehicle(name)[RATE] for name in ("own", "wild"))
-    assert own.value == pytest.approx(1.343e-7, abs=4.0 * own.std_error)
-    assert own.relative_error < 0.02  # once would leave some 2 %
-    assert wild.value == pytest.approx(2.43e-5, abs=4.0 * wild.std_error)
-
-
 def test_equals_are_found_and_left_out(drivers, population):
     vehicle = population.crash_mass(drivers.vehicles["equal"])
     assert equals(LIBRARY, population, vehicle) == {"brakes-3"}
@@ -87,53 +78,21 @@ def test_drawn_pools_scatter_around_the_population(drivers, population):
     assert all(each.design.statements[-1].boundary == LIBRARY.boundary for each in drawn)
 
 
-@pytest.mark.slow
-def test_real_pools_have_the_shells_of_drawn_ones(drivers):
-    """A pool as a campaign builds it, from other paths: shell probabilities and their errors agree."""
-    paths = 16_384
-    population = enumerated(drivers, paths)
-    _, source = shells_of(drivers, population, paths=paths)
-    real = build_pool(ENVIRONMENT, LIBRARY, PoolSettings(relative_error=0.01, seed=7), "real")
-    template = source.template
-    assert real.names == template.names
-    kept = [real.cut_ins.path_mass[real.shell == s, s].mean(dtype=float) for s in range(real.shell_p.size)]
-    # A kept cut-in is a draw in proportion to its path's mass.
-    squares = (source.mass**2).mean(0), real.shell_p * kept
-    errors = [
-        np.sqrt(np.maximum(square - pool.shell_p**2, 0.0) / n)
-        for square, pool, n in zip(squares, (template, real), (paths, real.n_paths), strict=True)
-    ]
-    assert np.all(np.abs(real.shell_p - template.shell_p) < 4.5 * np.hypot(*errors))
-    ratio = errors[1] * np.sqrt(real.n_paths) / (errors[0] * np.sqrt(paths))
-    assert np.all((ratio[:5] > 0.6) & (ratio[:5] < 1.6))  # inside; outside the aims differ
-
-
-def adversary_of(drivers, population, **made):
+@pytest.mark.parametrize("made", [{"crashes": "on_heaviest_paths", "share": 0.3}, {"hole": 0.01}], ids=str)
+def test_adversaries_crash_on_few_paths_inside_or_in_a_share_of_all_outside(made, drivers, population):
     division, source = shells_of(drivers, population)
-    adversary = Adversary(of="own", **made)
-    crashing = population.crash_mass(drivers.vehicles["own"])
-    return source, division.of_vehicle(division.as_adversary(adversary, crashing), adversary)
-
-
-def test_an_adversary_on_the_heaviest_paths_has_a_share_of_the_crashes_on_few_of_them(drivers, population):
-    source, heavy = adversary_of(drivers, population, crashes="on_heaviest_paths", share=0.3)
-    _, light = adversary_of(drivers, population, crashes="on_lightest_paths", share=0.3)
-    inside = source.template.boundary + 1
-    for made in (heavy, light):
-        assert 0.2 < made.crashing[0][:, :inside].sum() / source.crashing[0][:, :inside].sum() <= 0.3
-    used = [int((made.crashing[0][:, :inside].sum(1) > 0.0).sum()) for made in (heavy, light)]
-    assert used[0] < 0.2 * used[1]
-
-
-def test_an_adversary_with_a_hole_crashes_outside_in_that_share(drivers, population):
-    source, made = adversary_of(drivers, population, hole=0.01)
-    outside, mass = slice(source.template.boundary + 1, -1), source.mass
-    assert np.all(made.crashing[0][:, outside] >= (0.01 - 1e-12) * mass[:, outside])
-    hole = 0.01 * mass[:, outside].sum()
-    assert made.crashing[0].sum() == pytest.approx(source.crashing[0].sum() + hole, rel=0.05)
-    before = source.crashes_outside(source.crashing[0])
-    after = made.crashes_outside(made.crashing[0])
-    assert all(after[name] > share for name, share in before.items())
+    adversary, crashing = Adversary(of="own", **made), population.crash_mass(drivers.vehicles["own"])
+    own, other = (
+        source.crashing[0],
+        division.of_vehicle(division.as_adversary(adversary, crashing), adversary).crashing[0],
+    )
+    inside, outside = slice(source.template.boundary + 1), slice(source.template.boundary + 1, -1)
+    if "hole" in made:
+        assert np.all(other[:, outside] >= (0.01 - 1e-12) * source.mass[:, outside])
+        assert other.sum() == pytest.approx(own.sum() + 0.01 * source.mass[:, outside].sum(), rel=0.05)
+    else:
+        assert 0.2 < other[:, inside].sum() / own[:, inside].sum() <= 0.3
+        assert (other[:, inside].sum(1) > 0.0).sum() < 0.2 * (own[:, inside].sum(1) > 0.0).sum()
 
 
 def test_cells_divide_strata_by_what_references_do():

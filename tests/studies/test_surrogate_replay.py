@@ -25,7 +25,6 @@ from harness.pool.cut_ins import Pool
 from harness.records.schemas import episodes_table
 from harness.resolved import resolve
 from harness.runner.prepare import prepare
-from harness.vehicles.drivers import Followers, driver_records
 from harness.vocabulary import CRASH, BoolArray
 from harness.worlds.twin import TwinWorld
 from studies.alarm import Alarm, KnownRates, drivers_crash, surrogates_crash
@@ -79,19 +78,6 @@ def test_a_surrogate_that_is_the_av_crashes_where_the_av_did(forced):
     assert not np.array_equal(crashes[:, pool.names.index("brakes-3")], block.crash)
 
 
-@pytest.mark.parametrize("model", ["r157-cc", "r157-fsm", "need-based"])
-def test_a_driver_that_remembers_is_the_same_as_av_and_as_surrogate(model):
-    one = campaign("forced", av=AutomatedVehicle(model=model))
-    _, table = drive(one, 4_000)
-    crash = np.array(table.column("outcome").cast(pa.string()).to_pylist()) == "crash"
-    environment = resolve(one).environment
-    records = driver_records([AutomatedVehicle(model=name).parameters for name in (model, "idm")])
-    own, idm = drivers_crash(table, one.seed, environment, Followers(records)).T
-    assert crash.sum() > 10
-    np.testing.assert_array_equal(own, crash)
-    assert not np.array_equal(idm, crash)
-
-
 @pytest.mark.parametrize("hold_s", [1.0, 0.1])
 def test_other_draws_after_the_end_do_not_change_what_was_driven(hold_s):
     """The AV never brakes: its crashes cut the paths short, and careful surrogates need what comes after."""
@@ -122,14 +108,6 @@ def test_weighted_crashes_of_surrogates_have_the_rates_of_the_pool(method, setti
     assert np.count_nonzero(many) >= 5
     assert np.max(np.abs(h.mean(axis=0) - pool.mu)[many] / error[many]) < 4.0
     assert not found["raised"]
-
-
-def test_the_step_mixture_is_shown_and_not_judged():
-    one = campaign("step_mixture")
-    found = alarmed(one, drive(one)[1], campaign_pool(resolve(one)))
-    assert "not bounded" in found["no_verdict"]
-    for entry in found["surrogates"]:  # of the right size, although no interval can be given
-        assert 0.5 < entry["mean"] / entry["mu"] < 2.0
 
 
 def test_the_pool_knows_how_likely_a_cut_in_is_where_surrogates_crash(forced):
