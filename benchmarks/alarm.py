@@ -23,7 +23,7 @@ from harness.importance.functions import mixture_weights
 from harness.pool.build import campaign_pool
 from harness.records.schemas import episodes_table
 from harness.resolved import resolve
-from harness.runner.prepare import prepare
+from harness.sampling import prepare
 from harness.vocabulary import BoolArray, FloatArray, IntArray, Method
 from harness.worlds.twin import TwinWorld
 from studies.alarm import LEVEL, Alarm, KnownRates, surrogates_crash

@@ -24,9 +24,9 @@ from harness.episode.loop import Shard
 from harness.records.folder import encoded, write_shard
 from harness.records.schemas import shard_tables
 from harness.resolved import resolve
-from harness.runner.prepare import prepare
 from harness.runner.workers import LocalWorkers
-from harness.sampling import ShardRequest, Source
+from harness.sampling import prepare
+from harness.sampling.protocol import ShardRequest, Source
 from harness.worlds import World
 from harness.worlds.shim import shim_library
 from harness.worlds.sumo import SumoWorld, sumo_program

@@ -19,7 +19,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from harness.campaign.files import load_campaign
 from harness.resolved import resolve
-from harness.runner.prepare import prepare
+from harness.sampling import prepare
 from harness.worlds import build_world
 from harness.worlds.sumo import SumoWorld
 

@@ -24,8 +24,8 @@ import numpy as np
 from harness.campaign.campaign import Campaign
 from harness.campaign.files import load_campaign
 from harness.resolved import resolve
-from harness.runner.prepare import prepare
-from harness.sampling import Source
+from harness.sampling import prepare
+from harness.sampling.protocol import Source
 from harness.vocabulary import BV_LV_CONTACT, CRASH
 from harness.worlds.twin import TwinWorld
 

@@ -1,4 +1,7 @@
-"""A campaign with all that its names stand for: read once, near the door, and handed on; nothing reads a file again."""
+"""A campaign with all that its names stand for: refused at the door, or read once and handed on; no file is read again.
+
+`require_ready` asks all that can be known before anything is simulated or written, `resolve` reads what is named.
+"""
 
 from __future__ import annotations
 
@@ -6,12 +9,15 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from harness.campaign.campaign import Campaign, Command, Use, refusal
+from harness.controllers.find import require_controller
 from harness.errors import CampaignError
 from harness.traffic.laws import Environment
 from harness.traffic.loading import load_environment, load_parameters
 from harness.vehicles.drivers import av_records, driver_records
 from harness.vehicles.library import Library, load_library
 from harness.vocabulary import RecordArray
+from harness.worlds.sumo_driven import av_type
+from harness.worlds.system_libraries import require_libraries
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,6 +43,33 @@ class Resolved:
         Raises `CampaignError`: the library's file is missing or wrong.
         """
         return load_library(self.campaign.pool.library)
+
+
+def require_ready(campaign: Campaign, command: Command = "run") -> Resolved:
+    """Resolve a campaign for a command; refuse what can be known to be wrong before anything is simulated or written.
+
+    Raises `CampaignError`: the AV's controller cannot be found or made, SUMO knows no such attribute of it, strangers
+    could drive it, the environment's parameters are wrong, or the surrogate library is wrong or lacks the boundary.
+    Raises `HarnessError`: SUMO's system libraries are missing.
+    """
+    require_world(campaign)
+    controller_sha256 = require_controller(campaign)
+    if campaign.av.sumo is not None:
+        av_type(campaign.av.sumo)
+    if campaign.av.traci is not None:
+        from harness.worlds.program import require_private  # noqa: PLC0415 - imports traci
+
+        require_private(campaign.av.traci)
+    resolved = resolve(campaign, command, controller_sha256=controller_sha256)
+    if campaign.sampling.strata:
+        resolved.library.statement_settings(campaign.testing.shells)  # it knows what is stated
+    return resolved
+
+
+def require_world(campaign: Campaign) -> None:
+    """Refuse a machine on which SUMO's system libraries are missing, before anything is built for them."""
+    if campaign.world.engine == "sumo":
+        require_libraries()
 
 
 def resolve(campaign: Campaign, command: Command = "run", *, controller_sha256: str | None = None) -> Resolved:

@@ -29,7 +29,7 @@ from harness.processes import ForkServer
 from harness.runner import workers
 from harness.runner.run import RunResult
 from harness.runner.workers import ShardResult, ShardRunner
-from harness.sampling import ShardRequest
+from harness.sampling.protocol import ShardRequest
 
 
 @contextmanager

@@ -26,11 +26,10 @@ from harness.pool.shells import Draw, acceleration_limit
 from harness.progress import Progress
 from harness.records.folder import read_manifest, require_place, sole_use, write_json
 from harness.records.reader import read_shards
-from harness.resolved import Resolved
-from harness.runner.prepare import require_ready
+from harness.resolved import Resolved, require_ready
 from harness.runner.resume import require_own_folder
 from harness.runner.run import Run
-from harness.sampling import ShardRequest
+from harness.sampling.protocol import ShardRequest
 from harness.sampling.shells import PairRounds, Shells, round_requests
 
 SIDES = ("a", "b")

@@ -20,10 +20,10 @@ from harness.controllers.find import AvEndedProcessError, build_host, has_foreig
 from harness.episode.loop import EpisodeLoop, RecordPolicy, Shard
 from harness.errors import EXIT_DONE, EXIT_TOO_MANY_FAILED
 from harness.estimators.estimate import finite_json
-from harness.resolved import resolve
-from harness.runner.prepare import prepare, require_ready, require_world
+from harness.resolved import require_ready, require_world, resolve
 from harness.runner.workers import Bits, bits_of
-from harness.sampling import EPISODES_PER_S, ShardRequest, Source, source_of
+from harness.sampling import EPISODES_PER_S, prepare, source_of
+from harness.sampling.protocol import ShardRequest, Source
 from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import AV, CRASH, FAILED
 from harness.worlds import AVLostError, build_world

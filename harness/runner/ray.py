@@ -42,8 +42,9 @@ from harness.runner.workers import (
     WorkerProcess,
     Workers,
 )
-from harness.sampling import ShardRequest, source_of
+from harness.sampling import source_of
 from harness.sampling.baseline import SHADOW
+from harness.sampling.protocol import ShardRequest
 
 LOCAL = "local"
 """Ray's word for a cluster of this machine alone, which ends with the run."""

@@ -38,7 +38,7 @@ from harness.records.folder import (
 from harness.records.schemas import ShardTables
 from harness.resolved import Resolved
 from harness.runner.workers import ShardResult, finished
-from harness.sampling import ShardRequest, Source
+from harness.sampling.protocol import ShardRequest, Source
 
 INTERVAL_S = 5.0
 SMALLEST_FAILED_SAMPLE = 200

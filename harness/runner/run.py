@@ -32,8 +32,7 @@ from harness.records.folder import (
     write_sealed,
     write_shard,
 )
-from harness.resolved import Resolved
-from harness.runner.prepare import distance_per_test_m, prepare, require_ready
+from harness.resolved import Resolved, require_ready
 from harness.runner.resume import (
     SMALLEST_FAILED_SAMPLE,
     Manifest,
@@ -46,8 +45,9 @@ from harness.runner.resume import (
 )
 from harness.runner.stored import estimate_run
 from harness.runner.workers import LocalWorkers, ShardResult, Workers
-from harness.sampling import Rounds, ShardRequest
+from harness.sampling import distance_per_test_m, prepare
 from harness.sampling.baseline import as_recorded, baseline_file, baseline_requests, stored_baseline
+from harness.sampling.protocol import Rounds, ShardRequest
 from harness.strata import STORED_DESIGN
 
 EXIT_OF: Mapping[Verdict, int] = {"accepted": EXIT_DONE, "rejected": EXIT_REFUTED, "undecided": EXIT_BUDGET_SPENT}

@@ -21,10 +21,9 @@ from harness.processes import made_ahead
 from harness.records.folder import CAMPAIGN, concatenated, no_episodes, read_kept, read_manifest
 from harness.records.reader import read_campaign, read_shard, require_campaign
 from harness.records.schemas import shard_tables
-from harness.resolved import Resolved, resolve
-from harness.runner.prepare import prepare, require_world
+from harness.resolved import Resolved, require_world, resolve
 from harness.runner.resume import cpu_name, require_same_pool, versions
-from harness.sampling import source_of
+from harness.sampling import prepare, source_of
 from harness.sampling.baseline import read_baseline
 from harness.sampling.protocol import block_of
 from harness.vocabulary import ESTIMATORS, EstimatorName

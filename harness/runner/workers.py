@@ -46,9 +46,9 @@ from harness.processes import (
 from harness.records.folder import Repeated, encoded
 from harness.records.schemas import ShardTables, shard_tables
 from harness.resolved import Resolved
-from harness.runner.prepare import prepare
-from harness.sampling import ShardRequest, Source
+from harness.sampling import prepare
 from harness.sampling.baseline import BaselineRequest, BaselineResult, read_baseline, run_baseline
+from harness.sampling.protocol import ShardRequest, Source
 from harness.vocabulary import FAILED
 from harness.worlds import build_world
 from harness.worlds.twin import TwinWorld

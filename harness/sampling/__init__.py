@@ -1,16 +1,36 @@
-"""Ways of sampling tests, all of one shape (`harness.sampling.protocol`): `forced` and `shells` have a file each.
+"""How tests are drawn, by method: `source_of` names the class, `prepare` builds what its tests are drawn from.
 
-What is to be known of every method, such as whether it needs surrogates, stands in `harness.vocabulary.SAMPLING`.
+Where the cut-in of a test is drawn, and its weight made:
+
+- `nde`, `forced` and the mixtures: step by step in the loop, by `harness.episode.decide` (forced: its step, before the
+  test), the weight by `harness.episode.likelihood_ratio`; of vehicles that act before the cut-in by `forced`;
+- `shells`: from the pool, by `harness.pool.shells.PrescribedEpisodes`, which also has the weight, log p_s; how many
+  from which shell says `allocation`.
+
+All have one shape (`protocol`); what is to be known of every method, such as whether it needs surrogates, stands in
+`harness.vocabulary.SAMPLING`.
 """
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 
 from harness.campaign.campaign import Campaign
+from harness.compiled import is_cached, unboxed
+from harness.episode.judge import judge
+from harness.episode.loop import Drawing, EpisodeLoop, RecordPolicy
+from harness.episode.path import empty_trajectory, mean_test_distance
+from harness.importance.functions import build_importance
+from harness.pool.replay import Retracing
+from harness.progress import Progress
+from harness.records.schemas import shard_tables
+from harness.resolved import Resolved
 from harness.sampling.forced import Forced
-from harness.sampling.protocol import Rounds, ShardRequest, Source
+from harness.sampling.protocol import Source
 from harness.sampling.shells import Shells
+from harness.traffic.laws import Environment, InitialStates
 from harness.vocabulary import Method
 
 _SOURCES: Mapping[Method, type[Source]] = {"forced": Forced, "shells": Shells}
@@ -22,6 +42,9 @@ EPISODES_PER_S: Mapping[Method, Mapping[str, int]] = {
     "shells": {"sumo": 1700, "sumo with shim": 2700, "twin": 30000},
 }
 """On one core of a 2020s server by engine, recording included: orders of magnitude; `benchmarks/` tells yours."""
+DISTANCE_SEED = 20_000
+DISTANCE_PATHS = 20_000
+"""Paths over which the mean distance of a test is taken; its standard error is below 0.5 %."""
 
 
 def source_of(campaign: Campaign) -> type[Source]:
@@ -29,4 +52,45 @@ def source_of(campaign: Campaign) -> type[Source]:
     return _SOURCES.get(campaign.testing.method, Source)
 
 
-__all__ = ["EPISODES_PER_S", "Rounds", "ShardRequest", "Source", "source_of"]
+def prepare(resolved: Resolved, progress: Progress | None = None) -> Source:
+    """Build (or read) what a campaign's tests are drawn from, while kernels are compiled if they have to be."""
+    progress, is_warm = progress or Progress(), is_cached(judge)
+    if not is_warm:
+        progress.stage("compiling, once per version", None)
+    with ThreadPoolExecutor(1) as thread:
+        building = thread.submit(source_of(resolved.campaign), resolved, progress)
+        if not is_warm:
+            gc.disable()  # a compiler makes many small objects, and next to no garbage
+            try:
+                compile_kernels(resolved)
+            finally:
+                gc.enable()
+        return building.result()
+
+
+def compile_kernels(resolved: Resolved) -> None:
+    """Compile what episodes will need, while threads build tables: neither waits for the other.
+
+    Kernels are the same for all methods and worlds, so one naturalistic episode in the twin, retraced as if SUMO had
+    driven it, compiles them into the cache, where worker processes find them.
+    """
+    from harness.worlds.twin import TwinWorld  # noqa: PLC0415 - only a cold start needs it
+
+    campaign, environment = resolved.campaign, resolved.environment
+    naturalistic = campaign.model_copy(update={"testing": campaign.testing.model_copy(update={"method": "nde"})})
+    importance = build_importance(naturalistic, None)
+    policy = Drawing(campaign.seed, environment, importance, resolved.av, boundary=resolved.surrogates[:1])
+    states = InitialStates(environment.numbers).draw(0, 0, 1)
+    shard = EpisodeLoop(TwinWorld(1), policy, RecordPolicy(0, "none", 0.0)).run(0, states)
+    Retracing(resolved).check(shard_tables(shard, campaign.seed, keep_traces=False).episodes)
+    distance_per_test_m(environment)
+
+
+def distance_per_test_m(environment: Environment) -> float:
+    """Mean distance (m) that the AV drives in a naturalistic test.
+
+    Overtakings without cut-in: the others are too few (some 3e-5 at level 1) to matter.
+    """
+    states = InitialStates(environment.numbers).draw(DISTANCE_SEED, 0, DISTANCE_PATHS)
+    scratch = empty_trajectory(environment)
+    return float(mean_test_distance(DISTANCE_SEED, states, unboxed(environment), unboxed(scratch)))

@@ -113,10 +113,6 @@ class Source:
         return build_tables(self.resolved.environment, drivers, self.campaign.testing.challenge, progress.advance)
 
     @classmethod
-    def require(cls, resolved: Resolved) -> None:
-        """Refuse (`CampaignError`) what can be known to be wrong before anything is built."""
-
-    @classmethod
     def cached_files(cls, resolved: Resolved) -> list[Path]:
         """What building leaves in the cache, or has found there: with these another machine builds nothing."""
         if not resolved.campaign.sampling.mixes:

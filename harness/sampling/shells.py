@@ -68,11 +68,6 @@ class Shells(Source):
         self.policy = self.policy._replace(boundary=boundary)
 
     @classmethod
-    def require(cls, resolved: Resolved) -> None:
-        """See `Source`: the library knows what is stated."""
-        resolved.library.statement_settings(resolved.campaign.testing.shells)
-
-    @classmethod
     def cached_files(cls, resolved: Resolved) -> list[Path]:
         own = resolved.campaign.has_baseline_runs
         return [baseline_paths_file(resolved) if own else pool_path(campaign_pool_key(resolved))]

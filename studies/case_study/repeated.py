@@ -14,8 +14,8 @@ from scipy.stats import ttest_1samp
 from harness.campaign.campaign import Campaign
 from harness.campaign.files import load_campaign
 from harness.resolved import resolve
-from harness.runner.prepare import prepare
 from harness.runner.run import run_campaign
+from harness.sampling import prepare
 from harness.vocabulary import EstimatorName, FloatArray
 from studies.case_study.counted import Claims, Counted
 from studies.case_study.figures import (

@@ -14,8 +14,8 @@ from harness.errors import HarnessError
 from harness.estimators.limits import clopper_pearson, normal_half_width
 from harness.records.folder import read_table
 from harness.resolved import resolve
-from harness.runner.prepare import prepare
 from harness.runner.run import RunResult, run_campaign
+from harness.sampling import prepare
 from harness.vocabulary import FloatArray, Method
 from studies.case_study.figures import exactly, figure, is_settled, marked, tests_for, weights_are_in
 from studies.case_study.study import Context, Made, Run, TwinTests

@@ -16,8 +16,8 @@ from harness.estimators.stopping import StopRule
 from harness.importance.functions import mixture_weights
 from harness.records.schemas import shard_tables
 from harness.resolved import resolve
-from harness.runner.prepare import prepare
-from harness.sampling import Source
+from harness.sampling import prepare
+from harness.sampling.protocol import Source
 from harness.vocabulary import EstimatorName, Method
 from harness.worlds.twin import TwinWorld
 from studies.chains.chain import Chain

@@ -11,7 +11,7 @@ import pytest
 from harness.campaign.campaign import Campaign
 from harness.episode.loop import Shard
 from harness.resolved import resolve
-from harness.runner.prepare import prepare
+from harness.sampling import prepare
 from harness.worlds import World
 from harness.worlds.twin import TwinWorld
 from tests.worlds.running import smoke

@@ -14,7 +14,7 @@ from harness.episode.loop import Drawing, EpisodeLoop, RecordPolicy
 from harness.importance.functions import build_importance
 from harness.records.schemas import episodes_table
 from harness.resolved import resolve
-from harness.runner.prepare import prepare
+from harness.sampling import prepare
 from harness.vocabulary import AV, CRASH, CUT_IN, PASSED, STATE_DTYPE
 from harness.worlds.twin import TwinWorld
 from tests.chains.seed import SEED

@@ -11,8 +11,8 @@ from harness.campaign.sections import EnvironmentSettings, Records, Testing
 from harness.campaign.vehicle import AutomatedVehicle
 from harness.episode.loop import Shard
 from harness.resolved import resolve
-from harness.runner.prepare import prepare
-from harness.sampling import Source
+from harness.sampling import prepare
+from harness.sampling.protocol import Source
 from harness.vocabulary import CRASH
 from harness.worlds.twin import TwinWorld
 from tests.chains.seed import SEED

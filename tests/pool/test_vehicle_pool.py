@@ -12,7 +12,7 @@ from harness.pool.vehicle_pool import CANDIDATES, EVENLY, chances, vehicle_pool
 from harness.pool.walk import BaselineRuns, Enumerator, enumerate_cut_ins
 from harness.progress import Progress
 from harness.resolved import resolve
-from harness.runner.prepare import prepare
+from harness.sampling import prepare
 from harness.sampling.baseline import as_recorded, baseline_requests, run_baseline, without_cut_in
 from harness.vehicles.drivers import Followers, driver_records
 from harness.vocabulary import CRASH

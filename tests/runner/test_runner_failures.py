@@ -18,7 +18,7 @@ from harness.progress import ShownProgress
 from harness.runner import run as running
 from harness.runner import workers
 from harness.runner.workers import WorkerLostError
-from harness.sampling import ShardRequest
+from harness.sampling.protocol import ShardRequest
 from tests.in_process import workers_alive
 from tests.runner import bad_workers
 from tests.runner.conftest import MIXTURE_FILE, SMALL, TWIN

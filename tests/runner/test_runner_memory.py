@@ -23,7 +23,7 @@ def run_shards(connection, folder: Path) -> None:
     """Work like a worker process, and say after every shard how much memory that takes."""
     from harness.resolved import resolve
     from harness.runner.workers import ShardRunner
-    from harness.sampling import ShardRequest
+    from harness.sampling.protocol import ShardRequest
 
     runner = ShardRunner(resolve(load_campaign(MIXTURE_FILE)), folder)
     for index in range(EPISODES // SHARD):

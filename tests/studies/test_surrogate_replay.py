@@ -24,7 +24,7 @@ from harness.pool.build import campaign_pool
 from harness.pool.cut_ins import Pool
 from harness.records.schemas import episodes_table
 from harness.resolved import resolve
-from harness.runner.prepare import prepare
+from harness.sampling import prepare
 from harness.vocabulary import CRASH, BoolArray
 from harness.worlds.twin import TwinWorld
 from studies.alarm import Alarm, KnownRates, drivers_crash, surrogates_crash

@@ -12,7 +12,7 @@ from harness.campaign.files import load_campaign
 from harness.campaign.vehicle import AutomatedVehicle, Limits, TraciProcess
 from harness.episode.loop import Shard
 from harness.resolved import resolve
-from harness.runner.prepare import prepare
+from harness.sampling import prepare
 from harness.worlds import build_world
 from harness.worlds.twin import TwinWorld
 

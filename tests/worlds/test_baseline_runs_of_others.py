@@ -7,7 +7,7 @@ import pytest
 
 from harness.campaign.files import load_campaign
 from harness.resolved import resolve
-from harness.runner.prepare import prepare
+from harness.sampling import prepare
 from harness.sampling.baseline import as_recorded, baseline_requests, run_baseline
 from harness.worlds import build_world
 from harness.worlds.sumo_driven import FreshWorld, SumoAvWorld

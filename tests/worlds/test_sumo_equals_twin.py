@@ -19,7 +19,7 @@ import pytest
 
 from harness.episode.loop import Shard
 from harness.resolved import resolve
-from harness.runner.prepare import prepare
+from harness.sampling import prepare
 from harness.vocabulary import AV, BV, BV_LV_CONTACT, CRASH, LV, PASSED, STATE_DTYPE, VEHICLES
 from harness.worlds.twin import TwinWorld
 from tests.episode.twin_runs import TWO

@@ -14,7 +14,7 @@ import pytest
 from harness.episode.loop import EpisodeLoop, RecordPolicy, Shard
 from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, WorldDisagreementError
 from harness.resolved import resolve
-from harness.runner.prepare import prepare
+from harness.sampling import prepare
 from harness.vocabulary import CRASH, LV
 from harness.worlds.shim import shim_library
 from harness.worlds.twin import TwinWorld
