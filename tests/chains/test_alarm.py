@@ -19,9 +19,8 @@ from harness.estimators.block import Block
 from harness.vocabulary import BoolArray
 from studies.alarm import LEVEL, Alarm, KnownRates
 from studies.chains.sampler import SingleChoice
+from tests.chains.seed import SEED
 from tests.estimators.small_blocks import block
-
-from .seed import SEED
 
 N = 2_000
 

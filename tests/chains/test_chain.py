@@ -9,8 +9,7 @@ from studies.case_study.theorems import small_chains
 from studies.chains.chain import enumerate_episodes, overtaking, panel, replayed
 from studies.chains.sampler import draw, mixture_weights
 from studies.chains.shells import ChainShells, joint_outcomes
-
-from .seed import SEED
+from tests.chains.seed import SEED
 
 IMMEDIATE = overtaking("immediate", skill=0.6, level=0.05, horizon=4, surrogates=[0.6, 0.3], challenge="immediate")
 

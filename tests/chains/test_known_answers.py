@@ -16,9 +16,8 @@ from harness.estimators.one_pass import one_pass
 from harness.estimators.weighted import Nade
 from studies.chains.chain import frequent_decisive, panel, rare_decisive
 from studies.chains.sampler import Sampler, blocks
+from tests.chains.seed import SEED
 from tests.estimators.small_blocks import fed
-
-from .seed import SEED
 
 SIZES = [5_000] * 12
 METHODS = {

@@ -11,8 +11,7 @@ from harness.vocabulary import FAILED, OUTCOMES
 from studies.chains.chain import overtaking
 from studies.chains.sampler import draw
 from tests.chains.seed import SEED
-
-from .small_blocks import block as made
+from tests.estimators.small_blocks import block as made
 
 CHAIN = overtaking("ten steps", skill=0.5, surrogates=[0.5, 0.2], level=0.02, horizon=11)
 

@@ -20,8 +20,7 @@ from harness.estimators.weighted import Nade
 from studies.chains.chain import frequent_decisive, overtaking, panel
 from studies.chains.sampler import blocks, draw
 from tests.chains.seed import SEED
-
-from .small_blocks import block, fed
+from tests.estimators.small_blocks import block, fed
 
 SMALL = overtaking("short", skill=0.5, surrogates=[0.5, 0.2, 0.8], level=0.02, horizon=5)
 LONG = overtaking("long", skill=0.5, surrogates=[0.5, 0.2, 0.8], level=0.02, horizon=12)
@@ -111,17 +110,6 @@ def test_columns_that_never_vary_explain_nothing():
 def test_columns_stay_within_729(level, surrogates, steps, columns):
     assert steps_used(level, surrogates) == steps
     assert n_columns(level, surrogates) == columns
-
-
-@pytest.mark.parametrize("k", [1, 5, 33, 100])
-def test_rows_folded_in_blocks_have_the_factor_of_the_whole_matrix(k):
-    matrix = np.random.default_rng(k).normal(size=(300, k)) * np.logspace(0, 6, k)
-    factor = None
-    for rows in np.split(matrix, [1, 40, 40, 170]):
-        factor = fold_rows(factor, np.array(rows, order="F"))
-    expected = np.linalg.qr(matrix, mode="r")
-    np.testing.assert_allclose(np.abs(factor), np.abs(expected), rtol=0, atol=1e-12 * np.abs(expected).max())
-    assert np.array_equal(factor, np.triu(factor))
 
 
 @pytest.mark.parametrize(("k", "order"), [(3, "C"), (4, "F")])

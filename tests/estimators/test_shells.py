@@ -14,8 +14,7 @@ from harness.estimators.likelihood import Level, likelihood_limit
 from harness.estimators.one_pass import one_pass
 from harness.estimators.tally import FEWEST_PATHS, CrashPaths, Tally, combined, empty_tally, pool_variance
 from harness.strata import Statement
-
-from .small_blocks import EXACT, SHELLS, in_shells, tally
+from tests.estimators.small_blocks import EXACT, SHELLS, in_shells, tally
 
 P, LEVEL = SHELLS.p, Level.two_sided(0.9)
 

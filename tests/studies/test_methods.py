@@ -24,8 +24,7 @@ from studies.replication.run import validate
 from studies.replication.shells import FREE, ShellCampaign, limit_at, result_of
 from studies.replication.weighted import WeightedCampaign, chain_episodes
 from tests.golden.record import unlike
-
-from .here import wrong_shell
+from tests.studies.here import wrong_shell
 
 ROOT = Path(__file__).parents[2]
 CONFIDENCE = 0.9

@@ -15,8 +15,7 @@ from studies.case_study.small_case import AV_MPS, _crashes, small_world
 from studies.case_study.study import Context, SmallCase
 from tests.chains.seed import SEED
 from tests.estimators.small_blocks import fed
-
-from .here import Here
+from tests.studies.here import Here
 
 
 @pytest.fixture(scope="module")

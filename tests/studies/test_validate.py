@@ -17,8 +17,7 @@ from studies.replication import run
 from studies.replication.experiment import load_experiment
 from studies.replication.judgement import Row, Subject, corrected, judge
 from studies.work import worker_processes
-
-from .here import Here
+from tests.studies.here import Here
 
 CHAINS = """
 format: validation-experiment

@@ -22,8 +22,7 @@ from studies.replication.populations import (
     walk_paths,
 )
 from studies.replication.shells import FREE, Division, ShellCampaign
-
-from .here import Here, wrong_shell
+from tests.studies.here import Here, wrong_shell
 
 LIBRARY = load_library("ladder-2")
 PATHS = 1024

@@ -1,19 +1,60 @@
-"""Likelihood-ratio limits: against the definition, identities, and coverage by exact enumeration."""
+"""Likelihood-ratio limits, alone and beside a reference: against the definition, identities, exact coverage."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterator, Sequence
+from itertools import product
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import brentq, minimize
-from scipy.special import betaincinv, xlogy
+from scipy.special import betaincinv, gammaln, xlogy
 
 from harness.estimators.likelihood import Level, contrast_limit, likelihood_limit, ratio_limits, spread
+from harness.estimators.shells import preventable_share, rate_ratio_limits
+from harness.estimators.tally import Tally
+from tests.estimators.small_blocks import EXACT, tally
 
-from .exact import coverage, tilted
+
+def _outcomes(share: Sequence[float], n: int) -> Iterator[tuple[float, np.ndarray]]:
+    """How often ``n`` tests may have each outcome, the last being all that have no ``share``, and its probability."""
+    counts = np.array([(*k, n - sum(k)) for k in product(range(n + 1), repeat=len(share)) if sum(k) <= n])
+    shares = np.array([*share, max(1.0 - sum(share), 0.0)])
+    chance = np.exp(gammaln(n + 1) - gammaln(counts + 1).sum(1) + xlogy(counts, shares).sum(1))
+    likely = chance > 1e-6
+    return zip(chance[likely].tolist(), counts[likely], strict=True)
+
+
+def coverage(
+    shares: Sequence[Sequence[float]],
+    tests: Sequence[int],
+    truth: float,
+    limits: Callable[[np.ndarray], tuple[float, float]],
+) -> float:
+    """Probability that limits of counts (S, J) of independent strata hold the truth, unlikely counts being misses."""
+    covered = 0.0
+    for drawn in product(*(list(_outcomes(share, n)) for share, n in zip(shares, tests, strict=True))):
+        chance = math.prod(probability for probability, _ in drawn)
+        if chance > 1e-8:
+            low, high = limits(np.array([counts for _, counts in drawn]))
+            covered += chance * (low - 1e-9 <= truth <= high + 1e-9)  # up to rounding
+    return covered
+
+
+def tilted(a: np.ndarray, crashes: np.ndarray, tests: np.ndarray) -> tuple[np.ndarray, float]:
+    """Shares nearest to those seen, tilted by ``a`` per test, as roots of a quadratic; and Σ n KL of them."""
+    c = crashes / tests
+    root = np.sqrt((1 - a) ** 2 + 4 * a * c)
+    shares = np.where(a <= 1, 2 * c / (1 - a + root), (a - 1 + root) / (2 * np.where(a > 1, a, 1)))
+    cost = xlogy(c, c) - xlogy(c, shares) + xlogy(1 - c, 1 - c) - xlogy(1 - c, 1 - shares)
+    return shares, float((tests * cost).sum())
+
+
+# -- limits of weighted sums and of ratios --
+
 
 MANY = 1e6
 """A quantile so large that the threshold for few crashes always holds."""
@@ -228,3 +269,92 @@ def test_shares_end_at_0_and_1_and_without_a_crash_the_bound_is_the_exact_one_at
 def test_an_error_of_the_weights_alone_gives_the_normal_interval():
     limits = binomial([1.0], [10**12 // 4], [10**12], Level.two_sided(0.9), 0.01)
     assert limits == pytest.approx((0.25 - 1.6449 * 0.1, 0.25 + 1.6449 * 0.1), abs=2e-3)
+
+
+# -- beside a reference driver --
+
+
+FEW = Level(2.6, MANY)
+"""The threshold for few crashes always holds."""
+TWO_SIDED = Level.two_sided(0.9)
+P = np.array([1e-7, 3e-7, 2e-6])
+
+
+@pytest.mark.parametrize("crashes", [(5, 9, 0), (0, 0, 0)])
+def test_the_ratio_to_a_known_rate_is_the_rate_over_it(crashes):
+    found = tally(P, crashes, (10, 20, 300))
+    low, high = (likelihood_limit(P, found.crashes, found.tests, TWO_SIDED, side) / 2e-7 for side in (-1.0, 1.0))
+    ratio = rate_ratio_limits(P, found, np.zeros(3), (2e-7, 4e-14), EXACT, TWO_SIDED)
+    assert ratio == pytest.approx((low, high), rel=1e-6)
+    assert (ratio[0] == 0.0) == (sum(crashes) == 0)
+
+
+def test_the_reference_itself_is_as_often_as_itself_whatever_the_pool():
+    """It crashes on all cut-ins of its cells: the error of the pool cancels where both crash on the same paths."""
+    mass = np.random.default_rng(1).exponential(P[:1], 4_000)
+    crashed = mass[np.random.default_rng(2).choice(4_000, 1_000_000, p=mass / mass.sum())]
+    found = Tally(*(np.array([x]) for x in (1_000_000, 1_000_000, 0)), crashed.sum()[None, None], np.zeros((1, 1)))
+    p, square = mass.mean(), (mass**2).mean()
+    alone = rate_ratio_limits(np.array([p]), found, np.zeros(1), (p, p * p), 4_000, TWO_SIDED)
+    beside = rate_ratio_limits(np.array([p]), found, np.array([crashed.sum()]), (p, square), 4_000, TWO_SIDED)
+    assert alone[1] - alone[0] > 0.04
+    assert beside == pytest.approx((1.0, 1.0), abs=2e-3)
+
+
+def least_cost(p, k, n, prevented, y):
+    """Σ n KL at the shares nearest to those seen that have this share of crashes in the prevented cells."""
+    weights, how = p * (prevented - y) / p.max(), {"xtol": 1e-14, "rtol": 1e-15, "maxiter": 1000}
+    off = brentq(lambda nu: weights @ tilted(nu * weights / n, k, n)[0], -1e5, 1e5, **how)
+    return tilted(off * weights / n, k, n)[1]
+
+
+@pytest.mark.parametrize(("k", "n"), [((6, 9, 3), (40, 30, 200)), ((1, 20, 5), (25, 30, 400))])
+def test_the_preventable_shares_are_those_that_some_crash_shares_explain(k, n):
+    k, n, prevented = np.array(k), np.array(n), np.array([True, False, True])
+    share, low, high = preventable_share(P, tally(np.zeros(3), k, n), prevented, EXACT, FEW)
+    both = P * k / n
+    assert share == pytest.approx(both[prevented].sum() / both.sum())
+    assert low < share < high
+    for limit in (low, high):
+        assert least_cost(P, k, n, prevented, limit) == pytest.approx(FEW.threshold, rel=1e-5)
+
+
+def test_a_share_stays_a_share():
+    def found(crashes, tests):
+        return preventable_share(P, tally(P, crashes, tests), np.array([True, False, True]), EXACT, TWO_SIDED)
+
+    assert found((0, 0, 0), (10, 10, 10))[1:] == (0.0, 1.0)
+    share, low, high = found((9, 0, 9), (10, 50, 10))
+    assert 0.5 < low < share == high == 1.0
+    share, low, high = found((0, 45, 0), (90, 50, 900))
+    assert share == low == 0.0 < high < 0.05
+
+
+def test_failed_tests_count_as_whatever_is_worse():
+    def found(crashes, failed=0):
+        counts = tally(P[:2], crashes, (20, 30), failed)
+        return preventable_share(P[:2], counts, np.array([True, False]), EXACT, TWO_SIDED)
+
+    plain, failed = found((8, 9)), found((8, 9), (3, 4))
+    assert failed[0] == plain[0]
+    for crashes in product(range(8, 12), range(9, 14)):
+        _, low, high = found(crashes)
+        assert failed[1] <= low + 1e-9
+        assert high <= failed[2] + 1e-9
+    assert failed[1] < plain[1] < plain[2] < failed[2]
+
+
+@pytest.mark.parametrize("share", [(0.9, 0.4, 0.0), (0.3, 0.1, 0.01), (0.02, 0.9, 0.05)])
+def test_the_preventable_share_is_held_often_enough_whatever_the_counts(share):
+    """Known answers: coverage summed over outcomes, nominal 0.90; and too narrow a level does not hold it."""
+    tests, prevented, true = (8, 9, 14), np.array([True, False, True]), P * share
+    truth = true[prevented].sum() / true.sum()
+
+    def covered(level):
+        def limits(counts):
+            return preventable_share(P, tally(P, counts[:, 0], tests), prevented, EXACT, level)[1:]
+
+        return coverage([(each,) for each in share], tests, truth, limits)
+
+    assert covered(TWO_SIDED) >= 0.90
+    assert covered(Level(0.3, 0.5)) < 0.85
