@@ -73,11 +73,6 @@ class Subject:
     left_out: tuple[str, ...] = ()
     boundary: str | None = None
 
-    @classmethod
-    def exact(cls, name: str, crash_rate: float, **more: Any) -> Subject:
-        """One whose crash rate is known without error."""
-        return cls(name, Known(crash_rate, 0.0, crash_rate), **more)
-
     def truth(self, result: str) -> Known:
         """What a result estimates."""
         return self.others.get(result.removesuffix(FORMER), self.crash_rate)

@@ -196,6 +196,11 @@ class Known:
     std_error: float
     scale: float
 
+    @classmethod
+    def exactly(cls, value: float) -> Known:
+        """One that is known without error, and is its own scale."""
+        return cls(value, 0.0, value)
+
     @property
     def relative_error(self) -> float:
         """Standard error over the scale; infinite at scale 0."""

@@ -19,6 +19,7 @@ from harness.estimators.weighted import Nade
 from studies.chains.chain import frequent_decisive, rare_decisive
 from studies.chains.sampler import draw, with_optimal_function
 from studies.replication.judgement import Judgement, Subject, estimate_row, judge
+from studies.replication.populations import Known
 from tests.estimators.small_blocks import fed
 
 REPLICATIONS = 200
@@ -34,7 +35,7 @@ def replicate(
         name: [estimate_row(name, k, fed(new(), [block]).result(0.9), reached=False) for k, block in enumerate(drawn)]
         for name, new in make.items()
     }
-    return {name: judge(Subject.exact("", truth), name, of_name, 0.9) for name, of_name in rows.items()}
+    return {name: judge(Subject("", Known.exactly(truth)), name, of_name, 0.9) for name, of_name in rows.items()}
 
 
 def covers(covered: int) -> bool:

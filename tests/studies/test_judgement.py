@@ -31,7 +31,9 @@ def test_holm_as_in_a_worked_example():
 
 def test_normal_estimates_are_judged_right():
     rates = np.random.default_rng(1).normal(1.0, 0.1, 4000)
-    right, narrow, wide = (judge(Subject.exact(str(h), 1.0), "x", rows(rates, h), 0.9) for h in (0.16449, 0.13, 0.3))
+    right, narrow, wide = (
+        judge(Subject(str(h), Known.exactly(1.0)), "x", rows(rates, h), 0.9) for h in (0.16449, 0.13, 0.3)
+    )
     assert abs(right["bias"]) < 4.0 * right["bias_std_error"]
     assert right["true_relvar"] == pytest.approx(0.01, rel=0.1)
     assert right["claimed_relvar"] == pytest.approx(0.01, rel=1e-9)
@@ -56,7 +58,7 @@ def test_a_difference_of_nothing_is_judged_relative_to_the_rates():
 
 
 def test_a_refusal_counts_as_covered_and_says_nothing_else():
-    subject = Subject("a", Known(1.0, 0.0, 1.0))
+    subject = Subject("a", Known.exactly(1.0))
     refused = [Row("x", k, 100, 5, math.nan, math.inf, 0.0, math.inf, False, refused=True) for k in range(4)]
     found = judge(subject, "x", rows([1.1] * 6, 0.2) + refused, 0.9)
     assert (found["covered"], found["refused"]) == (10, 0.4)

@@ -19,7 +19,7 @@ from studies.chains.chain import CHAINS, replayed
 from studies.chains.shells import ChainShells
 from studies.replication.experiment import Experiment, load_experiment
 from studies.replication.judgement import Judgement, Row, Subject, corrected, judge
-from studies.replication.populations import preventable_by, ratio_to
+from studies.replication.populations import Known, preventable_by, ratio_to
 from studies.replication.run import validate
 from studies.replication.shells import FREE, ShellCampaign, limit_at, result_of
 from studies.replication.weighted import WeightedCampaign, chain_episodes
@@ -41,7 +41,7 @@ def judged(runs: dict[str, list[Row]], result: str) -> list[Judgement]:
     found = []
     for name, rows in runs.items():
         of_result = [row for row in rows if row.result == result]
-        found.append(judge(Subject.exact(name, CHAINS[name].crash_rate), result, of_result, CONFIDENCE))
+        found.append(judge(Subject(name, Known.exactly(CHAINS[name].crash_rate)), result, of_result, CONFIDENCE))
     return corrected(found)
 
 
@@ -81,7 +81,7 @@ def decisions(name: str, wrong: float = 1.0) -> list[Judgement]:
     names = [name for factor in limits for name in limit_at(factor)]
     draw = wrong_shell(ChainShells(chain, 2048).draw, 0, wrong)
     rows = ShellCampaign(campaign("shells", 4000), draw, 11, limits).run(range(FEW // 2))
-    subject = Subject.exact(chain.name, chain.crash_rate)
+    subject = Subject(chain.name, Known.exactly(chain.crash_rate))
     return corrected([judge(subject, name, [row for row in rows if row.result == name], 0.95) for name in names])
 
 

@@ -16,6 +16,7 @@ from studies.__main__ import main
 from studies.replication import run
 from studies.replication.experiment import load_experiment
 from studies.replication.judgement import Row, Subject, corrected, judge
+from studies.replication.populations import Known
 from studies.work import worker_processes
 from tests.studies.here import Here
 
@@ -69,7 +70,7 @@ def test_workers_change_no_bit_and_the_online_rule_is_followed(tmp_path, monkeyp
 
 def test_what_never_crashes_has_results_too(tmp_path):
     (tmp_path / "x.yaml").write_text(CHAINS)
-    never, rows = Subject.exact("never", 0.0), [Row("x", k, 9, 0, 0.0, 0.0, 0.0, 0.1, False) for k in range(5)]
+    never, rows = Subject("never", Known.exactly(0.0)), [Row("x", k, 9, 0, 0.0, 0.0, 0.0, 0.1, False) for k in range(5)]
     experiment = load_experiment(tmp_path / "x.yaml")
     run.write_results(tmp_path, experiment, corrected([judge(never, "x", rows, 0.9)]), {never: rows})
     content = json.loads((tmp_path / "results.json").read_text())
