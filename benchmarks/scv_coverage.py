@@ -15,10 +15,10 @@ from harness.estimators.block import Block
 from harness.estimators.estimate import Estimate
 from harness.estimators.scv import Scv
 from harness.estimators.weighted import Nade
-from studies.chains.chain import frequent_decisive, rare_decisive
+from studies.chains.chain import DECISIVE
 from studies.chains.sampler import draw
 
-SETTINGS = [(frequent_decisive, 2_000), (frequent_decisive, 20_000), (rare_decisive, 2_000), (rare_decisive, 20_000)]
+SETTINGS = [(chain, n) for chain in DECISIVE for n in (2_000, 20_000)]
 SEED = 5
 COLUMNS = ("crash_rate", "std_error", "ci_low", "ci_high")
 
@@ -32,8 +32,7 @@ def estimate(state: Nade | Scv, block: Block) -> Estimate:
 def main(replications: int) -> None:
     print("| crash rate | tests | true relvar | nade: claimed | covers | scv: claimed | covers | largest difference |")
     print("| --- | --- | --- | --- | --- | --- | --- | --- |")
-    for make_chain, n in SETTINGS:
-        chain = make_chain()
+    for chain, n in SETTINGS:
         truth, relvar = chain.crash_rate, chain.step_mixture_variance / chain.crash_rate**2
         drawn = (draw(chain, "step_mixture", n, np.random.default_rng([SEED, k])) for k in range(replications))
         found = [[estimate(Nade(), block), estimate(Scv(), block)] for block in drawn]

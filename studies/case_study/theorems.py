@@ -18,7 +18,7 @@ from harness.estimators.scv import MixtureCv, Scv
 from harness.vocabulary import FloatArray
 from studies.case_study.figures import exactly
 from studies.case_study.study import Context, Theorems
-from studies.chains.chain import Chain, Episodes, enumerate_episodes, overtaking, rare_decisive
+from studies.chains.chain import DECISIVE, Chain, Episodes, enumerate_episodes, overtaking
 from studies.chains.sampler import with_optimal_function
 from studies.work import write_table
 
@@ -28,7 +28,7 @@ def small_chains() -> list[Chain]:
     return [
         overtaking("right and wrong", skill=0.6, surrogates=[0.6, 0.2], level=0.05, horizon=4),
         overtaking("all wrong", skill=0.9, surrogates=[0.1, 0.3], level=1e-4, horizon=4),
-        rare_decisive(),
+        DECISIVE[1],
     ]
 
 

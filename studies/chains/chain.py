@@ -265,20 +265,15 @@ def _chain(
 
 def _approach(closer: float, wait: float, back: float) -> FloatArray:
     """State 0 is passed; the others come closer, wait, or fall back."""
-    table = np.zeros((N_APPROACH, N_APPROACH))
-    table[0, 0] = 1.0
-    for g in range(1, N_APPROACH):
-        table[g, g - 1] += closer
-        table[g, g] += wait
-        table[g, min(g + 1, N_APPROACH - 1)] += back
+    table = closer * np.eye(N_APPROACH, k=-1) + wait * np.eye(N_APPROACH) + back * np.eye(N_APPROACH, k=1)
+    table[0], table[-1, -1] = np.eye(N_APPROACH)[0], wait + back
     return table
 
 
 def _entry() -> FloatArray:
     """The closer the cut-in, the more danger; cutting in at the largest distance is safe."""
     table = np.zeros((N_APPROACH, N_DANGER + 2))
-    table[[0, 5], N_DANGER] = 1.0
-    table[4, 0] = 1.0
+    table[[0, 5], N_DANGER] = table[4, 0] = 1.0
     for g, states in ((1, [3, 2]), (2, [2, 1]), (3, [1, 0])):
         table[g, states] = 0.6, 0.4
     return table
@@ -306,38 +301,25 @@ def _response(*moves: tuple[float, float, float]) -> FloatArray:
     return table
 
 
-def panel() -> list[Chain]:
-    """Chains that every estimator must get right."""
-    return [
-        overtaking("frequent", skill=0.5, surrogates=[0.5, 0.3, 0.8], level=0.02, horizon=8),
-        overtaking("one surrogate right", skill=0.7, surrogates=[0.7, 0.2], level=1e-3, horizon=10),
-        overtaking("all surrogates wrong", skill=0.7, surrogates=[0.3, 0.55], level=3e-5, horizon=10),
-        overtaking("rare", skill=0.9, surrogates=[0.9, 0.5, 0.7], level=1e-5, horizon=12),
-        overtaking("very rare", skill=0.97, surrogates=[0.95, 0.7], level=1e-6, horizon=12),
-    ]
-
-
-def frequent_decisive() -> Chain:
-    """Crash probability 1.2e-2; its step mixture's Y is well explained by products of ratios."""
-    return decisive("decisive", skill=0.3, surrogates=[0.9, 0.3, 0.0], level=0.05, horizon=5, brake=0.2)
-
-
-def rare_decisive() -> Chain:
-    """Crash probability 6e-6, otherwise alike."""
-    return decisive("rare decisive", skill=1.0, surrogates=[0.9, 0.6, 0.3], level=1e-3, horizon=5, brake=0.01)
-
-
-def replayed() -> list[Chain]:
-    """Chains whose surrogates can be replayed on the vehicle's paths: good, partly and wholly wrong, strong noise."""
-    return [
-        overtaking("good surrogates", skill=0.7, surrogates=[0.8, 0.65, 0.5], level=0.02, horizon=8, noise="shared"),
-        overtaking("partly wrong", skill=0.55, surrogates=[0.9, 0.75], level=0.02, horizon=8, noise="shared"),
-        overtaking("wholly wrong", skill=0.6, surrogates=[0.8, 0.6], level=0.02, horizon=8, noise="opposite"),
-        overtaking("strong noise", skill=0.6, surrogates=[0.75, 0.6, 0.45], level=0.02, horizon=8, noise="own"),
-    ]
-
-
-CHAINS: dict[str, Chain] = {
-    chain.name: chain for chain in [*panel(), *replayed(), frequent_decisive(), rare_decisive()]
-}
+PANEL = [
+    overtaking("frequent", skill=0.5, surrogates=[0.5, 0.3, 0.8], level=0.02, horizon=8),
+    overtaking("one surrogate right", skill=0.7, surrogates=[0.7, 0.2], level=1e-3, horizon=10),
+    overtaking("all surrogates wrong", skill=0.7, surrogates=[0.3, 0.55], level=3e-5, horizon=10),
+    overtaking("rare", skill=0.9, surrogates=[0.9, 0.5, 0.7], level=1e-5, horizon=12),
+    overtaking("very rare", skill=0.97, surrogates=[0.95, 0.7], level=1e-6, horizon=12),
+]
+"""Chains that every estimator must get right."""
+REPLAYED = [
+    overtaking("good surrogates", skill=0.7, surrogates=[0.8, 0.65, 0.5], level=0.02, horizon=8, noise="shared"),
+    overtaking("partly wrong", skill=0.55, surrogates=[0.9, 0.75], level=0.02, horizon=8, noise="shared"),
+    overtaking("wholly wrong", skill=0.6, surrogates=[0.8, 0.6], level=0.02, horizon=8, noise="opposite"),
+    overtaking("strong noise", skill=0.6, surrogates=[0.75, 0.6, 0.45], level=0.02, horizon=8, noise="own"),
+]
+"""Chains whose surrogates can be replayed on the vehicle's paths."""
+DECISIVE = [
+    decisive("decisive", skill=0.3, surrogates=[0.9, 0.3, 0.0], level=0.05, horizon=5, brake=0.2),
+    decisive("rare decisive", skill=1.0, surrogates=[0.9, 0.6, 0.3], level=1e-3, horizon=5, brake=0.01),
+]
+"""Crash probabilities 1.2e-2 and 6e-6; their step mixture's Y is well explained by products of ratios."""
+CHAINS = {chain.name: chain for chain in [*PANEL, *REPLAYED, *DECISIVE]}
 """Chains that an experiment can name."""

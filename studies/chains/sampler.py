@@ -163,10 +163,6 @@ class SingleChoice:
         """μ."""
         return float(self.p @ self.crash)
 
-    def draw(self, method: Method, n: int, rng: np.random.Generator) -> Block:
-        """Episodes of exactly one control step each."""
-        return self.block(method, self.maneuvers(n, rng))
-
     def maneuvers(self, n: int, rng: np.random.Generator) -> IntArray:
         """Drawn from the mixture."""
         return rng.choice(len(self.p), size=n, p=self.alpha @ self.q)

@@ -8,11 +8,13 @@ probability of every combination of crashes.
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 
 from harness.pool.shells import shells_of
 from harness.strata import LIBRARY_STATEMENT, OUTSIDE, ShellDesign, Statement
-from harness.vocabulary import FloatArray, IntArray
+from harness.vocabulary import FloatArray
 from studies.chains.chain import Chain
 from studies.chains.sampler import approach_paths
 from studies.replication.shells import DrawnPool
@@ -80,58 +82,32 @@ def joint_outcomes(chain: Chain) -> FloatArray:
     """
     if not np.allclose(chain.exposure, chain.exposure[0], rtol=0.0, atol=0.0):
         raise ValueError(f"chain {chain.name!r}: maneuvers depend on the danger that the vehicle is in")
-    value = _at_the_end(chain.n_surrogates, chain.crashed + 1)
+    n, width = chain.n_surrogates + 1, chain.crashed + 1
+    crashed = np.indices((width,) * n) == chain.crashed  # (n, …): the vehicle, then its surrogates, in each joint state
+    value = np.eye(1 << n)[np.tensordot(1 << np.arange(n), crashed, axes=1)].reshape(*(width,) * n, -1, 2)
     joint = np.zeros((chain.horizon, len(chain.start), 1 << chain.n_surrogates, 2))
-    same = (np.arange(chain.crashed + 1),) * (chain.n_surrogates + 1)
     for t in range(chain.horizon - 1, -1, -1):
-        joint[t] = np.einsum("gd,dmc->gmc", chain.entry, value[same])
-        value = _step_back(chain, value)
+        joint[t] = np.einsum("gd,dmc->gmc", chain.entry, value[(np.arange(width),) * n])
+        value = np.asarray(sum(p * _step_back(chain, a, value) for a, p in enumerate(chain.exposure[0])))
     return joint
 
 
-def _at_the_end(n_surrogates: int, width: int) -> FloatArray:
-    """One combination is certain in each joint state; axes: vehicle under test, surrogates, mask, crash."""
-    value = np.zeros((width,) * (n_surrogates + 1) + (1 << n_surrogates, 2))
-    for state in np.ndindex(value.shape[:-2]):
-        crashed, *others = (d == width - 1 for d in state)
-        mask = sum(1 << k for k, other in enumerate(others) if other)
-        value[(*state, mask, int(crashed))] = 1.0
-    return value
-
-
-def _step_back(chain: Chain, value: FloatArray) -> FloatArray:
-    move = _own_noise if chain.noise == "own" else _common_noise
-    absorbing = np.eye(chain.crashed + 1)[-2:]  # safe and crashed stay
-    responses = [chain.response, *chain.surrogate_responses]
-    parts = []
-    for a, p in enumerate(chain.exposure[0]):
-        tables = [np.vstack([response[:, a], absorbing]) for response in responses]
-        parts.append(p * move(tables, value, chain.noise == "opposite"))
-    return np.asarray(np.sum(parts, axis=0))
-
-
-def _own_noise(tables: list[FloatArray], value: FloatArray, _opposite: bool) -> FloatArray:
-    for axis, table in enumerate(tables):
-        value = np.moveaxis(np.tensordot(table, value, axes=(1, axis)), 0, axis)
-    return value
-
-
-def _common_noise(tables: list[FloatArray], value: FloatArray, opposite: bool) -> FloatArray:
-    """Cut the uniform where any vehicle's next state changes; within a piece all next states are certain."""
-    n = len(tables[0]) - 2
-    best_first = np.array([n, *range(n), n + 1])  # safe, then danger from low to high, then crashed
-    cumulative = [np.cumsum(table[:, best_first], axis=1) for table in tables]
-    mirrored = [opposite and k > 0 for k in range(len(tables))]
-    edges = [1.0 - c if m else c for c, m in zip(cumulative, mirrored, strict=True)]
-    cuts = np.unique(np.clip(np.concatenate([[0.0, 1.0], *(e.ravel() for e in edges)]), 0.0, 1.0))
+def _step_back(chain: Chain, maneuver: int, value: FloatArray) -> FloatArray:
+    """Values one step earlier, if the BV takes a maneuver; safe and crashed stay."""
+    absorbing = np.eye(chain.crashed + 1)[-2:]
+    tables = [np.vstack([each[:, maneuver], absorbing]) for each in (chain.response, *chain.surrogate_responses)]
+    if chain.noise == "own":
+        for axis, table in enumerate(tables):
+            value = np.moveaxis(np.tensordot(table, value, axes=(1, axis)), 0, axis)
+        return value
+    # The uniform is cut where any vehicle's next state changes; within a piece all next states are certain.
+    best_first = np.array([chain.crashed - 1, *range(chain.crashed - 1), chain.crashed])  # danger from low to high
+    cumulative = np.cumsum(np.stack(tables)[:, :, best_first], axis=2)
+    mirrored = ((np.arange(len(tables)) > 0) & (chain.noise == "opposite")).reshape(-1, 1, 1)
+    edges = np.where(mirrored, 1.0 - cumulative, cumulative)
     result = np.zeros_like(value)
-    for low, high in zip(cuts[:-1].tolist(), cuts[1:].tolist(), strict=True):
+    for low, high in pairwise(np.unique(np.clip([0.0, 1.0, *edges.ravel()], 0.0, 1.0)).tolist()):
         u = (low + high) / 2.0
-        places = [_place(c, 1.0 - u if m else u) for c, m in zip(cumulative, mirrored, strict=True)]
-        result += (high - low) * value[np.ix_(*(best_first[place] for place in places))]
+        place = (cumulative <= np.where(mirrored, 1.0 - u, u)).sum(axis=2)
+        result += (high - low) * value[np.ix_(*best_first[np.minimum(place, chain.crashed)])]
     return result
-
-
-def _place(cumulative: FloatArray, u: float) -> IntArray:
-    """Which of its next states, from the best on, a uniform leads each state to, shape (D + 2,)."""
-    return np.asarray(np.minimum((cumulative <= u).sum(axis=1), len(cumulative) - 1))

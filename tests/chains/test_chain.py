@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from studies.case_study.theorems import small_chains
-from studies.chains.chain import enumerate_episodes, overtaking, panel, replayed
+from studies.chains.chain import PANEL, REPLAYED, enumerate_episodes, overtaking
 from studies.chains.sampler import draw, mixture_weights
 from studies.chains.shells import ChainShells, joint_outcomes
 from tests.chains.seed import SEED
@@ -47,26 +47,26 @@ def drawn(chain, method: str, n: int):
 
 @pytest.mark.parametrize("method", ["nde", "step_mixture"])
 def test_without_control_the_log_weight_is_exactly_zero(method):
-    block = drawn(panel()[3], method, 20_000)
+    block = drawn(PANEL[3], method, 20_000)
     free = block.n_control_steps == 0
     assert not np.any(block.log_weight[free])
     assert not np.any(block.log_q[free])
 
 
 def test_weights_are_the_probability_of_a_cut_in_on_the_path_or_bounded_by_it():
-    chain = panel()[1]
+    chain = PANEL[1]
     block = drawn(chain, "forced", 5_000)
     assert block.cut_in.all()
     assert np.all(block.log_weight == block.log_p_cut_in)
     assert block.weighted_crashes().max() <= chain.cut_in_cap
-    block = drawn(panel()[2], "episode_mixture", 50_000)
+    block = drawn(PANEL[2], "episode_mixture", 50_000)
     assert np.all(block.weighted_crashes() <= np.exp(block.log_p_cut_in) / block.drawn.alpha[0] * (1.0 + 1e-12))
 
 
 # -- vehicles on the same cut-ins: joint outcomes, and shells that they make --
 
 
-@pytest.fixture(params=replayed(), ids=lambda c: c.name)
+@pytest.fixture(params=REPLAYED, ids=lambda c: c.name)
 def chain(request):
     return request.param
 
@@ -87,7 +87,7 @@ def test_marginals_are_those_of_each_vehicle_alone(chain):
 
 
 def test_with_shared_noise_the_more_skilled_crashes_only_where_the_less_skilled_does():
-    joint = joint_outcomes(replayed()[0]).sum(axis=3)  # skills 0.8, 0.65, 0.5
+    joint = joint_outcomes(REPLAYED[0]).sum(axis=3)  # skills 0.8, 0.65, 0.5
     nested = {0b000, 0b100, 0b110, 0b111}
     assert joint[:, :, [mask for mask in range(8) if mask not in nested]].max() < 1e-15
 

@@ -16,7 +16,7 @@ from harness.estimators.block import Block
 from harness.estimators.estimate import Accumulator
 from harness.estimators.scv import MixtureCv, Scv
 from harness.estimators.weighted import Nade
-from studies.chains.chain import frequent_decisive, rare_decisive
+from studies.chains.chain import DECISIVE
 from studies.chains.sampler import draw, with_optimal_function
 from studies.replication.judgement import Judgement, Subject, estimate_row, judge
 from studies.replication.populations import Known
@@ -42,7 +42,7 @@ def covers(covered: int) -> bool:
     return binomtest(covered, REPLICATIONS, 0.9).pvalue > 1e-4
 
 
-@pytest.mark.parametrize("chain", [frequent_decisive(), rare_decisive()], ids=lambda c: c.name)
+@pytest.mark.parametrize("chain", DECISIVE, ids=lambda c: c.name)
 def test_nade_covers_and_the_published_scv_does_not(chain):
     both = {"nade": Nade, "scv": Scv}
     nade, scv = replicate(lambda rng: draw(chain, "step_mixture", N, rng), 11, both, chain.crash_rate).values()
@@ -73,13 +73,13 @@ def test_known_means_cover_and_sample_means_do_not(tilt):
     """A nearly optimal importance function among others: the gain is real only if the means are known."""
     world = with_optimal_function(tilt)
     both = {"right": MixtureCv, "wrong": SampleCentred}
-    found = replicate(lambda rng: world.draw("episode_mixture", N, rng), 13, both, world.crash_rate)
+    found = replicate(lambda rng: world.block("episode_mixture", world.maneuvers(N, rng)), 13, both, world.crash_rate)
     assert covers(found["right"]["covered"])
     assert not covers(found["wrong"]["covered"])
 
 
 def test_known_mean_control_variates_cover_on_a_chain():
-    chain = frequent_decisive()
+    chain = DECISIVE[0]
     one = {"mixture_cv": MixtureCv}
     found = replicate(lambda rng: draw(chain, "episode_mixture", N, rng), 12, one, chain.crash_rate)
     assert covers(found["mixture_cv"]["covered"])

@@ -14,7 +14,7 @@ from scipy.stats import binomtest
 from harness.estimators.estimate import Estimate
 from harness.estimators.one_pass import one_pass
 from harness.estimators.weighted import Nade
-from studies.chains.chain import frequent_decisive, panel, rare_decisive
+from studies.chains.chain import DECISIVE, PANEL
 from studies.chains.sampler import Sampler, blocks
 from tests.chains.seed import SEED
 from tests.estimators.small_blocks import fed
@@ -33,7 +33,7 @@ def standard_errors_off(chain, estimate: Estimate, std_error: float | None = Non
     return abs(estimate.crash_rate - chain.crash_rate) / (estimate.std_error if std_error is None else std_error)
 
 
-@pytest.mark.parametrize("chain", [*panel(), frequent_decisive(), rare_decisive()], ids=lambda c: c.name)
+@pytest.mark.parametrize("chain", [*PANEL, *DECISIVE], ids=lambda c: c.name)
 @pytest.mark.parametrize("method", METHODS)
 def test_estimates_are_right(chain, method):
     done = one_pass(blocks(chain, method, SIZES, SEED))
@@ -67,7 +67,7 @@ class ForgetsTheCutIn(Sampler):
         self.log_step[cut] = before[cut]
 
 
-@pytest.mark.parametrize("chain", [panel()[0], frequent_decisive()], ids=lambda c: c.name)
+@pytest.mark.parametrize("chain", [PANEL[0], DECISIVE[0]], ids=lambda c: c.name)
 def test_a_dropped_ratio_is_caught(chain):
     """The check has teeth: leave the cut-in's own ratio out and the answer is off by far more than four errors."""
     wrong = ForgetsTheCutIn(chain, "step_mixture", sum(SIZES), np.random.default_rng(SEED)).run(0)

@@ -17,14 +17,14 @@ from harness.estimators.scv import (
     steps_used,
 )
 from harness.estimators.weighted import Nade
-from studies.chains.chain import frequent_decisive, overtaking, panel
+from studies.chains.chain import DECISIVE, PANEL, overtaking
 from studies.chains.sampler import blocks, draw
 from tests.chains.seed import SEED
 from tests.estimators.small_blocks import block, fed
 
 SMALL = overtaking("short", skill=0.5, surrogates=[0.5, 0.2, 0.8], level=0.02, horizon=5)
 LONG = overtaking("long", skill=0.5, surrogates=[0.5, 0.2, 0.8], level=0.02, horizon=12)
-MANY = panel()[0]
+MANY = PANEL[0]
 
 
 def algorithm_1(parts: list[Block]) -> tuple[float, float, dict[int, tuple[int, int, int]]]:
@@ -49,7 +49,7 @@ def algorithm_1(parts: list[Block]) -> tuple[float, float, dict[int, tuple[int, 
     return estimate, float(np.var(np.concatenate(z), ddof=1)) if n > 1 else 0.0, strata
 
 
-@pytest.mark.parametrize("chain", [SMALL, frequent_decisive(), panel()[1]], ids=lambda chain: chain.name)
+@pytest.mark.parametrize("chain", [SMALL, DECISIVE[0], PANEL[1]], ids=lambda chain: chain.name)
 def test_equals_an_independently_solved_regression_and_nade(chain):
     parts = list(blocks(chain, "step_mixture", [5_000, 2_000], SEED))
     estimate, nade = fed(Scv(), parts).result(0.9), fed(Nade(), parts).result(0.9)
@@ -67,7 +67,7 @@ def test_equals_an_independently_solved_regression_and_nade(chain):
     ("chain", "cuts"),
     [
         (SMALL, [0, 7, 1_000, CHUNK_ROWS, CHUNK_ROWS + 1, 3 * CHUNK_ROWS]),
-        (panel()[1], range(0, 9_001, 500)),  # the whole on threads, the pieces without
+        (PANEL[1], range(0, 9_001, 500)),  # the whole on threads, the pieces without
     ],
     ids=["few strata", "many strata"],
 )

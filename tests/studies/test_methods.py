@@ -15,7 +15,7 @@ import pytest
 
 from harness.campaign.campaign import Campaign
 from harness.strata import LIBRARY_STATEMENT
-from studies.chains.chain import CHAINS, replayed
+from studies.chains.chain import CHAINS, REPLAYED
 from studies.chains.shells import ChainShells
 from studies.replication.experiment import Experiment, load_experiment
 from studies.replication.judgement import Judgement, Row, Subject, corrected, judge
@@ -59,7 +59,7 @@ def forced(chain) -> list[Row]:
     ("result", "repeated"), [(FREE, lambda chain: shells(chain, FEW, 1000)), ("nade", forced)], ids=["shells", "forced"]
 )
 def test_right_methods_cover_and_are_unbiased(result, repeated):
-    for one in judged({chain.name: repeated(chain) for chain in replayed()}, result):
+    for one in judged({chain.name: repeated(chain) for chain in REPLAYED}, result):
         assert not one["coverage_too_low"]
         assert abs(one["bias"]) < 4.0 * one["bias_std_error"]
 
@@ -86,7 +86,7 @@ def decisions(name: str, wrong: float = 1.0) -> list[Judgement]:
 
 
 def test_limits_are_decided_rightly():
-    for chain in replayed():
+    for chain in REPLAYED:
         assert not any(one["coverage_too_low"] for one in decisions(chain.name))
 
 
