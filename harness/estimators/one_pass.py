@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Collection, Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,11 +18,11 @@ from harness.estimators.shells import Shells
 from harness.estimators.weighted import Moments, Nade, Nde
 from harness.vocabulary import BV_LV_CONTACT, ESTIMATORS, EstimatorName, Sampling
 
-ACCUMULATORS: dict[EstimatorName, type[Accumulator]] = {
+ACCUMULATORS: dict[EstimatorName, Callable[[], Accumulator]] = {
     "nde": Nde,
     "nade": Nade,
     "mixture_cv": MixtureCv,
-    "scv": Scv,
+    "scv": partial(Scv, leave_one_out=True),
     "shells": Shells,
 }
 SPACING = 1.01

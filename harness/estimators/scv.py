@@ -23,7 +23,9 @@ from __future__ import annotations
 
 import ctypes
 import math
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba.extending import get_cython_function_address
@@ -39,9 +41,15 @@ WARNING = (
     "this estimator: columns centred by their sample means leave the estimate equal to nade's, and var(Z) leaves out "
     "the error of those means"
 )
+MOST_NAMED = 12
 MAX_COLUMNS = 729
 """Most columns of one stratum: J = 3 reaches 2^9 = 512, J = 4 3^6 = 729 at six steps, and uses no more steps then."""
 CHUNK_ROWS = 2_048
+MOST_LEFT_OUT = 2 * CHUNK_ROWS
+"""Tests of a stratum up to which each is left out in turn; larger ones have 511 columns at most, and a mean leverage of
+an eighth, which stands for that of every test then."""
+LEVERAGE = 1.0 - 1e-9
+"""Leverage above which a test is fitted by itself alone: the others say nothing of it but their mean."""
 _ROWS_AT_ONCE = 4096
 _PANEL = 32
 _DTPQRT = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 12)(
@@ -123,10 +131,11 @@ def _regression(factor: FloatArray, n: int) -> tuple[FloatArray, int, float]:
 
 
 class Scv(Nade):
-    """One `Stratum` per number of control steps."""
+    """One `Stratum` per number of control steps; leaving tests out in turn takes as long as all else of a result."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, leave_one_out: bool = False) -> None:
         super().__init__()
+        self._leave_one_out = leave_one_out
         self._strata: dict[int, Stratum] = {}
 
     def add(self, block: Block) -> None:
@@ -148,13 +157,14 @@ class Scv(Nade):
         )
 
     def result(self, confidence: float) -> Estimate:
-        """Algorithm 1's estimate and its published variance."""
+        """Algorithm 1's estimate and its published variance, and what its gain would be without the fit's optimism."""
         n, (levels, fits) = self.n, zip(*self.fits(), strict=True)
         rate = math.fsum(fit.n * fit.intercept for fit in fits) / n
         within = math.fsum(fit.residual_squares for fit in fits)
         between = math.fsum(fit.n * (fit.intercept - rate) ** 2 for fit in fits)
         var_z = (within + between) / (n - 1) if n > 1 else math.inf
         var_y = self.y.variance(n)
+        gain = self._gain(levels, fits, between)
         return self.estimate(
             rate,
             math.sqrt(var_z / n),
@@ -162,11 +172,12 @@ class Scv(Nade):
             confidence,
             method="sparse control variates as published (Algorithm 1)",
             cautions=[WARNING],
+            warnings=_overfitted(gain),
             details={
-                "basis": "reduced",
                 "var_z": var_z,
                 "var_y": var_y,
                 "nade_std_error": math.sqrt(var_y / n),
+                "gain": gain,
                 "strata": [
                     {"n_control_steps": level, "n": fit.n, "columns": fit.n_columns, "rank": fit.rank}
                     for level, fit in zip(levels, fits, strict=True)
@@ -174,15 +185,36 @@ class Scv(Nade):
             },
         )
 
-    def fits(self) -> list[tuple[int, StratumFit]]:
+    def _gain(self, levels: Sequence[int], fits: Sequence[StratumFit], between: float) -> dict[str, Any]:
+        """NADE's variance over that of adjusted results, in all and by stratum: as claimed, and as corrected."""
+        before = math.fsum(fit.total_squares for fit in fits) + between
+        squares = [fit.squares() for fit in fits]
+        return {
+            **{key: _ratio(before, between + math.fsum(one[key] for one in squares)) for key in squares[0]},
+            "saturated": [level for level, fit in zip(levels, fits, strict=True) if fit.is_saturated],
+            "rank_deficient": [level for level, fit in zip(levels, fits, strict=True) if fit.is_rank_deficient],
+            "strata": [
+                {"n_control_steps": level}
+                | {key: None if fit.is_saturated else _ratio(fit.total_squares, left) for key, left in one.items()}
+                for level, fit, one in zip(levels, fits, squares, strict=True)
+            ],
+        }
+
+    def fits(self, cutoffs: Sequence[float] = (0.0,)) -> list[tuple[int, StratumFit]]:
         """Every number of control steps with its regression."""
         levels = sorted(self._strata)
-        fits = side_by_side(lambda level: self._strata[level].fit(), levels, worthwhile=self.n >= CHUNK_ROWS)
+        fit = partial(Stratum.fit, leave_one_out=self._leave_one_out, cutoffs=cutoffs)
+        fits = side_by_side(lambda level: fit(self._strata[level]), levels, worthwhile=self.n >= CHUNK_ROWS)
         return list(zip(levels, fits, strict=True))
 
 
 class StratumFit(NamedTuple):
-    """Regression of Y_l on H_l: episodes, columns, rank of the centred columns, η_l, Σ(Z - η_l)² and Σ(Y - η_l)²."""
+    """Regression of Y_l on H_l: episodes, columns, rank of the centred columns, η_l, Σ(Z - η_l)² and Σ(Y - η_l)².
+
+    ``means`` are of the columns, shape (d,), and ``beta``, shape (k, d), are without singular values below each of k
+    shares of the largest. ``left_out_squares`` is the sum of squared errors of each Y
+    as the regression on the other tests predicts it; NaN where that was not asked for.
+    """
 
     n: int
     n_columns: int
@@ -190,6 +222,50 @@ class StratumFit(NamedTuple):
     intercept: float
     residual_squares: float
     total_squares: float
+    means: FloatArray
+    beta: FloatArray
+    left_out_squares: float
+
+    @property
+    def is_saturated(self) -> bool:
+        """Whether any results would be fitted: as many independent columns as there are tests, but for their mean."""
+        return 0 < self.rank >= self.n - 1
+
+    @property
+    def is_rank_deficient(self) -> bool:
+        """Whether columns depend on each other, though there are tests enough to tell them apart."""
+        return self.rank < min(self.n_columns, self.n - 1)
+
+    def squares(self) -> dict[str, float]:
+        """Σ(Z - η_l)² as claimed; free of what a fit explains by chance; and of tests that the fit has not seen.
+
+        All to be compared with Σ(Y - η_l)². A saturated stratum says nothing of what columns explain: its results count
+        as they are.
+        """
+        n, free = self.n, self.n - self.rank - 1
+        fair, unseen = self.total_squares, self.total_squares
+        if free > 0:
+            fair = self.residual_squares * (n - 1) / free
+            unseen = self.left_out_squares * ((n - 1) / n) ** 2  # a mean, too, is farther from what it has not seen
+        return {"claimed": self.residual_squares, "degrees_of_freedom": fair, "leave_one_out": unseen}
+
+
+def _ratio(before: float, after: float) -> float | None:
+    """A gain, None where nothing varies before or after."""
+    return before / after if before > 0.0 and after > 0.0 else None
+
+
+def _overfitted(gain: Mapping[str, Any]) -> list[str]:
+    """Warn of strata in which a gain is claimed whatever the results are."""
+    if not (saturated := gain["saturated"]):
+        return []
+    shown = ", ".join(map(str, saturated[:MOST_NAMED])) + ", …" * (len(saturated) > MOST_NAMED)
+    claimed, corrected = (gain[key] or math.nan for key in ("claimed", "degrees_of_freedom"))
+    return [
+        f"{len(saturated)} of {len(gain['strata'])} strata are saturated (l = {shown}): with as many independent "
+        f"columns as tests, less one, any results are fitted. The gain claimed in all is {claimed:.3g}, and "
+        f"{corrected:.3g} with degrees of freedom"
+    ]
 
 
 class Stratum:
@@ -203,25 +279,30 @@ class Stratum:
     def __init__(self, level: int) -> None:
         self._level, self._n = level, 0
         self._factor: FloatArray | None = None
-        self._ratios: list[FloatArray] = []
-        self._y: list[FloatArray] = []
+        self._rows: list[tuple[FloatArray, FloatArray]] = []
+        self._n_folded = 0
 
     def add(self, first_ratios: FloatArray, y: FloatArray) -> None:
         """Add episodes of this stratum: ratios, shape (m, 9, J), and Y, shape (m,)."""
         chunks = range(CHUNK_ROWS - self._n % CHUNK_ROWS, len(y), CHUNK_ROWS)
-        for ratios, of_y in zip(np.split(first_ratios, chunks), np.split(y, chunks), strict=True):
-            self._ratios.append(ratios)
-            self._y.append(of_y)
-            self._n += len(of_y)
+        for part in zip(np.split(first_ratios, chunks), np.split(y, chunks), strict=True):
+            self._rows.append(part)
+            self._n += len(part[1])
             if self._n % CHUNK_ROWS == 0:
                 self._factor = fold_rows(self._factor, self._waiting_rows())
-                self._ratios, self._y = [], []
+                self._n_folded = len(self._rows)
+        if self._n > MOST_LEFT_OUT:  # only those that wait are needed again
+            del self._rows[: self._n_folded]
+            self._n_folded = 0
 
     def _waiting_rows(self) -> FloatArray:
         """Rows [1, H, Y] that wait, shape (m, d + 2), in Fortran order."""
-        first_ratios = np.concatenate(self._ratios)
+        return self._expanded(*map(np.concatenate, zip(*self._rows[self._n_folded :], strict=True)))
+
+    def _expanded(self, first_ratios: FloatArray, y: FloatArray) -> FloatArray:
+        """Rows [1, H, Y], shape (m, d + 2), in Fortran order."""
         rows = np.empty((len(first_ratios), n_columns(self._level, first_ratios.shape[2]) + 2), order="F")
-        rows[:, 0], rows[:, -1] = 1.0, np.concatenate(self._y)
+        rows[:, 0], rows[:, -1] = 1.0, y
         fill_product_columns(first_ratios, self._level, rows[:, 1:-1])
         return rows
 
@@ -232,31 +313,50 @@ class Stratum:
         decomposition would take hundreds of times as long.
         """
         if self._factor is not None:
-            return fold_rows(self._factor.copy(order="F"), self._waiting_rows()) if self._ratios else self._factor
+            waiting = len(self._rows) > self._n_folded
+            return fold_rows(self._factor.copy(order="F"), self._waiting_rows()) if waiting else self._factor
         rows = self._waiting_rows()
         return np.asarray(np.linalg.qr(rows, mode="r")) if rows.shape[0] < rows.shape[1] else fold_rows(None, rows)
 
-    def fit(self) -> StratumFit:
+    def fit(self, *, leave_one_out: bool = False, cutoffs: Sequence[float] = (0.0,)) -> StratumFit:
         """Solve the regression by SVD of the centred columns' triangular factor.
 
-        The tolerance for the rank is the customary one of least-squares solvers, the larger dimension times machine
-        epsilon times the largest singular value; but never below what centring has rounded away, which grows with the
-        columns' means. Else columns that never vary would be fitted as if their rounding errors were data.
+        The tolerance for the rank is the customary one of least-squares solvers, machine epsilon times the larger
+        dimension times the largest singular value; or times √n_l·|(1, means of the columns)| where that is larger,
+        which is the norm of what centring has taken away. Else columns that never vary would be fitted as if their
+        rounding errors were data.
         """
         factor = self._with_waiting_rows()
-        intercept = float(factor[0, -1] / factor[0, 0])
+        intercept, means = float(factor[0, -1] / factor[0, 0]), factor[0, 1:-1] / factor[0, 0]
         last = factor.shape[1] - 1
         centred, target = factor[1:last, 1:last], factor[1:last, last]
         residual_squares = float(factor[last, last] ** 2) if len(factor) > last else 0.0
         total_squares = residual_squares + float(np.sum(target**2))
-        rank = 0
+        rank, root, explained, beta = 0, np.zeros((last - 1, 0)), np.zeros(0), np.zeros((len(cutoffs), last - 1))
         if centred.size:
-            left, singular, _ = np.linalg.svd(centred, full_matrices=False)
+            left, singular, right = np.linalg.svd(centred, full_matrices=False)
             largest = max(singular[0], np.linalg.norm(factor[0, :-1]))
             kept = singular > max(self._n, last - 1) * np.finfo(np.float64).eps * largest
             rank = int(np.count_nonzero(kept))
             residual_squares += float(np.sum((left[:, ~kept].T @ target) ** 2))
-        return StratumFit(self._n, last - 1, rank, intercept, residual_squares, total_squares)
+            root, explained = right[kept].T / singular[kept], left[:, kept].T @ target
+            beta = np.array([root @ (explained * (singular[kept] >= share * singular[0])) for share in cutoffs])
+        fit = StratumFit(self._n, last - 1, rank, intercept, residual_squares, total_squares, means, beta, math.nan)
+        return fit._replace(left_out_squares=self._left_out(fit, root, explained)) if leave_one_out else fit
+
+    def _left_out(self, fit: StratumFit, root: FloatArray, explained: FloatArray) -> float:
+        """Sum of squared errors of each Y as the regression on the other tests predicts it: (Z - η)/(1 - leverage)."""
+        n, total = self._n, 0.0
+        if n > MOST_LEFT_OUT:
+            return fit.residual_squares * (n / (n - fit.rank - 1)) ** 2
+        for part in self._rows if n > 1 else ():
+            rows = self._expanded(*part)
+            scores = (rows[:, 1:-1] - fit.means) @ root
+            leverage, away = 1.0 / n + np.sum(scores**2, axis=1), rows[:, -1] - fit.intercept
+            alone = leverage > LEVERAGE
+            errors = (away - scores @ explained) / np.where(alone, 1.0, 1.0 - leverage)
+            total += float(np.sum(np.where(alone, away * (n / (n - 1)), errors) ** 2))
+        return total
 
 
 def steps_used(n_control_steps: int, n_surrogates: int) -> int:

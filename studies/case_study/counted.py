@@ -12,10 +12,11 @@ import pyarrow as pa
 from harness.estimators.block import MAX_CONTROL_STEPS, Block
 from harness.estimators.estimate import FailureBounds
 from harness.estimators.limits import normal_half_width
-from harness.estimators.scv import Scv, StratumFit, fill_product_columns, n_columns
+from harness.estimators.scv import CHUNK_ROWS as CHUNK
+from harness.estimators.scv import Scv, StratumFit, fill_product_columns
 from harness.estimators.weighted import Nade
 from harness.runner.stored import stored_blocks
-from harness.vocabulary import Method
+from harness.vocabulary import FloatArray, Method
 from studies.case_study.figures import (
     exactly,
     figure,
@@ -23,6 +24,7 @@ from studies.case_study.figures import (
     mean_of,
     ratio,
     ratio_of_means,
+    ratio_of_variances,
     tests_for,
     weights_are_in,
 )
@@ -39,12 +41,15 @@ from studies.rnot import (
 )
 from studies.work import write_table
 
+CORRECTED = ("degrees_of_freedom", "leave_one_out")
+"""Of the gains that `scv` reports, those without what its fit explains by chance."""
+
 
 class Claims:
     """Both estimators, fed with the same blocks; SCV only where it is defined and wanted."""
 
-    def __init__(self, *, with_scv: bool = True) -> None:
-        self.nade, self.scv = FailureBounds(Nade()), Scv()
+    def __init__(self, *, with_scv: bool = True, leave_one_out: bool = False) -> None:
+        self.nade, self.scv = FailureBounds(Nade()), Scv(leave_one_out=leave_one_out)
         self._scv, self._with_scv = FailureBounds(self.scv), with_scv
         self._n, self._weight = 0, 0.0
         self._method: Method = "nde"
@@ -58,6 +63,11 @@ class Claims:
         self.nade.add(block)
         if self._with_scv:
             self._scv.add(block)
+
+    def rates(self) -> tuple[float, float]:
+        """Both estimates."""
+        fits = [fit for _, fit in self.scv.fits()]
+        return self.nade.result(0.9).crash_rate, sum(fit.n * fit.intercept for fit in fits) / self._n
 
     def row(self, rhw: float, confidence: float) -> dict[str, Any]:
         """Figures of what is claimed so far; ``settled`` says whether it means anything."""
@@ -80,6 +90,9 @@ class Claims:
             row[f"{name}_tests"] = tests_for(self._n * (half / z / rate) ** 2, rhw, confidence) if rate > 0.0 else None
         beside = scv if scv is not None and scv.std_error > 0.0 < nade.crash_rate else None
         row["gain_claimed"] = None if beside is None else (nade.std_error / beside.std_error) ** 2
+        for key in CORRECTED:
+            row[f"gain_{key}"] = None if beside is None else beside.details["gain"][key]
+        row["n_saturated"] = 0 if scv is None else len(scv.details["gain"]["saturated"])
         row["difference"] = None if beside is None else abs(beside.crash_rate / nade.crash_rate - 1.0)
         return row
 
@@ -90,7 +103,7 @@ def compare_control_variates(step: ControlVariates, context: Context) -> dict[st
     shown = [size for size in step.sizes if size <= run.result["n"]]
     between = np.geomspace(min(300, shown[-1]), shown[-1], step.looks) if shown else np.zeros(0)
     sizes = sorted({*shown, *between.astype(int).tolist()})
-    claims, rows = Claims(), list[dict[str, Any]]()
+    claims, rows = Claims(leave_one_out=True), list[dict[str, Any]]()
     context.progress.stage("both estimates", sizes[-1] if sizes else 0)
     for block in cut_at(stored_blocks(run.folder / "run", moments=True), sizes) if sizes else ():
         claims.add(block)
@@ -99,11 +112,14 @@ def compare_control_variates(step: ControlVariates, context: Context) -> dict[st
             rows.append(claims.row(context.rhw, context.confidence))
         if n == sizes[-1]:
             break
+    parts = stored_blocks(run.folder / "run", moments=True)
+    again = gains_of_parts(parts, sizes, run.result["n"], step.parts, context.confidence)
+    rows = [{**row, "gain_replicated": again.get(row["n"], figure(None))} for row in rows]
     fits = claims.scv.fits()
-    strata = [{"control_steps": level, **_together([fit])} for level, fit in fits]
-    write_table(context.folder / "strata.parquet", pa.Table.from_pylist(strata))
-    first = first_block(run.folder / "run", min(step.spread_tests, run.result["n"]))
-    write_table(context.folder / SPREAD, spread(first))
+    strata = [{"control_steps": level, **_together([fit])} for level, fit in fits] if step.spread_tests else []
+    if step.spread_tests:
+        first = first_block(run.folder / "run", min(step.spread_tests, run.result["n"]))
+        write_table(context.folder / SPREAD, spread(first))
     return {
         "looks": rows,
         "sizes": [row for row in rows if row["n"] in shown],
@@ -115,22 +131,88 @@ def compare_control_variates(step: ControlVariates, context: Context) -> dict[st
     }
 
 
+def gains_of_parts(
+    blocks: Iterator[Block], sizes: Sequence[int], n: int, most: int, confidence: float
+) -> dict[int, dict[str, Any]]:
+    """NADE's variance over SCV's by size, between the estimates of several parts of the same run, three at least."""
+    found = {size: list[tuple[float, float]]() for size in sizes if n >= 3 * size}
+    states = {size: Claims() for size in found}
+    ends = sorted({k * size for size in found for k in range(1, 1 + min(most, n // size))})
+    for block in cut_at(blocks, ends) if ends else ():
+        stop = block.first_episode + len(block)
+        for size, rates in found.items():
+            if len(rates) < most:
+                states[size].add(block)
+                if stop % size == 0:
+                    rates.append(states[size].rates())
+                    states[size] = Claims()
+        if stop == ends[-1]:
+            break
+    pairs = {size: np.array(rates).T for size, rates in found.items()}
+    return {size: ratio_of_variances(pair[0], pair[1], confidence) for size, pair in pairs.items()}
+
+
 SPREAD = "results.parquet"
 
 
 def spread(block: Block) -> pa.Table:
     """Results of some tests before and after adjustment, Y and Z = Y - Hβ, those that are not 0, by control steps."""
-    y, parts = block.weighted_crashes(), list[pa.Table]()
-    for level in np.unique(block.n_control_steps).tolist():
-        rows = np.flatnonzero(block.n_control_steps == level)
-        ratios, of_y = block.first_ratios[rows], y[rows]
-        columns = np.empty((len(rows), n_columns(level, ratios.shape[2])), order="F")
-        fill_product_columns(ratios, level, columns)
-        columns -= columns.mean(axis=0)
-        z = of_y - columns @ np.linalg.lstsq(columns, of_y - of_y.mean())[0]
-        kept = (of_y != 0.0) | (z != 0.0)
-        parts.append(pa.table({"control_steps": np.full(kept.sum(), level), "y": of_y[kept], "z": z[kept]}))
-    return pa.concat_tables(parts)
+    scv = Scv()
+    scv.add(block)
+    y, (of_stratum, explained) = block.weighted_crashes(), explained_by(block, scv.fits())
+    z = y - explained + of_stratum
+    kept = (y != 0.0) | (z != 0.0)
+    return pa.table({"control_steps": block.n_control_steps[kept], "y": y[kept], "z": z[kept]})
+
+
+def explained_by(block: Block, fits: Sequence[tuple[int, StratumFit]]) -> FloatArray:
+    """What regressions say of each test, η_l, and η_l + (h - means)·β with each β, (1 + k, n); 0 where none is of its l."""
+    found = np.zeros((1 + len(fits[0][1].beta), len(block)))
+    for level, fit in fits:
+        at = np.flatnonzero(block.n_control_steps == level)
+        for rows in (at[start : start + CHUNK] for start in range(0, len(at), CHUNK)):
+            columns = np.empty((len(rows), fit.n_columns), order="F")
+            fill_product_columns(block.first_ratios[rows], level, columns)
+            found[:, rows] = fit.intercept
+            found[1:, rows] += fit.beta @ (columns - fit.means).T
+    return found
+
+
+CUTOFFS = (0.3, 0.1, 0.03, 0.01, 1e-3, 0.0)
+"""Of singular values: coefficients of columns that hardly vary are worse than none where they are estimated."""
+
+
+class KnownMeans:
+    """Results less what columns explain of them, with means and coefficients from other tests, which are not counted.
+
+    Of all `CUTOFFS` the best counts, in hindsight: what is measured is the most that could be gained.
+    """
+
+    def __init__(self, others: Scv) -> None:
+        self._fits, self._mean = others.fits(CUTOFFS), others.mean()
+        self._of_campaigns = list[FloatArray]()
+
+    def add(self, block: Block) -> None:
+        """Add a campaign: variances and means of Y, of Y adjusted by strata alone, and by columns within them."""
+        y, explained = block.weighted_crashes(), [explained_by(block, fits) for fits in self._fits]
+        results = np.array(
+            [y, *(y - one + self._mean for one in (explained[0][1], *(whole for whole, _ in explained)))]
+        )
+        self._of_campaigns.append(np.array([results.var(axis=1), results.mean(axis=1)]))
+
+    def row(self, confidence: float) -> dict[str, Any]:
+        """Gains over NADE: in other tests at most, and with degrees of freedom; by strata, and by columns in them."""
+        (plain, strata, *columns), (plain_rate, _, *rates) = np.array(self._of_campaigns).transpose(1, 2, 0)
+        best = int(np.argmin([np.mean(one) for one in columns]))
+        fits = [fit for _, fit in self._fits]
+        total, squares = sum(fit.total_squares for fit in fits), [fit.squares() for fit in fits]
+        left = {key: sum(one[key] for one in squares) for key in ("claimed", "degrees_of_freedom")}
+        return {
+            **{f"within_{key}": figure(total / one if one > 0.0 else None) for key, one in left.items()},
+            "gain_strata": ratio_of_means(plain, strata, confidence),
+            "gain_known": ratio_of_means(plain, columns[best], confidence),
+            "gain_known_replicated": ratio_of_variances(plain_rate, rates[best], confidence),
+        }
 
 
 def cut_at(blocks: Iterator[Block], sizes: list[int]) -> Iterator[Block]:
@@ -148,12 +230,15 @@ def _together(fits: Sequence[StratumFit]) -> dict[str, Any]:
     mean = sum(fit.n * fit.intercept for fit in fits) / max(n, 1)
     between = sum(fit.n * (fit.intercept - mean) ** 2 for fit in fits)
     before, after = sum(fit.total_squares for fit in fits), sum(fit.residual_squares for fit in fits)
+    fair = sum(fit.squares()["degrees_of_freedom"] for fit in fits)
     return {
         "n": n,
         "columns": max((fit.n_columns for fit in fits), default=0),
         "rank": max((fit.rank for fit in fits), default=0),
         "sd_before": float(np.sqrt((before + between) / max(n, 1))),
         "sd_after": float(np.sqrt((after + between) / max(n, 1))),
+        "sd_corrected": float(np.sqrt((fair + between) / max(n, 1))),
+        "saturated": sum(fit.is_saturated for fit in fits),
     }
 
 
@@ -161,12 +246,18 @@ def _figures(rows: list[dict[str, Any]], fits: list[tuple[int, StratumFit]]) -> 
     if not rows:
         return {}
     last, most = rows[-1], max(((fit.n, level) for level, fit in fits if level > 0), default=(0, None))[1]
+    total, late_total = (
+        sum(fit.n * fit.intercept for level, fit in fits if level > k) for k in (-1, MAX_CONTROL_STEPS)
+    )
     gain, late = last["gain_claimed"], _together([fit for level, fit in fits if level >= 4])
     left = late["sd_after"] / late["sd_before"] if late["sd_before"] else None
     return {
         "claimed_gain": marked(figure(None) if gain is None else exactly(gain), settled=last["settled"]),
         "rate_over_nade": exactly(1.0 + max(row["difference"] or 0.0 for row in rows)),
         "sd_left_from_4": figure(None) if left is None else marked(exactly(left), settled=last["settled"]),
+        "late_share": figure(
+            sum(fit.n * fit.intercept for level, fit in fits if level > MAX_CONTROL_STEPS) / total if total else None
+        ),
         "most_frequent_stratum": figure(None) if most is None else exactly(most),
     }
 
@@ -175,7 +266,10 @@ CURVES = "curves.parquet"
 
 
 def draw_convergence(step: Convergence, context: Context) -> dict[str, Any]:
-    """Curves as Parquet; how many tests each needed in the order in which it was tested; rates over the reference's."""
+    """Curves as Parquet; how many tests each needed in the order in which it was tested; rates over the reference's.
+
+    Where the rate is farther below the reference's than the half-width asked for, more tests are needed than were made.
+    """
     procedure = Procedure(context.rhw, context.confidence)
     tables, figures = list[pa.Table](), dict[str, Any]()
     reference = context.made[step.reference].result["figures"]["crash_rate"]
@@ -192,8 +286,10 @@ def draw_convergence(step: Convergence, context: Context) -> dict[str, Any]:
             "rhw": exactly(rhw[-1]) if np.isfinite(rhw[-1]) else figure(None),
             "over_reference": ratio(context.made[name].result["figures"]["crash_rate"], reference),
         }
+        too_few = found["over_reference"]["high"] is not None and found["over_reference"]["high"] < 1.0 - context.rhw
         is_in = settled(context.made[name])
         figures |= {f"{name}.{key}": marked(each, settled=is_in) for key, each in found.items()}
+        figures[f"{name}.needs"] = figure(None, tests.n) if too_few else figures[f"{name}.settled"]
     write_table(context.folder / CURVES, pa.concat_tables(tables))
     return {"figures": figures}
 

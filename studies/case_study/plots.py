@@ -49,9 +49,10 @@ def plots_of(study: Study, made: Mapping[str, Made], ours: Mapping[str, dict[str
             known = made[step.reference].result["figures"]["crash_rate"]["value"]
             plots.append(settings_plot(name, made[name].result["variants"], known, study.rhw))
         elif step.kind == "control_variates":
-            plots.append(strata_plot(name, made[name].result["strata"]))
             plots.append(growth_plot(f"{name}_growth", made[name].result["looks"], study.rhw))
-            plots.append(spread_plot(f"{name}_results", read_table(made[name].folder / SPREAD)))
+            if made[name].result["strata"]:
+                plots.append(strata_plot(name, made[name].result["strata"]))
+                plots.append(spread_plot(f"{name}_results", read_table(made[name].folder / SPREAD)))
     return {plot.name: plot for plot in plots if plot is not None}
 
 
@@ -136,7 +137,12 @@ def strata_plot(name: str, strata: list[dict[str, Any]]) -> Plot | None:
     counts = (("n", "tests", INK), ("columns", "control variates", GREY), ("rank", "rank", GREEN))
     for key, label, colour in counts:
         left.plot(steps, [max(row[key], 0.8) for row in shown], "o-", color=colour, label=label, markersize=3)
-    for key, label, colour in (("sd_before", "Y, NADE", BLUE), ("sd_after", "Z, SCV", VERMILLION)):
+    spreads = (
+        ("sd_before", "Y, NADE", BLUE),
+        ("sd_after", "Z, SCV", VERMILLION),
+        ("sd_corrected", "Z, corrected", INK),
+    )
+    for key, label, colour in spreads:
         right.plot(steps, [row[key] or np.nan for row in shown], "o-", color=colour, label=label, markersize=3)
     for axes, title in ((left, "number in a stratum"), (right, "standard deviation of results")):
         if any(row["sd_before"] for row in shown) or axes is left:
@@ -146,34 +152,45 @@ def strata_plot(name: str, strata: list[dict[str, Any]]) -> Plot | None:
         head(axes, title)
         only_horizontal_grid(axes)
     caption = (
-        "Left: tests, control variates and rank of the columns. Right: spread of Y (NADE) and of Z = Y − Hβ (SCV)."
+        "Left: tests, control variates and rank of the columns. Right: spread of Y (NADE), of Z = Y − Hβ (SCV), and of "
+        "Z with degrees of freedom."
     )
     return Plot(name, figure, "By number of control steps. " + caption, caption)
 
 
+_GAINS = (
+    ("claimed", "claimed", _COLOURS["scv"]),
+    ("degrees_of_freedom", "with degrees of freedom", INK),
+    ("leave_one_out", "by leave-one-out", GREEN),
+)
+
+
 def growth_plot(name: str, looks: list[dict[str, Any]], rhw: float) -> Plot | None:
-    """RHW of NADE and of SCV against tests, and the gain that SCV claims."""
+    """RHW of NADE and of SCV against tests, and the gain that SCV claims, corrected, and between parts of the run."""
     known = [row for row in looks if row["nade_rhw"] and row["scv_rhw"] and row["gain_claimed"]]
     if not known:
         return None
     n = [row["n"] for row in known]
-    figure, left, right = two_panels(3.0, ("tests", "tests"))
+    figure, left, right = two_panels(3.4, ("tests", "tests"))
     for key, label in (("nade", "NADE"), ("scv", "SCV, as it claims")):
         style: dict[str, Any] = {"color": _COLOURS[key], "linewidth": 4.0 if key == "nade" else 1.4, "markersize": 3}
         left.plot(n, [row[f"{key}_rhw"] for row in known], "o-", label=label, **style)
-    right.plot(n, [row["gain_claimed"] for row in known], "o-", color=_COLOURS["scv"], markersize=3)
+    for key, label, colour in _GAINS:
+        right.plot(n, [row[f"gain_{key}"] or np.nan for row in known], "o-", color=colour, markersize=3, label=label)
+    again = [row["gain_replicated"]["value"] or np.nan for row in known]
+    right.plot(n, again, "D", color=BLUE, markersize=5, markerfacecolor="none", label="by replication")
     left.axhline(rhw, **_DASHED)
-    left.set_yscale("log")
-    decades(left.yaxis, *left.get_ylim())
     right.axhline(1.0, **_DASHED)
-    right.set_ylim(0.0, max(2.0, *right.get_ylim()))
-    for axes, title in ((left, "relative half-width"), (right, "gain that SCV claims")):
+    for axes, title in ((left, "relative half-width"), (right, "NADE's variance over SCV's")):
+        axes.set_yscale("log")
+        decades(axes.yaxis, *axes.get_ylim())
         axes.set_xscale("log")
         decades(axes.xaxis, *axes.get_xlim())
         head(axes, title)
     caption = (
-        f"Left: relative half-widths on growing parts of one run; dashed: {rhw:g}. Right: NADE's variance over that "
-        "which SCV claims; its estimate is NADE's at every size, so that the true gain is 1 (dashed)."
+        f"Left: relative half-widths on growing parts of one run; dashed: {rhw:g}. Right: the gain that SCV claims; "
+        "what is left of it without what its fit explains by chance; and the gain between estimates of parts of the "
+        "run, which is 1 (dashed), as the estimates are NADE's."
     )
     return Plot(name, figure, caption, caption)
 

@@ -13,11 +13,12 @@ from scipy.stats import ttest_1samp
 
 from harness.campaign.campaign import Campaign
 from harness.campaign.files import load_campaign
+from harness.estimators.scv import Scv
 from harness.resolved import resolve
 from harness.runner.run import run_campaign
 from harness.sampling import prepare
 from harness.vocabulary import EstimatorName, FloatArray
-from studies.case_study.counted import Claims, Counted
+from studies.case_study.counted import Claims, Counted, KnownMeans
 from studies.case_study.figures import (
     covered,
     exactly,
@@ -52,6 +53,7 @@ def variants_of(step: Variants, *, shells: bool = False) -> dict[str, Campaign]:
 
 
 SHOWN = ("claimed", "true", "rnot", "gain_true", "scv_claimed")
+KNOWN = ("within_claimed", "gain_strata", "gain_known", "gain_known_replicated")
 """Figures of each variant beside its claimed gain."""
 
 
@@ -76,6 +78,10 @@ def test_variants(step: Variants, context: Context) -> dict[str, Any]:
     figures |= {f"{key}, {row['variant']}": row[key] for row in rows for key in SHOWN}
     figures["mean"] = marked(mean, settled=all(row["settled"] for row in rows))
     figures["minimum_at"] = _minimum_at({name: figures[name] for name in step.avs})
+    if step.means:
+        figures |= {
+            key: range_of(sorted((row[key] for row in rows), key=lambda gain: -(gain["value"] or 0.0))) for key in KNOWN
+        }
     if step.reference:
         best = min(rows, key=lambda row: float(row["true"]["value"] or math.inf))
         plain = context.made[step.reference].result["figures"]["plain_tests"]["value"] or math.nan
@@ -109,12 +115,20 @@ def claims_in_twin(
     asked: tuple[EstimatorName, ...] = ("nade", "scv") if campaign.testing.method == "step_mixture" else ("nade",)
     source, whole = twin_episodes(campaign, campaign.seed, asked), Claims(with_scv=False)
     rows, parts, steps = list[dict[str, Any]](), list[Tests](), np.zeros(0, np.int64)
+    known = None
+    if step.means:
+        others, stop = Scv(), n * step.replications + step.means
+        for first in range(n * step.replications, stop, AT_ONCE):
+            others.add(source(first, min(AT_ONCE, stop - first)))
+        known = KnownMeans(others)
     for start in range(0, n * step.replications, n):
         claims = Claims()
         for first in range(start, start + n, AT_ONCE):
             block = source(first, min(AT_ONCE, start + n - first))
             whole.add(block)
             claims.add(block)
+            if known:
+                known.add(block)
             parts.append(Tests.of(block.first_episode, block.outcome, block.log_weight))
             counts = np.bincount(block.n_control_steps, minlength=len(steps))
             steps = counts + np.pad(steps, (0, len(counts) - len(steps)))
@@ -138,6 +152,7 @@ def claims_in_twin(
         "scv_claimed": marked(mean_of(tests["scv"], confidence), settled=row["settled"]),
         "gain_claimed": marked(ratio_of_means(tests["nade"], tests["scv"], confidence), settled=row["settled"]),
         "gain_true": ratio_of_variances(rates["nade"], rates["scv"], confidence),
+        **(known.row(confidence) if known else {}),
         "difference": max((each["difference"] for each in rows if each["difference"] is not None), default=None),
     }
 

@@ -41,7 +41,7 @@ from harness.vocabulary import (
     FloatArray,
     RecordArray,
 )
-from studies.case_study.counted import Claims
+from studies.case_study.counted import Claims, KnownMeans
 from studies.case_study.figures import covered, exactly, is_settled, marked, mean_of, range_of, tests_for
 from studies.case_study.study import Context, SmallCase
 from studies.work import write_table
@@ -250,13 +250,15 @@ def claims_of_setting(
     place, (recursive, threshold, epsilon) = setting
     proposals = world.proposals(epsilon, recursive=recursive, threshold=threshold)
 
-    def claims(tests: int, *seed: int) -> dict[str, Any]:
+    blocks = (world.draw(proposals, n, np.random.default_rng([3, place, k])) for k in range(step.draws))
+    first = Claims()
+    first.add(world.draw(proposals, step.tests, np.random.default_rng([2, place])))
+    once, known, many = first.row(step.rhw, confidence), KnownMeans(first.scv), list[dict[str, Any]]()
+    for block in blocks:
         found = Claims()
-        found.add(world.draw(proposals, tests, np.random.default_rng(seed)))
-        return found.row(step.rhw, confidence)
-
-    once = claims(step.tests, 2, place)
-    many = [claims(n, 3, place, k) for k in range(step.draws)]
+        found.add(block)
+        known.add(block)
+        many.append(found.row(step.rhw, confidence))
     exact = tests_for(world.relvar(proposals), step.rhw, confidence)
     claimed = {name: mean_of((each[f"{name}_tests"] for each in many), confidence) for name in ("nade", "scv")}
     row: dict[str, Any] = {
@@ -266,14 +268,15 @@ def claims_of_setting(
         "mean_weight": once["mean_weight"],
         "difference": once["difference"],
         "nade_exact": exact,
+        **known.row(confidence),
     }
     means_something = once["settled"] and holds(claimed["nade"]["value"], exact)
-    for name, found in claimed.items():
+    for name, tests in claimed.items():
         rates = [each[f"{name}_rate"] for each in many]
         errors = [(rate["value"] or 0.0) / world.crash_rate - 1.0 for rate in rates]
         row |= {
             f"{name}_claimed_once": once[f"{name}_tests"],
-            f"{name}_claimed": marked(found, settled=means_something),
+            f"{name}_claimed": marked(tests, settled=means_something),
             f"{name}_repeated": tests_for(n * float(np.mean(np.square(errors))), step.rhw, confidence),
             f"{name}_covers": covered(rates, world.crash_rate),
         }

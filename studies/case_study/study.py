@@ -53,7 +53,10 @@ class ControlVariates(Section):
     of: StepName = Field(description="step of kind run: a step mixture with records.moments first_9 or all")
     sizes: list[Whole] = Field(min_length=1, description="numbers of tests, rising, for the table")
     looks: Whole = Field(12, ge=2, le=100, description="numbers of tests between 300 and the last one, for the plot")
-    spread_tests: Whole = Field(200_000, ge=10, description="first tests whose results are shown one by one")
+    spread_tests: Whole | None = Field(
+        200_000, ge=10, description="first tests whose results are shown one by one; null to leave strata out"
+    )
+    parts: Whole = Field(10, ge=3, le=1_000, description="most parts of a size, for the gain by replication")
 
 
 class RequiredNumbers(Section):
@@ -90,6 +93,7 @@ class Variants(Section):
     reference: StepName | None = Field(None, description="step with the crash rate of all, for tests by replication")
     shuffles: Whole = Field(0, ge=0, le=10_000, description="orderings of all tests of a variant, for their RNoT")
     reported: dict[str, Positive] = Field(default_factory=dict, description="the paper's gains, by variant")
+    means: Whole = Field(0, ge=0, le=100_000_000, description="other tests of each, whose means of columns are known")
 
 
 class Theorems(Section):
