@@ -200,10 +200,10 @@ class Scv(Nade):
             ],
         }
 
-    def fits(self, cutoffs: Sequence[float] = (0.0,)) -> list[tuple[int, StratumFit]]:
+    def fits(self, tests_each: Sequence[int] = (1,)) -> list[tuple[int, StratumFit]]:
         """Every number of control steps with its regression."""
         levels = sorted(self._strata)
-        fit = partial(Stratum.fit, leave_one_out=self._leave_one_out, cutoffs=cutoffs)
+        fit = partial(Stratum.fit, leave_one_out=self._leave_one_out, tests_each=tests_each)
         fits = side_by_side(lambda level: fit(self._strata[level]), levels, worthwhile=self.n >= CHUNK_ROWS)
         return list(zip(levels, fits, strict=True))
 
@@ -211,8 +211,8 @@ class Scv(Nade):
 class StratumFit(NamedTuple):
     """Regression of Y_l on H_l: episodes, columns, rank of the centred columns, η_l, Σ(Z - η_l)² and Σ(Y - η_l)².
 
-    ``means`` are of the columns, shape (d,), and ``beta``, shape (k, d), are without singular values below each of k
-    shares of the largest. ``left_out_squares`` is the sum of squared errors of each Y
+    ``means`` are of the columns, shape (d,), and ``beta``, shape (k, d), are of as many of their principal components,
+    the largest, as leave so many tests to each. ``left_out_squares`` is the sum of squared errors of each Y
     as the regression on the other tests predicts it; NaN where that was not asked for.
     """
 
@@ -318,7 +318,7 @@ class Stratum:
         rows = self._waiting_rows()
         return np.asarray(np.linalg.qr(rows, mode="r")) if rows.shape[0] < rows.shape[1] else fold_rows(None, rows)
 
-    def fit(self, *, leave_one_out: bool = False, cutoffs: Sequence[float] = (0.0,)) -> StratumFit:
+    def fit(self, *, leave_one_out: bool = False, tests_each: Sequence[int] = (1,)) -> StratumFit:
         """Solve the regression by SVD of the centred columns' triangular factor.
 
         The tolerance for the rank is the customary one of least-squares solvers, machine epsilon times the larger
@@ -332,7 +332,7 @@ class Stratum:
         centred, target = factor[1:last, 1:last], factor[1:last, last]
         residual_squares = float(factor[last, last] ** 2) if len(factor) > last else 0.0
         total_squares = residual_squares + float(np.sum(target**2))
-        rank, root, explained, beta = 0, np.zeros((last - 1, 0)), np.zeros(0), np.zeros((len(cutoffs), last - 1))
+        rank, root, explained, beta = 0, np.zeros((last - 1, 0)), np.zeros(0), np.zeros((len(tests_each), last - 1))
         if centred.size:
             left, singular, right = np.linalg.svd(centred, full_matrices=False)
             largest = max(singular[0], np.linalg.norm(factor[0, :-1]))
@@ -340,7 +340,8 @@ class Stratum:
             rank = int(np.count_nonzero(kept))
             residual_squares += float(np.sum((left[:, ~kept].T @ target) ** 2))
             root, explained = right[kept].T / singular[kept], left[:, kept].T @ target
-            beta = np.array([root @ (explained * (singular[kept] >= share * singular[0])) for share in cutoffs])
+            most = [self._n // each for each in tests_each]
+            beta = np.array([root[:, :k] @ explained[:k] for k in most])
         fit = StratumFit(self._n, last - 1, rank, intercept, residual_squares, total_squares, means, beta, math.nan)
         return fit._replace(left_out_squares=self._left_out(fit, root, explained)) if leave_one_out else fit
 

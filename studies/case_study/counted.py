@@ -166,7 +166,7 @@ def spread(block: Block) -> pa.Table:
 
 
 def explained_by(block: Block, fits: Sequence[tuple[int, StratumFit]]) -> FloatArray:
-    """What regressions say of each test, η_l, and η_l + (h - means)·β with each β, (1 + k, n); 0 where none is of its l."""
+    """What regressions say of each test: η_l, and η_l + (h - means)·β with each β, (1 + k, n); 0 where l has none."""
     found = np.zeros((1 + len(fits[0][1].beta), len(block)))
     for level, fit in fits:
         at = np.flatnonzero(block.n_control_steps == level)
@@ -178,26 +178,24 @@ def explained_by(block: Block, fits: Sequence[tuple[int, StratumFit]]) -> FloatA
     return found
 
 
-CUTOFFS = (0.3, 0.1, 0.03, 0.01, 1e-3, 0.0)
-"""Of singular values: coefficients of columns that hardly vary are worse than none where they are estimated."""
+TESTS_EACH = (1, 5, 20, 100, 1_000)
+"""Tests for each principal component of columns that is used: of few, coefficients are worse than none elsewhere."""
 
 
 class KnownMeans:
     """Results less what columns explain of them, with means and coefficients from other tests, which are not counted.
 
-    Of all `CUTOFFS` the best counts, in hindsight: what is measured is the most that could be gained.
+    Of all `TESTS_EACH` the best counts, in hindsight: what is measured is the most that could be gained.
     """
 
     def __init__(self, others: Scv) -> None:
-        self._fits, self._mean = others.fits(CUTOFFS), others.mean()
+        self._fits, self._mean = others.fits(TESTS_EACH), others.mean()
         self._of_campaigns = list[FloatArray]()
 
     def add(self, block: Block) -> None:
         """Add a campaign: variances and means of Y, of Y adjusted by strata alone, and by columns within them."""
-        y, explained = block.weighted_crashes(), [explained_by(block, fits) for fits in self._fits]
-        results = np.array(
-            [y, *(y - one + self._mean for one in (explained[0][1], *(whole for whole, _ in explained)))]
-        )
+        y = block.weighted_crashes()
+        results = np.vstack([y, y - explained_by(block, self._fits) + self._mean])
         self._of_campaigns.append(np.array([results.var(axis=1), results.mean(axis=1)]))
 
     def row(self, confidence: float) -> dict[str, Any]:
@@ -255,9 +253,7 @@ def _figures(rows: list[dict[str, Any]], fits: list[tuple[int, StratumFit]]) -> 
         "claimed_gain": marked(figure(None) if gain is None else exactly(gain), settled=last["settled"]),
         "rate_over_nade": exactly(1.0 + max(row["difference"] or 0.0 for row in rows)),
         "sd_left_from_4": figure(None) if left is None else marked(exactly(left), settled=last["settled"]),
-        "late_share": figure(
-            sum(fit.n * fit.intercept for level, fit in fits if level > MAX_CONTROL_STEPS) / total if total else None
-        ),
+        "late_share": figure(late_total / total if total else None),
         "most_frequent_stratum": figure(None) if most is None else exactly(most),
     }
 

@@ -183,7 +183,7 @@ def test_each_test_is_left_out_in_turn():
             rest.add(ratios[of][others], y[of][others])
             fit = rest.fit()
             plain.append(y[of][i] - fit.intercept)
-            adjusted = 0.0 if fit.rank < whole.rank else (columns[i] - fit.means) @ fit.beta
+            adjusted = 0.0 if fit.rank < whole.rank else (columns[i] - fit.means) @ fit.beta[0]
             errors.append(plain[-1] - adjusted)
         assert row["leave_one_out"] == pytest.approx(np.sum(np.square(plain)) / np.sum(np.square(errors)), rel=1e-6)
         free = len(of) - whole.rank - 1
