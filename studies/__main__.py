@@ -160,7 +160,6 @@ _SHARE = click.FloatRange(0, 1, min_open=True, max_open=True)
 @click.option("--confidence", type=_SHARE, default=0.9, help="Level of the normal interval.")
 @click.option("--shuffles", "n_shuffles", type=click.IntRange(min=1), default=200, help="Orderings of the tests.")
 @click.option("--seed", type=click.IntRange(min=0), default=1, help="Seed of the orderings.")
-@click.option("--first", type=click.IntRange(min=2), default=10, help="First look of the grid.")
 @click.option("--ratio", type=click.FloatRange(1, min_open=True), default=1.05, help="From one look to the next.")
 @click.option("--total", type=click.IntRange(min=2), help="Last look. Default, and at most: all tests on record.")
 @click.option(

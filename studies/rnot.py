@@ -15,7 +15,7 @@ in shards, and not by the estimator, so that two estimators of one run see the s
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
 from itertools import pairwise, takewhile
 from pathlib import Path
@@ -280,58 +280,48 @@ def required_tests_of_runs(
     The default estimator is the plain one of each run: ``nde`` for naturalistic tests, ``nade`` for weighted ones.
     Raises `HarnessError`, see `read_run`.
     """
-    told = progress or Progress()
+    told, rows = progress or Progress(), []
     reference: RequiredTests | None = None
-    rows = []
     for folder in folders:
         tests, block = read_run(folder, with_ratios="scv" in estimators)
         plain: RnotEstimator = "nde" if block.drawn.method == "nde" else "nade"
-        grid = procedure.grid(tests.n)
+        grid, n_crashes = procedure.grid(tests.n), int(np.count_nonzero(~tests.failed))
         for name in dict.fromkeys(estimators or [plain]):
-            told.stage(f"{folder.name} {name}", procedure.n_shuffles)
-            row = {"run": str(folder), "estimator": name, "n_episodes": tests.n}
-            row["n_crashes"] = int(np.count_nonzero(~tests.failed))
+            row = {"run": str(folder), "estimator": name, "n_episodes": tests.n, "n_crashes": n_crashes}
+            rows.append(row)
             if reason := block.refusal(name):
-                rows.append({**row, "mean": None, "reason": reason})
+                row |= {"mean": None, "reason": reason}
                 continue
+            told.stage(f"{folder.name} {name}", procedure.n_shuffles)
             found = over_shuffles(tests, procedure, lambda: told.advance(1), scv_of=block if name == "scv" else None)
             reference = reference or found
             aar, side = acceleration(reference, found)
-            rows.append(
-                row
-                | {
-                    "grid": f"{grid[0]:,} to {grid[-1]:,} by {procedure.ratio - 1.0:.3g} n ({len(grid)} looks)",
-                    "mean": found.mean,
-                    "mean_is_lower_limit": found.is_lower_limit,
-                    "low_5": found.quantile(0.05),
-                    "high_95": found.quantile(0.95),
-                    "never_reached": int(np.count_nonzero(found.never_reached)),
-                    "never_above": int(np.count_nonzero(found.never_above)),
-                    "aar": None if side == "unknown" else aar,
-                    "aar_is": side,
-                    "remarks": list(_remarks(tests, name, found, int(grid[-1]), procedure)),
-                }
-            )
-    content: dict[str, Any] = finite_json({**asdict(procedure), "rows": rows})
-    return content
+            row |= {
+                "grid": f"{grid[0]:,} to {grid[-1]:,} by {procedure.ratio - 1.0:.3g} n ({len(grid)} looks)",
+                "mean": found.mean,
+                "mean_is_lower_limit": found.is_lower_limit,
+                "low_5": found.quantile(0.05),
+                "high_95": found.quantile(0.95),
+                "never_reached": int(np.count_nonzero(found.never_reached)),
+                "never_above": int(np.count_nonzero(found.never_above)),
+                "aar": None if side == "unknown" else aar,
+                "aar_is": side,
+                "remarks": _remarks(tests, name, found, int(grid[-1]), procedure.rhw),
+            }
+    return finite_json({**asdict(procedure), "rows": rows})
 
 
-def _remarks(tests: Tests, name: str, found: RequiredTests, total: int, procedure: Procedure) -> Iterator[str]:
+def _remarks(tests: Tests, name: str, found: RequiredTests, total: int, rhw: float) -> list[str]:
     """What limits a required number of tests."""
     many, above, n_failed = (np.count_nonzero(x) for x in (found.never_reached, found.never_above, tests.failed))
-    of_shuffles = f"of {procedure.n_shuffles} shuffles are"
-    if name == "scv":
-        yield SCV_REMARK
-    if n_failed:
-        yield f"{n_failed} tests failed: the lower limit counts them as no crash, the upper one as crashes"
-    if found.is_lower_limit:
-        at = f"{many} {of_shuffles} above RHW {procedure.rhw:g} at {total:,} tests"
-        yield f"{at} and count as {total:,}: the mean is a lower limit"
-    elif found.quantile(0.95) > tests.n / 2:
-        yield (
-            f"above half of the {tests.n:,} tests on record shuffles of the same tests hardly differ: ask a longer "
-            "run for a mean and a range to rely on"
-        )
-    if above:
-        nowhere = f"{above} {of_shuffles} nowhere above RHW {procedure.rhw:g}"
-        yield f"{nowhere}: each counts with the n of its largest RHW, as in the paper"
+    shuffles = f"of {len(found.n)} shuffles are"
+    remarks = {
+        SCV_REMARK: name == "scv",
+        f"{n_failed} tests failed: the lower limit counts them as no crash, the upper one as crashes": n_failed,
+        f"{many} {shuffles} above RHW {rhw:g} at {total:,} tests and count as so many: the mean is a lower limit": many,
+        f"above half of the {tests.n:,} tests on record shuffles of the same tests hardly differ: ask a longer run": (
+            not many and found.quantile(0.95) > tests.n / 2
+        ),
+        f"{above} {shuffles} nowhere above RHW {rhw:g}: each has the n of its largest RHW, as in the paper": above,
+    }
+    return [remark for remark, holds in remarks.items() if holds]
