@@ -29,7 +29,7 @@ from harness.campaign.files import load_campaign
 from harness.compiled import compiled_threads, unboxed
 from harness.episode.path import Trajectory, empty_trajectory, who_crashes
 from harness.errors import CampaignError, HarnessError, RunFolderError
-from harness.estimators.block import EPISODE_COLUMNS, Block, block_from_tables
+from harness.estimators.block import EPISODE_COLUMNS, Block, Drawn, block_from_tables
 from harness.estimators.estimate import finite_json
 from harness.importance.functions import mixture_weights
 from harness.pool.build import campaign_pool
@@ -42,7 +42,7 @@ from harness.records.reader import read_shard
 from harness.resolved import Resolved, resolve
 from harness.traffic.laws import Environment
 from harness.vehicles.drivers import Followers
-from harness.vocabulary import BV_LV_CONTACT, RUNNING, BoolArray, FloatArray, IntArray, Method
+from harness.vocabulary import BV_LV_CONTACT, RUNNING, BoolArray, FloatArray, IntArray
 
 
 @compiled_threads
@@ -142,18 +142,17 @@ class Alarm:
 
     def __init__(self, known: KnownRates) -> None:
         self._known, d = known, known.mu.size
-        self._method: Method | None = None
+        self._drawn = Drawn("nde")  # that of the first block
         self._n = self._n_lost = 0
         self._hits, self._sum, self._squares = np.zeros((3, d))
-        self._mean_weight, self._won = np.full(d, np.inf), np.zeros((BETS.size, d))
+        self._won = np.zeros((BETS.size, d))
         # Rates that bets are measured in; infinite where there is none, and then nothing is bet.
         self._unit = np.where(known.mu > 0.0, known.mu, np.inf)
 
     def add(self, block: Block, crashes: BoolArray) -> None:
         """Add one block, and which surrogates would have crashed in its tests (n, D)."""
         h = np.where(crashes, block.weights()[:, None], 0.0)
-        if not self._n:
-            self._method, self._mean_weight = block.drawn.method, _mean_weight(block, self._known)
+        self._drawn = block.drawn
         self._n += len(block)
         self._n_lost += int(np.count_nonzero(block.failed & ~block.cut_in))
         self._hits += np.count_nonzero(h, axis=0)
@@ -164,29 +163,27 @@ class Alarm:
 
     def result(self) -> dict[str, Any]:
         """Means against known rates, and whether the alarm is raised."""
-        known, mean = self._known, self._sum / self._n
-        effective = np.divide(self._sum**2, self._squares, out=np.zeros_like(mean), where=self._squares > 0.0)
-        log_capital = self._log_capital()
-        p_value = _p_value(float(logsumexp(log_capital)) - math.log(mean.size))
-        no_verdict = _UNBOUNDED if self._method == "step_mixture" else None
+        known, drawn, log_capital = self._known, self._drawn, self._log_capital()
+        p_value = _p_value(float(logsumexp(log_capital)) - math.log(log_capital.size))
+        no_verdict = _UNBOUNDED if drawn.method == "step_mixture" else None
         if no_verdict is None and self._n_lost:
             lost = "failed tests have no cut-in, and what surrogates would have done in them is not known"
             no_verdict = f"{self._n_lost} {lost}"
         columns = {
-            "n_crashes": self._hits.astype(int),
-            "n_effective": effective,
-            "mean": mean,
-            "mu": known.mu,
-            "mu_std_error": known.std_error,
-            "p_value": np.array([_p_value(each) for each in log_capital.tolist()]),
+            "surrogate": known.names,
+            "n_crashes": self._hits.astype(int).tolist(),
+            "n_effective": (self._sum**2 / np.where(self._squares > 0.0, self._squares, np.inf)).tolist(),
+            "mean": (self._sum / self._n).tolist(),
+            "mu": known.mu.tolist(),
+            "mu_std_error": known.std_error.tolist(),
+            "p_value": list(map(_p_value, log_capital.tolist())),
         }
-        rows = zip(known.names, *(column.tolist() for column in columns.values()), strict=True)
         return {
             "raised": no_verdict is None and p_value <= LEVEL,
             "no_verdict": no_verdict,
             "n_episodes": self._n,
             "p_value": p_value,
-            "surrogates": [dict(zip(("surrogate", *columns), row, strict=True)) for row in rows],
+            "surrogates": [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)],
         }
 
     def _log_capital(self) -> FloatArray:
@@ -195,23 +192,17 @@ class Alarm:
         The pool's own error of μ_k is taken as normal. The log of each product then has a normal error too, and half
         its variance is what that adds to the log of the product's mean.
         """
-        n, unit, bets = self._n, self._unit, BETS[:, None]
-        error = self._known.std_error / unit
-        heavy = np.maximum(self._mean_weight / unit, 1.0)
+        n, unit, bets, known, drawn = self._n, self._unit, BETS[:, None], self._known, self._drawn
+        # Mean square of W f_k over its mean, at most; infinite where nothing bounds W.
+        at_crash = known.p_cut_in_at_crash / drawn.forced_share if drawn.forced_share else np.inf
+        heavy = np.maximum((at_crash if drawn.weight_cap is None else drawn.weight_cap) / unit, 1.0)
+        error = known.std_error / unit
         many, few = bets, np.expm1(-bets * heavy) / heavy  # mean factors are 1 + these, their errors these times μ_k's
         won = np.stack([self._won, -bets * self._sum / unit])
-        gain = np.stack([np.broadcast_to(many, few.shape), few]) * (self._known.mu > 0.0)
+        gain = np.stack([np.broadcast_to(many, few.shape), few]) * (known.mu > 0.0)
         price = n * np.log1p(gain) + 0.5 * (n * gain * error / (1.0 + gain)) ** 2
         found: FloatArray = logsumexp(won - price, axis=(0, 1)) - math.log(2 * BETS.size)
         return found
-
-
-def _mean_weight(block: Block, known: KnownRates) -> FloatArray:
-    """Mean square of W f_k over its mean, shape (D,), at most; infinite where nothing bounds W."""
-    if block.drawn.weight_cap is not None:
-        return np.full(known.mu.shape, block.drawn.weight_cap)
-    share = block.drawn.forced_share
-    return known.p_cut_in_at_crash / share if share else np.full(known.mu.shape, np.inf)
 
 
 def _p_value(log_capital: float) -> float:
