@@ -27,7 +27,7 @@ from harness.pool.shells import design_shells
 from harness.resolved import resolve
 from harness.sampling.shells import ShellRounds, round_requests
 from harness.vocabulary import FloatArray
-from studies.replication.shells import DrawnPool, campaign_block
+from studies.replication.shells import DrawnPool
 
 WORKERS = (8, 64, 512)
 TEST_S = (0.01, 1.0, 20.0)
@@ -55,7 +55,8 @@ def rounds_of(campaign: Campaign, pool: DrawnPool, rng: np.random.Generator) -> 
         tests = planner.tally.tests
         specs = round_requests(tests, added, 0, int(tests.sum()), campaign.run.smallest_shard)
         rounds.append([spec.n_episodes for spec in specs])
-        enough = planner.enough(campaign_block(pool, added, int(tests.sum()), rng))
+        pool.count(added, planner.seen, rng)
+        enough = planner.enough_after(int(added.sum()))
     return rounds
 
 

@@ -259,6 +259,8 @@ def _refusal(strata: WeightedSum, level: Level, nu: float, by_crashes: bool) -> 
     if not by_crashes:
         return cost - level.threshold
     threshold = _threshold(level, crashes)
+    if strata.variance == 0.0:  # the threshold has no part in T then
+        return cost - threshold
     return _at(strata, level, nu, threshold)[1] - threshold
 
 

@@ -40,7 +40,7 @@ from harness.estimators.tally import (
     pool_variance,
 )
 from harness.strata import ShellDesign
-from harness.vocabulary import BoolArray, FloatArray
+from harness.vocabulary import BoolArray, FloatArray, IntArray
 
 MOST_NAMED = 10
 """Tests that are named of those that refute a statement, or show that its reason fails."""
@@ -127,28 +127,40 @@ class ShellDetails:
 
 
 class Shells:
-    """Tests of a shells campaign, counted within the cells of strata."""
+    """Tests of a shells campaign, counted within the cells of strata.
 
-    _design: ShellDesign  # of the first block
+    ``tally`` has the counts by stratum; of no strata before the first tests.
+    """
+
+    _design: ShellDesign  # of the first tests
 
     def __init__(self) -> None:
-        self._cells = empty_tally(0)
+        self.tally = self._cells = empty_tally(0)
+        self._known: dict[tuple[int, Level], RateLimits] = {}  # of so many first strata
         self._paths = CrashPaths()
         self._crashed: dict[int, list[int]] = {}  # stratum → its first few tests that crashed
         self._n_checked = self._n_ahead = 0
         self._ahead_in: list[int] = []
 
-    @property
-    def tally(self) -> Tally:
-        """Counts by stratum; of no strata before the first block."""
-        return self._cells.joined(self._design.joined) if self._cells.tests.size else self._cells
-
     @classmethod
     def of(cls, design: ShellDesign, tally: Tally) -> Shells:
         """From counts by stratum, which say nothing about reference drivers."""
         shells = cls()
-        shells._design, shells._cells = design.without_references(), tally
+        shells.count(design.without_references(), tally)
         return shells
+
+    def count(self, design: ShellDesign, cells: Tally, paths: tuple[FloatArray, IntArray] | None = None) -> None:
+        """Count tests by cell of the design; ``paths`` of crashed ones see `CrashPaths`."""
+        self._design = design
+        known = self._cells if self._cells.tests.size else empty_tally(cells.tests.size)
+        self._cells = known.plus(cells)
+        if paths is not None:
+            self._paths.add(*paths)
+        self._join()
+
+    def _join(self) -> None:
+        self.tally = self._cells.joined(self._design.joined)
+        self._known.clear()
 
     def add(self, block: Block) -> None:
         """Count one block."""
@@ -166,27 +178,28 @@ class Shells:
             np.add.at(counts, cell[rows], 1)
             np.add.at(sums, cell[rows], block.cell_mass[rows])
         if design.shadow_runs:
-            self._paths.add(block.cell_mass[crash], stratum[crash], design.p.size)
+            self._paths.add(block.cell_mass[crash], np.eye(design.p.size, dtype=np.int64)[stratum[crash]])
         for s in np.unique(stratum[crash]).tolist():
             _name(self._crashed.setdefault(s, []), block, crash & (stratum == s))
         if design.checked is not None and "ahead" in block.columns:
             self._n_checked += len(block)
             self._n_ahead += int(block.ahead.sum())
             _name(self._ahead_in, block, block.ahead)
+        self._join()
 
     def result(self, confidence: float) -> Estimate:
         """Assumption-free estimate; the other statements are among its details."""
         tally, design = self.tally, self._design
         n, n_crashes, _ = tally.totals
-        cautions = tuple(self._cautions(tally))
-        free, y = self._limits(tally, Level.two_sided(confidence)), design.p / tally.at_least_one
+        cautions = tuple(self._cautions())
+        free, y = self._limits(design.p.size, Level.two_sided(confidence)), design.p / tally.at_least_one
         squares = float((tally.crashes * y * y).sum())
         return Estimate(
             crash_rate=free.rate,
             std_error=self.std_error(),
             ci_low=free.low,
             ci_high=free.high,
-            upper_bound=self._limits(tally, Level.of_bound(confidence, n)).high,
+            upper_bound=self._limits(design.p.size, Level.of_bound(confidence, n)).high,
             confidence=confidence,
             rhw=free.rhw,
             n_episodes=n,
@@ -218,7 +231,7 @@ class Shells:
 
     def limits_of(self, statement: str, level: Level) -> RateLimits:
         """Rate and limits of a statement, or of all strata."""
-        return self._limits(self.tally.part(slice(0, self._design.n_within(statement))), level)
+        return self._limits(self._design.n_within(statement), level)
 
     def contradicts(self, statement: str) -> bool:
         """Whether a test crashed beyond the boundary of a statement, or was ahead of it where that is checked."""
@@ -226,21 +239,23 @@ class Shells:
         checked = any(each.checked and each.name == statement for each in self._design.statements)
         return bool(beyond.any()) or (checked and self._n_ahead > 0)
 
-    def _limits(self, tally: Tally, level: Level) -> RateLimits:
-        """Of the first strata, those of a tally; anything is possible where crashes lie on too few paths."""
-        p = self._design.p[: tally.tests.size]
-        if self._n_paths(tally) < FEWEST_PATHS:
-            return RateLimits(float(p @ tally.share), 0.0, 1.0, math.inf, math.inf)
-        return combined(p, tally, self._design.n_paths, level)
+    def _limits(self, n_strata: int, level: Level) -> RateLimits:
+        """Of the first strata; anything is possible where crashes lie on too few paths."""
+        if (n_strata, level) not in self._known:
+            p, tally = self._design.p[:n_strata], self.tally.part(slice(0, n_strata))
+            found = RateLimits(float(p @ tally.share), 0.0, 1.0, math.inf, math.inf)
+            if self._n_paths(n_strata) >= FEWEST_PATHS:
+                found = combined(p, tally, self._design.n_paths, level)
+            self._known[n_strata, level] = found
+        return self._known[n_strata, level]
 
-    def _n_paths(self, tally: Tally) -> float:
-        """Number of paths that the crashes in the first strata, those of a tally, lie on, in effect."""
-        weight = np.zeros_like(self._design.p)
-        weight[: tally.tests.size] = self._design.p[: tally.tests.size] / tally.at_least_one
-        return self._paths.number(weight)
+    def _n_paths(self, n_strata: int) -> float:
+        """Number of paths that the crashes in the first strata lie on, in effect."""
+        weight = self._design.p / self.tally.at_least_one
+        return self._paths.number(np.where(np.arange(weight.size) < n_strata, weight, 0.0))
 
-    def _cautions(self, tally: Tally) -> list[str]:
-        if (n := self._n_paths(tally)) >= FEWEST_PATHS:
+    def _cautions(self) -> list[str]:
+        if (n := self._n_paths(self._design.p.size)) >= FEWEST_PATHS:
             return []
         return [
             f"no interval: nearly all crashes lie on some {max(n, 1.0):.0f} of the {self._design.n_paths:,} paths that "
@@ -254,7 +269,7 @@ class Shells:
         given = next(each for each in design.statements if each.name == statement)
         n, level = given.n_inside, Level.two_sided(confidence)
         inside, outside = tally.part(slice(0, n)), tally.part(slice(n, None))
-        limits, (n_outside, n_crashes_outside, _) = self._limits(inside, level), outside.totals
+        limits, (n_outside, n_crashes_outside, _) = self._limits(n, level), outside.totals
         bound = combined(design.p[n:], outside, design.n_paths, Level.of_bound(confidence, n_outside)).high
         crashed = sorted(episode for s, episodes in self._crashed.items() if s >= n for episode in episodes)
         who = given.name, given.boundary, given.assumes, n

@@ -64,6 +64,11 @@ class Tally(NamedTuple):
         counts = self.tests[strata], self.crashes[strata], self.failed[strata]
         return Tally(*counts, self.crash_mass[strata, strata], self.failed_mass[strata, strata])
 
+    def plus(self, other: Tally) -> Tally:
+        """With further tests of the same strata."""
+        counts = self.tests + other.tests, self.crashes + other.crashes, self.failed + other.failed
+        return Tally(*counts, self.crash_mass + other.crash_mass, self.failed_mass + other.failed_mass)
+
     def joined(self, groups: FloatArray) -> Tally:
         """That of groups of strata: ``groups``, shape (S, G), is 1 where a stratum belongs to one."""
         tests, crashes, failed = (np.rint(each @ groups).astype(np.int64) for each in self[:3])
@@ -158,10 +163,11 @@ class CrashPaths:
     def __init__(self) -> None:
         self._by_path: dict[bytes, IntArray] = {}
 
-    def add(self, cell_mass: FloatArray, stratum: IntArray, n_strata: int) -> None:
-        """Count crashed tests (n,), whose paths are known by their probabilities of all cells (n, C)."""
-        for mass, s in zip(cell_mass.astype(np.float32), stratum.tolist(), strict=True):
-            self._by_path.setdefault(mass.tobytes(), np.zeros(n_strata, np.int64))[s] += 1
+    def add(self, cell_mass: FloatArray, crashes: IntArray) -> None:
+        """Count crashed tests of each stratum (n, S) on paths known by their probabilities of all cells (n, C)."""
+        for mass, of_path in zip(cell_mass.astype(np.float32), crashes, strict=True):
+            known = self._by_path.setdefault(mass.tobytes(), np.zeros_like(of_path))
+            known += of_path
 
     def number(self, weight: FloatArray) -> float:
         """Number of paths that count, crashes of a stratum having its ``weight`` (S,); infinite while little is known.

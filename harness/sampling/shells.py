@@ -204,7 +204,11 @@ class ShellRounds(Rounds):
 
     def enough(self, block: Block) -> bool:
         self.seen.add(block)
-        self._n_episodes += len(block)
+        return self.enough_after(len(block))
+
+    def enough_after(self, n: int) -> bool:
+        """Whether testing can end, with the next ``n`` tests in `seen`."""
+        self._n_episodes += n
         return self._n_episodes == self._look and self.rule.observe(self.seen)
 
 

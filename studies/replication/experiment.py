@@ -89,6 +89,11 @@ class Experiment(Section):
         description="judge decisions instead of intervals: limits of `accept`, as multiples of each one's crash rate "
         "in the super-population; at 1 both verdicts are wrong, and each is judged",
     )
+    budgets: list[Whole] = Field(
+        default_factory=list,
+        description="numbers of tests within which limits are judged, besides stop.episodes: a campaign's budget is "
+        "raised from one to the next",
+    )
     siblings: bool = Field(
         False,
         description="also judge the rules that those of limits and bounds took the place of, which err more often",
@@ -105,6 +110,12 @@ class Experiment(Section):
         """Share of intervals that are to hold the truth, or of decisions that are to be right."""
         confidence = self.campaign.stop.confidence
         return (1.0 + confidence) / 2.0 if self.limits else confidence
+
+    @property
+    def all_budgets(self) -> tuple[int, ...]:
+        """Numbers of tests within which limits are judged, ascending."""
+        most = self.campaign.stop.episodes
+        return tuple(sorted({min(budget, most) for budget in (*self.budgets, most)}))
 
     def subject(self, name: str) -> Campaign:
         """The campaign with one of the vehicles."""

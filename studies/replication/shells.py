@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -20,7 +21,6 @@ from scipy.special import ndtri
 from harness.campaign.campaign import Campaign
 from harness.campaign.sections import Accept, ShellSettings
 from harness.errors import CampaignError
-from harness.estimators.block import Block, Drawn
 from harness.estimators.estimate import Estimate
 from harness.estimators.likelihood import Level, likelihood_limit
 from harness.estimators.pairs import CRASH, NO_CRASH, PairCounts, no_pairs
@@ -29,11 +29,11 @@ from harness.estimators.stopping import PairRule, RoundRule
 from harness.estimators.tally import Tally
 from harness.pool.cut_ins import CutIns, Pool
 from harness.pool.shells import cells_in_strata, design_shells, outermost, shells_in_strata, shells_of
+from harness.sampling.allocation import Allocation
 from harness.sampling.shells import PairRounds, ShellRounds
 from harness.strata import LIBRARY_STATEMENT, ShellDesign
 from harness.vehicles.library import Library
-from harness.vocabulary import CRASH as CRASHED
-from harness.vocabulary import FAILED, TIMEOUT, BoolArray, FloatArray, IntArray
+from harness.vocabulary import BoolArray, FloatArray, IntArray
 from studies.replication.experiment import Adversary
 from studies.replication.judgement import FORMER, Row, estimate_row
 from studies.replication.populations import (
@@ -54,13 +54,15 @@ _STATEMENT = ("testing", "shells", "statement")
 
 
 BOUND = "shells, upper bound"
-ACCEPTED_AT_TRUTH, REJECTED_AT_TRUTH = "limit 1 x rate, accepted", "limit 1 x rate, rejected"
-"""Where the limit is the truth, either verdict is wrong: how often each is given is an error rate of its own."""
 
 
-def limit_at(factor: float) -> tuple[str, ...]:
-    """Names of what is judged of the decision about a limit, a multiple of the crash rate."""
-    return (ACCEPTED_AT_TRUTH, REJECTED_AT_TRUTH) if factor == 1.0 else (f"limit {factor:g} x rate",)
+def limit_at(factor: float, budget: int) -> tuple[str, ...]:
+    """Names of what is judged of the decision about a limit, a multiple of the crash rate, within a budget.
+
+    Where the limit is the truth, either verdict is wrong: how often each is given is an error rate of its own.
+    """
+    verdicts = ("accepted ", "rejected ") if factor == 1.0 else ("",)
+    return tuple(f"limit {factor:g} x rate, {verdict}within {budget:,} tests" for verdict in verdicts)
 
 
 def bound_outside(statement: str) -> str:
@@ -94,20 +96,57 @@ class DrawnPool:
         share = np.divide(crash_p, p, out=np.zeros_like(p), where=p > 0.0)
         return np.asarray(np.clip(share, 0.0, 1.0))  # rounding may leave the unit interval
 
-    def tests_of_cells(self, added: IntArray, rng: np.random.Generator) -> IntArray:
-        """How many of so many tests of each stratum (S,) are of each cell, shape (C,)."""
-        if added.size == self.mass.shape[1]:
-            return added
+    @cached_property
+    def _of_stratum(self) -> FloatArray:
+        """Shares of a stratum's tests that are of each cell, shape (S, C)."""
         within = (self.design.joined * self.mass.sum(0)[:, None]).T
-        p = within / np.maximum(within.sum(1, keepdims=True), np.finfo(np.float64).tiny)
-        found: IntArray = rng.multinomial(added, p).sum(0)
-        return found
+        return np.asarray(within / np.maximum(within.sum(1, keepdims=True), np.finfo(np.float64).tiny))
 
-    def paths_of(self, tests: FloatArray, cell: int, n: int, rng: np.random.Generator) -> FloatArray:
-        """Mass (n, C) of the paths of n tests of a cell: any by ``mass``, crashed ones by ``crash_mass``."""
-        cumulative = np.cumsum(tests[:, cell])
-        paths: FloatArray = self.mass[np.searchsorted(cumulative, rng.random(n) * cumulative[-1], side="right")]
-        return paths
+    @cached_property
+    def _cumulative(self) -> tuple[FloatArray, FloatArray]:
+        """Sums of crash mass and mass up to each path, by cell, shape (C, n) each."""
+        crash_mass, mass = (np.cumsum(np.ascontiguousarray(each.T), axis=1) for each in (self.crash_mass, self.mass))
+        return crash_mass, mass
+
+    def paths_of(self, n_by_cell: IntArray, rng: np.random.Generator, *, crashed: bool = True) -> list[IntArray]:
+        """Paths of so many crashed tests of each cell (C,), or of any."""
+        cumulative = self._cumulative[0 if crashed else 1]
+        return [
+            np.searchsorted(up_to, rng.random(n) * up_to[-1], side="right")
+            for up_to, n in zip(cumulative, n_by_cell.tolist(), strict=True)
+        ]
+
+    def tests_of(self, added: IntArray, rng: np.random.Generator) -> tuple[IntArray, list[IntArray], list[IntArray]]:
+        """So many more tests of each stratum (S,): how many are of each cell (C,), paths of crashed and failed ones."""
+        tests = added
+        if added.size != self.mass.shape[1]:
+            tests = rng.multinomial(added, self._of_stratum).sum(0)
+        bad = rng.binomial(tests, self.share)
+        n_failed = rng.binomial(bad, self.failing) if self.failing else np.zeros_like(bad)
+        if self.failing_tests:
+            n_failed = n_failed + rng.binomial(bad - n_failed, self.failing_tests)
+        paths = list(zip(self.paths_of(bad, rng), n_failed.tolist(), strict=True))
+        crashed, failed = [rows[n:] for rows, n in paths], [rows[:n] for rows, n in paths]
+        if self.failing_tests:
+            more = self.paths_of(rng.binomial(tests - bad, self.failing_tests), rng, crashed=False)
+            failed = [np.concatenate(both) for both in zip(failed, more, strict=True)]
+        return tests, crashed, failed
+
+    def count(self, added: IntArray, seen: Shells, rng: np.random.Generator) -> None:
+        """Draw so many more tests of each stratum (S,), and count what their records would say."""
+        tests, *paths = self.tests_of(added, rng)
+        (crashes, crash_mass), (failed, failed_mass) = (
+            (np.array([rows.size for rows in cells]), np.array([self.mass[rows].sum(0) for rows in cells]))
+            for cells in paths
+        )
+        tally = Tally(tests, crashes, failed, crash_mass, failed_mass)
+        if not self.design.shadow_runs:
+            seen.count(self.design, tally)
+            return
+        by_cell = [np.bincount(rows, minlength=len(self.mass)) for rows in paths[0]]
+        by_path = np.column_stack(by_cell) @ self.design.joined.astype(np.int64)
+        used = by_path.any(1)
+        seen.count(self.design, tally, (self.mass[used], by_path[used]))
 
     def available(self, campaign: Campaign) -> IntArray:
         """The most tests of each stratum, shape (S,)."""
@@ -118,36 +157,29 @@ Draw = Callable[[np.random.Generator], Sequence[DrawnPool]]
 """Draws a new pool: with the crashes of a vehicle, or without references where both of two crash, only A, only B."""
 
 
-def simulated(campaign: Campaign, drawn: DrawnPool, rng: np.random.Generator) -> Iterator[tuple[ShellRounds, bool]]:
-    """One campaign on a pool, round by round until nothing is left: its planner, and whether its own rule is content.
+def looks(
+    campaign: Campaign, drawn: DrawnPool, rng: np.random.Generator, budgets: Sequence[int] = ()
+) -> Iterator[tuple[Shells, ShellRounds, bool]]:
+    """One campaign on a pool until nothing is left: all tests after each round, the planner, and its rule's answer.
 
-    The planner's ``seen`` are the tests so far, with estimate and bounds; its ``rule.look`` has the decision.
+    Its budget is raised from each of some smaller ones to the next. Such a budget ends in the midst of a round, with a
+    smaller round in its place: that is a look, too. What both rounds have in common is tested once.
     """
-    planner = ShellRounds(campaign, drawn.design, drawn.available(campaign))
+    available = drawn.available(campaign)
+    planner = ShellRounds(campaign, drawn.design, available)
+    allocation = Allocation.of(campaign.testing.shells, drawn.design, available)
     while (added := planner.next_round()).any():
-        yield planner, planner.enough(campaign_block(drawn, added, int(planner.tally.tests.sum()), rng))
-
-
-def campaign_block(drawn: DrawnPool, added: IntArray, first: int, rng: np.random.Generator) -> Block:
-    """What the records of a round become: within a cell the crashes come first, which no estimator can see."""
-    tests = drawn.tests_of_cells(added, rng)
-    cell, crashes = np.repeat(np.arange(tests.size), tests), rng.binomial(tests, drawn.share)
-    n = cell.size
-    rank = np.arange(n) - np.repeat(np.cumsum(tests) - tests, tests)
-    none, bad = np.zeros(n, np.bool_), rank < crashes[cell]
-    failed = bad & (rank < rng.binomial(crashes, drawn.failing)[cell]) if drawn.failing else none
-    mass = np.zeros((n, tests.size))
-    for c in np.flatnonzero(crashes).tolist():
-        mass[bad & (cell == c)] = drawn.paths_of(drawn.crash_mass, c, int(crashes[c]), rng)
-    if drawn.failing_tests:
-        broken = rng.random(n) < drawn.failing_tests
-        failed = failed | broken
-        for c in np.unique(cell[broken & ~bad]).tolist():
-            rows = broken & ~bad & (cell == c)
-            mass[rows] = drawn.paths_of(drawn.mass, c, int(rows.sum()), rng)
-    columns = {"cut_in": ~none, "stratum": np.array(drawn.design.cell_stratum)[cell], "cell": cell, "cell_mass": mass}
-    outcome = np.select([failed, bad], [FAILED, CRASHED], TIMEOUT).astype(np.int8)
-    return Block(first, outcome, np.zeros(n), columns, Drawn("shells", shells=drawn.design))
+        before, left = planner.tally, added
+        n = int(before.tests.sum())
+        for budget in budgets:
+            if n < budget < n + added.sum():
+                last = np.maximum(allocation.next_round(before, budget - n) - (added - left), 0)
+                drawn.count(np.minimum(last, left), planner.seen, rng)
+                drawn.count(np.maximum(last - left, 0), spent := deepcopy(planner.seen), rng)
+                left = np.maximum(left - last, 0)
+                yield spent, planner, False
+        drawn.count(left, planner.seen, rng)
+        yield planner.seen, planner, planner.enough_after(int(added.sum()))
 
 
 class FormerRule(RoundRule):
@@ -171,14 +203,15 @@ class ShellCampaign:
     """A shells campaign to replicate, each time on a new pool; its stop rule, statement and first tests are used.
 
     Judged are all statements and the comparisons with reference drivers. With ``limits``, by their multiple of the
-    crash rate, it is repeated until all of these are decided, as by ``accept``, and they are judged instead.
-    ``siblings`` see `FORMER`.
+    crash rate, all of these are decided instead, as by ``accept``, and judged within each of the ``budgets``; what is
+    tested next depends on neither. ``siblings`` see `FORMER`.
     """
 
     campaign: Campaign
     draw: Draw
     seed: int
     limits: Mapping[float, float] = field(default_factory=dict)
+    budgets: Sequence[int] = ()
     siblings: bool = False
 
     def run(self, replications: range) -> list[Row]:
@@ -187,50 +220,55 @@ class ShellCampaign:
         for replication in replications:
             rng = np.random.default_rng([self.seed, replication])
             (drawn,) = self.draw(rng)
-            rounds = simulated(self.campaign, drawn, rng)
-            found += (self._decide if self.limits else self._replicate)(replication, rounds, drawn.design)
+            found += (self._decide if self.limits else self._replicate)(replication, drawn, rng)
         return found
 
-    def _decide(
-        self, replication: int, rounds: Iterator[tuple[ShellRounds, bool]], _design: ShellDesign
-    ) -> Iterator[Row]:
-        """All limits from the same tests: what is tested next does not depend on any."""
-        pending: dict[tuple[float, str], RoundRule] = {}
+    def _decide(self, replication: int, drawn: DrawnPool, rng: np.random.Generator) -> Iterator[Row]:
+        rules: dict[tuple[float, str], RoundRule] = {}
         for factor, limit in self.limits.items():
             asked = self.campaign.model_copy(update={"accept": Accept(crash_rate_below=limit)})
-            pending[factor, ""] = RoundRule(asked)
-            if self.siblings:
-                pending[factor, FORMER] = FormerRule(asked)
-        for planner, _ in rounds:
-            for which in [which for which, rule in pending.items() if rule.observe(planner.seen)]:
-                yield from self._decision_rows(planner.seen, *which, replication, pending.pop(which))
-            if not pending:
-                return
-        for which, rule in pending.items():
-            yield from self._decision_rows(planner.seen, *which, replication, rule)
+            rules[factor, ""] = RoundRule(asked)
+            if self.siblings and factor == 1.0:
+                rules[factor, FORMER] = FormerRule(asked)
+        known, left = dict[tuple[float, str], Row](), list(self.budgets)
 
-    def _decision_rows(self, seen: Shells, factor: float, by: str, replication: int, rule: RoundRule) -> Iterator[Row]:
-        """A decision is a one-sided interval: below the limit, or above; at the truth one that is wrong is empty."""
-        verdict = "undecided" if rule.look.decision is None else rule.look.decision.verdict
-        limit, tally = self.limits[factor], seen.tally
-        level, statement = Level.two_sided(self.campaign.stop.confidence), self.campaign.testing.shells.statement
-        rate = seen.limits_of(statement, level).rate
-        counts = int(tally.tests.sum()), int(tally.crashes.sum())
-        for name in limit_at(factor):
-            low, high = limit if verdict == "rejected" else 0.0, limit if verdict == "accepted" else math.inf
-            if factor == 1.0:
-                low, high = 0.0, 0.0 if name.endswith(verdict) else math.inf
-            yield Row(
-                name + by, replication, *counts, rate, seen.std_error(), low, high, reached=verdict != "undecided"
-            )
+        def judged(seen: Shells, budget: int) -> Iterator[Row]:
+            for (factor, by), rule in rules.items():
+                row = known.get((factor, by)) or self._decision(seen, replication, rule)
+                for name in limit_at(factor, budget):
+                    low, high = row.ci_low, row.ci_high
+                    if factor == 1.0:  # nothing is right about the verdict of this name
+                        low, high = 0.0, 0.0 if row.result in name else math.inf
+                    yield replace(row, result=name + by, ci_low=low, ci_high=high)
 
-    def _replicate(
-        self, replication: int, rounds: Iterator[tuple[ShellRounds, bool]], design: ShellDesign
-    ) -> Iterator[Row]:
+        for seen, *_ in looks(self.campaign, drawn, rng, self.budgets):
+            for which, rule in rules.items():
+                if which not in known and rule.observe(seen):
+                    known[which] = self._decision(seen, replication, rule)
+            if seen.tally.tests.sum() == left[0]:
+                yield from judged(seen, left.pop(0))
+            if len(known) == len(rules):
+                break
+        for budget in left:  # everything is decided, or nothing left to test
+            yield from judged(seen, budget)
+
+    def _decision(self, seen: Shells, replication: int, rule: RoundRule) -> Row:
+        """A decision is a one-sided interval: below the limit, or above."""
+        decision = rule.look.decision
+        if decision is None:
+            raise ValueError("the rule has looked at no limit")
+        verdict, limit, (n, n_crashes, _) = decision.verdict, decision.crash_rate_below, seen.tally.totals
+        low, high = limit if verdict == "rejected" else 0.0, limit if verdict == "accepted" else math.inf
+        rate = seen.limits_of(decision.statement, Level.two_sided(self.campaign.stop.confidence)).rate
+        known = verdict != "undecided"
+        return Row(verdict, replication, n, n_crashes, rate, seen.std_error(), low, high, reached=known)
+
+    def _replicate(self, replication: int, drawn: DrawnPool, rng: np.random.Generator) -> Iterator[Row]:
+        design = drawn.design
         names = [each.name for each in design.statements]
         rules = {name: RoundRule(self.campaign.replaced(_STATEMENT, name)) for name in names}
         known: dict[str, Row] = {}
-        for planner, enough in rounds:
+        for _, planner, enough in looks(self.campaign, drawn, rng):
             for name, rule in rules.items():
                 pending = name not in known and planner.seen.tally.tests.size
                 if pending and rule.observe(planner.seen) and rule.look.stopped:
@@ -322,7 +360,7 @@ def _with_round(pairs: PairCounts, drawn: Sequence[DrawnPool], added: IntArray, 
     ends[:, NO_CRASH, NO_CRASH] += counts[:, -1]
     for kind, pool, of_kind in zip(_CRASHING, drawn, counts.T[:-1], strict=True):
         ends[:, *kind] += of_kind
-        mass[:, *kind] += [pool.paths_of(pool.crash_mass, s, k, rng).sum(0) for s, k in enumerate(of_kind.tolist())]
+        mass[:, *kind] += [pool.mass[rows].sum(0) for rows in pool.paths_of(of_kind, rng)]
     return PairCounts(pairs.design, ends, mass)
 
 

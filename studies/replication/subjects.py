@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from concurrent.futures import Executor
 from dataclasses import replace
 from functools import partial
-from itertools import permutations
+from itertools import permutations, product
 from typing import Any
 
 from harness.campaign.campaign import Campaign
@@ -134,15 +134,15 @@ def _of_shells(
 
     ``beyond`` is the share of that rate beyond the boundary of each statement.
     """
-    limits = {factor: factor * own_rate for factor in experiment.limits}
-    decisions = [result for factor in limits for result in limit_at(factor)]
+    limits, budgets = {factor: factor * own_rate for factor in experiment.limits}, experiment.all_budgets
+    decisions = [result for pair in product(limits, budgets) for result in limit_at(*pair)]
     outside = {result_of(each): share for each, share in beyond.items()}
     outside |= dict.fromkeys(decisions, outside.get(result_of(campaign.testing.shells.statement), 0.0))
     others = {result: value for result, value in known.items() if result != RATE}
     others |= dict.fromkeys([BOUND, *decisions], Known.exactly(own_rate))
     others |= {bound_outside(each): Known(share * own_rate, 0.0, own_rate) for each, share in beyond.items()}
     subject = Subject(name, known[RATE], others, outside, **more)
-    return subject, ShellCampaign(campaign, draw, seed, limits, siblings=experiment.siblings)
+    return subject, ShellCampaign(campaign, draw, seed, limits, budgets, siblings=experiment.siblings)
 
 
 def _exactly(known: Mapping[str, Known]) -> dict[str, Known]:

@@ -177,7 +177,7 @@ def test_plain_means_do_not_know_what_to_do_with_shells():
 def counted(paths, strata, n_strata=2):
     """Crashed tests of paths that are known by one number each."""
     found = CrashPaths()
-    found.add(np.asarray(paths, np.float64)[:, None], np.asarray(strata, np.int64), n_strata)
+    found.add(np.asarray(paths, np.float64)[:, None], np.eye(n_strata, dtype=np.int64)[strata])
     return found
 
 

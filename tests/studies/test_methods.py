@@ -78,9 +78,9 @@ def decisions(name: str, wrong: float = 1.0) -> list[Judgement]:
     """Of a chain at 0.5, 0.8, 1.25 and 2 times its crash rate; nominal: 95 of 100 are right."""
     chain = CHAINS[name]
     limits = {factor: factor * chain.crash_rate for factor in (0.5, 0.8, 1.0, 1.25, 2.0)}
-    names = [name for factor in limits for name in limit_at(factor)]
+    names = [name for factor in limits for name in limit_at(factor, 4000)]
     draw = wrong_shell(ChainShells(chain, 2048).draw, 0, wrong)
-    rows = ShellCampaign(campaign("shells", 4000), draw, 11, limits).run(range(FEW // 2))
+    rows = ShellCampaign(campaign("shells", 4000), draw, 11, limits, (4000,)).run(range(FEW // 2))
     subject = Subject(chain.name, Known.exactly(chain.crash_rate))
     return corrected([judge(subject, name, [row for row in rows if row.result == name], 0.95) for name in names])
 

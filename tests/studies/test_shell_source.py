@@ -2,18 +2,29 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict, replace
+
 import numpy as np
 import pytest
 
+from harness.campaign.campaign import Campaign
 from harness.campaign.sections import EnvironmentSettings
 from harness.campaign.vehicle import AutomatedVehicle
+from harness.estimators.block import Block, Drawn
+from harness.estimators.estimate import Estimate
+from harness.estimators.likelihood import Level
+from harness.estimators.tally import combined
 from harness.pool.shells import acceleration_limit
 from harness.progress import Progress
+from harness.sampling.shells import ShellRounds
+from harness.strata import ASSUMPTION_FREE
 from harness.traffic.loading import load_environment
 from harness.vehicles.library import load_library
+from harness.vocabulary import CRASH, FAILED, TIMEOUT
 from studies.replication.experiment import Adversary
 from studies.replication.populations import Drivers, enumerate_paths
-from studies.replication.shells import Division, campaign_block, equals
+from studies.replication.shells import Division, equals, looks
+from tests.golden.record import unlike
 
 PATHS = 1024
 ENVIRONMENT = load_environment(EnvironmentSettings())
@@ -29,6 +40,11 @@ AVS = {
         "faster": {"model": "constant", "parameters": {"acceleration_mps2": 3.0}},
     }.items()
 }
+
+
+def campaign_of(episodes) -> Campaign:
+    content = {"name": "x", "testing": {"method": "shells"}, "stop": {"episodes": episodes, "rhw": None}}
+    return Campaign.model_validate(content)
 
 
 def drivers_of(*names) -> Drivers:
@@ -95,29 +111,91 @@ def test_adversaries_crash_on_few_paths_inside_or_in_a_share_of_all_outside(made
         assert (other[:, inside].sum(1) > 0.0).sum() < 0.2 * (own[:, inside].sum(1) > 0.0).sum()
 
 
-def test_cells_divide_strata_by_what_references_do():
-    """Pools with references: rates, moments and cells of the design are those of the drawn paths, test by test."""
+@pytest.fixture(scope="module")
+def with_references():
+    """A pool with references."""
     library = load_library("ladder-2")
     drivers = Drivers.of(library, {"own": AVS["own"]})
     population = enumerated(drivers)
     crashing = population.crash_mass(drivers.vehicles["own"])
     source = Division(library, population, [crashing], 512, limit_mps2=2.0).of_vehicle(crashing)
-    (drawn,) = source.draw(np.random.default_rng(4))
-    design = drawn.design
+    return source.draw(np.random.default_rng(4))[0]
+
+
+def test_cells_divide_strata_by_what_references_do(with_references):
+    """Rates, moments and cells of the design are those of the drawn paths, test by test."""
+    drawn, design = with_references, with_references.design
     np.testing.assert_allclose(drawn.mass.mean(0), design.cell_p, rtol=1e-12)
     crash_too = (np.array(design.cell_references) & 1).astype(bool)
     of_reference = drawn.mass[:, crash_too].sum(1)
     assert design.reference_rate[0] == pytest.approx(of_reference.mean(), rel=1e-9)
     assert design.reference_square[0] == pytest.approx((of_reference**2).mean(), rel=1e-9)
     rng, added = np.random.default_rng(5), np.full(design.p.size, 20_000)
-    block = campaign_block(drawn, added, 0, rng)
-    np.testing.assert_array_equal(np.bincount(block.stratum), added)
-    tests, crashes = (np.bincount(block.cell[rows], minlength=crash_too.size) for rows in (..., block.crash))
+    tests, crashed, _ = drawn.tests_of(added, rng)
+    crashes = np.array([paths.size for paths in crashed])
+    np.testing.assert_array_equal(tests @ design.joined, added)
     expected = 20_000 * design.cell_p / design.p[list(design.cell_stratum)]
     assert np.all(np.abs(tests - expected) < 5.0 * np.sqrt(expected + 1.0))
     mass = drawn.mass.sum(0)
     share = np.divide(drawn.crash_mass.sum(0), mass, out=np.zeros_like(mass), where=mass > 0.0)
     assert np.all(np.abs(crashes - tests * share) < 5.0 * np.sqrt(tests * share * (1.0 - share) + 1.0))
+
+
+def as_block(drawn, tests, crashed, failed, first) -> Block:
+    """The same tests as rows of records, those of a cell one after the other, in any order."""
+    ends = zip(tests.tolist(), crashed, failed, strict=True)
+    rows = [
+        (cell, outcome, drawn.mass[path] if path >= 0 else np.zeros(tests.size))
+        for cell, (n, *bad) in enumerate(ends)
+        for outcome, paths in zip((CRASH, FAILED, TIMEOUT), (*bad, [-1] * (n - sum(map(len, bad)))), strict=True)
+        for path in paths
+    ]
+    cell, outcome, mass = (np.array(column) for column in zip(*rows, strict=True))
+    columns = {"stratum": np.array(drawn.design.cell_stratum)[cell], "cell": cell, "cell_mass": mass}
+    return Block(first, outcome, np.zeros(cell.size), columns, Drawn("shells", shells=drawn.design))
+
+
+@pytest.mark.parametrize("shadow_runs", [False, True])
+def test_counted_tests_say_what_their_records_would(with_references, shadow_runs):
+    """Whole campaigns: rounds, counts, limits and results, with failed tests and paths that the vehicle has walked."""
+    design = replace(with_references.design, shadow_runs=shadow_runs)
+    drawn = replace(with_references, design=design, failing=0.1, failing_tests=0.02)
+    campaign, rng = campaign_of(2_000), np.random.default_rng(6)
+    by_row, level, n = ShellRounds(campaign, design, drawn.available(campaign)), Level.two_sided(0.9), 0
+    for seen, _, enough in looks(campaign, drawn, np.random.default_rng(6)):
+        added = by_row.next_round()
+        assert by_row.enough(as_block(drawn, *drawn.tests_of(added, rng), n)) == enough
+        n += int(added.sum())
+        for one, other in zip(seen.tally, by_row.tally, strict=True):
+            np.testing.assert_allclose(one, other, rtol=1e-12)
+        limits = by_row.seen.limits_of(ASSUMPTION_FREE, level)
+        assert seen.limits_of(ASSUMPTION_FREE, level) == pytest.approx(limits, rel=1e-12)
+    assert n == 2_000
+    assert limits == combined(design.p, by_row.tally, design.n_paths, level)  # of all tests, not of an earlier look
+    assert by_row.tally.totals[2] > 40
+    found, expected = (as_tree(each.result(0.9)) for each in (seen, by_row.seen))
+    assert unlike(found, expected, digits=1e-12) == []
+
+
+def as_tree(estimate: Estimate) -> dict[str, object]:
+    """What it says, but for which tests refuted a statement: those have no numbers where they are counted alone."""
+    found = asdict(estimate)
+    for rows in ("statements", "references", "shells"):
+        named = enumerate(found["details"][rows])
+        found["details"][rows] = {k: {key: row[key] for key in row if key != "refuted_by"} for k, row in named}
+    return found
+
+
+def test_a_raised_budget_is_looked_at_where_it_ends_and_goes_on_as_without(with_references):
+    def tests(episodes, budgets=()):
+        found = looks(campaign_of(episodes), with_references, np.random.default_rng(8), budgets)
+        return [seen.tally.tests.tolist() for seen, *_ in found]
+
+    raised, alone = tests(2_000, (300, 900, 2_000)), tests(300)
+    assert [n for n in map(sum, raised) if n in (300, 900, 2_000)] == [300, 900, 2_000]
+    assert raised[: len(alone)] == alone
+    sizes = sorted(set(map(sum, raised)) - {300, 900})
+    assert sizes[:12] == list(map(sum, tests(2_000)))[:12]
 
 
 def test_pairs_are_divided_into_both_only_a_and_only_b(drivers, population):

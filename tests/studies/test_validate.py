@@ -124,6 +124,12 @@ def test_shipped_experiments_are_right(file):
     assert experiment.campaign.world.engine == "twin"
 
 
+def test_budgets_end_with_that_of_the_campaign(tmp_path):
+    file = written(tmp_path, "chains: [rare]\nlimits: [1]\nbudgets: [3_000, 30_000]\n" + SHELLS)
+    for most, budgets in ((400_000, (3_000, 30_000, 400_000)), (9_000, (3_000, 9_000)), (3_000, (3_000,))):
+        assert load_experiment(file, [f"campaign.stop.episodes={most}"]).all_budgets == budgets
+
+
 @pytest.mark.parametrize(
     ("text", "where", "found"),
     [
