@@ -166,8 +166,8 @@ class CrashPaths:
     def add(self, cell_mass: FloatArray, crashes: IntArray) -> None:
         """Count crashed tests of each stratum (n, S) on paths known by their probabilities of all cells (n, C)."""
         for mass, of_path in zip(cell_mass.astype(np.float32), crashes, strict=True):
-            known = self._by_path.setdefault(mass.tobytes(), np.zeros_like(of_path))
-            known += of_path
+            key = mass.tobytes()
+            self._by_path[key] = self._by_path.get(key, 0) + of_path
 
     def number(self, weight: FloatArray) -> float:
         """Number of paths that count, crashes of a stratum having its ``weight`` (S,); infinite while little is known.
