@@ -207,24 +207,20 @@ class Known:
         return self.std_error / self.scale if self.scale > 0.0 else float("inf")
 
 
-def mean_of(by_path: FloatArray, scale: float | None = None) -> Known:
-    """Mean of a number that each path has (n,)."""
-    mean = float(by_path.mean())
-    return Known(mean, float(by_path.std() / np.sqrt(by_path.size)), mean if scale is None else scale)
-
-
-def ratio_of(above: FloatArray, below: FloatArray, scale: float | None = None) -> Known:
-    """Ratio of the means of two numbers that each path has (n,), with the error of the delta method."""
-    mean = float(below.mean())
-    ratio = float(above.mean()) / mean if mean > 0.0 else float("nan")
-    error = float((above - ratio * below).std() / np.sqrt(below.size)) / mean if mean > 0.0 else float("nan")
+def ratio_of(above: FloatArray, below: FloatArray | None = None, scale: float | None = None) -> Known:
+    """Ratio of the means of two numbers that each path has (n,), with the error of the delta method; or one mean."""
+    mean = 1.0 if below is None else float(below.mean())
+    if mean <= 0.0:
+        return Known(np.nan, np.nan, np.nan if scale is None else scale)
+    ratio = float(above.mean()) / mean
+    error = float((above if below is None else above - ratio * below).std() / np.sqrt(above.size)) / mean
     return Known(ratio, error, ratio if scale is None else scale)
 
 
 def of_vehicle(population: SuperPopulation, crashing: FloatArray, references: Mapping[str, int]) -> dict[str, Known]:
     """Everything about a vehicle by its mass of crashes (m,), beside reference drivers."""
     own = population.by_path(crashing)
-    found = {RATE: mean_of(own)}
+    found = {RATE: ratio_of(own)}
     for name, driver in references.items():
         crashes_too = population.crashes(driver)
         found[ratio_to(name)] = ratio_of(own, population.by_path(population.mass * crashes_too))
@@ -234,8 +230,8 @@ def of_vehicle(population: SuperPopulation, crashing: FloatArray, references: Ma
 
 def of_pair(population: SuperPopulation, a: FloatArray, b: FloatArray) -> dict[str, Known]:
     """How much more often one vehicle crashes than another, by their masses of crashes (m,); both statements' truth."""
-    by_path = population.by_path(a - b)
-    difference = mean_of(by_path, max(float(x.sum()) for x in (a, b)) / population.n_paths)
+    larger = max(float(x.sum()) for x in (a, b)) / population.n_paths
+    difference = ratio_of(population.by_path(a - b), scale=larger)
     return {DIFFERENCE: difference, CONDITIONAL_DIFFERENCE: difference}
 
 
@@ -255,8 +251,7 @@ class Truths:
         progress: Progress,
         beside: Mapping[str, set[str]] | None = None,
     ) -> None:
-        population = enumerate_paths(environment, drivers, seed, n_paths, progress)
-        self._enumerated = [(drivers, population)]
+        self._enumerated = [(drivers, enumerate_paths(environment, drivers, seed, n_paths, progress))]
         imprecise = {name for name in drivers.vehicles if self.vehicle(name)[RATE].relative_error > LARGEST_ERROR}
         if imprecise:
             again = drivers.only(imprecise.union(*((beside or {}).get(name, set()) for name in imprecise)))
@@ -265,18 +260,17 @@ class Truths:
 
     def vehicle(self, name: str) -> dict[str, Known]:
         """Everything about one vehicle."""
-        drivers, population, (crashing,) = self._where(name)
-        return of_vehicle(population, crashing, drivers.references)
+        drivers, population = self._where(name)
+        return of_vehicle(population, population.crash_mass(drivers.vehicles[name]), drivers.references)
 
     def pair(self, a: str, b: str) -> dict[str, Known]:
         """Everything about two vehicles."""
-        _, population, crashing = self._where(a, b)
-        return of_pair(population, *crashing)
+        drivers, population = self._where(a, b)
+        return of_pair(population, *(population.crash_mass(drivers.vehicles[name]) for name in (a, b)))
 
-    def _where(self, *names: str) -> tuple[Drivers, SuperPopulation, list[FloatArray]]:
-        """The most precise paths that have all of them, and their masses of crashes."""
-        drivers, population = next(found for found in self._enumerated if set(names) <= set(found[0].vehicles))
-        return drivers, population, [population.crash_mass(drivers.vehicles[name]) for name in names]
+    def _where(self, *names: str) -> tuple[Drivers, SuperPopulation]:
+        """The most precise paths that have all of them."""
+        return next(found for found in self._enumerated if {*names} <= {*found[0].vehicles})
 
 
 CELLS = 1024
