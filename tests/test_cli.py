@@ -232,7 +232,7 @@ def test_estimate_writes_only_when_asked(folder, capsys):
 def test_replay_says_how_it_compares_when_the_cut_in_began_and_writes_the_trace(
     stored_run, capsys, tmp_path, name, episode, said
 ):
-    """A replay that differs is in tests/runner/test_runner_replay.py."""
+    """A replay that differs is in tests/runner/test_stored.py."""
     command, as_csv, as_parquet = ["replay", str(stored_run(name)), episode], tmp_path / "a.csv", tmp_path / "a.parquet"
     assert main([*command, "--out", str(as_csv)]) == 0
     out = capsys.readouterr().out

@@ -1,7 +1,5 @@
 """``av.fmu`` is checked against the FMU before anything runs; an instance per cell, a reset per episode."""
 
-import errno
-import os
 import re
 import sys
 import zipfile
@@ -10,7 +8,6 @@ from contextlib import closing
 import pytest
 
 from harness.campaign.files import load_campaign
-from harness.commands.printing import system_error
 from harness.controllers import EpisodeStart, Neighbour, Observation
 from harness.controllers.find import build_host, require_controller
 from harness.controllers.fmu import fmu_maker
@@ -52,19 +49,6 @@ def test_a_wrong_wiring_is_named_with_the_variables(fmu, tmp_path, text, where, 
     assert error.value.where == f"av.fmu.{where}"
     assert found in error.value.found
     assert "x (Real input), a (Real output)" in error.value.mend or "observation" in found
-
-
-def test_a_full_cache_disk_is_not_the_fault_of_the_fmu(fmu, tmp_path, monkeypatch):
-    def full(*_: object) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    cache = tmp_path / "cache"
-    monkeypatch.setenv("HARNESS_CACHE_DIR", str(cache))
-    monkeypatch.setattr(zipfile.ZipFile, "extractall", full)
-    with pytest.raises(OSError, match="No space left") as raised:
-        fmu_maker(load(tmp_path, f"{{file: '{fmu}', {WIRED}}}").av.fmu)
-    assert str(cache) in system_error(raised.value).where
-    assert list((cache / "fmu").iterdir()) == []
 
 
 @pytest.mark.parametrize(

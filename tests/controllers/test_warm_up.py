@@ -13,10 +13,9 @@ from examples.idm import IDM, idm_acceleration
 from harness.campaign.files import load_campaign
 from harness.controllers.traci_style import TraciStyleController
 from harness.worlds.sumo import SumoWorld
-from tests.controllers.delay_line import DELAY_STEPS, Line
+from tests.controllers.delay_line import Line
 from tests.controllers.driving import LATERAL, drive, fmu_av, make_fmu, motion
-from tests.worlds.running import MISBEHAVING, ROOT, program
-from tests.worlds.running import run as run_in_sumo
+from tests.worlds.running import ROOT
 
 HERE = "tests.controllers.test_warm_up"
 SHOWN = 300
@@ -110,16 +109,6 @@ def test_so_is_that_of_an_fmu(filled, tmp_path):
 def test_both_worlds_show_the_same(traffic, shim):
     with closing(SumoWorld(5, shim=shim)) as world:
         assert motion(av("Delayed"), *traffic, n=40, world=world) == motion(av("Delayed"), *traffic, n=40)
-
-
-def test_a_program_has_seen_them_in_sumo():
-    """It is there from the start of an episode; what it commands until the cut-in is overruled."""
-    shard = run_in_sumo(program(MISBEHAVING, "delays"), 0, 30)
-    twin = drive(av("Delayed"), n=30)
-    rows = np.flatnonzero(shard.results.episode["cut_in_step"] > DELAY_STEPS)
-    assert rows.size > 10
-    for row in rows:
-        assert shard.traces[row][..., :2].tobytes() == twin.traces[row][..., :2].tobytes()
 
 
 @pytest.mark.parametrize(("episode", "traffic"), [(0, LATERAL), (1, "environment.cut_in_lead_s=0")])

@@ -13,9 +13,11 @@ import matplotlib.pyplot as plt
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from junitparser import JUnitXml
 
 from harness.campaign.sections import Accept
 from harness.errors import RunFolderError
+from harness.report.junit import Case, outcome_of, statement_cases, write_junit
 from harness.report.page import run_notes, verdict, write_report
 from harness.report.summary import read_run_folder, summarise, typed_folder
 from tests.report.page_text import GOLDEN, KINDS, PAGES, Page, golden_text
@@ -188,3 +190,41 @@ def test_what_no_run_has_written_is_named(run_folder, file, damage, said):
         write_report(run_folder)
     assert (caught.value.exit_code, caught.value.mend != "") == (2, True)
     assert (run_folder / "report.html").read_text() == "of an earlier report"
+
+
+# -- JUnit XML as a CI system reads it --
+
+
+CONTENT = {
+    "decision": {"sentence": "REJECTED: <above> & beyond\x1b[31m."},
+    "statement": "The crash rate is 1e-07 per test.",
+    "boundary_statements": {"library": "If it crashes only where …"},
+}
+
+
+@pytest.mark.parametrize(("code", "kind"), [(0, None), (4, "Error"), (5, "Failure"), (3, "Failure")])
+def test_what_was_asked_decides_and_the_rest_is_shown(tmp_path, code, kind):
+    file, report = tmp_path / "gate.xml", tmp_path / "report.html"
+    write_junit(file, "smoke", statement_cases(CONTENT, "assumption_free", code), [report])
+    (suite,) = JUnitXml.fromfile(str(file))
+    assert (suite.name, suite.tests, suite.skipped) == ("smoke", 2, 1)
+    assert (suite.failures, suite.errors) == (int(kind == "Failure"), int(kind == "Error"))
+    asked, other = suite
+    assert (asked.name, other.name) == ("assumption_free", "library")
+    assert [type(each).__name__ for each in asked.result] == ([] if kind is None else [kind])
+    assert [type(each).__name__ for each in other.result] == ["Skipped"]
+    message = f"REJECTED: <above> & beyond\\u001b[31m. {CONTENT['statement']}"
+    assert all(each.message == message for each in asked.result)
+    assert f"[[ATTACHMENT|{report}]]" in asked.system_out
+
+
+def test_a_gate_never_passes_because_nothing_was_asked():
+    """A method without shells may still carry a statement's name in its settings."""
+    cases = statement_cases({**CONTENT, "decision": None, "boundary_statements": {}}, "library", 4)
+    assert [(case.name, case.outcome) for case in cases] == [("assumption_free", "error")]
+
+
+def test_a_comparison_is_one_case(tmp_path):
+    write_junit(tmp_path / "c.xml", "a and b", [Case("difference", "B is worse.", outcome_of(5))], [])
+    (suite,) = JUnitXml.fromfile(str(tmp_path / "c.xml"))
+    assert (suite.failures, [case.name for case in suite]) == (1, ["difference"])

@@ -1,15 +1,23 @@
-"""`av-check` with good and bad controllers: each fault is seen, and a good one passes."""
+"""`av-check` and the tests that a run repeats: each fault is seen, and a good vehicle passes."""
+
+from __future__ import annotations
 
 import json
-from pathlib import Path
+import sys
 
 import pytest
 
 from harness.campaign.files import load_campaign
 from harness.cli import main
+from harness.errors import CampaignError
+from harness.records.folder import read_manifest
 from harness.runner.look import check_av
+from harness.runner.stored import replay_episode, suspects
+from tests.controllers.driving import fmu_av
+from tests.stored_runs import copy_of, edit
+from tests.worlds.running import EXAMPLE, ROOT
 
-MIXTURE_FILE = str(Path(__file__).parents[2] / "scenarios/overtaking_mixture.yaml")
+MIXTURE_FILE, FORCED = (str(ROOT / f"scenarios/overtaking_{name}.yaml") for name in ("mixture", "forced"))
 EXITS = "av={controller: 'tests.controllers.misbehaving:Misbehaving', parameters: {bad: {'2': ends_the_process}}}"
 
 
@@ -44,11 +52,6 @@ class Remembering(Steady):
         return -0.01 * self.seen
 
 
-class Undefined(Steady):
-    def step(self, seen):
-        return float("nan") if seen.speed_mps > 30.0 else -1.0
-
-
 def check(name, *overrides):
     controller = name if ":" in name else f"{__name__}:{name}"
     return check_av(load_campaign(MIXTURE_FILE, ["av={}", f"av.controller={controller}", *overrides]), 24)
@@ -75,13 +78,6 @@ def test_a_controller_that_is_not_reproduced_is_found_out(name, differs):
         assert (did.reaction_s, did.braking_share, did.share_at_min) == (0.0, 1.0, 0.0)
 
 
-def test_failures_are_counted_by_cause():
-    found = check("Undefined")
-    assert (found.exit_code, found.differing) == (3, ())
-    assert all("nan" in cause for cause in found.failures)
-    assert 0 < sum(found.failures.values()) <= 24
-
-
 def test_a_controller_that_acts_early_is_checked_without_forcing():
     found = check("Steady", "av.before_cut_in=controller", "testing.method=nde")
     assert (found.method, found.exit_code) == ("step_mixture", 0)
@@ -102,3 +98,90 @@ def test_the_command_line(capfd):
         "error: av.controller\n  found:    the controller ended the worker process (exit code 7), in "
     )
     assert "of step" in err
+
+
+# -- vehicles that are no Python classes --
+
+
+@pytest.fixture
+def checked(capfd):
+    def check_form(av: str) -> tuple[int, dict]:
+        code = main(["av-check", FORCED, "--json", "--episodes", "6", "--set", f"av={av}"])
+        return code, json.loads(capfd.readouterr().out)
+
+    return check_form
+
+
+@pytest.mark.parametrize("form", ["ACC", "EIDM", "program", "fmu"])
+def test_it_sees_that_each_form_brakes_and_is_deterministic(form, checked, request):
+    if form == "fmu":
+        av = fmu_av(request.getfixturevalue("fmu"))
+    elif form == "program":
+        av = f"{{traci: {{command: '{sys.executable} {EXAMPLE} --port {{port}} --cells {{cells}}'}}}}"
+    else:
+        av = f"{{sumo: {{carFollowModel: {form}}}}}"
+    code, found = checked(av)
+    assert (code, found["deterministic"], found["failures"]) == (0, True, {})
+    assert found["behaviour"]["n_cut_ins"] == 6
+    braking = found["behaviour"]["min_acceleration_mps2"]
+    assert braking == pytest.approx(-4.0) if form in ("program", "fmu") else braking < -1.0
+
+
+def test_a_program_that_dies_is_found_out(checked):
+    code, found = checked("{traci: {command: 'false', connect_time_s: 5, restarts: 0}}")
+    assert code == 3
+    assert sum(found["failures"].values()) == 6
+
+
+# -- a run repeats some of its own tests, and replay knows --
+
+
+SMALL = ("world.engine=twin", "stop.rhw=null", "stop.episodes=400", "run.shard_size=100", "records.traces=none")
+GLOBAL = "{controller: 'tests.controllers.misbehaving:Global'}"
+
+
+@pytest.fixture
+def run_av(run_here, tmp_path):
+    def run_one(av, *overrides, name="run", run=run_here, **options):
+        return run(load_campaign(FORCED, [*SMALL, f"av={av}", *overrides]), tmp_path / name, **options).folder
+
+    return run_one
+
+
+def statement(folder):
+    return json.loads((folder / "estimates.json").read_text())["statement"]
+
+
+@pytest.mark.parametrize("name", ["shells-controller-twin", "forced-batch", "forced-krauss", "forced-traci-style"])
+def test_a_vehicle_that_does_the_same_again_is_said_to(name, stored_run):
+    manifest = read_manifest(stored_run(name))
+    assert (manifest["repeated"]["differing"], manifest["reproducible"]) == ([], True)
+    assert (n := manifest["repeated"]["n_episodes"]) > 5
+    assert statement(stored_run(name)).endswith(f"{n} of these tests were run a second time: same bits.")
+
+
+def test_a_vehicle_that_does_not_is_found_out_for_any_number_of_workers_and_after_a_resume(run_av, run, tmp_path):
+    folders = [run_av(GLOBAL, name="1"), run_av(GLOBAL, name="2", run=run, workers=2)]
+    one, two = (read_manifest(folder) for folder in folders)
+    assert one["repeated"] == two["repeated"]
+    assert len(one["repeated"]["differing"]) == one["repeated"]["n_episodes"] == 10
+    assert (one["reproducible"], two["reproducible"]) == (False, False)
+    assert statement(folders[0]).startswith("WARNING: 10 of 10 tests that were run a second time DIFFERED")
+    with pytest.raises(CampaignError, match="10 of 10 tests that it repeated itself came out otherwise"):
+        replay_episode(folders[0], 3)
+    copied = copy_of(folders[0], tmp_path / "copy")
+    run_av(GLOBAL, "stop.episodes=500", name=copied.name, resume=True)
+    longer = read_manifest(copied)
+    assert (longer["repeated"], longer["reproducible"], longer["n_episodes"]) == (one["repeated"], False, 500)
+
+
+def test_a_replay_that_differs_names_what_it_knows(stored_run, tmp_path):
+    folder = copy_of(stored_run("shells-controller-twin"), tmp_path / "run")
+    manifest = read_manifest(folder)
+    (folder / "estimates.json").unlink()
+    edit(folder, repeated=None)
+    assert replay_episode(folder, 3).suspects is None
+    campaign = load_campaign(folder / "campaign.yaml")
+    assert "the vehicle does not do the same again" in suspects(manifest, campaign)
+    assert "source file has been changed" in suspects({**manifest, "controller_sha256": "0"}, campaign)
+    assert "CPU Z80 (here" in suspects({**manifest, "cpu": "Z80"}, campaign)

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import errno
-import io
-import itertools
 import os
 import pickle
-from collections.abc import Callable
+from multiprocessing import get_context
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
+from harness.campaign.files import load_campaign
 from harness.cli import main
 from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, WorldDisagreementError
-from harness.progress import ShownProgress
 from harness.runner import run as running
 from harness.runner import workers
 from harness.runner.workers import WorkerLostError
@@ -90,101 +89,81 @@ def test_a_disk_that_is_full_at_the_very_end(run_here, campaign, twin_run, tmp_p
     assert unlike_columns(twin_run, out) == []
 
 
-def test_a_clock_that_jumps_back(run_here, campaign, twin_run, tmp_path, monkeypatch):
-    """An hour at every look, in both sessions of a run: nothing but the time of day in a line of progress knows it."""
-    hours, stream, out = itertools.count(start=500_000, step=-1), io.StringIO(), tmp_path / "run"
-    monkeypatch.setattr("time.time", lambda: 3600.0 * next(hours))
-    with ShownProgress(stream=stream, interval_s=0.01) as progress:
-        run_here(campaign(*TWIN, "stop.episodes=240"), out, progress=progress)
-        run_here(campaign(*TWIN), out, resume=True, progress=progress)
-        progress.stage("episodes", 400, done=200)
-        progress.advance(100)
-        assert "300 of 400" in next(progress.lines())
-    assert unlike_columns(twin_run, out) == []
-    assert 0.0 <= manifest(out)["wall_time_s"] < 600.0
-    assert " -" not in stream.getvalue()
-
-
 # -- the worker's side of the pipe --
 
 
 class Pipe:
-    """A connection whose other end sends shards and then is closed."""
+    """A connection whose other end sends a shard and then is closed."""
 
-    def __init__(self, n_shards: int) -> None:
-        self._specs = [ShardRequest(i, 10 * i, 10) for i in range(n_shards)]
-        self.sent: list[object] = []
+    def __init__(self) -> None:
+        self.requests, self.answers = [(ShardRequest(0, 0, 10), {})], []
 
     def recv(self) -> tuple[ShardRequest, dict]:
-        if not self._specs:
+        if not self.requests:
             raise EOFError
-        return self._specs.pop(0), {}
+        return self.requests.pop()
 
     def send(self, answer: object) -> None:
-        pickle.dumps(answer)
-        self.sent.append(answer)
+        self.answers.append(pickle.loads(pickle.dumps(answer)))
 
 
-@pytest.fixture
-def serve(campaign, tmp_path, monkeypatch):
-    """Serve shards with stand-ins for preparing and running one; returns what was noted."""
-
-    def served(pipe: Pipe, run: Callable = lambda spec: spec.index, prepare: Callable = lambda: None) -> list[str]:
-        events = []
-
-        class Runner:
-            def __init__(self, *_: object) -> None:
-                prepare()
-                events.append("prepared")
-
-            def run(self, spec: ShardRequest, fatal_episodes: dict) -> object:
-                return run(spec)
-
-            def close(self) -> None:
-                events.append("closed")
-
-        monkeypatch.setattr(workers, "ShardRunner", Runner)
-        resolved = tmp_path / "resolved"
-        resolved.write_bytes(pickle.dumps(campaign()))
-        workers.serve(pipe, resolved, tmp_path, tmp_path / "black-box")
-        return events
-
-    return served
-
-
-@pytest.mark.parametrize(("lost", "error"), [(None, None), ("recv", ConnectionResetError), ("send", BrokenPipeError)])
-def test_a_worker_prepares_once_and_ends_quietly_with_its_parent(lost, error, serve, monkeypatch):
-    def broken(*_: object) -> None:
-        raise error
-
-    pipe = Pipe(3)
-    if lost:
-        monkeypatch.setattr(pipe, lost, broken)
-    assert serve(pipe) == ([] if lost == "recv" else ["prepared", "closed"])
-    assert pipe.sent == ([] if lost else [0, 1, 2])
-
-
-def raises(error: Exception) -> Callable[..., None]:
-    def raising(*_: object) -> None:
-        raise error
-
-    return raising
-
-
-def test_errors_reach_the_parent(serve):
+@pytest.mark.parametrize("at", ["__init__", "run"])
+@pytest.mark.parametrize("error", [CampaignError("world.cells", "300", "at most 256", "Use fewer."), KeyError(1), None])
+def test_errors_reach_the_parent(error, at, campaign, tmp_path, monkeypatch):
     """As they are, a defect with the worker's traceback, and one that cannot be pickled in words."""
-    refused = CampaignError("world.cells", found="300", expected="at most 256", mend="Use fewer.")
     strange = ValueError("of a strange kind")
     strange.handle = lambda: None
-    prepared, defect, unpicklable = Pipe(1), Pipe(1), Pipe(1)
-    serve(prepared, prepare=raises(refused))
-    serve(defect, lambda spec: 1 / spec.index)
-    serve(unpicklable, raises(strange))
-    (error,) = prepared.sent
-    assert (type(error), str(error)) == (CampaignError, "world.cells: found 300; expected at most 256. Use fewer.")
-    (error,) = defect.sent
-    assert isinstance(error, ZeroDivisionError)
-    assert "lambda spec: 1 / spec.index" in pickle.loads(pickle.dumps(error)).__notes__[0]
-    (error,) = unpicklable.sent
-    assert isinstance(error, RuntimeError)
-    assert "ValueError: of a strange kind" in str(error)
+    raising = Mock(side_effect=error or strange)
+    monkeypatch.setattr(workers, "ShardRunner", raising if at == "__init__" else Mock(return_value=Mock(run=raising)))
+    (tmp_path / "resolved").write_bytes(pickle.dumps(campaign()))
+    pipe = Pipe()
+    workers.serve(pipe, tmp_path / "resolved", tmp_path, tmp_path / "black-box")
+    (found,) = pipe.answers
+    if isinstance(error, CampaignError):
+        assert (type(found), str(found)) == (CampaignError, str(error))
+    elif error:
+        assert isinstance(found, KeyError)
+        assert "in run\n" in found.__notes__[0]
+    else:
+        assert isinstance(found, RuntimeError)
+        assert "ValueError: of a strange kind" in str(found)
+
+
+# -- a worker's memory does not grow: after 2e5 episodes it is what it was after 1e4, within 10 % --
+
+
+SHARD, WARM_UP, EPISODES = 1_000, 10_000, 200_000
+
+
+def resident_mb() -> float:
+    """Resident memory of this process, as the kernel counts it."""
+    status = Path("/proc/self/status").read_text()
+    return int(status.split("VmRSS:")[1].split()[0]) / 1024.0
+
+
+def run_shards(connection, folder: Path) -> None:
+    """Work like a worker process, and say after every shard how much memory that takes."""
+    from harness.resolved import resolve
+    from harness.runner.workers import ShardRunner
+    from harness.sampling.protocol import ShardRequest
+
+    runner = ShardRunner(resolve(load_campaign(MIXTURE_FILE)), folder)
+    for index in range(EPISODES // SHARD):
+        runner.run(ShardRequest(index, index * SHARD, SHARD))
+        for path in folder.rglob("*.parquet"):
+            path.unlink()
+        connection.send(resident_mb())
+
+
+@pytest.mark.slow
+def test_memory_of_a_worker_stays_within_ten_percent(tmp_path, record_property):
+    ours, theirs = get_context("spawn").Pipe()
+    worker = get_context("spawn").Process(target=run_shards, args=(theirs, tmp_path), daemon=True)
+    worker.start()
+    theirs.close()
+    resident = [ours.recv() for _ in range(EPISODES // SHARD)]
+    worker.join()
+    after_warm_up = resident[WARM_UP // SHARD - 1 :]
+    record_property("resident_mb", after_warm_up[:: WARM_UP // SHARD])
+    print(f"resident MB every {WARM_UP} episodes:", *(f"{mb:.1f}" for mb in after_warm_up[:: WARM_UP // SHARD]))  # noqa: T201
+    assert max(after_warm_up) <= 1.1 * after_warm_up[0]

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import contextlib
-import math
 import os
 import signal
 import sys
 import time
 from pathlib import Path
 
-sys.path.extend(str(Path(__file__).parents[2] / each) for each in ("examples/traci_client", "tests/controllers"))
+sys.path.append(str(Path(__file__).parents[2] / "examples/traci_client"))
 
 import idm_client
-from delay_line import Line
 
 FAULT_STEP = 60
 
@@ -60,21 +57,6 @@ class Faulty:
         return self._connection.simulationStep()
 
 
-def delays(sumo, cells):
-    """An IDM that acts on what it has measured half a second ago."""
-    sumo.setOrder(1)
-    sumo.simulationStep()
-    lines = [Line(idm_client.idm) for _ in range(cells)]
-    while True:
-        sumo.simulationStep()
-        vehicle = sumo.vehicle
-        for k, line in enumerate(lines):
-            av, bv, speed = f"AV{k}", f"BV{k}", vehicle.getSpeed(f"AV{k}")
-            gap = vehicle.getLanePosition(bv) - 5.0 - vehicle.getLanePosition(av)
-            a = line.acceleration(speed, vehicle.getSpeed(bv), gap if vehicle.getLaneIndex(bv) == 0 else math.inf)
-            vehicle.setSpeed(av, max(speed + a * 0.1, 0.0))
-
-
 def main():
     fault, port, cells = sys.argv[1], int(sys.argv[3]), int(sys.argv[5])
     if fault == "never_connects":
@@ -82,10 +64,6 @@ def main():
     if fault == "connects_late":
         time.sleep(1.5)
         fault = "pushes_held_avs"
-    if fault == "delays":
-        with contextlib.suppress(idm_client.traci.exceptions.FatalTraCIError):
-            delays(idm_client.connect(port), cells)
-        return
     idm_client.drive(Faulty(idm_client.connect(port), fault), cells)
 
 

@@ -1,0 +1,255 @@
+"""`harness estimate` on a stored run is `estimates.json`, exactly, and the rate is the mean of stored weights."""
+
+from __future__ import annotations
+
+import json
+import re
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+import pytest
+
+import harness
+from harness.cli import main
+from harness.errors import RunFolderError, WorldDisagreementError
+from harness.estimators.block import joined
+from harness.pool.replay import Retracing
+from harness.resolved import resolve
+from harness.runner import stored
+from harness.runner.stored import estimate_run, replay_episode, stored_blocks
+from tests.golden.record import column_hash
+from tests.in_process import run_here
+from tests.stored_runs import copy_of, edit, estimates, golden, manifest, of_before, shard_files, stored_table
+
+ESTIMATOR = {"shells-twin": "shells", "nde-twin": "nde"}
+RECORDS = (Path(__file__).parents[2] / "docs/records.md").read_text()
+LINES = "\n".join(re.findall(r"^```python\n(.*?)^```$", RECORDS, re.MULTILINE | re.DOTALL))
+
+
+def test_estimating_again_gives_the_same_content(sumo_run, twin_run, capsys):
+    for folder in (sumo_run, twin_run):
+        assert estimate_run(folder) == estimates(folder)
+    assert main(["estimate", str(twin_run), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == estimates(twin_run)
+
+
+def test_another_confidence_changes_intervals_and_not_the_rate(twin_run):
+    stored = estimates(twin_run)
+    wider = estimate_run(twin_run, confidence=0.99)
+    headline = stored["headline"]
+    assert wider["estimates"][headline]["crash_rate"] == stored["estimates"][headline]["crash_rate"]
+    assert wider["estimates"][headline]["ci_high"] > stored["estimates"][headline]["ci_high"]
+
+
+def test_of_the_prefix_that_counts_what_is_asked_and_the_headline_are_estimated(stored_run, tmp_path):
+    folder = copy_of(stored_run("step-recursive-twin"), tmp_path / "run")
+    shards = [{**shard, "files": {"episodes": shard["files"]["episodes"]}} for shard in manifest(folder)["shards"]]
+    edit(folder, n_episodes=200, shards=shards)
+    content, asked = estimate_run(folder), estimate_run(folder, estimators=["scv"])
+    assert content["n_episodes"] == content["convergence"][-1]["n"] == 200
+    assert asked["estimates"] == {name: content["estimates"][name] for name in ("nade", "scv")}
+    assert content["estimates"]["scv"]["crash_rate"] is None
+    assert "records.moments" in content["estimates"]["scv"]["reason"]
+
+
+@pytest.mark.parametrize(("most", "sizes"), [(90, [80, 160, 160]), (170, [80, 240, 80]), (5_000, [80, 320])])
+def test_shards_are_read_in_groups_without_changing_a_bit(most, sizes, twin_run, monkeypatch):
+    """Five shards of 80 tests, as one block of several tables."""
+    one_by_one = list(stored_blocks(twin_run, moments=False))
+    monkeypatch.setattr(stored, "SPACING", 100.0)
+    monkeypatch.setattr(stored, "MOST_GROUPED", most)
+    grouped = list(stored_blocks(twin_run, moments=False))
+    assert ([len(block) for block in one_by_one], [len(block) for block in grouped]) == ([80] * 5, sizes)
+    whole, again = joined(one_by_one), joined(grouped)
+    assert whole.columns.keys() == again.columns.keys()
+    assert all(np.array_equal(column, again.columns[name]) for name, column in whole.columns.items())
+    np.testing.assert_array_equal(whole.outcome, again.outcome)
+    np.testing.assert_array_equal(whole.log_weight, again.log_weight)
+
+
+def test_shards_with_columns_of_other_types_are_refused(twin_run, tmp_path, monkeypatch):
+    folder = of_before(copy_of(twin_run, tmp_path / "run"))
+    path = folder / "episodes" / sorted(path.name for path in (folder / "episodes").iterdir())[2]
+    table = pq.read_table(path)
+    column = table.schema.get_field_index("cut_in_step")
+    pq.write_table(table.set_column(column, "cut_in_step", table.column(column).cast("float64")), path)
+    monkeypatch.setattr(stored, "SPACING", 100.0)
+    with pytest.raises(RunFolderError, match="cut_in_step as double and int16"):
+        list(stored_blocks(folder, moments=False))
+
+
+@pytest.mark.parametrize("name", ["shells-twin", "forced-twin", "nde-twin", "step-recursive-twin", "mixture-twin"])
+def test_the_weights_give_the_rate_of_every_method_as_docs_have_it(name, stored_run, capsys):
+    folder = stored_run(name)
+    rate = estimates(folder)["estimates"][ESTIMATOR.get(name, "nade")]["crash_rate"]
+    assert rate > 0.0
+    tests = harness.read(folder).episodes(["outcome", "log_weight"])
+    crash = tests.outcome == "crash"
+    assert (tests.weight * crash).mean() == pytest.approx(rate, rel=1e-9)
+    plain = (np.exp(tests.log_weight) * crash).mean()
+    assert (plain == pytest.approx(rate, rel=1e-9)) == (name != "shells-twin")
+    exec(LINES.replace("runs/hard-braking", str(folder)), {})
+    assert float(capsys.readouterr().out.split()[-1]) == pytest.approx(rate, rel=1e-9)
+
+
+# -- replay gives stored rows and traces bit for bit, and says so where they have been tampered with --
+
+
+REPLAYED = (
+    *("mixture-seven", "mixture-twin", "nde-twin", "shells-sumo", "shells-acting-sumo", "forced-acting-twin"),
+    *("shells-lateral-sumo", "forced-krauss"),
+)
+
+
+def rows_of(table: pa.Table, episode: int) -> pa.Table:
+    return table.filter(pc.equal(table["episode"], episode))
+
+
+@pytest.mark.parametrize("name", REPLAYED)
+def test_stored_rows_and_traces_come_out_again(name, stored_run):
+    """The first and the last test, a crash, one that ended well, one without cut-in if there is one, a traced one."""
+    rows, traces = (stored_table(stored_run(name), table) for table in ("episodes", "traces"))
+    outcome, cut_in = rows["outcome"].to_pylist(), rows["cut_in_step"].to_pylist()
+    chosen = {0, len(outcome) - 1, outcome.index("timeout")}
+    chosen |= {
+        next((i for i, value in enumerate(values) if value == of), 0)
+        for values, of in ((outcome, "crash"), (cut_in, None))
+    }
+    chosen.add(traces["episode"][0].as_py())
+    for episode in sorted(chosen):
+        result = replay_episode(stored_run(name), episode)
+        row, stored = rows_of(rows, episode), rows_of(traces, episode)
+        assert (result.bit_equal, result.compared) == (True, ("episodes", "traces")[: 1 + (stored.num_rows > 0)])
+        assert result.outcome == result.row["outcome"] == row["outcome"].to_pylist()[0]
+        assert result.row["log_weight"].hex() == row["log_weight"].to_pylist()[0].hex()
+        if stored.num_rows:
+            assert all(column_hash(result.trace[name]) == column_hash(stored[name]) for name in stored.column_names)
+
+
+@pytest.mark.parametrize(("table", "column"), [("traces", "x_m"), ("traces", "v_mps"), ("episodes", "log_weight")])
+def test_a_record_that_was_tampered_with_is_noticed(table, column, twin_run, tmp_path, capsys):
+    """By one unit in the last place."""
+    folder = of_before(copy_of(twin_run, tmp_path / "run"))
+    path = shard_files(folder, table)[1]
+    rows = pq.read_table(path, partitioning=None)
+    values = rows[column].to_numpy().copy()
+    values[30] = np.nextafter(values[30], -1e9)
+    index = rows.column_names.index(column)
+    pq.write_table(rows.set_column(index, rows.schema.field(column), [values]), path)
+    episode = rows["episode"][30].as_py()
+    assert replay_episode(folder, episode).bit_equal is False
+    assert main(["replay", str(folder), str(episode)]) == 3
+    out, err = capsys.readouterr()
+    assert "NOT as stored" in out
+    assert f"episode {episode}" in err
+
+
+@pytest.mark.parametrize("engine", ["sumo", "twin"])
+def test_floating_car_data_hold_the_episodes_motion(engine, request, tmp_path):
+    folder = request.getfixturevalue(f"{engine}_run")
+    episode = stored_table(folder, "episodes")["outcome"].to_pylist().index("crash")
+    fcd = tmp_path / "fcd.xml"
+    result = replay_episode(folder, episode, fcd=fcd)
+    assert result.bit_equal is True
+    frames = ET.parse(fcd).getroot().findall("timestep")
+    n_steps = result.row["n_steps"]
+    seen = [
+        {v.get("id").rstrip("0"): (float(v.get("pos")), float(v.get("speed")), v.get("lane")) for v in frame}
+        for frame in frames[-n_steps:]
+    ]
+    expected: list[dict] = [{} for _ in range(n_steps + 1)]
+    columns = (result.trace[name].to_pylist() for name in ("step", "vehicle", "x_m", "v_mps", "lane"))
+    for step, vehicle, x, v, lane in zip(*columns, strict=True):
+        expected[step][vehicle] = (x, v, f"cell0_{lane}")
+    for frame, motion in zip(seen, expected[1:], strict=True):
+        for vehicle, (x, v, lane) in motion.items():
+            assert frame[vehicle] == (pytest.approx(x, abs=1e-8), pytest.approx(v, abs=1e-8), lane)
+
+
+# -- the twin retraces what was driven: to the last bit where nothing is wrong, and no further where anything is --
+
+
+RETRACED = (
+    *("nde-sumo", "forced-sumo", "step-recursive-sumo", "shells-lateral-sumo", "shells-refuted", "shells-need-based"),
+    *("forced-inattentive", "forced-reference", "nde-lateral", "shells-stops"),
+)
+
+
+def check(name: str, table: pa.Table, *overrides: str) -> int:
+    return Retracing(resolve(golden(name, "world.engine=sumo", *overrides))).check(table)
+
+
+@pytest.mark.parametrize("name", RETRACED)
+def test_every_episode_of_a_built_in_av_is_retraced(name, stored_run):
+    table = stored_table(stored_run(name), "episodes")
+    assert check(name, table) == table.num_rows
+    if name.endswith("sumo"):
+        said = manifest(stored_run(name))["retraced"]
+        assert said["n_episodes"] == said["n_equal"] == table.num_rows
+        assert ("onset_r2_m" if "lateral" in name else "cut_in_r2_m") in said["compared"]
+
+
+def changed(table: pa.Table, name: str, value) -> pa.Table:
+    """The table with another value in the first row that has a crash."""
+    row = table.column("outcome").to_pylist().index("crash")
+    values = table.column(name).to_pylist()
+    values[row] = value(values[row])
+    at = table.column_names.index(name)
+    field = table.schema.field(at)
+    column = pa.array(values, pa.string()).dictionary_encode() if name == "outcome" else pa.array(values, field.type)
+    return table.set_column(at, name, column)
+
+
+def one_bit(value: float) -> float:
+    return float(np.nextafter(value, np.inf))
+
+
+@pytest.fixture
+def forced(stored_run) -> pa.Table:
+    return stored_table(stored_run("forced-twin"), "episodes")
+
+
+@pytest.mark.parametrize(
+    ("column", "value", "named"),
+    [
+        ("cut_in_r2_m", one_bit, "cut_in_r2_m"),
+        ("cut_in_r2dot_mps", one_bit, "cut_in_r2dot_mps"),
+        ("impact_speed_mps", one_bit, "impact_speed_mps"),
+        ("crash_time_s", one_bit, "crash_time_s"),
+        ("r2_m", lambda r2: r2 + 1e-9, "cut_in_r2_m"),
+        ("outcome", lambda _: "timeout", "outcome"),
+        ("n_steps", lambda n: n - 1, "outcome"),
+        ("bv_maneuvers", lambda path: [30 - path[0], *path[1:]], "cut_in_r2_m"),
+        ("bv_maneuvers", lambda path: path[:1], "maneuvers"),
+    ],
+)
+def test_one_changed_value_raises_the_alarm(forced, column, value, named):
+    with pytest.raises(WorldDisagreementError, match=named):
+        check("forced-twin", changed(forced, column, value))
+
+
+def test_of_another_av_only_the_way_to_the_cut_in_is_known(forced):
+    unknown = "av={sumo: {carFollowModel: IDM}}"
+    assert check("forced-sumo", changed(forced, "impact_speed_mps", one_bit), unknown) == forced.num_rows
+    with pytest.raises(WorldDisagreementError):
+        check("forced-sumo", changed(forced, "cut_in_r2_m", one_bit), unknown)
+    early = Retracing(resolve(golden("forced-acting-sumo")))
+    assert early.check(forced) == 0
+    assert "before the cut-in" in early.summary(0)["reason"]
+
+
+def test_a_stored_shard_is_retraced_when_a_run_goes_on(sumo_run, tmp_path):
+    folder = of_before(copy_of(sumo_run, tmp_path / "run"))  # without checksums, which would notice it first
+    path = shard_files(folder)[0]
+    table = pq.read_table(path, partitioning=None)
+    values = table.column("cut_in_r2_m").to_pylist()
+    row = next(i for i, value in enumerate(values) if value is not None)
+    values[row] = one_bit(values[row])
+    at = table.column_names.index("cut_in_r2_m")
+    pq.write_table(table.set_column(at, table.schema.field(at), pa.array(values, pa.float64())), path)
+    with pytest.raises(WorldDisagreementError, match=f"episode {row}"):
+        run_here(golden("mixture-seven"), folder, resume=True)
