@@ -12,7 +12,6 @@ import click
 import pyarrow as pa
 import pytest
 from click.testing import CliRunner
-from pyarrow import csv, parquet
 
 from harness.campaign.files import load_campaign
 from harness.cli import cli, main
@@ -107,7 +106,7 @@ def test_wrong_campaign_leaves_nothing_behind(capsys, tmp_path):
         ["estimate", "no-such-folder"],
         ["estimate", ".", "--confidence", "1"],
         ["replay", ".", "-1"],
-        ["replay", ".", "1", "--out", "trace.txt"],
+        ["export", ".", "1", "--to", "csv", "--out", "trace.txt"],
         [],
     ],
 )
@@ -135,7 +134,7 @@ def test_wrong_calls_end_with_2(capsys, arguments):
         (["run", *CAMPAIGN, "--out", "an out", "--resume"], 0),
         (["report", "an out"], 0),
         (["estimate", "an out"], 0),
-        (["replay", "an out", "1", "--out", "{}.csv"], 0),
+        (["export", "an out", "1", "--to", "csv", "--out", "{}.csv"], 0),
     ],
 )
 def test_names_move_no_cursor(folder, capsys, monkeypatch, arguments, code):
@@ -229,19 +228,15 @@ def test_estimate_writes_only_when_asked(folder, capsys):
         ("forced-lateral-twin", "44", "  BV comes over 1.8 s, "),
     ],
 )
-def test_replay_says_how_it_compares_when_the_cut_in_began_and_writes_the_trace(
-    stored_run, capsys, tmp_path, name, episode, said
-):
+def test_replay_says_how_it_compares_and_when_the_cut_in_began(stored_run, capsys, tmp_path, name, episode, said):
     """A replay that differs is in tests/runner/test_stored.py."""
-    command, as_csv, as_parquet = ["replay", str(stored_run(name)), episode], tmp_path / "a.csv", tmp_path / "a.parquet"
-    assert main([*command, "--out", str(as_csv)]) == 0
+    command, page = ["replay", str(stored_run(name)), episode], tmp_path / "a.html"
+    assert main(command) == 0
     out = capsys.readouterr().out
     assert out.startswith(f"episode {episode}: ")
     assert said in out
-    assert out.endswith(f"{as_csv}\n")
-    assert main([*command, "--out", str(as_parquet), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["files"] == [str(as_parquet)]
-    assert csv.read_csv(as_csv)["x_m"].to_pylist() == parquet.read_table(as_parquet)["x_m"].to_pylist()
+    assert main([*command, "--html", str(page), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["files"] == [str(page)]
 
 
 def test_replay_says_where_nothing_is_stored_to_compare_with(monkeypatch, capsys, tmp_path):
@@ -253,11 +248,11 @@ def test_replay_says_where_nothing_is_stored_to_compare_with(monkeypatch, capsys
     )
 
 
-@pytest.mark.parametrize("option", ["--out", "--fcd"])
+@pytest.mark.parametrize("option", ["--html", "--fcd"])
 def test_a_file_that_cannot_be_written_is_refused_first(raising, capsys, tmp_path, option):
     (tmp_path / "file").write_text("not a folder")
     never = ZeroDivisionError(), "harness.runner.stored.replay_episode", "replay"
-    assert raising(*never, more=["17", option, str(tmp_path / "file" / "x.csv")]) == 2
+    assert raising(*never, more=["17", option, str(tmp_path / "file" / "x.html")]) == 2
     assert "nothing can be written" in capsys.readouterr().err
 
 

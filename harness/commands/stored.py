@@ -10,10 +10,11 @@ import click
 
 from harness.commands.options import FILE, RUN_FOLDER, examples, json_option, written_file
 from harness.commands.printing import in_folder, print_estimates, print_json, say
-from harness.errors import EXIT_BAD_INPUT, WorldDisagreementError
+from harness.errors import EXIT_BAD_INPUT, HarnessError, WorldDisagreementError
 from harness.vocabulary import ESTIMATORS
 
 if TYPE_CHECKING:
+    from harness.runner.stored import ReplayResult
     from harness.vocabulary import EstimatorName
 
 
@@ -83,22 +84,16 @@ def report(folder: Path) -> None:
     epilog=examples(
         "harness replay runs/smoke 17",
         "harness replay runs/smoke 17 --html episode_17.html",
-        "harness replay runs/smoke 17 --out episode_17.csv",
         "harness replay runs/smoke 17 --gui",
     ),
 )
 @click.argument("folder", metavar="DIR", type=RUN_FOLDER)
 @click.argument("episode", type=click.IntRange(min=0))
-@click.option(
-    "--out", type=FILE, callback=written_file(".csv", ".parquet"), help="Write the trace: FILE.parquet or FILE.csv."
-)
 @click.option("--html", type=FILE, callback=written_file(".html"), help="Write a page that plays the episode.")
 @click.option("--fcd", type=FILE, callback=written_file(), help="Write SUMO's floating car data (XML) of the episode.")
 @click.option("--gui", is_flag=True, help="Show the episode in sumo-gui (extra 'sumo').")
 @json_option
-def replay(
-    folder: Path, episode: int, *, out: Path | None, html: Path | None, fcd: Path | None, gui: bool, as_json: bool
-) -> None:
+def replay(folder: Path, episode: int, *, html: Path | None, fcd: Path | None, gui: bool, as_json: bool) -> None:
     """Simulate episode number EPISODE of the run in DIR again, bit for bit, and say what happens when.
 
     And what would have happened with others in the vehicle's place: the careful and competent driver of UN Regulation
@@ -109,18 +104,11 @@ def replay(
     from harness.runner.stored import replay_episode  # noqa: PLC0415 - keeps --help fast
 
     result = replay_episode(folder, episode, gui=gui, fcd=fcd)
-    files = [str(file) for file in (out, html, fcd) if file is not None]
+    files = [str(file) for file in (html, fcd) if file is not None]
     if html is not None:
         from harness.report.player import write_player  # noqa: PLC0415 - keeps --help fast
 
         write_player(result.scene, html)
-    if out is not None:
-        from pyarrow import csv, parquet  # noqa: PLC0415 - keeps --help fast
-
-        from harness.records.folder import write_atomically  # noqa: PLC0415 - keeps --help fast
-
-        write = csv.write_csv if out.suffix == ".csv" else parquet.write_table
-        write_atomically(out, lambda unfinished: write(result.trace, unfinished))
     if as_json:
         content = {"episode": episode, "outcome": result.outcome, "bit_equal": result.bit_equal, "files": files}
         print_json({**content, **{name: result.row[name] for name in LATERAL if name in result.row}})
@@ -128,6 +116,48 @@ def replay(
         compared = {None: "no stored trace to compare with", True: "bit for bit as stored", False: "NOT as stored"}
         facts = [f"  {name:<13} {fact}" for name, fact in result.scene["facts"]]
         say(f"episode {episode}: {result.outcome}; {compared[result.bit_equal]}", *facts, *files)
+    _require_bits(result, folder, episode)
+
+
+@click.command(
+    short_help="Write one episode of a run for other tools.",
+    epilog=examples(
+        "harness export runs/smoke 17 --to xosc", "harness export runs/smoke 17 --to csv --out episode_17.csv"
+    ),
+)
+@click.argument("folder", metavar="DIR", type=RUN_FOLDER)
+@click.argument("episode", type=click.IntRange(min=0))
+@click.option("--to", "form", type=click.Choice(["xosc", "csv"]), required=True, help="Kind of file.")
+@click.option("--out", type=FILE, callback=written_file(), help="File to write. Default: episode_N.xosc or .csv, here.")
+def export(folder: Path, episode: int, *, form: str, out: Path | None) -> None:
+    """Simulate episode number EPISODE of the run in DIR again, bit for bit, and write its motion for other tools.
+
+    xosc: OpenSCENARIO XML 1.2, and its OpenDRIVE road beside it (.xodr), with the motion of all three vehicles in steps
+    of 0.1 s. Needs the extra 'export'.
+
+    csv: a row for each vehicle and step; the columns' names say the units.
+    """
+    file = out or Path(f"episode_{episode}.{form}")
+    if file.suffix != f".{form}":
+        mend = f"Write --out {file.with_suffix(f'.{form}')}, or another --to."
+        raise HarnessError(f"--out {file}", f"a name that ends in '{file.suffix}'", f"one that ends in .{form}", mend)
+    if form == "xosc":
+        try:
+            from harness.report.openscenario import write_openscenario as write  # noqa: PLC0415 - an extra
+        except ModuleNotFoundError as error:
+            mend = "Install it: pip install 'harness[export]', in the checkout pip install '.[export]'."
+            raise HarnessError("--to xosc", f"no package {error.name}", "the extra 'export'", mend) from error
+    else:
+        from harness.report.player import write_csv as write  # noqa: PLC0415 - keeps --help fast
+    from harness.runner.stored import replay_episode  # noqa: PLC0415 - keeps --help fast
+
+    result = replay_episode(folder, episode)
+    _require_bits(result, folder, episode)
+    write(result.trace, file)
+    say(str(file), *([str(file.with_suffix(".xodr"))] if form == "xosc" else []))
+
+
+def _require_bits(result: ReplayResult, folder: Path, episode: int) -> None:
     if result.bit_equal is False:
         found = "a replay that differs from the stored trace"
         raise WorldDisagreementError(f"episode {episode} of {folder}", found, "the same bits", str(result.suspects))

@@ -17,6 +17,7 @@ import pyarrow.compute as pc
 from jinja2 import Environment as Templates
 from jinja2 import PackageLoader, StrictUndefined
 from markupsafe import Markup
+from pyarrow import csv
 
 from harness.campaign.campaign import Campaign
 from harness.compiled import unboxed
@@ -25,7 +26,7 @@ from harness.errors import printable
 from harness.numbers import tenths
 from harness.pool.cut_ins import onset_steps
 from harness.pool.replay import drive_others, stored_paths
-from harness.records.folder import write_bytes
+from harness.records.folder import write_atomically, write_bytes
 from harness.report.summary import floats
 from harness.traffic.laws import Environment
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
@@ -92,9 +93,7 @@ class Scenes:
         episode, outcome, cut = (row.column(name)[0].as_py() for name in ("episode", "outcome", "cut_in_step"))
         tracks = [{"name": name, **_states(_of(trace, name)), "crash": None} for name in VEHICLES]
         _, bv, av = tracks
-        last, over = av["x"].size - 1, 1.0 - floats(_of(trace, "BV").column("lane"))
-        if "lateral_m" in trace.column_names:
-            over = np.maximum(over, floats(_of(trace, "BV").column("lateral_m")) / LANE_M)
+        last, over = av["x"].size - 1, share_over(_of(trace, "BV"))
         av["crash"] = last if outcome == "crash" else None
         first, onset, ghosts = 0, None, list[Scene]()
         if cut is not None and cut < last:
@@ -137,6 +136,19 @@ class Scenes:
 
 def _states(rows: pa.Table) -> dict[str, Any]:
     return {"x": floats(rows.column("x_m")), "v": floats(rows.column("v_mps"))}
+
+
+def write_csv(trace: pa.Table, file: Path) -> None:
+    """The rows of a trace with the time in place of episode and step; the columns' names say the units."""
+    time_s = pa.array(trace.column("step").to_numpy() * STEP_S).cast(pa.float64())
+    rows = trace.drop_columns(["episode", "step"]).add_column(0, "time_s", pc.round(time_s, 1))
+    write_atomically(file, lambda unfinished: csv.write_csv(rows, unfinished))
+
+
+def share_over(track: pa.Table) -> FloatArray:
+    """How far a vehicle has come over from the left lane in each row of its trace: 0 to 1."""
+    over: FloatArray = 1.0 - floats(track.column("lane"))
+    return np.maximum(over, floats(track.column("lateral_m")) / LANE_M) if "lateral_m" in track.column_names else over
 
 
 def _of(traces: pa.Table, vehicle: str) -> pa.Table:

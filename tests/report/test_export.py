@@ -1,0 +1,87 @@
+"""Episodes for other tools: what they hold is the trace, and a checker of the format has no complaint."""
+
+import csv
+import sys
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from qc_baselib import Configuration, Result
+from qc_openscenario.main import run_checks
+
+import harness
+from harness.cli import main
+from harness.report.player import LANE_M
+from harness.vocabulary import VEHICLES
+from tests.stored_runs import copy_of, shard_files, truncate
+
+
+def complaints(file):
+    """Of ASAM's own checker: schema, references, names."""
+    config, result = Configuration(), Result()
+    config.set_config_param("InputFile", str(file))
+    result.register_checker_bundle(name="xoscBundle", description="", version="1.0.0")
+    result.set_result_version("1.0.0")
+    run_checks(config, result)
+    assert len(result.get_checker_results("xoscBundle")) == 17
+    return [issue.description for each in result.get_checker_results("xoscBundle") for issue in each.issues]
+
+
+@pytest.mark.parametrize("name", ["shells-twin", "forced-lateral-sumo"])
+def test_openscenario_moves_everybody_as_the_trace_does(name, stored_run, tmp_path, capsys):
+    folder, file = stored_run(name), tmp_path / "out" / "crash.xosc"
+    tests = harness.read(folder).episodes(["episode", "outcome", "cut_in_step"])
+    crash = tests[tests.outcome == "crash"].iloc[0]
+    assert main(["export", str(folder), str(crash.episode), "--to", "xosc", "--out", str(file)]) == 0
+    assert capsys.readouterr().out.split() == [str(file), str(file.with_suffix(".xodr"))]
+    assert complaints(file) == []
+    trace = harness.replay(folder, int(crash.episode)).trace.to_pandas()
+    scenario = ElementTree.parse(file)
+    assert scenario.find("RoadNetwork/LogicFile").get("filepath") == "crash.xodr"
+    for group in scenario.iterfind(".//ManeuverGroup"):
+        vehicle = group.find("Actors/EntityRef").get("entityRef")
+        rows = trace[trace.vehicle == vehicle]
+        vertices = [(each.get("time"), each.find(".//WorldPosition")) for each in group.iterfind(".//Vertex")]
+        time_s, x, y = np.array([(time, at.get("x"), at.get("y")) for time, at in vertices], float).T
+        assert time_s.tolist() == [step / 10 for step in rows.step]
+        centre = float(scenario.find(f".//Vehicle[@name='{vehicle}']/BoundingBox/Center").get("x"))
+        np.testing.assert_allclose(x + centre + 2.5, rows.x_m, rtol=0, atol=1e-9)  # the middle, and half a vehicle
+        ends = {"LV": (-0.5, -0.5), "BV": (-0.5, -1.5), "AV": (-1.5, -1.5)}[vehicle]
+        assert (y[0], y[-1]) == pytest.approx([LANE_M * end for end in ends])
+        assert (np.diff(y) <= 0.0).all()
+    actors = [each.get("entityRef") for each in scenario.iterfind(".//EntityRef") if each.get("entityRef")]
+    assert set(actors) == set(VEHICLES)
+
+
+def test_the_checker_complains_of_what_is_wrong(stored_run, tmp_path):
+    file = tmp_path / "episode.xosc"
+    assert main(["export", str(stored_run("shells-twin")), "0", "--to", "xosc", "--out", str(file)]) == 0
+    file.write_text(file.read_text().replace('<ScenarioObject name="LV">', '<ScenarioObject name="other">'))
+    assert complaints(file)
+
+
+def test_csv_has_units_in_its_names(stored_run, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    folder = stored_run("shells-twin")
+    assert main(["export", str(folder), "3", "--to", "csv"]) == 0
+    with (tmp_path / "episode_3.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    trace = harness.replay(folder, 3).trace.to_pylist()
+    assert list(rows[0]) == ["time_s", "vehicle", "lane", "x_m", "v_mps", "a_mps2"]
+    assert [(round(float(row["time_s"]) * 10), row["vehicle"], float(row["x_m"])) for row in rows] == [
+        (row["step"], row["vehicle"], row["x_m"]) for row in trace
+    ]
+
+
+def test_what_cannot_be_written_is_said_and_nothing_is_left(stored_run, tmp_path, monkeypatch, capsys):
+    folder = stored_run("shells-twin")
+    assert main(["export", str(folder), "0", "--to", "csv", "--out", str(tmp_path / "a.xosc")]) == 2
+    assert "a.csv" in capsys.readouterr().err
+    damaged = copy_of(folder, tmp_path / "damaged")
+    truncate(shard_files(damaged)[0])
+    assert main(["export", str(damaged), "0", "--to", "csv", "--out", str(tmp_path / "a.csv")]) == 2
+    monkeypatch.setitem(sys.modules, "scenariogeneration", None)
+    monkeypatch.delitem(sys.modules, "harness.report.openscenario", raising=False)
+    assert main(["export", str(folder), "0", "--to", "xosc", "--out", str(tmp_path / "a.xosc")]) == 2
+    assert "harness[export]" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["damaged"]
