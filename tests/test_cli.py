@@ -9,7 +9,6 @@ from pathlib import Path
 from unittest.mock import Mock
 
 import click
-import pyarrow as pa
 import pytest
 from click.testing import CliRunner
 
@@ -19,7 +18,7 @@ from harness.commands.printing import in_folder, say
 from harness.errors import EXIT_BAD_INPUT, EXIT_REFUTED, RunFolderError, TooManyFailedError
 from harness.numbers import interval, words
 from harness.pool.cut_ins import read_pool
-from harness.runner.stored import ReplayResult, estimate_run
+from harness.runner.stored import estimate_run
 from tests.golden.campaigns import BASE, RUNS
 from tests.in_process import one_process, without_page
 from tests.stored_runs import copy_of, estimates, sets
@@ -42,14 +41,6 @@ def test_help_teaches():
         result = CliRunner().invoke(cli, [*command, "--help"])
         assert result.exit_code == 0
         assert "Examples:\n    harness " in result.output
-
-
-def test_a_shell_completes_commands(monkeypatch, capsys):
-    for name, value in {"_HARNESS_COMPLETE": "bash_complete", "COMP_WORDS": "harness r", "COMP_CWORD": "1"}.items():
-        monkeypatch.setenv(name, value)
-    with pytest.raises(SystemExit):
-        main([])
-    assert capsys.readouterr().out.split() == ["plain,replay", "plain,report", "plain,run"]
 
 
 def test_check_prints_a_campaign_file(capsys, tmp_path):
@@ -237,15 +228,6 @@ def test_replay_says_how_it_compares_and_when_the_cut_in_began(stored_run, capsy
     assert said in out
     assert main([*command, "--html", str(page), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["files"] == [str(page)]
-
-
-def test_replay_says_where_nothing_is_stored_to_compare_with(monkeypatch, capsys, tmp_path):
-    answer = ReplayResult("passed", {}, pa.table({}), None, (), {"facts": [("AV", "passes BV at 9.3 s")]})
-    monkeypatch.setattr("harness.runner.stored.replay_episode", lambda *_, **__: answer)
-    assert main(["replay", str(tmp_path), "17"]) == 0
-    assert capsys.readouterr().out == (
-        "episode 17: passed; no stored trace to compare with\n  AV            passes BV at 9.3 s\n"
-    )
 
 
 @pytest.mark.parametrize("option", ["--html", "--fcd"])

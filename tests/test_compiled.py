@@ -29,50 +29,29 @@ def module_path(name: str) -> str | None:
     return None
 
 
-def imported_from(tree: ast.Module) -> dict[str, str]:
-    """Name in the module → file of the harness that it comes from."""
-    origin = {}
-    for node in ast.walk(tree):
-        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("harness"):
-            for alias in node.names:
-                path = module_path(f"{node.module}.{alias.name}") or module_path(node.module)
-                origin[alias.asname or alias.name] = path
-    return origin
-
-
 def names_in(nodes) -> set[str]:
     return {name.id for node in nodes for name in ast.walk(node) if isinstance(name, ast.Name)}
 
 
-def compiled_functions(tree: ast.Module) -> list[ast.FunctionDef]:
+def files_behind(name: str, *, constants_alone: bool = False) -> set[str]:
+    """Files whose content ends in the machine code of this one: its own, and those of the names its kernels read.
+
+    And of the names that its own constants are made from, which alone count where it holds no kernels.
+    """
+    tree = ast.parse((ROOT / name).read_text(encoding="utf-8"))
+    origin = {
+        alias.asname or alias.name: module_path(f"{node.module}.{alias.name}") or module_path(node.module)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("harness")
+        for alias in node.names
+    }
     functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
-    return [f for f in functions if names_in(f.decorator_list) & DECORATORS]
-
-
-def constants(tree: ast.Module) -> list[ast.expr]:
-    """What the module's own names are made from."""
-    return [node.value for node in tree.body if isinstance(node, ast.Assign | ast.AnnAssign) and node.value]
-
-
-def files_read(tree: ast.Module, nodes) -> set[str]:
-    origin = imported_from(tree)
-    return {origin[name] for name in names_in(nodes) if origin.get(name)}
-
-
-def needed_by(name: str) -> set[str]:
-    """Files whose content ends in the machine code of this one: its own, and those of the names its kernels read."""
-    tree = ast.parse((ROOT / name).read_text(encoding="utf-8"))
-    functions = compiled_functions(tree)
-    if not functions:
+    kernels = [each for each in functions if names_in(each.decorator_list) & DECORATORS]
+    if not kernels and not constants_alone:
         return set()
-    bodies = [node for function in functions for node in (*function.body, *function.decorator_list)]
-    return {name} | files_read(tree, bodies) | files_read(tree, constants(tree))
-
-
-def constants_of(name: str) -> set[str]:
-    """Files that the constants of a file are made from, whether or not it holds kernels."""
-    tree = ast.parse((ROOT / name).read_text(encoding="utf-8"))
-    return files_read(tree, constants(tree))
+    read = [node for kernel in kernels for node in (*kernel.body, *kernel.decorator_list)]
+    read += [node.value for node in tree.body if isinstance(node, ast.Assign | ast.AnnAssign) and node.value]
+    return {name} | {origin[each] for each in names_in(read) if origin.get(each)}
 
 
 def covered(patterns) -> set[str]:
@@ -81,8 +60,8 @@ def covered(patterns) -> set[str]:
 
 def test_every_file_that_kernels_come_from_is_hashed():
     modules = [path.relative_to(ROOT).as_posix() for path in ROOT.rglob("*.py")]
-    needed = set().union(*map(needed_by, modules))
-    while more := set().union(*map(constants_of, needed)) - needed:
+    needed = set().union(*map(files_behind, modules))
+    while more := set().union(*(files_behind(each, constants_alone=True) for each in needed)) - needed:
         needed |= more
     assert len(needed) >= 18  # the search itself must not silently find nothing
     assert needed <= covered(KERNEL_SOURCES)

@@ -15,8 +15,8 @@ from harness.episode.loop import EpisodeLoop, RecordPolicy, Shard
 from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, WorldDisagreementError
 from harness.resolved import resolve
 from harness.sampling import prepare
-from harness.vocabulary import CRASH, LV
-from harness.worlds.shim import shim_library
+from harness.vocabulary import CRASH, LV, VEHICLES
+from harness.worlds.shim import Shim, open_shim, shim_library
 from harness.worlds.twin import TwinWorld
 from tests.worlds.running import smoke
 
@@ -156,3 +156,35 @@ def test_a_collision_in_the_first_step_of_a_refilled_cell_is_flagged(open_world)
         assert world.step(speed, nobody).tolist() == [True, True]
     world.place(np.array([0]), X[:2], speed)
     assert world.step(speed, nobody).tolist() == [False, True]
+
+
+# -- the compiled shim --
+
+compiled_shim = pytest.mark.skipif(shim_library() is None, reason="no compiled shim")
+
+
+@compiled_shim
+@pytest.mark.parametrize(("switch", "used"), [("1", True), ("0", False)])
+def test_where_it_is_built_it_is_used_unless_it_is_switched_off(switch, used, driving, monkeypatch):
+    steps, step = [], Shim.step
+    monkeypatch.setattr(Shim, "step", lambda shim, wanted: steps.append(wanted) or step(shim, wanted))
+    monkeypatch.setenv("HARNESS_SHIM", switch)
+    drive(driving(2))
+    assert len(steps) == used
+
+
+@compiled_shim
+def test_vehicles_that_are_gone_are_an_error_and_those_of_another_simulation_are_found_anew(driving):
+    world, names = driving(2), [f"{vehicle}{k}" for k in range(2) for vehicle in VEHICLES]
+    shim = open_shim(names, V[:2].copy(), X[:2] + 0.1 * V[:2], V[:2].copy())  # a second one for the same vehicles
+    libsumo.vehicle.moveTo("LV0", "cell0_1", libsumo.lane.getLength("cell0_1") - 1.0)
+    for _ in range(2):
+        with pytest.raises(RuntimeError, match="a vehicle has left the road"):
+            shim.step(V[:2])
+    with pytest.raises(RuntimeError, match="LV0"):
+        shim.find_vehicles()
+    shim.close()
+    world.load_again()
+    world.place(np.arange(2), X[:2], V[:2])
+    drive(world, steps=3)
+    assert world.x[0, 0] == libsumo.vehicle.getLanePosition("LV0") > 300.0
