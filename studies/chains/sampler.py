@@ -56,7 +56,7 @@ class Sampler:
     """Episodes on their way: path before the cut-in ahead, then maneuvers and responses step by step."""
 
     def __init__(self, chain: Chain, method: Method, n: int, rng: np.random.Generator) -> None:
-        self.chain, self.method, self.n, self.rng = chain, method, n, rng
+        self.chain, self.method, self.rng = chain, method, rng
         self.alpha = mixture_weights(chain, method)
         self.path = approach_paths(chain, n, rng)
         stay = np.log1p(-chain.hazard[self.path])
@@ -76,16 +76,20 @@ class Sampler:
             after = np.flatnonzero(self.cut_in & (self.after < self.chain.crashed - 1))
             self._step_before(t, np.flatnonzero(~self.cut_in))
             self._step_after(t, after)
-        log_q, cap = self._log_q(), self.chain.cut_in_cap
+        log_q, log_weight, cap = self.log_ratio, self.log_step, self.chain.cut_in_cap
+        if self.method != "step_mixture":
+            forced = np.where(self.cut_in, -self.log_p_cut, -np.inf)
+            log_q = np.column_stack([forced, log_q])[:, : len(self.alpha)]
         columns = {"cut_in": self.cut_in, "log_q": log_q, "n_control_steps": self.n_control}
         if self.method == "step_mixture":
             columns["first_ratios"] = self.ratios
         if self.method in ("forced", "episode_mixture"):
             columns["log_p_cut_in"] = self.log_p_cut
+            log_weight = -logsumexp(log_q + np.log(self.alpha), axis=1)
+            log_weight[np.isinf(log_weight)] = 0.0  # a forced cut-in that could not be
         outcome = np.where(self.after == self.chain.crashed, CRASH, TIMEOUT).astype(np.int8)
         weight_cap = {"nde": 1.0, "forced": cap, "episode_mixture": cap / DEFENSIVE_SHARE}.get(self.method)
-        drawn = Drawn(self.method, self.alpha, weight_cap)
-        return Block(first_episode, outcome, self._log_weight(log_q), columns, drawn)
+        return Block(first_episode, outcome, log_weight, columns, Drawn(self.method, self.alpha, weight_cap))
 
     def _step_before(self, t: int, rows: IntArray) -> None:
         chain, state = self.chain, self.path[rows, t]
@@ -109,7 +113,13 @@ class Sampler:
         self, rows: IntArray, p: FloatArray, q: FloatArray, forced: FloatArray, critical: BoolArray
     ) -> IntArray:
         """Draw from what the method says and keep the likelihood ratios; p (m, A), q (m, J, A)."""
-        chosen = _choose(self._sampled(rows, p, q, forced, critical), self.rng)
+        sampled = p
+        if self.method == "step_mixture":
+            sampled = np.where(critical[:, None], np.einsum("mja,j->ma", q, self.alpha), p)
+        elif self.method != "nde":
+            candidates = np.concatenate([forced[:, None, :], q], axis=1)
+            sampled = candidates[np.arange(len(rows)), self.component[rows]]
+        chosen = _choose(sampled, self.rng)
         self.cut_in[rows] |= (self.after[rows] < 0) & (chosen == 1)
         if self.method in ("nde", "forced"):
             return chosen
@@ -125,28 +135,6 @@ class Sampler:
             self.ratios[episode[kept], step[kept]] = (picked_q / mixed[:, None])[kept]
         self.n_control[episode] += 1
         return chosen
-
-    def _sampled(
-        self, rows: IntArray, p: FloatArray, q: FloatArray, forced: FloatArray, critical: BoolArray
-    ) -> FloatArray:
-        if self.method == "nde":
-            return p
-        if self.method == "step_mixture":
-            return np.where(critical[:, None], np.einsum("mja,j->ma", q, self.alpha), p)
-        candidates = np.concatenate([forced[:, None, :], q], axis=1)
-        return candidates[np.arange(len(rows)), self.component[rows]]
-
-    def _log_q(self) -> FloatArray:
-        forced = np.where(self.cut_in, -self.log_p_cut, -np.inf)
-        all_of_them = [self.log_ratio] if self.method == "step_mixture" else [forced, self.log_ratio]
-        return np.column_stack(all_of_them)[:, : len(self.alpha)]
-
-    def _log_weight(self, log_q: FloatArray) -> FloatArray:
-        if self.method == "forced":
-            return np.where(self.cut_in, self.log_p_cut, 0.0)
-        if self.method == "step_mixture":
-            return self.log_step
-        return -logsumexp(log_q + np.log(self.alpha), axis=1) if len(self.alpha) else np.zeros(self.n)
 
 
 @dataclass(frozen=True, eq=False)
