@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from harness.cli import main as run_main
-from harness.commands.options import CAMPAIGN, FILE, FOLDER, RUN_FOLDER, examples, json_option, quiet_option
+from harness.commands.options import CAMPAIGN, FOLDER, RUN_FOLDER, examples, json_option, quiet_option
 from harness.commands.printing import print_json, print_table
 from harness.errors import WorldDisagreementError
 from harness.progress import shown_progress
@@ -203,17 +203,13 @@ def rnot(folders: Sequence[Path], *, estimators: Sequence[RnotEstimator], as_jso
 
 @cli.command(
     short_help="Do weights, traffic and pool of a run belong together?",
-    epilog=examples(
-        f"{_ME} alarm runs/mixture                       # against the campaign's own pool",
-        f"{_ME} alarm runs/mixture --pool pool.parquet   # of `harness pool CAMPAIGN --out pool.parquet`",
-    ),
+    epilog=examples(f"{_ME} alarm runs/mixture   # builds the campaign's pool where it is not there"),
 )
 @click.argument("folder", metavar="RUN", type=RUN_FOLDER)
-@click.option("--pool", "pool_file", type=FILE, help="A pool of the same environment. Default: the campaign's own.")
 @json_option
 @click.pass_context
-def alarm(ctx: click.Context, folder: Path, *, pool_file: Path | None, as_json: bool) -> None:
-    """Put the surrogates of a pool in the AV's place in all tests of RUN, and see if they crash as the pool says.
+def alarm(ctx: click.Context, folder: Path, *, as_json: bool) -> None:
+    """Put the pool's surrogates in the AV's place in all tests of RUN, and see if they crash as the pool says.
 
     The alarm is raised, and the exit code is 3, where they do not, which a sound run shows once in 10,000 times: then a
     weight, a maneuver on record, the twin or the pool is wrong.
@@ -222,7 +218,7 @@ def alarm(ctx: click.Context, folder: Path, *, pool_file: Path | None, as_json: 
 
     bar = shown_progress()
     with bar:
-        found = alarm_of_run(folder, pool_file, bar)
+        found = alarm_of_run(folder, bar)
     if as_json:
         print_json(found)
     else:

@@ -28,12 +28,12 @@ from scipy.special import logsumexp
 from harness.campaign.files import load_campaign
 from harness.compiled import compiled_threads, unboxed
 from harness.episode.path import Trajectory, empty_trajectory, who_crashes
-from harness.errors import CampaignError, HarnessError, RunFolderError
+from harness.errors import HarnessError, RunFolderError
 from harness.estimators.block import EPISODE_COLUMNS, Block, Drawn, block_from_tables
 from harness.estimators.estimate import finite_json
 from harness.importance.functions import mixture_weights
 from harness.pool.build import campaign_pool
-from harness.pool.cut_ins import Pool, environment_hash, read_pool
+from harness.pool.cut_ins import Pool
 from harness.pool.replay import LEAD, PATH_COLUMNS, StoredPaths, approach_cut_in, leave_stored, stored_paths
 from harness.processes import made_ahead
 from harness.progress import Progress
@@ -92,22 +92,10 @@ def drivers_crash(episodes: pa.Table, seed: int, environment: Environment, follo
 
 
 def surrogates_crash(episodes: pa.Table, resolved: Resolved, pool: Pool) -> BoolArray:
-    """Which surrogates of a pool, in its order, would have crashed in the AV's place in consecutive episodes, (n, D).
-
-    A pool of another environment is a `CampaignError`.
-    """
+    """`drivers_crash` of a pool's surrogates, in its order, shape (n, D)."""
     environment, names = resolved.environment, list(pool.library.surrogates)
-    if pool.environment != (own := environment_hash(environment)):
-        raise CampaignError(
-            "pool",
-            f"a pool of another environment ({pool.environment})",
-            f"one of the campaign's ({own}): crash rates of surrogates depend on traffic, level of lane "
-            "changing and hold time",
-            "Leave the pool out: the right one is built, which takes about 15 s.",
-        )
-    crashes = drivers_crash(
-        episodes, resolved.campaign.seed, environment, pool.library.followers(environment.lateral.present)
-    )
+    followers = pool.library.followers(environment.lateral.present)
+    crashes = drivers_crash(episodes, resolved.campaign.seed, environment, followers)
     return crashes[:, [names.index(name) for name in pool.names]]
 
 
@@ -210,11 +198,10 @@ def _p_value(log_capital: float) -> float:
     return max(math.exp(-max(log_capital, 0.0)), sys.float_info.min)
 
 
-def alarm_of_run(folder: Path, pool_file: Path | None = None, progress: Progress | None = None) -> dict[str, Any]:
-    """Ask the surrogates of the campaign's pool, or of that in a file, about all tests that a run has on record.
+def alarm_of_run(folder: Path, progress: Progress | None = None) -> dict[str, Any]:
+    """Ask the surrogates of the campaign's pool about all tests that a run has on record.
 
-    Raises `HarnessError`: the folder is not a run, its records are damaged or do not allow it, or the pool is of
-    another environment.
+    Raises `HarnessError`: the folder is not a run, or its records are damaged or do not allow it.
     """
     progress, manifest = progress or Progress(), read_manifest(folder)
     resolved = resolve(load_campaign(folder / "campaign.yaml", check_files=False))
@@ -227,7 +214,7 @@ def alarm_of_run(folder: Path, pool_file: Path | None = None, progress: Progress
             + ("shells have used the surrogates' outcomes" if drawn else "where it was when BV cut in depends on it"),
             "Choose another run; that SUMO and the twin agree is checked in each by retracing.",
         )
-    pool = campaign_pool(resolved, progress) if pool_file is None else read_pool(pool_file)
+    pool = campaign_pool(resolved, progress)
     alarm, alpha = Alarm(KnownRates.of(pool)), mixture_weights(campaign)
     lead = [LEAD] if resolved.environment.lateral.present else []
     columns = [*dict.fromkeys([*EPISODE_COLUMNS, *PATH_COLUMNS, *lead])]
