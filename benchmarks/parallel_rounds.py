@@ -40,7 +40,7 @@ SETTINGS = ("stop.min_crashes=null", "testing.shells.first_tests=null", "stop.rh
 
 def drawn_pool(campaign: Campaign) -> DrawnPool:
     """The shipped pool, taken as exact, with the default IDM's shares of crashes."""
-    design = replace(design_shells(campaign_pool(resolve(campaign)), limit_mps2=2.0), n_paths=10**12)
+    design = replace(design_shells(campaign_pool(resolve(campaign)), 2.0), n_paths=10**12)
     design = design.without_references()
     share = np.array([IDM.get(name, 0.0) for name in design.strata])
     return DrawnPool(design, design.p[None], (design.p * share)[None])

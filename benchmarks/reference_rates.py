@@ -56,7 +56,7 @@ def sums_of(task: tuple[str, tuple[str, ...], int, int]) -> np.ndarray:
 
 def reference(path: str, overrides: Sequence[str], episodes: int, workers: int) -> dict[str, float]:
     """Rate and standard error over ``episodes`` episodes."""
-    settings = (*overrides, "world.engine=twin", "records.moments=none", "records.traces=none", "stop.estimator=null")
+    settings = (*overrides, "world.engine=twin", "records.moments=none", "records.traces=none")
     prepare(resolve(_campaign(path, settings)))  # tables and kernels are built once, before the workers start
     tasks = [(path, settings, first, min(CHUNK, episodes - first)) for first in range(0, episodes, CHUNK)]
     with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:

@@ -33,7 +33,7 @@ def main(replications: int, overrides: list[str]) -> None:
     """Print the table."""
     settings = ["stop.min_crashes=null", "testing.shells.first_tests=null", "stop.episodes=1e6", *overrides]
     pool = campaign_pool(resolve(load_campaign(SCENARIOS / "smoke.yaml", settings)))
-    design = replace(design_shells(pool, limit_mps2=2.0), n_paths=10**12).without_references()
+    design = replace(design_shells(pool, 2.0), n_paths=10**12).without_references()
     print("| crashes outside | asked RHW | confidence | median tests | bias | covers |")
     print("| --- | --- | --- | --- | --- | --- |")
     for rhw, confidence in ASKED:

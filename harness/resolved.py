@@ -62,7 +62,7 @@ def require_ready(campaign: Campaign, command: Command = "run") -> Resolved:
         require_private(campaign.av.traci)
     resolved = resolve(campaign, command, controller_sha256=controller_sha256)
     if campaign.sampling.strata:
-        resolved.library.statement_settings(campaign.testing.shells)  # it knows what is stated
+        resolved.library.require_statement(campaign.testing.shells.statement)
     return resolved
 
 

@@ -25,6 +25,7 @@ from harness.campaign.sections import (
     Records,
     Run,
     Section,
+    ShellSettings,
     Stop,
     SurrogateName,
     Testing,
@@ -34,7 +35,7 @@ from harness.campaign.sections import (
 )
 from harness.campaign.vehicle import AutomatedVehicle
 from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT
-from harness.vocabulary import METHODS, SAMPLING, Sampling
+from harness.vocabulary import SAMPLING, Sampling
 
 
 class Campaign(Section):
@@ -115,7 +116,7 @@ class Campaign(Section):
             del environment["cut_in_lead_s"]
         if testing["shells"]["smallest_round"] == 1:
             del testing["shells"]["smallest_round"]
-        testing["shells"]["stopping"] = "sequential"  # nor does what went
+        testing["shells"] |= ShellSettings.gone  # nor does what went
         unused = {"shadow_paths"} if not self.av.acts_before_cut_in else set()
         content = {
             "seed": self.seed,
@@ -224,20 +225,6 @@ REFUSED = (
         "its interval looks narrow",
         "Set it to null for a fixed number of tests (stop.episodes), or choose shells, forced or episode_mixture.",
     ),
-    Combination(
-        "stop.estimator",
-        lambda c, _: c.stop.estimator == "scv" and c.records.moments == "none",
-        "scv, with records.moments none",
-        "records.moments first_9 or all, whose control steps it is computed from",
-        "Change one of the two, or leave stop.estimator out for the method's own.",
-    ),
-    Combination(
-        "stop.estimator",
-        lambda c, _: c.stop.estimator is not None and c.stop.estimator not in c.sampling.estimators,
-        "{stop.estimator}, with testing.method {testing.method}",
-        "testing.method {allowing}",
-        "Change one of the two, or leave stop.estimator out for the method's own.",
-    ),
     # -- cut-ins that take time --
     Combination(
         "av.before_cut_in",
@@ -299,8 +286,7 @@ REFUSED = (
 
 def refusal(campaign: Campaign, use: Use = WHILE_READ) -> tuple[str, str, str, str] | None:
     """Where, found, expected and mend of the first combination that is refused; None if the campaign may go on."""
-    allowing = (name for name in METHODS if campaign.stop.estimator in SAMPLING[name].estimators)
-    values = {**dict(campaign), "allowing": " or ".join(allowing)}
+    values = dict(campaign)
     for row in REFUSED:
         # A command may change a campaign that has been read: what it was allowed with then is not asked again.
         if row.is_asked(campaign, use) and not (use != WHILE_READ and row.is_asked(campaign, WHILE_READ)):

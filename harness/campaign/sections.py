@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
-from typing import Annotated, Any, Literal, Self
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import (
     AfterValidator,
@@ -19,8 +19,8 @@ from pydantic import (
 )
 
 from harness.campaign.problems import SURROGATE_PATTERN, broken_rule, in_words
-from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT
-from harness.vocabulary import EstimatorName, Method
+from harness.strata import ASSUMPTION_FREE
+from harness.vocabulary import Method
 
 LARGEST_EXACT_WHOLE_FLOAT = 2.0**53
 
@@ -42,10 +42,14 @@ class Section(BaseModel):
     """A section of the campaign: unknown keys are errors, values never change after loading."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+    gone: ClassVar[Mapping[str, Any]] = {}
+    """Keys of earlier versions, which stored campaigns name, with the value that they had where nobody asked."""
 
     @model_validator(mode="wrap")
     @classmethod
     def _errors_in_words(cls, data: Any, validate: ModelWrapValidatorHandler[Self]) -> Self:
+        if isinstance(data, dict) and not cls.gone.keys().isdisjoint(data):
+            data = {key: value for key, value in data.items() if key not in cls.gone or value != cls.gone[key]}
         try:
             return validate(data)
         except ValidationError as error:
@@ -100,25 +104,11 @@ class EnvironmentSettings(Section):
     )
 
 
-class StatementSettings(Section):
-    """A statement about vehicles that crash only inside a boundary."""
-
-    boundary: SurrogateName = Field(description="the most careless surrogate inside")
-    assumes: str = Field("", description='what it assumes, as the end of a sentence that begins with "If this vehicle"')
-    checked: bool = Field(
-        False, description="whether each test has to show that the vehicle is never ahead of that surrogate"
-    )
-
-
 class ShellSettings(Section):
     """How tests are spread over the shells of the pool, and what is said about vehicles that keep to some of them."""
 
-    boundary: SurrogateName | None = Field(
-        None, description="surrogate within which the statement library assumes all crashes; the library's own"
-    )
-    statements: dict[SurrogateName, StatementSettings] | None = Field(
-        None, description="further statements by name, in place of the library's"
-    )
+    gone = {"stopping": "sequential", "boundary": None, "statements": None}
+
     statement: str = Field(
         ASSUMPTION_FREE,
         description="what has to reach stop.rhw: assumption_free, or a statement, outside of which nothing is tested",
@@ -132,32 +122,6 @@ class ShellSettings(Section):
         le=10_000,
         description="fewest tests of a round: as many as workers, where a test takes seconds",
     )
-
-    @model_validator(mode="before")
-    @classmethod
-    def _of_before(cls, content: Any) -> Any:
-        """Campaigns of earlier versions name the one way to stop that is left."""
-        if isinstance(content, dict) and content.get("stopping") == "sequential":
-            return {key: value for key, value in content.items() if key != "stopping"}
-        return content
-
-    @field_validator("statements")
-    @classmethod
-    def _can_be_told_apart(cls, found: dict[str, StatementSettings] | None) -> dict[str, StatementSettings] | None:
-        return None if found is None else checked_statements(found)
-
-
-def checked_statements(statements: dict[str, StatementSettings]) -> dict[str, StatementSettings]:
-    """The statements, if they can stand beside the library's own one, and in one test."""
-    if taken := {ASSUMPTION_FREE, LIBRARY_STATEMENT} & set(statements):
-        expected = f"another name: {ASSUMPTION_FREE} and {LIBRARY_STATEMENT} are there always"
-        mend = "Rename it; the boundary of the statement library is the key boundary."
-        raise broken_rule("", f"a statement named {min(taken)}", expected, mend)
-    if len(checked := [name for name, each in statements.items() if each.checked]) > 1:
-        found = f"{len(checked)} statements that are checked in each test: {listed(checked)}"
-        mend = "Leave checked out of the others: a crash beyond their boundary refutes them."
-        raise broken_rule("", found, "one at most", mend)
-    return statements
 
 
 class Testing(Section):
@@ -235,12 +199,13 @@ class Records(Section):
 class Stop(Section):
     """When the campaign is long enough."""
 
+    gone = {"estimator": None}
+
     episodes: Whole = Field(100_000, ge=1, le=10**10, description="most episodes to run")
     rhw: float | None = Field(
         None, gt=0.0, lt=10.0, description="stop at this relative half-width of the interval; not for step_mixture"
     )
     confidence: float = Field(0.9, gt=0.0, lt=1.0, description="level of every interval")
-    estimator: EstimatorName | None = Field(None, description="whose RHW is watched; default: the method's own")
     min_crashes: Annotated[int, Field(ge=1), BeforeValidator(whole)] | None = Field(
         None, description="sampled crashes needed before RHW may stop the campaign; 100, with shells 1"
     )

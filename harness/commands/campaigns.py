@@ -11,7 +11,6 @@ import click
 
 from harness.commands.options import (
     CAMPAIGN,
-    FILE,
     FOLDER,
     av_option,
     examples,
@@ -22,7 +21,6 @@ from harness.commands.options import (
     quiet_option,
     set_option,
     workers_option,
-    written_file,
 )
 from harness.commands.printing import in_folder, print_json, print_plan, print_statements, print_table, say
 from harness.numbers import leaves, words
@@ -261,18 +259,12 @@ def compare(
 
 @click.command(
     short_help="Build the pool of cut-ins, and show its shells.",
-    epilog=examples("harness pool scenarios/smoke.yaml", "harness pool scenarios/smoke.yaml --out pool.parquet"),
+    epilog=examples("harness pool scenarios/smoke.yaml"),
 )
 @click.argument("campaign_file", metavar="CAMPAIGN", type=CAMPAIGN)
-@click.option(
-    "--out",
-    type=FILE,
-    callback=written_file(".parquet"),
-    help="Write the pool there, too: FILE.parquet, one row per cut-in.",
-)
 @set_option
 @json_option
-def pool(campaign_file: Path, *, out: Path | None, overrides: Sequence[str], as_json: bool) -> None:
+def pool(campaign_file: Path, *, overrides: Sequence[str], as_json: bool) -> None:
     """Build the pool that belongs to CAMPAIGN's environment and surrogate library, and show what is in it.
 
     Shown are the surrogates from careful to careless with their crash rates, and how probable it is that a cut-in is
@@ -283,23 +275,17 @@ def pool(campaign_file: Path, *, out: Path | None, overrides: Sequence[str], as_
 
     with shown_progress() as bar:
         from harness.pool.build import campaign_pool  # noqa: PLC0415 - slow to import: the bar is there meanwhile
-        from harness.pool.cut_ins import write_pool  # noqa: PLC0415 - slow to import
         from harness.resolved import resolve  # noqa: PLC0415 - slow to import
 
-        found = campaign_pool(resolve(campaign), bar)
-    if out is not None:
-        write_pool(out, found)
+        content = campaign_pool(resolve(campaign), bar).to_json()
     if as_json:
-        print_json(found.to_json() | ({} if out is None else {"file": str(out)}))
+        print_json(content)
         return
-    content = found.to_json()
     print_table(f"Pool {content['pool']}: {content['n_paths']:,} paths", content.pop("surrogates"))
     if references := content.pop("references", ()):
         print_table("Reference drivers", references)
     for name, value in leaves(content):
         say(f"{name.replace('_', ' ')}: {words(value, 4)}")
-    if out is not None:
-        say(out)
 
 
 @click.command(

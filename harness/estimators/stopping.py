@@ -207,8 +207,8 @@ def look_grid(n_episodes: int, shard_ends: Sequence[int], ratio: float = LOOK_RA
 class StopRule(Rule):
     """Fed with the estimate of weighted tests at each look in turn.
 
-    ``estimator`` is whose estimate `observe` wants, the method's own unless ``stop.estimator`` says another, ``looks``
-    at which numbers of episodes. ``min_crashes`` is the floor where ``stop.min_crashes`` says nothing.
+    ``estimator``, the method's own, is whose estimate `observe` wants, ``looks`` at which numbers of episodes.
+    ``min_crashes`` is the floor where ``stop.min_crashes`` says nothing.
     """
 
     def __init__(
@@ -221,7 +221,7 @@ class StopRule(Rule):
         min_crashes: int = DEFAULT_MIN_CRASHES,
     ) -> None:
         super().__init__(campaign_stop.rhw, campaign_stop.min_crashes or min_crashes, passes=PASSES_NEEDED)
-        self.estimator: EstimatorName = campaign_stop.estimator or SAMPLING[method].headline
+        self.estimator: EstimatorName = SAMPLING[method].headline
         self.looks = look_grid(campaign_stop.episodes, shard_ends, ratio)
         self.look = Look(one_more_crash=math.inf)
         self._n_looks = 0

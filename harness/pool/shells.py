@@ -16,13 +16,12 @@ import numpy as np
 
 from harness.campaign.campaign import Campaign
 from harness.campaign.drivers import BuiltInParameters
-from harness.campaign.sections import ShellSettings, StatementSettings
 from harness.campaign.vehicle import AutomatedVehicle
 from harness.episode.cells import PrescribedCutIns, PrescribedTraffic
 from harness.pool.cut_ins import Pool
 from harness.strata import FAILED_BASELINE, OUTSIDE, Reference, ShellDesign, Statement
 from harness.traffic.laws import Environment
-from harness.vehicles.library import Library, library_records
+from harness.vehicles.library import Library, StatementSettings, library_records
 from harness.vocabulary import FloatArray, Int8Array, IntArray, RecordArray
 
 _REFERENCES = {"r157-cc": "a careful and competent driver", "r157-fsm": "a driver by the fuzzy safety model"}
@@ -71,11 +70,9 @@ def acceleration_limit(av: AutomatedVehicle) -> float:
     return float("inf")
 
 
-def shells_in_strata(pool: Pool, boundary: int, limit_mps2: float) -> list[list[int]]:
-    """Which shells of the pool make up each stratum; empty shells belong to none.
-
-    ``boundary`` is the index of the outermost shell inside, ``limit_mps2`` the vehicle's hardest acceleration.
-    """
+def shells_in_strata(pool: Pool, limit_mps2: float) -> list[list[int]]:
+    """Which shells of the pool make up each stratum, for a vehicle that accelerates so hard; empty ones none."""
+    boundary = outermost(pool)
     present = [s for s in range(pool.shell_p.size) if pool.shell_p[s] > 0.0]
     tested = present if limit_mps2 > pool.library.envelope_mps2 else [s for s in present if s < len(pool.names)]
     inside = [[s] for s in tested if s <= boundary]
@@ -83,19 +80,15 @@ def shells_in_strata(pool: Pool, boundary: int, limit_mps2: float) -> list[list[
     return [*inside, outside] if outside else inside
 
 
-def outermost(pool: Pool, shells: ShellSettings) -> int:
-    """Index of the shell up to which a campaign's strata are shells: the widest boundary of its statements."""
-    return max(pool.names.index(each.boundary) for each in pool.library.statement_settings(shells).values())
+def outermost(pool: Pool) -> int:
+    """Index of the shell up to which strata are shells: the widest boundary of the library's statements."""
+    return max(pool.names.index(each.boundary) for each in pool.library.all_statements.values())
 
 
-def design_shells(pool: Pool, *, shells: ShellSettings | None = None, limit_mps2: float) -> ShellDesign:
-    """Strata of a campaign; see `acceleration_limit`.
-
-    Raises `CampaignError`: the library knows no such boundary or statement.
-    """
-    shells = shells or ShellSettings()
-    groups = shells_in_strata(pool, outermost(pool, shells), limit_mps2)
-    statements = _statements(pool, shells, groups)
+def design_shells(pool: Pool, limit_mps2: float) -> ShellDesign:
+    """Strata of a campaign whose vehicle accelerates at most so hard (`acceleration_limit`)."""
+    groups = shells_in_strata(pool, limit_mps2)
+    statements = _statements(pool, groups)
     cells, stratum, references = cells_in_strata(pool, groups)
     n_inside, takes_time = statements[-1].n_inside, bool(pool.cut_ins.lead.any())
     p = np.asarray(np.bincount(cells[cells >= 0], pool.cell_p[cells >= 0]), np.float64)
@@ -130,8 +123,8 @@ def design_shells(pool: Pool, *, shells: ShellSettings | None = None, limit_mps2
     )
 
 
-def _statements(pool: Pool, shells: ShellSettings, groups: list[list[int]]) -> tuple[Statement, ...]:
-    """The statements of a campaign, the narrowest boundary first."""
+def _statements(pool: Pool, groups: list[list[int]]) -> tuple[Statement, ...]:
+    """The library's statements, the narrowest boundary first."""
 
     def place(each: StatementSettings) -> int:
         return pool.names.index(each.boundary)
@@ -140,7 +133,7 @@ def _statements(pool: Pool, shells: ShellSettings, groups: list[list[int]]) -> t
         return sum(group[-1] <= place(each) for group in groups)
 
     keeps_to = "crashes only where the surrogate {} or a more careful one crashes"
-    found = sorted(pool.library.statement_settings(shells).items(), key=lambda each: place(each[1]))
+    found = sorted(pool.library.all_statements.items(), key=lambda each: place(each[1]))
     return tuple(
         Statement(name, each.boundary, each.assumes or keeps_to.format(each.boundary), inside(each), each.checked)
         for name, each in found
@@ -184,8 +177,7 @@ class PrescribedEpisodes:
 
     def __init__(self, campaign: Campaign, pool: Pool) -> None:
         limit = acceleration_limit(campaign.av)
-        design = design_shells(pool, shells=campaign.testing.shells, limit_mps2=limit)
-        groups = shells_in_strata(pool, outermost(pool, campaign.testing.shells), limit)
+        design, groups = design_shells(pool, limit), shells_in_strata(pool, limit)
         self._cut_ins = pool.cut_ins
         self._cells = cells_in_strata(pool, groups)[0]
         self._order = [_order(pool, group, campaign.seed, stratum) for stratum, group in enumerate(groups)]

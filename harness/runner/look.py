@@ -242,8 +242,7 @@ def plan_campaign(campaign: Campaign) -> dict[str, Any]:
 
     That is ``expected_tests`` and ``expected_seconds`` (to within a factor of three; in words where nobody can tell),
     ``most_tests`` and ``most_seconds``, the budget; ``tests_per_second`` (all cores), ``tables`` (in words) and
-    ``most_disk_mb``; of an AV that is not built in ``av_ms_per_test``, measured, or in words why there is none. Where
-    cut-ins take time, ``within_reach_of_`` each statement: which rates it can tell, in words.
+    ``most_disk_mb``; of an AV that is not built in ``av_ms_per_test``, measured, or in words why there is none.
 
     Raises `CampaignError`: a run would refuse the campaign before it starts.
     """
@@ -271,7 +270,6 @@ def plan_campaign(campaign: Campaign) -> dict[str, Any]:
         "tables": source.building(resolved),
         "most_disk_mb": round(episodes * (KB_PER_EPISODE + KB_PER_MOMENT * moments) / 1000.0, 1),
         **of_av,
-        **source.reach(resolved),
     }
 
 

@@ -170,7 +170,7 @@ class ShardRunner:
 def finished(source: Source, retracing: Retracing, request: ShardRequest, tables: ShardTables) -> ShardResult:
     """What is to be known of a shard's tables, after the twin has retraced them."""
     n_retraced = retracing.check(tables.episodes)
-    block = source.block(tables.episodes, tables.moments if source.campaign.stop.estimator == "scv" else None)
+    block = source.block(tables.episodes)
     failures = Counter(tables.episodes.column("failure").drop_null().to_pylist())
     return ShardResult(request, block, n_retraced, failures, repeated_of(tables.episodes))
 

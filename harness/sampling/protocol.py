@@ -135,11 +135,6 @@ class Source:
         return stop.episodes if stop.rhw is None and resolved.campaign.accept is None else None
 
     @classmethod
-    def reach(cls, resolved: Resolved) -> dict[str, str]:  # noqa: ARG003 - nothing is known of it
-        """Which rates the statements of a campaign can tell, in words, by key; nothing where that is no question."""
-        return {}
-
-    @classmethod
     def stored_design(cls, folder: Path) -> ShellDesign | None:  # noqa: ARG003 - there is none
         """Strata of a stored run."""
         return None
@@ -191,9 +186,9 @@ class Source:
         """Whether stored episodes are those that are asked for, and not the last shard of a smaller budget."""
         return bool(episodes.num_rows == request.n_episodes)
 
-    def block(self, episodes: pa.Table, moments: pa.Table | None) -> Block:
-        """What estimators read of a shard."""
-        return block_of(self.campaign, episodes, moments, self.design)
+    def block(self, episodes: pa.Table) -> Block:
+        """What the stop rule reads of a shard."""
+        return block_of(self.campaign, episodes, None, self.design)
 
 
 def block_of(campaign: Campaign, episodes: pa.Table, moments: pa.Table | None, design: ShellDesign | None) -> Block:

@@ -18,7 +18,6 @@ import numpy as np
 import pyarrow as pa
 
 from harness.campaign.campaign import Campaign
-from harness.campaign.sections import Stop
 from harness.episode.loop import EpisodeLoop, Shard
 from harness.errors import RunFolderError
 from harness.estimators.block import EPISODE_COLUMNS, SHELL_COLUMNS, Block
@@ -37,7 +36,7 @@ from harness.records.folder import SHELLS, read_as, read_manifest
 from harness.resolved import Resolved
 from harness.sampling.allocation import CONFIDENCE, Allocation
 from harness.sampling.protocol import Rounds, ShardRequest, Source
-from harness.strata import ASSUMPTION_FREE, ShellDesign, StoredDesign
+from harness.strata import ShellDesign, StoredDesign
 from harness.vocabulary import IntArray
 
 MOST_SHARDS_PER_ROUND = 16
@@ -46,7 +45,6 @@ _FINISH = "Run `harness run` with --resume, which makes missing shards."
 POOL_S = "about 15 s"
 OVER_BOUND = 1.6
 """Tests that a rate takes, over the lower bound (measured: medians of the panel, 1.5 to 1.75)."""
-USUAL_RHW = 0.3
 
 
 class Shells(Source):
@@ -82,31 +80,20 @@ class Shells(Source):
 
     @classmethod
     def expected_tests(cls, resolved: Resolved) -> int | None:
-        """See `Source`: those of a vehicle that crashes as often as the first reference driver (`within_reach`)."""
+        """See `Source`: those of a vehicle that crashes as often as the first reference driver.
+
+        At least ln(1/α) p/(2 r μ), for a rate μ to within ± r of itself where cut-ins of probability p are at stake.
+        """
         campaign = resolved.campaign
         rhw, asked = campaign.stop.rhw, campaign.testing.shells.statement
         if rhw is None or campaign.accept is not None or campaign.has_baseline_runs:
             return super().expected_tests(resolved)
         if (pool := cached_pool(resolved)) is None or not pool.reference_rate.any():
             return None
-        design = design_shells(pool, shells=campaign.testing.shells, limit_mps2=acceleration_limit(campaign.av))
-        n_inside = next((each.n_inside for each in design.statements if each.name == asked), len(design.p))
-        at_stake = float(design.p[:n_inside].sum())
-        n = OVER_BOUND * _nats(campaign.stop) * at_stake / (2.0 * rhw * float(pool.reference_rate[0]))
+        design = design_shells(pool, acceleration_limit(campaign.av))
+        at_stake = float(design.p[: design.n_within(asked)].sum())
+        n = OVER_BOUND * -math.log1p(-campaign.stop.confidence) * at_stake / (2.0 * rhw * float(pool.reference_rate[0]))
         return min(max(round(n), campaign.min_crashes), campaign.stop.episodes)
-
-    @classmethod
-    def reach(cls, resolved: Resolved) -> dict[str, str]:
-        """See `Source`: where cut-ins take time the rates of attentive vehicles are tiny."""
-        campaign = resolved.campaign
-        if not resolved.environment.lateral.present or campaign.has_baseline_runs:
-            return {}
-        if (pool := cached_pool(resolved)) is None:
-            return {"within_reach": "known once the pool is built (harness pool)"}
-        design = design_shells(pool, shells=campaign.testing.shells, limit_mps2=acceleration_limit(campaign.av))
-        p = {ASSUMPTION_FREE: float(design.p.sum())}
-        p |= {each.name: float(design.p[: each.n_inside].sum()) for each in design.statements}
-        return {f"within_reach_of_{name}": within_reach(at_stake, campaign.stop) for name, at_stake in p.items()}
 
     @classmethod
     def stored_design(cls, folder: Path) -> ShellDesign:
@@ -144,27 +131,6 @@ class Shells(Source):
         """See `Source`: nor of the last round of a smaller budget."""
         cut_ins, wanted = episodes.column("pool_cut_in"), self.prescribed.rows(request.draws)[0]
         return super().is_shard(request, episodes) and not cut_ins.null_count and np.array_equal(cut_ins, wanted)
-
-
-def _nats(stop: Stop) -> float:
-    return math.log(1.0 / (1.0 - stop.confidence))
-
-
-def within_reach(p: float, stop: Stop) -> str:
-    """What can be said of a rate where cut-ins of probability ``p`` have to be shown not to crash.
-
-    A rate to within ± r of itself needs some 1.6 ln(1/α) p/(2 r μ) tests: without an assumption p is that of all that
-    the envelope reaches, inside a boundary that of its shells. (Lower bound ln(1/α) p/(2 r μ); the panel of
-    docs/internals/shells-validation.md took 1.5 to 1.75 times that.) Where cut-ins take time, the rate of an attentive
-    vehicle falls by orders of magnitude, and that number of tests grows as its inverse; what remains is the upper limit
-    ln(1/α) p/n.
-    """
-    rhw, n, nats = stop.rhw or USUAL_RHW, stop.episodes, _nats(stop)
-    smallest, limit = OVER_BOUND * nats * p / (2.0 * rhw * n), nats * p / n
-    return (
-        f"a rate to within ±{100.0 * rhw:.0f} % from some {smallest:.1e} per test on, with {n:,} tests; of a vehicle "
-        f"that crashes less an upper limit, {limit:.1e} without a crash"
-    )
 
 
 class ShellRounds(Rounds):

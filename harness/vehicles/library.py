@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 from harness.campaign.drivers import Driver, Reference, Reflexes
 from harness.campaign.files import read_model, shipped_or_own
 from harness.campaign.problems import broken_rule, did_you_mean
-from harness.campaign.sections import Section, ShellSettings, StatementSettings, SurrogateName, checked_statements
+from harness.campaign.sections import Section, SurrogateName, listed
 from harness.errors import CampaignError
 from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT
 from harness.vehicles.drivers import Followers, driver_records
@@ -33,6 +33,16 @@ class LibraryDriver(Driver):
         if not isinstance(self.parameters, Reference):
             return None
         return self.parameters.delay_after_cut_in_s + self.reaction.delay_s
+
+
+class StatementSettings(Section):
+    """A statement about vehicles that crash only inside a boundary."""
+
+    boundary: SurrogateName = Field(description="the most careless surrogate inside")
+    assumes: str = Field("", description='what it assumes, as the end of a sentence that begins with "If this vehicle"')
+    checked: bool = Field(
+        False, description="whether each test has to show that the vehicle is never ahead of that surrogate"
+    )
 
 
 def library_records(models: Sequence[LibraryDriver], see_onset: bool) -> RecordArray:
@@ -89,29 +99,17 @@ class Library(Section):
         statements = {name: each for name, each in self.statements.items() if each.boundary not in names}
         return Library.model_validate({**dict(self), "surrogates": kept, "statements": statements})
 
-    def statement_settings(self, shells: ShellSettings) -> dict[str, StatementSettings]:
-        """The statements of a campaign, its own or the library's, by name.
+    @property
+    def all_statements(self) -> dict[str, StatementSettings]:
+        """The statement `library`, with the library's own boundary, and the further ones."""
+        return {LIBRARY_STATEMENT: StatementSettings(boundary=self.boundary, assumes=self.assumes), **self.statements}
 
-        Raises `CampaignError`: a boundary is no surrogate that reacts, or the statement that is asked for is none of
-        them.
-        """
-        own = shells.boundary or self.boundary
-        assumes = self.assumes if own == self.boundary else ""
-        found = {LIBRARY_STATEMENT: StatementSettings(boundary=own, assumes=assumes)}
-        found |= self.statements if shells.statements is None else shells.statements
-        allowed = [name for name in self.surrogates if name != self.envelope]
-        for name, each in found.items():
-            if each.boundary not in allowed:
-                key = "boundary" if name == LIBRARY_STATEMENT else "statements"
-                where = f"testing.shells.{key}" + (f".{name}.boundary" if key == "statements" else "")
-                expected = f"a surrogate of the library other than its envelope: {', '.join(allowed)}"
-                mend = f"Name one of them, or leave {key} out for the library's own."
-                raise CampaignError(where, f"'{each.boundary}'", expected, mend)
-        if shells.statement not in (ASSUMPTION_FREE, *found):
-            expected = f"one of {ASSUMPTION_FREE}, {', '.join(found)}"
-            mend = "Name one of them, or add it to testing.shells.statements."
-            raise CampaignError("testing.shells.statement", f"'{shells.statement}'", expected, mend)
-        return found
+    def require_statement(self, asked: str) -> None:
+        """Refuse (`CampaignError`) a statement that a campaign asks for where there is none of that name."""
+        if asked not in (known := (ASSUMPTION_FREE, *self.all_statements)):
+            expected = f"one of {', '.join(known)}"
+            mend = did_you_mean(asked, known) or "Name one of them, or add it to a library of your own (pool.library)."
+            raise CampaignError("testing.shells.statement", f"'{asked}'", expected, mend)
 
     @model_validator(mode="after")
     def _names_are_known(self) -> Self:
@@ -125,7 +123,14 @@ class Library(Section):
                 expected = "a driver that reacts: the envelope crashes nearly always, which says nothing"
                 mend = "Name the most careless driver that the vehicle can be expected to outdo."
                 raise broken_rule(key, f"'{name}', which is the envelope", expected, mend)
-        checked_statements(self.statements)
+        if taken := {ASSUMPTION_FREE, LIBRARY_STATEMENT} & set(self.statements):
+            expected = f"another name: {ASSUMPTION_FREE} and {LIBRARY_STATEMENT} are there always"
+            mend = "Rename it; the boundary of the statement library is the key boundary."
+            raise broken_rule("statements", f"a statement named {min(taken)}", expected, mend)
+        if len(checked := [name for name, each in self.statements.items() if each.checked]) > 1:
+            found = f"{len(checked)} statements that are checked in each test: {listed(checked)}"
+            mend = "Leave checked out of the others: a crash beyond their boundary refutes them."
+            raise broken_rule("statements", found, "one at most", mend)
         if (n := self.n_drivers) > MOST_SURROGATES:
             mend = "Every shell costs tests: keep those that differ in crash rate by a quarter or more."
             raise broken_rule("surrogates", f"{n} of them, with the references", f"at most {MOST_SURROGATES}", mend)

@@ -19,7 +19,7 @@ import numpy as np
 from scipy.special import ndtri
 
 from harness.campaign.campaign import Campaign
-from harness.campaign.sections import Accept, ShellSettings
+from harness.campaign.sections import Accept
 from harness.errors import CampaignError
 from harness.estimators.estimate import Estimate
 from harness.estimators.likelihood import Level, likelihood_limit
@@ -390,7 +390,7 @@ class OvertakingShells:
     def crashes_outside(self, crashing: FloatArray) -> dict[str, float]:
         """Share of a crash mass by cell (n, C) that lies beyond the boundary of each statement; 0 of no crash."""
         by_cell, names = crashing.sum(0), self.template.names
-        total, statements = by_cell.sum() or 1.0, self.template.library.statement_settings(ShellSettings())
+        total, statements = by_cell.sum() or 1.0, self.template.library.all_statements
         places = {name: names.index(each.boundary) for name, each in statements.items()}
         return {name: float(by_cell[self.template.cell_shell > place].sum() / total) for name, place in places.items()}
 
@@ -408,8 +408,8 @@ class OvertakingShells:
             reference_rate=by_reference.mean(0),
             reference_square=(by_reference * by_reference).mean(0),
         )
-        design = design_shells(pool, limit_mps2=limit)
-        cells = cells_in_strata(pool, shells_in_strata(pool, outermost(pool, ShellSettings()), limit))[0]
+        design = design_shells(pool, limit)
+        cells = cells_in_strata(pool, shells_in_strata(pool, limit))[0]
         tested = np.flatnonzero(cells >= 0)
         joined = np.zeros((tested.size, design.cell_p.size))
         joined[np.arange(tested.size), cells[tested]] = 1.0
@@ -490,7 +490,7 @@ class Division:
     def as_adversary(self, made: Adversary, crashing: FloatArray) -> FloatArray:
         """The mass of crashes (m,) of an adversary made of a vehicle."""
         template, population = self._shells.template, self._population
-        inside: BoolArray = self._shell <= outermost(template, ShellSettings())
+        inside: BoolArray = self._shell <= outermost(template)
         if made.crashes != "everywhere":
             weight = population.by_path(crashing * inside)
             order = np.argsort(-weight if made.crashes == "on_heaviest_paths" else weight, kind="stable")

@@ -67,8 +67,6 @@ BROKEN_RULES = (
     ("environment:\n  acceleration_hold_s: 0.25", "environment.acceleration_hold_s", 3, "multiple of the 0.1 s"),
     ("environment:\n  parameters: gone.yaml", "environment.parameters", 3, "a parameter file"),
     ("environment:\n  parameters: ndd-overtaking-2", "environment.parameters", 3, "Did you mean"),
-    ("stop:\n  estimator: nde", "stop.estimator", 3, "testing.method nde"),
-    ("stop:\n  estimator: scv\nrecords: {moments: none}", "stop.estimator", 3, "records.moments"),
     ("av:\n  sumo: {tau: 1}\nworld: {engine: twin}", "world.engine", 4, "Write engine: sumo"),
     ("av:\n  traci: {command: 'x {host}'}", "av.traci.command", 3, "Double a brace"),
     ("av:\n  before_cut_in: controller", "av.before_cut_in", 3, "hold_speed"),

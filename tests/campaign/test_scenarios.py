@@ -30,7 +30,7 @@ CHANGES = [
     "av={parameters: {time_headway_s: 2}, limits: {step_time_s: 1}}",
     "surrogates={A: {model: fvdm, parameters: {c2: 1}}, b-2: {model: idm}}",
     "testing={method: nde, alpha: null}",
-    "testing.shells.statements={mine: {boundary: brakes-3, assumes: it brakes, checked: true}}",
+    "testing.shells={statement: library, first_tests: 5}",
     "environment={lane_change_level: 350, cut_in_lead_s: 0.5}",
     "run={executor: ray, ray: {address: auto, resources: {cpus: 2}, runtime_env: {env_vars: {A: '1'}}}}",
     "records={moments: all, traces: critical, trace_share: 0.25}",
@@ -163,14 +163,16 @@ SHIPPED = {
 }
 PANEL = "85f51781dfe16fec"
 CHANGED = [
-    (["testing.shells.stopping=sequential"], "7af628145960e74a"),  # of before; the only way that is left
+    (
+        ["testing.shells.stopping=sequential", "testing.shells.statements=null", "stop.estimator=null"],
+        "7af628145960e74a",
+    ),
     (["environment.cut_in_lead_s=0.5"], "849f9c8cd132d0f4"),
     (["testing.shells.smallest_round=8"], "9effa1d477121757"),
     (["av={controller: 'a:B', parameters: {x: 1}, before_cut_in: controller}"], "0b74ded34c4cb2ce"),
     (["av={controller: 'a:B', warm_up_s: 0}"], "e554cf95f11fe057"),  # as before there was one
     (["av={traci: {command: x}}"], "bd13597d5b96bc4b"),
     (["av={sumo: {tau: 1}}"], "32f3238a2fdebd9c"),
-    (["testing.shells.statements={mine: {boundary: brakes-3, checked: true}}"], "ebd005bdfd4934f6"),
     (["surrogates={}", "accept.crash_rate_below=1e-7"], "8550aa94734883c2"),
     (["testing.method=forced"], "03cae7d7dff5e59c"),
     (["run.shard_size=7", "records.moments=all", "pool.library=ladder-1"], "a96e964afce39346"),

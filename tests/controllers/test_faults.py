@@ -157,11 +157,7 @@ REFUSED = [
     (_of("says_nothing"), "av.controller", "without start, step, close"),
     (POPEN, "av.controller", "Popen without start, step, close"),
 ]
-SETTINGS = [
-    ("{boundary: foo}", "testing.shells.boundary"),
-    ("{statement: foo}", "testing.shells.statement"),
-    ("{statements: {a: {boundary: foo}}}", "testing.shells.statements.a.boundary"),
-]
+SETTINGS = [("{statement: foo}", "testing.shells.statement")]
 
 
 @pytest.mark.parametrize(

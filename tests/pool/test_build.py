@@ -157,8 +157,8 @@ def test_a_stride_asks_the_same_cut_ins_and_each_stands_for_as_many(environment)
 
 
 def test_strata_of_a_vehicle_that_may_accelerate_harder_include_what_the_envelope_survives(pool):
-    within = design_shells(pool, limit_mps2=2.0)
-    beyond = design_shells(pool, limit_mps2=2.5)
+    within = design_shells(pool, 2.0)
+    beyond = design_shells(pool, 2.5)
     assert within.p_unreachable == pytest.approx(pool.shell_p[-1])
     stored = STORED_DESIGN.dump_python(within, mode="json")
     of_earlier_days = {("p_impossible" if name == "p_unreachable" else name): each for name, each in stored.items()}

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import json
-
-import numpy as np
 import pytest
 
 from harness.errors import CampaignError
@@ -63,20 +60,12 @@ def test_av_check_looks_at_a_vehicle_from_the_onset_on_and_refuses_one_that_acts
         check_av(campaign(LEAD, "testing.method=forced", f"av={ACTING.format('Speeds')}"), 4)
 
 
-def test_check_says_what_is_within_reach(stored_run):
+def test_check_says_how_many_tests_are_expected():
     def plan(*more: str):
         return plan_campaign(golden("shells-lateral-twin", "stop.rhw=0.5", "stop.episodes=4000", *more))
 
     asked = plan()
-    said = {name: text for name, text in asked.items() if name.startswith("within_reach_of_")}
-    assert set(said) == {f"within_reach_of_{name}" for name in ("assumption_free", "library", "sees-the-overlap")}
-    assert all("upper limit" in text for text in said.values())
     assert 0 < asked["expected_tests"] < asked["most_tests"]
     assert asked["expected_seconds"] <= asked["most_seconds"]
     assert "until the limit is decided" in plan("accept.crash_rate_below=1e-7")["expected_tests"]
     assert plan("stop.rhw=null")["expected_tests"] == asked["most_tests"]
-    smallest = {name: float(text.split("some ")[1].split(" per test")[0]) for name, text in said.items()}
-    assert smallest["within_reach_of_library"] < smallest["within_reach_of_assumption_free"] / 10.0
-    shells = json.loads((stored_run("shells-lateral-twin") / "shells.json").read_text(encoding="utf-8"))
-    free = 1.6 * np.log(10.0) * sum(shells["cell_p"]) / (2.0 * 0.5 * 4000)
-    assert smallest["within_reach_of_assumption_free"] == pytest.approx(free, rel=0.05)
