@@ -280,6 +280,48 @@ def validated_table(name: str) -> str:
     return f"{_table(head, rows)}\n{_command(name)}\n"
 
 
+FORMER = ", by the former rule"
+
+
+def decisions_table() -> str:
+    """Per cent of campaigns that accept / reject at the truth, by rule and budget; tests for other limits; command."""
+    content = _result("gate")
+    budgets = [*content["experiment"]["budgets"], content["experiment"]["campaign"]["stop"]["episodes"]]
+    rows = []
+    for subject, of in _by_result(content["judgements"]).items():
+        wrong = (_wrong(of, budget, by) for by in ("", FORMER) for budget in budgets)
+        ways = ("2 x rate, rejected", "0.5 x rate, accepted")
+        at_last = [of[f"limit {way} within {budgets[-1]:,} tests"] for way in ways]
+        tests = (f"{one['tests_median']:,.0f}" if one["reached"] > 0.5 else "undecided" for one in at_last)
+        rows.append((f"`{subject}`", f"{at_last[0]['truth']:.2g}", *wrong, *tests))
+    words = [f"≤ {budget:,} tests" for budget in budgets]
+    head = ("vehicle", "crash rate", *words, *(f"former, {each}" for each in words), "at twice the rate", "at half")
+    return _table(head, rows) + f"\n{at_last[0]['replications']} campaigns each: {_command('gate')}\n"
+
+
+def _wrong(of: dict[str, dict[str, Any]], budget: int, by: str) -> str:
+    verdicts = [of[f"limit 1 x rate, {verdict} within {budget:,} tests{by}"] for verdict in ("accepted", "rejected")]
+    return " / ".join(f"{100.0 * (1.0 - one['coverage']):.1f}" for one in verdicts)
+
+
+def _by_result(judgements: list[dict[str, Any]]) -> dict[str, dict[str, dict[str, Any]]]:
+    found: dict[str, dict[str, dict[str, Any]]] = {}
+    for one in judgements:
+        found.setdefault(one["subject"], {})[one["result"]] = one
+    return found
+
+
+def bounds_table() -> str:
+    """Share of campaigns in which bounds hold, beside the former ones; command."""
+    names = "shells, upper bound", "shells, upper bound beyond library"
+    rows = []
+    for subject, of in _by_result(_result("shells_bounds")["judgements"]).items():
+        held = (f"{of[name + by]['coverage']:.3f}" for name in names for by in ("", FORMER))
+        rows.append((f"`{subject}`", *held, f"{of['shells']['tests_median']:,.0f}"))
+    head = ("vehicle", "`upper_bound`", "former", "`upper_bound_outside`", "former", "tests")
+    return _table(head, rows) + f"\n{of['shells']['replications']} campaigns each: {_command('shells_bounds')}\n"
+
+
 def coverage_table() -> str:
     """Lowest coverage over the vehicles that meet the assumption, by experiment, its variants, and kind of result."""
     kinds = ("assumption-free", "given a statement", "ratio to a reference", "preventable")
@@ -379,6 +421,8 @@ PARTS: dict[str, Callable[[], str]] = {
     **{f"results-{name}": partial(results_table, results) for name, results in RESULTS.items()},
     **{f"validated-{name}": partial(validated_table, name) for name in VALIDATED},
     "coverage": coverage_table,
+    "decisions": decisions_table,
+    "bounds": bounds_table,
 }
 """All generated parts by name."""
 

@@ -51,18 +51,16 @@ EQUAL_RATE = 0.02
 _CRASHING = ((CRASH, CRASH), (CRASH, NO_CRASH), (NO_CRASH, CRASH))
 """How A and B end: both crash, only A, only B."""
 _STATEMENT = ("testing", "shells", "statement")
-
-
 BOUND = "shells, upper bound"
 
 
-def limit_at(factor: float, budget: int) -> tuple[str, ...]:
-    """Names of what is judged of the decision about a limit, a multiple of the crash rate, within a budget.
+def limit_at(factor: float, budget: int) -> dict[str, str]:
+    """Names of what is judged of decisions about a limit within a budget: how often a verdict that is wrong is given.
 
-    Where the limit is the truth, either verdict is wrong: how often each is given is an error rate of its own.
+    The limit is a multiple of the crash rate. Where it is the truth, either verdict is wrong.
     """
-    verdicts = ("accepted ", "rejected ") if factor == 1.0 else ("",)
-    return tuple(f"limit {factor:g} x rate, {verdict}within {budget:,} tests" for verdict in verdicts)
+    wrong = ["accepted"] * (factor <= 1.0) + ["rejected"] * (factor >= 1.0)
+    return {f"limit {factor:g} x rate, {verdict} within {budget:,} tests": verdict for verdict in wrong}
 
 
 def bound_outside(statement: str) -> str:
@@ -104,16 +102,15 @@ class DrawnPool:
 
     @cached_property
     def _cumulative(self) -> tuple[FloatArray, FloatArray]:
-        """Sums of crash mass and mass up to each path, by cell, shape (C, n) each."""
-        crash_mass, mass = (np.cumsum(np.ascontiguousarray(each.T), axis=1) for each in (self.crash_mass, self.mass))
-        return crash_mass, mass
+        """Sums of mass, and of crash mass, up to each path, by cell, shape (C, n)."""
+        mass, crash_mass = (np.cumsum(np.ascontiguousarray(each.T), axis=1) for each in (self.mass, self.crash_mass))
+        return mass, crash_mass
 
     def paths_of(self, n_by_cell: IntArray, rng: np.random.Generator, *, crashed: bool = True) -> list[IntArray]:
         """Paths of so many crashed tests of each cell (C,), or of any."""
-        cumulative = self._cumulative[0 if crashed else 1]
         return [
             np.searchsorted(up_to, rng.random(n) * up_to[-1], side="right")
-            for up_to, n in zip(cumulative, n_by_cell.tolist(), strict=True)
+            for up_to, n in zip(self._cumulative[int(crashed)], n_by_cell.tolist(), strict=True)
         ]
 
     def tests_of(self, added: IntArray, rng: np.random.Generator) -> tuple[IntArray, list[IntArray], list[IntArray]]:
@@ -122,14 +119,11 @@ class DrawnPool:
         if added.size != self.mass.shape[1]:
             tests = rng.multinomial(added, self._of_stratum).sum(0)
         bad = rng.binomial(tests, self.share)
-        n_failed = rng.binomial(bad, self.failing) if self.failing else np.zeros_like(bad)
-        if self.failing_tests:
-            n_failed = n_failed + rng.binomial(bad - n_failed, self.failing_tests)
-        paths = list(zip(self.paths_of(bad, rng), n_failed.tolist(), strict=True))
-        crashed, failed = [rows[n:] for rows, n in paths], [rows[:n] for rows, n in paths]
-        if self.failing_tests:
-            more = self.paths_of(rng.binomial(tests - bad, self.failing_tests), rng, crashed=False)
-            failed = [np.concatenate(both) for both in zip(failed, more, strict=True)]
+        n_failed = rng.binomial(bad, self.failing + self.failing_tests * (1.0 - self.failing)).tolist()
+        paths = self.paths_of(bad, rng)
+        others = self.paths_of(rng.binomial(tests - bad, self.failing_tests), rng, crashed=False)
+        crashed = [rows[n:] for rows, n in zip(paths, n_failed, strict=True)]
+        failed = [np.append(rows[:n], other) for rows, n, other in zip(paths, n_failed, others, strict=True)]
         return tests, crashed, failed
 
     def count(self, added: IntArray, seen: Shells, rng: np.random.Generator) -> None:
@@ -235,11 +229,8 @@ class ShellCampaign:
         def judged(seen: Shells, budget: int) -> Iterator[Row]:
             for (factor, by), rule in rules.items():
                 row = known.get((factor, by)) or self._decision(seen, replication, rule)
-                for name in limit_at(factor, budget):
-                    low, high = row.ci_low, row.ci_high
-                    if factor == 1.0:  # nothing is right about the verdict of this name
-                        low, high = 0.0, 0.0 if row.result in name else math.inf
-                    yield replace(row, result=name + by, ci_low=low, ci_high=high)
+                for name, wrong in limit_at(factor, budget).items():
+                    yield replace(row, result=name + by, ci_high=0.0 if row.result == wrong else math.inf)
 
         for seen, *_ in looks(self.campaign, drawn, rng, self.budgets):
             for which, rule in rules.items():
@@ -253,15 +244,12 @@ class ShellCampaign:
             yield from judged(seen, budget)
 
     def _decision(self, seen: Shells, replication: int, rule: RoundRule) -> Row:
-        """A decision is a one-sided interval: below the limit, or above."""
-        decision = rule.look.decision
-        if decision is None:
-            raise ValueError("the rule has looked at no limit")
-        verdict, limit, (n, n_crashes, _) = decision.verdict, decision.crash_rate_below, seen.tally.totals
-        low, high = limit if verdict == "rejected" else 0.0, limit if verdict == "accepted" else math.inf
-        rate = seen.limits_of(decision.statement, Level.two_sided(self.campaign.stop.confidence)).rate
-        known = verdict != "undecided"
-        return Row(verdict, replication, n, n_crashes, rate, seen.std_error(), low, high, reached=known)
+        """A verdict, for now with an interval that holds whatever is true."""
+        verdict = "undecided" if rule.look.decision is None else rule.look.decision.verdict
+        level, (n, n_crashes, _) = Level.two_sided(self.campaign.stop.confidence), seen.tally.totals
+        rate = seen.limits_of(self.campaign.testing.shells.statement, level).rate
+        decided = verdict != "undecided"
+        return Row(verdict, replication, n, n_crashes, rate, seen.std_error(), 0.0, math.inf, decided)
 
     def _replicate(self, replication: int, drawn: DrawnPool, rng: np.random.Generator) -> Iterator[Row]:
         design = drawn.design
