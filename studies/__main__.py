@@ -144,6 +144,7 @@ def study(study_file: Path, folder: Path, *, quick: bool, workers: int | None, q
 
 
 _SHARE = click.FloatRange(0, 1, min_open=True, max_open=True)
+_WHOSE = "Whose RHW; may be given several times. Default: nde for naturalistic runs, else nade."
 
 
 @cli.command(
@@ -162,27 +163,18 @@ _SHARE = click.FloatRange(0, 1, min_open=True, max_open=True)
 @click.option("--seed", type=click.IntRange(min=0), default=1, help="Seed of the orderings.")
 @click.option("--ratio", type=click.FloatRange(1, min_open=True), default=1.05, help="From one look to the next.")
 @click.option("--total", type=click.IntRange(min=2), help="Last look. Default, and at most: all tests on record.")
-@click.option(
-    "--estimator",
-    "-e",
-    "estimators",
-    type=click.Choice(["nde", "nade", "scv"]),
-    multiple=True,
-    help="Whose RHW; may be given several times. Default: nde for naturalistic runs, else nade.",
-)
+@click.option("-e", "estimators", type=click.Choice(["nde", "nade", "scv"]), multiple=True, help=_WHOSE)
 @json_option
 def rnot(folders: Sequence[Path], *, estimators: Sequence[RnotEstimator], as_json: bool, **asked: Any) -> None:
     """Count the tests that each RUN needed, the way the paper counts them; nothing is simulated.
 
-    The tests of a run are shuffled. The required number of tests (RNoT) of a shuffle is the first look at which the
-    relative half-width is at most --rhw and stays so until the last look. Printed are its mean over all shuffles, its
-    5-95 % range, and the average acceleration ratio (AAR): the mean of the first row over that of each row.
+    The tests of a run are shuffled. The required number of tests (RNoT) of a shuffle is the first look from which on
+    the relative half-width is at most --rhw. Printed are its mean over all shuffles, its 5-95 % range, and the average
+    acceleration ratio (AAR): the mean of the first row over that of each row. Where shuffles are above --rhw at the
+    last look, the mean is a lower limit. Runs that draw from shells are refused: their tests cannot change places.
 
-    Shuffles that are above --rhw at the last look count as that many tests; how many these are is printed, and the mean
-    is a lower limit then. Runs that draw from shells are refused: their tests cannot change places.
-
-    'scv' is computed only when asked for. It solves its regressions anew at each look of each shuffle, which takes
-    minutes: a larger --ratio and a smaller --total make it quicker. Its RHW rests on a variance that is too small.
+    'scv' solves its regressions anew at each look of each shuffle, which takes minutes: a larger --ratio and a smaller
+    --total make it quicker. Its RHW rests on a variance that is too small.
     """
     from studies.rnot import SHOWN, Procedure, required_tests_of_runs  # noqa: PLC0415 - keeps --help fast
 

@@ -50,13 +50,12 @@ def worker_processes(workers: int | None) -> Iterator[ProcessPoolExecutor]:
 def _end_with_parent() -> None:
     """Let this worker process end when its parent is killed."""
     leave_signals_to_parent()
+    threading.Thread(target=_end_after, args=(parent_process(),), daemon=True).start()
 
-    def end() -> None:
-        if (parent := parent_process()) is not None:
-            parent.join()
-            os._exit(1)
 
-    threading.Thread(target=end, daemon=True).start()
+def _end_after(parent: Any) -> None:
+    parent.join()
+    os._exit(1)
 
 
 def results_of(
