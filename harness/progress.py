@@ -112,10 +112,14 @@ class ShownProgress(Progress):
     def status(self, **figures: Figure) -> None:
         """Show figures beside the bar, keeping those not named."""
         for task in self._bars.tasks:
-            task.fields["figures"] |= figures
-            if (budget := task.fields["budget"]) is not None:
+            told = task.fields["figures"]
+            # A half-width is that of the last look: with tests that came since, it would foresee too many.
+            foreseen = task.total is not None and task.completed < task.total and "rhw" in told
+            outdated = foreseen and figures.get("rhw", told["rhw"]) == told["rhw"]
+            told |= figures
+            if (budget := task.fields["budget"]) is not None and not outdated:
                 # Not by `update`, which begins to measure time anew where the total is another one.
-                left = episodes_left(task.completed, budget, *self._asked, task.fields["figures"])
+                left = episodes_left(task.completed, budget, *self._asked, told)
                 task.total = None if left is None else task.completed + left
             self._bars.update(task.id, words=_words(task))
 

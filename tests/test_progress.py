@@ -79,6 +79,16 @@ def test_the_share_is_that_of_the_work_thought_necessary(watched, target, share)
     assert re.findall(r"(\d+)%", stream.getvalue())[-1] == share
 
 
+def test_tests_since_the_last_look_bring_the_end_nearer():
+    bar, foreseen = ShownProgress(0.05, 0, io.StringIO()), []
+    bar.stage("episodes", total=200_000)
+    for n, rhw in ((5_000, 0.1), (5_000, 0.1), (9_000, 0.06), (1_000, 0.06)):
+        bar.advance(n)
+        bar.status(crashes=1_500, rhw=rhw)
+        foreseen.append(re.search(r" of ([\d,]+)", next(bar.lines()))[1])
+    assert foreseen == ["20,000", "20,000", "27,360", "27,360"]
+
+
 def test_work_of_an_earlier_run_is_not_its_speed():
     stream = Terminal()
     with ShownProgress(stream=stream) as bar:
