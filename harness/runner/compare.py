@@ -12,7 +12,6 @@ from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -24,7 +23,7 @@ from harness.estimators.pairs import MarginVerdict, PairedEstimate, PairedShells
 from harness.estimators.stopping import PairRule
 from harness.pool.shells import Draw, acceleration_limit
 from harness.progress import Progress
-from harness.records.folder import read_manifest, require_place, sole_use, write_json
+from harness.records.folder import read_manifest, sole_use, write_json
 from harness.records.reader import read_shards
 from harness.resolved import Resolved, require_ready
 from harness.runner.resume import require_own_folder
@@ -180,13 +179,16 @@ def _take_over(stored: Path, folder: Path, resolved: Resolved) -> None:
         expected = f"one of A as it is to be compared ({resolved.content_hash})"
         mend = "Leave out --set and --av where they change more than the stop rule, or name A's campaign file."
         raise RunFolderError(str(stored), f"a run of campaign {manifest['campaign_hash']}", expected, mend)
-    require_place(folder.parent)
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    with TemporaryDirectory(dir=folder.parent, prefix=".", suffix=".part") as unfinished:
-        copy = shutil.copytree(stored, Path(unfinished) / "a")
-        if folder.exists():
-            folder.rmdir()
-        copy.replace(folder)
+    unfinished = folder.with_name(f".{folder.name}.part")
+    with sole_use(unfinished):  # in which a call that was killed may have left a part
+        try:
+            shutil.rmtree(unfinished / "a", ignore_errors=True)
+            copy = shutil.copytree(stored, unfinished / "a")
+            if folder.exists():
+                folder.rmdir()
+            copy.replace(folder)
+        finally:
+            shutil.rmtree(unfinished)
 
 
 def require_comparable(a: Campaign, b: Campaign) -> None:

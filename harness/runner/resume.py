@@ -202,7 +202,7 @@ def require_own_folder(folder: Path, resolved: Resolved, *, resume: bool) -> dic
     """Refuse a folder that holds something else; return the manifest of a run to be continued, or one without shards.
 
     Raises `RunFolderError`: the folder cannot be written to, holds another campaign, this one without ``--resume`` or
-    with another controller (one file may not mix two versions of it), only a part of a run, or files that are no run.
+    with another controller (one file may not mix two versions of it), or files that are no run.
     """
 
     def refusal(found: str, expected: str, mend: str) -> RunFolderError:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import fcntl
 import os
 import pickle
 import random
@@ -57,6 +58,16 @@ def test_a_write_that_fails_leaves_nothing_but_the_old_file(tmp_path):
         assert files_below(tmp_path) == old
         write_atomically(path, lambda temporary: temporary.write_text("old"))
     assert path.read_text() == "old"
+
+
+def test_what_a_killed_writer_has_left_goes_with_the_next_write(tmp_path):
+    left, in_use, foreign = (tmp_path / f".{name}.part" for name in ("harness-a", "harness-b", "download"))
+    for path in (left, in_use, foreign):
+        path.write_text("half of it")
+    with in_use.open() as writer:
+        fcntl.flock(writer, fcntl.LOCK_EX)
+        write_json(tmp_path / "file.json", {})
+    assert files_below(tmp_path) == {"file.json", in_use.name, foreign.name}
 
 
 def test_a_real_limit_on_file_size_leaves_nothing(tmp_path, tables):
