@@ -209,7 +209,7 @@ class Workers(Contender):
 
     def __init__(self, settings: Campaign, workers: int) -> None:
         self._folder = Path(tempfile.mkdtemp(prefix="harness-benchmark-"))
-        self._pool = LocalWorkers(resolve(settings), self._folder, workers)
+        self._pool = LocalWorkers(resolve(settings), workers)
 
     def run(self, first: int, n: int) -> Work:
         # As many shards of 2,500 episodes for every worker.

@@ -313,8 +313,6 @@ def _serve_forks(connection: Connection, modules: Sequence[str]) -> None:
         with suppress(ImportError):  # who needs it will say so
             import_module(name)
     gc.freeze()  # what is never looked through is never copied
-    if sys.platform == "linux":  # what children leave behind becomes a child of this process
-        ctypes.CDLL(None).prctl(_PR_SET_CHILD_SUBREAPER, 1)
     server, parent = os.getpid(), os.getppid()
     ended: dict[int, int] = {}
     while True:
@@ -414,6 +412,8 @@ def end(process: subprocess.Popen[bytes] | Forked) -> int:
 def _begin(descriptor: int, parent: int) -> None:
     """Do what this process has been started for."""
     leave_signals_to_parent()
+    if sys.platform == "linux":  # what children leave behind becomes a child of this process
+        ctypes.CDLL(None).prctl(_PR_SET_CHILD_SUBREAPER, 1)
     with suppress(OSError):  # stderr may be closed
         os.dup2(2, 1)
     connection = Connection(descriptor)

@@ -43,8 +43,8 @@ def without_page() -> Iterator[None]:
 class WorkerInThisProcess:
     """Stands in for `WorkerProcess` where the tests are not about processes: spares starting one."""
 
-    def __init__(self, server: ForkServer, resolved: Path, folder: Path) -> None:
-        self._runner = ShardRunner(pickle.loads(resolved.read_bytes()), folder)
+    def __init__(self, server: ForkServer, resolved: Path, baseline: Path) -> None:
+        self._runner = ShardRunner(pickle.loads(resolved.read_bytes()), baseline)
 
     def give(self, spec: ShardRequest, fatal_episodes: Mapping[int, Death]) -> bool:
         self._done = self._runner.run(spec, fatal_episodes)

@@ -15,8 +15,6 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 from importlib import metadata
-from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -43,8 +41,6 @@ from harness.runner.workers import (
     Workers,
 )
 from harness.sampling import source_of
-from harness.sampling.baseline import SHADOW
-from harness.sampling.protocol import ShardRequest
 
 LOCAL = "local"
 """Ray's word for a cluster of this machine alone, which ends with the run."""
@@ -57,7 +53,7 @@ STARTS = 3
 """As many workers in a row may be lost before they are ready."""
 
 Files = Mapping[str, ray.ObjectRef]
-"""Content of files in the object store, by their names below some folder."""
+"""Content of files in the object store, by their names below the cache."""
 
 
 # -- on another machine --
@@ -79,24 +75,26 @@ class OnMachine:
 
     def __init__(self, resolved: Resolved) -> None:
         self._resolved = resolved
-        self._folder = TemporaryDirectory(prefix="harness-baseline-runs-")
-        self._workers = LocalWorkers(resolved, Path(self._folder.name), 1)
+        self._workers = LocalWorkers(resolved, 1)
         self._worker: WorkerProcess | None = None
+        self._follows = False
 
     def begin(self, cached: Files) -> tuple[dict[str, str | None], str] | Exception:
         """Fill the cache, and say what there is."""
         try:
-            _place(cached, cache_root())
+            _fill_cache(cached)
             return this_machine(self._resolved, require_controller(self._resolved.campaign))
         except Exception as error:  # noqa: BLE001 - see the class
             return fit_to_travel(error)
 
     def run(
-        self, request: Request, fatal_episodes: Mapping[int, Death], baseline: Files
+        self, request: Request, fatal_episodes: Mapping[int, Death], baseline: Sequence[ray.ObjectRef[bytes]]
     ) -> Result | WorkerDeath | Exception:
-        """Run a shard; tests may follow from the ``baseline`` runs, files of the run folder."""
+        """Run a shard; tests may follow from ``baseline`` runs, which lie in the object store."""
         try:
-            _place(baseline, Path(self._folder.name))
+            if baseline and not self._follows:
+                self._workers.follow_from(ray.get(baseline[0]))
+                self._follows = True
             worker = self._worker or self._workers.new_worker()
             worker.give(request, fatal_episodes)  # if it is dead, it has no answer either
             answer: Result | WorkerDeath = self._workers.first_to_answer([worker]).answer()
@@ -111,13 +109,11 @@ class OnMachine:
             self._worker.dismiss()
             self._worker.wait(CLOSING_S)
         self._workers.close()
-        self._folder.cleanup()
 
 
-def _place(files: Files, folder: Path) -> None:
+def _fill_cache(files: Files) -> None:
     for name, content in files.items():
-        if not (path := folder / name).exists():
-            path.parent.mkdir(parents=True, exist_ok=True)
+        if not (path := cache_root() / name).exists():
             write_bytes(path, ray.get(content))
 
 
@@ -132,7 +128,7 @@ class RayWorker:
 
     def give(self, request: Request, fatal_episodes: Mapping[int, Death]) -> bool:
         """See `harness.runner.workers.WorkerProcess`: that it is dead shows in its answer."""
-        self.pending = self._actor.run.remote(request, dict(fatal_episodes), self._workers.baseline(request))
+        self.pending = self._actor.run.remote(request, dict(fatal_episodes), self._workers.baseline)
         return True
 
     def answer(self) -> Result | WorkerDeath:
@@ -177,8 +173,7 @@ class RayWorkers(Workers):
     cluster, or no room in it for one worker.
     """
 
-    def __init__(self, resolved: Resolved, folder: Path, n_workers: int | None, *, n_runs: int = 1) -> None:
-        self._folder = folder
+    def __init__(self, resolved: Resolved, n_workers: int | None, *, n_runs: int = 1) -> None:
         self._settings = settings = resolved.campaign.run.ray
         address = settings.address or os.environ.get("RAY_ADDRESS") or LOCAL
         environment = _runtime_env(settings)
@@ -197,10 +192,15 @@ class RayWorkers(Workers):
         self._here = this_machine(resolved, resolved.controller_sha256)[0]
         self._cpus: set[str] = set()
         self._lost_at_start, self._patient_until = 0, time.monotonic() + PATIENCE_S
-        self._baseline: Files | None = None
+        self.baseline: list[ray.ObjectRef[bytes]] = []
+        """Baseline runs, once they have all been made."""
         self._content = ray.put(resolved)
         cached = source_of(resolved.campaign).cached_files(resolved)
-        self._cached = {} if address == LOCAL else _stored(cached, cache_root())
+        self._cached = (
+            {}
+            if address == LOCAL
+            else {str(path.relative_to(cache_root())): ray.put(np.fromfile(path, np.uint8)) for path in cached}
+        )
         self._actor_class = ray.remote(OnMachine).options(
             num_cpus=settings.resources.cpus / n_runs,
             num_gpus=settings.resources.gpus / n_runs,
@@ -211,13 +211,9 @@ class RayWorkers(Workers):
         """See `Workers.cpus`."""
         return self._cpus
 
-    def baseline(self, request: Request) -> Files:
-        """Baseline runs that tests follow from: they have all been written before the first test."""
-        if not isinstance(request, ShardRequest):
-            return {}
-        if self._baseline is None:
-            self._baseline = _stored(sorted((self._folder / SHADOW).glob("*.parquet")), self._folder)
-        return self._baseline
+    def follow_from(self, baseline: bytes) -> None:
+        """See `Workers.follow_from`."""
+        self.baseline = [ray.put(baseline)]
 
     def new_worker(self) -> RayWorker | None:
         """See `Workers.new_worker`."""
@@ -354,8 +350,3 @@ def _room(settings: RaySettings) -> int:
 
 def _words(resources: Mapping[str, float]) -> str:
     return f"{resources.get('CPU', 0.0):g} CPUs and {resources.get('GPU', 0.0):g} GPUs"
-
-
-def _stored(paths: Sequence[Path], folder: Path) -> Files:
-    """Put files into the object store."""
-    return {str(path.relative_to(folder)): ray.put(np.fromfile(path, np.uint8)) for path in paths}

@@ -14,6 +14,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
+
 from harness.campaign.campaign import Campaign
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED, CampaignError
 from harness.estimators.answer import conclusion
@@ -26,6 +28,8 @@ from harness.records.folder import (
     TABLES,
     StoppedBy,
     checksum,
+    parquet,
+    remove_unfinished,
     shards_on_disk,
     sole_use,
     write_bytes,
@@ -127,12 +131,11 @@ class Run:
     ) -> None:
         self.resolved, self.campaign, self.out, self._progress = resolved, resolved.campaign, out, progress
         began = time.monotonic()
-        for left in out.rglob(".*.part"):  # of an earlier run that was killed
-            left.unlink()
+        remove_unfinished(out.rglob(".*.part"))
         self.source = prepare(resolved, progress)
         self.held = int(earlier["n_episodes"])
         self._retracing = Retracing(resolved)
-        self._workers = workers_of(resolved, out, n_workers, n_runs=n_runs)
+        self._workers = workers_of(resolved, n_workers, n_runs=n_runs)
         with ExitStack() as refused:
             refused.callback(self._workers.close)
             distance_m = distance_per_test_m(resolved.environment)
@@ -176,8 +179,8 @@ class Run:
         """
         watched = "half_width" if self.campaign.stop.rhw is None else "rhw"
         one_more = {"one_more_crash": rule.look.one_more_crash} if self.campaign.sampling.forces else {}
-        self._progress.status(crashes=self.manifest.n_crashes, **{watched: rule.look.rhw}, **one_more)
         self._progress.advance(min(max(self.manifest.n_episodes - self.held, 0), shard.request.n_episodes))
+        self._progress.status(crashes=self.manifest.n_crashes, **{watched: rule.look.rhw}, **one_more)
         self.manifest.follow()
 
     def _known(self, request: ShardRequest) -> ShardResult | None:
@@ -216,7 +219,9 @@ class Run:
             self.manifest.follow()
         most, where = self.campaign.run.max_failed_share, "the run folder's shadow/ tables"
         require_few_failed(causes.total(), n, causes, most, "baseline runs", where)
-        runs = as_recorded(tables, environment)
+        table = pa.concat_tables(tables)
+        self._workers.follow_from(parquet(table))
+        runs = as_recorded(table, environment)
         self.manifest.note(distance_per_test_m=runs.mean_distance_m(paths.weight))
         self.source.begin_after(runs)
 
@@ -257,13 +262,13 @@ def load_report_meanwhile() -> None:
     threading.Thread(target=import_module, args=("harness.report.page",), daemon=True).start()
 
 
-def workers_of(resolved: Resolved, folder: Path, n_workers: int | None, *, n_runs: int = 1) -> Workers:
+def workers_of(resolved: Resolved, n_workers: int | None, *, n_runs: int = 1) -> Workers:
     """Where a campaign's shards are run; ``n_runs`` campaigns share it and take turns.
 
     Raises `HarnessError`: the package, the cluster or room in it is missing.
     """
     if resolved.campaign.run.executor == "local":
-        return LocalWorkers(resolved, folder, n_workers)
+        return LocalWorkers(resolved, n_workers)
     try:
         from harness.runner.ray import RayWorkers  # noqa: PLC0415 - an extra
     except ModuleNotFoundError as error:
@@ -275,4 +280,4 @@ def workers_of(resolved: Resolved, folder: Path, n_workers: int | None, *, n_run
             "the extra for clusters",
             "Install it here and on all machines of the cluster: pip install 'harness[ray]'.",
         ) from error
-    return RayWorkers(resolved, folder, n_workers, n_runs=n_runs)
+    return RayWorkers(resolved, n_workers, n_runs=n_runs)

@@ -43,11 +43,11 @@ from harness.processes import (
     tell,
     worker_modules,
 )
-from harness.records.folder import Repeated, encoded
+from harness.records.folder import Repeated, encoded, read_table
 from harness.records.schemas import ShardTables, shard_tables
 from harness.resolved import Resolved
 from harness.sampling import prepare
-from harness.sampling.baseline import BaselineRequest, BaselineResult, read_baseline, run_baseline
+from harness.sampling.baseline import BaselineRequest, BaselineResult, as_recorded, run_baseline
 from harness.sampling.protocol import ShardRequest, Source
 from harness.vocabulary import FAILED
 from harness.worlds import build_world
@@ -99,18 +99,17 @@ _Request = TypeVar("_Request", bound=Request)
 _Result = TypeVar("_Result", bound=Result)
 
 
-def serve(connection: Connection, resolved: Path, folder: Path, black_box: Path) -> None:
+def serve(connection: Connection, resolved: Path, baseline: Path, black_box: Path) -> None:
     """Prepare with the first shard, run shards until the parent is gone or has no more.
 
-    The file ``resolved`` holds the campaign. In the run's ``folder`` stand the baseline runs that tests
-    follow from, once there are some.
+    The file ``resolved`` holds the campaign, ``baseline`` the baseline runs that tests follow from, once there are any.
     """
     runner: ShardRunner | None = None
 
     def run(request: Request, fatal_episodes: Mapping[int, Death]) -> Result:
         nonlocal runner
         if runner is None:
-            runner = ShardRunner(pickle.loads(resolved.read_bytes()), folder, black_box)  # noqa: S301 - our own
+            runner = ShardRunner(pickle.loads(resolved.read_bytes()), baseline, black_box)  # noqa: S301 - our own
         return runner.run(request, fatal_episodes)
 
     with suppress(EOFError, OSError):
@@ -126,9 +125,9 @@ class ShardRunner:
     The file ``black_box`` tells that process in which call of a controller this one died.
     """
 
-    def __init__(self, resolved: Resolved, folder: Path, black_box: Path | None = None) -> None:
+    def __init__(self, resolved: Resolved, baseline: Path, black_box: Path | None = None) -> None:
         self._fatal_episodes: dict[int, Death] = {}
-        self._folder = folder
+        self._baseline = baseline
         self._source = prepare(resolved)
         self._retracing = Retracing(resolved)
         self._begun = False
@@ -150,7 +149,7 @@ class ShardRunner:
         if isinstance(request, ShardRequest):
             if paths is not None and not self._begun:
                 self._begun = True
-                source.begin_after(read_baseline(self._folder, paths, source.resolved.environment))
+                source.begin_after(as_recorded(read_table(self._baseline), source.resolved.environment))
                 self._loop = self._loop.beside(drawing=source.policy)
             return self._tests(request)
         if paths is None:
@@ -234,8 +233,8 @@ class WorkerLostError(HarnessError):
 class WorkerProcess(Apart):
     """A process that runs one shard after another: what any worker is, also one on another machine."""
 
-    def __init__(self, server: ForkServer, resolved: Path, folder: Path) -> None:
-        super().__init__(server, serve, resolved, folder)
+    def __init__(self, server: ForkServer, resolved: Path, baseline: Path) -> None:
+        super().__init__(server, serve, resolved, baseline)
 
     def give(self, request: Request, fatal_episodes: Mapping[int, Death]) -> bool:
         """Give it a shard to run, with the episodes known to end a process; False if it is dead."""
@@ -275,6 +274,10 @@ class Workers:
         self._campaign, self.n_workers = resolved.campaign, n_workers
         self._idle: list[Any] = []
         self._busy: dict[Any, _Job] = {}
+
+    def follow_from(self, baseline: bytes) -> None:
+        """Hand over all baseline runs, as a Parquet file, before the first test that follows from them."""
+        raise NotImplementedError
 
     def cpus(self) -> set[str]:
         """Names of the processors of other machines that have worked: bits are promised for one family."""
@@ -386,18 +389,21 @@ class Workers:
 
 
 class LocalWorkers(Workers):
-    """Processes of this machine, each started when it is first needed; tests may follow from files in ``folder``."""
+    """Processes of this machine, each started when it is first needed."""
 
-    def __init__(self, resolved: Resolved, folder: Path, n_workers: int | None) -> None:
+    def __init__(self, resolved: Resolved, n_workers: int | None) -> None:
         super().__init__(resolved, n_workers or os.cpu_count() or 1)
-        self._folder = folder
         # As a file: what a pipe cannot hold is waited for until the new process has imported all that it needs.
-        self._resolved = SharedFile(pickle.dumps(resolved))
+        self._resolved, self._baseline = SharedFile(pickle.dumps(resolved)), SharedFile()
         self._server = fork_server(*worker_modules(resolved.campaign.world.engine))
 
     def new_worker(self) -> WorkerProcess:
         """See `Workers.new_worker`."""
-        return WorkerProcess(self._server, self._resolved.path, self._folder)
+        return WorkerProcess(self._server, self._resolved.path, self._baseline.path)
+
+    def follow_from(self, baseline: bytes) -> None:
+        """See `Workers.follow_from`."""
+        self._baseline.path.write_bytes(baseline)
 
     def first_to_answer(self, busy: Sequence[WorkerProcess]) -> WorkerProcess:
         """See `Workers.first_to_answer`."""

@@ -106,12 +106,11 @@ def read_baseline(
         there = f"baseline runs of {sum(done is not None for done in found)} of {len(found)} files"
         expected = "those of all paths: they say how probable each test is"
         raise RunFolderError(str(folder / SHADOW), there, expected, "Let `harness run` go on with --resume.")
-    return as_recorded([done.table for done in found if done is not None], environment)
+    return as_recorded(pa.concat_tables(done.table for done in found if done is not None), environment)
 
 
-def as_recorded(tables: list[pa.Table], environment: Environment) -> BaselineRuns:
-    """Consecutive baseline runs as arrays."""
-    table = pa.concat_tables(tables, promote_options="none")
+def as_recorded(table: pa.Table, environment: Environment) -> BaselineRuns:
+    """All baseline runs of a campaign as arrays."""
     width = int(environment.numbers["max_steps"]) + 1
     n_steps = table.column("n_steps").to_numpy().astype(np.int64)
     failed = np.asarray(pc.equal(table.column("outcome").cast(pa.string()), "failed"))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pyarrow as pa
 import pytest
 
 from harness.campaign.files import load_campaign
@@ -36,9 +37,8 @@ def prepared_after(campaign):
     loop = ready.loop(TwinWorld(32))
     environment = ready.policy.environment
     specs = baseline_requests(len(ready.baseline_paths))
-    runs = as_recorded(
-        [run_baseline(loop, ready.baseline_paths, environment, spec).table for spec in specs], environment
-    )
+    tables = [run_baseline(loop, ready.baseline_paths, environment, spec).table for spec in specs]
+    runs = as_recorded(pa.concat_tables(tables), environment)
     ready.begin_after(runs)
     return ready, loop, runs
 

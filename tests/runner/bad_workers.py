@@ -9,13 +9,13 @@ import time
 from pathlib import Path
 
 
-def dying(connection, resolved, folder, black_box) -> None:
+def dying(connection, resolved, baseline, black_box) -> None:
     """Is killed by its first shard, every time."""
     connection.recv()
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-def disobedient(connection, resolved, folder, black_box) -> None:
+def disobedient(connection, resolved, baseline, black_box) -> None:
     """Finds SUMO disagreeing in its first shard."""
     from harness.errors import WorldDisagreementError
 

@@ -9,13 +9,14 @@ import json
 import os
 import signal
 import sys
+import tempfile
 import threading
 import time
 from pathlib import Path
 
 import pytest
 
-from benchmarks.kills import descendants, started_by
+from benchmarks.kills import descendants, orphans, started_by
 from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, HarnessError
 from tests.runner.conftest import TWIN
 from tests.runner.test_shadow_runs import FORCED, SHADOWS, SHELLS, of
@@ -27,6 +28,7 @@ from harness.processes import WorkerDeath  # noqa: E402
 
 ROOT = Path(__file__).parents[2]
 ON_RAY = "run.executor=ray"
+EARLY = "before_cut_in: controller, limits: {max_acceleration_mps2: 2}"
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -90,6 +92,30 @@ def test_killed_actors_and_workers_take_nothing_along(run, campaign, tmp_path):
     thread.join()
     assert len(struck) == 2
     assert unlike_columns(a.folder, b.folder) == []
+
+
+@pytest.mark.parametrize("struck", [b"", b"ray::OnMachine", b"harness.processes"], ids=["none", "actor", "its child"])
+def test_what_a_controller_starts_ends_with_the_run_and_no_file_is_left(struck, run, campaign, tmp_path, monkeypatch):
+    """In sessions of their own, some adopted; the vehicle acts early, so that machines are handed baseline runs."""
+    monkeypatch.chdir(ROOT)
+    note, out, left = tmp_path / "started", tmp_path / "ray", set(Path(tempfile.gettempdir()).glob("harness-*"))
+    acting = f"{{controller: 'tests.controllers.misbehaving:StartsPrograms', parameters: {{note: {note}}}, {EARLY}}}"
+    settings = (*FORCED, SHADOWS, TWIN[0], f"av={acting}", "world.cells=8", "stop.episodes=3000")
+
+    def strike() -> None:
+        while len(shard_files(out)) < 2:
+            time.sleep(0.02)
+        for pid in below(struck)[:1] if struck else []:
+            os.kill(pid, signal.SIGKILL)
+
+    thread = threading.Thread(target=strike)
+    thread.start()
+    run(campaign(*settings, ON_RAY), out)
+    thread.join()
+    started = {int(pid) for pid in note.read_text().split()}
+    assert len(started) >= 2 * 8 * 2
+    assert orphans(sorted(started), 10.0) == []
+    assert set(Path(tempfile.gettempdir()).glob("harness-*")) <= left
 
 
 def test_a_shard_that_is_lost_thrice_with_its_machine_is_named(run, campaign, tmp_path, monkeypatch):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pyarrow as pa
 import pytest
 
 from harness.campaign.files import load_campaign
@@ -36,7 +37,7 @@ def driven_in(world, campaign):
     try:
         specs = list(baseline_requests(len(ready.baseline_paths)))
         done = [run_baseline(loop, ready.baseline_paths, environment, spec) for spec in specs]
-        runs = as_recorded([part.table for part in done], environment)
+        runs = as_recorded(pa.concat_tables(part.table for part in done), environment)
         ready.begin_after(runs)
         rows = np.linspace(0, ready.prescribed.available.sum() - 1, SHOWN).astype(np.int64)
         shard = loop.run(1000, *ready.prescribed.of_rows(rows, np.zeros(SHOWN, np.int64)))
