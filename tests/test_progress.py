@@ -82,8 +82,8 @@ def test_the_share_is_that_of_the_work_thought_necessary(watched, target, share)
 def test_tests_since_the_last_look_bring_the_end_nearer():
     bar, foreseen = ShownProgress(0.05, 0, io.StringIO()), []
     bar.stage("episodes", total=200_000)
-    for n, rhw in ((5_000, 0.1), (5_000, 0.1), (9_000, 0.06), (1_000, 0.06)):
-        bar.advance(n)
+    for added, rhw in ((5_000, 0.1), (5_000, 0.1), (9_000, 0.06), (1_000, 0.06)):
+        bar.advance(added)
         bar.status(crashes=1_500, rhw=rhw)
         foreseen.append(re.search(r" of ([\d,]+)", next(bar.lines()))[1])
     assert foreseen == ["20,000", "20,000", "27,360", "27,360"]
