@@ -11,6 +11,7 @@ import resource
 import shutil
 import signal
 from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pyarrow as pa
@@ -29,9 +30,9 @@ from harness.records.folder import (
 from harness.records.reader import read, read_shards, table_sizes
 from harness.records.schemas import ShardTables
 from harness.report.summary import read_run_folder, summarise
-from harness.runner.stored import estimate_run
+from harness.runner.stored import estimate_run, replay_episode
 from tests.golden.record import column_hash
-from tests.in_process import run_here
+from tests.in_process import controllers_here, run_here
 from tests.stored_runs import copy_of, edit, golden, of_before, shard_files, stored_table, unlike_columns
 
 
@@ -136,7 +137,7 @@ def test_shards_are_read_in_the_manifests_order_and_no_others(tmp_path, tables):
 # -- a bit that flips, or a file of another run, changes no number without a word --
 
 
-NAME, FLIPS = "mixture-twin", 200
+NAME, ACTS, FLIPS = "mixture-twin", "shells-acting-twin", 200
 TABLES = ("episodes", "moments", "traces")
 
 
@@ -157,6 +158,18 @@ def told(folder: Path) -> str:
     return repr((tables, estimate_run(folder), page.estimates, page.campaign, table_sizes(folder), summary))
 
 
+@contextmanager
+def flipped(path: Path, chance: random.Random) -> Iterator[int]:
+    """Flip a bit of a file for a while."""
+    content = path.read_bytes()
+    bit = chance.randrange(8 * len(content))
+    path.write_bytes(content[: bit // 8] + bytes([content[bit // 8] ^ 1 << bit % 8]) + content[bit // 8 + 1 :])
+    try:
+        yield bit
+    finally:
+        path.write_bytes(content)
+
+
 def flips_unnoticed(folder: Path, n: int, seed: int) -> Iterator[str]:
     """Flip ``n`` bits one after the other, in files of equal chance; those that changed a number without an error."""
     files = [
@@ -165,15 +178,9 @@ def flips_unnoticed(folder: Path, n: int, seed: int) -> Iterator[str]:
     before, chance = told(folder), random.Random(seed)
     for _ in range(n):
         path = chance.choice(files)
-        content = path.read_bytes()
-        bit = chance.randrange(8 * len(content))
-        path.write_bytes(content[: bit // 8] + bytes([content[bit // 8] ^ 1 << bit % 8]) + content[bit // 8 + 1 :])
-        try:
+        with flipped(path, chance) as bit, suppress(HarnessError):
             if told(folder) != before:
                 yield f"bit {bit} of {path}"
-        except HarnessError:
-            pass
-        path.write_bytes(content)
 
 
 def test_a_flipped_bit_changes_no_number_silently(stored):
@@ -184,6 +191,30 @@ def test_without_checksums_it_would(stored):
     """The same flips in a folder of before: this is what they are for."""
     assert told(of_before(stored))
     assert next(flips_unnoticed(stored, FLIPS, seed=2))
+
+
+def test_a_flipped_bit_of_a_baseline_run_changes_no_test(stored_run, tmp_path):
+    """Of a run that was killed before its manifest listed the file, too: its pages and the pool have checksums."""
+    whole, chance, n_refused = stored_run(ACTS), random.Random(4), 0
+    folder = copy_of(whole, tmp_path / "run")
+    for listed in (True, False):
+        if not listed:
+            edit(folder, baseline_crc32=[])
+        for path in (folder / "shadow").iterdir():
+            with flipped(path, chance), controllers_here():
+                begun = copy_of(folder, tmp_path / path.stem)
+                edit(begun, n_episodes=0, shards=[], status="running")
+                for table in ("episodes", "traces"):
+                    shutil.rmtree(begun / table)
+                try:
+                    assert replay_episode(folder, 5).bit_equal
+                    run_here(golden(ACTS), begun, resume=True)
+                    assert not listed
+                    assert unlike_columns(whole, begun) == []
+                except RunFolderError:
+                    n_refused += 1
+                shutil.rmtree(begun)
+    assert n_refused >= 3
 
 
 @pytest.mark.parametrize("table", TABLES)
