@@ -17,7 +17,7 @@ from pydantic_core import CoreSchema, core_schema
 
 from harness.campaign.campaign import Campaign
 from harness.campaign.drivers import default_surrogates
-from harness.campaign.problems import NAME_PATTERN, describe_found, did_you_mean, in_words
+from harness.campaign.problems import MOST_SHOWN, NAME_PATTERN, describe_found, did_you_mean, in_words
 from harness.campaign.sections import Section
 from harness.campaign.vehicle import AV_SOURCES, AutomatedVehicle
 from harness.campaign.yaml_text import Lines, YamlPath, dotted, parse_value, read_yaml, yaml_text
@@ -216,7 +216,8 @@ class InvalidFileError(CampaignError):
         first, *more = self.problems = tuple(problems)
         super().__init__(first.where, first.found, first.expected, first.mend)
         if more:
-            super().__init__(path, f"{len(self.problems)} problems", "none", "")
+            at_least = "at least " if len(self.problems) == MOST_SHOWN else ""
+            super().__init__(path, f"{at_least}{len(self.problems)} problems", "none", "")
             # Not shortened: each of its lines is short.
             self.mend = "Mend each:\n" + "\n".join(f"  {problem}" for problem in self.problems)
         self.path = path

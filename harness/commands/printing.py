@@ -43,7 +43,7 @@ def show_error(error: HarnessError) -> None:
     parts = getattr(error, "problems", (error,))
     if len(parts) > 1:
         click.secho("error:", fg="red", bold=True, err=True, nl=False)
-        say(f" {error.where}: {len(parts)} problems", err=True)
+        say(f" {error.where}: {error.found}", err=True)
     for part in parts:
         click.secho("error:", fg="red", bold=True, err=True, nl=False)
         say(f" {part.where}", *(f"  {each + ':':<9} {getattr(part, each)}" for each in _PARTS), err=True)
